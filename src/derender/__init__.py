@@ -1,0 +1,40 @@
+"""Take pictures apart into geometry, albedo, light and camera.
+
+Everything public is reached from here and imported on first use, so that
+``import derender`` costs no more than finding the package.
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from derender.features import DisentangledFeatures, FeatureTable
+    from derender.model import Derenderer, load
+    from derender.scene import Scene
+
+__version__ = "0.1.0"
+
+_HOME = {
+    "Derenderer": "derender.model",
+    "load": "derender.model",
+    "Scene": "derender.scene",
+    "FeatureTable": "derender.features",
+    "DisentangledFeatures": "derender.features",
+}
+_SUBMODULES = (
+    "scene render data networks objectives model training features baselines evaluation interpretation report"
+).split()
+
+__all__ = ["DisentangledFeatures", "Derenderer", "FeatureTable", "Scene", "__version__", "load"]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOME:
+        return getattr(importlib.import_module(_HOME[name]), name)
+    if name in _SUBMODULES:
+        return importlib.import_module(f"derender.{name}")
+    raise AttributeError(f"module 'derender' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *_HOME, *_SUBMODULES])

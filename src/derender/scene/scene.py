@@ -1,0 +1,76 @@
+"""The value that travels through the left half of the program: one batch of scenes.
+
+Conventions (axes, signs, units) are written in docs/conventions.md.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+
+from jaxtyping import Float
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A batch of N scenes, each one object seen by one camera under one light.
+
+    Attributes:
+        depth: (N, H, W) distance along z of the canonical surface from the camera, metric (0.9..1.1 for the presets).
+        albedo: (N, 3, H, W) reflectance in the canonical view, 0..1.
+        light: (N, 4) ambient, diffuse (both 0..1), pitch, yaw (radians; 0, 0 is frontal).
+        camera: (N, 6) rotation about x, y, z (radians, about the point (0, 0, 1)), translation along x, y, z.
+        extra: parameters of factors beyond these four, by name, each with N rows.
+    """
+
+    depth: Float[Tensor, "n h w"]
+    albedo: Float[Tensor, "n 3 h w"]
+    light: Float[Tensor, "n 4"]
+    camera: Float[Tensor, "n 6"]
+    extra: Mapping[str, Tensor] = field(default_factory=dict)
+
+    @classmethod
+    def from_parameters(cls, parameters: Mapping[str, Tensor]) -> "Scene":
+        """Gather parameters by name; names other than the four fields go to ``extra``."""
+        missing = [name for name in _FIELDS if name not in parameters]
+        if missing:
+            raise ValueError(f"a scene needs {', '.join(_FIELDS)}; missing: {', '.join(missing)}")
+        extra = {name: value for name, value in parameters.items() if name not in _FIELDS}
+        return cls(*(parameters[name] for name in _FIELDS), extra=extra)
+
+    @property
+    def parameters(self) -> dict[str, Tensor]:
+        """Every parameter by name, extras last."""
+        return {**{name: getattr(self, name) for name in _FIELDS}, **self.extra}
+
+    def with_parameters(self, **changed: Tensor) -> "Scene":
+        """The same scenes with some parameters exchanged; an unknown name is an error."""
+        unknown = sorted(set(changed) - set(self.parameters))
+        if unknown:
+            raise ValueError(f"unknown scene parameter {unknown[0]!r}; this scene has {', '.join(self.parameters)}")
+        return Scene.from_parameters({**self.parameters, **changed})
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> "Scene":
+        """Apply one function to every parameter (move to a device, detach, select rows)."""
+        return Scene.from_parameters({name: function(value) for name, value in self.parameters.items()})
+
+    def to(self, device) -> "Scene":
+        return self.map(lambda value: value.to(device))
+
+    def detach(self) -> "Scene":
+        return self.map(lambda value: value.detach())
+
+    def __getitem__(self, rows) -> "Scene":
+        """Select scenes by slice, list or index tensor; an integer keeps the batch axis."""
+        if isinstance(rows, int):
+            rows = slice(rows, rows + 1 or None)
+        return self.map(lambda value: value[rows])
+
+    def __len__(self) -> int:
+        return self.depth.shape[0]
+
+    def with_extra(self, **values: Tensor) -> "Scene":
+        """The same scenes with parameters of further factors added or exchanged."""
+        return replace(self, extra={**self.extra, **values})
+
+
+_FIELDS = ("depth", "albedo", "light", "camera")
