@@ -1,1 +1,38 @@
-""""""
+"""Pictures in: folders, zips and published data sets, decoded once into one array.
+
+source      files of a folder, a zip, or one picture
+layout      what a data set's layout is: faces, rendered, folders hold one row each, registry lists them
+inventory   files and labels, nothing decoded
+decode      one picture; loading: all, on every core; duplicates; cache: large sets in a memory map
+pictures    all of it joined: read_pictures
+splits      which rows are for training, validation, test
+ground_truth  the exact maps of rendered sets
+"""
+
+from derender.data.cache import cache_folder
+from derender.data.decode import Unreadable, read_picture
+from derender.data.duplicates import Duplicate
+from derender.data.ground_truth import GroundTruth, read_ground_truth
+from derender.data.inventory import Inventory, take_inventory
+from derender.data.pictures import PictureSet, as_float, read_pictures
+from derender.data.registry import LAYOUTS
+from derender.data.source import Skipped
+from derender.data.splits import Split, split_indices
+
+__all__ = [
+    "LAYOUTS",
+    "Duplicate",
+    "GroundTruth",
+    "Inventory",
+    "PictureSet",
+    "Skipped",
+    "Split",
+    "Unreadable",
+    "as_float",
+    "cache_folder",
+    "read_ground_truth",
+    "read_picture",
+    "read_pictures",
+    "split_indices",
+    "take_inventory",
+]

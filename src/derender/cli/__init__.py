@@ -1,0 +1,95 @@
+"""The command line: reads arguments, calls the library, says what came out.
+
+One file per group of commands; ``main`` turns bad input into exit code 2 and one line, Ctrl-C into 130.
+Nothing heavy is imported before a command runs, so that help appears at once.
+"""
+
+import os
+import sys
+from collections.abc import Sequence
+from typing import Annotated
+
+import typer
+
+from derender import __version__
+from derender.cli import demo, embed, evaluate, pictures, synth, train
+
+app = typer.Typer(
+    name="derender",
+    help="Take pictures apart into geometry, albedo, light and camera. Start with: derender demo",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"derender {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool,
+        typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version and leave."),
+    ] = False,
+) -> None:
+    pass
+
+
+for group in (demo, train, embed, evaluate, pictures, synth):
+    group.register(app)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; gives the exit code: 0, 2 for bad input, 130 after Ctrl-C."""
+    arguments = sys.argv[1:] if arguments is None else list(arguments)
+    try:
+        code = app(arguments, prog_name="derender", standalone_mode=False)
+        sys.stdout.flush()
+        return code if isinstance(code, int) else 0
+    except BrokenPipeError:  # the reader of our output has gone, as with `| head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except (KeyboardInterrupt, typer.Abort) as error:
+        _complain(_interruption(error))
+        return 130
+    except (ValueError, OSError) as error:
+        if os.environ.get("DERENDER_TRACEBACK"):
+            raise
+        _complain(_one_line(error))
+        return 2
+    except Exception as error:
+        if not hasattr(error, "format_message"):
+            raise
+        command = getattr(getattr(error, "ctx", None), "command_path", "derender")
+        message = error.format_message().strip()
+        if not message:  # no command given: help has been shown
+            return 2
+        _complain(f"{message.rstrip('.')} (see {command} --help)")
+        return 2
+
+
+def _complain(message: str) -> None:
+    sys.stderr.write(f"derender: {message}\n")
+
+
+def _interruption(error: BaseException) -> str:
+    cause = error if isinstance(error, KeyboardInterrupt) else error.__cause__
+    return _flat(str(cause or "")) or "stopped by Ctrl-C; nothing half-written was kept"
+
+
+def _one_line(error: ValueError | OSError) -> str:
+    """What, where and what to do, on one line."""
+    if isinstance(error, OSError) and error.errno is not None and error.strerror:
+        where = f"{error.filename}: " if error.filename is not None else ""
+        hint = "; free some space and run the command again" if error.errno == 28 else ""
+        return _flat(f"{where}{error.strerror.lower()}{hint}")
+    return _flat(str(error)) or type(error).__name__
+
+
+def _flat(text: str) -> str:
+    return " ".join(text.split())

@@ -1,0 +1,157 @@
+"""What all commands share: where words, numbers and progress go.
+
+Results go to standard output, everything else to standard error, so that a pipe carries results only.
+Leaves out what any single command does.
+"""
+
+import dataclasses
+import json
+import math
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    SpinnerColumn,
+    TaskProgressColumn,
+    TextColumn,
+    TimeRemainingColumn,
+)
+from rich.table import Table
+from rich.text import Text
+
+if TYPE_CHECKING:
+    from derender.report.score_table import ScoreTable
+
+PLAIN_LINE_EVERY_SECONDS = 30.0
+
+
+def say(text: str) -> None:
+    """One note for the person at the terminal."""
+    Console(stderr=True, highlight=False, soft_wrap=True, markup=False).print(text)
+
+
+def result(text: str) -> None:
+    """One line of result."""
+    Console(highlight=False, soft_wrap=True, markup=False).print(text)
+
+
+@contextmanager
+def bar(description: str, unit: str = "pictures") -> Iterator[Callable[..., None]]:
+    """A progress bar on standard error: call the given function with (done, total) and, if any, a note.
+
+    Where standard error is no terminal, a plain line appears every half minute instead.
+    """
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield _plain_lines(description, unit)
+        return
+    columns = (
+        SpinnerColumn(),
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        TaskProgressColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[unit]}", markup=False),
+        TimeRemainingColumn(compact=True),
+        TextColumn("{task.fields[note]}", style="dim", markup=False),
+    )
+    with Progress(*columns, console=console) as progress:
+        task = progress.add_task(description, total=None, unit=unit, note="")
+
+        def report(done: int, total: int, note: str = "", **fields: str) -> None:
+            progress.update(task, completed=done, total=total, note=note, **fields)  # pyright: ignore[reportArgumentType]
+
+        yield report
+
+
+def _plain_lines(description: str, unit: str) -> Callable[..., None]:
+    last = time.monotonic()
+
+    def report(
+        done: int, total: int, note: str = "", description: str = description, unit: str = unit
+    ) -> None:
+        nonlocal last
+        if time.monotonic() - last >= PLAIN_LINE_EVERY_SECONDS:
+            last = time.monotonic()
+            say(f"{description}: {done:,} of {total:,} {unit} {note}".rstrip())
+
+    return report
+
+
+def show_scores(scores: "ScoreTable") -> None:
+    """A table of scores on standard output: controls dim, the best of each column bold."""
+    table = Table(
+        title=scores.caption,
+        title_justify="left",
+        title_style="none",
+        box=None,
+        pad_edge=False,
+        padding=(0, 3, 0, 0),
+    )
+    table.add_column(scores.first, header_style="dim")
+    for column in scores.columns:
+        arrow = {"high": " ↑", "low": " ↓", None: ""}[column.best]
+        table.add_column(column.name + arrow, justify="right", no_wrap=True, header_style="dim")
+    for row in scores.rows:
+        cells = [
+            Text(column.text(cell), style="bold" if cell is not None and cell == scores.best(index) else "")
+            for index, (column, cell) in enumerate(zip(scores.columns, row.cells, strict=True))
+        ]
+        table.add_row(Text(row.name), *cells, style="dim" if row.control else "")
+    console = Console(highlight=False)
+    console.print(table, crop=False)
+
+
+def write_json(target: str | None, values: Mapping[str, Any]) -> None:
+    """What ``--json`` asks for: a file written whole, or standard output for ``-``; nothing for None."""
+    if target is None:
+        return
+    text = json.dumps(plain(values), indent=1, ensure_ascii=False) + "\n"
+    if target == "-":
+        sys.stdout.write(text)
+    else:
+        from derender.report.page import write_whole
+
+        write_whole(target, text.encode("utf-8", errors="replace"))
+
+
+def plain(value: Any) -> Any:
+    """Dataclasses, arrays, tensors and paths as what JSON can hold; NaN and infinity become null."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, Path):
+        return str(value)
+    if hasattr(value, "tolist"):
+        return plain(value.tolist())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def out_of_the_way(path: Path, force: bool) -> None:
+    """Refuse to write over an existing file unless told to."""
+    if path.is_dir():
+        raise IsADirectoryError(f"{path} is a folder: give --out the name of a file")
+    if path.exists() and not force:
+        raise FileExistsError(f"{path} exists already: choose another --out, or add --force to replace it")
+
+
+def duration(seconds: float) -> str:
+    """Seconds as a person says them."""
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    if hours:
+        return f"{hours} h {minutes} min"
+    return f"{minutes} min {rest} s" if minutes else f"{rest} s"

@@ -1,0 +1,40 @@
+"""Opening a model, and the part of a data set that it did or did not see in training."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from derender.data import PictureSet
+    from derender.model import Derenderer
+
+PARTS = ("all", "train", "validation", "test")
+
+
+def open_model(source: str, device: str) -> "Derenderer":
+    """Load a model onto ``cpu``, ``cuda`` or, for ``auto``, the graphics card if there is one."""
+    import torch
+
+    from derender.model import load
+
+    if device not in ("auto", "cpu", "cuda"):
+        raise ValueError(f"unknown device {device!r}: choose auto, cpu or cuda")
+    if device == "cuda" and not torch.cuda.is_available():
+        raise ValueError("no CUDA device here: choose --device cpu")
+    chosen = "cuda" if device == "cuda" or (device == "auto" and torch.cuda.is_available()) else "cpu"
+    return load(source, device=chosen)
+
+
+def part_of(pictures: "PictureSet", part: str, model: str) -> "PictureSet":
+    """The pictures of one part of the split that the run ``model`` was trained with."""
+    if part not in PARTS:
+        raise ValueError(f"unknown part {part!r}: choose {', '.join(PARTS)}")
+    if part == "all":
+        return pictures
+    from derender.data import split_indices
+    from derender.training.run_folder import read_config
+
+    if not (Path(model) / "config.yaml").is_file():
+        raise ValueError(f"{model} is no run folder and records no split: use --part all")
+    config = read_config(Path(model))
+    split = split_indices(pictures.files, config.split, seed=config.seed)
+    return pictures.select(getattr(split, part)).require(1, f"the {part} part")

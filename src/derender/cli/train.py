@@ -1,0 +1,97 @@
+"""`derender train`: pre-training on a folder of pictures."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from derender.cli import options
+from derender.cli.console import bar, duration, result, say, write_json
+
+
+def register(app: typer.Typer) -> None:
+    app.command("train", epilog="Example: derender train --data photos/ --preset faces --out runs/faces")(
+        train
+    )
+
+
+def train(
+    data: options.Data,
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="Run folder to make, or to go on with.", metavar="RUN")
+    ],
+    preset: Annotated[
+        str | None,
+        typer.Option("--preset", help="faces, cars, cats, paper, or small for a CPU; default: faces."),
+    ] = None,
+    loocc: Annotated[
+        str | None, typer.Option("--loocc", help="Contrast over none, light, light+camera or all factors.")
+    ] = None,
+    overrides: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="Change one setting; may be repeated.", metavar="KEY=VALUE"),
+    ] = None,
+    dataset: options.Dataset = "auto",
+    limit: options.Limit = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with the run in --out.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Show all settings and stop.")] = False,
+    device: options.Device = "auto",
+    json_file: options.Json = None,
+) -> None:
+    """Learn to take pictures apart, from a folder of unlabelled pictures of one kind of thing."""
+    from derender.training.config import TrainConfig, resolve, to_yaml
+
+    settings_given = preset is not None or loocc is not None or bool(overrides)
+
+    def configuration() -> TrainConfig:
+        if resume and not settings_given and (out / "config.yaml").is_file():
+            from derender.training.run_folder import read_config
+
+            return read_config(out)
+        return resolve(preset or "faces", overrides or [], objective__loocc=loocc)
+
+    config = configuration()
+    if dry_run:
+        result(to_yaml(config).rstrip())
+        write_json(json_file, config.model_dump(mode="json"))
+        return
+
+    from derender.data import read_pictures
+    from derender.report.run import decomposition_sheet, run_page
+    from derender.training.loop import Progress
+    from derender.training.loop import train as train_model
+
+    if out.exists() and any(out.iterdir() if out.is_dir() else [out]) and not resume:
+        raise FileExistsError(
+            f"{out} exists and is not empty: add --resume to go on with that run, or choose another --out"
+        )
+    with bar("reading") as report:
+        pictures = read_pictures(
+            data, config.model.network.image_size, dataset=dataset, limit=limit, progress=report
+        )
+    say(pictures.describe())
+    with bar("training") as report:
+
+        def show(progress: Progress) -> None:
+            if progress.phase == "train":
+                speed = f"{progress.images_per_second:.0f} pictures/s"
+                report(progress.done, progress.total, speed, description="training", unit="pictures")
+            else:
+                report(progress.done, progress.total, description="perceptual features", unit="steps")
+
+        trained = train_model(
+            config,
+            pictures,
+            out,
+            resume=resume,
+            sample_sheet=decomposition_sheet,
+            progress=show,
+            accelerator={"cuda": "cuda", "cpu": "cpu"}.get(device, "auto"),
+        )
+    page = run_page(out).write(out / "report.html")
+    for finding in trained.findings:
+        say(finding.text)
+    say(f"{trained.images:,} pictures in {duration(trained.seconds)}; stopped by: {trained.stopped}")
+    result(f"model {trained.folder}")
+    result(f"report {page}")
+    write_json(json_file, {"run": trained, "report": page})

@@ -1,0 +1,168 @@
+"""Keeps decoded pictures of a large data set in one file that is mapped into memory.
+
+The file is the rows themselves, then a JSON note (what they were made from, which files they are), then the
+note's length and a mark. It is written under another name and moved into place when complete, so a reader
+never sees half of one. It counts only if the note's fingerprint is that of the source as it is now (name,
+size, and checksum or time of change of every file, and every setting), its length is right, and a sample of
+its rows has the recorded checksum; otherwise it is made again. One file per source and setting: a new
+version takes the old one's place.
+"""
+
+import hashlib
+import json
+import os
+import sys
+import tempfile
+import time
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import PIL
+from jaxtyping import UInt8
+
+from derender.data.duplicates import Duplicate
+from derender.data.loading import Loaded
+from derender.data.source import Skipped, Source
+
+_MARK = b"derender pictures 1\n"
+_SAMPLED_ROWS = 64
+
+
+def cache_folder() -> Path:
+    """``$DERENDER_CACHE``, or derender's folder in the place this system has for caches."""
+    if "DERENDER_CACHE" in os.environ:
+        return Path(os.environ["DERENDER_CACHE"])
+    if sys.platform == "darwin":
+        base = Path.home() / "Library" / "Caches"
+    elif sys.platform == "win32":
+        base = Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData" / "Local"))
+    else:
+        base = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
+    return base / "derender"
+
+
+def fingerprint(source: Source, files: tuple[str, ...], settings: tuple[object, ...]) -> str:
+    """Changes whenever the decoded rows would: with any file's content, the order, or a setting."""
+    digest = hashlib.sha256(repr((settings, PIL.__version__)).encode())
+    for file in files:
+        digest.update(repr((file, source.stamp(file))).encode("utf-8"))
+    return digest.hexdigest()
+
+
+def cache_file(folder: Path, source: Source, settings: tuple[object, ...]) -> Path:
+    """Where the rows of this source under these settings are kept."""
+    key = hashlib.sha256(
+        repr((str(source.path.resolve()), settings)).encode("utf-8", "backslashreplace")
+    ).hexdigest()
+    return folder / f"{source.path.stem[:40]}-{key[:16]}.pictures"
+
+
+def read_cache(
+    file: Path, expected: str, image_size: int
+) -> tuple[UInt8[np.ndarray, "n 3 s s"], Loaded] | None:
+    """The rows as a private memory map with what they are, or None if there are none or not these."""
+    try:
+        with file.open("rb") as stream:
+            end = stream.seek(-len(_MARK) - 8, os.SEEK_END)
+            length = int.from_bytes(stream.read(8), "little")
+            if stream.read() != _MARK or length > end:
+                return None
+            stream.seek(end - length)
+            note = json.loads(stream.read(length))
+        loaded = Loaded(
+            tuple(note["files"]),
+            tuple(Skipped(**row) for row in note["skipped"]),
+            tuple(Duplicate(**row) for row in note["duplicates"]),
+        )
+    except (OSError, ValueError, LookupError, TypeError):
+        return None
+    count = len(loaded.files)
+    if note["fingerprint"] != expected or end - length != count * 3 * image_size * image_size or not count:
+        return None
+    images = np.memmap(file, np.uint8, mode="c", shape=(count, 3, image_size, image_size))
+    return (images, loaded) if _sample_checksum(images) == note["checksum"] else None
+
+
+@contextmanager
+def new_cache(file: Path, count: int, image_size: int) -> Iterator["CacheWriter"]:
+    """Room for ``count`` rows beside ``file``; what is not finished is deleted."""
+    needed = count * 3 * image_size * image_size
+    draft = None
+    try:
+        try:
+            file.parent.mkdir(parents=True, exist_ok=True)
+            _remove_abandoned(file)
+            handle, name = tempfile.mkstemp(prefix=f".{file.name}.", dir=file.parent)
+            draft = Path(name)
+            with os.fdopen(handle, "r+b") as stream:
+                _reserve(stream.fileno(), needed)
+        except OSError as problem:
+            raise _no_room(file, needed, problem) from problem
+        yield CacheWriter(
+            file, draft, np.memmap(draft, np.uint8, mode="r+", shape=(count, 3, image_size, image_size))
+        )
+    finally:
+        if draft is not None:
+            draft.unlink(missing_ok=True)
+
+
+def _no_room(file: Path, needed: int, problem: OSError) -> OSError:
+    return OSError(
+        f"cannot keep {needed / 1e9:.3g} GB of decoded pictures in {file.parent} "
+        f"({problem.strerror or problem}); "
+        "set DERENDER_CACHE to a folder on another disk, or ask for smaller pictures"
+    )
+
+
+def _remove_abandoned(file: Path) -> None:
+    """Delete drafts of this file that a killed process left behind more than a day ago."""
+    for draft in file.parent.iterdir():
+        if draft.name.startswith(f".{file.name}.") and draft.stat().st_mtime < time.time() - 86_400:
+            draft.unlink(missing_ok=True)
+
+
+def _reserve(handle: int, size: int) -> None:
+    """Claim disk blocks now: writing through a map to a full disk would kill the process."""
+    if hasattr(os, "posix_fallocate"):
+        os.posix_fallocate(handle, 0, size)
+    else:
+        os.truncate(handle, size)
+
+
+class CacheWriter:
+    """Rows being written; ``finish`` puts them in place."""
+
+    def __init__(self, file: Path, draft: Path, rows: np.memmap):
+        self.file = file
+        self.draft = draft
+        self.rows = rows
+
+    def finish(self, loaded: Loaded, mark: str) -> None:
+        """Cut the file to the rows that count, append the note, and move it into place."""
+        kept = self.rows[: len(loaded.files)]
+        note = {"fingerprint": mark, "checksum": _sample_checksum(kept), **asdict(loaded)}
+        self.rows.flush()
+        encoded = json.dumps(note).encode()
+        try:
+            with self.draft.open("r+b") as stream:
+                stream.truncate(kept.size)
+                stream.seek(0, os.SEEK_END)
+                stream.write(encoded + len(encoded).to_bytes(8, "little") + _MARK)
+                stream.flush()
+                os.fsync(stream.fileno())
+            self.draft.replace(self.file)
+        except OSError as problem:
+            raise _no_room(self.file, kept.size, problem) from problem
+
+
+def _sample_checksum(rows: np.ndarray) -> int:
+    """CRC of at most 64 rows, evenly spaced, the first and the last among them."""
+    chosen = np.unique(np.linspace(0, len(rows) - 1, _SAMPLED_ROWS).astype(int)) if len(rows) else []
+    checksum = 0
+    for row in chosen:
+        checksum = zlib.crc32(rows[row].tobytes(), checksum)
+    return checksum

@@ -1,0 +1,259 @@
+"""Where pictures come from: a folder, a zip read in place, or one picture file.
+
+All three answer the same questions: which files are there (sorted by posix path relative to the source),
+what is in one of them, and what identifies its present content. Nothing is ever extracted, so a zip with
+absolute names or ``..`` in them cannot write anywhere; such members are passed over and listed. Hidden
+files and ``__MACOSX`` are left out. Links are followed, each real folder once, so that loops end. Nested
+archives are not opened.
+"""
+
+import lzma
+import os
+import stat
+import struct
+import zipfile
+import zlib
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path, PurePosixPath
+
+from derender.data.nearest import nearest
+
+SUFFIXES = (
+    *(".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".webp", ".avif", ".bmp", ".gif"),
+    *(".tif", ".tiff", ".ppm", ".pgm", ".pnm"),
+)
+"""File names that end in one of these are taken for pictures."""
+
+FILE_LIMIT_BYTES = 512 << 20
+"""No single file larger than this is read: a bound on memory, and on what a zip bomb can unpack to."""
+
+# What the zip reader raises on damaged archives (found by feeding it such). NotImplementedError, for
+# a way of packing that Python does not know, is a RuntimeError; names that are not text give a ValueError.
+_ZIP_ERRORS = (
+    zipfile.BadZipFile,
+    OSError,
+    RuntimeError,
+    ValueError,
+    EOFError,
+    OverflowError,
+    struct.error,
+    zlib.error,
+    lzma.LZMAError,
+)
+
+
+@dataclass(frozen=True)
+class Skipped:
+    """A file that is no part of the result, and why."""
+
+    file: str
+    reason: str
+
+
+class Source(ABC):
+    """Named files, read by name.
+
+    Attributes:
+        path: the folder or file that the user named.
+        files: every regular file, as sorted posix paths relative to the source.
+        skipped: files that cannot even be opened (unsafe names, broken links, no permission, encrypted).
+    """
+
+    path: Path
+    files: tuple[str, ...]
+    skipped: tuple[Skipped, ...] = ()
+
+    @abstractmethod
+    def read(self, file: str) -> bytes:
+        """The whole content of one file; at most ``FILE_LIMIT_BYTES``. Safe to call from several threads."""
+
+    @abstractmethod
+    def stamp(self, file: str) -> tuple[int, int]:
+        """Two numbers that change when the file's content does: size, and checksum or time of change."""
+
+    @cached_property
+    def pictures(self) -> tuple[str, ...]:
+        """The files with a picture's suffix."""
+        return tuple(file for file in self.files if is_picture(file))
+
+    def close(self) -> None:  # noqa: B027  (folders hold nothing open)
+        """Release what the source holds open."""
+
+    def __enter__(self) -> "Source":
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    def read_text(self, file: str) -> str:
+        """One file as text: UTF-8, with or without a byte order mark."""
+        try:
+            return self.read(file).decode("utf-8-sig")
+        except UnicodeDecodeError as problem:
+            raise ValueError(
+                f"{file} in {self.path} is not UTF-8 text ({problem.reason}); save it as UTF-8"
+            ) from problem
+
+    def named(self, name: str) -> str | None:
+        """The first file with this base name, shallowest first, or None."""
+        found = [file for file in self.files if PurePosixPath(file).name == name]
+        return min(found, key=lambda file: (file.count("/"), file), default=None)
+
+
+class FolderSource(Source):
+    """Every file below a folder."""
+
+    def __init__(self, folder: Path):
+        self.path = folder
+        self._real: dict[str, Path] = {}
+        skipped: list[Skipped] = []
+        seen: set[tuple[int, int]] = set()
+
+        def cannot_list(problem: OSError) -> None:
+            name = Path(problem.filename).relative_to(folder).as_posix()
+            skipped.append(Skipped(_printable(name), f"folder cannot be listed: {problem.strerror}"))
+
+        for here, folders, files in os.walk(folder, followlinks=True, onerror=cannot_list):
+            status = Path(here).stat()
+            identity = (status.st_dev, status.st_ino)
+            if identity in seen:
+                folders.clear()
+                continue
+            seen.add(identity)
+            folders[:] = sorted(name for name in folders if not _is_hidden(name))
+            for name in files:
+                if _is_hidden(name):
+                    continue
+                real = Path(here) / name
+                file = _printable(real.relative_to(folder).as_posix())
+                try:
+                    regular = stat.S_ISREG(real.stat().st_mode)
+                except OSError as problem:
+                    skipped.append(Skipped(file, f"broken link or unreachable file: {problem.strerror}"))
+                    continue
+                if regular:
+                    self._real[file] = real
+                else:
+                    skipped.append(Skipped(file, "not a regular file"))
+        self.files = tuple(sorted(self._real))
+        self.skipped = tuple(sorted(skipped, key=lambda row: row.file))
+
+    def read(self, file: str) -> bytes:
+        return read_bounded(self._real[file])
+
+    def stamp(self, file: str) -> tuple[int, int]:
+        status = self._real[file].stat()
+        return status.st_size, status.st_mtime_ns
+
+
+class ZipSource(Source):
+    """The members of a zip archive, read in place."""
+
+    def __init__(self, path: Path):
+        self.path = path
+        self._stream = path.open("rb")
+        try:
+            self._archive = zipfile.ZipFile(self._stream)
+        except _ZIP_ERRORS as problem:
+            self._stream.close()
+            raise ValueError(
+                f"{path} is damaged or not a whole zip file ({problem}); download or copy it again"
+            ) from problem
+        self._members: dict[str, zipfile.ZipInfo] = {}
+        skipped: list[Skipped] = []
+        for member in self._archive.infolist():
+            file = member.filename.replace("\\", "/")
+            parts = file.split("/")
+            if member.is_dir() or any(_is_hidden(part) for part in parts if part not in ("", ".", "..")):
+                continue
+            if file.startswith("/") or ".." in parts or ":" in parts[0]:
+                skipped.append(Skipped(file, "unsafe name in the zip (absolute or with ..)"))
+            elif member.flag_bits & 1:
+                skipped.append(Skipped(file, "encrypted in the zip"))
+            else:
+                self._members[_printable(file)] = member
+        self.files = tuple(sorted(self._members))
+        self.skipped = tuple(sorted(skipped, key=lambda row: row.file))
+
+    def read(self, file: str) -> bytes:
+        member = self._members[file]
+        if member.file_size > FILE_LIMIT_BYTES:
+            raise ValueError(
+                f"unpacks to {member.file_size >> 20:,} MiB, more than {FILE_LIMIT_BYTES >> 20:,} MiB"
+            )
+        try:
+            return self._archive.read(member)
+        except _ZIP_ERRORS as problem:
+            raise ValueError(f"cannot be unpacked: {problem}") from problem
+
+    def stamp(self, file: str) -> tuple[int, int]:
+        member = self._members[file]
+        return member.file_size, member.CRC
+
+    def close(self) -> None:
+        self._archive.close()
+        self._stream.close()
+
+
+class FileSource(Source):
+    """One picture."""
+
+    def __init__(self, path: Path):
+        self.path = path
+        self.files = (_printable(path.name),)
+
+    def read(self, file: str) -> bytes:
+        return read_bounded(self.path)
+
+    def stamp(self, file: str) -> tuple[int, int]:
+        status = self.path.stat()
+        return status.st_size, status.st_mtime_ns
+
+
+def open_source(path: Path) -> Source:
+    """Open a folder, a zip or a picture; anything else is an error that says what to give instead."""
+    if not path.exists():
+        raise ValueError(f"{path} does not exist{_nearest_sibling(path)}")
+    if path.is_dir():
+        return FolderSource(path)
+    if path.suffix.lower() in SUFFIXES:
+        return FileSource(path)
+    if zipfile.is_zipfile(path) or path.suffix.lower() == ".zip":
+        return ZipSource(path)
+    raise ValueError(
+        f"{path} is no folder, zip or picture ({' '.join(SUFFIXES)}); unpack other archives into a folder"
+    )
+
+
+def is_picture(file: str) -> bool:
+    """Whether the name has a picture's suffix."""
+    return PurePosixPath(file).suffix.lower() in SUFFIXES
+
+
+def read_bounded(path: Path) -> bytes:
+    """A file's content, or ValueError when it is larger than ``FILE_LIMIT_BYTES``."""
+    size = path.stat().st_size
+    if size > FILE_LIMIT_BYTES:
+        raise ValueError(f"file of {size >> 20:,} MiB is larger than {FILE_LIMIT_BYTES >> 20:,} MiB")
+    return path.read_bytes()
+
+
+def _is_hidden(name: str) -> bool:
+    return name.startswith(".") or name == "__MACOSX"
+
+
+def _printable(name: str) -> str:
+    """The name with bytes that are not UTF-8 as backslash escapes, so that it can be stored anywhere."""
+    return name.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
+
+
+def _nearest_sibling(path: Path) -> str:
+    parent = path.absolute().parent
+    if not parent.is_dir():
+        return f"; nor does its folder {parent}"
+    try:
+        return nearest(path.name, sorted(entry.name for entry in parent.iterdir()))
+    except OSError:
+        return ""

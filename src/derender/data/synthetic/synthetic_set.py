@@ -1,0 +1,43 @@
+"""The value that generators return: pictures with the factors and maps that made them."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from jaxtyping import Bool, Float32, Int64, Shaped, UInt8
+from numpy import ndarray
+
+
+@dataclass(frozen=True)
+class SyntheticSet:
+    """N square pictures of size S with exact truth, one sample at each pixel's centre.
+
+    Attributes:
+        images: shaded pictures over a background.
+        depth: z in camera space, 0 on the background.
+        normal: inward unit normals in the camera frame, 0 on the background.
+        albedo: reflectance as seen by the camera, 0 on the background.
+        mask: where the object is.
+        light: ambient, diffuse, pitch, yaw (radians, canonical frame).
+        camera: rotation x, y, z (radians, about (0, 0, 1)), translation x, y, z.
+        identity: number of the person or model.
+        expression: name of the expression.
+        strength: how strongly it shows.
+        identity_traits: what was drawn for each picture's identity, by name.
+        fov_deg: field of view of every picture.
+    """
+
+    images: UInt8[ndarray, "n 3 s s"]
+    depth: Float32[ndarray, "n s s"]
+    normal: Float32[ndarray, "n s s 3"]
+    albedo: UInt8[ndarray, "n 3 s s"]
+    mask: Bool[ndarray, "n s s"]
+    light: Float32[ndarray, "n 4"]
+    camera: Float32[ndarray, "n 6"]
+    identity: Int64[ndarray, "n"]
+    expression: Shaped[ndarray, "n"]
+    strength: Float32[ndarray, "n"]
+    identity_traits: Mapping[str, Float32[ndarray, "n"]]
+    fov_deg: float = 10.0
+
+    def __len__(self) -> int:
+        return len(self.images)

@@ -1,0 +1,168 @@
+"""How far predicted albedo, light and camera are from the true ones, up to what no picture can tell.
+
+A picture fixes albedo only up to a factor that the light takes back, and the canonical frame only up to one
+rotation for the whole model (which way an average face looks is a convention). So: albedo is compared after
+the best scale per picture, light in the frame of the camera, camera rotation after the best constant
+rotation. Leaves out translations: at 10 degrees of field of view they trade against depth.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from derender.data import GroundTruth
+from derender.features import Progress, map_batches
+from derender.scene.camera import rotation_matrix
+from derender.scene.light import light_direction
+
+
+@dataclass(frozen=True)
+class AngleScores:
+    """Angles between predictions and truth.
+
+    Attributes:
+        mean_deg: mean over pictures, 0..180, best 0.
+        median_deg: median over pictures, 0..180, best 0.
+        each_deg: (N,) per picture.
+    """
+
+    mean_deg: float
+    median_deg: float
+    each_deg: np.ndarray
+
+
+@dataclass(frozen=True)
+class FactorResult:
+    """A model's errors in albedo, light and camera, each beside the best constant answer.
+
+    Attributes:
+        albedo: mean over pictures of ``albedo_error``, in the view of the picture; 0 and up, best 0.
+        albedo_control: the same of the mean true albedo.
+        light, light_control: of the predictions, and of the mean true direction.
+        camera, camera_control: of the predictions, and of a camera that never turns.
+    """
+
+    albedo: float
+    albedo_control: float
+    light: AngleScores
+    light_control: AngleScores
+    camera: AngleScores
+    camera_control: AngleScores
+
+
+def albedo_error(
+    albedo_pred: Float[Tensor, "n 3 h w"],
+    albedo_true: Float[Tensor, "n 3 h w"],
+    mask: Bool[Tensor, "n h w"],
+) -> Float[Tensor, " n"]:
+    """Root mean square albedo error after the best scale, per picture; 0 and up, best 0.
+
+    One scale for the three channels, so a colour cast costs; at most the root mean square of the true albedo.
+    """
+    inside = mask[:, None].expand_as(albedo_true)
+    count = inside.sum(dim=(1, 2, 3))
+    if bool((count == 0).any()):
+        raise ValueError(f"the mask of {int((count == 0).sum())} pictures is empty: leave these pictures out")
+    predicted, true = (torch.where(inside, a.double(), 0.0) for a in (albedo_pred, albedo_true))
+    power = predicted.square().sum(dim=(1, 2, 3))
+    scale = (predicted * true).sum(dim=(1, 2, 3)) / torch.where(power > 0, power, 1.0)
+    rest = (scale[:, None, None, None] * predicted - true).square().sum(dim=(1, 2, 3))
+    return (rest / count).sqrt()
+
+
+def light_error(
+    light_pred: Float[Tensor, "n 4"],
+    camera_pred: Float[Tensor, "n 6"],
+    light_true: Float[Tensor, "n 4"],
+    camera_true: Float[Tensor, "n 6"],
+) -> AngleScores:
+    """Angle between the directions in which light travels, in the camera's frame; 0..180 degrees, best 0."""
+    return _between(_light_in_camera(light_pred, camera_pred), _light_in_camera(light_true, camera_true))
+
+
+def camera_error(camera_pred: Float[Tensor, "n 6"], camera_true: Float[Tensor, "n 6"]) -> AngleScores:
+    """Angle of the rotation left between predicted and true cameras after the best alignment; 0..180
+    degrees, best 0.
+
+    The alignment is one rotation A of the canonical frame for all pictures, predicted = true A, by least
+    squares. A constant prediction then scores the spread of the true cameras, which is the control to print
+    beside it.
+    """
+    predicted, true = (rotation_matrix(camera[:, :3].double()) for camera in (camera_pred, camera_true))
+    u, _, vh = torch.linalg.svd((true.mT @ predicted).sum(dim=0))
+    signs = torch.ones(3, dtype=u.dtype, device=u.device)
+    signs[2] = torch.linalg.det(u @ vh).sign()
+    rest = (true @ (u * signs) @ vh).mT @ predicted
+    twist = rest - rest.mT
+    sine = torch.stack([twist[:, 2, 1], twist[:, 0, 2], twist[:, 1, 0]]).norm(dim=0) / 2
+    cosine = (rest.diagonal(dim1=1, dim2=2).sum(dim=1) - 1) / 2
+    return _angles(torch.atan2(sine, cosine))
+
+
+def evaluate_factors(
+    model: Any, truth: GroundTruth, *, batch_size: int = 64, progress: Progress | None = None
+) -> FactorResult:
+    """Albedo, light and camera that a model sees in pictures with ground truth, beside constant answers.
+
+    Args:
+        model: with ``decompose``, ``render``, ``image_size``, ``device``.
+        truth: pictures with albedo, light, camera and mask at the model's image size.
+        batch_size: pictures at a time; changes speed and memory only.
+        progress: called with (pictures done, pictures in all) after every batch.
+    """
+    if truth.albedo is None:
+        raise ValueError("this ground truth has no albedo maps: give a set that stores them")
+    size = truth.images.shape[-1]
+    if size != model.image_size:
+        raise ValueError(f"the ground truth is {size} pixels wide, the model takes {model.image_size}")
+    albedo, mask, light, camera = _predictions(model, truth.images, batch_size, progress)
+    albedo_true, mask_true = torch.as_tensor(truth.albedo), torch.as_tensor(truth.mask)
+    light_true, camera_true = torch.as_tensor(truth.light), torch.as_tensor(truth.camera)
+    both = mask & mask_true
+    seen = both.any(dim=(1, 2))
+    if not bool(seen.any()):
+        raise ValueError("prediction and truth share no pixel in any picture: check the camera or the masks")
+    mean_albedo = albedo_true.sum(dim=0) / mask_true.sum(dim=0).clamp_min(1)
+    direction = _light_in_camera(light_true, camera_true)
+    return FactorResult(
+        albedo=albedo_error(albedo[seen], albedo_true[seen], both[seen]).mean().item(),
+        albedo_control=albedo_error(mean_albedo.expand_as(albedo_true), albedo_true, mask_true).mean().item(),
+        light=light_error(light, camera, light_true, camera_true),
+        light_control=_between(direction.mean(dim=0).expand_as(direction), direction),
+        camera=camera_error(camera, camera_true),
+        camera_control=camera_error(torch.zeros_like(camera_true), camera_true),
+    )
+
+
+def _predictions(
+    model: Any, images: np.ndarray, batch_size: int, progress: Progress | None
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Albedo and mask in the picture's view (rendered under plain ambient light), light, camera."""
+
+    def see(batch: Tensor) -> tuple[Tensor, ...]:
+        scene = model.decompose(batch)
+        white = torch.tensor([1.0, 0.0, 0.0, 0.0], device=batch.device).expand_as(scene.light)
+        flat = model.render(scene.with_parameters(light=white))
+        return flat.image.cpu(), flat.mask.cpu() > 0.5, scene.light.cpu(), scene.camera.cpu()
+
+    parts = map_batches(see, model, images, batch_size=batch_size, progress=progress)
+    albedo, mask, light, camera = (torch.cat(values) for values in zip(*parts, strict=True))
+    return albedo, mask, light, camera
+
+
+def _light_in_camera(light: Float[Tensor, "n 4"], camera: Float[Tensor, "n 6"]) -> Float[Tensor, "n 3"]:
+    return (rotation_matrix(camera[:, :3].double()) @ light_direction(light.double())[..., None])[..., 0]
+
+
+def _between(a: Float[Tensor, "n 3"], b: Float[Tensor, "n 3"]) -> AngleScores:
+    """Angles between directions of any length, exact also where they are small."""
+    return _angles(torch.atan2(torch.linalg.cross(a, b).norm(dim=-1), (a * b).sum(dim=-1)))
+
+
+def _angles(radians: Tensor) -> AngleScores:
+    degrees = torch.rad2deg(radians)
+    return AngleScores(degrees.mean().item(), degrees.median().item(), degrees.numpy(force=True))

@@ -1,0 +1,29 @@
+"""Stage 6: features extracted once, kept in one table, scored many times.
+
+table: the value; parquet: its file; extract: model and pictures in, table out; transformer: the same for
+    scikit-learn.
+"""
+
+from derender.features.extract import (
+    Progress,
+    embed_images,
+    embed_pictures,
+    map_batches,
+    model_fingerprint,
+    table_labels,
+)
+from derender.features.table import FeatureTable, missing, named
+from derender.features.transformer import DisentangledFeatures
+
+__all__ = [
+    "DisentangledFeatures",
+    "FeatureTable",
+    "Progress",
+    "embed_images",
+    "embed_pictures",
+    "map_batches",
+    "missing",
+    "model_fingerprint",
+    "named",
+    "table_labels",
+]

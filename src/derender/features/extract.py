@@ -1,0 +1,113 @@
+"""From a model and pictures to a FeatureTable."""
+
+import hashlib
+from collections.abc import Callable, Mapping
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+import derender
+from derender.data import PictureSet, as_float
+from derender.features.table import FeatureTable
+
+Progress = Callable[[int, int], object]
+T = TypeVar("T")
+
+
+def model_fingerprint(model: nn.Module) -> str:
+    """16 hexadecimal digits that change when a weight, its name or its shape changes."""
+    digest = hashlib.sha256()
+    for name, value in sorted(model.state_dict().items()):
+        array = value.detach().cpu().contiguous()
+        digest.update(f"{name} {array.dtype} {tuple(array.shape)}".encode())
+        digest.update(array.reshape(-1).view(torch.uint8).numpy())
+    return digest.hexdigest()[:16]
+
+
+def map_batches(
+    function: Callable[[Tensor], T],
+    model: Any,
+    images: np.ndarray,
+    *,
+    batch_size: int,
+    progress: Progress | None = None,
+) -> list[T]:
+    """Results of a function of pictures in 0..1 on the model's device, batch by batch, without gradients.
+
+    The model is in evaluation mode meanwhile, and afterwards as it was. Pictures are (N, 3, H, W), uint8 or
+    float.
+    """
+    if batch_size < 1:
+        raise ValueError(f"batch_size must be 1 or more, got {batch_size}")
+    if len(images) == 0:
+        raise ValueError("there are no pictures")
+    was_training, results = model.training, []
+    model.eval()
+    try:
+        with torch.inference_mode():
+            for start in range(0, len(images), batch_size):
+                batch = np.asarray(images[start : start + batch_size])
+                tensor = as_float(batch) if batch.dtype == np.uint8 else torch.from_numpy(batch).float()
+                results.append(function(tensor.to(model.device)))
+                if progress is not None:
+                    progress(min(start + batch_size, len(images)), len(images))
+    finally:
+        model.train(was_training)
+    return results
+
+
+def embed_images(
+    model: Any, images: np.ndarray, *, batch_size: int = 256, progress: Progress | None = None
+) -> dict[str, np.ndarray]:
+    """Features of pictures (N, 3, H, W), uint8 or float in 0..1, by factor: each (N, D) float32."""
+
+    def embed(batch: Tensor) -> dict[str, np.ndarray]:
+        return {name: code.float().cpu().numpy() for name, code in model.embed(batch).items()}
+
+    parts = map_batches(embed, model, images, batch_size=batch_size, progress=progress)
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
+def embed_pictures(
+    model: Any,
+    pictures: PictureSet,
+    *,
+    batch_size: int = 256,
+    progress: Progress | None = None,
+    origin: Mapping[str, Any] | None = None,
+) -> FeatureTable:
+    """Run a model's encoders over a picture set.
+
+    Args:
+        model: a module with ``embed(pictures in 0..1) -> {factor: (N, D)}``, ``device`` and ``image_size``.
+        pictures: read at the model's image size; their labels and the owners' split go into the table.
+        batch_size: pictures at a time; changes speed and memory only.
+        progress: called with (pictures done, pictures in all) after every batch.
+        origin: further facts for the table, such as the model's path and preset; they win over those found here.
+    """
+    size = model.image_size
+    if tuple(pictures.images.shape[-2:]) != (size, size):
+        height, width = pictures.images.shape[-2:]
+        raise ValueError(
+            f"the pictures are {height}x{width}, the model takes {size}x{size}: "
+            f"read them with image_size={size}"
+        )
+    factors = embed_images(model, pictures.images, batch_size=batch_size, progress=progress)
+    facts: dict[str, Any] = {
+        "derender": derender.__version__,
+        "model": type(model).__name__,
+        "weights": model_fingerprint(model),
+        "data": pictures.source,
+        "layout": pictures.layout,
+    }
+    if hasattr(model, "settings"):
+        facts["settings"] = model.settings.model_dump(mode="json")
+    return FeatureTable(pictures.files, factors, table_labels(pictures), {**facts, **(origin or {})})
+
+
+def table_labels(pictures: PictureSet) -> dict[str, np.ndarray]:
+    """A picture set's labels, and the owners' split as one more label ``partition`` where there is one."""
+    owners = {} if pictures.partition is None else {"partition": pictures.partition}
+    return {**owners, **pictures.labels}

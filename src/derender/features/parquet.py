@@ -1,0 +1,147 @@
+"""The file a FeatureTable lives in: parquet that any tool reads.
+
+Column ``file``, one list column of float32 per factor, then the label columns. Which column is which, and
+where the table came from, stands as JSON in the file's metadata. Files made elsewhere are read too: without
+our metadata the list columns are factors and all others labels.
+"""
+
+import json
+import os
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+FORMAT = 1
+METADATA_KEY = b"derender"
+
+
+@dataclass(frozen=True)
+class Columns:
+    """What stands in a file, not yet checked against each other."""
+
+    files: Sequence[str]
+    factors: Mapping[str, np.ndarray]
+    labels: Mapping[str, np.ndarray]
+    origin: Mapping[str, Any]
+
+
+def write_columns(path: Path, content: Columns) -> None:
+    """Write a parquet file; at ``path`` stands the old file or the whole new one, never half of it."""
+    if path.is_dir():
+        raise ValueError(f"{path} is a folder: name a file to write, such as {path / 'features.parquet'}")
+    columns: dict[str, pa.Array] = {"file": pa.array(content.files, pa.string())}
+    for name, values in content.factors.items():
+        flat = pa.array(np.ascontiguousarray(values, np.float32).reshape(-1))
+        columns[name] = pa.FixedSizeListArray.from_arrays(flat, values.shape[1])
+    for name, values in content.labels.items():
+        columns[name] = _label_column(name, values)
+    described = {
+        "format": FORMAT,
+        "factors": list(content.factors),
+        "labels": list(content.labels),
+        "origin": dict(content.origin),
+    }
+    metadata = {METADATA_KEY: json.dumps(described, ensure_ascii=False).encode()}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(prefix=f".{path.name}-", dir=path.parent)
+    os.close(handle)
+    try:
+        pq.write_table(pa.table(columns).replace_schema_metadata(metadata), temporary)
+        Path(temporary).chmod(0o644)
+        Path(temporary).replace(path)
+    finally:
+        Path(temporary).unlink(missing_ok=True)
+
+
+def read_columns(path: Path) -> Columns:
+    """Read a feature table's file, ours or a similar one made elsewhere."""
+    if not path.is_file():
+        raise FileNotFoundError(f"no feature table at {path}: make one with 'derender embed --out {path}'")
+    try:
+        table = pq.ParquetFile(path).read()
+    except (pa.ArrowException, OSError) as error:
+        raise ValueError(f"{path} is not a readable parquet file: make it with 'derender embed'") from error
+    if "file" not in table.column_names:
+        found = ", ".join(table.column_names) or "no columns"
+        raise ValueError(f"{path} has no column 'file' (it has {found}): add one with the pictures' names")
+    described = _described(table.schema.metadata, path)
+    others = [name for name in table.column_names if name != "file"]
+    lists = [name for name in others if _is_list(table.schema.field(name).type)]
+    factors = described.get("factors", lists)
+    labels = described.get("labels", [name for name in others if name not in factors])
+    if not factors:
+        raise ValueError(f"{path} has no column of lists, so no features: make it with 'derender embed'")
+    absent = [name for name in (*factors, *labels) if name not in others]
+    if absent:
+        raise ValueError(f"{path} lacks the column {absent[0]!r} that its metadata names: make it again")
+    return Columns(
+        [str(file) for file in table.column("file").to_pylist()],
+        {name: _factor(table.column(name), name, path) for name in factors},
+        {name: _label(table.column(name)) for name in labels},
+        described.get("origin", {}),
+    )
+
+
+def _described(metadata: Mapping[bytes, bytes] | None, path: Path) -> dict[str, Any]:
+    text = (metadata or {}).get(METADATA_KEY)
+    if text is None:
+        return {}
+    try:
+        described = json.loads(text)
+        version = int(described["format"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"the metadata of {path} is damaged: make it again with 'derender embed'") from error
+    if version > FORMAT:
+        raise ValueError(f"{path} has format {version}, this version reads up to {FORMAT}: update derender")
+    return described
+
+
+def _is_list(kind: pa.DataType) -> bool:
+    return pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind)
+
+
+def _factor(column: pa.ChunkedArray, name: str, path: Path) -> np.ndarray:
+    where = f"{path}: factor {name!r}"
+    if not _is_list(column.type):
+        raise ValueError(f"{where} is a column of {column.type}, expected a list of numbers in each row")
+    if column.null_count:
+        raise ValueError(f"{where} is empty in {column.null_count} rows: drop these rows")
+    value_type = column.type.value_type
+    if not (pa.types.is_floating(value_type) or pa.types.is_integer(value_type)):
+        raise ValueError(f"{where} holds {value_type}, expected numbers")
+    if pa.types.is_fixed_size_list(column.type):
+        widths = [column.type.list_size]
+    else:
+        widths = sorted({width for chunk in column.chunks for width in chunk.value_lengths().to_pylist()})
+    if len(widths) > 1:
+        raise ValueError(f"{where} has rows of different lengths ({widths[0]} to {widths[-1]})")
+    parts = [chunk.flatten().to_numpy(zero_copy_only=False).astype(np.float32) for chunk in column.chunks]
+    flat = np.concatenate([np.zeros(0, np.float32), *parts])
+    return flat.reshape(len(column), widths[0] if widths else 1)
+
+
+def _label_column(name: str, values: np.ndarray) -> pa.Array:
+    try:
+        return pa.array(values.tolist() if values.dtype.kind in "UO" else values, from_pandas=True)
+    except pa.ArrowException as error:
+        raise ValueError(f"label {name!r} mixes kinds of values that no column holds ({error})") from error
+
+
+def _label(column: pa.ChunkedArray) -> np.ndarray:
+    """Numbers and texts as their own kinds; what is missing is NaN among floats, None elsewhere."""
+    kind = column.type
+    if pa.types.is_floating(kind):
+        return column.to_numpy()
+    if column.null_count == 0 and (pa.types.is_integer(kind) or pa.types.is_boolean(kind)):
+        return column.to_numpy()
+    if column.null_count == 0 and (pa.types.is_string(kind) or pa.types.is_large_string(kind)):
+        return np.array(column.to_pylist(), dtype=str)
+    values = np.empty(len(column), dtype=object)
+    values[:] = column.to_pylist()
+    return values

@@ -1,0 +1,155 @@
+"""FeatureTable: one row per picture, one feature per factor, labels, and where it all came from.
+
+The value that travels through the right half of the program. Leaves out how features are made (extract.py,
+baselines/) and every score (evaluation/).
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from derender.data.nearest import nearest
+from derender.features.parquet import Columns, read_columns, write_columns
+
+
+def missing(labels: np.ndarray) -> np.ndarray:
+    """Which labels are missing, (N,) bool: None, NaN, an empty text, and -1 in int8 (yes/no attributes)."""
+    labels = np.asarray(labels)
+    if labels.dtype == np.int8:
+        return labels == -1
+    if labels.dtype.kind == "f":
+        return np.isnan(labels)
+    if labels.dtype.kind in "biu":
+        return np.zeros(labels.shape, dtype=bool)
+    return np.array([value is None or value != value or value == "" for value in labels.tolist()], dtype=bool)
+
+
+def named(values: Mapping[str, Any], name: str, kind: str) -> Any:
+    """``values[name]``; an unknown name is an error that names the nearest."""
+    if name not in values:
+        have = ", ".join(values) or "none"
+        raise ValueError(f"unknown {kind} {name!r}{nearest(name, values)}; there is {have}")
+    return values[name]
+
+
+@dataclass(frozen=True, eq=False)
+class FeatureTable:
+    """N pictures, one feature per factor each.
+
+    Attributes:
+        files: where each row's picture came from.
+        factors: by name, (N, D) float32, finite; D may differ between factors.
+        labels: by name, (N,) of any kind; ``missing`` says which values stand for unknown.
+        origin: what made the table (model, version, preset, data): anything JSON can hold.
+    """
+
+    files: tuple[str, ...]
+    factors: Mapping[str, np.ndarray]
+    labels: Mapping[str, np.ndarray] = field(default_factory=dict)
+    origin: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        factors = {name: np.ascontiguousarray(values, np.float32) for name, values in self.factors.items()}
+        labels = {name: np.asarray(values) for name, values in self.labels.items()}
+        object.__setattr__(self, "files", tuple(str(file) for file in self.files))
+        object.__setattr__(self, "factors", factors)
+        object.__setattr__(self, "labels", labels)
+        object.__setattr__(self, "origin", dict(self.origin))
+        if not factors:
+            raise ValueError("a feature table needs at least one factor")
+        twice = set(factors) & set(labels) or {"file"} & {*factors, *labels}
+        if twice:
+            raise ValueError(f"column name {min(twice)!r} is used twice: rename the factor or the label")
+        for name, values in labels.items():
+            self._check_shape("label", name, values, 1)
+        for name, values in factors.items():
+            self._check_shape("factor", name, values, 2)
+            self._check_finite(name, values)
+
+    def _check_shape(self, kind: str, name: str, values: np.ndarray, dimensions: int) -> None:
+        if values.ndim != dimensions or 0 in values.shape[1:]:
+            expected = "one value" if dimensions == 1 else "at least one number"
+            raise ValueError(f"{kind} {name!r} must have {expected} in each row, got shape {values.shape}")
+        if len(values) != len(self.files):
+            raise ValueError(f"{kind} {name!r} has {len(values)} rows, but there are {len(self.files)} files")
+
+    def _check_finite(self, name: str, values: np.ndarray) -> None:
+        finite = np.isfinite(values).all(axis=1)
+        if not finite.all():
+            raise ValueError(
+                f"factor {name!r} is not finite in {int((~finite).sum())} of {len(values)} rows, first in "
+                f"{self.files[int(np.argmin(finite))]}: drop these rows, or check the model that made them"
+            )
+
+    def __len__(self) -> int:
+        return len(self.files)
+
+    def concatenate(self, factors: Sequence[str] | None = None) -> np.ndarray:
+        """Features of several factors side by side, (N, sum of D) float32; all of them by default."""
+        names = [factors] if isinstance(factors, str) else list(self.factors if factors is None else factors)
+        if not names:
+            raise ValueError(f"name at least one factor; there is {', '.join(self.factors)}")
+        return np.concatenate([named(self.factors, name, "factor") for name in names], axis=1)
+
+    def label(self, name: str) -> np.ndarray:
+        """One label column; an unknown name is an error that names the nearest."""
+        return named(self.labels, name, "label")
+
+    def select(self, rows: Any) -> "FeatureTable":
+        """The rows given by a slice, a list of indices or a bool mask."""
+        chosen = np.arange(len(self))[rows if isinstance(rows, slice) else np.asarray(rows)].reshape(-1)
+        return type(self)(
+            tuple(self.files[row] for row in chosen),
+            {name: values[chosen] for name, values in self.factors.items()},
+            {name: values[chosen] for name, values in self.labels.items()},
+            self.origin,
+        )
+
+    def mean_by(self, *labels: str) -> "FeatureTable":
+        """One row for each distinct combination of labels (a face track, say): the mean feature of its rows.
+
+        Rows with one of these labels missing belong to no group and are left out. Of the labels those are
+        kept that are constant inside every group. ``files`` becomes the labels' values joined by "/".
+        """
+        if not labels:
+            raise ValueError(f"name labels to average by; there is {', '.join(self.labels) or 'none'}")
+        columns = [self.label(name) for name in labels]
+        table = self.select(~np.any([missing(column) for column in columns], axis=0))
+        keys = list(zip(*(table.labels[name].tolist() for name in labels), strict=True))
+        number = {key: position for position, key in enumerate(dict.fromkeys(keys))}
+        group = np.array([number[key] for key in keys], dtype=np.int64)
+        first = np.unique(group, return_index=True)[1]
+        return type(self)(
+            tuple("/".join(map(str, key)) for key in number),
+            {name: _group_mean(values, group, len(number)) for name, values in table.factors.items()},
+            {name: v[first] for name, v in table.labels.items() if _equal(v[first][group], v)},
+            {**self.origin, "mean_by": list(labels)},
+        )
+
+    def write(self, path: str | Path) -> Path:
+        """Write parquet; at ``path`` stands the old file or the whole new one, never half of it."""
+        write_columns(Path(path), Columns(self.files, self.factors, self.labels, self.origin))
+        return Path(path)
+
+    @classmethod
+    def read(cls, path: str | Path) -> "FeatureTable":
+        """Read what ``write`` wrote, or any parquet with a column ``file`` and columns of equal lists."""
+        content = read_columns(Path(path))
+        try:
+            return cls(tuple(content.files), content.factors, content.labels, content.origin)
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from error
+
+
+def _group_mean(values: np.ndarray, group: np.ndarray, count: int) -> np.ndarray:
+    total = np.zeros((count, values.shape[1]))
+    np.add.at(total, group, values)
+    return total / np.bincount(group, minlength=count)[:, None]
+
+
+def _equal(a: np.ndarray, b: np.ndarray) -> bool:
+    """Equal everywhere, NaN counting as equal to NaN."""
+    return all(x == y or (x != x and y != y) for x, y in zip(a.tolist(), b.tolist(), strict=True))

@@ -1,0 +1,244 @@
+"""Stages 1 to 4 joined: pictures in, scenes and features out, pictures rendered again.
+
+Source: Klinghoffer et al., ECCV 2022, Sec. 3; networks and scene of unsup3d (Wu et al., CVPR 2020).
+Training lives in training/, scores in evaluation/; the model knows neither.
+"""
+
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from pydantic import ValidationError
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+
+from derender.networks import FACTORS, Factor, NetworkSettings
+from derender.networks.confidence import Confidence, ConfidenceNet
+from derender.presets import MODEL_PRESETS, ModelSettings, named_preset
+from derender.render import Rendering, render_scene
+from derender.scene import Scene
+
+FORMAT = 1
+WEIGHTS_FILE, CONFIG_FILE = "model.safetensors", "config.json"
+Renderer = Callable[[Scene, float], Rendering]
+
+
+class Derenderer(nn.Module):
+    """Takes pictures of one kind of thing apart into geometry, albedo, light and camera.
+
+    Args:
+        settings: sizes of the networks and ranges of the scene.
+        factors: declared rows, by default the paper's four.
+        renderer: makes pictures of scenes, given the horizontal field of view in degrees.
+    """
+
+    def __init__(
+        self,
+        settings: ModelSettings | None = None,
+        factors: Sequence[Factor] = FACTORS,
+        renderer: Renderer = render_scene,
+    ):
+        super().__init__()
+        self.settings = settings or ModelSettings()
+        self.factors = tuple(factors)
+        self.renderer = renderer
+        self.nets = nn.ModuleDict({factor.name: factor.build(self.settings.network) for factor in self.factors})
+        self.nets["confidence"] = ConfidenceNet(self.settings.network)
+
+    @classmethod
+    def from_preset(cls, name: str, *, seed: int | None = None, **network: Any) -> "Derenderer":
+        """An untrained model by preset name; keywords change network sizes (``image_size=128``).
+
+        With ``seed`` the initial weights are reproducible and torch's global generator is left as it was.
+        """
+        preset = named_preset(name, MODEL_PRESETS)
+        sizes = NetworkSettings(**{**preset.network.model_dump(), **network})
+        settings = preset.model_copy(update={"network": sizes})
+        return cls(settings) if seed is None else cls.seeded(settings, seed)
+
+    @classmethod
+    def seeded(cls, settings: ModelSettings, seed: int, **rows: Any) -> "Derenderer":
+        """An untrained model with reproducible weights; torch's global generator is left as it was."""
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            return cls(settings, **rows)
+
+    @property
+    def image_size(self) -> int:
+        """Side of the pictures the networks take, in pixels."""
+        return self.settings.network.image_size
+
+    @property
+    def fov_deg(self) -> float:
+        """Horizontal field of view of every picture, in degrees."""
+        return self.settings.ranges.fov_deg
+
+    @property
+    def device(self) -> torch.device:
+        return next(self.parameters()).device
+
+    def embed(self, images: Float[Tensor, "n 3 h w"]) -> dict[str, Float[Tensor, "n code"]]:
+        """One feature per factor for pictures in 0..1, by factor name."""
+        self._check(images)
+        return {factor.name: self.nets[factor.name].encode(images) for factor in self.factors}  # type: ignore[operator]
+
+    def decode(self, codes: Mapping[str, Float[Tensor, "n code"]]) -> Scene:
+        """The scene that features stand for."""
+        return Scene.from_parameters(
+            {
+                factor.parameter: factor.to_parameter(
+                    self.nets[factor.name].decode(codes[factor.name]),  # type: ignore[operator]
+                    self.settings.ranges,
+                )
+                for factor in self.factors
+            }
+        )
+
+    def decompose(self, images: Float[Tensor, "n 3 h w"]) -> Scene:
+        """Geometry, albedo, light and camera of pictures in 0..1."""
+        return self.decode(self.embed(images))
+
+    def render(self, scene: Scene) -> Rendering:
+        """Pictures of scenes, with the model's field of view."""
+        return self.renderer(scene, self.fov_deg)
+
+    def reconstruct(self, images: Float[Tensor, "n 3 h w"]) -> Rendering:
+        """Take pictures apart and render them again."""
+        return self.render(self.decompose(images))
+
+    def confidence(self, images: Float[Tensor, "n 3 h w"]) -> Confidence:
+        """Where the reconstruction is expected to fail (used in training)."""
+        self._check(images)
+        return self.nets["confidence"](images)
+
+    def mirror(self, scene: Scene) -> Scene:
+        """The flipped twin of a scene: its maps mirrored left to right, everything else as it is."""
+        return scene.with_parameters(
+            **{f.parameter: scene.parameters[f.parameter].flip(-1) for f in self.factors if f.mirrored}
+        )
+
+    def save(self, folder: str | Path, *, overwrite: bool = False) -> Path:
+        """Write settings and weights to ``folder``; complete or not at all."""
+        folder = Path(folder)
+        if folder.exists() and not overwrite:
+            raise FileExistsError(f"{folder} exists already: choose another folder or pass overwrite=True")
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        config = {
+            "format": FORMAT,
+            "factors": [factor.name for factor in self.factors],
+            "settings": self.settings.model_dump(mode="json"),
+        }
+        temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
+        try:
+            weights = {name: value.detach().cpu().contiguous() for name, value in self.state_dict().items()}
+            save_file(weights, temporary / WEIGHTS_FILE)
+            (temporary / CONFIG_FILE).write_text(json.dumps(config, indent=1))
+            temporary.chmod(0o755)
+            _replace_folder(temporary, folder)
+        finally:
+            shutil.rmtree(temporary, ignore_errors=True)
+        return folder
+
+    def _check(self, images: Tensor) -> None:
+        size = self.image_size
+        if images.ndim != 4 or images.shape[1:] != (3, size, size):
+            raise ValueError(
+                f"this model takes pictures of shape (N, 3, {size}, {size}), got {tuple(images.shape)}: "
+                f"read them with derender.data.read_pictures(..., image_size={size}) or resize them"
+            )
+        if not images.is_floating_point():
+            raise ValueError(f"pictures must be floating point in 0..1, got {images.dtype}: divide uint8 by 255")
+
+
+def load(
+    source: str | Path,
+    *,
+    device: str | torch.device = "cpu",
+    factors: Sequence[Factor] = FACTORS,
+    renderer: Renderer = render_scene,
+) -> Derenderer:
+    """A trained model, ready for use: evaluation mode, parameters without gradient.
+
+    Args:
+        source: a run folder, a saved folder, or a Hugging Face Hub id ("owner/name", downloaded and cached).
+        device: where to put it.
+        factors: the rows the model was made with, if not the paper's four.
+        renderer: the renderer it was made with, if not the project's own.
+
+    Raises:
+        FileNotFoundError: nothing is there.
+        ValueError: what is there is damaged, or made with other factors or by a newer version.
+    """
+    folder = _model_folder(source)
+    config = _read_config(folder)
+    names = [factor.name for factor in factors]
+    if config["factors"] != names:
+        raise ValueError(
+            f"{folder} holds factors {', '.join(config['factors'])}, asked for {', '.join(names)}: pass its rows as factors="
+        )
+    try:
+        settings = ModelSettings.model_validate(config["settings"])
+        model = Derenderer(settings, factors, renderer)
+        model.load_state_dict(load_file(folder / WEIGHTS_FILE))
+    except (SafetensorError, ValidationError, RuntimeError) as error:
+        raise ValueError(f"{folder} is damaged ({str(error).splitlines()[0]}): copy or train the model again") from error
+    return model.to(device).eval().requires_grad_(False)
+
+
+def _model_folder(source: str | Path) -> Path:
+    folder = Path(source)
+    for candidate in (folder, folder / "model"):
+        if (candidate / CONFIG_FILE).is_file() and (candidate / WEIGHTS_FILE).is_file():
+            return candidate
+    if folder.exists():
+        raise FileNotFoundError(
+            f"{folder} holds no model (expected {CONFIG_FILE} and {WEIGHTS_FILE} in it or in its folder 'model'): "
+            "give a run folder made by 'derender train' or a folder made by model.save"
+        )
+    if isinstance(source, str) and source.count("/") == 1 and not source.startswith((".", "/", "~")):
+        return _from_hub(source)
+    raise FileNotFoundError(f"no model at {source}: give a run folder, a saved folder or a Hub id 'owner/name'")
+
+
+def _from_hub(repository: str) -> Path:
+    from huggingface_hub import snapshot_download
+    from huggingface_hub.errors import HfHubHTTPError, HFValidationError, LocalEntryNotFoundError
+
+    try:
+        return Path(snapshot_download(repository, allow_patterns=[CONFIG_FILE, WEIGHTS_FILE]))
+    except (HfHubHTTPError, HFValidationError, LocalEntryNotFoundError, OSError) as error:
+        raise FileNotFoundError(
+            f"no folder {repository} here, and the Hub gave nothing under that id ({type(error).__name__}): "
+            "check the path or the id, and the network"
+        ) from error
+
+
+def _read_config(folder: Path) -> dict[str, Any]:
+    try:
+        config = json.loads((folder / CONFIG_FILE).read_text())
+        version, complete = config["format"], {"factors", "settings"} <= set(config)
+    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError) as error:
+        raise ValueError(f"{folder / CONFIG_FILE} is damaged: copy or train the model again") from error
+    if not isinstance(version, int) or version > FORMAT:
+        raise ValueError(f"{folder} was saved in format {version}, this version reads up to {FORMAT}: update derender")
+    if not complete:
+        raise ValueError(f"{folder / CONFIG_FILE} is damaged: copy or train the model again")
+    return config
+
+
+def _replace_folder(temporary: Path, folder: Path) -> None:
+    """Put ``temporary`` in the place of ``folder``; at every moment one of the two is whole."""
+    if not folder.exists():
+        temporary.rename(folder)
+        return
+    old = folder.with_name(f".{folder.name}-old-{os.getpid()}")
+    folder.rename(old)
+    temporary.rename(folder)
+    shutil.rmtree(old, ignore_errors=True)

@@ -1,0 +1,65 @@
+"""Per-pixel uncertainty of the reconstruction; used in training only.
+
+Source: unsup3d, Sec. 3.2. The network sees the picture alone and says where its rendering cannot be trusted.
+"""
+
+from dataclasses import dataclass
+
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn.functional import softplus
+
+from derender.networks.encoders import Encoder, group_norm
+from derender.networks.settings import NetworkSettings
+
+
+@dataclass(frozen=True)
+class Confidence:
+    """Standard deviations, positive, of the reconstruction and of its flipped twin.
+
+    Attributes:
+        photometric: sigma for the reconstruction's colours, (N, 1, H, W).
+        photometric_flip: the same for the flipped twin.
+        perceptual: sigma for the reconstruction's perceptual features, (N, 1, H/4, W/4).
+        perceptual_flip: the same for the flipped twin.
+    """
+
+    photometric: Float[Tensor, "n 1 h w"]
+    photometric_flip: Float[Tensor, "n 1 h w"]
+    perceptual: Float[Tensor, "n 1 h4 w4"]
+    perceptual_flip: Float[Tensor, "n 1 h4 w4"]
+
+
+class ConfidenceNet(nn.Module):
+    """Picture to four maps of uncertainty."""
+
+    def __init__(self, settings: NetworkSettings):
+        super().__init__()
+        width = settings.width
+        self.encoder = Encoder(settings, width, settings.confidence_code_size, normalised=True)
+        upsampling: list[nn.Module] = [nn.ConvTranspose2d(settings.confidence_code_size, 8 * width, 4, bias=False)]
+        upsampling.append(nn.ReLU())
+        previous = 8 * width
+        for stage in range(settings.stages - 2):
+            channels = max(4 * width // 2**stage, 2 * width)
+            upsampling += [*_upsample(previous, channels)]
+            previous = channels
+        self.trunk = nn.Sequential(*upsampling)
+        self.photometric_head = nn.Sequential(
+            *_upsample(previous, width), *_upsample(width, width), nn.Conv2d(width, 2, 5, padding=2, bias=False)
+        )
+        self.perceptual_head = nn.Conv2d(previous, 2, 3, padding=1, bias=False)
+
+    def forward(self, images: Float[Tensor, "n 3 h w"]) -> Confidence:
+        trunk = self.trunk(self.encoder(images)[:, :, None, None])
+        photometric = softplus(self.photometric_head(trunk).float())
+        perceptual = softplus(self.perceptual_head(trunk).float())
+        return Confidence(photometric[:, :1], photometric[:, 1:], perceptual[:, :1], perceptual[:, 1:])
+
+
+def _upsample(channels_in: int, channels_out: int) -> list[nn.Module]:
+    return [
+        nn.ConvTranspose2d(channels_in, channels_out, 4, stride=2, padding=1, bias=False),
+        group_norm(channels_out),
+        nn.ReLU(),
+    ]

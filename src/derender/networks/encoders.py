@@ -1,0 +1,94 @@
+"""Picture to code: strided convolutions down to 4x4 pixels, then one convolution to 1x1.
+
+Source: unsup3d's networks as pinned in the paper's appendix; the U-Net encoder is the one the paper
+swaps in for segmentation. No convolution has a bias. Input pictures are 0..1 and are moved to -1..1 here.
+"""
+
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from derender.networks.settings import NetworkSettings
+
+CHANNELS_PER_GROUP = 4
+
+
+def stage_widths(first: int, stages: int) -> list[int]:
+    """Channels after each halving: doubling from ``first``, never above 8 times it."""
+    return [first * min(2**stage, 8) for stage in range(stages)]
+
+
+def group_norm(channels: int) -> nn.GroupNorm:
+    """GroupNorm with four channels a group: 16, 32, 64 groups for 64, 128, 256 channels."""
+    return nn.GroupNorm(channels // CHANNELS_PER_GROUP, channels)
+
+
+class Encoder(nn.Module):
+    """Strided convolutions to a code of 1x1 pixels.
+
+    ``spatial`` gives the last features that still have a place in the picture, for attribution.
+    """
+
+    def __init__(self, settings: NetworkSettings, width: int, code_size: int, *, normalised: bool):
+        super().__init__()
+        widths = stage_widths(width, settings.stages)
+        layers: list[nn.Module] = []
+        previous = 3
+        for stage, channels in enumerate(widths):
+            layers.append(nn.Conv2d(previous, channels, 4, stride=2, padding=1, bias=False))
+            if normalised and stage < settings.stages - 1:
+                layers.append(group_norm(channels))
+            layers.append(nn.LeakyReLU(0.2) if normalised else nn.ReLU())
+            previous = channels
+        self.convolutions = nn.Sequential(*layers)
+        self.to_code = nn.Sequential(nn.Conv2d(previous, code_size, 4, bias=False), nn.ReLU())
+        self.code_size = code_size
+
+    def spatial(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n channels 4 4"]:
+        return self.convolutions(images * 2 - 1)
+
+    def forward(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n code"]:
+        return self.to_code(self.spatial(images)).flatten(1)
+
+
+class UNetEncoder(nn.Module):
+    """The contracting half of a U-Net, with a code read from its 4x4 centre.
+
+    ``skips`` gives the features at every resolution, finest first, for a segmentation decoder.
+    """
+
+    def __init__(self, settings: NetworkSettings, code_size: int):
+        super().__init__()
+        widths = [settings.unet_width * 2**level for level in range(settings.stages + 1)]
+        self.levels = nn.ModuleList(
+            _double_convolution(previous, channels) for previous, channels in zip([3, *widths], widths, strict=False)
+        )
+        self.pool = nn.MaxPool2d(2)
+        self.to_code = nn.Sequential(nn.Conv2d(widths[-1], code_size, 4, bias=False), nn.ReLU())
+        self.code_size = code_size
+        self.widths = widths
+
+    def skips(self, images: Float[Tensor, "n 3 h w"]) -> list[Tensor]:
+        """Features after each level, from full resolution down to 4x4."""
+        features, found = images * 2 - 1, []
+        for level, block in enumerate(self.levels):
+            features = block(features if level == 0 else self.pool(features))
+            found.append(features)
+        return found
+
+    def spatial(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n channels 4 4"]:
+        return self.skips(images)[-1]
+
+    def forward(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n code"]:
+        return self.to_code(self.spatial(images)).flatten(1)
+
+
+def _double_convolution(channels_in: int, channels_out: int) -> nn.Sequential:
+    layers: list[nn.Module] = []
+    for previous in (channels_in, channels_out):
+        layers += [
+            nn.Conv2d(previous, channels_out, 3, padding=1, bias=False),
+            nn.BatchNorm2d(channels_out),
+            nn.ReLU(),
+        ]
+    return nn.Sequential(*layers)
+

@@ -1,0 +1,136 @@
+"""The factors a picture is taken apart into: one declared row each.
+
+Training, features and evaluation go through these rows only, so that a fifth factor (the strength of a
+highlight, say) is a new row and a renderer that uses it, and nothing else changes.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Generator, Tensor, nn
+from torch.nn.functional import pad
+
+from derender.networks.decoders import MapDecoder, VectorDecoder
+from derender.networks.encoders import Encoder, UNetEncoder
+from derender.networks.settings import NetworkSettings
+from derender.scene.perturb import PerturbSettings, exchange, perturb_camera, perturb_light
+from derender.scene.ranges import SceneRanges
+
+
+class FactorNet(nn.Module):
+    """Encoder and decoder of one factor."""
+
+    def __init__(self, encoder: nn.Module, decoder: nn.Module):
+        super().__init__()
+        self.encoder = encoder
+        self.decoder = decoder
+
+    def encode(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n code"]:
+        """The factor's feature, one row per picture (pictures in 0..1)."""
+        return self.encoder(images)
+
+    def decode(self, code: Float[Tensor, "n code"]) -> Tensor:
+        """The factor's raw value, before its range is applied."""
+        return self.decoder(code)
+
+    def forward(self, images: Float[Tensor, "n 3 h w"]) -> Tensor:
+        return self.decode(self.encode(images))
+
+
+@dataclass(frozen=True)
+class Factor:
+    """One row: what the factor is called, how it is predicted, what it means and how it is perturbed.
+
+    Attributes:
+        name: key of the network and of the feature column.
+        parameter: the field of `Scene` (or key of ``Scene.extra``) that it fills.
+        build: makes the factor's network.
+        to_parameter: gives a raw network output its physical range.
+        mirrored: whether the parameter is a map that the flipped twin of a scene shows mirrored.
+        perturb: draws, for each row, another physically possible value; None if LOOCC never perturbs it.
+    """
+
+    name: str
+    parameter: str
+    build: Callable[[NetworkSettings], FactorNet]
+    to_parameter: Callable[[Tensor, SceneRanges], Tensor]
+    mirrored: bool
+    perturb: Callable[[Tensor, Generator, PerturbSettings], Tensor] | None
+
+
+def depth_from_raw(raw: Float[Tensor, "n 1 h w"], ranges: SceneRanges) -> Float[Tensor, "n h w"]:
+    """Centre each map, squash it into the depth range and hold both side borders at the border depth."""
+    raw = raw.float()
+    centred = (raw - raw.mean(dim=(1, 2, 3), keepdim=True)).squeeze(1)
+    middle, half = (ranges.depth_max + ranges.depth_min) / 2, (ranges.depth_max - ranges.depth_min) / 2
+    depth = middle + half * centred.tanh()
+    columns = ranges.border_columns(depth.shape[-1])
+    if columns == 0:
+        return depth
+    return pad(depth[..., columns:-columns], (columns, columns), value=ranges.border_depth)
+
+
+def albedo_from_raw(raw: Float[Tensor, "n 3 h w"], ranges: SceneRanges) -> Float[Tensor, "n 3 h w"]:
+    """Reflectance in 0..1."""
+    return raw.float().tanh() / 2 + 0.5
+
+
+def light_from_raw(raw: Float[Tensor, "n 4"], ranges: SceneRanges) -> Float[Tensor, "n 4"]:
+    """Ambient, diffuse, pitch, yaw from numbers in -1..1; the last two are slopes, so angles are their arctangents."""
+    raw = raw.float()
+    intensity = [
+        low + (high - low) * (raw[:, i] / 2 + 0.5) for i, (low, high) in enumerate((ranges.ambient, ranges.diffuse))
+    ]
+    pitch, yaw = (raw[:, 2:] * ranges.light_slope).atan().unbind(1)
+    return torch.stack([*intensity, pitch, yaw], dim=1)
+
+
+def camera_from_raw(raw: Float[Tensor, "n 6"], ranges: SceneRanges) -> Float[Tensor, "n 6"]:
+    """Rotation (radians) and translation from numbers in -1..1."""
+    rotation = torch.deg2rad(torch.tensor(ranges.rotation_deg))
+    scale = [rotation.item()] * 3 + [ranges.translation_xy] * 2 + [ranges.translation_z]
+    return raw.float() * torch.tensor(scale, device=raw.device)
+
+
+def map_net(channels: int, initial_scale: float = 1.0) -> Callable[[NetworkSettings], FactorNet]:
+    """Builder of a network that predicts a picture-sized map.
+
+    ``initial_scale`` shrinks the last layer's first weights, for maps that must not start as noise.
+    """
+
+    def build(settings: NetworkSettings) -> FactorNet:
+        encoder = (
+            UNetEncoder(settings, settings.code_size)
+            if settings.encoder == "unet"
+            else Encoder(settings, settings.width, settings.code_size, normalised=True)
+        )
+        decoder = MapDecoder(settings, channels)
+        with torch.no_grad():
+            decoder.last.weight.mul_(initial_scale)
+        return FactorNet(encoder, decoder)
+
+    return build
+
+
+def vector_net(numbers: int) -> Callable[[NetworkSettings], FactorNet]:
+    """Builder of a network that predicts a few numbers in -1..1."""
+
+    def build(settings: NetworkSettings) -> FactorNet:
+        encoder = Encoder(settings, settings.light_width, settings.code_size, normalised=False)
+        return FactorNet(encoder, VectorDecoder(settings.code_size, numbers))
+
+    return build
+
+
+def _exchange(value: Tensor, generator: Generator, settings: PerturbSettings) -> Tensor:
+    return exchange(value, generator)
+
+
+GEOMETRY = Factor("geometry", "depth", map_net(1, initial_scale=0.1), depth_from_raw, mirrored=True, perturb=_exchange)
+ALBEDO = Factor("albedo", "albedo", map_net(3), albedo_from_raw, mirrored=True, perturb=_exchange)
+LIGHT = Factor("light", "light", vector_net(4), light_from_raw, mirrored=False, perturb=perturb_light)
+CAMERA = Factor("camera", "camera", vector_net(6), camera_from_raw, mirrored=False, perturb=perturb_camera)
+
+FACTORS = (GEOMETRY, ALBEDO, LIGHT, CAMERA)

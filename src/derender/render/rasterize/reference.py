@@ -1,0 +1,126 @@
+"""The rasteriser's definition in plain torch: any device, any floating dtype, arithmetic in float64.
+
+Two steps. ``visible_triangle`` finds, without gradients, the triangle each pixel shows: every triangle is
+paired with the pixels of its bounding box, the pairs are tested, and the nearest kept by scatter reductions.
+``intersect`` then computes, differentiably, where the pixel's ray meets that triangle. Memory is bounded by
+working through pairs ``PAIRS_AT_ONCE`` at a time. Speed is not an aim.
+"""
+
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor
+
+from derender.render.rasterize.rule import (
+    EDGE_TOLERANCE,
+    MAX_COORDINATE_PX,
+    MIN_TWICE_AREA_PX2,
+    NEAR_Z,
+    TIE_TOLERANCE,
+)
+
+PAIRS_AT_ONCE = 1 << 20
+
+
+def rasterize(vertices: Tensor, focal_px: float) -> tuple[Tensor, Tensor, Tensor]:
+    """uv (N, H, W, 2), depth (N, H, W) and the visible triangle (N, H, W), -1 where there is none."""
+    with torch.no_grad():
+        triangle = torch.stack(
+            [visible_triangle(mesh, focal_px) for mesh in vertices.detach().double()]
+            or [vertices.new_empty(vertices.shape[1:3], dtype=torch.long)]
+        )[: len(vertices)]
+    uv, depth = intersect(vertices, triangle, focal_px)
+    return uv, depth, triangle
+
+
+def triangle_corners(height: int, width: int, device: torch.device) -> Tensor:
+    """Vertex indices (2 (H-1) (W-1), 3): each cell is cut from its top right to its bottom left corner."""
+    row, column = torch.arange(height - 1, device=device), torch.arange(width - 1, device=device)
+    top_left = (row[:, None] * width + column).ravel()
+    upper = torch.stack((top_left, top_left + 1, top_left + width), -1)
+    lower = torch.stack((top_left + 1, top_left + width + 1, top_left + width), -1)
+    return torch.stack((upper, lower), 1).view(-1, 3)
+
+
+def visible_triangle(vertices: Tensor, focal_px: float) -> Tensor:
+    """Index of the triangle each pixel of one mesh (H, W, 3) shows, or -1."""
+    height, width, _ = vertices.shape
+    inverse_z = 1 / vertices[..., 2]
+    u = vertices[..., 0] * inverse_z * focal_px + (width - 1) / 2
+    v = vertices[..., 1] * inverse_z * focal_px + (height - 1) / 2
+    corners = triangle_corners(height, width, vertices.device)
+    u, v, inverse_z, z = (value.ravel()[corners] for value in (u, v, inverse_z, vertices[..., 2]))
+    area = (u[:, 1] - u[:, 0]) * (v[:, 2] - v[:, 0]) - (u[:, 2] - u[:, 0]) * (v[:, 1] - v[:, 0])
+    kept = (z > NEAR_Z).all(-1) & (area.abs() > MIN_TWICE_AREA_PX2)
+    kept &= ((u.abs() <= MAX_COORDINATE_PX) & (v.abs() <= MAX_COORDINATE_PX)).all(-1)
+    kept = kept.nonzero()[:, 0]
+    u, v, inverse_z, area = u[kept], v[kept], inverse_z[kept], area[kept]
+
+    nearest = vertices.new_zeros(height * width)
+    for _, pixel, inverse_depth in _covered(u, v, inverse_z, area, height, width):
+        nearest.scatter_reduce_(0, pixel, inverse_depth, "amax")
+    none = torch.iinfo(torch.long).max
+    first = torch.full((height * width,), none, device=vertices.device)
+    for chosen, pixel, inverse_depth in _covered(u, v, inverse_z, area, height, width):
+        tied = inverse_depth >= nearest[pixel] * (1 - TIE_TOLERANCE)
+        first.scatter_reduce_(0, pixel[tied], kept[chosen[tied]], "amin")
+    return torch.where(first == none, -1, first).view(height, width)
+
+
+def _covered(
+    u: Tensor, v: Tensor, inverse_z: Tensor, area: Tensor, height: int, width: int
+) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    """Pairs (triangle, pixel) where one covers the other, with the inverse depth there, in portions."""
+    first_u, last_u = _span(u, width)
+    first_v, last_v = _span(v, height)
+    columns = (last_u - first_u + 1).clamp(min=0)
+    ends = (columns * (last_v - first_v + 1).clamp(min=0)).cumsum(0)
+    total = int(ends[-1]) if len(ends) else 0
+    for start in range(0, total, PAIRS_AT_ONCE):
+        pair = torch.arange(start, min(start + PAIRS_AT_ONCE, total), device=u.device)
+        triangle = torch.searchsorted(ends, pair, right=True)
+        within = pair - torch.where(triangle > 0, ends[triangle - 1], 0)
+        pixel_u = first_u[triangle] + within % columns[triangle]
+        pixel_v = first_v[triangle] + within // columns[triangle]
+        (u0, u1, u2), (v0, v1, v2) = u[triangle].unbind(-1), v[triangle].unbind(-1)
+        u0, u1, u2 = u0 - pixel_u, u1 - pixel_u, u2 - pixel_u
+        v0, v1, v2 = v0 - pixel_v, v1 - pixel_v, v2 - pixel_v
+        scale = 1 / area[triangle]
+        weight0, weight1 = (u1 * v2 - u2 * v1) * scale, (u2 * v0 - u0 * v2) * scale
+        weight2 = (u0 * v1 - u1 * v0) * scale
+        inverse_z0, inverse_z1, inverse_z2 = inverse_z[triangle].unbind(-1)
+        inverse_depth = weight0 * inverse_z0 + weight1 * inverse_z1 + weight2 * inverse_z2
+        inside = (weight0 >= -EDGE_TOLERANCE) & (weight1 >= -EDGE_TOLERANCE) & (weight2 >= -EDGE_TOLERANCE)
+        inside &= inverse_depth > 0
+        yield triangle[inside], (pixel_v * width + pixel_u)[inside], inverse_depth[inside]
+
+
+def _span(coordinate: Tensor, size: int) -> tuple[Tensor, Tensor]:
+    """First and last pixel along one axis that the triangles (T, 3), grown by the tolerance, can cover."""
+    low, high = coordinate.amin(-1), coordinate.amax(-1)
+    margin = 3 * EDGE_TOLERANCE * (high - low)
+    return (low - margin).ceil().clamp(0, size).long(), (high + margin).floor().clamp(-1, size - 1).long()
+
+
+def intersect(vertices: Tensor, triangle: Tensor, focal_px: float) -> tuple[Tensor, Tensor]:
+    """Canonical pixel coordinates and depth where each pixel's ray meets its triangle; 0 where there is none.
+
+    With q_k = (x_k, y_k) - (r_x, r_y) z_k for the ray (r_x, r_y, 1), the weights w_k = q_i x q_j are the
+    determinants [r, P_i, P_j], so b = w / sum(w) are perspective-correct: r z = sum b_k P_k.
+    """
+    count, height, width, _ = vertices.shape
+    image, v, u = (triangle >= 0).nonzero(as_tuple=True)
+    corners = triangle_corners(height, width, vertices.device)[triangle[image, v, u]]
+    points = vertices.reshape(count, -1, 3)[image[:, None], corners].double()
+    ray_x, ray_y = (u.double() - (width - 1) / 2) / focal_px, (v.double() - (height - 1) / 2) / focal_px
+    qx = points[..., 0] - ray_x[:, None] * points[..., 2]
+    qy = points[..., 1] - ray_y[:, None] * points[..., 2]
+    weight = qx.roll(-1, 1) * qy.roll(-2, 1) - qx.roll(-2, 1) * qy.roll(-1, 1)
+    weight = weight / weight.sum(1, keepdim=True)
+    carried = torch.stack((corners % width, corners // width), -1).double()
+    uv = (weight[..., None] * carried).sum(1).to(vertices.dtype)
+    depth = (weight * points[..., 2]).sum(1).to(vertices.dtype)
+    return (
+        vertices.new_zeros(count, height, width, 2).index_put((image, v, u), uv),
+        vertices.new_zeros(count, height, width).index_put((image, v, u), depth),
+    )

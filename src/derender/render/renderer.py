@@ -1,0 +1,106 @@
+"""Scene to image: shade the canonical view, move its surface in front of the camera, look colours up there.
+
+image(p) = canonical image at the canonical coordinates that pixel p sees. The canonical image is albedo times
+Lambertian shading with the light in the canonical frame. Leaves out cast shadows, speculars, clipping at 1
+and gradients at occlusion edges. Geometry is computed in float32 at least, whatever autocast says.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from derender.render.rasterize import rasterize
+from derender.render.sample import sample
+from derender.scene.camera import focal_px, to_camera, unproject
+from derender.scene.light import lambert_shading
+from derender.scene.normals import normals_from_depth
+from derender.scene.scene import Scene
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """Pictures of a batch of scenes.
+
+    Attributes:
+        image: (N, C, H, W) colours from 0 on, not clipped at 1; 0 where nothing is seen. ``render``: C = 3.
+        depth: (N, H, W) z of the visible surface in the camera frame; 0 where nothing is seen.
+        mask: (N, H, W) 1 where the surface is seen, else 0.
+    """
+
+    image: Float[Tensor, "n c h w"]
+    depth: Float[Tensor, "n h w"]
+    mask: Float[Tensor, "n h w"]
+
+
+def render(
+    depth: Tensor,  # (N, H, W), positive
+    albedo: Tensor,  # (N, 3, H, W), 0..1
+    light: Tensor,  # (N, 4) ambient, diffuse, pitch, yaw
+    camera: Tensor,  # (N, 6) rotation and translation along x, y, z
+    fov_deg: float = 10.0,
+    backend: str = "auto",
+) -> Rendering:
+    """Render a batch of canonical surfaces; gradients reach all four inputs (conventions as in ``Scene``)."""
+    return warp(shade(depth, albedo, light, fov_deg), depth, camera, fov_deg, backend)
+
+
+def render_scene(scene: Scene, fov_deg: float = 10.0, backend: str = "auto") -> Rendering:
+    """Render a batch of scenes; parameters of further factors are left to their own renderers."""
+    return render(scene.depth, scene.albedo, scene.light, scene.camera, fov_deg, backend)
+
+
+def shade(depth: Tensor, albedo: Tensor, light: Tensor, fov_deg: float = 10.0) -> Float[Tensor, "n 3 h w"]:
+    """The canonical image: albedo times shading, before any camera. Shade once, warp to many cameras."""
+    count, height, width = _map_size(depth)
+    depth, albedo, light = _checked(
+        depth=(depth, (count, height, width)),
+        albedo=(albedo, (count, 3, height, width)),
+        light=(light, (count, 4)),
+    )
+    with torch.autocast(depth.device.type, enabled=False):
+        return albedo * lambert_shading(normals_from_depth(depth, fov_deg), light)
+
+
+def warp(
+    image: Tensor, depth: Tensor, camera: Tensor, fov_deg: float = 10.0, backend: str = "auto"
+) -> Rendering:
+    """Show a canonical image (N, C, H, W), painted on the surface ``depth``, to another camera."""
+    count, height, width = _map_size(depth)
+    channels = image.shape[1] if image.dim() == 4 else 3
+    image, depth, camera = _checked(
+        image=(image, (count, channels, height, width)),
+        depth=(depth, (count, height, width)),
+        camera=(camera, (count, 6)),
+    )
+    with torch.autocast(depth.device.type, enabled=False):
+        vertices = to_camera(unproject(depth, fov_deg), camera)
+        seen = rasterize(vertices, focal_px(width, fov_deg), backend)
+        return Rendering(sample(image, seen.uv, seen.mask, backend), seen.depth, seen.mask)
+
+
+def _map_size(depth: Tensor) -> tuple[int, int, int]:
+    if depth.dim() != 3:
+        raise ValueError(f"render: depth must have shape (N, H, W), got {tuple(depth.shape)}")
+    count, height, width = depth.shape
+    return count, height, width
+
+
+def _checked(**inputs: tuple[Tensor, tuple[int, ...]]) -> list[Tensor]:
+    """The tensors in float32 or float64, or an error that says which one does not fit and why."""
+    values = []
+    for name, (value, shape) in inputs.items():
+        if not value.is_floating_point():
+            raise ValueError(f"render: {name} must be floating point, got {value.dtype}; use .float()")
+        if tuple(value.shape) != shape:
+            raise ValueError(f"render: {name} must have shape {shape} to fit depth, got {tuple(value.shape)}")
+        values.append(value.float() if value.dtype in (torch.float16, torch.bfloat16) else value)
+    for what, kinds in (
+        ("dtype", [value.dtype for value in values]),
+        ("device", [value.device for value in values]),
+    ):
+        if any(kind != kinds[0] for kind in kinds):
+            found = ", ".join(f"{name} {kind}" for name, kind in zip(inputs, kinds, strict=True))
+            raise ValueError(f"render: inputs must all have one {what}, got {found}")
+    return values

@@ -1,0 +1,109 @@
+"""From values to colours: pictures, depth maps, normals and shading as 8-bit images.
+
+Every function takes one array for a whole set and uses one range for all of it, so that images side by
+side can be compared. Leaves out layout (see ``panel``) and anything that needs a model.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib import colormaps
+from PIL import Image
+from torch import Tensor
+
+Images = list[Image.Image]
+
+
+def as_numpy(values: Tensor | np.ndarray) -> np.ndarray:
+    """The same values as a numpy array, wherever the tensor lives."""
+    return values.detach().cpu().float().numpy() if isinstance(values, Tensor) else np.asarray(values)
+
+
+def pictures(values: Tensor | np.ndarray, mask: Tensor | np.ndarray | None = None) -> Images:
+    """(N, 3, H, W) colours, uint8 or float 0..1, as images; pixels outside ``mask`` are transparent."""
+    colours = as_numpy(values)
+    if colours.ndim != 4 or colours.shape[1] != 3:
+        raise ValueError(f"pictures must have shape (N, 3, H, W); got {colours.shape}")
+    return _images(np.moveaxis(colours, 1, -1), mask)
+
+
+def depth_range(depth: Tensor | np.ndarray, mask: Tensor | np.ndarray | None = None) -> tuple[float, float]:
+    """Nearest and farthest depth worth showing: 1st and 99th percentile of all covered pixels."""
+    values = as_numpy(depth)
+    covered = values[as_numpy(mask) > 0.5] if mask is not None else values.ravel()
+    covered = covered[np.isfinite(covered)]
+    if covered.size == 0:
+        return 0.0, 1.0
+    near, far = np.percentile(covered, (1, 99))
+    return float(near), float(far)
+
+
+def depth_maps(
+    depth: Tensor | np.ndarray,
+    mask: Tensor | np.ndarray | None = None,
+    limits: tuple[float, float] | None = None,
+    colour_map: str = "magma",
+) -> Images:
+    """(N, H, W) depth as images, near is bright; one range for the whole set.
+
+    ``magma`` shows relief in lightness as well as in colour; any colour map of matplotlib will do.
+    """
+    near, far = limits or depth_range(depth, mask)
+    values = np.nan_to_num(as_numpy(depth), nan=far)
+    nearness = np.clip((far - values) / max(far - near, 1e-9), 0, 1)
+    return _images(colormaps[colour_map](nearness)[..., :3], mask)
+
+
+def normal_maps(normal: Tensor | np.ndarray, mask: Tensor | np.ndarray | None = None) -> Images:
+    """(N, H, W, 3) inward unit normals (y down) in the colours of a tangent-space normal map.
+
+    Red grows to the right, green upwards, blue towards the viewer, all of the OUTWARD normal.
+    """
+    inward = as_numpy(normal)
+    outward_right_up_viewer = inward * np.array([-1.0, 1.0, 1.0])
+    return _images((outward_right_up_viewer + 1) / 2, mask)
+
+
+def shading_maps(shading: Tensor | np.ndarray, mask: Tensor | np.ndarray | None = None) -> Images:
+    """(N, 1, H, W) shading as grey images; white is 1, or the 99th percentile where that is more."""
+    grey = as_numpy(shading)[:, 0]
+    white = max(1.0, float(np.percentile(grey, 99))) if grey.size else 1.0
+    return _images(np.repeat(grey[..., None] / white, 3, axis=-1), mask)
+
+
+def error_maps(first: Tensor | np.ndarray, second: Tensor | np.ndarray, full_scale: float = 0.25) -> Images:
+    """Absolute difference of two (N, 3, H, W) sets, mean over colours; brightest is ``full_scale``."""
+    difference = np.abs(as_numpy(first) - as_numpy(second)).mean(axis=1)
+    return _images(colormaps["magma"](np.clip(difference / full_scale, 0, 1))[..., :3], None)
+
+
+def _images(colours: np.ndarray, mask: Tensor | np.ndarray | None) -> Images:
+    """(N, H, W, 3) floats 0..1 or uint8, and a mask (N, H, W) or None, as RGB or RGBA images."""
+    pixels = colours if colours.dtype == np.uint8 else np.rint(np.clip(colours, 0, 1) * 255).astype(np.uint8)
+    if mask is None:
+        return [Image.fromarray(np.ascontiguousarray(row)) for row in pixels]
+    opacity = np.rint(np.clip(as_numpy(mask).astype(np.float32), 0, 1) * 255).astype(np.uint8)
+    return [Image.fromarray(np.dstack(pair)) for pair in zip(pixels, opacity, strict=True)]
+
+
+def on_background(image: Image.Image, background: tuple[int, int, int] = (255, 255, 255)) -> Image.Image:
+    """An opaque RGB copy, transparent parts filled with ``background``."""
+    if image.mode != "RGBA":
+        return image.convert("RGB")
+    filled = Image.new("RGB", image.size, background)
+    filled.paste(image, mask=image.getchannel("A"))
+    return filled
+
+
+def enlarged(image: Image.Image, width: int) -> Image.Image:
+    """The image at ``width`` pixels, aspect kept, by bicubic interpolation (smooth) in either direction."""
+    height = max(1, round(image.height * width / image.width))
+    return image.resize((width, height), Image.Resampling.BICUBIC)
+
+
+def same_length(columns: Sequence[Sequence[object]]) -> int:
+    """How many rows all columns have; ValueError where they differ."""
+    lengths = {len(column) for column in columns}
+    if len(lengths) != 1:
+        raise ValueError(f"all columns of a grid need the same number of images; got {sorted(lengths)}")
+    return lengths.pop()

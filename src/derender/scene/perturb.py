@@ -1,0 +1,154 @@
+"""Physical augmentation: change one factor of a scene by a random, physically possible amount.
+
+Source: the paper, section 4 (LOOCC): uniform additive perturbations of light (ambient and diffuse +-0.5,
+pitch and yaw +-45 degrees) and camera (pitch +-22.5, yaw +-45 degrees). The paper does not say what happens
+at the bounds. Here the perturbation is uniform over those values in its range that keep the result physical
+(the law that rejecting and drawing again would give, from one draw): intensities stay in their bounds, light
+within 45 degrees, camera within 60, and nothing piles up at a bound. Geometry and albedo, which have no such
+range, are exchanged between images. Leaves out rendering and encoding the new scene.
+"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+
+import torch
+from jaxtyping import Float, Int64, Shaped
+from pydantic import Field
+from torch import Generator, Tensor
+
+from derender.scene.ranges import SceneRanges
+from derender.scene.scene import Scene
+from derender.settings import Settings
+
+Perturbation = Callable[[Tensor, Generator, "PerturbSettings", SceneRanges], Tensor]
+
+
+class PerturbSettings(Settings):
+    """Largest change of each perturbed number; the bounds of the result are those of `SceneRanges`."""
+
+    ambient: float = Field(default=0.5, ge=0)
+    diffuse: float = Field(default=0.5, ge=0)
+    light_deg: float = Field(default=45.0, ge=0)  # pitch and yaw of the light
+    camera_pitch_deg: float = Field(default=22.5, ge=0)  # rotation about x
+    camera_yaw_deg: float = Field(default=45.0, ge=0)  # rotation about y
+
+
+DEFAULT_CHANGES = PerturbSettings()
+DEFAULT_RANGES = SceneRanges()
+
+
+def perturb_light(
+    light: Float[Tensor, "n 4"],
+    generator: Generator,
+    settings: PerturbSettings = DEFAULT_CHANGES,
+    ranges: SceneRanges = DEFAULT_RANGES,
+) -> Float[Tensor, "n 4"]:
+    """New ambient, diffuse, pitch and yaw for every row, each drawn by itself about the old one."""
+    angle, bound = math.radians(settings.light_deg), math.radians(ranges.light_deg)
+    changes = (settings.ambient, settings.diffuse, angle, angle)
+    bounds = (ranges.ambient, ranges.diffuse, (-bound, bound), (-bound, bound))
+    return _uniform_about(light, changes, bounds, generator)
+
+
+def perturb_camera(
+    camera: Float[Tensor, "n 6"],
+    generator: Generator,
+    settings: PerturbSettings = DEFAULT_CHANGES,
+    ranges: SceneRanges = DEFAULT_RANGES,
+) -> Float[Tensor, "n 6"]:
+    """New pitch (rotation about x) and yaw (about y) for every row; roll and translation stay as they are."""
+    changes = (math.radians(settings.camera_pitch_deg), math.radians(settings.camera_yaw_deg))
+    bound = math.radians(ranges.rotation_deg)
+    turned = _uniform_about(camera[:, :2], changes, ((-bound, bound), (-bound, bound)), generator)
+    return torch.cat([turned, camera[:, 2:]], dim=1)
+
+
+def exchange(
+    value: Shaped[Tensor, "n ..."],
+    generator: Generator,
+    settings: PerturbSettings = DEFAULT_CHANGES,
+    ranges: SceneRanges = DEFAULT_RANGES,
+) -> Shaped[Tensor, "n ..."]:
+    """Give every row the value of another row (a derangement), for factors without a range of change.
+
+    What it gives is in range because another scene had it, so ``settings`` and ``ranges`` are not consulted;
+    they are there because every perturbation is called alike.
+    """
+    return value[derangement(len(value), generator).to(value.device)]
+
+
+def derangement(n: int, generator: Generator) -> Int64[Tensor, " n"]:
+    """A permutation of 0..n-1 that leaves nothing in its place, uniform over all of those."""
+    if n < 2:
+        raise ValueError(f"exchanging between images needs at least 2 of them, got {n}; raise the batch size")
+    places = torch.arange(n, device=generator.device)
+    while True:
+        order = torch.randperm(n, generator=generator, device=generator.device)
+        if bool((order != places).all()):
+            return order
+
+
+def choose_factors(n: int, candidates: Sequence[int], generator: Generator) -> Int64[Tensor, " n"]:
+    """For each of n images, which factor to perturb: uniform over the candidates, each image by itself."""
+    if not candidates:
+        raise ValueError("no factor to choose from; name at least one that may be perturbed")
+    drawn = torch.randint(len(candidates), (n,), generator=generator, device=generator.device)
+    return torch.tensor(tuple(candidates), device=generator.device)[drawn]
+
+
+PHYSICAL: Mapping[str, Perturbation] = {
+    "depth": exchange,
+    "albedo": exchange,
+    "light": perturb_light,
+    "camera": perturb_camera,
+}
+
+
+def perturb_scene(
+    scene: Scene,
+    chosen: Int64[Tensor, " n"],
+    generator: Generator,
+    settings: PerturbSettings = DEFAULT_CHANGES,
+    ranges: SceneRanges = DEFAULT_RANGES,
+    perturbations: Mapping[str, Perturbation] = PHYSICAL,
+) -> Scene:
+    """Change, in image i, only the parameter at place ``chosen[i]`` of ``perturbations``; -1 changes nothing.
+
+    The keys name parameters of the scene. A perturbation that some image chose draws for the whole batch, in
+    the mapping's order, so the result depends on the generator and the choice alone.
+    """
+    if len(chosen) != len(scene):
+        raise ValueError(f"the choice names {len(chosen)} images, the scene holds {len(scene)}")
+    names = tuple(perturbations)
+    if len(chosen) and not -1 <= int(chosen.min()) <= int(chosen.max()) < len(names):
+        raise ValueError(
+            f"the choice must lie in -1..{len(names) - 1} ({', '.join(names)}), got {chosen.tolist()}"
+        )
+    changed = {}
+    for index, name in enumerate(names):
+        if bool((rows := chosen == index).any()):
+            value = scene.parameters[name]
+            drawn = perturbations[name](value, generator, settings, ranges)
+            rows = rows.to(value.device).view(-1, *[1] * (value.dim() - 1))
+            changed[name] = torch.where(rows, drawn, value)
+    return scene.with_parameters(**changed)
+
+
+def _uniform_about(
+    value: Float[Tensor, "n k"],
+    changes: Sequence[float],
+    bounds: Sequence[tuple[float, float]],
+    generator: Generator,
+) -> Float[Tensor, "n k"]:
+    """Uniform over the part of [value - change, value + change] inside the bounds.
+
+    A value outside the bounds is first brought to the nearest one. The result keeps its gradient to the
+    value.
+    """
+    low, high = value.new_tensor(bounds).unbind(dim=1)
+    half_width = value.new_tensor(changes)
+    inside = torch.minimum(torch.maximum(value, low), high)
+    start = torch.maximum(inside - half_width, low)
+    end = torch.minimum(inside + half_width, high)
+    drawn = torch.rand(value.shape, generator=generator, device=generator.device).to(value)
+    return torch.lerp(start, end, drawn)

@@ -1,0 +1,46 @@
+"""Which values a scene may take: the bounds that networks' raw outputs are scaled to.
+
+Source: unsup3d's published settings for faces and cats; cars differ in border depth, diffuse range
+and translation. Angles are degrees here because people write settings; radians everywhere else.
+"""
+
+import math
+
+from pydantic import Field, model_validator
+
+from derender.settings import Settings
+
+
+class SceneRanges(Settings):
+    """Bounds of every scene parameter, and the field of view that all pictures share."""
+
+    fov_deg: float = Field(10.0, gt=0, lt=180)
+    depth_min: float = Field(0.9, gt=0)
+    depth_max: float = Field(1.1, gt=0)
+    border_depth: float = Field(0.7 * 1.1 + 0.3 * 0.9, gt=0)  # depth held at the picture's left and right edge
+    border_share: float = Field(2 / 64, ge=0, lt=0.5)  # share of the width, each side, held at border_depth
+    ambient: tuple[float, float] = (0.0, 1.0)
+    diffuse: tuple[float, float] = (0.0, 1.0)
+    light_deg: float = Field(45.0, gt=0, lt=90)  # light pitch and yaw lie in +- this
+    rotation_deg: float = Field(60.0, gt=0, lt=90)
+    translation_xy: float = Field(0.1, ge=0)
+    translation_z: float = Field(0.0, ge=0)
+
+    @model_validator(mode="after")
+    def _ordered(self) -> "SceneRanges":
+        if self.depth_min >= self.depth_max:
+            raise ValueError(f"depth_min {self.depth_min} must be below depth_max {self.depth_max}")
+        for name in ("ambient", "diffuse"):
+            low, high = getattr(self, name)
+            if low > high:
+                raise ValueError(f"{name} must be (low, high) with low <= high, got ({low}, {high})")
+        return self
+
+    def border_columns(self, width: int) -> int:
+        """How many pixel columns at each side are held at ``border_depth`` (2 at 64 pixels)."""
+        return round(self.border_share * width)
+
+    @property
+    def light_slope(self) -> float:
+        """The largest tangent of light pitch and yaw."""
+        return math.tan(math.radians(self.light_deg))

@@ -1,0 +1,308 @@
+"""The training loop: one process or many (Lightning Fabric), resumable to the same weights.
+
+Everything random is a function of the seed and the number of pictures seen, so the loop needs nothing but
+weights, optimiser and counters to go on where it stopped.
+"""
+
+import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from lightning_fabric import Fabric
+from PIL import Image
+from torch import Tensor, nn
+from torch.utils.tensorboard.writer import SummaryWriter
+
+from derender.data import PictureSet, Split, split_indices
+from derender.model import Derenderer
+from derender.training.batches import Batches, random_stream
+from derender.training.checkpoint import TrainState, load_checkpoint, save_checkpoint
+from derender.training.config import TrainConfig
+from derender.training.interrupt import TrainingInterrupted, stop_on_signal
+from derender.training.perceptual import prepare_perceptual
+from derender.training.run_folder import RunFolder, append_metrics, drop_metrics_after, reopen_run, start_run
+from derender.training.schedule import learning_rate
+from derender.training.step import Precision, StepResult
+from derender.training.step_module import StepModule, compute_step
+from derender.training.validate import validate
+from derender.training.watch import Finding, Watcher
+
+SAMPLE_COUNT = 8
+LOG_EVERY_STEPS = 50
+MAX_VALIDATION_PICTURES = 1_000
+
+SampleSheet = Callable[[Derenderer, Tensor], Image.Image]
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where a run stands, for a progress bar.
+
+    Attributes:
+        phase: "perceptual" while perceptual features are learnt, then "train".
+        done, total: steps of the first phase, pictures of the second.
+        images_per_second: since the run was started or resumed.
+        terms: the latest losses by name.
+    """
+
+    phase: str
+    done: int
+    total: int
+    images_per_second: float = 0.0
+    terms: dict[str, float] | None = None
+
+
+@dataclass(frozen=True)
+class TrainResult:
+    """How a run ended.
+
+    Attributes:
+        folder: the run folder; `derender.load` takes it.
+        images: pictures seen.
+        seconds: time spent training, resumed parts included.
+        images_per_second: of this call.
+        validation: last validation losses by name.
+        stopped: "images", "minutes", "patience" or "collapse".
+        findings: what the watcher saw last; empty when nothing was wrong.
+    """
+
+    folder: Path
+    images: int
+    seconds: float
+    images_per_second: float
+    validation: dict[str, float]
+    stopped: str
+    findings: tuple[Finding, ...]
+
+
+def train(
+    config: TrainConfig,
+    pictures: PictureSet,
+    out: str | Path,
+    *,
+    resume: bool = False,
+    sample_sheet: SampleSheet | None = None,
+    progress: Callable[[Progress], None] | None = None,
+    accelerator: str = "auto",
+) -> TrainResult:
+    """Train a model on pictures; everything it makes lies in the folder ``out``.
+
+    Args:
+        config: see `derender.training.config.resolve`.
+        pictures: at the model's image size.
+        out: a new folder, or with ``resume`` the folder of an unfinished run.
+        sample_sheet: draws a sheet for a few held-out pictures from time to time.
+        progress: called after every step.
+        accelerator: "auto", "cpu" or "cuda".
+
+    Raises:
+        FileExistsError: ``out`` is not empty and ``resume`` was not asked for.
+        ValueError: pictures and configuration do not fit, or the run to resume has other settings.
+        TrainingInterrupted: Ctrl-C or SIGTERM; the run can be resumed.
+    """
+    report = progress or (lambda _: None)
+    pictures.require(10)
+    fabric = Fabric(accelerator=accelerator, devices=1)
+    split = split_indices(pictures.files, config.split, seed=config.seed)
+    training = torch.from_numpy(np.ascontiguousarray(pictures.images[split.train]))
+    held_out = torch.from_numpy(np.ascontiguousarray(pictures.images[split.validation[:MAX_VALIDATION_PICTURES]]))
+    batches = Batches(fabric.to_device(training), config.batch_size, config.seed, config.horizontal_flips)
+
+    out = Path(out)
+    if resume:
+        run = reopen_run(out, config)
+    else:
+        run = start_run(out, config, describe_data(pictures, split), str(fabric.device))
+    torch.use_deterministic_algorithms(config.deterministic)
+    model = Derenderer.seeded(config.model, config.seed).to(fabric.device)
+    if config.channels_last:
+        model = model.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
+    perceptual = prepare_perceptual(
+        config, run.perceptual, batches.images, lambda done, total, _: report(Progress("perceptual", done, total))
+    )
+    settings = config.optimiser
+    optimiser = torch.optim.Adam(
+        model.parameters(), lr=settings.learning_rate, betas=settings.betas, weight_decay=settings.weight_decay, fused=True
+    )
+    module, wrapped = fabric.setup(StepModule(model, config.objective, perceptual), optimiser)
+    state = load_checkpoint(run.last, model, optimiser) if resume and run.last.exists() else TrainState()
+    for group in optimiser.param_groups:
+        group.update(betas=settings.betas, weight_decay=settings.weight_decay)
+    drop_metrics_after(run, state.images)
+    watcher = Watcher.remembering(config.model.ranges, state.watcher) if config.watch else None
+    return _go_on(
+        _Run(config, run, fabric, module, wrapped, batches, fabric.to_device(held_out), watcher, sample_sheet, state),
+        report,
+    )
+
+
+@dataclass
+class _Run:
+    """A run in progress: everything that lasts from one step to the next."""
+
+    config: TrainConfig
+    folder: RunFolder
+    fabric: Fabric
+    module: nn.Module
+    optimiser: torch.optim.Optimizer
+    batches: Batches
+    held_out: Tensor
+    watcher: Watcher | None
+    sample_sheet: SampleSheet | None
+    state: TrainState
+    validation: dict[str, float] = field(default_factory=dict)
+    findings: tuple[Finding, ...] = ()
+
+    def __post_init__(self) -> None:
+        self.precision = network_precision(self.config.precision, self.fabric.device)
+        self.writer = SummaryWriter(str(self.folder.path / "tensorboard"), purge_step=self.state.images)
+
+    @property
+    def model(self) -> Derenderer:
+        return self.module.model  # type: ignore[return-value]
+
+    def step(self) -> StepResult:
+        """One batch: losses, gradients, update, watcher."""
+        config, state = self.config, self.state
+        position = state.images // config.batch_size
+        rate = learning_rate(config.optimiser, state.images, config.images)
+        for group in self.optimiser.param_groups:
+            group["lr"] = rate
+        noise = random_stream(config.seed, "perturb", position)
+        result = compute_step(self.module, self.batches.at(position), noise, self.precision)
+        self.fabric.backward(result.total)
+        self.optimiser.step()
+        self.optimiser.zero_grad(set_to_none=True)
+        state.images += config.batch_size
+        if self.watcher is not None:
+            self.findings = self.watcher.look(state.images, result.total.item(), result.scene)
+        return result
+
+    def validate(self) -> None:
+        """Score held-out pictures; keep the weights if they are the best so far."""
+        if not len(self.held_out):
+            return
+        self.validation = validate(self.module, self.held_out, self.config, self.precision)
+        loss, best = self.validation["loss"], self.state.best_loss
+        self.log("validation", self.validation)
+        if best is not None and not loss < best:
+            self.state.validations_since_best += 1
+            return
+        self.state.best_loss, self.state.validations_since_best = loss, 0
+        save_checkpoint(self.folder.best, self.model, self.optimiser, self.state)
+        self.model.save(self.folder.model, overwrite=True)
+
+    def draw(self) -> None:
+        """Write a sheet of held-out pictures taken apart."""
+        if self.sample_sheet is None or not len(self.held_out):
+            return
+        self.model.eval()
+        with torch.no_grad():
+            sheet = self.sample_sheet(self.model, self.held_out[:SAMPLE_COUNT].float() / 255)
+        self.model.train()
+        sheet.save(self.folder.samples / f"{self.state.images:09d}.png")
+
+    def checkpoint(self) -> None:
+        """Keep everything a resumed run needs."""
+        self.state.watcher = self.watcher.memory() if self.watcher is not None else {}
+        save_checkpoint(self.folder.last, self.model, self.optimiser, self.state)
+        if not self.folder.model.exists():
+            self.model.save(self.folder.model)
+
+    def log(self, kind: str, values: dict[str, Any]) -> None:
+        state = self.state
+        append_metrics(
+            self.folder, {"kind": kind, "images": state.images, "seconds": round(state.seconds, 2), **values}
+        )
+        for name, value in values.items():
+            if isinstance(value, float):
+                self.writer.add_scalar(f"{kind}/{name}", value, state.images)
+
+    def why_stop(self) -> str | None:
+        """What ends the run now, if anything."""
+        config, state = self.config, self.state
+        if any(finding.fatal for finding in self.findings):
+            return "collapse"
+        if state.images >= config.images:
+            return "images"
+        if config.minutes is not None and state.seconds >= 60 * config.minutes:
+            return "minutes"
+        if state.validations_since_best >= config.patience:
+            return "patience"
+        return None
+
+
+def _go_on(run: _Run, report: Callable[[Progress], None]) -> TrainResult:
+    """Train from where the run stands until something ends it."""
+    config, state = run.config, run.state
+    began, images_before, seconds_before = time.perf_counter(), state.images, state.seconds
+    stopped, steps = run.why_stop(), 0
+    with stop_on_signal() as signal_request:
+        while stopped is None:
+            before = state.images
+            result = run.step()
+            steps += 1
+            elapsed = time.perf_counter() - began
+            state.seconds = seconds_before + elapsed
+            speed = (state.images - images_before) / elapsed
+            terms = None
+            if steps % LOG_EVERY_STEPS == 1:
+                terms = {name: value.item() for name, value in result.terms.items()}
+                run.log("train", {**terms, "images_per_second": speed})
+            report(Progress("train", state.images, config.images, speed, terms))
+
+            stopped = run.why_stop()
+            if stopped == "collapse":
+                break
+            healthy = run.watcher is None or not run.watcher.uneasy
+            due = partial(_passed, before, state.images, ended=stopped is not None)
+            if due(config.validate_every) and healthy:
+                run.validate()
+                stopped = stopped or run.why_stop()
+            if due(config.sample_every):
+                run.draw()
+            if (due(config.checkpoint_every) and healthy) or signal_request.asked:
+                run.checkpoint()
+            if signal_request.asked and stopped is None:
+                run.writer.close()
+                raise TrainingInterrupted(
+                    f"stopped after {state.images:,} pictures and saved; the same command with --resume goes on"
+                )
+    if stopped == "collapse":
+        run.log("collapse", {finding.sign: finding.text for finding in run.findings})
+    run.writer.close()
+    speed = (state.images - images_before) / max(time.perf_counter() - began, 1e-9)
+    return TrainResult(
+        run.folder.path, state.images, state.seconds, speed, run.validation, stopped or "images", run.findings
+    )
+
+
+def network_precision(precision: str, device: torch.device) -> Precision:
+    """A context in which networks run in that precision; geometry and losses are computed outside it."""
+    if precision == "32-true":
+        return nullcontext
+    return partial(torch.autocast, device.type, torch.bfloat16)
+
+
+def describe_data(pictures: PictureSet, split: Split) -> dict[str, Any]:
+    """What a run was trained on, for its environment.json."""
+    return {
+        "layout": pictures.layout,
+        "pictures": len(pictures),
+        "train": len(split.train),
+        "validation": len(split.validation),
+        "test": len(split.test),
+        "skipped": len(pictures.skipped),
+        "duplicates": len(pictures.duplicates),
+    }
+
+
+def _passed(before: int, now: int, interval: int, *, ended: bool) -> bool:
+    """Whether a multiple of ``interval`` lies in (before, now], or the run has ended."""
+    return ended or now // interval > before // interval

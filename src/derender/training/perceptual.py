@@ -1,0 +1,42 @@
+"""The perceptual features of a run: learnt or loaded once, kept in the run folder, the same after a resume."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from jaxtyping import UInt8
+from torch import Tensor
+
+from derender.objectives.perceptual import PerceptualFeatures, build_perceptual
+from derender.objectives.self_features import SelfFeatures, load_self_features
+from derender.training.config import TrainConfig
+
+
+def prepare_perceptual(
+    config: TrainConfig,
+    file: Path,
+    images: UInt8[Tensor, "n 3 h w"],
+    progress: Callable[[int, int, float], None] | None = None,
+) -> PerceptualFeatures | None:
+    """Features of the kind that the configuration names, or None where it names none or gives them no weight.
+
+    Self-trained features are read from ``file`` where it exists, else learnt from ``images`` and written there.
+    """
+    objective = config.objective
+    if objective.perceptual == "none" or objective.perceptual_weight == 0:
+        return None
+    if objective.perceptual == "self" and file.exists():
+        return load_self_features(file).to(images.device)
+    features = build_perceptual(
+        objective.perceptual,
+        images,
+        weights=objective.vgg16_path,
+        seed=config.seed,
+        steps=objective.self_features_steps,
+        progress=progress,
+        device=images.device,
+    )
+    if isinstance(features, SelfFeatures):
+        partial = file.with_name(f".{file.name}.partial")
+        features.save(partial)
+        partial.replace(file)
+    return features

@@ -1,0 +1,178 @@
+"""What a run leaves on disk, and the rules under which a folder may be written.
+
+config.yaml, environment.json, metrics.jsonl, samples/, checkpoints/{last,best}, model/, tensorboard/.
+"""
+
+import json
+import os
+import platform
+import subprocess
+import tempfile
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import torch
+import yaml
+
+from derender.training.config import TrainConfig, config_from_tree, to_yaml
+
+_MAY_CHANGE_ON_RESUME = (
+    *("images", "minutes", "validate_every", "sample_every", "checkpoint_every", "patience", "watch"),
+    "optimiser",  # a run that the watcher stopped goes on with a smaller rate
+)
+_REPORTED_PACKAGES = ("derender", "torch", "numpy", "numba", "lightning-fabric", "safetensors", "pillow")
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """Paths inside one run."""
+
+    path: Path
+
+    @property
+    def config(self) -> Path:
+        return self.path / "config.yaml"
+
+    @property
+    def metrics(self) -> Path:
+        return self.path / "metrics.jsonl"
+
+    @property
+    def samples(self) -> Path:
+        return self.path / "samples"
+
+    @property
+    def last(self) -> Path:
+        return self.path / "checkpoints" / "last"
+
+    @property
+    def best(self) -> Path:
+        return self.path / "checkpoints" / "best"
+
+    @property
+    def model(self) -> Path:
+        return self.path / "model"
+
+    @property
+    def perceptual(self) -> Path:
+        return self.path / "perceptual.safetensors"
+
+
+def start_run(path: Path, config: TrainConfig, data: dict[str, Any], device: str) -> RunFolder:
+    """Make a new run folder; one that holds anything already is never touched.
+
+    Raises:
+        FileExistsError: the folder is not empty.
+    """
+    if path.exists() and (not path.is_dir() or any(path.iterdir())):
+        raise FileExistsError(
+            f"{path} exists and is not empty: add --resume to go on with that run, or choose another --out"
+        )
+    run = RunFolder(path)
+    run.samples.mkdir(parents=True, exist_ok=True)
+    write_text(run.config, to_yaml(config))
+    write_text(path / "environment.json", json.dumps({**environment(device), "data": data}, indent=1))
+    return run
+
+
+def reopen_run(path: Path, config: TrainConfig) -> RunFolder:
+    """The folder of a run to go on with, after checking that it was made with the same settings.
+
+    Raises:
+        FileNotFoundError: there is no run.
+        ValueError: its settings differ in something that a resumed run must keep.
+    """
+    run = RunFolder(path)
+    if not run.config.is_file():
+        raise FileNotFoundError(f"no run to resume in {path} (no config.yaml): train without --resume first")
+    stored = read_config(path).model_dump(mode="json")
+    asked = config.model_dump(mode="json")
+    different = [key for key in asked if key not in _MAY_CHANGE_ON_RESUME and asked[key] != stored[key]]
+    if different:
+        key = different[0]
+        raise ValueError(
+            f"{path} was trained with another {key} ({stored[key]}, now {asked[key]}): "
+            "resume with the same settings, or start a new run in another folder"
+        )
+    write_text(run.config, to_yaml(config))
+    return run
+
+
+def read_config(path: Path) -> TrainConfig:
+    """The configuration of a run."""
+    file = path / "config.yaml"
+    try:
+        return config_from_tree(yaml.safe_load(file.read_text()))
+    except yaml.YAMLError as error:
+        raise ValueError(f"{file} is damaged: restore it, or start a new run in another folder") from error
+
+
+def append_metrics(run: RunFolder, row: dict[str, Any]) -> None:
+    """Add one line to metrics.jsonl."""
+    with run.metrics.open("a") as file:
+        file.write(json.dumps(row) + "\n")
+
+
+def read_metrics(path: Path) -> list[dict[str, Any]]:
+    """Every complete line of a run's metrics.jsonl."""
+    file = RunFolder(path).metrics
+    rows = []
+    for line in file.read_text().splitlines() if file.exists() else []:
+        try:
+            rows.append(json.loads(line))
+        except json.JSONDecodeError:  # the line a killed run was writing
+            continue
+    return rows
+
+
+def drop_metrics_after(run: RunFolder, images: int) -> None:
+    """Forget rows written after a checkpoint, so that a resumed run does not tell its story twice."""
+    kept = [row for row in read_metrics(run.path) if row.get("images", 0) <= images]
+    write_text(run.metrics, "".join(json.dumps(row) + "\n" for row in kept))
+
+
+def environment(device: str) -> dict[str, Any]:
+    """Versions, machine and commit, for whoever wants to repeat the run."""
+    return {
+        "python": platform.python_version(),
+        "platform": platform.platform(terse=True),
+        "processor_threads": torch.get_num_threads(),
+        "device": device,
+        "packages": {name: _version(name) for name in _REPORTED_PACKAGES},
+        "commit": _commit(),
+    }
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a file whole or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(prefix=f".{path.name}-", dir=path.parent)
+    try:
+        with os.fdopen(handle, "w") as file:
+            file.write(text)
+        Path(temporary).chmod(0o644)
+        Path(temporary).replace(path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
+
+
+def _commit() -> str | None:
+    """The commit of the source tree, if the package runs from one."""
+    source = Path(__file__).resolve().parent
+    try:
+        found = subprocess.run(
+            ["git", "-C", str(source), "rev-parse", "HEAD"], capture_output=True, text=True, timeout=5, check=False
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return found.stdout.strip() or None

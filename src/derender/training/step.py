@@ -1,0 +1,158 @@
+"""One training step's losses: take apart, render the scene and its flipped twin, compare; then LOOCC.
+
+Source: unsup3d Sec. 3 (reconstruction), Klinghoffer et al. Sec. 3.2 (LOOCC). Every picture is encoded and
+decoded once; the twin reuses the decoded maps, and perturbed scenes are rendered in the same call.
+"""
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Generator, Tensor
+
+from derender.model import Derenderer
+from derender.networks.confidence import Confidence
+from derender.objectives.loocc import loocc_loss
+from derender.objectives.perceptual import PerceptualFeatures, perceptual_loss
+from derender.objectives.reconstruction import depth_curvature, depth_smoothness, masked_l1, photometric_loss
+from derender.render import Rendering
+from derender.scene import Scene
+from derender.scene.perturb import choose_factors
+from derender.training.config import LOOCC_FACTORS, ObjectiveSettings
+
+Precision = Callable[[], AbstractContextManager]
+
+
+@dataclass(frozen=True)
+class StepResult:
+    """Losses of one batch and what the watcher and the sample sheets look at.
+
+    Attributes:
+        total: what is minimised.
+        terms: every weighted term of it by name, and the plain masked L1 ("l1"), detached.
+        scene: the scenes predicted for the batch.
+        rendering: their renderings, without the twins.
+    """
+
+    total: Tensor
+    terms: dict[str, Tensor]
+    scene: Scene
+    rendering: Rendering
+
+
+def training_step(
+    model: Derenderer,
+    images: Float[Tensor, "n 3 h w"],
+    objective: ObjectiveSettings,
+    perceptual: PerceptualFeatures | None,
+    generator: Generator,
+    precision: Precision = nullcontext,
+) -> StepResult:
+    """Losses for one batch of pictures in 0..1; networks run under ``precision``, geometry in float32."""
+    count = images.shape[0]
+    with precision():
+        codes = model.embed(images)
+        scene = model.decode(codes)
+        confidence = model.confidence(images) if objective.confidence else None
+    scenes = [scene, model.mirror(scene)]
+    left_out = None
+    if objective.loocc != "none":
+        perturbed, left_out = perturb_one_factor(model, scene, objective, generator)
+        scenes.append(perturbed)
+    rendering = model.render(concatenate(scenes))
+
+    covered = rendering.mask[:count] * rendering.mask[count : 2 * count]
+    straight, twin = rendering.image[:count], rendering.image[count : 2 * count]
+    terms = {
+        "photometric": photometric_loss(straight, images, covered, _sigma(confidence, "photometric")),
+        "photometric_flip": objective.flip_weight
+        * photometric_loss(twin, images, covered, _sigma(confidence, "photometric_flip")),
+    }
+    if perceptual is not None and objective.perceptual_weight > 0:
+        straight_term, twin_term = _perceptual_terms(
+            perceptual, straight, twin, images, covered, confidence, precision
+        )
+        terms["perceptual"] = objective.perceptual_weight * straight_term
+        terms["perceptual_flip"] = objective.perceptual_weight * objective.flip_weight * twin_term
+    if objective.smoothness_weight > 0:
+        terms["smoothness"] = objective.smoothness_weight * depth_smoothness(scene.depth, *_inside(model))
+    if objective.curvature_weight > 0:
+        terms["curvature"] = objective.curvature_weight * depth_curvature(scene.depth, *_inside(model))
+    if left_out is not None:
+        with precision():
+            again = model.embed(rendering.image[2 * count :])
+        terms["loocc"] = objective.loocc_weight * loocc_loss(codes, again, left_out, objective.loocc_temperature)
+
+    total = torch.stack(list(terms.values())).sum()
+    reported = {name: term.detach() for name, term in terms.items()}
+    reported["l1"] = masked_l1(straight, images, covered).detach()
+    shown = Rendering(image=straight, depth=rendering.depth[:count], mask=rendering.mask[:count])
+    return StepResult(total, reported, scene, shown)
+
+
+def perturb_one_factor(
+    model: Derenderer, scene: Scene, objective: ObjectiveSettings, generator: Generator
+) -> tuple[Scene, Int[Tensor, " n"]]:
+    """Change one factor of every scene, drawn per picture; also which one, as an index into ``model.factors``.
+
+    Raises:
+        ValueError: the model has none of the factors that ``objective.loocc`` names, or cannot perturb one.
+    """
+    wanted = LOOCC_FACTORS[objective.loocc]
+    candidates = [i for i, factor in enumerate(model.factors) if factor.name in wanted and factor.perturb is not None]
+    if objective.loocc == "all":
+        candidates = [i for i, factor in enumerate(model.factors) if factor.perturb is not None]
+    if not candidates:
+        raise ValueError(f"loocc {objective.loocc!r} needs a factor that can be perturbed, this model has none of them")
+    chosen = choose_factors(len(scene), candidates, generator).to(scene.depth.device)
+    changed = {}
+    for index in candidates:
+        factor = model.factors[index]
+        assert factor.perturb is not None
+        value = scene.parameters[factor.parameter]
+        drawn = factor.perturb(value, generator, objective.perturb)
+        rows = (chosen == index).view(-1, *[1] * (value.ndim - 1))
+        changed[factor.parameter] = torch.where(rows, drawn, value)
+    return scene.with_parameters(**changed), chosen
+
+
+def concatenate(scenes: list[Scene]) -> Scene:
+    """Batches of scenes one after the other."""
+    return Scene.from_parameters(
+        {name: torch.cat([scene.parameters[name] for scene in scenes]) for name in scenes[0].parameters}
+    )
+
+
+def _inside(model: Derenderer) -> tuple[float, int]:
+    """Depth range and border columns, for terms that look at the free part of the depth maps."""
+    ranges = model.settings.ranges
+    return ranges.depth_max - ranges.depth_min, ranges.border_columns(model.image_size)
+
+
+def _sigma(confidence: Confidence | None, name: str) -> Tensor | None:
+    return None if confidence is None else getattr(confidence, name)
+
+
+def _perceptual_terms(
+    perceptual: PerceptualFeatures,
+    straight: Float[Tensor, "n 3 h w"],
+    twin: Float[Tensor, "n 3 h w"],
+    images: Float[Tensor, "n 3 h w"],
+    covered: Float[Tensor, "n h w"],
+    confidence: Confidence | None,
+    precision: Precision,
+) -> tuple[Tensor, Tensor]:
+    """The perceptual term of the reconstruction and of its twin; uncovered pixels show the picture itself."""
+    hole = covered[:, None] == 0
+    filled = torch.cat([torch.where(hole, images, straight), torch.where(hole, images, twin)])
+    with precision():
+        with torch.no_grad():
+            target = perceptual(images)
+        predicted = perceptual(filled)
+    count = images.shape[0]
+    return (
+        perceptual_loss(predicted[:count], target, covered, _sigma(confidence, "perceptual")),
+        perceptual_loss(predicted[count:], target, covered, _sigma(confidence, "perceptual_flip")),
+    )

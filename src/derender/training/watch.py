@@ -1,0 +1,193 @@
+"""Notices a training that fails while its loss still falls, and says so in plain words.
+
+Unsupervised geometry can fail in ways that reconstruction does not show: depth that is flat, hollow, torn into stripes
+or stuck at its bounds, every camera at its limit, albedo that simply is the picture. Each sign below is a number
+measured on training batches, smoothed, and compared with a limit; a sign that stays on for a while is a finding.
+The limits were set on healthy and collapsed runs (docs/log.md).
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from derender.scene import Scene
+from derender.scene.light import lambert_shading
+from derender.scene.normals import normals_from_depth
+from derender.scene.ranges import SceneRanges
+
+GRACE_IMAGES = 6_000  # a network that has just started has no geometry yet
+PERSISTENCE_IMAGES = 4_000  # how long a sign must stay on
+MEMORY_IMAGES = 2_000  # over how many pictures measurements are averaged
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something wrong with a run.
+
+    Attributes:
+        sign: short name.
+        text: what is seen, in plain words with the number.
+        advice: what to change.
+        fatal: whether training on is pointless.
+    """
+
+    sign: str
+    text: str
+    advice: str
+    fatal: bool
+
+
+@dataclass(frozen=True)
+class Sign:
+    """One row of the table of signs: a measurement, its limit and what it means."""
+
+    name: str
+    measure: str
+    limit: float
+    above: bool  # the sign is on when the measurement is above the limit (else below)
+    fatal: bool
+    text: str  # {value} is the measurement
+    advice: str
+
+    def is_on(self, measured: float) -> bool:
+        return measured > self.limit if self.above else measured < self.limit
+
+
+SLOWER = "use a smaller learning_rate (1e-4 or less), a weight_decay of 5e-4 and warmup_images"
+
+SIGNS = (
+    Sign(
+        "saturated depth", "depth_at_bound", 0.5, True, True,
+        "{value:.0%} of the depth values lie at the bounds of their range", SLOWER,
+    ),
+    Sign(
+        "torn depth", "depth_roughness", 0.6, True, True,
+        "depth jumps from pixel to pixel ({value:.2f} of its spread; a smooth surface has less than 0.3)", SLOWER,
+    ),
+    Sign(
+        "flat depth", "depth_spread", 0.03, False, False,
+        "depth is flat (spread {value:.1%} of its range)",
+        "train longer; if it stays, the pictures may show too little variety of light and view (derender doctor)",
+    ),
+    Sign(
+        "hollow depth", "bulge", -0.15, False, True,
+        "surfaces are hollow: the middle lies {value:.0%} of the depth range behind the rim",
+        "start again with another seed; light from above in most pictures helps, upside-down pictures hurt",
+    ),
+    Sign(
+        "view at its bound", "view_at_bound", 0.5, True, True,
+        "{value:.0%} of the pictures have the camera turned to its limit", SLOWER,
+    ),
+    Sign(
+        "light at its bound", "light_at_bound", 0.8, True, False,
+        "{value:.0%} of the pictures have the light at the limit of its angles",
+        "look at the samples; a smaller learning_rate or a wider light_deg may help",
+    ),
+    Sign(
+        "albedo copies the picture", "shading_contrast", 0.004, False, False,
+        "shading is the same everywhere (contrast {value:.2%}), so albedo is the picture itself",
+        "raise flip_weight, or check that the pictures show the thing from the front and roughly symmetric",
+    ),
+)
+
+
+@dataclass
+class Watcher:
+    """Looks at training batches and remembers what it saw.
+
+    Args:
+        ranges: bounds of the scene.
+        memory: what `memory()` gave in the run that is resumed.
+    """
+
+    ranges: SceneRanges
+    averages: dict[str, float] = field(default_factory=dict)
+    on_since: dict[str, int] = field(default_factory=dict)  # pictures seen when a sign came on
+    last_images: int = 0
+
+    @classmethod
+    def remembering(cls, ranges: SceneRanges, memory: Mapping[str, Any]) -> "Watcher":
+        """A watcher that goes on where ``memory`` was taken; an empty one starts fresh."""
+        return cls(ranges, **memory)
+
+    def memory(self) -> dict[str, Any]:
+        """What a resumed run needs."""
+        return {"averages": dict(self.averages), "on_since": dict(self.on_since), "last_images": self.last_images}
+
+    @property
+    def uneasy(self) -> bool:
+        """Whether a fatal sign is on, though perhaps not for long: such a state is no good checkpoint."""
+        return any(sign.name in self.on_since and sign.fatal for sign in SIGNS)
+
+    def look(self, images: int, loss: float, scene: Scene) -> tuple[Finding, ...]:
+        """What is wrong after ``images`` pictures, given the latest batch; usually nothing."""
+        if not math.isfinite(loss):
+            return (Finding("non-finite loss", f"the loss is {loss}", f"{SLOWER}; with bf16, try 32-true", True),)
+        share = min(1.0, (images - self.last_images) / MEMORY_IMAGES)
+        self.last_images = images
+        for name, value in measure(scene, self.ranges).items():
+            before = self.averages.get(name, value)
+            self.averages[name] = before + share * (value - before)
+        findings = []
+        for sign in SIGNS:
+            value = self.averages[sign.measure]
+            if images < GRACE_IMAGES or not sign.is_on(value):
+                self.on_since.pop(sign.name, None)
+                continue
+            since = self.on_since.setdefault(sign.name, images)
+            if images - since >= PERSISTENCE_IMAGES:
+                findings.append(Finding(sign.name, sign.text.format(value=value), sign.advice, sign.fatal))
+        return tuple(findings)
+
+
+@torch.no_grad()
+def measure(scene: Scene, ranges: SceneRanges) -> dict[str, float]:
+    """The numbers that signs are read from, each a mean over the batch.
+
+    depth_at_bound, view_at_bound, light_at_bound: shares, 0..1. depth_spread: standard deviation of a depth map over
+    its range. depth_roughness: mean step between neighbours over the standard deviation. bulge: how far the
+    rim lies behind the middle, over the range; negative is hollow. shading_contrast: standard deviation of the shading
+    in a picture over its mean.
+    """
+    depth = _inside(scene.depth, ranges)
+    low, high = ranges.depth_min, ranges.depth_max
+    half, middle = (high - low) / 2, (high + low) / 2
+    spread = depth.std(dim=(1, 2))
+    steps = (depth.diff(dim=2).abs().mean(dim=(1, 2)) + depth.diff(dim=1).abs().mean(dim=(1, 2))) / 2
+    rotation = scene.camera[:, :2].abs() / math.radians(ranges.rotation_deg)
+    light = scene.light[:, 2:].abs() / math.radians(ranges.light_deg)
+    shading = _shading(scene, ranges)
+    values = {
+        "depth_at_bound": ((depth - middle).abs() > 0.97 * half).float().mean(),
+        "depth_spread": (spread / (high - low)).mean(),
+        "depth_roughness": (steps / spread.clamp(min=1e-6)).mean(),
+        "bulge": _bulge(depth).mean() / (high - low),
+        "view_at_bound": (rotation > 0.95).any(dim=1).float().mean(),
+        "light_at_bound": (light > 0.95).any(dim=1).float().mean(),
+        "shading_contrast": (shading.std(dim=(1, 2)) / shading.mean(dim=(1, 2)).clamp(min=1e-6)).mean(),
+    }
+    return {name: float(value) for name, value in values.items()}
+
+
+def _inside(depth: Float[Tensor, "n h w"], ranges: SceneRanges) -> Float[Tensor, "n h w_inside"]:
+    columns = ranges.border_columns(depth.shape[-1])
+    return depth[..., columns:-columns] if columns else depth
+
+
+def _bulge(depth: Float[Tensor, "n h w"]) -> Float[Tensor, " n"]:
+    """Mean depth of the outer ring minus mean depth of the middle."""
+    height, width = depth.shape[1:]
+    y = torch.linspace(-1, 1, height, device=depth.device)[:, None]
+    x = torch.linspace(-1, 1, width, device=depth.device)[None]
+    radius = (x.square() + y.square()).sqrt()
+    ring, core = (radius > 0.7) & (radius < 1.0), radius < 0.4
+    return depth[:, ring].mean(dim=1) - depth[:, core].mean(dim=1)
+
+
+def _shading(scene: Scene, ranges: SceneRanges) -> Float[Tensor, "n h w"]:
+    return lambert_shading(normals_from_depth(scene.depth, ranges.fov_deg), scene.light).squeeze(1)

@@ -1,0 +1,93 @@
+"""Controls are what they say, keep the pictures' names and labels, and repeat for the same seed."""
+
+import numpy as np
+import pytest
+import torch
+from sklearn.decomposition import PCA
+
+from derender.baselines.controls import (
+    noise_features,
+    pca_features,
+    pixel_features,
+    untrained_features,
+    untrained_twin,
+)
+from derender.data import PictureSet
+from derender.features import embed_pictures, model_fingerprint
+
+
+def pictures(count: int = 30, size: int = 8, seed: int = 0) -> PictureSet:
+    images = np.random.default_rng(seed).integers(0, 256, (count, 3, size, size), dtype=np.uint8)
+    return PictureSet(
+        images, tuple(f"{i}.png" for i in range(count)), {"who": np.arange(count) % 3}, source="made"
+    )
+
+
+def test_pixels_are_the_pixels():
+    given = pictures()
+    table = pixel_features(given)
+    np.testing.assert_allclose(table.concatenate("pixels"), given.images.reshape(30, -1) / 255, rtol=1e-6)
+    assert table.files == given.files and table.label("who").tolist() == given.labels["who"].tolist()
+    assert table.origin == {"data": "made", "layout": "folder", "control": "pixels"}
+
+
+def test_pca_agrees_with_its_definition():
+    given = pictures()
+    codes = pca_features(given, components=5).concatenate("pca")
+    flat = given.images.reshape(30, -1) / 255
+    centred = flat - flat.mean(axis=0)
+    u, s, _ = np.linalg.svd(centred, full_matrices=False)
+    np.testing.assert_allclose(np.abs(codes), np.abs(u[:, :5]) * np.sqrt(29), rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(np.cov(codes.T), np.eye(5), atol=1e-3)
+    plain = pca_features(given, components=5, whiten=False).concatenate("pca")
+    np.testing.assert_allclose(np.abs(plain), np.abs(u[:, :5] * s[:5]), rtol=1e-3, atol=1e-3)
+
+
+def test_pca_takes_its_components_from_other_pictures():
+    train, test = pictures(), pictures(6, seed=1)
+    codes = pca_features(test, components=4, fit_on=train).concatenate("pca")
+    flat = [p.images.reshape(len(p), -1).astype(np.float32) / 255 for p in (train, test)]
+    expected = PCA(4, whiten=True, random_state=0).fit(flat[0]).transform(flat[1])
+    np.testing.assert_allclose(codes, expected, rtol=1e-4, atol=1e-4)
+    with pytest.raises(ValueError, match=r"64 components cannot be had from 30 pictures: ask for 1 to 30"):
+        pca_features(train)
+    with pytest.raises(ValueError, match=r"fitted on pictures \(3, 4, 4\) does not take \(3, 8, 8\)"):
+        pca_features(train, components=4, fit_on=pictures(size=4))
+
+
+def test_noise_knows_nothing_and_repeats():
+    table = noise_features(pictures(500), dimensions=7, seed=3)
+    again = noise_features(pictures(500, seed=9), dimensions=7, seed=3)
+    np.testing.assert_array_equal(table.factors["noise"], again.factors["noise"])
+    assert table.factors["noise"].shape == (500, 7) and abs(table.factors["noise"].std() - 1) < 0.05
+    assert not np.allclose(
+        table.factors["noise"], noise_features(pictures(500), dimensions=7, seed=4).factors["noise"]
+    )
+
+
+@pytest.fixture
+def small():
+    from derender.model import Derenderer
+
+    return Derenderer.from_preset("small", seed=5)
+
+
+def test_an_untrained_twin_has_the_shape_not_the_weights_and_leaves_the_generator(small):
+    state = torch.random.get_rng_state()
+    first, again, other = untrained_twin(small, 0), untrained_twin(small, 0), untrained_twin(small, 1)
+    assert torch.equal(torch.random.get_rng_state(), state)
+    assert model_fingerprint(first) == model_fingerprint(again) != model_fingerprint(other)
+    assert model_fingerprint(first) != model_fingerprint(small)
+    shapes = [{n: v.shape for n, v in m.state_dict().items()} for m in (first, small)]
+    assert shapes[0] == shapes[1] and not first.training
+
+
+def test_untrained_features_are_those_of_the_twin(small):
+    given = pictures(5, small.image_size)
+    table = untrained_features(small, given, seed=2)
+    expected = embed_pictures(untrained_twin(small, 2), given)
+    assert set(table.factors) == {"geometry", "albedo", "light", "camera"}
+    for name in table.factors:
+        np.testing.assert_array_equal(table.factors[name], expected.factors[name])
+    assert table.origin["control"] == "untrained" and table.origin["seed"] == 2
+    assert table.origin["settings"]["network"]["image_size"] == small.image_size

@@ -1,0 +1,60 @@
+"""Makes small pictures and trees of them; none shows anything but noise and ramps."""
+
+import io
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+
+def noise(seed: int, width: int = 12, height: int = 12, channels: int = 3) -> np.ndarray:
+    shape = (height, width, channels) if channels > 1 else (height, width)
+    return np.random.default_rng(seed).integers(0, 256, shape, dtype=np.uint8)
+
+
+@pytest.fixture
+def encoded() -> Callable[..., bytes]:
+    """``encoded(seed)`` is a small PNG of noise; ``encoded(array, "JPEG", ...)`` encodes what is given."""
+
+    def encode(what: int | np.ndarray | Image.Image, form: str = "PNG", **options: object) -> bytes:
+        array = noise(what) if isinstance(what, int) else what
+        picture = array if isinstance(array, Image.Image) else Image.fromarray(array)
+        buffer = io.BytesIO()
+        picture.save(buffer, form, **options)
+        return buffer.getvalue()
+
+    return encode
+
+
+@pytest.fixture
+def tree(tmp_path: Path, encoded) -> Callable[..., Path]:
+    """``tree(files, zipped)`` writes a folder or zip: each name gets its own picture or what is given."""
+
+    def make(
+        files: list[str] | dict[str, bytes | str | None], zipped: bool = False, name: str = "set"
+    ) -> Path:
+        contents = dict.fromkeys(files) if isinstance(files, list) else files
+        data = {
+            file: encoded(seed)
+            if content is None
+            else content.encode()
+            if isinstance(content, str)
+            else content
+            for seed, (file, content) in enumerate(contents.items())
+        }
+        if zipped:
+            path = tmp_path / f"{name}.zip"
+            with zipfile.ZipFile(path, "w") as archive:
+                for file, content in data.items():
+                    archive.writestr(file, content)
+            return path
+        for file, content in data.items():
+            path = tmp_path / name / file
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(content)
+        return tmp_path / name
+
+    return make

@@ -1,0 +1,104 @@
+"""The readers on the development data as it is published: counts, labels, copies."""
+
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from derender.data import read_ground_truth, read_pictures, split_indices, take_inventory
+from derender.data.loading import load_into
+
+
+@pytest.mark.parametrize(
+    ("source", "layout", "count", "labels"),
+    [
+        ("utkface64.zip", "utkface", 21_336, {"age", "gender", "race"}),
+        ("lfw64.zip", "lfw", 6_502, {"identity", "emotion"}),
+        ("celeba64.zip", "celeba", 7_000, {"Male", "Smiling", "5_o_Clock_Shadow"}),
+        ("celebamask128.zip", "celebamask", 800, {"mask"}),
+        ("synface64.zip", "synface", 12_000, {"identity", "expression", "light_yaw_rad", "camera_y_rad"}),
+        (
+            "synface64.zip::test_gt",
+            "synface",
+            800,
+            {"identity", "expression", "light_yaw_rad", "camera_y_rad"},
+        ),
+        ("syncar64.zip", "syncar", 8_000, {"class", "model", "light_pitch_rad"}),
+        ("syncar64.zip::test", "syncar", 1_000, {"class", "model"}),
+        ("synface_tracks64.zip", "synface_tracks", 1_440, {"identity", "track", "expression"}),
+    ],
+)
+def test_every_archive_is_recognised_and_whole(shared_data, source, layout, count, labels):
+    name, _, subset = source.partition("::")
+    inventory = take_inventory(shared_data(f"data/{name}"), subset=subset or None)
+    inventory.source.close()
+    assert inventory.layout.name == layout
+    assert len(inventory.table.files) == count
+    assert labels <= set(inventory.table.labels)
+    assert inventory.source.skipped == ()
+
+
+def test_utkface_labels(shared_data):
+    pictures = read_pictures(shared_data("data/utkface64.zip"), 64, limit=300)
+    assert len(pictures) == 300
+    assert set(pictures.label("race")) <= {"white", "black", "asian", "indian", "other"}
+    assert (pictures.label("age").min(), pictures.label("age").max()) > (0, 90)
+
+
+def test_utkface_copies(shared_data):
+    """The archive's copies are byte for byte the same, so its checksums tell how many pixels must find."""
+    inventory = take_inventory(shared_data("data/utkface64.zip"))
+    with inventory.source as source:
+        files = inventory.table.files
+        assert (inventory.table.labels["race"] == "").sum() == 3
+        stamps = Counter(source.stamp(file) for file in files)
+        copied = [file for file in files if stamps[source.stamp(file)] > 1]
+        single = [file for file in files if stamps[source.stamp(file)] == 1][::200]
+        images = np.empty((len(copied) + len(single), 3, 64, 64), np.uint8)
+        loaded = load_into(images, source, [*copied, *single], fit="crop", keep_duplicates=False)
+    assert len(loaded.duplicates) == sum(count - 1 for count in stamps.values()) == 390
+    assert loaded.skipped == ()
+
+
+def test_lfw_people(shared_data):
+    inventory = take_inventory(shared_data("data/lfw64.zip"))
+    inventory.source.close()
+    labels = inventory.table.labels
+    _, counts = np.unique(labels["identity"], return_counts=True)
+    assert (counts >= 20).sum() == 31
+    assert {"neutral", "happiness"} <= set(labels["emotion"])
+    split = split_indices(inventory.table.files, groups=labels["identity"], seed=0)
+    assert not set(labels["identity"][split.train]) & set(labels["identity"][split.test])
+
+
+def test_tracks(shared_data):
+    pictures = read_pictures(shared_data("data/synface_tracks64.zip"), 64)
+    assert len(np.unique(pictures.label("identity"))) == 12
+    assert len(np.unique(pictures.label("track"))) == 240
+
+
+def test_synface_ground_truth_explains_its_pictures(shared_data):
+    """Depth, normals, albedo, light and camera fit together: shading by them gives the stored picture."""
+    truth = read_ground_truth(shared_data("data/synface64.zip"), limit=40)
+    assert 0.93 < truth.depth[truth.mask].min() < truth.depth[truth.mask].max() < 1.16
+    pitch, yaw = truth.light[:, 2], truth.light[:, 3]
+    light = np.stack([np.tan(yaw), np.tan(pitch), np.ones_like(yaw)], axis=1)
+    light /= np.linalg.norm(light, axis=1, keepdims=True)
+    x, y, z = truth.camera[:, 0], truth.camera[:, 1], truth.camera[:, 2]
+    zero, one = np.zeros_like(x), np.ones_like(x)
+    about_x = np.array([[one, zero, zero], [zero, np.cos(x), -np.sin(x)], [zero, np.sin(x), np.cos(x)]])
+    about_y = np.array([[np.cos(y), zero, np.sin(y)], [zero, one, zero], [-np.sin(y), zero, np.cos(y)]])
+    about_z = np.array([[np.cos(z), -np.sin(z), zero], [np.sin(z), np.cos(z), zero], [zero, zero, one]])
+    in_camera = np.einsum("ijn,jkn,kln,nl->ni", about_z, about_y, about_x, light)
+    cosine = np.maximum(0, np.einsum("nhwi,ni->nhw", truth.normal, in_camera))
+    shading = truth.light[:, 0, None, None] + truth.light[:, 1, None, None] * cosine
+    picture = np.clip(truth.albedo * shading[:, None], 0, 1) * 255
+    error = np.abs(picture - truth.images).mean(axis=1)[truth.mask]
+    assert np.median(error) < 2
+    assert error.mean() < 3
+
+
+def test_syncar_ground_truth(shared_data):
+    truth = read_ground_truth(shared_data("data/syncar64.zip"), limit=10)
+    assert truth.normal is None and truth.albedo is None
+    assert 0.85 < truth.depth[truth.mask].min() < truth.depth[truth.mask].max() < 1.15

@@ -1,0 +1,138 @@
+"""Errors of albedo, light and camera: zero up to what no picture can tell, known on closed forms."""
+
+import numpy as np
+import pytest
+import torch
+
+from derender.data import GroundTruth
+from derender.evaluation import albedo_error, camera_error, evaluate_factors, light_error
+from derender.scene import Scene
+from derender.scene.camera import rotation_matrix
+
+
+def cameras(count: int = 20, seed: int = 0, spread_rad: float = 0.3) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    rotation = spread_rad * torch.randn(count, 3, generator=generator)
+    return torch.cat([rotation, torch.zeros(count, 3)], dim=1)
+
+
+def turned(camera: torch.Tensor, about: torch.Tensor) -> torch.Tensor:
+    """Cameras whose rotation is R @ about, as angles: R = Rz Ry Rx gives them back."""
+    r = rotation_matrix(camera[:, :3].double()) @ about
+    angles = torch.stack(
+        [torch.atan2(r[:, 2, 1], r[:, 2, 2]), -torch.asin(r[:, 2, 0]), torch.atan2(r[:, 1, 0], r[:, 0, 0])],
+        dim=1,
+    )
+    return torch.cat([angles, camera[:, 3:].double()], dim=1).float()
+
+
+def test_albedo_error_is_zero_up_to_scale_and_blind_outside_the_mask():
+    albedo = torch.rand(3, 3, 6, 7, generator=torch.Generator().manual_seed(0))
+    mask = torch.rand(3, 6, 7, generator=torch.Generator().manual_seed(1)) > 0.3
+    scaled = albedo * torch.tensor([0.2, 1.0, 1.7])[:, None, None, None]
+    dirty = torch.where(mask[:, None], scaled, torch.nan)
+    assert albedo_error(dirty, albedo, mask).max() < 1e-7
+
+
+def test_albedo_error_of_a_constant_is_the_standard_deviation_and_of_nothing_the_whole():
+    albedo = torch.rand(2, 3, 8, 8, generator=torch.Generator().manual_seed(0))
+    mask = torch.ones(2, 8, 8, dtype=torch.bool)
+    constant = albedo_error(torch.full_like(albedo, 0.3), albedo, mask)
+    np.testing.assert_allclose(constant, albedo.flatten(1).std(dim=1, correction=0), rtol=1e-5)
+    nothing = albedo_error(torch.zeros_like(albedo), albedo, mask)
+    np.testing.assert_allclose(nothing, albedo.square().flatten(1).mean(dim=1).sqrt(), rtol=1e-5)
+    with pytest.raises(ValueError, match="the mask of 2 pictures is empty"):
+        albedo_error(albedo, albedo, ~mask)
+
+
+def test_light_error_is_the_angle_between_directions():
+    yaw_deg = torch.tensor([0.0, 10.0, 44.0])
+    light = torch.zeros(3, 4)
+    turned_light = light.clone()
+    turned_light[:, 3] = torch.deg2rad(yaw_deg)
+    still = torch.zeros(3, 6)
+    scores = light_error(light, still, turned_light, still)
+    np.testing.assert_allclose(scores.each_deg, yaw_deg, atol=1e-5)
+    assert scores.mean_deg == pytest.approx(18) and scores.median_deg == pytest.approx(10)
+
+
+def test_light_is_compared_in_the_frame_of_the_camera():
+    """A light turned one way on an object turned back by as much is the same light."""
+    light, camera = torch.zeros(1, 4), torch.zeros(1, 6)
+    light[0, 3], camera[0, 1] = 0.3, -0.3
+    frontal = torch.zeros(1, 4), torch.zeros(1, 6)
+    assert light_error(light, camera, *frontal).mean_deg < 1e-5
+    assert light_error(light, -camera, *frontal).mean_deg == pytest.approx(np.degrees(0.6), rel=1e-5)
+
+
+def test_a_constant_turn_of_the_canonical_frame_costs_nothing():
+    camera = cameras()
+    about = rotation_matrix(torch.tensor([0.2, -0.7, 0.4], dtype=torch.float64))
+    assert camera_error(camera, camera).mean_deg < 1e-5
+    assert camera_error(turned(camera, about), camera).mean_deg < 1e-4
+    assert camera_error(turned(camera, torch.eye(3, dtype=torch.float64)), camera).mean_deg < 1e-4
+
+
+def test_two_cameras_apart_about_one_axis_leave_half_the_angle_each():
+    true, predicted = torch.zeros(2, 6), torch.zeros(2, 6)
+    true[:, 1] = torch.deg2rad(torch.tensor([-20.0, 20.0]))
+    np.testing.assert_allclose(camera_error(predicted, true).each_deg, [20, 20], atol=1e-4)
+
+
+def test_a_mirrored_camera_is_not_forgiven():
+    camera = cameras(200)
+    mirrored = camera * torch.tensor([1, -1, -1, 1, 1, 1])
+    assert camera_error(mirrored, camera).mean_deg > camera_error(torch.zeros_like(camera), camera).mean_deg
+
+
+class Oracle(torch.nn.Module):
+    """A model that knows a scene; under plain ambient light its rendering is the albedo it knows."""
+
+    image_size, device = 5, torch.device("cpu")
+
+    def __init__(self, albedo, mask, light, camera):
+        super().__init__()
+        self.known, self.mask, self.done = Scene(torch.ones(len(light), 5, 5), albedo, light, camera), mask, 0
+
+    def decompose(self, images):
+        self.done += len(images)
+        return self.known[self.done - len(images) : self.done]
+
+    def render(self, scene):
+        assert scene.light.tolist() == [[1, 0, 0, 0]] * len(scene)
+        self.image, self.shown = scene.albedo, self.mask[self.done - len(scene) : self.done]
+        return Shown(scene.albedo, self.shown)
+
+
+class Shown:
+    def __init__(self, image, mask):
+        self.image, self.mask = image, mask
+
+
+def ground_truth() -> GroundTruth:
+    rng = np.random.default_rng(0)
+    light = np.concatenate([np.full((6, 2), 0.5), rng.uniform(-0.7, 0.7, (6, 2))], axis=1)
+    return GroundTruth(
+        images=np.zeros((6, 3, 5, 5), np.uint8),
+        depth=np.ones((6, 5, 5), np.float32),
+        normal=None,
+        albedo=rng.random((6, 3, 5, 5), np.float32),
+        mask=np.ones((6, 5, 5), bool),
+        light=light.astype(np.float32),
+        camera=cameras(6).numpy(),
+        files=tuple("abcdef"),
+        labels={},
+    )
+
+
+def test_a_model_that_knows_the_truth_scores_zero_and_constants_do_not():
+    truth = ground_truth()
+    about = rotation_matrix(torch.tensor([0.0, 0.3, 0.0], dtype=torch.float64))
+    values = [torch.as_tensor(v) for v in (truth.albedo, truth.mask, truth.light, truth.camera)]
+    result = evaluate_factors(Oracle(values[0] / 2, values[1].float(), *values[2:]), truth, batch_size=4)
+    assert result.albedo < 1e-6 and result.light.mean_deg < 1e-4 and result.camera.mean_deg < 1e-4
+    assert result.albedo_control > 0.1 and result.light_control.mean_deg > 5
+    assert result.camera_control.mean_deg > 5
+    turned_model = Oracle(*values[:3], turned(values[3], about))
+    elsewhere = evaluate_factors(turned_model, truth)
+    assert elsewhere.camera.mean_deg < 1e-4 and elsewhere.light.mean_deg > 5

@@ -1,0 +1,44 @@
+"""A tiny model and picture set with the interfaces that features need."""
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from derender.data import PictureSet
+
+SIZE = 8
+
+
+class TinyModel(nn.Module):
+    """Two factors of 3 and 2 numbers: fixed random projections of the picture, one with a BatchNorm."""
+
+    def __init__(self, seed: int = 0):
+        super().__init__()
+        generator = torch.Generator().manual_seed(seed)
+        self.register_buffer("a", torch.randn(3 * SIZE * SIZE, 3, generator=generator))
+        self.register_buffer("b", torch.randn(3 * SIZE * SIZE, 2, generator=generator))
+        self.norm = nn.BatchNorm1d(3)
+        self.image_size = SIZE
+
+    @property
+    def device(self) -> torch.device:
+        return self.a.device
+
+    def embed(self, images: torch.Tensor) -> dict[str, torch.Tensor]:
+        flat = images.flatten(1)
+        return {"geometry": self.norm(flat @ self.a), "albedo": flat @ self.b}
+
+
+@pytest.fixture
+def model() -> TinyModel:
+    return TinyModel()
+
+
+@pytest.fixture
+def pictures() -> PictureSet:
+    images = np.random.default_rng(0).integers(0, 256, (11, 3, SIZE, SIZE), dtype=np.uint8)
+    labels = {"identity": np.array(["a", "b", "", "c", "a", "b", "c", "a", "b", "c", "a"])}
+    partition = np.array(["train"] * 6 + ["test"] * 5)
+    files = tuple(f"{i}.png" for i in range(11))
+    return PictureSet(images, files, labels, partition=partition, source="made")

@@ -1,0 +1,60 @@
+"""Features do not depend on batches, leave the model as it was, and say where they come from."""
+
+import numpy as np
+import pytest
+import torch
+
+from derender.features import FeatureTable, embed_pictures, model_fingerprint
+
+
+def test_features_are_those_of_the_model_whatever_the_batch(model, pictures):
+    expected = model.eval().embed(torch.from_numpy(pictures.images).float() / 255)
+    for batch_size in (1, 4, 11, 100):
+        table = embed_pictures(model, pictures, batch_size=batch_size)
+        for name in expected:
+            np.testing.assert_allclose(table.factors[name], expected[name].detach(), rtol=1e-5, atol=1e-5)
+
+
+def test_labels_partition_and_origin_go_with_the_features(model, pictures, tmp_path):
+    table = embed_pictures(model, pictures, origin={"model": "runs/x"})
+    assert table.files == pictures.files
+    assert table.label("identity").tolist() == pictures.labels["identity"].tolist()
+    assert table.label("partition").tolist() == ["train"] * 6 + ["test"] * 5
+    assert table.origin["model"] == "runs/x" and table.origin["data"] == "made"
+    assert table.origin["weights"] == model_fingerprint(model)
+    assert FeatureTable.read(table.write(tmp_path / "t.parquet")).origin == table.origin
+
+
+def test_the_model_is_left_in_its_mode_with_its_statistics(model, pictures):
+    model.train()
+    before = model_fingerprint(model)
+    embed_pictures(model, pictures)
+    assert model.training and model_fingerprint(model) == before
+
+
+def test_the_fingerprint_sees_one_changed_weight(model):
+    before = model_fingerprint(model)
+    model.b[0, 0] += 1e-6
+    assert model_fingerprint(model) != before
+
+
+def test_progress_counts_pictures(model, pictures):
+    seen = []
+    embed_pictures(model, pictures, batch_size=4, progress=lambda done, total: seen.append((done, total)))
+    assert seen == [(4, 11), (8, 11), (11, 11)]
+
+
+def test_bad_input_is_refused_in_words(model, pictures):
+    model.image_size = 16
+    with pytest.raises(
+        ValueError, match="pictures are 8x8, the model takes 16x16: read them with image_size=16"
+    ):
+        embed_pictures(model, pictures)
+    model.image_size = 8
+    with pytest.raises(ValueError, match="batch_size must be 1 or more, got 0"):
+        embed_pictures(model, pictures, batch_size=0)
+    with pytest.raises(ValueError, match="no pictures"):
+        embed_pictures(model, pictures.select([]))
+    model.b[:] = torch.nan
+    with pytest.raises(ValueError, match=r"factor 'albedo' is not finite in 11 of 11 rows, first in 0\.png"):
+        embed_pictures(model, pictures)

@@ -1,0 +1,122 @@
+"""DisentangledFeatures keeps scikit-learn's promises."""
+
+import pickle
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from sklearn.base import clone
+from sklearn.linear_model import LogisticRegression
+from sklearn.model_selection import GridSearchCV
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import StandardScaler
+
+import derender
+from derender.features import DisentangledFeatures, embed_pictures
+
+
+@pytest.fixture
+def loads(model, monkeypatch) -> list:
+    """Lets ``derender.load`` give the tiny model, and lists what was asked for."""
+    asked = []
+
+    def load(source, device="cpu"):
+        asked.append((source, device))
+        return model
+
+    monkeypatch.setitem(vars(derender), "load", load)
+    return asked
+
+
+def test_transform_gives_the_table_s_features_in_the_order_asked_for(model, pictures):
+    table = embed_pictures(model, pictures)
+    features = DisentangledFeatures(model, factors=("albedo", "geometry")).fit_transform(pictures.images)
+    np.testing.assert_allclose(features, table.concatenate(("albedo", "geometry")), rtol=1e-5, atol=1e-5)
+    one = DisentangledFeatures(model, factors="albedo", batch_size=2).transform(pictures.images)
+    np.testing.assert_allclose(one, table.factors["albedo"], rtol=1e-5, atol=1e-5)
+    assert DisentangledFeatures(model, factors=None).transform(pictures.images).shape == (11, 5)
+
+
+def test_every_form_of_picture_gives_the_same_features(model, pictures, tmp_path):
+    images = pictures.images
+    paths = [tmp_path / f"{i}.png" for i in range(len(images))]
+    for path, image in zip(paths, images, strict=True):
+        Image.fromarray(image.transpose(1, 2, 0)).save(path)
+    transformer = DisentangledFeatures(model)
+    expected = transformer.transform(images)
+    forms = [
+        images.transpose(0, 2, 3, 1),
+        images / 255,
+        (images / 255).astype(np.float32).transpose(0, 2, 3, 1),
+        torch.from_numpy(images) / 255,
+        list(images),
+        paths,
+        [str(path) for path in paths],
+        np.array([str(path) for path in paths])[:, None],
+    ]
+    for form in forms:
+        np.testing.assert_allclose(transformer.transform(form), expected, rtol=1e-4, atol=1e-4)
+
+
+def test_clone_and_parameters(model):
+    transformer = DisentangledFeatures("runs/x", factors=("albedo",), batch_size=3, device="cpu")
+    copy = clone(transformer)
+    assert copy is not transformer and copy.get_params() == transformer.get_params()
+    assert transformer.set_params(batch_size=5).batch_size == 5
+    twin = clone(DisentangledFeatures(model))
+    assert twin.model is not model and torch.equal(twin.model.a, model.a)
+    assert "runs/x" in repr(transformer)
+
+
+def test_the_model_is_loaded_late_once_and_again_when_another_is_asked_for(loads, pictures):
+    transformer = DisentangledFeatures("runs/x")
+    assert loads == []
+    transformer.fit(pictures.images)
+    transformer.transform(pictures.images)
+    assert loads == [("runs/x", "cpu")]
+    transformer.set_params(model="runs/y").transform(pictures.images)
+    assert loads == [("runs/x", "cpu"), ("runs/y", "cpu")]
+
+
+def test_a_copy_carries_the_path_not_the_weights(loads, pictures):
+    transformer = DisentangledFeatures("runs/x").fit()
+    copy = pickle.loads(pickle.dumps(transformer))
+    assert "_model" not in vars(copy)
+    np.testing.assert_array_equal(copy.transform(pictures.images), transformer.transform(pictures.images))
+
+
+def test_it_works_in_a_pipeline_under_grid_search_with_names_and_pandas(model, pictures):
+    labels = np.arange(11) % 2
+    images = pictures.images.copy()
+    images[labels == 1] //= 4
+    pipeline = make_pipeline(DisentangledFeatures(model), StandardScaler(), LogisticRegression())
+    grid = {"disentangledfeatures__factors": [("geometry",), ("geometry", "albedo")]}
+    search = GridSearchCV(pipeline, grid, cv=2).fit(images, labels)
+    assert search.score(images, labels) == 1.0
+    names = search.best_estimator_[:-1].get_feature_names_out()
+    assert names[0] == "geometry_0" and len(names) == search.best_estimator_[-1].n_features_in_
+    frame = DisentangledFeatures(model).set_output(transform="pandas").fit_transform(images)
+    assert list(frame.columns) == ["geometry_0", "geometry_1", "geometry_2", "albedo_0", "albedo_1"]
+
+
+def test_bad_input_is_refused_in_words(model, pictures):
+    transformer = DisentangledFeatures(model)
+    with pytest.raises(ValueError, match="unknown factor 'geomtry'; did you mean 'geometry'\\?"):
+        DisentangledFeatures(model, factors=("geomtry",)).fit(pictures.images)
+    with pytest.raises(ValueError, match="name at least one factor; there is geometry, albedo"):
+        DisentangledFeatures(model, factors=()).fit()
+    for wrong, message in [
+        (
+            pictures.images[:, :, :4],
+            r"expected pictures \(N, 3, 8, 8\) or \(N, 8, 8, 3\), got shape \(11, 3, 4, 8\)",
+        ),
+        (pictures.images[0], r"got shape \(3, 8, 8\)"),
+        (pictures.images.astype(np.int64), "expected pictures in uint8 or floats in 0..1, got int64"),
+        (pictures.images.astype(np.float32), "must lie in 0..1 without NaN: divide by 255"),
+        (np.full((1, 3, 8, 8), np.nan), "must lie in 0..1 without NaN"),
+        ("one.png", "got the one path 'one.png': give a list of paths"),
+        ([None, None], "expected paths of pictures, got NoneType"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            transformer.transform(wrong)

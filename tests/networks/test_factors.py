@@ -1,0 +1,74 @@
+"""Factor rows: raw network outputs become physical parameters with the stated ranges."""
+
+import math
+
+import pytest
+import torch
+from derender.networks.factors import albedo_from_raw, camera_from_raw, depth_from_raw, light_from_raw
+from derender.scene.ranges import SceneRanges
+
+RANGES = SceneRanges()
+
+
+def test_depth_is_centred_squashed_and_clamped_at_both_sides(generator):
+    raw = 3 * torch.randn(2, 1, 64, 64, generator=generator) + 40
+    depth = depth_from_raw(raw, RANGES)
+    torch.testing.assert_close(depth[:, :, :2], torch.full((2, 64, 2), 1.04))
+    torch.testing.assert_close(depth[:, :, -2:], torch.full((2, 64, 2), 1.04))
+    expected = 1 + 0.1 * (raw - raw.mean(dim=(2, 3), keepdim=True)).tanh().squeeze(1)
+    torch.testing.assert_close(depth[:, :, 2:-2], expected[:, :, 2:-2])
+    assert depth.min() >= 0.9
+    assert depth.max() <= 1.1
+
+
+def test_depth_ignores_a_constant_added_to_the_raw_map(generator):
+    raw = torch.randn(1, 1, 32, 32, generator=generator)
+    torch.testing.assert_close(depth_from_raw(raw, RANGES), depth_from_raw(raw + 5, RANGES))
+
+
+def test_cars_hold_the_border_deeper():
+    depth = depth_from_raw(torch.zeros(1, 1, 64, 64), SceneRanges(border_depth=1.08))
+    assert depth[0, 0, 0].item() == pytest.approx(1.08)
+    assert depth[0, 0, 32].item() == pytest.approx(1.0)
+
+
+def test_border_width_follows_the_picture_size():
+    assert [RANGES.border_columns(size) for size in (32, 64, 128, 256)] == [1, 2, 4, 8]
+
+
+def test_albedo_spans_0_to_1():
+    raw = torch.tensor([-100.0, 0.0, 100.0]).view(1, 3, 1, 1)
+    torch.testing.assert_close(albedo_from_raw(raw, RANGES).flatten(), torch.tensor([0.0, 0.5, 1.0]))
+
+
+def test_light_ends_are_the_ranges_ends_and_angles_are_arctangents():
+    raw = torch.tensor([[-1.0, 1.0, 1.0, -1.0], [1.0, -1.0, 0.5, 0.0]])
+    light = light_from_raw(raw, RANGES)
+    quarter = math.pi / 4
+    torch.testing.assert_close(light[0], torch.tensor([0.0, 1.0, quarter, -quarter]))
+    torch.testing.assert_close(light[1], torch.tensor([1.0, 0.0, math.atan(0.5), 0.0]))
+
+
+def test_cars_light_is_never_without_a_diffuse_part():
+    light = light_from_raw(torch.full((1, 4), -1.0), SceneRanges(diffuse=(0.5, 1.0)))
+    assert light[0, 1].item() == pytest.approx(0.5)
+
+
+def test_camera_ends_are_60_degrees_and_a_tenth():
+    ranges = SceneRanges(translation_z=0.1)
+    camera = camera_from_raw(torch.ones(1, 6), ranges)
+    torch.testing.assert_close(camera[0], torch.tensor([math.pi / 3] * 3 + [0.1] * 3))
+    assert camera_from_raw(torch.ones(1, 6), RANGES)[0, 5] == 0
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"depth_min": 1.2}, "depth_min 1.2 must be below depth_max 1.1"),
+        ({"ambient": (0.9, 0.1)}, "low <= high"),
+        ({"fov": 10}, "Extra inputs are not permitted"),
+    ],
+)
+def test_impossible_ranges_are_refused(change, message):
+    with pytest.raises(ValueError, match=message):
+        SceneRanges(**change)

@@ -1,0 +1,86 @@
+"""Networks: the paper's parameter counts, every picture size, bounded outputs."""
+
+import pytest
+import torch
+from derender.model import Derenderer
+from derender.networks import FACTORS, NetworkSettings
+from derender.networks.confidence import ConfidenceNet
+from derender.networks.encoders import UNetEncoder
+from derender.networks.settings import IMAGE_SIZES
+
+PAPER_PARAMETERS = {
+    "geometry": 12_979_648,
+    "albedo": 12_982_848,
+    "light": 1_739_264,
+    "camera": 1_739_776,
+    "confidence": 7_678_208,
+}
+
+
+def parameter_count(module: torch.nn.Module) -> int:
+    return sum(parameter.numel() for parameter in module.parameters() if parameter.requires_grad)
+
+
+@pytest.mark.parametrize("name", PAPER_PARAMETERS)
+def test_paper_networks_have_the_papers_parameter_counts(name):
+    assert parameter_count(Derenderer.from_preset("paper").nets[name]) == PAPER_PARAMETERS[name]
+
+
+def test_the_four_nets_together_have_the_papers_total():
+    nets = Derenderer.from_preset("paper").nets
+    assert sum(parameter_count(nets[factor.name]) for factor in FACTORS) == 29_441_536
+
+
+def multiplications(model: Derenderer) -> int:
+    """Multiplications of one picture taken apart, counted at every convolution and linear layer."""
+    counted = 0
+
+    def count(layer, inputs, output):
+        nonlocal counted
+        places = inputs[0] if isinstance(layer, torch.nn.ConvTranspose2d) else output
+        counted += layer.weight.numel() * (places.shape[-1] * places.shape[-2] if places.ndim == 4 else 1)
+
+    for layer in model.modules():
+        if isinstance(layer, torch.nn.Conv2d | torch.nn.ConvTranspose2d | torch.nn.Linear):
+            layer.register_forward_hook(count)
+    images = torch.zeros(1, 3, model.image_size, model.image_size)
+    model.decompose(images)
+    model.confidence(images)
+    return counted
+
+
+def test_small_does_about_a_sixteenth_of_the_work():
+    paper, small = (multiplications(Derenderer.from_preset(name)) for name in ("paper", "small"))
+    assert 13 < paper / small < 17
+
+
+@pytest.mark.parametrize("size", IMAGE_SIZES)
+@pytest.mark.parametrize("encoder", ["conv", "unet"])
+def test_every_picture_size_gives_maps_and_codes_of_the_right_shape(size, encoder):
+    model = Derenderer.from_preset("small", image_size=size, encoder=encoder, width=8, unet_width=4).eval()
+    images = torch.rand(2, 3, size, size)
+    codes = model.embed(images)
+    assert {name: tuple(code.shape) for name, code in codes.items()} == {f.name: (2, 256) for f in FACTORS}
+    scene = model.decode(codes)
+    assert scene.depth.shape == (2, size, size)
+    assert scene.albedo.shape == (2, 3, size, size)
+    confidence = model.confidence(images)
+    assert confidence.photometric.shape == confidence.photometric_flip.shape == (2, 1, size, size)
+    assert confidence.perceptual.shape == confidence.perceptual_flip.shape == (2, 1, size // 4, size // 4)
+
+
+def test_unet_encoder_follows_the_papers_widths_and_offers_skips():
+    encoder = UNetEncoder(NetworkSettings(encoder="unet"), 256).eval()
+    skips = encoder.skips(torch.rand(1, 3, 64, 64))
+    assert [(skip.shape[1], skip.shape[-1]) for skip in skips] == [(16, 64), (32, 32), (64, 16), (128, 8), (256, 4)]
+
+
+def test_confidence_is_positive():
+    confidence = ConfidenceNet(NetworkSettings(width=8))(torch.rand(3, 3, 64, 64) * 100)
+    assert all(bool((value > 0).all()) for value in vars(confidence).values())
+
+
+@pytest.mark.parametrize("size", [48, 0, 512])
+def test_an_impossible_picture_size_is_named(size):
+    with pytest.raises(ValueError, match="image_size must be one of 32, 64, 128, 256"):
+        NetworkSettings(image_size=size)

@@ -1,0 +1,223 @@
+"""NT-Xent against pytorch-metric-learning, and what leaving a factor out does to loss and gradient."""
+
+import math
+
+import pytest
+import torch
+from pytorch_metric_learning.losses import NTXentLoss
+
+from derender.objectives.loocc import NOTHING_LEFT_OUT, loocc_loss, nt_xent
+
+CLOSE = {"rtol": 1e-5, "atol": 1e-6}
+FACTORS = ("geometry", "albedo", "light", "camera")
+
+
+def oracle(a, b, temperature=0.5):
+    """The same loss by an independent implementation: 2N embeddings, two of each label."""
+    labels = torch.arange(len(a))
+    return NTXentLoss(temperature=temperature)(torch.cat([a, b]), torch.cat([labels, labels]))
+
+
+def codes(generator, n=6, sizes=(8, 8, 5, 3), requires_grad=False):
+    drawn = [torch.randn(n, size, generator=generator) for size in sizes]
+    return {name: value.requires_grad_(requires_grad) for name, value in zip(FACTORS, drawn, strict=True)}
+
+
+@pytest.mark.parametrize("n", [2, 3, 17])
+@pytest.mark.parametrize("temperature", [0.1, 0.5, 2.0])
+def test_value_and_gradients_agree_with_pytorch_metric_learning(generator, n, temperature):
+    a, b = (torch.randn(n, 6, generator=generator, requires_grad=True) for _ in range(2))
+    ours, theirs = nt_xent(a, b, temperature), oracle(a, b, temperature)
+    torch.testing.assert_close(ours, theirs, **CLOSE)
+    for mine, other in zip(
+        torch.autograd.grad(ours, (a, b)), torch.autograd.grad(theirs, (a, b)), strict=True
+    ):
+        torch.testing.assert_close(mine, other, **CLOSE)
+
+
+def test_closed_forms():
+    same = torch.ones(4, 3)
+    assert nt_xent(same, same).item() == pytest.approx(math.log(7), rel=1e-6)
+    axes = torch.eye(3)
+    expected = (
+        math.log(math.exp(2) + 4) - 2
+    )  # positive at similarity 1, the four others at 0, temperature 0.5
+    assert nt_xent(axes, axes).item() == pytest.approx(expected, rel=1e-6)
+    opposite = torch.tensor([[1.0, 0.0], [-1.0, 0.0]])
+    assert nt_xent(opposite, opposite).item() == pytest.approx(
+        math.log(math.exp(2) + 2 * math.exp(-2)) - 2, rel=1e-6
+    )
+
+
+def test_gradcheck(generator):
+    a, b = (torch.randn(3, 4, generator=generator, dtype=torch.float64, requires_grad=True) for _ in range(2))
+    assert torch.autograd.gradcheck(nt_xent, (a, b))
+
+
+def test_lengths_do_not_matter_and_order_does_not_matter(generator):
+    a, b = (torch.randn(5, 6, generator=generator) for _ in range(2))
+    expected = nt_xent(a, b)
+    lengths = torch.rand(5, 1, generator=generator) * 100 + 0.01
+    torch.testing.assert_close(nt_xent(a * lengths, b / lengths), expected, **CLOSE)
+    torch.testing.assert_close(nt_xent(b, a), expected, **CLOSE)
+    order = torch.randperm(5, generator=generator)
+    torch.testing.assert_close(nt_xent(a[order], b[order]), expected, **CLOSE)
+    assert not torch.isclose(nt_xent(a[order], b), expected), "mismatched pairs must not score the same"
+
+
+@pytest.mark.parametrize("size", [1e-10, 1e4, 1e30])
+def test_codes_of_any_size_are_safe(generator, size):
+    a, b = (torch.randn(4, 8, generator=generator) for _ in range(2))
+    large = (a * size).requires_grad_()
+    loss = nt_xent(large, b * size)
+    loss.backward()
+    torch.testing.assert_close(loss.detach(), nt_xent(a, b), **CLOSE)
+    assert large.grad.isfinite().all()
+
+
+def test_a_code_of_zeros_has_similarity_zero_and_no_gradient(generator):
+    a = torch.randn(3, 4, generator=generator)
+    a[1] = 0
+    a.requires_grad_()
+    b = torch.randn(3, 4, generator=generator, requires_grad=True)
+    loss = nt_xent(a, b)
+    loss.backward()
+    assert loss.isfinite() and a.grad.isfinite().all() and b.grad.isfinite().all()
+    assert torch.equal(a.grad[1], torch.zeros(4))
+    assert nt_xent(torch.zeros(3, 4), torch.zeros(3, 4)).item() == pytest.approx(math.log(5), rel=1e-6)
+
+
+def test_half_precision_codes_are_compared_in_float32_even_under_autocast(generator):
+    a, b = (torch.randn(16, 32, generator=generator).bfloat16() for _ in range(2))
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        loss = nt_xent(a, b)
+    assert loss.dtype == torch.float32
+    torch.testing.assert_close(loss, nt_xent(a.float(), b.float()), rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("n", [0, 1])
+def test_fewer_than_two_images_are_refused(n):
+    with pytest.raises(ValueError, match="at least 2 images"):
+        nt_xent(torch.zeros(n, 4), torch.zeros(n, 4))
+    with pytest.raises(ValueError, match=r"light: .*at least 2 images"):
+        loocc_loss(
+            {"light": torch.zeros(n, 4)}, {"light": torch.zeros(n, 4)}, torch.zeros(n, dtype=torch.long)
+        )
+
+
+def test_nothing_left_out_is_the_mean_of_nt_xent_over_factors(generator):
+    first, again = codes(generator), codes(generator)
+    nothing = torch.full((6,), NOTHING_LEFT_OUT)
+    expected = torch.stack([oracle(first[name], again[name]) for name in FACTORS]).mean()
+    torch.testing.assert_close(loocc_loss(first, again, nothing), expected, **CLOSE)
+
+
+def test_one_factor_left_out_in_the_whole_batch_is_the_mean_over_the_others(generator):
+    first, again = codes(generator), codes(generator)
+    expected = torch.stack([oracle(first[name], again[name]) for name in FACTORS if name != "camera"]).mean()
+    torch.testing.assert_close(loocc_loss(first, again, torch.full((6,), 3)), expected, **CLOSE)
+
+
+def test_choice_per_image_is_the_oracle_on_the_images_that_kept_each_factor(generator):
+    first, again = codes(generator), codes(generator)
+    perturbed = torch.tensor([2, 3, 2, 2, 0, NOTHING_LEFT_OUT])
+    total, contrasted = 0.0, 0
+    for index, name in enumerate(FACTORS):
+        kept = perturbed != index
+        total = total + oracle(first[name][kept], again[name][kept]) * kept.sum()
+        contrasted += int(kept.sum())
+    torch.testing.assert_close(loocc_loss(first, again, perturbed), total / contrasted, **CLOSE)
+    assert contrasted == 24 - 5
+
+
+def test_the_perturbed_factor_of_an_image_gets_no_gradient_and_everything_else_does(generator):
+    first, again = codes(generator, requires_grad=True), codes(generator, requires_grad=True)
+    perturbed = torch.tensor([2, 3, 2, 3, 0, 1])
+    loocc_loss(first, again, perturbed).backward()
+    for index, name in enumerate(FACTORS):
+        for side in (first, again):
+            touched = side[name].grad.abs().sum(dim=1) > 0
+            assert touched.tolist() == (perturbed != index).tolist(), name
+
+
+def test_the_perturbed_factor_of_an_image_cannot_change_the_loss(generator):
+    first, again = codes(generator), codes(generator)
+    perturbed = torch.tensor([2, 3, 2, 3, 2, 3])
+    before = loocc_loss(first, again, perturbed)
+    for side in (first, again):
+        side["light"][perturbed == 2] = 1e4
+        side["camera"][perturbed == 3] = 0.0
+    torch.testing.assert_close(loocc_loss(first, again, perturbed), before, rtol=0, atol=0)
+
+
+def test_descending_pulls_kept_pairs_together_and_leaves_the_perturbed_pair_alone(generator):
+    first, again = codes(generator, n=4, requires_grad=True), codes(generator, n=4, requires_grad=True)
+    perturbed = torch.tensor([2, 3, 2, 3])
+
+    def similarity(name):
+        return torch.cosine_similarity(first[name], again[name]).detach()
+
+    before = {name: similarity(name) for name in FACTORS}
+    optimiser = torch.optim.SGD([*first.values(), *again.values()], lr=1.0)
+    for _ in range(200):
+        optimiser.zero_grad()
+        loocc_loss(first, again, perturbed).backward()
+        optimiser.step()
+    for index, name in enumerate(FACTORS):
+        left_out = perturbed == index
+        assert torch.equal(similarity(name)[left_out], before[name][left_out])
+        assert (similarity(name)[~left_out] > 0.9).all()
+
+
+def test_a_factor_that_fewer_than_two_images_kept_contributes_nothing(generator):
+    first, again = codes(generator, n=2, requires_grad=True), codes(generator, n=2)
+    loss = loocc_loss(first, again, torch.tensor([2, 3]))  # light is kept by one image, camera by the other
+    expected = torch.stack([oracle(first[name], again[name]) for name in ("geometry", "albedo")]).mean()
+    torch.testing.assert_close(loss, expected, **CLOSE)
+    loss.backward()
+    assert torch.equal(first["light"].grad, torch.zeros(2, 5))
+
+
+def test_when_no_factor_is_left_the_loss_is_zero_with_zero_gradient(generator):
+    light = torch.randn(2, 5, generator=generator, requires_grad=True)
+    loss = loocc_loss({"light": light}, {"light": light * 2}, torch.tensor([0, 0]))
+    loss.backward()
+    assert loss.item() == 0
+    assert torch.equal(light.grad, torch.zeros(2, 5))
+
+
+def test_images_may_come_in_any_order(generator):
+    first, again = codes(generator), codes(generator)
+    perturbed = torch.tensor([2, 3, 2, 3, 0, 1])
+    order = torch.randperm(6, generator=generator)
+    shuffled = loocc_loss(
+        {name: value[order] for name, value in first.items()},
+        {name: again[name][order] for name in reversed(FACTORS)},
+        perturbed[order],
+    )
+    torch.testing.assert_close(shuffled, loocc_loss(first, again, perturbed), **CLOSE)
+
+
+def test_gradcheck_with_factors_left_out(generator):
+    values = [
+        torch.randn(3, 2, generator=generator, dtype=torch.float64, requires_grad=True) for _ in range(4)
+    ]
+
+    def loss(a, b, c, d):
+        return loocc_loss({"x": a, "y": b}, {"x": c, "y": d}, torch.tensor([0, 1, -1]))
+
+    assert torch.autograd.gradcheck(loss, values)
+
+
+def test_bad_input_is_named():
+    two = {"light": torch.zeros(2, 3)}
+    with pytest.raises(ValueError, match="same factors"):
+        loocc_loss(two, {"camera": torch.zeros(2, 3)}, torch.tensor([0, 0]))
+    with pytest.raises(ValueError, match=r"must lie in -1\.\.0 \(light\), got \[0, 1\]"):
+        loocc_loss(two, two, torch.tensor([0, 1]))
+    with pytest.raises(ValueError, match="one shape"):
+        loocc_loss(two, {"light": torch.zeros(2, 4)}, torch.tensor([0, 0]))
+    with pytest.raises(ValueError, match="at least one factor"):
+        loocc_loss({}, {}, torch.zeros(2, dtype=torch.long))
+    with pytest.raises(ValueError, match="temperature must be positive"):
+        nt_xent(torch.ones(2, 3), torch.ones(2, 3), temperature=0.0)

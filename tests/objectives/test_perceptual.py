@@ -1,0 +1,164 @@
+"""The perceptual loss against closed forms, and what every frozen feature extractor promises."""
+
+import math
+
+import pytest
+import torch
+from torch import nn
+
+from derender.objectives.frozen import PerceptualFeatures
+from derender.objectives.perceptual import build_perceptual, perceptual_loss
+from derender.objectives.self_features import SelfFeatures
+
+
+class Tiny(PerceptualFeatures):
+    """Two random convolutions at half resolution."""
+
+    kind = "tiny"
+    stride = 2
+    channels = 4
+
+    def __init__(self, generator: torch.Generator):
+        layers = nn.Sequential(nn.Conv2d(3, 4, 3, padding=1), nn.ReLU(), nn.AvgPool2d(2))
+        nn.init.normal_(layers[0].weight, generator=generator)
+        nn.init.zeros_(layers[0].bias)
+        super().__init__(layers, (0.5, 0.4, 0.3), (0.2, 0.3, 0.4))
+
+
+def feature_maps(generator, n=2, c=5, h=3, w=4):
+    prediction = torch.randn(n, c, h, w, generator=generator, dtype=torch.float64)
+    target = torch.randn(n, c, h, w, generator=generator, dtype=torch.float64)
+    sigma = 0.2 + torch.rand(n, 1, h, w, generator=generator, dtype=torch.float64)
+    return prediction, target, sigma
+
+
+def test_constant_difference_and_sigma_give_the_closed_form():
+    prediction = torch.full((1, 6, 4, 4), 1.5, dtype=torch.float64)
+    target = torch.full((1, 6, 4, 4), 0.9, dtype=torch.float64)
+    sigma = torch.full((1, 1, 4, 4), 0.4, dtype=torch.float64)
+    mask = torch.ones(1, 16, 16, dtype=torch.float64)
+    expected = 0.6**2 / (2 * 0.4**2) + math.log(0.4)
+    assert perceptual_loss(prediction, target, mask, sigma).item() == pytest.approx(expected, abs=1e-4)
+    assert perceptual_loss(prediction, target, mask, None).item() == pytest.approx(0.36, abs=1e-12)
+
+
+def test_the_best_sigma_is_the_size_of_the_difference():
+    difference = torch.full((1, 3, 1, 1), 0.3, dtype=torch.float64)
+    sigmas = torch.linspace(0.05, 1, 1901, dtype=torch.float64)
+    losses = [
+        perceptual_loss(difference, 0 * difference, torch.ones(1, 4, 4), s.view(1, 1, 1, 1)).item()
+        for s in sigmas
+    ]
+    assert sigmas[int(torch.tensor(losses).argmin())].item() == pytest.approx(0.3, abs=1e-3)
+
+
+def test_a_location_counts_by_the_share_of_its_pixels_that_the_mask_keeps():
+    prediction = torch.zeros(1, 2, 1, 3, dtype=torch.float64)
+    target = torch.tensor([1.0, 2.0, 5.0], dtype=torch.float64).expand(1, 2, 1, 3)
+    mask = torch.zeros(1, 4, 12, dtype=torch.float64)
+    mask[0, :, :4] = 1  # all of the first location
+    mask[0, :2, 4:8] = 1  # half of the second, none of the third
+    expected = (1 * 1 + 0.5 * 4) / 1.5
+    assert perceptual_loss(prediction, target, mask, None).item() == pytest.approx(expected)
+    assert perceptual_loss(prediction, target, mask.bool(), None).item() == pytest.approx(expected)
+
+
+def test_gradients_with_respect_to_features_and_sigma(generator):
+    prediction, target, sigma = feature_maps(generator, c=2, h=2, w=2)
+    mask = (torch.rand(2, 6, 6, generator=generator) < 0.5).double()
+    inputs = [value.requires_grad_() for value in (prediction, target, sigma)]
+    assert torch.autograd.gradcheck(lambda p, t, s: perceptual_loss(p, t, mask, s), inputs)
+    assert torch.autograd.gradcheck(lambda p, t: perceptual_loss(p, t, mask, None), inputs[:2])
+
+
+@pytest.mark.parametrize("with_sigma", [True, False])
+def test_an_empty_mask_gives_zero_and_no_gradient(generator, with_sigma):
+    prediction, target, sigma = feature_maps(generator)
+    prediction.requires_grad_()
+    loss = perceptual_loss(prediction, target, torch.zeros(2, 12, 16), sigma if with_sigma else None)
+    loss.backward()
+    assert loss.item() == 0
+    assert torch.equal(prediction.grad, torch.zeros_like(prediction))
+
+
+@pytest.mark.parametrize("with_sigma", [True, False])
+def test_what_stands_outside_the_mask_does_not_matter(generator, with_sigma):
+    prediction, target, sigma = feature_maps(generator)
+    mask = torch.ones(2, 12, 16)
+    mask[:, :4, :4] = 0
+    results = []
+    for value in (0.0, float("nan")):
+        p, s = prediction.clone(), sigma.clone()
+        p[:, :, 0, 0], s[:, :, 0, 0] = value, value
+        p.requires_grad_(), s.requires_grad_()
+        loss = perceptual_loss(p, target, mask, s if with_sigma else None)
+        results.append([loss, *torch.autograd.grad(loss, (p, s) if with_sigma else (p,))])
+    for clean, poisoned in zip(*results, strict=True):
+        torch.testing.assert_close(poisoned, clean, rtol=0, atol=0)
+
+
+def test_sigma_of_another_resolution_is_refused(generator):
+    prediction, target, _ = feature_maps(generator)
+    with pytest.raises(ValueError, match="resolution 3 x 4"):
+        perceptual_loss(prediction, target, torch.ones(2, 12, 16), torch.ones(2, 1, 6, 8))
+
+
+def test_half_precision_is_compared_in_float32(generator):
+    prediction, target, sigma = (value.bfloat16() for value in feature_maps(generator))
+    mask = torch.ones(2, 12, 16)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        loss = perceptual_loss(prediction, target, mask, sigma)
+    assert loss.dtype == torch.float32
+    expected = perceptual_loss(prediction.double(), target.double(), mask.double(), sigma.double())
+    assert loss.item() == pytest.approx(expected.item(), rel=1e-5)
+
+
+def test_features_are_normalised_pictures_through_the_layers(generator):
+    net = Tiny(generator)
+    images = torch.rand(2, 3, 6, 8, generator=generator)
+    normalised = torch.stack(
+        [(images[:, c] - m) / s for c, (m, s) in enumerate([(0.5, 0.2), (0.4, 0.3), (0.3, 0.4)])], 1
+    )
+    torch.testing.assert_close(net(images), net.features(normalised))
+
+
+def test_calibration_makes_the_spread_one_and_keeps_relations(generator):
+    net = Tiny(generator)
+    images = torch.rand(70, 3, 6, 8, generator=generator)
+    before = net(images)
+    net.calibrate_(images)
+    after = net(images)
+    spread = (after - after.mean(dim=(0, 2, 3), keepdim=True)).square().mean().sqrt()
+    assert spread.item() == pytest.approx(1, rel=1e-5)
+    torch.testing.assert_close(after / after.max(), before / before.max())
+    again = net.scale.clone()
+    assert torch.equal(net.calibrate_(images).scale, again)
+    assert "scale" in net.state_dict()
+
+
+def test_calibration_on_pictures_that_do_not_differ_is_refused(generator):
+    net = Tiny(generator)
+    net.features[0].bias.fill_(-1e3)
+    with pytest.raises(ValueError, match="do not vary over 2 calibration pictures"):
+        net.calibrate_(torch.rand(2, 3, 6, 8, generator=generator))
+
+
+def test_frozen_whatever_the_model_around_does(generator):
+    whole = nn.Sequential(Tiny(generator))
+    whole.train()
+    assert not whole[0].training and not whole[0].features.training
+    assert not any(parameter.requires_grad for parameter in whole.parameters())
+    images = torch.rand(1, 3, 6, 8, generator=generator, requires_grad=True)
+    assert not whole[0].target(images).requires_grad
+    (gradient,) = torch.autograd.grad(whole[0](images).sum(), images)
+    assert gradient.abs().sum() > 0
+
+
+def test_the_factory_knows_its_kinds(generator, tmp_path):
+    images = (torch.rand(4, 3, 32, 32, generator=generator) * 255).byte()
+    assert build_perceptual("none") is None
+    assert isinstance(build_perceptual("self", images, seed=1, steps=1), SelfFeatures)
+    with pytest.raises(ValueError, match="give images"):
+        build_perceptual("self")
+    with pytest.raises(ValueError, match="no VGG16 weights at"):
+        build_perceptual("vgg16", weights=tmp_path / "absent.npz")

@@ -1,0 +1,173 @@
+"""The photometric losses against closed forms, and the laws that masks obey."""
+
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from derender.objectives.reconstruction import (
+    SIGMA_FLOOR,
+    bounded_sigma,
+    depth_smoothness,
+    masked_l1,
+    photometric_loss,
+)
+
+EXACT = {"rtol": 1e-12, "atol": 1e-12}
+
+
+def pictures(generator, n=2, h=5, w=7, dtype=torch.float64):
+    prediction = torch.rand(n, 3, h, w, generator=generator, dtype=dtype)
+    target = torch.rand(n, 3, h, w, generator=generator, dtype=dtype)
+    mask = (torch.rand(n, h, w, generator=generator) < 0.6).to(dtype)
+    sigma = 0.1 + torch.rand(n, 1, h, w, generator=generator, dtype=dtype)
+    return prediction, target, mask, sigma
+
+
+def test_constant_error_and_sigma_give_the_closed_form():
+    prediction = torch.full((1, 3, 4, 6), 0.7, dtype=torch.float64)
+    target = torch.full((1, 3, 4, 6), 0.4, dtype=torch.float64)
+    sigma = torch.full((1, 1, 4, 6), 0.5, dtype=torch.float64)
+    mask = torch.ones(1, 4, 6, dtype=torch.float64)
+    expected = math.sqrt(2) * 0.3 / 0.5 + math.log(0.5)
+    assert photometric_loss(prediction, target, mask, sigma).item() == pytest.approx(expected, abs=1e-5)
+    assert photometric_loss(prediction, target, mask, None).item() == pytest.approx(0.3, abs=1e-12)
+
+
+def test_pixel_by_pixel_definition(generator):
+    prediction, target, mask, sigma = pictures(generator)
+    total, count = 0.0, 0
+    for n in range(2):
+        for v in range(5):
+            for u in range(7):
+                if mask[n, v, u]:
+                    error = sum(abs((prediction - target)[n, c, v, u].item()) for c in range(3)) / 3
+                    spread = math.hypot(sigma[n, 0, v, u].item(), SIGMA_FLOOR)
+                    total += math.sqrt(2) * error / spread + math.log(spread)
+                    count += 1
+    assert 0 < count < mask.numel()
+    torch.testing.assert_close(
+        photometric_loss(prediction, target, mask, sigma),
+        torch.tensor(total / count, dtype=torch.float64),
+        **EXACT,
+    )
+
+
+def test_the_best_sigma_is_root_two_times_the_error():
+    error = 0.2
+    prediction = torch.zeros(1, 3, 1, 1, dtype=torch.float64)
+    sigmas = torch.linspace(0.05, 1.0, 2001, dtype=torch.float64)
+    losses = [
+        photometric_loss(prediction, prediction + error, torch.ones(1, 1, 1), s.view(1, 1, 1, 1)).item()
+        for s in sigmas
+    ]
+    assert sigmas[int(torch.tensor(losses).argmin())].item() == pytest.approx(math.sqrt(2) * error, abs=1e-3)
+
+
+def test_gradients_with_respect_to_prediction_target_and_sigma(generator):
+    prediction, target, mask, sigma = pictures(generator, n=2, h=3, w=2)
+    inputs = [value.requires_grad_() for value in (prediction, target, sigma)]
+    assert torch.autograd.gradcheck(lambda p, t, s: photometric_loss(p, t, mask, s), inputs)
+    assert torch.autograd.gradcheck(lambda p, t: masked_l1(p, t, mask), inputs[:2])
+
+
+@pytest.mark.parametrize("with_sigma", [True, False])
+def test_an_empty_mask_gives_zero_and_no_gradient(generator, with_sigma):
+    prediction, target, mask, sigma = pictures(generator)
+    prediction.requires_grad_()
+    sigma.requires_grad_()
+    loss = photometric_loss(prediction, target, torch.zeros_like(mask), sigma if with_sigma else None)
+    loss.backward()
+    assert loss.item() == 0
+    assert torch.equal(prediction.grad, torch.zeros_like(prediction))
+    if with_sigma:
+        assert torch.equal(sigma.grad, torch.zeros_like(sigma))
+
+
+@pytest.mark.parametrize("poison", [float("nan"), float("inf"), 1e30])
+@pytest.mark.parametrize("with_sigma", [True, False])
+def test_what_stands_outside_the_mask_changes_neither_loss_nor_gradient(generator, poison, with_sigma):
+    prediction, target, mask, sigma = pictures(generator)
+    results = []
+    for value in (0.0, poison):
+        p, s = (torch.where(mask[:, None] > 0, x, value).requires_grad_() for x in (prediction, sigma))
+        loss = photometric_loss(p, target, mask, s if with_sigma else None)
+        gradients = torch.autograd.grad(loss, (p, s) if with_sigma else (p,))
+        results.append([loss, *gradients])
+    for clean, poisoned in zip(*results, strict=True):
+        torch.testing.assert_close(poisoned, clean, rtol=0, atol=0)
+        assert (clean.dim() == 0) or bool((clean.abs().sum(1)[mask == 0] == 0).all())
+
+
+def test_the_mean_runs_over_all_kept_pixels_of_the_batch_not_over_images(generator):
+    prediction, target, mask, _ = pictures(generator, n=2, h=4, w=4)
+    mask[0], mask[1] = 1, 0
+    mask[1, 0, 0] = 1
+    error = (prediction - target).abs().mean(1)
+    expected = (error[0].sum() + error[1, 0, 0]) / 17
+    torch.testing.assert_close(masked_l1(prediction, target, mask), expected, **EXACT)
+    torch.testing.assert_close(masked_l1(prediction, target, mask.bool()), expected, **EXACT)
+
+
+def test_scaling_images_and_sigma_only_shifts_the_loss(generator):
+    prediction, target, mask, _ = pictures(generator)
+    sigma = torch.full((2, 1, 5, 7), 0.5, dtype=torch.float64)
+    one = photometric_loss(prediction, target, mask, sigma)
+    two = photometric_loss(2 * prediction - 1, 2 * target - 1, mask, 2 * sigma)
+    assert (two - one).item() == pytest.approx(math.log(2), abs=1e-5)
+
+
+@given(st.floats(0, 1e4))
+@settings(max_examples=50, deadline=None)
+def test_bounded_sigma_stays_above_the_floor_and_close_to_sigma(value):
+    result = bounded_sigma(torch.tensor([value], dtype=torch.float64)).item()
+    assert result >= max(SIGMA_FLOOR, value) * (1 - 1e-12)
+    assert result - value <= SIGMA_FLOOR
+    if value >= 0.1:
+        assert result == pytest.approx(value, rel=1e-4)
+
+
+def test_a_sigma_of_zero_gives_a_finite_loss_and_gradient(generator):
+    prediction, target, mask, _ = pictures(generator, dtype=torch.float32)
+    sigma = torch.zeros(2, 1, 5, 7, requires_grad=True)
+    prediction.requires_grad_()
+    loss = photometric_loss(prediction, target, mask, sigma)
+    loss.backward()
+    assert loss.isfinite() and sigma.grad.isfinite().all() and prediction.grad.isfinite().all()
+    raw = torch.full((2, 1, 5, 7), -9.0, requires_grad=True)
+    photometric_loss(prediction, target, mask, torch.nn.functional.softplus(raw)).backward()
+    assert (raw.grad[mask[:, None] > 0] < 0).all(), "a sigma far below the error must be pushed up again"
+
+
+def test_half_precision_is_computed_in_float32(generator):
+    prediction, target, mask, sigma = (x.bfloat16() for x in pictures(generator))
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        loss = photometric_loss(prediction, target, mask.float(), sigma)
+    expected = photometric_loss(prediction.double(), target.double(), mask.double(), sigma.double())
+    assert loss.dtype == torch.float32
+    assert loss.item() == pytest.approx(expected.item(), rel=1e-5)
+
+
+def test_smoothness_of_known_surfaces():
+    rows, columns = torch.meshgrid(torch.arange(6.0), torch.arange(9.0), indexing="ij")
+    assert depth_smoothness(torch.full((2, 6, 9), 1.05)).item() == 0
+    ramp = (0.02 * rows + 0.03 * columns)[None]
+    assert depth_smoothness(ramp, depth_range=0.2).item() == pytest.approx((0.02 + 0.03) / 0.2, rel=1e-5)
+    step = (columns >= 4).float()[None] * 0.2
+    assert depth_smoothness(step, depth_range=0.2).item() == pytest.approx(1 / 8, rel=1e-5)
+
+
+def test_smoothness_leaves_the_clamped_border_out(generator):
+    inside = 1 + 0.05 * torch.rand(2, 5, 6, generator=generator)
+    clamped = torch.nn.functional.pad(inside, (2, 2), value=1.04)
+    torch.testing.assert_close(depth_smoothness(clamped, border=2), depth_smoothness(inside))
+    assert depth_smoothness(clamped) != depth_smoothness(inside)
+
+
+def test_smoothness_refuses_what_has_no_steps():
+    with pytest.raises(ValueError, match="2 rows and 2 columns"):
+        depth_smoothness(torch.ones(1, 5, 4), border=2)
+    with pytest.raises(ValueError, match="depth_range must be above 0"):
+        depth_smoothness(torch.ones(1, 5, 4), depth_range=0.0)

@@ -1,0 +1,286 @@
+"""The Numba implementation against the definition, and as a good citizen of torch, threads and processes."""
+
+import math
+import os
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+import torch
+from torch import Tensor
+
+from derender.render import (
+    available_backends,
+    chosen_backend,
+    rasterize,
+    render,
+    shade,
+    warp,
+)
+from derender.render.rasterize import numba_cpu as rasterize_numba
+from derender.render.rasterize import reference
+from derender.render.sample import numba_cpu as sample_numba
+from derender.render.sample import sample
+from derender.scene.camera import focal_px, to_camera, unproject
+from tests.render.scenes import FOV_DEG, scene, smooth_depth
+from tests.tolerances import assert_agrees
+
+needs_numba = pytest.mark.skipif("numba" not in available_backends(), reason="numba is not installed")
+
+
+@pytest.fixture
+def nan_filled_memory():
+    """Memory handed out uninitialised holds NaN (and the largest integer) for the length of a test."""
+    was = torch.are_deterministic_algorithms_enabled()
+    torch.use_deterministic_algorithms(True)
+    assert torch.utils.deterministic.fill_uninitialized_memory
+    assert torch.empty(3).isnan().all()
+    yield
+    torch.use_deterministic_algorithms(was)
+
+
+def gradients_with(
+    cotangents: torch.Generator, outputs: tuple[Tensor, ...], inputs: list[Tensor]
+) -> tuple[Tensor, ...]:
+    weights = [torch.randn(value.shape, generator=cotangents, dtype=value.dtype) for value in outputs]
+    return torch.autograd.grad(outputs, inputs, weights)
+
+
+def assert_backends_agree(values: tuple[Tensor, ...]) -> None:
+    """Outputs and the gradient of each of render's four inputs."""
+    kept = {}
+    for backend in ("reference", "numba"):
+        inputs = [value.clone().requires_grad_() for value in values]
+        before = [value.detach().clone() for value in inputs]
+        result = render(*inputs, FOV_DEG, backend)
+        cotangents = torch.Generator().manual_seed(1)
+        gradients = gradients_with(cotangents, (result.image, result.depth), inputs)
+        kept[backend] = {"image": result.image, "depth": result.depth, "mask": result.mask}
+        names = ("depth", "albedo", "light", "camera")
+        kept[backend] |= {f"d/d {name}": gradient for name, gradient in zip(names, gradients, strict=True)}
+        for value, original in zip(inputs, before, strict=True):
+            assert torch.equal(value, original), "inputs must not be written to"
+    assert torch.equal(kept["numba"]["mask"], kept["reference"]["mask"])
+    for name, expected in kept["reference"].items():
+        assert_agrees(kept["numba"][name], expected, name)
+
+
+@needs_numba
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize(
+    ("count", "height", "width"), [(3, 17, 23), (1, 31, 12), (2, 2, 2), (5, 3, 9), (1, 48, 48)]
+)
+def test_backends_agree(count, height, width, dtype, generator, nan_filled_memory):
+    assert_backends_agree(scene(count, height, width, generator, dtype))
+
+
+@needs_numba
+@pytest.mark.parametrize("degrees", [70, 85, 89, 89.9])
+@pytest.mark.parametrize("axis", [0, 1])
+def test_backends_agree_at_grazing_angles(degrees, axis, generator, nan_filled_memory):
+    depth, albedo, light, pose = scene(2, 16, 21, generator, torch.float64)
+    pose[:, axis] = math.radians(degrees)
+    assert_backends_agree((depth, albedo, light, pose))
+
+
+@needs_numba
+def test_backends_agree_on_rough_depth_with_many_layers(generator, nan_filled_memory):
+    _, albedo, light, pose = scene(4, 19, 16, generator, torch.float64, turn_rad=math.pi)
+    depth = 0.9 + 0.2 * torch.rand(4, 19, 16, generator=generator, dtype=torch.float64)
+    assert_backends_agree((depth, albedo, light, pose))
+
+
+@needs_numba
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_backends_choose_the_same_triangle(dtype, generator):
+    """Bit for bit, ties of the identity camera and of exact half pixels included."""
+    depth, _, _, pose = scene(6, 20, 17, generator, dtype, turn_rad=1.5)
+    pose[0] = 0
+    pose[1] = 0
+    depth[1] = 1
+    pose[1, 3] = 0.5 / focal_px(17, FOV_DEG)
+    vertices, focal = to_camera(unproject(depth, FOV_DEG), pose), focal_px(17, FOV_DEG)
+    expected = reference.rasterize(vertices, focal)[2]
+    assert (expected >= 0).float().mean() > 0.2
+    assert torch.equal(rasterize_numba.rasterize(vertices, focal)[2].long(), expected)
+
+
+@needs_numba
+def test_identity_camera_takes_the_first_triangle_of_each_vertex(generator):
+    vertices = unproject(smooth_depth(1, 6, 6, generator), FOV_DEG)
+    triangle = rasterize_numba.rasterize(vertices, focal_px(6, FOV_DEG))[2][0]
+    # the vertex below and right of a cell is first met as that cell's lower triangle's corner
+    v, u = torch.meshgrid(torch.arange(1, 6), torch.arange(1, 6), indexing="ij")
+    assert torch.equal(triangle[1:, 1:].long(), 2 * ((v - 1) * 5 + u - 1) + 1)
+
+
+def test_reference_gives_the_same_in_small_portions(generator, monkeypatch):
+    depth, _, _, pose = scene(3, 12, 10, generator)
+    vertices = to_camera(unproject(depth, FOV_DEG), pose)
+    whole = rasterize(vertices, focal_px(10, FOV_DEG), "reference")
+    monkeypatch.setattr(reference, "PAIRS_AT_ONCE", 37)
+    parts = rasterize(vertices, focal_px(10, FOV_DEG), "reference")
+    assert torch.equal(parts.uv, whole.uv)
+    assert torch.equal(parts.depth, whole.depth)
+
+
+@needs_numba
+@pytest.mark.parametrize("channels", [1, 3, 5])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_sampling_agrees(channels, dtype, generator, nan_filled_memory):
+    """Also where the picture looked up and the picture made differ in size, and just beyond the border."""
+    image = torch.randn(2, channels, 5, 8, generator=generator, dtype=dtype)
+    uv = torch.rand(2, 9, 6, 2, generator=generator, dtype=dtype) * torch.tensor([7.0, 4.0], dtype=dtype)
+    uv[0, 0, 0], uv[0, 0, 1] = torch.tensor([-1e-4, 4 + 1e-4]), torch.tensor([7 + 1e-4, -1e-4])
+    mask = (torch.rand(2, 9, 6, generator=generator) > 0.3).to(dtype)
+    mask[0, 0, :2] = 1
+    kept = []
+    for backend in ("reference", "numba"):
+        inputs = [image.clone().requires_grad_(), uv.clone().requires_grad_()]
+        colour = sample(*inputs, mask, backend)
+        kept.append((colour, *gradients_with(torch.Generator().manual_seed(1), (colour,), inputs)))
+    for name, expected, actual in zip(("colour", "d/d image", "d/d uv"), *kept, strict=True):
+        assert_agrees(actual, expected, name)
+
+
+@pytest.mark.parametrize("backend", available_backends())
+def test_sampling_is_exact_on_bilinear_images_and_at_pixels(backend, generator):
+    v, u = torch.meshgrid(torch.arange(5.0), torch.arange(8.0), indexing="ij")
+    image = (2 * u - 3 * v + 0.5 * u * v + 1)[None, None].double()
+    uv = torch.rand(1, 9, 6, 2, generator=generator, dtype=torch.float64) * torch.tensor([7.0, 4.0])
+    expected = 2 * uv[..., 0] - 3 * uv[..., 1] + 0.5 * uv[..., 0] * uv[..., 1] + 1
+    assert_agrees(sample(image, uv, torch.ones(1, 9, 6).double(), backend)[:, 0], expected)
+    at_pixels = torch.stack((u, v), -1)[None].double()
+    assert torch.equal(sample(image, at_pixels, torch.ones(1, 5, 8).double(), backend), image)
+
+
+@pytest.mark.parametrize("backend", available_backends())
+def test_sampling_ignores_what_stands_outside_the_mask(backend, generator):
+    image = torch.randn(1, 2, 4, 4, generator=generator).requires_grad_()
+    uv = torch.full((1, 3, 3, 2), math.nan, requires_grad=True)
+    colour = sample(image, uv, torch.zeros(1, 3, 3), backend)
+    assert (colour == 0).all()
+    for gradient in torch.autograd.grad(colour.sum(), (image, uv)):
+        assert (gradient == 0).all()
+
+
+@needs_numba
+def test_operators_keep_torch_s_rules(generator):
+    depth, albedo, _, pose = scene(2, 5, 6, generator)
+    vertices = to_camera(unproject(depth, FOV_DEG), pose).requires_grad_()
+    uv, distance, triangle = rasterize_numba.rasterize(vertices, 20.0)
+    mask = (triangle >= 0).float()
+    torch.library.opcheck(torch.ops.derender.rasterize_numba.default, (vertices, 20.0))
+    torch.library.opcheck(
+        torch.ops.derender.rasterize_numba_backward.default,
+        (uv.detach(), distance.detach(), vertices.detach(), triangle, 20.0),
+    )
+    image, uv = albedo.requires_grad_(), uv.detach().requires_grad_()
+    torch.library.opcheck(torch.ops.derender.sample_numba.default, (image, uv, mask))
+    torch.library.opcheck(
+        torch.ops.derender.sample_numba_backward.default,
+        (torch.randn(2, 3, 5, 6, generator=generator), image.detach(), uv.detach(), mask),
+    )
+    assert sample_numba.sample(image, uv, mask).requires_grad
+
+
+@needs_numba
+def test_compiles_without_graph_breaks(generator):
+    values = scene(2, 7, 6, generator)
+
+    def loss(*inputs: Tensor) -> Tensor:
+        result = render(*inputs, FOV_DEG, "numba")
+        return result.image.square().sum() + result.depth.sum()
+
+    compiled = torch.compile(loss, backend="aot_eager", fullgraph=True)
+    gradients = []
+    for function in (loss, compiled):
+        inputs = [value.clone().requires_grad_() for value in values]
+        gradients.append(torch.autograd.grad(function(*inputs), inputs))
+    for actual, expected in zip(gradients[1], gradients[0], strict=True):
+        assert_agrees(actual, expected)
+
+
+@needs_numba
+def test_memory_layout_does_not_matter(generator):
+    depth, albedo, light, pose = scene(2, 9, 8, generator)
+    image = shade(depth, albedo, light, FOV_DEG)
+    expected = warp(image, depth, pose, FOV_DEG, "numba").image
+    swapped = image.contiguous(memory_format=torch.channels_last)
+    strided = depth.transpose(1, 2).contiguous().transpose(1, 2)
+    assert torch.equal(warp(swapped, strided, pose, FOV_DEG, "numba").image, expected)
+
+
+@needs_numba
+def test_threads_change_nothing(generator):
+    """One or two threads inside, and several Python threads outside."""
+    values, threads = scene(7, 12, 11, generator), torch.get_num_threads()
+
+    def job(_: int) -> Tensor:
+        inputs = [value.clone().requires_grad_() for value in values]
+        return torch.autograd.grad(render(*inputs, FOV_DEG, "numba").image.square().sum(), inputs)[0]
+
+    try:
+        torch.set_num_threads(1)
+        expected = job(0)
+        torch.set_num_threads(2)
+        with ThreadPoolExecutor(4) as pool:
+            results = list(pool.map(job, range(12)))
+    finally:
+        torch.set_num_threads(threads)
+    assert all(torch.equal(result, expected) for result in results)
+
+
+@needs_numba
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system cannot fork")
+def test_works_in_a_forked_process():
+    code = """
+import os, signal, torch
+from derender.render import rasterize
+from derender.scene.camera import focal_px, unproject
+torch.set_num_threads(2)
+points = unproject(torch.ones(4, 5, 5), 10.0)
+expected = rasterize(points, focal_px(5, 10.0), "numba").depth
+child = os.fork()
+if child == 0:
+    signal.alarm(60)
+    same = torch.equal(rasterize(points, focal_px(5, 10.0), "numba").depth, expected)
+    os._exit(0 if same else 1)
+raise SystemExit(os.waitpid(child, 0)[1])
+"""
+    assert subprocess.run([sys.executable, "-c", code], timeout=120, check=False).returncode == 0
+
+
+def test_importing_the_renderer_does_not_import_numba():
+    code = "import sys, derender.render; raise SystemExit('numba' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], timeout=120, check=False).returncode == 0
+
+
+@needs_numba
+def test_auto_takes_numba_on_the_cpu_and_the_reference_elsewhere():
+    assert chosen_backend("cpu") == chosen_backend(torch.device("cpu"), "auto") == "numba"
+    assert chosen_backend("cuda:0") == "reference"
+    assert chosen_backend("cpu", "reference") == "reference"
+
+
+def test_without_numba_auto_takes_the_reference_and_numba_is_an_error(monkeypatch):
+    monkeypatch.setattr("derender.render.rasterize._numba_installed", lambda: False)
+    assert available_backends() == ("reference",)
+    assert chosen_backend("cpu") == "reference"
+    with pytest.raises(ValueError, match="needs the package numba"):
+        chosen_backend("cpu", "numba")
+
+
+@pytest.mark.parametrize(
+    ("device", "backend", "message"),
+    [
+        ("cpu", "fast", "unknown render backend 'fast'; choose one of auto, reference, numba, triton"),
+        ("cpu", "triton", "triton render backend is not in this version"),
+        ("cuda", "triton", "triton render backend is not in this version"),
+        pytest.param("cuda", "numba", "works on the CPU, the tensors are on cuda", marks=needs_numba),
+    ],
+)
+def test_impossible_backends_are_errors(device, backend, message):
+    with pytest.raises(ValueError, match=message):
+        chosen_backend(device, backend)

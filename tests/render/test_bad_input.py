@@ -1,0 +1,72 @@
+"""What cannot be rendered is refused in one sentence that says what was expected."""
+
+import pytest
+import torch
+
+from derender.render import rasterize, render, shade, warp
+
+
+def good() -> dict[str, torch.Tensor]:
+    return {
+        "depth": torch.ones(2, 6, 5),
+        "albedo": torch.ones(2, 3, 6, 5),
+        "light": torch.zeros(2, 4),
+        "camera": torch.zeros(2, 6),
+    }
+
+
+@pytest.mark.parametrize(
+    ("name", "shape", "message"),
+    [
+        ("depth", (6, 5), r"depth must have shape \(N, H, W\), got \(6, 5\)"),
+        ("depth", (2, 1, 6, 5), r"depth must have shape \(N, H, W\), got \(2, 1, 6, 5\)"),
+        ("depth", (2, 1, 5), "at least 2x2"),
+        ("depth", (2, 6, 1), "at least 2x2"),
+        ("albedo", (2, 3, 5, 6), r"albedo must have shape \(2, 3, 6, 5\), got \(2, 3, 5, 6\)"),
+        ("albedo", (1, 3, 6, 5), r"albedo must have shape \(2, 3, 6, 5\), got \(1, 3, 6, 5\)"),
+        ("albedo", (2, 1, 6, 5), r"albedo must have shape \(2, 3, 6, 5\), got \(2, 1, 6, 5\)"),
+        ("light", (2, 3), r"light must have shape \(2, 4\), got \(2, 3\)"),
+        ("camera", (2, 5), r"camera must have shape \(2, 6\), got \(2, 5\)"),
+        ("camera", (3, 6), r"camera must have shape \(2, 6\), got \(3, 6\)"),
+    ],
+)
+def test_wrong_shapes(name, shape, message):
+    inputs = good()
+    inputs[name] = torch.ones(shape)
+    if name == "depth" and len(shape) == 3:
+        inputs["albedo"] = torch.ones(2, 3, *shape[1:])
+    with pytest.raises(ValueError, match=message):
+        render(**inputs)
+
+
+@pytest.mark.parametrize("name", ["depth", "albedo", "light", "camera"])
+def test_integers_and_mixed_precision(name):
+    inputs = good()
+    inputs[name] = inputs[name].long()
+    with pytest.raises(ValueError, match=rf"{name} must be floating point, got torch.int64"):
+        render(**inputs)
+    inputs[name] = inputs[name].double()
+    with pytest.raises(ValueError, match=r"must all have one dtype, got .*float64"):
+        render(**inputs)
+
+
+@pytest.mark.parametrize("fov_deg", [0.0, 180.0, -5.0])
+def test_field_of_view(fov_deg):
+    with pytest.raises(ValueError, match="fov_deg must lie between 0 and 180"):
+        render(**good(), fov_deg=fov_deg)
+
+
+def test_backend_name():
+    with pytest.raises(ValueError, match="unknown render backend 'gpu'"):
+        render(**good(), backend="gpu")
+
+
+def test_parts_refuse_too():
+    with pytest.raises(ValueError, match="image must have shape"):
+        warp(torch.ones(2, 3, 4, 4), torch.ones(2, 6, 5), torch.zeros(2, 6))
+    with pytest.raises(ValueError, match="light must have shape"):
+        shade(torch.ones(2, 6, 5), torch.ones(2, 3, 6, 5), torch.zeros(4))
+    with pytest.raises(ValueError, match="at least 2x2 vertices, got 1x4"):
+        rasterize(torch.ones(1, 1, 4, 3), 10.0)
+    with pytest.raises(ValueError, match="focal length must be positive"):
+        rasterize(torch.ones(1, 4, 4, 3), 0.0)

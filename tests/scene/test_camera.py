@@ -1,0 +1,120 @@
+"""Camera: the matrices and signs of the conventions, inverses, projection."""
+
+import math
+
+import pytest
+import torch
+from torch.autograd import gradcheck
+
+from derender.scene.camera import (
+    focal_px,
+    pixel_rays,
+    project,
+    rotation_matrix,
+    to_camera,
+    to_canonical,
+    unproject,
+)
+from tests.tolerances import assert_agrees
+
+
+def camera(**angles_and_shifts: float) -> torch.Tensor:
+    names = ("pitch", "yaw", "roll", "tx", "ty", "tz")
+    return torch.tensor([[angles_and_shifts.get(name, 0.0) for name in names]], dtype=torch.float64)
+
+
+def random_cameras(count: int, generator: torch.Generator) -> torch.Tensor:
+    return torch.randn(count, 6, generator=generator, dtype=torch.float64)
+
+
+def test_rotation_is_rz_ry_rx():
+    a, b, c = 0.3, -0.7, 1.1
+    rx = torch.tensor([[1, 0, 0], [0, math.cos(a), -math.sin(a)], [0, math.sin(a), math.cos(a)]])
+    ry = torch.tensor([[math.cos(b), 0, math.sin(b)], [0, 1, 0], [-math.sin(b), 0, math.cos(b)]])
+    rz = torch.tensor([[math.cos(c), -math.sin(c), 0], [math.sin(c), math.cos(c), 0], [0, 0, 1]])
+    assert_agrees(rotation_matrix(torch.tensor([a, b, c])), rz @ ry @ rx)
+
+
+def test_rotation_is_orthonormal_and_right_handed(generator):
+    rotation = rotation_matrix(random_cameras(50, generator)[:, :3])
+    assert_agrees(rotation @ rotation.mT, torch.eye(3, dtype=torch.float64).expand(50, 3, 3))
+    assert_agrees(torch.linalg.det(rotation), torch.ones(50, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_turns_about_one_axis_add_up(axis):
+    first, second = torch.zeros(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
+    first[axis], second[axis] = 0.4, -1.3
+    both = rotation_matrix(first) @ rotation_matrix(second)
+    assert_agrees(both, rotation_matrix(first + second))
+    assert_agrees(rotation_matrix(first) @ rotation_matrix(-first), torch.eye(3, dtype=torch.float64))
+
+
+def test_to_canonical_undoes_to_camera(generator):
+    points = torch.randn(4, 5, 3, 3, generator=generator, dtype=torch.float64)
+    cameras = random_cameras(4, generator)
+    assert_agrees(to_canonical(to_camera(points, cameras), cameras), points)
+    assert_agrees(to_camera(to_canonical(points, cameras), cameras), points)
+
+
+def test_to_camera_turns_about_the_object_centre_then_shifts(generator):
+    cameras = random_cameras(6, generator)
+    centre = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    assert_agrees(to_camera(centre.expand(6, 1, 3), cameras)[:, 0], centre + cameras[:, 3:])
+
+
+@pytest.mark.parametrize(
+    ("turn", "point", "axis", "sign"),
+    [
+        ("pitch", (0.0, -0.1, 1.0), 2, -1),  # the top comes towards the camera
+        ("yaw", (0.0, 0.0, 0.9), 0, -1),  # the near side moves to the left
+        ("roll", (0.0, -0.1, 1.0), 0, 1),  # clockwise: the top moves to the right
+    ],
+)
+def test_signs_of_the_angles(turn, point, axis, sign):
+    before = torch.tensor([[point]], dtype=torch.float64)
+    change = to_camera(before, camera(**{turn: 0.2})) - before
+    assert change[0, 0, axis] * sign > 0.01
+
+
+def test_translation_moves_right_down_and_away():
+    before = torch.tensor([[[0.02, 0.03, 1.05]]], dtype=torch.float64)
+    moved = to_camera(before, camera(tx=0.1, ty=0.2, tz=0.3))
+    assert_agrees(moved - before, torch.tensor([[[0.1, 0.2, 0.3]]], dtype=torch.float64))
+
+
+@pytest.mark.parametrize(("height", "width"), [(64, 64), (5, 8), (9, 4)])
+def test_outermost_pixel_centres_span_the_field_of_view(height, width):
+    rays = pixel_rays(height, width, 10.0, dtype=torch.float64)
+    assert math.degrees(2 * math.atan(float(rays[0, -1, 0]))) == pytest.approx(10.0)
+    assert_agrees(rays[:, 0, 0], -rays[:, -1, 0])
+    assert_agrees(rays[0, :, 1], -rays[-1, :, 1])
+    # square pixels: a step down is as long as a step to the right
+    assert_agrees(rays[1, 0, 1] - rays[0, 0, 1], rays[0, 1, 0] - rays[0, 0, 0])
+    assert (rays[..., 2] == 1).all()
+
+
+def test_focal_length_of_synface64():
+    assert focal_px(64, 10.0) == pytest.approx(360.05, abs=0.005)
+
+
+@pytest.mark.parametrize(("height", "width"), [(6, 6), (5, 8), (9, 4)])
+def test_project_undoes_unproject(height, width, generator):
+    depth = 0.5 + torch.rand(2, height, width, generator=generator, dtype=torch.float64)
+    uv = project(unproject(depth, 30.0), height, width, 30.0)
+    v, u = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    assert_agrees(uv, torch.stack((u, v), -1).double().expand(2, -1, -1, -1))
+    assert_agrees(unproject(depth, 30.0)[..., 2], depth)
+
+
+def test_gradients(generator):
+    depth = (0.9 + torch.rand(2, 3, 4, generator=generator, dtype=torch.float64)).requires_grad_()
+    cameras = random_cameras(2, generator).requires_grad_()
+    assert gradcheck(lambda d, c: to_camera(unproject(d, 20.0), c), (depth, cameras))
+    assert gradcheck(lambda d, c: to_canonical(unproject(d, 20.0), c), (depth, cameras))
+
+
+@pytest.mark.parametrize("fov_deg", [0.0, -10.0, 180.0, float("nan")])
+def test_impossible_field_of_view_is_an_error(fov_deg):
+    with pytest.raises(ValueError, match="fov_deg must lie between 0 and 180"):
+        focal_px(64, fov_deg)

@@ -1,0 +1,80 @@
+"""Light: direction, signs of the angles, Lambertian shading with known answers."""
+
+import math
+
+import pytest
+import torch
+from torch.autograd import gradcheck
+
+from derender.scene.camera import pixel_rays
+from derender.scene.light import lambert_shading, light_direction
+from derender.scene.normals import normals_from_depth
+from tests.tolerances import assert_agrees
+
+
+def light(ambient: float = 0.0, diffuse: float = 1.0, pitch: float = 0.0, yaw: float = 0.0) -> torch.Tensor:
+    return torch.tensor([[ambient, diffuse, pitch, yaw]], dtype=torch.float64)
+
+
+def bump(size: int = 21) -> torch.Tensor:
+    """Depth of a ball in front of the camera: nearest in the middle."""
+    rays = pixel_rays(size, size, 10.0, dtype=torch.float64)
+    b = rays[..., 2] * 1.1
+    length2 = rays.square().sum(-1)
+    return ((b - (b.square() - length2 * (1.1**2 - 0.15**2)).sqrt()) / length2)[None]
+
+
+def test_direction_is_tan_yaw_tan_pitch_one_normalised(generator):
+    angles = (torch.rand(50, 2, generator=generator, dtype=torch.float64) - 0.5) * 3.0
+    expected = torch.stack((angles[:, 1].tan(), angles[:, 0].tan(), torch.ones(50, dtype=torch.float64)), -1)
+    expected = expected / expected.norm(dim=-1, keepdim=True)
+    assert_agrees(light_direction(torch.cat((torch.zeros_like(angles), angles), -1)), expected)
+
+
+def test_frontal_light_on_a_facing_plane_gives_ambient_plus_diffuse():
+    normal = torch.zeros(1, 4, 5, 3, dtype=torch.float64)
+    normal[..., 2] = 1
+    shading = lambert_shading(normal, light(0.3, 0.9))
+    assert_agrees(shading, torch.full((1, 1, 4, 5), 1.2, dtype=torch.float64))  # not clipped at 1
+
+
+def test_shading_is_the_cosine_between_normal_and_light():
+    normal = torch.tensor([0.0, math.sin(0.5), math.cos(0.5)], dtype=torch.float64).expand(1, 2, 2, 3)
+    shading = lambert_shading(normal, light(0.1, 0.6, pitch=-0.3))
+    assert_agrees(shading, torch.full((1, 1, 2, 2), 0.1 + 0.6 * math.cos(0.8), dtype=torch.float64))
+
+
+def test_a_surface_turned_away_gets_ambient_only():
+    normal = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64).expand(1, 2, 2, 3)
+    shading = lambert_shading(normal, light(0.25, 0.7, yaw=-0.4))
+    assert_agrees(shading, torch.full((1, 1, 2, 2), 0.25, dtype=torch.float64))
+
+
+def test_yaw_lights_the_left_and_pitch_the_top():
+    normal = normals_from_depth(bump(), 10.0)
+    from_left = lambert_shading(normal, light(yaw=0.5))[0, 0]
+    assert (from_left[:, :10] > from_left[:, 11:].flip(1)).all()
+    from_above = lambert_shading(normal, light(pitch=0.5))[0, 0]
+    assert (from_above[:10] > from_above[11:].flip(0)).all()
+
+
+@pytest.mark.parametrize("angle", ["pitch", "yaw"])
+def test_direction_is_continuous_at_ninety_degrees(angle):
+    before = light_direction(light(**{angle: math.pi / 2 - 1e-6}))
+    after = light_direction(light(**{angle: math.pi / 2 + 1e-6}))
+    assert (before - after).abs().max() < 1e-5
+
+
+def test_direction_is_finite_where_it_is_not_defined():
+    angles = light(pitch=math.pi / 2, yaw=math.pi / 2).requires_grad_()
+    light_direction(angles).sum().backward()
+    assert light_direction(angles).isfinite().all()
+    assert angles.grad.isfinite().all()
+
+
+def test_gradients(generator):
+    normal = torch.nn.functional.normalize(
+        torch.randn(2, 3, 4, 3, generator=generator, dtype=torch.float64), dim=-1
+    ).requires_grad_()
+    lights = torch.rand(2, 4, generator=generator, dtype=torch.float64).requires_grad_()
+    assert gradcheck(lambert_shading, (normal, lights))

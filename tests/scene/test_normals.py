@@ -1,0 +1,70 @@
+"""Normals of depth maps: exact on planes, close on a ball, equal to the differences they stand for."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+from torch.autograd import gradcheck
+from torch.nn.functional import normalize
+
+from derender.scene.camera import pixel_rays, unproject
+from derender.scene.normals import normals_from_depth
+from tests.tolerances import assert_agrees
+
+FOV_DEG = 10.0
+
+
+def plane(normal: Tensor, height: int, width: int) -> Tensor:
+    """Depth (1, H, W) of the plane through (0, 0, 1) with this normal."""
+    rays = pixel_rays(height, width, FOV_DEG, dtype=torch.float64)
+    return (normal[2] / (rays @ normal))[None]
+
+
+def test_a_plane_facing_the_camera_has_normal_001():
+    normal = normals_from_depth(torch.full((2, 5, 7), 1.3), FOV_DEG)
+    assert_agrees(normal, torch.tensor([0.0, 0.0, 1.0]).expand(2, 5, 7, 3))
+
+
+@pytest.mark.parametrize(("height", "width"), [(2, 2), (3, 8), (9, 4)])
+@pytest.mark.parametrize("tilt", [(0.5, 0.0), (0.0, -1.0), (1.3, 0.4)])
+def test_exact_on_planes_up_to_the_border(height, width, tilt):
+    expected = normalize(torch.tensor([math.tan(tilt[0]), math.tan(tilt[1]), 1.0]).double(), dim=0)
+    normal = normals_from_depth(plane(expected, height, width), FOV_DEG)
+    assert_agrees(normal, expected.expand(1, height, width, 3))
+
+
+def test_close_on_a_ball():
+    rays = pixel_rays(41, 33, FOV_DEG, dtype=torch.float64)
+    length2, radius, distance = rays.square().sum(-1), 0.3, 1.3
+    depth = (distance - (distance**2 - length2 * (distance**2 - radius**2)).sqrt()) / length2
+    centre = torch.tensor([0.0, 0.0, distance], dtype=torch.float64)
+    outward = normalize(depth[..., None] * rays - centre, dim=-1)
+    cosine = (normals_from_depth(depth[None], FOV_DEG)[0] * -outward).sum(-1)
+    # the angle between a chord and the sphere is second order inside, first order at the border
+    assert math.degrees(math.acos(float(cosine[1:-1, 1:-1].min()))) < 0.02
+    assert math.degrees(math.acos(float(cosine.min()))) < 1.0
+
+
+def test_equals_the_cross_product_of_differences(generator):
+    depth = 0.9 + 0.2 * torch.rand(3, 6, 9, generator=generator, dtype=torch.float64)
+    points = unproject(depth, FOV_DEG)
+    along_u = points[:, 1:-1, 2:] - points[:, 1:-1, :-2]
+    along_v = points[:, 2:, 1:-1] - points[:, :-2, 1:-1]
+    expected = normalize(torch.linalg.cross(along_u, along_v), dim=-1)
+    assert_agrees(normals_from_depth(depth, FOV_DEG)[:, 1:-1, 1:-1], expected)
+    corner = torch.linalg.cross(points[:, 0, 1] - points[:, 0, 0], points[:, 1, 0] - points[:, 0, 0])
+    assert_agrees(normals_from_depth(depth, FOV_DEG)[:, 0, 0], normalize(corner, dim=-1))
+    corner = torch.linalg.cross(points[:, -1, -1] - points[:, -1, -2], points[:, -1, -1] - points[:, -2, -1])
+    assert_agrees(normals_from_depth(depth, FOV_DEG)[:, -1, -1], normalize(corner, dim=-1))
+
+
+@pytest.mark.parametrize(("height", "width"), [(2, 2), (4, 3)])
+def test_gradients(height, width, generator):
+    depth = (0.9 + torch.rand(2, height, width, generator=generator, dtype=torch.float64)).requires_grad_()
+    assert gradcheck(lambda d: normals_from_depth(d, 40.0), (depth,))
+
+
+def test_a_single_row_is_an_error():
+    with pytest.raises(ValueError, match="at least 2x2 pixels, got 1x5"):
+        normals_from_depth(torch.ones(1, 1, 5), FOV_DEG)

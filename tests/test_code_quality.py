@@ -1,0 +1,27 @@
+"""ruff and pyright run with the tests, in the versions that constraints.txt names."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def complaints(*command: str) -> str:
+    """What a tool has to say about the checkout; empty when it is content."""
+    done = subprocess.run(
+        [sys.executable, "-m", *command], cwd=ROOT, capture_output=True, text=True, timeout=250
+    )
+    return "" if done.returncode == 0 else f"{done.stdout}{done.stderr}"
+
+
+def test_ruff_finds_nothing():
+    assert not (found := complaints("ruff", "check", "--quiet", "--output-format=concise", ".")), found
+
+
+def test_code_is_formatted():
+    assert not (found := complaints("ruff", "format", "--quiet", "--diff", ".")), f"run: make format\n{found}"
+
+
+def test_pyright_finds_nothing():
+    assert not (found := complaints("pyright", "--pythonpath", sys.executable)), found

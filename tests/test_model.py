@@ -1,0 +1,206 @@
+"""Derenderer: the Python contract, saving and loading, and a fifth factor added from outside."""
+
+import json
+import math
+from dataclasses import dataclass
+
+import derender
+import pytest
+import torch
+from derender.model import CONFIG_FILE, WEIGHTS_FILE, Derenderer, load
+from derender.networks import FACTORS, Factor
+from derender.networks.factors import vector_net
+from derender.presets import ModelSettings
+from derender.render import Rendering, render_scene
+from derender.scene import Scene
+from derender.training.config import ObjectiveSettings
+from derender.training.step import training_step
+
+
+@pytest.fixture(scope="module")
+def model() -> Derenderer:
+    return Derenderer.from_preset("small", seed=0, image_size=32, width=8).eval()
+
+
+@pytest.fixture
+def images(generator) -> torch.Tensor:
+    return torch.rand(3, 3, 32, 32, generator=generator)
+
+
+def test_decompose_gives_a_scene_in_range(model, images):
+    scene = model.decompose(images)
+    assert isinstance(scene, Scene)
+    assert scene.depth.shape == (3, 32, 32)
+    assert 0.9 <= scene.depth.min() and scene.depth.max() <= 1.1
+    assert 0 <= scene.albedo.min() and scene.albedo.max() <= 1
+    assert 0 <= scene.light[:, :2].min() and scene.light[:, :2].max() <= 1
+    assert scene.light[:, 2:].abs().max() <= math.pi / 4
+    assert scene.camera[:, :3].abs().max() <= math.pi / 3
+    assert (scene.camera[:, 5] == 0).all()
+
+
+def test_render_of_decompose_is_reconstruct(model, images):
+    first, second = model.render(model.decompose(images)), model.reconstruct(images)
+    torch.testing.assert_close(first.image, second.image)
+    assert first.image.shape == (3, 3, 32, 32)
+    assert first.depth.shape == first.mask.shape == (3, 32, 32)
+
+
+def test_embed_gives_one_feature_per_factor(model, images):
+    features = model.embed(images)
+    assert list(features) == ["geometry", "albedo", "light", "camera"]
+    assert all(feature.shape == (3, 256) for feature in features.values())
+
+
+def test_each_feature_decides_its_own_parameter_only(model, images):
+    codes = model.embed(images)
+    before = model.decode(codes)
+    after = model.decode({**codes, "light": codes["light"].flip(0)})
+    torch.testing.assert_close(after.light, before.light.flip(0))
+    for name in ("depth", "albedo", "camera"):
+        torch.testing.assert_close(getattr(after, name), getattr(before, name))
+
+
+def test_mirrored_scene_seen_from_the_mirrored_side_is_the_mirrored_picture(model, images):
+    scene = model.decompose(images)
+    twin = model.mirror(scene)
+    sign = torch.tensor([1, 1, 1, -1.0])
+    turned = torch.tensor([1, -1, -1, -1, 1, 1.0])
+    twin = twin.with_parameters(light=scene.light * sign, camera=scene.camera * turned)
+    straight, mirrored = model.render(scene), model.render(twin)
+    both = (straight.mask * mirrored.mask.flip(-1)).bool()
+    difference = (straight.image - mirrored.image.flip(-1)).abs().amax(1)[both]
+    assert both.float().mean() > 0.3
+    assert difference.quantile(0.98) < 1e-2  # measured 3e-3: the diagonal of a cell has no mirror image
+
+
+@pytest.mark.parametrize(
+    ("shape", "dtype", "message"),
+    [
+        ((2, 3, 64, 64), torch.float32, r"takes pictures of shape \(N, 3, 32, 32\), got \(2, 3, 64, 64\)"),
+        ((3, 32, 32), torch.float32, r"got \(3, 32, 32\)"),
+        ((2, 3, 32, 32), torch.uint8, "divide uint8 by 255"),
+    ],
+)
+def test_wrong_pictures_are_named(model, shape, dtype, message):
+    with pytest.raises(ValueError, match=message):
+        model._check(torch.zeros(shape, dtype=dtype))
+
+
+def test_same_seed_same_weights_and_the_global_generator_is_left_alone():
+    torch.manual_seed(5)
+    expected = torch.rand(3)
+    torch.manual_seed(5)
+    one, two, other = (Derenderer.from_preset("small", seed=seed, width=8) for seed in (1, 1, 2))
+    torch.testing.assert_close(torch.rand(3), expected)
+    weights = [model.nets["geometry"].encoder.to_code[0].weight for model in (one, two, other)]
+    assert torch.equal(weights[0], weights[1])
+    assert not torch.equal(weights[0], weights[2])
+
+
+def test_an_unknown_preset_names_the_nearest():
+    with pytest.raises(ValueError, match="'smal'.*did you mean 'small'"):
+        Derenderer.from_preset("smal")
+
+
+def test_saved_and_loaded_models_agree(model, images, tmp_path):
+    folder = model.save(tmp_path / "m")
+    loaded = load(folder)
+    assert loaded.settings == model.settings
+    assert not loaded.training
+    assert not any(parameter.requires_grad for parameter in loaded.parameters())
+    for name, feature in loaded.embed(images).items():
+        assert torch.equal(feature, model.embed(images)[name])
+
+
+def test_a_run_folder_is_loaded_by_its_model(model, tmp_path):
+    model.save(tmp_path / "run" / "model")
+    assert derender.load(str(tmp_path / "run")).image_size == 32
+
+
+def test_saving_never_overwrites_unasked(model, tmp_path):
+    model.save(tmp_path / "m")
+    with pytest.raises(FileExistsError, match="choose another folder"):
+        model.save(tmp_path / "m")
+    model.save(tmp_path / "m", overwrite=True)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["m"]
+
+
+def test_a_missing_model_says_what_to_give(tmp_path):
+    with pytest.raises(FileNotFoundError, match="give a run folder, a saved folder or a Hub id"):
+        load(tmp_path / "nothing")
+    with pytest.raises(FileNotFoundError, match="holds no model"):
+        load(tmp_path)
+
+
+def _truncate(folder):
+    data = (folder / WEIGHTS_FILE).read_bytes()
+    (folder / WEIGHTS_FILE).write_bytes(data[: len(data) // 2])
+
+
+def _break_json(folder):
+    (folder / CONFIG_FILE).write_text("{")
+
+
+def _from_the_future(folder):
+    config = json.loads((folder / CONFIG_FILE).read_text())
+    (folder / CONFIG_FILE).write_text(json.dumps({**config, "format": 99}))
+
+
+def _strange_setting(folder):
+    config = json.loads((folder / CONFIG_FILE).read_text())
+    config["settings"]["ranges"]["fov"] = 3
+    (folder / CONFIG_FILE).write_text(json.dumps(config))
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (_truncate, "damaged"),
+        (_break_json, "damaged"),
+        (_from_the_future, "format 99.*update derender"),
+        (_strange_setting, "damaged"),
+    ],
+)
+def test_damaged_models_are_refused_with_one_sentence(model, tmp_path, damage, message):
+    folder = model.save(tmp_path / "m")
+    damage(folder)
+    with pytest.raises(ValueError, match=message) as caught:
+        load(folder)
+    assert "\n" not in str(caught.value)
+
+
+@dataclass(frozen=True)
+class Shine:
+    """A renderer that adds the fifth factor's strength to every covered pixel."""
+
+    def __call__(self, scene: Scene, fov_deg: float) -> Rendering:
+        plain = render_scene(scene, fov_deg)
+        strength = scene.extra["highlight"][:, :, None, None]
+        return Rendering(plain.image + strength * plain.mask[:, None], plain.depth, plain.mask)
+
+
+HIGHLIGHT = Factor(
+    name="highlight",
+    parameter="highlight",
+    build=vector_net(1),
+    to_parameter=lambda raw, ranges: raw.float() / 2 + 0.5,
+    mirrored=False,
+    perturb=lambda value, generator, settings: torch.rand(value.shape, generator=generator),
+)
+
+
+def test_a_fifth_factor_trains_embeds_and_is_perturbed_without_touching_anything_else(images, tmp_path):
+    settings = ModelSettings(network=Derenderer.from_preset("small", image_size=32, width=8).settings.network)
+    rows = {"factors": (*FACTORS, HIGHLIGHT), "renderer": Shine()}
+    model = Derenderer.seeded(settings, 0, **rows)
+    assert model.embed(images)["highlight"].shape == (3, 256)
+    objective = ObjectiveSettings(perceptual="none", loocc="all")
+    model.zero_grad()
+    training_step(model, images, objective, None, torch.Generator().manual_seed(0)).total.backward()
+    gradients = [parameter.grad for parameter in model.nets["highlight"].parameters()]
+    assert all(gradient is not None and gradient.abs().sum() > 0 for gradient in gradients)
+    folder = model.save(tmp_path / "five")
+    assert "highlight" in load(folder, **rows).embed(images)
+    with pytest.raises(ValueError, match="pass its rows as factors="):
+        load(folder)

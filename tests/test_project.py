@@ -1,0 +1,329 @@
+"""What holds for the whole project: the way imports go, what one costs, how files look, that docs are true."""
+
+import ast
+import importlib
+import json
+import re
+import shutil
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = ROOT / "src" / "derender"
+SOURCES = sorted(PACKAGE.rglob("*.py"))
+TESTS = sorted((ROOT / "tests").rglob("*.py"))
+DOCS = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md"), *(ROOT / "benchmarks").glob("*.md")])
+
+# A module imports only from its own stage or from stages to its left.
+STAGES = [
+    "settings",
+    "scene",
+    "render",
+    "data",
+    "networks",
+    "objectives",
+    "presets",
+    "model",
+    "training",
+    "features",
+    "baselines",
+    "evaluation",
+    "interpretation",
+    "report",
+    "demo",
+    "cli",
+]
+
+# Never imported by `import derender`: whatever is slow to load, or needed by one command only.
+HEAVY = {
+    *("torch", "triton", "numba", "numpy", "scipy", "sklearn", "pyarrow", "PIL", "imageio", "matplotlib"),
+    *("pydantic", "typer", "rich", "lightning_fabric", "tensorboard", "huggingface_hub"),
+}
+
+
+@cache
+def syntax(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(encoding="utf-8"), filename=str(path))
+
+
+def name_of(path: Path) -> str:
+    """Dotted name of a module of the package, from its file."""
+    parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def stage_of(module: str) -> str | None:
+    """The stage a module belongs to; None for the package itself, which only forwards names."""
+    parts = module.split(".")
+    return parts[1] if len(parts) > 1 else None
+
+
+def imported_modules(tree: ast.AST, known: frozenset[str]) -> Iterator[tuple[int, str]]:
+    """Every module of ours that a file imports, in functions too, with its line."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (
+                (node.lineno, alias.name) for alias in node.names if alias.name.split(".")[0] == "derender"
+            )
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"line {node.lineno}: write imports in full, as derender.x.y"
+            if node.module is not None and node.module.split(".")[0] == "derender":
+                for alias in node.names:
+                    inner = f"{node.module}.{alias.name}"
+                    yield node.lineno, inner if inner in known else node.module
+
+
+def modules() -> frozenset[str]:
+    return frozenset(name_of(path) for path in SOURCES)
+
+
+def wrong_way_imports(module: str, tree: ast.AST) -> list[str]:
+    """Imports of stages that stand to the right of the module's own."""
+    home = stage_of(module)
+    if home is None:
+        return []
+    own = STAGES.index(home)
+    return [
+        f"{module} line {line} imports {target}"
+        for line, target in imported_modules(tree, modules())
+        if (stage := stage_of(target)) is not None and STAGES.index(stage) > own
+    ]
+
+
+def test_every_module_belongs_to_a_stage():
+    strangers = {stage for path in SOURCES if (stage := stage_of(name_of(path))) is not None} - set(STAGES)
+    assert not strangers, f"give these a place in the order of imports: {sorted(strangers)}"
+
+
+def test_imports_go_one_way():
+    wrong = [line for path in SOURCES for line in wrong_way_imports(name_of(path), syntax(path))]
+    assert not wrong, "\n".join(wrong)
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "import derender.model",
+        "from derender.training import train",
+        "from derender import cli",
+        "def later():\n    from derender.features import FeatureTable",
+    ],
+)
+def test_an_import_that_goes_the_wrong_way_is_seen(source):
+    assert wrong_way_imports("derender.render.rasterize", ast.parse(source))
+    assert not wrong_way_imports("derender.cli", ast.parse(source))
+
+
+def run_python(code: str) -> str:
+    """What code prints in a fresh process, with this interpreter."""
+    return subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120
+    ).stdout
+
+
+def test_import_takes_less_than_a_second_and_a_half():
+    code = "import time; t = time.perf_counter(); import derender; print(time.perf_counter() - t)"
+    assert min(float(run_python(code)) for _ in range(3)) < 1.5
+
+
+def test_import_loads_no_heavy_package():
+    loaded = json.loads(
+        run_python("import json, sys; import derender; print(json.dumps(sorted(sys.modules)))")
+    )
+    assert "derender" in loaded
+    assert not {name.split(".")[0] for name in loaded} & HEAVY
+
+
+def test_import_touches_no_network_and_writes_nothing(tmp_path):
+    names = sorted(name for name in modules() if not name.endswith("__main__"))
+    code = f"""
+import importlib, os, socket, sys
+def refuse(*_, **__):
+    raise AssertionError("network touched at import")
+socket.socket.connect = socket.getaddrinfo = socket.create_connection = refuse
+os.chdir({str(tmp_path)!r})
+for name in {names!r}:
+    importlib.import_module(name)
+print("imported", len(sys.modules))
+"""
+    assert run_python(code).startswith("imported")
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_package_offers_what_it_lists():
+    import derender
+
+    for name in [*derender.__all__, *derender._SUBMODULES]:
+        assert getattr(derender, name) is not None
+    assert set(derender.__all__) <= set(dir(derender))
+    with pytest.raises(AttributeError, match="no attribute 'relight_everything'"):
+        derender.relight_everything  # noqa: B018
+
+
+def test_versions_agree():
+    import derender
+
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert derender.__version__ == project["version"]
+    assert f"## [{derender.__version__}]" in (ROOT / "CHANGELOG.md").read_text()
+
+
+def test_dependencies_have_a_tested_version():
+    document = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    asked = [*document["project"]["dependencies"], *document["dependency-groups"]["dev"]]
+    pinned = {
+        line.split("==")[0].lower().replace("_", "-")
+        for line in (ROOT / "constraints.txt").read_text().splitlines()
+        if "==" in line
+    }
+    wanted = {re.split(r"[\[<>=!~; ]", one, maxsplit=1)[0].lower().replace("_", "-") for one in asked}
+    assert wanted - pinned == set()
+
+
+def test_the_hook_runs_the_ruff_that_is_tested():
+    pinned = re.search(r"^ruff==(.+)$", (ROOT / "constraints.txt").read_text(), re.MULTILINE)
+    hook = re.search(r"ruff-pre-commit\s+rev: v(\S+)", (ROOT / ".pre-commit-config.yaml").read_text())
+    assert pinned is not None and hook is not None
+    assert hook[1] == pinned[1]
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_file_has_the_shape_of_ours(path):
+    text, tree = path.read_text(encoding="utf-8"), syntax(path)
+    assert path.stem not in {"utils", "util", "helpers", "misc", "common"}, "name a file after its one idea"
+    assert text.count("\n") <= 400, "more than one idea: split the file"
+    assert ast.get_docstring(tree), "open with what the file computes, its source, and what it leaves out"
+    assert "from __future__ import annotations" not in text, "it would switch off the checking of shapes"
+
+
+def test_the_library_never_prints():
+    calls = [
+        f"{path.relative_to(ROOT)}:{node.lineno}"
+        for path in SOURCES
+        for node in ast.walk(syntax(path))
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "print"
+    ]
+    assert not calls, f"raise, return or hand to a callback instead of printing: {calls}"
+
+
+def test_no_file_names_a_place_on_one_machine():
+    everything = [
+        *SOURCES,
+        *TESTS,
+        *DOCS,
+        *(ROOT / "benchmarks").rglob("*.py"),
+        ROOT / "Makefile",
+        ROOT / "constraints.txt",
+    ]
+    place = re.compile(r"(?<![\w.])/(?:home|root|Users|work|opt)/\w")
+    found = [
+        f"{path.relative_to(ROOT)}: {match[0]}"
+        for path in everything
+        if (match := place.search(path.read_text()))
+    ]
+    assert not found
+
+
+def test_tests_mirror_the_package():
+    """A folder of tests has the name of a stage or a module at the top, and every stage has tests."""
+    stages = {path.name for path in PACKAGE.iterdir() if path.is_dir()} - {"__pycache__"}
+    names = stages | {path.stem for path in PACKAGE.glob("*.py")}
+    folders = {
+        path.parent.relative_to(ROOT / "tests").parts[0] for path in TESTS if path.parent != ROOT / "tests"
+    }
+    assert folders <= names, f"no such stage: {sorted(folders - names)}"
+    for stage in stages:
+        if any(path.stem != "__init__" for path in (PACKAGE / stage).rglob("*.py")):
+            assert list((ROOT / "tests" / stage).rglob("test_*.py")), f"{stage} has code and no test"
+
+
+def readme_tree() -> dict[str, str]:
+    """The paths drawn in the README's tree, with the phrase beside each."""
+    drawn = re.search(r"```text\nsrc/derender/\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    assert drawn is not None, "the README shows the tree of src/derender in a ```text block"
+    rows = [re.match(r"[├└]── (\S+)\s+(.*)", line) for line in drawn[1].splitlines()]
+    return {row[1].rstrip("/"): row[2] for row in rows if row is not None}
+
+
+def test_the_readme_tree_is_the_tree():
+    drawn = readme_tree()
+    real = {path.name for path in PACKAGE.iterdir() if path.name not in {"__pycache__", "__init__.py"}}
+    assert set(drawn) == real
+    assert all(drawn.values()), "a phrase per file"
+
+
+@pytest.mark.parametrize("path", DOCS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_docs_point_at_what_exists(path):
+    text = path.read_text(encoding="utf-8")
+    links = re.findall(r"\]\((?!https?:|#|mailto:)([^)#\s]+)", text)
+    missing = [link for link in links if not (path.parent / link).exists()]
+    named = re.findall(
+        r"`((?:src/derender|tests|benchmarks|docs|examples)/[\w/.-]+)(?:::[\w.\[\]-]+)?`", text
+    )
+    missing += [name for name in named if not (ROOT / name).exists()]
+    short = re.findall(r"`((?:" + "|".join(STAGES) + r")/[\w/]+\.py)`", text)
+    missing += [name for name in short if not (PACKAGE / name).exists()]
+    assert not missing, f"{path.name} names what is not there: {missing}"
+
+
+@pytest.mark.parametrize("path", DOCS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_docs_name_functions_that_exist(path):
+    """`derender.a.b` and `tests/x.py::name` in a document can be followed."""
+    text = path.read_text(encoding="utf-8")
+    for dotted in set(re.findall(r"`(derender(?:\.[a-z_]\w*)+(?:\.[A-Z]\w+)?)`", text)):
+        assert follow(dotted), f"{path.name} names {dotted}"
+    for file, name in set(re.findall(r"`(tests/[\w/]+\.py)::(\w+)`", text)):
+        assert re.search(rf"def {name}\b", (ROOT / file).read_text()), f"{path.name} names {file}::{name}"
+
+
+def follow(dotted: str) -> bool:
+    """Whether a dotted name leads to a module or to something in one."""
+    parts = dotted.split(".")
+    for cut in range(len(parts), 0, -1):
+        if ".".join(parts[:cut]) in modules():
+            value = importlib.import_module(".".join(parts[:cut]))
+            for part in parts[cut:]:
+                if not hasattr(value, part):
+                    return False
+                value = getattr(value, part)
+            return True
+    return False
+
+
+def test_conventions_name_their_tests():
+    """Every numbered rule of docs/conventions.md says which test pins it."""
+    rules = re.split(r"^### ", (ROOT / "docs" / "conventions.md").read_text(), flags=re.MULTILINE)[1:]
+    assert len(rules) >= 10
+    unpinned = [rule.splitlines()[0] for rule in rules if not re.search(r"`tests/[\w/]+\.py::\w+`", rule)]
+    assert not unpinned, f"no test named for: {unpinned}"
+
+
+def test_the_readme_python_runs():
+    """The README's Python compiles, and every name it takes from derender is there."""
+    import derender
+
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    assert blocks
+    for block in blocks:
+        compile(block, "README.md", "exec")
+        for node in ast.walk(ast.parse(block)):
+            if (
+                isinstance(node, ast.Attribute)
+                and isinstance(node.value, ast.Name)
+                and node.value.id == "derender"
+            ):
+                assert hasattr(derender, node.attr), node.attr
+
+
+@pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
+def test_make_describes_its_commands():
+    shown = subprocess.run(
+        ["make", "-s", "help"], cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout
+    assert {"make demo", "make test"} <= {" ".join(line.split()[:2]) for line in shown.splitlines()}

@@ -1,0 +1,66 @@
+"""Batches are a function of seed and position; the learning rate one of pictures seen."""
+
+import pytest
+import torch
+from derender.training.batches import Batches, random_stream
+from derender.training.config import OptimiserSettings
+from derender.training.schedule import learning_rate
+
+
+def numbered(count: int) -> torch.Tensor:
+    """Pictures whose first pixel row holds their own number, left to right ascending."""
+    images = torch.zeros(count, 3, 4, 4, dtype=torch.uint8)
+    images[:] = torch.arange(count, dtype=torch.uint8)[:, None, None, None]
+    images[..., 0] = 255
+    return images
+
+
+def numbers(batch: torch.Tensor) -> list[int]:
+    return (batch[:, 0, 0, 1] * 255).round().int().tolist()
+
+
+def test_an_epoch_shows_every_picture_once_in_a_new_order_each_time():
+    batches = Batches(numbered(12), 4, seed=3, horizontal_flips=False)
+    epochs = [sum((numbers(batches.at(3 * epoch + i)) for i in range(3)), []) for epoch in range(2)]
+    assert sorted(epochs[0]) == sorted(epochs[1]) == list(range(12))
+    assert epochs[0] != epochs[1]
+
+
+def test_a_position_always_gives_the_same_batch():
+    images = numbered(12)
+    one, two = Batches(images, 5, 7, True), Batches(images, 5, 7, True)
+    two.at(0)
+    assert torch.equal(one.at(9), two.at(9))
+    assert not torch.equal(one.at(9), Batches(images, 5, 8, True).at(9))
+
+
+def test_about_half_of_the_pictures_are_mirrored():
+    batches = Batches(numbered(200), 100, 0, True)
+    batch = torch.cat([batches.at(i) for i in range(10)])
+    mirrored = batch[:, 0, 0, -1] == 1
+    assert 0.42 < mirrored.float().mean() < 0.58
+
+
+def test_a_batch_larger_than_the_set_is_refused():
+    with pytest.raises(ValueError, match="batch_size 64 is more than the 12 training pictures: set batch_size=6"):
+        Batches(numbered(12), 64, 0, True)
+
+
+def test_streams_differ_by_purpose_and_position_and_repeat():
+    draws = {
+        (purpose, position): torch.rand(4, generator=random_stream(0, purpose, position)).tolist()
+        for purpose in ("order", "flip", "perturb")
+        for position in range(5)
+    }
+    assert len({tuple(value) for value in draws.values()}) == len(draws)
+    assert torch.rand(4, generator=random_stream(0, "flip", 3)).tolist() == draws["flip", 3]
+
+
+def test_learning_rate_warms_up_then_falls_along_a_cosine():
+    settings = OptimiserSettings(learning_rate=1e-3, warmup_images=100, final_rate=0.1)
+    rates = [learning_rate(settings, images, 1100) for images in (0, 49, 99, 100, 600, 1100, 5000)]
+    assert rates == pytest.approx([1e-5, 5e-4, 1e-3, 1e-3, 5.5e-4, 1e-4, 1e-4])
+
+
+def test_learning_rate_is_constant_by_default():
+    assert learning_rate(OptimiserSettings(), 0, 100) == learning_rate(OptimiserSettings(), 99, 100) == 1e-4

@@ -1,0 +1,65 @@
+"""Configuration: presets, overrides, and errors that name the nearest key."""
+
+import pytest
+import yaml
+from derender.training.config import PRESETS, TrainConfig, config_from_tree, resolve, setting_names, to_yaml
+
+
+def test_every_preset_survives_yaml():
+    for name, preset in PRESETS.items():
+        assert preset.preset == name
+        assert config_from_tree(yaml.safe_load(to_yaml(preset))) == preset
+
+
+def test_overrides_by_full_and_by_short_name():
+    config = resolve("small", ["optimiser.learning_rate=3e-4", "batch_size=16", "betas=[0.5, 0.99]", "confidence=false"])
+    assert config.optimiser.learning_rate == 3e-4
+    assert config.batch_size == 16
+    assert config.optimiser.betas == (0.5, 0.99)
+    assert config.objective.confidence is False
+    assert config.model == PRESETS["small"].model
+
+
+def test_explicit_values_win_and_none_means_not_given():
+    config = resolve("small", ["seed=1"], seed=2, objective__loocc="light", images=None)
+    assert (config.seed, config.objective.loocc, config.images) == (2, "light", PRESETS["small"].images)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["lerning_rate=1"], "unknown setting 'lerning_rate'.*did you mean 'learning_rate'|optimiser.learning_rate"),
+        (["learning_rate"], "write key=value"),
+        (["learning_rate=fast"], "'optimiser.learning_rate'.*'fast'"),
+        (["learning_rate=-1"], "'optimiser.learning_rate'.*greater than 0"),
+        (["image_size=48"], "image_size must be one of 32, 64, 128, 256"),
+        (["loocc=lite"], "'objective.loocc'"),
+        (["batch_size=1"], "'batch_size'.*greater than or equal to 2"),
+        (["betas=[1, 2"], "cannot read the value"),
+        (["learning_rate=.nan"], "finite"),
+    ],
+)
+def test_bad_overrides_are_one_clear_sentence(overrides, message):
+    with pytest.raises(ValueError, match=message) as caught:
+        resolve("small", overrides)
+    assert "\n" not in str(caught.value)
+
+
+def test_an_unknown_preset_names_the_nearest():
+    with pytest.raises(ValueError, match="did you mean 'faces'"):
+        resolve("face")
+
+
+def test_an_unknown_key_in_a_file_is_refused():
+    tree = yaml.safe_load(to_yaml(PRESETS["small"]))
+    with pytest.raises(ValueError, match="unknown setting 'objective.flip_wieght'"):
+        config_from_tree({**tree, "objective": {**tree["objective"], "flip_wieght": 1}})
+
+
+def test_every_setting_has_a_name_that_resolves():
+    for name in setting_names():
+        value = TrainConfig().model_dump(mode="json")
+        for part in name.split("."):
+            value = value[part]
+        if value is not None:
+            resolve("paper", [f"{name}={yaml.safe_dump(value, default_flow_style=True).splitlines()[0]}"])

@@ -1,0 +1,175 @@
+"""The training loop: what a run leaves behind, exact resume, early stop, interruption, refusals."""
+
+import json
+import os
+import signal
+
+import derender
+import numpy as np
+import pytest
+import torch
+from derender.data import PictureSet
+from derender.training import TrainingInterrupted, resolve, train
+from derender.training.checkpoint import WEIGHTS_FILE, load_checkpoint
+from derender.training.loop import Progress
+from derender.training.run_folder import read_config, read_metrics
+from PIL import Image
+from safetensors.torch import load_file
+
+TINY = ["image_size=32", "width=8", "light_width=4", "perceptual=none", "batch_size=8", "checkpoint_every=32"]
+TINY += ["validate_every=32", "sample_every=64", "deterministic=true", "learning_rate=1e-3"]
+
+
+@pytest.fixture(autouse=True)
+def _restore_determinism():
+    yield
+    torch.use_deterministic_algorithms(False)
+
+
+@pytest.fixture(scope="module")
+def pictures() -> PictureSet:
+    noise = np.random.default_rng(0)
+    smooth = noise.integers(0, 256, (60, 3, 4, 4), dtype=np.uint8)
+    images = np.repeat(np.repeat(smooth, 8, axis=2), 8, axis=3)
+    return PictureSet(images=images, files=tuple(f"{i:03d}.png" for i in range(60)), source="made by the test")
+
+
+def weights(run) -> dict[str, torch.Tensor]:
+    return load_file(run / "checkpoints" / "last" / WEIGHTS_FILE)
+
+
+def assert_same_weights(one, two):
+    first, second = weights(one), weights(two)
+    assert first.keys() == second.keys()
+    assert all(torch.equal(first[name], second[name]) for name in first)
+
+
+def test_a_run_leaves_everything_named_in_the_design(pictures, tmp_path):
+    def sheet(model, images):
+        return Image.fromarray((model.reconstruct(images).image[0, 0].clamp(0, 1) * 255).byte().numpy())
+
+    seen: list[Progress] = []
+    config = resolve("small", [*TINY, "images=128"])
+    result = train(config, pictures, tmp_path / "run", sample_sheet=sheet, progress=seen.append)
+    run = tmp_path / "run"
+    assert result.stopped == "images"
+    assert result.images == 128
+    assert read_config(run) == config
+    environment = json.loads((run / "environment.json").read_text())
+    assert environment["data"]["pictures"] == 60
+    assert environment["packages"]["torch"]
+    assert sorted(path.name for path in (run / "samples").iterdir()) == ["000000064.png", "000000128.png"]
+    assert {path.name for path in (run / "checkpoints").iterdir()} == {"last", "best"}
+    assert derender.load(run).embed(torch.rand(2, 3, 32, 32))["geometry"].shape == (2, 256)
+    kinds = [row["kind"] for row in read_metrics(run)]
+    assert kinds.count("validation") == 4
+    assert "train" in kinds
+    assert [progress.done for progress in seen] == list(range(8, 129, 8))
+    assert not [path for path in run.rglob("*") if path.suffix in (".pkl", ".pt", ".pth")]
+
+
+def test_training_lowers_the_loss(pictures, tmp_path):
+    train(resolve("small", [*TINY, "images=416", "watch=false"]), pictures, tmp_path / "run")
+    losses = [row["l1"] for row in read_metrics(tmp_path / "run") if row["kind"] == "train"]
+    assert losses[-1] < 0.9 * losses[0], losses
+
+
+@pytest.mark.parametrize("loocc", ["none", "light+camera"])
+def test_a_resumed_run_ends_with_the_very_weights_of_an_undisturbed_one(pictures, tmp_path, loocc):
+    settings = [*TINY, f"loocc={loocc}"]
+    train(resolve("small", [*settings, "images=192"]), pictures, tmp_path / "whole")
+    train(resolve("small", [*settings, "images=96"]), pictures, tmp_path / "parts")
+    result = train(resolve("small", [*settings, "images=192"]), pictures, tmp_path / "parts", resume=True)
+    assert result.images == 192
+    assert_same_weights(tmp_path / "whole", tmp_path / "parts")
+    images = [row["images"] for row in read_metrics(tmp_path / "parts") if row["kind"] == "validation"]
+    assert images == [32, 64, 96, 128, 160, 192]
+
+
+def test_an_interrupted_run_is_saved_and_resumes_exactly(pictures, tmp_path):
+    def press_ctrl_c(progress: Progress) -> None:
+        if progress.done == 72:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    config = resolve("small", [*TINY, "images=160"])
+    with pytest.raises(TrainingInterrupted, match="stopped after 72 pictures and saved.*--resume"):
+        train(config, pictures, tmp_path / "parts", progress=press_ctrl_c)
+    train(config, pictures, tmp_path / "parts", resume=True)
+    train(config, pictures, tmp_path / "whole")
+    assert_same_weights(tmp_path / "whole", tmp_path / "parts")
+
+
+def test_self_trained_perceptual_features_are_kept_for_the_resumed_run(pictures, tmp_path):
+    settings = [*TINY, "perceptual=self", "self_features_steps=3"]
+    train(resolve("small", [*settings, "images=64"]), pictures, tmp_path / "parts")
+    before = (tmp_path / "parts" / "perceptual.safetensors").read_bytes()
+    train(resolve("small", [*settings, "images=96"]), pictures, tmp_path / "parts", resume=True)
+    assert (tmp_path / "parts" / "perceptual.safetensors").read_bytes() == before
+    train(resolve("small", [*settings, "images=96"]), pictures, tmp_path / "whole")
+    assert_same_weights(tmp_path / "whole", tmp_path / "parts")
+
+
+def test_patience_ends_a_run_that_no_longer_improves(pictures, tmp_path):
+    config = resolve("small", [*TINY, "images=3200", "patience=2", "learning_rate=1e-12", "watch=false"])
+    result = train(config, pictures, tmp_path / "run")
+    assert result.stopped == "patience"
+    assert result.images <= 32 * 8
+
+
+def test_minutes_end_a_run(pictures, tmp_path):
+    result = train(resolve("small", [*TINY, "images=1000000", "minutes=0.02"]), pictures, tmp_path / "run")
+    assert result.stopped == "minutes"
+    assert (tmp_path / "run" / "checkpoints" / "last").is_dir()
+
+
+def test_a_run_folder_that_exists_is_not_touched(pictures, tmp_path):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "thesis.txt").write_text("mine")
+    with pytest.raises(FileExistsError, match="not empty: add --resume"):
+        train(resolve("small", TINY), pictures, tmp_path / "run")
+    assert [path.name for path in (tmp_path / "run").iterdir()] == ["thesis.txt"]
+
+
+def test_resuming_nothing_or_with_other_settings_is_refused(pictures, tmp_path):
+    config = resolve("small", [*TINY, "images=32"])
+    with pytest.raises(FileNotFoundError, match="no run to resume"):
+        train(config, pictures, tmp_path / "run", resume=True)
+    train(config, pictures, tmp_path / "run")
+    with pytest.raises(ValueError, match="trained with another seed"):
+        train(resolve("small", [*TINY, "images=64", "seed=4"]), pictures, tmp_path / "run", resume=True)
+
+
+def test_a_damaged_checkpoint_is_named(pictures, tmp_path):
+    config = resolve("small", [*TINY, "images=32"])
+    train(config, pictures, tmp_path / "run")
+    file = tmp_path / "run" / "checkpoints" / "last" / WEIGHTS_FILE
+    file.write_bytes(file.read_bytes()[:1000])
+    with pytest.raises(ValueError, match="damaged or of another model"):
+        train(resolve("small", [*TINY, "images=64"]), pictures, tmp_path / "run", resume=True)
+
+
+def test_one_picture_or_too_few_for_a_batch_is_refused_before_a_folder_is_made(pictures, tmp_path):
+    with pytest.raises(ValueError, match="only one picture was found"):
+        train(resolve("small", TINY), pictures.select([0]), tmp_path / "run")
+    with pytest.raises(ValueError, match="batch_size 64 is more than the 48 training pictures"):
+        train(resolve("small", [*TINY, "batch_size=64"]), pictures, tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_checkpoint_that_cannot_be_written_leaves_the_old_one_whole(pictures, tmp_path, monkeypatch):
+    config = resolve("small", [*TINY, "images=32"])
+    train(config, pictures, tmp_path / "run")
+    before = weights(tmp_path / "run")
+
+    def disk_full(*args, **kwargs):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("derender.training.checkpoint.save_file", disk_full)
+    with pytest.raises(OSError, match="No space left"):
+        train(resolve("small", [*TINY, "images=64"]), pictures, tmp_path / "run", resume=True)
+    monkeypatch.undo()
+    after = weights(tmp_path / "run")
+    assert all(torch.equal(before[name], after[name]) for name in before)
+    assert sorted(path.name for path in (tmp_path / "run" / "checkpoints").iterdir()) == ["best", "last"]
+    model = derender.Derenderer.seeded(config.model, 0)
+    assert load_checkpoint(tmp_path / "run" / "checkpoints" / "last", model, None).images == 32
