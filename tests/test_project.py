@@ -1,4 +1,4 @@
-"""What holds for the whole project: the way imports go, what one costs, how files look, that docs are true."""
+"""What holds for the whole project: the way imports go, what one costs, how files look, that docs hold."""
 
 import ast
 import importlib

@@ -1,4 +1,4 @@
-"""How closely results must agree, by dtype. A looser bound anywhere else cites the error that was measured."""
+"""How closely results must agree, by dtype. A looser bound elsewhere cites the error that was measured."""
 
 import torch
 from torch import Tensor

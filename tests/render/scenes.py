@@ -4,7 +4,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from derender.render import Fragments, Rendering
+from derender.render import Rendering
+from derender.render.rasterize import Fragments
 from derender.scene.camera import pixel_rays
 
 FOV_DEG = 10.0

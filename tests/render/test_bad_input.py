@@ -3,7 +3,8 @@
 import pytest
 import torch
 
-from derender.render import rasterize, render, shade, warp
+from derender.render import render, shade, warp
+from derender.render.rasterize import rasterize
 
 
 def good() -> dict[str, torch.Tensor]:
@@ -22,12 +23,12 @@ def good() -> dict[str, torch.Tensor]:
         ("depth", (2, 1, 6, 5), r"depth must have shape \(N, H, W\), got \(2, 1, 6, 5\)"),
         ("depth", (2, 1, 5), "at least 2x2"),
         ("depth", (2, 6, 1), "at least 2x2"),
-        ("albedo", (2, 3, 5, 6), r"albedo must have shape \(2, 3, 6, 5\), got \(2, 3, 5, 6\)"),
-        ("albedo", (1, 3, 6, 5), r"albedo must have shape \(2, 3, 6, 5\), got \(1, 3, 6, 5\)"),
-        ("albedo", (2, 1, 6, 5), r"albedo must have shape \(2, 3, 6, 5\), got \(2, 1, 6, 5\)"),
-        ("light", (2, 3), r"light must have shape \(2, 4\), got \(2, 3\)"),
-        ("camera", (2, 5), r"camera must have shape \(2, 6\), got \(2, 5\)"),
-        ("camera", (3, 6), r"camera must have shape \(2, 6\), got \(3, 6\)"),
+        ("albedo", (2, 3, 5, 6), r"albedo must have shape \(2, 3, 6, 5\) to fit depth, got \(2, 3, 5, 6\)"),
+        ("albedo", (1, 3, 6, 5), r"albedo must have shape \(2, 3, 6, 5\) to fit depth, got \(1, 3, 6, 5\)"),
+        ("albedo", (2, 1, 6, 5), r"albedo must have shape \(2, 3, 6, 5\) to fit depth, got \(2, 1, 6, 5\)"),
+        ("light", (2, 3), r"light must have shape \(2, 4\) to fit depth, got \(2, 3\)"),
+        ("camera", (2, 5), r"camera must have shape \(2, 6\) to fit depth, got \(2, 5\)"),
+        ("camera", (3, 6), r"camera must have shape \(2, 6\) to fit depth, got \(3, 6\)"),
     ],
 )
 def test_wrong_shapes(name, shape, message):

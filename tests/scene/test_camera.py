@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from tests.tolerances import assert_agrees
 from torch.autograd import gradcheck
 
 from derender.scene.camera import (
@@ -15,7 +16,6 @@ from derender.scene.camera import (
     to_canonical,
     unproject,
 )
-from tests.tolerances import assert_agrees
 
 
 def camera(**angles_and_shifts: float) -> torch.Tensor:

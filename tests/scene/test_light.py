@@ -4,12 +4,12 @@ import math
 
 import pytest
 import torch
+from tests.tolerances import assert_agrees
 from torch.autograd import gradcheck
 
 from derender.scene.camera import pixel_rays
 from derender.scene.light import lambert_shading, light_direction
 from derender.scene.normals import normals_from_depth
-from tests.tolerances import assert_agrees
 
 
 def light(ambient: float = 0.0, diffuse: float = 1.0, pitch: float = 0.0, yaw: float = 0.0) -> torch.Tensor:

@@ -4,13 +4,13 @@ import math
 
 import pytest
 import torch
+from tests.tolerances import assert_agrees
 from torch import Tensor
 from torch.autograd import gradcheck
 from torch.nn.functional import normalize
 
 from derender.scene.camera import pixel_rays, unproject
 from derender.scene.normals import normals_from_depth
-from tests.tolerances import assert_agrees
 
 FOV_DEG = 10.0
 

@@ -85,7 +85,8 @@ def embed_pictures(
         pictures: read at the model's image size; their labels and the owners' split go into the table.
         batch_size: pictures at a time; changes speed and memory only.
         progress: called with (pictures done, pictures in all) after every batch.
-        origin: further facts for the table, such as the model's path and preset; they win over those found here.
+        origin: further facts for the table, such as the model's path and preset; they win over those found
+            here.
     """
     size = model.image_size
     if tuple(pictures.images.shape[-2:]) != (size, size):

@@ -1,14 +1,15 @@
-"""Scene to image. This is the only door: everything else in this folder is how."""
+"""Scene to image. This is the only door: everything else in this folder is how.
 
-from derender.render.rasterize import Fragments, available_backends, chosen_backend, rasterize
+``rasterize`` (coordinates and depth without colours) is reached as ``derender.render.rasterize.rasterize``.
+"""
+
+from derender.render.rasterize import available_backends, chosen_backend
 from derender.render.renderer import Rendering, render, render_scene, shade, warp
 
 __all__ = [
-    "Fragments",
     "Rendering",
     "available_backends",
     "chosen_backend",
-    "rasterize",
     "render",
     "render_scene",
     "shade",

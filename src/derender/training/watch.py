@@ -20,7 +20,8 @@ from derender.scene.light import lambert_shading
 from derender.scene.normals import normals_from_depth
 from derender.scene.ranges import SceneRanges
 
-GRACE_IMAGES = 6_000  # a network that has just started has no geometry yet
+GRACE_IMAGES = 4_000  # a network that has just started has no geometry yet
+SLOW_GRACE_IMAGES = 14_000  # slow starts show pixel noise for longer, and recover
 PERSISTENCE_IMAGES = 4_000  # how long a sign must stay on
 MEMORY_IMAGES = 2_000  # over how many pictures measurements are averaged
 
@@ -53,6 +54,7 @@ class Sign:
     fatal: bool
     text: str  # {value} is the measurement
     advice: str
+    grace_images: int = GRACE_IMAGES
 
     def is_on(self, measured: float) -> bool:
         return measured > self.limit if self.above else measured < self.limit
@@ -67,7 +69,8 @@ SIGNS = (
     ),
     Sign(
         "torn depth", "depth_roughness", 0.6, True, True,
-        "depth jumps from pixel to pixel ({value:.2f} of its spread; a smooth surface has less than 0.3)", SLOWER,
+        "depth jumps from pixel to pixel ({value:.2f} of its spread; a smooth surface has less than 0.3)",
+        f"set curvature_weight=3, which removes stripes; {SLOWER}", SLOW_GRACE_IMAGES,
     ),
     Sign(
         "flat depth", "depth_spread", 0.03, False, False,
@@ -136,7 +139,7 @@ class Watcher:
         findings = []
         for sign in SIGNS:
             value = self.averages[sign.measure]
-            if images < GRACE_IMAGES or not sign.is_on(value):
+            if images < sign.grace_images or not sign.is_on(value):
                 self.on_since.pop(sign.name, None)
                 continue
             since = self.on_since.setdefault(sign.name, images)

@@ -68,7 +68,7 @@ def action_fields(grid: FaceGrid) -> dict[str, Float[ndarray, "rows columns 3"]]
     fold = _fold(p, q)
     brow = np.exp(-0.5 * ((q + 20.0) / 3.6) ** 2)
     inner = np.exp(-(((p - 3.0) / 6.5) ** 2)) * brow
-    wrinkle = np.sin(2.0 * np.pi * (q + 27.0) / 3.4) * np.exp(-(((q + 26.5) / 4.6) ** 4)) * np.exp(-((p / 14.0) ** 4))
+    wrinkle = np.sin(2.0 * np.pi * (q + 25.0) / 2.6) * np.exp(-(((q + 24.3) / 2.6) ** 4)) * np.exp(-((p / 13.0) ** 4))
     return {
         "jaw_open": field(x=-0.09 * grid.p * smoothstep(4.0, 18.0, q) * hinge, y=9.0 * drop, z=2.2 * drop + 4.5 * inside),
         "lips_part": field(y=-1.6 * upper_side + 2.0 * lower_side, z=1.6 * inside),
@@ -92,8 +92,8 @@ def action_fields(grid: FaceGrid) -> dict[str, Float[ndarray, "rows columns 3"]]
             y=0.7 * bump((0.0, 12.0), (7.5, 1.2)) - 0.8 * bump((0.0, 16.4), (6.5, 1.4)),
             z=0.9 * bump((0.0, 13.9), (7.0, 2.0)) - 0.5 * bump((0.0, 23.0), (4.5, 3.0)),
         ),
-        "brow_inner_up": field(y=-2.8 * inner, z=0.35 * wrinkle * np.exp(-((p / 9.0) ** 4))),
-        "brow_outer_up": field(y=-2.8 * bump((14.5, -20.0), (5.5, 3.6)), z=0.3 * wrinkle),
+        "brow_inner_up": field(y=-2.8 * inner, z=0.2 * wrinkle * np.exp(-((p / 9.0) ** 4))),
+        "brow_outer_up": field(y=-2.8 * bump((14.5, -20.0), (5.5, 3.6)), z=0.2 * wrinkle),
         "brow_lower": field(
             x=-sign * 0.9 * bump((6.0, -19.5), (4.0, 3.0)),
             y=2.3 * np.exp(-(((p - 5.0) / 7.0) ** 2)) * brow,
@@ -107,4 +107,4 @@ def _fold(p: ndarray, q: ndarray) -> ndarray:
     """The crease between cheek and upper lip that a smile deepens."""
     centre = 6.3 + 5.6 * np.clip((q - 0.5) / 11.5, 0.0, 1.0) ** 0.8
     depth = 0.8 * np.exp(-0.5 * ((p - centre) / 1.1) ** 2) - 0.6 * np.exp(-0.5 * ((p - centre - 2.4) / 1.8) ** 2)
-    return depth * np.exp(-(((q - 6.5) / 6.5) ** 4))
+    return 0.75 * depth * np.exp(-(((q - 6.5) / 6.5) ** 4))

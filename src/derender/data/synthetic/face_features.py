@@ -7,9 +7,9 @@ parted. Colours only: no highlights, since albedo holds no light.
 from typing import no_type_check
 
 import numpy as np
-from numba import njit
 
 from derender.data.synthetic.face_grid import EYE_P, EYE_Q, MOUTH_BAND, MOUTH_Q
+from derender.render.numba_threads import kernel
 
 _LASH = (0.10, 0.07, 0.06)
 _SCLERA = (0.86, 0.83, 0.81)
@@ -21,7 +21,7 @@ _TONGUE = (0.60, 0.26, 0.25)
 _IRIS_RADIUS, _PUPIL_RADIUS = 2.4, 1.0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def paint_features(albedo, p, q, gap, eyes, iris, lips, gaze):
     """Paint in place, one face per row.
@@ -43,7 +43,7 @@ def paint_features(albedo, p, q, gap, eyes, iris, lips, gaze):
                     _paint_mouth(albedo[n, r, c], p[c], (q[r] - MOUTH_Q) / MOUTH_BAND, gap[n, c], lips[n])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _paint_eye(colour, p, y, eye, iris, gaze):
     side = 1.0 if p > 0.0 else -1.0
@@ -72,7 +72,7 @@ def _paint_eye(colour, p, y, eye, iris, gaze):
         colour[k] = _mixed(colour[k], _LASH[k], 0.28 * lashes * rim)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _paint_eyeball(colour, inside, distance, below_upper, along, iris):
     shade = (1.0 - 0.28 * np.exp(-max(below_upper, 0.0) / 0.7)) * (1.0 - 0.12 * abs(along))
@@ -84,7 +84,7 @@ def _paint_eyeball(colour, inside, distance, below_upper, along, iris):
         colour[k] = _mixed(colour[k], value, inside)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _paint_mouth(colour, p, across, gap, lips):
     """``across`` runs from -1 (upper lip's edge) to 1 (lower lip's edge)."""
@@ -100,7 +100,7 @@ def _paint_mouth(colour, p, across, gap, lips):
         colour[k] = _mixed(colour[k], _mixed(0.38 * lips[k], value, parted), cover)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _mixed(value, other, alpha):
     return value + (other - value) * min(max(alpha, 0.0), 1.0)

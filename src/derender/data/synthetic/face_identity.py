@@ -113,7 +113,7 @@ def draw_identity(generator: np.random.Generator, modes: tuple[str, ...]) -> Fac
         iris=iris,
         lips=np.clip(lips, 0.0, 1.0),
         hair_style=style,
-        hair_line=float(generator.uniform(-2.0, 2.5)),
+        hair_line=float(generator.uniform(-3.0, 2.2)),
         hair_recession=float(generator.uniform(0, 1) * (0.25 + 0.75 * age) * build),
         hair_volume=float(generator.uniform(0.6, 1.4)),
         hair_parting=float(generator.uniform(-1, 1)),
@@ -155,8 +155,8 @@ def _hair_colour(generator: np.random.Generator, melanin: float, age: float) -> 
 
 
 def _hair_style(generator: np.random.Generator, build: float, age: float) -> str:
-    heavy = np.array([0.12 + 0.35 * age, 0.35, 1.0, 0.4, 0.05, 0.07])
-    delicate = np.array([0.02, 0.05, 0.25, 0.35, 0.8, 1.0])
+    heavy = np.array([0.12 + 0.35 * age, 0.35, 1.0, 0.25, 0.05, 0.07])
+    delicate = np.array([0.02, 0.05, 0.3, 0.22, 0.7, 1.0])
     return HAIR_STYLES[_pick(generator, build * heavy + (1.0 - build) * delicate)]
 
 

@@ -16,7 +16,7 @@ from scipy.interpolate import PchipInterpolator
 from derender.data.synthetic.face_grid import EYE_P, EYE_Q, MOUTH_BAND, MOUTH_Q, FaceGrid, face_grid, smoothstep
 
 _Q = (-51.0, -49.0, -46.0, -40.0, -31.0, -22.0, -14.0, -4.0, 6.0, 14.0, 22.0, 29.5, 34.0)
-_HALF_WIDTH = (2.0, 8.5, 14.5, 21.5, 26.4, 28.2, 28.2, 27.6, 26.2, 24.8, 23.4, 21.2, 20.0)
+_HALF_WIDTH = (2.0, 8.5, 14.5, 21.5, 26.4, 28.2, 28.2, 27.6, 26.4, 25.2, 23.8, 21.2, 19.0)
 _FRONT = (26.0, 18.0, 9.5, -1.0, -8.2, -10.0, -8.6, -8.0, -9.0, -10.0, -9.6, -9.4, -6.5)
 _EAR_PLANE = 30.0  # z of the widest section
 
@@ -53,21 +53,21 @@ def bare_head(grid: FaceGrid) -> Float[ndarray, "rows columns 3"]:
     jaw = np.stack(
         [
             width * np.sin(grid.theta),
-            q_face - 17.5 * smoothstep(-8.0, 29.0, q_face) * lift,
+            q_face - 14.5 * smoothstep(-6.0, 29.0, q_face) * lift,
             front + (_EAR_PLANE - front) * (1.0 - np.cos(grid.theta)),
         ],
         axis=-1,
     )
-    neck_width = 19.0 + 0.10 * np.maximum(grid.q - 40.0, 0.0)
+    neck_width = 17.0 + 0.16 * np.maximum(grid.q - 40.0, 0.0)
     neck = np.stack(
         [
             neck_width * np.sin(grid.theta),
             grid.q - 1.0 - 8.0 * lift,
-            33.0 - 19.0 * np.cos(grid.theta) + 0.15 * (grid.q - 36.0),
+            37.0 - 17.0 * np.cos(grid.theta) + 0.12 * (grid.q - 36.0),
         ],
         axis=-1,
     )
-    below = smoothstep(29.0, 37.0, grid.q)[..., None]
+    below = smoothstep(29.0, 36.0, grid.q)[..., None]
     return (1.0 - below) * jaw + below * neck
 
 
@@ -106,7 +106,7 @@ def nose(grid: FaceGrid, bridge: float = 1.0) -> ndarray:
     ridge = height * np.exp(-0.5 * (grid.p / width) ** 2)
     foot = 1.7 * grid.bump((0.0, -3.0), (5.0, 5.0))
     ball = 2.4 * grid.bump((0.0, -1.1), (2.2, 1.9))
-    wings = 3.1 * grid.bump((4.4, 0.5), (1.45, 1.55))
+    wings = 3.3 * grid.bump((4.3, 0.4), (1.5, 1.5))
     nostrils = 0.8 * grid.bump((2.3, 2.3), (0.9, 0.7))
     crease = 0.6 * grid.bump((6.6, 0.6), (1.0, 2.0))
     return -ridge - foot - ball - wings + nostrils + crease
@@ -184,7 +184,7 @@ def identity_modes(grid: FaceGrid) -> dict[str, Float[ndarray, "rows columns 3"]
         "chin_length": field(y=1.1 * bump((0.0, 28.0), (9.0, 5.0))),
         "chin_width": field(x=0.9 * sign * bump((6.0, 26.0), (6.0, 5.0)), z=-0.6 * bump((6.0, 26.0), (3.0, 3.0))),
         "chin_cleft": field(z=0.4 * bump((0.0, 25.5), (0.9, 2.2))),
-        "neck_width": field(x=1.5 * side * smoothstep(31.0, 40.0, q)),
+        "neck_width": field(x=1.3 * side * smoothstep(31.0, 40.0, q)),
         "temple": field(z=0.7 * bump((22.0, -20.0), (5.0, 6.0))),
         "under_eye": field(z=0.28 * bump((10.5, -9.3), (3.8, 1.0)) - 0.22 * bump((11.0, -11.2), (3.8, 0.8))),
         "fold": field(z=_fold(p, q)),

@@ -43,7 +43,7 @@ def skin_basis(detail: float = 1.0) -> SkinBasis:
     cheeks_and_nose = np.maximum(bump((11.0, -2.0), (7.0, 4.5)), bump((0.0, -4.0), (4.0, 4.0)))
     return SkinBasis(
         mottling=np.stack([_waves(generator, grid, 10, 9.0, 24.0) for _ in range(SKIN_FIELDS)]),
-        strands=_waves(generator, grid, 24, 1.5, 4.0, along=7.0),
+        strands=_waves(generator, grid, 40, 1.4, 7.0, along=9.0),
         freckles=smoothstep(1.1, 1.9, freckle_noise) * cheeks_and_nose,
         grain=_waves(generator, grid, 40, 1.3, 2.6),
         blush=bump((13.0, 1.0), (5.5, 4.5)) + 0.55 * bump((0.0, -1.5), (3.2, 2.6)),
@@ -69,17 +69,18 @@ def paint_skin(identity: FaceIdentity, detail: float = 1.0) -> tuple[ndarray, nd
     albedo = _over(albedo, lips, 0.92 * basis.lips)
     albedo *= 1.0 - 0.6 * basis.nostrils[..., None] * np.array((0.85, 1.0, 1.0))
     stubble = identity.stubble * basis.beard * (1.0 - basis.lips) * (1.0 + 0.1 * basis.grain)
-    albedo = _over(albedo, 0.35 * identity.hair + 0.35 * identity.skin, 0.38 * np.clip(stubble, 0.0, 1.0))
-    strand_colour = identity.hair * (1.0 + 0.16 * basis.strands[..., None])
-    beard = identity.beard * basis.beard * (1.0 - basis.lips)
-    albedo = _over(albedo, strand_colour, 0.9 * smoothstep(0.1, 0.6, beard))
+    albedo = _over(albedo, 0.35 * identity.hair + 0.35 * identity.skin, 0.5 * np.clip(stubble, 0.0, 1.0))
+    strand_colour = identity.hair * (1.0 + 0.15 * basis.strands[..., None])
+    beard = np.clip(identity.beard * basis.beard * (1.0 + 0.18 * basis.strands), 0.0, 1.0) * (1.0 - basis.lips)
+    albedo = _over(albedo, strand_colour, 0.92 * smoothstep(0.05, 0.75, beard))
     albedo = _over(albedo, 0.85 * identity.hair + 0.05, identity.brow_strength * brow_mask(identity, grid, basis))
     distance = hair_distance(identity, grid)
-    hair = smoothstep(-0.7, 0.7, distance)
+    distance = distance + 0.35 * basis.strands
+    hair = smoothstep(-0.8, 0.8, distance)
     cover = {"bald": 0.0, "buzz": 0.75}.get(identity.hair_style, 1.0)
     albedo = _over(albedo, strand_colour, cover * hair)
-    thickness = hair_thickness(identity, grid, distance) + 1.1 * beard
-    return np.clip(albedo, 0.0, 1.0), thickness + 0.16 * basis.strands * np.clip(thickness, 0.0, 1.0)
+    thickness = hair_thickness(identity, grid, distance) + 1.0 * smoothstep(0.35, 1.0, beard)
+    return np.clip(albedo, 0.0, 1.0), thickness + 0.045 * basis.strands * np.clip(thickness, 0.0, 1.0)
 
 
 def brow_mask(identity: FaceIdentity, grid: FaceGrid, basis: SkinBasis) -> ndarray:
@@ -116,10 +117,10 @@ def hair_distance(identity: FaceIdentity, grid: FaceGrid) -> ndarray:
     limit = PchipInterpolator(at, line)(turn)
     sway, first, second, third = identity.hair_wave
     p = grid.p[0]
-    limit += (0.4 + 0.7 * sway) * (np.sin(0.42 * p + 6.3 * first) + 0.7 * np.sin(0.83 * p + 6.3 * second)) * np.exp(-((turn / 58.0) ** 6))
+    limit += (0.2 + 0.6 * sway) * (np.sin(0.24 * p + 6.3 * first) + 0.6 * np.sin(0.55 * p + 6.3 * second)) * np.exp(-((turn / 58.0) ** 6))
     if style in ("fringe", "bob", "long"):
         part = 12.0 * identity.hair_parting
-        limit -= (3.5 + 2.0 * third) * np.exp(-(((p - part) / 6.0) ** 2)) * (0.3 if style == "fringe" else 1.0)
+        limit -= (2.5 + 2.0 * third) * np.exp(-(((p - part) / 8.5) ** 2)) * (0.3 if style == "fringe" else 1.0)
     slope = np.gradient(limit, p)
     return (limit - grid.q) / np.sqrt(1.0 + slope**2)
 
@@ -131,7 +132,7 @@ def hair_thickness(identity: FaceIdentity, grid: FaceGrid, distance: ndarray) ->
     hang = {"bob": 1.0, "long": 4.0}.get(identity.hair_style, 0.0)
     crown = 1.0 - smoothstep(-36.0, -12.0, grid.q)
     low = smoothstep(0.0, 34.0, grid.q)
-    full = identity.hair_volume * (0.4 * top + 0.6 * top * crown + side * (1.0 - crown) + hang * low)
+    full = identity.hair_volume * (0.4 * top + 0.6 * top * crown + side * (1.0 - crown) + hang * (low + 1.2 * smoothstep(27.0, 37.0, grid.q)))
     return full * smoothstep(-0.3, 1.2 + 1.6 * np.maximum(full, 0.2), distance)
 
 
@@ -143,16 +144,16 @@ def ear_share(identity: FaceIdentity) -> float:
 def _lip_mask(p: ndarray, q: ndarray) -> ndarray:
     arc = np.clip(1.0 - (p / 9.3) ** 2, 0.0, 1.0)
     top = MOUTH_Q - 2.9 * arc**0.9 + 0.55 * np.exp(-((p / 1.3) ** 2))
-    bottom = MOUTH_Q + 3.9 * np.clip(1.0 - (p / 8.8) ** 2, 0.0, 1.0) ** 0.8
+    bottom = MOUTH_Q + 3.5 * np.clip(1.0 - (p / 8.9) ** 2, 0.0, 1.0) ** 0.7
     return smoothstep(-0.45, 0.45, q - top) * smoothstep(-0.6, 0.6, bottom - q) * smoothstep(0.0, 0.08, arc)
 
 
 def _beard_mask(p: ndarray, q: ndarray) -> ndarray:
     line = PchipInterpolator(
-        [0.0, 4.0, 8.5, 11.0, 15.0, 20.0, 24.0, 27.0, 80.0], [19.0, 19.5, 17.5, 11.5, 8.5, 4.0, -2.0, -6.0, 60.0]
+        [0.0, 3.0, 7.0, 10.0, 13.0, 17.0, 21.0, 24.0, 27.0, 31.0, 80.0], [18.8, 19.0, 18.2, 12.5, 10.0, 7.5, 3.0, -1.0, 6.0, 12.0, 12.0]
     )(p)
-    cheeks = smoothstep(-2.0, 2.5, q - line) * (1.0 - smoothstep(33.0, 38.0, q))
-    moustache = np.exp(-(((q - 8.9 - 0.03 * p**2) / 2.3) ** 4)) * np.exp(-((p / 9.0) ** 6))
+    cheeks = smoothstep(-2.5, 3.5, q - line) * (1.0 - smoothstep(33.0, 38.0, q))
+    moustache = np.exp(-(((q - 9.2 - 0.032 * p**2) / 2.3) ** 4)) * np.exp(-((p / 10.5) ** 6)) * (1.0 - 0.5 * np.exp(-((p / 1.2) ** 2)))
     return np.maximum(cheeks, moustache)
 
 

@@ -11,8 +11,8 @@ from functools import lru_cache
 from typing import no_type_check
 
 import numpy as np
+import torch
 from jaxtyping import Float32
-from numba import get_num_threads, njit
 from numpy import ndarray
 
 from derender.data.synthetic.backgrounds import draw_background
@@ -24,7 +24,9 @@ from derender.data.synthetic.face_shape import bare_head, shape_basis
 from derender.data.synthetic.face_skin import ear_share, paint_skin
 from derender.data.synthetic.mesh_picture import draw_meshes
 from derender.data.synthetic.settings import FaceSettings
-from derender.data.synthetic.synthetic_set import SyntheticSet
+from derender.data.synthetic.synthetic_set import SyntheticSet, camera_rotation_and_light
+from derender.render.numba_threads import kernel
+from derender.scene.camera import focal_px
 
 FOV_DEG = 10.0
 NOSE_TIP_Z = 0.947
@@ -57,7 +59,7 @@ def generate(
         return [rows_of[d.identity] for d in draws]
 
     chunks = _chunks(first, count, settings.pictures_per_identity, max(1, _CHUNK * 64 // image_size))
-    with ThreadPoolExecutor(get_num_threads()) as pool:
+    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
         for rows, found in zip(chunks, pool.map(work, chunks), strict=True):
             traits.extend(found)
             if progress is not None:
@@ -180,12 +182,10 @@ def _picture(draws: list[_Draw], people: dict[int, _Person], detail: float, size
     )  # fmt: skip
     camera = np.stack([d.camera for d in draws])
     light = np.stack([d.light for d in draws])
-    rotation = _rotation(camera[:, :3].astype(np.float64))
-    direction = np.stack([np.tan(light[:, 3]), np.tan(light[:, 2]), np.ones(len(draws))], axis=1)
-    direction = np.einsum("nij,nj->ni", rotation, direction / np.linalg.norm(direction, axis=1, keepdims=True))
+    rotation, direction = camera_rotation_and_light(camera, light)
     draw_meshes(
         vertices, albedo, rotation.astype(np.float32), camera[:, 3:], np.hstack([light[:, :2], direction]).astype(np.float32),
-        np.stack([d.background for d in draws]), size, np.float32((size - 1) / 2 / np.tan(np.deg2rad(FOV_DEG / 2))),
+        np.stack([d.background for d in draws]), size, np.float32(focal_px(size, FOV_DEG)),
         out["images"], out["depth"], out["normal"], out["albedo"], out["mask"],
     )  # fmt: skip
     out["light"][:], out["camera"][:] = light, camera
@@ -194,7 +194,7 @@ def _picture(draws: list[_Draw], people: dict[int, _Person], detail: float, size
     out["strength"][:] = [d.strength for d in draws]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _assemble(base, who, actions, fields, scale, tip, vertices, top, bottom, gap):
     """Add expressions to neutral surfaces, move to scene units, and measure how far the lips have parted."""
@@ -221,24 +221,11 @@ def _assemble(base, who, actions, fields, scale, tip, vertices, top, bottom, gap
 def _lids(who: FaceIdentity, lids: ndarray) -> list[float]:
     """The row that paint_features wants."""
     wide, squint = lids
-    opening = np.clip(who.eye_opening * (1.0 + 0.42 * wide - 0.42 * squint), 0.25, 1.7)
+    opening = np.clip(who.eye_opening * (1.0 + 0.34 * wide - 0.42 * squint), 0.25, 1.7)
     low = np.clip(who.eye_opening * (1.0 + 0.2 * wide - 0.45 * squint), 0.2, 1.5)
     up = 2.35 * opening
     low = 1.4 * low
     return [who.eye_length, up[0], low[0], up[1], low[1], who.eye_tilt, who.lashes, who.lid_crease]
-
-
-def _rotation(angles: ndarray) -> ndarray:
-    """Rz Ry Rx for rows of (x, y, z) angles in radians."""
-    (cx, cy, cz), (sx, sy, sz) = np.cos(angles).T, np.sin(angles).T
-    return np.stack(
-        [
-            np.stack([cz * cy, cz * sy * sx - sz * cx, cz * sy * cx + sz * sx], axis=1),
-            np.stack([sz * cy, sz * sy * sx + cz * cx, sz * sy * cx - cz * sx], axis=1),
-            np.stack([-sy, cy * sx, cy * cx], axis=1),
-        ],
-        axis=1,
-    )
 
 
 def _scaled(ends: tuple[float, float], share: float) -> float:

@@ -9,12 +9,13 @@ draws meshes whose points are not a depth map. Leaves out cast shadows, specular
 from typing import no_type_check
 
 import numpy as np
-from numba import njit
+
+from derender.render.numba_threads import kernel
 
 SAMPLES = 3
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def draw_meshes(vertices, albedo, rotation, translation, light, background, size, focal_px,
                 image, depth, normal, albedo_map, mask):  # fmt: skip
@@ -50,7 +51,7 @@ def draw_meshes(vertices, albedo, rotation, translation, light, background, size
                image[n], depth[n], normal[n], albedo_map[n], mask[n])  # fmt: skip
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _to_camera(vertices, rotation, translation, camera):
     for r in range(vertices.shape[0]):
@@ -61,7 +62,7 @@ def _to_camera(vertices, rotation, translation, camera):
             camera[r, c, 2] += np.float32(1.0)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _vertex_normals(points, normal):
     """Inward unit normals by central differences along rows and columns (d/dcolumn x d/drow)."""
@@ -81,7 +82,7 @@ def _vertex_normals(points, normal):
             normal[r, c, 0], normal[r, c, 1], normal[r, c, 2] = x / length, y / length, z / length
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _draw_triangle(point, ra, ca, rb, cb, rc, cc, number, nearest, owner):
     """Z-buffer one triangle; one that is seen from behind or has no area is skipped."""
@@ -109,7 +110,7 @@ def _draw_triangle(point, ra, ca, rb, cb, rc, cc, number, nearest, owner):
                     owner[v, u] = number
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _shade(point, facing, albedo, owner, light, background, size, columns,
            image, depth, normal, albedo_map, mask):  # fmt: skip
@@ -149,7 +150,7 @@ def _shade(point, facing, albedo, owner, light, background, size, columns,
                 image[k, i, j] = np.uint8(mean * np.float32(255.0) + np.float32(0.5))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _weights(point, ra, ca, rb, cb, rc, cc, u, v):
     """Perspective-correct weights of a triangle's corners at sample (u, v), and 1 / z there."""

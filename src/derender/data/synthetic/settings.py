@@ -31,7 +31,7 @@ class FaceSettings(Settings):
     expressions: tuple[str, ...] = tuple(EXPRESSIONS)  # drawn with equal chance
     strength: tuple[float, float] = (0.4, 1.05)
     asymmetry: float = Field(0.12, ge=0, le=1)  # sd by which the two halves of an expression differ
-    gaze_px: float = Field(0.9, ge=0, le=3)  # sd of the irises' shift
+    gaze_px: float = Field(0.6, ge=0, le=3)  # sd of the irises' shift
     backgrounds: tuple[str, ...] = ("plain", "gradient", "noise")
 
     @field_validator("light_pitch_deg", "light_yaw_deg", "ambient", "diffuse", "strength")

@@ -3,8 +3,13 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from jaxtyping import Bool, Float32, Int64, Shaped, UInt8
+import numpy as np
+import torch
+from jaxtyping import Bool, Float32, Float64, Int64, Shaped, UInt8
 from numpy import ndarray
+
+from derender.scene.camera import rotation_matrix
+from derender.scene.light import light_direction
 
 
 @dataclass(frozen=True)
@@ -41,3 +46,12 @@ class SyntheticSet:
 
     def __len__(self) -> int:
         return len(self.images)
+
+
+def camera_rotation_and_light(
+    camera: Float32[ndarray, "n 6"], light: Float32[ndarray, "n 4"]
+) -> tuple[Float64[ndarray, "n 3 3"], Float64[ndarray, "n 3"]]:
+    """Rotation from canonical to camera frame, and the unit direction of light in the camera frame."""
+    rotation = rotation_matrix(torch.from_numpy(camera[:, :3].astype(np.float64))).numpy()
+    direction = light_direction(torch.from_numpy(light.astype(np.float64))).numpy()
+    return rotation, np.einsum("nij,nj->ni", rotation, direction)

@@ -13,7 +13,7 @@ from jaxtyping import Float32, UInt8, UInt16
 from numpy import ndarray
 from PIL import Image
 
-from derender.data.synthetic.synthetic_set import SyntheticSet
+from derender.data.synthetic.synthetic_set import SyntheticSet, camera_rotation_and_light
 
 DEPTH_LOW, DEPTH_SPAN = 0.8, 0.4
 
@@ -58,9 +58,8 @@ def encode_normal(normal: Float32[ndarray, "*shape 3"]) -> UInt8[ndarray, "*shap
 def _parameters(synthetic: SyntheticSet, i: int) -> dict[str, str]:
     ambient, diffuse, light_pitch, light_yaw = synthetic.light[i].astype(float)
     pitch, yaw, roll, tx, ty, _ = synthetic.camera[i].astype(float)
-    light = np.array([np.tan(light_yaw), np.tan(light_pitch), 1.0])
-    light /= np.linalg.norm(light)
-    seen = turn(pitch, yaw, roll) @ light
+    rotation, direction = camera_rotation_and_light(synthetic.camera[i : i + 1], synthetic.light[i : i + 1])
+    seen, light = direction[0], rotation[0].T @ direction[0]
     degrees = {
         "light_pitch": light_pitch, "light_yaw": light_yaw,
         "lx": light[0], "ly": light[1], "lz": light[2],
@@ -78,15 +77,6 @@ def _parameters(synthetic: SyntheticSet, i: int) -> dict[str, str]:
         "diffuse": f"{diffuse:.6f}",
         **{name: f"{np.rad2deg(value) if name in angles else value:.6f}" for name, value in degrees.items()},
     }
-
-
-def turn(pitch: float, yaw: float, roll: float) -> ndarray:
-    """Rz(roll) Ry(yaw) Rx(pitch), radians, in double precision (derender.scene.rotation_matrix is the tensor form)."""
-    (cx, cy, cz), (sx, sy, sz) = np.cos([pitch, yaw, roll]), np.sin([pitch, yaw, roll])
-    about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
-    about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
-    about_z = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
-    return about_z @ about_y @ about_x
 
 
 def _identities(synthetic: SyntheticSet) -> list[dict[str, str]]:

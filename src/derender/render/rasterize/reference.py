@@ -24,11 +24,9 @@ PAIRS_AT_ONCE = 1 << 20
 
 def rasterize(vertices: Tensor, focal_px: float) -> tuple[Tensor, Tensor, Tensor]:
     """uv (N, H, W, 2), depth (N, H, W) and the visible triangle (N, H, W), -1 where there is none."""
-    with torch.no_grad():
-        triangle = torch.stack(
-            [visible_triangle(mesh, focal_px) for mesh in vertices.detach().double()]
-            or [vertices.new_empty(vertices.shape[1:3], dtype=torch.long)]
-        )[: len(vertices)]
+    triangle = torch.full(vertices.shape[:3], -1, device=vertices.device)
+    for n, mesh in enumerate(vertices.detach().double()):
+        triangle[n] = visible_triangle(mesh, focal_px)
     uv, depth = intersect(vertices, triangle, focal_px)
     return uv, depth, triangle
 
@@ -111,7 +109,7 @@ def intersect(vertices: Tensor, triangle: Tensor, focal_px: float) -> tuple[Tens
     count, height, width, _ = vertices.shape
     image, v, u = (triangle >= 0).nonzero(as_tuple=True)
     corners = triangle_corners(height, width, vertices.device)[triangle[image, v, u]]
-    points = vertices.reshape(count, -1, 3)[image[:, None], corners].double()
+    points = vertices.flatten(1, 2)[image[:, None], corners].double()
     ray_x, ray_y = (u.double() - (width - 1) / 2) / focal_px, (v.double() - (height - 1) / 2) / focal_px
     qx = points[..., 0] - ray_x[:, None] * points[..., 2]
     qy = points[..., 1] - ray_y[:, None] * points[..., 2]

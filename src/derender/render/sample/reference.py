@@ -11,7 +11,7 @@ def sample(image: Tensor, uv: Tensor, mask: Tensor) -> Tensor:
     left = uv[..., 0].detach().floor().clamp(0, width - 2)
     top = uv[..., 1].detach().floor().clamp(0, height - 2)
     across, down = (uv[..., 0] - left)[:, None], (uv[..., 1] - top)[:, None]
-    corner = (top * width + left).long().view(count, 1, -1).expand(-1, channels, -1)
+    corner = (top * width + left).long().flatten(1)[:, None].expand(-1, channels, -1)
 
     def look_up(step: int) -> Tensor:
         return image.flatten(2).gather(2, corner + step).view(count, channels, *mask.shape[1:])

@@ -1,0 +1,171 @@
+"""Images show what the values say: sizes, labels, one scale for a set, directions of normals, transparency."""
+
+from io import BytesIO
+from math import radians
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image, ImageDraw
+
+from derender.render import render_scene
+from derender.report import colours, films, panel
+from derender.report.figures import COLUMN_MEANING, decomposition, from_another_view, under_another_light
+from derender.report.panel import GridLayout, before_after, contact_sheet, labelled_grid
+from derender.scene import Scene
+
+FOV_DEG = 10.0
+
+
+def bump(count: int = 3, size: int = 16) -> Scene:
+    """A hill in the middle of a plane, lit from different sides."""
+    axis = torch.linspace(-1, 1, size)
+    hill = 1.05 - 0.1 * torch.exp(-4 * (axis[:, None] ** 2 + axis[None] ** 2))
+    light = torch.tensor([0.4, 0.5, 0.0, 0.0]).repeat(count, 1)
+    light[:, 3] = torch.linspace(-0.5, 0.5, count)
+    camera = torch.zeros(count, 6)
+    camera[:, 1] = torch.linspace(-0.3, 0.3, count)
+    return Scene(hill.repeat(count, 1, 1), torch.full((count, 3, size, size), 0.6), light, camera)
+
+
+def render(scene: Scene):
+    return render_scene(scene, FOV_DEG)
+
+
+@pytest.fixture
+def drawn_text(monkeypatch) -> list[str]:
+    """Every text that is drawn into an image."""
+    seen: list[str] = []
+    original = ImageDraw.ImageDraw.text
+
+    def text(self, xy, text, *rest, **named):
+        seen.append(text)
+        return original(self, xy, text, *rest, **named)
+
+    monkeypatch.setattr(ImageDraw.ImageDraw, "text", text)
+    return seen
+
+
+def test_decomposition_has_every_column_for_every_picture():
+    scene = bump()
+    drawn = decomposition(render(scene).image.clamp(0, 1), scene, render, FOV_DEG)
+    assert list(drawn.columns) == list(COLUMN_MEANING)
+    assert all([image.size for image in images] == [(16, 16)] * 3 for images in drawn.columns.values())
+    near, far = drawn.depth_range
+    assert near == pytest.approx(0.95, abs=0.01) and far == pytest.approx(1.05, abs=0.01)
+
+
+def test_panel_has_the_expected_size_and_labels(drawn_text):
+    scene = bump()
+    drawn = decomposition(render(scene).image.clamp(0, 1), scene, render, FOV_DEG)
+    layout = GridLayout(cell=90, gap=10, margin=20, label=12)
+    one = drawn.panel(1, layout)
+    assert drawn_text == list(COLUMN_MEANING)
+    assert one.size == (20 + 8 * 90 + 7 * 10 + 20, 20 + 12 + 10 + 90 + 20)
+    sheet = drawn.sheet(["a.jpg", "b.jpg", "c.jpg"], layout)
+    assert sheet.height == one.height + 2 * (90 + 10) and sheet.width > one.width
+    assert {"a.jpg", "b.jpg", "c.jpg"} <= set(drawn_text)
+
+
+def test_panel_cells_show_their_images():
+    shades = {"red": (200, 0, 0), "blue": (0, 0, 200)}
+    images = {name: [Image.new("RGB", (4, 4), colour)] for name, colour in shades.items()}
+    layout = GridLayout(cell=40, gap=10, margin=20, label=10)
+    sheet = labelled_grid(images, layout=layout)
+    y = 20 + 10 + 10 + 20
+    assert sheet.getpixel((20 + 20, y)) == (200, 0, 0)
+    assert sheet.getpixel((20 + 40 + 10 + 20, y)) == (0, 0, 200)
+
+
+def test_contact_sheet_and_pairs():
+    images = [Image.new("RGB", (8, 8), (index * 20, 0, 0)) for index in range(5)]
+    layout = GridLayout(cell=20, gap=5, margin=10, label=10)
+    assert contact_sheet(images, across=3, layout=layout).size == (10 + 3 * 25 - 5 + 10, 10 + 2 * 25 - 5 + 10)
+    assert contact_sheet(images, ["x"] * 5, across=3, layout=layout).height == 10 + 2 * (25 + 15) - 5 + 10
+    assert before_after(images[:2], images[2:4]).size[1] > 2 * 160
+    with pytest.raises(ValueError, match="at least one image"):
+        contact_sheet([])
+    with pytest.raises(ValueError, match="expected 5 captions"):
+        contact_sheet(images, ["x"])
+    with pytest.raises(ValueError, match="expected 1 row labels"):
+        labelled_grid({"a": images[:1]}, ["x", "y"])
+    with pytest.raises(ValueError, match="same number of images"):
+        labelled_grid({"a": images[:1], "b": images})
+
+
+def test_long_names_are_shortened_in_the_middle_and_kept_on_one_line():
+    font = panel.ImageFont.load_default(12)
+    short = panel.shortened("holiday\npictures/of_a_very_long_name_000123.jpg", font, 100)
+    assert "…" in short and short.startswith("hol") and short.endswith(".jpg") and "\n" not in short
+    assert font.getlength(short) <= 100
+
+
+def test_near_is_brighter_and_the_scale_is_one_for_the_set():
+    depth = np.stack([np.full((4, 4), z, np.float32) for z in (0.9, 1.0, 1.1)])
+    levels = [np.asarray(image.convert("L"))[0, 0] for image in colours.depth_maps(depth)]
+    assert levels[0] > levels[1] > levels[2]
+    mask = np.ones_like(depth)
+    mask[2] = 0
+    near, far = colours.depth_range(depth, mask)
+    assert (near, far) == pytest.approx((0.9, 1.0))
+    assert colours.depth_range(depth, np.zeros_like(depth)) == (0.0, 1.0)
+
+
+def test_normals_are_red_to_the_right_and_green_upwards():
+    toward, right, up = (
+        [0, 0, 1],
+        [-0.6, 0, 0.8],
+        [0, 0.6, 0.8],
+    )  # inward normals, y down, of surfaces facing so
+    image = colours.normal_maps(np.array([[toward, right, up]], np.float32)[:, None])[0]
+    flat, to_right, upwards = (image.getpixel((x, 0)) for x in range(3))
+    assert flat == (128, 128, 255)
+    assert to_right[0] > 200 and to_right[1] == 128
+    assert upwards[1] > 200 and upwards[0] == 128
+
+
+def test_uncovered_pixels_are_transparent_and_white_on_paper():
+    mask = np.zeros((1, 2, 2))
+    mask[0, 0] = 1
+    image = colours.pictures(np.zeros((1, 3, 2, 2), np.uint8), mask)[0]
+    assert image.mode == "RGBA" and image.getpixel((0, 1))[3] == 0
+    paper = colours.on_background(image)
+    assert paper.getpixel((0, 0)) == (0, 0, 0) and paper.getpixel((0, 1)) == (255, 255, 255)
+
+
+def test_pictures_need_channels_first():
+    with pytest.raises(ValueError, match=r"shape \(N, 3, H, W\)"):
+        colours.pictures(np.zeros((2, 4, 4, 3)))
+
+
+def test_shading_is_white_where_fully_lit():
+    shading = np.stack([np.full((1, 2, 2), level) for level in (0.5, 1.0)])
+    dim, full = (image.getpixel((0, 0))[0] for image in colours.shading_maps(shading))
+    assert (dim, full) == (128, 255)
+
+
+def test_another_light_comes_from_the_other_side_and_another_view_turns_back():
+    scene = bump()
+    light, camera = under_another_light(scene).light, from_another_view(scene).camera
+    assert (light[:, 3].sign() == torch.tensor([1.0, 1.0, -1.0])).all()
+    assert (camera[:, 1] - scene.camera[:, 1]).abs() == pytest.approx([radians(35)] * 3)
+    assert camera[0, 1] > scene.camera[0, 1] and camera[2, 1] < scene.camera[2, 1]
+    assert torch.equal(scene.light, bump().light)
+
+
+def test_films_are_loops_that_move():
+    scene = bump()
+    for film in (films.relighting, films.rotation):
+        frames = film(scene[1], render, frames=8)
+        content = films.animated_png(frames)
+        with Image.open(BytesIO(content)) as image:
+            assert image.n_frames == 8 and image.info["loop"] == 0 and image.size == (16, 16)
+        assert len({frame.tobytes() for frame in frames}) > 4
+        first, last = (
+            np.asarray(colours.on_background(frame)).astype(int) for frame in (frames[0], frames[-1])
+        )
+        assert np.abs(first - last).mean() < 40
+    with pytest.raises(ValueError, match="one scene"):
+        films.relighting(scene, render)
+    with pytest.raises(ValueError, match="two frames"):
+        films.animated_png(frames[:1])

@@ -1,0 +1,156 @@
+"""A page is one file that needs nothing else, shows every text as text, and is written whole."""
+
+import hashlib
+import re
+from base64 import b64encode
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from derender.report import blocks, charts, films
+from derender.report.page import Page, Section, write_whole
+from derender.report.score_table import Column, Row, ScoreTable
+
+HOSTILE = "<script>alert('x')</script>\"&"
+
+
+def picture(level: int = 90) -> Image.Image:
+    return Image.fromarray(np.full((6, 4, 3), level, np.uint8))
+
+
+def full_page(text: str = "plain") -> str:
+    """One of every block, with ``text`` wherever a text goes."""
+    table = ScoreTable(
+        text,
+        text,
+        [Column(text, "high", note=text)],
+        [Row(text, [0.5], note=text), Row("control", [text], control=True)],
+    )
+    parts = [
+        blocks.prose(text, blocks.strong(text), blocks.code(text)),
+        blocks.listing(text),
+        blocks.key_figures({text: (text, text)}),
+        blocks.facts({text: text}),
+        blocks.definitions({text: text}),
+        blocks.folded(text, blocks.prose(text)),
+        blocks.figure(blocks.image(picture(), text), text),
+        blocks.row_of([(blocks.film(films.animated_png([picture(1), picture(2)]), picture(), text), text)]),
+        blocks.image_grid({text: [picture()]}, [text], text, {text: text}),
+        blocks.table(table),
+        blocks.chart(charts.curves({text: ([0, 1], [2, 3])}, text, text, {text: 2.5}), text, text),
+        blocks.chart(charts.bars({text: 1.0, "b": 2.0}, text, [text], (text, 0.5)), text, text),
+    ]
+    return Page(text, text, [Section(text, parts, text)], text).html()
+
+
+class Elements(HTMLParser):
+    """Every element with its attributes."""
+
+    def __init__(self, html: str):
+        super().__init__()
+        self.found: list[tuple[str, dict[str, str | None]]] = []
+        self.feed(html)
+
+    def handle_starttag(self, tag, attrs):
+        self.found.append((tag, dict(attrs)))
+
+
+def test_every_text_is_escaped_in_every_block():
+    html = full_page(HOSTILE)
+    assert HOSTILE not in html
+    assert [tag for tag, _ in Elements(html).found].count("script") == 1  # the page's own
+    assert html.count("&lt;script&gt;") >= 25
+
+
+def test_page_refers_to_nothing_outside_itself():
+    html = full_page()
+    for tag, attributes in Elements(html).found:
+        assert tag not in ("link", "iframe", "object", "embed", "base")
+        for name in ("src", "href", "srcset", "xlink:href", "action", "data"):
+            value = attributes.get(name)
+            assert value is None or value.startswith(("data:image/", "#")), (tag, name, value[:80])
+    style = html[html.index("<style>") : html.index("</style>")]
+    assert "@import" not in style and "url(" not in style
+    assert not re.search(r"url\((?!#)", html)
+
+
+def test_policy_allows_the_page_s_own_script_and_no_other():
+    html = full_page()
+    script = re.search(r"<script>(.*?)</script>", html, re.DOTALL)
+    assert script is not None
+    digest = b64encode(hashlib.sha256(script[1].encode()).digest()).decode()
+    assert f"script-src 'sha256-{digest}'" in html
+    assert "default-src 'none'" in html
+
+
+def test_every_image_has_an_alternative_text_and_every_link_a_target():
+    elements = Elements(full_page()).found
+    assert all(attributes.get("alt") for tag, attributes in elements if tag == "img")
+    ids = {attributes["id"] for _, attributes in elements if "id" in attributes}
+    links = [attributes["href"] or "" for tag, attributes in elements if tag == "a"]
+    assert links and all(link[1:] in ids for link in links)
+
+
+def test_ids_of_several_charts_do_not_meet():
+    svgs = [charts.curves({"a": ([0, 1], [0, y])}, "x", "y") for y in (1.0, 2.0)]
+    ids = [re.findall(r' id="([^"]+)"', svg) for svg in svgs]
+    assert ids[0] and not set(ids[0]) & set(ids[1])
+    for svg, own in zip(svgs, ids, strict=True):
+        assert set(re.findall(r'(?:url\(#|href="#)([^)"]+)', svg)) == set(own)
+
+
+def test_charts_take_the_colour_of_the_page_and_are_the_same_every_time():
+    first, again = (charts.bars({"a": 1.0, "b": 0.5}, "score") for _ in range(2))
+    assert first == again
+    assert "currentColor" in first and "#010203" not in first
+    assert ">score</text>" in first  # text stays text
+
+
+def test_light_dark_print_and_phone_are_provided_for():
+    html = full_page()
+    for needed in ("prefers-color-scheme: dark", "@media print", "max-width: 560px", "width=device-width"):
+        assert needed in html
+
+
+def test_table_marks_the_best_and_gives_numbers_to_sort_by():
+    columns = [Column("up", "high"), Column("down", "low", 1), Column("size")]
+    rows = [
+        Row("ours", [0.4, 3.0, 1200]),
+        Row("pixels", [0.5, 2.0, 7], True),
+        Row("none", [None, float("nan"), "-"], True),
+    ]
+    html = blocks.table(ScoreTable("scores", "features", columns, rows)).text
+    best = re.findall(r'<td data-value="([^"]+)" class="best"', html)
+    assert best == ["0.5", "2"]
+    assert html.count('class="none"') == 2
+    assert ">1,200<" in html and '<tr class="control">' in html
+
+
+def test_grid_and_image_reject_what_does_not_fit():
+    with pytest.raises(ValueError, match="same number of images"):
+        blocks.image_grid({"a": [picture()], "b": []}, ["x"], "")
+    with pytest.raises(ValueError, match="expected 1 row names"):
+        blocks.image_grid({"a": [picture()]}, [], "")
+    with pytest.raises(ValueError, match="PNG, GIF or JPEG"):
+        blocks.image(b"<svg onload=alert(1)>", "x")
+    with pytest.raises(ValueError, match="at least one series"):
+        charts.curves({}, "x", "y")
+
+
+def test_write_is_whole_and_leaves_the_old_file_on_failure(tmp_path: Path, monkeypatch):
+    page = Page("title", "lead", [Section("one", [blocks.prose("text")])])
+    file = page.write(tmp_path / "new" / "folder" / "page.html")
+    assert file.read_text() == page.html()
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "replace", full)
+    with pytest.raises(OSError, match="No space left"):
+        write_whole(file, b"half")
+    monkeypatch.undo()
+    assert file.read_text() == page.html()
+    assert [entry.name for entry in file.parent.iterdir()] == ["page.html"]

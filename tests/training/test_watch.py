@@ -1,0 +1,150 @@
+"""The watcher: each sign on a scene made to show it, and a real collapse caught while its loss still falls."""
+
+import math
+
+import pytest
+import torch
+from derender.data import PictureSet
+from derender.data.synthetic import faces
+from derender.scene import Scene
+from derender.scene.ranges import SceneRanges
+from derender.training import resolve, train
+from derender.training.run_folder import read_metrics
+from derender.training.watch import SIGNS, Watcher, measure
+
+RANGES = SceneRanges()
+STEP = 500
+
+
+def healthy_scene(count: int = 4, size: int = 64) -> Scene:
+    """Round heads of different depth, turned and lit differently."""
+    axis = torch.linspace(-1, 1, size)
+    radius = (axis[:, None].square() + axis[None].square()).sqrt().clamp(max=1)
+    height = torch.linspace(0.05, 0.09, count)
+    depth = 1.04 - height[:, None, None] * (1 - radius.square())
+    light = torch.tensor([0.4, 0.5, 0.1, 0.0]).repeat(count, 1)
+    light[:, 3] = torch.linspace(-0.5, 0.5, count)
+    camera = torch.zeros(count, 6)
+    camera[:, 1] = torch.linspace(-0.4, 0.4, count)
+    return Scene(depth, torch.full((count, 3, size, size), 0.6), light, camera)
+
+
+def stripes(size: int = 64) -> torch.Tensor:
+    return torch.where(torch.arange(size) % 2 == 0, 1.0, -1.0)
+
+
+def with_depth(change) -> Scene:
+    scene = healthy_scene()
+    return scene.with_parameters(depth=change(scene.depth))
+
+
+def with_column(parameter: str, column: int, value: float) -> Scene:
+    scene = healthy_scene()
+    changed = scene.parameters[parameter].clone()
+    changed[:, column] = value
+    return scene.with_parameters(**{parameter: changed})
+
+
+FAILED_SCENES = {
+    "saturated depth": with_depth(lambda depth: torch.where(depth > 1.0, 1.1, 0.9)),
+    "torn depth": with_depth(lambda depth: depth + 0.03 * stripes()[None, None]),
+    "flat depth": with_depth(lambda depth: 1.0 + 0.01 * (depth - 1)),
+    "hollow depth": with_depth(lambda depth: 2.0 - depth),
+    "view at its bound": with_column("camera", 1, math.radians(59.5)),
+    "light at its bound": with_column("light", 3, math.radians(-44.5)),
+    "albedo copies the picture": with_column("light", 1, 0.0),
+}
+
+
+def watch(scene: Scene, images: int, watcher: Watcher | None = None) -> list[str]:
+    watcher = watcher or Watcher(RANGES)
+    findings = ()
+    for seen in range(STEP, images + 1, STEP):
+        findings = watcher.look(seen, 0.1, scene)
+    return [finding.sign for finding in findings]
+
+
+def test_a_healthy_scene_raises_nothing():
+    assert watch(healthy_scene(), 40_000) == []
+
+
+def test_there_is_a_failed_scene_for_every_sign():
+    assert set(FAILED_SCENES) == {sign.name for sign in SIGNS}
+
+
+@pytest.mark.parametrize("sign", FAILED_SCENES)
+def test_each_failure_is_found_within_20000_images_but_not_at_once(sign):
+    assert sign in watch(FAILED_SCENES[sign], 20_000)
+    assert watch(FAILED_SCENES[sign], 6_000) == []
+
+
+@pytest.mark.parametrize("sign", FAILED_SCENES)
+def test_findings_say_what_is_seen_and_what_to_change(sign):
+    watcher = Watcher(RANGES)
+    for seen in range(STEP, 20_001, STEP):
+        findings = watcher.look(seen, 0.1, FAILED_SCENES[sign])
+    found = next(finding for finding in findings if finding.sign == sign)
+    assert "{" not in found.text
+    assert any(character.isdigit() for character in found.text)
+    assert len(found.advice) > 20
+
+
+def test_a_failure_that_passes_is_forgiven():
+    watcher = Watcher(RANGES)
+    failed = FAILED_SCENES["view at its bound"]
+    for seen in range(STEP, 6_001, STEP):
+        watcher.look(seen, 0.1, failed)
+    assert watcher.uneasy
+    for seen in range(6_500, 20_001, STEP):
+        findings = watcher.look(seen, 0.1, healthy_scene())
+    assert findings == ()
+    assert not watcher.uneasy
+
+
+@pytest.mark.parametrize("loss", [math.nan, math.inf])
+def test_a_loss_that_is_no_number_is_fatal_at_once(loss):
+    (finding,) = Watcher(RANGES).look(16, loss, healthy_scene())
+    assert finding.fatal
+    assert finding.sign == "non-finite loss"
+
+
+def test_a_watcher_goes_on_from_its_memory():
+    failed = FAILED_SCENES["view at its bound"]
+    first = Watcher(RANGES)
+    assert watch(failed, 7_000, first) == []
+    second = Watcher.remembering(RANGES, first.memory())
+    (finding,) = second.look(9_000, 0.1, failed)
+    assert finding.sign == "view at its bound"
+
+
+def test_measurements_of_known_scenes():
+    flat = with_depth(lambda depth: torch.ones_like(depth))
+    measured = measure(flat, RANGES)
+    assert measured["depth_spread"] == pytest.approx(0, abs=1e-6)
+    assert measured["bulge"] == pytest.approx(0, abs=1e-5)
+    assert measure(FAILED_SCENES["saturated depth"], RANGES)["depth_at_bound"] == 1
+    assert measure(FAILED_SCENES["view at its bound"], RANGES)["view_at_bound"] == 1
+    assert measure(healthy_scene(), RANGES)["view_at_bound"] == 0
+    assert measure(FAILED_SCENES["hollow depth"], RANGES)["bulge"] == pytest.approx(
+        -measure(healthy_scene(), RANGES)["bulge"], rel=1e-4
+    )
+
+
+COLLAPSING = ["image_size=32", "width=8", "light_width=4", "batch_size=32", "perceptual=none", "curvature_weight=0"]
+COLLAPSING += ["learning_rate=1e-3", "weight_decay=0", "warmup_images=0", "final_rate=1", "images=20000"]
+COLLAPSING += ["checkpoint_every=4000", "validate_every=4000"]
+
+
+def test_a_real_collapse_is_caught_within_20000_images_while_its_loss_still_falls(tmp_path):
+    images = faces.generate(600, image_size=32, seed=0).images
+    pictures = PictureSet(images=images, files=tuple(f"{i:04d}.png" for i in range(len(images))))
+    result = train(resolve("small", COLLAPSING), pictures, tmp_path / "run")
+    assert result.stopped == "collapse"
+    assert result.images < 20_000
+    assert [finding.sign for finding in result.findings if finding.fatal] == ["torn depth"]
+    rows = read_metrics(tmp_path / "run")
+    errors = [row["l1"] for row in rows if row["kind"] == "train"]
+    assert sum(errors[-4:]) < sum(errors[:4])
+    assert "torn depth" in rows[-1]
+    last_good = max(row["images"] for row in rows if row["kind"] == "validation")
+    assert last_good < result.images - 3_000
