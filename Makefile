@@ -26,6 +26,7 @@ format: $(STAMP)  ## ruff: formatting and the fixes it is sure of
 	@$(BIN)/ruff format . && $(BIN)/ruff check --fix .
 
 bench: $(STAMP)  ## the speed tables of docs/results.md
+	@$(BIN)/python benchmarks/rasterize.py
 	@$(BIN)/python benchmarks/training_step.py $(ARGS)
 
 constraints: $(STAMP)  ## write the versions installed in .venv to constraints.txt

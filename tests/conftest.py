@@ -11,7 +11,9 @@ ROOT = Path(__file__).resolve().parents[1]
 
 def shared_folder() -> Path | None:
     """Where the development data lies: $DERENDER_SHARED, or ``shared`` beside the checkout, or None."""
-    candidates = [Path(os.environ["DERENDER_SHARED"])] if "DERENDER_SHARED" in os.environ else [ROOT.parent / "shared"]
+    candidates = (
+        [Path(os.environ["DERENDER_SHARED"])] if "DERENDER_SHARED" in os.environ else [ROOT.parent / "shared"]
+    )
     return next((path for path in candidates if path.is_dir()), None)
 
 
@@ -22,7 +24,9 @@ def shared_data():
     def find(name: str) -> Path:
         folder = shared_folder()
         if folder is None or not (folder / name).exists():
-            pytest.skip(f"development data {name} is not here (set DERENDER_SHARED to the folder that holds it)")
+            pytest.skip(
+                f"development data {name} is not here (set DERENDER_SHARED to the folder that holds it)"
+            )
         return folder / name
 
     return find

@@ -4,9 +4,10 @@ import json
 import math
 from dataclasses import dataclass
 
-import derender
 import pytest
 import torch
+
+import derender
 from derender.model import CONFIG_FILE, WEIGHTS_FILE, Derenderer, load
 from derender.networks import FACTORS, Factor
 from derender.networks.factors import vector_net
@@ -31,9 +32,9 @@ def test_decompose_gives_a_scene_in_range(model, images):
     scene = model.decompose(images)
     assert isinstance(scene, Scene)
     assert scene.depth.shape == (3, 32, 32)
-    assert 0.9 <= scene.depth.min() and scene.depth.max() <= 1.1
-    assert 0 <= scene.albedo.min() and scene.albedo.max() <= 1
-    assert 0 <= scene.light[:, :2].min() and scene.light[:, :2].max() <= 1
+    assert scene.depth.min() >= 0.9 and scene.depth.max() <= 1.1
+    assert scene.albedo.min() >= 0 and scene.albedo.max() <= 1
+    assert scene.light[:, :2].min() >= 0 and scene.light[:, :2].max() <= 1
     assert scene.light[:, 2:].abs().max() <= math.pi / 4
     assert scene.camera[:, :3].abs().max() <= math.pi / 3
     assert (scene.camera[:, 5] == 0).all()
@@ -99,7 +100,7 @@ def test_same_seed_same_weights_and_the_global_generator_is_left_alone():
 
 
 def test_an_unknown_preset_names_the_nearest():
-    with pytest.raises(ValueError, match="'smal'.*did you mean 'small'"):
+    with pytest.raises(ValueError, match=r"'smal'.*did you mean 'small'"):
         Derenderer.from_preset("smal")
 
 
@@ -186,7 +187,7 @@ HIGHLIGHT = Factor(
     build=vector_net(1),
     to_parameter=lambda raw, ranges: raw.float() / 2 + 0.5,
     mirrored=False,
-    perturb=lambda value, generator, settings: torch.rand(value.shape, generator=generator),
+    perturb=lambda value, generator, settings, ranges: torch.rand(value.shape, generator=generator),
 )
 
 

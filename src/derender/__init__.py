@@ -21,11 +21,22 @@ _HOME = {
     "FeatureTable": "derender.features",
     "DisentangledFeatures": "derender.features",
 }
-_SUBMODULES = (
-    "scene render data networks objectives model training features baselines evaluation interpretation report"
-).split()
+_SUBMODULES = [
+    "scene",
+    "render",
+    "data",
+    "networks",
+    "objectives",
+    "model",
+    "training",
+    "features",
+    "baselines",
+    "evaluation",
+    "interpretation",
+    "report",
+]
 
-__all__ = ["DisentangledFeatures", "Derenderer", "FeatureTable", "Scene", "__version__", "load"]
+__all__ = ["Derenderer", "DisentangledFeatures", "FeatureTable", "Scene", "__version__", "load"]
 
 
 def __getattr__(name: str) -> Any:

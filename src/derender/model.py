@@ -49,7 +49,9 @@ class Derenderer(nn.Module):
         self.settings = settings or ModelSettings()
         self.factors = tuple(factors)
         self.renderer = renderer
-        self.nets = nn.ModuleDict({factor.name: factor.build(self.settings.network) for factor in self.factors})
+        self.nets = nn.ModuleDict(
+            {factor.name: factor.build(self.settings.network) for factor in self.factors}
+        )
         self.nets["confidence"] = ConfidenceNet(self.settings.network)
 
     @classmethod
@@ -154,7 +156,9 @@ class Derenderer(nn.Module):
                 f"read them with derender.data.read_pictures(..., image_size={size}) or resize them"
             )
         if not images.is_floating_point():
-            raise ValueError(f"pictures must be floating point in 0..1, got {images.dtype}: divide uint8 by 255")
+            raise ValueError(
+                f"pictures must be floating point in 0..1, got {images.dtype}: divide uint8 by 255"
+            )
 
 
 def load(
@@ -181,14 +185,17 @@ def load(
     names = [factor.name for factor in factors]
     if config["factors"] != names:
         raise ValueError(
-            f"{folder} holds factors {', '.join(config['factors'])}, asked for {', '.join(names)}: pass its rows as factors="
+            f"{folder} holds factors {', '.join(config['factors'])}, asked for {', '.join(names)}: "
+            "pass its rows as factors="
         )
     try:
         settings = ModelSettings.model_validate(config["settings"])
         model = Derenderer(settings, factors, renderer)
         model.load_state_dict(load_file(folder / WEIGHTS_FILE))
     except (SafetensorError, ValidationError, RuntimeError) as error:
-        raise ValueError(f"{folder} is damaged ({str(error).splitlines()[0]}): copy or train the model again") from error
+        raise ValueError(
+            f"{folder} is damaged ({str(error).splitlines()[0]}): copy or train the model again"
+        ) from error
     return model.to(device).eval().requires_grad_(False)
 
 
@@ -199,12 +206,14 @@ def _model_folder(source: str | Path) -> Path:
             return candidate
     if folder.exists():
         raise FileNotFoundError(
-            f"{folder} holds no model (expected {CONFIG_FILE} and {WEIGHTS_FILE} in it or in its folder 'model'): "
+            f"{folder} holds no model (expected {CONFIG_FILE} and {WEIGHTS_FILE} here or in 'model'): "
             "give a run folder made by 'derender train' or a folder made by model.save"
         )
     if isinstance(source, str) and source.count("/") == 1 and not source.startswith((".", "/", "~")):
         return _from_hub(source)
-    raise FileNotFoundError(f"no model at {source}: give a run folder, a saved folder or a Hub id 'owner/name'")
+    raise FileNotFoundError(
+        f"no model at {source}: give a run folder, a saved folder or a Hub id 'owner/name'"
+    )
 
 
 def _from_hub(repository: str) -> Path:
@@ -227,7 +236,9 @@ def _read_config(folder: Path) -> dict[str, Any]:
     except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError) as error:
         raise ValueError(f"{folder / CONFIG_FILE} is damaged: copy or train the model again") from error
     if not isinstance(version, int) or version > FORMAT:
-        raise ValueError(f"{folder} was saved in format {version}, this version reads up to {FORMAT}: update derender")
+        raise ValueError(
+            f"{folder} was saved in format {version}, this version reads up to {FORMAT}: update derender"
+        )
     if not complete:
         raise ValueError(f"{folder / CONFIG_FILE} is damaged: copy or train the model again")
     return config

@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+
 from derender.networks.factors import albedo_from_raw, camera_from_raw, depth_from_raw, light_from_raw
 from derender.scene.ranges import SceneRanges
 

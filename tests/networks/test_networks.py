@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+
 from derender.model import Derenderer
 from derender.networks import FACTORS, NetworkSettings
 from derender.networks.confidence import ConfidenceNet
@@ -72,7 +73,13 @@ def test_every_picture_size_gives_maps_and_codes_of_the_right_shape(size, encode
 def test_unet_encoder_follows_the_papers_widths_and_offers_skips():
     encoder = UNetEncoder(NetworkSettings(encoder="unet"), 256).eval()
     skips = encoder.skips(torch.rand(1, 3, 64, 64))
-    assert [(skip.shape[1], skip.shape[-1]) for skip in skips] == [(16, 64), (32, 32), (64, 16), (128, 8), (256, 4)]
+    assert [(skip.shape[1], skip.shape[-1]) for skip in skips] == [
+        (16, 64),
+        (32, 32),
+        (64, 16),
+        (128, 8),
+        (256, 4),
+    ]
 
 
 def test_confidence_is_positive():

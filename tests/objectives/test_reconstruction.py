@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from derender.objectives.reconstruction import (
     SIGMA_FLOOR,
     bounded_sigma,
+    depth_curvature,
     depth_smoothness,
     masked_l1,
     photometric_loss,
@@ -164,6 +165,22 @@ def test_smoothness_leaves_the_clamped_border_out(generator):
     clamped = torch.nn.functional.pad(inside, (2, 2), value=1.04)
     torch.testing.assert_close(depth_smoothness(clamped, border=2), depth_smoothness(inside))
     assert depth_smoothness(clamped) != depth_smoothness(inside)
+
+
+def test_curvature_of_known_surfaces(generator):
+    rows, columns = torch.meshgrid(torch.arange(6.0), torch.arange(9.0), indexing="ij")
+    plane = (0.02 * rows - 0.03 * columns + 1)[None]
+    assert depth_curvature(plane).item() == pytest.approx(0, abs=1e-5)
+    bowl = (0.01 * rows**2 + 0.02 * columns**2)[None]
+    assert depth_curvature(bowl, depth_range=0.2).item() == pytest.approx((0.02 + 0.04) / 0.2, rel=1e-4)
+    clamped = torch.nn.functional.pad(bowl, (2, 2), value=1.04)
+    torch.testing.assert_close(depth_curvature(clamped, border=2), depth_curvature(bowl))
+    depth = torch.rand(1, 4, 4, generator=generator, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(depth_curvature, (depth,))
+    with pytest.raises(ValueError, match="3 rows and 3 columns"):
+        depth_curvature(torch.ones(1, 5, 6), border=2)
+    with pytest.raises(ValueError, match="depth_range must be above 0"):
+        depth_curvature(torch.ones(1, 5, 5), depth_range=-1.0)
 
 
 def test_smoothness_refuses_what_has_no_steps():

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+
 from derender.training.batches import Batches, random_stream
 from derender.training.config import OptimiserSettings
 from derender.training.schedule import learning_rate
@@ -21,7 +22,7 @@ def numbers(batch: torch.Tensor) -> list[int]:
 
 def test_an_epoch_shows_every_picture_once_in_a_new_order_each_time():
     batches = Batches(numbered(12), 4, seed=3, horizontal_flips=False)
-    epochs = [sum((numbers(batches.at(3 * epoch + i)) for i in range(3)), []) for epoch in range(2)]
+    epochs = [[n for i in range(3) for n in numbers(batches.at(3 * epoch + i))] for epoch in range(2)]
     assert sorted(epochs[0]) == sorted(epochs[1]) == list(range(12))
     assert epochs[0] != epochs[1]
 
@@ -42,7 +43,9 @@ def test_about_half_of_the_pictures_are_mirrored():
 
 
 def test_a_batch_larger_than_the_set_is_refused():
-    with pytest.raises(ValueError, match="batch_size 64 is more than the 12 training pictures: set batch_size=6"):
+    with pytest.raises(
+        ValueError, match="batch_size 64 is more than the 12 training pictures: set batch_size=6"
+    ):
         Batches(numbered(12), 64, 0, True)
 
 

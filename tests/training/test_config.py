@@ -2,6 +2,7 @@
 
 import pytest
 import yaml
+
 from derender.training.config import PRESETS, TrainConfig, config_from_tree, resolve, setting_names, to_yaml
 
 
@@ -12,7 +13,9 @@ def test_every_preset_survives_yaml():
 
 
 def test_overrides_by_full_and_by_short_name():
-    config = resolve("small", ["optimiser.learning_rate=3e-4", "batch_size=16", "betas=[0.5, 0.99]", "confidence=false"])
+    config = resolve(
+        "small", ["optimiser.learning_rate=3e-4", "batch_size=16", "betas=[0.5, 0.99]", "confidence=false"]
+    )
     assert config.optimiser.learning_rate == 3e-4
     assert config.batch_size == 16
     assert config.optimiser.betas == (0.5, 0.99)
@@ -28,7 +31,10 @@ def test_explicit_values_win_and_none_means_not_given():
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["lerning_rate=1"], "unknown setting 'lerning_rate'.*did you mean 'learning_rate'|optimiser.learning_rate"),
+        (
+            ["lerning_rate=1"],
+            "unknown setting 'lerning_rate'.*did you mean 'learning_rate'|optimiser.learning_rate",
+        ),
         (["learning_rate"], "write key=value"),
         (["learning_rate=fast"], "'optimiser.learning_rate'.*'fast'"),
         (["learning_rate=-1"], "'optimiser.learning_rate'.*greater than 0"),
@@ -52,7 +58,7 @@ def test_an_unknown_preset_names_the_nearest():
 
 def test_an_unknown_key_in_a_file_is_refused():
     tree = yaml.safe_load(to_yaml(PRESETS["small"]))
-    with pytest.raises(ValueError, match="unknown setting 'objective.flip_wieght'"):
+    with pytest.raises(ValueError, match=r"unknown setting 'objective.flip_wieght'"):
         config_from_tree({**tree, "objective": {**tree["objective"], "flip_wieght": 1}})
 
 

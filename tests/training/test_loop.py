@@ -4,17 +4,18 @@ import json
 import os
 import signal
 
-import derender
 import numpy as np
 import pytest
 import torch
+from PIL import Image
+from safetensors.torch import load_file
+
+import derender
 from derender.data import PictureSet
 from derender.training import TrainingInterrupted, resolve, train
 from derender.training.checkpoint import WEIGHTS_FILE, load_checkpoint
 from derender.training.loop import Progress
 from derender.training.run_folder import read_config, read_metrics
-from PIL import Image
-from safetensors.torch import load_file
 
 TINY = ["image_size=32", "width=8", "light_width=4", "perceptual=none", "batch_size=8", "checkpoint_every=32"]
 TINY += ["validate_every=32", "sample_every=64", "deterministic=true", "learning_rate=1e-3"]
@@ -31,7 +32,9 @@ def pictures() -> PictureSet:
     noise = np.random.default_rng(0)
     smooth = noise.integers(0, 256, (60, 3, 4, 4), dtype=np.uint8)
     images = np.repeat(np.repeat(smooth, 8, axis=2), 8, axis=3)
-    return PictureSet(images=images, files=tuple(f"{i:03d}.png" for i in range(60)), source="made by the test")
+    return PictureSet(
+        images=images, files=tuple(f"{i:03d}.png" for i in range(60)), source="made by the test"
+    )
 
 
 def weights(run) -> dict[str, torch.Tensor]:
@@ -92,7 +95,7 @@ def test_an_interrupted_run_is_saved_and_resumes_exactly(pictures, tmp_path):
             os.kill(os.getpid(), signal.SIGINT)
 
     config = resolve("small", [*TINY, "images=160"])
-    with pytest.raises(TrainingInterrupted, match="stopped after 72 pictures and saved.*--resume"):
+    with pytest.raises(TrainingInterrupted, match=r"stopped after 72 pictures and saved.*--resume"):
         train(config, pictures, tmp_path / "parts", progress=press_ctrl_c)
     train(config, pictures, tmp_path / "parts", resume=True)
     train(config, pictures, tmp_path / "whole")

@@ -1,9 +1,10 @@
-"""The watcher: each sign on a scene made to show it, and a real collapse caught while its loss still falls."""
+"""The watcher: each sign on a scene made to show it, and a real collapse caught while its loss falls."""
 
 import math
 
 import pytest
 import torch
+
 from derender.data import PictureSet
 from derender.data.synthetic import faces
 from derender.scene import Scene
@@ -130,7 +131,14 @@ def test_measurements_of_known_scenes():
     )
 
 
-COLLAPSING = ["image_size=32", "width=8", "light_width=4", "batch_size=32", "perceptual=none", "curvature_weight=0"]
+COLLAPSING = [
+    "image_size=32",
+    "width=8",
+    "light_width=4",
+    "batch_size=32",
+    "perceptual=none",
+    "curvature_weight=0",
+]
 COLLAPSING += ["learning_rate=1e-3", "weight_decay=0", "warmup_images=0", "final_rate=1", "images=20000"]
 COLLAPSING += ["checkpoint_every=4000", "validate_every=4000"]
 

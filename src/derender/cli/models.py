@@ -11,17 +11,21 @@ PARTS = ("all", "train", "validation", "test")
 
 
 def open_model(source: str, device: str) -> "Derenderer":
-    """Load a model onto ``cpu``, ``cuda`` or, for ``auto``, the graphics card if there is one."""
-    import torch
-
+    """Load a model onto a device named as in ``chosen_device``."""
     from derender.model import load
+
+    return load(source, device=chosen_device(device))
+
+
+def chosen_device(device: str) -> str:
+    """``cpu`` or ``cuda``; for ``auto`` the graphics card if there is one."""
+    import torch
 
     if device not in ("auto", "cpu", "cuda"):
         raise ValueError(f"unknown device {device!r}: choose auto, cpu or cuda")
     if device == "cuda" and not torch.cuda.is_available():
         raise ValueError("no CUDA device here: choose --device cpu")
-    chosen = "cuda" if device == "cuda" or (device == "auto" and torch.cuda.is_available()) else "cpu"
-    return load(source, device=chosen)
+    return "cuda" if device != "cpu" and torch.cuda.is_available() else "cpu"
 
 
 def part_of(pictures: "PictureSet", part: str, model: str) -> "PictureSet":

@@ -5,7 +5,10 @@ from typing import Annotated
 
 import typer
 
-Model = Annotated[str, typer.Option("--model", "-m", help="Run folder, saved model or Hugging Face Hub id.", metavar="MODEL")]
+Model = Annotated[
+    str,
+    typer.Option("--model", "-m", help="Run folder, saved model or Hugging Face Hub id.", metavar="MODEL"),
+]
 Data = Annotated[
     str,
     typer.Option(
@@ -20,9 +23,14 @@ Json = Annotated[
     str | None,
     typer.Option("--json", help="Also write the numbers as JSON; - is standard output.", metavar="FILE"),
 ]
-Limit = Annotated[int | None, typer.Option("--limit", min=1, metavar="N", help="At most so many pictures, evenly spaced.")]
+Limit = Annotated[
+    int | None, typer.Option("--limit", min=1, metavar="N", help="At most so many pictures, evenly spaced.")
+]
 BatchSize = Annotated[
-    int, typer.Option("--batch-size", min=1, metavar="N", help="Pictures at a time; changes speed and memory only.")
+    int,
+    typer.Option(
+        "--batch-size", min=1, metavar="N", help="Pictures at a time; changes speed and memory only."
+    ),
 ]
 Part = Annotated[
     str,

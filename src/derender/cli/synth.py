@@ -18,7 +18,9 @@ def register(app: typer.Typer) -> None:
 
 def faces(
     out: options.OutFolder,
-    count: Annotated[int, typer.Option("--count", "-n", min=1, metavar="N", help="How many pictures.")] = 1000,
+    count: Annotated[
+        int, typer.Option("--count", "-n", min=1, metavar="N", help="How many pictures.")
+    ] = 1000,
     image_size: Annotated[
         int, typer.Option("--image-size", min=8, max=1024, metavar="N", help="Width and height in pixels.")
     ] = 64,

@@ -56,11 +56,13 @@ def train(
         write_json(json_file, config.model_dump(mode="json"))
         return
 
+    from derender.cli.models import chosen_device
     from derender.data import read_pictures
     from derender.report.run import decomposition_sheet, run_page
     from derender.training.loop import Progress
     from derender.training.loop import train as train_model
 
+    accelerator = chosen_device(device)
     if out.exists() and any(out.iterdir() if out.is_dir() else [out]) and not resume:
         raise FileExistsError(
             f"{out} exists and is not empty: add --resume to go on with that run, or choose another --out"
@@ -86,7 +88,7 @@ def train(
             resume=resume,
             sample_sheet=decomposition_sheet,
             progress=show,
-            accelerator={"cuda": "cuda", "cpu": "cpu"}.get(device, "auto"),
+            accelerator=accelerator,
         )
     page = run_page(out).write(out / "report.html")
     for finding in trained.findings:

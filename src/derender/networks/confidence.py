@@ -37,7 +37,9 @@ class ConfidenceNet(nn.Module):
         super().__init__()
         width = settings.width
         self.encoder = Encoder(settings, width, settings.confidence_code_size, normalised=True)
-        upsampling: list[nn.Module] = [nn.ConvTranspose2d(settings.confidence_code_size, 8 * width, 4, bias=False)]
+        upsampling: list[nn.Module] = [
+            nn.ConvTranspose2d(settings.confidence_code_size, 8 * width, 4, bias=False)
+        ]
         upsampling.append(nn.ReLU())
         previous = 8 * width
         for stage in range(settings.stages - 2):
@@ -46,7 +48,9 @@ class ConfidenceNet(nn.Module):
             previous = channels
         self.trunk = nn.Sequential(*upsampling)
         self.photometric_head = nn.Sequential(
-            *_upsample(previous, width), *_upsample(width, width), nn.Conv2d(width, 2, 5, padding=2, bias=False)
+            *_upsample(previous, width),
+            *_upsample(width, width),
+            nn.Conv2d(width, 2, 5, padding=2, bias=False),
         )
         self.perceptual_head = nn.Conv2d(previous, 2, 3, padding=1, bias=False)
 

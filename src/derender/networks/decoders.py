@@ -4,6 +4,8 @@ Source: unsup3d's networks as pinned in the paper's appendix. No convolution has
 (the factor's row in factors.py gives them range and meaning).
 """
 
+from itertools import pairwise
+
 from jaxtyping import Float
 from torch import Tensor, nn
 
@@ -23,7 +25,7 @@ class MapDecoder(nn.Module):
             nn.Conv2d(widths[0], widths[0], 3, padding=1, bias=False),
             nn.ReLU(),
         ]
-        for previous, width in zip(widths, widths[1:], strict=False):
+        for previous, width in pairwise(widths):
             layers += [
                 nn.ConvTranspose2d(previous, width, 4, stride=2, padding=1, bias=False),
                 *_normalised(width),
@@ -46,7 +48,7 @@ class MapDecoder(nn.Module):
 
 
 class VectorDecoder(nn.Module):
-    """A code becomes a few numbers in -1..1 (light: 4, camera: 6). The tanh stands last, so they are bounded."""
+    """A code becomes a few numbers in -1..1 (light: 4, camera: 6); the tanh stands last and bounds them."""
 
     def __init__(self, code_size: int, numbers: int):
         super().__init__()

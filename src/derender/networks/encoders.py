@@ -60,7 +60,8 @@ class UNetEncoder(nn.Module):
         super().__init__()
         widths = [settings.unet_width * 2**level for level in range(settings.stages + 1)]
         self.levels = nn.ModuleList(
-            _double_convolution(previous, channels) for previous, channels in zip([3, *widths], widths, strict=False)
+            _double_convolution(previous, channels)
+            for previous, channels in zip([3, *widths], widths, strict=False)
         )
         self.pool = nn.MaxPool2d(2)
         self.to_code = nn.Sequential(nn.Conv2d(widths[-1], code_size, 4, bias=False), nn.ReLU())
@@ -91,4 +92,3 @@ def _double_convolution(channels_in: int, channels_out: int) -> nn.Sequential:
             nn.ReLU(),
         ]
     return nn.Sequential(*layers)
-

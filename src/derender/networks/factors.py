@@ -57,7 +57,7 @@ class Factor:
     build: Callable[[NetworkSettings], FactorNet]
     to_parameter: Callable[[Tensor, SceneRanges], Tensor]
     mirrored: bool
-    perturb: Callable[[Tensor, Generator, PerturbSettings], Tensor] | None
+    perturb: Callable[[Tensor, Generator, PerturbSettings, SceneRanges], Tensor] | None
 
 
 def depth_from_raw(raw: Float[Tensor, "n 1 h w"], ranges: SceneRanges) -> Float[Tensor, "n h w"]:
@@ -78,10 +78,11 @@ def albedo_from_raw(raw: Float[Tensor, "n 3 h w"], ranges: SceneRanges) -> Float
 
 
 def light_from_raw(raw: Float[Tensor, "n 4"], ranges: SceneRanges) -> Float[Tensor, "n 4"]:
-    """Ambient, diffuse, pitch, yaw from numbers in -1..1; the last two are slopes, so angles are their arctangents."""
+    """Ambient, diffuse, pitch, yaw from numbers in -1..1; the last two are slopes: angles are arctangents."""
     raw = raw.float()
     intensity = [
-        low + (high - low) * (raw[:, i] / 2 + 0.5) for i, (low, high) in enumerate((ranges.ambient, ranges.diffuse))
+        low + (high - low) * (raw[:, i] / 2 + 0.5)
+        for i, (low, high) in enumerate((ranges.ambient, ranges.diffuse))
     ]
     pitch, yaw = (raw[:, 2:] * ranges.light_slope).atan().unbind(1)
     return torch.stack([*intensity, pitch, yaw], dim=1)
@@ -124,12 +125,10 @@ def vector_net(numbers: int) -> Callable[[NetworkSettings], FactorNet]:
     return build
 
 
-def _exchange(value: Tensor, generator: Generator, settings: PerturbSettings) -> Tensor:
-    return exchange(value, generator)
-
-
-GEOMETRY = Factor("geometry", "depth", map_net(1, initial_scale=0.1), depth_from_raw, mirrored=True, perturb=_exchange)
-ALBEDO = Factor("albedo", "albedo", map_net(3), albedo_from_raw, mirrored=True, perturb=_exchange)
+GEOMETRY = Factor(
+    "geometry", "depth", map_net(1, initial_scale=0.1), depth_from_raw, mirrored=True, perturb=exchange
+)
+ALBEDO = Factor("albedo", "albedo", map_net(3), albedo_from_raw, mirrored=True, perturb=exchange)
 LIGHT = Factor("light", "light", vector_net(4), light_from_raw, mirrored=False, perturb=perturb_light)
 CAMERA = Factor("camera", "camera", vector_net(6), camera_from_raw, mirrored=False, perturb=perturb_camera)
 

@@ -17,12 +17,12 @@ class NetworkSettings(Settings):
     """
 
     image_size: int = 64
-    width: int = Field(64, ge=4, multiple_of=4)
-    light_width: int = Field(32, ge=1)
-    code_size: int = Field(256, ge=1)
-    confidence_code_size: int = Field(128, ge=1)
+    width: int = Field(default=64, ge=4, multiple_of=4)
+    light_width: int = Field(default=32, ge=1)
+    code_size: int = Field(default=256, ge=1)
+    confidence_code_size: int = Field(default=128, ge=1)
     encoder: Literal["conv", "unet"] = "conv"
-    unet_width: int = Field(16, ge=1)
+    unet_width: int = Field(default=16, ge=1)
 
     @field_validator("image_size")
     @classmethod

@@ -72,10 +72,10 @@ def depth_curvature(
     depth_range: float = 0.2,
     border: int = 0,
 ) -> Float[Tensor, ""]:
-    """Mean |second difference| down the columns plus along the rows, in depth ranges; 0 for every plane, however steep.
+    """Mean |second difference| down the columns plus along the rows, in depth ranges; 0 for every plane.
 
-    Depth noise of a thousandth turns normals by tens of degrees, and stripes can pass for matt skin; this term
-    removes both and leaves slopes alone, which ``depth_smoothness`` flattens. ``border`` as there. Ours.
+    Depth noise of a thousandth turns normals by tens of degrees, and stripes can pass for matt skin; this
+    term removes both and leaves slopes alone, which ``depth_smoothness`` flattens. ``border`` as there. Ours.
     """
     if depth_range <= 0:
         raise ValueError(f"depth_range must be above 0, got {depth_range}; give farthest minus nearest depth")

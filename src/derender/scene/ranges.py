@@ -14,17 +14,21 @@ from derender.settings import Settings
 class SceneRanges(Settings):
     """Bounds of every scene parameter, and the field of view that all pictures share."""
 
-    fov_deg: float = Field(10.0, gt=0, lt=180)
-    depth_min: float = Field(0.9, gt=0)
-    depth_max: float = Field(1.1, gt=0)
-    border_depth: float = Field(0.7 * 1.1 + 0.3 * 0.9, gt=0)  # depth held at the picture's left and right edge
-    border_share: float = Field(2 / 64, ge=0, lt=0.5)  # share of the width, each side, held at border_depth
+    fov_deg: float = Field(default=10.0, gt=0, lt=180)
+    depth_min: float = Field(default=0.9, gt=0)
+    depth_max: float = Field(default=1.1, gt=0)
+    border_depth: float = Field(
+        default=0.7 * 1.1 + 0.3 * 0.9, gt=0
+    )  # depth held at the picture's left and right edge
+    border_share: float = Field(
+        default=2 / 64, ge=0, lt=0.5
+    )  # share of the width, each side, held at border_depth
     ambient: tuple[float, float] = (0.0, 1.0)
     diffuse: tuple[float, float] = (0.0, 1.0)
-    light_deg: float = Field(45.0, gt=0, lt=90)  # light pitch and yaw lie in +- this
-    rotation_deg: float = Field(60.0, gt=0, lt=90)
-    translation_xy: float = Field(0.1, ge=0)
-    translation_z: float = Field(0.0, ge=0)
+    light_deg: float = Field(default=45.0, gt=0, lt=90)  # light pitch and yaw lie in +- this
+    rotation_deg: float = Field(default=60.0, gt=0, lt=90)
+    translation_xy: float = Field(default=0.1, ge=0)
+    translation_z: float = Field(default=0.0, ge=0)
 
     @model_validator(mode="after")
     def _ordered(self) -> "SceneRanges":

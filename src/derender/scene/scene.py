@@ -15,7 +15,7 @@ class Scene:
     """A batch of N scenes, each one object seen by one camera under one light.
 
     Attributes:
-        depth: (N, H, W) distance along z of the canonical surface from the camera, metric (0.9..1.1 for the presets).
+        depth: (N, H, W) z of the canonical surface, metric, seen from the camera (0.9..1.1 in the presets).
         albedo: (N, 3, H, W) reflectance in the canonical view, 0..1.
         light: (N, 4) ambient, diffuse (both 0..1), pitch, yaw (radians; 0, 0 is frontal).
         camera: (N, 6) rotation about x, y, z (radians, about the point (0, 0, 1)), translation along x, y, z.
@@ -46,7 +46,9 @@ class Scene:
         """The same scenes with some parameters exchanged; an unknown name is an error."""
         unknown = sorted(set(changed) - set(self.parameters))
         if unknown:
-            raise ValueError(f"unknown scene parameter {unknown[0]!r}; this scene has {', '.join(self.parameters)}")
+            raise ValueError(
+                f"unknown scene parameter {unknown[0]!r}; this scene has {', '.join(self.parameters)}"
+            )
         return Scene.from_parameters({**self.parameters, **changed})
 
     def map(self, function: Callable[[Tensor], Tensor]) -> "Scene":

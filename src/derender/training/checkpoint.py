@@ -39,7 +39,9 @@ class TrainState:
     watcher: dict[str, Any] = field(default_factory=dict)
 
 
-def save_checkpoint(folder: Path, model: nn.Module, optimiser: torch.optim.Optimizer, state: TrainState) -> None:
+def save_checkpoint(
+    folder: Path, model: nn.Module, optimiser: torch.optim.Optimizer, state: TrainState
+) -> None:
     """Write a checkpoint to ``folder``, replacing the one that is there only once the new one is whole."""
     folder.parent.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
@@ -63,7 +65,9 @@ def load_checkpoint(folder: Path, model: nn.Module, optimiser: torch.optim.Optim
         ValueError: it is damaged, or of another model.
     """
     if not (folder / STATE_FILE).is_file():
-        raise FileNotFoundError(f"no checkpoint in {folder}: train without --resume, or give the run's own folder")
+        raise FileNotFoundError(
+            f"no checkpoint in {folder}: train without --resume, or give the run's own folder"
+        )
     try:
         stored = json.loads((folder / STATE_FILE).read_text())
         state = TrainState(**stored["state"])
@@ -71,7 +75,15 @@ def load_checkpoint(folder: Path, model: nn.Module, optimiser: torch.optim.Optim
         if optimiser is not None:
             optimiser.load_state_dict(_unflatten(load_file(folder / OPTIMISER_FILE), stored["groups"]))
             _lay_out_like_parameters(optimiser)
-    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError, SafetensorError, RuntimeError, OSError) as error:
+    except (
+        json.JSONDecodeError,
+        UnicodeDecodeError,
+        KeyError,
+        TypeError,
+        SafetensorError,
+        RuntimeError,
+        OSError,
+    ) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise ValueError(
             f"the checkpoint {folder} is damaged or of another model ({reason}): "

@@ -28,27 +28,27 @@ LOOCC_FACTORS: dict[str, tuple[str, ...]] = {
 class ObjectiveSettings(Settings):
     """What is minimised: reconstruction of the picture by a scene and by its flipped twin, plus LOOCC."""
 
-    flip_weight: float = Field(0.5, ge=0)
+    flip_weight: float = Field(default=0.5, ge=0)
     confidence: bool = True
     perceptual: Literal["vgg16", "self", "none"] = "self"
-    perceptual_weight: float = Field(1.0, ge=0)
-    smoothness_weight: float = Field(0.0, ge=0)  # on steps of depth, as unsup3d for cars
-    curvature_weight: float = Field(3.0, ge=0)  # on second differences of depth; ours, 0 in the paper
+    perceptual_weight: float = Field(default=1.0, ge=0)
+    smoothness_weight: float = Field(default=0.0, ge=0)  # on steps of depth, as unsup3d for cars
+    curvature_weight: float = Field(default=3.0, ge=0)  # on second differences of depth; ours, 0 in the paper
     vgg16_path: str | None = None  # None: the file torch hub keeps
-    self_features_steps: int = Field(1500, ge=1)
+    self_features_steps: int = Field(default=600, ge=1)
     loocc: LooccKind = "none"
-    loocc_weight: float = Field(0.01, ge=0)
-    loocc_temperature: float = Field(0.5, gt=0)
+    loocc_weight: float = Field(default=0.01, ge=0)
+    loocc_temperature: float = Field(default=0.5, gt=0)
     perturb: PerturbSettings = PerturbSettings()
 
 
 class OptimiserSettings(Settings):
-    """Adam with weight decay, after a linear warm-up; ``final_rate`` < 1 lets the rate fall along a cosine."""
+    """Adam with weight decay, after a linear warm-up; ``final_rate`` < 1 lets it fall along a cosine."""
 
-    learning_rate: float = Field(1e-4, gt=0)
-    final_rate: float = Field(1.0, gt=0, le=1)  # share of learning_rate at the end
-    weight_decay: float = Field(5e-4, ge=0)
-    warmup_images: int = Field(0, ge=0)
+    learning_rate: float = Field(default=1e-4, gt=0)
+    final_rate: float = Field(default=1.0, gt=0, le=1)  # share of learning_rate at the end
+    weight_decay: float = Field(default=5e-4, ge=0)
+    warmup_images: int = Field(default=0, ge=0)
     betas: tuple[float, float] = (0.9, 0.999)
 
 
@@ -59,13 +59,13 @@ class TrainConfig(Settings):
     model: ModelSettings = ModelSettings()
     objective: ObjectiveSettings = ObjectiveSettings()
     optimiser: OptimiserSettings = OptimiserSettings()
-    batch_size: int = Field(64, ge=2)
-    images: int = Field(600_000, ge=1)  # pictures seen in the whole run, repeats counted
-    minutes: float | None = Field(None, gt=0)  # stop earlier once training has taken this long
-    validate_every: int = Field(20_000, ge=1)  # pictures between validations
-    sample_every: int = Field(20_000, ge=1)  # pictures between sample sheets
-    checkpoint_every: int = Field(20_000, ge=1)  # pictures between checkpoints
-    patience: int = Field(10, ge=1)  # validations without improvement before stopping
+    batch_size: int = Field(default=64, ge=2)
+    images: int = Field(default=600_000, ge=1)  # pictures seen in the whole run, repeats counted
+    minutes: float | None = Field(default=None, gt=0)  # stop earlier once training has taken this long
+    validate_every: int = Field(default=20_000, ge=1)  # pictures between validations
+    sample_every: int = Field(default=20_000, ge=1)  # pictures between sample sheets
+    checkpoint_every: int = Field(default=20_000, ge=1)  # pictures between checkpoints
+    patience: int = Field(default=10, ge=1)  # validations without improvement before stopping
     horizontal_flips: bool = True
     split: tuple[float, float, float] = (0.8, 0.1, 0.1)  # train, validation, test
     precision: Literal["32-true", "bf16-mixed"] = "32-true"  # networks only; geometry is always float32
@@ -102,7 +102,7 @@ PRESETS: dict[str, TrainConfig] = {
 def resolve(preset: str, overrides: Iterable[str] = (), **explicit: Any) -> TrainConfig:
     """The configuration of a run: a preset, then ``key=value`` overrides, then explicit dotted keys.
 
-    Keys are dotted (``optimiser.learning_rate``); a last part that is unique may stand alone (``learning_rate``).
+    Keys are dotted (``optimiser.learning_rate``); a unique last part may stand alone (``learning_rate``).
     Values are read as YAML. In ``explicit`` dots are written as double underscores and None means not given.
 
     Raises:
@@ -176,12 +176,12 @@ def _read_value(text: str) -> Any:
     try:
         value = yaml.safe_load(text)
     except yaml.YAMLError as error:
-        raise ValueError(f"cannot read the value {text!r}: write a number, a word, true, false or [a, b]") from error
+        raise ValueError(
+            f"cannot read the value {text!r}: write a number, a word, true, false or [a, b]"
+        ) from error
     if isinstance(value, str):
         try:
             return float(value)
         except ValueError:
             return value
     return value
-
-

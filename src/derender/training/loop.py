@@ -6,7 +6,7 @@ weights, optimiser and counters to go on where it stopped.
 
 import time
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -111,7 +111,9 @@ def train(
     fabric = Fabric(accelerator=accelerator, devices=1)
     split = split_indices(pictures.files, config.split, seed=config.seed)
     training = torch.from_numpy(np.ascontiguousarray(pictures.images[split.train]))
-    held_out = torch.from_numpy(np.ascontiguousarray(pictures.images[split.validation[:MAX_VALIDATION_PICTURES]]))
+    held_out = torch.from_numpy(
+        np.ascontiguousarray(pictures.images[split.validation[:MAX_VALIDATION_PICTURES]])
+    )
     batches = Batches(fabric.to_device(training), config.batch_size, config.seed, config.horizontal_flips)
 
     out = Path(out)
@@ -124,11 +126,18 @@ def train(
     if config.channels_last:
         model = model.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
     perceptual = prepare_perceptual(
-        config, run.perceptual, batches.images, lambda done, total, _: report(Progress("perceptual", done, total))
+        config,
+        run.perceptual,
+        batches.images,
+        lambda done, total, _: report(Progress("perceptual", done, total)),
     )
     settings = config.optimiser
     optimiser = torch.optim.Adam(
-        model.parameters(), lr=settings.learning_rate, betas=settings.betas, weight_decay=settings.weight_decay, fused=True
+        model.parameters(),
+        lr=settings.learning_rate,
+        betas=settings.betas,
+        weight_decay=settings.weight_decay,
+        fused=True,
     )
     module, wrapped = fabric.setup(StepModule(model, config.objective, perceptual), optimiser)
     state = load_checkpoint(run.last, model, optimiser) if resume and run.last.exists() else TrainState()
@@ -137,7 +146,18 @@ def train(
     drop_metrics_after(run, state.images)
     watcher = Watcher.remembering(config.model.ranges, state.watcher) if config.watch else None
     return _go_on(
-        _Run(config, run, fabric, module, wrapped, batches, fabric.to_device(held_out), watcher, sample_sheet, state),
+        _Run(
+            config,
+            run,
+            fabric,
+            module,
+            wrapped,
+            batches,
+            fabric.to_device(held_out),
+            watcher,
+            sample_sheet,
+            state,
+        ),
         report,
     )
 
@@ -272,7 +292,7 @@ def _go_on(run: _Run, report: Callable[[Progress], None]) -> TrainResult:
             if signal_request.asked and stopped is None:
                 run.writer.close()
                 raise TrainingInterrupted(
-                    f"stopped after {state.images:,} pictures and saved; the same command with --resume goes on"
+                    f"stopped after {state.images:,} pictures and saved; the same with --resume goes on"
                 )
     if stopped == "collapse":
         run.log("collapse", {finding.sign: finding.text for finding in run.findings})

@@ -1,4 +1,4 @@
-"""The perceptual features of a run: learnt or loaded once, kept in the run folder, the same after a resume."""
+"""The perceptual features of a run: learnt or loaded once, kept in its folder, the same after a resume."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -19,7 +19,7 @@ def prepare_perceptual(
 ) -> PerceptualFeatures | None:
     """Features of the kind that the configuration names, or None where it names none or gives them no weight.
 
-    Self-trained features are read from ``file`` where it exists, else learnt from ``images`` and written there.
+    Self-trained features are read from ``file`` where it exists, else learnt and written there.
     """
     objective = config.objective
     if objective.perceptual == "none" or objective.perceptual_weight == 0:

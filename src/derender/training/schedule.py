@@ -6,7 +6,7 @@ from derender.training.config import OptimiserSettings
 
 
 def learning_rate(settings: OptimiserSettings, images: int, total_images: int) -> float:
-    """Linear warm-up from zero, then constant or along a cosine to ``final_rate`` of the full rate at the end."""
+    """Linear warm-up from zero, then constant, or along a cosine to ``final_rate`` of the rate."""
     if images < settings.warmup_images:
         return settings.learning_rate * (images + 1) / settings.warmup_images
     span = max(total_images - settings.warmup_images, 1)

@@ -83,7 +83,9 @@ def training_step(
     if left_out is not None:
         with precision():
             again = model.embed(rendering.image[2 * count :])
-        terms["loocc"] = objective.loocc_weight * loocc_loss(codes, again, left_out, objective.loocc_temperature)
+        terms["loocc"] = objective.loocc_weight * loocc_loss(
+            codes, again, left_out, objective.loocc_temperature
+        )
 
     total = torch.stack(list(terms.values())).sum()
     reported = {name: term.detach() for name, term in terms.items()}
@@ -95,24 +97,28 @@ def training_step(
 def perturb_one_factor(
     model: Derenderer, scene: Scene, objective: ObjectiveSettings, generator: Generator
 ) -> tuple[Scene, Int[Tensor, " n"]]:
-    """Change one factor of every scene, drawn per picture; also which one, as an index into ``model.factors``.
+    """Change one factor of every scene, drawn per picture; also which, as an index into ``model.factors``.
 
     Raises:
         ValueError: the model has none of the factors that ``objective.loocc`` names, or cannot perturb one.
     """
     wanted = LOOCC_FACTORS[objective.loocc]
-    candidates = [i for i, factor in enumerate(model.factors) if factor.name in wanted and factor.perturb is not None]
+    candidates = [
+        i for i, factor in enumerate(model.factors) if factor.name in wanted and factor.perturb is not None
+    ]
     if objective.loocc == "all":
         candidates = [i for i, factor in enumerate(model.factors) if factor.perturb is not None]
     if not candidates:
-        raise ValueError(f"loocc {objective.loocc!r} needs a factor that can be perturbed, this model has none of them")
+        raise ValueError(
+            f"loocc {objective.loocc!r} needs a factor that can be perturbed, this model has none of them"
+        )
     chosen = choose_factors(len(scene), candidates, generator).to(scene.depth.device)
     changed = {}
     for index in candidates:
         factor = model.factors[index]
         assert factor.perturb is not None
         value = scene.parameters[factor.parameter]
-        drawn = factor.perturb(value, generator, objective.perturb)
+        drawn = factor.perturb(value, generator, objective.perturb, model.settings.ranges)
         rows = (chosen == index).view(-1, *[1] * (value.ndim - 1))
         changed[factor.parameter] = torch.where(rows, drawn, value)
     return scene.with_parameters(**changed), chosen

@@ -17,9 +17,11 @@ class Held:
 
 
 class StepModule(nn.Module):
-    """Model, objective and perceptual features; called with a batch, gives the total loss and the rest of the result."""
+    """Model, objective and perceptual features; a batch goes in, the total and the result come out."""
 
-    def __init__(self, model: Derenderer, objective: ObjectiveSettings, perceptual: PerceptualFeatures | None):
+    def __init__(
+        self, model: Derenderer, objective: ObjectiveSettings, perceptual: PerceptualFeatures | None
+    ):
         super().__init__()
         self.model, self.objective, self.perceptual = model, objective, perceptual
 

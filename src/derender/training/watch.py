@@ -1,8 +1,9 @@
 """Notices a training that fails while its loss still falls, and says so in plain words.
 
-Unsupervised geometry can fail in ways that reconstruction does not show: depth that is flat, hollow, torn into stripes
-or stuck at its bounds, every camera at its limit, albedo that simply is the picture. Each sign below is a number
-measured on training batches, smoothed, and compared with a limit; a sign that stays on for a while is a finding.
+Unsupervised geometry can fail in ways that reconstruction does not show: depth that is flat, hollow, torn
+into stripes or stuck at its bounds, every camera at its limit, albedo that simply is the picture. Each sign
+below is a number measured on training batches, smoothed, and compared with a limit; a sign that stays on for
+a while is a finding.
 The limits were set on healthy and collapsed runs (docs/log.md).
 """
 
@@ -64,35 +65,66 @@ SLOWER = "use a smaller learning_rate (1e-4 or less), a weight_decay of 5e-4 and
 
 SIGNS = (
     Sign(
-        "saturated depth", "depth_at_bound", 0.5, True, True,
-        "{value:.0%} of the depth values lie at the bounds of their range", SLOWER,
+        "saturated depth",
+        "depth_at_bound",
+        0.5,
+        True,
+        True,
+        "{value:.0%} of the depth values lie at the bounds of their range",
+        SLOWER,
     ),
     Sign(
-        "torn depth", "depth_roughness", 0.6, True, True,
+        "torn depth",
+        "depth_roughness",
+        0.6,
+        True,
+        True,
         "depth jumps from pixel to pixel ({value:.2f} of its spread; a smooth surface has less than 0.3)",
-        f"set curvature_weight=3, which removes stripes; {SLOWER}", SLOW_GRACE_IMAGES,
+        f"set curvature_weight=3, which removes stripes; {SLOWER}",
+        SLOW_GRACE_IMAGES,
     ),
     Sign(
-        "flat depth", "depth_spread", 0.03, False, False,
+        "flat depth",
+        "depth_spread",
+        0.03,
+        False,
+        False,
         "depth is flat (spread {value:.1%} of its range)",
-        "train longer; if it stays, the pictures may show too little variety of light and view (derender doctor)",
+        "train longer; if it stays, the pictures may show too little variety of light and view",
     ),
     Sign(
-        "hollow depth", "bulge", -0.15, False, True,
+        "hollow depth",
+        "bulge",
+        -0.15,
+        False,
+        True,
         "surfaces are hollow: the middle lies {value:.0%} of the depth range behind the rim",
         "start again with another seed; light from above in most pictures helps, upside-down pictures hurt",
     ),
     Sign(
-        "view at its bound", "view_at_bound", 0.5, True, True,
-        "{value:.0%} of the pictures have the camera turned to its limit", SLOWER,
+        "view at its bound",
+        "view_at_bound",
+        0.5,
+        True,
+        True,
+        "{value:.0%} of the pictures have the camera turned to its limit",
+        SLOWER,
     ),
     Sign(
-        "light at its bound", "light_at_bound", 0.8, True, False,
+        "light at its bound",
+        "light_at_bound",
+        0.8,
+        True,
+        False,
         "{value:.0%} of the pictures have the light at the limit of its angles",
         "look at the samples; a smaller learning_rate or a wider light_deg may help",
     ),
     Sign(
-        "albedo copies the picture", "shading_contrast", 0.004, False, False,
+        "albedo copies the picture",
+        "shading_contrast",
+        0.004,
+        False,
+        False,
         "shading is the same everywhere (contrast {value:.2%}), so albedo is the picture itself",
         "raise flip_weight, or check that the pictures show the thing from the front and roughly symmetric",
     ),
@@ -120,7 +152,11 @@ class Watcher:
 
     def memory(self) -> dict[str, Any]:
         """What a resumed run needs."""
-        return {"averages": dict(self.averages), "on_since": dict(self.on_since), "last_images": self.last_images}
+        return {
+            "averages": dict(self.averages),
+            "on_since": dict(self.on_since),
+            "last_images": self.last_images,
+        }
 
     @property
     def uneasy(self) -> bool:
@@ -130,7 +166,9 @@ class Watcher:
     def look(self, images: int, loss: float, scene: Scene) -> tuple[Finding, ...]:
         """What is wrong after ``images`` pictures, given the latest batch; usually nothing."""
         if not math.isfinite(loss):
-            return (Finding("non-finite loss", f"the loss is {loss}", f"{SLOWER}; with bf16, try 32-true", True),)
+            return (
+                Finding("non-finite loss", f"the loss is {loss}", f"{SLOWER}; with bf16, try 32-true", True),
+            )
         share = min(1.0, (images - self.last_images) / MEMORY_IMAGES)
         self.last_images = images
         for name, value in measure(scene, self.ranges).items():
@@ -152,10 +190,10 @@ class Watcher:
 def measure(scene: Scene, ranges: SceneRanges) -> dict[str, float]:
     """The numbers that signs are read from, each a mean over the batch.
 
-    depth_at_bound, view_at_bound, light_at_bound: shares, 0..1. depth_spread: standard deviation of a depth map over
-    its range. depth_roughness: mean step between neighbours over the standard deviation. bulge: how far the
-    rim lies behind the middle, over the range; negative is hollow. shading_contrast: standard deviation of the shading
-    in a picture over its mean.
+    depth_at_bound, view_at_bound, light_at_bound: shares, 0..1. depth_spread: standard deviation of a depth
+    map over its range. depth_roughness: mean step between neighbours over the standard deviation. bulge: how far
+    the rim lies behind the middle, over the range; negative is hollow. shading_contrast: standard deviation
+    of the shading in a picture over its mean.
     """
     depth = _inside(scene.depth, ranges)
     low, high = ranges.depth_min, ranges.depth_max

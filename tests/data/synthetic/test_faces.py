@@ -12,7 +12,12 @@ from derender.scene.normals import normals_from_depth
 
 FRONTAL = {"yaw_sd_deg": 0.0, "pitch_sd_deg": 0.0, "roll_sd_deg": 0.0, "translation_sd": 0.0}
 STILL = {"expressions": ("neutral",), "asymmetry": 0.0, "gaze_px": 0.0}
-EVEN_LIGHT = {"light_pitch_deg": (0.0, 0.0), "light_yaw_deg": (0.0, 0.0), "ambient": (0.6, 0.6), "diffuse": (0.3, 0.3)}
+EVEN_LIGHT = {
+    "light_pitch_deg": (0.0, 0.0),
+    "light_yaw_deg": (0.0, 0.0),
+    "ambient": (0.6, 0.6),
+    "diffuse": (0.3, 0.3),
+}
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +63,9 @@ def test_shading_the_truth_again_gives_the_picture(sample):
 
 
 def test_shading_with_a_wrong_light_does_not(sample):
-    _, direction = camera_rotation_and_light(sample.camera, sample.light * np.array([1, 1, -1, -1], np.float32))
+    _, direction = camera_rotation_and_light(
+        sample.camera, sample.light * np.array([1, 1, -1, -1], np.float32)
+    )
     cosine = np.maximum(0.0, np.einsum("nhwk,nk->nhw", sample.normal, direction))
     shading = sample.light[:, 0, None, None] + sample.light[:, 1, None, None] * cosine
     again = np.clip(sample.albedo / 255.0 * shading[:, None], 0.0, 1.0) * 255.0
@@ -76,7 +83,7 @@ def test_normals_are_those_of_the_depth_map(sample):
 
 def test_depth_lies_in_the_stated_range_and_fills_the_picture(sample):
     seen = sample.depth[sample.mask]
-    assert 0.9 < seen.min() and seen.max() < 1.16
+    assert seen.min() > 0.9 and seen.max() < 1.16
     assert not sample.depth[~sample.mask].any()
     assert 0.45 < sample.mask.mean(axis=(1, 2)).mean() < 0.95
 
@@ -86,23 +93,28 @@ def test_unprojected_points_lie_on_the_canonical_surface():
     turned = faces.generate(4, seed=5, settings=FaceSettings(**STILL))
     frontal = faces.generate(4, seed=5, settings=FaceSettings(**STILL, **FRONTAL))
     assert np.abs(turned.camera).max() > 0.1 and not frontal.camera.any()
-    points = to_canonical(unproject(torch.from_numpy(turned.depth), 10.0), torch.from_numpy(turned.camera)).numpy()
+    points = to_canonical(
+        unproject(torch.from_numpy(turned.depth), 10.0), torch.from_numpy(turned.camera)
+    ).numpy()
     focal = 31.5 / np.tan(np.deg2rad(5.0))
     for n in range(4):
         x, y, z = points[n][turned.mask[n]].T
         column, row = np.rint(x / z * focal + 31.5).astype(int), np.rint(y / z * focal + 31.5).astype(int)
         inside = (abs(column - 31.5) < 16) & (abs(row - 31.5) < 24)
         expected = frontal.depth[n][row[inside], column[inside]]
-        error = np.abs(expected - z[inside])
-        assert inside.sum() > 500
+        seen = expected > 0  # some of these points are hidden or outside the frontal picture
+        error = np.abs(expected - z[inside])[seen]
+        assert seen.sum() > 500
         assert np.median(error) < 1.0e-3  # rounding to the nearest pixel included; the face is 0.15 deep
-        assert np.corrcoef(expected, z[inside])[0, 1] > 0.97
+        assert np.percentile(error, 75) < 3.0e-3
+        assert np.corrcoef(expected[seen], z[inside][seen])[0, 1] > 0.9
 
 
 def test_neutral_surfaces_are_symmetric_with_the_nose_tip_in_place():
     still = faces.generate(16, seed=6, settings=FaceSettings(**STILL, **FRONTAL, pictures_per_identity=1))
     both = still.mask & still.mask[..., ::-1]
-    assert np.abs(still.depth - still.depth[..., ::-1])[inner(both, 3)].max() < 0.01
+    apart = np.abs(still.depth - still.depth[..., ::-1])[inner(both, 3)]
+    assert np.percentile(apart, 99) < 5e-4 and np.median(apart) < 2e-5
     tip = still.depth[:, 24:42, 26:38].min(axis=(1, 2))
     assert np.allclose(tip, faces.NOSE_TIP_Z, atol=1.5e-3)
 
@@ -127,7 +139,9 @@ def test_people_differ_and_pictures_of_one_person_agree_without_light():
 def test_each_expression_changes_the_face_in_its_own_way():
     common = {**FRONTAL, **EVEN_LIGHT, "strength": (1.0, 1.0), "asymmetry": 0.0, "gaze_px": 0.0}
     shown = {
-        name: faces.generate(3, seed=8, settings=FaceSettings(**common, expressions=(name,))).depth[:, 8:56, 14:50]
+        name: faces.generate(3, seed=8, settings=FaceSettings(**common, expressions=(name,))).depth[
+            :, 8:56, 14:50
+        ]
         for name in FaceSettings().expressions
     }
     names = list(shown)
@@ -138,21 +152,21 @@ def test_each_expression_changes_the_face_in_its_own_way():
 
 def test_settings_are_respected():
     settings = FaceSettings(
-        yaw_mean_deg=30, yaw_sd_deg=5, yaw_limit_deg=8, light_yaw_deg=(50, 70), ambient=(0.1, 0.2), diffuse=(0.9, 1.0),
-        expressions=("happy", "fear"), pictures_per_identity=3,
+        yaw_mean_deg=30, yaw_sd_deg=5, yaw_limit_deg=8, light_yaw_deg=(50, 70), ambient=(0.1, 0.2),
+        diffuse=(0.9, 1.0), expressions=("happy", "fear"), pictures_per_identity=3,
     )  # fmt: skip
     made = faces.generate(30, image_size=32, settings=settings)
     yaw, light = np.rad2deg(made.camera[:, 1]), made.light
-    assert 22 <= yaw.min() and yaw.max() <= 38 and yaw.std() > 1
-    assert 50 <= np.rad2deg(light[:, 3]).min() and np.rad2deg(light[:, 3]).max() <= 70
-    assert 0.1 <= light[:, 0].min() <= light[:, 0].max() <= 0.2
-    assert 0.9 <= light[:, 1].min() <= light[:, 1].max() <= 1.0
+    assert yaw.min() >= 21.99 and yaw.max() <= 38.01 and yaw.std() > 1
+    assert np.rad2deg(light[:, 3]).min() >= 49.99 and np.rad2deg(light[:, 3]).max() <= 70.01
+    assert 0.099 <= light[:, 0].min() <= light[:, 0].max() <= 0.201
+    assert 0.899 <= light[:, 1].min() <= light[:, 1].max() <= 1.0
     assert set(made.expression.tolist()) == {"happy", "fear"}
     assert made.identity.tolist() == [i // 3 for i in range(30)]
 
 
 def test_default_distribution_is_that_of_the_rendered_development_set():
-    made = faces.generate(400, image_size=16)
+    made = faces.generate(240, image_size=16)
     pitch, yaw, roll = np.rad2deg(made.camera[:, :3]).T
     assert abs(yaw.mean()) < 3 and 15 < yaw.std() < 21 and abs(yaw).max() <= 45.001
     assert 6.5 < pitch.std() < 9.5 and abs(pitch).max() <= 20.001
@@ -164,10 +178,14 @@ def test_default_distribution_is_that_of_the_rendered_development_set():
 
 def test_yaw_and_light_turn_the_way_the_conventions_say():
     ahead = {**STILL, **FRONTAL, "ambient": (0.3, 0.3), "diffuse": (0.4, 0.4), "pictures_per_identity": 1}
-    left_lit = faces.generate(6, seed=9, settings=FaceSettings(**ahead, light_yaw_deg=(40, 40), light_pitch_deg=(0, 0)))
+    left_lit = faces.generate(
+        6, seed=9, settings=FaceSettings(**ahead, light_yaw_deg=(40, 40), light_pitch_deg=(0, 0))
+    )
     columns = (left_lit.images.mean(axis=1) * left_lit.mask)[:, 20:50]
     assert (columns[..., 8:28].sum(axis=(1, 2)) > 1.1 * columns[..., 36:56].sum(axis=(1, 2))).all()
-    turned = faces.generate(6, seed=9, settings=FaceSettings(**{**STILL, **FRONTAL}, yaw_mean_deg=25, pictures_per_identity=1))
+    turned = faces.generate(
+        6, seed=9, settings=FaceSettings(**{**STILL, **FRONTAL}, yaw_mean_deg=25, pictures_per_identity=1)
+    )
     nearest = np.where(turned.mask, turned.depth, 9.0)[:, 24:44].min(axis=1).argmin(axis=1)
     assert (nearest < 29).all()
 

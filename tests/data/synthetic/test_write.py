@@ -48,7 +48,9 @@ def test_light_columns_agree_with_each_other(made, folder):
         rows = list(csv.DictReader(file))
     for row in rows:
         value = {k: float(v) for k, v in row.items() if k not in ("file", "expression")}
-        slope = np.array([np.tan(np.deg2rad(value["light_yaw"])), np.tan(np.deg2rad(value["light_pitch"])), 1.0])
+        slope = np.array(
+            [np.tan(np.deg2rad(value["light_yaw"])), np.tan(np.deg2rad(value["light_pitch"])), 1.0]
+        )
         direction = np.array([value["lx"], value["ly"], value["lz"]])
         assert np.allclose(direction, slope / np.linalg.norm(slope), atol=2e-6)
         pitch, yaw, roll = np.deg2rad([value["pitch"], value["yaw"], value["roll"]])
@@ -73,7 +75,9 @@ def test_identities_are_listed_once_with_their_traits(made, folder):
     with (folder / "identities.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [int(row["identity"]) for row in rows] == [0]
-    assert float(rows[0]["shape_nose_length"]) == pytest.approx(made.identity_traits["shape_nose_length"][0], abs=1e-4)
+    assert float(rows[0]["shape_nose_length"]) == pytest.approx(
+        made.identity_traits["shape_nose_length"][0], abs=1e-4
+    )
 
 
 def test_without_truth_only_pictures_and_tables(made, tmp_path):

@@ -1,8 +1,9 @@
 """Muscle actions as displacement fields, and the seven named expressions as weights of them.
 
-The names follow facial action coding loosely; skin (brows, lips) is attached to the surface and moves with it, while
-the lids are drawn by face_look from the weights ``wide`` and ``squint``. Each action comes as a left and a right half
-so that a little asymmetry is possible. Leaves out the tongue's motion, blinks, and puckered lips.
+The names follow facial action coding loosely; skin (brows, lips) is attached to the surface and moves with
+it, while the lids are drawn by face_features from the weights ``wide`` and ``squint``. Each action comes as
+a left and a right half so that a little asymmetry is possible. Leaves out the tongue's motion, blinks, and
+puckered lips.
 """
 
 from dataclasses import dataclass
@@ -26,14 +27,28 @@ EXPRESSIONS: dict[str, dict[str, float]] = {
     "surprise": {"jaw_open": 0.75, "brow_inner_up": 0.9, "brow_outer_up": 1.0, "wide": 1.0},
     "sad": {"brow_inner_up": 1.0, "frown": 1.0, "brow_lower": 0.25, "squint": 0.4},
     "anger": {"brow_lower": 1.15, "press": 0.8, "squint": 0.45, "sneer": 0.3, "frown": 0.45},
-    "disgust": {"sneer": 1.1, "brow_lower": 0.6, "squint": 0.6, "frown": 0.5, "cheek_raise": 0.6, "lips_part": 0.25},
-    "fear": {"brow_inner_up": 1.0, "brow_outer_up": 0.5, "wide": 0.9, "stretch": 1.0, "lips_part": 0.6, "jaw_open": 0.25},
+    "disgust": {
+        "sneer": 1.1,
+        "brow_lower": 0.6,
+        "squint": 0.6,
+        "frown": 0.5,
+        "cheek_raise": 0.6,
+        "lips_part": 0.25,
+    },
+    "fear": {
+        "brow_inner_up": 1.0,
+        "brow_outer_up": 0.5,
+        "wide": 0.9,
+        "stretch": 1.0,
+        "lips_part": 0.6,
+        "jaw_open": 0.25,
+    },
 }
 
 
 @dataclass(frozen=True)
 class ExpressionBasis:
-    """``fields`` (actions, 2 sides, rows, columns, 3): displacement in face pixels of each action's left and right half."""
+    """``fields`` (actions, 2 sides, rows, columns, 3): displacement by each action's left and right half."""
 
     fields: Float[ndarray, "actions two rows columns 3"]
 
@@ -68,9 +83,15 @@ def action_fields(grid: FaceGrid) -> dict[str, Float[ndarray, "rows columns 3"]]
     fold = _fold(p, q)
     brow = np.exp(-0.5 * ((q + 20.0) / 3.6) ** 2)
     inner = np.exp(-(((p - 3.0) / 6.5) ** 2)) * brow
-    wrinkle = np.sin(2.0 * np.pi * (q + 25.0) / 2.6) * np.exp(-(((q + 24.3) / 2.6) ** 4)) * np.exp(-((p / 13.0) ** 4))
+    wrinkle = (
+        np.sin(2.0 * np.pi * (q + 25.0) / 2.6)
+        * np.exp(-(((q + 24.3) / 2.6) ** 4))
+        * np.exp(-((p / 13.0) ** 4))
+    )
     return {
-        "jaw_open": field(x=-0.09 * grid.p * smoothstep(4.0, 18.0, q) * hinge, y=9.0 * drop, z=2.2 * drop + 4.5 * inside),
+        "jaw_open": field(
+            x=-0.09 * grid.p * smoothstep(4.0, 18.0, q) * hinge, y=9.0 * drop, z=2.2 * drop + 4.5 * inside
+        ),
         "lips_part": field(y=-1.6 * upper_side + 2.0 * lower_side, z=1.6 * inside),
         "smile": field(
             x=sign * 2.6 * corner,
@@ -79,13 +100,15 @@ def action_fields(grid: FaceGrid) -> dict[str, Float[ndarray, "rows columns 3"]]
         ),
         "cheek_raise": field(y=-1.1 * cheek, z=-1.7 * cheek + 0.45 * bump((11.0, -9.0), (5.0, 1.0))),
         "frown": field(
-            x=sign * 0.4 * corner, y=2.4 * corner - 0.9 * bump((0.0, 17.0), (4.5, 3.5)),
+            x=sign * 0.4 * corner,
+            y=2.4 * corner - 0.9 * bump((0.0, 17.0), (4.5, 3.5)),
             z=0.7 * fold - 0.8 * bump((0.0, 23.0), (4.0, 2.5)) + 0.5 * bump((11.0, 18.0), (1.3, 2.4)),
         ),
         "stretch": field(x=sign * 2.6 * corner, y=0.9 * corner + 0.5 * lower_side, z=0.9 * corner),
         "sneer": field(
             y=-1.7 * upper_side - 1.2 * bump((0.0, 10.5), (6.0, 2.5)) - 1.1 * bump((4.3, 0.6), (2.2, 2.4)),
-            z=1.4 * fold - 0.5 * bump((4.3, 0.6), (1.6, 1.8))
+            z=1.4 * fold
+            - 0.5 * bump((4.3, 0.6), (1.6, 1.8))
             + 0.5 * np.sin(2.0 * np.pi * (q + 11.0) / 3.0) * bump((0.0, -11.0), (2.6, 2.6)),
         ),
         "press": field(
@@ -97,7 +120,8 @@ def action_fields(grid: FaceGrid) -> dict[str, Float[ndarray, "rows columns 3"]]
         "brow_lower": field(
             x=-sign * 0.9 * bump((6.0, -19.5), (4.0, 3.0)),
             y=2.3 * np.exp(-(((p - 5.0) / 7.0) ** 2)) * brow,
-            z=-0.9 * bump((7.0, -18.5), (5.0, 1.8)) + 0.9 * bump((2.0, -19.0), (0.7, 2.6))
+            z=-0.9 * bump((7.0, -18.5), (5.0, 1.8))
+            + 0.9 * bump((2.0, -19.0), (0.7, 2.6))
             - 0.4 * bump((0.0, -19.0), (1.0, 2.6)),
         ),
     }
@@ -106,5 +130,7 @@ def action_fields(grid: FaceGrid) -> dict[str, Float[ndarray, "rows columns 3"]]
 def _fold(p: ndarray, q: ndarray) -> ndarray:
     """The crease between cheek and upper lip that a smile deepens."""
     centre = 6.3 + 5.6 * np.clip((q - 0.5) / 11.5, 0.0, 1.0) ** 0.8
-    depth = 0.8 * np.exp(-0.5 * ((p - centre) / 1.1) ** 2) - 0.6 * np.exp(-0.5 * ((p - centre - 2.4) / 1.8) ** 2)
+    depth = 0.8 * np.exp(-0.5 * ((p - centre) / 1.1) ** 2) - 0.6 * np.exp(
+        -0.5 * ((p - centre - 2.4) / 1.8) ** 2
+    )
     return 0.75 * depth * np.exp(-(((q - 6.5) / 6.5) ** 4))

@@ -1,7 +1,7 @@
 """Eyes and the inside of the mouth, painted picture by picture over the skin's albedo.
 
-Lids follow the expression, irises the gaze; the mouth's inside shows teeth, dark and tongue as far as the lips have
-parted. Colours only: no highlights, since albedo holds no light.
+Lids follow the expression, irises the gaze; the mouth's inside shows teeth, dark and tongue as far as the
+lips have parted. Colours only: no highlights, since albedo holds no light.
 """
 
 from typing import no_type_check
@@ -26,9 +26,9 @@ _IRIS_RADIUS, _PUPIL_RADIUS = 2.4, 1.0
 def paint_features(albedo, p, q, gap, eyes, iris, lips, gaze):
     """Paint in place, one face per row.
 
-    albedo (N,R,C,3); p (C,) and q (R,) domain coordinates; gap (N,C) by how much the lips have parted, face pixels;
-    eyes (N,8): half length; upper and lower opening of the eye at p < 0, then of the eye at p > 0; tilt, lashes, crease;
-    iris, lips (N,3); gaze (N,2), face pixels.
+    albedo (N,R,C,3); p (C,) and q (R,) domain coordinates; gap (N,C) by how much the lips have parted, face
+    pixels; eyes (N,8): half length; upper and lower opening of the eye at p < 0, then of the eye at p > 0;
+    tilt, lashes, crease; iris, lips (N,3); gaze (N,2), face pixels.
     """
     for n in range(albedo.shape[0]):
         for r in range(len(q)):
@@ -92,7 +92,11 @@ def _paint_mouth(colour, p, across, gap, lips):
     below = 0.5 * (across + 1.0) * gap
     groove = 1.0 - 0.12 * np.exp(-(((p - 1.9 * np.round(p / 1.9)) / 0.25) ** 2))
     tongue = (2.2 * lens - (gap - below)) * min(max((gap - 4.0) / 2.0, 0.0), 1.0)
-    teeth = min((2.7 - below) / 0.4 + 0.5, 1.0) * (1.0 - 0.5 * (p / 8.0) ** 2) * min(max(gap - 0.9, 0.0) / 0.9, 1.0)
+    teeth = (
+        min((2.7 - below) / 0.4 + 0.5, 1.0)
+        * (1.0 - 0.5 * (p / 8.0) ** 2)
+        * min(max(gap - 0.9, 0.0) / 0.9, 1.0)
+    )
     parted = min(max((gap - 0.8) / 0.7, 0.0), 1.0)
     cover = (1.08 - abs(across)) / 0.25 * min(lens * 2.5, 1.0) * (0.85 + 0.15 * parted)
     for k in range(3):

@@ -1,11 +1,11 @@
 """The parameter domain of the procedural face: rows (down the face) times columns (around the head).
 
-A face is a grid of free 3D points. Column angle ``theta`` turns around the vertical axis of the head (0 = the
-middle of the face, positive to the right of the picture); row coordinate ``q`` runs down the face. ``p`` is the
-sideways coordinate in which features are placed: like x near the front, the arc length further back. Unit of
-``p`` and ``q``: one pixel of a 64-pixel picture at z = 1, eyes at (+-12, -14), mouth at (0, 14), as on a mean face.
-Rows and columns are closer together where the face has detail. All shapes and skins are smooth functions of this
-domain, so a finer grid shows the same face in more detail.
+A face is a grid of free 3D points. Column angle ``theta`` turns around the vertical axis of the head (0 =
+the middle of the face, positive to the right of the picture); row coordinate ``q`` runs down the face.
+``p`` is the sideways coordinate in which features are placed: like x near the front, the arc length further
+back. Unit of ``p`` and ``q``: one pixel of a 64-pixel picture at z = 1, eyes at (+-12, -14), mouth at (0,
+14), as on a mean face. Rows and columns are closer together where the face has detail. All shapes and skins
+are smooth functions of this domain, so a finer grid shows the same face in more detail.
 """
 
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ _HEAD_RADIUS = 26.0
 
 @dataclass(frozen=True)
 class FaceGrid:
-    """Domain coordinates of every vertex: ``theta`` (radians), ``p`` and ``q`` (face pixels), each (rows, columns)."""
+    """Domain coordinates of every vertex: ``theta`` in radians, ``p`` and ``q`` in face pixels."""
 
     theta: Float[ndarray, "rows columns"]
     p: Float[ndarray, "rows columns"]
@@ -56,7 +56,9 @@ def face_grid(detail: float = 1.0) -> FaceGrid:
     rows, columns = len(q), len(theta)
     shape = (rows, columns)
     return FaceGrid(
-        np.broadcast_to(theta, shape).copy(), np.broadcast_to(p, shape).copy(), np.broadcast_to(q[:, None], shape).copy()
+        np.broadcast_to(theta, shape).copy(),
+        np.broadcast_to(p, shape).copy(),
+        np.broadcast_to(q[:, None], shape).copy(),
     )
 
 

@@ -1,7 +1,7 @@
 """The colour of a face (albedo free of shading) and the thickness of its hair, over the face's domain.
 
-Skin tone with mottling, blush, freckles and stubble; lips; brows; hair with a hair line and strands; beard. Eyes and the
-inside of the mouth change from picture to picture and are painted by face_features.
+Skin tone with mottling, blush, freckles and stubble; lips; brows; hair with a hair line and strands; beard.
+Eyes and the inside of the mouth change from picture to picture and are painted by face_features.
 """
 
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ _FIELD_SEED = 7  # the noise fields are part of the model, the same for everyone
 
 @dataclass(frozen=True)
 class SkinBasis:
-    """Fixed fields over the domain, each (rows, columns) unless said otherwise, all between 0 and 1 or zero-mean."""
+    """Fixed fields over the domain, between 0 and 1 or zero-mean."""
 
     mottling: Float[ndarray, "fields rows columns"]
     strands: Float[ndarray, "rows columns"]
@@ -58,7 +58,11 @@ def skin_basis(detail: float = 1.0) -> SkinBasis:
 def paint_skin(identity: FaceIdentity, detail: float = 1.0) -> tuple[ndarray, ndarray]:
     """Albedo (rows, columns, 3) and hair thickness (rows, columns) in face pixels."""
     grid, basis = face_grid(detail), skin_basis(detail)
-    tone = 1.0 + 0.028 * np.tensordot(identity.skin_noise, basis.mottling, 1) / np.sqrt(SKIN_FIELDS) + 0.012 * basis.grain
+    tone = (
+        1.0
+        + 0.028 * np.tensordot(identity.skin_noise, basis.mottling, 1) / np.sqrt(SKIN_FIELDS)
+        + 0.012 * basis.grain
+    )
     albedo = identity.skin * tone[..., None]
     redness = (0.4 + 0.6 * (1.0 - identity.melanin)) * identity.blush * basis.blush
     albedo *= 1.0 - redness[..., None] * np.array((0.01, 0.13, 0.12))
@@ -71,9 +75,13 @@ def paint_skin(identity: FaceIdentity, detail: float = 1.0) -> tuple[ndarray, nd
     stubble = identity.stubble * basis.beard * (1.0 - basis.lips) * (1.0 + 0.1 * basis.grain)
     albedo = _over(albedo, 0.35 * identity.hair + 0.35 * identity.skin, 0.5 * np.clip(stubble, 0.0, 1.0))
     strand_colour = identity.hair * (1.0 + 0.15 * basis.strands[..., None])
-    beard = np.clip(identity.beard * basis.beard * (1.0 + 0.18 * basis.strands), 0.0, 1.0) * (1.0 - basis.lips)
+    beard = np.clip(identity.beard * basis.beard * (1.0 + 0.18 * basis.strands), 0.0, 1.0) * (
+        1.0 - basis.lips
+    )
     albedo = _over(albedo, strand_colour, 0.92 * smoothstep(0.05, 0.75, beard))
-    albedo = _over(albedo, 0.85 * identity.hair + 0.05, identity.brow_strength * brow_mask(identity, grid, basis))
+    albedo = _over(
+        albedo, 0.85 * identity.hair + 0.05, identity.brow_strength * brow_mask(identity, grid, basis)
+    )
     distance = hair_distance(identity, grid)
     distance = distance + 0.35 * basis.strands
     hair = smoothstep(-0.8, 0.8, distance)
@@ -87,8 +95,15 @@ def brow_mask(identity: FaceIdentity, grid: FaceGrid, basis: SkinBasis) -> ndarr
     """Brows: an arch that is thickest at a third and tapers outwards, with a hairy edge."""
     p = np.abs(grid.p)
     along = np.clip((p - 4.6) / 13.2, 0.0, 1.0)
-    centre = -19.6 + 0.5 * (1.0 - along) - identity.brow_arch * 1.6 * np.sin(np.pi * along**1.25) + 1.3 * along**3
-    half = identity.brow_thickness * 1.15 * (0.75 + 0.5 * np.sin(np.pi * np.minimum(along * 1.3 + 0.1, 1.0))) * (1.0 - 0.65 * along**1.5)
+    centre = (
+        -19.6 + 0.5 * (1.0 - along) - identity.brow_arch * 1.6 * np.sin(np.pi * along**1.25) + 1.3 * along**3
+    )
+    half = (
+        identity.brow_thickness
+        * 1.15
+        * (0.75 + 0.5 * np.sin(np.pi * np.minimum(along * 1.3 + 0.1, 1.0)))
+        * (1.0 - 0.65 * along**1.5)
+    )
     edge = (half - np.abs(grid.q - centre)) / 0.7 + 0.12 * basis.grain
     ends = smoothstep(3.9, 6.2, p) * (1.0 - smoothstep(15.8, 18.6, p))
     return smoothstep(-0.6, 0.8, edge) * ends
@@ -111,28 +126,52 @@ def hair_distance(identity: FaceIdentity, grid: FaceGrid) -> ndarray:
         line = np.array([front, front + 0.5, front + 4.0, front + 12.0, 2.0, end, end, end, end, end])
     else:
         at = (0.0, 24.0, 42.0, 58.0, 68.0, 76.0, 84.0, 96.0, 104.0, 115.0)
-        line = np.array([front + 1.0, front, front + 0.5 - recede, front + 7.0 - recede, -12.0, -2.5, -14.0, -10.0, 9.0, 18.0])
+        line = np.array(
+            [
+                front + 1.0,
+                front,
+                front + 0.5 - recede,
+                front + 7.0 - recede,
+                -12.0,
+                -2.5,
+                -14.0,
+                -10.0,
+                9.0,
+                18.0,
+            ]
+        )
     if style == "fringe" or (style == "bob" and identity.hair_line > 0.5):
         line[:4] = np.maximum(line[:4], np.array([-22.6, -23.2, -22.0, -16.0]) + 0.5 * identity.hair_line)
     limit = PchipInterpolator(at, line)(turn)
     sway, first, second, third = identity.hair_wave
-    p = grid.p[0]
-    limit += (0.2 + 0.6 * sway) * (np.sin(0.24 * p + 6.3 * first) + 0.6 * np.sin(0.55 * p + 6.3 * second)) * np.exp(-((turn / 58.0) ** 6))
+    p = np.abs(grid.p[0])
+    limit += (
+        (0.2 + 0.6 * sway)
+        * (np.sin(0.24 * p + 6.3 * first) + 0.6 * np.sin(0.55 * p + 6.3 * second))
+        * np.exp(-((turn / 58.0) ** 6))
+    )
     if style in ("fringe", "bob", "long"):
-        part = 12.0 * identity.hair_parting
-        limit -= (2.5 + 2.0 * third) * np.exp(-(((p - part) / 8.5) ** 2)) * (0.3 if style == "fringe" else 1.0)
-    slope = np.gradient(limit, p)
+        depth = (3.0 + 2.0 * third) * identity.hair_parting * (0.4 if style == "fringe" else 1.0)
+        limit -= depth * np.exp(-((p / 9.0) ** 2))
+    slope = np.gradient(limit, grid.p[0])
     return (limit - grid.q) / np.sqrt(1.0 + slope**2)
 
 
 def hair_thickness(identity: FaceIdentity, grid: FaceGrid, distance: ndarray) -> ndarray:
     """How far hair stands off the head, face pixels; hanging hair stands off the neck by more."""
-    top = {"bald": 0.0, "buzz": 0.35, "short": 1.8, "fringe": 2.3, "bob": 2.6, "long": 2.2}[identity.hair_style]
+    top = {"bald": 0.0, "buzz": 0.35, "short": 1.8, "fringe": 2.3, "bob": 2.6, "long": 2.2}[
+        identity.hair_style
+    ]
     side = {"bob": 2.6, "long": 2.6}.get(identity.hair_style, 0.0)
     hang = {"bob": 1.0, "long": 4.0}.get(identity.hair_style, 0.0)
     crown = 1.0 - smoothstep(-36.0, -12.0, grid.q)
     low = smoothstep(0.0, 34.0, grid.q)
-    full = identity.hair_volume * (0.4 * top + 0.6 * top * crown + side * (1.0 - crown) + hang * (low + 1.2 * smoothstep(27.0, 37.0, grid.q)))
+    full = identity.hair_volume * (
+        0.4 * top
+        + 0.6 * top * crown
+        + side * (1.0 - crown)
+        + hang * (low + 1.2 * smoothstep(27.0, 37.0, grid.q))
+    )
     return full * smoothstep(-0.3, 1.2 + 1.6 * np.maximum(full, 0.2), distance)
 
 
@@ -150,10 +189,15 @@ def _lip_mask(p: ndarray, q: ndarray) -> ndarray:
 
 def _beard_mask(p: ndarray, q: ndarray) -> ndarray:
     line = PchipInterpolator(
-        [0.0, 3.0, 7.0, 10.0, 13.0, 17.0, 21.0, 24.0, 27.0, 31.0, 80.0], [18.8, 19.0, 18.2, 12.5, 10.0, 7.5, 3.0, -1.0, 6.0, 12.0, 12.0]
+        [0.0, 3.0, 7.0, 10.0, 13.0, 17.0, 21.0, 24.0, 27.0, 31.0, 80.0],
+        [18.8, 19.0, 18.2, 12.5, 10.0, 7.5, 3.0, -1.0, 6.0, 12.0, 12.0],
     )(p)
     cheeks = smoothstep(-2.5, 3.5, q - line) * (1.0 - smoothstep(33.0, 38.0, q))
-    moustache = np.exp(-(((q - 9.2 - 0.032 * p**2) / 2.3) ** 4)) * np.exp(-((p / 10.5) ** 6)) * (1.0 - 0.5 * np.exp(-((p / 1.2) ** 2)))
+    moustache = (
+        np.exp(-(((q - 9.2 - 0.032 * p**2) / 2.3) ** 4))
+        * np.exp(-((p / 10.5) ** 6))
+        * (1.0 - 0.5 * np.exp(-((p / 1.2) ** 2)))
+    )
     return np.maximum(cheeks, moustache)
 
 
@@ -162,11 +206,17 @@ def _over(under: ndarray, colour: ndarray, alpha: ndarray) -> ndarray:
 
 
 def _waves(
-    generator: np.random.Generator, grid: FaceGrid, count: int, shortest: float, longest: float, along: float | None = None
+    generator: np.random.Generator,
+    grid: FaceGrid,
+    count: int,
+    shortest: float,
+    longest: float,
+    along: float | None = None,
 ) -> ndarray:
-    """A smooth zero-mean field of unit variance: ``count`` plane waves with wavelengths in the given range (face pixels).
+    """A smooth zero-mean field of unit variance: ``count`` plane waves with wavelengths in the given range
+    (face pixels).
 
-    With ``along`` the waves run sideways only and bend slowly over that length, like strands of hair.
+    With ``along`` the waves run sideways only, mirrored, and bend slowly over that length, like strands.
     """
     total = np.zeros(grid.shape)
     for _ in range(count):
@@ -176,5 +226,5 @@ def _waves(
             total += np.cos(number * (np.cos(angle) * grid.p + np.sin(angle) * grid.q) + phase)
         else:
             bend = generator.uniform(0.3, 0.9) * np.sin(grid.q / along + angle)
-            total += np.cos(number * (grid.p + bend) + phase)
+            total += np.cos(number * (np.abs(grid.p) + bend) + phase)
     return total * np.sqrt(2.0 / count)

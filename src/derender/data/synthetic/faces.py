@@ -1,9 +1,10 @@
-"""Procedural faces: identity, expression, light and view are drawn, a face is assembled and pictured with exact truth.
+"""Procedural faces: identity, expression, light and view are drawn, the face is pictured with exact truth.
 
-Each picture is a function of the seed and its index alone: asking for more pictures does not change the first ones.
-Conventions are those of docs/conventions.md; nose tips of neutral faces stand at z = 0.947.
+Each picture is a function of the seed and its index alone: asking for more pictures does not change the
+first ones. Conventions are those of docs/conventions.md; nose tips of neutral faces stand at z = 0.947.
 """
 
+import itertools
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -12,7 +13,7 @@ from typing import no_type_check
 
 import numpy as np
 import torch
-from jaxtyping import Float32
+from jaxtyping import Float32, Float64
 from numpy import ndarray
 
 from derender.data.synthetic.backgrounds import draw_background
@@ -49,7 +50,8 @@ def generate(
     detail = _detail(image_size)
     out = _empty(count, image_size)
     traits: list[dict[str, float]] = []
-    _outward(detail), expression_basis(detail)  # shared by the threads
+    for shared in (_outward, expression_basis):  # computed once, before threads ask for them
+        shared(detail)
 
     def work(rows: slice) -> list[dict[str, float]]:
         draws = [_draw(seed, first + i, image_size, settings) for i in range(rows.start, rows.stop)]
@@ -75,7 +77,7 @@ def _chunks(first: int, count: int, per_identity: int, most: int) -> list[slice]
     while starts[-1] < count:
         in_block = (first + starts[-1]) % whole
         starts.append(min(starts[-1] + min(whole - in_block, most), count))
-    return [slice(a, b) for a, b in zip(starts, starts[1:], strict=False)]
+    return [slice(a, b) for a, b in itertools.pairwise(starts)]
 
 
 @dataclass(frozen=True)
@@ -117,7 +119,9 @@ def _draw(seed: int, index: int, image_size: int, settings: FaceSettings) -> _Dr
     means = np.deg2rad([settings.pitch_mean_deg, settings.yaw_mean_deg, 0.0])
     spreads = np.deg2rad([settings.pitch_sd_deg, settings.yaw_sd_deg, settings.roll_sd_deg])
     rotation = means + np.clip(normal[:3] * spreads, -limits, limits)
-    shift = np.clip(normal[3:5] * settings.translation_sd, -settings.translation_limit, settings.translation_limit)
+    shift = np.clip(
+        normal[3:5] * settings.translation_sd, -settings.translation_limit, settings.translation_limit
+    )
     light = [
         _scaled(settings.ambient, uniform[2]),
         _scaled(settings.diffuse, uniform[3]),
@@ -159,7 +163,9 @@ def _outward(detail: float) -> ndarray:
     return normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-9)
 
 
-def _picture(draws: list[_Draw], people: dict[int, _Person], detail: float, size: int, out: dict[str, ndarray]) -> None:
+def _picture(
+    draws: list[_Draw], people: dict[int, _Person], detail: float, size: int, out: dict[str, ndarray]
+) -> None:
     """Assemble the faces of one chunk and draw them into ``out``."""
     grid = face_grid(detail)
     numbers = list(people)
@@ -177,15 +183,16 @@ def _picture(draws: list[_Draw], people: dict[int, _Person], detail: float, size
     eyes = np.array([_lids(people[d.identity].who, d.lids) for d in draws])
     traits = [people[d.identity].who for d in draws]
     paint_features(
-        albedo, grid.p[0], q, gap, eyes, np.stack([w.iris for w in traits]), np.stack([w.lips for w in traits]),
-        np.stack([d.gaze for d in draws]),
+        albedo, grid.p[0], q, gap, eyes, np.stack([w.iris for w in traits]),
+        np.stack([w.lips for w in traits]), np.stack([d.gaze for d in draws]),
     )  # fmt: skip
     camera = np.stack([d.camera for d in draws])
     light = np.stack([d.light for d in draws])
     rotation, direction = camera_rotation_and_light(camera, light)
     draw_meshes(
-        vertices, albedo, rotation.astype(np.float32), camera[:, 3:], np.hstack([light[:, :2], direction]).astype(np.float32),
-        np.stack([d.background for d in draws]), size, np.float32(focal_px(size, FOV_DEG)),
+        vertices, albedo, rotation.astype(np.float32), camera[:, 3:],
+        np.hstack([light[:, :2], direction]).astype(np.float32), np.stack([d.background for d in draws]),
+        size, np.float32(focal_px(size, FOV_DEG)),
         out["images"], out["depth"], out["normal"], out["albedo"], out["mask"],
     )  # fmt: skip
     out["light"][:], out["camera"][:] = light, camera
@@ -215,17 +222,20 @@ def _assemble(base, who, actions, fields, scale, tip, vertices, top, bottom, gap
             for c in range(columns):
                 vertices[n, r, c, 0] *= np.float32(_FACE_PX)
                 vertices[n, r, c, 1] = np.float32(_FACE_PX) * (vertices[n, r, c, 1] + np.float32(_DOWN_PX))
-                vertices[n, r, c, 2] = np.float32(NOSE_TIP_Z) + np.float32(_FACE_PX) * (vertices[n, r, c, 2] - tip[n])
+                vertices[n, r, c, 2] = np.float32(NOSE_TIP_Z) + np.float32(_FACE_PX) * (
+                    vertices[n, r, c, 2] - tip[n]
+                )
 
 
-def _lids(who: FaceIdentity, lids: ndarray) -> list[float]:
+def _lids(who: FaceIdentity, lids: Float32[ndarray, "2 2"]) -> Float64[ndarray, "8"]:
     """The row that paint_features wants."""
     wide, squint = lids
     opening = np.clip(who.eye_opening * (1.0 + 0.34 * wide - 0.42 * squint), 0.25, 1.7)
     low = np.clip(who.eye_opening * (1.0 + 0.2 * wide - 0.45 * squint), 0.2, 1.5)
     up = 2.35 * opening
     low = 1.4 * low
-    return [who.eye_length, up[0], low[0], up[1], low[1], who.eye_tilt, who.lashes, who.lid_crease]
+    tail = (who.eye_tilt, who.lashes, who.lid_crease)
+    return np.array([who.eye_length, up[0], low[0], up[1], low[1], *tail], np.float64)
 
 
 def _scaled(ends: tuple[float, float], share: float) -> float:

@@ -1,9 +1,10 @@
 """Grid meshes of free 3D points to pictures with exact truth: a fast forward-only z-buffer.
 
-Each pixel takes 3 x 3 samples (offsets -1/3, 0, 1/3); the picture is their mean, the truth maps are the middle sample
-alone, at the pixel's centre. Every sample is shaded by itself: albedo and vertex normals are interpolated with
-perspective. Unlike derender.render this needs no gradient, shades a second texture-free truth (normals, albedo), and
-draws meshes whose points are not a depth map. Leaves out cast shadows, speculars, and surfaces seen from behind.
+Each pixel takes 3 x 3 samples (offsets -1/3, 0, 1/3); the picture is their mean, the truth maps are the
+middle sample alone, at the pixel's centre. Every sample is shaded by itself: albedo and vertex normals are
+interpolated with perspective. Unlike derender.render this needs no gradient, shades a second texture-free
+truth (normals, albedo), and draws meshes whose points are not a depth map. Leaves out cast shadows,
+speculars, and surfaces seen from behind.
 """
 
 from typing import no_type_check
@@ -21,9 +22,9 @@ def draw_meshes(vertices, albedo, rotation, translation, light, background, size
                 image, depth, normal, albedo_map, mask):  # fmt: skip
     """Fill the five outputs, one picture per row.
 
-    vertices (N,R,C,3) canonical points, albedo (N,R,C,3) 0..1, rotation (N,3,3), translation (N,3), light (N,5) =
-    ambient, diffuse and the direction in the camera frame, background (N,S,S,3) 0..1; image (N,3,S,S) uint8,
-    depth (N,S,S), normal (N,S,S,3), albedo_map (N,3,S,S) uint8, mask (N,S,S).
+    vertices (N,R,C,3) canonical points, albedo (N,R,C,3) 0..1, rotation (N,3,3), translation (N,3), light
+    (N,5) = ambient, diffuse and the direction in the camera frame, background (N,S,S,3) 0..1; image
+    (N,3,S,S) uint8, depth (N,S,S), normal (N,S,S,3), albedo_map (N,3,S,S) uint8, mask (N,S,S).
     """
     count, rows, columns = vertices.shape[0], vertices.shape[1], vertices.shape[2]
     fine = size * SAMPLES
@@ -58,7 +59,9 @@ def _to_camera(vertices, rotation, translation, camera):
         for c in range(vertices.shape[1]):
             x, y, z = vertices[r, c, 0], vertices[r, c, 1], vertices[r, c, 2] - np.float32(1.0)
             for k in range(3):
-                camera[r, c, k] = rotation[k, 0] * x + rotation[k, 1] * y + rotation[k, 2] * z + translation[k]
+                camera[r, c, k] = (
+                    rotation[k, 0] * x + rotation[k, 1] * y + rotation[k, 2] * z + translation[k]
+                )
             camera[r, c, 2] += np.float32(1.0)
 
 
@@ -116,6 +119,7 @@ def _shade(point, facing, albedo, owner, light, background, size, columns,
            image, depth, normal, albedo_map, mask):  # fmt: skip
     ambient, diffuse = light[0], light[1]
     colour = np.empty(3, np.float32)
+    weight = np.empty(4, np.float32)
     total = np.empty(3, np.float32)
     for i in range(size):
         for j in range(size):
@@ -129,7 +133,8 @@ def _shade(point, facing, albedo, owner, light, background, size, columns,
                     continue
                 r, c = number // 2 // (columns - 1), number // 2 % (columns - 1)
                 ra, ca, rb, cb, rc, cc = r, c + number % 2, r + number % 2, c + 1, r + 1, c
-                wa, wb, wc, inverse_z = _weights(point, ra, ca, rb, cb, rc, cc, u, v)
+                _weights(point, ra, ca, rb, cb, rc, cc, u, v, weight)
+                wa, wb, wc = weight[0], weight[1], weight[2]
                 x = wa * facing[ra, ca, 0] + wb * facing[rb, cb, 0] + wc * facing[rc, cc, 0]
                 y = wa * facing[ra, ca, 1] + wb * facing[rb, cb, 1] + wc * facing[rc, cc, 1]
                 z = wa * facing[ra, ca, 2] + wb * facing[rb, cb, 2] + wc * facing[rc, cc, 2]
@@ -141,7 +146,7 @@ def _shade(point, facing, albedo, owner, light, background, size, columns,
                     total[k] += min(max(colour[k] * shading, np.float32(0.0)), np.float32(1.0))
                 if s == SAMPLES * SAMPLES // 2:
                     mask[i, j] = True
-                    depth[i, j] = np.float32(1.0) / inverse_z
+                    depth[i, j] = weight[3]
                     normal[i, j, 0], normal[i, j, 1], normal[i, j, 2] = x, y, z
                     for k in range(3):
                         albedo_map[k, i, j] = np.uint8(colour[k] * np.float32(255.0) + np.float32(0.5))
@@ -152,13 +157,13 @@ def _shade(point, facing, albedo, owner, light, background, size, columns,
 
 @kernel
 @no_type_check
-def _weights(point, ra, ca, rb, cb, rc, cc, u, v):
-    """Perspective-correct weights of a triangle's corners at sample (u, v), and 1 / z there."""
+def _weights(point, ra, ca, rb, cb, rc, cc, u, v, weight):
+    """Perspective-correct weights of a triangle's corners at sample (u, v), and z there."""
     ax, ay, bx, by = point[ra, ca, 0], point[ra, ca, 1], point[rb, cb, 0], point[rb, cb, 1]
     cx, cy = point[rc, cc, 0], point[rc, cc, 1]
     area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
     wa = ((bx - u) * (cy - v) - (by - v) * (cx - u)) / area * point[ra, ca, 2]
     wb = ((cx - u) * (ay - v) - (cy - v) * (ax - u)) / area * point[rb, cb, 2]
     wc = ((ax - u) * (by - v) - (ay - v) * (bx - u)) / area * point[rc, cc, 2]
-    inverse_z = wa + wb + wc
-    return wa / inverse_z, wb / inverse_z, wc / inverse_z, inverse_z
+    z = np.float32(1.0) / (wa + wb + wc)
+    weight[0], weight[1], weight[2], weight[3] = wa * z, wb * z, wc * z, z

@@ -1,8 +1,9 @@
 """Write synthetic pictures in the layout of the rendered data sets, truth maps included.
 
 ``images/NNNNNN.jpg`` (JPEG quality 92, 4:4:4), ``params.csv`` (degrees), ``identities.csv``, and with truth
-``depth/`` (16 bit, z = 0.8 + value/65535*0.4, 0 = background), ``normal/`` (round((n+1)/2*255)), ``albedo/`` and
-``mask/`` as PNG. The column ``expr_weights`` of the morphable-model sets has no counterpart here.
+``depth/`` (16 bit, z = 0.8 + value/65535*0.4, 0 = background), ``normal/`` (round((n+1)/2*255)),
+``albedo/`` and ``mask/`` as PNG. The column ``expr_weights`` of the morphable-model sets has no counterpart
+here.
 """
 
 import csv
@@ -19,7 +20,7 @@ DEPTH_LOW, DEPTH_SPAN = 0.8, 0.4
 
 
 def write(synthetic: SyntheticSet, folder: Path | str, truth: bool = True) -> Path:
-    """Write the set into ``folder`` (made if missing, refused if it already holds a set) and return that folder."""
+    """Write the set into ``folder`` (made if missing, refused if it holds a set) and return that folder."""
     folder = Path(folder)
     if (folder / "params.csv").exists():
         raise ValueError(f"{folder} already holds a set (params.csv): choose another folder or delete it")

@@ -1,0 +1,298 @@
+"""The command line as a person meets it: help, one story from pictures to scores, and every way to get it wrong."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from derender import FeatureTable, __version__
+from derender.cli import main
+from derender.cli.console import duration, plain
+from derender.report.figures import COLUMN_MEANING
+
+COMMANDS = [
+    ["demo"],
+    ["train"],
+    ["embed"],
+    ["decompose"],
+    ["evaluate", "cluster"],
+    ["evaluate", "geometry"],
+    ["evaluate", "reconstruction"],
+    ["synth", "faces"],
+]
+TINY = ["image_size=32", "width=4", "light_width=4", "perceptual=none", "batch_size=4", "images=8"]
+SETTINGS = ["--preset", "small", *(word for setting in TINY for word in ("--set", setting))]
+
+
+@pytest.fixture(scope="module")
+def faces(tmp_path_factory) -> Path:
+    """Generated faces with ground truth, as `synth faces` writes them."""
+    folder = tmp_path_factory.mktemp("cli") / "faces"
+    assert main(["synth", "faces", "--out", str(folder), "--count", "24", "--image-size", "32"]) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def run(faces: Path, tmp_path_factory) -> Path:
+    """A run folder of a training that lasted two steps."""
+    folder = tmp_path_factory.mktemp("cli") / "run"
+    assert main(["train", "--data", str(faces), "--out", str(folder), *SETTINGS]) == 0
+    return folder
+
+
+@pytest.fixture
+def refused(capsys):
+    """Run a command that must fail with exit code 2 and one line; gives that line."""
+
+    def call(*arguments: object) -> str:
+        capsys.readouterr()
+        assert main([str(argument) for argument in arguments]) == 2
+        lines = capsys.readouterr().err.strip().splitlines()
+        assert len(lines) == 1, lines
+        assert lines[0].startswith("derender: ")
+        return lines[0]
+
+    return call
+
+
+def test_version_and_help_need_no_heavy_import():
+    code = (
+        "import sys; from derender.cli import main; code = main(['--help']); "
+        "heavy = {'torch', 'numpy', 'numba', 'matplotlib', 'PIL', 'sklearn', 'pyarrow'} & set(sys.modules); "
+        "print(heavy, file=sys.stderr); sys.exit(code or len(heavy))"
+    )
+    source = str(Path(__file__).resolve().parents[1] / "src")
+    environment = {**os.environ, "PYTHONPATH": source}
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    for name in ("demo", "train", "embed", "decompose", "evaluate", "synth"):
+        assert name in done.stdout
+
+
+def test_version(capsys):
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out.strip() == f"derender {__version__}"
+
+
+@pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
+def test_help_has_an_example_of_the_command(command, capsys):
+    assert main([*command, "--help"]) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    assert f"Example: derender {' '.join(command)}" in text
+    assert "--json" in text
+
+
+def test_a_run_folder_holds_model_and_report(run: Path):
+    assert (run / "model" / "model.safetensors").is_file()
+    page = (run / "report.html").read_text()
+    assert "Training run" in page and "objective.loocc" in page
+    assert len(list((run / "samples").glob("*.png"))) >= 1
+
+
+def test_dry_run_shows_the_resolved_settings_and_makes_nothing(tmp_path, capsys):
+    out = tmp_path / "run"
+    command = ["train", "--data", "none", "--out", str(out), "--loocc", "light+camera", "--dry-run"]
+    assert main([*command, *SETTINGS, "--json", "-"]) == 0
+    shown = capsys.readouterr().out
+    assert "loocc: light+camera" in shown and "image_size: 32" in shown
+    assert json.loads(shown[shown.index("{") :])["objective"]["loocc"] == "light+camera"
+    assert not out.exists()
+
+
+def test_embed_then_cluster(run, faces, tmp_path, capsys):
+    table_file, numbers, scores = (
+        tmp_path / "features.parquet",
+        tmp_path / "embed.json",
+        tmp_path / "scores.json",
+    )
+    embed = ["embed", "--model", run, "--data", faces, "--out", table_file, "--json", numbers]
+    assert main([str(word) for word in embed]) == 0
+    table = FeatureTable.read(table_file)
+    told = json.loads(numbers.read_text())
+    assert told["rows"] == len(table) == 24
+    assert told["factors"] == {name: values.shape[1] for name, values in table.factors.items()}
+    assert "identity" in told["labels"]
+    capsys.readouterr()
+    cluster = ["evaluate", "cluster", "--features", table_file, "--label", "identity", "--json", scores]
+    assert main([str(word) for word in cluster]) == 0
+    assert "geometry + albedo" in capsys.readouterr().out
+    result = json.loads(scores.read_text())["results"]["geometry + albedo"]
+    assert result["n_rows"] == 24 and result["n_classes"] == 3
+    assert 0 < result["chance"]["accuracy"] <= 1
+
+
+def test_cluster_with_a_model_carries_every_control(run, faces, capsys):
+    assert (
+        main(["evaluate", "cluster", "-m", str(run), "-d", str(faces), "-l", "identity", "--json", "-"]) == 0
+    )
+    out = capsys.readouterr().out
+    results = json.loads(out[out.index("{") :])["results"]
+    assert list(results) == ["geometry + albedo", "untrained encoder", "PCA (23)", "pixels"]
+
+
+def test_geometry_and_reconstruction_of_generated_faces(run, faces, capsys):
+    assert (
+        main(["evaluate", "geometry", "-m", str(run), "-d", str(faces), "--limit", "6", "--json", "-"]) == 0
+    )
+    out = capsys.readouterr().out
+    found = json.loads(out[out.index("{") :])
+    assert found["pictures"] == 6
+    assert {"model", "average_depth", "plane", "untrained"} <= set(found["geometry"])
+    assert found["geometry"]["plane"]["side"] > found["geometry"]["average_depth"]["side"] > 0
+    assert "average depth" in out and "untrained model" in out
+    assert (
+        main(
+            ["evaluate", "reconstruction", "-m", str(run), "-d", str(faces), "--part", "test", "--json", "-"]
+        )
+        == 0
+    )
+    out = capsys.readouterr().out
+    assert json.loads(out[out.index("{") :])["pictures"] == 2  # a tenth of 24
+    assert "mean picture" in out
+
+
+def test_decompose_writes_panels_factors_and_numbers(run, faces, tmp_path, refused, capsys):
+    first, second = sorted((faces / "images").iterdir())[:2]
+    other = tmp_path / "other" / first.name
+    other.parent.mkdir()
+    shutil.copy(second, other)
+    out = tmp_path / "apart"
+    assert main(["decompose", "-m", str(run), str(first), str(other), "--out", str(out)]) == 0
+    folders = sorted(out.iterdir())
+    assert [folder.name for folder in folders] == [first.stem, f"{first.stem}-2"]
+    expected = {"panel.png", "scene.json", "scene.npz"} | {
+        f"{name.replace(' ', '_')}.png" for name in COLUMN_MEANING
+    }
+    assert {file.name for file in folders[0].iterdir()} == expected
+    with Image.open(folders[0] / "depth.png") as depth:
+        assert depth.size == (32, 32)
+    record = json.loads((folders[0] / "scene.json").read_text())
+    assert record["picture"] == str(first) and -60 <= record["camera"]["rotation_deg"][1] <= 60
+    with np.load(folders[0] / "scene.npz") as scene:
+        assert scene["depth"].shape == (32, 32) and scene["normal"].shape == (32, 32, 3)
+        assert np.degrees(scene["camera"][1]) == pytest.approx(record["camera"]["rotation_deg"][1], abs=1e-4)
+    before = (folders[0] / "panel.png").read_bytes()
+    assert "exists already" in refused("decompose", "-m", run, first, "--out", out)
+    (folders[0] / "panel.png").write_bytes(b"old")
+    assert main(["decompose", "-m", str(run), str(first), "--out", str(out), "--force"]) == 0
+    assert (folders[0] / "panel.png").read_bytes() == before
+
+
+def test_decompose_does_what_it_can_and_names_the_rest(run, faces, tmp_path, capsys):
+    good = min((faces / "images").iterdir())
+    bad = tmp_path / "bad.jpg"
+    bad.write_bytes(b"no picture")
+    assert main(["decompose", "-m", str(run), str(bad), str(good), "--out", str(tmp_path / "apart")]) == 2
+    assert f"left out {bad}" in capsys.readouterr().err
+    assert [folder.name for folder in (tmp_path / "apart").iterdir()] == [good.stem]
+
+
+def test_bad_words_on_the_command_line(refused, tmp_path):
+    assert "'train'" in refused("trian")
+    assert "--out" in refused("train", "--data", "x")
+    assert "see derender train --help" in refused(
+        "train", "--data", "x", "--out", tmp_path / "r", "--sett", "a=1"
+    )
+    assert "--features" in refused("evaluate", "cluster", "--label", "identity")
+    assert "--data" in refused("evaluate", "cluster", "--label", "identity", "--model", "m")
+    assert "choose auto, cpu or cuda" in refused(
+        "train", "--data", "x", "--out", tmp_path / "r", "--device", "gpu0", *SETTINGS
+    )
+
+
+def test_bad_settings_name_the_nearest(refused, tmp_path):
+    train = ("train", "--data", tmp_path, "--out", tmp_path / "run")
+    assert "'faces'" in refused(*train, "--preset", "facs")
+    assert "optimiser.learning_rate" in refused(*train, "--set", "learning_rat=3")
+    assert "key=value" in refused(*train, "--set", "learning_rate")
+    assert "light+camera" in refused(*train, "--loocc", "everything")
+
+
+def test_bad_data(refused, tmp_path):
+    train = ("train", "--out", tmp_path / "run", *SETTINGS)
+    missing = tmp_path / "missing"
+    assert str(missing) in refused(*train, "--data", missing)
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    assert "no pictures" in refused(*train, "--data", empty)
+    assert "'utkface'" in refused(*train, "--data", empty, "--dataset", "utkfac")
+    single = tmp_path / "single"
+    single.mkdir()
+    Image.new("RGB", (8, 8)).save(single / "a.png")
+    assert "only one picture" in refused(*train, "--data", single)
+    assert not (tmp_path / "run").exists()
+
+
+def test_nothing_is_written_over(run, faces, refused, tmp_path):
+    assert "--resume" in refused("train", "--data", faces, "--out", run, *SETTINGS)
+    assert "another --out" in refused("synth", "faces", "--out", faces)
+    assert "is not empty" in refused("demo", "--out", faces)
+    there = tmp_path / "there.parquet"
+    there.write_text("mine")
+    assert "--force" in refused("embed", "-m", run, "-d", faces, "--out", there)
+    assert there.read_text() == "mine"
+    assert "is a folder" in refused("embed", "-m", run, "-d", faces, "--out", tmp_path)
+
+
+def test_missing_and_damaged_models(run, faces, refused, tmp_path):
+    embed = ("embed", "--data", faces, "--out", tmp_path / "f.parquet", "--model")
+    assert "no model at" in refused(*embed, tmp_path / "none")
+    assert "holds no model" in refused(*embed, faces)
+    damaged = tmp_path / "damaged"
+    shutil.copytree(run / "model", damaged)
+    weights = damaged / "model.safetensors"
+    weights.write_bytes(weights.read_bytes()[:-100])
+    assert "damaged" in refused(*embed, damaged)
+    assert "records no split" in refused(*embed, run / "model", "--part", "test")
+    assert "unknown part" in refused(*embed, run, "--part", "tst")
+    not_parquet = tmp_path / "x.parquet"
+    not_parquet.write_bytes(b"nothing")
+    assert str(not_parquet) in refused(
+        "evaluate", "cluster", "--features", not_parquet, "--label", "identity"
+    )
+    assert "identity" in refused("evaluate", "cluster", "-m", run, "-d", faces, "--label", "identty")
+
+
+def test_resume_takes_the_stored_settings(run, faces, tmp_path, capsys):
+    copy = tmp_path / "run"
+    shutil.copytree(run, copy)
+    assert main(["train", "--data", str(faces), "--out", str(copy), "--resume", "--dry-run"]) == 0
+    assert "image_size: 32" in capsys.readouterr().out
+    (copy / "checkpoints" / "last").rename(copy / "checkpoints" / "gone")
+    assert main(["train", "--data", str(faces), "--out", str(tmp_path / "no"), "--resume"]) == 2
+    assert "no run to resume" in capsys.readouterr().err
+
+
+def test_ctrl_c_says_how_to_go_on(faces, tmp_path, monkeypatch, capsys):
+    from derender.training import loop
+    from derender.training.interrupt import TrainingInterrupted
+
+    def interrupted(*_, **__):
+        raise TrainingInterrupted("stopped after 32 pictures; run the same command with --resume to go on")
+
+    monkeypatch.setattr(loop, "train", interrupted)
+    assert main(["train", "--data", str(faces), "--out", str(tmp_path / "run"), *SETTINGS]) == 130
+    assert capsys.readouterr().err.splitlines()[-1].endswith("with --resume to go on")
+
+
+def test_a_full_disk_is_one_line(run, faces, tmp_path, monkeypatch, refused):
+    def full(*_, **__):
+        raise OSError(28, "No space left on device", "f.parquet")
+
+    monkeypatch.setattr(FeatureTable, "write", full)
+    line = refused("embed", "-m", run, "-d", faces, "--out", tmp_path / "f.parquet")
+    assert line == "derender: f.parquet: no space left on device; free some space and run the command again"
+
+
+def test_json_holds_no_nan_and_names_every_number():
+    values = plain({"a": float("nan"), "b": np.array([1.5, np.inf]), "c": Path("x"), 3: (np.int64(2), None)})
+    assert values == {"a": None, "b": [1.5, None], "c": "x", "3": [2, None]}
+    assert [duration(seconds) for seconds in (9.4, 75, 3720)] == ["9 s", "1 min 15 s", "1 h 2 min"]

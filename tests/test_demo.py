@@ -1,0 +1,114 @@
+"""The demo from end to end in a very small setting: it must hold together, not impress."""
+
+import json
+import re
+from dataclasses import replace
+
+import pytest
+
+from derender.demo import DemoSettings, demo_page, run_demo
+from derender.demo.page import score_tables, shown_rows
+from derender.demo.story import STAGES
+from derender.evaluation import GeometryResult
+
+TINY = DemoSettings(
+    train_pictures=24,
+    test_pictures=16,
+    images=16,
+    minutes=5,
+    shown=2,
+    films=1,
+    overrides=("image_size=32", "width=4", "light_width=4", "batch_size=8", "self_features_steps=1"),
+)
+
+
+@pytest.fixture(scope="module")
+def told(tmp_path_factory):
+    """A finished demo, and the stages it reported."""
+    stages: list[str] = []
+    result = run_demo(
+        tmp_path_factory.mktemp("demo") / "out", TINY, seed=3, report=lambda stage, *_: stages.append(stage)
+    )
+    return result, list(dict.fromkeys(stages))
+
+
+@pytest.fixture(scope="module")
+def html(told) -> str:
+    return demo_page(told[0]).html()
+
+
+def test_every_stage_happens_in_order(told):
+    result, stages = told
+    assert stages == list(STAGES[:4])
+    assert set(result.seconds) == set(STAGES[:4])
+    assert result.trained.images == 16
+
+
+def test_scores_stand_beside_their_controls(told):
+    result, _ = told
+    tables = score_tables(result)
+    assert list(tables["clustering"].values()) == [
+        "geometry + albedo",
+        "untrained encoder",
+        "PCA (15)",
+        "pixels",
+        "chance",
+    ]
+    assert list(tables["geometry"].values()) == ["model", "average depth", "plane", "untrained model"]
+    assert result.reconstruction.mean_picture.l1 > 0
+    assert len(set(result.clusters)) == len(set(result.identities)) == 2
+
+
+def test_training_and_scored_faces_are_other_people(told):
+    result, _ = told
+    seen = {picture.tobytes() for picture in result.seen.images}
+    assert not seen & {picture.tobytes() for picture in result.truth.images}
+
+
+def test_page_shows_every_column_and_number(told, html):
+    result, _ = told
+    assert f"{100 * result.geometry.model.side:.2f}" in html
+    for word in (
+        "reconstruction",
+        "another light",
+        "another view",
+        "true depth",
+        "true albedo",
+        "PCA (15)",
+        "plane",
+    ):
+        assert word in html
+    assert html.count("<img") >= 2 * 8 + 2 * 7 + 2
+    assert not re.search(r'(?:src|href|srcset)="(?!data:|#)', html)
+
+
+def test_sentences_follow_the_numbers(told):
+    result, _ = told
+    geometry = result.geometry
+    better = replace(geometry.model, side=geometry.plane.side / 100, mad_deg=0.1)
+    worse = replace(geometry.model, side=1.0, mad_deg=179.0)
+    for scores, said in ((better, "better than every control"), (worse, "behind the strongest control")):
+        changed = replace(
+            result, geometry=GeometryResult(scores, geometry.average_depth, geometry.plane, None)
+        )
+        tables = score_tables(changed)
+        assert all(said in tables["geometry"].verdict(column) for column in (0, 1))
+        assert f"Depth</dt><dd>{said}" in demo_page(changed).html()
+
+
+def test_pictures_on_the_page_are_spread_over_the_set(told):
+    assert shown_rows(told[0]).tolist() == [0, 15]
+
+
+def test_command_writes_page_and_numbers(tmp_path, monkeypatch, capsys):
+    import derender.demo as package
+    from derender.cli import main
+
+    monkeypatch.setattr(package, "QUICK", TINY)
+    monkeypatch.chdir(tmp_path)
+    assert main(["demo", "--quick", "--json", "numbers.json"]) == 0
+    out = capsys.readouterr().out
+    assert out.strip().splitlines()[-1] == "report derender-demo/report.html"
+    assert (tmp_path / "derender-demo" / "report.html").stat().st_size > 20_000
+    numbers = json.loads((tmp_path / "numbers.json").read_text())
+    assert numbers["geometry"]["plane"]["MAD"] > 0 and numbers["clustering"]["pixels"]["accuracy"] > 0
