@@ -31,7 +31,7 @@ bench: $(STAMP)  ## the speed tables of docs/results.md
 
 constraints: $(STAMP)  ## write the versions installed in .venv to constraints.txt
 	@{ sed -n '/^#/p' constraints.txt; \
-	   $(BIN)/python -m pip freeze --all --exclude-editable | sed -e 's/+[a-z0-9.]*$$//' -e '/^setuptools==/d' -e '/ @ /d'; } > constraints.tmp
+	   $(BIN)/python -m pip freeze --all --exclude-editable | sed -e 's/+[a-z0-9.]*$$//' -e '/ @ /d'; } > constraints.tmp
 	@mv constraints.tmp constraints.txt && touch $(STAMP)
 
 clean:  ## remove .venv and everything a tool has cached

@@ -1,4 +1,4 @@
-"""The command line as a person meets it: help, one story from pictures to scores, and every way to get it wrong."""
+"""The command line as a person meets it: help, a story from pictures to scores, and ways to get it wrong."""
 
 import json
 import os
@@ -135,7 +135,7 @@ def test_cluster_with_a_model_carries_every_control(run, faces, capsys):
     )
     out = capsys.readouterr().out
     results = json.loads(out[out.index("{") :])["results"]
-    assert list(results) == ["geometry + albedo", "untrained encoder", "PCA (23)", "pixels"]
+    assert list(results) == ["geometry + albedo", "untrained encoder", "PCA (6)", "pixels"]
 
 
 def test_geometry_and_reconstruction_of_generated_faces(run, faces, capsys):

@@ -50,7 +50,7 @@ def test_scores_stand_beside_their_controls(told):
     assert list(tables["clustering"].values()) == [
         "geometry + albedo",
         "untrained encoder",
-        "PCA (15)",
+        "PCA (6)",
         "pixels",
         "chance",
     ]
@@ -74,7 +74,7 @@ def test_page_shows_every_column_and_number(told, html):
         "another view",
         "true depth",
         "true albedo",
-        "PCA (15)",
+        "PCA (6)",
         "plane",
     ):
         assert word in html

@@ -247,6 +247,19 @@ raise SystemExit(os.waitpid(child, 0)[1])
     assert subprocess.run([sys.executable, "-c", code], timeout=120, check=False).returncode == 0
 
 
+@needs_numba
+def test_kernels_are_compiled_where_no_folder_can_cache_them():
+    from derender.render.numba_threads import kernel
+
+    namespace = {"kernel": kernel}
+    exec(
+        "@kernel\ndef count(values, start, stop):\n    values[start:stop] += 1", namespace
+    )  # no file, no cache
+    values = torch.zeros(5, dtype=torch.float64)
+    namespace["count"](values.numpy(), 1, 4)
+    assert values.tolist() == [0, 1, 1, 1, 0]
+
+
 def test_importing_the_renderer_does_not_import_numba():
     code = "import sys, derender.render; raise SystemExit('numba' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], timeout=120, check=False).returncode == 0

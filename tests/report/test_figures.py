@@ -1,4 +1,4 @@
-"""Images show what the values say: sizes, labels, one scale for a set, directions of normals, transparency."""
+"""Images show what the values say: sizes, labels, one scale for a set, normals, transparency."""
 
 from io import BytesIO
 from math import radians

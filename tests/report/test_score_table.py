@@ -25,19 +25,28 @@ def table(ours: float, controls: dict[str, float | None], best="high") -> ScoreT
     return ScoreTable("", "", [Column("score", best)], rows)
 
 
+TWO = {"pca": 0.5, "pixels": 0.6}
+DEPTHS = {"plane": 3.0, "average": 2.0}
+
+
 @pytest.mark.parametrize(
     ("ours", "controls", "best", "said"),
     [
-        (0.9, {"pca": 0.5, "pixels": 0.6}, "high", "better than every control: 0.900 against 0.600 (pixels)"),
-        (0.55, {"pca": 0.5, "pixels": 0.6}, "high", "behind the strongest control: 0.550 against 0.600 (pixels), but ahead of pca"),
-        (0.1, {"pca": 0.5, "pixels": 0.6}, "high", "behind the strongest control: 0.100 against 0.600 (pixels)"),
-        (0.6, {"pca": 0.5, "pixels": 0.6}, "high", "level with the strongest control: 0.600 (pixels)"),
-        (1.0, {"plane": 3.0, "average": 2.0}, "low", "better than every control: 1.000 against 2.000 (average)"),
-        (2.5, {"plane": 3.0, "average": 2.0}, "low", "behind the strongest control: 2.500 against 2.000 (average), but ahead of plane"),
+        (0.9, TWO, "high", "better than every control: 0.900 against 0.600 (pixels)"),
+        (0.55, TWO, "high", "behind the strongest control: 0.550 against 0.600 (pixels), but ahead of pca"),
+        (0.1, TWO, "high", "behind the strongest control: 0.100 against 0.600 (pixels)"),
+        (0.6, TWO, "high", "level with the strongest control: 0.600 (pixels)"),
+        (1.0, DEPTHS, "low", "better than every control: 1.000 against 2.000 (average)"),
+        (
+            2.5,
+            DEPTHS,
+            "low",
+            "behind the strongest control: 2.500 against 2.000 (average), but ahead of plane",
+        ),
         (0.0, {"plane": 0.5}, "low", "better than every control: 0.000 against 0.500 (plane)"),
         (0.5, {"missing": None}, "high", "ours: 0.500 (score)"),
     ],
-)  # fmt: skip
+)
 def test_verdict_compares(ours, controls, best, said):
     assert table(ours, controls, best).verdict(0) == said
 

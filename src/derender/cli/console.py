@@ -133,8 +133,8 @@ def plain(value: Any) -> Any:
         return [plain(item) for item in value]
     if isinstance(value, Path):
         return str(value)
-    if hasattr(value, "tolist"):
-        return plain(value.tolist())
+    if callable(listed := getattr(value, "tolist", None)):
+        return plain(listed())
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value

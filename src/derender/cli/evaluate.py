@@ -83,7 +83,7 @@ def cluster(
             tables[factors.replace(",", " + ")] = embed_pictures(net, pictures, progress=report)
         with bar("untrained control") as report:
             tables["untrained encoder"] = untrained_features(net, pictures, seed=seed, progress=report)
-        components = min(64, len(pictures) - 1)
+        components = max(1, min(64, len(pictures) // 4))  # whitening needs many more rows than components
         tables[f"PCA ({components})"] = pca_features(pictures, components=components, seed=seed)
         tables["pixels"] = pixel_features(pictures)
 

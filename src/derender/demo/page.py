@@ -29,6 +29,13 @@ from derender.training.config import PRESETS
 from derender.training.run_folder import read_metrics
 
 CLUSTERS_SHOWN, MEMBERS_SHOWN, INPUTS_SHOWN = 5, 12, 10
+ENDED = {
+    "images": "the planned number of pictures",
+    "minutes": "the time limit",
+    "patience": "no more improvement on held-out pictures",
+    "collapse": "the watcher",
+}
+FRAMES, MOVES = 16, "the light goes round, the head turns"
 
 
 def demo_page(result: DemoResult) -> Page:
@@ -102,13 +109,12 @@ def _summary(result: DemoResult, tables: dict[str, ScoreTable]) -> list[blocks.H
     length = f"It saw {seen:,} pictures (repeats counted)"
     if seen < usual:
         length += f"; an ordinary run of the same preset sees {usual:,}: read this as a beginning"
-    names = {
-        "geometry": ("Depth", 0),
-        "reconstruction": ("Rendering again", 0),
-        "clustering": ("Clusters by identity", 0),
+    verdicts = {
+        "Depth": tables["geometry"].verdict(0),
+        "Normals": tables["geometry"].verdict(1),
+        "Clusters by identity": clustering.verdict(0),
+        "Rendered again": tables["reconstruction"].verdict(0),
     }
-    verdicts = {title: tables[name].verdict(column) for name, (title, column) in names.items()}
-    verdicts["Normals"] = tables["geometry"].verdict(1)
     warnings = [
         blocks.prose(blocks.strong("The watcher says: "), finding.text) for finding in result.trained.findings
     ]
@@ -139,10 +145,13 @@ def _decomposed(drawn: Decomposition) -> list[blocks.Html]:
 def _films(result: DemoResult, scene) -> list[blocks.Html]:
     items = []
     for index in range(min(result.settings.films, len(scene))):
-        for film, label in ((films.relighting, "the light goes round"), (films.rotation, "the head turns")):
-            frames = film(scene[index], result.model.render, frames=16)
-            moving = films.animated_png(frames)
-            items.append((blocks.film(moving, frames[4], f"unseen face {index + 1}: {label}", 118), label))
+        relit = films.relighting(scene[index], result.model.render, frames=FRAMES)
+        turned = films.rotation(scene[index], result.model.render, frames=FRAMES)
+        both = films.side_by_side([relit, turned])
+        film = blocks.film(
+            films.animated_png(both), both[FRAMES // 4], f"unseen face {index + 1}: {MOVES}", 236
+        )
+        items.append((film, MOVES))
     return [
         blocks.figure(
             blocks.row_of(items),
@@ -221,12 +230,9 @@ def _clusters(result: DemoResult, table: ScoreTable) -> list[blocks.Html]:
     return [
         blocks.prose(
             f"The unseen faces show {people} people in changing light, view and expression. "
-            f"Ward clustering of geometry and albedo features into {people} clusters, without any label, is ",
-            blocks.strong(table.verdict(0)),
-            " in accuracy, and ",
-            blocks.strong(table.verdict(2)),
-            " in NMI.",
+            f"Ward clustering sorted their geometry and albedo features into {people} groups."
         ),
+        blocks.definitions({f"{table.columns[column].name}": table.verdict(column) for column in (0, 1, 2)}),
         blocks.table(table),
         blocks.folded("Some of the clusters", *shown),
     ]
@@ -257,7 +263,7 @@ def _training(result: DemoResult) -> list[blocks.Html]:
         **minutes,
         "pictures seen": f"{trained.images:,}",
         "pictures per second": f"{trained.images_per_second:.0f}",
-        "training ended by": trained.stopped,
+        "training ended by": ENDED.get(trained.stopped, trained.stopped),
         "preset": result.config.preset,
         "perceptual features": result.config.objective.perceptual,
         "seed": result.seed,

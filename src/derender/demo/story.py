@@ -34,7 +34,7 @@ from derender.settings import Settings
 from derender.training.config import TrainConfig, resolve
 from derender.training.loop import Progress, TrainResult, train
 
-Report = Callable[[str, int, int, str], object]
+Report = Callable[[str, int, int, str], None]
 """Called with (stage, done, total, note)."""
 
 STAGES = (
@@ -52,7 +52,7 @@ class DemoSettings(Settings):
 
     train_pictures: int = Field(default=4_000, ge=20)
     test_pictures: int = Field(default=240, ge=16)
-    images: int = Field(default=10_000, ge=32)  # pictures seen in training, repeats counted
+    images: int = Field(default=10_000, ge=2)  # pictures seen in training, repeats counted
     minutes: float = Field(default=4.5, gt=0)  # training stops here on a slow machine
     shown: int = Field(default=8, ge=1)  # unseen pictures on the page
     films: int = Field(default=4, ge=1)
@@ -118,7 +118,7 @@ def run_demo(
         FileExistsError: ``out`` is not empty.
         ValueError: training collapsed before it had a model to show.
     """
-    out, tell = Path(out), report or (lambda *_: None)
+    out, tell = Path(out), report or _quiet
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise FileExistsError(f"{out} exists and is not empty: choose another --out")
     clock = _Clock()
@@ -156,10 +156,10 @@ def run_demo(
     reconstruction = evaluate_reconstruction(model, unseen.images, mean=mean_picture(seen.images))
     tell(STAGES[3], 2, 4, "features")
     table = embed_pictures(model, unseen)
-    components = min(64, len(unseen) - 1)
+    components = min(64, len(seen) // 4)
     controls = {
         "untrained encoder": (untrained_features(model, unseen, seed=seed), FACTORS),
-        f"PCA ({components})": (pca_features(unseen, components=components, seed=seed), None),
+        f"PCA ({components})": (pca_features(unseen, components=components, fit_on=seen, seed=seed), None),
         "pixels": (pixel_features(unseen), None),
     }
     tell(STAGES[3], 3, 4, "clusters")
@@ -187,6 +187,10 @@ def _training_config(settings: DemoSettings, seed: int) -> TrainConfig:
         "seed": seed,
     }
     return resolve("small", settings.overrides, **fixed)
+
+
+def _quiet(stage: str, done: int, total: int, note: str) -> None:
+    pass
 
 
 class _Clock:

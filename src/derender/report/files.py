@@ -94,7 +94,8 @@ def _write_folder(
         (temporary / "scene.json").write_text(
             json.dumps(record, indent=1, ensure_ascii=False), encoding="utf-8"
         )
-        values: dict[str, Any] = {name: value[0].cpu().numpy() for name, value in scene.detach().parameters.items()}
+        parameters = scene.detach().parameters
+        values: dict[str, Any] = {name: value[0].cpu().numpy() for name, value in parameters.items()}
         values["normal"] = normals_from_depth(scene.depth, fov_deg)[0].detach().cpu().numpy()
         np.savez_compressed(temporary / "scene.npz", **values)
         temporary.chmod(0o755)

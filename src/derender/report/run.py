@@ -69,7 +69,7 @@ def loss_charts(metrics: Sequence[dict[str, Any]]) -> list[blocks.Html]:
             ]
             if points:
                 series[name] = tuple(zip(*points, strict=True))
-        if series:
+        if any(len(x) > 1 for x, _ in series.values()):  # one point is no curve
             svg = charts.curves(series, "pictures seen", label)
             charts_made.append(blocks.chart(svg, f"{label} over pictures seen", text))
     return charts_made

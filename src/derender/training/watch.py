@@ -191,7 +191,7 @@ def measure(scene: Scene, ranges: SceneRanges) -> dict[str, float]:
     """The numbers that signs are read from, each a mean over the batch.
 
     depth_at_bound, view_at_bound, light_at_bound: shares, 0..1. depth_spread: standard deviation of a depth
-    map over its range. depth_roughness: mean step between neighbours over the standard deviation. bulge: how far
+    map over its range. depth_roughness: mean step between neighbours over that deviation. bulge: how far
     the rim lies behind the middle, over the range; negative is hollow. shading_contrast: standard deviation
     of the shading in a picture over its mean.
     """

@@ -19,7 +19,7 @@ from numpy import ndarray
 from derender.data.synthetic.backgrounds import draw_background
 from derender.data.synthetic.face_expression import ACTIONS, EXPRESSIONS, LID_ACTIONS, expression_basis
 from derender.data.synthetic.face_features import paint_features
-from derender.data.synthetic.face_grid import MOUTH_BAND, MOUTH_Q, face_grid
+from derender.data.synthetic.face_grid import MOUTH_BAND, MOUTH_Q, face_grid, smoothstep
 from derender.data.synthetic.face_identity import FaceIdentity, draw_identity
 from derender.data.synthetic.face_shape import bare_head, shape_basis
 from derender.data.synthetic.face_skin import ear_share, paint_skin
@@ -157,10 +157,15 @@ def _person(seed: int, identity: int, detail: float) -> _Person:
 
 @lru_cache(maxsize=4)
 def _outward(detail: float) -> ndarray:
-    """Unit normals of the bare head, pointing out of it."""
-    head = bare_head(face_grid(detail))
+    """Unit vectors out of the bare head: its normals, level below the ears, where hair hangs."""
+    grid = face_grid(detail)
+    head = bare_head(grid)
     normal = np.cross(np.gradient(head, axis=0), np.gradient(head, axis=1))
-    return normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-9)
+    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-9)
+    level = np.stack([np.sin(grid.theta), np.zeros(grid.shape), -np.cos(grid.theta)], axis=-1)
+    low = smoothstep(2.0, 20.0, grid.q)[..., None]
+    out = (1.0 - low) * normal + low * level
+    return out / np.maximum(np.linalg.norm(out, axis=-1, keepdims=True), 1e-9)
 
 
 def _picture(

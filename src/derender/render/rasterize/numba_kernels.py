@@ -75,13 +75,13 @@ def choose(vertices, focal, triangle, start, stop):
                                 du0, du1, du2 = u0 - p, u1 - p, u2 - p
                                 dv0, dv1, dv2 = v0 - q, v1 - q, v2 - q
                                 weight0 = (du1 * dv2 - du2 * dv1) * scale
-                                if weight0 < -EDGE_TOLERANCE:
-                                    continue
                                 weight1 = (du2 * dv0 - du0 * dv2) * scale
-                                if weight1 < -EDGE_TOLERANCE:
-                                    continue
                                 weight2 = (du0 * dv1 - du1 * dv0) * scale
-                                if weight2 < -EDGE_TOLERANCE:
+                                if (
+                                    weight0 < -EDGE_TOLERANCE
+                                    or weight1 < -EDGE_TOLERANCE
+                                    or weight2 < -EDGE_TOLERANCE
+                                ):
                                     continue
                                 inverse_depth = weight0 * a0 + weight1 * a1 + weight2 * a2
                                 if walk == 1:

@@ -1,0 +1,51 @@
+"""A run's page is made from its folder alone, also from one that broke off."""
+
+from PIL import Image
+
+from derender.report.run import loss_charts, run_page
+from derender.training.config import resolve
+from derender.training.run_folder import append_metrics, start_run
+
+
+def test_page_of_a_run_shows_curves_samples_settings_and_what_failed(tmp_path):
+    run = start_run(tmp_path / "run", resolve("small", ["seed=7"]), {"pictures": 12}, "cpu")
+    assert "Nothing was logged yet." in run_page(run.path).html()
+    for images in (32, 64, 96):
+        append_metrics(
+            run, {"kind": "train", "images": images, "seconds": 1.0, "l1": 1 / images, "images_per_second": 9}
+        )
+        append_metrics(
+            run, {"kind": "validation", "images": images, "seconds": 1.0, "l1": 2 / images, "loss": -images}
+        )
+        Image.new("RGB", (8, 8)).save(run.samples / f"{images:09d}.png")
+    append_metrics(
+        run, {"kind": "collapse", "images": 96, "seconds": 1.0, "flat": "depth is <flat>: lower the rate"}
+    )
+    html = run_page(run.path).html()
+    assert html.count("<svg") == 2 and "held out" in html
+    assert "The watcher stopped this run." in html and "depth is &lt;flat&gt;" in html
+    assert "After 32 pictures." in html and "After 96 pictures." in html
+    assert "<dt>seed</dt><dd>7</dd>" in html and "<dt>pictures</dt><dd>12</dd>" in html
+
+
+def test_only_first_last_and_evenly_chosen_samples_are_shown(tmp_path):
+    run = start_run(tmp_path / "run", resolve("small"), {}, "cpu")
+    for images in range(1, 21):
+        Image.new("RGB", (8, 8)).save(run.samples / f"{images:09d}.png")
+    html = run_page(run.path).html()
+    shown = [number for number in range(1, 21) if f"After {number} pictures." in html]
+    assert len(shown) == 4 and shown[0] == 1 and shown[-1] == 20
+
+
+def test_a_damaged_environment_does_not_hide_the_rest(tmp_path):
+    run = start_run(tmp_path / "run", resolve("small"), {}, "cpu")
+    (run.path / "environment.json").write_text("{")
+    assert "<dt>environment.json</dt><dd>damaged</dd>" in run_page(run.path).html()
+
+
+def test_curves_need_two_points_and_leave_out_what_is_no_number():
+    rows = [
+        {"kind": "train", "images": n, "l1": value} for n, value in ((1, 0.5), (2, float("nan")), (3, None))
+    ]
+    assert loss_charts(rows) == []
+    assert len(loss_charts([*rows, {"kind": "train", "images": 4, "l1": 0.25}])) == 1
