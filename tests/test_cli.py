@@ -48,15 +48,15 @@ def run(faces: Path, tmp_path_factory) -> Path:
 
 @pytest.fixture
 def refused(capsys):
-    """Run a command that must fail with exit code 2 and one line; gives that line."""
+    """Run a command that must fail with exit code 2 and one line of complaint, the last; gives that line."""
 
     def call(*arguments: object) -> str:
         capsys.readouterr()
         assert main([str(argument) for argument in arguments]) == 2
-        lines = capsys.readouterr().err.strip().splitlines()
-        assert len(lines) == 1, lines
-        assert lines[0].startswith("derender: ")
-        return lines[0]
+        *notes, last = capsys.readouterr().err.strip().splitlines()
+        assert last.startswith("derender: ")
+        assert not any(note.startswith(("derender:", "Traceback")) for note in notes)
+        return last
 
     return call
 
@@ -101,9 +101,9 @@ def test_dry_run_shows_the_resolved_settings_and_makes_nothing(tmp_path, capsys)
     out = tmp_path / "run"
     command = ["train", "--data", "none", "--out", str(out), "--loocc", "light+camera", "--dry-run"]
     assert main([*command, *SETTINGS, "--json", "-"]) == 0
-    shown = capsys.readouterr().out
-    assert "loocc: light+camera" in shown and "image_size: 32" in shown
-    assert json.loads(shown[shown.index("{") :])["objective"]["loocc"] == "light+camera"
+    shown = capsys.readouterr()
+    assert "loocc: light+camera" in shown.err and "image_size: 32" in shown.err
+    assert json.loads(shown.out)["objective"]["loocc"] == "light+camera"
     assert not out.exists()
 
 
@@ -133,8 +133,7 @@ def test_cluster_with_a_model_carries_every_control(run, faces, capsys):
     assert (
         main(["evaluate", "cluster", "-m", str(run), "-d", str(faces), "-l", "identity", "--json", "-"]) == 0
     )
-    out = capsys.readouterr().out
-    results = json.loads(out[out.index("{") :])["results"]
+    results = json.loads(capsys.readouterr().out)["results"]
     assert list(results) == ["geometry + albedo", "untrained encoder", "PCA (6)", "pixels"]
 
 
@@ -142,21 +141,21 @@ def test_geometry_and_reconstruction_of_generated_faces(run, faces, capsys):
     assert (
         main(["evaluate", "geometry", "-m", str(run), "-d", str(faces), "--limit", "6", "--json", "-"]) == 0
     )
-    out = capsys.readouterr().out
-    found = json.loads(out[out.index("{") :])
+    shown = capsys.readouterr()
+    found = json.loads(shown.out)
     assert found["pictures"] == 6
     assert {"model", "average_depth", "plane", "untrained"} <= set(found["geometry"])
     assert found["geometry"]["plane"]["side"] > found["geometry"]["average_depth"]["side"] > 0
-    assert "average depth" in out and "untrained model" in out
+    assert "average depth" in shown.err and "untrained model" in shown.err
     assert (
         main(
             ["evaluate", "reconstruction", "-m", str(run), "-d", str(faces), "--part", "test", "--json", "-"]
         )
         == 0
     )
-    out = capsys.readouterr().out
-    assert json.loads(out[out.index("{") :])["pictures"] == 2  # a tenth of 24
-    assert "mean picture" in out
+    shown = capsys.readouterr()
+    assert json.loads(shown.out)["pictures"] == 2  # a tenth of 24
+    assert "mean picture" in shown.err
 
 
 def test_decompose_writes_panels_factors_and_numbers(run, faces, tmp_path, refused, capsys):
@@ -179,11 +178,11 @@ def test_decompose_writes_panels_factors_and_numbers(run, faces, tmp_path, refus
     with np.load(folders[0] / "scene.npz") as scene:
         assert scene["depth"].shape == (32, 32) and scene["normal"].shape == (32, 32, 3)
         assert np.degrees(scene["camera"][1]) == pytest.approx(record["camera"]["rotation_deg"][1], abs=1e-4)
-    before = (folders[0] / "panel.png").read_bytes()
     assert "exists already" in refused("decompose", "-m", run, first, "--out", out)
     (folders[0] / "panel.png").write_bytes(b"old")
     assert main(["decompose", "-m", str(run), str(first), "--out", str(out), "--force"]) == 0
-    assert (folders[0] / "panel.png").read_bytes() == before
+    with Image.open(folders[0] / "panel.png") as panel:
+        assert panel.width > 8 * 160
 
 
 def test_decompose_does_what_it_can_and_names_the_rest(run, faces, tmp_path, capsys):

@@ -49,14 +49,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; gives the exit code: 0, 2 for bad input, 130 after Ctrl-C."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     try:
-        code = app(arguments, prog_name="derender", standalone_mode=False)
+        command = typer.main.get_command(app)
+        with command.make_context(
+            "derender", arguments
+        ) as context:  # typer's own main hides what Ctrl-C said
+            command.invoke(context)
         sys.stdout.flush()
-        return code if isinstance(code, int) else 0
+        return 0
+    except typer.Exit as end:
+        return end.exit_code
     except BrokenPipeError:  # the reader of our output has gone, as with `| head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except (KeyboardInterrupt, typer.Abort) as error:
-        _complain(_interruption(error))
+        _complain(_flat(str(error)) or "stopped by Ctrl-C; nothing half-written was kept")
         return 130
     except (ValueError, OSError) as error:
         if os.environ.get("DERENDER_TRACEBACK"):
@@ -64,10 +70,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _complain(_one_line(error))
         return 2
     except Exception as error:
-        if not hasattr(error, "format_message"):
+        describe = getattr(error, "format_message", None)  # bad words; typer has several kinds
+        if describe is None:
             raise
         command = getattr(getattr(error, "ctx", None), "command_path", "derender")
-        message = error.format_message().strip()
+        message = describe().strip()
         if not message:  # no command given: help has been shown
             return 2
         _complain(f"{message.rstrip('.')} (see {command} --help)")
@@ -76,11 +83,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _complain(message: str) -> None:
     sys.stderr.write(f"derender: {message}\n")
-
-
-def _interruption(error: BaseException) -> str:
-    cause = error if isinstance(error, KeyboardInterrupt) else error.__cause__
-    return _flat(str(cause or "")) or "stopped by Ctrl-C; nothing half-written was kept"
 
 
 def _one_line(error: ValueError | OSError) -> str:

@@ -38,9 +38,9 @@ def say(text: str) -> None:
     Console(stderr=True, highlight=False, soft_wrap=True, markup=False).print(text)
 
 
-def result(text: str) -> None:
-    """One line of result."""
-    Console(highlight=False, soft_wrap=True, markup=False).print(text)
+def result(text: str, json_file: str | None) -> None:
+    """One line of result; it makes way on standard output where the JSON goes there."""
+    Console(stderr=json_file == "-", highlight=False, soft_wrap=True, markup=False).print(text)
 
 
 @contextmanager
@@ -86,8 +86,8 @@ def _plain_lines(description: str, unit: str) -> Callable[..., None]:
     return report
 
 
-def show_scores(scores: "ScoreTable") -> None:
-    """A table of scores on standard output: controls dim, the best of each column bold."""
+def show_scores(scores: "ScoreTable", json_file: str | None) -> None:
+    """A table of scores where results go: controls dim, the best of each column bold."""
     table = Table(
         title=scores.caption,
         title_justify="left",
@@ -106,7 +106,7 @@ def show_scores(scores: "ScoreTable") -> None:
             for index, (column, cell) in enumerate(zip(scores.columns, row.cells, strict=True))
         ]
         table.add_row(Text(row.name), *cells, style="dim" if row.control else "")
-    console = Console(highlight=False)
+    console = Console(stderr=json_file == "-", highlight=False)
     console.print(table, crop=False)
 
 

@@ -26,10 +26,7 @@ def demo(
 ) -> None:
     """Generate faces, train on them without labels, score unseen ones, write one page. Offline."""
     began = time.monotonic()
-    say(
-        "derender demo: taking faces apart, learned from scratch on this machine"
-        + (" (quick)" if quick else "")
-    )
+    say("taking faces apart, learned from scratch on this machine" + (" (quick)" if quick else ""))
     from derender.demo import FULL, QUICK, demo_page, run_demo
     from derender.demo.page import score_tables
     from derender.training.interrupt import TrainingInterrupted
@@ -51,12 +48,12 @@ def demo(
         ) from stop
     tables = score_tables(told)
     for table in tables.values():
-        show_scores(table)
-        result("")
+        show_scores(table, json_file)
+        result("", json_file)
     for finding in told.trained.findings:
         say(finding.text)
     say(f"done in {duration(time.monotonic() - began)}; the model is in {told.trained.folder}")
-    result(f"report {page}")
+    result(f"report {page}", json_file)
     write_json(
         json_file,
         {"report": page, "run": told.trained, "seconds": told.seconds}

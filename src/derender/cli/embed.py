@@ -44,7 +44,10 @@ def embed(
         )
     table.write(out)
     sizes = {name: values.shape[1] for name, values in table.factors.items()}
-    result(f"{len(table):,} rows in {out}: " + ", ".join(f"{name} {size}" for name, size in sizes.items()))
+    result(
+        f"{len(table):,} rows in {out}: " + ", ".join(f"{name} {size}" for name, size in sizes.items()),
+        json_file,
+    )
     write_json(
         json_file,
         {

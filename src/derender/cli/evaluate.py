@@ -103,7 +103,7 @@ def cluster(
         )
     ours, *controls = results
     scores = clustering_table(results, controls)
-    show_scores(scores)
+    show_scores(scores, json_file)
     say(f"{ours} is {scores.verdict(0)}")
     write_json(json_file, {"label": label, "results": results, "chance_of": ours})
 
@@ -131,11 +131,11 @@ def geometry(
             net, truth, batch_size=batch_size, untrained=untrained_twin(net, seed), progress=report
         )
     scores = geometry_table(found, len(truth))
-    show_scores(scores)
+    show_scores(scores, json_file)
     values = {"pictures": len(truth), "geometry": found}
     if truth.albedo is not None:
         factors = evaluate_factors(net, truth, batch_size=batch_size)
-        show_scores(factor_table(factors, len(truth)))
+        show_scores(factor_table(factors, len(truth)), json_file)
         values["factors"] = factors
     say(f"depth is {scores.verdict(0)}")
     say(f"normals are {scores.verdict(1)}")
@@ -166,6 +166,6 @@ def reconstruction(
     with bar("rendering") as report:
         found = evaluate_reconstruction(net, chosen.images, mean=mean, batch_size=batch_size, progress=report)
     scores = reconstruction_table(found, len(chosen))
-    show_scores(scores)
+    show_scores(scores, json_file)
     say(f"the model is {scores.verdict(0)}")
     write_json(json_file, {"pictures": len(chosen), "part": part, "reconstruction": found})

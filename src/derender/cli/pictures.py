@@ -53,7 +53,8 @@ def decompose(
         )
     for path, reason in refused.items():
         say(f"left out {path}: {reason}")
-    result(f"{len(written)} pictures in {out}")
+    count = "1 picture" if len(written) == 1 else f"{len(written):,} pictures"
+    result(f"{count} in {out}", json_file)
     write_json(json_file, {"out": out, "pictures": written, "refused": refused})
     if refused:
         raise typer.Exit(2)

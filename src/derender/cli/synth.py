@@ -37,5 +37,5 @@ def faces(
         made = generator.generate(count, image_size, seed, progress=report)
     say(f"writing to {out}")
     write(made, out)
-    result(f"{count:,} faces in {out}")
+    result(f"{count:,} faces in {out}", json_file)
     write_json(json_file, {"out": out, "count": count, "image_size": image_size, "seed": seed})

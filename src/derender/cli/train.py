@@ -52,7 +52,7 @@ def train(
 
     config = configuration()
     if dry_run:
-        result(to_yaml(config).rstrip())
+        result(to_yaml(config).rstrip(), json_file)
         write_json(json_file, config.model_dump(mode="json"))
         return
 
@@ -62,6 +62,8 @@ def train(
     from derender.training.loop import Progress
     from derender.training.loop import train as train_model
 
+    if resume and not (out / "config.yaml").is_file():
+        raise FileNotFoundError(f"no run to resume in {out} (no config.yaml): train without --resume first")
     accelerator = chosen_device(device)
     if out.exists() and any(out.iterdir() if out.is_dir() else [out]) and not resume:
         raise FileExistsError(
@@ -94,6 +96,6 @@ def train(
     for finding in trained.findings:
         say(finding.text)
     say(f"{trained.images:,} pictures in {duration(trained.seconds)}; stopped by: {trained.stopped}")
-    result(f"model {trained.folder}")
-    result(f"report {page}")
+    result(f"model {trained.folder}", json_file)
+    result(f"report {page}", json_file)
     write_json(json_file, {"run": trained, "report": page})

@@ -39,6 +39,7 @@ class ObjectiveSettings(Settings):
     loocc: LooccKind = "none"
     loocc_weight: float = Field(default=0.01, ge=0)
     loocc_temperature: float = Field(default=0.5, gt=0)
+    cycle_weight: float = Field(default=0.0, ge=0)  # light and camera read back from LOOCC's renderings; ours
     perturb: PerturbSettings = PerturbSettings()
 
 

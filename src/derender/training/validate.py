@@ -11,6 +11,8 @@ from derender.training.config import TrainConfig
 from derender.training.step import Precision
 from derender.training.step_module import compute_step
 
+NOT_RECONSTRUCTION = ("l1", "loocc", "cycle")
+
 
 @torch.no_grad()
 def validate(
@@ -30,4 +32,4 @@ def validate(
         count += len(batch)
     module.train()
     means = {name: value / max(count, 1) for name, value in sums.items()}
-    return {"loss": sum(value for name, value in means.items() if name not in ("l1", "loocc")), **means}
+    return {"loss": sum(value for name, value in means.items() if name not in NOT_RECONSTRUCTION), **means}
