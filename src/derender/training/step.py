@@ -84,7 +84,8 @@ def training_step(
         seen = fill_uncovered(rendering.image[2 * count :], rendering.mask[2 * count :], images)
         with precision():
             again = model.embed(seen)
-        terms["loocc"] = objective.loocc_weight * loocc_loss(codes, again, left_out, objective.loocc_temperature)
+        contrast = loocc_loss(codes, again, left_out, objective.loocc_temperature)
+        terms["loocc"] = objective.loocc_weight * contrast
         if objective.cycle_weight > 0:
             terms["cycle"] = objective.cycle_weight * cycle_loss(model, again, scenes[2], objective)
 
@@ -145,14 +146,15 @@ def cycle_loss(
 ) -> Float[Tensor, ""]:
     """How far light and camera, read from a rendering, are from those it was rendered with; ours, 0 is best.
 
-    Mean absolute difference (radians, intensities, scene units) over the vector factors that were perturbed, with
-    the rendered scene as a fixed target: renderings come with exact labels, so they can teach what a picture alone
-    leaves open (pitch above all, which shifted albedo explains nearly as well).
+    Mean absolute difference (radians, intensities, scene units) over the vector factors that were perturbed,
+    with the rendered scene as a fixed target: renderings come with exact labels, so they can teach what a
+    picture alone leaves open (pitch above all, which shifted albedo explains nearly as well).
     """
     wanted = LOOCC_FACTORS[objective.loocc]
     differences = []
     for factor in model.factors:
-        if factor.mirrored or factor.perturb is None or (factor.name not in wanted and objective.loocc != "all"):
+        asked = factor.name in wanted or objective.loocc == "all"
+        if factor.mirrored or factor.perturb is None or not asked:
             continue
         raw = model.nets[factor.name].decode(codes_again[factor.name].float())  # type: ignore[operator]
         found = factor.to_parameter(raw, model.settings.ranges)

@@ -1,0 +1,141 @@
+"""The step: what each term is made of, who gets which gradient, which factor is perturbed."""
+
+from collections import Counter
+
+import pytest
+import torch
+
+from derender.model import Derenderer
+from derender.objectives.reconstruction import masked_l1, photometric_loss
+from derender.training.config import ObjectiveSettings
+from derender.training.step import (
+    cycle_loss,
+    fill_uncovered,
+    perturb_one_factor,
+    training_step,
+)
+
+PLAIN = ObjectiveSettings(perceptual="none", curvature_weight=0.0)
+
+
+@pytest.fixture(scope="module")
+def model() -> Derenderer:
+    return Derenderer.from_preset("small", seed=0, image_size=32, width=8, light_width=4)
+
+
+@pytest.fixture
+def images(generator) -> torch.Tensor:
+    return torch.rand(6, 3, 32, 32, generator=generator)
+
+
+def test_reconstruction_terms_are_the_losses_of_scene_and_twin(model, images, generator):
+    result = training_step(model, images, PLAIN, None, generator)
+    scene = model.decompose(images)
+    straight, twin = model.render(scene), model.render(model.mirror(scene))
+    confidence = model.confidence(images)
+    covered = straight.mask * twin.mask
+    expected = photometric_loss(straight.image, images, covered, confidence.photometric)
+    flipped = photometric_loss(twin.image, images, covered, confidence.photometric_flip)
+    torch.testing.assert_close(result.terms["photometric"], expected.detach())
+    torch.testing.assert_close(result.terms["photometric_flip"], 0.5 * flipped.detach())
+    torch.testing.assert_close(result.terms["l1"], masked_l1(straight.image, images, covered).detach())
+    torch.testing.assert_close(result.total, expected + 0.5 * flipped)
+
+
+def test_every_network_learns_from_one_step(model, images, generator):
+    model.zero_grad()
+    training_step(model, images, PLAIN, None, generator).total.backward()
+    for name, net in model.nets.items():
+        assert sum(p.grad.abs().sum() for p in net.parameters() if p.grad is not None) > 0, name
+
+
+def test_without_confidence_its_network_is_left_alone(model, images, generator):
+    model.zero_grad(set_to_none=True)
+    objective = PLAIN.model_copy(update={"confidence": False})
+    training_step(model, images, objective, None, generator).total.backward()
+    assert all(parameter.grad is None for parameter in model.nets["confidence"].parameters())
+
+
+def test_every_weighted_term_appears_only_when_asked_for(model, images, generator):
+    asked = {
+        "smoothness": {"smoothness_weight": 0.1},
+        "curvature": {"curvature_weight": 1.0},
+        "loocc": {"loocc": "light+camera"},
+        "cycle": {"loocc": "light+camera", "cycle_weight": 1.0},
+    }
+    plain = set(training_step(model, images, PLAIN, None, generator).terms)
+    assert plain == {"photometric", "photometric_flip", "l1"}
+    for name, change in asked.items():
+        terms = training_step(model, images, PLAIN.model_copy(update=change), None, generator).terms
+        assert name in terms
+        assert terms[name] > 0
+
+
+@pytest.mark.parametrize("kind", ["light", "light+camera", "all"])
+def test_exactly_the_chosen_factor_of_each_picture_is_changed(model, images, kind, generator):
+    objective = ObjectiveSettings(loocc=kind)
+    scene = model.decompose(images).detach()
+    perturbed, chosen = perturb_one_factor(model, scene, objective, generator)
+    for row, index in enumerate(chosen.tolist()):
+        for i, factor in enumerate(model.factors):
+            before, after = (s.parameters[factor.parameter][row] for s in (scene, perturbed))
+            assert torch.equal(before, after) == (i != index)
+
+
+def test_factors_are_chosen_per_picture_and_evenly(model):
+    scene = model.decompose(torch.rand(2, 3, 32, 32))[[0] * 400].detach()
+    _, chosen = perturb_one_factor(
+        model, scene, ObjectiveSettings(loocc="light+camera"), torch.Generator().manual_seed(1)
+    )
+    counts = Counter(model.factors[i].name for i in chosen.tolist())
+    assert set(counts) == {"light", "camera"}
+    assert 160 < counts["light"] < 240
+
+
+def test_perturbed_light_of_cars_stays_in_the_cars_range(generator):
+    cars = Derenderer.from_preset("cars", seed=0, image_size=32, width=4, light_width=4)
+    scene = cars.decompose(torch.rand(2, 3, 32, 32))[[0] * 200].detach()
+    perturbed, _ = perturb_one_factor(cars, scene, ObjectiveSettings(loocc="light"), generator)
+    assert perturbed.light[:, 1].min() >= 0.5
+    assert perturbed.light[:, 1].max() <= 1.0
+
+
+def test_uncovered_pixels_take_the_colour_of_the_pictures_edge():
+    picture = torch.full((1, 3, 4, 4), 0.25)
+    picture[:, :, 1:3, 1:3] = 1.0
+    rendered, mask = torch.ones(1, 3, 4, 4), torch.ones(1, 4, 4)
+    mask[0, :, 0] = 0
+    filled = fill_uncovered(rendered, mask, picture)
+    assert torch.equal(filled[..., 0], torch.full((1, 3, 4), 0.25))
+    assert torch.equal(filled[..., 1:], rendered[..., 1:])
+
+
+def test_cycle_loss_is_zero_on_what_the_codes_say_and_grows_with_the_difference(model, images):
+    objective = ObjectiveSettings(loocc="light+camera")
+    codes = model.embed(images)
+    scene = model.decode(codes)
+    assert cycle_loss(model, codes, scene, objective).item() == pytest.approx(0, abs=1e-6)
+    turned = scene.with_parameters(camera=scene.camera + 0.1)
+    assert cycle_loss(model, codes, turned, objective).item() == pytest.approx(0.1, rel=1e-3)
+    light_only = ObjectiveSettings(loocc="light")
+    assert cycle_loss(model, codes, turned, light_only).item() == pytest.approx(0, abs=1e-6)
+
+
+def test_cycle_loss_teaches_the_readers_not_the_scene(model, images):
+    model.zero_grad(set_to_none=True)
+    codes = {name: code.detach() for name, code in model.embed(images).items()}
+    scene = model.decompose(images)
+    turned = scene.with_parameters(camera=scene.camera + 0.1)
+    cycle_loss(model, codes, turned, ObjectiveSettings(loocc="light+camera")).backward()
+    assert model.nets["camera"].decoder.linear.weight.grad.abs().sum() > 0
+    assert all(parameter.grad is None for parameter in model.nets["geometry"].parameters())
+
+
+def test_bf16_networks_leave_geometry_in_float32(model, images, generator):
+    def precision():
+        return torch.autocast("cpu", torch.bfloat16)
+
+    exact = training_step(model, images, PLAIN, None, generator)
+    mixed = training_step(model, images, PLAIN, None, generator, precision)
+    assert mixed.scene.depth.dtype == mixed.rendering.image.dtype == mixed.total.dtype == torch.float32
+    assert abs(mixed.terms["l1"] - exact.terms["l1"]) < 0.02
