@@ -23,6 +23,7 @@ DOCS = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md"), *(ROOT / "benc
 # A module imports only from its own stage or from stages to its left.
 STAGES = [
     "settings",
+    "whole",
     "scene",
     "render",
     "data",
@@ -34,7 +35,6 @@ STAGES = [
     "features",
     "baselines",
     "evaluation",
-    "interpretation",
     "report",
     "demo",
     "cli",

@@ -32,7 +32,6 @@ _SUBMODULES = [
     "features",
     "baselines",
     "evaluation",
-    "interpretation",
     "report",
 ]
 

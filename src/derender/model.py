@@ -5,9 +5,6 @@ Training lives in training/, scores in evaluation/; the model knows neither.
 """
 
 import json
-import os
-import shutil
-import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -24,6 +21,7 @@ from derender.networks.confidence import Confidence, ConfidenceNet
 from derender.presets import MODEL_PRESETS, ModelSettings, named_preset
 from derender.render import Rendering, render_scene
 from derender.scene import Scene
+from derender.whole import whole_folder
 
 FORMAT = 1
 WEIGHTS_FILE, CONFIG_FILE = "model.safetensors", "config.json"
@@ -131,21 +129,15 @@ class Derenderer(nn.Module):
         folder = Path(folder)
         if folder.exists() and not overwrite:
             raise FileExistsError(f"{folder} exists already: choose another folder or pass overwrite=True")
-        folder.parent.mkdir(parents=True, exist_ok=True)
         config = {
             "format": FORMAT,
             "factors": [factor.name for factor in self.factors],
             "settings": self.settings.model_dump(mode="json"),
         }
-        temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
-        try:
-            weights = {name: value.detach().cpu().contiguous() for name, value in self.state_dict().items()}
+        weights = {name: value.detach().cpu().contiguous() for name, value in self.state_dict().items()}
+        with whole_folder(folder) as temporary:
             save_file(weights, temporary / WEIGHTS_FILE)
             (temporary / CONFIG_FILE).write_text(json.dumps(config, indent=1))
-            temporary.chmod(0o755)
-            _replace_folder(temporary, folder)
-        finally:
-            shutil.rmtree(temporary, ignore_errors=True)
         return folder
 
     def _check(self, images: Tensor) -> None:
@@ -242,14 +234,3 @@ def _read_config(folder: Path) -> dict[str, Any]:
     if not complete:
         raise ValueError(f"{folder / CONFIG_FILE} is damaged: copy or train the model again")
     return config
-
-
-def _replace_folder(temporary: Path, folder: Path) -> None:
-    """Put ``temporary`` in the place of ``folder``; at every moment one of the two is whole."""
-    if not folder.exists():
-        temporary.rename(folder)
-        return
-    old = folder.with_name(f".{folder.name}-old-{os.getpid()}")
-    folder.rename(old)
-    temporary.rename(folder)
-    shutil.rmtree(old, ignore_errors=True)

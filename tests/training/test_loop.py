@@ -18,7 +18,14 @@ from derender.training.loop import Progress
 from derender.training.run_folder import read_config, read_metrics
 
 TINY = ["image_size=32", "width=8", "light_width=4", "perceptual=none", "batch_size=8", "checkpoint_every=32"]
-TINY += ["validate_every=32", "sample_every=64", "deterministic=true", "learning_rate=1e-3"]
+TINY += [
+    "validate_every=32",
+    "sample_every=64",
+    "deterministic=true",
+    "learning_rate=1e-3",
+    "warmup_images=0",
+    "final_rate=1",
+]
 
 
 @pytest.fixture(autouse=True)
@@ -94,7 +101,7 @@ def test_an_interrupted_run_is_saved_and_resumes_exactly(pictures, tmp_path):
         if progress.done == 72:
             os.kill(os.getpid(), signal.SIGINT)
 
-    config = resolve("small", [*TINY, "images=160"])
+    config = resolve("small", [*TINY, "images=160", "warmup_images=40", "final_rate=0.1"])
     with pytest.raises(TrainingInterrupted, match=r"stopped after 72 pictures and saved.*--resume"):
         train(config, pictures, tmp_path / "parts", progress=press_ctrl_c)
     train(config, pictures, tmp_path / "parts", resume=True)

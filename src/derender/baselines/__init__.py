@@ -1,1 +1,1 @@
-""""""
+"""Other ways to make a feature table, for comparison."""

@@ -6,8 +6,6 @@ our metadata the list columns are factors and all others labels.
 """
 
 import json
-import os
-import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +14,8 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+
+from derender.whole import whole_file
 
 FORMAT = 1
 METADATA_KEY = b"derender"
@@ -48,15 +48,8 @@ def write_columns(path: Path, content: Columns) -> None:
         "origin": dict(content.origin),
     }
     metadata = {METADATA_KEY: json.dumps(described, ensure_ascii=False).encode()}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(prefix=f".{path.name}-", dir=path.parent)
-    os.close(handle)
-    try:
+    with whole_file(path) as temporary:
         pq.write_table(pa.table(columns).replace_schema_metadata(metadata), temporary)
-        Path(temporary).chmod(0o644)
-        Path(temporary).replace(path)
-    finally:
-        Path(temporary).unlink(missing_ok=True)
 
 
 def read_columns(path: Path) -> Columns:

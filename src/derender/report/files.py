@@ -5,8 +5,6 @@ the renderer takes them; ``scene.json`` light and camera in words and degrees.
 """
 
 import json
-import shutil
-import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from math import degrees
 from pathlib import Path
@@ -21,6 +19,7 @@ from derender.report.figures import Decomposition, decomposition
 from derender.report.panel import strip
 from derender.scene import Scene
 from derender.scene.normals import normals_from_depth
+from derender.whole import whole_folder
 
 
 def folder_names(pictures: Sequence[Path], out: Path) -> list[Path]:
@@ -85,9 +84,7 @@ def scene_numbers(drawn: Decomposition, index: int) -> dict[str, Any]:
 def _write_folder(
     folder: Path, drawn: Decomposition, index: int, scene: Scene, fov_deg: float, record: Mapping[str, Any]
 ) -> None:
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(prefix=".decompose-", dir=folder.parent))
-    try:
+    with whole_folder(folder) as temporary:
         drawn.panel(index).save(temporary / "panel.png")
         for name, images in drawn.columns.items():
             strip([images[index]]).save(temporary / f"{name.replace(' ', '_')}.png")
@@ -98,9 +95,3 @@ def _write_folder(
         values: dict[str, Any] = {name: value[0].cpu().numpy() for name, value in parameters.items()}
         values["normal"] = normals_from_depth(scene.depth, fov_deg)[0].detach().cpu().numpy()
         np.savez_compressed(temporary / "scene.npz", **values)
-        temporary.chmod(0o755)
-        if folder.exists():
-            shutil.rmtree(folder)
-        temporary.rename(folder)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)

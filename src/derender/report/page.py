@@ -4,8 +4,6 @@ The page carries a content security policy that forbids every connection and eve
 the browser itself holds it to that. Leaves out the blocks (see ``blocks``).
 """
 
-import os
-import tempfile
 from base64 import b64encode
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,6 +13,7 @@ from importlib.resources import files
 from pathlib import Path
 
 from derender.report.blocks import Html, joined
+from derender.whole import whole_file
 
 
 @dataclass(frozen=True)
@@ -75,15 +74,8 @@ class Page:
 def write_whole(path: str | Path, content: bytes) -> Path:
     """Write a file whole or not at all; a failure leaves the old one. Makes the folder."""
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(prefix=f".{path.name}-"[:80], dir=path.parent)
-    try:
-        with os.fdopen(handle, "wb") as stream:
-            stream.write(content)
-        Path(temporary).chmod(0o644)
-        Path(temporary).replace(path)
-    finally:
-        Path(temporary).unlink(missing_ok=True)
+    with whole_file(path) as temporary:
+        temporary.write_bytes(content)
     return path
 
 

@@ -5,9 +5,6 @@ any moment leaves a whole checkpoint behind.
 """
 
 import json
-import os
-import shutil
-import tempfile
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,6 +13,8 @@ import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
+
+from derender.whole import whole_folder
 
 WEIGHTS_FILE, OPTIMISER_FILE, STATE_FILE = "model.safetensors", "optimiser.safetensors", "state.json"
 
@@ -43,18 +42,12 @@ def save_checkpoint(
     folder: Path, model: nn.Module, optimiser: torch.optim.Optimizer, state: TrainState
 ) -> None:
     """Write a checkpoint to ``folder``, replacing the one that is there only once the new one is whole."""
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
-    try:
-        weights = {name: value.detach().cpu().contiguous() for name, value in model.state_dict().items()}
+    weights = {name: value.detach().cpu().contiguous() for name, value in model.state_dict().items()}
+    tensors, groups = _flatten(optimiser.state_dict())
+    with whole_folder(folder) as temporary:
         save_file(weights, temporary / WEIGHTS_FILE)
-        tensors, groups = _flatten(optimiser.state_dict())
         save_file(tensors, temporary / OPTIMISER_FILE)
         (temporary / STATE_FILE).write_text(json.dumps({"state": asdict(state), "groups": groups}))
-        temporary.chmod(0o755)
-        replace_folder(temporary, folder)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def load_checkpoint(folder: Path, model: nn.Module, optimiser: torch.optim.Optimizer | None) -> TrainState:
@@ -90,17 +83,6 @@ def load_checkpoint(folder: Path, model: nn.Module, optimiser: torch.optim.Optim
             "delete it to fall back on checkpoints/best, or train again"
         ) from error
     return state
-
-
-def replace_folder(new: Path, folder: Path) -> None:
-    """Put folder ``new`` in the place of ``folder``."""
-    if not folder.exists():
-        new.rename(folder)
-        return
-    old = folder.with_name(f".{folder.name}-old-{os.getpid()}")
-    folder.rename(old)
-    new.rename(folder)
-    shutil.rmtree(old, ignore_errors=True)
 
 
 def _lay_out_like_parameters(optimiser: torch.optim.Optimizer) -> None:

@@ -131,6 +131,8 @@ def train(
         batches.images,
         lambda done, total, _: report(Progress("perceptual", done, total)),
     )
+    if config.channels_last and perceptual is not None:
+        perceptual = perceptual.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
     settings = config.optimiser
     optimiser = torch.optim.Adam(
         model.parameters(),

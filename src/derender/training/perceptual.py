@@ -9,6 +9,7 @@ from torch import Tensor
 from derender.objectives.perceptual import PerceptualFeatures, build_perceptual
 from derender.objectives.self_features import SelfFeatures, load_self_features
 from derender.training.config import TrainConfig
+from derender.whole import whole_file
 
 
 def prepare_perceptual(
@@ -36,7 +37,6 @@ def prepare_perceptual(
         device=images.device,
     )
     if isinstance(features, SelfFeatures):
-        partial = file.with_name(f".{file.name}.partial")
-        features.save(partial)
-        partial.replace(file)
+        with whole_file(file) as temporary:
+            features.save(temporary)
     return features

@@ -67,7 +67,7 @@ def test_version_and_help_need_no_heavy_import():
         "heavy = {'torch', 'numpy', 'numba', 'matplotlib', 'PIL', 'sklearn', 'pyarrow'} & set(sys.modules); "
         "print(heavy, file=sys.stderr); sys.exit(code or len(heavy))"
     )
-    source = str(Path(__file__).resolve().parents[1] / "src")
+    source = str(Path(__file__).resolve().parents[2] / "src")
     environment = {**os.environ, "PYTHONPATH": source}
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=False
