@@ -42,7 +42,7 @@ class OurStep:
 
     def __init__(self, model: Derenderer, vgg: Vgg16Features, precision: str):
         self.model = model.to(memory_format=torch.channels_last)
-        self.vgg = vgg
+        self.vgg = vgg.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
         self.precision = network_precision(precision, model.device)
         self.generator = torch.Generator().manual_seed(0)
         settings = CONFIG.optimiser
