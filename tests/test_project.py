@@ -38,6 +38,7 @@ STAGES = [
     "report",
     "demo",
     "cli",
+    "__main__",
 ]
 
 # Never imported by `import derender`: whatever is slow to load, or needed by one command only.

@@ -93,7 +93,8 @@ class PictureSet:
 
     def describe(self) -> str:
         """One line: how many pictures, of which layout, what was left out."""
-        parts = [f"{len(self):,} pictures from {self.source} ({self.layout})"]
+        noun = "picture" if len(self) == 1 else "pictures"
+        parts = [f"{len(self):,} {noun} from {self.source} ({self.layout})"]
         if self.skipped:
             parts.append(f"{len(self.skipped):,} skipped")
         if self.duplicates:
