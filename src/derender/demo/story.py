@@ -52,22 +52,26 @@ class DemoSettings(Settings):
 
     train_pictures: int = Field(default=4_000, ge=20)
     test_pictures: int = Field(default=240, ge=16)
-    images: int = Field(default=10_000, ge=2)  # pictures seen in training, repeats counted
-    minutes: float = Field(default=4.5, gt=0)  # training stops here on a slow machine
+    images: int = Field(default=24_000, ge=2)  # pictures seen in training, repeats counted
+    minutes: float = Field(default=4.0, gt=0)  # training stops here on a slow machine
     shown: int = Field(default=8, ge=1)  # unseen pictures on the page
     films: int = Field(default=4, ge=1)
-    overrides: tuple[str, ...] = ()  # of the preset `small`, as in --set
+    overrides: tuple[str, ...] = (  # of the preset `small`, as in --set
+        "border_depth=1.08",  # these heads reach further back than the default border
+        "warmup_images=2000",
+        "objective.self_features_steps=300",
+    )
 
 
 FULL = DemoSettings()
 QUICK = DemoSettings(
     train_pictures=1_500,
     test_pictures=160,
-    images=1_500,
-    minutes=0.75,
+    images=3_000,
+    minutes=0.6,
     shown=6,
     films=3,
-    overrides=("objective.self_features_steps=100",),
+    overrides=("border_depth=1.08", "warmup_images=500", "objective.self_features_steps=60"),
 )
 
 
