@@ -52,8 +52,8 @@ class DemoSettings(Settings):
 
     train_pictures: int = Field(default=4_000, ge=20)
     test_pictures: int = Field(default=240, ge=16)
-    images: int = Field(default=24_000, ge=2)  # pictures seen in training, repeats counted
-    minutes: float = Field(default=4.0, gt=0)  # training stops here on a slow machine
+    images: int = Field(default=30_000, ge=2)  # pictures seen in training, repeats counted
+    minutes: float = Field(default=4.3, gt=0)  # training stops here on a slow machine
     shown: int = Field(default=8, ge=1)  # unseen pictures on the page
     films: int = Field(default=4, ge=1)
     overrides: tuple[str, ...] = (  # of the preset `small`, as in --set

@@ -21,6 +21,7 @@ from torch.utils.tensorboard.writer import SummaryWriter
 
 from derender.data import PictureSet, Split, split_indices
 from derender.model import Derenderer
+from derender.training.allocator import freed_memory_kept
 from derender.training.batches import Batches, random_stream
 from derender.training.checkpoint import TrainState, load_checkpoint, save_checkpoint
 from derender.training.config import TrainConfig
@@ -147,21 +148,23 @@ def train(
         group.update(betas=settings.betas, weight_decay=settings.weight_decay)
     drop_metrics_after(run, state.images)
     watcher = Watcher.remembering(config.model.ranges, state.watcher) if config.watch else None
-    return _go_on(
-        _Run(
-            config,
-            run,
-            fabric,
-            module,
-            wrapped,
-            batches,
-            fabric.to_device(held_out),
-            watcher,
-            sample_sheet,
-            state,
-        ),
-        report,
-    )
+    memory = freed_memory_kept() if fabric.device.type == "cpu" else nullcontext()
+    with memory:
+        return _go_on(
+            _Run(
+                config,
+                run,
+                fabric,
+                module,
+                wrapped,
+                batches,
+                fabric.to_device(held_out),
+                watcher,
+                sample_sheet,
+                state,
+            ),
+            report,
+        )
 
 
 @dataclass
