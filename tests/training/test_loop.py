@@ -166,6 +166,13 @@ def test_one_picture_or_too_few_for_a_batch_is_refused_before_a_folder_is_made(p
     assert not (tmp_path / "run").exists()
 
 
+def test_missing_perceptual_weights_are_refused_before_a_folder_is_made(pictures, tmp_path):
+    config = resolve("small", [*TINY, "perceptual=vgg16", f"vgg16_path={tmp_path / 'none.npz'}"])
+    with pytest.raises((ValueError, OSError), match=r"none\.npz"):
+        train(config, pictures, tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
 def test_a_checkpoint_that_cannot_be_written_leaves_the_old_one_whole(pictures, tmp_path, monkeypatch):
     config = resolve("small", [*TINY, "images=32"])
     train(config, pictures, tmp_path / "run")

@@ -21,6 +21,7 @@ from torch.utils.tensorboard.writer import SummaryWriter
 
 from derender.data import PictureSet, Split, split_indices
 from derender.model import Derenderer
+from derender.objectives import load_vgg16
 from derender.training.allocator import freed_memory_kept
 from derender.training.batches import Batches, random_stream
 from derender.training.checkpoint import TrainState, load_checkpoint, save_checkpoint
@@ -117,6 +118,8 @@ def train(
     )
     batches = Batches(fabric.to_device(training), config.batch_size, config.seed, config.horizontal_flips)
 
+    if config.objective.perceptual == "vgg16":
+        load_vgg16(config.objective.vgg16_path)  # missing weights are an error before a folder is made
     out = Path(out)
     if resume:
         run = reopen_run(out, config)
