@@ -51,7 +51,7 @@ def demo(
         show_scores(table, json_file)
         result("", json_file)
     for finding in told.trained.findings:
-        say(finding.text)
+        say(f"{finding.sign}: {finding.text}; {finding.advice}")
     say(f"done in {duration(time.monotonic() - began)}; the model is in {told.trained.folder}")
     result(f"report {page}", json_file)
     write_json(

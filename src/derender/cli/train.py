@@ -94,7 +94,11 @@ def train(
         )
     page = run_page(out).write(out / "report.html")
     for finding in trained.findings:
-        say(finding.text)
+        say(f"{finding.sign}: {finding.text}; {finding.advice}")
+    if trained.stopped == "collapse":
+        say(
+            "training on would be pointless: what is left is the last good checkpoint and model, if there was one"
+        )
     say(f"{trained.images:,} pictures in {duration(trained.seconds)}; stopped by: {trained.stopped}")
     result(f"model {trained.folder}", json_file)
     result(f"report {page}", json_file)
