@@ -97,7 +97,7 @@ def train(
         say(f"{finding.sign}: {finding.text}; {finding.advice}")
     if trained.stopped == "collapse":
         say(
-            "training on would be pointless: what is left is the last good checkpoint and model, if there was one"
+            "training on is pointless: what is left is the last good checkpoint and model, if any"
         )
     say(f"{trained.images:,} pictures in {duration(trained.seconds)}; stopped by: {trained.stopped}")
     result(f"model {trained.folder}", json_file)
