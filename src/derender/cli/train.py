@@ -96,9 +96,7 @@ def train(
     for finding in trained.findings:
         say(f"{finding.sign}: {finding.text}; {finding.advice}")
     if trained.stopped == "collapse":
-        say(
-            "training on is pointless: what is left is the last good checkpoint and model, if any"
-        )
+        say("training on is pointless: what is left is the last good checkpoint and model, if any")
     say(f"{trained.images:,} pictures in {duration(trained.seconds)}; stopped by: {trained.stopped}")
     result(f"model {trained.folder}", json_file)
     result(f"report {page}", json_file)
