@@ -34,13 +34,13 @@ def look(depth: Tensor, view: Tensor, backend: str):
     return fragments, to_canonical(unproject(fragments.depth, FOV_DEG), view)
 
 
-@pytest.mark.parametrize(("height", "width"), [(64, 64), (33, 48), (2, 2), (7, 3)])
+@pytest.mark.parametrize(("height", "width"), [(64, 64), (33, 48), (2, 2), (7, 3), (128, 128), (200, 256)])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_identity_camera_renders_the_canonical_image(backend, height, width, dtype, generator):
     depth = 0.9 + 0.2 * torch.rand(2, height, width, generator=generator, dtype=dtype)
     _, albedo, light, _ = scene(2, height, width, generator, dtype)
     result = render(depth, albedo, light, torch.zeros(2, 6, dtype=dtype), FOV_DEG, backend)
-    bound = 1e-5 if dtype == torch.float32 else 1e-12
+    bound = 1e-7 if dtype == torch.float32 else 1e-12  # float32 is rounded once, from float64
     assert (result.mask == 1).all()
     assert (result.image - shade(depth, albedo, light, FOV_DEG)).abs().max() < bound
     assert (result.depth - depth).abs().max() < bound

@@ -9,7 +9,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
-from derender.networks.encoders import Encoder, group_norm
+from derender.networks.convolutions import NarrowConv2d
+from derender.networks.encoders import Encoder, norm_relu
 from derender.networks.settings import NetworkSettings
 
 
@@ -50,7 +51,7 @@ class ConfidenceNet(nn.Module):
         self.photometric_head = nn.Sequential(
             *_upsample(previous, width),
             *_upsample(width, width),
-            nn.Conv2d(width, 2, 5, padding=2, bias=False),
+            NarrowConv2d(width, 2),
         )
         self.perceptual_head = nn.Conv2d(previous, 2, 3, padding=1, bias=False)
 
@@ -64,6 +65,5 @@ class ConfidenceNet(nn.Module):
 def _upsample(channels_in: int, channels_out: int) -> list[nn.Module]:
     return [
         nn.ConvTranspose2d(channels_in, channels_out, 4, stride=2, padding=1, bias=False),
-        group_norm(channels_out),
-        nn.ReLU(),
+        norm_relu(channels_out),
     ]

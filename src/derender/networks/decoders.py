@@ -9,7 +9,8 @@ from itertools import pairwise
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from derender.networks.encoders import group_norm, stage_widths
+from derender.networks.convolutions import NarrowConv2d, UpsampledConv2d
+from derender.networks.encoders import norm_relu, stage_widths
 from derender.networks.settings import NetworkSettings
 
 
@@ -28,20 +29,19 @@ class MapDecoder(nn.Module):
         for previous, width in pairwise(widths):
             layers += [
                 nn.ConvTranspose2d(previous, width, 4, stride=2, padding=1, bias=False),
-                *_normalised(width),
+                norm_relu(width),
                 nn.Conv2d(width, width, 3, padding=1, bias=False),
-                *_normalised(width),
+                norm_relu(width),
             ]
         last = widths[-1]
         layers += [
-            nn.Upsample(scale_factor=2, mode="nearest"),
-            nn.Conv2d(last, last, 3, padding=1, bias=False),
-            *_normalised(last),
+            UpsampledConv2d(last, last),
+            norm_relu(last),
             nn.Conv2d(last, last, 5, padding=2, bias=False),
-            *_normalised(last),
+            norm_relu(last),
         ]
         self.layers = nn.Sequential(*layers)
-        self.last = nn.Conv2d(last, channels, 5, padding=2, bias=False)
+        self.last = NarrowConv2d(last, channels)
 
     def forward(self, code: Float[Tensor, "n code"]) -> Float[Tensor, "n channels h w"]:
         return self.last(self.layers(code[:, :, None, None]))
@@ -56,7 +56,3 @@ class VectorDecoder(nn.Module):
 
     def forward(self, code: Float[Tensor, "n code"]) -> Float[Tensor, "n numbers"]:
         return self.linear(code).tanh()
-
-
-def _normalised(width: int) -> list[nn.Module]:
-    return [group_norm(width), nn.ReLU()]

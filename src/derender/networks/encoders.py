@@ -7,6 +7,7 @@ swaps in for segmentation. No convolution has a bias. Input pictures are 0..1 an
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from derender.networks.norm_relu import NormReLU
 from derender.networks.settings import NetworkSettings
 
 CHANNELS_PER_GROUP = 4
@@ -17,9 +18,9 @@ def stage_widths(first: int, stages: int) -> list[int]:
     return [first * min(2**stage, 8) for stage in range(stages)]
 
 
-def group_norm(channels: int) -> nn.GroupNorm:
-    """GroupNorm with four channels a group: 16, 32, 64 groups for 64, 128, 256 channels."""
-    return nn.GroupNorm(channels // CHANNELS_PER_GROUP, channels)
+def norm_relu(channels: int, slope: float = 0.0) -> NormReLU:
+    """GroupNorm with four channels a group (16, 32, 64 groups for 64, 128, 256 channels) and a rectifier."""
+    return NormReLU(channels, channels // CHANNELS_PER_GROUP, slope)
 
 
 class Encoder(nn.Module):
@@ -36,8 +37,9 @@ class Encoder(nn.Module):
         for stage, channels in enumerate(widths):
             layers.append(nn.Conv2d(previous, channels, 4, stride=2, padding=1, bias=False))
             if normalised and stage < settings.stages - 1:
-                layers.append(group_norm(channels))
-            layers.append(nn.LeakyReLU(0.2) if normalised else nn.ReLU())
+                layers.append(norm_relu(channels, slope=0.2))
+            else:
+                layers.append(nn.LeakyReLU(0.2) if normalised else nn.ReLU())
             previous = channels
         self.convolutions = nn.Sequential(*layers)
         self.to_code = nn.Sequential(nn.Conv2d(previous, code_size, 4, bias=False), nn.ReLU())

@@ -2,7 +2,8 @@
 
 image(p) = canonical image at the canonical coordinates that pixel p sees. The canonical image is albedo times
 Lambertian shading with the light in the canonical frame. Leaves out cast shadows, speculars, clipping at 1
-and gradients at occlusion edges. Geometry is computed in float32 at least, whatever autocast says.
+and gradients at occlusion edges. Shading is computed in float32 at least, whatever autocast says; where the
+surface lands in the picture in float64, so that the identity camera gives the canonical image bit for bit.
 """
 
 from dataclasses import dataclass
@@ -75,9 +76,10 @@ def warp(
         camera=(camera, (count, 6)),
     )
     with torch.autocast(depth.device.type, enabled=False):
-        vertices = to_camera(unproject(depth, fov_deg), camera)
+        vertices = to_camera(unproject(depth.double(), fov_deg), camera.double())
         seen = rasterize(vertices, focal_px(width, fov_deg), backend)
-        return Rendering(sample(image, seen.uv, seen.mask, backend), seen.depth, seen.mask)
+        uv, mask = seen.uv.to(image.dtype), seen.mask.to(image.dtype)
+        return Rendering(sample(image, uv, mask, backend), seen.depth.to(image.dtype), mask)
 
 
 def _map_size(depth: Tensor) -> tuple[int, int, int]:

@@ -1,0 +1,122 @@
+"""Group normalisation and rectifier on the CPU through Numba: a torch operator with an analytic derivative.
+
+Kernels live in ``numba_kernels.py`` and are imported on the first call. The backward pass works from the
+input and each group's mean and deviation: the normalised values are not kept.
+"""
+
+import importlib.util
+from functools import cache
+
+import torch
+from torch import Tensor
+
+SPAN = 256  # numbers in a row of the kernels' inner loops, at most
+WORTHWHILE = 1 << 18  # numbers from which on a pass over memory costs more than calling the operator
+
+
+def suits(values: Tensor, weight: Tensor) -> bool:
+    """Whether this is the one to use: large, CPU, float32 or float64, channels last, Numba installed."""
+    return (
+        values.device.type == "cpu"
+        and values.numel() >= WORTHWHILE
+        and values.dtype == weight.dtype
+        and values.dtype in (torch.float32, torch.float64)
+        and values.is_contiguous(memory_format=torch.channels_last)
+        and _numba_installed()
+    )
+
+
+def norm_relu(
+    values: Tensor, weight: Tensor, bias: Tensor, groups: int, slope: float, epsilon: float
+) -> Tensor:
+    """Group normalisation, then a rectifier that keeps ``slope`` of what is negative."""
+    return _forward(values, weight, bias, groups, slope, epsilon)[0]
+
+
+@torch.library.custom_op("derender::norm_relu_numba", mutates_args=(), device_types="cpu")
+def _forward(
+    values: Tensor, weight: Tensor, bias: Tensor, groups: int, slope: float, epsilon: float
+) -> tuple[Tensor, Tensor]:
+    from derender.networks.norm_relu import numba_kernels
+    from derender.render.numba_threads import array, over_images
+
+    result, statistics = torch.empty_like(values), values.new_empty((len(values), groups, 2))
+    over_images(
+        numba_kernels.forward,
+        len(values),
+        _rows(values),
+        array(weight),
+        array(bias),
+        slope,
+        epsilon,
+        _rows(result),
+        array(statistics),
+    )
+    return result, statistics
+
+
+@_forward.register_fake
+def _(
+    values: Tensor, weight: Tensor, bias: Tensor, groups: int, slope: float, epsilon: float
+) -> tuple[Tensor, Tensor]:
+    return torch.empty_like(values), values.new_empty((len(values), groups, 2))
+
+
+@torch.library.custom_op("derender::norm_relu_numba_backward", mutates_args=(), device_types="cpu")
+def _backward(
+    grad: Tensor, values: Tensor, weight: Tensor, bias: Tensor, statistics: Tensor, slope: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    from derender.networks.norm_relu import numba_kernels
+    from derender.render.numba_threads import array, over_images
+
+    grad = grad.contiguous(memory_format=torch.channels_last)
+    grad_values = torch.empty_like(values)
+    each = values.new_empty((2, len(values), values.shape[1]))  # per picture, summed below in one order
+    over_images(
+        numba_kernels.backward,
+        len(values),
+        _rows(grad),
+        _rows(values),
+        array(weight),
+        array(bias),
+        array(statistics),
+        slope,
+        _rows(grad_values),
+        array(each),
+    )
+    grad_weight, grad_bias = each.sum(dim=1)
+    return grad_values, grad_weight.clone(), grad_bias.clone()
+
+
+@_backward.register_fake
+def _(
+    grad: Tensor, values: Tensor, weight: Tensor, bias: Tensor, statistics: Tensor, slope: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    return torch.empty_like(values), torch.empty_like(weight), torch.empty_like(bias)
+
+
+def _setup_context(ctx, inputs, output) -> None:
+    values, weight, bias, _, ctx.slope, _ = inputs
+    ctx.mark_non_differentiable(output[1])
+    ctx.save_for_backward(values, weight, bias, output[1])
+
+
+def _differentiate(ctx, grad: Tensor, _) -> tuple[Tensor | None, ...]:
+    return (*_backward(grad, *ctx.saved_tensors, ctx.slope), None, None, None)
+
+
+_forward.register_autograd(_differentiate, setup_context=_setup_context)
+
+
+def _rows(values: Tensor):
+    """Memory of a channels-last map as (N, rows, neighbouring pixels times C)."""
+    count, channels, height, width = values.shape
+    together = 1
+    while 2 * together * channels <= SPAN and (height * width) % (2 * together) == 0:
+        together *= 2
+    return values.detach().permute(0, 2, 3, 1).reshape(count, -1, together * channels).numpy()
+
+
+@cache
+def _numba_installed() -> bool:
+    return importlib.util.find_spec("numba") is not None
