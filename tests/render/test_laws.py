@@ -40,10 +40,14 @@ def test_identity_camera_renders_the_canonical_image(backend, height, width, dty
     depth = 0.9 + 0.2 * torch.rand(2, height, width, generator=generator, dtype=dtype)
     _, albedo, light, _ = scene(2, height, width, generator, dtype)
     result = render(depth, albedo, light, torch.zeros(2, 6, dtype=dtype), FOV_DEG, backend)
-    bound = 1e-7 if dtype == torch.float32 else 1e-12  # float32 is rounded once, from float64
+    canonical = shade(depth, albedo, light, FOV_DEG)
     assert (result.mask == 1).all()
-    assert (result.image - shade(depth, albedo, light, FOV_DEG)).abs().max() < bound
-    assert (result.depth - depth).abs().max() < bound
+    if dtype == torch.float32:  # rounded once, from float64: the very bits
+        assert torch.equal(result.image, canonical)
+        assert torch.equal(result.depth, depth)
+    else:
+        assert (result.image - canonical).abs().max() < 1e-12
+        assert (result.depth - depth).abs().max() < 1e-12
 
 
 @pytest.mark.parametrize(("height", "width"), [(24, 24), (13, 20)])
