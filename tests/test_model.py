@@ -8,7 +8,9 @@ import pytest
 import torch
 
 import derender
-from derender.model import CONFIG_FILE, WEIGHTS_FILE, Derenderer, load
+from derender.data import read_ground_truth
+from derender.evaluation import evaluate_geometry
+from derender.model import CONFIG_FILE, PRETRAINED, WEIGHTS_FILE, Derenderer, bundled_models, load
 from derender.networks import FACTORS, Factor
 from derender.networks.factors import vector_net
 from derender.presets import ModelSettings
@@ -128,7 +130,7 @@ def test_saving_never_overwrites_unasked(model, tmp_path):
 
 
 def test_a_missing_model_says_what_to_give(tmp_path):
-    with pytest.raises(FileNotFoundError, match="give a run folder, a saved folder or a Hub id"):
+    with pytest.raises(FileNotFoundError, match="give a run folder, a saved folder, a Hub id"):
         load(tmp_path / "nothing")
     with pytest.raises(FileNotFoundError, match="holds no model"):
         load(tmp_path)
@@ -205,3 +207,30 @@ def test_a_fifth_factor_trains_embeds_and_is_perturbed_without_touching_anything
     assert "highlight" in load(folder, **rows).embed(images)
     with pytest.raises(ValueError, match="pass its rows as factors="):
         load(folder)
+
+
+def test_every_bundled_model_loads_by_name_and_has_a_card(generator):
+    assert "rendered-faces-64" in bundled_models()
+    for name in bundled_models():
+        model = derender.load(name)
+        assert not model.training
+        assert all(value.dtype == torch.float32 for value in model.parameters())
+        size = model.image_size
+        found = model.reconstruct(torch.rand(2, 3, size, size, generator=generator))
+        assert found.image.isfinite().all()
+        card = (PRETRAINED / name / "README.md").read_text()
+        assert "**Trained on**" in card
+        assert "**Known failures.**" in card
+        assert (PRETRAINED / name / "model.safetensors").stat().st_size <= 12 << 20
+
+
+def test_the_bundled_face_model_has_the_geometry_its_card_says(shared_data):
+    truth = read_ground_truth(shared_data("data/synface64.zip"), limit=100)
+    found = evaluate_geometry(derender.load("rendered-faces-64"), truth)
+    assert found.model.side < 0.009
+    assert found.model.mad_deg < 13
+
+
+def test_an_unknown_name_names_the_bundled_models(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"come with derender .*rendered-faces-64"):
+        derender.load("rendered-faces-65")

@@ -35,6 +35,7 @@ STAGES = [
     "features",
     "baselines",
     "evaluation",
+    "interpretation",
     "report",
     "demo",
     "cli",
@@ -44,7 +45,8 @@ STAGES = [
 # Never imported by `import derender`: whatever is slow to load, or needed by one command only.
 HEAVY = {
     *("torch", "triton", "numba", "numpy", "scipy", "sklearn", "pyarrow", "PIL", "imageio", "matplotlib"),
-    *("pydantic", "typer", "rich", "lightning_fabric", "tensorboard", "huggingface_hub"),
+    *("pydantic", "typer", "rich", "lightning_fabric", "tensorboard", "huggingface_hub", "torchmetrics"),
+    *("captum", "datasets", "transformers", "vector_quantize_pytorch", "skimage", "trimesh"),
 }
 
 

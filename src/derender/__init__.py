@@ -32,6 +32,7 @@ _SUBMODULES = [
     "features",
     "baselines",
     "evaluation",
+    "interpretation",
     "report",
 ]
 

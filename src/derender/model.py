@@ -25,6 +25,7 @@ from derender.whole import whole_folder
 
 FORMAT = 1
 WEIGHTS_FILE, CONFIG_FILE = "model.safetensors", "config.json"
+PRETRAINED = Path(__file__).parent / "pretrained"
 Renderer = Callable[[Scene, float], Rendering]
 
 
@@ -163,7 +164,8 @@ def load(
     """A trained model, ready for use: evaluation mode, parameters without gradient.
 
     Args:
-        source: a run folder, a saved folder, or a Hugging Face Hub id ("owner/name", downloaded and cached).
+        source: a run folder, a saved folder, the name of a model that comes with derender (`bundled_models`),
+            or a Hugging Face Hub id ("owner/name", downloaded and cached).
         device: where to put it.
         factors: the rows the model was made with, if not the paper's four.
         renderer: the renderer it was made with, if not the project's own.
@@ -191,6 +193,11 @@ def load(
     return model.to(device).eval().requires_grad_(False)
 
 
+def bundled_models() -> tuple[str, ...]:
+    """Names of the trained models that come with derender; each has a card, ``pretrained/NAME/README.md``."""
+    return tuple(sorted(folder.parent.name for folder in PRETRAINED.glob(f"*/{CONFIG_FILE}")))
+
+
 def _model_folder(source: str | Path) -> Path:
     folder = Path(source)
     for candidate in (folder, folder / "model"):
@@ -201,10 +208,13 @@ def _model_folder(source: str | Path) -> Path:
             f"{folder} holds no model (expected {CONFIG_FILE} and {WEIGHTS_FILE} here or in 'model'): "
             "give a run folder made by 'derender train' or a folder made by model.save"
         )
+    if source in bundled_models():
+        return PRETRAINED / source
     if isinstance(source, str) and source.count("/") == 1 and not source.startswith((".", "/", "~")):
         return _from_hub(source)
     raise FileNotFoundError(
-        f"no model at {source}: give a run folder, a saved folder or a Hub id 'owner/name'"
+        f"no model at {source}: give a run folder, a saved folder, a Hub id 'owner/name', or one of those "
+        f"that come with derender ({', '.join(bundled_models())})"
     )
 
 
@@ -227,6 +237,12 @@ def _read_config(folder: Path) -> dict[str, Any]:
         version, complete = config["format"], {"factors", "settings"} <= set(config)
     except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError) as error:
         raise ValueError(f"{folder / CONFIG_FILE} is damaged: copy or train the model again") from error
+    if "baseline" in config:
+        name = config["baseline"]
+        raise ValueError(
+            f"{folder} holds the baseline {name!r}, not our model: add --baseline {name}, or load it with "
+            "derender.baselines.training.load_baseline"
+        )
     if not isinstance(version, int) or version > FORMAT:
         raise ValueError(
             f"{folder} was saved in format {version}, this version reads up to {FORMAT}: update derender"

@@ -18,13 +18,18 @@ from derender.report.figures import COLUMN_MEANING
 
 COMMANDS = [
     ["demo"],
+    ["doctor"],
     ["train"],
     ["embed"],
     ["decompose"],
     ["evaluate", "cluster"],
+    ["evaluate", "linear"],
+    ["compare"],
+    ["evaluate", "disentangle"],
     ["evaluate", "geometry"],
     ["evaluate", "reconstruction"],
     ["synth", "faces"],
+    ["synth", "cars"],
 ]
 TINY = ["image_size=32", "width=4", "light_width=4", "perceptual=none", "batch_size=4", "images=8"]
 SETTINGS = ["--preset", "small", *(word for setting in TINY for word in ("--set", setting))]
@@ -124,17 +129,20 @@ def test_embed_then_cluster(run, faces, tmp_path, capsys):
     cluster = ["evaluate", "cluster", "--features", table_file, "--label", "identity", "--json", scores]
     assert main([str(word) for word in cluster]) == 0
     assert "geometry + albedo" in capsys.readouterr().out
-    result = json.loads(scores.read_text())["results"]["geometry + albedo"]
-    assert result["n_rows"] == 24 and result["n_classes"] == 3
-    assert 0 < result["chance"]["accuracy"] <= 1
+    result = json.loads(scores.read_text())
+    assert result["n_rows"] == 24 and result["labels"] == {"identity": 3}
+    assert list(result["rows"]) == ["geometry + albedo", "majority", "chance"]
+    assert 0 < result["rows"]["chance"]["scores"]["accuracy"]["value"] <= 1
 
 
 def test_cluster_with_a_model_carries_every_control(run, faces, capsys):
-    assert (
-        main(["evaluate", "cluster", "-m", str(run), "-d", str(faces), "-l", "identity", "--json", "-"]) == 0
-    )
-    results = json.loads(capsys.readouterr().out)["results"]
-    assert list(results) == ["geometry + albedo", "untrained encoder", "PCA (6)", "pixels"]
+    command = ["evaluate", "cluster", "-m", str(run), "-d", str(faces), "-l", "identity", "--cache", "none"]
+    assert main([*command, "--json", "-"]) == 0
+    rows = json.loads(capsys.readouterr().out)["rows"]
+    controls = ["untrained encoder", "PCA (6)", "pixels", "majority", "chance"]
+    assert list(rows) == ["geometry + albedo", *controls]
+    assert [name for name, row in rows.items() if row["control"]] == controls
+    assert rows["untrained encoder"]["runs"] == 3
 
 
 def test_geometry_and_reconstruction_of_generated_faces(run, faces, capsys):
@@ -286,7 +294,7 @@ def test_a_full_disk_is_one_line(run, faces, tmp_path, monkeypatch, refused):
     def full(*_, **__):
         raise OSError(28, "No space left on device", "f.parquet")
 
-    monkeypatch.setattr(FeatureTable, "write", full)
+    monkeypatch.setattr("derender.features.embedding.write_row_groups", full)
     line = refused("embed", "-m", run, "-d", faces, "--out", tmp_path / "f.parquet")
     assert line == "derender: f.parquet: no space left on device; free some space and run the command again"
 

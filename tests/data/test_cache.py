@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from derender.data import cache as module
+from derender.data import cache_folder, read_pictures
 from derender.data import pictures as pictures_module
-from derender.data import read_pictures
 from derender.data.loading import load_into
 
 
@@ -66,7 +66,7 @@ def test_user_folder_of_this_system(monkeypatch, tmp_path):
     monkeypatch.delenv("DERENDER_CACHE", raising=False)
     monkeypatch.setattr("sys.platform", "linux")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert module.cache_folder() == tmp_path / "derender"
+    assert cache_folder() == tmp_path / "derender"
 
 
 def change_content(folder: Path, encoded) -> None:

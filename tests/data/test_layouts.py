@@ -46,6 +46,20 @@ SYNCAR = {
 }
 TRACKS = ["tracks/id1/track_000/000.jpg", "tracks/id1/track_001/000.jpg", "tracks/id2/track_000/000.jpg"]
 MASKS = ["images/0.jpg", "images/1.jpg", "masks/0.png", "masks/1.png"]
+RAFDB = {
+    "basic/EmoLabel/list_patition_label.txt": "train_00001.jpg 5\ntest_0001.jpg 7\n",
+    "basic/Image/aligned/train_00001_aligned.jpg": None,
+    "basic/Image/aligned/test_0001_aligned.jpg": None,
+}
+CARS = {
+    "02958343/train/1a2b3c4d5e6f708192a3b4c5d6e7f809_000.png": None,
+    "02958343/test/0a2b3c4d5e6f708192a3b4c5d6e7f80_001.png": None,
+}
+FACE_TRACKS = {
+    "buffy_s05e02.ids": "CVHCI_TRACKLABELS_V1\n1 giles\n13 buffy\n",
+    "buffy_s05e02/00001/0001.jpg": None,
+    "buffy_s05e02/00013/0001.jpg": None,
+}
 
 TREES = {
     "utkface": UTKFACE,
@@ -55,6 +69,11 @@ TREES = {
     "synface": SYNFACE,
     "syncar": SYNCAR,
     "synface_tracks": TRACKS,
+    "rafdb": RAFDB,
+    "depth_pairs": ["train/image/1.png", "train/depth/1.png", "test/image/1.png", "test/depth/1.png"],
+    "shapenet_cars": CARS,
+    "face_tracks": FACE_TRACKS,
+    "table": {"data.csv": "file,kind\na b/1.png,x\n2.png,y\n", "a b/1.png": None, "2.png": None},
     "classes": ["cats/1.png", "cats/2.png", "dogs/1.png"],
     "folder": ["1.png", "a/2.png", "b/c/3.png"],
 }
@@ -85,12 +104,31 @@ def test_recognised_wherever_the_tree_lies(tree, name, zipped, wrapped):
         assert len(column) == len(inventory.table.files) > 0
 
 
+def test_every_published_set_says_where_it_is_and_on_what_terms():
+    published = {layout.name for layout in LAYOUTS if layout.home}
+    assert published >= {"utkface", "celeba", "celebamask", "lfw", "rafdb", "face_tracks", "shapenet_cars"}
+    for layout in LAYOUTS:
+        assert bool(layout.home) == bool(layout.terms), layout.name
+        assert not layout.home or layout.home.startswith("http"), layout.name
+
+
 def test_utkface_labels_and_missing_race(tree):
     found = table(tree(UTKFACE))
     assert found.labels["age"].tolist() == [100, 24, 39, 55]
     assert found.labels["age"].dtype == np.float32
     assert found.labels["gender"].tolist() == ["female", "male", "female", "male"]
     assert found.labels["race"].tolist() == ["white", "black", "", ""]
+
+
+def test_utkface_codes_out_of_range_are_unknown(tree):
+    """117 is older than anybody there, genders are 0 and 1; one published name has no gender at all."""
+    names = ["117_0_0", "116_3_4", "53__0", "7_1_5"]
+    found = table(tree([f"{name}_20170116184028385.jpg" for name in names]))
+    by_name = dict(zip([file.rsplit("_", 1)[0] for file in found.files], range(4), strict=True))
+    rows = [by_name[name] for name in names]
+    assert np.isnan(found.labels["age"][rows]).tolist() == [True, False, False, False]
+    assert found.labels["gender"][rows].tolist() == ["male", "", "", "female"]
+    assert found.labels["race"][rows].tolist() == ["white", "other", "white", ""]
 
 
 def test_a_stray_name_among_utkface_has_no_labels(tree):
@@ -140,8 +178,9 @@ def test_celeba_csv_identity_and_partition(tree):
             "2\nBald Smiling\n000001.jpg -1 1\n000002.jpg 1\n",
             r"line 4: expected a name and 2 values of -1 or 1",
         ),
-        ("2\nBald Smiling\n000001.jpg -1 5\n", r"line 3: expected a name and 2 values"),
+        ("1\nBald Smiling\n000001.jpg -1 5\n", r"line 3: expected a name and 2 values"),
         ("2\n", "cut short"),
+        ("3\nBald\n000001.jpg -1\n", "cut short: its first line says 3 rows and it has 1; copy it again"),
         ("", "cut short"),
     ],
 )
@@ -156,12 +195,6 @@ def test_celeba_without_its_list_says_where_it_is_published(tree):
         ValueError, match=r"has no list_attr_celeba\.txt; CelebA's owners publish it at https"
     ):
         take_inventory(tree(files), dataset="celeba")
-
-
-def test_celebamask_reads_pictures_only(tree):
-    found = table(tree([*MASKS, "images/2.jpg"]), dataset="celebamask")
-    assert found.files == ("images/0.jpg", "images/1.jpg")
-    assert found.labels["mask"].tolist() == ["masks/0.png", "masks/1.png"]
 
 
 def test_rendered_labels_are_in_radians(tree):

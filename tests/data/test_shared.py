@@ -5,7 +5,14 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from derender.data import read_ground_truth, read_pictures, split_indices, take_inventory
+from derender.data import (
+    MASK_CLASSES,
+    read_ground_truth,
+    read_masks,
+    read_pictures,
+    split_indices,
+    take_inventory,
+)
 from derender.data.loading import load_into
 
 
@@ -69,6 +76,16 @@ def test_lfw_people(shared_data):
     assert {"neutral", "happiness"} <= set(labels["emotion"])
     split = split_indices(inventory.table.files, groups=labels["identity"], seed=0)
     assert not set(labels["identity"][split.train]) & set(labels["identity"][split.test])
+
+
+def test_celebamask_masks(shared_data):
+    """Skin and hair are most of a face's picture, the middle of the picture is no background."""
+    pictures, masks, classes = read_masks(shared_data("data/celebamask128.zip"), 64, limit=100)
+    assert (len(pictures), masks.shape, classes) == (100, (100, 64, 64), MASK_CLASSES)
+    shares = np.bincount(masks.ravel(), minlength=19) / masks.size
+    assert {"background", "skin", "hair"} == {classes[place] for place in np.argsort(shares)[-3:]}
+    assert shares.min() > 0 or classes[int(shares.argmin())] in ("neck_l", "hat", "ear_r", "eye_g")
+    assert (masks[:, 32, 32] != 0).mean() > 0.95
 
 
 def test_tracks(shared_data):

@@ -19,7 +19,7 @@ from derender.evaluation import (
     evaluate_clustering,
     ward,
 )
-from derender.evaluation.clustering import cut, ward_tree
+from derender.evaluation.clustering_ward import cut, ward_tree
 from derender.features import FeatureTable
 
 SCORES = ("accuracy", "f1", "nmi", "hungarian", "ari")
@@ -142,11 +142,6 @@ def test_missing_labels_are_dropped_and_counted():
 def test_bad_input_is_refused_in_words(features, labels, n_clusters, message):
     with pytest.raises(ValueError, match=message):
         evaluate_clustering(features, np.array(labels), n_clusters)
-
-
-def test_too_many_rows_are_refused_before_memory_is_taken():
-    with pytest.raises(ValueError, match="takes 2 to 20000 rows, got 20001: select a part"):
-        ward_tree(np.zeros((20_001, 1)))
 
 
 def test_scores_need_rows_labels_and_one_length():

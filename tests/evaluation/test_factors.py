@@ -1,5 +1,7 @@
 """Errors of albedo, light and camera: zero up to what no picture can tell, known on closed forms."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -8,6 +10,7 @@ from derender.data import GroundTruth
 from derender.evaluation import albedo_error, camera_error, evaluate_factors, light_error
 from derender.scene import Scene
 from derender.scene.camera import rotation_matrix
+from derender.scene.light import light_direction
 
 
 def cameras(count: int = 20, seed: int = 0, spread_rad: float = 0.3) -> torch.Tensor:
@@ -43,6 +46,41 @@ def test_albedo_error_of_a_constant_is_the_standard_deviation_and_of_nothing_the
     np.testing.assert_allclose(nothing, albedo.square().flatten(1).mean(dim=1).sqrt(), rtol=1e-5)
     with pytest.raises(ValueError, match="the mask of 2 pictures is empty"):
         albedo_error(albedo, albedo, ~mask)
+
+
+def test_one_scale_for_all_pictures_forgives_one_scale_only():
+    albedo = torch.rand(3, 3, 6, 7, generator=torch.Generator().manual_seed(0))
+    mask = torch.ones(3, 6, 7, dtype=torch.bool)
+    assert albedo_error(albedo * 0.4, albedo, mask, one_scale=True).max() < 1e-7
+    scaled = albedo * torch.tensor([0.5, 1.0, 2.0])[:, None, None, None]
+    power = albedo.double().square().sum(dim=(1, 2, 3))
+    factor = torch.tensor([0.5, 1.0, 2.0])
+    best = (factor * power).sum() / (factor.square() * power).sum()
+    expected = (best * factor - 1).abs() * (power / (3 * 6 * 7)).sqrt()
+    np.testing.assert_allclose(albedo_error(scaled, albedo, mask, one_scale=True), expected, rtol=1e-5)
+
+
+def test_alignment_forgives_a_constant_turn_of_the_light_and_nothing_else():
+    generator = torch.Generator().manual_seed(0)
+    light = torch.cat([torch.zeros(30, 2), 0.4 * torch.randn(30, 2, generator=generator)], dim=1)
+    still, turn = torch.zeros(30, 6), torch.zeros(30, 6)
+    turn[:, :3] = torch.tensor([0.3, -0.5, 0.2])
+    assert light_error(light, turn, light, still).mean_deg > 20
+    assert light_error(light, turn, light, still, aligned=True).mean_deg < 1e-4
+    mirrored = light * torch.tensor([1, 1, 1, -1])
+    plain, aligned = (light_error(mirrored, still, light, still, aligned=a) for a in (False, True))
+    assert 5 < aligned.mean_deg <= plain.mean_deg + 1e-6
+
+
+def test_a_constant_light_aligned_is_the_mean_direction():
+    generator = torch.Generator().manual_seed(1)
+    light = torch.cat([torch.zeros(40, 2), 0.3 * torch.randn(40, 2, generator=generator) + 0.2], dim=1)
+    still, away = torch.zeros(40, 6), torch.zeros(40, 4)
+    away[:, 2] = -0.7
+    scores = light_error(away, still, light, still, aligned=True)
+    direction = torch.nn.functional.normalize(light_direction(light.double()).mean(dim=0), dim=0)
+    angle = torch.rad2deg(torch.arccos(light_direction(light.double()) @ direction))
+    np.testing.assert_allclose(scores.each_deg, angle, atol=1e-5)
 
 
 def test_light_error_is_the_angle_between_directions():
@@ -134,5 +172,9 @@ def test_a_model_that_knows_the_truth_scores_zero_and_constants_do_not():
     assert result.albedo_control > 0.1 and result.light_control.mean_deg > 5
     assert result.camera_control.mean_deg > 5
     turned_model = Oracle(*values[:3], turned(values[3], about))
+    assert result.albedo_global < 1e-6 < result.albedo_global_control
+    assert result.light_aligned.mean_deg < 1e-4
+    with pytest.raises(ValueError, match="this ground truth has no camera: give a set that stores it"):
+        evaluate_factors(turned_model, replace(truth, camera=None))
     elsewhere = evaluate_factors(turned_model, truth)
     assert elsewhere.camera.mean_deg < 1e-4 and elsewhere.light.mean_deg > 5

@@ -27,6 +27,19 @@ def test_depth_ignores_a_constant_added_to_the_raw_map(generator):
     torch.testing.assert_close(depth_from_raw(raw, RANGES), depth_from_raw(raw + 5, RANGES))
 
 
+def test_level_depth_loses_its_slope_from_top_to_bottom_and_nothing_else(generator):
+    level = SceneRanges(level_depth=True, border_share=0)
+    raw = 0.01 * torch.randn(2, 1, 48, 64, generator=generator)
+    down = torch.linspace(-1, 1, 48)[:, None].expand(48, 64)
+    torch.testing.assert_close(depth_from_raw(raw + 0.3 * down, level), depth_from_raw(raw, level))
+    across = raw + 0.3 * torch.linspace(-1, 1, 64)
+    assert (depth_from_raw(across, level) - depth_from_raw(raw, level)).abs().max() > 0.02
+    ridge = (raw * 0 + torch.exp(-((down * 3) ** 2))).contiguous()  # the same above and below: no slope
+    torch.testing.assert_close(
+        depth_from_raw(ridge, level), depth_from_raw(ridge, SceneRanges(border_share=0))
+    )
+
+
 def test_cars_hold_the_border_deeper():
     depth = depth_from_raw(torch.zeros(1, 1, 64, 64), SceneRanges(border_depth=1.08))
     assert depth[0, 0, 0].item() == pytest.approx(1.08)

@@ -87,5 +87,5 @@ def test_geometry_and_reconstruction_tables_print_in_the_papers_units():
     assert list(found) == ["model", "average depth", "plane"]
     with_untrained = GeometryResult(scores(0.01), scores(0.02), scores(0.03), scores(0.04))
     assert list(geometry_table(with_untrained, 2).values())[-1] == "untrained model"
-    both = [ReconstructionScores(l1, 20.0, 0.9, 0, each, each) for l1 in (0.05, 0.1)]
+    both = [ReconstructionScores(l1, 20.0, 0.9, 0, each, each, 0.5, each) for l1 in (0.05, 0.1)]
     assert "better than every control" in reconstruction_table(ReconstructionResult(*both), 2).verdict(0)

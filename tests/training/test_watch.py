@@ -139,8 +139,8 @@ COLLAPSING = [
     "perceptual=none",
     "curvature_weight=0",
 ]
-COLLAPSING += ["learning_rate=1e-3", "weight_decay=0", "warmup_images=0", "final_rate=1", "images=20000"]
-COLLAPSING += ["checkpoint_every=4000", "validate_every=4000"]
+COLLAPSING += ["learning_rate=5e-3", "weight_decay=0", "warmup_images=0", "final_rate=1", "images=20000"]
+COLLAPSING += ["checkpoint_every=1000", "validate_every=1000"]
 
 
 def test_a_real_collapse_is_caught_within_20000_images_while_its_loss_still_falls(tmp_path):
@@ -149,10 +149,12 @@ def test_a_real_collapse_is_caught_within_20000_images_while_its_loss_still_fall
     result = train(resolve("small", COLLAPSING), pictures, tmp_path / "run")
     assert result.stopped == "collapse"
     assert result.images < 20_000
-    assert [finding.sign for finding in result.findings if finding.fatal] == ["torn depth"]
+    signs = {finding.sign for finding in result.findings if finding.fatal}
+    assert signs & {"saturated depth", "torn depth"}  # stripes between the bounds of depth,
+    assert "view at its bound" in signs  # every camera turned as far as it goes,
     rows = read_metrics(tmp_path / "run")
     errors = [row["l1"] for row in rows if row["kind"] == "train"]
-    assert sum(errors[-4:]) < sum(errors[:4])
-    assert "torn depth" in rows[-1]
+    assert errors[-1] < errors[0] / 2  # and the pictures look better all the while
+    assert signs <= set(rows[-1])
     last_good = max(row["images"] for row in rows if row["kind"] == "validation")
     assert last_good < result.images - 3_000

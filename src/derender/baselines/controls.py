@@ -16,7 +16,7 @@ from derender.features import FeatureTable, Progress, embed_pictures, table_labe
 
 def pixel_features(pictures: PictureSet) -> FeatureTable:
     """Pixels themselves, in 0..1, flattened: factor ``pixels``."""
-    return _table(pictures, "pixels", _flat(pictures), {"control": "pixels"})
+    return control_table(pictures, "pixels", _flat(pictures), {"control": "pixels"})
 
 
 def pca_features(
@@ -55,7 +55,7 @@ def pca_features(
         "fitted_on": len(source),
         "seed": seed,
     }
-    return _table(pictures, "pca", pca.transform(_flat(pictures)), origin)
+    return control_table(pictures, "pca", pca.transform(_flat(pictures)), origin)
 
 
 def untrained_twin(model: Any, seed: int) -> Any:
@@ -82,13 +82,16 @@ def untrained_features(
 def noise_features(pictures: PictureSet, *, dimensions: int = 64, seed: int = 0) -> FeatureTable:
     """Normal noise that knows nothing of the pictures, factor ``noise``: the chance level of any protocol."""
     noise = np.random.default_rng(seed).standard_normal((len(pictures), dimensions))
-    return _table(pictures, "noise", noise, {"control": "noise", "seed": seed})
+    return control_table(pictures, "noise", noise, {"control": "noise", "seed": seed})
 
 
 def _flat(pictures: PictureSet) -> np.ndarray:
     return np.asarray(pictures.images, np.float32).reshape(len(pictures), -1) / 255
 
 
-def _table(pictures: PictureSet, name: str, values: np.ndarray, origin: dict[str, Any]) -> FeatureTable:
+def control_table(
+    pictures: PictureSet, name: str, values: np.ndarray, origin: dict[str, Any]
+) -> FeatureTable:
+    """One factor (N, D) as a table, with the pictures' names and labels; ``origin`` says what made it."""
     origin = {"data": pictures.source, "layout": pictures.layout, **origin}
     return FeatureTable(pictures.files, {name: values.astype(np.float32)}, table_labels(pictures), origin)

@@ -12,7 +12,21 @@ from typing import Annotated
 import typer
 
 from derender import __version__
-from derender.cli import demo, embed, evaluate, pictures, synth, train
+from derender.cli import (
+    compare,
+    demo,
+    doctor,
+    embed,
+    evaluate,
+    explain,
+    finetune,
+    mesh,
+    move,
+    pictures,
+    search,
+    synth,
+    train,
+)
 
 app = typer.Typer(
     name="derender",
@@ -41,7 +55,9 @@ def _options(
     pass
 
 
-for group in (demo, train, embed, evaluate, pictures, synth):
+for group in (
+    demo, doctor, train, embed, evaluate, explain, finetune, compare, pictures, move, mesh, search, synth
+):  # fmt: skip
     group.register(app)
 
 

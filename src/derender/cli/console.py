@@ -107,6 +107,9 @@ def show_scores(scores: "ScoreTable", json_file: str | None) -> None:
         ]
         table.add_row(Text(row.name), *cells, style="dim" if row.control else "")
     console = Console(stderr=json_file == "-", highlight=False)
+    if not console.is_terminal:  # a file or a pipe is as wide as the table
+        widest = console.options.update(max_width=1_000)
+        console.width = max(console.width, console.measure(table, options=widest).maximum)
     console.print(table, crop=False)
 
 

@@ -1,12 +1,29 @@
 """`derender embed`: one feature per factor for every picture, in one parquet file."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from derender.cli import options
+from derender.cli.baselines import (
+    BaselineComponents,
+    BaselineFeatures,
+    BaselineImageSize,
+    BaselineName,
+    BaselineSeed,
+)
 from derender.cli.console import bar, out_of_the_way, result, say, write_json
+
+if TYPE_CHECKING:
+    from derender.data import PictureSet
+    from derender.data.stream import Stream
+    from derender.features import Embedded
+
+NAMED = 5
+"""So many unreadable pictures are named."""
 
 
 def register(app: typer.Typer) -> None:
@@ -16,9 +33,19 @@ def register(app: typer.Typer) -> None:
 
 
 def embed(
-    model: options.Model,
     data: options.Data,
     out: Annotated[Path, typer.Option("--out", "-o", help="The table to write.", metavar="FILE.parquet")],
+    model: Annotated[
+        str | None,
+        typer.Option(
+            "--model", "-m", help="Run folder, saved model or Hugging Face Hub id.", metavar="MODEL"
+        ),
+    ] = None,
+    baseline: BaselineName = None,
+    features: BaselineFeatures = None,
+    image_size: BaselineImageSize = 64,
+    components: BaselineComponents = 64,
+    seed: BaselineSeed = 0,
     dataset: options.Dataset = "auto",
     part: options.Part = "all",
     limit: options.Limit = None,
@@ -27,34 +54,89 @@ def embed(
     force: options.Force = False,
     json_file: options.Json = None,
 ) -> None:
-    """Write a feature table: file, one list column per factor, and the labels of the data set."""
-    out_of_the_way(out, force)
-    from derender.cli.models import open_model, part_of
-    from derender.data import read_pictures
-    from derender.features import embed_pictures
+    """Write a feature table: file, one list column per factor, and the labels of the data set.
 
-    net = open_model(model, device)
-    with bar("reading") as report:
-        pictures = read_pictures(data, net.image_size, dataset=dataset, limit=limit, progress=report)
-    pictures = part_of(pictures, part, model)
-    say(pictures.describe())
-    with bar("embedding") as report:
-        table = embed_pictures(
-            net, pictures, batch_size=batch_size, progress=report, origin={"source": model}
+    Pictures are read, embedded and written as they come, so memory does not grow with their number. A run
+    that was stopped goes on where it was when the command is given again.
+    """
+    out_of_the_way(out, force)
+    from derender.cli.models import open_model
+    from derender.features import embed_to_file
+
+    if baseline is not None:
+        from derender.cli.baselines import CONTROLS, checked, open_baseline, write_control
+
+        if checked(baseline) in CONTROLS:
+            write_control(
+                baseline, data, out, dataset=dataset, part=part, limit=limit, model=model,
+                image_size=image_size, components=components, seed=seed, json_file=json_file,
+            )  # fmt: skip
+            return
+        net = open_baseline(
+            baseline, model, device=device, features=features, image_size=image_size, seed=seed
         )
-    table.write(out)
-    sizes = {name: values.shape[1] for name, values in table.factors.items()}
-    result(
-        f"{len(table):,} rows in {out}: " + ", ".join(f"{name} {size}" for name, size in sizes.items()),
-        json_file,
-    )
+        origin = {"source": model, "baseline": baseline}
+    elif model is None:
+        raise ValueError("give --model RUN, or --baseline NAME (see derender embed --help)")
+    else:
+        net, origin = open_model(model, device), {"source": model}
+    with _opened(data, dataset, part, limit, model, net.image_size) as source, bar("embedding") as report:
+        done = embed_to_file(
+            net,
+            source,
+            out,
+            batch_size=batch_size,
+            fresh=force,
+            progress=report,
+            origin=origin,
+        )
+        say(_account(done, source))
+    sizes = ", ".join(f"{name} {size}" for name, size in done.factors.items())
+    result(f"{done.rows:,} rows in {out}: {sizes}", json_file)
     write_json(
         json_file,
         {
             "out": out,
-            "rows": len(table),
-            "factors": sizes,
-            "labels": list(table.labels),
-            "origin": table.origin,
+            "rows": done.rows,
+            "factors": done.factors,
+            "labels": done.labels,
+            "origin": done.origin,
+            "skipped": done.skipped,
+            "copies": done.copies,
+            "resumed": done.resumed,
         },
     )
+
+
+@contextmanager
+def _opened(
+    data: str, dataset: str, part: str, limit: int | None, model: str | None, image_size: int
+) -> "Iterator[Stream | PictureSet]":
+    """The pictures as a stream; those of one part of a split, which has to know them all first, as a set."""
+    from derender.data import read_pictures
+    from derender.data.stream import stream_of
+
+    if part == "all":
+        with stream_of(data, dataset=dataset, limit=limit) as stream:
+            yield stream
+        return
+    from derender.cli.models import part_of
+
+    with bar("reading") as report:
+        pictures = read_pictures(data, image_size, dataset=dataset, limit=limit, progress=report)
+    say(pictures.describe())
+    yield part_of(pictures, part, model)
+
+
+def _account(done: "Embedded", source: "Stream | PictureSet") -> str:
+    """One line: how many pictures of what, and what was left out or had been there."""
+    noun = "picture" if done.rows == 1 else "pictures"
+    parts = [f"{done.rows:,} {noun} from {source.source} ({source.layout})"]
+    if done.resumed:
+        parts.append(f"{done.resumed:,} of them from the run before")
+    if done.skipped:
+        parts.append(f"{done.skipped:,} skipped")
+    if done.copies:
+        parts.append(f"{done.copies:,} identical copies dropped")
+    lines = [", ".join(parts), *(f"skipped {row.file}: {row.reason}" for row in done.examples[:NAMED])]
+    return "\n".join(lines)

@@ -28,17 +28,19 @@ def chosen_device(device: str) -> str:
     return "cuda" if device != "cpu" and torch.cuda.is_available() else "cpu"
 
 
-def part_of(pictures: "PictureSet", part: str, model: str) -> "PictureSet":
+def part_of(pictures: "PictureSet", part: str, model: str | None) -> "PictureSet":
     """The pictures of one part of the split that the run ``model`` was trained with."""
     if part not in PARTS:
         raise ValueError(f"unknown part {part!r}: choose {', '.join(PARTS)}")
     if part == "all":
         return pictures
+    from derender.baselines.training import read_any_config
     from derender.data import split_indices
-    from derender.training.run_folder import read_config
 
+    if model is None:
+        raise ValueError("--part needs --model: the run whose split it is")
     if not (Path(model) / "config.yaml").is_file():
         raise ValueError(f"{model} is no run folder and records no split: use --part all")
-    config = read_config(Path(model))
+    config = read_any_config(Path(model))
     split = split_indices(pictures.files, config.split, seed=config.seed)
     return pictures.select(getattr(split, part)).require(1, f"the {part} part")

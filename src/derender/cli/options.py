@@ -12,7 +12,7 @@ Model = Annotated[
 Data = Annotated[
     str,
     typer.Option(
-        "--data", "-d", help="Folder, zip, or PATH::SUBSET for one part of a data set.", metavar="PATH"
+        "--data", "-d", help="Folder, zip, .tar shards or Hugging Face id; ::PART for a part.", metavar="PATH"
     ),
 ]
 Dataset = Annotated[

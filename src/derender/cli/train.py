@@ -20,6 +20,12 @@ def train(
     out: Annotated[
         Path, typer.Option("--out", "-o", help="Run folder to make, or to go on with.", metavar="RUN")
     ],
+    model: Annotated[
+        str,
+        typer.Option(
+            "--model", help="derender, or a baseline: vqvae, simclr, ae, beta-vae, resnet18.", metavar="NAME"
+        ),
+    ] = "derender",
     preset: Annotated[
         str | None,
         typer.Option("--preset", help="faces, cars, cats, paper, or small for a CPU; default: faces."),
@@ -39,15 +45,20 @@ def train(
     json_file: options.Json = None,
 ) -> None:
     """Learn to take pictures apart, from a folder of unlabelled pictures of one kind of thing."""
+    from derender.settings import Settings
     from derender.training.config import TrainConfig, resolve, to_yaml
 
     settings_given = preset is not None or loocc is not None or bool(overrides)
 
-    def configuration() -> TrainConfig:
+    def configuration() -> Settings:
         if resume and not settings_given and (out / "config.yaml").is_file():
-            from derender.training.run_folder import read_config
+            from derender.cli.baselines import stored_config
 
-            return read_config(out)
+            return stored_config(out, model)
+        if model != "derender":
+            from derender.cli.baselines import baseline_config
+
+            return baseline_config(model, overrides or [], preset=preset, loocc=loocc)
         return resolve(preset or "faces", overrides or [], objective__loocc=loocc)
 
     config = configuration()
@@ -56,6 +67,7 @@ def train(
         write_json(json_file, config.model_dump(mode="json"))
         return
 
+    from derender.cli.baselines import picture_size, train_baseline
     from derender.cli.models import chosen_device
     from derender.data import read_pictures
     from derender.report.run import decomposition_sheet, run_page
@@ -70,9 +82,7 @@ def train(
             f"{out} exists and is not empty: add --resume to go on with that run, or choose another --out"
         )
     with bar("reading") as report:
-        pictures = read_pictures(
-            data, config.model.network.image_size, dataset=dataset, limit=limit, progress=report
-        )
+        pictures = read_pictures(data, picture_size(config), dataset=dataset, limit=limit, progress=report)
     say(pictures.describe())
     with bar("training") as report:
 
@@ -83,15 +93,11 @@ def train(
             else:
                 report(progress.done, progress.total, description="perceptual features", unit="steps")
 
-        trained = train_model(
-            config,
-            pictures,
-            out,
-            resume=resume,
-            sample_sheet=decomposition_sheet,
-            progress=show,
-            accelerator=accelerator,
-        )
+        how = {"resume": resume, "progress": show, "accelerator": accelerator}
+        if isinstance(config, TrainConfig):
+            trained = train_model(config, pictures, out, sample_sheet=decomposition_sheet, **how)
+        else:
+            trained = train_baseline(config, pictures, out, **how)
     page = run_page(out).write(out / "report.html")
     for finding in trained.findings:
         say(f"{finding.sign}: {finding.text}; {finding.advice}")

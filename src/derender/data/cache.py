@@ -5,20 +5,21 @@ note's length and a mark. It is written under another name and moved into place 
 never sees half of one. It counts only if the note's fingerprint is that of the source as it is now (name,
 size, and checksum or time of change of every file, and every setting), its length is right, and a sample of
 its rows has the recorded checksum; otherwise it is made again. One file per source and setting: a new
-version takes the old one's place.
+version takes the old one's place. Rows of a stream are appended one after the other, since nobody knows how
+many there will be; their labels stand in the note.
 """
 
 import hashlib
 import json
 import os
-import sys
 import tempfile
 import time
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import IO, Any
 
 import numpy as np
 import PIL
@@ -32,17 +33,19 @@ _MARK = b"derender pictures 1\n"
 _SAMPLED_ROWS = 64
 
 
-def cache_folder() -> Path:
-    """``$DERENDER_CACHE``, or derender's folder in the place this system has for caches."""
-    if "DERENDER_CACHE" in os.environ:
-        return Path(os.environ["DERENDER_CACHE"])
-    if sys.platform == "darwin":
-        base = Path.home() / "Library" / "Caches"
-    elif sys.platform == "win32":
-        base = Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData" / "Local"))
-    else:
-        base = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
-    return base / "derender"
+@dataclass(frozen=True)
+class Cached:
+    """What a cache file holds.
+
+    Attributes:
+        images: the rows, as a private memory map: writing to it changes no file.
+        loaded: which files they are, and what became of the others.
+        further: what else was noted when they were written.
+    """
+
+    images: UInt8[np.ndarray, "n 3 s s"]
+    loaded: Loaded
+    further: dict[str, Any] = field(default_factory=dict)
 
 
 def fingerprint(source: Source, files: tuple[str, ...], settings: tuple[object, ...]) -> str:
@@ -53,18 +56,14 @@ def fingerprint(source: Source, files: tuple[str, ...], settings: tuple[object, 
     return digest.hexdigest()
 
 
-def cache_file(folder: Path, source: Source, settings: tuple[object, ...]) -> Path:
-    """Where the rows of this source under these settings are kept."""
-    key = hashlib.sha256(
-        repr((str(source.path.resolve()), settings)).encode("utf-8", "backslashreplace")
-    ).hexdigest()
-    return folder / f"{source.path.stem[:40]}-{key[:16]}.pictures"
+def cache_file(folder: Path, name: str, key: tuple[object, ...]) -> Path:
+    """Where rows are kept: a source's name for people, and everything that tells it from others."""
+    digest = hashlib.sha256(repr(key).encode("utf-8", "backslashreplace")).hexdigest()
+    return folder / f"{name[:40]}-{digest[:16]}.pictures"
 
 
-def read_cache(
-    file: Path, expected: str, image_size: int
-) -> tuple[UInt8[np.ndarray, "n 3 s s"], Loaded] | None:
-    """The rows as a private memory map with what they are, or None if there are none or not these."""
+def read_cache(file: Path, expected: str, image_size: int) -> Cached | None:
+    """What the file holds, or None if there is none or it was made of something else."""
     try:
         with file.open("rb") as stream:
             end = stream.seek(-len(_MARK) - 8, os.SEEK_END)
@@ -84,13 +83,31 @@ def read_cache(
     if note["fingerprint"] != expected or end - length != count * 3 * image_size * image_size or not count:
         return None
     images = np.memmap(file, np.uint8, mode="c", shape=(count, 3, image_size, image_size))
-    return (images, loaded) if _sample_checksum(images) == note["checksum"] else None
+    if sample_checksum(images) != note["checksum"]:
+        return None
+    return Cached(images, loaded, note.get("further", {}))
 
 
 @contextmanager
 def new_cache(file: Path, count: int, image_size: int) -> Iterator["CacheWriter"]:
     """Room for ``count`` rows beside ``file``; what is not finished is deleted."""
     needed = count * 3 * image_size * image_size
+    with _draft(file, needed) as draft:
+        yield CacheWriter(
+            file, draft, np.memmap(draft, np.uint8, mode="r+", shape=(count, 3, image_size, image_size))
+        )
+
+
+@contextmanager
+def growing_cache(file: Path, image_size: int) -> Iterator["GrowingCache"]:
+    """A draft beside ``file`` that rows are appended to; what is not finished is deleted."""
+    with _draft(file, 0) as draft, draft.open("ab") as stream:
+        yield GrowingCache(file, draft, stream, image_size)
+
+
+@contextmanager
+def _draft(file: Path, needed: int) -> Iterator[Path]:
+    """An unfinished file of this many bytes beside ``file``."""
     draft = None
     try:
         try:
@@ -99,12 +116,11 @@ def new_cache(file: Path, count: int, image_size: int) -> Iterator["CacheWriter"
             handle, name = tempfile.mkstemp(prefix=f".{file.name}.", dir=file.parent)
             draft = Path(name)
             with os.fdopen(handle, "r+b") as stream:
-                _reserve(stream.fileno(), needed)
+                if needed:
+                    _reserve(stream.fileno(), needed)
         except OSError as problem:
             raise _no_room(file, needed, problem) from problem
-        yield CacheWriter(
-            file, draft, np.memmap(draft, np.uint8, mode="r+", shape=(count, 3, image_size, image_size))
-        )
+        yield draft
     finally:
         if draft is not None:
             draft.unlink(missing_ok=True)
@@ -144,22 +160,57 @@ class CacheWriter:
     def finish(self, loaded: Loaded, mark: str) -> None:
         """Cut the file to the rows that count, append the note, and move it into place."""
         kept = self.rows[: len(loaded.files)]
-        note = {"fingerprint": mark, "checksum": _sample_checksum(kept), **asdict(loaded)}
         self.rows.flush()
-        encoded = json.dumps(note).encode()
+        _seal(self.file, self.draft, kept, loaded, mark, {})
+
+
+class GrowingCache:
+    """Rows being appended; ``finish`` puts them in place."""
+
+    def __init__(self, file: Path, draft: Path, stream: IO[bytes], image_size: int):
+        self.file = file
+        self.draft = draft
+        self._stream = stream
+        self._size = image_size
+
+    def append(self, rows: UInt8[np.ndarray, "n 3 s s"]) -> None:
+        """Write some rows behind those that are there."""
         try:
-            with self.draft.open("r+b") as stream:
-                stream.truncate(kept.size)
-                stream.seek(0, os.SEEK_END)
-                stream.write(encoded + len(encoded).to_bytes(8, "little") + _MARK)
-                stream.flush()
-                os.fsync(stream.fileno())
-            self.draft.replace(self.file)
+            self._stream.write(np.ascontiguousarray(rows).data)
         except OSError as problem:
-            raise _no_room(self.file, kept.size, problem) from problem
+            raise _no_room(self.file, self._stream.tell(), problem) from problem
+
+    def finish(self, loaded: Loaded, mark: str, further: dict[str, Any]) -> None:
+        """Append the note, and move the file into place; ``further`` is anything JSON can hold."""
+        self._stream.flush()
+        kept = np.memmap(self.draft, np.uint8, mode="r", shape=(len(loaded.files), 3, self._size, self._size))
+        _seal(self.file, self.draft, kept, loaded, mark, further)
 
 
-def _sample_checksum(rows: np.ndarray) -> int:
+def _seal(
+    file: Path, draft: Path, kept: np.ndarray, loaded: Loaded, mark: str, further: dict[str, Any]
+) -> None:
+    """Cut a draft to the rows that count, append the note, and move it into place."""
+    note = {
+        "fingerprint": mark,
+        "checksum": sample_checksum(kept),
+        **asdict(loaded),
+        **({"further": further} if further else {}),
+    }
+    encoded = json.dumps(note).encode()
+    try:
+        with draft.open("r+b") as stream:
+            stream.truncate(kept.size)
+            stream.seek(0, os.SEEK_END)
+            stream.write(encoded + len(encoded).to_bytes(8, "little") + _MARK)
+            stream.flush()
+            os.fsync(stream.fileno())
+        draft.replace(file)
+    except OSError as problem:
+        raise _no_room(file, kept.size, problem) from problem
+
+
+def sample_checksum(rows: np.ndarray) -> int:
     """CRC of at most 64 rows, evenly spaced, the first and the last among them."""
     chosen = np.unique(np.linspace(0, len(rows) - 1, _SAMPLED_ROWS).astype(int)) if len(rows) else []
     checksum = 0

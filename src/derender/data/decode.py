@@ -5,7 +5,8 @@ Orientation from EXIF is applied; grey, palette and CMYK become RGB; transparent
 Colour profiles are not applied. Pictures that are not square are cropped to their centre (``fit="crop"``),
 laid whole on white ("pad"), or squeezed ("stretch"); all are then resized with an antialiased Lanczos
 filter. A JPEG much larger than needed is decoded at a reduced scale. Pictures above ``PIXEL_LIMIT`` and
-damaged ones raise ``Unreadable``, nothing else.
+damaged ones raise ``Unreadable``, nothing else. A box (left, top, right, bottom in pixels of the upright
+picture) cuts out a part first; it is moved and shrunk as far as needed to lie inside the picture.
 """
 
 import io
@@ -19,7 +20,7 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float32, UInt8
 from PIL import Image
 
 from derender.data.nearest import nearest
@@ -95,18 +96,24 @@ def check_fit(fit: str) -> None:
         raise ValueError(f"unknown fit {fit!r}{nearest(fit, FITS)} (known: {', '.join(FITS)})")
 
 
-def decode(encoded: bytes, image_size: int, fit: str = "crop") -> UInt8[np.ndarray, "3 s s"]:
+def decode(
+    encoded: bytes, image_size: int, fit: str = "crop", box: Float32[np.ndarray, "4"] | None = None
+) -> UInt8[np.ndarray, "3 s s"]:
     """Decode one picture; ``Unreadable`` if that cannot be done. Wrap many calls in ``quiet_pillow``."""
+    if box is not None and not (np.isfinite(box).all() and (box[2:] > box[:2]).all()):
+        raise Unreadable("no usable box is known for the part to read")
     try:
         with Image.open(io.BytesIO(encoded), formats=_known_formats()) as opened:
             width, height = opened.size
             if width * height > PIXEL_LIMIT:
                 raise Unreadable(f"{width} x {height} is more than {PIXEL_LIMIT // 10**6} million pixels")
-            _reduce_while_decoding(opened, image_size, fit)
+            _reduce_while_decoding(opened, image_size, fit, box)
+            if box is not None:
+                box = box * (opened.size[0] / width)
             if opened.size[0] * opened.size[1] > _LARGE_PIXELS:
                 with _one_large_picture_at_a_time:
-                    return _finish(opened, image_size, fit)
-            return _finish(opened, image_size, fit)
+                    return _finish(opened, image_size, fit, box)
+            return _finish(opened, image_size, fit, box)
     except Unreadable:
         raise
     except Image.UnidentifiedImageError as problem:
@@ -131,22 +138,36 @@ def _known_formats() -> tuple[str, ...]:
     return tuple(form for form in _FORMATS if form in Image.OPEN)
 
 
-def _reduce_while_decoding(opened: Image.Image, image_size: int, fit: str) -> None:
+def _reduce_while_decoding(
+    opened: Image.Image, image_size: int, fit: str, box: Float32[np.ndarray, "4"] | None
+) -> None:
     """Let the JPEG decoder scale by 1/2, 1/4 or 1/8, never below twice the size that is needed."""
-    short, long = sorted(opened.size)
+    short, long = sorted(opened.size if box is None else (box[2:] - box[:2]).tolist())
     kept = long if fit == "pad" else short
     if opened.format in ("JPEG", "MPO") and kept >= 4 * image_size:
         scale = 2 * image_size / kept
         opened.draft(None, (int(opened.size[0] * scale), int(opened.size[1] * scale)))
 
 
-def _finish(opened: Image.Image, image_size: int, fit: str) -> UInt8[np.ndarray, "3 s s"]:
-    picture = _square(_upright(_as_rgb(opened), opened), image_size, fit)
-    return np.ascontiguousarray(np.asarray(picture).transpose(2, 0, 1))
+def _finish(
+    opened: Image.Image, image_size: int, fit: str, box: Float32[np.ndarray, "4"] | None
+) -> UInt8[np.ndarray, "3 s s"]:
+    picture = upright(_as_rgb(opened), opened)
+    if box is not None:
+        picture = _cut(picture, box)
+    return np.ascontiguousarray(np.asarray(fit_square(picture, image_size, fit)).transpose(2, 0, 1))
 
 
-def _upright(picture: Image.Image, opened: Image.Image) -> Image.Image:
-    """Turn the picture as its EXIF orientation says; damaged EXIF counts as none."""
+def _cut(picture: Image.Image, box: Float32[np.ndarray, "4"]) -> Image.Image:
+    """The part in the box, to the nearest pixel; a square box stays square."""
+    sides = np.maximum(1, np.round(box[2:] - box[:2])).astype(int)
+    sides = np.minimum(sides, min(picture.size)) if sides[0] == sides[1] else np.minimum(sides, picture.size)
+    left, top = np.clip(np.round((box[:2] + box[2:] - sides) / 2).astype(int), 0, picture.size - sides)
+    return picture.crop((int(left), int(top), int(left + sides[0]), int(top + sides[1])))
+
+
+def upright(picture: Image.Image, opened: Image.Image) -> Image.Image:
+    """Turn the picture as the EXIF orientation of the ``opened`` file says; damaged EXIF counts as none."""
     if opened.format == "JPEG" and "exif" not in opened.info and "xmp" not in opened.info:
         return picture
     try:
@@ -183,8 +204,14 @@ def _from_high_depth(picture: Image.Image) -> Image.Image:
     return Image.fromarray(((values.astype(np.uint32) + 128) // 257).astype(np.uint8))
 
 
-def _square(picture: Image.Image, image_size: int, fit: str) -> Image.Image:
-    """Crop, pad or squeeze to a square of the wanted size."""
+def fit_square(
+    picture: Image.Image,
+    image_size: int,
+    fit: str,
+    resample: Image.Resampling = Image.Resampling.LANCZOS,
+    background: int | tuple[int, ...] = _BACKGROUND,
+) -> Image.Image:
+    """Crop, pad or squeeze to a square of the wanted size; maps of classes take NEAREST and a class."""
     size = (image_size, image_size)
     if picture.size == size:
         return picture
@@ -192,12 +219,12 @@ def _square(picture: Image.Image, image_size: int, fit: str) -> Image.Image:
     if fit == "pad":
         scale = image_size / max(width, height)
         inner = (max(1, round(width * scale)), max(1, round(height * scale)))
-        square = Image.new("RGB", size, _BACKGROUND)
-        resized = picture.resize(inner, Image.Resampling.LANCZOS, reducing_gap=3.0)
+        square = Image.new(picture.mode, size, background)
+        resized = picture.resize(inner, resample, reducing_gap=3.0)
         square.paste(resized, ((image_size - inner[0]) // 2, (image_size - inner[1]) // 2))
         return square
     if fit == "crop" and width != height:
         side = min(width, height)
         left, top = (width - side) // 2, (height - side) // 2
         picture = picture.crop((left, top, left + side, top + side))
-    return picture.resize(size, Image.Resampling.LANCZOS, reducing_gap=3.0)
+    return picture.resize(size, resample, reducing_gap=3.0)

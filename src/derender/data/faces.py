@@ -1,7 +1,9 @@
-"""Published collections of real faces: UTKFace, LFW, CelebA, and CelebAMask-HQ as picture and mask pairs.
+"""Real faces whose labels are in the names of their files: UTKFace, and Labeled Faces in the Wild.
 
-All are for non-commercial research only; none is part of this package. The masks themselves are read
-elsewhere.
+UTKFace: ``[age]_[gender]_[race]_[date].jpg.chip.jpg``. Its owners give no split; the paper's 80/10/10 is
+made by data/splits.py. LFW: ``First_Last/First_Last_0001.jpg``; where the lists of its view 1
+(``peopleDevTrain.txt``, ``peopleDevTest.txt``: a count, then a name and a count a line) lie beside the
+pictures they are the official split by people. The pairs of its verification protocol are not read.
 """
 
 import re
@@ -13,6 +15,7 @@ from derender.data.layout import (
     Layout,
     Table,
     number_column,
+    part_of,
     pictures_of,
     read_csv,
     text_column,
@@ -21,15 +24,16 @@ from derender.data.source import Source
 
 _MOSTLY = 0.9  # share of names that must look right: real collections hold a few misnamed files
 
-# UTKFace: [age]_[gender]_[race]_[date].jpg.chip.jpg; in a few names the race is missing.
-_UTK_NAME = re.compile(r"(?P<age>\d{1,3})_(?P<gender>\d)_(?:(?P<race>\d)_)?\d{8,}")
+# In a few published names the race is missing, in one the gender.
+_UTK_NAME = re.compile(r"(?P<age>\d{1,3})_(?P<gender>\d?)_(?:(?P<race>\d)_)?\d{8,}")
 _UTK_GENDERS = ("male", "female")
 _UTK_RACES = ("white", "black", "asian", "indian", "other")
+_UTK_OLDEST = 116
+_UTK_HOME = "https://susanqq.github.io/UTKFace/"
 
-# LFW: a folder per person, and that person's name and a number in each file's name
 _LFW_NAME = re.compile(r"(?:.*/)?(?P<identity>[^/]+)/(?P=identity)_\d{4}\.\w+")
-
-_CELEBA_PARTITIONS = {"0": "train", "1": "validation", "2": "test"}
+_LFW_PARTS = {"peopleDevTrain.txt": "train", "peopleDevTest.txt": "test"}
+_LFW_HOME = "https://vis-www.cs.umass.edu/lfw/"
 
 
 def _share(files: tuple[str, ...], pattern: re.Pattern[str], whole_path: bool) -> float:
@@ -47,13 +51,14 @@ def _read_utkface(source: Source, subset: str | None) -> Table:
     ages, genders, races = [], [], []
     for file in files:
         found = _UTK_NAME.match(PurePosixPath(file).name)
-        ages.append(float(found["age"]) if found else np.nan)
+        age = float(found["age"]) if found else np.nan
+        ages.append(age if age <= _UTK_OLDEST else np.nan)
         genders.append(_coded(found["gender"] if found else None, _UTK_GENDERS))
         races.append(_coded(found["race"] if found else None, _UTK_RACES))
     if files and np.isnan(ages).all():
         raise ValueError(
-            f"no picture in {source.path} is named as in UTKFace "
-            f"([age]_[gender]_[race]_[date].jpg): the first is {files[0]!r}"
+            f"no picture in {source.path} is named as in UTKFace ([age]_[gender]_[race]_[date].jpg): "
+            f"the first is {files[0]!r}; the owners publish the set at {_UTK_HOME}"
         )
     return Table(
         files, {"age": number_column(ages), "gender": text_column(genders), "race": text_column(races)}
@@ -61,7 +66,7 @@ def _read_utkface(source: Source, subset: str | None) -> Table:
 
 
 def _coded(code: str | None, names: tuple[str, ...]) -> str:
-    return names[int(code)] if code is not None and int(code) < len(names) else ""
+    return names[int(code)] if code and int(code) < len(names) else ""
 
 
 def _is_lfw(source: Source) -> bool:
@@ -70,147 +75,63 @@ def _is_lfw(source: Source) -> bool:
 
 def _read_lfw(source: Source, subset: str | None) -> Table:
     """Identity from the folder; emotion from ``emotions.csv`` (file, emotion) where there is one."""
-    files = pictures_of(source, subset)
+    partition = _lfw_partition(source)
+    files = pictures_of(source, subset if partition is None else None)
     lonely = next((file for file in files if "/" not in file), None)
     if lonely is not None:
-        raise ValueError(f"LFW has one folder per person, but {lonely} in {source.path} lies in none")
-    labels = {"identity": text_column(PurePosixPath(file).parent.name for file in files)}
+        raise ValueError(
+            f"LFW has one folder per person, but {lonely} in {source.path} lies in none; "
+            f"the owners publish the set at {_LFW_HOME}"
+        )
+    people = [PurePosixPath(file).parent.name for file in files]
+    labels = {"identity": text_column(people)}
     emotions = source.named("emotions.csv")
     if emotions is not None:
         by_name = {row["file"]: row["emotion"] for row in read_csv(source, emotions, ("file", "emotion"))}
         labels["emotion"] = text_column(by_name.get(PurePosixPath(file).name, "") for file in files)
-    return Table(files, labels)
+    if partition is None:
+        return Table(files, labels)
+    table = Table(files, labels, text_column(partition.get(person, "") for person in people))
+    return part_of(table, source, subset, "peopleDevTrain.txt")
 
 
-def _is_celeba(source: Source) -> bool:
-    return (
-        source.named("list_attr_celeba.txt") is not None or source.named("list_attr_celeba.csv") is not None
-    )
-
-
-def _read_celeba(source: Source, subset: str | None) -> Table:
-    """The 40 attributes, and identity and the official partition where their files are there."""
-    files = source.pictures
-    aligned = tuple(file for file in files if "img_align_celeba" in PurePosixPath(file).parts[:-1])
-    files = aligned or files
-    names = [PurePosixPath(file).name for file in files]
-    attributes, by_name = _celeba_attributes(source)
-    unknown = np.full(len(attributes), -1, np.int8)
-    values = (
-        np.stack([by_name.get(name, unknown) for name in names])
-        if names
-        else np.zeros((0, len(attributes)), np.int8)
-    )
-    labels = {name: values[:, column].copy() for column, name in enumerate(attributes)}
-    identities = _celeba_pairs(source, "identity_CelebA.txt")
-    if identities is not None:
-        labels["identity"] = text_column(identities.get(name, "") for name in names)
-    partitions = _celeba_pairs(source, "list_eval_partition.txt")
-    partition = None
-    if partitions is not None:
-        partition = text_column(_CELEBA_PARTITIONS.get(partitions.get(name, ""), "") for name in names)
-    table = Table(files, labels, partition)
-    if subset is None:
-        return table
-    if partition is None or subset not in _CELEBA_PARTITIONS.values():
-        raise ValueError(
-            f"CelebA's subsets are train, validation and test, and need list_eval_partition.txt; "
-            f"asked for {subset!r} of {source.path}"
-        )
-    return table.select(np.flatnonzero(partition == subset))
-
-
-def _celeba_attributes(source: Source) -> tuple[list[str], dict[str, np.ndarray]]:
-    """Attribute names, and 0/1 values by picture name, from the original text file or its CSV copy."""
-    file = source.named("list_attr_celeba.txt") or source.named("list_attr_celeba.csv")
-    if file is None:
-        raise ValueError(
-            f"{source.path} has no list_attr_celeba.txt; CelebA's owners publish it at {_CELEBA_HOME}"
-        )
-    lines = source.read_text(file).splitlines()
-    if len(lines) < 2:
-        raise ValueError(
-            f"{file} in {source.path} is cut short: expected the attribute names and rows below them"
-        )
-    if file.endswith(".csv"):
-        head, body, first = lines[0].split(",")[1:], [line.split(",") for line in lines[1:]], 2
-    else:
-        head, body, first = lines[1].split(), [line.split() for line in lines[2:]], 3
-    by_name = {}
-    for number, row in enumerate(body, first):
-        if not row:
+def _lfw_partition(source: Source) -> dict[str, str] | None:
+    """The part of each person in the lists of view 1, or None without them."""
+    partition: dict[str, str] = {}
+    for name, part in _LFW_PARTS.items():
+        file = source.named(name)
+        if file is None:
             continue
-        if len(row) != len(head) + 1 or any(value not in ("-1", "0", "1") for value in row[1:]):
+        lines = source.read_text(file).splitlines()
+        rows = [line.rsplit(maxsplit=1) for line in lines[1:] if line.strip()]
+        if not lines or not lines[0].strip().isdecimal() or len(rows) != int(lines[0]):
             raise ValueError(
-                f"{file} in {source.path}, line {number}: expected a name and {len(head)} values of -1 or 1"
+                f"{file} in {source.path} is cut short: expected the number of people and as many lines below"
             )
-        by_name[row[0]] = np.array([value == "1" for value in row[1:]], np.int8)
-    return head, by_name
+        for number, row in enumerate(rows, 2):
+            if len(row) != 2 or not row[1].isdecimal():
+                raise ValueError(
+                    f"{file} in {source.path}, line {number}: expected a name and a number of pictures"
+                )
+            partition[row[0]] = part
+    return partition or None
 
-
-def _celeba_pairs(source: Source, file: str) -> dict[str, str] | None:
-    """``name value`` lines, or None when the file is not there."""
-    found = source.named(file)
-    if found is None:
-        return None
-    rows = (line.split() for line in source.read_text(found).splitlines())
-    return {row[0]: row[1] for row in rows if len(row) == 2}
-
-
-def _is_celebamask(source: Source) -> bool:
-    pictured = sum(1 for file in source.pictures if _in(file, "images"))
-    return pictured > 0 and len(_mask_pairs(source)) >= _MOSTLY * pictured
-
-
-def _read_celebamask(source: Source, subset: str | None) -> Table:
-    """The pictures that have a mask; the label ``mask`` names the mask's file."""
-    pairs = {
-        file: mask
-        for file, mask in _mask_pairs(source).items()
-        if subset is None or subset in file.split("/")
-    }
-    if not pairs:
-        raise ValueError(f"{source.path} has no pairs images/NAME.jpg and masks/NAME.png")
-    return Table(tuple(pairs), {"mask": text_column(pairs.values())})
-
-
-def _in(file: str, folder: str) -> bool:
-    return PurePosixPath(file).parent.name == folder
-
-
-def _mask_pairs(source: Source) -> dict[str, str]:
-    masks = {
-        PurePosixPath(file).stem: file
-        for file in source.files
-        if _in(file, "masks") and file.endswith(".png")
-    }
-    pictures = [file for file in source.pictures if _in(file, "images")]
-    return {file: masks[PurePosixPath(file).stem] for file in pictures if PurePosixPath(file).stem in masks}
-
-
-_CELEBA_HOME = "https://mmlab.ie.cuhk.edu.hk/projects/CelebA.html"
 
 FACES = (
-    Layout("celeba", "CelebA: faces with 40 attributes", _CELEBA_HOME, _is_celeba, _read_celeba),
-    Layout(
-        "celebamask",
-        "CelebAMask-HQ: faces with masks of their parts",
-        "https://github.com/switchablenorms/CelebAMask-HQ",
-        _is_celebamask,
-        _read_celebamask,
-    ),
     Layout(
         "utkface",
         "UTKFace: faces with age, gender and race in their names",
-        "https://susanqq.github.io/UTKFace/",
+        _UTK_HOME,
         _is_utkface,
         _read_utkface,
+        "non-commercial research only",
     ),
     Layout(
         "lfw",
         "Labeled Faces in the Wild: one folder per person",
-        "https://vis-www.cs.umass.edu/lfw/",
+        _LFW_HOME,
         _is_lfw,
         _read_lfw,
+        "no licence stated; news photographs, collected for research",
     ),
 )

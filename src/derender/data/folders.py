@@ -3,37 +3,25 @@
 A folder named train, val or test (and the like) around them is read as a partition, not as a class.
 """
 
-from pathlib import PurePosixPath
-
-from derender.data.layout import Layout, Table, pictures_of, text_column
+from derender.data.layout import PARTITION_NAMES, Layout, Table, pictures_of, text_column
 from derender.data.source import Source
-
-_PARTITIONS = {
-    "train": "train",
-    "training": "train",
-    "val": "validation",
-    "valid": "validation",
-    "validation": "validation",
-    "dev": "validation",
-    "test": "test",
-    "testing": "test",
-    "eval": "test",
-}
 
 
 def _folders(file: str) -> tuple[str, ...]:
-    return PurePosixPath(file).parts[:-1]
+    return tuple(part for part in file.split("/")[:-1] if part not in ("", "."))
 
 
 def _partition(file: str) -> str:
     """The partition that the outermost folder so named stands for, or ""."""
-    return next((_PARTITIONS[name.lower()] for name in _folders(file) if name.lower() in _PARTITIONS), "")
+    return next(
+        (PARTITION_NAMES[name.lower()] for name in _folders(file) if name.lower() in PARTITION_NAMES), ""
+    )
 
 
 def _class_folder(file: str) -> str:
     """The folder that the file lies in, unless that is a partition."""
     folders = _folders(file)
-    return folders[-1] if folders and folders[-1].lower() not in _PARTITIONS else ""
+    return folders[-1] if folders and folders[-1].lower() not in PARTITION_NAMES else ""
 
 
 def _is_classes(source: Source) -> bool:

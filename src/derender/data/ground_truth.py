@@ -1,7 +1,9 @@
 """Reads the exact maps of a rendered set: depth, normals, albedo, mask, light and camera of every picture.
 
-Maps are in the camera frame of their picture, as docs/conventions.md defines it. Depth is stored as z = 0.8
-+ value / 65535 * 0.4, normals as (n + 1) / 2 * 255, albedo as 0..255; value 0 is background.
+Two layouts: synface64's, with a params.csv, described here; and pictures beside depth maps alone
+(data/paired.py). Maps are in the camera frame of their picture, as docs/conventions.md defines it. Depth is
+stored as z = 0.8 + value / 65535 * 0.4, normals as (n + 1) / 2 * 255, albedo as 0..255; value 0 is
+background.
 """
 
 import io
@@ -16,6 +18,7 @@ from PIL import Image
 from derender.data.decode import DECODER_ERRORS
 from derender.data.inventory import parse_source
 from derender.data.layout import Labels, read_csv
+from derender.data.paired import pairs_of, read_depth, subset_pairs
 from derender.data.rendered import CAMERA, LIGHT, parameters_of, subset_folder, subsets_of
 from derender.data.source import Source, open_source
 
@@ -30,8 +33,8 @@ class GroundTruth:
         normal: (N, H, W, 3) inward unit normals in the camera frame, zero in the background; or None.
         albedo: (N, 3, H, W) in 0..1, zero in the background; or None.
         mask: (N, H, W) true on the object.
-        light: (N, 4) ambient, diffuse, pitch, yaw (radians, canonical frame).
-        camera: (N, 6) rotation about x, y, z (radians), translation along x, y, z (z is 0).
+        light: (N, 4) ambient, diffuse, pitch, yaw (radians, canonical frame); or None.
+        camera: (N, 6) rotation about x, y, z (radians), translation along x, y, z (z is 0); or None.
         files: the pictures' names, relative to the source.
         labels: the other columns (identity, expression, class, ...).
     """
@@ -41,8 +44,8 @@ class GroundTruth:
     normal: Float32[np.ndarray, "n h w 3"] | None
     albedo: Float32[np.ndarray, "n 3 h w"] | None
     mask: Bool[np.ndarray, "n h w"]
-    light: Float32[np.ndarray, "n 4"]
-    camera: Float32[np.ndarray, "n 6"]
+    light: Float32[np.ndarray, "n 4"] | None
+    camera: Float32[np.ndarray, "n 6"] | None
     files: tuple[str, ...]
     labels: Labels
 
@@ -51,17 +54,22 @@ class GroundTruth:
 
 
 def read_ground_truth(
-    source: str | Path, subset: str | None = None, *, limit: int | None = None
+    source: str | Path, subset: str | None = None, *, limit: int | None = None, image_size: int | None = None
 ) -> GroundTruth:
-    """Read the pictures of a rendered set that have a depth map, at the size they were rendered in.
+    """Read the pictures of a rendered set that have a depth map.
 
     Args:
-        source: a folder or zip in synface64's format, or ``PATH::SUBSET``.
+        source: a folder or zip in synface64's format or with folders ``image`` and ``depth``, or
+            ``PATH::SUBSET``.
         subset: "test_gt" or "test" by default, or the only subset there is.
         limit: only the first so many.
+        image_size: side to bring pictures and maps to, where the set is pictures beside depth maps alone; a
+            set in synface64's format is read at the size it was rendered in.
     """
     path, named = parse_source(source)
     with open_source(path) as opened:
+        if not subsets_of(opened) and pairs_of(opened):
+            return _read_pairs(opened, subset or named, limit, image_size)
         subset = (
             subset
             or named
@@ -101,6 +109,44 @@ def read_ground_truth(
             files=tuple(folder + name for name in names),
             labels=labels,
         )
+
+
+def _read_pairs(source: Source, subset: str | None, limit: int | None, image_size: int | None) -> GroundTruth:
+    """Pictures beside depth maps: neither normals nor albedo, light and camera are known."""
+    pairs = dict(list(subset_pairs(source, subset).items())[:limit])
+    read = [read_depth(source, file, image_size) for file in pairs.values()]
+    pictures = []
+    for (file, map_file), (depth, _) in zip(pairs.items(), read, strict=True):
+        picture = _picture(source, file)
+        if picture.width != picture.height:
+            raise ValueError(f"{file} in {source.path} is {picture.size}: pictures with depth must be square")
+        if image_size is not None:
+            picture = picture.resize((image_size, image_size), Image.Resampling.BOX)
+        if (picture.height, picture.width) != depth.shape or depth.shape != read[0][0].shape:
+            raise ValueError(
+                f"{file} in {source.path} is {picture.size}, its map {map_file} {depth.shape[::-1]}: both "
+                "must have one size, the same in the whole set; or give image_size"
+            )
+        pictures.append(np.asarray(picture).transpose(2, 0, 1))
+    return GroundTruth(
+        images=np.ascontiguousarray(pictures),
+        depth=np.stack([depth for depth, _ in read]),
+        normal=None,
+        albedo=None,
+        mask=np.stack([mask for _, mask in read]),
+        light=None,
+        camera=None,
+        files=tuple(pairs),
+        labels={},
+    )
+
+
+def _picture(source: Source, file: str) -> Image.Image:
+    try:
+        with Image.open(io.BytesIO(source.read(file))) as picture:
+            return picture.convert("RGB")
+    except DECODER_ERRORS as problem:
+        raise ValueError(f"{file} in {source.path} cannot be read: {problem}") from problem
 
 
 def _map_name(folder: str, kind: str, picture: str) -> str:

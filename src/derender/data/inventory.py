@@ -1,7 +1,7 @@
 """Which pictures a source holds, with labels, before any is decoded.
 
-``SOURCE::SUBSET`` names one part of a data set: ``synface64.zip::test_gt``, or any sub-folder of a plain
-folder.
+The source is a folder, a zip, one picture, or a table of paths (data/tables.py). ``SOURCE::SUBSET`` names
+one part of a data set: ``synface64.zip::test_gt``, or any sub-folder of a plain folder.
 """
 
 from collections import Counter
@@ -11,6 +11,7 @@ from pathlib import Path, PurePosixPath
 from derender.data.layout import Layout, Table
 from derender.data.registry import layout_named, recognise
 from derender.data.source import SUFFIXES, Source, open_source
+from derender.data.tables import TableSource, is_table
 
 
 @dataclass(frozen=True)
@@ -42,9 +43,9 @@ def take_inventory(source: str | Path, *, dataset: str = "auto", subset: str | N
             f"{source} names the subset {named!r}, but subset={subset!r} was given too; give one"
         )
     subset = named if subset is None else subset
-    opened = open_source(path)
+    opened = TableSource(path) if is_table(path) else open_source(path)
     try:
-        layout = layout or recognise(opened)
+        layout = layout or _recognised(opened)
         table = layout.read(opened, subset)
         if not table.files:
             raise ValueError(_nothing_found(opened))
@@ -52,6 +53,13 @@ def take_inventory(source: str | Path, *, dataset: str = "auto", subset: str | N
         opened.close()
         raise
     return Inventory(opened, subset, layout, table)
+
+
+def _recognised(source: Source) -> Layout:
+    """The layout a source looks like, remembered in it."""
+    layout = layout_named(source.recognised) if source.recognised else recognise(source)
+    source.recognised = layout.name
+    return layout
 
 
 def parse_source(source: str | Path) -> tuple[Path, str | None]:

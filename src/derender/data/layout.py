@@ -11,10 +11,24 @@ from dataclasses import dataclass, field
 from pathlib import PurePosixPath
 
 import numpy as np
+from jaxtyping import Float32
 
-from derender.data.source import Source
+from derender.data.source import Skipped, Source
 
 Labels = dict[str, np.ndarray]
+
+PARTITION_NAMES = {
+    "train": "train",
+    "training": "train",
+    "val": "validation",
+    "valid": "validation",
+    "validation": "validation",
+    "dev": "validation",
+    "test": "test",
+    "testing": "test",
+    "eval": "test",
+}
+"""What people call the parts of a split, and what they are called here."""
 
 
 @dataclass(frozen=True)
@@ -25,11 +39,16 @@ class Table:
         files: pictures, as named by the source.
         labels: columns by name, one value per file.
         partition: the owners' own split of each file ("train", "validation", "test"; "" unknown), or None.
+        boxes: (N, 4) left, top, right, bottom of the part of each picture that is read, in pixels of the
+            upright picture, or None for whole pictures. NaN: no box is known, and the picture is passed over.
+        skipped: pictures that a user's own list names and that are not there, with reasons.
     """
 
     files: tuple[str, ...]
     labels: Labels = field(default_factory=dict)
     partition: np.ndarray | None = None
+    boxes: Float32[np.ndarray, "n 4"] | None = None
+    skipped: tuple[Skipped, ...] = ()
 
     def select(self, rows: np.ndarray) -> "Table":
         """The same table with only these rows."""
@@ -37,6 +56,8 @@ class Table:
             tuple(self.files[row] for row in rows),
             {name: column[rows] for name, column in self.labels.items()},
             None if self.partition is None else self.partition[rows],
+            None if self.boxes is None else self.boxes[rows],
+            self.skipped,
         )
 
 
@@ -47,9 +68,10 @@ class Layout:
     Attributes:
         name: what the user writes to ask for this layout.
         title: what it is, in a few words.
-        home: where the owners publish it, and on what terms; "" for layouts that are nobody's.
+        home: where the owners publish it; "" for layouts that are nobody's.
         recognise: whether a source looks like it, from the names of its files (and a header line).
         read: the table of one subset; None asks for the default. An error names the file that is missing.
+        terms: on what terms the owners give it, in a few words; "" for layouts that are nobody's.
     """
 
     name: str
@@ -57,6 +79,7 @@ class Layout:
     home: str
     recognise: Callable[[Source], bool]
     read: Callable[[Source, str | None], Table]
+    terms: str = ""
 
 
 def pictures_of(source: Source, subset: str | None = None) -> tuple[str, ...]:
@@ -69,6 +92,26 @@ def pictures_of(source: Source, subset: str | None = None) -> tuple[str, ...]:
         known = f"its folders are {', '.join(folders[:8])}" if folders else "it has no folders with pictures"
         raise ValueError(f"{source.path} has no pictures in a folder {subset!r}; {known}")
     return inside
+
+
+def part_of(table: Table, source: Source, subset: str | None, needed: str) -> Table:
+    """The rows of one part of the official split, or all; ``needed`` is the file that gives the split."""
+    if subset is None:
+        return table
+    if table.partition is None:
+        raise ValueError(f"{source.path} has no official split, so no subset {subset!r}: {needed} is missing")
+    rows = np.flatnonzero(table.partition == PARTITION_NAMES.get(subset.lower(), ""))
+    if not len(rows) or subset.lower() not in PARTITION_NAMES:
+        known = sorted(set(table.partition.tolist()) - {""})
+        raise ValueError(f"{source.path} has no subset {subset!r}; there are {', '.join(known) or 'none'}")
+    return table.select(rows)
+
+
+def count_unknown(column: np.ndarray) -> int:
+    """How many values of a column of labels are unknown: "", NaN, or -1 of a yes/no attribute."""
+    if column.dtype.kind == "U":
+        return int((column == "").sum())
+    return int(np.isnan(column).sum()) if column.dtype.kind == "f" else int((column == -1).sum())
 
 
 def text_column(values: Iterable[str]) -> np.ndarray:

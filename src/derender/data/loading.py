@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float32, UInt8
 
 from derender.data.decode import Unreadable, decode, quiet_pillow
 from derender.data.duplicates import Duplicate, find_duplicates, pixel_digest
@@ -39,23 +39,24 @@ def load_into(
     *,
     fit: str,
     keep_duplicates: bool,
+    boxes: Float32[np.ndarray, "n 4"] | None = None,
     progress: Progress | None = None,
     workers: int | None = None,
 ) -> Loaded:
     """Decode ``files`` into ``images``; the result's files are the first rows, the rows after them are waste.
 
-    Copies are found whether or not they are dropped.
+    Copies are found whether or not they are dropped. ``boxes`` has a row for each file (data/layout.py).
     """
     size = images.shape[-1]
 
     def load(start: int) -> list[bytes | Unreadable]:
         return [
-            _load_one(images[row], source, files[row], size, fit)
+            _load_one(images[row], source, files[row], size, fit, None if boxes is None else boxes[row])
             for row in range(start, min(start + _CHUNK, len(files)))
         ]
 
     outcomes: list[bytes | Unreadable] = []
-    with quiet_pillow(), _threads(workers or usable_cores()) as pool:
+    with quiet_pillow(), decoding_threads(workers or usable_cores()) as pool:
         for part in pool.map(load, range(0, len(files), _CHUNK)):
             outcomes.extend(part)
             if progress is not None:
@@ -81,7 +82,9 @@ def usable_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _load_one(target: np.ndarray, source: Source, file: str, size: int, fit: str) -> bytes | Unreadable:
+def _load_one(
+    target: np.ndarray, source: Source, file: str, size: int, fit: str, box: np.ndarray | None
+) -> bytes | Unreadable:
     """Decode one file into its row and digest its pixels, or say why that cannot be done."""
     try:
         encoded = source.read(file)
@@ -92,14 +95,14 @@ def _load_one(target: np.ndarray, source: Source, file: str, size: int, fit: str
     if not encoded:
         return Unreadable("empty file")
     try:
-        target[:] = decode(encoded, size, fit)
+        target[:] = decode(encoded, size, fit, box)
     except Unreadable as problem:
         return problem
     return pixel_digest(target)
 
 
 @contextmanager
-def _threads(count: int) -> Iterator[ThreadPoolExecutor]:
+def decoding_threads(count: int) -> Iterator[ThreadPoolExecutor]:
     """A pool that drops the work not yet begun when an error or Ctrl-C ends the block."""
     pool = ThreadPoolExecutor(count, thread_name_prefix="decode")
     try:

@@ -1,6 +1,7 @@
-"""From a folder, a zip or a picture to one array of decoded pictures with their labels."""
+"""From a folder, a zip, a picture or a stream to one array of decoded pictures with their labels."""
 
 from dataclasses import dataclass, field, replace
+from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
@@ -8,14 +9,17 @@ import torch
 from jaxtyping import Float, Shaped, UInt8
 from torch import Tensor
 
-from derender.data.cache import cache_file, cache_folder, fingerprint, new_cache, read_cache
+from derender.data.cache import cache_file, fingerprint, new_cache, read_cache
 from derender.data.decode import READER_VERSION, check_fit
 from derender.data.duplicates import Duplicate
 from derender.data.inventory import Inventory, take_inventory
-from derender.data.layout import Labels
+from derender.data.layout import Labels, count_unknown
 from derender.data.loading import Loaded, Progress, load_into
 from derender.data.nearest import nearest
+from derender.data.places import cache_folder
 from derender.data.source import Skipped
+from derender.data.stream.address import open_stream
+from derender.data.stream.collect import collect
 
 MEMORY_LIMIT_BYTES = 2 << 30
 """Sets larger than this (175,000 pictures of 64 x 64) are kept in a memory-mapped file instead of memory."""
@@ -101,6 +105,11 @@ class PictureSet:
             kept = set(self.files)
             verb = "kept" if all(row.file in kept for row in self.duplicates) else "dropped"
             parts.append(f"{len(self.duplicates):,} identical copies {verb}")
+        unknown = {name: count_unknown(column) for name, column in self.labels.items()}
+        partly = [f"{name} unknown for {count:,}" for name, count in unknown.items() if count]
+        parts += (
+            partly if len(partly) <= 3 else [*partly[:2], f"{len(partly) - 2} more labels in part unknown"]
+        )
         return ", ".join(parts)
 
 
@@ -118,16 +127,17 @@ def read_pictures(
     workers: int | None = None,
     progress: Progress | None = None,
 ) -> PictureSet:
-    """Read every picture of a folder or zip at ``image_size`` x ``image_size``.
+    """Read every picture of a folder, zip or stream at ``image_size`` x ``image_size``.
 
     Args:
-        source: a folder, a zip, one picture, or ``PATH::SUBSET``.
+        source: a folder, a zip, one picture, or ``PATH::SUBSET``; also shards and Hugging Face data sets
+            (data/stream/address.py), which are always kept in a cache file.
         image_size: side of the square pictures, in pixels.
         dataset: the layout's name, or "auto" to recognise it.
         subset: a part of the data set ("train", "test_gt", a sub-folder); rendered sets: "train" by default.
         fit: what becomes of pictures that are not square: "crop" to the centre, "pad" with white, "stretch".
         keep_duplicates: keep all of identical pictures and not only the first; they are listed in any case.
-        limit: read at most so many pictures, evenly spaced in the sorted list.
+        limit: read at most so many pictures, evenly spaced in the sorted list; of a stream the first.
         cache: a folder to keep decoded pictures in, whatever their size. None keeps sets above
             ``memory_limit_bytes`` in the user's cache folder (``DERENDER_CACHE`` names another), and
             others in memory.
@@ -139,13 +149,39 @@ def read_pictures(
     if limit is not None and limit < 1:
         raise ValueError(f"limit must be 1 or more, got {limit}")
     check_fit(fit)
+    stream = open_stream(source, dataset=dataset, subset=subset)
+    if stream is not None:
+        folder = Path(cache) if cache is not None else cache_folder()
+        stream.limit = limit
+        with stream:
+            collected = collect(
+                stream,
+                image_size,
+                folder,
+                fit=fit,
+                keep_duplicates=keep_duplicates,
+                workers=workers,
+                progress=progress,
+            )
+        return PictureSet(
+            images=collected.images,
+            files=collected.loaded.files,
+            labels=collected.labels,
+            layout=stream.layout,
+            skipped=collected.loaded.skipped,
+            duplicates=collected.loaded.duplicates,
+            partition=collected.partition,
+            source=stream.source,
+        )
     inventory = take_inventory(source, dataset=dataset, subset=subset)
     with inventory.source:
-        files = inventory.table.files
+        files, boxes = inventory.table.files, inventory.table.boxes
         if limit is not None and limit < len(files):
-            files = tuple(files[row] for row in np.linspace(0, len(files) - 1, limit).astype(int))
+            rows = np.linspace(0, len(files) - 1, limit).astype(int)
+            files = tuple(files[row] for row in rows)
+            boxes = None if boxes is None else boxes[rows]
         needed = len(files) * 3 * image_size * image_size
-        how = _How(image_size, fit, keep_duplicates, limit, workers, progress)
+        how = _How(image_size, fit, keep_duplicates, limit, boxes, workers, progress)
         if cache is None and needed <= memory_limit_bytes:
             images = np.empty((len(files), 3, image_size, image_size), np.uint8)
             loaded = how.load(images, inventory, files)
@@ -171,13 +207,15 @@ class _How:
     fit: str
     keep_duplicates: bool
     limit: int | None
+    boxes: np.ndarray | None
     workers: int | None
     progress: Progress | None
 
     @property
     def settings(self) -> tuple[object, ...]:
         """What the decoded rows depend on."""
-        return (self.image_size, self.fit, self.keep_duplicates, self.limit)
+        settings = (self.image_size, self.fit, self.keep_duplicates, self.limit)
+        return settings if self.boxes is None else (*settings, sha256(self.boxes.tobytes()).hexdigest())
 
     def load(self, images: np.ndarray, inventory: Inventory, files: tuple[str, ...]) -> Loaded:
         loaded = load_into(
@@ -186,6 +224,7 @@ class _How:
             files,
             fit=self.fit,
             keep_duplicates=self.keep_duplicates,
+            boxes=self.boxes,
             progress=self.progress,
             workers=self.workers,
         )
@@ -203,7 +242,8 @@ def _through_cache(
 ) -> tuple[np.ndarray, Loaded]:
     """Rows from the cache file if it is good, else decoded into a new one."""
     settings = (READER_VERSION, inventory.layout.name, inventory.subset, *how.settings)
-    file = cache_file(folder, inventory.source, settings)
+    path = inventory.source.path
+    file = cache_file(folder, path.stem, (str(path.resolve()), settings))
     mark = fingerprint(inventory.source, files, settings)
     cached = read_cache(file, mark, how.image_size)
     if cached is None:
@@ -214,7 +254,7 @@ def _through_cache(
             raise OSError(f"decoded pictures could not be read back from {file}; check the disk")
     elif how.progress is not None:
         how.progress(len(files), len(files))
-    return cached
+    return cached.images, cached.loaded
 
 
 def _with_labels(inventory: Inventory, images: np.ndarray, loaded: Loaded) -> PictureSet:
@@ -230,7 +270,7 @@ def _with_labels(inventory: Inventory, images: np.ndarray, loaded: Loaded) -> Pi
         files=loaded.files,
         labels=table.labels,
         layout=inventory.layout.name,
-        skipped=(*inventory.source.skipped, *loaded.skipped),
+        skipped=(*inventory.source.skipped, *inventory.table.skipped, *loaded.skipped),
         duplicates=loaded.duplicates,
         partition=table.partition,
         source=where,

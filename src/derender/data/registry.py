@@ -1,13 +1,34 @@
-"""The list of layouts, most particular first. A new data set is one more row in the file of its kind."""
+"""The list of layouts, most particular first. A new data set is one more row in the file of its kind.
 
+A table that somebody laid beside pictures comes first: it says what they are.
+"""
+
+from derender.data.cars import SHAPENET_CARS
+from derender.data.celeba import CELEBA
+from derender.data.celebamask import CELEBAMASK
+from derender.data.emotions import RAFDB
 from derender.data.faces import FACES
 from derender.data.folders import FOLDERS
 from derender.data.layout import Layout
 from derender.data.nearest import nearest
+from derender.data.paired import PAIRED
 from derender.data.rendered import RENDERED
 from derender.data.source import Source
+from derender.data.tables import TABLE
+from derender.data.tracks import FACE_TRACKS
 
-LAYOUTS: tuple[Layout, ...] = (*RENDERED, *FACES, *FOLDERS)
+LAYOUTS: tuple[Layout, ...] = (
+    TABLE,
+    *RENDERED,
+    *PAIRED,
+    RAFDB,
+    CELEBAMASK,
+    CELEBA,
+    *FACES,
+    SHAPENET_CARS,
+    FACE_TRACKS,
+    *FOLDERS,
+)
 
 
 def layout_named(name: str) -> Layout:

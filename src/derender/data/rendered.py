@@ -27,6 +27,8 @@ from derender.data.source import Source
 # column in params.csv: (label, factor to our unit)
 _NUMBERS = {
     "strength": ("strength", 1.0),
+    "age": ("age", 1.0),
+    "skin_tone": ("skin_tone", 1.0),
     "ambient": ("ambient", 1.0),
     "diffuse": ("diffuse", 1.0),
     "light_pitch": ("light_pitch_rad", math.pi / 180),
@@ -39,7 +41,10 @@ _NUMBERS = {
     "elev": ("elevation_rad", math.pi / 180),
     "azim": ("azimuth_rad", math.pi / 180),
 }
-_TEXTS = ("identity", "expression", "class", "model", "track", "frame", "light_kind")
+_TEXTS = (
+    *("identity", "expression", "class", "model", "track", "frame", "light_kind"),
+    *("hair", "hair_colour", "beard", "style"),
+)
 LIGHT = ("ambient", "diffuse", "light_pitch_rad", "light_yaw_rad")
 CAMERA = ("camera_x_rad", "camera_y_rad", "camera_z_rad", "camera_tx", "camera_ty")
 
@@ -48,12 +53,12 @@ _TRACK = re.compile(r"(?:.*/)?tracks/(?P<identity>[^/]+)/(?P<track>[^/]+)/(?P<fr
 
 def subsets_of(source: Source) -> dict[str, str]:
     """Folder of each params.csv that has an images folder beside it, by the folder's name ("" at the top)."""
+    tables = [PurePosixPath(file) for file in source.files if f"/{file}".endswith("/params.csv")]
+    if not tables:
+        return {}
     pictured = {
-        PurePosixPath(file).parent.parent
-        for file in source.files
-        if PurePosixPath(file).parent.name == "images"
+        PurePosixPath(file).parent.parent for file in source.files if f"/{file}".rsplit("/", 2)[1] == "images"
     }
-    tables = (PurePosixPath(file) for file in source.files if PurePosixPath(file).name == "params.csv")
     folders = [table.parent for table in tables if table.parent in pictured]
     return {folder.name: "" if str(folder) == "." else f"{folder}/" for folder in folders}
 
@@ -101,6 +106,9 @@ def _read_rendered(source: Source, subset: str | None) -> Table:
     labels = parameters_of(
         [by_file.get(file, empty) for file in files], f"{folder}params.csv in {source.path}"
     )
+    masks = [f"{folder}masks/{PurePosixPath(file).stem}.png" for file in files]
+    if masks and set(masks) <= set(source.files):
+        labels["mask"] = text_column(masks)  # numbers of parts, for read_masks
     name = folder.rstrip("/").rpartition("/")[2]
     return Table(files, labels, text_column([name] * len(files)) if name else None)
 

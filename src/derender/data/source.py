@@ -8,17 +8,21 @@ archives are not opened.
 """
 
 import lzma
-import os
-import stat
 import struct
 import zipfile
 import zlib
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from bisect import bisect_left
+from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
+import numpy as np
+
+from derender.data import listing
+from derender.data.listing import list_files, listing_file, recall, remember, stamps_of
 from derender.data.nearest import nearest
+from derender.data.places import cache_folder
 
 SUFFIXES = (
     *(".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".webp", ".avif", ".bmp", ".gif"),
@@ -59,11 +63,13 @@ class Source(ABC):
         path: the folder or file that the user named.
         files: every regular file, as sorted posix paths relative to the source.
         skipped: files that cannot even be opened (unsafe names, broken links, no permission, encrypted).
+        recognised: the layout that it was recognised as, "" until then.
     """
 
     path: Path
     files: tuple[str, ...]
     skipped: tuple[Skipped, ...] = ()
+    recognised: str = ""
 
     @abstractmethod
     def read(self, file: str) -> bytes:
@@ -98,54 +104,47 @@ class Source(ABC):
 
     def named(self, name: str) -> str | None:
         """The first file with this base name, shallowest first, or None."""
-        found = [file for file in self.files if PurePosixPath(file).name == name]
-        return min(found, key=lambda file: (file.count("/"), file), default=None)
+        return self._by_name.get(name)
+
+    @cached_property
+    def _by_name(self) -> dict[str, str]:
+        """The first file of each base name, shallowest first."""
+        deepest_first = sorted(self.files, key=lambda file: (file.count("/"), file), reverse=True)
+        return {file.rpartition("/")[2]: file for file in deepest_first}
 
 
 class FolderSource(Source):
-    """Every file below a folder."""
+    """Every file below a folder; the listing of a very large one is remembered (data/listing.py)."""
 
     def __init__(self, folder: Path):
         self.path = folder
-        self._real: dict[str, Path] = {}
-        skipped: list[Skipped] = []
-        seen: set[tuple[int, int]] = set()
-
-        def cannot_list(problem: OSError) -> None:
-            name = Path(problem.filename).relative_to(folder).as_posix()
-            skipped.append(Skipped(_printable(name), f"folder cannot be listed: {problem.strerror}"))
-
-        for here, folders, files in os.walk(folder, followlinks=True, onerror=cannot_list):
-            status = Path(here).stat()
-            identity = (status.st_dev, status.st_ino)
-            if identity in seen:
-                folders.clear()
-                continue
-            seen.add(identity)
-            folders[:] = sorted(name for name in folders if not _is_hidden(name))
-            for name in files:
-                if _is_hidden(name):
-                    continue
-                real = Path(here) / name
-                file = _printable(real.relative_to(folder).as_posix())
-                try:
-                    regular = stat.S_ISREG(real.stat().st_mode)
-                except OSError as problem:
-                    skipped.append(Skipped(file, f"broken link or unreachable file: {problem.strerror}"))
-                    continue
-                if regular:
-                    self._real[file] = real
-                else:
-                    skipped.append(Skipped(file, "not a regular file"))
-        self.files = tuple(sorted(self._real))
-        self.skipped = tuple(sorted(skipped, key=lambda row: row.file))
+        self._kept = listing_file(cache_folder(), folder)
+        self._stamps: np.ndarray | None = None
+        known = recall(self._kept, str(folder), is_picture)
+        if known is None:
+            found = list_files(str(folder), is_hidden)
+            self._listing = replace(found, files=tuple(sorted(found.files, key=printable)))
+        else:
+            self._listing, self._stamps, self.recognised = known.listing, known.stamps, known.layout
+        self.files = tuple(printable(file) for file in self._listing.files)
+        self._real = {
+            name: file for name, file in zip(self.files, self._listing.files, strict=True) if name is not file
+        }
+        faults = [Skipped(printable(file), reason) for file, reason in self._listing.faults]
+        self.skipped = tuple(sorted(faults, key=lambda row: row.file))
 
     def read(self, file: str) -> bytes:
-        return read_bounded(self._real[file])
+        return read_bounded(self.path / self._real.get(file, file))
 
     def stamp(self, file: str) -> tuple[int, int]:
-        status = self._real[file].stat()
-        return status.st_size, status.st_mtime_ns
+        if self._stamps is None and len(self.files) >= listing.REMEMBERED_FROM:
+            self._stamps = stamps_of(str(self.path), self._listing.files)
+            remember(self._kept, self._listing, self._stamps, self.recognised)
+        if self._stamps is None:
+            status = (self.path / self._real.get(file, file)).stat()
+            return status.st_size, status.st_mtime_ns
+        size, changed = self._stamps[bisect_left(self.files, file)].tolist()
+        return size, changed
 
 
 class ZipSource(Source):
@@ -166,14 +165,14 @@ class ZipSource(Source):
         for member in self._archive.infolist():
             file = member.filename.replace("\\", "/")
             parts = file.split("/")
-            if member.is_dir() or any(_is_hidden(part) for part in parts if part not in ("", ".", "..")):
+            if member.is_dir() or any(is_hidden(part) for part in parts if part not in ("", ".", "..")):
                 continue
             if file.startswith("/") or ".." in parts or ":" in parts[0]:
                 skipped.append(Skipped(file, "unsafe name in the zip (absolute or with ..)"))
             elif member.flag_bits & 1:
                 skipped.append(Skipped(file, "encrypted in the zip"))
             else:
-                self._members[_printable(file)] = member
+                self._members[printable(file)] = member
         self.files = tuple(sorted(self._members))
         self.skipped = tuple(sorted(skipped, key=lambda row: row.file))
 
@@ -202,7 +201,7 @@ class FileSource(Source):
 
     def __init__(self, path: Path):
         self.path = path
-        self.files = (_printable(path.name),)
+        self.files = (printable(path.name),)
 
     def read(self, file: str) -> bytes:
         return read_bounded(self.path)
@@ -215,7 +214,7 @@ class FileSource(Source):
 def open_source(path: Path) -> Source:
     """Open a folder, a zip or a picture; anything else is an error that says what to give instead."""
     if not path.exists():
-        raise ValueError(f"{path} does not exist{_nearest_sibling(path)}")
+        raise ValueError(f"{path} does not exist{nearest_sibling(path)}")
     if path.is_dir():
         return FolderSource(path)
     if path.suffix.lower() in SUFFIXES:
@@ -229,7 +228,8 @@ def open_source(path: Path) -> Source:
 
 def is_picture(file: str) -> bool:
     """Whether the name has a picture's suffix."""
-    return PurePosixPath(file).suffix.lower() in SUFFIXES
+    stem, dot, suffix = file.rpartition("/")[2].rpartition(".")
+    return bool(stem) and f"{dot}{suffix}".lower() in SUFFIXES
 
 
 def read_bounded(path: Path) -> bytes:
@@ -240,16 +240,21 @@ def read_bounded(path: Path) -> bytes:
     return path.read_bytes()
 
 
-def _is_hidden(name: str) -> bool:
+def is_hidden(name: str) -> bool:
     return name.startswith(".") or name == "__MACOSX"
 
 
-def _printable(name: str) -> str:
+def printable(name: str) -> str:
     """The name with bytes that are not UTF-8 as backslash escapes, so that it can be stored anywhere."""
-    return name.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
+    return name if name.isascii() else _escaped(name)
 
 
-def _nearest_sibling(path: Path) -> str:
+def _escaped(name: str) -> str:
+    escaped = name.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
+    return name if escaped == name else escaped
+
+
+def nearest_sibling(path: Path) -> str:
     parent = path.absolute().parent
     if not parent.is_dir():
         return f"; nor does its folder {parent}"

@@ -52,12 +52,15 @@ class DemoSettings(Settings):
 
     train_pictures: int = Field(default=4_000, ge=20)
     test_pictures: int = Field(default=240, ge=16)
-    images: int = Field(default=30_000, ge=2)  # pictures seen in training, repeats counted
+    images: int = Field(default=24_000, ge=2)  # pictures seen in training, repeats counted
     minutes: float = Field(default=4.3, gt=0)  # training stops here on a slow machine
     shown: int = Field(default=8, ge=1)  # unseen pictures on the page
     films: int = Field(default=4, ge=1)
     overrides: tuple[str, ...] = (  # of the preset `small`, as in --set
         "border_depth=1.08",  # these heads reach further back than the default border
+        "level_depth=true",
+        "template_share=0.1",
+        "release_share=0.3",
         "warmup_images=2000",
         "objective.self_features_steps=300",
     )

@@ -2,14 +2,13 @@
 
 from derender.evaluation.clustering import (
     ClusteringResult,
-    ClusterScores,
     at_least,
-    chance_scores,
-    cluster_scores,
     cluster_table,
     evaluate_clustering,
     ward,
 )
+from derender.evaluation.clustering_compare import ClusterComparison, compare_clusterings
+from derender.evaluation.clustering_scores import ClusterScores, chance_scores, cluster_scores
 from derender.evaluation.factors import (
     AngleScores,
     FactorResult,
@@ -19,6 +18,7 @@ from derender.evaluation.factors import (
     light_error,
 )
 from derender.evaluation.geometry import GeometryResult, GeometryScores, evaluate_geometry, geometry_scores
+from derender.evaluation.linear_compare import LinearComparison, compare_linear
 from derender.evaluation.reconstruction import (
     ReconstructionResult,
     ReconstructionScores,
@@ -29,11 +29,13 @@ from derender.evaluation.reconstruction import (
 
 __all__ = [
     "AngleScores",
+    "ClusterComparison",
     "ClusterScores",
     "ClusteringResult",
     "FactorResult",
     "GeometryResult",
     "GeometryScores",
+    "LinearComparison",
     "ReconstructionResult",
     "ReconstructionScores",
     "albedo_error",
@@ -42,6 +44,8 @@ __all__ = [
     "chance_scores",
     "cluster_scores",
     "cluster_table",
+    "compare_clusterings",
+    "compare_linear",
     "evaluate_clustering",
     "evaluate_factors",
     "evaluate_geometry",

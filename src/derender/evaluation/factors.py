@@ -2,8 +2,9 @@
 
 A picture fixes albedo only up to a factor that the light takes back, and the canonical frame only up to one
 rotation for the whole model (which way an average face looks is a convention). So: albedo is compared after
-the best scale per picture, light in the frame of the camera, camera rotation after the best constant
-rotation. Leaves out translations: at 10 degrees of field of view they trade against depth.
+the best scale per picture, and after the best one for the whole set; light in the frame of the camera, as it
+is and after the best rotation for the whole set; camera rotation after the best rotation for the whole set.
+Leaves out translations: at 10 degrees of field of view they trade against depth.
 """
 
 from dataclasses import dataclass
@@ -42,14 +43,21 @@ class FactorResult:
     Attributes:
         albedo: mean over pictures of ``albedo_error``, in the view of the picture; 0 and up, best 0.
         albedo_control: the same of the mean true albedo.
+        albedo_global, albedo_global_control: the same after one scale for all pictures, so that a model that
+            takes bright skin under weak light for dark skin under strong light pays for it.
         light, light_control: of the predictions, and of the mean true direction.
+        light_aligned: of the predictions after the best rotation of all of them at once; its control is
+            ``light_control`` too, since a rotation brings any constant to the mean direction.
         camera, camera_control: of the predictions, and of a camera that never turns.
     """
 
     albedo: float
     albedo_control: float
+    albedo_global: float
+    albedo_global_control: float
     light: AngleScores
     light_control: AngleScores
+    light_aligned: AngleScores
     camera: AngleScores
     camera_control: AngleScores
 
@@ -58,18 +66,24 @@ def albedo_error(
     albedo_pred: Float[Tensor, "n 3 h w"],
     albedo_true: Float[Tensor, "n 3 h w"],
     mask: Bool[Tensor, "n h w"],
+    *,
+    one_scale: bool = False,
 ) -> Float[Tensor, " n"]:
     """Root mean square albedo error after the best scale, per picture; 0 and up, best 0.
 
-    One scale for the three channels, so a colour cast costs; at most the root mean square of the true albedo.
+    One scale for the three channels, so a colour cast costs. The scale is each picture's own, and the error
+    at most the root mean square of its true albedo; or, with ``one_scale``, the best for all pictures
+    together.
     """
     inside = mask[:, None].expand_as(albedo_true)
     count = inside.sum(dim=(1, 2, 3))
     if bool((count == 0).any()):
         raise ValueError(f"the mask of {int((count == 0).sum())} pictures is empty: leave these pictures out")
     predicted, true = (torch.where(inside, a.double(), 0.0) for a in (albedo_pred, albedo_true))
-    power = predicted.square().sum(dim=(1, 2, 3))
-    scale = (predicted * true).sum(dim=(1, 2, 3)) / torch.where(power > 0, power, 1.0)
+    power, match = (p.sum(dim=(1, 2, 3)) for p in (predicted.square(), predicted * true))
+    if one_scale:
+        power, match = (p.sum().expand(len(p)) for p in (power, match))
+    scale = match / torch.where(power > 0, power, 1.0)
     rest = (scale[:, None, None, None] * predicted - true).square().sum(dim=(1, 2, 3))
     return (rest / count).sqrt()
 
@@ -79,9 +93,16 @@ def light_error(
     camera_pred: Float[Tensor, "n 6"],
     light_true: Float[Tensor, "n 4"],
     camera_true: Float[Tensor, "n 6"],
+    *,
+    aligned: bool = False,
 ) -> AngleScores:
-    """Angle between the directions in which light travels, in the camera's frame; 0..180 degrees, best 0."""
-    return _between(_light_in_camera(light_pred, camera_pred), _light_in_camera(light_true, camera_true))
+    """Angle between the directions in which light travels, in the camera's frame; 0..180 degrees, best 0.
+
+    With ``aligned``, after the one rotation of all predicted directions that fits the true ones best (least
+    squares), which forgives a constant error.
+    """
+    predicted, true = _light_in_camera(light_pred, camera_pred), _light_in_camera(light_true, camera_true)
+    return _between(predicted @ _best_rotation(predicted, true) if aligned else predicted, true)
 
 
 def camera_error(camera_pred: Float[Tensor, "n 6"], camera_true: Float[Tensor, "n 6"]) -> AngleScores:
@@ -93,10 +114,7 @@ def camera_error(camera_pred: Float[Tensor, "n 6"], camera_true: Float[Tensor, "
     beside it.
     """
     predicted, true = (rotation_matrix(camera[:, :3].double()) for camera in (camera_pred, camera_true))
-    u, _, vh = torch.linalg.svd((true.mT @ predicted).sum(dim=0))
-    signs = torch.ones(3, dtype=u.dtype, device=u.device)
-    signs[2] = torch.linalg.det(u @ vh).sign()
-    rest = (true @ (u * signs) @ vh).mT @ predicted
+    rest = (true @ _nearest_rotation((true.mT @ predicted).sum(dim=0))).mT @ predicted
     twist = rest - rest.mT
     sine = torch.stack([twist[:, 2, 1], twist[:, 0, 2], twist[:, 1, 0]]).norm(dim=0) / 2
     cosine = (rest.diagonal(dim1=1, dim2=2).sum(dim=1) - 1) / 2
@@ -114,8 +132,9 @@ def evaluate_factors(
         batch_size: pictures at a time; changes speed and memory only.
         progress: called with (pictures done, pictures in all) after every batch.
     """
-    if truth.albedo is None:
-        raise ValueError("this ground truth has no albedo maps: give a set that stores them")
+    if truth.albedo is None or truth.light is None or truth.camera is None:
+        lacking = next(name for name in ("albedo", "light", "camera") if getattr(truth, name) is None)
+        raise ValueError(f"this ground truth has no {lacking}: give a set that stores it")
     size = truth.images.shape[-1]
     if size != model.image_size:
         raise ValueError(f"the ground truth is {size} pixels wide, the model takes {model.image_size}")
@@ -126,13 +145,16 @@ def evaluate_factors(
     seen = both.any(dim=(1, 2))
     if not bool(seen.any()):
         raise ValueError("prediction and truth share no pixel in any picture: check the camera or the masks")
-    mean_albedo = albedo_true.sum(dim=0) / mask_true.sum(dim=0).clamp_min(1)
+    constant = (albedo_true.sum(dim=0) / mask_true.sum(dim=0).clamp_min(1)).expand_as(albedo_true)
     direction = _light_in_camera(light_true, camera_true)
     return FactorResult(
         albedo=albedo_error(albedo[seen], albedo_true[seen], both[seen]).mean().item(),
-        albedo_control=albedo_error(mean_albedo.expand_as(albedo_true), albedo_true, mask_true).mean().item(),
+        albedo_control=albedo_error(constant, albedo_true, mask_true).mean().item(),
+        albedo_global=albedo_error(albedo[seen], albedo_true[seen], both[seen], one_scale=True).mean().item(),
+        albedo_global_control=albedo_error(constant, albedo_true, mask_true, one_scale=True).mean().item(),
         light=light_error(light, camera, light_true, camera_true),
         light_control=_between(direction.mean(dim=0).expand_as(direction), direction),
+        light_aligned=light_error(light, camera, light_true, camera_true, aligned=True),
         camera=camera_error(camera, camera_true),
         camera_control=camera_error(torch.zeros_like(camera_true), camera_true),
     )
@@ -156,6 +178,19 @@ def _predictions(
 
 def _light_in_camera(light: Float[Tensor, "n 4"], camera: Float[Tensor, "n 6"]) -> Float[Tensor, "n 3"]:
     return (rotation_matrix(camera[:, :3].double()) @ light_direction(light.double())[..., None])[..., 0]
+
+
+def _best_rotation(a: Float[Tensor, "n 3"], b: Float[Tensor, "n 3"]) -> Float[Tensor, "3 3"]:
+    """The rotation Q for which the rows of a @ Q come nearest to those of b (Wahba's problem)."""
+    return _nearest_rotation(a.mT @ b)
+
+
+def _nearest_rotation(matrix: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
+    """The rotation with the largest inner product with a matrix; never a reflection."""
+    u, _, vh = torch.linalg.svd(matrix)
+    signs = torch.ones(3, dtype=u.dtype, device=u.device)
+    signs[2] = torch.linalg.det(u @ vh).sign()
+    return (u * signs) @ vh
 
 
 def _between(a: Float[Tensor, "n 3"], b: Float[Tensor, "n 3"]) -> AngleScores:

@@ -1,7 +1,7 @@
 """How well a model renders pictures it has not seen, beside the mean picture.
 
 A low error alone proves nothing about geometry (a copied picture has none): read it with
-evaluation/geometry.py. Leaves out SSIM and learned similarities.
+evaluation/geometry.py. SSIM is in evaluation/structural_similarity.py. Leaves out learned similarities.
 """
 
 from dataclasses import dataclass
@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from derender.evaluation.structural_similarity import WINDOW, masked_ssim
 from derender.features import Progress, map_batches
 
 
@@ -26,6 +27,9 @@ class ReconstructionScores:
         coverage: share of all pixels inside the mask, 0..1.
         n_empty: pictures with an empty mask, left out of the means.
         l1_each, psnr_db_each: (N,) per picture, NaN where the mask is empty.
+        ssim: structural similarity, -1..1, best 1; mean over the pictures with a window of 11 x 11 pixels
+            inside the mask, NaN where there is none (or the pictures are smaller than that).
+        ssim_each: (N,) per picture, NaN where there is no such window.
     """
 
     l1: float
@@ -34,6 +38,8 @@ class ReconstructionScores:
     n_empty: int
     l1_each: np.ndarray
     psnr_db_each: np.ndarray
+    ssim: float
+    ssim_each: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -49,7 +55,7 @@ def reconstruction_scores(
     target: Float[Tensor, "n 3 h w"],
     mask: Float[Tensor, "n h w"],
 ) -> ReconstructionScores:
-    """Masked L1 and PSNR of pictures in 0..1, averaged over pixels, channels, then pictures."""
+    """Masked L1, PSNR and SSIM of pictures in 0..1, averaged over pixels, channels, then pictures."""
     weight = mask[:, None].double().expand_as(target)
     total = weight.sum(dim=(1, 2, 3))
     difference = torch.where(weight > 0, prediction.double() - target.double(), 0.0)
@@ -58,6 +64,9 @@ def reconstruction_scores(
     empty = total == 0
     if bool(empty.all()):
         raise ValueError("every mask is empty: the model renders nothing into the picture")
+    ssim = torch.full_like(l1, torch.nan)
+    if min(target.shape[-2:]) >= WINDOW:
+        ssim = masked_ssim(prediction, target, mask)
     return ReconstructionScores(
         l1=l1[~empty].mean().item(),
         psnr_db=psnr[~empty].mean().item(),
@@ -65,6 +74,8 @@ def reconstruction_scores(
         n_empty=int(empty.sum()),
         l1_each=l1.numpy(force=True),
         psnr_db_each=psnr.numpy(force=True),
+        ssim=ssim.nanmean().item(),
+        ssim_each=ssim.numpy(force=True),
     )
 
 

@@ -1,9 +1,11 @@
 """Stage 6: features extracted once, kept in one table, scored many times.
 
 table: the value; parquet: its file; extract: model and pictures in, table out; transformer: the same for
-    scikit-learn.
+    scikit-learn; embedding: any source to a file, never whole in memory (batches, parts: its halves);
+    search: nearest rows by one factor.
 """
 
+from derender.features.embedding import Embedded, embed_to_file
 from derender.features.extract import (
     Progress,
     embed_images,
@@ -17,10 +19,12 @@ from derender.features.transformer import DisentangledFeatures
 
 __all__ = [
     "DisentangledFeatures",
+    "Embedded",
     "FeatureTable",
     "Progress",
     "embed_images",
     "embed_pictures",
+    "embed_to_file",
     "map_batches",
     "missing",
     "model_fingerprint",

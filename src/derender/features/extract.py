@@ -1,7 +1,9 @@
 """From a model and pictures to a FeatureTable."""
 
 import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
@@ -43,30 +45,44 @@ def map_batches(
         raise ValueError(f"batch_size must be 1 or more, got {batch_size}")
     if len(images) == 0:
         raise ValueError("there are no pictures")
-    was_training, results = model.training, []
+    results = []
+    with evaluating(model):
+        for start in range(0, len(images), batch_size):
+            results.append(function(as_batch(images[start : start + batch_size], model.device)))
+            if progress is not None:
+                progress(min(start + batch_size, len(images)), len(images))
+    return results
+
+
+@contextmanager
+def evaluating(model: Any) -> Iterator[None]:
+    """The model in evaluation mode and without gradients meanwhile, and afterwards as it was."""
+    was_training = model.training
     model.eval()
     try:
         with torch.inference_mode():
-            for start in range(0, len(images), batch_size):
-                batch = np.asarray(images[start : start + batch_size])
-                tensor = as_float(batch) if batch.dtype == np.uint8 else torch.from_numpy(batch).float()
-                results.append(function(tensor.to(model.device)))
-                if progress is not None:
-                    progress(min(start + batch_size, len(images)), len(images))
+            yield
     finally:
         model.train(was_training)
-    return results
+
+
+def as_batch(images: np.ndarray, device: torch.device) -> Tensor:
+    """Pictures, uint8 or float in 0..1, as a float32 tensor of 0..1 on a device; bytes travel as bytes."""
+    array = np.array(images)
+    tensor = torch.from_numpy(array).to(device)
+    return as_float(tensor) if array.dtype == np.uint8 else tensor.float()
+
+
+def factor_codes(model: Any, batch: Tensor) -> dict[str, np.ndarray]:
+    """A batch's features by factor, each (n, D) float32."""
+    return {name: code.float().cpu().numpy() for name, code in model.embed(batch).items()}
 
 
 def embed_images(
     model: Any, images: np.ndarray, *, batch_size: int = 256, progress: Progress | None = None
 ) -> dict[str, np.ndarray]:
     """Features of pictures (N, 3, H, W), uint8 or float in 0..1, by factor: each (N, D) float32."""
-
-    def embed(batch: Tensor) -> dict[str, np.ndarray]:
-        return {name: code.float().cpu().numpy() for name, code in model.embed(batch).items()}
-
-    parts = map_batches(embed, model, images, batch_size=batch_size, progress=progress)
+    parts = map_batches(partial(factor_codes, model), model, images, batch_size=batch_size, progress=progress)
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
@@ -88,6 +104,14 @@ def embed_pictures(
         origin: further facts for the table, such as the model's path and preset; they win over those found
             here.
     """
+    check_size(model, pictures)
+    factors = embed_images(model, pictures.images, batch_size=batch_size, progress=progress)
+    facts = {**model_facts(model, pictures.source, pictures.layout), **(origin or {})}
+    return FeatureTable(pictures.files, factors, table_labels(pictures), facts)
+
+
+def check_size(model: Any, pictures: PictureSet) -> None:
+    """Pictures of another size than the model's are an error."""
     size = model.image_size
     if tuple(pictures.images.shape[-2:]) != (size, size):
         height, width = pictures.images.shape[-2:]
@@ -95,17 +119,20 @@ def embed_pictures(
             f"the pictures are {height}x{width}, the model takes {size}x{size}: "
             f"read them with image_size={size}"
         )
-    factors = embed_images(model, pictures.images, batch_size=batch_size, progress=progress)
+
+
+def model_facts(model: Any, source: str, layout: str) -> dict[str, Any]:
+    """What a table's origin says: version, model, weights, data."""
     facts: dict[str, Any] = {
         "derender": derender.__version__,
         "model": type(model).__name__,
         "weights": model_fingerprint(model),
-        "data": pictures.source,
-        "layout": pictures.layout,
+        "data": source,
+        "layout": layout,
     }
     if hasattr(model, "settings"):
         facts["settings"] = model.settings.model_dump(mode="json")
-    return FeatureTable(pictures.files, factors, table_labels(pictures), {**facts, **(origin or {})})
+    return facts
 
 
 def table_labels(pictures: PictureSet) -> dict[str, np.ndarray]:

@@ -6,7 +6,7 @@ our metadata the list columns are factors and all others labels.
 """
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -35,10 +35,44 @@ def write_columns(path: Path, content: Columns) -> None:
     """Write a parquet file; at ``path`` stands the old file or the whole new one, never half of it."""
     if path.is_dir():
         raise ValueError(f"{path} is a folder: name a file to write, such as {path / 'features.parquet'}")
+    with whole_file(path) as temporary:
+        pq.write_table(as_arrow(content), temporary)
+
+
+def write_row_groups(path: Path, groups: Iterable[Columns]) -> int:
+    """Write a table that is never whole in memory, each of ``groups`` as a row group; gives its rows.
+
+    All groups have the same factors, labels and origin. What stands at ``path`` in the end is as with
+    ``write_columns``: the file reads the same.
+    """
+    rows, writer = 0, None
+    with whole_file(path) as temporary:
+        try:
+            for group in groups:
+                table = as_arrow(group)
+                writer = writer or pq.ParquetWriter(temporary, table.schema, use_dictionary=_repeating(group))
+                writer.write_table(table.cast(writer.schema))
+                rows += len(table)
+                del table
+                pa.default_memory_pool().release_unused()
+        finally:
+            if writer is not None:
+                writer.close()
+        if not rows:
+            raise ValueError(f"there are no rows to write to {path}")
+    return rows
+
+
+def _repeating(content: Columns) -> Any:  # a list of names, which pyarrow's stubs do not know of
+    """The columns in which values repeat; features and names would only fill a dictionary in vain."""
+    return list(content.labels)
+
+
+def as_arrow(content: Columns) -> pa.Table:
+    """The columns as they stand in the file, with what describes them."""
     columns: dict[str, pa.Array] = {"file": pa.array(content.files, pa.string())}
     for name, values in content.factors.items():
-        flat = pa.array(np.ascontiguousarray(values, np.float32).reshape(-1))
-        columns[name] = pa.FixedSizeListArray.from_arrays(flat, values.shape[1])
+        columns[name] = factor_column(values)
     for name, values in content.labels.items():
         columns[name] = _label_column(name, values)
     described = {
@@ -48,8 +82,13 @@ def write_columns(path: Path, content: Columns) -> None:
         "origin": dict(content.origin),
     }
     metadata = {METADATA_KEY: json.dumps(described, ensure_ascii=False).encode()}
-    with whole_file(path) as temporary:
-        pq.write_table(pa.table(columns).replace_schema_metadata(metadata), temporary)
+    return pa.table(columns).replace_schema_metadata(metadata)
+
+
+def factor_column(values: np.ndarray) -> pa.Array:
+    """(N, D) numbers as N lists of D float32."""
+    flat = pa.array(np.ascontiguousarray(values, np.float32).reshape(-1))
+    return pa.FixedSizeListArray.from_arrays(flat, values.shape[1])
 
 
 def read_columns(path: Path) -> Columns:

@@ -4,7 +4,7 @@ The value that travels through the right half of the program. Leaves out how fea
 baselines/) and every score (evaluation/).
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -60,14 +60,12 @@ class FeatureTable:
         object.__setattr__(self, "origin", dict(self.origin))
         if not factors:
             raise ValueError("a feature table needs at least one factor")
-        twice = set(factors) & set(labels) or {"file"} & {*factors, *labels}
-        if twice:
-            raise ValueError(f"column name {min(twice)!r} is used twice: rename the factor or the label")
+        check_names(factors, labels)
         for name, values in labels.items():
             self._check_shape("label", name, values, 1)
         for name, values in factors.items():
             self._check_shape("factor", name, values, 2)
-            self._check_finite(name, values)
+        check_finite(factors, self.files)
 
     def _check_shape(self, kind: str, name: str, values: np.ndarray, dimensions: int) -> None:
         if values.ndim != dimensions or 0 in values.shape[1:]:
@@ -75,14 +73,6 @@ class FeatureTable:
             raise ValueError(f"{kind} {name!r} must have {expected} in each row, got shape {values.shape}")
         if len(values) != len(self.files):
             raise ValueError(f"{kind} {name!r} has {len(values)} rows, but there are {len(self.files)} files")
-
-    def _check_finite(self, name: str, values: np.ndarray) -> None:
-        finite = np.isfinite(values).all(axis=1)
-        if not finite.all():
-            raise ValueError(
-                f"factor {name!r} is not finite in {int((~finite).sum())} of {len(values)} rows, first in "
-                f"{self.files[int(np.argmin(finite))]}: drop these rows, or check the model that made them"
-            )
 
     def __len__(self) -> int:
         return len(self.files)
@@ -142,6 +132,24 @@ class FeatureTable:
             return cls(tuple(content.files), content.factors, content.labels, content.origin)
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from error
+
+
+def check_names(factors: Iterable[str], labels: Iterable[str]) -> None:
+    """A column name that is used twice is an error."""
+    twice = set(factors) & set(labels) or {"file"} & {*factors, *labels}
+    if twice:
+        raise ValueError(f"column name {min(twice)!r} is used twice: rename the factor or the label")
+
+
+def check_finite(factors: Mapping[str, np.ndarray], files: Sequence[str]) -> None:
+    """A feature that is no finite number is an error that names the first picture concerned."""
+    for name, values in factors.items():
+        finite = np.isfinite(values).all(axis=1)
+        if not finite.all():
+            raise ValueError(
+                f"factor {name!r} is not finite in {int((~finite).sum())} of {len(values)} rows, first in "
+                f"{files[int(np.argmin(finite))]}: drop these rows, or check the model that made them"
+            )
 
 
 def _group_mean(values: np.ndarray, group: np.ndarray, count: int) -> np.ndarray:

@@ -62,7 +62,7 @@ class UNetEncoder(nn.Module):
         super().__init__()
         widths = [settings.unet_width * 2**level for level in range(settings.stages + 1)]
         self.levels = nn.ModuleList(
-            _double_convolution(previous, channels)
+            double_convolution(previous, channels)
             for previous, channels in zip([3, *widths], widths, strict=False)
         )
         self.pool = nn.MaxPool2d(2)
@@ -85,7 +85,8 @@ class UNetEncoder(nn.Module):
         return self.to_code(self.spatial(images)).flatten(1)
 
 
-def _double_convolution(channels_in: int, channels_out: int) -> nn.Sequential:
+def double_convolution(channels_in: int, channels_out: int) -> nn.Sequential:
+    """Twice a 3x3 convolution, BatchNorm and ReLU: a level of a U-Net."""
     layers: list[nn.Module] = []
     for previous in (channels_in, channels_out):
         layers += [

@@ -64,12 +64,26 @@ def depth_from_raw(raw: Float[Tensor, "n 1 h w"], ranges: SceneRanges) -> Float[
     """Centre each map, squash it into the depth range and hold both side borders at the border depth."""
     raw = raw.float()
     centred = (raw - raw.mean(dim=(1, 2, 3), keepdim=True)).squeeze(1)
+    if ranges.level_depth:
+        centred = level(centred)
     middle, half = (ranges.depth_max + ranges.depth_min) / 2, (ranges.depth_max - ranges.depth_min) / 2
     depth = middle + half * centred.tanh()
     columns = ranges.border_columns(depth.shape[-1])
     if columns == 0:
         return depth
     return pad(depth[..., columns:-columns], (columns, columns), value=ranges.border_depth)
+
+
+def level(values: Float[Tensor, "n h w"]) -> Float[Tensor, "n h w"]:
+    """Take away each map's slope from top to bottom, measured under a window that is 0 beyond the edges."""
+    height, width = values.shape[-2:]
+    down = torch.linspace(-1, 1, height, device=values.device)[:, None]
+    across, along = (
+        torch.hann_window(size + 2, periodic=False, device=values.device)[1:-1] for size in (width, height)
+    )
+    window = along[:, None] * across
+    slope = (window * down * values).sum(dim=(1, 2)) / (window * down.square()).sum()
+    return values - slope[:, None, None] * down
 
 
 def albedo_from_raw(raw: Float[Tensor, "n 3 h w"], ranges: SceneRanges) -> Float[Tensor, "n 3 h w"]:

@@ -21,7 +21,7 @@ from torch import Tensor
 PORTIONS_PER_THREAD = 4
 
 
-def kernel(function: Callable[..., None]) -> Callable[..., None]:
+def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile on first use, without the interpreter lock, keeping the machine code on disk where possible."""
     options: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
     try:

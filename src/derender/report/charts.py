@@ -5,9 +5,9 @@ Leaves out interaction.
 """
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from hashlib import sha256
-from io import StringIO
+from io import BytesIO, StringIO
 from typing import Any
 
 import matplotlib
@@ -90,6 +90,32 @@ def bars(
         axes.set_xlabel(x_label)
         axes.tick_params(axis="y", length=0)
         return _svg(figure)
+
+
+def side_by_side(
+    panels: Mapping[str, Callable[[Axes], None]], x_label: str, size: tuple[float, float]
+) -> tuple[str, bytes]:
+    """Panels by title with one vertical axis, each drawn by its function, as SVG text and as PNG.
+
+    What the first panel labels is explained below them all.
+    """
+    if not panels:
+        raise ValueError("a chart needs at least one panel")
+    with matplotlib.rc_context(_STYLE):
+        figure = Figure(figsize=size, layout="constrained")
+        figure.patch.set_alpha(0)
+        drawn = figure.subplots(1, len(panels), sharex=True, sharey=True, squeeze=False)[0]
+        for axes, (title, draw) in zip(drawn, panels.items(), strict=True):
+            axes.patch.set_alpha(0)
+            draw(axes)
+            axes.set_title(title, fontsize=10)
+            axes.set_xlabel(x_label)
+        handles, labels = drawn[0].get_legend_handles_labels()
+        if handles:
+            figure.legend(handles, labels, loc="outside lower center", ncols=len(handles))
+        stream = BytesIO()
+        figure.savefig(stream, format="png", dpi=150, facecolor="white", metadata={"Software": None})
+        return _svg(figure), stream.getvalue()
 
 
 def _axes(size: tuple[float, float]) -> tuple[Figure, Axes]:

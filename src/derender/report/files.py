@@ -40,9 +40,19 @@ def write_decompositions(
     pictures: Mapping[Path, tuple[Path, UInt8[np.ndarray, "3 s s"]]],
     *,
     batch_size: int = 64,
+    refine: Callable[[Scene, Sequence[Path]], Scene] | None = None,
     progress: Callable[[int, int], object] | None = None,
+    keep: Callable[[Decomposition], object] | None = None,
 ) -> list[dict[str, Any]]:
     """Take pictures apart, each into its folder (the keys; values: where it came from, and the picture).
+
+    Args:
+        model: with ``decompose``, ``render``, ``fov_deg``, ``device``.
+        pictures: folder to where the picture came from, and the picture.
+        batch_size: pictures at a time.
+        refine: makes the scenes of these sources finer before they are drawn and written (``texture``).
+        progress: called with (pictures done, pictures in all).
+        keep: is given each batch as it was drawn (for a sheet).
 
     Gives one dictionary per picture: what its ``scene.json`` says.
     """
@@ -53,7 +63,11 @@ def write_decompositions(
         images = as_float(np.stack([picture for _, (_, picture) in part])).to(model.device)
         with torch.no_grad():
             scene = model.decompose(images)
+            if refine is not None:
+                scene = refine(scene, [source for _, (source, _) in part])
         drawn = decomposition(images, scene, model.render, model.fov_deg)
+        if keep is not None:
+            keep(drawn)
         for index, (folder, (source, _)) in enumerate(part):
             record = {"picture": str(source), "folder": str(folder), **scene_numbers(drawn, index)}
             _write_folder(folder, drawn, index, scene[index], model.fov_deg, record)

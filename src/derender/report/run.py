@@ -9,14 +9,24 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
+from derender.baselines.training import read_any_config
 from derender.model import Derenderer
 from derender.report import blocks, charts
 from derender.report.figures import decomposition
 from derender.report.page import Page, Section
-from derender.training.config import setting_names
-from derender.training.run_folder import RunFolder, read_config, read_metrics
+from derender.settings import Settings
+from derender.training.config import TrainConfig, setting_names
+from derender.training.run_folder import RunFolder, read_metrics
 
 SHEETS_SHOWN = 4
+CHARTS = (
+    ("l1", "L1", "Mean absolute difference between picture and rendering, inside the mask."),
+    ("loss", "loss", "What is minimised; it can fall below zero, because confidence enters as a logarithm."),
+)
+BASELINE_CHARTS = (
+    ("l1", "L1", "Mean absolute difference between picture and reconstruction."),
+    ("loss", "loss", "What held-out pictures are judged by."),
+)
 
 
 def decomposition_sheet(model: Derenderer, pictures: Float[Tensor, "n 3 h w"]) -> Image.Image:
@@ -27,13 +37,14 @@ def decomposition_sheet(model: Derenderer, pictures: Float[Tensor, "n 3 h w"]) -
 def run_page(folder: str | Path) -> Page:
     """The page of a run folder, finished or not."""
     run = RunFolder(Path(folder))
-    config = read_config(run.path)
+    config = read_any_config(run.path)
+    charts_wanted = CHARTS if isinstance(config, TrainConfig) else BASELINE_CHARTS
     metrics = read_metrics(run.path)
     environment = _read_environment(run.path / "environment.json")
     tree = config.model_dump(mode="json")
-    settings = {name: _at(tree, name) for name in setting_names()}
+    settings = {name: _at(tree, name) for name in setting_names(type(config))}
     sections = [
-        Section("How it went", [*_course(metrics), *loss_charts(metrics)], "Training"),
+        Section("How it went", [*_course(metrics), *loss_charts(metrics, charts_wanted)], "Training"),
         Section("Held-out pictures through time", _samples(run), "Samples"),
         Section(
             "Settings and versions",
@@ -43,23 +54,25 @@ def run_page(folder: str | Path) -> Page:
     ]
     return Page(
         f"Training run {run.path.name}",
-        f"Preset {config.preset}, LOOCC {config.objective.loocc}, seed {config.seed}.",
+        _subtitle(config),
         [section for section in sections if section.blocks],
         f"derender {environment.get('derender', '')}".strip(),
     )
 
 
-def loss_charts(metrics: Sequence[dict[str, Any]]) -> list[blocks.Html]:
+def _subtitle(config: Settings) -> str:
+    if isinstance(config, TrainConfig):
+        return f"Preset {config.preset}, LOOCC {config.objective.loocc}, seed {config.seed}."
+    values = config.model_dump()
+    return f"Baseline {values['baseline']}, seed {values['seed']}."
+
+
+def loss_charts(
+    metrics: Sequence[dict[str, Any]], wanted: Sequence[tuple[str, str, str]] = CHARTS
+) -> list[blocks.Html]:
     """The total loss and the reconstruction error over pictures seen, training beside held-out."""
     charts_made = []
-    for key, label, text in (
-        ("l1", "L1", "Mean absolute difference between picture and rendering, inside the mask."),
-        (
-            "loss",
-            "loss",
-            "What is minimised; it can fall below zero, because confidence enters as a logarithm.",
-        ),
-    ):
+    for key, label, text in wanted:
         series = {}
         for kind, name in (("train", "training"), ("validation", "held out")):
             points = [

@@ -172,22 +172,30 @@ def geometry_table(result: GeometryResult, pictures: int) -> ScoreTable:
     return ScoreTable(f"Geometry on {pictures:,} pictures with exact depth", "prediction", columns, rows)
 
 
-def factor_table(result: FactorResult, pictures: int) -> ScoreTable:
-    """Errors of albedo, light and camera beside the best constant answers."""
+def factor_table(result: FactorResult, pictures: int, untrained: FactorResult | None = None) -> ScoreTable:
+    """Errors of albedo, light and camera beside the best constant answers and an untrained model's."""
     columns = (
-        Column("albedo", "low", 4, "root mean square error after the best scale, best 0"),
+        Column("albedo", "low", 4, "root mean square error after each picture's best scale, best 0"),
+        Column("one scale", "low", 4, "the same after one scale for all pictures"),
         Column("light", "low", 1, "mean angle in degrees between true and found direction, best 0"),
+        Column("aligned", "low", 1, "the same after the best rotation of all directions at once"),
         Column("camera", "low", 1, "mean angle in degrees of the rotation left over, best 0"),
     )
-    rows = (
-        Row("model", (result.albedo, result.light.mean_deg, result.camera.mean_deg)),
-        Row(
-            "constant answer",
-            (result.albedo_control, result.light_control.mean_deg, result.camera_control.mean_deg),
-            True,
-            "mean albedo, mean light, a camera that never turns",
-        ),
-    )
+
+    def row(name: str, scores: FactorResult, control: bool = False) -> Row:
+        errors = (scores.albedo, scores.albedo_global)
+        angles = (scores.light, scores.light_aligned, scores.camera)
+        return Row(name, (*errors, *(angle.mean_deg for angle in angles)), control)
+
+    light = result.light_control.mean_deg
+    constant = (result.albedo_control, result.albedo_global_control, light, light)
+    note = "mean albedo, mean light, a camera that never turns"
+    rows = [
+        row("model", result),
+        Row("constant answer", (*constant, result.camera_control.mean_deg), True, note),
+    ]
+    if untrained is not None:
+        rows.append(row("untrained model", untrained, control=True))
     return ScoreTable(f"Albedo, light and camera on {pictures:,} pictures", "prediction", columns, rows)
 
 
@@ -196,8 +204,9 @@ def reconstruction_table(result: ReconstructionResult, pictures: int) -> ScoreTa
     columns = (
         Column("L1", "low", 4, "mean absolute difference inside the mask, 0 to 1, best 0"),
         Column("PSNR", "high", 2, "peak signal-to-noise ratio in decibels"),
+        Column("SSIM", "high", note="structural similarity of windows inside the mask, at most 1"),
         Column("coverage", None, note="share of all pixels inside the mask"),
     )
     both = (("model", result.model), ("mean picture", result.mean_picture))
-    rows = [Row(name, (s.l1, s.psnr_db, s.coverage), name != "model") for name, s in both]
+    rows = [Row(name, (s.l1, s.psnr_db, s.ssim, s.coverage), name != "model") for name, s in both]
     return ScoreTable(f"Reconstruction of {pictures:,} pictures", "prediction", columns, rows)

@@ -23,6 +23,7 @@ class SceneRanges(Settings):
     border_share: float = Field(
         default=2 / 64, ge=0, lt=0.5
     )  # share of the width, each side, held at border_depth
+    level_depth: bool = False  # take each map's slope from top to bottom away: only the camera tilts; ours
     ambient: tuple[float, float] = (0.0, 1.0)
     diffuse: tuple[float, float] = (0.0, 1.0)
     light_deg: float = Field(default=45.0, gt=0, lt=90)  # light pitch and yaw lie in +- this

@@ -14,6 +14,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
+from derender.training.weights import fit_weights
 from derender.whole import whole_folder
 
 WEIGHTS_FILE, OPTIMISER_FILE, STATE_FILE = "model.safetensors", "optimiser.safetensors", "state.json"
@@ -64,13 +65,12 @@ def load_checkpoint(folder: Path, model: nn.Module, optimiser: torch.optim.Optim
     try:
         stored = json.loads((folder / STATE_FILE).read_text())
         state = TrainState(**stored["state"])
-        model.load_state_dict(load_file(folder / WEIGHTS_FILE))
+        fit_weights(model, load_file(folder / WEIGHTS_FILE))
         if optimiser is not None:
             optimiser.load_state_dict(_unflatten(load_file(folder / OPTIMISER_FILE), stored["groups"]))
             _lay_out_like_parameters(optimiser)
     except (
-        json.JSONDecodeError,
-        UnicodeDecodeError,
+        ValueError,
         KeyError,
         TypeError,
         SafetensorError,

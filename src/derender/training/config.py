@@ -5,7 +5,7 @@ Source: the paper, Sec. 4 and its published settings; where the two differ (lear
 """
 
 from collections.abc import Iterable, Mapping
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar, overload
 
 import yaml
 from pydantic import Field, ValidationError
@@ -40,6 +40,8 @@ class ObjectiveSettings(Settings):
     loocc_weight: float = Field(default=0.01, ge=0)
     loocc_temperature: float = Field(default=0.5, gt=0)
     cycle_weight: float = Field(default=0.0, ge=0)  # light and camera read back from LOOCC's renderings; ours
+    template_share: float = Field(default=0.0, ge=0, le=1)  # of the run: all share one shape and albedo; ours
+    release_share: float = Field(default=0.0, ge=0, le=1)  # of the run: each gets its own bit by bit
     perturb: PerturbSettings = PerturbSettings()
 
 
@@ -53,12 +55,9 @@ class OptimiserSettings(Settings):
     betas: tuple[float, float] = (0.9, 0.999)
 
 
-class TrainConfig(Settings):
-    """One training run, whole."""
+class LoopSettings(Settings):
+    """What every run of the training loop has, whatever it trains."""
 
-    preset: str = "faces"
-    model: ModelSettings = ModelSettings()
-    objective: ObjectiveSettings = ObjectiveSettings()
     optimiser: OptimiserSettings = OptimiserSettings()
     batch_size: int = Field(default=64, ge=2)
     images: int = Field(default=600_000, ge=1)  # pictures seen in the whole run, repeats counted
@@ -74,6 +73,17 @@ class TrainConfig(Settings):
     deterministic: bool = False
     watch: bool = True  # look for collapse and return to the last good checkpoint
     seed: int = 0
+
+
+class TrainConfig(LoopSettings):
+    """One training run of our model, whole."""
+
+    preset: str = "faces"
+    model: ModelSettings = ModelSettings()
+    objective: ObjectiveSettings = ObjectiveSettings()
+
+
+Config = TypeVar("Config", bound=Settings)
 
 
 def _preset(name: str, **changes: Any) -> TrainConfig:
@@ -109,7 +119,12 @@ def resolve(preset: str, overrides: Iterable[str] = (), **explicit: Any) -> Trai
     Raises:
         ValueError: unknown preset or key (names the nearest), or a value that does not fit.
     """
-    tree = named_preset(preset, PRESETS).model_dump(mode="json")
+    return with_changes(named_preset(preset, PRESETS), overrides, **explicit)
+
+
+def with_changes(config: Config, overrides: Iterable[str] = (), **explicit: Any) -> Config:
+    """The same kind of configuration with changes as in ``resolve``."""
+    tree = config.model_dump(mode="json")
     changes: list[tuple[str, Any]] = []
     for override in overrides:
         key, equals, text = override.partition("=")
@@ -119,29 +134,33 @@ def resolve(preset: str, overrides: Iterable[str] = (), **explicit: Any) -> Trai
     changes += [(key.replace("__", "."), value) for key, value in explicit.items() if value is not None]
     for key, value in changes:
         _assign(tree, _full_key(key, tree), value)
-    return config_from_tree(tree)
+    return config_from_tree(tree, type(config))
 
 
-def config_from_tree(tree: Mapping[str, Any]) -> TrainConfig:
+@overload
+def config_from_tree(tree: Mapping[str, Any]) -> TrainConfig: ...
+@overload
+def config_from_tree(tree: Mapping[str, Any], kind: type[Config]) -> Config: ...
+def config_from_tree(tree: Mapping[str, Any], kind: type[Settings] = TrainConfig) -> Settings:
     """Check plain values (from YAML or JSON) and give the configuration, or one clear error."""
     try:
-        return TrainConfig.model_validate(tree)
+        return kind.model_validate(tree)
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"])
         if first["type"] == "extra_forbidden":
-            raise ValueError(f"unknown setting {key!r}{nearest(key, setting_names())}") from error
+            raise ValueError(f"unknown setting {key!r}{nearest(key, setting_names(kind))}") from error
         raise ValueError(f"setting {key!r}: {first['msg']}, got {first['input']!r}") from error
 
 
-def to_yaml(config: TrainConfig) -> str:
+def to_yaml(config: Settings) -> str:
     """The whole configuration as YAML, in the order of its definition."""
     return yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
 
 
-def setting_names() -> list[str]:
+def setting_names(kind: type[Settings] = TrainConfig) -> list[str]:
     """Every setting by its dotted name."""
-    return list(_leaves(TrainConfig().model_dump(mode="json")))
+    return list(_leaves(kind().model_dump(mode="json")))
 
 
 def _leaves(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -10,7 +10,7 @@ from contextlib import nullcontext
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -20,26 +20,27 @@ from torch import Tensor, nn
 from torch.utils.tensorboard.writer import SummaryWriter
 
 from derender.data import PictureSet, Split, split_indices
-from derender.model import Derenderer
-from derender.objectives import load_vgg16
 from derender.training.allocator import freed_memory_kept
 from derender.training.batches import Batches, random_stream
 from derender.training.checkpoint import TrainState, load_checkpoint, save_checkpoint
 from derender.training.config import TrainConfig
+from derender.training.derender_task import DerenderTask
+from derender.training.determinism import deterministic_algorithms
 from derender.training.interrupt import TrainingInterrupted, stop_on_signal
-from derender.training.perceptual import prepare_perceptual
 from derender.training.run_folder import RunFolder, append_metrics, drop_metrics_after, reopen_run, start_run
 from derender.training.schedule import learning_rate
-from derender.training.step import Precision, StepResult
-from derender.training.step_module import StepModule, compute_step
+from derender.training.step import Precision
+from derender.training.step_module import compute_step
+from derender.training.task import SavedModel, StepLosses, Task, Watch
 from derender.training.validate import validate
-from derender.training.watch import Finding, Watcher
+from derender.training.watch import Finding
 
 SAMPLE_COUNT = 8
 LOG_EVERY_STEPS = 50
 MAX_VALIDATION_PICTURES = 1_000
 
-SampleSheet = Callable[[Derenderer, Tensor], Image.Image]
+SampleSheet = Callable[[Any, Tensor], Image.Image]
+"""Draws what a model makes of a few pictures."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +94,7 @@ def train(
     progress: Callable[[Progress], None] | None = None,
     accelerator: str = "auto",
 ) -> TrainResult:
-    """Train a model on pictures; everything it makes lies in the folder ``out``.
+    """Train our model on pictures; everything it makes lies in the folder ``out``.
 
     Args:
         config: see `derender.training.config.resolve`.
@@ -108,7 +109,44 @@ def train(
         ValueError: pictures and configuration do not fit, or the run to resume has other settings.
         TrainingInterrupted: Ctrl-C or SIGTERM; the run can be resumed.
     """
-    report = progress or (lambda _: None)
+    return train_task(
+        DerenderTask(config),
+        pictures,
+        out,
+        resume=resume,
+        sample_sheet=sample_sheet,
+        progress=progress,
+        accelerator=accelerator,
+    )
+
+
+def train_task(
+    task: Task,
+    pictures: PictureSet,
+    out: str | Path,
+    *,
+    resume: bool = False,
+    sample_sheet: SampleSheet | None = None,
+    progress: Callable[[Progress], None] | None = None,
+    accelerator: str = "auto",
+) -> TrainResult:
+    """Train whatever the task says, as ``train`` does with our model."""
+    with deterministic_algorithms(task.config.deterministic):
+        return _train(
+            task, pictures, Path(out), resume, sample_sheet, progress or (lambda _: None), accelerator
+        )
+
+
+def _train(
+    task: Task,
+    pictures: PictureSet,
+    out: Path,
+    resume: bool,
+    sample_sheet: SampleSheet | None,
+    report: Callable[[Progress], None],
+    accelerator: str,
+) -> TrainResult:
+    config = task.config
     pictures.require(10)
     fabric = Fabric(accelerator=accelerator, devices=1)
     split = split_indices(pictures.files, config.split, seed=config.seed)
@@ -118,25 +156,17 @@ def train(
     )
     batches = Batches(fabric.to_device(training), config.batch_size, config.seed, config.horizontal_flips)
 
-    if config.objective.perceptual == "vgg16":
-        load_vgg16(config.objective.vgg16_path)  # missing weights are an error before a folder is made
-    out = Path(out)
+    task.check()
     if resume:
         run = reopen_run(out, config)
     else:
         run = start_run(out, config, describe_data(pictures, split), str(fabric.device))
-    torch.use_deterministic_algorithms(config.deterministic)
-    model = Derenderer.seeded(config.model, config.seed).to(fabric.device)
+    model = task.build().to(fabric.device)
     if config.channels_last:
         model = model.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
-    perceptual = prepare_perceptual(
-        config,
-        run.perceptual,
-        batches.images,
-        lambda done, total, _: report(Progress("perceptual", done, total)),
+    step = task.step_module(
+        model, run, batches.images, lambda done, total: report(Progress("perceptual", done, total))
     )
-    if config.channels_last and perceptual is not None:
-        perceptual = perceptual.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
     settings = config.optimiser
     optimiser = torch.optim.Adam(
         model.parameters(),
@@ -145,17 +175,17 @@ def train(
         weight_decay=settings.weight_decay,
         fused=True,
     )
-    module, wrapped = fabric.setup(StepModule(model, config.objective, perceptual), optimiser)
+    module, wrapped = fabric.setup(step, optimiser)
     state = load_checkpoint(run.last, model, optimiser) if resume and run.last.exists() else TrainState()
     for group in optimiser.param_groups:
         group.update(betas=settings.betas, weight_decay=settings.weight_decay)
     drop_metrics_after(run, state.images)
-    watcher = Watcher.remembering(config.model.ranges, state.watcher) if config.watch else None
+    watcher = task.watch(state.watcher) if config.watch else None
     memory = freed_memory_kept() if fabric.device.type == "cpu" else nullcontext()
     with memory:
         return _go_on(
             _Run(
-                config,
+                task,
                 run,
                 fabric,
                 module,
@@ -174,28 +204,33 @@ def train(
 class _Run:
     """A run in progress: everything that lasts from one step to the next."""
 
-    config: TrainConfig
+    task: Task
     folder: RunFolder
     fabric: Fabric
     module: nn.Module
     optimiser: torch.optim.Optimizer
     batches: Batches
     held_out: Tensor
-    watcher: Watcher | None
+    watcher: Watch | None
     sample_sheet: SampleSheet | None
     state: TrainState
     validation: dict[str, float] = field(default_factory=dict)
     findings: tuple[Finding, ...] = ()
 
     def __post_init__(self) -> None:
+        self.config = self.task.config
         self.precision = network_precision(self.config.precision, self.fabric.device)
         self.writer = SummaryWriter(str(self.folder.path / "tensorboard"), purge_step=self.state.images)
 
     @property
-    def model(self) -> Derenderer:
+    def model(self) -> nn.Module:
         return self.module.model  # type: ignore[return-value]
 
-    def step(self) -> StepResult:
+    def save_model(self, *, overwrite: bool) -> None:
+        """Write the model as others load it."""
+        cast(SavedModel, self.model).save(self.folder.model, overwrite=overwrite)
+
+    def step(self) -> StepLosses:
         """One batch: losses, gradients, update, watcher."""
         config, state = self.config, self.state
         position = state.images // config.batch_size
@@ -203,20 +238,24 @@ class _Run:
         for group in self.optimiser.param_groups:
             group["lr"] = rate
         noise = random_stream(config.seed, "perturb", position)
-        result = compute_step(self.module, self.batches.at(position), noise, self.precision)
+        result = compute_step(
+            self.module, self.batches.at(position), noise, self.precision, state.images / config.images
+        )
         self.fabric.backward(result.total)
         self.optimiser.step()
         self.optimiser.zero_grad(set_to_none=True)
         state.images += config.batch_size
         if self.watcher is not None:
-            self.findings = self.watcher.look(state.images, result.total.item(), result.scene)
+            self.findings = self.watcher.look(state.images, result)
         return result
 
     def validate(self) -> None:
         """Score held-out pictures; keep the weights if they are the best so far."""
         if not len(self.held_out):
             return
-        self.validation = validate(self.module, self.held_out, self.config, self.precision)
+        self.validation = validate(
+            self.module, self.held_out, self.config, self.precision, self.task.outside_loss
+        )
         loss, best = self.validation["loss"], self.state.best_loss
         self.log("validation", self.validation)
         if best is not None and not loss < best:
@@ -224,7 +263,7 @@ class _Run:
             return
         self.state.best_loss, self.state.validations_since_best = loss, 0
         save_checkpoint(self.folder.best, self.model, self.optimiser, self.state)
-        self.model.save(self.folder.model, overwrite=True)
+        self.save_model(overwrite=True)
 
     def draw(self) -> None:
         """Write a sheet of held-out pictures taken apart."""
@@ -241,7 +280,7 @@ class _Run:
         self.state.watcher = self.watcher.memory() if self.watcher is not None else {}
         save_checkpoint(self.folder.last, self.model, self.optimiser, self.state)
         if not self.folder.model.exists():
-            self.model.save(self.folder.model)
+            self.save_model(overwrite=False)
 
     def log(self, kind: str, values: dict[str, Any]) -> None:
         state = self.state

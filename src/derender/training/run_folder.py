@@ -9,12 +9,13 @@ import subprocess
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 
 import torch
 import yaml
 
-from derender.training.config import TrainConfig, config_from_tree, to_yaml
+from derender.settings import Settings
+from derender.training.config import Config, TrainConfig, config_from_tree, to_yaml
 from derender.whole import whole_file
 
 _MAY_CHANGE_ON_RESUME = (
@@ -59,7 +60,7 @@ class RunFolder:
         return self.path / "perceptual.safetensors"
 
 
-def start_run(path: Path, config: TrainConfig, data: dict[str, Any], device: str) -> RunFolder:
+def start_run(path: Path, config: Settings, data: dict[str, Any], device: str) -> RunFolder:
     """Make a new run folder; one that holds anything already is never touched.
 
     Raises:
@@ -76,7 +77,7 @@ def start_run(path: Path, config: TrainConfig, data: dict[str, Any], device: str
     return run
 
 
-def reopen_run(path: Path, config: TrainConfig) -> RunFolder:
+def reopen_run(path: Path, config: Settings) -> RunFolder:
     """The folder of a run to go on with, after checking that it was made with the same settings.
 
     Raises:
@@ -86,7 +87,7 @@ def reopen_run(path: Path, config: TrainConfig) -> RunFolder:
     run = RunFolder(path)
     if not run.config.is_file():
         raise FileNotFoundError(f"no run to resume in {path} (no config.yaml): train without --resume first")
-    stored = read_config(path).model_dump(mode="json")
+    stored = read_config(path, type(config)).model_dump(mode="json")
     asked = config.model_dump(mode="json")
     different = [key for key in asked if key not in _MAY_CHANGE_ON_RESUME and asked[key] != stored[key]]
     if different:
@@ -99,13 +100,35 @@ def reopen_run(path: Path, config: TrainConfig) -> RunFolder:
     return run
 
 
-def read_config(path: Path) -> TrainConfig:
-    """The configuration of a run."""
+@overload
+def read_config(path: Path) -> TrainConfig: ...
+@overload
+def read_config(path: Path, kind: type[Config]) -> Config: ...
+def read_config(path: Path, kind: type[Settings] = TrainConfig) -> Settings:
+    """The configuration of a run, which must be of this kind.
+
+    Raises:
+        ValueError: it is damaged, or the run trained something else.
+    """
+    tree = read_config_tree(path)
+    trained, asked = (tree.get("baseline"), kind.model_fields.get("baseline"))
+    wanted = None if asked is None else asked.default
+    if trained != wanted:
+        names = [f"the baseline {name}" if name else "a derender model" for name in (trained, wanted)]
+        raise ValueError(f"{path} is a run of {names[0]}, not of {names[1]}: give another run folder")
+    return config_from_tree(tree, kind)
+
+
+def read_config_tree(path: Path) -> dict[str, Any]:
+    """The configuration of a run as plain values, whatever it trained."""
     file = path / "config.yaml"
     try:
-        return config_from_tree(yaml.safe_load(file.read_text()))
-    except yaml.YAMLError as error:
+        tree = yaml.safe_load(file.read_text())
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ValueError(f"{file} is damaged: restore it, or start a new run in another folder") from error
+    if not isinstance(tree, dict):
+        raise ValueError(f"{file} is damaged: restore it, or start a new run in another folder")
+    return tree
 
 
 def append_metrics(run: RunFolder, row: dict[str, Any]) -> None:

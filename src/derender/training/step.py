@@ -21,6 +21,7 @@ from derender.render import Rendering
 from derender.scene import Scene
 from derender.scene.perturb import choose_factors
 from derender.training.config import LOOCC_FACTORS, ObjectiveSettings
+from derender.training.sharing import share_codes
 
 Precision = Callable[[], AbstractContextManager]
 
@@ -34,12 +35,14 @@ class StepResult:
         terms: every weighted term of it by name, and the plain masked L1 ("l1"), detached.
         scene: the scenes predicted for the batch.
         rendering: their renderings, without the twins.
+        codes: the pictures' features by factor, with gradient, for an objective beside this one.
     """
 
     total: Tensor
     terms: dict[str, Tensor]
     scene: Scene
     rendering: Rendering
+    codes: dict[str, Tensor]
 
 
 def training_step(
@@ -49,12 +52,16 @@ def training_step(
     perceptual: PerceptualFeatures | None,
     generator: Generator,
     precision: Precision = nullcontext,
+    own: float = 1.0,
 ) -> StepResult:
-    """Losses for one batch of pictures in 0..1; networks run under ``precision``, geometry in float32."""
+    """Losses for one batch of pictures in 0..1; networks run under ``precision``, geometry in float32.
+
+    ``own`` is each picture's share in its maps (see sharing.py).
+    """
     count = images.shape[0]
     with precision():
         codes = model.embed(images)
-        scene = model.decode(codes)
+        scene = model.decode(share_codes(codes, [f.name for f in model.factors if f.mirrored], own))
         confidence = model.confidence(images) if objective.confidence else None
     scenes = [scene, model.mirror(scene)]
     left_out = None
@@ -93,7 +100,7 @@ def training_step(
     reported = {name: term.detach() for name, term in terms.items()}
     reported["l1"] = masked_l1(straight, images, covered).detach()
     shown = Rendering(image=straight, depth=rendering.depth[:count], mask=rendering.mask[:count])
-    return StepResult(total, reported, scene, shown)
+    return StepResult(total, reported, scene, shown, codes)
 
 
 def perturb_one_factor(

@@ -6,13 +6,15 @@ from torch import Generator, Tensor, nn
 from derender.model import Derenderer
 from derender.objectives.perceptual import PerceptualFeatures
 from derender.training.config import ObjectiveSettings
-from derender.training.step import Precision, StepResult, training_step
+from derender.training.sharing import own_share
+from derender.training.step import Precision, training_step
+from derender.training.task import StepLosses
 
 
 class Held:
     """Keeps a result out of sight of wrappers that walk through a module's output in search of tensors."""
 
-    def __init__(self, result: StepResult):
+    def __init__(self, result: StepLosses):
         self.result = result
 
 
@@ -25,14 +27,25 @@ class StepModule(nn.Module):
         super().__init__()
         self.model, self.objective, self.perceptual = model, objective, perceptual
 
-    def forward(self, images: Tensor, generator: Generator, precision: Precision) -> tuple[Tensor, Held]:
-        result = training_step(self.model, images, self.objective, self.perceptual, generator, precision)
+    def forward(
+        self, images: Tensor, generator: Generator, precision: Precision, done: float | None = None
+    ) -> tuple[Tensor, Held]:
+        own = 1.0 if done is None else own_share(self.objective, done)
+        result = training_step(self.model, images, self.objective, self.perceptual, generator, precision, own)
         return result.total, Held(result)
 
 
 def compute_step(
-    module: nn.Module, images: Float[Tensor, "n 3 h w"], generator: Generator, precision: Precision
-) -> StepResult:
-    """The losses of one batch through a `StepModule`, wrapped by a strategy or not."""
-    _, held = module(images, generator, precision)
+    module: nn.Module,
+    images: Float[Tensor, "n 3 h w"],
+    generator: Generator,
+    precision: Precision,
+    done: float | None = None,
+) -> StepLosses:
+    """The losses of one batch through a task's step module, wrapped by a strategy or not.
+
+    ``done`` is the share of the run that lies behind, for what changes in its course; None where the model is
+    judged as it will be used.
+    """
+    _, held = module(images, generator, precision, done)
     return held.result

@@ -7,7 +7,7 @@ from jaxtyping import UInt8
 from torch import Tensor, nn
 
 from derender.training.batches import random_stream
-from derender.training.config import TrainConfig
+from derender.training.config import LoopSettings
 from derender.training.step import Precision
 from derender.training.step_module import compute_step
 
@@ -16,9 +16,13 @@ NOT_RECONSTRUCTION = ("l1", "loocc", "cycle")
 
 @torch.no_grad()
 def validate(
-    module: nn.Module, held_out: UInt8[Tensor, "n 3 h w"], config: TrainConfig, precision: Precision
+    module: nn.Module,
+    held_out: UInt8[Tensor, "n 3 h w"],
+    config: LoopSettings,
+    precision: Precision,
+    outside_loss: tuple[str, ...] = NOT_RECONSTRUCTION,
 ) -> dict[str, float]:
-    """Mean losses over held-out pictures; "loss" is the reconstruction part of the total, without LOOCC."""
+    """Mean losses over held-out pictures; "loss" is the sum of all but those ``outside_loss``."""
     module.eval()
     sums: dict[str, float] = defaultdict(float)
     count = 0
@@ -32,4 +36,4 @@ def validate(
         count += len(batch)
     module.train()
     means = {name: value / max(count, 1) for name, value in sums.items()}
-    return {"loss": sum(value for name, value in means.items() if name not in NOT_RECONSTRUCTION), **means}
+    return {"loss": sum(value for name, value in means.items() if name not in outside_loss), **means}

@@ -1,23 +1,23 @@
 """Procedural faces: reproducible to the byte, and every truth map explains its picture."""
 
+import hashlib
+
 import numpy as np
 import pytest
 import torch
 from scipy.ndimage import binary_erosion
 
-from derender.data.synthetic import FaceSettings, faces
+from derender.data.celebamask import MASK_CLASSES
+from derender.data.synthetic import LIGHTS, VIEWS, FaceSettings, LightSettings, ViewSettings, faces
 from derender.data.synthetic.synthetic_set import SyntheticSet, camera_rotation_and_light
+from derender.render import render
 from derender.scene.camera import to_canonical, unproject
 from derender.scene.normals import normals_from_depth
 
-FRONTAL = {"yaw_sd_deg": 0.0, "pitch_sd_deg": 0.0, "roll_sd_deg": 0.0, "translation_sd": 0.0}
+AHEAD = VIEWS["frontal"]
 STILL = {"expressions": ("neutral",), "asymmetry": 0.0, "gaze_px": 0.0}
-EVEN_LIGHT = {
-    "light_pitch_deg": (0.0, 0.0),
-    "light_yaw_deg": (0.0, 0.0),
-    "ambient": (0.6, 0.6),
-    "diffuse": (0.3, 0.3),
-}
+EVEN_LIGHT = LightSettings(yaw_deg=(0, 0), pitch_deg=(0, 0), ambient=(0.6, 0.6), diffuse=(0.3, 0.3))
+ARRAYS = ("images", "depth", "normal", "albedo", "mask", "parts", "light", "camera", "identity", "strength")
 
 
 @pytest.fixture(scope="module")
@@ -31,25 +31,31 @@ def inner(mask: np.ndarray, pixels: int = 1) -> np.ndarray:
 
 def test_same_seed_same_bytes_and_another_seed_other_faces(sample):
     again, other = faces.generate(24, seed=3), faces.generate(24, seed=4)
-    for name in ("images", "depth", "normal", "albedo", "mask", "light", "camera", "identity", "strength"):
+    for name in ARRAYS:
         assert getattr(sample, name).tobytes() == getattr(again, name).tobytes(), name
     assert (sample.images != other.images).any(axis=(1, 2, 3)).all()
 
 
 def test_a_picture_depends_on_seed_and_index_alone(sample):
     short, later = faces.generate(5, seed=3), faces.generate(7, seed=3, first=13)
-    for name in ("images", "depth", "normal", "albedo", "mask", "light", "camera", "identity", "expression"):
+    for name in (*ARRAYS, "expression"):
         assert getattr(short, name).tobytes() == getattr(sample, name)[:5].tobytes(), name
         assert getattr(later, name).tobytes() == getattr(sample, name)[13:20].tobytes(), name
 
 
-def test_one_thread_and_many_make_the_same_bytes(sample):
+@pytest.mark.parametrize("count_of_threads", [1, 2])
+def test_any_number_of_threads_makes_the_same_bytes(sample, count_of_threads):
     threads = torch.get_num_threads()
     try:
-        torch.set_num_threads(3)
-        assert faces.generate(24, seed=3).images.tobytes() == sample.images.tobytes()
+        torch.set_num_threads(count_of_threads)
+        made = faces.generate(24, seed=3)
     finally:
         torch.set_num_threads(threads)
+    assert digest(made) == digest(sample)
+
+
+def digest(made: SyntheticSet) -> str:
+    return hashlib.sha256(b"".join(getattr(made, name).tobytes() for name in ARRAYS)).hexdigest()
 
 
 def test_shading_the_truth_again_gives_the_picture(sample):
@@ -91,7 +97,7 @@ def test_depth_lies_in_the_stated_range_and_fills_the_picture(sample):
 def test_unprojected_points_lie_on_the_canonical_surface():
     """The same people seen frontally and turned: turned-back points land on the frontal depth map."""
     turned = faces.generate(4, seed=5, settings=FaceSettings(**STILL))
-    frontal = faces.generate(4, seed=5, settings=FaceSettings(**STILL, **FRONTAL))
+    frontal = faces.generate(4, seed=5, settings=FaceSettings(**STILL, view=AHEAD))
     assert np.abs(turned.camera).max() > 0.1 and not frontal.camera.any()
     for n in range(4):
         error = distance_to_frontal(turned, frontal, n, turned.camera[n])
@@ -114,17 +120,17 @@ def distance_to_frontal(
     return np.abs(frontal.depth[n][row[inside], column[inside]] - z[inside])
 
 
-def test_neutral_surfaces_are_symmetric_with_the_nose_tip_in_place():
-    still = faces.generate(16, seed=6, settings=FaceSettings(**STILL, **FRONTAL, pictures_per_identity=1))
-    both = still.mask & still.mask[..., ::-1]
-    apart = np.abs(still.depth - still.depth[..., ::-1])[inner(both, 3)]
+def test_neutral_faces_are_symmetric_with_the_nose_tip_in_place():
+    still = faces.generate(16, seed=6, settings=FaceSettings(**STILL, view=AHEAD, pictures_per_identity=1))
+    bare = still.mask & (still.parts != MASK_CLASSES.index("hair"))  # hair may be parted
+    apart = np.abs(still.depth - still.depth[..., ::-1])[inner(bare & bare[..., ::-1], 3)]
     assert np.percentile(apart, 99) < 5e-4 and np.median(apart) < 2e-5
     tip = still.depth[:, 24:42, 26:38].min(axis=(1, 2))
     assert np.allclose(tip, faces.NOSE_TIP_Z, atol=1.5e-3)
 
 
 def test_people_differ_and_pictures_of_one_person_agree_without_light():
-    settings = FaceSettings(**STILL, **FRONTAL, pictures_per_identity=2)
+    settings = FaceSettings(**STILL, view=AHEAD, pictures_per_identity=2)
     people = faces.generate(24, seed=7, settings=settings)
     assert (people.albedo[::2] == people.albedo[1::2]).all()
     assert (people.depth[::2] == people.depth[1::2]).all()
@@ -141,7 +147,7 @@ def test_people_differ_and_pictures_of_one_person_agree_without_light():
 
 
 def test_each_expression_changes_the_face_in_its_own_way():
-    common = {**FRONTAL, **EVEN_LIGHT, "strength": (1.0, 1.0), "asymmetry": 0.0, "gaze_px": 0.0}
+    common = {"view": AHEAD, "light": EVEN_LIGHT, "strength": (1.0, 1.0), "asymmetry": 0.0, "gaze_px": 0.0}
     shown = {
         name: faces.generate(3, seed=8, settings=FaceSettings(**common, expressions=(name,))).depth[
             :, 8:56, 14:50
@@ -156,17 +162,32 @@ def test_each_expression_changes_the_face_in_its_own_way():
 
 def test_settings_are_respected():
     settings = FaceSettings(
-        yaw_mean_deg=30, yaw_sd_deg=5, yaw_limit_deg=8, light_yaw_deg=(50, 70), ambient=(0.1, 0.2),
-        diffuse=(0.9, 1.0), expressions=("happy", "fear"), pictures_per_identity=3,
-    )  # fmt: skip
-    made = faces.generate(30, image_size=32, settings=settings)
+        view=ViewSettings(yaw_deg=(22, 38), yaw_sd_deg=5),
+        light=LightSettings(yaw_deg=(50, 70), ambient=(0.1, 0.2), diffuse=(0.9, 1.0)),
+        expressions={"happiness": 3, "fear": 1},
+        pictures_per_identity=3,
+        first_identity=7,
+        age_years=(30, 40),
+        skin_tone=(0.5, 0.6),
+    )
+    made = faces.generate(60, image_size=16, settings=settings)
     yaw, light = np.rad2deg(made.camera[:, 1]), made.light
     assert yaw.min() >= 21.99 and yaw.max() <= 38.01 and yaw.std() > 1
     assert np.rad2deg(light[:, 3]).min() >= 49.99 and np.rad2deg(light[:, 3]).max() <= 70.01
     assert 0.099 <= light[:, 0].min() <= light[:, 0].max() <= 0.201
     assert 0.899 <= light[:, 1].min() <= light[:, 1].max() <= 1.0
-    assert set(made.expression.tolist()) == {"happy", "fear"}
-    assert made.identity.tolist() == [i // 3 for i in range(30)]
+    assert set(made.expression.tolist()) == {"happiness", "fear"}
+    assert 0.6 < (made.expression == "happiness").mean() < 0.9
+    assert made.identity.tolist() == [7 + i // 3 for i in range(60)]
+    assert 30 <= made.labels["age"].min() < made.labels["age"].max() <= 40
+    assert 0.5 <= made.labels["skin_tone"].min() <= made.labels["skin_tone"].max() <= 0.6
+
+
+def test_first_identity_chooses_other_people_of_the_same_seed():
+    both = faces.generate(16, image_size=16, seed=4)
+    later = faces.generate(8, image_size=16, seed=4, settings=FaceSettings(first_identity=1))
+    rows = {name: values[8:] for name, values in both.identity_traits.items()}
+    assert all((rows[name] == values).all() for name, values in later.identity_traits.items())
 
 
 def test_default_distribution_is_that_of_the_rendered_development_set():
@@ -180,18 +201,153 @@ def test_default_distribution_is_that_of_the_rendered_development_set():
     assert (made.strength[made.expression == "neutral"] == 0).all()
 
 
+def test_wide_light_and_view_lie_outside_the_usual_ones():
+    made = faces.generate(120, image_size=16, settings=FaceSettings(light=LIGHTS["wide"], view=VIEWS["wide"]))
+    pitch, yaw = np.rad2deg(made.light[:, 2:]).T
+    assert (np.maximum(abs(pitch), abs(yaw)) > 34.99).all() and (
+        np.minimum(abs(pitch), abs(yaw)) < 20.01
+    ).all()
+    assert abs(yaw).max() <= 70.01 and abs(pitch).max() <= 60.01
+    assert 0.4 < (abs(yaw) > abs(pitch)).mean() < 0.8
+    turned = np.rad2deg(made.camera[:, 1])
+    assert abs(turned).min() > 19.99 and abs(turned).max() <= 60.01 and 0.3 < (turned > 0).mean() < 0.7
+    assert made.light[:, 0].max() <= 0.301 and made.light[:, 1].min() >= 0.599
+
+
+def test_the_same_seed_shows_the_same_people_in_another_light():
+    usual = faces.generate(8, image_size=32, seed=5)
+    wide = faces.generate(8, image_size=32, seed=5, settings=FaceSettings(light=LIGHTS["wide"]))
+    assert (usual.depth == wide.depth).all() and (usual.albedo == wide.albedo).all()
+    assert (usual.light != wide.light).any(axis=1).all()
+
+
+def test_a_track_keeps_light_and_person_while_the_head_moves_smoothly():
+    settings = FaceSettings(tracks=3, frames=5, expressions=("happiness",), backgrounds=("plain",))
+    made = faces.generate(30, image_size=32, seed=2, settings=settings)
+    assert made.identity.tolist() == [0] * 15 + [1] * 15
+    assert made.labels["track"].tolist() == [i // 5 % 3 for i in range(30)]
+    assert made.labels["frame"].tolist() == [i % 5 for i in range(30)]
+    light, camera = made.light.reshape(6, 5, 4), made.camera.reshape(6, 5, 6)
+    assert (light == light[:, :1]).all() and len(np.unique(light[:, 0], axis=0)) == 6
+    step = np.abs(np.diff(camera, axis=1))
+    whole = np.abs(camera[:, -1] - camera[:, 0])
+    assert whole[:, :3].max(axis=1).min() > 0.02 and np.rad2deg(whole[:, 1]).max() <= 18.01
+    assert (step.sum(axis=1) <= whole + 1e-6).all()  # no way back
+    assert (made.strength.reshape(6, 5).std(axis=1) > 1e-4).all()
+    again = faces.generate(4, image_size=32, seed=2, settings=settings, first=17)
+    assert (again.images == made.images[17:21]).all()
+
+
 def test_yaw_and_light_turn_the_way_the_conventions_say():
-    ahead = {**STILL, **FRONTAL, "ambient": (0.3, 0.3), "diffuse": (0.4, 0.4), "pictures_per_identity": 1}
+    from_left = LightSettings(yaw_deg=(40, 40), pitch_deg=(0, 0), ambient=(0.3, 0.3), diffuse=(0.4, 0.4))
     left_lit = faces.generate(
-        6, seed=9, settings=FaceSettings(**ahead, light_yaw_deg=(40, 40), light_pitch_deg=(0, 0))
+        6, seed=9, settings=FaceSettings(**STILL, view=AHEAD, light=from_left, pictures_per_identity=1)
     )
     columns = (left_lit.images.mean(axis=1) * left_lit.mask)[:, 20:50]
     assert (columns[..., 8:28].sum(axis=(1, 2)) > 1.1 * columns[..., 36:56].sum(axis=(1, 2))).all()
-    turned = faces.generate(
-        6, seed=9, settings=FaceSettings(**{**STILL, **FRONTAL}, yaw_mean_deg=25, pictures_per_identity=1)
-    )
+    to_left = ViewSettings(yaw_deg=(25, 25), pitch_sd_deg=0, roll_sd_deg=0, shift_sd=0)
+    turned = faces.generate(6, seed=9, settings=FaceSettings(**STILL, view=to_left, pictures_per_identity=1))
     nearest = np.where(turned.mask, turned.depth, 9.0)[:, 24:44].min(axis=1).argmin(axis=1)
     assert (nearest < 29).all()
+
+
+def test_rendering_the_truth_again_gives_the_picture():
+    """Depth, albedo and light through the project's own renderer, in the frame of each picture."""
+    made = faces.generate(12, seed=3, settings=FaceSettings(view=AHEAD))
+    depth = torch.from_numpy(np.where(made.mask, made.depth, 1.15))
+    again = render(
+        depth,
+        torch.from_numpy(made.albedo / np.float32(255)),
+        torch.from_numpy(made.light),
+        torch.from_numpy(made.camera),
+    )
+    assert np.median(grey_levels_apart(again.image, made)) < 2.5
+    dark = made.light * np.array([1, 1, -1, -1], np.float32)
+    wrong = render(
+        depth,
+        torch.from_numpy(made.albedo / np.float32(255)),
+        torch.from_numpy(dark),
+        torch.from_numpy(made.camera),
+    )
+    assert np.median(grey_levels_apart(wrong.image, made)) > 6.0
+
+
+def test_rendering_the_canonical_truth_with_the_stored_camera_gives_the_turned_picture():
+    near = ViewSettings(yaw_deg=(-15, 15), pitch_deg=(-8, 8))
+    turned = faces.generate(12, seed=3, settings=FaceSettings(view=near))
+    ahead = faces.generate(12, seed=3, settings=FaceSettings(view=AHEAD))
+    depth = torch.from_numpy(np.where(ahead.mask, ahead.depth, 1.15))
+    albedo, light = torch.from_numpy(ahead.albedo / np.float32(255)), torch.from_numpy(turned.light)
+    again = render(depth, albedo, light, torch.from_numpy(turned.camera))
+    away = render(depth, albedo, light, torch.from_numpy(-turned.camera))
+    assert np.median(grey_levels_apart(again.image, turned)) < 4.0
+    assert np.median(grey_levels_apart(away.image, turned)) > 8.0
+
+
+def grey_levels_apart(image: torch.Tensor, made: SyntheticSet) -> np.ndarray:
+    """Differences well inside the face, as the picture stores them."""
+    return np.abs(image.clamp(0, 1).numpy() * 255 - made.images).mean(axis=1)[inner(made.mask, 3)]
+
+
+def test_parts_are_where_they_belong():
+    frontal = FaceSettings(**STILL, view=AHEAD, pictures_per_identity=1)
+    made = faces.generate(24, seed=12, settings=frontal)
+    assert made.part_names == MASK_CLASSES
+    assert ((made.parts > 0) == made.mask).all()
+    rows, columns = np.mgrid[:64, :64]
+
+    def centre(name: str) -> np.ndarray:
+        """(faces, 2): mean row and column of a part, NaN where fewer than three pixels show it."""
+        seen = made.parts == MASK_CLASSES.index(name)
+        size = seen.sum(axis=(1, 2)).astype(float)
+        size[size < 3] = np.nan
+        return np.stack(
+            [(seen * rows).sum(axis=(1, 2)) / size, (seen * columns).sum(axis=(1, 2)) / size], axis=1
+        )
+
+    left, right, nose = centre("l_eye"), centre("r_eye"), centre("nose")
+    assert np.isfinite(left).all() and np.isfinite(nose).all()
+    assert (left[:, 1] > 38).all() and (right[:, 1] < 25).all()  # the person's own left
+    assert (nose[:, 0] > left[:, 0] + 5).all() and abs(nose[:, 1] - 31.5).max() < 2
+    upper, lower, hair, neck = centre("u_lip"), centre("l_lip"), centre("hair"), centre("neck")
+    assert (lower[:, 0] > upper[:, 0] + 1).all() and (upper[:, 0] > nose[:, 0] + 5).all()
+    assert np.nanmax(hair[:, 0] - nose[:, 0]) < 12 and np.nanmin(neck[:, 0] - lower[:, 0]) > 5
+    assert np.isnan(hair[:, 0]).sum() == (made.labels["hair"] == "bald").sum()
+    brow = centre("l_brow")
+    assert np.nanmax(brow[:, 0] - left[:, 0]) < -2
+    assert not (made.parts == MASK_CLASSES.index("mouth")).any()
+    loud = FaceSettings(view=AHEAD, expressions=("surprise",), strength=(1, 1), pictures_per_identity=1)
+    surprised = faces.generate(8, seed=12, settings=loud)
+    assert ((surprised.parts == MASK_CLASSES.index("mouth")).sum(axis=(1, 2)) > 10).all()
+
+
+def test_age_shows_in_hair_and_skin():
+    def drawn(ages: tuple[float, float]) -> SyntheticSet:
+        settings = FaceSettings(
+            **STILL, view=AHEAD, age_years=ages, skin_tone=(0.2, 0.2), pictures_per_identity=1
+        )
+        return faces.generate(24, image_size=16, seed=1, settings=settings)
+
+    young, old = drawn((18, 22)), drawn((76, 80))
+    assert (
+        (young.labels["hair_colour"] == "grey").mean()
+        < 0.1
+        < 0.5
+        < (old.labels["hair_colour"] == "grey").mean()
+    )
+    assert (
+        old.identity_traits["shape_forehead_lines"].min()
+        > young.identity_traits["shape_forehead_lines"].max()
+    )
+
+
+def test_people_are_varied():
+    made = faces.generate(80, image_size=16, settings=FaceSettings(pictures_per_identity=1))
+    assert len(set(made.labels["hair"].tolist())) >= 9
+    assert len(set(made.labels["hair_colour"].tolist())) >= 5
+    assert len(set(made.labels["beard"].tolist())) >= 4
+    assert made.labels["age"].min() < 22 and made.labels["age"].max() > 70
+    assert made.labels["skin_tone"].min() < 0.1 and made.labels["skin_tone"].max() > 0.9
 
 
 @pytest.mark.parametrize("size", [32, 48, 128])
@@ -225,11 +381,13 @@ def test_bad_arguments_are_named(arguments, message):
 @pytest.mark.parametrize(
     ("setting", "message"),
     [
-        ({"ambient": (0.7, 0.2)}, "low <= high"),
-        ({"ambient": (0.2, 1.7)}, "ambient must lie within"),
-        ({"light_yaw_deg": (0, 95)}, "light_yaw_deg must lie within"),
+        ({"light": {"ambient": (0.7, 0.2)}}, "light.ambient must be two numbers, low <= high, within 0..1"),
+        ({"light": {"ambient": (0.2, 1.7)}}, "light.ambient must be"),
+        ({"light": {"yaw_deg": (0, 95)}}, "light.yaw_deg must be"),
+        ({"view": {"yaw_beyond_deg": 50}}, "yaw_beyond_deg must lie within"),
         ({"expressions": ("smug",)}, "expressions must be one or more of neutral"),
         ({"expressions": ()}, "expressions must be one or more"),
+        ({"expressions": {"fear": 0.0}}, "shares must be 0 or more and not all 0"),
         ({"backgrounds": ("beach",)}, "backgrounds must be"),
         ({"pictures_per_identity": 0}, "pictures_per_identity"),
         ({"yaw": 3}, "yaw"),

@@ -6,8 +6,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from derender.data import read_pictures
 from derender.data.ground_truth import read_ground_truth
-from derender.data.synthetic import faces, write
+from derender.data.masks import read_masks
+from derender.data.synthetic import FaceSettings, faces, write, write_tracks
+
+_TEXTS = ("file", "expression", "hair", "hair_colour", "beard")
 
 
 @pytest.fixture(scope="module")
@@ -40,14 +44,17 @@ def test_columns_are_those_of_the_rendered_development_set(folder, shared_data):
         theirs = archive.read("test_gt/params.csv").decode().splitlines()[0].split(",")
     with (folder / "params.csv").open() as file:
         ours = next(csv.reader(file))
-    assert ours == [name for name in theirs if name not in ("expr_weights", "skin_id")]
+    extra = {"age", "skin_tone", "build", "hair", "hair_colour", "beard"}
+    assert extra <= set(ours)
+    common = [name for name in theirs if name not in ("expr_weights", "skin_id")]
+    assert [name for name in ours if name not in extra] == common
 
 
 def test_light_columns_agree_with_each_other(made, folder):
     with (folder / "params.csv").open() as file:
         rows = list(csv.DictReader(file))
     for row in rows:
-        value = {k: float(v) for k, v in row.items() if k not in ("file", "expression")}
+        value = {k: float(v) for k, v in row.items() if k not in _TEXTS}
         slope = np.array(
             [np.tan(np.deg2rad(value["light_yaw"])), np.tan(np.deg2rad(value["light_pitch"])), 1.0]
         )
@@ -88,3 +95,35 @@ def test_without_truth_only_pictures_and_tables(made, tmp_path):
 def test_a_folder_that_holds_a_set_is_refused(made, folder):
     with pytest.raises(ValueError, match="already holds a set"):
         write(made, folder)
+
+
+def test_parts_are_written_as_class_numbers_with_their_names(made, folder):
+    parts = np.asarray(Image.open(folder / "masks" / "000003.png"))
+    assert (parts == made.parts[3]).all()
+    assert tuple((folder / "classes.txt").read_text().splitlines()) == made.part_names
+
+
+def test_parts_read_back_as_masks_for_segmentation(made, folder):
+    read = read_masks(folder, 64)
+    assert read.classes == made.part_names and (read.masks == made.parts).all()
+    assert read.pictures.label("age").tolist() == made.labels["age"].tolist()
+
+
+def test_tracks_read_back_as_tracks(tmp_path):
+    settings = FaceSettings(tracks=2, frames=3)
+    made = faces.generate(12, image_size=16, settings=settings)
+    folder = write_tracks(made, tmp_path / "set")
+    assert sorted(str(p.relative_to(folder)) for p in folder.rglob("*.jpg"))[:4] == [
+        "tracks/id0000/track_000/000.jpg",
+        "tracks/id0000/track_000/001.jpg",
+        "tracks/id0000/track_000/002.jpg",
+        "tracks/id0000/track_001/000.jpg",
+    ]
+    read = read_pictures(folder, 16)
+    assert len(read) == 12 and len(set(read.label("track").tolist())) >= 2
+    assert len(set(read.label("identity").tolist())) == 2
+
+
+def test_only_tracks_are_written_as_tracks(made, tmp_path):
+    with pytest.raises(ValueError, match="these pictures are no tracks"):
+        write_tracks(made, tmp_path / "set")

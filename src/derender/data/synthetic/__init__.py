@@ -1,11 +1,30 @@
-"""Built-in pictures with exact ground truth: a procedural face generator that needs no download.
+"""Built-in pictures with exact ground truth: procedural generators that need no download.
 
-``faces.generate`` makes them, ``write`` saves them in the layout of the rendered data sets.
+``faces.generate`` and ``cars.generate`` make them, ``write`` saves them in the layout of the rendered data
+sets.
 """
 
-from derender.data.synthetic import faces
-from derender.data.synthetic.settings import FaceSettings
+from derender.data.synthetic import cars, faces
+from derender.data.synthetic.car_settings import CAR_LIGHTS, CAR_VIEWS, CarSettings, CarViewSettings
+from derender.data.synthetic.morphable import MorphableFaces
+from derender.data.synthetic.settings import LIGHTS, VIEWS, FaceSettings, LightSettings, ViewSettings
 from derender.data.synthetic.synthetic_set import SyntheticSet
-from derender.data.synthetic.write import write
+from derender.data.synthetic.write import write, write_tracks
 
-__all__ = ["FaceSettings", "SyntheticSet", "faces", "write"]
+__all__ = [
+    "CAR_LIGHTS",
+    "CAR_VIEWS",
+    "LIGHTS",
+    "VIEWS",
+    "CarSettings",
+    "CarViewSettings",
+    "FaceSettings",
+    "LightSettings",
+    "MorphableFaces",
+    "SyntheticSet",
+    "ViewSettings",
+    "cars",
+    "faces",
+    "write",
+    "write_tracks",
+]

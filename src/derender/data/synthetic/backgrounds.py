@@ -1,4 +1,7 @@
-"""What lies behind an object: a plain colour, a gradient between two, or smooth coloured noise."""
+"""What lies behind an object: a plain colour, a gradient between two, or smooth coloured noise.
+
+Colours are muted, as rooms and skies are; a strong colour is rare.
+"""
 
 import numpy as np
 from jaxtyping import Float32
@@ -9,7 +12,9 @@ _NOISE_CELLS = 5
 
 def draw_background(kind: str, generator: np.random.Generator, size: int) -> Float32[ndarray, "s s 3"]:
     """One background, values 0..1. Draws the same number of random values whatever the kind."""
-    ends = generator.random((2, 3), dtype=np.float32)
+    grey = generator.random((2, 1), dtype=np.float32)
+    strength = np.float32(0.15 + 0.45 * generator.random() ** 2)
+    ends = grey + strength * (generator.random((2, 3), dtype=np.float32) - grey)
     angle = np.float32(generator.uniform(0.0, 2.0 * np.pi))
     knots = generator.random((_NOISE_CELLS, _NOISE_CELLS, 3), dtype=np.float32)
     if kind == "plain":
@@ -18,7 +23,12 @@ def draw_background(kind: str, generator: np.random.Generator, size: int) -> Flo
     if kind == "gradient":
         at = 0.5 + 0.5 * (np.cos(angle) * across + np.sin(angle) * across[:, None]) / np.float32(np.sqrt(2.0))
         return ends[0] + (ends[1] - ends[0]) * at[..., None]
-    knots = np.float32(0.5) * (ends[0] + (ends[1] - ends[0]) * knots[..., :1] + knots)
+    knots = (
+        ends[0]
+        + (ends[1] - ends[0]) * knots[..., :1]
+        + np.float32(0.3) * strength * (knots - np.float32(0.5))
+    )
+    knots = np.clip(knots, 0.0, 1.0)
     return _stretch(_stretch(knots, size).transpose(1, 0, 2), size).transpose(1, 0, 2)
 
 

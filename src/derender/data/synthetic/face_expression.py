@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from numpy import ndarray
 
 from derender.data.synthetic.face_grid import MOUTH_BAND, MOUTH_Q, FaceGrid, face_grid, smoothstep
@@ -20,13 +20,14 @@ ACTIONS = (
     "brow_inner_up", "brow_outer_up", "brow_lower",
 )  # fmt: skip
 LID_ACTIONS = ("wide", "squint")
+_TOO_LITTLE = 0.002  # face pixels
 
 EXPRESSIONS: dict[str, dict[str, float]] = {
     "neutral": {},
-    "happy": {"smile": 1.0, "cheek_raise": 0.9, "lips_part": 0.75, "squint": 0.45, "stretch": 0.2},
-    "surprise": {"jaw_open": 0.75, "brow_inner_up": 0.9, "brow_outer_up": 1.0, "wide": 1.0},
-    "sad": {"brow_inner_up": 1.0, "frown": 1.0, "brow_lower": 0.25, "squint": 0.4},
-    "anger": {"brow_lower": 1.15, "press": 0.8, "squint": 0.45, "sneer": 0.3, "frown": 0.45},
+    "happiness": {"smile": 1.0, "cheek_raise": 0.9, "lips_part": 0.75, "squint": 0.45, "stretch": 0.2},
+    "sadness": {"brow_inner_up": 1.0, "frown": 0.85, "brow_lower": 0.25, "squint": 0.4},
+    "surprise": {"jaw_open": 1.0, "stretch": -0.6, "brow_inner_up": 0.9, "brow_outer_up": 1.0, "wide": 0.9},
+    "anger": {"brow_lower": 1.15, "press": 0.8, "squint": 0.3, "sneer": 0.3, "frown": 0.45},
     "disgust": {
         "sneer": 1.1,
         "brow_lower": 0.6,
@@ -48,9 +49,11 @@ EXPRESSIONS: dict[str, dict[str, float]] = {
 
 @dataclass(frozen=True)
 class ExpressionBasis:
-    """``fields`` (actions, 2 sides, rows, columns, 3): displacement by each action's left and right half."""
+    """``fields`` (actions, 2 sides, rows, columns, 3): displacement by each action's left and right half;
+    ``boxes`` (actions, 2, 4): the rows and columns (first, last exclusive) where it moves anything."""
 
     fields: Float[ndarray, "actions two rows columns 3"]
+    boxes: Int64[ndarray, "actions two 4"]
 
 
 @lru_cache(maxsize=4)
@@ -59,7 +62,14 @@ def expression_basis(detail: float = 1.0) -> ExpressionBasis:
     left = 1.0 - smoothstep(-4.0, 4.0, grid.p)
     fields = np.stack([action_fields(grid)[name] for name in ACTIONS])
     halves = np.stack([fields * left[..., None], fields * (1.0 - left)[..., None]], axis=1)
-    return ExpressionBasis(halves.astype(np.float32))
+    halves[np.abs(halves) < _TOO_LITTLE] = 0.0
+    boxes = np.array([[_box(np.abs(half).max(axis=-1) > 0) for half in pair] for pair in halves], np.int64)
+    return ExpressionBasis(halves.astype(np.float32), boxes)
+
+
+def _box(moved: ndarray) -> tuple[int, int, int, int]:
+    rows, columns = np.flatnonzero(moved.any(axis=1)), np.flatnonzero(moved.any(axis=0))
+    return int(rows[0]), int(rows[-1]) + 1, int(columns[0]), int(columns[-1]) + 1
 
 
 def action_fields(grid: FaceGrid) -> dict[str, Float[ndarray, "rows columns 3"]]:
@@ -109,7 +119,7 @@ def action_fields(grid: FaceGrid) -> dict[str, Float[ndarray, "rows columns 3"]]
             y=-1.7 * upper_side - 1.2 * bump((0.0, 10.5), (6.0, 2.5)) - 1.1 * bump((4.3, 0.6), (2.2, 2.4)),
             z=1.4 * fold
             - 0.5 * bump((4.3, 0.6), (1.6, 1.8))
-            + 0.5 * np.sin(2.0 * np.pi * (q + 11.0) / 3.0) * bump((0.0, -11.0), (2.6, 2.6)),
+            + 0.22 * np.sin(2.0 * np.pi * (q + 11.0) / 3.0) * bump((0.0, -11.0), (2.6, 2.6)),
         ),
         "press": field(
             y=0.7 * bump((0.0, 12.0), (7.5, 1.2)) - 0.8 * bump((0.0, 16.4), (6.5, 1.4)),

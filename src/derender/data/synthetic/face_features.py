@@ -8,6 +8,7 @@ from typing import no_type_check
 
 import numpy as np
 
+from derender.data.celebamask import MASK_CLASSES
 from derender.data.synthetic.face_grid import EYE_P, EYE_Q, MOUTH_BAND, MOUTH_Q
 from derender.render.numba_threads import kernel
 
@@ -18,17 +19,19 @@ _PUPIL = (0.02, 0.02, 0.02)
 _TOOTH = (0.87, 0.83, 0.76)
 _DARK = (0.15, 0.05, 0.05)
 _TONGUE = (0.60, 0.26, 0.25)
+_LEFT_EYE, _RIGHT_EYE, _MOUTH = (np.uint8(MASK_CLASSES.index(name)) for name in ("l_eye", "r_eye", "mouth"))
 _IRIS_RADIUS, _PUPIL_RADIUS = 2.4, 1.0
 
 
 @kernel
 @no_type_check
-def paint_features(albedo, p, q, gap, eyes, iris, lips, gaze):
+def paint_features(albedo, parts, p, q, gap, eyes, iris, lips, gaze):
     """Paint in place, one face per row.
 
-    albedo (N,R,C,3); p (C,) and q (R,) domain coordinates; gap (N,C) by how much the lips have parted, face
-    pixels; eyes (N,8): half length; upper and lower opening of the eye at p < 0, then of the eye at p > 0;
-    tilt, lashes, crease; iris, lips (N,3); gaze (N,2), face pixels.
+    albedo (N,R,C,3); parts (N,R,C) uint8, set where eyes and the mouth's inside show; p (C,) and q (R,)
+    domain coordinates; gap (N,C) by how much the lips have parted, face pixels; eyes (N,8): half length,
+    upper and lower opening of the eye at p < 0, then of the eye at p > 0, tilt, lashes, crease; iris, lips
+    (N,3); gaze (N,2), face pixels.
     """
     for n in range(albedo.shape[0]):
         for r in range(len(q)):
@@ -37,15 +40,18 @@ def paint_features(albedo, p, q, gap, eyes, iris, lips, gaze):
             if not (near_eye or in_mouth):
                 continue
             for c in range(len(p)):
-                if near_eye and abs(abs(p[c]) - EYE_P) < 8.0:
-                    _paint_eye(albedo[n, r, c], p[c], q[r] - EYE_Q, eyes[n], iris[n], gaze[n])
+                beside = near_eye and abs(abs(p[c]) - EYE_P) < 8.0
+                part = parts[n, r, c : c + 1]
+                if beside:
+                    _paint_eye(albedo[n, r, c], part, p[c], q[r] - EYE_Q, eyes[n], iris[n], gaze[n])
                 if in_mouth and abs(p[c]) < 9.3:
-                    _paint_mouth(albedo[n, r, c], p[c], (q[r] - MOUTH_Q) / MOUTH_BAND, gap[n, c], lips[n])
+                    across = (q[r] - MOUTH_Q) / MOUTH_BAND
+                    _paint_mouth(albedo[n, r, c], part, p[c], across, gap[n, c], lips[n])
 
 
 @kernel
 @no_type_check
-def _paint_eye(colour, p, y, eye, iris, gaze):
+def _paint_eye(colour, part, p, y, eye, iris, gaze):
     side = 1.0 if p > 0.0 else -1.0
     up, low = (eye[3], eye[4]) if side > 0 else (eye[1], eye[2])
     length, tilt, lashes, crease = eye[0], eye[5], eye[6], eye[7]
@@ -59,6 +65,7 @@ def _paint_eye(colour, p, y, eye, iris, gaze):
     lid = np.exp(-0.5 * ((below_upper + 0.9) / 0.9) ** 2) * np.exp(-((outward / (1.1 * length)) ** 4))
     for k in range(3):
         colour[k] *= (1.0 - 0.28 * crease * fold) * (1.0 - 0.10 * lid)
+    inside = 0.0
     if body > 0.0:
         inside = min(below_upper, above_lower) / 0.45 + 0.5
         if inside > 0.0:
@@ -70,6 +77,8 @@ def _paint_eye(colour, p, y, eye, iris, gaze):
     for k in range(3):
         colour[k] = _mixed(colour[k], _LASH[k], 0.95 * lashes * lash)
         colour[k] = _mixed(colour[k], _LASH[k], 0.28 * lashes * rim)
+    if inside > 0.5:
+        part[0] = _LEFT_EYE if p > 0.0 else _RIGHT_EYE
 
 
 @kernel
@@ -86,7 +95,7 @@ def _paint_eyeball(colour, inside, distance, below_upper, along, iris):
 
 @kernel
 @no_type_check
-def _paint_mouth(colour, p, across, gap, lips):
+def _paint_mouth(colour, part, p, across, gap, lips):
     """``across`` runs from -1 (upper lip's edge) to 1 (lower lip's edge)."""
     lens = np.sqrt(max(1.0 - (p / 9.3) ** 2, 0.0))
     below = 0.5 * (across + 1.0) * gap
@@ -102,6 +111,8 @@ def _paint_mouth(colour, p, across, gap, lips):
     for k in range(3):
         value = _mixed(_mixed(_DARK[k], _TONGUE[k], tongue), _TOOTH[k] * groove, teeth)
         colour[k] = _mixed(colour[k], _mixed(0.38 * lips[k], value, parted), cover)
+    if cover > 0.5 and parted > 0.5:
+        part[0] = _MOUTH
 
 
 @kernel

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int32
 from numpy import ndarray
 
 THETA_MAX = np.deg2rad(112.0)
-Q_TOP, Q_BOTTOM = -51.0, 66.0
+Q_TOP, Q_BOTTOM = -51.0, 58.0
 MOUTH_Q = 14.0
 MOUTH_BAND = 0.35  # half height of the closed mouth's line, which opens into the mouth's inside
 EYE_P, EYE_Q = 12.2, -14.0
@@ -46,9 +46,9 @@ class FaceGrid:
 @lru_cache(maxsize=4)
 def face_grid(detail: float = 1.0) -> FaceGrid:
     """The grid with ``detail`` times the rows and columns that suit a 64-pixel picture."""
-    half = _spaced(0.0, THETA_MAX, round(52 * detail) + 1, _column_density)
+    half = _spaced(0.0, THETA_MAX, round(48 * detail) + 1, _column_density)
     theta = np.concatenate([-half[:0:-1], half])
-    q = _spaced(Q_TOP, Q_BOTTOM, round(124 * detail), _row_density)
+    q = _spaced(Q_TOP, Q_BOTTOM, round(116 * detail), _row_density)
     turn = np.deg2rad(55.0)
     front = np.sin(np.minimum(half, turn))
     p_half = _HEAD_RADIUS * (front + np.cos(turn) * np.maximum(half - turn, 0.0))
@@ -84,3 +84,14 @@ def _spaced(low: float, high: float, count: int, density) -> ndarray:
     fine = np.linspace(low, high, 8001)
     mass = np.concatenate([[0.0], np.cumsum(0.5 * (density(fine)[1:] + density(fine)[:-1]))])
     return np.interp(np.linspace(0.0, mass[-1], count), mass, fine)
+
+
+@lru_cache(maxsize=4)
+def grid_triangles(rows: int, columns: int) -> Int32[ndarray, "f 3"]:
+    """Two triangles a cell of a grid whose vertices are numbered row by row."""
+    corner = np.arange(rows * columns, dtype=np.int32).reshape(rows, columns)
+    upper, right, lower, across = corner[:-1, :-1], corner[:-1, 1:], corner[1:, :-1], corner[1:, 1:]
+    pairs = np.stack(
+        [np.stack([upper, right, lower], axis=-1), np.stack([right, across, lower], axis=-1)], axis=2
+    )
+    return np.ascontiguousarray(pairs.reshape(-1, 3))

@@ -10,34 +10,48 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from derender.data.synthetic.face_hair import BEARDS, HAIR_STYLES
+
 _SKIN = np.array(
     [
-        (0.95, 0.80, 0.72),
-        (0.90, 0.71, 0.60),
-        (0.80, 0.60, 0.47),
-        (0.66, 0.46, 0.34),
-        (0.49, 0.33, 0.24),
-        (0.35, 0.23, 0.17),
+        (0.96, 0.80, 0.72),
+        (0.92, 0.72, 0.61),
+        (0.83, 0.62, 0.49),
+        (0.70, 0.50, 0.37),
+        (0.54, 0.37, 0.27),
+        (0.40, 0.27, 0.20),
     ]
 )
 _HAIR = {
-    "black": (0.07, 0.06, 0.06), "dark brown": (0.16, 0.11, 0.08), "brown": (0.30, 0.20, 0.13),
-    "auburn": (0.42, 0.21, 0.11), "blond": (0.68, 0.53, 0.33), "fair": (0.82, 0.71, 0.50),
+    "black": (0.09, 0.08, 0.08), "dark brown": (0.19, 0.13, 0.10), "brown": (0.33, 0.22, 0.14),
+    "auburn": (0.46, 0.24, 0.13), "blond": (0.76, 0.57, 0.32), "fair": (0.87, 0.73, 0.47),
 }  # fmt: skip
-_GREY = np.array((0.66, 0.65, 0.63))
+_GREY = np.array((0.70, 0.69, 0.67))
 _IRIS = {
-    "dark brown": (0.13, 0.07, 0.04), "brown": (0.27, 0.15, 0.07), "hazel": (0.38, 0.28, 0.13),
-    "green": (0.30, 0.38, 0.24), "blue": (0.30, 0.45, 0.62), "grey": (0.42, 0.47, 0.50),
+    "dark brown": (0.15, 0.08, 0.05), "brown": (0.29, 0.17, 0.09), "hazel": (0.38, 0.29, 0.15),
+    "green": (0.30, 0.38, 0.26), "blue": (0.29, 0.43, 0.58), "grey": (0.42, 0.47, 0.50),
 }  # fmt: skip
-HAIR_STYLES = ("bald", "buzz", "short", "fringe", "bob", "long")
+_CLOTH = np.array(
+    [(0.12, 0.13, 0.17), (0.85, 0.85, 0.83), (0.25, 0.30, 0.42), (0.45, 0.16, 0.16), (0.30, 0.36, 0.28)]
+)
 SKIN_FIELDS = 6  # how many noise fields of face_skin are mixed into the skin
 _HEAVY = {  # modes that go with the heavy (1) rather than the delicate (0) end of the build
-    "brow_ridge": 0.9, "jaw_width": 0.7, "jaw_corner": 0.5, "chin_width": 0.6, "nose_width": 0.4,
-    "neck_width": 0.9, "brow_height": -0.6, "face_length": 0.4, "upper_lip": -0.3, "lower_lip": -0.2,
-    "forehead_bulge": -0.4, "temple": 0.2,
+    "brow_ridge": 0.9, "jaw_width": 0.7, "jaw_corner": 0.6, "chin_width": 0.6, "nose_width": 0.3,
+    "neck_width": 1.0, "brow_height": -0.6, "face_length": 0.4, "upper_lip": -0.4, "lower_lip": -0.3,
+    "forehead_bulge": -0.4, "temple": 0.2, "cheekbones": -0.2,
 }  # fmt: skip
-_OLD = {"fold": 1.8, "under_eye": 1.6, "cheek_fullness": -0.5, "nose_length": 0.5, "philtrum": 0.4}
-_MODE_LIMIT = 2.2
+_OLD = {
+    "fold": 2.2, "under_eye": 1.8, "cheek_fullness": -0.6, "nose_length": 0.6, "philtrum": 0.5, "jowls": 2.4,
+    "upper_lip": -0.9, "lower_lip": -0.4, "brow_height": -0.5,
+}  # fmt: skip
+_LINES = ("forehead_lines", "crows_feet")  # they come with age alone
+_SPREAD = 0.75
+_LESS = {  # modes that would look odd at the common spread
+    "skull_width": 0.6, "jaw_width": 0.6, "jaw_corner": 0.5, "face_width": 0.7, "nose_turn": 0.7,
+    "cheek_fullness": 0.7, "chin_width": 0.7, "cheekbones": 0.8,
+}  # fmt: skip
+_MODE_LIMIT = 2.0
+YOUNG, OLD = 18.0, 80.0
 
 
 @dataclass(frozen=True)
@@ -47,17 +61,21 @@ class FaceIdentity:
     shape: dict[str, float]  # coefficient of every mode of face_shape
     scale: float  # size in the picture, 1 = the mean face of the domain
     build: float  # 0 delicate .. 1 heavy
-    age: float  # 0 young .. 1 old
+    age_years: float
     melanin: float  # 0 fair .. 1 dark
     skin: Float[ndarray, "3"]
     hair: Float[ndarray, "3"]
+    hair_colour: str
+    grey: float  # 0..1
     iris: Float[ndarray, "3"]
     lips: Float[ndarray, "3"]
+    cloth: Float[ndarray, "3"]
+    collar: float  # row at which clothes begin
     hair_style: str
     hair_line: float  # face pixels by which the hair line sits lower (+) or higher (-)
     hair_recession: float  # 0..1, at the temples
     hair_volume: float
-    hair_parting: float  # 0 a closed fringe .. 1 parted in the middle
+    hair_parting: float  # -1 .. 1
     hair_wave: Float[ndarray, "4"]  # phases and sizes of the hair line's irregularity
     ear_size: float
     brow_thickness: float
@@ -70,93 +88,108 @@ class FaceIdentity:
     lid_crease: float
     blush: float
     freckles: float
-    stubble: float
-    beard: float
+    beard: str
     skin_noise: Float[ndarray, "fields"]
 
-    def vector(self) -> dict[str, float]:
-        """All traits as named numbers (the style by its index), for tables."""
-        row: dict[str, float] = {f"shape_{name}": value for name, value in self.shape.items()}
+    @property
+    def age(self) -> float:
+        """0 at 18 years .. 1 at 80."""
+        return float(np.clip((self.age_years - YOUNG) / (OLD - YOUNG), 0.0, 1.2))
+
+    def vector(self) -> dict[str, float | str]:
+        """All traits as named numbers and words, for tables."""
+        row: dict[str, float | str] = {f"shape_{name}": value for name, value in self.shape.items()}
         for name, value in vars(self).items():
             if name in ("shape", "skin_noise", "hair_wave"):
                 continue
-            if name == "hair_style":
-                row[name] = float(HAIR_STYLES.index(value))
-            elif isinstance(value, ndarray):
+            if isinstance(value, ndarray):
                 row.update({f"{name}_{channel}": float(v) for channel, v in zip("rgb", value, strict=True)})
             else:
-                row[name] = float(value)
+                row[name] = value if isinstance(value, str) else float(value)
         return row
 
 
-def draw_identity(generator: np.random.Generator, modes: tuple[str, ...]) -> FaceIdentity:
-    """One person."""
+def draw_identity(
+    generator: np.random.Generator,
+    modes: tuple[str, ...],
+    age_years: tuple[float, float] = (YOUNG, OLD),
+    skin_tone: tuple[float, float] = (0.0, 1.0),
+) -> FaceIdentity:
+    """One person of an age and a skin tone within those ranges."""
     build = float(
-        np.clip(0.5 + 0.42 * np.sign(generator.uniform(-1, 1)) * generator.uniform(0, 1) ** 0.5, 0, 1)
+        np.clip(0.5 + 0.45 * np.sign(generator.uniform(-1, 1)) * generator.uniform(0, 1) ** 0.35, 0, 1)
     )
-    age = float(generator.uniform(0, 1) ** 1.3)
-    melanin = float(generator.uniform(0, 1))
+    years = float(age_years[0] + (age_years[1] - age_years[0]) * generator.uniform(0, 1) ** 1.25)
+    age = float(np.clip((years - YOUNG) / (OLD - YOUNG), 0.0, 1.2))
+    melanin = float(skin_tone[0] + (skin_tone[1] - skin_tone[0]) * generator.uniform(0, 1))
     normal = generator.standard_normal(len(modes))
     lean = 2.0 * build - 1.0
-    shape = {
-        name: float(
-            np.clip(
-                0.95 * z + _HEAVY.get(name, 0.0) * lean + _OLD.get(name, 0.0) * (age - 0.4),
-                -_MODE_LIMIT,
-                _MODE_LIMIT,
+    shape = {}
+    for name, z in zip(modes, normal, strict=True):
+        if name in _LINES:
+            value = max(0.0, 2.4 * (age - 0.35)) * (1.0 + 0.35 * np.clip(z, -2, 2))
+        elif name == "jowls":
+            value = max(0.0, _OLD[name] * (age - 0.45) + 0.3 * z)
+        else:
+            value = (
+                _SPREAD * _LESS.get(name, 1.0) * z
+                + _HEAVY.get(name, 0.0) * lean
+                + _OLD.get(name, 0.0) * (age - 0.35)
             )
-        )
-        for name, z in zip(modes, normal, strict=True)
-    }
+        shape[name] = float(np.clip(value, -_MODE_LIMIT, _MODE_LIMIT))
     skin = _between(_SKIN, melanin) * (
-        1.0 + generator.uniform(-0.045, 0.045, 3) + generator.uniform(-0.05, 0.05)
+        1.0 + generator.uniform(-0.035, 0.035, 3) + generator.uniform(-0.05, 0.05)
     )
-    hair = _hair_colour(generator, melanin, age)
-    iris_names = list(_IRIS)
-    dark = np.array(
+    colour_name, hair, grey = _hair_colour(generator, melanin, age)
+    fair = (1.0 - melanin) ** 2
+    weights = np.array(
         [
             0.25 + 2.5 * melanin,
             0.6 + melanin,
-            0.5,
-            0.4 * (1 - melanin) ** 2,
-            1.1 * (1 - melanin) ** 3,
-            0.3 * (1 - melanin) ** 3,
+            0.5 * (1 - melanin) + 0.05,
+            0.4 * fair,
+            1.0 * fair**1.5,
+            0.3 * fair**1.5,
         ]
     )
-    iris = np.array(_IRIS[iris_names[_pick(generator, dark)]]) * generator.uniform(0.85, 1.2)
-    made_up = generator.uniform() < 0.5 * (1.0 - build)
-    lips = skin * np.array((0.93, 0.68, 0.68)) if not made_up else _lipstick(generator, skin)
-    style = _hair_style(generator, build, age)
-    stubble = float(generator.uniform(0.1, 1.0)) if build > 0.55 and generator.uniform() < 0.75 else 0.0
-    beard = float(generator.uniform(0.5, 1.0)) if build > 0.55 and generator.uniform() < 0.28 else 0.0
+    iris = np.array(_IRIS[list(_IRIS)[_pick(generator, weights)]]) * generator.uniform(0.85, 1.2)
+    lips = skin * np.array((0.90, 0.66, 0.66)) + np.array((0.02, 0.0, 0.01))
+    strength = max(0.0, generator.uniform(-0.35, 0.75)) * max(0.0, 1.0 - 1.6 * build)
+    lips = (1.0 - strength) * lips + strength * _lipstick(generator, skin)
+    style = _hair_style(generator, build, age, melanin)
+    beard = _beard(generator, build)
+    cloth = _CLOTH[_pick(generator, np.ones(len(_CLOTH)))] * generator.uniform(0.8, 1.15, 3)
     return FaceIdentity(
         shape=shape,
-        scale=float(0.93 + 0.025 * np.clip(generator.standard_normal(), -2, 2)),
+        scale=float(0.865 + 0.02 * np.clip(generator.standard_normal(), -2, 2)),
         build=build,
-        age=age,
+        age_years=years,
         melanin=melanin,
         skin=np.clip(skin, 0.0, 1.0),
         hair=hair,
+        hair_colour=colour_name,
+        grey=grey,
         iris=iris,
         lips=np.clip(lips, 0.0, 1.0),
+        cloth=np.clip(cloth, 0.0, 1.0),
+        collar=float(generator.uniform(34.0, 44.0)),
         hair_style=style,
-        hair_line=float(generator.uniform(-3.0, 2.2)),
-        hair_recession=float(generator.uniform(0, 1) * (0.25 + 0.75 * age) * build),
-        hair_volume=float(generator.uniform(0.6, 1.4)),
-        hair_parting=float(generator.uniform(-0.2, 1)),
+        hair_line=float(generator.uniform(-2.5, 1.8)),
+        hair_recession=float(generator.uniform(0, 1) * (0.2 + 0.8 * age) * build),
+        hair_volume=float(generator.uniform(0.75, 1.2)),
+        hair_parting=float(generator.uniform(-1, 1)),
         hair_wave=generator.uniform(0, 1, 4),
-        ear_size=float(np.clip(0.9 + 0.2 * generator.standard_normal() + 0.25 * (age - 0.4), 0.4, 1.4)),
-        brow_thickness=float(generator.uniform(0.65, 1.1) + 0.35 * build),
+        ear_size=float(np.clip(0.9 + 0.15 * generator.standard_normal() + 0.25 * (age - 0.4), 0.5, 1.3)),
+        brow_thickness=float(generator.uniform(0.65, 1.05) + 0.35 * build),
         brow_arch=float(generator.uniform(0.2, 1.2) * (1.2 - 0.6 * build)),
-        brow_strength=float(generator.uniform(0.55, 0.95)),
-        eye_length=float(5.0 + 0.3 * np.clip(generator.standard_normal(), -2, 2)),
-        eye_opening=float(generator.uniform(0.82, 1.2) - 0.1 * age),
-        eye_tilt=float(generator.uniform(-0.05, 0.13)),
+        brow_strength=float(generator.uniform(0.6, 0.95) * (1.0 - 0.25 * age)),
+        eye_length=float(5.2 + 0.25 * np.clip(generator.standard_normal(), -2, 2)),
+        eye_opening=float(generator.uniform(0.92, 1.25) - 0.15 * age),
+        eye_tilt=float(generator.uniform(-0.04, 0.12) - 0.05 * age),
         lashes=float(generator.uniform(0.5, 0.8) + 0.3 * (1 - build)),
-        lid_crease=float(generator.uniform(0.2, 1.0)),
+        lid_crease=float(generator.uniform(0.3, 1.0)),
         blush=float(generator.uniform(0.2, 1.0)),
-        freckles=float(max(0.0, generator.uniform(-1.2, 1.0)) * (1.0 - melanin)),
-        stubble=stubble,
+        freckles=float(max(0.0, generator.uniform(-1.6, 1.0)) * (1.0 - melanin)),
         beard=beard,
         skin_noise=generator.standard_normal(SKIN_FIELDS),
     )
@@ -173,27 +206,48 @@ def _pick(generator: np.random.Generator, weights: ndarray) -> int:
     return int(min(np.searchsorted(edges, generator.uniform()), len(weights) - 1))
 
 
-def _hair_colour(generator: np.random.Generator, melanin: float, age: float) -> Float[ndarray, "3"]:
+def _hair_colour(
+    generator: np.random.Generator, melanin: float, age: float
+) -> tuple[str, Float[ndarray, "3"], float]:
+    """Name, colour as seen, and share of grey."""
     fair = (1.0 - melanin) ** 2
     weights = np.array(
-        [0.25 + 2.0 * melanin, 0.7 + melanin, 0.2 + 0.8 * fair, 0.7 * fair, 1.1 * fair, 0.5 * fair]
+        [0.25 + 2.0 * melanin, 0.7 + melanin, 0.2 + 0.8 * fair, 0.5 * fair, 1.0 * fair, 0.4 * fair]
     )
-    colour = np.array(_HAIR[list(_HAIR)[_pick(generator, weights)]]) * generator.uniform(0.85, 1.2)
-    grey = np.clip(generator.uniform(-0.4, 0.4) + 1.6 * (age - 0.55), 0.0, 0.9)
-    return np.clip((1.0 - grey) * colour + grey * _GREY, 0.0, 1.0)
+    name = list(_HAIR)[_pick(generator, weights)]
+    colour = np.array(_HAIR[name]) * generator.uniform(0.85, 1.2)
+    grey = float(np.clip(generator.uniform(-0.45, 0.35) + 1.9 * (age - 0.52), 0.0, 0.95))
+    seen = np.clip((1.0 - grey) * colour + grey * _GREY, 0.0, 1.0)
+    return ("grey" if grey > 0.5 else name), seen, grey
 
 
-def _hair_style(generator: np.random.Generator, build: float, age: float) -> str:
-    heavy = np.array([0.12 + 0.35 * age, 0.35, 1.0, 0.25, 0.05, 0.07])
-    delicate = np.array([0.02, 0.05, 0.3, 0.22, 0.7, 1.0])
-    return HAIR_STYLES[_pick(generator, build * heavy + (1.0 - build) * delicate)]
+def _hair_style(generator: np.random.Generator, build: float, age: float, melanin: float) -> str:
+    afro = max(0.0, melanin - 0.6)
+    heavy = {
+        "bald": 0.1 + 0.5 * age, "receding": max(0.0, 1.8 * (age - 0.35)), "buzz": 0.35, "short": 1.0,
+        "quiff": max(0.0, 0.8 * (1.0 - age)), "side part": 0.7, "fringe": 0.12, "curly": 0.35,
+        "afro": 0.5 * afro, "long": 0.06, "long wavy": 0.06,
+    }  # fmt: skip
+    delicate = {
+        "bald": 0.015, "buzz": 0.03, "short": 0.15 + 0.5 * age, "side part": 0.15 + 0.3 * age, "fringe": 0.1,
+        "curly": 0.3 + 0.4 * age, "afro": 0.9 * afro, "tied": 0.6, "bob": 0.6, "bob with fringe": 0.35,
+        "long": 0.9 - 0.6 * age, "long with fringe": 0.4 - 0.3 * age, "long wavy": 0.7 - 0.4 * age,
+    }  # fmt: skip
+    names = list(HAIR_STYLES)
+    weights = [
+        build**2 * heavy.get(name, 0.0) + (1.0 - build) ** 2 * delicate.get(name, 0.0) for name in names
+    ]
+    return names[_pick(generator, np.array(weights))]
+
+
+def _beard(generator: np.random.Generator, build: float) -> str:
+    """Drawn from the same number of random values whatever the build."""
+    kind = BEARDS[_pick(generator, np.array([0.42, 0.28, 0.04, 0.07, 0.11, 0.08]))]
+    return kind if build > 0.55 else "none"
 
 
 def _lipstick(generator: np.random.Generator, skin: ndarray) -> ndarray:
     tone = _between(
-        np.array([(0.72, 0.20, 0.22), (0.62, 0.16, 0.30), (0.78, 0.40, 0.38)]), float(generator.uniform())
+        np.array([(0.70, 0.20, 0.22), (0.60, 0.18, 0.30), (0.78, 0.40, 0.38)]), float(generator.uniform())
     )
-    strength = generator.uniform(0.35, 0.85)
-    return (1.0 - strength) * skin * np.array((0.93, 0.68, 0.68)) + strength * tone * (
-        0.55 + 0.45 * skin.mean()
-    )
+    return tone * (0.55 + 0.45 * skin.mean())

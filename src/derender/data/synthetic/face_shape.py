@@ -1,8 +1,9 @@
-"""The mean head and the shape modes that make identities: displacement fields over the face's domain.
+"""The mean head, and the linear family of heads around it: mean + sum of coefficient * mode.
 
-A head is ``mean + sum of coefficient * mode``, in face pixels (see face_grid), axes as the camera's: x
-right, y down, z away from the viewer, origin at the object's centre. Every mode is left-right symmetric.
-Proportions follow published facial averages by eye; no scan went into them.
+In face pixels (see face_grid), axes as the camera's: x right, y down, z away from the viewer, origin at the
+object's centre. The mean is symmetric and smooth: elliptic sections plus hills, whose heights, places and
+widths were fitted by least squares to the average neutral surface of renders of a published morphable model
+(ICT-FaceKit, MIT licence; 0.2 face pixels rms). Leaves out the back of the head. Modes are in face_modes.
 """
 
 from dataclasses import dataclass
@@ -13,20 +14,28 @@ from jaxtyping import Float
 from numpy import ndarray
 from scipy.interpolate import PchipInterpolator
 
-from derender.data.synthetic.face_grid import (
-    EYE_P,
-    EYE_Q,
-    MOUTH_BAND,
-    MOUTH_Q,
-    FaceGrid,
-    face_grid,
-    smoothstep,
-)
+from derender.data.synthetic.face_grid import MOUTH_BAND, MOUTH_Q, FaceGrid, face_grid, smoothstep
+from derender.data.synthetic.face_modes import identity_modes
 
 _Q = (-51.0, -49.0, -46.0, -40.0, -31.0, -22.0, -14.0, -4.0, 6.0, 14.0, 22.0, 29.5, 34.0)
-_HALF_WIDTH = (2.0, 8.5, 14.5, 21.5, 26.4, 28.2, 28.2, 27.6, 26.4, 25.2, 23.8, 21.2, 19.0)
-_FRONT = (26.0, 18.0, 9.5, -1.0, -8.2, -10.0, -8.6, -8.0, -9.0, -10.0, -9.6, -9.4, -6.5)
+_HALF_WIDTH = (2.0, 11.0, 17.5, 24.0, 28.0, 28.6, 28.9, 28.0, 26.7, 26.1, 24.8, 21.4, 18.5)
+_FRONT = (25.0, 14.5, 7.0, -1.2, -7.6, -9.5, -7.6, -7.1, -9.7, -9.2, -9.2, -5.4, -5.2)
 _EAR_PLANE = 30.0  # z of the widest section
+# brow, sockets, cheeks, nose, mouth, chin as hills: height (z), place (p, q), widths
+_RELIEF = (
+    (-2.78, 13.38, -19.78, 9.95, 3.45), (1.76, 0.04, -21.71, 3.54, 5.57), (4.28, 10.18, -17.07, 4.23, 3.77),
+    (1.71, 4.5, -13.4, 2.21, 3.55), (-2.79, 11.76, -14.16, 2.33, 2.8), (1.28, 13.01, -12.15, 6.56, 3.17),
+    (-5.37, 21.62, -4.02, 4.05, 5.68), (-2.57, 17.77, 6.42, 7.56, 5.17), (-1.58, 0, 12.21, 7.83, 4.73),
+    (0.5, 0, 6.37, 1.37, 1.61), (-0.75, 1.32, 8.95, 2.76, 2.97), (2.12, 2.82, 20.98, 8.13, 2.22),
+    (-1.25, 0, 25.98, 5.45, 3.24), (-3.11, 23.74, 17.03, 5.79, 11.77), (0.85, 24.71, -18.78, 3.23, 4.86),
+    (-1.91, 1.25, -13.3, 1.58, 2.75), (-3.82, 0.47, -9.43, 2.83, 2.76), (-4.63, 1.14, -4.6, 2.92, 2.85),
+    (-4.29, 1.19, -1.6, 4.03, 2.44), (-1.39, -0.72, -2.8, 4.12, 4.51), (-3.39, -0.35, 1.35, 1.78, 1.51),
+    (-3.84, 4.76, 0.44, 1.57, 1.88), (1.85, 3.83, 2.02, 1.02, 1.09), (2.73, 6.37, -0.32, 2.56, 5.27),
+    (1.25, 3.1, 12.6, 3.4, 0.7), (0.82, 0, 11.9, 3.46, 0.98), (-0.79, 0.96, 14.35, 4.84, 2.08),
+    (1.69, 9.69, 15.59, 2.54, 2.58), (1.08, 5.9, -27.81, 9.31, 6.2), (-2.11, 21.12, -14.58, 5.16, 8.15),
+    (2.83, 12.4, 6.61, 4.63, 4.2), (2.41, 17.14, 28.14, 4.53, 7.73), (1.62, 19.53, -8.05, 2.32, 5.77),
+    (-0.59, 6.64, 8.68, 2.57, 2.62), (1.57, 4.78, -14.85, 5.28, 5.54), (1.39, 19.44, 12.45, 2.7, 9.33),
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -80,61 +89,29 @@ def bare_head(grid: FaceGrid) -> Float[ndarray, "rows columns 3"]:
 
 
 def mean_head(grid: FaceGrid) -> Float[ndarray, "rows columns 3"]:
-    """The bare head with brow ridge, sockets, nose, lips and chin, without ears."""
+    """The bare head with its relief and lips, without ears."""
     head = bare_head(grid)
-    bump = grid.bump
-    head[..., 2] += (
-        -1.5 * bump((9.5, -19.2), (6.5, 2.4))
-        - 0.6 * bump((0.0, -18.0), (4.0, 3.0))
-        + 3.0 * bump((11.0, -14.6), (5.6, 3.3))
-        + 1.0 * bump((5.6, -13.0), (1.8, 3.0))
-        - 2.1 * bump((EYE_P, EYE_Q + 0.2), (3.6, 2.5))
-        + 0.5 * bump((11.5, -9.6), (4.5, 1.5))
-        - 2.6 * bump((17.5, -4.0), (4.6, 4.6))
-        - 2.2 * bump((15.5, 6.0), (6.0, 7.0))
-        - 2.0 * bump((0.0, 12.5), (8.5, 6.0))
-        + 0.45 * bump((0.0, 7.5), (1.0, 2.6))
-        - 0.3 * bump((1.7, 7.5), (0.8, 2.8))
-        + 1.5 * bump((0.0, 20.0), (5.0, 1.9))
-        - 2.3 * bump((0.0, 25.5), (5.2, 3.2))
-        - 1.2 * bump((18.5, 17.0), (5.0, 6.0))
-        + 1.3 * bump((25.0, -20.0), (4.0, 7.0))
-        + nose(grid)
-        + lips(grid)
-    )
+    for height, p, q, wide, high in _RELIEF:
+        head[..., 2] += height * grid.bump((p, q), (wide, high))
+    head[..., 2] += lips(grid)
+    lifted = head[..., 1] - head[:, grid.shape[1] // 2, None, 1]  # by the jaw line's rise: a mouth is level
+    head[..., 1] -= 0.85 * lifted * np.exp(-(((grid.q - 14.5) / 5.0) ** 2)) * np.exp(-((grid.p / 13.0) ** 4))
     return head
 
 
-def nose(grid: FaceGrid, bridge: float = 1.0) -> ndarray:
-    """Depth offset of the nose: a ridge that widens to the tip, a ball, two wings, two nostrils."""
-    q = grid.q
-    along = np.clip((q + 16.0) / 14.0, 0.0, 1.2)
-    height = (
-        (2.2 + 6.2 * along**1.35) * smoothstep(-20.5, -11.5, q) * (1.0 - smoothstep(-2.2, 3.6, q)) * bridge
-    )
-    width = 1.7 + 1.1 * along**1.5
-    ridge = height * np.exp(-0.5 * (grid.p / width) ** 2)
-    foot = 1.7 * grid.bump((0.0, -3.0), (5.0, 5.0))
-    ball = 2.4 * grid.bump((0.0, -1.1), (2.2, 1.9))
-    wings = 3.3 * grid.bump((4.3, 0.4), (1.5, 1.5))
-    nostrils = 0.8 * grid.bump((2.3, 2.3), (0.9, 0.7))
-    crease = 0.6 * grid.bump((6.6, 0.6), (1.0, 2.0))
-    return -ridge - foot - ball - wings + nostrils + crease
-
-
 def lips(grid: FaceGrid) -> ndarray:
-    """Depth offset of the lips and of the line between them."""
+    """What the averages blur away: the lips' fullness, the line between them and their corners, nostrils."""
     p, q = np.abs(grid.p), grid.q
-    across = np.exp(-((p / 7.8) ** 4))
-    upper = 1.5 * across * np.exp(-0.5 * ((q - 12.3) / 1.15) ** 2)
-    lower = 2.0 * np.exp(-((p / 6.6) ** 4)) * np.exp(-0.5 * ((q - 16.2) / 1.45) ** 2)
+    upper = 0.7 * np.exp(-((p / 6.8) ** 4)) * np.exp(-0.5 * ((q - 12.4) / 1.0) ** 2)
+    lower = 0.9 * np.exp(-((p / 6.2) ** 4)) * np.exp(-0.5 * ((q - 16.0) / 1.3) ** 2)
     line = (
-        1.5
+        1.1
         * np.clip(1.0 - (p / 10.0) ** 4, 0.0, 1.0)
         * np.exp(-0.5 * ((q - MOUTH_Q) / (1.6 * MOUTH_BAND)) ** 2)
     )
-    corner = 0.9 * grid.bump((9.8, MOUTH_Q), (1.3, 1.6))
-    return -upper - lower + line + corner
+    corner = 0.5 * grid.bump((9.6, MOUTH_Q), (1.2, 1.5))
+    nostrils = 0.6 * grid.bump((2.4, 3.1), (1.0, 0.6))
+    return -upper - lower + line + corner + nostrils
 
 
 def ear(grid: FaceGrid) -> Float[ndarray, "rows columns 3"]:
@@ -151,81 +128,3 @@ def ear(grid: FaceGrid) -> Float[ndarray, "rows columns 3"]:
     out[..., 0] = side * height * rise * 4.0 - side * bowl * 1.0
     out[..., 2] = -1.5 * height * rise
     return out
-
-
-def identity_modes(grid: FaceGrid) -> dict[str, Float[ndarray, "rows columns 3"]]:
-    """One symmetric displacement per name; a coefficient of 1 is one standard deviation among people."""
-    p, q, bump = np.abs(grid.p), grid.q, grid.bump
-    side = np.sin(grid.theta)
-    zero = np.zeros(grid.shape)
-    upper, lower = 1.0 - smoothstep(-18.0, 2.0, q), smoothstep(2.0, 22.0, q)
-    face_only = 1.0 - smoothstep(31.0, 42.0, q)
-
-    def field(x: ndarray = zero, y: ndarray = zero, z: ndarray = zero) -> ndarray:
-        return np.stack([x, y, z], axis=-1)
-
-    eye = bump((EYE_P, EYE_Q - 1.0), (6.5, 5.5))
-    nose_area = bump((0.0, -3.0), (5.5, 6.5))
-    mouth = bump((0.0, MOUTH_Q), (11.0, 5.0))
-    sign = np.tanh(grid.p / 3.0)
-    return {
-        "skull_width": field(x=1.5 * side * upper),
-        "face_width": field(x=1.2 * side * bump((20.0, -2.0), (30.0, 11.0))),
-        "jaw_width": field(x=1.2 * side * lower * face_only),
-        "jaw_corner": field(
-            x=0.7 * side * bump((26.0, 20.0), (7.0, 7.0)), y=1.0 * bump((24.0, 22.0), (8.0, 7.0))
-        ),
-        "face_length": field(y=1.3 * smoothstep(0.0, 28.0, q) * (1.0 - smoothstep(40.0, 56.0, q))),
-        "forehead_height": field(y=-1.6 * (1.0 - smoothstep(-36.0, -20.0, q))),
-        "forehead_slope": field(
-            z=1.6 * (1.0 - smoothstep(-36.0, -20.0, q)) * bump((0.0, -36.0), (20.0, 30.0))
-        ),
-        "forehead_bulge": field(z=-0.8 * bump((7.0, -28.0), (8.0, 5.0))),
-        "brow_ridge": field(z=-0.9 * bump((9.0, -18.8), (6.5, 2.3)) - 0.5 * bump((0.0, -18.0), (4.0, 2.5))),
-        "brow_height": field(y=-0.75 * bump((11.0, -20.0), (8.0, 2.6))),
-        "eye_distance": field(x=0.7 * sign * eye),
-        "eye_depth": field(z=0.8 * bump((11.5, -14.5), (5.5, 3.4))),
-        "eye_height": field(y=-0.5 * eye),
-        "cheekbones": field(
-            z=-1.1 * bump((17.0, -4.0), (4.4, 3.6)), x=0.8 * side * bump((21.0, -4.0), (5.0, 4.0))
-        ),
-        "cheek_fullness": field(
-            z=-1.5 * bump((14.5, 8.0), (5.0, 6.0)), x=0.9 * side * bump((22.0, 9.0), (7.0, 7.0))
-        ),
-        "nose_length": field(y=0.9 * bump((0.0, 0.0), (6.0, 4.5)), z=-0.3 * nose_area),
-        "nose_width": field(
-            x=0.75 * sign * bump((4.5, 0.2), (3.0, 3.2)), z=-0.25 * bump((4.8, 0.6), (1.5, 1.7))
-        ),
-        "nose_bridge": field(
-            z=-1.0 * np.exp(-0.5 * (grid.p / 2.2) ** 2) * np.exp(-0.5 * ((q + 10.0) / 4.5) ** 2)
-        ),
-        "nose_hump": field(z=-0.6 * bump((0.0, -8.0), (1.7, 2.4))),
-        "nose_tip": field(z=-1.3 * bump((0.0, -1.2), (2.6, 2.8)), y=0.15 * bump((0.0, -1.2), (2.6, 2.8))),
-        "nose_turn": field(y=-0.9 * bump((0.0, -0.2), (3.0, 2.6)), z=-0.2 * bump((0.0, 1.0), (2.5, 2.0))),
-        "nose_bulb": field(
-            z=-0.5 * bump((1.6, -1.3), (1.1, 1.5)), x=0.35 * sign * bump((1.8, -1.3), (1.5, 1.7))
-        ),
-        "philtrum": field(y=0.8 * smoothstep(4.0, 11.0, q) * bump((0.0, 13.0), (11.0, 7.0))),
-        "mouth_width": field(x=0.9 * np.tanh(grid.p / 5.0) * bump((8.0, MOUTH_Q), (5.0, 4.0))),
-        "mouth_forward": field(z=-0.9 * mouth),
-        "upper_lip": field(y=-0.45 * bump((0.0, 11.6), (6.5, 1.3)), z=-0.35 * bump((0.0, 12.4), (6.0, 1.1))),
-        "lower_lip": field(y=0.55 * bump((0.0, 17.4), (5.5, 1.6)), z=-0.45 * bump((0.0, 16.3), (5.0, 1.3))),
-        "chin_forward": field(z=-1.4 * bump((0.0, 25.5), (7.0, 5.0))),
-        "chin_length": field(y=1.1 * bump((0.0, 28.0), (9.0, 5.0))),
-        "chin_width": field(
-            x=0.9 * sign * bump((6.0, 26.0), (6.0, 5.0)), z=-0.6 * bump((6.0, 26.0), (3.0, 3.0))
-        ),
-        "chin_cleft": field(z=0.4 * bump((0.0, 25.5), (0.9, 2.2))),
-        "neck_width": field(x=1.3 * side * smoothstep(31.0, 40.0, q)),
-        "temple": field(z=0.7 * bump((22.0, -20.0), (5.0, 6.0))),
-        "under_eye": field(z=0.28 * bump((10.5, -9.3), (3.8, 1.0)) - 0.22 * bump((11.0, -11.2), (3.8, 0.8))),
-        "fold": field(z=_fold(p, q)),
-    }
-
-
-def _fold(p: ndarray, q: ndarray) -> ndarray:
-    """The crease from the nose's wing to the mouth's corner."""
-    along = np.clip((q - 0.5) / 11.5, 0.0, 1.0)
-    centre = 6.3 + 4.6 * along**0.8
-    depth = np.exp(-0.5 * ((p - centre) / 1.1) ** 2) - 0.6 * np.exp(-0.5 * ((p - centre - 2.4) / 1.8) ** 2)
-    return 0.3 * depth * np.exp(-(((q - 6.5) / 6.5) ** 4))

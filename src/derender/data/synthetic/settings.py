@@ -1,61 +1,137 @@
-"""Which views, lights and expressions generated faces show; defaults follow the rendered development set.
+"""Which views, lights and expressions generated pictures show; defaults follow the rendered development set.
 
 Angles are degrees because people write settings; radians everywhere else. A setting changes only what it
 names: the random numbers behind each picture do not depend on it, so the same seed shows the same people in
-another light.
+another light. ``LIGHTS`` and ``VIEWS`` name whole sets of them: "wide" is outside what "usual" ever shows.
 """
+
+from collections.abc import Mapping
 
 from pydantic import Field, field_validator, model_validator
 
 from derender.data.synthetic.face_expression import EXPRESSIONS
 from derender.settings import Settings
 
+Range = tuple[float, float]
+BACKGROUNDS = ("plain", "gradient", "noise")
 
-class FaceSettings(Settings):
-    """Distributions: ``*_sd_deg`` of a normal clipped at ``*_limit_deg``; pairs are the ends of a uniform."""
 
-    pictures_per_identity: int = Field(default=8, ge=1)
-    yaw_mean_deg: float = Field(default=0.0, ge=-90, le=90)
-    yaw_sd_deg: float = Field(default=18.0, ge=0, le=90)
-    yaw_limit_deg: float = Field(default=45.0, ge=0, le=90)
-    pitch_mean_deg: float = Field(default=0.0, ge=-60, le=60)
-    pitch_sd_deg: float = Field(default=8.0, ge=0, le=60)
-    pitch_limit_deg: float = Field(default=20.0, ge=0, le=60)
-    roll_sd_deg: float = Field(default=4.0, ge=0, le=90)
-    roll_limit_deg: float = Field(default=12.0, ge=0, le=90)
-    translation_sd: float = Field(default=0.0035, ge=0, le=0.1)  # scene units; one pixel of 64 is 0.0028
-    translation_limit: float = Field(default=0.008, ge=0, le=0.1)
-    light_pitch_deg: tuple[float, float] = (-45.0, 45.0)
-    light_yaw_deg: tuple[float, float] = (-45.0, 45.0)
-    ambient: tuple[float, float] = (0.25, 0.7)
-    diffuse: tuple[float, float] = (0.2, 0.8)
-    expressions: tuple[str, ...] = tuple(EXPRESSIONS)  # drawn with equal chance
-    strength: tuple[float, float] = (0.4, 1.05)
-    asymmetry: float = Field(default=0.12, ge=0, le=1)  # sd by which the two halves of an expression differ
-    gaze_px: float = Field(default=0.6, ge=0, le=3)  # sd of the irises' shift
-    backgrounds: tuple[str, ...] = ("plain", "gradient", "noise")
-
-    @field_validator("light_pitch_deg", "light_yaw_deg", "ambient", "diffuse", "strength")
-    @classmethod
-    def _ordered(cls, value: tuple[float, float]) -> tuple[float, float]:
-        if value[0] > value[1]:
-            raise ValueError(f"expected (low, high) with low <= high, got {value}")
-        return value
-
-    @model_validator(mode="after")
-    def _possible(self) -> "FaceSettings":
-        for name in ("light_pitch_deg", "light_yaw_deg"):
-            if max(map(abs, getattr(self, name))) >= 90:
-                raise ValueError(f"{name} must lie within (-90, 90), got {getattr(self, name)}")
-        for name, top in (("ambient", 1.0), ("diffuse", 1.0), ("strength", 1.5)):
-            low, high = getattr(self, name)
-            if low < 0 or high > top:
-                raise ValueError(f"{name} must lie within 0..{top}, got ({low}, {high})")
-        _known("expressions", self.expressions, tuple(EXPRESSIONS))
-        _known("backgrounds", self.backgrounds, ("plain", "gradient", "noise"))
-        return self
+def _within(name: str, value: Range, low: float, high: float) -> None:
+    if not low <= value[0] <= value[1] <= high:
+        raise ValueError(f"{name} must be two numbers, low <= high, within {low}..{high}; got {value}")
 
 
 def _known(name: str, values: tuple[str, ...], known: tuple[str, ...]) -> None:
     if not values or not set(values) <= set(known):
         raise ValueError(f"{name} must be one or more of {', '.join(known)}; got {values}")
+
+
+class LightSettings(Settings):
+    """Uniform ranges. With ``beyond_deg`` either yaw or pitch (60 : 40) is at least so far off the front, on
+    either side, and the other at most 20 degrees."""
+
+    yaw_deg: Range = (-45.0, 45.0)
+    pitch_deg: Range = (-45.0, 45.0)
+    beyond_deg: float = Field(default=0.0, ge=0, lt=85)
+    ambient: Range = (0.25, 0.7)
+    diffuse: Range = (0.2, 0.8)
+
+    @model_validator(mode="after")
+    def _possible(self) -> "LightSettings":
+        for name, low, high in (
+            ("yaw_deg", -85, 85),
+            ("pitch_deg", -85, 85),
+            ("ambient", 0, 1),
+            ("diffuse", 0, 1),
+        ):
+            _within(f"light.{name}", getattr(self, name), low, high)
+        return self
+
+
+class ViewSettings(Settings):
+    """Ranges of the camera's angles. A spread (``*_sd_deg``) draws a normal about the middle of the range,
+    clipped at its ends; without one (null) the range is uniform. With ``yaw_beyond_deg`` yaw is uniform on
+    either side, from there to the range's ends."""
+
+    yaw_deg: Range = (-45.0, 45.0)
+    yaw_sd_deg: float | None = Field(default=18.0, ge=0, le=90)
+    yaw_beyond_deg: float = Field(default=0.0, ge=0, lt=90)
+    pitch_deg: Range = (-20.0, 20.0)
+    pitch_sd_deg: float | None = Field(default=8.0, ge=0, le=90)
+    roll_deg: Range = (-12.0, 12.0)
+    roll_sd_deg: float | None = Field(default=4.0, ge=0, le=90)
+    shift: Range = (-0.008, 0.008)  # scene units, right and down; one pixel of 64 is 0.0028
+    shift_sd: float | None = Field(default=0.0035, ge=0, le=0.1)
+
+    @model_validator(mode="after")
+    def _possible(self) -> "ViewSettings":
+        for name, limit in (("yaw_deg", 90.0), ("pitch_deg", 60.0), ("roll_deg", 180.0), ("shift", 0.1)):
+            _within(f"view.{name}", getattr(self, name), -limit, limit)
+        if (
+            self.yaw_beyond_deg > 0
+            and not self.yaw_deg[0] <= -self.yaw_beyond_deg <= self.yaw_beyond_deg <= self.yaw_deg[1]
+        ):
+            raise ValueError(
+                f"view.yaw_beyond_deg must lie within view.yaw_deg {self.yaw_deg} on both sides, "
+                f"got {self.yaw_beyond_deg}"
+            )
+        return self
+
+
+LIGHTS: Mapping[str, LightSettings] = {
+    "usual": LightSettings(),
+    "wide": LightSettings(
+        yaw_deg=(-70, 70), pitch_deg=(-60, 60), beyond_deg=35, ambient=(0.05, 0.3), diffuse=(0.6, 1.0)
+    ),
+    "frontal": LightSettings(yaw_deg=(0, 0), pitch_deg=(0, 0), ambient=(0.45, 0.45), diffuse=(0.5, 0.5)),
+}
+VIEWS: Mapping[str, ViewSettings] = {
+    "usual": ViewSettings(),
+    "wide": ViewSettings(yaw_deg=(-60, 60), yaw_beyond_deg=20),
+    "frontal": ViewSettings(yaw_sd_deg=0, pitch_sd_deg=0, roll_sd_deg=0, shift_sd=0),
+}
+
+
+class FaceSettings(Settings):
+    """Everything that may be asked of generated faces.
+
+    With ``tracks`` (per identity) pictures come as sequences of ``frames``: light and background stay, head
+    and expression move smoothly; otherwise an identity has ``pictures_per_identity`` pictures.
+    """
+
+    light: LightSettings = LightSettings()
+    view: ViewSettings = ViewSettings()
+    pictures_per_identity: int = Field(default=8, ge=1)
+    first_identity: int = Field(default=0, ge=0)  # other people from the same seed
+    tracks: int = Field(default=0, ge=0)
+    frames: int = Field(default=6, ge=1)
+    expressions: Mapping[str, float] = Field(default=dict.fromkeys(EXPRESSIONS, 1.0))  # name: share
+    strength: Range = (0.4, 1.05)
+    asymmetry: float = Field(default=0.12, ge=0, le=1)  # sd by which the two halves of an expression differ
+    gaze_px: float = Field(default=0.6, ge=0, le=3)  # sd of the irises' shift
+    age_years: Range = (18.0, 80.0)
+    skin_tone: Range = (0.0, 1.0)  # 0 fair .. 1 dark
+    backgrounds: tuple[str, ...] = BACKGROUNDS
+
+    @field_validator("expressions", mode="before")
+    @classmethod
+    def _shares(cls, value: object) -> object:
+        """A list of names means equal shares."""
+        return dict.fromkeys(value, 1.0) if isinstance(value, (list, tuple)) else value
+
+    @model_validator(mode="after")
+    def _possible(self) -> "FaceSettings":
+        for name, low, high in (("strength", 0.0, 1.5), ("age_years", 16.0, 100.0), ("skin_tone", 0.0, 1.0)):
+            _within(name, getattr(self, name), low, high)
+        _known("expressions", tuple(self.expressions), tuple(EXPRESSIONS))
+        if min(self.expressions.values()) < 0 or sum(self.expressions.values()) <= 0:
+            raise ValueError(
+                f"expressions: shares must be 0 or more and not all 0, got {dict(self.expressions)}"
+            )
+        _known("backgrounds", self.backgrounds, BACKGROUNDS)
+        return self
+
+    @property
+    def per_identity(self) -> int:
+        """How many consecutive pictures show one person."""
+        return self.tracks * self.frames or self.pictures_per_identity

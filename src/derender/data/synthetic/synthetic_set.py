@@ -22,12 +22,13 @@ class SyntheticSet:
         normal: inward unit normals in the camera frame, 0 on the background.
         albedo: reflectance as seen by the camera, 0 on the background.
         mask: where the object is.
+        parts: which part of the object is seen, a number into ``part_names``; 0 on the background.
         light: ambient, diffuse, pitch, yaw (radians, canonical frame).
         camera: rotation x, y, z (radians, about (0, 0, 1)), translation x, y, z.
         identity: number of the person or model.
-        expression: name of the expression.
-        strength: how strongly it shows.
+        labels: what else is known of each picture, by column name (expression, age, ...): text or numbers.
         identity_traits: what was drawn for each picture's identity, by name.
+        part_names: names of the parts, background first.
         fov_deg: field of view of every picture.
     """
 
@@ -36,16 +37,27 @@ class SyntheticSet:
     normal: Float32[ndarray, "n s s 3"]
     albedo: UInt8[ndarray, "n 3 s s"]
     mask: Bool[ndarray, "n s s"]
+    parts: UInt8[ndarray, "n s s"]
     light: Float32[ndarray, "n 4"]
     camera: Float32[ndarray, "n 6"]
     identity: Int64[ndarray, "n"]
-    expression: Shaped[ndarray, "n"]
-    strength: Float32[ndarray, "n"]
-    identity_traits: Mapping[str, Float32[ndarray, "n"]]
+    labels: Mapping[str, Shaped[ndarray, "n"]]
+    identity_traits: Mapping[str, Shaped[ndarray, "n"]]
+    part_names: tuple[str, ...]
     fov_deg: float = 10.0
 
     def __len__(self) -> int:
         return len(self.images)
+
+    @property
+    def expression(self) -> Shaped[ndarray, "n"]:
+        """Name of each face's expression."""
+        return self.labels["expression"]
+
+    @property
+    def strength(self) -> Shaped[ndarray, "n"]:
+        """How strongly each expression shows."""
+        return self.labels["strength"]
 
 
 def camera_rotation_and_light(

@@ -1,9 +1,10 @@
 """Write synthetic pictures in the layout of the rendered data sets, truth maps included.
 
 ``images/NNNNNN.jpg`` (JPEG quality 92, 4:4:4), ``params.csv`` (degrees), ``identities.csv``, and with truth
-``depth/`` (16 bit, z = 0.8 + value/65535*0.4, 0 = background), ``normal/`` (round((n+1)/2*255)),
-``albedo/`` and ``mask/`` as PNG. The column ``expr_weights`` of the morphable-model sets has no counterpart
-here.
+``depth/`` (16 bit, z = 0.8 + value/65535*0.4, 0 = background), ``normal/`` (round((n+1)/2*255)), ``albedo/``,
+``mask/`` (255 = object) and ``masks/`` (number of the part, named line by line in ``classes.txt``) as PNG.
+Tracks lie at ``tracks/idNNNN/track_NNN/NNN.jpg`` without maps. The column ``expr_weights`` of the
+morphable-model sets has no counterpart here.
 """
 
 import csv
@@ -17,30 +18,67 @@ from PIL import Image
 from derender.data.synthetic.synthetic_set import SyntheticSet, camera_rotation_and_light
 
 DEPTH_LOW, DEPTH_SPAN = 0.8, 0.4
+_FAST = 1  # PNG compression: a third larger than the default, three times as fast
 
 
 def write(synthetic: SyntheticSet, folder: Path | str, truth: bool = True) -> Path:
     """Write the set into ``folder`` (made if missing, refused if it holds a set) and return that folder."""
+    folder = _free(folder)
+    for name in ("images", *(("depth", "normal", "albedo", "mask", "masks") if truth else ())):
+        (folder / name).mkdir(parents=True, exist_ok=True)
+    files = [f"images/{i:06d}.jpg" for i in range(len(synthetic))]
+    for i, file in enumerate(files):
+        _save_picture(synthetic, i, folder / file)
+        if truth:
+            for name, pixels in _encoded(synthetic, i).items():
+                Image.fromarray(np.ascontiguousarray(pixels)).save(
+                    folder / name / f"{i:06d}.png", compress_level=_FAST
+                )
+    if truth:
+        (folder / "classes.txt").write_text("\n".join(synthetic.part_names) + "\n", encoding="utf-8")
+    return _write_tables(synthetic, folder, files)
+
+
+def write_tracks(synthetic: SyntheticSet, folder: Path | str) -> Path:
+    """Write a set of tracks into ``folder``, one folder per identity and track; no maps are kept."""
+    if "track" not in synthetic.labels:
+        raise ValueError("these pictures are no tracks: generate them with the setting tracks above 0")
+    folder = _free(folder)
+    track, frame = synthetic.labels["track"], synthetic.labels["frame"]
+    files = [
+        f"tracks/id{synthetic.identity[i]:04d}/track_{track[i]:03d}/{frame[i]:03d}.jpg"
+        for i in range(len(synthetic))
+    ]
+    for i, file in enumerate(files):
+        (folder / file).parent.mkdir(parents=True, exist_ok=True)
+        _save_picture(synthetic, i, folder / file)
+    return _write_tables(synthetic, folder, files)
+
+
+def _free(folder: Path | str) -> Path:
     folder = Path(folder)
     if (folder / "params.csv").exists():
         raise ValueError(f"{folder} already holds a set (params.csv): choose another folder or delete it")
-    maps = ("depth", "normal", "albedo", "mask") if truth else ()
-    for name in ("images", *maps):
-        (folder / name).mkdir(parents=True, exist_ok=True)
-    for i in range(len(synthetic)):
-        picture = Image.fromarray(synthetic.images[i].transpose(1, 2, 0))
-        picture.save(folder / "images" / f"{i:06d}.jpg", quality=92, subsampling=0)
-        if truth:
-            mask = synthetic.mask[i]
-            encoded = {
-                "depth": encode_depth(synthetic.depth[i]),
-                "normal": encode_normal(synthetic.normal[i]) * mask[..., None],
-                "albedo": synthetic.albedo[i].transpose(1, 2, 0),
-                "mask": mask.astype(np.uint8) * 255,
-            }
-            for name, pixels in encoded.items():
-                Image.fromarray(np.ascontiguousarray(pixels)).save(folder / name / f"{i:06d}.png")
-    _write_table(folder / "params.csv", [_parameters(synthetic, i) for i in range(len(synthetic))])
+    return folder
+
+
+def _save_picture(synthetic: SyntheticSet, i: int, path: Path) -> None:
+    Image.fromarray(synthetic.images[i].transpose(1, 2, 0)).save(path, quality=92, subsampling=0)
+
+
+def _encoded(synthetic: SyntheticSet, i: int) -> dict[str, ndarray]:
+    mask = synthetic.mask[i]
+    return {
+        "depth": encode_depth(synthetic.depth[i]),
+        "normal": encode_normal(synthetic.normal[i]) * mask[..., None],
+        "albedo": synthetic.albedo[i].transpose(1, 2, 0),
+        "mask": mask.astype(np.uint8) * 255,
+        "masks": synthetic.parts[i],
+    }
+
+
+def _write_tables(synthetic: SyntheticSet, folder: Path, files: list[str]) -> Path:
+    _write_table(folder / "params.csv", [_parameters(synthetic, i, file) for i, file in enumerate(files)])
     _write_table(folder / "identities.csv", _identities(synthetic))
     return folder
 
@@ -56,7 +94,7 @@ def encode_normal(normal: Float32[ndarray, "*shape 3"]) -> UInt8[ndarray, "*shap
     return np.round((normal.astype(np.float64) + 1.0) / 2.0 * 255).astype(np.uint8)
 
 
-def _parameters(synthetic: SyntheticSet, i: int) -> dict[str, str]:
+def _parameters(synthetic: SyntheticSet, i: int, file: str) -> dict[str, str]:
     ambient, diffuse, light_pitch, light_yaw = synthetic.light[i].astype(float)
     pitch, yaw, roll, tx, ty, _ = synthetic.camera[i].astype(float)
     rotation, direction = camera_rotation_and_light(synthetic.camera[i : i + 1], synthetic.light[i : i + 1])
@@ -70,10 +108,9 @@ def _parameters(synthetic: SyntheticSet, i: int) -> dict[str, str]:
     }  # fmt: skip
     angles = {"light_pitch", "light_yaw", "light_pitch_cam", "light_yaw_cam", "pitch", "yaw", "roll"}
     return {
-        "file": f"images/{i:06d}.jpg",
+        "file": file,
         "identity": str(int(synthetic.identity[i])),
-        "expression": str(synthetic.expression[i]),
-        "strength": f"{synthetic.strength[i]:.4f}",
+        **{name: _text(values[i], 4) for name, values in synthetic.labels.items()},
         "ambient": f"{ambient:.6f}",
         "diffuse": f"{diffuse:.6f}",
         **{name: f"{np.rad2deg(value) if name in angles else value:.6f}" for name, value in degrees.items()},
@@ -84,9 +121,13 @@ def _identities(synthetic: SyntheticSet) -> list[dict[str, str]]:
     numbers, rows = np.unique(synthetic.identity, return_index=True)
     traits = synthetic.identity_traits
     return [
-        {"identity": str(int(n)), **{name: f"{values[i]:.5f}" for name, values in traits.items()}}
+        {"identity": str(int(n)), **{name: _text(values[i], 5) for name, values in traits.items()}}
         for n, i in zip(numbers, rows, strict=True)
     ]
+
+
+def _text(value: object, digits: int) -> str:
+    return f"{value:.{digits}f}" if isinstance(value, (float, np.floating)) else str(value)
 
 
 def _write_table(path: Path, rows: list[dict[str, str]]) -> None:

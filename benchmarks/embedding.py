@@ -1,0 +1,204 @@
+"""Pictures per CPU second of embedding beside training, and the memory that embedding takes at two sizes.
+
+Speed: the same networks (preset paper) take turns at a training step, at encoding pictures that are in
+memory, and at `derender embed`'s whole way from JPEGs in a tar to a parquet file. Before any clock runs, both
+ways of embedding must give the same numbers. Memory: a model that computes next to nothing, and writes as
+many numbers as a real one, reads streams of pictures that are made up as they are asked for, all different;
+each size runs in a process of its own, whose highest resident memory is reported.
+
+    python benchmarks/embedding.py --rounds 3 --json embedding.json
+    python benchmarks/embedding.py --memory 5000 50000
+"""
+
+import argparse
+import io
+import json
+import os
+import resource
+import statistics
+import subprocess
+import sys
+import tarfile
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import torch
+from machine import describe_machine
+from PIL import Image
+from torch import nn
+from training_step import CONFIG, OurStep
+
+from derender.data import as_float
+from derender.data.stream import Sample, Stream, stream_of
+from derender.features import FeatureTable, embed_images, embed_to_file
+from derender.model import Derenderer
+from derender.objectives import Vgg16Features
+
+SIZE = 64
+CODES = {"geometry": 256, "albedo": 256, "light": 256, "camera": 256}
+
+
+class MadeUp(Stream):
+    """Pictures of SIZE x SIZE that all differ, made when they are read."""
+
+    layout = "made up"
+
+    def __init__(self, count: int):
+        self.source = f"{count} pictures"
+        self.count = count
+        self.pixels = np.random.default_rng(0).integers(0, 256, SIZE * SIZE * 3, dtype=np.uint8)
+
+    def identity(self) -> object:
+        return self.count
+
+    def samples(self, start: int = 0) -> Iterator[Sample]:
+        for row in range(start, self.count):
+            yield Sample(f"{row:08d}.ppm", lambda row=row: self.encoded(row), (row + 1) / self.count)
+
+    def encoded(self, row: int) -> bytes:
+        pixels = self.pixels.copy()
+        pixels[:8] = np.frombuffer(row.to_bytes(8, "little"), np.uint8)
+        return f"P6 {SIZE} {SIZE} 255\n".encode() + pixels.tobytes()
+
+
+class Idle(nn.Module):
+    """Takes the first pixels for features: nothing to compute, as much to write as with real networks."""
+
+    image_size = SIZE
+    device = torch.device("cpu")
+
+    def embed(self, images: torch.Tensor) -> dict[str, torch.Tensor]:
+        flat = images.flatten(1)
+        return {name: flat[:, :width].clone() for name, width in CODES.items()}
+
+
+def shard_of(folder: Path, count: int) -> Path:
+    """A tar of JPEGs of smooth noise, which are about as large as those of faces."""
+    path = folder / "pictures.tar"
+    generator = np.random.default_rng(0)
+    with tarfile.open(path, "w") as tar:
+        for row in range(count):
+            coarse = Image.fromarray(generator.integers(0, 256, (16, 16, 3), dtype=np.uint8))
+            buffer = io.BytesIO()
+            coarse.resize((SIZE, SIZE), Image.Resampling.BICUBIC).save(buffer, "JPEG", quality=88)
+            info = tarfile.TarInfo(f"{row:06d}.jpg")
+            info.size = buffer.tell()
+            buffer.seek(0)
+            tar.addfile(info, buffer)
+    return path
+
+
+def seconds(work: Callable[[], object], clock: Callable[[], float] = time.process_time) -> float:
+    """CPU seconds of every thread, which a busy machine hardly changes."""
+    began = clock()
+    work()
+    return clock() - began
+
+
+def measure_speed(batch: int, count: int, rounds: int) -> dict[str, float]:
+    """Median pictures per CPU second of each way, after a check and a round to warm up."""
+    torch.manual_seed(0)
+    trained = OurStep(Derenderer(CONFIG.model), Vgg16Features(), "32-true")
+    model = Derenderer(CONFIG.model)
+    images = np.random.default_rng(0).integers(0, 256, (count, 3, SIZE, SIZE), dtype=np.uint8)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        shard, table = shard_of(folder, count), folder / "features.parquet"
+
+        def whole_way() -> None:
+            with stream_of(shard) as stream:
+                embed_to_file(model, stream, table)
+
+        whole_way()
+        with stream_of(shard) as stream:
+            sample = next(iter(stream.samples())).read()
+        first = np.asarray(Image.open(io.BytesIO(sample))).transpose(2, 0, 1)[None]
+        expected = embed_images(model, np.ascontiguousarray(first))
+        written = FeatureTable.read(table)
+        for factor, codes in expected.items():
+            difference = float(np.abs(written.factors[factor][:1] - codes).max())
+            if difference > 1e-4 * max(1.0, float(np.abs(codes).max())):
+                raise SystemExit(f"the two ways of embedding disagree by {difference:.1e} in {factor}")
+        ways: dict[str, tuple[Callable[[], object], int]] = {
+            "training step": (lambda: trained.step(as_float(images[:batch])), batch),
+            "encoders alone": (lambda: embed_images(model, images), count),
+            "derender embed, tar to parquet": (whole_way, count),
+        }
+        speeds: dict[str, list[float]] = {way: [] for way in ways}
+        for number in range(rounds + 1):
+            for way, (work, pictures) in ways.items():
+                speed = pictures / seconds(work)
+                if number:
+                    speeds[way].append(speed)
+    return {way: statistics.median(values) for way, values in speeds.items()}
+
+
+def measure_memory(count: int) -> dict[str, float]:
+    """Embed so many pictures in this process; its highest resident memory before and after, in MB."""
+    with tempfile.TemporaryDirectory() as name:
+        embed_to_file(Idle(), MadeUp(600), Path(name) / "warm.parquet", workers=2)
+        before = peak_mb()
+        table = Path(name) / "t.parquet"
+        took = seconds(lambda: embed_to_file(Idle(), MadeUp(count), table, workers=2), time.perf_counter)
+    usage = resource.getrusage(resource.RUSAGE_SELF)
+    return {
+        "pictures": count,
+        "before_mb": before,
+        "peak_mb": peak_mb(),
+        "pictures_per_second": count / took,
+        "cpu_seconds": usage.ru_utime + usage.ru_stime,
+    }
+
+
+def peak_mb() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1e6 if sys.platform == "darwin" else 1e3)
+
+
+def in_a_process_of_its_own(count: int) -> dict[str, float]:
+    said = subprocess.run(
+        [sys.executable, __file__, "--one-size", str(count)], capture_output=True, text=True, check=True
+    )
+    return json.loads(said.stdout)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--batch", type=int, default=64, help="pictures in a training step (default 64)")
+    parser.add_argument("--count", type=int, default=1024, help="pictures to embed (default 1024)")
+    parser.add_argument("--rounds", type=int, default=3, help="timed rounds after one to warm up (default 3)")
+    parser.add_argument("--threads", type=int, default=os.cpu_count(), help="torch's threads")
+    parser.add_argument(
+        "--memory", type=int, nargs=2, metavar="N", help="measure memory at two sizes instead"
+    )
+    parser.add_argument("--one-size", type=int, help=argparse.SUPPRESS)
+    parser.add_argument("--json", type=Path, help="also write the numbers, machine and versions here")
+    options = parser.parse_args()
+    torch.set_num_threads(options.threads)
+    if options.one_size is not None:
+        print(json.dumps(measure_memory(options.one_size)))
+        return
+    result: dict[str, object]
+    if options.memory is not None:
+        rows = [in_a_process_of_its_own(count) for count in options.memory]
+        for row in rows:
+            print(", ".join(f"{name} {value:,.0f}" for name, value in row.items()))
+        result = {"benchmark": "embedding memory", "rows": rows}
+    else:
+        speeds = measure_speed(options.batch, options.count, options.rounds)
+        base = speeds["training step"]
+        for way, speed in speeds.items():
+            print(f"| {way} | {speed:.1f} pictures per CPU second | {speed / base:.1f}x |")
+        result = {"benchmark": "embedding", "rounds": options.rounds, "speeds": speeds}
+    machine = describe_machine()
+    print(", ".join(f"{name} {value}" for name, value in machine.items()))
+    if options.json is not None:
+        options.json.write_text(json.dumps({**result, "machine": machine}, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

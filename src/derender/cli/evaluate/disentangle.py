@@ -1,0 +1,95 @@
+"""`derender evaluate disentangle`: does each feature hold its own factor, and only that?"""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from derender.cli import options
+from derender.cli.console import bar, out_of_the_way, result, say, show_scores, write_json
+
+
+def register(group: typer.Typer) -> None:
+    group.command(
+        "disentangle",
+        epilog="Example: derender evaluate disentangle --model runs/faces --data made/ --out card.png",
+    )(disentangle)
+
+
+def disentangle(
+    model: options.Model,
+    data: options.Data,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="Draw all matrices into this picture.", metavar="FILE.png"),
+    ] = None,
+    dataset: options.Dataset = "auto",
+    part: options.Part = "all",
+    limit: options.Limit = 2000,
+    seeds: Annotated[
+        int, typer.Option("--seeds", min=1, max=20, metavar="N", help="Repeat with so many seeds.")
+    ] = 3,
+    swap_pictures: Annotated[
+        int, typer.Option("--swap-pictures", min=2, metavar="N", help="At most so many in the swap test.")
+    ] = 256,
+    dimensions: Annotated[
+        str,
+        typer.Option("--dimensions", help="Scores by dimension: lasso, trees (takes minutes), or none."),
+    ] = "lasso",
+    batch_size: options.BatchSize = 64,
+    seed: options.Seed = 0,
+    device: options.Device = "auto",
+    force: options.Force = False,
+    json_file: options.Json = None,
+) -> None:
+    """Does each feature hold its own factor? Correlation, CKA, swap test; on rendered data DCI, MIG, SAP."""
+    if dimensions not in ("lasso", "trees", "none"):
+        raise ValueError(f"unknown --dimensions {dimensions!r}: choose lasso, trees or none")
+    if out is not None:
+        if out.suffix.lower() != ".png":
+            raise ValueError(f"--out {out} must end in .png: the matrices are drawn as a PNG picture")
+        out_of_the_way(out, force)
+    from derender.cli.models import open_model, part_of
+    from derender.data import read_pictures
+    from derender.evaluation.disentanglement import evaluate_disentanglement
+    from derender.report import tables_disentanglement as tables
+
+    net = open_model(model, device)
+    with bar("reading") as report:
+        pictures = read_pictures(data, net.image_size, dataset=dataset, limit=limit, progress=report)
+    pictures = part_of(pictures, part, model)
+    say(pictures.describe())
+    with bar("scoring", "steps") as report:
+        card = evaluate_disentanglement(
+            net,
+            pictures,
+            seeds=range(seed, seed + seeds),
+            dimensions=None if dimensions == "none" else dimensions,
+            swap_pictures=swap_pictures,
+            batch_size=batch_size,
+            progress=report,
+        )
+    summary = tables.summary_table(card)
+    truth = (tables.truth_table(card), tables.dimension_table(card), tables.factor_r2_table(card))
+    for table in (summary, *tables.swap_tables(card), *truth):
+        if table is not None:
+            show_scores(table, json_file)
+    for column, name in ((4, "swap test"), (5, "swap test, decoded")):
+        say(f"{name}: {summary.verdict(column)}")
+    if out is not None:
+        from derender.report.matrices import card_matrices, matrix_sheet
+        from derender.whole import whole_file
+
+        sheet = matrix_sheet(card_matrices(card), f"{model}: {card.n_pictures:,} pictures")
+        with whole_file(out) as temporary:
+            sheet.save(temporary, "PNG")
+        result(f"matrices in {out}", json_file)
+    write_json(
+        json_file,
+        {
+            "pictures": card.n_pictures,
+            "features": dict(zip(card.features, card.dimensions, strict=True)),
+            "seeds": list(range(seed, seed + seeds)),
+            "rows": card.rows,
+        },
+    )

@@ -1,0 +1,153 @@
+"""What the commands that take pictures by name share: reading them, where their folders lie, finer scenes.
+
+A picture that cannot be read is left out and named at the end (exit code 2); the others are done.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from derender.cli.console import result, say, write_json
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from derender.model import Derenderer
+    from derender.scene import Scene
+
+PictureFiles = Annotated[list[Path], typer.Argument(help="Pictures to take apart.", metavar="IMAGE...")]
+Size = Annotated[
+    int,
+    typer.Option("--size", min=8, max=4096, metavar="N", help="Side of what is drawn, in pixels."),
+]
+OwnSize = Annotated[
+    int | None,
+    typer.Option(
+        "--size", min=8, max=4096, metavar="N", help="Side of what is drawn and written; else the model's."
+    ),
+]  # fmt: skip
+Texture = Annotated[
+    str,
+    typer.Option(
+        "--texture", help="model: its albedo. original: the picture's own detail where it shows.",
+        metavar="model|original",
+    ),
+]  # fmt: skip
+TEXTURES = ("model", "original")
+PIXELS_AT_ONCE = 1 << 22
+
+
+@dataclass(frozen=True)
+class Given:
+    """Pictures that were named.
+
+    Attributes:
+        pictures: those that can be read, (3, S, S) at the model's size, by path.
+        folders: where each goes.
+        refused: reasons why the others cannot be read, by path.
+    """
+
+    pictures: "Mapping[Path, np.ndarray]"
+    folders: list[Path]
+    refused: Mapping[Path, str]
+
+
+def given_pictures(images: Sequence[Path], size: int, out: Path, force: bool, *, sheet: bool = True) -> Given:
+    """Read the pictures, and refuse to write over what an earlier command left."""
+    from derender.report.files import folder_names
+    from derender.report.sheets import sheet_paths
+
+    readable: dict[Path, Any] = {}
+    refused: dict[Path, str] = {}
+    for path in dict.fromkeys(images):
+        try:
+            readable[path] = one_picture(path, size)
+        except (ValueError, OSError) as problem:
+            refused[path] = " ".join(str(problem).split())
+    if not readable:
+        raise ValueError(next(iter(refused.values())))
+    if out.exists() and not out.is_dir():
+        raise NotADirectoryError(f"{out} is a file: give --out the name of a folder")
+    folders = folder_names(list(readable), out)
+    files = sheet_paths(out, len(folders)) if sheet and len(folders) > 1 else []
+    taken = [place for place in (*folders, *files) if place.exists()]
+    if taken and not force:
+        raise FileExistsError(
+            f"{taken[0]} exists already: choose another --out, or add --force to replace it"
+        )
+    return Given(readable, folders, refused)
+
+
+def one_picture(path: Path, size: int) -> "np.ndarray":
+    """One picture; a path that leads nowhere is an error that says so."""
+    from derender.data import read_picture
+    from derender.data.source import nearest_sibling
+
+    if not path.exists():
+        raise FileNotFoundError(f"{path} does not exist{nearest_sibling(path)}")
+    if path.is_dir():
+        raise IsADirectoryError(f"{path} is a folder: name pictures, such as {path / '*.jpg'}")
+    return read_picture(path, size)
+
+
+def scenes_of(net: "Derenderer", given: Given, batch_size: int) -> "list[Scene]":
+    """The scene of every picture, on the model's device."""
+    import numpy as np
+
+    from derender.features import map_batches
+
+    stacked = np.stack(list(given.pictures.values()))
+    batches = map_batches(net.decompose, net, stacked, batch_size=batch_size)
+    return [batch[row] for batch in batches for row in range(len(batch))]
+
+
+def refining(
+    net: "Derenderer", size: int | None, texture: str
+) -> "Callable[[Scene, Sequence[Path]], Scene] | None":
+    """What makes scenes finer: enlarges them, and takes albedo from the pictures; None for neither."""
+    from derender.data import as_float
+    from derender.data.nearest import nearest
+    from derender.report.texture import picture_albedo, picture_on_grid
+    from derender.scene.enlarge import at_size
+
+    if texture not in TEXTURES:
+        raise ValueError(
+            f"unknown texture {texture!r}{nearest(texture, TEXTURES)}: choose {' or '.join(TEXTURES)}"
+        )
+    side = net.image_size if size is None else size
+    if side < net.image_size:
+        raise ValueError(f"--size {side} is below the model's {net.image_size}: give that or more")
+    if side == net.image_size and texture == "model":
+        return None
+
+    def refine(scene: "Scene", sources: Sequence[Path]) -> "Scene":
+        import numpy as np
+
+        scene = at_size(scene, side)
+        if texture == "model":
+            return scene
+        pixels = as_float(np.stack([one_picture(path, side) for path in sources])).to(scene.depth)
+        if side != net.image_size:
+            pixels = picture_on_grid(pixels, net.image_size)
+        return scene.with_parameters(albedo=picture_albedo(pixels, scene, net.fov_deg))
+
+    return refine
+
+
+def batch_that_fits(batch_size: int, size: int | None) -> int:
+    """Fewer pictures at a time where each is large."""
+    return batch_size if size is None else max(1, min(batch_size, PIXELS_AT_ONCE // size**2))
+
+
+def finish(given: Given, out: Path, written: Sequence[Any], json_file: str | None, **more: Any) -> None:
+    """Name what was left out, say what was done, write the JSON; exit code 2 if something was left out."""
+    for path, reason in given.refused.items():
+        say(f"left out {path}: {reason}")
+    count = "1 picture" if len(written) == 1 else f"{len(written):,} pictures"
+    result(f"{count} in {out}", json_file)
+    write_json(json_file, {"out": out, "pictures": written, "refused": given.refused, **more})
+    if given.refused:
+        raise typer.Exit(2)

@@ -1,0 +1,149 @@
+"""How sure a score is: resamples of the rows, intervals, and differences to the strongest control.
+
+Source: Efron's percentile bootstrap. Rows are drawn with replacement; what was fitted (clusters, heads)
+stays as it is, so an interval speaks of which pictures happened to be scored and not of another training.
+All features of a table are scored on the same resamples, which makes their differences paired. Leaves out
+corrections for many comparisons: of twenty rows that are no better than a control, half a one is called
+better by chance.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+RESAMPLES = 1_000
+LEVEL = 0.95
+CHUNK_BYTES = 64 << 20
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A score with its uncertainty.
+
+    Attributes:
+        value: on the rows as they are; mean over runs.
+        low, high: the 95 % interval over resamples of the rows; NaN where there is none.
+        spread: standard deviation over runs (seeds); NaN for a single run.
+        resampled: (B,) the score on each resample.
+    """
+
+    value: float
+    low: float
+    high: float
+    spread: float
+    resampled: np.ndarray = field(repr=False)
+
+
+@dataclass(frozen=True)
+class Difference:
+    """A score less that of the strongest control, on the same resamples.
+
+    Attributes:
+        rival: the strongest control's name.
+        value, low, high: the difference and its 95 % interval.
+        above: whether the whole interval lies above 0; False where there is none.
+    """
+
+    rival: str
+    value: float
+    low: float
+    high: float
+    above: bool
+
+
+@dataclass(frozen=True)
+class ScoredRow:
+    """One row of a comparison.
+
+    Attributes:
+        name: of the features.
+        control: whether it learned nothing.
+        runs: seeds behind it.
+        scores: by name.
+        versus: by name, against the strongest control; empty for controls.
+    """
+
+    name: str
+    control: bool
+    runs: int
+    scores: Mapping[str, Estimate]
+    versus: Mapping[str, Difference] = field(default_factory=dict)
+
+    def numbers(self) -> dict[str, Any]:
+        """Everything but the resamples, as JSON takes it."""
+        scores = {
+            name: {part: getattr(one, part) for part in ("value", "low", "high", "spread")}
+            for name, one in self.scores.items()
+        }
+        return {"control": self.control, "runs": self.runs, "scores": scores, "versus": dict(self.versus)}
+
+
+def resamples(n_rows: int, count: int = RESAMPLES, seed: int = 0) -> Iterator[np.ndarray]:
+    """How often each row is drawn, in portions of (b, N) float32 that together hold ``count`` resamples."""
+    if n_rows < 1 or count < 1:
+        raise ValueError(f"resampling needs a row and a resample, got {n_rows} rows and {count} resamples")
+    generator = np.random.default_rng(seed)
+    portion = max(1, CHUNK_BYTES // (8 * n_rows))
+    for start in range(0, count, portion):
+        size = min(portion, count - start)
+        drawn = generator.integers(n_rows, size=(size, n_rows)) + n_rows * np.arange(size)[:, None]
+        yield np.bincount(drawn.ravel(), minlength=size * n_rows).reshape(size, n_rows).astype(np.float32)
+
+
+def estimate(runs: Sequence[float], resampled: np.ndarray, *, centred: bool = False) -> Estimate:
+    """The mean over runs with its percentile interval.
+
+    Args:
+        runs: the score of each run.
+        resampled: (B,) the mean over runs on each resample.
+        centred: move the resamples so that their mean is the value. Scores of clusters need it: a row drawn
+            twice agrees with itself, which makes every resample look purer than the rows are.
+    """
+    value = float(np.mean(runs))
+    if centred:
+        resampled = resampled - resampled.mean() + value
+    low, high = _interval(resampled)
+    spread = float(np.std(runs, ddof=1)) if len(runs) > 1 else float("nan")
+    return Estimate(value, low, high, spread, resampled)
+
+
+def constant(value: float, count: int = RESAMPLES, spread: float = float("nan")) -> Estimate:
+    """A score that does not depend on the rows drawn, such as a chance level."""
+    return Estimate(value, float("nan"), float("nan"), spread, np.full(count, value))
+
+
+def difference(ours: Estimate, rivals: Mapping[str, Estimate]) -> Difference:
+    """Ours against the highest of the rivals; higher is better.
+
+    Where ours has no interval the difference has none, and is not called above.
+    """
+    if not rivals:
+        raise ValueError("there is no control to compare with: give at least one")
+    name = max(rivals, key=lambda rival: rivals[rival].value)
+    low, high = _interval(ours.resampled - rivals[name].resampled)
+    if np.isnan(ours.low):
+        low = high = float("nan")
+    return Difference(name, ours.value - rivals[name].value, low, high, above=low > 0)
+
+
+def with_verdicts(rows: Sequence[ScoredRow]) -> tuple[ScoredRow, ...]:
+    """The rows, those that are no controls compared with the strongest control, score by score."""
+    controls = [row for row in rows if row.control]
+
+    def judged(row: ScoredRow) -> ScoredRow:
+        if row.control or not controls:
+            return row
+        versus = {
+            name: difference(ours, {c.name: c.scores[name] for c in controls if name in c.scores})
+            for name, ours in row.scores.items()
+        }
+        return ScoredRow(row.name, row.control, row.runs, row.scores, versus)
+
+    return tuple(judged(row) for row in rows)
+
+
+def _interval(values: np.ndarray) -> tuple[float, float]:
+    low, high = np.quantile(values, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
+    return float(low), float(high)

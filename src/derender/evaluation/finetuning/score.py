@@ -1,0 +1,101 @@
+"""Joint training on held-out pictures, beside heads on the frozen features it began with, and the majority.
+
+The test part of the run's own split is scored; neither training nor the choice of weights saw it. The heads
+on frozen features (the paper's, and penalised logistic regression) learn from the very same labels.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from derender.evaluation.bootstrap import RESAMPLES, Difference, ScoredRow, difference
+from derender.evaluation.finetuning.model import FinetunedModel
+from derender.evaluation.finetuning.task import FinetuneTask
+from derender.evaluation.linear_compare import Progress, compare_linear
+from derender.evaluation.linear_task import Rows, Task
+from derender.features import embed_images, map_batches
+
+JOINT, LOGISTIC, PAPER_HEAD, MAJORITY = "fine-tuned", "frozen, logistic", "frozen, paper's head", "majority"
+
+
+@dataclass(frozen=True)
+class FinetuneScores:
+    """Held-out scores.
+
+    Attributes:
+        rows: ``fine-tuned``, both heads on frozen features, ``majority``; accuracy, balanced_accuracy and
+            average_precision (0..1, best 1) of each, the first two with intervals.
+        versus: by score, the fine-tuned model against the best of the others.
+        kind, names: of the task.
+        n_train, n_test: labelled pictures learned from, and tested.
+    """
+
+    rows: tuple[ScoredRow, ...]
+    versus: dict[str, Difference]
+    kind: str
+    names: tuple[str, ...]
+    n_train: int
+    n_test: int
+
+    def numbers(self) -> dict[str, Any]:
+        """Everything as JSON takes it."""
+        versus = {
+            name: {part: getattr(one, part) for part in ("rival", "value", "low", "high", "above")}
+            for name, one in self.versus.items()
+        }
+        sizes = {name: getattr(self, name) for name in ("kind", "names", "n_train", "n_test")}
+        return {**sizes, "rows": {row.name: row.numbers() for row in self.rows}, "versus": versus}
+
+
+def score_finetuned(
+    tuned: FinetunedModel,
+    task: FinetuneTask,
+    *,
+    resample_count: int = RESAMPLES,
+    progress: Progress | None = None,
+) -> FinetuneScores:
+    """Score a trained model on the task's test part.
+
+    Raises:
+        ValueError: no tested picture has a label.
+    """
+    target = task.target
+    test = target.split.test[target.asked.known[target.split.test]]
+    train = target.split.train[(target.visible[target.split.train] >= 0).any(axis=1)]
+    if len(test) < 2:
+        raise ValueError(
+            f"the test part has {len(test)} pictures with a label, two are needed to score: "
+            "bring more pictures, or set a larger test share in split="
+        )
+    images, answered = task.images[test], lambda batch: tuned.answer(batch).cpu().numpy()
+    answers = np.concatenate(map_batches(answered, tuned, images, batch_size=256))
+    rows = np.concatenate([train, test])
+    start = (task.start if task.start is not None else task.build().model).to(tuned.device)
+    codes = embed_images(start, task.images[rows])
+    frozen = np.concatenate([codes[name] for name in task.config.target.factors], axis=1)
+    asked = Task(target.asked.kind, target.asked.names, target.asked.targets[rows])
+    count = len(train)
+    found = compare_linear(
+        {LOGISTIC: [frozen]},
+        asked,
+        Rows(np.arange(count, len(rows)), {count: np.arange(count)[None]}),
+        (task.config.seed,),
+        heads=("logistic", "linear"),
+        finetuned={JOINT: {count: answers[None]}},
+        resample_count=resample_count,
+        progress=progress,
+    )
+    by_head = {part.head: part.rows for part in found.parts}
+    joint, majority = by_head["fine-tuned"]
+    heads = [
+        ScoredRow(name, True, 1, by_head[head][0].scores)
+        for name, head in ((LOGISTIC, "logistic"), (PAPER_HEAD, "linear"))
+    ]
+    ours = ScoredRow(JOINT, False, 1, joint.scores)
+    others = (*heads, ScoredRow(MAJORITY, True, 1, majority.scores))
+    versus = {
+        name: difference(ours.scores[name], {row.name: row.scores[name] for row in others})
+        for name in ("accuracy", "balanced_accuracy")
+    }
+    return FinetuneScores((ours, *others), versus, asked.kind, asked.names, count, len(test))

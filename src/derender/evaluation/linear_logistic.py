@@ -1,0 +1,169 @@
+"""Logistic regression with a penalty chosen by cross-validation, for many labels at once.
+
+The objective is scikit-learn's: C times the sum of the losses plus half the squared weights, intercept
+free; tests hold both to the same answer. Forty labels, six penalties and five folds are 1,200 regressions
+on one set of rows, so all are solved together: the rows are rotated onto their principal axes (which
+changes nothing under this penalty, and makes 12,288 pixels of 1,000 rows 1,000 numbers), there the
+curvature has a diagonal bound (Boehning and Lindsay 1988), and accelerated steps scaled by it need only two
+matrix products each.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import expit, log_softmax, softmax
+
+PENALTIES = (1e-2, 1e-1, 1.0, 1e1, 1e2, 1e3)
+"""C for rows whose mean squared length is 1: standardised features divided by the root of their number."""
+FOLDS = 5
+
+
+@dataclass(frozen=True)
+class Axes:
+    """How features become what is regressed on: standardised, scaled, rotated."""
+
+    mean: np.ndarray
+    scale: np.ndarray
+    rotation: np.ndarray
+
+    def apply(self, features: np.ndarray) -> np.ndarray:
+        """(N, D) features as (N, R)."""
+        return ((np.asarray(features, np.float64) - self.mean) / self.scale) @ self.rotation
+
+
+def axes_of(features: np.ndarray) -> Axes:
+    """Fit to (n, D) training rows; R is their rank."""
+    features = np.asarray(features, np.float64)
+    mean, deviation = features.mean(axis=0), features.std(axis=0)
+    scale = np.where(deviation > 1e-8 * max(deviation.max(), 1e-300), deviation, np.inf)
+    scale *= max(np.isfinite(scale).sum(), 1) ** 0.5
+    rows = (features - mean) / scale
+    if rows.shape[0] < rows.shape[1]:
+        value, vector = np.linalg.eigh(rows @ rows.T)
+        kept = value > max(value.max(), 0) * 1e-10
+        return Axes(mean, scale, rows.T @ (vector[:, kept] / np.sqrt(value[kept])))
+    value, vector = np.linalg.eigh(rows.T @ rows)
+    return Axes(mean, scale, vector[:, value > max(value.max(), 0) * 1e-10])
+
+
+def fit_logistic(
+    features: np.ndarray,
+    targets: np.ndarray,
+    tested: np.ndarray,
+    *,
+    kind: str,
+    penalties: Sequence[float] = PENALTIES,
+    folds: int = FOLDS,
+    seed: int = 0,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Choose C on the training rows alone, fit on all of them, answer for others.
+
+    Args:
+        features: (n, D) training rows.
+        targets: (n, A) in -1 (unknown), 0, 1; one-hot for classes.
+        tested: (T, D) rows to answer for; C is chosen without them.
+        kind: "labels" (a C for each label) or "classes" (one C).
+        penalties: the values of C tried.
+        folds: parts of the training rows.
+        seed: of the folds.
+
+    Returns:
+        (T, A) probabilities, and the chosen C: (A,) or (1,).
+    """
+    if len(features) < folds or folds < 2:
+        raise ValueError(
+            f"{len(features)} rows cannot be cut into {folds} folds: ask for 2 to {len(features)}"
+        )
+    axes = axes_of(features)
+    rows, labels, groups = axes.apply(features), np.asarray(targets, np.float64), targets.shape[1]
+    fold = np.random.default_rng(seed).permutation(len(rows)) % folds
+    learned = np.repeat(
+        [fold != number for number in range(folds)], len(penalties), axis=0
+    ).T  # (n, problems)
+    c = np.tile(np.asarray(penalties, np.float64), folds)
+    weights = solve_logistic(rows.astype(np.float32), labels, learned, c, kind, tolerance=1e-3)
+    loss = _losses(_logits(rows.astype(np.float32), weights), labels, kind)  # (n, problems, A or 1)
+    loss = np.where(learned[:, :, None], 0.0, loss).reshape(len(rows), folds, len(penalties), -1)
+    chosen = np.asarray(penalties)[loss.sum(axis=(0, 1)).argmin(axis=0)]  # (A,) or (1,)
+    distinct = np.unique(chosen)
+    every = np.ones((len(rows), len(distinct)), bool)
+    final = solve_logistic(rows, labels, every, distinct, kind, tolerance=1e-5)
+    own = np.searchsorted(distinct, chosen)
+    answer = _logits(axes.apply(tested), final)
+    picked = answer[:, own, np.arange(groups)] if kind == "labels" else answer[:, own[0]]
+    return (expit(picked) if kind == "labels" else softmax(picked, axis=1)), chosen
+
+
+def solve_logistic(
+    rows: np.ndarray,
+    targets: np.ndarray,
+    learned: np.ndarray,
+    c: np.ndarray,
+    kind: str,
+    *,
+    tolerance: float = 1e-5,
+    most_steps: int = 2_000,
+) -> np.ndarray:
+    """Solve P regressions on parts of the same rows: (R + 1, P, A) weights, the intercept last.
+
+    Args:
+        rows: (n, R) centred, with columns orthogonal to each other (from ``axes_of``).
+        targets: (n, A) in -1 (unknown), 0, 1.
+        learned: (n, P) bool: the rows that each regression learns from.
+        c: (P,) penalties.
+        kind: "labels" or "classes".
+        tolerance: the scaled gradient at which to stop, relative to its start.
+        most_steps: stop there in any case.
+    """
+    dtype = rows.dtype
+    design = np.column_stack((rows, np.ones(len(rows), dtype)))
+    known = (targets >= 0).astype(dtype)
+    truth = np.maximum(targets, 0).astype(dtype)[:, None]
+    counted = (learned[:, :, None] & (known > 0)[:, None]).astype(dtype)
+    ridge = np.append(np.ones(rows.shape[1]), 0.0)[:, None, None].astype(dtype)
+    curve = 0.25 if kind == "labels" else 0.5
+    bound = curve * (design.astype(np.float64) ** 2).sum(axis=0)[:, None, None] * c[None, :, None] + ridge
+    bound, strength = bound.astype(dtype), c[None, :, None].astype(dtype)
+
+    weights = np.zeros((design.shape[1], len(c), targets.shape[1]), dtype)
+    ahead, momentum, start = weights, 1.0, None
+    for step in range(most_steps):
+        logits = _logits_of(design, ahead)
+        answer = expit(logits) if kind == "labels" else softmax(logits, axis=2)
+        residual = (answer - truth) * counted
+        slope = _slope(design, residual) * strength + ridge * ahead
+        moved = ahead - slope / bound
+        if step % 10 == 0:
+            size = np.sqrt((slope.astype(np.float64) ** 2 / bound).sum(axis=0))
+            start = np.maximum(size, 1e-12) if start is None else start
+            if (size <= tolerance * start).all():
+                return moved
+        change = moved - weights
+        if float((slope * change).sum()) > 0:  # uphill: forget the momentum
+            momentum = 1.0
+        following = (1 + (1 + 4 * momentum**2) ** 0.5) / 2
+        ahead = moved + (momentum - 1) / following * change
+        weights, momentum = moved, following
+    return weights
+
+
+def _logits_of(design: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    return (design @ weights.reshape(len(weights), -1)).reshape(len(design), *weights.shape[1:])
+
+
+def _slope(design: np.ndarray, residual: np.ndarray) -> np.ndarray:
+    return (design.T @ residual.reshape(len(design), -1)).reshape(design.shape[1], *residual.shape[1:])
+
+
+def _logits(rows: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """(N, P, A) logits of (N, R) rows."""
+    return _logits_of(rows, weights[:-1]) + weights[-1]
+
+
+def _losses(logits: np.ndarray, targets: np.ndarray, kind: str) -> np.ndarray:
+    """Negative log-likelihood of each row: (N, P, A), or (N, P, 1) for classes; 0 where unknown."""
+    truth = targets[:, None]
+    if kind == "classes":
+        return -(log_softmax(logits, axis=2) * np.maximum(truth, 0)).sum(axis=2, keepdims=True)
+    return np.where(truth >= 0, np.logaddexp(0, logits) - truth * logits, 0.0)

@@ -1,0 +1,138 @@
+"""What a linear probe is asked: targets from label columns, rows to learn from and rows to be tested on.
+
+Columns of two values each are asked together, each by a yes or no of its own (multi-label, as CelebA's 40
+attributes); one column of more values is asked as a choice of one (multi-class). The test rows are fixed:
+no seed, no number of labels and no choice of a penalty ever touches them.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from derender.data import split_indices
+from derender.features import missing
+
+
+@dataclass(frozen=True)
+class Task:
+    """Targets of N rows.
+
+    Attributes:
+        kind: "labels" (yes or no, each apart) or "classes" (one of several).
+        names: of the labels, or of the classes.
+        targets: (N, A) int8 in -1 (unknown), 0, 1; for classes one-hot, and all -1 where unknown.
+    """
+
+    kind: str
+    names: tuple[str, ...]
+    targets: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.targets)
+
+    @property
+    def known(self) -> np.ndarray:
+        """(N,) bool: rows that carry a label at all."""
+        return np.any(self.targets >= 0, axis=1)
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Who learns and who is tested, by row number.
+
+    Attributes:
+        test: (T,) never learned from.
+        train: for each number of labels, (S, number) rows for each of S seeds; smaller sets lie in larger.
+    """
+
+    test: np.ndarray
+    train: Mapping[int, np.ndarray]
+
+
+def task_of(labels: Mapping[str, np.ndarray]) -> Task:
+    """The task that label columns set.
+
+    Raises:
+        ValueError: one value only, a value that a single row has, or several columns one of which has more
+            than two values.
+    """
+    if not labels:
+        raise ValueError("a linear probe needs at least one label column")
+    columns = {name: _column(np.asarray(values), name) for name, values in labels.items()}
+    many = [name for name, (values, _) in columns.items() if len(values) > 2]
+    if not many:
+        targets = np.column_stack([numbers for _, numbers in columns.values()])
+        return Task("labels", tuple(columns), targets.astype(np.int8))
+    if len(columns) > 1:
+        raise ValueError(
+            f"label {many[0]!r} has {len(columns[many[0]][0])} classes and cannot be asked together with "
+            "others: name it alone, or only labels of two values"
+        )
+    values, numbers = columns[many[0]]
+    targets = (numbers[:, None] == np.arange(len(values))).astype(np.int8)
+    targets[numbers < 0] = -1
+    return Task("classes", tuple(str(value) for value in values), targets)
+
+
+def choose_rows(
+    task: Task,
+    files: Sequence[str],
+    counts: Sequence[int] = (100, 500, 1_000),
+    seeds: Sequence[int] = (0, 1, 2, 3, 4),
+    *,
+    test_fraction: float = 0.5,
+    partition: np.ndarray | None = None,
+    groups: np.ndarray | None = None,
+) -> Rows:
+    """Test rows and, for every seed, nested training rows.
+
+    Args:
+        task: rows without a label are left out.
+        files: names of the N rows; the split goes by a hash of these.
+        counts: numbers of labelled rows to learn from.
+        seeds: each draws its own training rows.
+        test_fraction: share of the rows that is tested.
+        partition: the owners' split; where it has "test" rows, these are tested and no others.
+        groups: (N,) labels that must not lie on both sides, such as identities.
+    """
+    known = task.known
+    if partition is not None and (np.asarray(partition) == "test").any():
+        test = np.flatnonzero(known & (np.asarray(partition) == "test"))
+        pool = np.flatnonzero(known & (np.asarray(partition) != "test"))
+    else:
+        if not 0 < test_fraction < 1:
+            raise ValueError(f"the tested share must lie between 0 and 1, got {test_fraction}")
+        split = split_indices(files, (1 - test_fraction, 0.0, test_fraction), groups=groups)
+        test, pool = split.test[known[split.test]], split.train[known[split.train]]
+    if not len(seeds):
+        raise ValueError("a linear probe needs at least one seed")
+    if not len(counts) or min(counts) < 2 or max(counts) > len(pool) or len(test) < 2:
+        raise ValueError(
+            f"asked to learn from {', '.join(map(str, counts)) or 'no'} labelled rows: {len(pool)} can be "
+            f"learned from and {len(test)} are tested; ask for 2 to {len(pool)}"
+        )
+    orders = [np.random.default_rng(seed).permutation(pool) for seed in seeds]
+    return Rows(test, {count: np.stack([order[:count] for order in orders]) for count in counts})
+
+
+def _column(values: np.ndarray, name: str) -> tuple[list[Any], np.ndarray]:
+    """The distinct values of a column, sorted, and (N,) their numbers, -1 where missing."""
+    known = ~missing(values)
+    distinct = sorted(set(values[known].tolist()))
+    if len(distinct) < 2:
+        raise ValueError(
+            f"a linear probe needs at least two classes, the {int(known.sum())} labelled rows of {name!r} "
+            f"have {len(distinct)}: choose another label column"
+        )
+    number = {value: at for at, value in enumerate(distinct)}
+    numbers = np.full(len(values), -1, np.int64)
+    numbers[known] = [number[value] for value in values[known].tolist()]
+    rarest = int(np.bincount(numbers[known]).argmin())
+    if (numbers == rarest).sum() < 2:
+        raise ValueError(
+            f"class {distinct[rarest]!r} of label {name!r} has one row, which cannot be both learned and "
+            "tested: leave it out (--min-count 2)"
+        )
+    return distinct, numbers

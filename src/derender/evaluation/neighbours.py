@@ -1,0 +1,66 @@
+"""Each row's nearest other row, exactly, without ever holding all distances.
+
+Distances are made in square tiles with one matrix product each: memory is a copy of the rows and 8 MB.
+Equally near rows: the first counts.
+"""
+
+from typing import Literal
+
+import numpy as np
+
+Metric = Literal["cosine", "euclidean"]
+TILE = 1024
+
+
+def finite_rows(features: np.ndarray, purpose: str) -> np.ndarray:
+    """(N, D) features as float64, or an error that says what is wrong with them."""
+    features = np.asarray(features, dtype=np.float64)
+    if features.ndim != 2:
+        raise ValueError(f"features must be (rows, dimensions), got shape {features.shape}")
+    if not np.isfinite(features).all():
+        bad = int((~np.isfinite(features).all(axis=1)).sum())
+        raise ValueError(
+            f"features are not finite in {bad} of {len(features)} rows: drop these rows or check the model"
+        )
+    if len(features) < 2:
+        raise ValueError(f"{purpose} takes 2 rows or more, got {len(features)}")
+    return features
+
+
+def prepared(points: np.ndarray, metric: Metric) -> np.ndarray:
+    """Rows whose squared Euclidean distances are the metric's (cosine: twice 1 - cosine; a zero row is
+    at distance 1 from all)."""
+    if metric == "euclidean":
+        return points - points.mean(axis=0)
+    length = np.linalg.norm(points, axis=1, keepdims=True)
+    return np.divide(points, length, out=np.zeros_like(points), where=length > 0)
+
+
+def nearest_rows(points: np.ndarray, metric: Metric = "cosine") -> tuple[np.ndarray, np.ndarray]:
+    """For each of (N, D) rows the nearest other row, (N,) integers, and the distance to it, (N,).
+
+    Cosine distance is 1 - cosine, 0..2. Euclidean distance is not squared.
+    """
+    points = prepared(points, metric)
+    nearest, distance = np.zeros(len(points), np.int64), np.full(len(points), np.inf)
+    for start in range(0, len(points), TILE):
+        rows = slice(start, start + TILE)
+        for left in range(0, len(points), TILE):
+            block = _distances(points[rows], points[left : left + TILE], metric)
+            if left == start:
+                np.fill_diagonal(block, np.inf)
+            at = block.argmin(axis=1)
+            found = block[np.arange(len(block)), at]
+            better = found < distance[rows]
+            nearest[rows] = np.where(better, at + left, nearest[rows])
+            distance[rows] = np.where(better, found, distance[rows])
+    return nearest, distance
+
+
+def _distances(a: np.ndarray, b: np.ndarray, metric: Metric) -> np.ndarray:
+    """(A, B) distances of prepared rows."""
+    product = a @ b.T
+    if metric == "cosine":
+        return 1 - product
+    square = (a**2).sum(axis=1)[:, None] + (b**2).sum(axis=1) - 2 * product
+    return np.sqrt(np.maximum(square, 0))

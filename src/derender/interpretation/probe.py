@@ -1,0 +1,203 @@
+"""A linear answer on the features of several factors: fitted, asked, written, read.
+
+Two ways to fit: ``logistic``, the penalised regression of ``evaluation/linear_logistic.py`` (its weights
+taken back to the features as they are), and ``linear``, the paper's head of ``evaluation/linear_head.py``.
+Weights of classes are centred over the classes, which changes no probability and makes the logit of a class
+its lead over the mean. Leaves out scores (``derender.evaluation``).
+"""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from safetensors import SafetensorError
+from safetensors.numpy import load_file, save_file
+from scipy.special import expit, softmax
+
+from derender.data.nearest import nearest
+from derender.evaluation.linear_head import PAPER_HEAD, HeadSettings, head_loss
+from derender.evaluation.linear_logistic import axes_of, fit_logistic, solve_logistic
+from derender.evaluation.linear_task import Task
+from derender.whole import whole_folder
+
+HEADS = ("logistic", "linear")
+PENALTIES = (1e-1, 1.0, 1e1)
+FOLDS = 3
+FORMAT = 1
+WEIGHTS_FILE, CONFIG_FILE = "probe.safetensors", "probe.json"
+
+
+@dataclass(frozen=True, eq=False)
+class Probe:
+    """Logits that are linear in the features.
+
+    Attributes:
+        kind: "labels" (yes or no, each apart) or "classes" (one of several).
+        names: (A) labels or classes.
+        sizes: factor name to the length of its feature, in the order in which they stand side by side.
+        weight: (A, D) float32.
+        bias: (A,) float32.
+        head: how it was fitted.
+    """
+
+    kind: str
+    names: tuple[str, ...]
+    sizes: Mapping[str, int]
+    weight: np.ndarray
+    bias: np.ndarray
+    head: str = "logistic"
+
+    def __post_init__(self) -> None:
+        expected = (len(self.names), sum(self.sizes.values()))
+        if self.weight.shape != expected or self.bias.shape != expected[:1]:
+            raise ValueError(
+                f"a probe of {expected[0]} answers and {expected[1]} features has weights {expected}, got "
+                f"{self.weight.shape} and bias {self.bias.shape}"
+            )
+
+    @property
+    def factors(self) -> tuple[str, ...]:
+        return tuple(self.sizes)
+
+    @property
+    def slices(self) -> dict[str, slice]:
+        """Where each factor's columns lie."""
+        ends = np.cumsum(list(self.sizes.values())).tolist()
+        return {
+            name: slice(end - size, end) for (name, size), end in zip(self.sizes.items(), ends, strict=True)
+        }
+
+    def columns(self, features: Mapping[str, np.ndarray]) -> np.ndarray:
+        """The features of its factors side by side, (N, D)."""
+        for name, size in self.sizes.items():
+            found = features[name].shape[1] if name in features else 0
+            if found != size:
+                raise ValueError(
+                    f"the probe needs {size} numbers of factor {name!r}, the features have {found}: use the "
+                    "model that it was fitted on"
+                )
+        return np.concatenate([features[name] for name in self.sizes], axis=1)
+
+    def logits(self, features: Mapping[str, np.ndarray]) -> np.ndarray:
+        """(N, A) float64."""
+        return self.columns(features).astype(np.float64) @ self.weight.T.astype(np.float64) + self.bias
+
+    def probabilities(self, features: Mapping[str, np.ndarray]) -> np.ndarray:
+        """(N, A) in 0..1."""
+        logits = self.logits(features)
+        return softmax(logits, axis=1) if self.kind == "classes" else expit(logits)
+
+    def number(self, name: str) -> int:
+        """The place of a label or class; an unknown name is an error that names the nearest."""
+        if name not in self.names:
+            raise ValueError(
+                f"the probe was not asked about {name!r}{nearest(name, self.names)}; "
+                f"it knows {', '.join(self.names)}"
+            )
+        return self.names.index(name)
+
+    def save(self, folder: str | Path, *, overwrite: bool = False) -> Path:
+        """Write weights and what they mean to ``folder``; complete or not at all."""
+        folder = Path(folder)
+        if folder.exists() and not overwrite:
+            raise FileExistsError(f"{folder} exists already: choose another folder or pass overwrite=True")
+        facts: dict[str, Any] = {"format": FORMAT, "kind": self.kind, "names": list(self.names)}
+        facts |= {"sizes": [[name, size] for name, size in self.sizes.items()], "head": self.head}
+        with whole_folder(folder) as temporary:
+            save_file({"weight": self.weight, "bias": self.bias}, temporary / WEIGHTS_FILE)
+            (temporary / CONFIG_FILE).write_text(json.dumps(facts, indent=1))
+        return folder
+
+
+def load_probe(folder: str | Path) -> Probe:
+    """What ``Probe.save`` wrote.
+
+    Raises:
+        FileNotFoundError: there is none.
+        ValueError: it is damaged, or of a newer version.
+    """
+    folder = Path(folder)
+    if not (folder / CONFIG_FILE).is_file() or not (folder / WEIGHTS_FILE).is_file():
+        raise FileNotFoundError(
+            f"no probe at {folder}: give a folder that holds {CONFIG_FILE} and {WEIGHTS_FILE}"
+        )
+    try:
+        facts = json.loads((folder / CONFIG_FILE).read_text())
+        if facts["format"] > FORMAT:
+            raise ValueError(f"format {facts['format']} is newer than this version of derender")
+        arrays = load_file(folder / WEIGHTS_FILE)
+        sizes = {str(name): int(size) for name, size in facts["sizes"]}
+        return Probe(
+            facts["kind"], tuple(facts["names"]), sizes, arrays["weight"], arrays["bias"], facts["head"]
+        )
+    except (KeyError, TypeError, ValueError, SafetensorError) as error:
+        raise ValueError(f"the probe in {folder} cannot be read ({error}): fit it again") from error
+
+
+def fit_probe(
+    features: Mapping[str, np.ndarray],
+    task: Task,
+    rows: np.ndarray,
+    *,
+    head: str = "logistic",
+    seed: int = 0,
+    settings: HeadSettings = PAPER_HEAD,
+) -> Probe:
+    """Learn from some rows.
+
+    Args:
+        features: by factor, (N, D_f), finite.
+        task: what is asked of the N rows.
+        rows: (n,) training rows.
+        head: "logistic" or "linear".
+        seed: of folds, or of the start and the order of rows.
+        settings: of the paper's head.
+    """
+    if head not in HEADS:
+        raise ValueError(f"unknown head {head!r}{nearest(head, HEADS)}; there is {', '.join(HEADS)}")
+    sizes = {name: values.shape[1] for name, values in features.items()}
+    x = np.concatenate(list(features.values()), axis=1)[rows]
+    fitted = _logistic(x, task, rows, seed) if head == "logistic" else _paper(x, task, rows, seed, settings)
+    weight, bias = fitted
+    if task.kind == "classes":
+        weight, bias = weight - weight.mean(axis=0), bias - bias.mean()
+    return Probe(task.kind, task.names, sizes, weight.astype(np.float32), bias.astype(np.float32), head)
+
+
+def _logistic(x: np.ndarray, task: Task, rows: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    targets = task.targets[rows]
+    folds = min(FOLDS, len(x))
+    _, chosen = fit_logistic(x, targets, x[:1], kind=task.kind, penalties=PENALTIES, folds=folds, seed=seed)
+    axes, distinct = axes_of(x), np.unique(chosen)
+    every = np.ones((len(x), len(distinct)), bool)
+    found = solve_logistic(axes.apply(x), targets.astype(np.float64), every, distinct, task.kind)
+    own, answers = np.searchsorted(distinct, chosen), np.arange(targets.shape[1])
+    picked = found[:, own, answers] if task.kind == "labels" else found[:, own[0]]  # (R + 1, A)
+    weight = (axes.rotation @ picked[:-1]) / axes.scale[:, None]
+    return weight.T, picked[-1] - axes.mean @ weight
+
+
+def _paper(
+    x: np.ndarray, task: Task, rows: np.ndarray, seed: int, settings: HeadSettings
+) -> tuple[np.ndarray, np.ndarray]:
+    """The head of ``train_heads`` for one seed, with its weights."""
+    generator = torch.Generator().manual_seed(seed)
+    inputs = torch.from_numpy(np.ascontiguousarray(x, np.float32))
+    targets = torch.from_numpy(task.targets[rows].astype(np.float32))
+    reach = inputs.shape[1] ** 0.5
+    weight, bias = (
+        ((torch.rand(shape, generator=generator) * 2 - 1) / reach).requires_grad_()
+        for shape in ((inputs.shape[1], targets.shape[1]), (1, targets.shape[1]))
+    )
+    optimiser = torch.optim.Adam([weight, bias], lr=settings.learning_rate)
+    for _ in range(settings.epochs):
+        for batch in torch.randperm(len(inputs), generator=generator).split(settings.batch_size):
+            loss = head_loss((inputs[batch] @ weight + bias)[None], targets[batch][None], task.kind).sum()
+            optimiser.zero_grad(set_to_none=True)
+            loss.backward()
+            optimiser.step()
+    return weight.detach().numpy().T.astype(np.float64), bias.detach().numpy()[0].astype(np.float64)

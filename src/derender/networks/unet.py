@@ -1,0 +1,72 @@
+"""The expanding half of a U-Net, over the skip features of one encoder or of several side by side.
+
+Source: Ronneberger et al., MICCAI 2015 (transposed convolution, skip features joined, two 3x3 convolutions),
+with the widths of the encoders (encoders.py); Klinghoffer et al., ECCV 2022, Sec. 4.7 joins two encoders by
+stacking their features at each skip. The features of the centre are joined in the same way, so that each
+encoder's centre enters once. Leaves out cropping: convolutions are padded.
+"""
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from derender.networks.encoders import UNetEncoder, double_convolution
+
+
+class UNetDecoder(nn.Module):
+    """Features at every resolution, finest first, joined over all encoders, to one value a class and pixel.
+
+    The decoder keeps the widths of a single encoder, however many are joined.
+    """
+
+    def __init__(self, widths: Sequence[int], encoders: int, outputs: int):
+        super().__init__()
+        self.upsample, self.convolve = nn.ModuleList(), nn.ModuleList()
+        channels = encoders * widths[-1]
+        for _, finer in pairwise(reversed(widths)):
+            self.upsample.append(nn.ConvTranspose2d(channels, finer, 2, stride=2))
+            self.convolve.append(double_convolution((1 + encoders) * finer, finer))
+            channels = finer
+        self.to_outputs = nn.Conv2d(channels, outputs, 1)
+
+    def forward(self, skips: Sequence[Float[Tensor, "n _ _ _"]]) -> Float[Tensor, "n outputs h w"]:
+        *finer, features = skips
+        for up, convolve, skip in zip(self.upsample, self.convolve, reversed(finer), strict=True):
+            features = convolve(torch.cat([skip, up(features)], dim=1))
+        return self.to_outputs(features)
+
+
+class SegmentationNet(nn.Module):
+    """Pictures in 0..1 to one logit a class and pixel, from U-Net encoders and a fresh decoder.
+
+    A frozen net's encoders never change: their weights take no gradient, and their BatchNorm uses and keeps
+    the statistics they came with, in training too.
+    """
+
+    def __init__(self, encoders: Sequence[UNetEncoder], outputs: int, *, frozen: bool = False):
+        super().__init__()
+        widths = {tuple(encoder.widths) for encoder in encoders}
+        if len(widths) != 1:
+            raise ValueError(
+                f"encoders of one net have the same widths, got {sorted(widths) or 'no encoder'}"
+            )
+        self.encoders = nn.ModuleList(encoders).requires_grad_(not frozen)
+        for encoder in encoders:
+            encoder.to_code.requires_grad_(False)  # the code takes no part here
+        self.decoder = UNetDecoder(widths.pop(), len(encoders), outputs)
+        self.frozen = frozen
+
+    def train(self, mode: bool = True) -> "SegmentationNet":
+        super().train(mode)
+        if self.frozen:
+            self.encoders.eval()
+        return self
+
+    def forward(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n outputs h w"]:
+        with torch.set_grad_enabled(torch.is_grad_enabled() and not self.frozen):
+            levels = zip(*(encoder.skips(images) for encoder in self.encoders), strict=True)  # type: ignore[operator]
+            joined = [torch.cat(level, dim=1) for level in levels]
+        return self.decoder(joined)

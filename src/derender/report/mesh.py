@@ -1,0 +1,119 @@
+"""A scene's surface as a triangle mesh that other programs open right way up.
+
+Axes change on the way: here x is right, y DOWN, z forward and normals point inward (conventions.md); in the
+mesh x is right, y UP, z towards the viewer and normals point outward, as in glTF, so that the object looks
+along +z. That is half a turn about x, (x, y, z) -> (x, -y, 1 - z): handedness stays, and the object's centre
+(0, 0, 1) becomes the origin. Lengths stay scene units. Texture coordinates have their origin at the texture's
+lower left corner. Cells of the pixel grid that are no surface are left out: the border columns that the model
+holds at one depth, cells seen at a grazing angle (on a grid a jump in depth is one), and scraps that hang
+together with the rest nowhere. Leaves out closing the back, and files (``mesh_files``).
+"""
+
+from dataclasses import dataclass
+from math import cos, radians
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32, Int64
+from PIL import Image
+from scipy import ndimage
+from torch import Tensor
+
+from derender.report.colours import pictures
+from derender.scene import Scene
+from derender.scene.camera import unproject
+from derender.scene.normals import normals_from_depth
+
+GRAZING_DEG = 80.0
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """A textured triangle mesh; x right, y up, z towards the viewer.
+
+    Attributes:
+        vertices: (V, 3) scene units, the object's centre at the origin.
+        normals: (V, 3) unit length, outward.
+        uv: (V, 2) 0..1, from the lower left corner of the texture.
+        faces: (F, 3) vertex numbers, counter-clockwise seen from outside.
+        texture: albedo, first row at the top.
+        trimmed: share of the grid's cells that were left out, 0..1.
+    """
+
+    vertices: Float32[np.ndarray, "v 3"]
+    normals: Float32[np.ndarray, "v 3"]
+    uv: Float32[np.ndarray, "v 2"]
+    faces: Int64[np.ndarray, "f 3"]
+    texture: Image.Image
+    trimmed: float
+
+
+def mesh_of(scene: Scene, fov_deg: float, border_columns: int = 0, grazing_deg: float = GRAZING_DEG) -> Mesh:
+    """The mesh of one scene in its canonical view.
+
+    Args:
+        scene: one scene.
+        fov_deg: horizontal field of view.
+        border_columns: pixel columns at each side that the model holds at one depth; they are left out.
+        grazing_deg: cells whose surface is turned further from the viewer are left out.
+
+    Raises:
+        ValueError: there are several scenes, or nothing of the surface is left.
+    """
+    if len(scene) != 1:
+        raise ValueError(f"a mesh shows one scene, got {len(scene)}: pass scene[index]")
+    depth = scene.depth.detach().double().cpu()
+    height, width = depth.shape[1:]
+    points = unproject(depth, fov_deg)[0]
+    inside = torch.ones(height - 1, width - 1, dtype=torch.bool)
+    inside[:, :border_columns] = inside[:, width - 1 - border_columns :] = False
+    kept = _largest_piece((inside & _facing(points, grazing_deg)).numpy())
+    if not kept.any():
+        raise ValueError(
+            f"nothing of this surface is seen at less than {grazing_deg:g} degrees: allow more, or see "
+            "whether the model was trained"
+        )
+    corners = _faces(kept, width)
+    used, faces = np.unique(corners, return_inverse=True)
+    turned = np.array([1.0, -1.0, -1.0])
+    vertices = (points.numpy().reshape(-1, 3) - (0, 0, 1)) * turned
+    outward = -normals_from_depth(depth, fov_deg)[0].numpy().reshape(-1, 3) * turned
+    row, column = np.divmod(used, width)
+    uv = np.stack(((column + 0.5) / width, 1 - (row + 0.5) / height), axis=1)
+    return Mesh(
+        vertices[used].astype(np.float32),
+        outward[used].astype(np.float32),
+        uv.astype(np.float32),
+        faces.reshape(-1, 3).astype(np.int64),
+        pictures(scene.albedo.detach())[0],
+        float(1 - kept.mean()),
+    )
+
+
+def _facing(points: Float[Tensor, "h w 3"], grazing_deg: float) -> Tensor:
+    """Which cells (H-1, W-1) show both their triangles to the viewer at less than this angle."""
+    a, c = points[:-1, :-1], points[:-1, 1:]
+    b, d = points[1:, :-1], points[1:, 1:]
+    facing = torch.ones(a.shape[:2], dtype=torch.bool)
+    for corner, right, down in ((a, c - a, b - a), (d, d - b, d - c)):
+        normal = torch.linalg.cross(right, down)  # inward, like every normal here
+        cosine = (normal * corner).sum(dim=-1) / (normal.norm(dim=-1) * corner.norm(dim=-1))
+        facing &= cosine > cos(radians(grazing_deg))
+    return facing
+
+
+def _largest_piece(cells: np.ndarray) -> np.ndarray:
+    """The largest set of cells that hang together by their sides."""
+    pieces = np.zeros(cells.shape, np.int32)
+    ndimage.label(cells, output=pieces)
+    if pieces.max() <= 1:
+        return cells
+    return pieces == 1 + np.argmax(np.bincount(pieces.ravel())[1:])
+
+
+def _faces(cells: np.ndarray, width: int) -> np.ndarray:
+    """(F, 3) numbers of grid points, two triangles for each cell, counter-clockwise with y up."""
+    row, column = np.nonzero(cells)
+    a = row * width + column
+    b, c, d = a + width, a + 1, a + width + 1
+    return np.concatenate((np.stack((a, b, c), axis=1), np.stack((c, b, d), axis=1)))

@@ -1,0 +1,95 @@
+"""Masks in colours over their pictures, what several nets answered side by side, and a legend.
+
+Left and right of a pair share a hue. Leaves out scores (``tables_segmentation``) and writing files.
+"""
+
+from collections.abc import Mapping, Sequence
+from math import ceil
+
+import numpy as np
+from matplotlib.colors import hsv_to_rgb
+from PIL import Image, ImageDraw, ImageFont
+
+from derender.report import colours
+from derender.report.colours import Images
+from derender.report.panel import INK, PAPER, GridLayout, labelled_grid, shortened
+
+FACE_PALETTE = (
+    *((38, 40, 46), (240, 178, 140), (214, 112, 64), (122, 86, 196), (66, 134, 244), (120, 186, 255)),
+    *((20, 120, 80), (64, 190, 130), (226, 160, 30), (252, 206, 92), (120, 8, 40), (228, 26, 74)),
+    *((252, 108, 150), (104, 62, 30), (150, 150, 156), (255, 245, 60), (0, 206, 209), (198, 148, 170)),
+    (70, 92, 120),
+)
+"""Red, green, blue of CelebAMask-HQ's 19 classes in their order."""
+
+OPACITY = 0.62
+
+
+def palette(n_classes: int) -> np.ndarray:
+    """(C, 3) uint8: the faces' colours, then further ones spaced by the golden angle."""
+    more = np.arange(max(0, n_classes - len(FACE_PALETTE)))
+    hues = np.stack([(0.11 + 0.618034 * more) % 1, np.full(len(more), 0.75), np.full(len(more), 0.9)], axis=1)
+    further = np.rint(hsv_to_rgb(hues) * 255).astype(np.uint8).reshape(-1, 3)
+    return np.concatenate([np.array(FACE_PALETTE, np.uint8), further])[:n_classes]
+
+
+def overlays(pictures: np.ndarray, masks: np.ndarray, n_classes: int, *, scale: int = 1) -> Images:
+    """Masks (N, S, S) in colours over pictures (N, 3, S, S) uint8; every pixel becomes ``scale`` squared."""
+    if pictures.shape != (len(masks), 3, *masks.shape[1:]):
+        raise ValueError(f"pictures {pictures.shape} and masks {masks.shape} must be of one size and number")
+    ground = np.moveaxis(pictures, 1, -1).astype(np.float32)
+    mixed = (1 - OPACITY) * ground + OPACITY * palette(n_classes)[masks]
+    return colours.pictures(_larger(np.moveaxis(np.rint(mixed).astype(np.uint8), -1, 1), scale))
+
+
+def segmentation_sheet(
+    pictures: np.ndarray,
+    masks: np.ndarray,
+    answers: Mapping[str, np.ndarray],
+    classes: Sequence[str],
+    layout: GridLayout | None = None,
+) -> Image.Image:
+    """A row for each picture: itself, its mask, every answer; the legend of the classes below.
+
+    Args:
+        pictures: (N, 3, S, S) uint8.
+        masks: (N, S, S) true class numbers.
+        answers: by column name, (N, S, S).
+        classes: the name of every class number.
+        layout: sizes in pixels.
+    """
+    layout = layout or GridLayout()
+    scale = max(1, ceil(layout.cell / masks.shape[-1]))  # pixels stay squares when the grid shrinks them
+    columns = {"picture": colours.pictures(_larger(pictures, scale))}
+    for name, shown in {"mask": masks, **answers}.items():
+        columns[name] = overlays(pictures, shown, len(classes), scale=scale)
+    grid = labelled_grid(columns, layout=layout)
+    key = legend(classes, grid.width, layout)
+    sheet = Image.new("RGB", (grid.width, grid.height + key.height), PAPER)
+    sheet.paste(grid, (0, 0))
+    sheet.paste(key, (0, grid.height))
+    return sheet
+
+
+def legend(classes: Sequence[str], width: int, layout: GridLayout | None = None) -> Image.Image:
+    """A swatch and a name for each class, in as many columns as fit into ``width`` pixels."""
+    layout = layout or GridLayout()
+    font = ImageFont.load_default(layout.label)
+    swatch, gap = layout.label + 4, layout.gap
+    widest = max(ceil(font.getlength(name)) for name in classes)
+    cell = min(swatch + 3 * gap + widest, width - 2 * layout.margin)
+    across = max(1, (width - 2 * layout.margin) // cell)
+    down = ceil(len(classes) / across)
+    key = Image.new("RGB", (width, down * (swatch + gap) + layout.margin), PAPER)
+    draw = ImageDraw.Draw(key)
+    for number, (name, colour) in enumerate(zip(classes, palette(len(classes)).tolist(), strict=True)):
+        x, y = layout.margin + number % across * cell, number // across * (swatch + gap)
+        draw.rectangle((x, y, x + swatch, y + swatch), fill=tuple(colour))
+        room = max(1, cell - swatch - 2 * gap)
+        draw.text((x + swatch + gap, y + swatch // 2), shortened(name, font, room), INK, font, anchor="lm")
+    return key
+
+
+def _larger(pictures: np.ndarray, scale: int) -> np.ndarray:
+    """Every pixel of (N, 3, S, S) repeated ``scale`` times each way."""
+    return pictures.repeat(scale, axis=2).repeat(scale, axis=3)

@@ -1,0 +1,105 @@
+"""One scene in many lights or from many sides: values for a strip of stills and for a film that loops.
+
+A sweep is a function of places t between 0 and 1; ``stills`` and ``there_and_back`` say at which. Lights are
+relative to the object (conventions.md), so the same light falls on the same side of every object, however it
+is turned. Leaves out drawing (``sheets``) and files (``moved``).
+"""
+
+from collections.abc import Callable
+from math import cos, pi, radians
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from derender.render import Rendering
+from derender.report.colours import Images, pictures
+from derender.scene import Scene
+
+AMBIENT, DIFFUSE = 0.35, 0.65
+FRAMES_AT_ONCE = 8
+
+
+def stills(count: int) -> Float[Tensor, " k"]:
+    """``count`` places, evenly from 0 to 1."""
+    if count < 2:
+        raise ValueError(f"a strip needs 2 stills or more, got {count}")
+    return torch.linspace(0, 1, count)
+
+
+def there_and_back(frames: int) -> Float[Tensor, " k"]:
+    """Places of a film that goes from 0 to 1 and back without a jerk; the last frame leads to the first."""
+    if frames < 2:
+        raise ValueError(f"a film needs 2 frames or more, got {frames}")
+    return torch.tensor([(1 - cos(2 * pi * frame / frames)) / 2 for frame in range(frames)])
+
+
+def lights_around(t: Float[Tensor, " k"], reach_deg: float, pitch_deg: float = 0.0) -> Float[Tensor, "k 4"]:
+    """Lights from the right of the picture (t = 0) to its left (t = 1), ``reach_deg`` off the axis."""
+    _within("reach", reach_deg, 90)
+    _within("pitch", pitch_deg, 90)
+    light = torch.tensor([AMBIENT, DIFFUSE, radians(pitch_deg), 0.0]).repeat(len(t), 1)
+    light[:, 3] = radians(reach_deg) * (2 * t - 1)
+    return light
+
+
+def lights_between(
+    t: Float[Tensor, " k"], start: Float[Tensor, " 4"], end: Float[Tensor, " 4"]
+) -> Float[Tensor, "k 4"]:
+    """Lights from one to another, each number on a straight line."""
+    return torch.lerp(start[None], end[None], t.to(start)[:, None])
+
+
+def cameras_around(t: Float[Tensor, " k"], reach_deg: float, pitch_deg: float = 0.0) -> Float[Tensor, "k 6"]:
+    """Cameras for an object that looks to the right of the picture (t = 0), then to its left (t = 1).
+
+    ``pitch_deg`` > 0 brings its top forward. No shift, no roll: yaw 0 and pitch 0 show the canonical view.
+    """
+    _within("reach", reach_deg, 90)
+    _within("pitch", pitch_deg, 90)
+    camera = torch.zeros(len(t), 6)
+    camera[:, 0] = radians(pitch_deg)
+    camera[:, 1] = radians(reach_deg) * (2 * t - 1)
+    return camera
+
+
+def varied(scene: Scene, **parameters: Tensor) -> Scene:
+    """One scene once for each row of the given parameters, with those in place of its own."""
+    if len(scene) != 1:
+        raise ValueError(f"a sweep shows one scene, got {len(scene)}: pass scene[index]")
+    counts = {len(value) for value in parameters.values()}
+    if len(counts) != 1:
+        raise ValueError(f"the parameters of a sweep need one number of rows, got {sorted(counts)}")
+    (count,) = counts
+    repeated = scene.detach().map(lambda value: value.expand(count, *value.shape[1:]))
+    return repeated.with_parameters(**{name: value.to(scene.depth) for name, value in parameters.items()})
+
+
+def swapped(scene: Scene, donor: Scene, parameter: str) -> Scene:
+    """The scenes with one parameter (depth, albedo, light, camera) of a single other scene."""
+    if len(donor) != 1:
+        raise ValueError(f"a swap takes from one scene, got {len(donor)}: pass donor[index]")
+    if parameter not in donor.parameters:
+        raise ValueError(
+            f"the other scene has no {parameter!r}; this scene has {', '.join(donor.parameters)}"
+        )
+    value = donor.parameters[parameter]
+    return scene.with_parameters(**{parameter: value.expand(len(scene), *value.shape[1:])})
+
+
+def drawn(scene: Scene, render: Callable[[Scene], Rendering]) -> Images:
+    """Renderings as images, transparent where nothing is seen; few at a time, so that large ones fit."""
+    images: Images = []
+    with torch.no_grad():
+        for start in range(0, len(scene), FRAMES_AT_ONCE):
+            rendering = render(scene[start : start + FRAMES_AT_ONCE])
+            images += pictures(rendering.image, rendering.mask)
+    return images
+
+
+def _within(name: str, angle_deg: float, limit_deg: float) -> None:
+    if not -limit_deg < angle_deg < limit_deg:
+        raise ValueError(
+            f"{name} must lie between -{limit_deg} and {limit_deg} degrees, got {angle_deg}: "
+            "give a smaller angle"
+        )

@@ -1,0 +1,103 @@
+"""Tables of segmentation: scores beside controls and the paper's lines, and the IoU of every class."""
+
+from math import isfinite
+
+from derender.evaluation.bootstrap import ScoredRow
+from derender.evaluation.segmentation import SegmentationComparison
+from derender.evaluation.tables import PaperRow
+from derender.report.score_table import Cell, Column, Row, ScoreTable
+
+PAPER: tuple[PaperRow, ...] = tuple(
+    PaperRow(
+        method,
+        "24,127 + 2,885 of CelebAMask-HQ, 64 x 64",
+        {"mean_iou": mean, "top10_iou": top, "pixel_accuracy": accuracy},
+    )
+    for method, mean, top, accuracy in (
+        ("Supervised (random init)", 0.3862, 0.5858, 0.8669),
+        ("Geometry Encoder", 0.4066, 0.5977, 0.8715),
+        ("Albedo Encoder", 0.3987, 0.5984, 0.8724),
+        ("Joint Encoders", 0.4390, 0.6221, 0.8781),
+        ("Joint Encoders Frozen", 0.3962, 0.5712, 0.8540),
+    )
+)
+"""Klinghoffer et al., ECCV 2022, Table 3."""
+
+SEGMENT_COLUMNS = {
+    "mean_iou": Column("mIoU", "high", note="intersection over union, mean over classes, 0 to 1"),
+    "top10_iou": Column("top 10", "high", note="the same over the row's own ten best classes, 0 to 1"),
+    "pixel_accuracy": Column("pixels", "high", note="share of right pixels, 0 to 1"),
+}
+_SHOWN = (
+    SEGMENT_COLUMNS["mean_iou"],
+    Column("95 %", note="interval of mIoU over resamples of the tested pictures"),
+    Column("±", note="standard deviation of mIoU over seeds"),
+    SEGMENT_COLUMNS["top10_iou"],
+    SEGMENT_COLUMNS["pixel_accuracy"],
+    Column("learn", note="weights that were trained"),
+)
+
+
+def segmentation_table(found: SegmentationComparison) -> ScoreTable:
+    """A row for each net and control."""
+    rows = [Row(row.scored.name, _cells(row.scored, row.trainable), row.scored.control) for row in found.rows]
+    return ScoreTable(_caption(found), "net", _SHOWN, rows)
+
+
+def beside_the_paper(found: SegmentationComparison) -> ScoreTable:
+    """Our nets over the paper's lines, which were made on other pictures: the last column says which."""
+    columns = (*SEGMENT_COLUMNS.values(), Column("data"))
+    ours = f"{found.n_train:,} + {found.n_test:,} pictures"
+    rows = [
+        Row(
+            row.scored.name,
+            (*(row.scored.scores[name].value for name in SEGMENT_COLUMNS), ours),
+            row.scored.control,
+        )
+        for row in found.rows
+        if row.trainable
+    ]
+    rows += [
+        Row(f"paper: {one.method}", (*one.scores.values(), one.dataset), control=True, note="paper")
+        for one in PAPER
+    ]
+    return ScoreTable("beside the paper's Table 3", "net", columns, rows)
+
+
+def class_table(found: SegmentationComparison) -> ScoreTable:
+    """A row for each class, most frequent first: its share of the tested pixels and every net's IoU."""
+    nets = [row for row in found.rows if row.trainable]
+    columns = (
+        Column("share", note="of the tested pixels"),
+        *(Column(row.scored.name, None, note="IoU, 0 to 1") for row in nets),
+    )
+    order = sorted(range(len(found.classes)), key=lambda number: -float(found.test_share[number]))
+    rows = [
+        Row(
+            found.classes[number],
+            (float(found.test_share[number]), *(float(row.class_iou[number]) for row in nets)),
+        )
+        for number in order
+    ]
+    return ScoreTable("intersection over union of every class", "class", columns, rows)
+
+
+def _cells(row: ScoredRow, trainable: int) -> tuple[Cell, ...]:
+    mean = row.scores["mean_iou"]
+    return (
+        mean.value,
+        f"{mean.low:.3f}-{mean.high:.3f}" if isfinite(mean.low) else None,
+        mean.spread if isfinite(mean.spread) else None,
+        row.scores["top10_iou"].value,
+        row.scores["pixel_accuracy"].value,
+        trainable or None,
+    )
+
+
+def _caption(found: SegmentationComparison) -> str:
+    seen = int((found.test_share > 0).sum())
+    seeds = "1 seed" if len(found.seeds) == 1 else f"{len(found.seeds)} seeds"
+    return (
+        f"segmentation: {found.n_train:,} pictures learned, {found.n_test:,} tested (by {found.split}), "
+        f"{seen} of {len(found.classes)} classes tested, {found.settings.epochs} epochs, {seeds}"
+    )

@@ -1,0 +1,66 @@
+"""The same scenes on a finer grid: smooth depth, sharp albedo, light and camera as they are.
+
+Depth becomes a uniform cubic B-spline whose control points are the depth map: twice differentiable, never
+outside the values it is made of, and its slope at the old pixels is the central difference that
+``normals_from_depth`` takes there, so that a model is seen with the normals it was trained with. Albedo is
+interpolated by the Catmull-Rom spline, which keeps every pixel's value, and clipped to 0..1. Source: de Boor,
+A Practical Guide to Splines; Catmull and Rom, 1974; one matrix product per axis. Outermost pixel centres stay
+where they are, as the field of view does. Leaves out maps of further factors and detail that the coarse maps
+never had.
+"""
+
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from derender.scene.scene import Scene
+
+SMALLEST_MAP = 4
+
+
+def at_size(scene: Scene, size: int) -> Scene:
+    """Scenes with depth and albedo of ``size`` x ``size``; no smaller than they are.
+
+    A scene that has that size already is returned as it is. Gradients reach depth and albedo.
+    """
+    height, width = scene.depth.shape[-2:]
+    if height != width:
+        raise ValueError(f"only square scenes can be enlarged, got {height}x{width}: cut or pad them first")
+    if size < width or width < SMALLEST_MAP:
+        least = max(width, SMALLEST_MAP)
+        raise ValueError(f"a scene of {width}x{width} cannot be shown at {size}x{size}: give {least} or more")
+    if size == width:
+        return scene
+    places = torch.linspace(0, width - 1, size, dtype=torch.float64)
+    smooth, sharp = (cubic_weights(places, width, kind).to(scene.depth) for kind in ("smooth", "sharp"))
+    depth = smooth @ scene.depth @ smooth.T
+    albedo = sharp @ scene.albedo @ sharp.T
+    return scene.with_parameters(depth=depth, albedo=albedo.clamp(0, 1))
+
+
+def cubic_weights(
+    places: Float[Tensor, " size"], count: int, kind: Literal["smooth", "sharp"]
+) -> Float[Tensor, "size count"]:
+    """What places between the first (0) and the last (count - 1) of some values take of each value; float64.
+
+    ``smooth`` is the uniform cubic B-spline, ``sharp`` the Catmull-Rom spline, which meets every value. Rows
+    sum to 1 and straight lines stay straight; beyond its ends the row of values goes on straight.
+    """
+    place = places.double()
+    left = place.floor().clamp(0, count - 2).long()
+    t = place - left
+    if kind == "smooth":
+        blend = ((1 - t) ** 3, 3 * t**3 - 6 * t**2 + 4, -3 * t**3 + 3 * t**2 + 3 * t + 1, t**3)
+        blend = [weight / 6 for weight in blend]
+    else:
+        blend = (-(t**3) + 2 * t**2 - t, 3 * t**3 - 5 * t**2 + 2, -3 * t**3 + 4 * t**2 + t, t**3 - t**2)
+        blend = [weight / 2 for weight in blend]
+    padded = place.new_zeros(len(place), count + 2)  # one value more at each end
+    for offset, weight in enumerate(blend):
+        padded[torch.arange(len(place)), left + offset] += weight
+    weights = padded[:, 1:-1].clone()
+    weights[:, :2] += padded[:, :1] * place.new_tensor([2.0, -1.0])
+    weights[:, -2:] += padded[:, -1:] * place.new_tensor([-1.0, 2.0])
+    return weights

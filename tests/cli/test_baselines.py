@@ -1,0 +1,142 @@
+"""Baselines on the command line: train, embed, score, and ways to get it wrong."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from derender import FeatureTable
+from derender.cli import main
+from derender.cli.baselines import NAMES
+
+TINY = ["image_size=32", "width=8", "codes=8", "batch_size=4", "images=8"]
+SETTINGS = [word for setting in TINY for word in ("--set", setting)]
+
+
+@pytest.fixture(scope="module")
+def faces(tmp_path_factory) -> Path:
+    """24 pictures in the folders of two classes."""
+    folder, random = tmp_path_factory.mktemp("cli") / "faces", np.random.default_rng(0)
+    for index in range(24):
+        picture = Image.fromarray(random.integers(0, 256, (4, 4, 3), dtype=np.uint8)).resize((32, 32))
+        file = folder / ("happy" if index % 2 else "sad") / f"{index:02d}.png"
+        file.parent.mkdir(parents=True, exist_ok=True)
+        picture.save(file)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def run(faces: Path, tmp_path_factory) -> Path:
+    """A run folder of a VQ-VAE trained for two steps."""
+    folder = tmp_path_factory.mktemp("cli") / "vqvae"
+    assert main(["train", "--model", "vqvae", "--data", str(faces), "--out", str(folder), *SETTINGS]) == 0
+    return folder
+
+
+@pytest.fixture
+def refused(capsys):
+    """Run a command that must fail with exit code 2 and one line of complaint; gives that line."""
+
+    def call(*arguments: object) -> str:
+        capsys.readouterr()
+        assert main([str(argument) for argument in arguments]) == 2
+        last = capsys.readouterr().err.strip().splitlines()[-1]
+        assert last.startswith("derender: ")
+        return last
+
+    return call
+
+
+def test_a_run_has_a_report_and_goes_on(run, faces, capsys):
+    assert "Baseline vqvae" in (run / "report.html").read_text()
+    assert (run / "model" / "model.safetensors").is_file() and list((run / "samples").glob("*.png"))
+    assert main(["train", "--data", str(faces), "--out", str(run), "--resume"]) == 0
+    assert "8 pictures in" in capsys.readouterr().err
+
+
+def test_embed_then_cluster_as_with_our_own(run, faces, tmp_path, capsys):
+    table_file, numbers = tmp_path / "vqvae.parquet", tmp_path / "numbers.json"
+    embed = ["embed", "--baseline", "vqvae", "-m", run, "-d", faces, "--features", "pooled,histogram"]
+    assert main([str(word) for word in [*embed, "--out", table_file, "--json", numbers]]) == 0
+    table = FeatureTable.read(table_file)
+    assert {name: values.shape for name, values in table.factors.items()} == {
+        "pooled": (24, 8),
+        "histogram": (24, 8),
+    }
+    assert table.origin["baseline"] == "vqvae" and table.origin["source"] == str(run)
+    assert json.loads(numbers.read_text())["factors"] == {"pooled": 8, "histogram": 8}
+    cluster = ["evaluate", "cluster", "--features", table_file, "--label", "class", "--factors", "pooled"]
+    assert main([str(word) for word in cluster]) == 0
+    assert "pooled" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("name", "size"), [("pixels", 3072), ("pca", 4), ("hog", 324), ("noise", 4)])
+def test_controls_need_no_model(name, size, faces, run, tmp_path):
+    out = tmp_path / "table.parquet"
+    embed = [
+        "embed",
+        "--baseline",
+        name,
+        "--data",
+        faces,
+        "--image-size",
+        32,
+        "--components",
+        4,
+        "--out",
+        out,
+    ]
+    assert main([str(word) for word in embed]) == 0
+    table = FeatureTable.read(out)
+    assert table.factors[name].shape == (24, size) and table.origin["control"] == name
+    assert "class" in table.labels
+    part = [*embed[:-1], tmp_path / "part.parquet", "--part", "test", "--model", run]
+    assert main([str(word) for word in part]) == 0
+    test = FeatureTable.read(tmp_path / "part.parquet")
+    assert len(test) == 2 and (name != "pca" or test.origin["fitted_on"] == 19)
+
+
+def test_resnet18_trains_on_labels_and_embeds(faces, tmp_path, refused):
+    run, out = tmp_path / "resnet18", tmp_path / "table.parquet"
+    train = ["train", "--model", "resnet18", "--data", faces, "--out", run]
+    few = ["labels=class", "labelled=8", "epochs=1", "batch_size=4", "image_size=32", "width=4"]
+    assert "name a label to learn" in refused(*train)
+    train += [word for setting in few for word in ("--set", setting)]
+    assert main([str(word) for word in train]) == 0
+    assert "is not resumed" in refused(*train, "--resume")
+    embed = ["embed", "--baseline", "resnet18", "--model", run, "--data", faces, "--out", out]
+    assert main([str(word) for word in embed]) == 0
+    assert FeatureTable.read(out).factors["pooled"].shape == (24, 32)
+
+
+def test_bad_words_are_one_line(run, faces, tmp_path, refused):
+    out = tmp_path / "t.parquet"
+    embed = ("embed", "--data", faces, "--out", out)
+    assert "did you mean 'vqvae'" in refused(*embed, "--baseline", "vqvea")
+    assert "give --model RUN, or --baseline NAME" in refused(*embed)
+    for name in ("vqvae", "untrained"):
+        assert f"--baseline {name} needs --model" in refused(*embed, "--baseline", name)
+    assert "has no feature 'maps'; did you mean 'map'" in refused(
+        *embed, "--baseline", "vqvae", "--model", run, "--features", "maps"
+    )
+    assert "holds the baseline 'vqvae'" in refused(*embed, "--model", run)
+    assert "holds the baseline 'vqvae', asked for ae" in refused(*embed, "--baseline", "ae", "--model", run)
+    assert "hf download" in refused(*embed, "--baseline", "dinov2", "--model", "nobody/nothing")
+    assert "--part needs --model" in refused(*embed, "--baseline", "pixels", "--part", "test")
+    assert "(N, 3" not in refused(*embed, "--baseline", "pca", "--image-size", "16")
+    train = ("train", "--data", faces, "--out", tmp_path / "run")
+    assert "did you mean 'simclr'" in refused(*train, "--model", "simcrl")
+    assert "--preset is for our own model" in refused(*train, "--model", "ae", "--preset", "small")
+    assert "'model.codes'" in refused(*train, "--model", "vqvae", "--set", "code=3")
+    assert f"{run} trained vqvae, not ae" in refused(
+        "train", "--model", "ae", "--data", faces, "--out", run, "--resume"
+    )
+    assert not out.exists() and not (tmp_path / "run").exists()
+
+
+def test_help_names_every_baseline(capsys):
+    assert main(["embed", "--help"]) == 0
+    text = capsys.readouterr().out
+    assert all(name in text for name in NAMES)

@@ -1,0 +1,167 @@
+"""Tables from the command line: files and models in, scores beside controls and the paper's numbers out."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from derender import Derenderer, FeatureTable
+from derender.cli import main
+
+ROWS = 64
+QUICK = ["--resamples", "20", "--untrained-seeds", "2", "--cache"]
+
+
+@pytest.fixture(scope="module")
+def people(tmp_path_factory) -> Path:
+    """Pictures of four made-up people, one folder each, told apart by their colour."""
+    folder, rng = tmp_path_factory.mktemp("compare") / "people", np.random.default_rng(0)
+    for row in range(ROWS):
+        colour = np.array([[200, 40, 40], [40, 200, 40], [40, 40, 200], [200, 200, 40]])[row % 4]
+        pixels = np.clip(colour + rng.integers(-30, 30, (16, 16, 3)), 0, 255).astype(np.uint8)
+        (folder / "abcd"[row % 4]).mkdir(parents=True, exist_ok=True)
+        Image.fromarray(pixels).save(folder / "abcd"[row % 4] / f"{row:03d}.png")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory) -> Path:
+    net = Derenderer.from_preset("small", seed=5, image_size=32, width=4, light_width=4)
+    return net.save(tmp_path_factory.mktemp("compare") / "model")
+
+
+@pytest.fixture(scope="module")
+def tables(tmp_path_factory) -> dict[str, Path]:
+    """Feature tables with yes/no attributes and identities, one that knows them and two that do not."""
+    folder, rng = tmp_path_factory.mktemp("tables"), np.random.default_rng(0)
+    who = np.arange(ROWS * 3) % 4
+    labels = {
+        "identity": np.array(list("abcd"))[who],
+        "smiles": (who % 2).astype(np.int8),
+        "young": (who // 2).astype(np.int8),
+        "single": np.array(["lonely"] + ["other"] * (len(who) - 1)),
+        "same": np.zeros(len(who)),
+    }
+    files = tuple(f"{row}.png" for row in range(len(who)))
+
+    def write(name: str, values: np.ndarray, files: tuple[str, ...] = files, **origin: object) -> Path:
+        factors = {"geometry": values, "albedo": values[:, :2]}
+        return FeatureTable(files, factors, labels, {"layout": "lfw", **origin}).write(
+            folder / f"{name}.parquet"
+        )
+
+    noise = rng.normal(size=(2, len(who), 4))
+    return {
+        "good": write("good", np.eye(4)[who] + 0.05 * noise[0]),
+        "noise": write("noise", noise[0], settings={"width": 1}),
+        "noise2": write("noise2", noise[1], settings={"width": 1}),
+        "wide": write("wide", noise[1], settings={"width": 2}),
+        "elsewhere": write("elsewhere", noise[1], tuple(f"x{file}" for file in files)),
+    }
+
+
+@pytest.fixture
+def refused(capsys):
+    def call(*words: object) -> str:
+        capsys.readouterr()
+        assert main([str(word) for word in words]) == 2
+        return capsys.readouterr().err.strip().splitlines()[-1]
+
+    return call
+
+
+def run(capsys, *words: object) -> dict:
+    capsys.readouterr()
+    assert main([*map(str, words), "--json", "-"]) == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def test_a_clustering_table_beside_the_papers(tables, tmp_path, capsys):
+    words = ["compare", "--table", "identity", "--features", f"good={tables['good']}"]
+    words += ["--features", f"noise={tables['noise']}", "--features", f"noise={tables['noise2']}"]
+    text = tmp_path / "table.md"
+    told = run(capsys, *words, *QUICK, tmp_path / "cache", "--markdown", text, "--latex", tmp_path / "t.tex")
+    part = told["parts"]["identity"]
+    assert told["number"] == 1 and list(part["rows"]) == ["good", "noise", "majority", "chance"]
+    assert part["rows"]["good"]["scores"]["accuracy"]["value"] == 1
+    assert part["rows"]["good"]["versus"]["accuracy"]["above"] is True
+    assert part["rows"]["noise"]["runs"] == 2 and part["n_rows"] == 80  # 20 of each
+    assert part["differs"].startswith("stand-in: 80 rows of lfw for 644 tracks")
+    assert {row["dataset"] for row in part["paper"]} == {"BBT", "Buffy"}
+    assert "paper: Ours - LOOCC-LV" in text.read_text()
+    assert (tmp_path / "t.tex").read_text().count(r"\begin{table}") == 3
+    assert len(list((tmp_path / "cache").iterdir())) == 3
+    capsys.readouterr()
+    assert main([*map(str, words), *QUICK, str(tmp_path / "cache")]) == 0
+    shown = capsys.readouterr()
+    assert "0 results computed, 3 found" in shown.err and "paper: Ours - LOOCC-L " in shown.out
+
+
+def test_a_linear_table_beside_the_papers(tables, tmp_path, capsys):
+    words = ["compare", "--table", "linear", "--features", f"good={tables['good']}", "--seeds", "2"]
+    told = run(capsys, *words, "--counts", "20,60", *QUICK, tmp_path)
+    part = told["parts"]["attributes"]
+    assert part["names"] == ["smiles", "young"] and part["n_test"] == 96 and part["seeds"] == [0, 1]
+    logistic = next(one for one in part["parts"] if (one["head"], one["labels"]) == ("logistic", 60))
+    assert logistic["rows"]["good"]["scores"]["balanced_accuracy"]["value"] > 0.95
+    assert logistic["rows"]["majority"]["scores"]["balanced_accuracy"]["value"] == 0.5
+
+
+def test_a_model_is_embedded_once_beside_its_untrained_twins(model, people, tmp_path, capsys):
+    words = ["evaluate", "linear", "-m", model, "-d", people, "--label", "class", "--counts", "20"]
+    words += ["--heads", "k-NN", "--seeds", "2", *QUICK, tmp_path]
+    told = run(capsys, *words, "--finetune", "--epochs", "1")
+    knn, tuned = told["parts"]
+    assert list(knn["rows"]) == ["geometry + albedo", "untrained encoder", "PCA (16)", "pixels", "majority"]
+    assert knn["rows"]["pixels"]["scores"]["accuracy"]["value"] > 0.5 and told["kind"] == "classes"
+    assert (tuned["head"], list(tuned["rows"])) == (
+        "fine-tuned",
+        ["geometry + albedo", "untrained encoder", "majority"],
+    )
+    clustered = ["evaluate", "cluster", "-m", model, "-d", people, "--label", "class", *QUICK, tmp_path]
+    assert main([str(word) for word in [*clustered, "--method", "finch"]]) == 0
+    shown = capsys.readouterr()
+    assert "FINCH on geometry + albedo: partitions found, 4 classes" in " ".join(shown.out.split())
+    assert "5 results computed, 8 found" in shown.err  # embeddings and PCA, and the levels' own trees
+
+
+def test_controls_for_a_table_made_before(model, people, tmp_path, capsys):
+    table = tmp_path / "f.parquet"
+    assert main(["embed", "-m", str(model), "-d", str(people), "--out", str(table)]) == 0
+    words = ["evaluate", "cluster", "-f", table, "-d", people, "--label", "class", *QUICK, "none"]
+    assert list(run(capsys, *words)["rows"])[1:4] == ["untrained encoder", "PCA (16)", "pixels"]
+
+
+def test_bad_input_is_one_line(tables, model, people, refused, tmp_path):
+    good = tables["good"]
+    cluster = ("evaluate", "cluster", "-f", good, "--cache", "none")
+    assert "unknown label 'identty'; did you mean 'identity'" in refused(*cluster, "-l", "identty")
+    assert "two classes, the 192 labelled rows of 'same' have 1" in refused(*cluster, "-l", "same")
+    assert "cannot make 500 clusters of 192 rows" in refused(*cluster, "-l", "identity", "--clusters", 500)
+    assert "either --label NAME" in refused(*cluster)
+    assert "either --label NAME" in refused(*cluster, "-l", "identity", "--attributes")
+    linear = ("evaluate", "linear", "-f", good, "--cache", "none")
+    assert "class 'lonely' of label 'single' has one row" in refused(*linear, "-l", "single")
+    assert "96 can be learned from" in refused(*linear, "--attributes")
+    assert "should read like 100,500,1000" in refused(*linear, "--attributes", "--counts", "ten")
+    assert "unknown head 'svm'" in refused(*linear, "--attributes", "--counts", "20", "--heads", "svm")
+    assert "--finetune trains the encoders" in refused(*linear, "--attributes", "--finetune")
+    compare = ("compare", "--table", "identity", "--cache", "none", "-f", f"good={good}")
+    assert "different pictures, in 192 of 192 rows" in refused(*compare, "-f", f"b={tables['elsewhere']}")
+    mixed = ("-f", f"n={tables['noise']}", "-f", f"n={tables['wide']}")
+    assert "row 'n' mixes features of different models" in refused(*compare, *mixed)
+    assert "are not among the pictures" in refused(*compare, "-d", people)
+    assert "unknown table 'identities'; did you mean 'identity'" in refused(
+        "compare", "--table", "identities"
+    )
+    assert "give --features NAME=FILE" in refused("compare", "--table", "identity")
+    assert "--model needs --data" in refused("compare", "--table", "identity", "-m", model)
+    assert "needs labels (class)" in refused("compare", "--table", "cars", "-f", f"good={good}")
+    assert "should read NAME=PATH" in refused("compare", "--table", "cars", "-f", f"={good}")
+    there = tmp_path / "there.md"
+    there.write_text("mine")
+    assert "exists already" in refused(*compare, "--markdown", there)
+    assert there.read_text() == "mine"
+    assert "no feature table at" in refused(*compare, "-f", f"b={tmp_path / 'none.parquet'}")

@@ -1,0 +1,97 @@
+"""`evaluate disentangle` and `evaluate geometry`: pictures drawn, numbers told, bad words refused."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from derender.cli import main
+from derender.data.synthetic import faces, write
+from derender.model import Derenderer
+from derender.presets import MODEL_PRESETS
+
+SIZE = 32
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory) -> Path:
+    """An untrained model on disk, for 32 pixels."""
+    settings = MODEL_PRESETS["small"]
+    sizes = {"image_size": SIZE, "width": 4, "light_width": 4, "code_size": 12}
+    network = settings.network.model_copy(update=sizes)
+    made = Derenderer.seeded(settings.model_copy(update={"network": network}), 0)
+    return made.save(tmp_path_factory.mktemp("disentangle") / "model")
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """Generated faces, in memory."""
+    return faces.generate(24, SIZE, 0)
+
+
+@pytest.fixture(scope="module")
+def rendered(tmp_path_factory, made) -> Path:
+    folder = tmp_path_factory.mktemp("disentangle") / "faces"
+    write(made, folder)
+    return folder
+
+
+def test_the_card_is_printed_drawn_and_written(model, rendered, tmp_path, capsys):
+    out = tmp_path / "card.png"
+    words = ["evaluate", "disentangle", "-m", model, "-d", rendered, "--seeds", "1", "--swap-pictures", "4"]
+    assert main([str(word) for word in [*words, "--out", out, "--json", "-"]]) == 0
+    shown = capsys.readouterr()
+    told = json.loads(shown.out)
+    assert told["pictures"] == 24 and told["features"]["geometry"] == 12 and told["seeds"] == [0]
+    assert list(told["rows"]) == ["model", "untrained encoder", "shuffled rows", "random pixels"]
+    scores = told["rows"]["model"][0]
+    assert len(scores["swap"]["moved"]) == 4 and scores["truth"]["factors"][:2] == ["ambient", "diffuse"]
+    assert told["rows"]["random pixels"][0]["swap"] is None
+    for words_shown in ("Swap test", "true factor", "swap test, decoded:", "random pixels"):
+        assert words_shown in shown.err
+    with Image.open(out) as sheet:
+        assert sheet.width > 900
+
+
+def test_bad_words(model, rendered, tmp_path, capsys):
+    def refused(*words) -> str:
+        capsys.readouterr()
+        assert main([str(w) for w in ("evaluate", "disentangle", "-m", model, "-d", rendered, *words)]) == 2
+        return capsys.readouterr().err.strip().splitlines()[-1]
+
+    assert "must end in .png" in refused("--out", tmp_path / "card.jpg")
+    taken = tmp_path / "taken.png"
+    taken.write_bytes(b"mine")
+    assert "--force" in refused("--out", taken) and taken.read_bytes() == b"mine"
+    assert "choose lasso, trees or none" in refused("--dimensions", "forest")
+    assert "needs 20 pictures or more" in refused("--limit", "5")
+
+
+def test_geometry_of_pictures_beside_depth_maps(model, made, tmp_path, capsys):
+    """unsup3d's layout, written here at twice the model's size: scores as for the same maps in our own."""
+    folder = tmp_path / "pairs" / "test"
+    for kind in ("image", "depth"):
+        (folder / kind).mkdir(parents=True)
+    code = np.where(made.mask, np.clip((1.1 - made.depth) / 0.2, 1 / 65_535, 1) * 65_535, 0)
+    for row in range(6):
+        picture = Image.fromarray(made.images[row].transpose(1, 2, 0))
+        picture.resize((2 * SIZE, 2 * SIZE), Image.Resampling.NEAREST).save(folder / f"image/{row}_image.png")
+        depth = code[row].round().astype(np.uint16).repeat(2, axis=0).repeat(2, axis=1)
+        Image.fromarray(depth).save(folder / f"depth/{row}_depth.png")
+    results = []
+    own = tmp_path / "own"
+    write(made, own)
+    for data in (tmp_path / "pairs", own):
+        words = ["evaluate", "geometry", "-m", model, "-d", data, "--limit", "6", "--json", "-"]
+        assert main([str(word) for word in words]) == 0
+        results.append(json.loads(capsys.readouterr().out))
+    pairs, ours = results
+    assert pairs["pictures"] == 6 and "factors" not in pairs and "factors_untrained" in ours
+    for row in ("model", "average_depth", "plane", "untrained"):
+        assert pairs["geometry"][row]["side"] == pytest.approx(ours["geometry"][row]["side"], rel=0.02)
+    assert pairs["geometry"]["plane"]["side"] > pairs["geometry"]["average_depth"]["side"]
+    assert pairs["reconstruction"]["model"]["ssim"] is not None
+    assert 0 < ours["factors"]["albedo"] <= ours["factors"]["albedo_global"]
+    assert ours["factors"]["light_aligned"]["mean_deg"] <= ours["factors"]["light"]["mean_deg"] + 1

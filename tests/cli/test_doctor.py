@@ -1,0 +1,77 @@
+"""`derender doctor` from a person's side: what it says, what it writes, and what it refuses."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from derender.cli import main
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Twenty-six pictures of noise, one of them twice, and one that cannot be read."""
+    made = tmp_path / "set"
+    made.mkdir()
+    for number, picture in enumerate(
+        np.random.default_rng(0).integers(0, 256, (26, 64, 64, 3), dtype=np.uint8)
+    ):
+        Image.fromarray(picture).save(made / f"{number:02}.png")
+    (made / "26.png").write_bytes((made / "00.png").read_bytes())
+    (made / "27.png").write_bytes(b"no picture")
+    return made
+
+
+def refused(capsys, *arguments: object) -> str:
+    assert main([str(argument) for argument in arguments]) == 2
+    last = capsys.readouterr().err.strip().splitlines()[-1]
+    assert last.startswith("derender: ")
+    return last
+
+
+def test_terminal_page_and_json_tell_the_same(folder: Path, tmp_path: Path, capsys):
+    page, numbers = tmp_path / "doctor.html", tmp_path / "doctor.json"
+    assert main(["doctor", str(folder), "--out", str(page), "--json", str(numbers)]) == 0
+    said = capsys.readouterr()
+    told = json.loads(numbers.read_text())
+    assert told["verdict"] == "does not suit" and told["distinct"] == 26 and told["identical"] == 1
+    assert told["copies"] == [{"file": "26.png", "first": "00.png"}]
+    assert [row["file"] for row in told["unreadable"]] == ["27.png"]
+    assert told["originals"]["median_short"] == 64
+    assert f"verdict: does not suit, because {'; '.join(told['because'])}" in said.out
+    assert "unreadable: 27.png" in said.err
+    html = page.read_text()
+    for finding in told["findings"]:
+        assert finding["text"] in html and finding["text"] in said.out
+
+
+def test_what_exists_is_not_replaced_unasked(folder: Path, tmp_path: Path, capsys):
+    page = tmp_path / "doctor.html"
+    page.write_text("mine")
+    assert "exists already" in refused(capsys, "doctor", folder, "--out", page)
+    assert "exists already" in refused(capsys, "doctor", folder, "--json", page)
+    assert "is a folder" in refused(capsys, "doctor", folder, "--out", tmp_path)
+    assert page.read_text() == "mine"
+    assert main(["doctor", str(folder), "--out", str(page), "--force"]) == 0
+    assert "mine" not in page.read_text()[:10]
+
+
+def test_what_is_no_set_of_pictures_is_refused(folder: Path, tmp_path: Path, capsys):
+    empty, broken, text = tmp_path / "empty", tmp_path / "broken", tmp_path / "notes.txt"
+    empty.mkdir()
+    broken.mkdir()
+    (broken / "a.png").write_bytes(b"no picture")
+    text.write_text("no picture")
+    assert "no pictures found" in refused(capsys, "doctor", empty)
+    assert "none of the 1 pictures" in refused(capsys, "doctor", broken)
+    assert "is no folder, zip or picture" in refused(capsys, "doctor", text)
+    assert "is one picture: a set of pictures" in refused(capsys, "doctor", folder / "00.png")
+    assert "does not exist" in refused(capsys, "doctor", tmp_path / "nowhere")
+
+
+def test_a_folder_with_one_picture_gets_a_verdict(tmp_path: Path, capsys):
+    Image.new("RGB", (80, 60), (200, 30, 30)).save(tmp_path / "one.png")
+    assert main(["doctor", str(tmp_path)]) == 0
+    assert "does not suit, because 1 distinct picture is too few to learn from" in capsys.readouterr().out

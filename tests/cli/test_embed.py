@@ -1,0 +1,115 @@
+"""`derender embed` on folders and streams: what it says, what it leaves after Ctrl-C, and how it goes on."""
+
+import io
+import json
+import tarfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from derender import Derenderer, FeatureTable
+from derender.cli import main
+from derender.data.stream import decoding
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory) -> str:
+    """An untrained model of the smallest kind, saved."""
+    folder = tmp_path_factory.mktemp("embed") / "model"
+    return str(Derenderer.from_preset("small", seed=0, image_size=32, width=4, light_width=4).save(folder))
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("DERENDER_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(decoding, "CHUNK", 4)
+
+
+def shards(folder: Path, count: int = 20) -> str:
+    folder.mkdir(exist_ok=True)
+    for number in range(2):
+        with tarfile.open(folder / f"s-{number}.tar", "w") as tar:
+            for row in range(number * count // 2, (number + 1) * count // 2):
+                buffer = io.BytesIO()
+                pixels = np.random.default_rng(row).integers(0, 256, (32, 32, 3), dtype=np.uint8)
+                Image.fromarray(pixels).save(buffer, "PNG")
+                for name, data in ((f"{row}.png", buffer.getvalue()), (f"{row}.cls", str(row % 2).encode())):
+                    info = tarfile.TarInfo(name)
+                    info.size = len(data)
+                    tar.addfile(info, io.BytesIO(data))
+    return str(folder / "s-{0..1}.tar")
+
+
+def embed(model: str, data: str, out: Path, *more: str) -> int:
+    return main(["embed", "--model", model, "--data", data, "--out", str(out), "--batch-size", "4", *more])
+
+
+def test_shards_with_a_cut_one_among_them(model, tmp_path, capsys):
+    data = shards(tmp_path / "set")
+    last = tmp_path / "set" / "s-1.tar"
+    last.write_bytes(last.read_bytes()[:-12_000])
+    assert embed(model, data, tmp_path / "f.parquet", "--json", str(tmp_path / "told.json")) == 0
+    said = capsys.readouterr()
+    table = FeatureTable.read(tmp_path / "f.parquet")
+    told = json.loads((tmp_path / "told.json").read_text())
+    assert told["rows"] == len(table) < 20 and told["skipped"] == 1 and told["labels"] == ["class"]
+    assert f"{len(table)} pictures from {data} (webdataset), 1 skipped" in said.err
+    assert "skipped s-1.tar: damaged or cut short, what comes before counts" in said.err
+    assert "rows in" in said.out
+
+
+def test_ctrl_c_leaves_only_what_the_next_run_goes_on_with(model, tmp_path, capsys, monkeypatch):
+    data, out = shards(tmp_path / "set"), tmp_path / "f.parquet"
+    assert embed(model, data, tmp_path / "whole.parquet") == 0
+    real, calls = Derenderer.embed, []
+
+    def interrupted(self, images):
+        calls.append(len(images))
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return real(self, images)
+
+    monkeypatch.setattr(Derenderer, "embed", interrupted)
+    before = set(tmp_path.iterdir())
+    capsys.readouterr()
+    assert embed(model, data, out) == 130
+    assert (
+        capsys.readouterr()
+        .err.strip()
+        .endswith(f"8 rows are kept in {out}.partial: the same command goes on from there")
+    )
+    assert set(tmp_path.iterdir()) - before == {tmp_path / "f.parquet.partial"}
+    assert embed(model, data, out, "--limit", "12") == 2
+    assert (
+        "holds an unfinished table that was made otherwise (differs in pictures)" in capsys.readouterr().err
+    )
+    assert embed(model, data, out) == 0
+    assert "8 of them from the run before" in capsys.readouterr().err
+    assert sum(calls) == 24, "twenty pictures, and the four that were interrupted"
+    whole, resumed = FeatureTable.read(tmp_path / "whole.parquet"), FeatureTable.read(out)
+    assert whole.files == resumed.files and whole.origin == resumed.origin
+    for name, values in whole.factors.items():
+        np.testing.assert_array_equal(resumed.factors[name], values)
+    assert set(tmp_path.iterdir()) - before == {out}
+
+
+def test_what_cannot_be_read_is_one_line(model, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    import huggingface_hub
+
+    def offline(self, *_, **__):
+        raise huggingface_hub.errors.OfflineModeIsEnabled("offline mode is enabled")
+
+    monkeypatch.setattr(huggingface_hub.HfApi, "dataset_info", offline)
+    for data, words in (
+        ("someone/faces", "someone/faces does not exist here; nor does its folder"),
+        ("shards-{000..002}.tar", "3 of the 3 shards of shards-{000..002}.tar do not exist"),
+        ("shards-{2..0}.tar", "should count up"),
+    ):
+        assert embed(model, data, tmp_path / "f.parquet") == 2
+        *_, last = capsys.readouterr().err.strip().splitlines()
+        assert last.startswith("derender: ") and words in last
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,119 @@
+"""`derender explain`: a folder with page, chart, maps and probe, numbers as JSON, bad words refused."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from derender.cli import main
+from derender.interpretation import load_probe
+from derender.model import Derenderer
+from derender.presets import MODEL_PRESETS
+
+SIZE = 32
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory) -> Path:
+    """An untrained model on disk, for 32 pixels."""
+    settings = MODEL_PRESETS["small"]
+    sizes = {"image_size": SIZE, "width": 4, "light_width": 4, "code_size": 8}
+    network = settings.network.model_copy(update=sizes)
+    made = Derenderer.seeded(settings.model_copy(update={"network": network}), 0)
+    return made.save(tmp_path_factory.mktemp("explain") / "model")
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> Path:
+    """Two classes of noise, one dark and one bright: anything that sees can tell them apart."""
+    folder = tmp_path_factory.mktemp("explain") / "pictures"
+    generator = np.random.default_rng(0)
+    for place in range(60):
+        name = ("dark", "bright")[place % 2]
+        (folder / name).mkdir(parents=True, exist_ok=True)
+        noise = generator.integers(0, 100, (SIZE, SIZE, 3)) + 150 * (place % 2)
+        Image.fromarray(noise.astype(np.uint8)).save(folder / name / f"{place:02}.png")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def why(model, data, tmp_path_factory) -> tuple[Path, dict]:
+    """One explanation with everything in it."""
+    folder = tmp_path_factory.mktemp("explain")
+    words = [
+        "explain",
+        "-m",
+        model,
+        "-d",
+        data,
+        "-l",
+        "class",
+        "--seeds",
+        "2",
+        "--sheets",
+        "1",
+        "--rows",
+        "2",
+    ]
+    words += ["--clusters", "2", "--pair", "dark/00.png", "dark/02.png", "--json", folder / "why.json"]
+    assert main([str(word) for word in [*words, "--out", folder / "why"]]) == 0
+    return folder / "why", json.loads((folder / "why.json").read_text())
+
+
+def test_the_folder_holds_page_chart_maps_and_probe(why):
+    folder, _ = why
+    names = sorted(path.name for path in folder.iterdir())
+    assert {"explain.html", "probe", "shares.png", "shares.svg"} <= set(names)
+    maps = [name for name in names if name.startswith("maps-1-")]
+    assert len(maps) == 5 and any("hires-cam" in name for name in maps)
+    page = (folder / "explain.html").read_text()
+    for word in (
+        "Which factor answers",
+        "Whether the maps can be trusted",
+        "most alike in",
+        "shuffled labels",
+    ):
+        assert word in page
+    assert "http://" not in page.replace("http://www.w3.org", "") and "<script src" not in page
+    with Image.open(folder / "shares.png") as chart:
+        assert chart.width > 800
+    assert load_probe(folder / "probe").factors == ("geometry", "albedo", "light", "camera")
+
+
+def test_the_numbers_add_up(why):
+    _, told = why
+    assert list(told["rows"]) == ["model", "shuffled labels", "untrained encoder"]
+    answers = told["rows"]["model"]["answers"]
+    for answer in answers.values():
+        assert sum(part["share"] for part in answer["factors"].values()) == pytest.approx(1)
+        assert answer["auc"] > 0.95
+    assert told["rows"]["model"]["completeness_error"] < 1e-6
+    assert sum(told["pair"]["distance_share"]) == pytest.approx(1)
+    np.testing.assert_allclose(np.sum(told["clusters"]["share"], axis=1), 1)
+    checked = {(row["method"], row["factor"], row["changed"]) for row in told["sanity"]}
+    assert len(checked) == 3 * 4 * 3
+
+
+def test_bad_words(model, data, why, tmp_path, capsys):
+    def refused(*words) -> str:
+        capsys.readouterr()
+        assert main([str(w) for w in ("explain", "-m", model, "-d", data, *words)]) == 2
+        return capsys.readouterr().err.strip().splitlines()[-1]
+
+    assert "no label 'clas'; did you mean 'class'" in refused("-l", "clas")
+    assert "give either --label NAME" in refused()
+    assert "add --force to replace it" in refused("-l", "class", "--out", why[0])
+    assert "needs 20 or more" in refused("-l", "class", "--limit", "12")
+    assert "no picture 'dark/0.png'; did you mean 'dark/" in refused(
+        "-l", "class", "--pair", "dark/0.png", "x"
+    )
+    assert "unknown head 'lin'" in refused("-l", "class", "--head", "lin")
+    flat = tmp_path / "flat"
+    flat.mkdir()
+    for place in range(24):
+        Image.fromarray(np.full((SIZE, SIZE, 3), place * 9, np.uint8)).save(flat / f"{place}.png")
+    capsys.readouterr()
+    assert main(["explain", "-m", str(model), "-d", str(flat), "-l", "class"]) == 2
+    assert "has no labels, and an explanation needs" in capsys.readouterr().err

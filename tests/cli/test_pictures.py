@@ -1,0 +1,224 @@
+"""`relight`, `rotate`, `swap`, `mesh`, `search` and finer `decompose` as a person meets them."""
+
+import io
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+from derender import Derenderer, FeatureTable
+from derender.cli import main
+
+SIZE = 32
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory) -> str:
+    """An untrained model of the smallest kind, saved."""
+    folder = tmp_path_factory.mktemp("pictures") / "model"
+    return str(Derenderer.from_preset("small", seed=0, image_size=SIZE, width=4, light_width=4).save(folder))
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory) -> Path:
+    """Six pictures of coloured noise, 64 pixels wide."""
+    folder = tmp_path_factory.mktemp("pictures") / "photos"
+    folder.mkdir()
+    for number in range(6):
+        coarse = np.random.default_rng(number).integers(0, 256, (8, 8, 3), dtype=np.uint8)
+        Image.fromarray(coarse).resize((64, 64)).save(folder / f"{number}.png")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def table(model, photos) -> str:
+    path = photos.parent / "F.parquet"
+    assert main(["embed", "--model", model, "--data", str(photos), "--out", str(path)]) == 0
+    return str(path)
+
+
+@pytest.fixture
+def refused(capsys):
+    """Run a command that must fail with exit code 2 and one line of complaint; gives that line."""
+
+    def call(*arguments: object) -> str:
+        capsys.readouterr()
+        assert main([str(argument) for argument in arguments]) == 2
+        *notes, last = capsys.readouterr().err.strip().splitlines()
+        assert last.startswith("derender: ")
+        assert not any(note.startswith(("derender:", "Traceback")) for note in notes)
+        return last
+
+    return call
+
+
+@pytest.mark.parametrize("name", ["relight", "rotate", "swap", "mesh", "search"])
+def test_help_has_an_example(name, capsys):
+    assert main([name, "--help"]) == 0
+    assert f"Example: derender {name}" in " ".join(capsys.readouterr().out.split())
+
+
+def test_relight_sweeps_and_says_which_light(model, photos, tmp_path):
+    out = tmp_path / "out"
+    words = ["--stills", "3", "--frames", "4", "--size", "40", "--reach", "30", "--film", "gif"]
+    told = tmp_path / "told.json"
+    names = [str(photos / "0.png"), str(photos / "1.png")]
+    assert main(["relight", "-m", model, *names, "-o", str(out), *words, "--json", str(told)]) == 0
+    assert sorted(path.name for path in out.iterdir()) == ["0", "1", "sheet.png"]
+    stills = json.loads((out / "0" / "moved.json").read_text())["stills"]
+    assert [still["label"] for still in stills] == ["yaw -30°", "yaw +0°", "yaw +30°"]
+    assert [round(np.degrees(still["light"][3])) for still in stills] == [-30, 0, 30]
+    with Image.open(out / "1" / "still-02.png") as still:
+        assert still.size == (40, 40)
+    with Image.open(out / "0" / "film.gif") as film:
+        assert film.n_frames == 4
+    assert not (out / "0" / "film.mp4").exists()
+    assert json.loads(told.read_text())["sheets"] == [str(out / "sheet.png")]
+
+
+def test_relight_ends_in_the_light_of_another(model, photos, tmp_path):
+    out = tmp_path / "out"
+    words = ["--like", str(photos / "2.png"), "--stills", "2", "--film", "none", "--size", "32"]
+    assert main(["relight", "-m", model, str(photos / "0.png"), "-o", str(out), *words]) == 0
+    first, last = json.loads((out / "0" / "moved.json").read_text())["stills"]
+    assert main(["decompose", "-m", model, str(photos / "2.png"), "-o", str(tmp_path / "apart")]) == 0
+    with np.load(tmp_path / "apart" / "2" / "scene.npz") as scene:
+        np.testing.assert_allclose(last["light"], scene["light"], atol=1e-5)
+        assert np.abs(np.subtract(first["light"], scene["light"])).max() > 1e-4
+
+
+def test_rotate_writes_films_anyone_can_play(model, photos, tmp_path):
+    out = tmp_path / "out"
+    words = ["--stills", "2", "--frames", "3", "--size", "33", "--pitch", "5"]
+    assert main(["rotate", "-m", model, str(photos / "0.png"), "-o", str(out), *words]) == 0
+    assert (out / "0" / "film.mp4").read_bytes()[4:8] == b"ftyp"
+    assert (out / "0" / "film.gif").read_bytes()[:4] == b"GIF8"
+    camera = json.loads((out / "0" / "moved.json").read_text())["stills"][0]["camera"]
+    assert np.degrees(camera[:2]).tolist() == pytest.approx([5, -40], abs=1e-3)
+    assert not (out / "sheet.png").exists()  # one picture needs none
+
+
+def test_swap_of_a_picture_with_itself_changes_nothing(model, photos, tmp_path):
+    out, one = tmp_path / "out", str(photos / "0.png")
+    assert main(["swap", "-m", model, one, "--from", one, "-o", str(out), "--size", "32"]) == 0
+    stills = json.loads((out / "0" / "moved.json").read_text())["stills"]
+    assert [still["factor"] for still in stills] == ["geometry", "albedo", "light", "camera"]
+    images = {(out / "0" / still["file"]).read_bytes() for still in stills}
+    assert len(images) == 1
+    words = ["--from", str(photos / "1.png"), "--factor", "albedo", "--force", "--size", "32"]
+    assert main(["swap", "-m", model, one, "-o", str(out), *words]) == 0
+    assert (out / "0" / "still-01.png").read_bytes() not in images
+
+
+def test_mesh_opens_elsewhere_and_takes_the_pictures_own_texture(model, photos, tmp_path):
+    for texture in ("model", "original"):
+        words = ["-m", model, str(photos / "0.png"), "-o", str(tmp_path / texture), "--size", "48"]
+        assert main(["mesh", *words, "--texture", texture, "--json", str(tmp_path / "told.json")]) == 0
+    told = json.loads((tmp_path / "told.json").read_text())["pictures"][0]
+    content = (tmp_path / "original" / "0" / "0.glb").read_bytes()
+    read = trimesh.load(io.BytesIO(content), file_type="glb", force="mesh", process=False)
+    assert len(read.vertices) == told["vertices"] and len(read.faces) == told["faces"]
+    assert told["trimmed"] > 2 / 48
+    assert content != (tmp_path / "model" / "0" / "0.glb").read_bytes()
+    words = ["-m", model, str(photos / "0.png"), "-o", str(tmp_path / "o"), "--format", "obj", "--size", "32"]
+    assert main(["mesh", *words]) == 0
+    assert {file.suffix for file in (tmp_path / "o" / "0").iterdir()} == {".obj", ".mtl", ".png"}
+
+
+def test_decompose_at_another_size_with_a_sheet(model, photos, tmp_path):
+    out = tmp_path / "out"
+    names = [str(photos / "0.png"), str(photos / "1.png")]
+    words = ["--size", "48", "--texture", "original", "--sheet"]
+    assert main(["decompose", "-m", model, *names, "-o", str(out), *words]) == 0
+    with np.load(out / "1" / "scene.npz") as scene:
+        assert scene["depth"].shape == (48, 48) and scene["albedo"].shape == (3, 48, 48)
+    with Image.open(out / "sheet.png") as sheet, Image.open(out / "0" / "albedo.png") as albedo:
+        assert sheet.height > 2 * 128 and albedo.size == (48, 48)
+
+
+def test_search_with_a_picture_finds_its_own_row(table, model, photos, tmp_path, capsys):
+    sheet, told = tmp_path / "sheet.png", tmp_path / "told.json"
+    words = ["--model", model, "-k", "3", "--out", str(sheet), "--json", str(told)]
+    assert main(["search", "-f", table, "--like", str(photos / "4.png"), *words]) == 0
+    found = json.loads(told.read_text())["found"]
+    assert found[0]["file"] == "4.png" and len(found) == 3
+    assert found[0]["distance"] == pytest.approx(0, abs=1e-5)
+    assert [row["distance"] for row in found] == sorted(row["distance"] for row in found)
+    with Image.open(sheet) as drawn:
+        assert drawn.width > 4 * 160
+    assert "4.png" in capsys.readouterr().out
+
+
+def test_search_with_a_row_leaves_that_row_out(table, tmp_path):
+    told = tmp_path / "told.json"
+    words = ["--factor", "light", "--metric", "euclidean", "-k", "9", "--json", str(told)]
+    assert main(["search", "-f", table, "--like", "2.png", *words]) == 0
+    found = json.loads(told.read_text())["found"]
+    assert sorted(row["file"] for row in found) == ["0.png", "1.png", "3.png", "4.png", "5.png"]
+    features = FeatureTable.read(table).factors["light"].astype(float)
+    assert found[0]["distance"] == pytest.approx(np.linalg.norm(features[2] - features[found[0]["row"]]))
+
+
+def test_bad_pictures_are_left_out_and_named(model, photos, tmp_path, capsys):
+    bad = tmp_path / "bad.jpg"
+    bad.write_bytes(b"no picture")
+    words = ["-m", model, str(bad), str(photos / "0.png"), "-o", str(tmp_path / "out"), "--size", "32"]
+    assert main(["mesh", *words]) == 2
+    assert f"left out {bad}" in capsys.readouterr().err
+    assert [folder.name for folder in (tmp_path / "out").iterdir()] == ["0"]
+
+
+def test_bad_questions_about_pictures(model, photos, tmp_path, refused):
+    one, out = photos / "0.png", tmp_path / "out"
+    given = ("-m", model, one, "-o", out)
+    assert "unknown factor 'albdo'; did you mean 'albedo'" in refused(
+        "swap", *given, "--from", photos / "1.png", "--factor", "albdo"
+    )
+    assert "none.png does not exist" in refused("relight", *given, "--like", tmp_path / "none.png")
+    assert "is a folder: name pictures" in refused("rotate", "-m", model, photos, "-o", out)
+    assert "reach must lie between" in refused("rotate", *given, "--reach", "120")
+    assert "--reach must be above 0" in refused("relight", *given, "--reach", "0")
+    assert "--size 16 is below the model's 32" in refused("relight", *given, "--size", "16")
+    assert "unknown texture 'orginal'; did you mean 'original'" in refused(
+        "mesh", *given, "--texture", "orginal"
+    )
+    assert "unknown format 'gbl'; did you mean 'glb'" in refused("mesh", *given, "--format", "gbl")
+    assert "unknown kind of film 'avi'" in refused("rotate", *given, "--film", "avi")
+    assert not out.exists()
+    assert "is a file: give --out the name of a folder" in refused("mesh", "-m", model, one, "-o", one)
+    (out / "0").mkdir(parents=True)
+    assert "exists already: choose another --out, or add --force" in refused("mesh", *given)
+    assert list((out / "0").iterdir()) == []
+
+
+@pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="needs a user whom permissions bind")
+def test_a_folder_that_may_not_be_written(model, photos, tmp_path, refused):
+    locked = tmp_path / "locked"
+    locked.mkdir(mode=0o500)
+    assert "permission denied" in refused("mesh", "-m", model, photos / "0.png", "-o", locked / "out")
+
+
+def test_bad_searches(table, model, photos, tmp_path, refused):
+    like = ("search", "-f", table, "--like")
+    assert "unknown factor 'shape'" in refused(*like, "0.png", "--factor", "shape")
+    assert "did you mean 'geometry'" in refused(*like, "0.png", "--factor", "geometri")
+    assert "unknown metric 'l2'" in refused(*like, "0.png", "--metric", "l2")
+    assert "has no row '9.png'" in refused(*like, "9.png")
+    assert "to search with a picture, add --model" in refused(*like, photos / "0.png")
+    assert "no.png does not exist" in refused(*like, tmp_path / "no.png", "--model", model)
+    assert "ends in .png" in refused(*like, "0.png", "--out", tmp_path / "sheet.gif")
+    taken = tmp_path / "taken.png"
+    taken.write_bytes(b"mine")
+    assert "exists already" in refused(*like, "0.png", "--out", taken)
+    other = Derenderer.from_preset("small", seed=1, image_size=SIZE, width=4, light_width=4)
+    saved = other.save(tmp_path / "other")
+    assert "was made by another model" in refused(*like, photos / "0.png", "--model", saved)
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    Image.new("RGB", (8, 8)).save(elsewhere / "x.png")
+    complaint = refused(*like, "0.png", "--out", tmp_path / "s.png", "--data", elsewhere)
+    assert "holds none of the pictures found" in complaint and not (tmp_path / "s.png").exists()

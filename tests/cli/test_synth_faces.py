@@ -1,0 +1,91 @@
+"""`derender synth faces` from the command line: what it writes, and what it refuses."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+
+from derender.cli import main
+from derender.data import read_pictures
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("synth")
+
+
+def made(folder, name: str, *arguments: str) -> list[dict[str, str]]:
+    assert main(["synth", "faces", "--out", str(folder / name), "--image-size", "16", *arguments]) == 0
+    with (folder / name / "params.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+def test_wide_light_and_view_are_one_flag_each(folder):
+    rows = made(folder, "wide", "--count", "24", "--light", "wide", "--view", "wide")
+    assert min(abs(float(row["yaw"])) for row in rows) > 19.9
+    assert min(max(abs(float(row["light_yaw"])), abs(float(row["light_pitch"]))) for row in rows) > 34.9
+
+
+def test_single_settings_identities_and_expressions(folder):
+    rows = made(
+        folder, "set", "--count", "12", "--identities", "3", "--expressions", "fear,anger",
+        "--set", "light.yaw_deg=[10, 12]", "--set", "view.yaw_sd_deg=0", "--json", str(folder / "set.json"),
+    )  # fmt: skip
+    assert [row["identity"] for row in rows] == [str(i // 4) for i in range(12)]
+    assert {row["expression"] for row in rows} == {"fear", "anger"}
+    assert all(10 <= float(row["light_yaw"]) <= 12 and float(row["yaw"]) == 0 for row in rows)
+    facts = json.loads((folder / "set.json").read_text())
+    assert facts["identities"] == 3 and facts["settings"]["light"]["yaw_deg"] == [10, 12]
+
+
+def test_tracks_are_laid_out_by_identity_and_track(folder):
+    rows = made(folder, "tracks", "--identities", "2", "--tracks", "3", "--frames", "2")
+    assert len(rows) == 12 and rows[7]["file"] == "tracks/id0001/track_000/001.jpg"
+    assert len(read_pictures(folder / "tracks", 16)) == 12
+    assert not (folder / "tracks" / "depth").exists()
+
+
+def test_pictures_alone_on_request(folder):
+    made(folder, "plain", "--count", "4", "--no-truth")
+    assert {path.name for path in (folder / "plain").iterdir()} == {"images", "params.csv", "identities.csv"}
+
+
+def test_a_model_of_ones_own(folder):
+    y, x = np.mgrid[1.0:-1.0:9j, -1.0:1.0:9j]
+    corner = np.arange(81).reshape(9, 9)
+    upper = np.stack([corner[:-1, :-1], corner[1:, :-1], corner[:-1, 1:]], -1).reshape(-1, 3)
+    lower = np.stack([corner[:-1, 1:], corner[1:, :-1], corner[1:, 1:]], -1).reshape(-1, 3)
+    mean = np.stack([x, y, -(x**2) - y**2], -1).reshape(-1, 3)
+    components = mean[None] * [0.1, 0.0, 0.0]
+    np.savez(
+        folder / "my.npz",
+        mean=mean,
+        triangles=np.concatenate([upper, lower]),
+        components=components,
+        std=[1.0],
+    )
+    rows = made(folder, "mine", "--count", "8", "--model", str(folder / "my.npz"))
+    assert len(rows) == 8 and "hair" not in rows[0]
+    with (folder / "mine" / "identities.csv").open() as file:
+        assert list(next(csv.reader(file))) == ["identity", "shape_000"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--light", "noon"], "--light must be one of usual, wide, frontal, got 'noon'"),
+        (["--view", "above"], "--view must be one of usual, wide, frontal"),
+        (["--set", "light.colour=red"], "unknown setting 'light.colour'; there are light.yaw_deg"),
+        (["--set", "light.yaw_deg"], "write key=value"),
+        (["--set", "light.yaw_deg=[-60,99]"], "light.yaw_deg must be two numbers"),
+        (["--expressions", "smug"], "expressions must be one or more of neutral, happiness"),
+        (["--tracks", "2", "--count", "5"], "--count does not go with --tracks"),
+        (["--model", "nowhere.npz"], "nowhere.npz does not exist: expected a morphable model"),
+    ],
+)
+def test_bad_input_is_one_line_and_leaves_nothing(folder, capsys, arguments, message):
+    assert main(["synth", "faces", "--out", str(folder / "bad"), *arguments]) == 2
+    said = capsys.readouterr().err.strip()
+    assert message in said and len(said.splitlines()) == 1
+    assert not (folder / "bad").exists()

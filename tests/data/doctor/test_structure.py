@@ -1,0 +1,186 @@
+"""Laws of what is measured: exact where a picture can be made for which the answer is known."""
+
+import numpy as np
+import pytest
+from tests.data.doctor import made
+
+from derender.data.doctor.estimate import jackknife
+from derender.data.doctor.kinds import likeness, split_in_two
+from derender.data.doctor.near_copies import near_copy_groups
+from derender.data.doctor.pixels import measure_pixels, shrunk
+from derender.data.doctor.structure import (
+    agreement,
+    edge_cells,
+    explained,
+    frame_filled,
+    mirrored,
+    structure_of,
+    symmetry,
+    symmetry_axis,
+)
+from derender.data.doctor.variety import light_variety, side_light, view_variety
+
+
+def structure(images: np.ndarray) -> np.ndarray:
+    return structure_of(edge_cells(shrunk(images)))
+
+
+def test_grey_is_the_mean_of_each_block():
+    images = np.random.default_rng(0).integers(0, 256, (3, 3, 64, 64), dtype=np.uint8)
+    found = shrunk(images)
+    block = images[1, :, 10:12, 40:42].astype(float).mean(axis=(1, 2)) @ [0.299, 0.587, 0.114] / 255
+    assert found[1, 5, 20] == pytest.approx(block, abs=1e-6)
+    with pytest.raises(ValueError, match="multiple of 32 pixels, got 40"):
+        shrunk(np.zeros((1, 3, 40, 40), np.uint8))
+
+
+def test_pixels_know_black_white_grey_and_blank():
+    images = np.full((4, 3, 32, 32), 100, np.uint8)
+    images[0, :, :8] = 0
+    images[1, :, :, :16] = 255
+    images[2, 0] = 200
+    found = measure_pixels(images)
+    np.testing.assert_allclose(found.dark, [0.25, 0, 0, 0])
+    np.testing.assert_allclose(found.bright, [0, 0.5, 0, 0])
+    assert found.colourless.tolist() == [True, True, False, True]
+    assert found.blank.tolist() == [False, False, True, True]
+    np.testing.assert_allclose((found.tiny**2).sum(axis=1), [1, 1, 0, 0], atol=1e-5)
+
+
+def test_the_cells_of_a_mirrored_picture_are_the_mirrored_cells(numbers):
+    images = made.noise(5, numbers)
+    np.testing.assert_allclose(
+        edge_cells(shrunk(images[..., ::-1])), mirrored(edge_cells(shrunk(images))), rtol=1e-4, atol=1e-4
+    )
+    np.testing.assert_array_equal(mirrored(mirrored(edge_cells(shrunk(images)))), edge_cells(shrunk(images)))
+
+
+def test_an_edge_lies_in_its_cell_and_orientation():
+    images = np.zeros((2, 3, 64, 64), np.uint8)
+    images[0, :, :, 32:] = 255  # the gradient points right: orientation 0
+    images[1, :, 32:] = 255  # down: orientation 4 of 8
+    upright, level = edge_cells(shrunk(images))
+    assert upright[:, [0, 1, 4, 5]].max() == 0 and upright[..., 1:].max() == pytest.approx(0, abs=1e-5)
+    assert level[[0, 1, 4, 5]].max() == 0 and level[..., [0, 1, 2, 3, 5, 6, 7]].max() == pytest.approx(
+        0, abs=1e-5
+    )
+    assert upright[..., 0].max() > 1 and level[..., 4].max() > 1
+
+
+def test_agreement_is_the_mean_over_pairs(numbers):
+    rows = structure(made.noise(6, numbers))
+    pairs = [(rows[i] * rows[j]).sum() for i in range(6) for j in range(6) if i != j]
+    assert agreement(rows) == pytest.approx(np.mean(pairs), abs=1e-6)
+    assert agreement(np.repeat(rows[:1], 4, axis=0)) == pytest.approx(1, abs=1e-5)
+
+
+def test_pictures_that_look_alike_at_every_shift_sideways_agree_in_nothing(numbers):
+    """Zero to within four standard errors, and these far below what is asked of a set."""
+    for images in (made.noise(200, numbers), made.landscapes(200, numbers)):
+        rows = structure(images)
+        found = jackknife(lambda kept, rows=rows: agreement(rows[kept]), len(rows))
+        assert abs(found.value) < 4 * found.error < 0.1 * agreement(structure(made.generated("faces")))
+
+
+def test_symmetry_is_one_for_mirrored_pairs_and_unbiased_for_few(numbers):
+    half = structure(made.generated("faces"))
+    both = np.concatenate([half, mirrored(half)])
+    assert symmetry(both) == pytest.approx(1, abs=0.02)
+    few = [symmetry(half[numbers.permutation(len(half))[:24]]) for _ in range(30)]
+    assert np.mean(few) == pytest.approx(symmetry(half), abs=0.03)
+    assert symmetry(structure(made.generated("from one side"))) < 0.5
+
+
+@pytest.mark.parametrize("pixels", [-10, -4, 0, 6])
+def test_the_axis_is_found_where_the_pictures_are_shifted_to(pixels):
+    wide = np.pad(made.generated("faces"), ((0, 0), (0, 0), (0, 0), (10, 10)), mode="edge")
+    shifted = wide[..., 10 - pixels : 74 - pixels]
+    axis = symmetry_axis(shrunk(shifted))
+    assert axis.offset * 64 == pytest.approx(pixels, abs=1)
+    assert axis.correlation > 0.8
+
+
+def test_frame_filled_counts_cells_with_common_structure():
+    everywhere = np.full((50, 6, 6, 8), 1 / np.sqrt(288), np.float32)
+    assert frame_filled(everywhere) == pytest.approx(1)
+    quarter = np.zeros((50, 6, 6, 8), np.float32)
+    quarter[:, :3, :3] = 1 / np.sqrt(72)
+    assert frame_filled(quarter) == pytest.approx(0.25)
+
+
+def test_components_explain_repeats_wholly_and_noise_hardly(numbers):
+    four = shrunk(made.noise(4, numbers))
+    assert explained(four[numbers.integers(0, 4, 60)], numbers)[0] == pytest.approx(1, abs=1e-4)
+    assert max(explained(shrunk(made.noise(100, numbers)), numbers)) < 0.05
+    there, rolled = explained(shrunk(made.generated("faces")), numbers)
+    assert there > rolled + 0.1
+
+
+def test_two_kinds_are_told_apart_and_one_kind_is_not(numbers):
+    faces = structure(made.generated("faces"))
+    other = np.roll(faces, (3, 3), axis=(1, 2))  # the same edges, all in other places
+    mixed = split_in_two(np.concatenate([faces, other]), numbers)
+    assert mixed is not None and mixed.kinship.value < 0.3
+    truth = np.arange(2 * len(faces)) < len(faces)
+    right = ((mixed.margin > 0) == truth).mean()
+    assert max(right, 1 - right) > 0.95
+    assert mixed.smaller == pytest.approx(0.5, abs=0.05)
+    single = split_in_two(faces, numbers)
+    assert single is not None and single.kinship.value > 0.6
+
+
+def test_a_stranger_is_unlike_the_others(numbers):
+    images = np.concatenate([made.generated("faces"), made.landscapes(4, numbers)])
+    assert likeness(structure(images))[-4:].max() < np.quantile(likeness(structure(images))[:-4], 0.05)
+
+
+def test_view_variety_is_zero_for_own_mirror_images_and_one_for_strangers(numbers):
+    images = made.noise(150, numbers)
+    own = np.concatenate([images[..., :32], images[..., :32][..., ::-1]], axis=-1)
+    assert view_variety(structure(own)) == pytest.approx(0, abs=1e-3)
+    assert view_variety(structure(images)) == pytest.approx(1, abs=0.02)
+
+
+def test_light_variety_is_the_spread_of_a_ramp(numbers):
+    """Ramps of known slope: (left - right) / (left + right) of the middle's halves is known."""
+    slope = numbers.normal(0, 0.2, 400).clip(-0.5, 0.5)
+    across = np.linspace(-1, 1, 32)
+    ramps = np.repeat(0.5 - 0.5 * slope[:, None, None] * across, 32, axis=1).astype(np.float32)
+    distance = across[16:22].mean()
+    expected = np.std(distance * slope * 0.5 / (0.5 + 0.01), ddof=1)
+    assert light_variety(side_light(ramps)) == pytest.approx(expected, rel=0.1)
+    assert (side_light(ramps)[slope > 0.05] > 0).all(), "above 0 is lit from the left"
+    flat = numbers.normal(0.5, 0.1, (400, 32, 32)).astype(np.float32)
+    assert abs(light_variety(side_light(flat))) < 0.02
+
+
+def test_near_copies_are_grouped_under_the_first(numbers):
+    apart = made.landscapes(30, numbers)
+    images = np.concatenate(
+        [apart, made.copies(40, numbers), apart[:2], np.full((2, 3, 64, 64), 9, np.uint8)]
+    )
+    group = near_copy_groups(measure_pixels(images).tiny)
+    assert group[:30].tolist() == list(range(30))
+    assert len(np.unique(group[30:70])) <= 4 and group[30:70].min() == 30
+    assert group[70:72].tolist() == [0, 1]
+    assert group[72:].tolist() == [72, 72], "blank pictures are copies of one another"
+    assert near_copy_groups(measure_pixels(images[:1]).tiny).tolist() == [0]
+
+
+def test_near_copies_are_those_that_brute_force_finds(numbers):
+    base = numbers.standard_normal((60, 256))
+    rows = np.concatenate([base, base[:20] + numbers.normal(0, 0.1, (20, 256))])
+    rows = (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
+    alike = rows @ rows.T >= 0.98
+    assert near_copy_groups(rows).tolist() == [int(np.flatnonzero(row)[0]) for row in alike]
+    assert (near_copy_groups(rows) != np.arange(80)).sum() == 20
+
+
+def test_the_jackknife_of_a_mean_is_its_standard_error(numbers):
+    values = numbers.normal(size=4800)
+    found = jackknife(lambda rows: float(values[rows].mean()), len(values))
+    assert found.value == values.mean()
+    assert found.error == pytest.approx(1 / np.sqrt(4800), rel=0.6)
+    assert found.text(1).startswith(f"{found.value:.1f} ± ")
+    with pytest.raises(ValueError, match="needs 24 rows or more, got 23"):
+        jackknife(lambda rows: 0.0, 23)

@@ -1,0 +1,25 @@
+"""Writes shards: ``shard(name, {member: content})`` where None is a small picture of its own."""
+
+import io
+import tarfile
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture
+def shard(tmp_path: Path, encoded) -> Callable[..., Path]:
+    def write(name: str, members: dict[str, bytes | str | None], mode: str = "w", first: int = 0) -> Path:
+        path = tmp_path / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tarfile.open(path, mode) as tar:
+            for seed, (member, content) in enumerate(members.items(), first):
+                data = encoded(seed) if content is None else content
+                data = data.encode() if isinstance(data, str) else data
+                info = tarfile.TarInfo(member)
+                info.size = len(data)
+                tar.addfile(info, io.BytesIO(data))
+        return path
+
+    return write

@@ -1,0 +1,220 @@
+"""Hugging Face data sets in the forms their library writes, without a network; ids that cannot be read."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from PIL import Image as Pillow
+
+from derender.data import read_picture, read_pictures
+
+datasets = pytest.importorskip("datasets", reason="needs the extra: pip install 'derender[huggingface]'")
+
+
+@pytest.fixture(autouse=True)
+def places(tmp_path, monkeypatch) -> Path:
+    """A cache of our own and of the library's, and no network."""
+    monkeypatch.setenv("DERENDER_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(datasets.config, "HF_DATASETS_CACHE", tmp_path / "hf")
+    monkeypatch.chdir(tmp_path)
+    datasets.disable_progress_bars()
+    return tmp_path
+
+
+def pixels(seed: int) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 256, (9, 9, 3), dtype=np.uint8)
+
+
+@pytest.fixture
+def rows():
+    """``rows(count, first)``: pictures of their own, a class, a number, a text, a list."""
+
+    def make(count: int, first: int = 0, **more: object):
+        features = datasets.Features(
+            {
+                "photo": datasets.Image(),
+                "label": datasets.ClassLabel(names=["cat", "dog"]),
+                "age": datasets.Value("int32"),
+                "note": datasets.Value("string"),
+                "box": datasets.Sequence(datasets.Value("int32")),
+                **{name: datasets.Image() for name in more},
+            }
+        )
+        number = range(first, first + count)
+        pictures = [Pillow.fromarray(pixels(seed)) for seed in number]
+        columns = {
+            "photo": pictures,
+            "label": [seed % 2 if seed != 3 else -1 for seed in number],
+            "age": [seed if seed != 2 else None for seed in number],
+            "note": [f"n{seed}" for seed in number],
+            "box": [[0, 1]] * count,
+            **dict.fromkeys(more, pictures),
+        }
+        return datasets.Dataset.from_dict(columns, features=features)
+
+    return make
+
+
+def check(pictures, count: int, split: str = "train", encoded=None) -> None:
+    assert pictures.layout == "huggingface"
+    assert pictures.files == tuple(f"{split}/{row:08d}" for row in range(count))
+    for row in range(count):
+        np.testing.assert_array_equal(pictures.images[row], pixels(row).transpose(2, 0, 1))
+    assert set(pictures.labels) == {"label", "age", "note"}
+    assert pictures.label("label").tolist()[:4] == ["cat", "dog", "cat", ""]
+    age = pictures.label("age")
+    assert age.dtype == np.float32 and np.isnan(age[2]) and age[4] == 4
+    assert pictures.label("note").tolist() == [f"n{row}" for row in range(count)]
+
+
+def test_parquet_as_on_the_hub(rows, places):
+    folder = places / "set" / "data"
+    folder.mkdir(parents=True)
+    rows(3).to_parquet(folder / "train-00000-of-00002.parquet")
+    rows(4, 3).to_parquet(folder / "train-00001-of-00002.parquet")
+    rows(2, 50).to_parquet(folder / "test-00000-of-00001.parquet")
+    check(read_pictures("set", 9), 7)
+    check(read_pictures("set", 9), 7)  # from the cache
+    assert read_pictures("set::test", 9).files == ("test/00000000", "test/00000001")
+    every = read_pictures("set::all", 9)
+    assert every.partition.tolist().count("train") == 7 and every.partition.tolist().count("test") == 2
+    assert len(read_pictures("set", 9, limit=2)) == 2
+    with pytest.raises(ValueError, match=r"set::tset: it has no split 'tset'; did you mean 'test'\?"):
+        read_pictures("set::tset", 9)
+    single = folder / "test-00000-of-00001.parquet"
+    assert len(read_pictures(single, 9)) == 2
+
+
+def test_saved_to_disk(rows, places):
+    rows(6).save_to_disk("one")
+    check(read_pictures("one", 9), 6)
+    datasets.DatasetDict({"train": rows(5), "test": rows(2)}).save_to_disk("two")
+    check(read_pictures("two", 9), 5)
+    assert len(read_pictures("two::test", 9)) == 2
+    assert len(read_pictures("two::all", 9, keep_duplicates=True)) == 7
+
+
+def test_a_stream_goes_on_in_the_middle_of_its_splits(rows, places):
+    from derender.data.stream import open_stream
+
+    datasets.DatasetDict({"train": rows(5), "test": rows(3, 10)}).save_to_disk("two")
+    with open_stream("two::all") as stream:
+        names = [sample.file for sample in stream.samples()]
+        assert len(names) == 8
+        for start in (0, 3, 5, 6, 8):
+            rest = list(stream.samples(start))
+            assert [sample.file for sample in rest] == names[start:]
+            assert not rest or rest[-1].share == 1
+
+
+def test_a_folder_of_pictures_asked_for_as_a_data_set(places, encoded):
+    for name in ("cat/1.png", "dog/2.png"):
+        (places / "tree" / name).parent.mkdir(parents=True, exist_ok=True)
+        (places / "tree" / name).write_bytes(encoded(len(name) + ord(name[0])))
+    assert read_pictures("tree", 12).layout == "classes"
+    streamed = read_pictures("tree", 12, dataset="huggingface")
+    assert streamed.files == ("train/00000000-1.png", "train/00000001-2.png")
+    np.testing.assert_array_equal(streamed.images[0], read_picture(places / "tree/cat/1.png", 12))
+
+
+def test_no_picture_column_and_several(rows, places):
+    rows(3).remove_columns("photo").to_parquet("none.parquet")
+    with pytest.raises(
+        ValueError, match=r"none\.parquet has no column of pictures; its columns are label \(int64\)"
+    ):
+        read_pictures("none.parquet", 9)
+    rows(5, other=1).to_parquet("both.parquet")
+    with pytest.raises(
+        ValueError,
+        match=r"several columns of pictures \(photo, other\); name one: 'both\.parquet\?column=photo'",
+    ):
+        read_pictures("both.parquet", 9)
+    check(read_pictures("both.parquet?column=other", 9), 5)
+    with pytest.raises(ValueError, match=r"no column of pictures 'photos'; did you mean 'photo'"):
+        read_pictures("both.parquet?column=photos", 9)
+
+
+def test_rows_that_only_point_at_a_file_outside_are_not_followed(places, encoded):
+    (places / "secret.png").write_bytes(encoded(1))
+    (places / "set").mkdir()
+    (places / "set" / "in.png").write_bytes(encoded(2))
+    schema = datasets.Features({"image": datasets.Image()}).arrow_schema
+    pointing = [{"bytes": None, "path": "../secret.png"}, {"bytes": None, "path": "in.png"}, None]
+    pq.write_table(pa.table({"image": pointing}, schema=schema), "set/rows.parquet")
+    pictures = read_pictures("set/rows.parquet", 12)
+    assert len(pictures) == 1
+    assert "which is not in the data set" in pictures.skipped[0].reason
+    assert pictures.skipped[1].reason == "no picture in this row"
+
+
+def test_a_path_wins_and_an_id_that_cannot_be_reached_names_both_readings(places, encoded, monkeypatch):
+    import huggingface_hub
+
+    asked = []
+
+    def unreachable(self, identifier, **_: object):
+        asked.append(identifier)
+        raise OSError("no route")
+
+    monkeypatch.setattr(huggingface_hub.HfApi, "dataset_info", unreachable)
+    (places / "owner").mkdir()
+    (places / "owner" / "name").mkdir()
+    (places / "owner" / "name" / "a.png").write_bytes(encoded(1))
+    assert len(read_pictures("owner/name", 8)) == 1
+    assert not asked
+    with pytest.raises(
+        ValueError,
+        match=r"owner/nam does not exist here; did you mean 'name'\?; "
+        r"and the Hugging Face Hub cannot be asked for owner/nam \(OSError\): check the network",
+    ):
+        read_pictures("owner/nam", 8)
+    assert asked == ["owner/nam"]
+    for path in ("./owner/nam", "owner/nam.zip", "owner/x.jpg", "owner/nam/more"):
+        with pytest.raises(ValueError, match="does not exist"):
+            read_pictures(path, 8)
+    assert len(asked) == 1
+
+
+def test_what_the_hub_answers_is_told(monkeypatch):
+    import huggingface_hub
+    from huggingface_hub.errors import RepositoryNotFoundError
+
+    def unknown(self, identifier, **_: object):
+        raise RepositoryNotFoundError.__new__(RepositoryNotFoundError)
+
+    monkeypatch.setattr(huggingface_hub.HfApi, "dataset_info", unknown)
+    with pytest.raises(
+        ValueError, match=r"owner/none does not exist here.*and the Hugging Face Hub has no data set"
+    ):
+        read_pictures("owner/none", 8)
+    with pytest.raises(ValueError, match="no folder here and no id"):
+        read_pictures("not an id", 8, dataset="huggingface")
+
+
+def test_an_id_is_loaded_at_the_commit_the_hub_names(rows, places, monkeypatch):
+    """The Hub stands in as a folder: the id, the commit and the configuration reach the library."""
+    import huggingface_hub
+
+    datasets.DatasetDict({"train": rows(5)}).save_to_disk("hub")
+    seen = []
+
+    def load(identifier, config, revision, streaming):
+        seen.append((identifier, config, revision, streaming))
+        return datasets.load_from_disk("hub")
+
+    answer = type("Info", (), {"sha": "abc123"})
+    monkeypatch.setattr(huggingface_hub.HfApi, "dataset_info", lambda self, name, **_: answer)
+    monkeypatch.setattr(datasets, "load_dataset", load)
+    check(read_pictures("owner/name?config=small", 9), 5)
+    assert seen == [("owner/name", "small", "abc123", True)]
+
+
+def test_the_missing_library_is_named_with_its_extra(places, monkeypatch):
+    monkeypatch.setitem(sys.modules, "datasets", None)
+    with pytest.raises(
+        ValueError, match=r"needs the package datasets: pip install 'derender\[huggingface\]'"
+    ):
+        read_pictures("owner/name", 8)

@@ -1,0 +1,242 @@
+"""WebDataset: the pictures and labels that were packed, whatever the packing; damage is listed, not fatal."""
+
+import io
+import json
+import tarfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from derender.data import read_picture, read_pictures
+from derender.data.stream.address import expand_braces
+from derender.data.stream.shards import find_shards
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path, monkeypatch) -> Path:
+    monkeypatch.setenv("DERENDER_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+def members(count: int, first: int = 0) -> dict[str, bytes | str | None]:
+    """Pictures with a class and a JSON object each; the seed of picture i is 3 i from the shard's first."""
+    written: dict[str, bytes | str | None] = {}
+    for row in range(first, first + count):
+        written[f"{row:04d}.png"] = None
+        written[f"{row:04d}.cls"] = str(row % 3)
+        written[f"{row:04d}.json"] = json.dumps({"age": row, "who": f"p{row}", "glad": row % 2 == 0})
+    return written
+
+
+@pytest.mark.parametrize(
+    ("name", "mode"), [("a.tar", "w"), ("a.tar.gz", "w:gz"), ("a.tar.xz", "w:xz"), ("a.tar.bz2", "w:bz2")]
+)
+def test_pictures_and_labels_are_those_packed(shard, encoded, name, mode):
+    pictures = read_pictures(shard(name, members(70), mode), 12)
+    assert pictures.layout == "webdataset"
+    assert pictures.files == tuple(f"{name}/{row:04d}.png" for row in range(70))
+    for row in (0, 31, 32, 69):
+        np.testing.assert_array_equal(pictures.images[row], read_picture(encoded(3 * row), 12))
+    assert pictures.label("class").tolist() == [str(row % 3) for row in range(70)]
+    assert pictures.label("who").tolist() == [f"p{row}" for row in range(70)]
+    assert pictures.label("age").dtype == np.float32
+    assert pictures.label("age").tolist() == list(range(70))
+    assert pictures.label("glad").dtype == np.int8
+    assert pictures.label("glad").tolist() == [1, 0] * 35
+    assert pictures.partition is None and not pictures.skipped
+
+
+def test_the_same_as_the_folder_it_was_packed_from(tree, shard, encoded):
+    """Order, pixels, unreadable ones and copies as if the members lay in a folder."""
+    files = {"a.png": None, "b.png": "no picture", "c.png": encoded(0), "d.png": None, "e.jpg": b""}
+    folder = read_pictures(tree(files), 8)
+    packed = read_pictures(shard("x.tar", files), 8)
+    strip = len("x.tar/")
+    assert tuple(file[strip:] for file in packed.files) == folder.files
+    np.testing.assert_array_equal(packed.images, folder.images)
+    assert [(row.file[strip:], row.reason) for row in packed.skipped] == [
+        (row.file, row.reason) for row in folder.skipped
+    ]
+    assert [(row.file[strip:], row.first[strip:]) for row in packed.duplicates] == [
+        (row.file, row.first) for row in folder.duplicates
+    ]
+    kept = read_pictures(shard("x.tar", files), 8, keep_duplicates=True)
+    assert len(kept) == 3 and kept.duplicates == packed.duplicates
+
+
+def test_names_with_braces_a_folder_and_its_parts(shard, tmp_path):
+    for number in range(3):
+        shard(f"set/train-{number:03d}.tar", members(4, 4 * number), first=100 * number)
+    shard("set/val-000.tar", members(2, 50), first=500)
+    pattern = str(tmp_path / "set" / "train-{000..002}.tar")
+    assert len(read_pictures(pattern, 8)) == 12
+    assert len(read_pictures(str(tmp_path / "set" / "{train,val}-000.tar"), 8)) == 6
+    whole = read_pictures(tmp_path / "set", 8)
+    assert whole.partition.tolist() == ["train"] * 12 + ["validation"] * 2
+    assert len(read_pictures(f"{tmp_path / 'set'}::val", 8)) == 2
+    assert len(read_pictures(tmp_path / "set", 8, subset="train", limit=5)) == 5
+    assert len(find_shards(tmp_path / "set")) == 4
+    with pytest.raises(ValueError, match=r"no shards of a part 'tes'; there are set, train, val"):
+        read_pictures(f"{tmp_path / 'set'}::tes", 8)
+    with pytest.raises(ValueError, match=r"2 of the 5 shards of .* do not exist; the first is .*train-003"):
+        read_pictures(str(tmp_path / "set" / "train-{000..004}.tar"), 8)
+
+
+def test_braces():
+    assert list(expand_braces("a{8..10}b{x,y}")) == ["a8bx", "a8by", "a9bx", "a9by", "a10bx", "a10by"]
+    assert list(expand_braces("{008..010}")) == ["008", "009", "010"]
+    for bad in ("{3..1}.tar", "{abc}.tar", "{0..99999999}.tar"):
+        with pytest.raises(ValueError, match="should"):
+            list(expand_braces(bad))
+
+
+@pytest.mark.parametrize("where", ["inside a picture", "inside a header", "between members"])
+def test_of_a_truncated_shard_counts_what_comes_before(shard, where):
+    path = shard("cut.tar", {f"{row}.png": None for row in range(10)})
+    with tarfile.open(path) as tar:
+        seventh = tar.getmembers()[7]
+    cut = {
+        "inside a picture": seventh.offset_data + 100,
+        "inside a header": seventh.offset + 200,
+        "between members": seventh.offset,
+    }[where]
+    path.write_bytes(path.read_bytes()[:cut])
+    pictures = read_pictures(path, 8)
+    assert pictures.files == tuple(f"cut.tar/{row}.png" for row in range(7))
+    (fault,) = pictures.skipped
+    assert fault.file == "cut.tar" and "damaged or cut short, what comes before counts" in fault.reason
+    assert "1 skipped" in pictures.describe()
+
+
+def test_a_damaged_shard_does_not_end_the_others(shard, tmp_path):
+    shard("s/0.tar", members(3))
+    (tmp_path / "s/1.tar").write_bytes(b"no tar at all" * 100)
+    (tmp_path / "s/2.tar").write_bytes(b"")
+    packed = shard("s/3.tar.gz", members(40, 10), "w:gz", first=300)
+    packed.write_bytes(packed.read_bytes()[:-400])
+    header = shard("s/4.tar", {f"{row}.png": None for row in range(4)}, first=900)
+    raw = bytearray(header.read_bytes())
+    with tarfile.open(header) as tar:
+        raw[tar.getmembers()[2].offset + 150] ^= 0xFF
+    header.write_bytes(raw)
+    pictures = read_pictures(tmp_path / "s", 8)
+    count = sum(file.startswith("3.tar.gz") for file in pictures.files)
+    assert 10 < count <= 40
+    assert len(pictures) == 3 + count + 2
+    assert [row.file for row in pictures.skipped] == ["1.tar", "2.tar", "3.tar.gz", "4.tar"]
+
+
+def test_several_pictures_in_a_sample_are_a_question(shard):
+    path = shard(
+        "p.tar", {"1.jpg": None, "1.seg.png": None, "2.jpg": None, "2.seg.png": None, "3.seg.png": None}
+    )
+    with pytest.raises(
+        ValueError,
+        match=r"'1' in p\.tar has several pictures \(jpg, seg\.png\); name one: '.*p\.tar\?column=jpg'",
+    ):
+        read_pictures(path, 8)
+    jpgs = read_pictures(f"{path}?column=jpg", 8)
+    assert jpgs.files == ("p.tar/1.jpg", "p.tar/2.jpg")
+    assert [row.reason for row in jpgs.skipped] == ["no 'jpg' in this sample (it has seg.png)"]
+    assert len(read_pictures(f"{path}?column=seg.png", 8)) == 3
+    with pytest.raises(ValueError, match=r"unknown option 'colum'; did you mean 'column'"):
+        read_pictures(f"{path}?colum=jpg", 8)
+
+
+def test_hostile_names_and_members_write_nothing_and_read_nothing_outside(shard, tmp_path, encoded):
+    (tmp_path / "secret.png").write_bytes(encoded(77))
+    path = tmp_path / "evil.tar"
+    with tarfile.open(path, "w") as tar:
+        for seed, name in enumerate(("../out.png", "/abs/out2.png", "./fine.png")):
+            data = encoded(seed)
+            info = tarfile.TarInfo(name)
+            info.size = len(data)
+            tar.addfile(info, io.BytesIO(data))
+        for kind, name in (
+            (tarfile.SYMTYPE, "link.png"),
+            (tarfile.LNKTYPE, "hard.png"),
+            (tarfile.FIFOTYPE, "fifo.png"),
+        ):
+            info = tarfile.TarInfo(name)
+            info.type, info.linkname = kind, str(tmp_path / "secret.png")
+            tar.addfile(info)
+    before = sorted(file for file in tmp_path.rglob("*") if "cache" not in file.parts)
+    pictures = read_pictures(path, 8)
+    assert len(pictures) == 3
+    assert sorted(file for file in tmp_path.rglob("*") if "cache" not in file.parts) == before
+
+
+def test_labels_that_are_missing_mixed_too_large_or_no_labels(shard):
+    path = shard(
+        "l.tar",
+        {
+            "1.png": None,
+            "1.json": json.dumps({"id": 1 << 30, "mixed": 1, "late": None, "list": [1], "file": "old.png"}),
+            "2.png": None,
+            "3.png": None,
+            "3.json": json.dumps({"id": 7, "mixed": "one", "late": 2.5, "yes": True}),
+            "4.png": None,
+            "4.json": "[1, 2]",
+            "5.png": None,
+            "5.json": "{",
+            "6.txt": "a caption without a picture",
+        },
+    )
+    pictures = read_pictures(path, 8)
+    labels = {name: column.tolist() for name, column in pictures.labels.items()}
+    assert labels.pop("late")[2] == 2.5
+    assert labels == {
+        "id": [str(1 << 30), "", "7"],
+        "mixed": ["1", "", "one"],
+        "original_file": ["old.png", "", ""],
+        "yes": [-1, -1, 1],
+    }
+    assert [row.file for row in pictures.skipped] == ["l.tar/4.png", "l.tar/5.png", "l.tar/6"]
+
+
+def test_it_is_decoded_once_and_again_after_a_change(shard, cache, encoded):
+    path = shard("c.tar", members(5))
+    first = read_pictures(path, 8)
+    assert isinstance(first.images, np.memmap)
+    (file,) = cache.iterdir()
+    made = file.stat().st_mtime_ns
+    again = read_pictures(path, 8)
+    assert file.stat().st_mtime_ns == made
+    np.testing.assert_array_equal(first.images, again.images)
+    assert again.labels.keys() == first.labels.keys()
+    shard("c.tar", members(6))
+    assert len(read_pictures(path, 8)) == 6
+    assert len(list(cache.iterdir())) == 1
+
+
+def test_nothing_usable_and_an_interruption_leave_nothing(shard, cache, tmp_path):
+    with pytest.raises(ValueError, match=r"no picture in .*e\.tar \(webdataset\) can be read; it is empty"):
+        read_pictures(shard("e.tar", {}), 8)
+    with pytest.raises(
+        ValueError, match=r"the first is 't\.tar/1': no picture in this sample \(it has txt\)"
+    ):
+        read_pictures(shard("t.tar", {"1.txt": "x"}), 8)
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(ValueError, match="holds no shards"):
+        read_pictures(tmp_path / "folder", 8, dataset="webdataset")
+
+    def stop(done: int, total: int) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        read_pictures(shard("i.tar", members(40)), 8, progress=stop)
+    assert list(cache.iterdir()) == []
+
+
+def test_progress_ends_at_the_total(shard):
+    calls = []
+    read_pictures(shard("n.tar", members(70)), 8, progress=lambda done, total: calls.append((done, total)))
+    assert [done for done, _ in calls] == [32, 64, 70, 70]
+    assert all(done <= total <= 80 for done, total in calls) and calls[-1] == (70, 70)
+
+
+def test_a_folder_with_a_picture_beside_a_tar_is_a_folder(shard, tmp_path, encoded):
+    shard("f/a.tar", members(3))
+    (tmp_path / "f" / "own.png").write_bytes(encoded(1))
+    assert read_pictures(tmp_path / "f", 8).files == ("own.png",)

@@ -1,0 +1,113 @@
+"""RAF-DB and LFW's official parts, on trees as their owners publish them."""
+
+import pytest
+
+from derender.data import take_inventory
+from derender.data.emotions import EMOTIONS, RAFDB
+
+RAF = {
+    "basic/EmoLabel/list_patition_label.txt": "".join(f"train_{row:05d}.jpg {row}\n" for row in range(1, 8))
+    + "test_0001.jpg 4\n",
+    **{f"basic/Image/aligned/train_{row:05d}_aligned.jpg": None for row in range(1, 9)},
+    "basic/Image/aligned/test_0001_aligned.jpg": None,
+    "basic/Image/original/train_00001.jpg": None,
+    "compound/EmoLabel/list_patition_label.txt": "train_0001.jpg 11\n",
+}
+LFW = {
+    "lfw-deepfunneled/Ann_Lee/Ann_Lee_0001.jpg": None,
+    "lfw-deepfunneled/Bo/Bo_0001.jpg": None,
+    "lfw-deepfunneled/Cy_X/Cy_X_0001.jpg": None,
+    "peopleDevTrain.txt": "2\nAnn_Lee\t1\nOther\t3\n",
+    "peopleDevTest.txt": "1\nBo\t1\n",
+    "pairs.txt": "10\t300\nBo\t1\t4\n",
+}
+
+
+def table(source, **options):
+    inventory = take_inventory(source, **options)
+    inventory.source.close()
+    return inventory.table
+
+
+@pytest.mark.parametrize("zipped", [False, True])
+def test_rafdb(tree, zipped):
+    """Aligned pictures only; the eighth has no row."""
+    source = tree(RAF, zipped)
+    found = table(source)
+    by_name = dict(zip([file[-18:-12] for file in found.files], found.labels["emotion"], strict=True))
+    assert [by_name[f"_{row:05d}"] for row in range(1, 9)] == [*EMOTIONS, ""]
+    assert EMOTIONS[0] == "surprise" and EMOTIONS[6] == "neutral"
+    assert sorted(found.partition.tolist()) == ["test"] + ["train"] * 8
+    test = table(f"{source}::test")
+    assert (test.files, test.labels["emotion"].tolist()) == (
+        ("basic/Image/aligned/test_0001_aligned.jpg",),
+        ["happiness"],
+    )
+    with pytest.raises(ValueError, match="no subset 'val'; there are test, train"):
+        take_inventory(source, subset="val")
+
+
+def test_rafdb_with_the_list_spelt_right(tree):
+    files = {"list_partition_label.txt": "test_1.jpg 1\n", "aligned/test_1_aligned.jpg": None}
+    assert table(tree(files)).labels["emotion"].tolist() == ["surprise"]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (
+            "train_00001.jpg 5\ntrain_00002.jpg 8\n",
+            r"line 2: expected a picture and an emotion from 1 \(surprise\)",
+        ),
+        ("train_00001.jpg 0\n", r"to 7 \(neutral\), got 'train_00001\.jpg 0'"),
+        ("5\n", r"line 1: expected a picture and an emotion"),
+        (
+            "other.jpg 5\n",
+            "names none of its pictures; the first is 'basic/Image/aligned/test_0001_aligned.jpg'",
+        ),
+    ],
+)
+def test_faults_in_rafdbs_list_are_named(tree, text, message):
+    with pytest.raises(ValueError, match=message):
+        take_inventory(tree({**RAF, "basic/EmoLabel/list_patition_label.txt": text}))
+
+
+def test_rafdb_half_unpacked(tree):
+    packed = {"basic/EmoLabel/list_patition_label.txt": "train_00001.jpg 5\n", "basic/Image/aligned.zip": "x"}
+    with pytest.raises(
+        ValueError, match=r"no aligned pictures: expected Image/aligned/.* unpack aligned\.zip"
+    ):
+        take_inventory(tree(packed))
+    with pytest.raises(
+        ValueError, match=rf"no EmoLabel/list_patition_label\.txt .* on request: {RAFDB.home}"
+    ):
+        take_inventory(tree(["aligned/test_1_aligned.jpg"], name="bare"), dataset="rafdb")
+
+
+@pytest.mark.parametrize("zipped", [False, True])
+def test_lfw_by_the_people_of_view_1(tree, zipped):
+    source = tree(LFW, zipped)
+    found = table(source)
+    assert found.labels["identity"].tolist() == ["Ann_Lee", "Bo", "Cy_X"]
+    assert found.partition.tolist() == ["train", "test", ""]
+    assert table(source, subset="test").labels["identity"].tolist() == ["Bo"]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("3\nBo\t1\n", r"peopleDevTest\.txt in .* is cut short: expected the number of people"),
+        ("", "is cut short"),
+        ("1\nBo x\n", "line 2: expected a name and a number of pictures"),
+    ],
+)
+def test_faults_in_lfws_lists_are_named(tree, text, message):
+    with pytest.raises(ValueError, match=message):
+        take_inventory(tree({**LFW, "peopleDevTest.txt": text}))
+
+
+def test_lfw_without_lists_has_no_parts(tree):
+    files = [name for name in LFW if name.endswith("jpg")]
+    assert table(tree(files)).partition is None
+    with pytest.raises(ValueError, match=r"no pictures in a folder 'test'"):
+        take_inventory(tree(files), subset="test")

@@ -1,0 +1,75 @@
+"""The whole card: every control is there, seeds repeat it, shuffling takes everything away."""
+
+import numpy as np
+import pytest
+
+from derender.data import PictureSet
+from derender.evaluation.disentanglement import evaluate_disentanglement, random_pixels, shuffled_rows
+from derender.model import Derenderer
+from derender.presets import MODEL_PRESETS
+
+
+def model() -> Derenderer:
+    settings = MODEL_PRESETS["small"]
+    network = settings.network.model_copy(
+        update={"image_size": 32, "width": 4, "light_width": 4, "code_size": 16}
+    )
+    return Derenderer.seeded(settings.model_copy(update={"network": network}), 3).eval()
+
+
+def lit_pictures(count: int = 60) -> PictureSet:
+    """Ramps whose slopes are labelled as light: any encoder sees them."""
+    rng = np.random.default_rng(0)
+    slopes = rng.uniform(-1, 1, (count, 2)).astype(np.float32)
+    axis = np.linspace(-1, 1, 32)
+    ramps = 0.5 + 0.2 * (slopes[:, :1, None] * axis + slopes[:, 1:, None] * axis[:, None])
+    images = np.repeat(ramps[:, None] * 255, 3, axis=1).astype(np.uint8)
+    labels = {"light_yaw_rad": slopes[:, 0], "light_pitch_rad": slopes[:, 1]}
+    return PictureSet(images, tuple(map(str, range(count))), labels)
+
+
+def test_the_card_holds_the_model_and_every_control_and_repeats_itself():
+    net, pictures, steps = model(), lit_pictures(), []
+    card = evaluate_disentanglement(
+        net, pictures, seeds=(0, 1), swap_pictures=8, progress=lambda done, total: steps.append((done, total))
+    )
+    assert list(card.rows) == ["model", "untrained encoder", "shuffled rows", "random pixels"]
+    assert all(len(results) == 2 for results in card.rows.values()) and steps[-1] == (8, 8)
+    assert card.features == ("geometry", "albedo", "light", "camera") and card.dimensions == (16,) * 4
+    assert card.correlations.shape == (64, 64) and card.n_pictures == 60
+    ours, untrained, shuffled, pixels = (results[0] for results in card.rows.values())
+    assert ours.swap is not None and ours.swap.n_pictures == 8 and untrained.swap is not None
+    assert shuffled.swap is None and pixels.swap is None
+    assert ours.truth is not None and ours.truth.by_dimension is not None and shuffled.truth is not None
+    assert ours.truth.by_feature.informativeness > 0.8 > 0.2 > shuffled.truth.by_feature.informativeness
+    assert ours.similarity.mean_cross_r2 > 0.5 > 0.1 > shuffled.similarity.mean_cross_r2
+    again = evaluate_disentanglement(net, pictures, seeds=(0,), swap_pictures=8, dimensions=None)
+    same = again.rows["untrained encoder"][0]
+    assert same.swap is not None and same.swap.ratio == pytest.approx(untrained.swap.ratio, rel=1e-5)
+    assert same.truth is not None and same.truth.by_dimension is None
+
+
+def test_without_true_factors_only_their_part_is_missing():
+    pictures = lit_pictures(20)
+    real = PictureSet(pictures.images, pictures.files, {"age": pictures.labels["light_yaw_rad"]})
+    card = evaluate_disentanglement(model(), real, seeds=(0,), swap_pictures=4)
+    scores = card.rows["model"][0]
+    assert scores.truth is None and np.isfinite(scores.pearson.mean_per_dimension)
+    with pytest.raises(ValueError, match="the disentanglement card needs 20 pictures or more"):
+        evaluate_disentanglement(model(), pictures.select(slice(0, 19)))
+    with pytest.raises(ValueError, match="at least one seed"):
+        evaluate_disentanglement(model(), real, seeds=())
+
+
+def test_controls_are_what_they_say():
+    features = {"a": np.arange(12.0).reshape(6, 2), "b": np.arange(6.0)[:, None]}
+    shuffled = shuffled_rows(features, 0)
+    for name, values in features.items():
+        assert sorted(map(tuple, shuffled[name])) == sorted(map(tuple, values))
+    assert not np.array_equal(shuffled["a"][:, 0] / 2, shuffled["b"][:, 0])
+    images = np.arange(2 * 3 * 2 * 2, dtype=np.uint8).reshape(2, 3, 2, 2)
+    blocks = random_pixels(images, {"a": 5, "b": 3}, 0)
+    assert blocks["a"].shape == (2, 5) and blocks["b"].shape == (2, 3)
+    drawn = np.concatenate([blocks["a"][0], blocks["b"][0]]) * 255
+    assert len(np.unique(drawn.round())) == 8 and drawn.max() < 12
+    assert sum(values.shape[1] for values in random_pixels(images, {"a": 256, "b": 256}, 0).values()) == 12

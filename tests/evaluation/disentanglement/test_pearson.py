@@ -1,0 +1,75 @@
+"""Both readings of Pearson: closed forms, NumPy as the oracle, invariances, what is left out."""
+
+import numpy as np
+import pytest
+
+from derender.evaluation.disentanglement import correlation_matrix, pearson, per_image
+
+
+def features(rows: int = 40, size: int = 6, seed: int = 0) -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    return {name: rng.standard_normal((rows, size)) for name in ("geometry", "albedo", "light", "camera")}
+
+
+def test_both_readings_are_what_numpy_says():
+    blocks = features()
+    a, b = blocks["geometry"], blocks["light"]
+    scores = pearson(blocks)
+    by_image = [np.corrcoef(a[i], b[i])[0, 1] for i in range(len(a))]
+    np.testing.assert_allclose(per_image(a, b), by_image, rtol=1e-10)
+    assert scores.per_image[0, 2] == pytest.approx(np.mean(by_image))
+    by_dimension = [abs(np.corrcoef(a[:, p], b[:, q])[0, 1]) for p in range(6) for q in range(6)]
+    assert scores.per_dimension[0, 2] == pytest.approx(np.mean(by_dimension))
+    whole = np.abs(np.corrcoef(np.concatenate(list(blocks.values()), axis=1).T))
+    np.testing.assert_allclose(correlation_matrix(blocks), whole, atol=1e-12)
+    off = ~np.eye(4, dtype=bool)
+    assert scores.mean_per_dimension == pytest.approx(scores.per_dimension[off].mean())
+    assert scores.mean_per_image == pytest.approx(scores.per_image[off].mean())
+
+
+def test_a_copy_scores_one_and_its_negative_is_told_apart_only_per_image():
+    a = features()["geometry"]
+    scores = pearson({"a": a, "copy": 3 * a, "negative": -a})
+    np.testing.assert_allclose(scores.per_image, [[1, 1, -1], [1, 1, -1], [-1, -1, 1]])
+    assert scores.per_dimension[0, 1] == pytest.approx(scores.per_dimension[0, 2])
+    one = pearson({"a": a[:, :1], "b": -2 * a[:, :1] + 5})
+    assert one.mean_per_dimension == pytest.approx(1)
+
+
+def test_chance_per_dimension_is_the_stated_floor():
+    blocks = features(rows=400, size=64)
+    assert pearson(blocks).mean_per_dimension == pytest.approx(np.sqrt(2 / (np.pi * 399)), rel=0.03)
+    assert abs(pearson(blocks).mean_per_image) < 0.01
+
+
+def test_order_of_dimensions_matters_to_the_reading_per_image_alone():
+    blocks = features()
+    mixed = blocks | {"light": blocks["light"][:, ::-1] * 4 + 1}
+    before, after = pearson(blocks), pearson(mixed)
+    np.testing.assert_allclose(after.per_dimension, before.per_dimension, rtol=1e-10)
+    assert abs(after.per_image[0, 2] - before.per_image[0, 2]) > 1e-3
+
+
+def test_dead_dimensions_and_constant_vectors_are_left_out_and_counted():
+    blocks = features()
+    dead = np.concatenate([blocks["light"], np.full((40, 2), 0.3)], axis=1)
+    scores = pearson(blocks | {"light": dead})
+    assert scores.n_dead == {"geometry": 0, "albedo": 0, "light": 2, "camera": 0}
+    np.testing.assert_allclose(scores.per_dimension, pearson(blocks).per_dimension)
+    assert np.isnan(scores.per_image[0, 2]) and np.isfinite(scores.mean_per_image)
+    assert np.isnan(correlation_matrix(blocks | {"light": dead})[18]).all()
+    a, b = blocks["geometry"].copy(), blocks["albedo"]
+    a[3] = 0.7
+    assert np.flatnonzero(np.isnan(per_image(a, b))).tolist() == [3]
+    collapsed = pearson({"a": np.ones((5, 3)), "b": blocks["albedo"][:5, :3]})
+    assert np.isnan(collapsed.mean_per_dimension)
+
+
+def test_bad_input():
+    blocks = features()
+    with pytest.raises(ValueError, match="two features or more"):
+        pearson({"a": blocks["light"]})
+    with pytest.raises(ValueError, match=r"one number of rows, 3 or more; there are \[39, 40\]"):
+        pearson(blocks | {"light": blocks["light"][1:]})
+    with pytest.raises(ValueError, match="vectors of one length"):
+        per_image(blocks["light"], blocks["light"][:, 1:])

@@ -1,0 +1,111 @@
+"""CKA and cross-prediction: kernels written out as the oracle, invariances, scikit-learn's ridge, chance."""
+
+import numpy as np
+import pytest
+from sklearn.linear_model import RidgeCV
+
+from derender.evaluation.disentanglement import fit_predict, held_out, linear_cka, r_squared, similarity
+
+
+def normal(*shape: int, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).standard_normal(shape)
+
+
+def rotation(size: int, seed: int = 0) -> np.ndarray:
+    return np.linalg.qr(normal(size, size, seed=seed))[0]
+
+
+def hsic_by_kernels(x: np.ndarray, y: np.ndarray, unbiased: bool) -> float:
+    """HSIC from N x N kernels, term by term as published."""
+    n = len(x)
+    k, m = x @ x.T, y @ y.T
+    if not unbiased:
+        centre = np.eye(n) - 1 / n
+        return np.trace(centre @ k @ centre @ m)
+    np.fill_diagonal(k, 0)
+    np.fill_diagonal(m, 0)
+    one = np.ones(n)
+    middle = (one @ k @ one) * (one @ m @ one) / ((n - 1) * (n - 2))
+    return (np.trace(k @ m) + middle - 2 / (n - 2) * (one @ k @ m @ one)) / (n * (n - 3))
+
+
+@pytest.mark.parametrize("unbiased", [False, True])
+def test_cka_is_what_the_kernels_give(unbiased):
+    x, y = normal(30, 7), normal(30, 12, seed=1) + 2
+    y[:, :3] += x[:, :3]
+    cross, own_x, own_y = (hsic_by_kernels(*pair, unbiased) for pair in ((x, y), (x, x), (y, y)))
+    assert linear_cka(x, y, unbiased=unbiased) == pytest.approx(cross / np.sqrt(own_x * own_y), rel=1e-9)
+
+
+@pytest.mark.parametrize("unbiased", [False, True])
+def test_cka_is_one_for_equal_features_in_another_basis(unbiased):
+    x = normal(50, 8)
+    assert linear_cka(x, 3 * x @ rotation(8) + 5, unbiased=unbiased) == pytest.approx(1)
+    y = normal(50, 5, seed=2)
+    before = linear_cka(x, y, unbiased=unbiased)
+    assert linear_cka(x @ rotation(8), y[:, ::-1] * 0.1, unbiased=unbiased) == pytest.approx(before)
+    assert np.isnan(linear_cka(x, np.ones((50, 3)), unbiased=unbiased))
+
+
+def test_only_the_unbiased_form_is_zero_by_chance():
+    x, y = normal(200, 128), normal(200, 128, seed=1)
+    assert linear_cka(x, y, unbiased=False) > 0.3
+    assert abs(linear_cka(x, y, unbiased=True)) < 0.02
+
+
+def test_ridge_is_scikit_learns_with_the_penalty_it_would_choose():
+    """Both where there are more rows than dimensions and where there are fewer."""
+    for rows, size in ((60, 10), (30, 50)):
+        x = normal(rows, size) * np.linspace(0.1, 3, size) + 1
+        y = np.stack([x[:, 0] + 0.1 * normal(rows, seed=2), normal(rows, seed=3), x[:, -1]], axis=1)
+        penalties = (1e-3, 1e-1, 10.0)
+        new = normal(9, size, seed=5)
+        power = np.linalg.svd(x - x.mean(axis=0), compute_uv=False) ** 2
+        scale = power[power > 1e-9 * power.max()].mean()
+        oracle = RidgeCV([p * scale for p in penalties], alpha_per_target=True, gcv_mode="svd")
+        np.testing.assert_allclose(
+            fit_predict(x, y, new, penalties), oracle.fit(x, y).predict(new), rtol=1e-6, atol=1e-8
+        )
+
+
+def test_predictions_do_not_change_with_scale_order_and_rotation():
+    x, y = normal(60, 8), normal(60, 2, seed=1)
+    y[:, 0] += x[:, 0]
+    expected = held_out(x, y)
+    for other in (100 * x, x[:, ::-1], x @ rotation(8), x - 3):
+        np.testing.assert_allclose(held_out(other, y), expected, rtol=1e-6, atol=1e-8)
+
+
+def test_r_squared_is_one_for_a_linear_map_and_about_zero_for_noise():
+    x = normal(200, 10)
+    y = x @ normal(10, 4, seed=1) + 3
+    np.testing.assert_allclose(r_squared(held_out(x, y), y), 1, atol=1e-6)
+    noise = normal(200, 4, seed=2)
+    assert abs(r_squared(held_out(x, noise), noise, pooled=True)) < 0.05
+    constant = held_out(np.ones((200, 3)), noise, seed=4)
+    assert r_squared(constant, noise, seed=4, pooled=True) == pytest.approx(0, abs=1e-12)
+    assert np.isnan(r_squared(np.ones((10, 1)), np.ones((10, 1)), folds=2)).all()
+
+
+def test_cross_prediction_has_a_direction():
+    a = normal(150, 6)
+    blocks = {"all": a, "part": a[:, :2], "other": normal(150, 6, seed=1)}
+    scores = similarity(blocks)
+    assert scores.cross_r2[0, 1] == pytest.approx(1, abs=1e-6)
+    assert scores.cross_r2[1, 0] == pytest.approx(1 / 3, abs=0.12)
+    assert abs(scores.cross_r2[0, 2]) < 0.1 and abs(scores.cka_unbiased[0, 2]) < 0.1
+    np.testing.assert_allclose(np.diag(scores.cka_unbiased), 1)
+    rows = np.random.default_rng(0).permutation(150)
+    shuffled = similarity(blocks | {"part": a[rows, :2]})
+    assert shuffled.cross_r2[0, 1] < 0.05 < scores.mean_cross_r2
+    off = ~np.eye(3, dtype=bool)
+    assert scores.mean_cka_biased == pytest.approx(scores.cka_biased[off].mean())
+
+
+def test_bad_input():
+    with pytest.raises(ValueError, match="same 4 rows or more, got 9 and 8"):
+        linear_cka(normal(9, 2), normal(8, 2), unbiased=True)
+    with pytest.raises(ValueError, match="9 rows of features but 8 rows of targets"):
+        held_out(normal(9, 2), normal(8, 2))
+    with pytest.raises(ValueError, match="6 rows cannot be dealt into 5 folds: use 2 to 3"):
+        held_out(normal(6, 2), normal(6, 2))

@@ -1,0 +1,113 @@
+"""The swap test: the identity for a model that reads every factor, all alike for one that mixes them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import torch
+
+from derender.evaluation.disentanglement import diagonal_over_rest, swap_test
+from derender.model import Derenderer
+from derender.presets import MODEL_PRESETS
+from derender.render import Rendering
+from derender.scene import Scene
+
+
+@dataclass(frozen=True)
+class Named:
+    name: str
+    parameter: str
+
+
+FACTORS = tuple(Named(*pair) for pair in (("geometry", "depth"), ("albedo", "albedo"), ("light", "light")))
+
+
+class Reader(torch.nn.Module):
+    """Pictures of 4 x 4 whose rows 0, 1, 2 hold depth, albedo and light; ``mix`` adds every row to each."""
+
+    factors, device = FACTORS, torch.device("cpu")
+
+    def __init__(self, mix: float, covered: bool = True, frozen: bool = False):
+        super().__init__()
+        self.mix, self.covered, self.frozen, self.seen = mix, covered, frozen, []
+
+    def embed(self, images):
+        rows = [images[:, 0, row] * (0 if self.frozen and row == 2 else 1) for row in range(3)]
+        mean = torch.stack(rows).sum(dim=0)
+        names = (factor.name for factor in FACTORS)
+        return {name: (1 - self.mix) * row + self.mix * mean for name, row in zip(names, rows, strict=True)}
+
+    def decode(self, codes):
+        depth = codes["geometry"][:, None].expand(-1, 4, 4)
+        albedo = codes["albedo"][:, None, None].expand(-1, 3, 4, 4)
+        return Scene(depth, albedo, codes["light"], torch.zeros(len(depth), 6))
+
+    def render(self, scene):
+        image = torch.zeros(len(scene), 3, 4, 4)
+        image[:, 0, 0], image[:, 0, 1] = scene.depth[:, 0], scene.albedo[:, 0, 0]
+        image[:, 0, 2] = scene.light
+        mask = torch.full((len(scene), 4, 4), float(self.covered))
+        return Rendering(image * mask[:, None], scene.depth * mask, mask)
+
+
+def pictures(count: int = 11) -> np.ndarray:
+    return np.random.default_rng(0).integers(0, 256, (count, 3, 4, 4), dtype=np.uint8)
+
+
+def test_a_model_that_reads_every_factor_gives_the_identity():
+    seen = []
+    scores = swap_test(Reader(0), pictures(), batch_size=4, progress=lambda *step: seen.append(step))
+    np.testing.assert_allclose(scores.moved, np.eye(3), atol=1e-6)
+    np.testing.assert_allclose(scores.moved_parameters, np.eye(3), atol=1e-6)
+    np.testing.assert_allclose(scores.arrived, 0, atol=1e-6)
+    np.testing.assert_allclose(scores.unexchanged, 0, atol=1e-6)
+    assert scores.ratio == float("inf") and scores.factors == ("geometry", "albedo", "light")
+    assert 0.3 < scores.moved_pixels.mean() < 0.9
+    assert seen[-1] == (44, 44) and scores.n_pictures == 11
+
+
+def test_features_that_hold_everything_move_alike_whatever_is_exchanged():
+    scores = swap_test(Reader(1), pictures())
+    np.testing.assert_allclose(scores.moved, scores.moved[:, :1].repeat(3, axis=1), rtol=1e-5)
+    assert scores.ratio == pytest.approx(1, rel=1e-5)
+    half = swap_test(Reader(0.3), pictures())
+    assert 1.5 < half.ratio < 10 and (np.diag(half.moved) > half.moved.mean(axis=1)).all()
+
+
+def test_the_seed_decides_who_gives_and_batches_do_not():
+    model = Reader(0.3)
+    first = swap_test(model, pictures(), seed=3, batch_size=2)
+    np.testing.assert_allclose(first.moved, swap_test(model, pictures(), seed=3).moved, rtol=1e-6)
+    assert not np.allclose(first.moved, swap_test(model, pictures(), seed=4).moved, rtol=1e-3)
+
+
+def test_uncovered_pixels_show_the_edge_of_the_picture_that_was_put_in():
+    """With nothing covered, all that is left to see is the input's edge, which no exchange changes."""
+    images = pictures()
+    scores = swap_test(Reader(0, covered=False), images)
+    np.testing.assert_allclose(scores.moved, 0, atol=1e-6)
+    np.testing.assert_allclose(scores.moved_pixels, 0, atol=1e-6)
+    assert np.isnan(scores.ratio)
+
+
+def test_what_never_differs_has_no_unit():
+    scores = swap_test(Reader(0, frozen=True), pictures())
+    assert np.isnan(scores.moved[:, 2]).all() and np.isfinite(scores.moved[:, :2]).all()
+    assert np.isnan(scores.ratio)
+
+
+def test_ratio_and_bad_input():
+    assert diagonal_over_rest(np.array([[0.8, 0.1], [0.3, 0.4]])) == pytest.approx(3)
+    with pytest.raises(ValueError, match="two pictures or more, got 1"):
+        swap_test(Reader(0), pictures(1))
+
+
+def test_a_whole_model_is_left_as_it_was():
+    settings = MODEL_PRESETS["small"]
+    network = settings.network.model_copy(update={"image_size": 32, "width": 4, "light_width": 4})
+    model = Derenderer.seeded(settings.model_copy(update={"network": network}), 0).train()
+    images = np.random.default_rng(0).integers(0, 256, (6, 3, 32, 32), dtype=np.uint8)
+    scores = swap_test(model, images)
+    assert model.training and scores.factors == ("geometry", "albedo", "light", "camera")
+    assert scores.moved.shape == (4, 4) and np.isfinite(scores.moved).all()
+    assert (scores.moved >= 0).all() and 0.2 < scores.ratio < 5

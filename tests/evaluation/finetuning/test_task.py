@@ -1,0 +1,208 @@
+"""Joint training: both objectives reach the encoders, runs resume exactly, models load, held-out scores."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+from torch.nn.functional import cross_entropy
+
+import derender
+from derender.data import PictureSet
+from derender.evaluation.finetuning import (
+    FinetuneTask,
+    load_finetuned,
+    score_finetuned,
+    target_loss,
+    target_of,
+)
+from derender.evaluation.finetuning.task import RENDERING_TERMS
+from derender.report.run import run_page
+from derender.report.tables_finetuning import finetuning_table
+from derender.training.batches import random_stream
+from derender.training.checkpoint import WEIGHTS_FILE
+from derender.training.config import PRESETS, with_changes
+from derender.training.finetune_config import FinetuneConfig
+from derender.training.loop import network_precision, train_task
+from derender.training.run_folder import RunFolder, read_metrics
+from derender.training.step_module import compute_step
+
+TINY = ["image_size=32", "width=4", "light_width=4", "perceptual=none", "batch_size=8", "patience=99"]
+TINY += ["validate_every=32", "checkpoint_every=32", "deterministic=true", "watch=false", "warmup_images=0"]
+TINY += ["final_rate=1"]  # resuming with more pictures goes on at the same rate
+
+
+@pytest.fixture(autouse=True)
+def _restore_determinism():
+    yield
+    torch.use_deterministic_algorithms(False)
+
+
+@pytest.fixture(scope="module")
+def pictures() -> PictureSet:
+    """Bright and dark pictures of which some carry no label; three shades; a value that never changes."""
+    random = np.random.default_rng(0)
+    shade = np.arange(60) % 3
+    images = random.integers(0, 60, (60, 3, 32, 32)) + 80 * shade[:, None, None, None]
+    bright = np.where(shade == 2, 1, 0).astype(np.int8)
+    bright[::10] = -1
+    labels = {
+        "bright": bright,
+        "dark": (shade == 0).astype(np.int8),
+        "shade": np.array(["low", "middle", "high"])[shade],
+        "same": np.zeros(60, np.int8),
+    }
+    files = tuple(f"{row:02d}.png" for row in range(60))
+    return PictureSet(images.astype(np.uint8), files, labels, source="made by the test")
+
+
+def config(*more: str, labels=("shade",), **explicit) -> FinetuneConfig:
+    base = FinetuneConfig(**PRESETS["small"].model_dump(mode="json"))
+    return with_changes(base, [*TINY, *more], target__labels=list(labels), **explicit)
+
+
+def task(pictures, *more: str, start=None, **how) -> FinetuneTask:
+    one = config(*more, **how)
+    return FinetuneTask(one, pictures.images, target_of(pictures, one), start)
+
+
+def weights(run) -> dict[str, torch.Tensor]:
+    return load_file(run / "checkpoints" / "last" / WEIGHTS_FILE)
+
+
+def test_both_objectives_reach_the_encoders(pictures, tmp_path):
+    """The total is the weighted sum of what each gives alone, and so are its gradients."""
+
+    def gradient(weight: float, rendering: float) -> tuple[float, torch.Tensor]:
+        one = task(pictures, target__weight=weight, target__rendering_weight=rendering)
+        model = one.build()
+        module = one.step_module(
+            model, RunFolder(tmp_path), torch.zeros(0, 3, 32, 32, dtype=torch.uint8), lambda *at: None
+        )
+        images = torch.from_numpy(pictures.images[one.target.split.train[:8]]).float() / 255
+        precision = network_precision("32-true", torch.device("cpu"))
+        losses = compute_step(module, images, random_stream(0, "perturb", 0), precision, 0.5)
+        assert set(losses.terms) - {"target"} <= set(RENDERING_TERMS)
+        losses.total.backward()
+        found = [
+            model.model.nets[name].encoder.convolutions[0].weight.grad for name in ("geometry", "albedo")
+        ]
+        return losses.total.item(), torch.stack(found)
+
+    target, rendering = gradient(1.0, 0.0), gradient(1e-12, 1.0)
+    both = gradient(2.0, 3.0)
+    assert both[0] == pytest.approx(2 * target[0] + 3 * rendering[0], rel=1e-4)
+    expected = 2 * target[1] + 3 * rendering[1]
+    assert (both[1] - expected).abs().max() < 1e-3 * expected.abs().max()
+    assert target[1].abs().max() > 0 and rendering[1].abs().max() > 0
+
+
+def test_a_resumed_run_ends_with_the_very_weights_and_the_model_loads(pictures, tmp_path):
+    whole, first, second = (task(pictures, f"images={count}") for count in (64, 32, 64))
+    train_task(whole, pictures, tmp_path / "whole")
+    train_task(first, pictures, tmp_path / "parts")
+    train_task(second, pictures, tmp_path / "parts", resume=True)
+    one, two = weights(tmp_path / "whole"), weights(tmp_path / "parts")
+    assert one.keys() == two.keys() and "head.linear.weight" in one
+    assert all(torch.equal(one[name], two[name]) for name in one)
+    kinds = [row["kind"] for row in read_metrics(tmp_path / "whole")]
+    assert kinds.count("validation") == 2
+    judged = [row for row in read_metrics(tmp_path / "whole") if row["kind"] == "validation"]
+    assert all(row["loss"] == row["target"] for row in judged)  # held-out pictures are judged by the task
+
+    model = derender.load(tmp_path / "whole")
+    images = torch.from_numpy(pictures.images[:4]).float() / 255
+    tuned = load_finetuned(tmp_path / "whole")
+    assert torch.equal(tuned.model.embed(images)["geometry"], model.embed(images)["geometry"])
+    assert tuned.answer(images).sum(dim=1) == pytest.approx(np.ones(4), abs=1e-5)
+    best = load_file(tmp_path / "whole" / "checkpoints" / "best" / WEIGHTS_FILE)
+    assert torch.equal(best["head.linear.weight"], tuned.head.linear.weight)
+    assert "Preset small" in run_page(tmp_path / "whole").html()
+    with pytest.raises(ValueError, match="was trained with another target"):
+        other = task(pictures, "images=96", labels=("dark",))
+        train_task(other, pictures, tmp_path / "whole", resume=True)
+
+
+def test_it_learns_beside_the_controls_and_leaves_its_start_alone(pictures, tmp_path):
+    start = derender.Derenderer.from_preset("small", seed=5, image_size=32, width=4, light_width=4)
+    start = start.eval().requires_grad_(False)
+    before = {name: value.clone() for name, value in start.state_dict().items()}
+    fast = ["images=240", "learning_rate=5e-3", "rendering_weight=0", "split=[0.4, 0.2, 0.4]"]
+    one = task(pictures, *fast, start=start, labels=("bright", "dark"))
+    assert torch.equal(
+        one.build().model.nets["albedo"].decoder.last.weight, before["nets.albedo.decoder.last.weight"]
+    )
+    train_task(one, pictures, tmp_path / "run")
+    found = score_finetuned(load_finetuned(tmp_path / "run"), one, resample_count=50)
+    rows = {row.name: row.scores["balanced_accuracy"].value for row in found.rows}
+    assert rows["fine-tuned"] > 0.9 and rows["majority"] == 0.5
+    assert (found.kind, found.n_train, found.n_test) == ("labels", 24, 24) and found.versus[
+        "accuracy"
+    ].rival != "fine-tuned"
+    table = finetuning_table(found, "fresh weights").values()
+    assert list(table) == ["fine-tuned", "frozen, logistic", "frozen, paper's head", "majority"]
+    assert all(torch.equal(value, before[name]) for name, value in start.state_dict().items())
+    assert not any(parameter.requires_grad for parameter in start.parameters())
+    changed = derender.load(tmp_path / "run").state_dict()
+    assert not torch.equal(
+        changed["nets.geometry.encoder.convolutions.0.weight"],
+        before["nets.geometry.encoder.convolutions.0.weight"],
+    )
+
+
+def test_labels_beyond_those_asked_for_and_those_tested_stay_hidden(pictures):
+    target = target_of(pictures, config(target__labelled=7))
+    train, held, tested = (getattr(target.split, part) for part in ("train", "validation", "test"))
+    assert (target.visible[train] >= 0).any(axis=1).sum() == 7
+    assert (target.visible[held] == target.asked.targets[held]).all() and (target.visible[tested] == -1).all()
+    smaller = target_of(pictures, config(target__labelled=3)).visible
+    assert ((smaller >= 0) <= (target.visible >= 0)).all()
+
+
+def test_target_loss_is_torchs_cross_entropy_over_what_is_known():
+    torch.manual_seed(0)
+    logits, classes = torch.randn(6, 3), torch.tensor([0, 1, 2, 2, 1, 0])
+    targets = torch.nn.functional.one_hot(classes, 3).float()
+    targets[4:] = -1
+    assert target_loss(logits, targets, "classes") == pytest.approx(
+        cross_entropy(logits[:4], classes[:4]).item()
+    )
+    yes_no = torch.tensor([[1.0, -1], [0, 1], [-1, -1]])
+    expected = torch.nn.functional.binary_cross_entropy_with_logits(
+        logits[[0, 1, 1], [0, 0, 1]], torch.tensor([1.0, 0, 1])
+    )
+    assert target_loss(logits[:3, :2], yes_no, "labels") == pytest.approx(expected.item())
+    for kind in ("classes", "labels"):
+        assert target_loss(logits, torch.full((6, 3), -1.0), kind) == 0
+
+
+def test_bad_input_is_named_before_a_folder_is_made(pictures, tmp_path):
+    with pytest.raises(ValueError, match="name a label to learn; the pictures have bright, dark"):
+        target_of(pictures, config(labels=()))
+    with pytest.raises(ValueError, match="has no label 'shades'; did you mean 'shade'"):
+        target_of(pictures, config(labels=("shades",)))
+    with pytest.raises(ValueError, match="of 'same' have 1"):
+        target_of(pictures, config(labels=("same",)))
+    with pytest.raises(ValueError, match="'shade' has 3 classes and cannot be asked together"):
+        target_of(pictures, config(labels=("shade", "dark")))
+    with pytest.raises(ValueError, match="48 with shade: set labelled=48 or fewer"):
+        target_of(pictures, config(target__labelled=49))
+    with pytest.raises(ValueError, match="no factor 'geomtry'; did you mean 'geometry'"):
+        train_task(task(pictures, target__factors=["geomtry"]), pictures, tmp_path / "run")
+    wide = derender.Derenderer.from_preset("small", seed=0, image_size=32, width=8, light_width=4)
+    with pytest.raises(ValueError, match=r"leave out settings of model\.network"):
+        train_task(task(pictures, start=wide), pictures, tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+    plain = derender.Derenderer.from_preset("small", seed=0, image_size=32, width=4, light_width=4)
+    plain.save(tmp_path / "plain")
+    with pytest.raises(FileNotFoundError, match="has no head"):
+        load_finetuned(tmp_path / "plain")
+    one = task(pictures)
+    saved = one.build().save(tmp_path / "head")
+    (saved / "head.safetensors").write_bytes(b"no")
+    with pytest.raises(ValueError, match=r"the head in .* is damaged"):
+        load_finetuned(saved)
+    nothing = replace(one.target.asked, targets=np.full_like(one.target.asked.targets, -1))
+    with pytest.raises(ValueError, match="test part has 0 pictures with a label"):
+        score_finetuned(one.build(), replace(one, target=replace(one.target, asked=nothing)))

@@ -1,0 +1,172 @@
+"""Nets beside controls: they learn, they start as told, runs are remembered, bad input is named."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from tests.evaluation.segmentation.conftest import NAMES, bands
+
+from derender import Derenderer
+from derender.evaluation.memory import Memory
+from derender.evaluation.segmentation import (
+    VARIANTS,
+    SegmentSettings,
+    answer,
+    build_variant,
+    chosen_variants,
+    compare_segmentations,
+    count_pixels,
+    divide,
+    segmentation_scores,
+    train_segmenter,
+)
+from derender.evaluation.segmentation.controls import by_colour, most_frequent, most_frequent_at_place
+from derender.report.tables_segmentation import (
+    PAPER,
+    beside_the_paper,
+    class_table,
+    segmentation_table,
+)
+
+QUICK = SegmentSettings(learning_rate=1e-2, epochs=6, batch_size=4)
+
+
+def judged(answers, data):
+    return segmentation_scores(count_pixels(answers, data.masks[data.test], len(data.classes)))
+
+
+def test_controls_answer_what_they_may_know(data):
+    truth = data.masks[data.test]
+    assert (most_frequent(data) == np.bincount(data.masks[data.train].ravel()).argmax()).all()
+    place = most_frequent_at_place(data)
+    column = [np.bincount(data.masks[data.train, row, 7]).argmax() for row in range(32)]
+    assert (place == place[0]).all() and (place[0, :, 7] == column).all()
+    colours = by_colour(data, seed=0)
+    assert judged(colours, data).mean_iou > 0.99  # here colour tells all
+    blind = replace(data, images=np.full_like(data.images, 90))
+    assert (by_colour(blind) == most_frequent(data)).all()
+    assert colours.shape == truth.shape and colours.dtype == np.uint8
+
+
+@pytest.mark.parametrize("name", ["joint", "joint-frozen", "random"])
+def test_a_net_learns_and_leaves_the_model_alone(name, data, model, before):
+    net = build_variant(model, VARIANTS[name], data, seed=0)
+    told = []
+    losses = train_segmenter(net, data, 0, QUICK, lambda seen, loss: told.append(seen))
+    assert losses[-1] < losses[0] and told[-1] == 6 * len(data.train)
+    assert judged(answer(net, data.images[data.test]), data).mean_iou > 0.5
+    frozen = build_variant(model, VARIANTS[name], data, seed=0)
+    same = [
+        torch.equal(a, b)
+        for a, b in zip(net.encoders.parameters(), frozen.encoders.parameters(), strict=True)
+    ]
+    assert all(same) == VARIANTS[name].frozen
+
+
+def test_where_the_weights_come_from(data, model, before):
+    built = {name: build_variant(model, variant, data, seed=3) for name, variant in VARIANTS.items()}
+    ours = {name: model.nets[name].encoder.levels[0][0].weight for name in ("geometry", "albedo")}
+
+    def starts(name):
+        return [encoder.levels[0][0].weight for encoder in built[name].encoders]
+
+    assert torch.equal(starts("geometry")[0], ours["geometry"]) and torch.equal(
+        starts("albedo")[0], ours["albedo"]
+    )
+    for name in ("joint", "joint-frozen"):
+        assert torch.equal(starts(name)[0], ours["geometry"]) and torch.equal(starts(name)[1], ours["albedo"])
+    fresh = [*starts("random"), *starts("joint-random"), *starts("joint-random-frozen")]
+    assert not any(torch.equal(one, two) for one in fresh for two in ours.values())
+    assert not torch.equal(*starts("joint-random"))
+    for alike in (("geometry", "albedo", "random"), ("joint", "joint-frozen", "joint-random")):
+        decoders = [built[name].decoder.to_outputs.weight for name in alike]
+        assert all(torch.equal(decoders[0], other) for other in decoders)
+    other = build_variant(model, VARIANTS["random"], data, seed=4)
+    assert not torch.equal(other.encoders[0].levels[0][0].weight, starts("random")[0])
+
+
+def test_a_frozen_random_encoder_has_the_statistics_of_the_training_pictures(data, model):
+    net = build_variant(model, VARIANTS["joint-random-frozen"], data, seed=0)
+    norm = net.encoders[0].levels[0][1]
+    seen = []
+    handle = norm.register_forward_hook(lambda module, inputs, output: seen.append(inputs[0]))
+    net.train()(torch.from_numpy(data.images[data.train]).float() / 255)
+    handle.remove()
+    assert norm.running_mean == pytest.approx(seen[0].mean(dim=(0, 2, 3)).numpy(), abs=1e-5)
+    assert norm.momentum == 0.1
+
+
+def test_a_comparison_goes_on_where_it_stopped(data, model, tmp_path, before):
+    settings, variants = QUICK.model_copy(update={"epochs": 1}), chosen_variants(["albedo", "random"])
+    options = {"settings": settings, "resample_count": 20}
+    first = Memory(tmp_path)
+    compare_segmentations(model, data, {"random": variants["random"]}, (0,), memory=first, **options)
+    assert (first.made, first.recalled) == (1, 0)
+    second, told = Memory(tmp_path), []
+    found = compare_segmentations(
+        model, data, variants, (0, 1), memory=second, **options, progress=lambda *at: told.append(at)
+    )
+    assert (second.made, second.recalled) == (3, 1)
+    assert told[-1][:2] == (4 * len(data.train),) * 2
+    again = compare_segmentations(model, data, variants, (0, 1), memory=Memory(tmp_path), **options)
+    for one, two in zip(found.rows, again.rows, strict=True):
+        assert str(one.scored.numbers()["scores"]) == str(two.scored.numbers()["scores"])
+        assert (one.shown == two.shown).all() and (one.losses == two.losses).all()
+    names = [row.scored.name for row in found.rows]
+    assert names[:2] == ["albedo encoder", "random start"] and "each place's class" in names
+    assert [row.scored.control for row in found.rows] == [False, True, True, True, True]
+    assert found.rows[0].scored.runs == 2 and found.rows[0].losses.shape == (2, 1)
+    assert found.test_share.sum() == pytest.approx(1) and found.test_share[3] == 0
+    changed = Memory(tmp_path)
+    more = {"settings": QUICK.model_copy(update={"epochs": 2}), "resample_count": 20}
+    compare_segmentations(model, data, {"random": variants["random"]}, (0,), memory=changed, **more)
+    assert changed.recalled == 0
+
+    table = segmentation_table(found)
+    assert "24 pictures learned, 16 tested" in table.caption and "3 of 4 classes" in table.caption
+    assert table.values()["most frequent class"]["learn"] is None
+    shown = class_table(found).values()
+    assert list(shown)[-1] == "nothing" and set(shown) == set(NAMES)
+    assert "paper: Joint Encoders" in beside_the_paper(found).values()
+
+
+def test_the_papers_numbers_are_the_papers(shared_data):
+    text = shared_data("paper.tex").read_text()
+    for row in PAPER:
+        assert row.method in text
+        line = text[text.index(f"{row.method} &") :].split("\n")[0]
+        assert all(f"{value:.4f}" in line for value in row.scores.values()), row.method
+
+
+def test_the_split_is_the_datas_own_or_by_name():
+    pictures, masks = bands(20)
+    parts = np.array(["train"] * 8 + ["validation"] * 4 + ["test"] * 8)
+    own = divide(replace(pictures, partition=parts), masks, NAMES)
+    assert own.train.tolist() == list(range(8)) and own.test.tolist() == list(range(12, 20))
+    hashed, other = divide(pictures, masks, NAMES), divide(pictures, masks, NAMES, split_seed=1)
+    assert len(hashed.test) == 4 and set(hashed.train).isdisjoint(hashed.test)
+    assert hashed.test.tolist() != other.test.tolist()
+    few, more = (divide(pictures, masks, NAMES, labelled=count) for count in (4, 8))
+    assert len(few.train) == 4 and set(few.train) < set(more.train) < set(hashed.train)
+    assert few.test.tolist() == hashed.test.tolist()
+
+
+def test_bad_input_is_named(data, model):
+    pictures, masks = bands(20)
+    with pytest.raises(ValueError, match=r"show one class only \(wall\)"):
+        divide(pictures, np.ones_like(masks), NAMES)
+    with pytest.raises(ValueError, match="learn from 99 pictures, there are 16"):
+        divide(pictures, masks, NAMES, labelled=99)
+    with pytest.raises(ValueError, match="leaves 1 pictures to learn from and 1 to test on"):
+        divide(pictures.select([0, 1]), masks[:2], NAMES, test_fraction=0.5)
+    with pytest.raises(ValueError, match="no variant 'joined'; did you mean 'joint'"):
+        chosen_variants(["joined"])
+    plain = Derenderer.from_preset("small", seed=0, image_size=32, width=4, light_width=4)
+    with pytest.raises(ValueError, match=r"no U-Net encoder for geometry.*--set encoder=unet"):
+        compare_segmentations(plain, data, chosen_variants(["geometry"]), (0,))
+    large = replace(
+        data, images=np.zeros((40, 3, 64, 64), np.uint8), masks=data.masks.repeat(2, axis=1).repeat(2, axis=2)
+    )
+    with pytest.raises(ValueError, match="64 pixels wide, the model takes 32"):
+        compare_segmentations(model, large, chosen_variants(["geometry"]), (0,))

@@ -1,0 +1,68 @@
+"""Scores against closed forms and torchmetrics; classes that are not there; resamples."""
+
+import numpy as np
+import pytest
+import torch
+from torchmetrics.functional.classification import multiclass_accuracy, multiclass_jaccard_index
+
+from derender.evaluation.segmentation.scores import (
+    best_classes,
+    count_pixels,
+    resampled_scores,
+    segmentation_scores,
+)
+
+
+def scores(answers, masks, n_classes=4):
+    return segmentation_scores(count_pixels(np.asarray(answers), np.asarray(masks), n_classes))
+
+
+def test_half_overlap_is_a_third():
+    """Two halves of which the answer gets one column wrong: 1/3 and 2/3 by hand."""
+    masks = np.array([[[0, 0, 1, 1]] * 4], np.uint8)
+    answers = np.array([[[0, 1, 1, 1]] * 4], np.uint8)
+    found = scores(answers, masks, 2)
+    assert found.class_iou == pytest.approx([1 / 2, 2 / 3])
+    assert found.mean_iou == pytest.approx(7 / 12)
+    assert found.pixel_accuracy == pytest.approx(3 / 4)
+    assert scores(masks, masks, 2).mean_iou == 1 and scores(1 - masks, masks, 2).mean_iou == 0
+
+
+def test_a_class_that_no_mask_shows_is_left_out_for_every_answer():
+    masks = np.array([[[0, 0], [1, 1]]], np.uint8)
+    right, wrong = masks.copy(), np.array([[[0, 3], [1, 1]]], np.uint8)
+    assert scores(right, masks).mean_iou == 1
+    found = scores(wrong, masks)
+    assert found.class_iou == pytest.approx([0.5, 1, np.nan, np.nan], nan_ok=True)
+    assert found.mean_iou == 0.75 == found.top10_iou
+
+
+def test_they_are_torchmetrics_own():
+    random = np.random.default_rng(0)
+    masks = random.integers(0, 19, (70, 6, 5)).astype(np.uint8)
+    answers = np.where(random.random(masks.shape) < 0.5, masks, random.integers(0, 19, masks.shape))
+    found = scores(answers.astype(np.uint8), masks, 19)
+    given, truth = torch.from_numpy(answers).long(), torch.from_numpy(masks).long()
+    each = multiclass_jaccard_index(given, truth, 19, average="none").numpy()
+    assert found.class_iou == pytest.approx(each, abs=1e-6)
+    assert found.mean_iou == pytest.approx(multiclass_jaccard_index(given, truth, 19).item(), abs=1e-6)
+    assert found.top10_iou == pytest.approx(np.sort(each)[-10:].mean(), abs=1e-6)
+    accuracy = multiclass_accuracy(given, truth, 19, average="micro").item()
+    assert found.pixel_accuracy == pytest.approx(accuracy, abs=1e-6)
+
+
+def test_resamples_are_scores_of_the_pictures_drawn_with_the_same_ten_classes():
+    random = np.random.default_rng(1)
+    masks = random.integers(0, 3, (6, 4, 4)).astype(np.uint8)
+    answers = random.integers(0, 3, masks.shape).astype(np.uint8)
+    counts, drawn = count_pixels(answers, masks, 4), [0, 0, 3, 5]
+    weights = np.bincount(drawn, minlength=6)[None]
+    found = scores(answers[drawn], masks[drawn])
+    expected = [found.mean_iou, found.mean_iou, found.pixel_accuracy]
+    assert resampled_scores(counts, weights)[0] == pytest.approx(expected)
+    assert set(best_classes(counts)) == {0, 1, 2} and len(best_classes(counts, 2)) == 2
+
+
+def test_arrays_that_do_not_fit_are_refused():
+    with pytest.raises(ValueError, match="must be alike, and one or more"):
+        count_pixels(np.zeros((1, 2, 2), np.uint8), np.zeros((1, 2, 3), np.uint8), 2)

@@ -1,0 +1,342 @@
+"""The linear protocol: rows, the paper's head, penalised regression and scores against oracles; controls."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from sklearn.linear_model import LogisticRegression
+from sklearn.metrics import accuracy_score, average_precision_score, balanced_accuracy_score
+from sklearn.neighbors import KNeighborsClassifier
+
+from derender.evaluation.linear_compare import compare_linear
+from derender.evaluation.linear_head import HeadSettings, train_heads
+from derender.evaluation.linear_logistic import axes_of, fit_logistic, solve_logistic
+from derender.evaluation.linear_probes import HEADS, majority_answers, nearest_answers, probe
+from derender.evaluation.linear_scores import count_scores, linear_scores
+from derender.evaluation.linear_task import Task, choose_rows, task_of
+from derender.evaluation.memory import Memory
+
+QUICK = HeadSettings(epochs=3, batch_size=16)
+
+
+def problem(rows: int = 160, labels: int = 3, seed: int = 0) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Features that hold each label in a direction of its own, and noise."""
+    rng = np.random.default_rng(seed)
+    hidden = rng.normal(size=(rows, labels))
+    features = np.hstack([hidden @ rng.normal(size=(labels, 6)), 0.5 * rng.normal(size=(rows, 4))])
+    columns = {f"a{at}": (hidden[:, at] > 0.3 * at).astype(np.int8) for at in range(labels)}
+    return features, columns
+
+
+def files(count: int) -> list[str]:
+    return [f"{number}.png" for number in range(count)]
+
+
+def test_two_values_are_asked_yes_or_no_and_more_are_a_choice():
+    task = task_of({"a": np.array([1, 0, -1, 1, 0], np.int8), "b": np.array(["x", "y", "y", "x", ""])})
+    assert task.kind == "labels" and task.names == ("a", "b")
+    assert task.targets.tolist() == [[1, 0], [0, 1], [-1, 1], [1, 0], [0, -1]]
+    task = task_of({"who": np.array(["c", "a", "b", "", "a", "c", "b"])})
+    assert task.kind == "classes" and task.names == ("a", "b", "c")
+    assert task.targets[:4].tolist() == [[0, 0, 1], [1, 0, 0], [0, 1, 0], [-1, -1, -1]]
+    assert task.known.tolist() == [True, True, True, False, True, True, True]
+
+
+@pytest.mark.parametrize(
+    ("labels", "message"),
+    [
+        ({}, "at least one label column"),
+        ({"a": np.ones(4)}, "two classes, the 4 labelled rows of 'a' have 1"),
+        ({"a": np.array(["x", "x", "y"])}, "class 'y' of label 'a' has one row"),
+        (
+            {"a": np.array([0, 1, 2] * 2), "b": np.array([0, 1] * 3)},
+            "'a' has 3 classes and cannot be asked together",
+        ),
+    ],
+)
+def test_tasks_that_cannot_be_asked(labels, message):
+    with pytest.raises(ValueError, match=message):
+        task_of(labels)
+
+
+def test_training_rows_are_nested_and_never_tested():
+    _, columns = problem()
+    columns["a0"][7] = columns["a1"][7] = columns["a2"][7] = -1
+    task = task_of(columns)
+    rows = choose_rows(task, files(160), (10, 40), (0, 1, 2))
+    assert rows.train[10].shape == (3, 10) and rows.train[40].shape == (3, 40)
+    assert np.array_equal(rows.train[40][:, :10], rows.train[10])
+    assert not set(rows.test) & set(rows.train[40].ravel()) and 7 not in {*rows.test, *rows.train[40].ravel()}
+    assert len(np.unique(rows.train[40], axis=0)) == 3
+    again = choose_rows(task, files(160), (10,), (1,))
+    assert np.array_equal(again.test, rows.test) and np.array_equal(again.train[10][0], rows.train[10][1])
+
+
+def test_the_owners_test_part_and_groups_are_kept():
+    task = task_of(problem()[1])
+    partition = np.array(["train", "test", "validation", "train"])[np.arange(160) % 4]
+    rows = choose_rows(task, files(160), (10,), (0,), partition=partition)
+    assert (partition[rows.test] == "test").all() and len(rows.test) == 40
+    people = np.arange(160) // 8
+    rows = choose_rows(task, files(160), (50,), (0,), groups=people)
+    assert not set(people[rows.test]) & set(people[rows.train[50][0]])
+
+
+@pytest.mark.parametrize(
+    ("counts", "options", "message"),
+    [
+        ((10, 100), {}, "learn from 10, 100 labelled rows: 80 can be learned from and 80 are tested"),
+        ((), {}, "learn from no labelled rows"),
+        ((10,), {"seeds": ()}, "at least one seed"),
+        ((10,), {"test_fraction": 1.0}, "between 0 and 1, got 1.0"),
+    ],
+)
+def test_rows_that_cannot_be_chosen(counts, options, message):
+    with pytest.raises(ValueError, match=message):
+        choose_rows(task_of(problem()[1]), files(160), counts, **options)
+
+
+@pytest.mark.parametrize("kind", ["labels", "classes"])
+def test_heads_trained_at_once_are_those_trained_one_by_one_in_plain_torch(kind):
+    features, columns = problem(60)
+    task = task_of(columns) if kind == "labels" else task_of({"who": np.arange(60) % 3})
+    targets = task.targets.copy()
+    if kind == "labels":
+        targets[3, 1] = -1
+    rows, tested, seeds = np.stack([np.arange(20), np.arange(10, 30)]), np.arange(40, 60), (4, 5)
+    together = train_heads(features, targets, rows, tested, kind=kind, seeds=seeds, settings=QUICK)
+    for own, seed, found in zip(rows, seeds, together, strict=True):
+        generator = torch.Generator().manual_seed(seed)
+        head = torch.nn.Linear(features.shape[1], targets.shape[1])
+        start = (torch.rand(head.weight.T.shape, generator=generator) * 2 - 1) / features.shape[1] ** 0.5
+        head.weight.data = start.T.contiguous()
+        head.bias.data = (torch.rand(targets.shape[1], generator=generator) * 2 - 1) / features.shape[
+            1
+        ] ** 0.5
+        optimiser = torch.optim.Adam(head.parameters(), lr=2e-4)
+        x, y = torch.from_numpy(features).float(), torch.from_numpy(targets)
+        for _ in range(QUICK.epochs):
+            order = own[torch.randperm(len(own), generator=generator).numpy()]
+            for batch in (order[:16], order[16:]):
+                logits = head(x[batch])
+                if kind == "labels":
+                    known = y[batch] >= 0
+                    loss = torch.nn.functional.binary_cross_entropy_with_logits(
+                        logits[known], y[batch][known].float()
+                    )
+                else:
+                    loss = torch.nn.functional.cross_entropy(logits, y[batch].argmax(dim=1))
+                optimiser.zero_grad()
+                loss.backward()
+                optimiser.step()
+        answer = head(x[tested]).sigmoid() if kind == "labels" else head(x[tested]).softmax(dim=1)
+        np.testing.assert_allclose(found, answer.detach().numpy(), atol=2e-6)
+
+
+@pytest.mark.parametrize(("rows", "dimensions"), [(80, 10), (30, 90)])
+@pytest.mark.parametrize("kind", ["labels", "classes"])
+def test_penalised_regression_is_scikit_learns(kind, rows, dimensions):
+    rng = np.random.default_rng(rows)
+    features = rng.normal(size=(rows + 20, dimensions)) * rng.uniform(0.1, 9, dimensions)
+    features[:, 0] = 3.0  # a constant tells nothing
+    classes = (features[:, 1] / features[:, 1].std() + rng.normal(size=rows + 20) * 0.3).argsort().argsort()
+    targets = (classes[:, None] * 3 // len(classes) == np.arange(3)).astype(np.int8)
+    axes = axes_of(features[:rows])
+    inside, c = axes.apply(features), np.array([0.3, 20.0])
+    every = np.ones((rows, 2), bool)
+    weights = solve_logistic(inside[:rows], targets[:rows], every, c, kind, tolerance=1e-8)
+    standard = (features - axes.mean) / axes.scale
+    for at, penalty in enumerate(c):
+        logits = inside @ weights[:-1, at] + weights[-1, at]
+        oracle = LogisticRegression(C=penalty, tol=1e-9, max_iter=10_000)
+        if kind == "classes":
+            expected = oracle.fit(standard[:rows], targets[:rows].argmax(axis=1)).predict_proba(standard)
+            found = np.exp(logits) / np.exp(logits).sum(axis=1, keepdims=True)
+            np.testing.assert_allclose(found, expected, atol=2e-4)
+        else:
+            for label in range(3):
+                expected = oracle.fit(standard[:rows], targets[:rows, label]).predict_proba(standard)[:, 1]
+                np.testing.assert_allclose(1 / (1 + np.exp(-logits[:, label])), expected, atol=2e-4)
+
+
+def test_each_label_gets_the_penalty_that_plain_cross_validation_chooses():
+    features, columns = problem(100, seed=2)
+    targets, grid = task_of(columns).targets, (1e-3, 1e-1, 10.0)
+    targets[5, 0] = -1
+    answers, chosen = fit_logistic(
+        features[:60], targets[:60], features[60:], kind="labels", penalties=grid, folds=4
+    )
+    axes, fold = axes_of(features[:60]), np.random.default_rng(0).permutation(60) % 4
+    standard = (features - axes.mean) / axes.scale
+    for label in range(3):
+        known = targets[:60, label] >= 0
+        losses = []
+        for c in grid:
+            total = 0.0
+            for number in range(4):
+                learned, asked = known & (fold != number), known & (fold == number)
+                model = LogisticRegression(C=c, tol=1e-8, max_iter=5_000)
+                model.fit(standard[:60][learned], targets[:60, label][learned])
+                shares = model.predict_proba(standard[:60][asked])
+                total -= np.log(shares[np.arange(asked.sum()), targets[:60, label][asked]]).sum()
+            losses.append(total)
+        assert chosen[label] == grid[int(np.argmin(losses))]
+        final = LogisticRegression(C=chosen[label], tol=1e-8, max_iter=5_000)
+        final.fit(standard[:60][known], targets[:60, label][known])
+        np.testing.assert_allclose(answers[:, label], final.predict_proba(standard[60:])[:, 1], atol=1e-3)
+
+
+@pytest.mark.parametrize("head", HEADS)
+def test_nothing_of_the_test_part_reaches_what_is_learned(head):
+    """Other features and labels for some of the tested rows leave the answers for all others as they were."""
+    features, columns = problem(80)
+    rows, tested = np.arange(30)[None], np.arange(40, 80)
+    straight = probe(head, features, task_of(columns), rows, tested, (0,), settings=QUICK)
+    features[40:50] += 100
+    for column in columns.values():
+        column[40:80] = 1 - column[40:80]
+    changed = probe(head, features, task_of(columns), rows, tested, (0,), settings=QUICK)
+    np.testing.assert_allclose(changed[:, 10:], straight[:, 10:], atol=1e-6)
+    assert np.abs(changed[:, :10] - straight[:, :10]).max() > 0.01
+
+
+def test_a_label_of_one_value_among_the_learned_rows_is_answered_with_it():
+    features, columns = problem(80)
+    columns["a0"][:30] = 0
+    for head in ("logistic", "k-NN"):
+        answers = probe(head, features, task_of(columns), np.arange(30)[None], np.arange(40, 80), (0,))
+        assert np.isfinite(answers).all() and (answers[0, :, 0] < 0.2).all()
+
+
+def test_neighbours_are_scikit_learns():
+    features, columns = problem(90)
+    targets = task_of(columns).targets
+    centred = features - features[:50].mean(axis=0)
+    oracle = KNeighborsClassifier(7, metric="cosine").fit(centred[:50], targets[:50])
+    expected = np.stack([share[:, 1] for share in oracle.predict_proba(centred[50:])], axis=1)
+    np.testing.assert_allclose(nearest_answers(features[:50], targets[:50], features[50:], 7), expected)
+
+
+@st.composite
+def answered(draw):
+    rows, labels = draw(st.integers(6, 30)), draw(st.integers(1, 4))
+    rng = np.random.default_rng(draw(st.integers(0, 999)))
+    targets = rng.integers(0, 2, (rows, labels)).astype(np.int8)
+    targets[:2] = [[0], [1]]
+    return targets, rng.random((rows, labels)).round(1) + 0.01
+
+
+@settings(max_examples=30, deadline=None)
+@given(answered(), st.integers(0, 99))
+def test_scores_are_scikit_learns_and_blind_to_order(case, seed):
+    targets, answers = case
+    found = linear_scores(targets, answers, "labels")
+    columns = list(zip(targets.T, answers.T, strict=True))
+    assert found.accuracy == pytest.approx(np.mean([accuracy_score(y, p > 0.5) for y, p in columns]))
+    expected = np.mean([balanced_accuracy_score(y, p > 0.5) for y, p in columns])
+    assert found.balanced_accuracy == pytest.approx(expected)
+    expected = np.mean([average_precision_score(y, p) for y, p in columns])
+    assert found.average_precision == pytest.approx(expected)
+    rows = np.random.default_rng(seed).permutation(len(targets))
+    labels = np.random.default_rng(seed).permutation(targets.shape[1])
+    moved = linear_scores(targets[rows][:, labels], answers[rows][:, labels], "labels")
+    for name in ("accuracy", "balanced_accuracy", "average_precision"):
+        assert getattr(moved, name) == pytest.approx(getattr(found, name))
+
+
+def test_scores_of_classes_are_scikit_learns():
+    rng = np.random.default_rng(0)
+    classes = np.concatenate([rng.integers(0, 4, 40), [0, 1, 2, 3]])
+    targets, answers = (classes[:, None] == np.arange(5)).astype(np.int8), rng.random((44, 5))
+    found = linear_scores(targets, answers, "classes")
+    assert found.accuracy == pytest.approx(accuracy_score(classes, answers.argmax(axis=1)))
+    recall = [(answers.argmax(axis=1)[classes == one] == one).mean() for one in range(4)]
+    assert found.balanced_accuracy == pytest.approx(np.mean(recall))
+    precisions = [average_precision_score(targets[:, one], answers[:, one]) for one in range(4)]
+    assert found.average_precision == pytest.approx(np.mean(precisions))
+
+
+def test_resampled_scores_are_those_of_rows_written_out():
+    rng = np.random.default_rng(0)
+    targets, answers = rng.integers(-1, 2, (30, 3)).astype(np.int8), rng.random((30, 3))
+    weights = rng.multinomial(30, np.full(30, 1 / 30), size=5).astype(np.float32)
+    found = count_scores(targets, answers, "labels", weights)
+    for drawn, scores in zip(weights, found, strict=True):
+        rows = np.repeat(np.arange(30), drawn.astype(int))
+        written = linear_scores(targets[rows], answers[rows], "labels")
+        assert scores == pytest.approx([written.accuracy, written.balanced_accuracy])
+
+
+def test_perfect_and_ignorant_answers_score_best_and_chance():
+    targets = (np.random.default_rng(0).random((400, 6)) < 0.2).astype(np.int8)
+    best = linear_scores(targets, targets.astype(float), "labels")
+    assert (best.accuracy, best.balanced_accuracy, best.average_precision) == (1, 1, 1)
+    ignorant = linear_scores(targets, np.full(targets.shape, 0.2), "labels")
+    assert ignorant.balanced_accuracy == 0.5
+    assert ignorant.accuracy == pytest.approx(1 - targets.mean())
+    assert ignorant.average_precision == pytest.approx(targets.mean())
+
+
+def comparison(tmp_path=None, **options):
+    features, columns = problem(200)
+    task = task_of(columns)
+    rows = choose_rows(task, files(200), (20, 60), (0, 1, 2))
+    noise = [np.random.default_rng(seed).normal(size=(200, 5)) for seed in range(2)]
+    memory = Memory(tmp_path)
+    found = compare_linear(
+        {"ours": [features], "noise": noise}, task, rows, (0, 1, 2),
+        controls=("noise",), settings=QUICK, resample_count=100, memory=memory, **options,
+    )  # fmt: skip
+    return found, memory, task, rows
+
+
+def test_features_that_hold_the_labels_are_above_every_control(tmp_path):
+    found, memory, task, rows = comparison(tmp_path)
+    assert [(part.head, part.count) for part in found.parts] == [(h, n) for h in HEADS for n in (20, 60)]
+    logistic = next(part for part in found.parts if (part.head, part.count) == ("logistic", 60))
+    ours, noise, majority = logistic.rows
+    assert ours.versus["accuracy"].above and ours.versus["balanced_accuracy"].above
+    assert ours.scores["accuracy"].value > 0.85 and ours.runs == 3 and ours.scores["accuracy"].spread > 0
+    assert noise.scores["balanced_accuracy"].value == pytest.approx(0.5, abs=0.08)
+    expected = linear_scores(
+        task.targets[rows.test], majority_answers(task, rows.train[60], 100)[0], "labels"
+    )
+    assert majority.scores["balanced_accuracy"].value == 0.5 and expected.balanced_accuracy == 0.5
+    assert majority.control and found.n_test == 100
+    made = memory.made
+    again, memory, *_ = comparison(tmp_path)
+    assert made == memory.recalled == 18 and memory.made == 0  # 3 heads x 2 counts x (1 + 2) runs
+    assert str(again.numbers()) == str(found.numbers())
+    assert not any(row.versus["average_precision"].above for row in logistic.rows if row.versus)
+
+
+def test_fine_tuned_answers_are_a_head_of_their_own():
+    task = task_of(problem(200)[1])
+    truth = task.targets[choose_rows(task, files(200), (20, 60), (0, 1, 2)).test].astype(np.float32)
+    perfect = {count: np.stack([truth] * 3) for count in (20, 60)}
+    found = comparison(heads=("k-NN",), finetuned={"ours": perfect})[0]
+    assert found.parts[-1].head == "fine-tuned"
+    assert found.parts[-1].rows[0].scores["accuracy"].value == 1
+    assert [row.name for row in found.parts[-1].rows] == ["ours", "majority"]
+
+
+@pytest.mark.parametrize(
+    ("head", "features", "message"),
+    [
+        ("logistics", np.ones((4, 2)), "unknown head 'logistics'; did you mean 'logistic'"),
+        ("k-NN", np.array([[1.0], [np.inf], [0], [0]]), "not finite in 1 of 4 rows"),
+        ("logistic", np.ones((4, 2)), "2 rows cannot be cut into 5 folds"),
+    ],
+)
+def test_probes_refuse_bad_input_in_words(head, features, message):
+    task = Task("labels", ("a",), np.array([[0], [1], [0], [1]], np.int8))
+    with pytest.raises(ValueError, match=message):
+        probe(head, features, task, np.array([[0, 1]]), np.array([2, 3]), (0,))
+
+
+def test_features_and_labels_are_of_the_same_rows():
+    task = task_of(problem(60)[1])
+    rows = choose_rows(task, files(60), (10,), (0,))
+    with pytest.raises(ValueError, match="features 'ours' have 59 rows, the labels 60"):
+        compare_linear({"ours": [np.ones((59, 2))]}, task, rows, (0,))

@@ -1,0 +1,65 @@
+"""What is remembered is found again by content, and only by the same content."""
+
+import numpy as np
+import pytest
+
+from derender.evaluation.memory import Memory, content_hash
+
+
+def test_the_same_inputs_are_computed_once(tmp_path):
+    calls = []
+
+    def make():
+        calls.append(1)
+        return {"a": np.arange(3), "b": np.eye(2, dtype=np.float32)}
+
+    memory = Memory(tmp_path)
+    for _ in range(2):
+        found = memory.recall("tree", {"x": np.ones(4), "k": 3}, make)
+        assert found["a"].tolist() == [0, 1, 2] and found["b"].dtype == np.float32
+    assert (len(calls), memory.made, memory.recalled) == (1, 1, 1)
+    memory.recall("tree", {"x": np.ones(4), "k": 4}, make)
+    memory.recall("other", {"x": np.ones(4), "k": 3}, make)
+    assert len(calls) == 3 and len(list(tmp_path.iterdir())) == 3
+
+
+def test_a_damaged_file_is_made_again(tmp_path):
+    memory = Memory(tmp_path)
+    memory.recall("x", {}, lambda: {"a": np.ones(2)})
+    (file,) = tmp_path.iterdir()
+    for damaged in (b"", b"nothing", file.read_bytes()[:-30]):
+        file.write_bytes(damaged)
+        assert Memory(tmp_path).recall("x", {}, lambda: {"a": np.zeros(2)})["a"].tolist() == [0, 0]
+        assert Memory(tmp_path).recall("x", {}, dict)["a"].tolist() == [0, 0]
+
+
+def test_a_failure_leaves_no_file(tmp_path):
+    def fail():
+        raise RuntimeError("no")
+
+    with pytest.raises(RuntimeError):
+        Memory(tmp_path).recall("x", {}, fail)
+    assert not list(tmp_path.iterdir())
+
+
+def test_without_a_folder_nothing_is_kept():
+    memory = Memory()
+    assert [memory.recall("x", {}, lambda: {"a": np.ones(1)})["a"][0] for _ in range(2)] == [1, 1]
+    assert (memory.made, memory.recalled) == (2, 0)
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"x": np.array([1.0, 2.0, 4.0])},
+        {"x": np.array([1, 2, 3])},
+        {"x": np.array([[1.0, 2.0, 3.0]])},
+        {"x": np.array([1.0, 2.0, 3.0], np.float32)},
+        {"y": np.array([1.0, 2.0, 3.0])},
+        {"x": np.array([1.0, 2.0, 3.0]), "k": None},
+        {"x": [1.0, 2.0, 3.0]},
+    ],
+)
+def test_every_difference_counts(other):
+    assert content_hash({"x": np.array([1.0, 2.0, 3.0])}) != content_hash(other)
+    assert content_hash(other) == content_hash(dict(reversed(other.items())))

@@ -1,0 +1,226 @@
+"""Embedding to a file gives the table that embedding in memory gives, however often it was stopped."""
+
+import io
+import json
+import tarfile
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from PIL import Image
+
+from derender.data import read_pictures
+from derender.data.stream import stream_of
+from derender.features import FeatureTable, embed_pictures, embed_to_file, embedding
+
+COUNT = 110
+
+
+def png(seed: int) -> bytes:
+    buffer = io.BytesIO()
+    pixels = np.random.default_rng(seed).integers(0, 256, (8, 8, 3), dtype=np.uint8)
+    Image.fromarray(pixels).save(buffer, "PNG")
+    return buffer.getvalue()
+
+
+def contents() -> dict[str, bytes]:
+    """Pictures in two classes, some unreadable, some copies of earlier ones, also at the very end."""
+    files = {f"{'cat' if row % 3 else 'dog'}/{row:03d}.png": png(row) for row in range(COUNT)}
+    names = list(files)
+    for row in (0, 5, 31, 32, 70, COUNT - 1):
+        files[names[row]] = b"no picture"
+    for row in (8, 64, 100, COUNT - 2):
+        files[names[row]] = png(7)
+    return files
+
+
+@pytest.fixture(autouse=True)
+def small_parts(monkeypatch, tmp_path):
+    monkeypatch.setattr(embedding, "PART_ROWS", 20)
+    monkeypatch.setenv("DERENDER_CACHE", str(tmp_path / "cache"))
+
+
+@pytest.fixture(params=["folder", "zip", "shards"])
+def source(request, tmp_path) -> str:
+    """The same pictures in three forms; the shards bring labels of several kinds along."""
+    files = contents()
+    if request.param == "folder":
+        for name, data in files.items():
+            (tmp_path / "set" / name).parent.mkdir(parents=True, exist_ok=True)
+            (tmp_path / "set" / name).write_bytes(data)
+        return str(tmp_path / "set")
+    if request.param == "zip":
+        with zipfile.ZipFile(tmp_path / "set.zip", "w") as archive:
+            for name, data in files.items():
+                archive.writestr(name, data)
+        return str(tmp_path / "set.zip")
+    for number in range(2):
+        with tarfile.open(tmp_path / f"train-{number}.tar", "w") as tar:
+            for row, (name, data) in enumerate(files.items()):
+                if row * 2 // COUNT != number:
+                    continue
+                labels = {"n": row, "who": f"p{row}"} if row < 90 else {"n": row / 2, "late": row % 2 == 0}
+                for ending, content in ((".png", data), (".json", json.dumps(labels).encode())):
+                    info = tarfile.TarInfo(name.removesuffix(".png") + ending)
+                    info.size = len(content)
+                    tar.addfile(info, io.BytesIO(content))
+    return str(tmp_path / "train-{0..1}.tar")
+
+
+def assert_same(path: Path, expected: FeatureTable) -> None:
+    """Bit for bit, kinds of columns and their order included."""
+    table = FeatureTable.read(path)
+    assert table.files == expected.files
+    assert list(table.factors) == list(expected.factors) and list(table.labels) == list(expected.labels)
+    for name, values in expected.factors.items():
+        np.testing.assert_array_equal(table.factors[name], values)
+    for name, values in expected.labels.items():
+        assert table.labels[name].dtype.kind == values.dtype.kind, name
+        np.testing.assert_array_equal(table.labels[name], values)
+    assert table.origin == expected.origin
+
+
+def in_memory(model, source: str, path: Path, **options) -> FeatureTable:
+    """The table of the whole set in memory, once through a file as any table goes."""
+    return FeatureTable.read(
+        embed_pictures(model, read_pictures(source, 8, **options), batch_size=16).write(path)
+    )
+
+
+@pytest.mark.parametrize("keep", [False, True])
+def test_the_table_is_that_of_the_set_in_memory(model, source, tmp_path, keep):
+    expected = in_memory(model, source, tmp_path / "memory.parquet", keep_duplicates=keep)
+    with stream_of(source) as stream:
+        done = embed_to_file(
+            model, stream, tmp_path / "out.parquet", batch_size=16, keep_duplicates=keep, workers=2
+        )
+    assert_same(tmp_path / "out.parquet", expected)
+    assert (done.rows, done.skipped, done.copies, done.resumed) == (len(expected), 6, 4, 0)
+    assert done.factors == {"geometry": 3, "albedo": 2} and list(done.labels) == list(expected.labels)
+    assert done.examples[0].reason == "not a picture in a known format"
+    assert pq.ParquetFile(tmp_path / "out.parquet").num_row_groups == -(-len(expected) // 32)
+    assert not (tmp_path / "out.parquet.partial").exists()
+
+
+@pytest.mark.parametrize("source", ["folder", "shards"], indirect=True)
+@pytest.mark.parametrize(
+    ("how", "stop_at"),
+    [(KeyboardInterrupt, [40]), (KeyboardInterrupt, [0, 60, 60, 100]), (RuntimeError, [10, 90])],
+)
+def test_a_stopped_run_goes_on_to_the_same_table(model, source, tmp_path, stop_at, how, monkeypatch):
+    """Stopped by Ctrl-C (what is computed is kept) or killed (what is written is kept)."""
+    expected = in_memory(model, source, tmp_path / "memory.parquet")
+    out, embedded = tmp_path / "out.parquet", []
+    real = model.embed
+    monkeypatch.setattr(model, "embed", lambda images: embedded.append(len(images)) or real(images))
+    for stop in stop_at:
+
+        def stop_there(done: int, total: int, stop: int = stop) -> None:
+            if done > stop:
+                raise how
+
+        with stream_of(source) as stream, pytest.raises(how) as stopped:
+            embed_to_file(model, stream, out, batch_size=16, progress=stop_there)
+        assert not out.exists()
+        if how is KeyboardInterrupt:
+            parts = list((tmp_path / "out.parquet.partial").glob("part-*"))
+            kept = sum(pq.ParquetFile(part).metadata.num_rows for part in parts)
+            assert kept == sum(embedded) > 0, "what was computed is kept"
+            assert f"stopped by Ctrl-C; {kept} rows are kept in" in str(stopped.value)
+    with stream_of(source) as stream:
+        done = embed_to_file(model, stream, out, batch_size=16)
+    assert_same(out, expected)
+    assert done.skipped == 6 and done.copies == 4
+    if how is KeyboardInterrupt:
+        assert done.resumed > 0 and sum(embedded) == len(expected), "nothing was computed twice"
+    assert {path.name for path in tmp_path.iterdir()} >= {"out.parquet"}
+    assert not (tmp_path / "out.parquet.partial").exists()
+
+
+@pytest.mark.parametrize("source", ["shards"], indirect=True)
+def test_a_set_is_written_as_a_stream_is(model, source, tmp_path):
+    pictures = read_pictures(source, 8)
+    part = pictures.select(np.arange(len(pictures)) % 2 == 0)
+    expected = FeatureTable.read(embed_pictures(model, part, batch_size=16).write(tmp_path / "m.parquet"))
+
+    def stop(done: int, total: int) -> None:
+        assert total == len(part)
+        if done > 30:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt, match="the same command goes on"):
+        embed_to_file(model, part, tmp_path / "out.parquet", batch_size=16, progress=stop)
+    assert embed_to_file(model, part, tmp_path / "out.parquet", batch_size=16).resumed == 32
+    assert_same(tmp_path / "out.parquet", expected)
+
+
+@pytest.mark.parametrize("source", ["zip"], indirect=True)
+def test_parts_of_another_run_are_an_error_until_told(model, source, tmp_path):
+    out = tmp_path / "out.parquet"
+
+    def stop(done: int, total: int) -> None:
+        raise KeyboardInterrupt
+
+    with stream_of(source) as stream, pytest.raises(KeyboardInterrupt):
+        embed_to_file(model, stream, out, batch_size=16, progress=stop)
+    with (
+        stream_of(source) as stream,
+        pytest.raises(ValueError, match=r"unfinished table .*\(differs in batch_size\): delete"),
+    ):
+        embed_to_file(model, stream, out, batch_size=8)
+    model.b[0, 0] += 1
+    with stream_of(source) as stream:
+        with pytest.raises(ValueError, match=r"differs in origin.*add --force"):
+            embed_to_file(model, stream, out, batch_size=16)
+        assert embed_to_file(model, stream, out, batch_size=16, fresh=True).resumed == 0
+    assert_same(out, in_memory(model, source, tmp_path / "memory.parquet"))
+
+
+@pytest.mark.parametrize("source", ["folder", "shards"], indirect=True)
+def test_limits(model, source, tmp_path):
+    for limit in (5, 40, 1000):
+        with stream_of(source, limit=limit) as stream:
+            embed_to_file(model, stream, tmp_path / "out.parquet", batch_size=16)
+        assert_same(
+            tmp_path / "out.parquet", in_memory(model, source, tmp_path / "memory.parquet", limit=limit)
+        )
+
+
+def test_bad_input_leaves_nothing(model, tmp_path):
+    (tmp_path / "bad").mkdir()
+    for name in ("a.png", "b.png"):
+        (tmp_path / "bad" / name).write_bytes(b"text")
+    out = tmp_path / "out.parquet"
+    with stream_of(str(tmp_path / "bad")) as stream:
+        with pytest.raises(
+            ValueError, match=r"no picture in .*bad \(folder\) can be read; the first is 'a\.png'"
+        ):
+            embed_to_file(model, stream, out)
+        with pytest.raises(ValueError, match="batch_size must be 1 or more, got 0"):
+            embed_to_file(model, stream, out, batch_size=0)
+    (tmp_path / "bad" / "c.png").write_bytes(png(1))
+    model.b[:] = np.nan
+    with (
+        stream_of(str(tmp_path / "bad")) as stream,
+        pytest.raises(ValueError, match=r"factor 'albedo' is not finite in 1 of 1 rows, first in c\.png"),
+    ):
+        embed_to_file(model, stream, out)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["bad"]
+    (tmp_path / "out.parquet.partial").write_text("in the way")
+    with stream_of(str(tmp_path / "bad")) as stream, pytest.raises(ValueError, match="in the way: delete it"):
+        embed_to_file(model, stream, out)
+
+
+@pytest.mark.parametrize("source", ["zip", "shards"], indirect=True)
+def test_the_model_keeps_its_mode_and_progress_ends_at_the_total(model, source, tmp_path):
+    model.train()
+    seen = []
+    with stream_of(source) as stream:
+        embed_to_file(
+            model, stream, tmp_path / "o.parquet", batch_size=16, progress=lambda *state: seen.append(state)
+        )
+    assert model.training
+    assert seen[-1] == (COUNT, COUNT) and all(done <= total for done, total in seen)
+    assert [done for done, _ in seen] == sorted(done for done, _ in seen)

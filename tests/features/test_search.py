@@ -1,0 +1,72 @@
+"""Nearest rows: against scikit-learn, with ties, blocks, known answers and bad questions."""
+
+import numpy as np
+import pytest
+from sklearn.neighbors import NearestNeighbors
+
+from derender.features import FeatureTable, search
+from derender.features.search import nearest
+
+
+@pytest.fixture
+def table() -> FeatureTable:
+    generator = np.random.default_rng(0)
+    factors = {"geometry": generator.normal(size=(300, 16)), "light": generator.normal(size=(300, 4)) + 50}
+    return FeatureTable(tuple(f"{row}.png" for row in range(300)), factors)
+
+
+@pytest.mark.parametrize("metric", ["cosine", "euclidean"])
+@pytest.mark.parametrize("factor", ["geometry", "light"])
+def test_same_as_scikit_learn(table, factor, metric, monkeypatch):
+    monkeypatch.setattr(search, "BLOCK_ROWS", 64)
+    monkeypatch.setattr(search, "NUMBERS_AT_ONCE", 1000)
+    rows = table.factors[factor].astype(np.float64)
+    query = rows[:7] + 0.1
+    found = nearest(table, query, factor, 9, metric=metric)
+    other = NearestNeighbors(n_neighbors=9, metric=metric, algorithm="brute").fit(rows)
+    distances, places = other.kneighbors(query)
+    np.testing.assert_array_equal(found.rows, places)
+    np.testing.assert_allclose(found.distances, distances, atol=1e-9)
+
+
+def test_a_row_finds_itself_unless_it_is_left_out(table):
+    query = table.factors["light"][42]
+    for metric in ("cosine", "euclidean"):
+        first = nearest(table, query, "light", 3, metric=metric)
+        assert first.rows[0, 0] == 42 and first.distances[0, 0] == pytest.approx(0, abs=1e-12)
+        others = nearest(table, query, "light", 2, metric=metric, exclude=[42])
+        np.testing.assert_array_equal(others.rows, first.rows[:, 1:])
+
+
+def test_one_factor_only_counts():
+    same = np.tile([[1.0, 0.0]], (3, 1))
+    table = FeatureTable(
+        ("a", "b", "c"),
+        {"shape": same + np.array([[0], [0.1], [5]]), "light": np.array([[0.0], [9.0], [0.0]])},
+    )
+    assert nearest(table, np.array([1.0, 0.0]), "shape", 2, metric="euclidean").rows.tolist() == [[0, 1]]
+    assert nearest(table, np.array([0.1]), "light", 2, metric="euclidean").rows.tolist() == [[0, 2]]
+
+
+def test_equal_rows_come_in_order_and_zero_rows_are_apart():
+    table = FeatureTable(tuple("abcde"), {"f": np.array([[0.0, 1], [1, 0], [1, 0], [0, 0], [1, 0]])})
+    found = nearest(table, np.array([2.0, 0]), "f", 4)
+    assert found.rows.tolist() == [[1, 2, 4, 0]]
+    assert found.distances.tolist() == [[0, 0, 0, 1]]
+    assert nearest(table, np.array([2.0, 0]), "f", 99).rows.tolist() == [[1, 2, 4, 0, 3]]
+
+
+@pytest.mark.parametrize(
+    ("query", "factor", "more", "message"),
+    [
+        (np.zeros(16), "geometri", {}, "unknown factor 'geometri'; did you mean 'geometry'"),
+        (np.zeros(15), "geometry", {}, "geometry has 16 numbers in this table, the query 15"),
+        (np.zeros(16), "geometry", {"metric": "cosin"}, "unknown metric 'cosin'; did you mean 'cosine'"),
+        (np.full(16, np.nan), "geometry", {}, "the query is not finite"),
+        (np.zeros(16), "geometry", {"k": 0}, "k must be 1 or more"),
+        (np.zeros(16), "geometry", {"exclude": range(300)}, "no row to find: the table has 300, 300"),
+    ],
+)
+def test_bad_questions(table, query, factor, more, message):
+    with pytest.raises(ValueError, match=message):
+        nearest(table, query, factor, **more)

@@ -1,0 +1,80 @@
+"""Clusters and pairs taken apart by factor: sums, known answers, invariances."""
+
+import numpy as np
+import pytest
+
+from derender.interpretation import cluster_shares, pair_parts
+
+N = 60
+
+
+@pytest.fixture
+def features() -> dict[str, np.ndarray]:
+    generator = np.random.default_rng(0)
+    return {name: generator.standard_normal((N, 3)) for name in ("geometry", "albedo", "light")}
+
+
+@pytest.fixture
+def clusters() -> np.ndarray:
+    return np.repeat(["x", "y", "z"], 20)
+
+
+def test_a_cluster_made_by_one_factor_says_so(features, clusters):
+    features["albedo"][clusters == "x"] += 10
+    found = cluster_shares(features, clusters)
+    assert found.names == ("x", "y", "z") and found.sizes.tolist() == [20, 20, 20]
+    np.testing.assert_allclose(found.share.sum(axis=1), 1)
+    assert found.share[0, 1] > 0.99 and found.ratio[0, 1] > 0.9
+    assert np.abs(found.ratio[0, [0, 2]] - found.chance[0, [0, 2]]).max() < 0.1
+
+
+def test_shares_are_those_of_the_distance_between_means(features, clusters):
+    found = cluster_shares(features, clusters)
+    inside = clusters == "y"
+    parts = [((v[inside].mean(axis=0) - v[~inside].mean(axis=0)) ** 2).sum() for v in features.values()]
+    np.testing.assert_allclose(found.share[1], np.array(parts) / sum(parts))
+    within = features["light"].copy()
+    within[inside] -= within[inside].mean(axis=0)
+    within[~inside] -= within[~inside].mean(axis=0)
+    total = ((features["light"] - features["light"].mean(axis=0)) ** 2).sum()
+    assert found.ratio[1, 2] == pytest.approx(1 - (within**2).sum() / total)
+
+
+def test_scale_changes_shares_and_not_ratios(features, clusters):
+    plain = cluster_shares(features, clusters)
+    louder = cluster_shares({**features, "light": 10 * features["light"]}, clusters)
+    np.testing.assert_allclose(louder.ratio, plain.ratio)
+    np.testing.assert_allclose(louder.chance, plain.chance)
+    assert (louder.share[:, 2] > plain.share[:, 2]).all()
+    every = cluster_shares({name: 10 * values + 3 for name, values in features.items()}, clusters)
+    np.testing.assert_allclose(every.share, plain.share)
+
+
+def test_equal_factors_have_equal_shares(features, clusters):
+    same = dict.fromkeys(features, features["light"])
+    np.testing.assert_allclose(cluster_shares(same, clusters).share, 1 / 3)
+
+
+def test_parts_of_a_pair_sum_to_distance_and_cosine(features):
+    found = pair_parts(features, 4, 7)
+    whole = np.concatenate(list(features.values()), axis=1)
+    assert found.distance.sum() == pytest.approx(((whole[4] - whole[7]) ** 2).sum())
+    assert found.distance_share.sum() == pytest.approx(1)
+    cosine = whole[4] @ whole[7] / np.linalg.norm(whole[4]) / np.linalg.norm(whole[7])
+    assert found.cosine.sum() == pytest.approx(cosine)
+
+
+def test_the_factor_two_pictures_share_is_named(features):
+    features["light"][9] = features["light"][30] * 1.001
+    found = pair_parts(features, 9, 30)
+    assert found.most_alike == "light" and found.quantile[2] > 0.97
+    assert found.own_cosine[2] == pytest.approx(1) and found.distance_share[2] < 0.01
+    louder = pair_parts({name: 5 * values for name, values in features.items()}, 9, 30)
+    np.testing.assert_allclose(louder.cosine, found.cosine)
+    np.testing.assert_allclose(louder.quantile, found.quantile)
+    np.testing.assert_allclose(pair_parts(features, 3, 3).distance_share, 0)
+
+
+def test_one_cluster_is_no_contrast(features):
+    with pytest.raises(ValueError, match="60 rows form 1 cluster"):
+        cluster_shares(features, np.zeros(N))

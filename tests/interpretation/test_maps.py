@@ -1,0 +1,186 @@
+"""Maps over the picture: where a network looks, what changes them, exact sums."""
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from derender.interpretation.cam import (
+    METHODS,
+    factor_weights,
+    pixel_attribution,
+    saliency,
+    score,
+    to_one,
+    upsampled,
+)
+from derender.interpretation.probe import Probe
+from derender.interpretation.sanity import sanity_check, similarity, spearman
+from derender.model import Derenderer
+from derender.presets import MODEL_PRESETS
+
+SIZE, CODE = 32, 6
+
+
+class QuadrantEncoder(nn.Module):
+    """Looks at the upper left quarter only: by what it takes in, or by what it reads from its features."""
+
+    def __init__(self, where: str):
+        super().__init__()
+        self.where = where
+        self.convolution = nn.Conv2d(3, 4, 8, stride=8, bias=False)
+        self.to_code = nn.Sequential(nn.Conv2d(4, CODE, 4, bias=False), nn.ReLU())
+        with torch.no_grad():
+            self.convolution.weight.fill_(0.1)
+            weight = self.to_code[0].weight.fill_(0.1)
+            if where == "code":
+                weight[:, :, 2:] = 0
+                weight[:, :, :, 2:] = 0
+
+    def spatial(self, images: torch.Tensor) -> torch.Tensor:
+        seen = torch.zeros_like(images)
+        seen[:, :, : SIZE // 2, : SIZE // 2] = 1
+        return self.convolution(images * seen if self.where == "input" else images)
+
+    def forward(self, images: torch.Tensor) -> torch.Tensor:
+        return self.to_code(self.spatial(images)).flatten(1)
+
+
+class Looking:
+    """As much of a model as maps need."""
+
+    def __init__(self, where: str):
+        net = nn.Module()
+        net.encoder = QuadrantEncoder(where)
+        net.encode = net.encoder.forward  # type: ignore[assignment]
+        self.nets = {"geometry": net}
+
+
+@pytest.fixture
+def images(generator) -> torch.Tensor:
+    return torch.rand(3, 3, SIZE, SIZE, generator=generator) * 0.5 + 0.25
+
+
+YES = Probe("labels", ("a",), {"geometry": CODE}, np.ones((1, CODE), np.float32), np.zeros(1, np.float32))
+
+
+def share_in_quadrant(maps: torch.Tensor) -> float:
+    half = maps.shape[-1] // 2
+    return float(maps[:, :half, :half].sum() / maps.sum())
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_network_that_sees_one_quadrant_lights_up_there(method, images):
+    maps = saliency(method, Looking("input"), images, "geometry", YES, [0, 0, 0])
+    assert share_in_quadrant(maps) == pytest.approx(1, abs=1e-5)
+
+
+def test_grad_cam_misleads_where_hires_cam_does_not(images):
+    """The features light up everywhere, the code reads a quarter of them: Grad-CAM cannot tell."""
+    model = Looking("code")
+    told = {m: share_in_quadrant(saliency(m, model, images, "geometry", YES, [0, 0, 0])) for m in METHODS}
+    assert told["hires-cam"] == pytest.approx(1, abs=1e-5) and told["pixels"] == pytest.approx(1, abs=1e-5)
+    assert told["grad-cam"] < 0.4
+
+
+def test_pixels_sum_to_the_change_of_the_answer(images):
+    """This network is linear where its ReLU is open, so the error is rounding."""
+    weight = factor_weights(YES, "geometry", [0, 0, 0])
+    maps, error = pixel_attribution(Looking("input"), images * 0.4 + 0.55, "geometry", weight)
+    assert error.max() < 1e-4
+    encode = Looking("input").nets["geometry"].encode
+    grey = torch.full_like(images, 0.5)
+    change = score(encode(images * 0.4 + 0.55), weight) - score(encode(grey), weight)
+    torch.testing.assert_close(maps.sum(dim=(1, 2)), change.detach(), rtol=1e-3, atol=1e-4)
+
+
+@pytest.fixture(scope="module")
+def model() -> Derenderer:
+    settings = MODEL_PRESETS["small"]
+    sizes = {"image_size": SIZE, "width": 4, "light_width": 4, "code_size": CODE}
+    network = settings.network.model_copy(update=sizes)
+    made = Derenderer.seeded(settings.model_copy(update={"network": network}), 0)
+    return made.eval().requires_grad_(False)
+
+
+@pytest.fixture(scope="module")
+def probe(model) -> Probe:
+    names = tuple(factor.name for factor in model.factors)
+    weight = np.random.default_rng(0).standard_normal((2, CODE * len(names))).astype(np.float32)
+    return Probe("labels", ("a", "b"), dict.fromkeys(names, CODE), weight, np.zeros(2, np.float32))
+
+
+def test_hires_cam_before_its_rectifier_sums_to_the_answer(model, probe, images):
+    """Features to code to logit is piecewise linear without bias: gradient times feature is the logit."""
+    for factor in probe.factors:
+        weight = factor_weights(probe, factor, [0, 1, 0])
+        encoder = model.nets[factor].encoder
+        with torch.enable_grad():
+            features = encoder.spatial(images).requires_grad_()
+            code = encoder.to_code(features).flatten(1)
+            (gradient,) = torch.autograd.grad(score(code, weight).sum(), features)
+        torch.testing.assert_close((gradient * features).sum(dim=(1, 2, 3)), score(code, weight))
+        expected = (gradient * features).sum(dim=1).relu()
+        torch.testing.assert_close(saliency("hires-cam", model, images, factor, probe, [0, 1, 0]), expected)
+
+
+def test_maps_do_not_change_shape_with_the_scale_of_the_probe(model, probe, images):
+    louder = Probe("labels", probe.names, probe.sizes, 5 * probe.weight, probe.bias)
+    for method in METHODS:
+        maps = [to_one(saliency(method, model, images, "geometry", p, [0, 1, 0])) for p in (probe, louder)]
+        torch.testing.assert_close(*maps, rtol=1e-3, atol=1e-5)
+
+
+def test_new_weights_change_the_map_and_the_same_weights_do_not(model, probe, images):
+    targets = np.zeros(3, np.int64)
+    found = sanity_check(model, probe, probe, images, targets, methods=("pixels", "hires-cam"), seeds=(1, 2))
+    by = {(row.method, row.factor, row.changed): row for row in found}
+    assert len(by) == 2 * 4 * 3
+    for factor in probe.factors:
+        kept = by["pixels", factor, "shuffled labels"]  # the very same probe: nothing was changed
+        assert kept.spearman == pytest.approx(1) and kept.ssim == pytest.approx(1, abs=1e-5)
+        assert kept.trusted is None
+        fresh = by["pixels", factor, "random weights"]
+        assert fresh.spearman < 0.9 and fresh.trusted is (fresh.spearman < 0.5)
+    again = sanity_check(model, probe, probe, images, targets, methods=("pixels",), seeds=(1, 2))
+    assert again == [row for row in found if row.method == "pixels"]
+
+
+def test_a_map_that_ignores_the_weights_is_not_trusted():
+    edges = torch.rand(3, SIZE, SIZE, generator=torch.Generator().manual_seed(1))
+    row = similarity("edges", "geometry", "random weights", edges, [edges * 2, edges.square()], SIZE)
+    assert row.spearman == pytest.approx(1) and row.trusted is False
+    other = torch.rand(3, SIZE, SIZE, generator=torch.Generator().manual_seed(2))
+    assert similarity("noise", "geometry", "random weights", edges, [other], SIZE).trusted is True
+    flat = similarity("flat", "geometry", "random weights", edges, [torch.zeros_like(edges)], SIZE)
+    assert flat.empty == 1 and flat.trusted is None
+
+
+def test_spearman_of_known_maps():
+    up = torch.arange(9.0).reshape(1, 3, 3)
+    assert spearman(up, up.exp())[0] == pytest.approx(1)
+    assert spearman(up, -up)[0] == pytest.approx(-1)
+    assert np.isnan(spearman(up, torch.ones(1, 3, 3))[0])
+
+
+def test_upsampling_keeps_a_constant_and_the_place():
+    torch.testing.assert_close(upsampled(torch.ones(1, 4, 4), 9), torch.ones(1, 9, 9))
+    corner = torch.zeros(1, 4, 4)
+    corner[0, 0, 3] = 1
+    assert divmod(int(upsampled(corner, 32)[0].argmax()), 32) == (0, 28)
+
+
+def test_without_a_probe_the_feature_itself_is_shown(model, images):
+    maps = saliency("grad-cam", model, images, "light")
+    assert maps.shape == (3, 4, 4) and bool((maps >= 0).all()) and float(maps.max()) > 0
+
+
+def test_bad_words(model, probe, images):
+    with pytest.raises(ValueError, match="did you mean 'grad-cam'"):
+        saliency("gradcam", model, images, "geometry")
+    with pytest.raises(ValueError, match="no factor 'shape'"):
+        saliency("grad-cam", model, images, "shape", probe, [0, 0, 0])
+    with pytest.raises(ValueError, match="3 pictures need as many targets, got 1"):
+        saliency("grad-cam", model, images, "geometry", probe, [0])
+    with pytest.raises(ValueError, match="2 pictures or more, got 1"):
+        sanity_check(model, probe, None, images[:1], np.zeros(1, np.int64))

@@ -1,0 +1,166 @@
+"""Laws of integrated gradients and of the shares of factors."""
+
+import numpy as np
+import pytest
+
+from derender.evaluation.linear_task import Rows, task_of
+from derender.interpretation import Probe, explain_labels
+from derender.interpretation.shares import factor_shares, integrated_gradients
+
+SIZES = {"geometry": 4, "albedo": 4, "light": 4}
+
+
+def probe_of(weight, bias=(0.3, -0.2), kind="labels") -> Probe:
+    weight = np.asarray(weight, np.float32)
+    return Probe(kind, ("a", "b"), SIZES, weight, np.asarray(bias, np.float32))
+
+
+@pytest.fixture
+def z() -> np.ndarray:
+    return np.random.default_rng(1).standard_normal((30, 12)).astype(np.float32)
+
+
+@pytest.fixture
+def weight() -> np.ndarray:
+    return np.random.default_rng(2).standard_normal((2, 12)).astype(np.float32)
+
+
+@pytest.mark.parametrize("kind", ["labels", "classes"])
+@pytest.mark.parametrize("output", ["logit", "probability"])
+def test_attributions_sum_to_the_change_of_the_answer(z, weight, kind, output):
+    probe = probe_of(weight, kind=kind)
+    start = np.full(12, 0.1)
+    found, error = integrated_gradients(probe, z, 1, baseline=start, output=output, steps=64)
+
+    def answer(values):
+        logits = values @ weight.T.astype(np.float64) + probe.bias
+        if output == "logit":
+            return logits[:, 1]
+        if kind == "labels":
+            return 1 / (1 + np.exp(-logits[:, 1]))
+        return np.exp(logits[:, 1]) / np.exp(logits).sum(axis=1)
+
+    change = answer(z.astype(np.float64)) - answer(start[None])
+    np.testing.assert_allclose(found.sum(axis=1), change, atol=2e-5)
+    assert np.abs(error).max() < 2e-5
+
+
+def test_of_a_linear_answer_it_is_weight_times_feature(z, weight):
+    found, _ = integrated_gradients(probe_of(weight), z, 0)
+    np.testing.assert_allclose(found, z.astype(np.float64) * weight[0], rtol=1e-6, atol=1e-9)
+
+
+def test_a_yes_or_no_has_the_same_shares_as_logit_and_as_probability(z, weight):
+    probe = probe_of(weight)
+    logit, probability = (
+        factor_shares(integrated_gradients(probe, z, 0, output=output)[0], probe)
+        for output in ("logit", "probability")
+    )
+    np.testing.assert_allclose(logit, probability, atol=1e-6)
+    np.testing.assert_allclose(logit.sum(axis=1), 1)
+
+
+def test_a_probe_that_uses_one_factor_gives_it_everything(z, weight):
+    weight[:, :4] = weight[:, 8:] = 0
+    shares = factor_shares(integrated_gradients(probe_of(weight), z, 0)[0], probe_of(weight))
+    np.testing.assert_allclose(shares, np.tile([0.0, 1.0, 0.0], (len(z), 1)), atol=1e-12)
+
+
+def test_symmetric_factors_get_equal_shares(z, weight):
+    z[:, 4:8] = z[:, 8:] = z[:, :4]
+    weight[:, 4:8] = -weight[:, :4]
+    weight[:, 8:] = weight[:, :4]
+    shares = factor_shares(integrated_gradients(probe_of(weight), z, 0)[0], probe_of(weight))
+    np.testing.assert_allclose(shares, 1 / 3, atol=1e-9)
+
+
+def test_scales_of_answer_and_of_feature_change_no_share(z, weight):
+    def shares(features, w):
+        return factor_shares(integrated_gradients(probe_of(w), features, 0)[0], probe_of(w))
+
+    stretch = np.repeat([2.0, 1.0, 0.25], 4).astype(np.float32)
+    np.testing.assert_allclose(shares(z, 7 * weight), shares(z, weight), rtol=1e-5)
+    np.testing.assert_allclose(shares(z * stretch, weight / stretch), shares(z, weight), rtol=1e-5)
+    assert np.abs(shares(z * stretch, weight) - shares(z, weight)).max() > 0.1
+
+
+def test_nothing_attributed_is_no_share(z, weight):
+    assert np.isnan(factor_shares(np.zeros((2, 12)), probe_of(weight))).all()
+
+
+def test_bad_words(z, weight, monkeypatch):
+    with pytest.raises(ValueError, match="did you mean 'logit'"):
+        integrated_gradients(probe_of(weight), z, 0, output="logits")
+    with pytest.raises(ValueError, match=r"takes features \(N, 12\), got \(30, 3\)"):
+        integrated_gradients(probe_of(weight), z[:, :3], 0)
+
+    def missing(name, *rest):
+        raise ImportError(f"No module named {name!r}")
+
+    monkeypatch.setattr("importlib.import_module", missing)
+    with pytest.raises(ValueError, match=r"pip install 'derender\[explain\]'"):
+        integrated_gradients(probe_of(weight), z, 0)
+
+
+N = 240
+
+
+@pytest.fixture(scope="module")
+def known():
+    """Geometry tells `shape`, light tells `lit`, albedo is large and tells nothing."""
+    generator = np.random.default_rng(0)
+    features = {name: generator.standard_normal((N, 4)).astype(np.float32) for name in SIZES}
+    features["albedo"] += 3
+    shape, lit = ((features[name][:, 0] > 0).astype(np.int8) for name in ("geometry", "light"))
+    rows = Rows(np.arange(120, N), {80: np.stack([generator.permutation(120)[:80] for _ in range(2)])})
+    return features, task_of({"shape": shape, "lit": lit}), rows
+
+
+def explained(known, **words):
+    features, task, rows = known
+    noise = {n: np.random.default_rng(9).standard_normal((N, 4)).astype(np.float32) for n in SIZES}
+    return explain_labels(features, task, rows, seeds=(0, 1), untrained=[noise], **words)
+
+
+def test_the_factor_that_knows_has_the_share_and_the_drop(known):
+    found = explained(known, baseline="mean")
+    model, *controls = found.rows
+    assert [row.name for row in controls] == ["shuffled labels", "untrained encoder"]
+    assert all(row.control for row in controls) and not model.control
+    shares = model.shares.mean(axis=0)
+    assert shares[0].argmax() == 0 and shares[1].argmax() == 2 and (shares.max(axis=1) > 0.6).all()
+    np.testing.assert_allclose(model.shares.sum(axis=2), 1)
+    assert ((model.low <= shares) & (shares <= model.high)).all()
+    assert (model.auc > 0.95).all() and (model.drop[:, 0, 0] > 0.2).all()
+    assert np.abs(model.drop[:, :, 1]).max() < 0.03
+    for control in controls:
+        assert np.abs(control.auc - 0.5).max() < 0.3
+        assert control.shares.mean(axis=0)[0, 0] < shares[0, 0] - 0.15
+    assert model.error < 1e-6 and model.shares.shape == (2, 2, 3) and controls[1].shares.shape[0] == 1
+
+
+def test_a_zero_baseline_counts_a_constant_feature_and_the_mean_does_not(known):
+    zero, mean = (explained(known, baseline=name).rows[0].shares.mean(axis=0) for name in ("zero", "mean"))
+    assert (zero[:, 1] > mean[:, 1]).all()
+
+
+def test_the_same_seed_gives_the_same_numbers(known):
+    first, again = explained(known), explained(known)
+    assert first.numbers() == again.numbers()
+
+
+def test_classes_are_explained_on_their_own_pictures(known):
+    features, _, rows = known
+    third = np.digitize(features["geometry"][:, 0], [-0.5, 0.5])
+    found = explain_labels(features, task_of({"third": third}), rows, seeds=(0, 1), baseline="mean")
+    assert found.names == ("0", "1", "2") and found.rows[0].shares.shape == (2, 3, 3)
+    assert (found.rows[0].shares.mean(axis=0)[[0, 2]].argmax(axis=1) == 0).all()
+    assert (found.rows[0].auc[:, [0, 2]] > 0.85).all()
+
+
+def test_an_explanation_refuses_what_does_not_fit(known):
+    features, task, rows = known
+    with pytest.raises(ValueError, match="unknown baseline 'black'"):
+        explain_labels(features, task, rows, seeds=(0, 1), baseline="black")
+    with pytest.raises(ValueError, match="3 seeds need as many draws"):
+        explain_labels(features, task, rows, seeds=(0, 1, 2))

@@ -1,0 +1,99 @@
+"""The U-Net over skip features: shapes, each encoder's centre used once, frozen encoders."""
+
+import copy
+
+import pytest
+import torch
+
+from derender.networks import NetworkSettings
+from derender.networks.encoders import UNetEncoder
+from derender.networks.unet import SegmentationNet, UNetDecoder
+
+WIDTH, CLASSES = 4, 5
+
+
+def encoder(seed: int, size: int = 32, width: int = WIDTH) -> UNetEncoder:
+    torch.manual_seed(seed)
+    settings = NetworkSettings(image_size=size, encoder="unet", unet_width=width)
+    return UNetEncoder(settings, settings.code_size)
+
+
+def test_the_papers_decoder_has_the_parameters_of_its_widths():
+    """Widths 16 to 256: transposed convolutions 2x2 with bias, two 3x3 with BatchNorm, a 1x1 with bias."""
+    widths = [16, 32, 64, 128, 256]
+    for encoders in (1, 2):
+        expected, below = 16 * 19 + 19, encoders * 256
+        for width in (128, 64, 32, 16):
+            expected += below * width * 4 + width
+            expected += (1 + encoders) * width * width * 9 + width * width * 9 + 2 * 2 * width
+            below = width
+        found = sum(p.numel() for p in UNetDecoder(widths, encoders, 19).parameters())
+        assert found == expected
+
+
+@pytest.mark.parametrize("size", [32, 64])
+def test_one_logit_for_each_class_and_pixel(size):
+    net = SegmentationNet([encoder(0, size), encoder(1, size)], CLASSES).eval()
+    assert net(torch.rand(2, 3, size, size)).shape == (2, CLASSES, size, size)
+
+
+def test_the_joint_net_uses_both_centres_once():
+    """Gradients reach both centres; the first step up has a channel for each of theirs, in order."""
+    one, two = encoder(0), encoder(1)
+    net = SegmentationNet([one, two], CLASSES).train()
+    centre = one.widths[-1]
+    up = net.decoder.upsample[0]
+    assert up.in_channels == 2 * centre
+    images, seen = torch.rand(2, 3, 32, 32), []
+    handle = up.register_forward_hook(lambda module, inputs, output: seen.append(inputs[0]))
+    before = net(images)
+    handle.remove()
+    assert torch.equal(seen[0], torch.cat([one.spatial(images), two.spatial(images)], dim=1))
+    before.square().sum().backward()
+    for each in (one, two):
+        assert each.levels[-1][0].weight.grad.abs().sum() > 0
+    for half in (slice(None, centre), slice(centre, None)):
+        deaf = copy.deepcopy(net)
+        with torch.no_grad():
+            deaf.decoder.upsample[0].weight[half] = 0
+        assert (deaf(images) - before).abs().max() > 1e-3
+
+
+def test_swapping_encoders_and_the_weights_that_read_them_changes_nothing():
+    one, two = encoder(0), encoder(1)
+    net = SegmentationNet([one, two], CLASSES).train()
+    swapped = SegmentationNet([two, one], CLASSES).train()
+    swapped.decoder.load_state_dict(net.decoder.state_dict())
+    centre = one.widths[-1]
+    with torch.no_grad():
+        up = swapped.decoder.upsample[0].weight
+        up.copy_(torch.cat([up[centre:], up[:centre]]))
+        for block, width in zip(swapped.decoder.convolve, reversed(one.widths[:-1]), strict=True):
+            first, second, rest = block[0].weight.split([width, width, width], dim=1)
+            block[0].weight.copy_(torch.cat([second, first, rest], dim=1))
+    images = torch.rand(2, 3, 32, 32)
+    assert torch.allclose(net(images), swapped(images), atol=1e-5)
+
+
+def test_frozen_encoders_keep_weights_and_statistics_while_the_decoder_learns():
+    net = SegmentationNet([encoder(0)], CLASSES, frozen=True).train()
+    free = SegmentationNet([encoder(0)], CLASSES).train()
+    for each, stays in ((net, True), (free, False)):
+        before = {name: value.clone() for name, value in each.encoders.state_dict().items()}
+        decoder = {name: value.clone() for name, value in each.decoder.state_dict().items()}
+        optimiser = torch.optim.Adam([p for p in each.parameters() if p.requires_grad], lr=1e-2)
+        each(torch.rand(4, 3, 32, 32)).square().mean().backward()
+        optimiser.step()
+        after = each.encoders.state_dict()
+        code = {name for name in before if ".to_code." in name}
+        assert all(torch.equal(before[name], after[name]) for name in (before if stays else code))
+        changed = [name for name in before if not torch.equal(before[name], after[name])]
+        assert stays or len(changed) == len(before) - len(code)
+        assert any(not torch.equal(value, each.decoder.state_dict()[name]) for name, value in decoder.items())
+
+
+def test_encoders_of_different_widths_are_refused():
+    with pytest.raises(ValueError, match=r"same widths, got \[\(4, 8, 16, 32\), \(8, 16, 32, 64\)\]"):
+        SegmentationNet([encoder(0), encoder(1, width=8)], CLASSES)
+    with pytest.raises(ValueError, match="got no encoder"):
+        SegmentationNet([], CLASSES)

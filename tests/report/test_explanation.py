@@ -1,0 +1,60 @@
+"""Overlays and tables of an explanation."""
+
+import numpy as np
+import pytest
+import torch
+
+from derender.interpretation import cluster_shares, pair_parts
+from derender.interpretation.sanity import Similarity
+from derender.report.charts import side_by_side
+from derender.report.saliency import overlays, safe_name
+from derender.report.tables_explanation import (
+    cluster_share_table,
+    pair_table,
+    sanity_table,
+    unasked,
+    untrusted,
+)
+
+
+def test_an_empty_map_leaves_a_grey_picture_and_a_full_one_lights_its_place():
+    picture = torch.rand(2, 3, 32, 32, generator=torch.Generator().manual_seed(0))
+    maps = torch.zeros(2, 4, 4)
+    maps[1, 0, 3] = 2
+    empty, lit = (np.asarray(image, np.int64) for image in overlays(picture, maps))
+    grey = (picture[0].mean(dim=0) * 255).round().numpy()
+    assert np.abs(empty - grey[..., None]).max() <= 1
+    changed = np.abs(lit - (picture[1].mean(dim=0) * 255).round().numpy()[..., None]).max(axis=2) > 2
+    assert changed[:4, 28:].all() and not changed[16:, :16].any()
+
+
+def test_the_sanity_table_names_what_not_to_trust():
+    rows = [
+        Similarity("pixels", "light", "random weights", 0.9, 0.8, 0.1, 0.0),
+        Similarity("pixels", "light", "shuffled labels", 0.2, 0.1, 0.1, 0.0),
+        Similarity("grad-cam", "camera", "random weights", 0.1, 0.1, 0.1, 0.5),
+        Similarity("grad-cam", "camera", "shuffled labels", 0.7, 0.1, 0.1, 0.5),
+    ]
+    assert untrusted(rows) == ["pixels, light"] and unasked(rows) == ["grad-cam, camera"]
+    values = sanity_table(rows).values()
+    assert values["pixels, light"]["changes"] == "no" and values["grad-cam, camera"]["changes"] == "yes"
+    assert values["pixels, light"]["other picture"] is None
+
+
+def test_tables_of_groups_hold_the_parts():
+    generator = np.random.default_rng(0)
+    features = {name: generator.standard_normal((20, 3)) for name in ("geometry", "light")}
+    parts = pair_parts(features, 0, 1)
+    table = pair_table(parts, ("a.png", "b.png")).values()
+    assert table["all"]["of the distance"] == pytest.approx(1)
+    assert table["geometry"]["of the cosine"] == pytest.approx(parts.cosine[0])
+    clusters = cluster_share_table(cluster_shares(features, np.arange(20) % 2)).values()
+    assert clusters["cluster 0"]["pictures"] == 10
+    shares = [clusters["cluster 0"][name] for name in features]
+    assert sum(float(share) for share in shares) == pytest.approx(1)
+
+
+def test_a_chart_of_no_panels_is_refused_and_names_are_safe():
+    with pytest.raises(ValueError, match="at least one panel"):
+        side_by_side({}, "share", (3, 2))
+    assert safe_name("1: 0.5 to 2/3") == "1-0-5-to-2-3" and safe_name("//") == "label"

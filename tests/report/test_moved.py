@@ -1,0 +1,107 @@
+"""Strips, films and sheets on disk: what a player and a person find in them."""
+
+import io
+import json
+import subprocess
+
+import numpy as np
+import pytest
+from imageio_ffmpeg import get_ffmpeg_exe
+from PIL import Image
+
+from derender.report.films import gif, mp4
+from derender.report.moved import Moved, film_kinds, write_moved
+from derender.report.sheets import Sheets, sheet_paths, write_sheets
+
+
+def frames(count: int = 6, size: tuple[int, int] = (33, 24)) -> list[Image.Image]:
+    """Frames that get darker, with a transparent left column."""
+    made = []
+    for number in range(count):
+        pixels = np.full((size[1], size[0], 4), 255, np.uint8)
+        pixels[..., :3] = 220 - 30 * number
+        pixels[:, :8, 3] = 0
+        made.append(Image.fromarray(pixels))
+    return made
+
+
+def test_gif_has_every_frame_on_white():
+    with Image.open(io.BytesIO(gif(frames(), seconds=1.2))) as film:
+        assert film.n_frames == 6 and film.size == (33, 24) and film.info["loop"] == 0
+        assert film.info["duration"] == 200
+        film.seek(3)
+        shown = np.asarray(film.convert("RGB"))
+    assert (shown[:, :8] == 255).all()
+    assert abs(int(shown[5, 20, 0]) - 130) <= 2
+
+
+def test_mp4_has_every_frame_and_even_sides(tmp_path):
+    (tmp_path / "film.mp4").write_bytes(mp4(frames(), seconds=1.2))
+    decode = [
+        get_ffmpeg_exe(),
+        "-v",
+        "error",
+        "-i",
+        tmp_path / "film.mp4",
+        "-f",
+        "rawvideo",
+        "-pix_fmt",
+        "rgb24",
+        "-",
+    ]
+    raw = subprocess.run(decode, capture_output=True, check=True).stdout
+    shown = np.frombuffer(raw, np.uint8).reshape(6, 24, 34, 3)
+    assert shown[3, 12, 20].astype(int).tolist() == pytest.approx([130] * 3, abs=6)
+    assert shown[3, 12, 3].min() > 245
+
+
+def test_a_film_needs_frames():
+    for film in (gif, mp4):
+        with pytest.raises(ValueError, match="at least two frames; got 1"):
+            film(frames(1))
+
+
+def test_no_ffmpeg_is_an_error_that_helps(monkeypatch):
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", "no-such-program")
+    with pytest.raises(ValueError, match=r"ffmpeg cannot write MP4 here .*: write a GIF instead"):
+        mp4(frames())
+
+
+def test_kinds_of_film():
+    assert film_kinds("mp4, gif,mp4") == ("mp4", "gif")
+    assert film_kinds("none") == ()
+    with pytest.raises(ValueError, match="unknown kind of film 'mp5'; did you mean 'mp4'"):
+        film_kinds("mp5")
+
+
+def test_a_folder_has_strip_stills_film_and_numbers(tmp_path):
+    images = frames(3, (20, 20))
+    moved = Moved(
+        {"input": images[0]}, dict(zip("ab", images[1:], strict=True)), {"a": {"x": 1}, "b": {"x": 2}}, images
+    )
+    told = write_moved(tmp_path / "one", moved, {"picture": "one.png"}, ("gif",), 0.3)
+    names = {"strip.png", "still-01.png", "still-02.png", "film.gif", "moved.json"}
+    assert {file.name for file in (tmp_path / "one").iterdir()} == names
+    assert json.loads((tmp_path / "one" / "moved.json").read_text()) == told
+    assert [still["x"] for still in told["stills"]] == [1, 2] and told["picture"] == "one.png"
+    with Image.open(tmp_path / "one" / "still-02.png") as still:
+        assert still.mode == "RGBA" and still.tobytes() == images[2].tobytes()
+    with Image.open(tmp_path / "one" / "strip.png") as strip:
+        assert strip.width > 3 * 128
+
+
+def test_sheets_break_after_so_many_rows(tmp_path):
+    sheets = Sheets("many", rows=2)
+    for number in range(5):
+        sheets.add(f"{number}.png", {"input": frames(1)[0], "after": frames(1)[0]})
+    paths = write_sheets(sheets, tmp_path)
+    assert paths == [tmp_path / f"sheet-{number}.png" for number in (1, 2, 3)] == sheet_paths(tmp_path, 5, 2)
+    heights = []
+    for path in paths:
+        with Image.open(path) as sheet:
+            heights.append(sheet.height)
+    assert heights[0] == heights[1] > heights[2]
+    assert sheet_paths(tmp_path, 2, 2) == [tmp_path / "sheet.png"]
+    with pytest.raises(ValueError, match="columns input, after; got input"):
+        sheets.add("6.png", {"input": frames(1)[0]})
+    assert write_sheets(Sheets(), tmp_path) == []
