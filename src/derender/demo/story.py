@@ -57,7 +57,6 @@ class DemoSettings(Settings):
     shown: int = Field(default=8, ge=1)  # unseen pictures on the page
     films: int = Field(default=4, ge=1)
     overrides: tuple[str, ...] = (  # of the preset `small`, as in --set
-        "border_depth=1.08",  # these heads reach further back than the default border
         "level_depth=true",
         "template_share=0.1",
         "release_share=0.3",
@@ -74,7 +73,7 @@ QUICK = DemoSettings(
     minutes=0.6,
     shown=6,
     films=3,
-    overrides=("border_depth=1.08", "warmup_images=500", "objective.self_features_steps=60"),
+    overrides=("warmup_images=500", "objective.self_features_steps=60"),
 )
 
 
