@@ -1,8 +1,9 @@
 """RAF-DB and LFW's official parts, on trees as their owners publish them."""
 
 import pytest
+from PIL import Image
 
-from derender.data import take_inventory
+from derender.data import read_pictures, take_inventory
 from derender.data.emotions import EMOTIONS, RAFDB
 
 RAF = {
@@ -111,3 +112,12 @@ def test_lfw_without_lists_has_no_parts(tree):
     assert table(tree(files)).partition is None
     with pytest.raises(ValueError, match=r"no pictures in a folder 'test'"):
         take_inventory(tree(files), subset="test")
+
+
+def test_a_published_set_says_on_whose_terms_it_is_read(tmp_path):
+    Image.new("RGB", (8, 8), (200, 20, 20)).save(tmp_path / "plain.png")
+    assert read_pictures(tmp_path, 8).terms == ""
+    chips = tmp_path / "UTKFace"
+    chips.mkdir()
+    Image.new("RGB", (8, 8), (20, 200, 20)).save(chips / "30_1_0_20170117000000000.jpg.chip.jpg")
+    assert "research" in read_pictures(chips, 8, dataset="utkface").terms

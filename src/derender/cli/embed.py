@@ -125,6 +125,8 @@ def _opened(
     with bar("reading") as report:
         pictures = read_pictures(data, image_size, dataset=dataset, limit=limit, progress=report)
     say(pictures.describe())
+    if pictures.terms:
+        say(f"on its owners' terms: {pictures.terms}")
     yield part_of(pictures, part, model)
 
 

@@ -84,6 +84,8 @@ def train(
     with bar("reading") as report:
         pictures = read_pictures(data, picture_size(config), dataset=dataset, limit=limit, progress=report)
     say(pictures.describe())
+    if pictures.terms:
+        say(f"on its owners' terms: {pictures.terms}")
     with bar("training") as report:
 
         def show(progress: Progress) -> None:

@@ -38,6 +38,7 @@ class PictureSet:
         duplicates: files with the very pixels of an earlier one; not in ``images`` unless copies were kept.
         partition: the owners' own split of each picture ("train", "validation", "test", ...), or None.
         source: what was read.
+        terms: on what terms the owners of a published set give it, in a few words.
     """
 
     images: UInt8[np.ndarray, "n 3 h w"]
@@ -48,6 +49,7 @@ class PictureSet:
     duplicates: tuple[Duplicate, ...] = ()
     partition: np.ndarray | None = None
     source: str = ""
+    terms: str = ""
 
     def __post_init__(self) -> None:
         columns = {"files": self.files, **self.labels}
@@ -274,4 +276,5 @@ def _with_labels(inventory: Inventory, images: np.ndarray, loaded: Loaded) -> Pi
         duplicates=loaded.duplicates,
         partition=table.partition,
         source=where,
+        terms=inventory.layout.terms,
     )
