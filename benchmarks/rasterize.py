@@ -1,4 +1,4 @@
-"""Rasteriser on the CPU: Numba against the plain torch definition, forward and backward, in one run.
+"""Rasteriser and renderer on the CPU: Numba against the plain torch definition, both ways, in one run.
 
 First checks that both agree in outputs and gradients on the benchmark's own input, then times them in turns
 (best of several, so that a busy machine disturbs least) and prints milliseconds per image and the ratio.

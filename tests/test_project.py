@@ -47,6 +47,7 @@ HEAVY = {
     *("torch", "triton", "numba", "numpy", "scipy", "sklearn", "pyarrow", "PIL", "imageio", "matplotlib"),
     *("pydantic", "typer", "rich", "lightning_fabric", "tensorboard", "huggingface_hub", "torchmetrics"),
     *("captum", "datasets", "transformers", "vector_quantize_pytorch", "skimage", "trimesh"),
+    *("starlette", "uvicorn", "playwright", "ray"),
 }
 
 

@@ -18,6 +18,7 @@ from torch import Tensor, nn
 
 from derender.networks import FACTORS, Factor, NetworkSettings
 from derender.networks.confidence import Confidence, ConfidenceNet
+from derender.networks.whitening import Whitening
 from derender.presets import MODEL_PRESETS, ModelSettings, named_preset
 from derender.render import Rendering, render_scene
 from derender.scene import Scene
@@ -25,6 +26,8 @@ from derender.whole import whole_folder
 
 FORMAT = 1
 WEIGHTS_FILE, CONFIG_FILE = "model.safetensors", "config.json"
+WHITENING_FILE = "whitening.safetensors"  # a model may lack it
+ERRORS_FILE = "held_out_errors.json"  # written and read by training/held_out_errors.py; a model may lack it
 PRETRAINED = Path(__file__).parent / "pretrained"
 Renderer = Callable[[Scene, float], Rendering]
 
@@ -52,6 +55,7 @@ class Derenderer(nn.Module):
             {factor.name: factor.build(self.settings.network) for factor in self.factors}
         )
         self.nets["confidence"] = ConfidenceNet(self.settings.network)
+        self.whitening: Whitening | None = None  # fitted after training (training/whitening.py)
 
     @classmethod
     def from_preset(cls, name: str, *, seed: int | None = None, **network: Any) -> "Derenderer":
@@ -86,12 +90,20 @@ class Derenderer(nn.Module):
         return next(self.parameters()).device
 
     def embed(self, images: Float[Tensor, "n 3 h w"]) -> dict[str, Float[Tensor, "n code"]]:
-        """One feature per factor for pictures in 0..1, by factor name."""
+        """One feature per factor for pictures in 0..1, by name: its code, whitened if that was fitted."""
+        return self.features(self.encode(images))
+
+    def features(self, codes: Mapping[str, Float[Tensor, "n code"]]) -> dict[str, Float[Tensor, "n code"]]:
+        """The features that belong to codes: what ``embed`` gives for the pictures they come from."""
+        return dict(codes) if self.whitening is None else self.whitening(codes)
+
+    def encode(self, images: Float[Tensor, "n 3 h w"]) -> dict[str, Float[Tensor, "n code"]]:
+        """One code per factor for pictures in 0..1, by factor name: what ``decode`` takes."""
         self._check(images)
         return {factor.name: self.nets[factor.name].encode(images) for factor in self.factors}  # type: ignore[operator]
 
     def decode(self, codes: Mapping[str, Float[Tensor, "n code"]]) -> Scene:
-        """The scene that features stand for."""
+        """The scene that codes stand for."""
         return Scene.from_parameters(
             {
                 factor.parameter: factor.to_parameter(
@@ -104,7 +116,7 @@ class Derenderer(nn.Module):
 
     def decompose(self, images: Float[Tensor, "n 3 h w"]) -> Scene:
         """Geometry, albedo, light and camera of pictures in 0..1."""
-        return self.decode(self.embed(images))
+        return self.decode(self.encode(images))
 
     def render(self, scene: Scene) -> Rendering:
         """Pictures of scenes, with the model's field of view."""
@@ -139,6 +151,8 @@ class Derenderer(nn.Module):
         with whole_folder(folder) as temporary:
             save_file(weights, temporary / WEIGHTS_FILE)
             (temporary / CONFIG_FILE).write_text(json.dumps(config, indent=1))
+            if self.whitening is not None:
+                self.whitening.save(temporary / WHITENING_FILE)
         return folder
 
     def _check(self, images: Tensor) -> None:
@@ -174,7 +188,7 @@ def load(
         FileNotFoundError: nothing is there.
         ValueError: what is there is damaged, or made with other factors or by a newer version.
     """
-    folder = _model_folder(source)
+    folder = model_folder(source)
     config = _read_config(folder)
     names = [factor.name for factor in factors]
     if config["factors"] != names:
@@ -186,7 +200,9 @@ def load(
         settings = ModelSettings.model_validate(config["settings"])
         model = Derenderer(settings, factors, renderer)
         model.load_state_dict(load_file(folder / WEIGHTS_FILE))
-    except (SafetensorError, ValidationError, RuntimeError) as error:
+        if (folder / WHITENING_FILE).is_file():
+            model.whitening = Whitening.load(folder / WHITENING_FILE)
+    except (SafetensorError, ValidationError, RuntimeError, ValueError) as error:
         raise ValueError(
             f"{folder} is damaged ({str(error).splitlines()[0]}): copy or train the model again"
         ) from error
@@ -198,7 +214,12 @@ def bundled_models() -> tuple[str, ...]:
     return tuple(sorted(folder.parent.name for folder in PRETRAINED.glob(f"*/{CONFIG_FILE}")))
 
 
-def _model_folder(source: str | Path) -> Path:
+def model_folder(source: str | Path) -> Path:
+    """The folder that ``load`` reads for this source.
+
+    Raises:
+        FileNotFoundError: nothing is there.
+    """
     folder = Path(source)
     for candidate in (folder, folder / "model"):
         if (candidate / CONFIG_FILE).is_file() and (candidate / WEIGHTS_FILE).is_file():
@@ -223,7 +244,11 @@ def _from_hub(repository: str) -> Path:
     from huggingface_hub.errors import HfHubHTTPError, HFValidationError, LocalEntryNotFoundError
 
     try:
-        return Path(snapshot_download(repository, allow_patterns=[CONFIG_FILE, WEIGHTS_FILE]))
+        return Path(
+            snapshot_download(
+                repository, allow_patterns=[CONFIG_FILE, WEIGHTS_FILE, WHITENING_FILE, ERRORS_FILE]
+            )
+        )
     except (HfHubHTTPError, HFValidationError, LocalEntryNotFoundError, OSError) as error:
         raise FileNotFoundError(
             f"no folder {repository} here, and the Hub gave nothing under that id ({type(error).__name__}): "

@@ -160,6 +160,8 @@ def test_bad_input_is_one_line(tables, model, people, refused, tmp_path):
     assert "--model needs --data" in refused("compare", "--table", "identity", "-m", model)
     assert "needs labels (class)" in refused("compare", "--table", "cars", "-f", f"good={good}")
     assert "should read NAME=PATH" in refused("compare", "--table", "cars", "-f", f"={good}")
+    assert "is a folder: name a file" in refused(*cluster, "-l", "identity", "--json", tmp_path)
+    assert "--method" in refused(*compare, "--method", "wards")
     there = tmp_path / "there.md"
     there.write_text("mine")
     assert "exists already" in refused(*compare, "--markdown", there)

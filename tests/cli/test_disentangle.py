@@ -41,7 +41,10 @@ def rendered(tmp_path_factory, made) -> Path:
 def test_the_card_is_printed_drawn_and_written(model, rendered, tmp_path, capsys):
     out = tmp_path / "card.png"
     words = ["evaluate", "disentangle", "-m", model, "-d", rendered, "--seeds", "1", "--swap-pictures", "4"]
-    assert main([str(word) for word in [*words, "--out", out, "--json", "-"]]) == 0
+    text, typeset = tmp_path / "card.md", tmp_path / "card.tex"
+    files = ["--json", "-", "--markdown", text, "--latex", typeset]
+    assert main([str(word) for word in [*words, "--out", out, *files]]) == 0
+    assert text.read_text().count("| :--- |") == typeset.read_text().count(r"\begin{table}") == 6
     shown = capsys.readouterr()
     told = json.loads(shown.out)
     assert told["pictures"] == 24 and told["features"]["geometry"] == 12 and told["seeds"] == [0]

@@ -3,6 +3,7 @@
 import io
 import json
 import os
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,8 @@ from PIL import Image
 
 from derender import Derenderer, FeatureTable
 from derender.cli import main
+from derender.model import ERRORS_FILE
+from derender.training.held_out_errors import HeldOutErrors, write_errors
 
 SIZE = 32
 
@@ -222,3 +225,28 @@ def test_bad_searches(table, model, photos, tmp_path, refused):
     Image.new("RGB", (8, 8)).save(elsewhere / "x.png")
     complaint = refused(*like, "0.png", "--out", tmp_path / "s.png", "--data", elsewhere)
     assert "holds none of the pictures found" in complaint and not (tmp_path / "s.png").exists()
+
+
+def test_pictures_unlike_what_the_model_was_validated_on_are_named(model, photos, tmp_path, capsys):
+    """Errors kept with a copy of the model decide which pictures are named; they never stop a command."""
+    known = Path(shutil.copytree(model, tmp_path / "known"))
+    one, two = photos / "0.png", photos / "1.png"
+    words = ["--size", "32", "--film", "none", "--stills", "2"]
+    for command in (["relight", *words], ["mesh", "--size", "32"], ["decompose"]):
+        name, *rest = command
+        assert main([name, "-m", model, str(one), "-o", str(tmp_path / f"no-{name}"), *rest]) == 0
+        assert "reconstructed worse" not in capsys.readouterr().err
+    write_errors(known, HeldOutErrors(np.linspace(0, 0.001, 101), 50))
+    told = tmp_path / "told.json"
+    words = ["--size", "32", "--from", str(two), "--factor", "light", "--json", str(told)]
+    assert main(["swap", "-m", str(known), str(one), "-o", str(tmp_path / "swapped"), *words]) == 0
+    said = capsys.readouterr().err
+    for path in (one, two):
+        assert f"{path}: reconstructed worse than 99 % of the pictures this model was validated on" in said
+    assert json.loads(told.read_text())["reconstruction_percentile"] == {str(one): 100, str(two): 100}
+    write_errors(known, HeldOutErrors(np.linspace(0, 2, 101), 50))
+    assert main(["mesh", "-m", str(known), str(one), "-o", str(tmp_path / "usual"), "--size", "32"]) == 0
+    assert "reconstructed worse" not in capsys.readouterr().err
+    (known / ERRORS_FILE).write_text("{")
+    assert main(["mesh", "-m", str(known), str(one), "-o", str(tmp_path / "damaged"), "--size", "32"]) == 0
+    assert "cannot tell odd pictures" in capsys.readouterr().err

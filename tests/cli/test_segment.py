@@ -71,6 +71,34 @@ def test_tables_overlays_and_going_on(parts, tmp_path, capsys, refused):
     assert "exists already" in refused(*again)
 
 
+def test_the_papers_table_beside_the_papers_numbers(parts, tmp_path, capsys, refused):
+    words = ["compare", "--table", "segmentation", "-m", f"ours={model(tmp_path, 'unet')}", "-d", parts]
+    words += ["--epochs", 1, "--resamples", 20, "--cache", tmp_path / "cache", "--seeds"]
+    text, typeset = tmp_path / "t.md", tmp_path / "t.tex"
+    files = ["--json", "-", "--markdown", text, "--latex", typeset]
+    assert main([str(word) for word in [*words, 1, *files]]) == 0
+    told = json.loads(capsys.readouterr().out)
+    ours = told["parts"]["ours"]
+    assert told["number"] == 3 and ours["differs"].startswith(
+        "subset: 13 + 3 pictures at 32 x 32, 19 classes"
+    )
+    names = ["joint encoders", "geometry encoder", "albedo encoder", "joint encoders, frozen", "random start"]
+    names += ["each place's class", "pixel colour", "most frequent class"]
+    assert list(ours["rows"]) == names and len(ours["paper"]) == 5
+    first = text.read_text().split("\n\n")[1]
+    assert [line.split(" | ")[0] for line in first.splitlines()[2:]] == [
+        *(f"| {name}" if at < 4 else f"| *{name}*" for at, name in enumerate(names)),
+        *(f"| paper: {row['method']}" for row in ours["paper"]),
+    ]
+    assert typeset.read_text().count(r"\begin{table}") == 4
+    assert main([str(word) for word in [*words, 1]]) == 0
+    assert "0 results computed, 5 found" in capsys.readouterr().err
+    feature = ("compare", "--table", "segmentation", "-f", "a=f.parquet", "-d", parts)
+    assert "features do not do" in refused(*feature)
+    assert "--masks goes with" in refused("compare", "--table", "cars", "-f", "a=f.parquet", "--masks", parts)
+    assert "no U-Net encoder" in refused(*words[:4], f"plain={model(tmp_path, 'conv')}", *words[5:], 1)
+
+
 def test_masks_of_ones_own(parts, tmp_path, capsys):
     net = model(tmp_path, "unet")
     (parts / "masks" / "classes.txt").write_text("\n".join(MASK_CLASSES))

@@ -1,4 +1,4 @@
-"""A layout can declare which part of each picture is read: decoding cuts it out before anything else."""
+"""Which part of each picture is read: decoding cuts it out first, and a list of one's own can name it."""
 
 import io
 
@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 from tests.data.conftest import noise
 
-from derender.data import Unreadable
+from derender.data import Unreadable, read_pictures, take_inventory
 from derender.data.decode import decode
 
 
@@ -64,3 +64,87 @@ def test_a_box_holds_where_the_jpeg_is_decoded_at_a_reduced_scale(encoded):
     assert np.abs(part - centres / 1024 * 255).max() < 1.5
     small = decode(jpeg, 16, "crop", box(512, 100, 528, 116)).mean()
     assert abs(small - 520 / 1024 * 255) < 1.5
+
+
+ROWS = ((2, 3, 22, 33), (5, 1, 25, 21), (0, 0, 40, 30))  # left, top, right, bottom
+NAMES = ("000001.jpg", "000002.jpg", "000003.jpg")
+SIZED = [f"{name},{a},{b},{c - a},{d - b}" for name, (a, b, c, d) in zip(NAMES, ROWS, strict=True)]
+SIDES = [f"{name},{a},{b},{c},{d}" for name, (a, b, c, d) in zip(NAMES, ROWS, strict=True)]
+HEADER = "file,left,top,width,height"
+
+
+@pytest.fixture
+def wild(tree, encoded):
+    """``wild({file: text})`` is CelebA in the wild, three pictures of 40 x 34 pixels, with these lists."""
+
+    def make(lists: dict[str, str], zipped: bool = False):
+        pictures = {f"Img/img_celeba/{name}": encoded(noise(i, 40, 34)) for i, name in enumerate(NAMES)}
+        attributes = "3\nBald \n" + "".join(f"{name} -1\n" for name in NAMES)
+        owners = "3\nimage_id x_1 y_1 width height\n" + "".join(f"{name} 9 9 9 9\n" for name in NAMES)
+        return tree(
+            {**pictures, "list_attr_celeba.txt": attributes, "list_bbox_celeba.txt": owners, **lists}, zipped
+        )
+
+    return make
+
+
+def boxes_of(source) -> list[list[float]]:
+    inventory = take_inventory(source)
+    inventory.source.close()
+    assert inventory.layout.name == "celeba" and inventory.table.boxes is not None
+    return inventory.table.boxes.tolist()
+
+
+@pytest.mark.parametrize(
+    ("file", "text"),
+    [
+        ("boxes.csv", "\n".join([HEADER, *SIZED])),
+        ("boxes.csv", "\n".join(["file,left,top,right,bottom", *SIDES])),
+        ("Anno/boxes.txt", "\r\n".join(line.replace(",", "  ") for line in ["3", *reversed(SIZED), ""])),
+        ("celeba_crop_bbox.txt", "\n".join(f"img_celeba/{line}" for line in SIZED)),
+        ("celeba_crop_bbox.txt", "\n".join(["3", "image_id x_1 y_1 width height", *SIZED]).replace(",", " ")),
+    ],
+)
+def test_a_list_beside_celeba_in_the_wild_comes_before_the_rule(wild, file, text):
+    for zipped in (False, True):
+        assert boxes_of(wild({file: text}, zipped)) == [list(row) for row in ROWS]
+
+
+def test_pictures_are_cut_by_the_list(wild, encoded):
+    read = read_pictures(wild({"boxes.csv": "\n".join([HEADER, *SIZED])}), 10)
+    for i, sides in enumerate(ROWS):
+        assert (read.images[i] == decode(encoded(noise(i, 40, 34)), 10, "crop", box(*sides))).all()
+
+
+@pytest.mark.parametrize(
+    ("lines", "message"),
+    [
+        ([HEADER, *SIZED[:2]], r"boxes\.csv in .* has no row for 000003\.jpg \(1 of 3 pictures have none"),
+        ([HEADER, *SIZED, SIZED[0]], r"line 5: a second row for 000001\.jpg"),
+        (
+            [HEADER, "000001.jpg,1,2,3"],
+            r"line 2: expected a picture's name and left, top, width, height, got '000001",
+        ),
+        ([*SIZED[:2], "000003.jpg,1,2,3,x"], r"line 3: expected a picture's name and left, top, width"),
+        ([*SIZED[:2], "000003.jpg,1,2,nan,4"], "line 3: expected a picture's name"),
+        ([HEADER, *SIZED[:2], "000003.jpg,1,2,0,4"], "line 4: the box has no area"),
+        (["file,left,top,right,bottom", *SIDES[:2], "000003.jpg,9,2,5,4"], "line 4: the box has no area"),
+        (
+            ["file,x,y,w,h", *SIZED],
+            "line 1: expected file,left,top,width,height or file,left,top,right,bottom",
+        ),
+        (
+            [HEADER, *SIZED[:2], "000003.jpg,30,20,30,20"],
+            r"line 4: the box from \(30, 20\) to \(60, 40\) lies outside 000003\.jpg, which is 40 x 34",
+        ),
+        ([HEADER], "has no rows"),
+    ],
+)
+def test_a_list_that_cannot_be_right_is_refused(wild, lines, message):
+    with pytest.raises(ValueError, match=message):
+        boxes_of(wild({"boxes.csv": "\n".join(lines)}))
+
+
+def test_a_box_that_sticks_out_a_little_is_no_error(wild):
+    rows = [*SIZED[:2], "000003.jpg,-5,-4,30,30"]
+    assert boxes_of(wild({"boxes.csv": "\n".join([HEADER, *rows])}))[2] == [-5, -4, 25, 26]

@@ -340,3 +340,9 @@ def test_features_and_labels_are_of_the_same_rows():
     rows = choose_rows(task, files(60), (10,), (0,))
     with pytest.raises(ValueError, match="features 'ours' have 59 rows, the labels 60"):
         compare_linear({"ours": [np.ones((59, 2))]}, task, rows, (0,))
+
+
+def test_features_that_never_change_answer_with_the_shares():
+    task = task_of({"a": np.arange(40) % 2, "b": np.arange(40) // 4 % 2})
+    answers, _ = fit_logistic(np.ones((40, 3)), task.targets, np.ones((5, 3)), kind="labels")
+    assert answers == pytest.approx(np.full((5, 2), 0.5), abs=1e-3)

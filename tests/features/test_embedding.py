@@ -4,6 +4,8 @@ import io
 import json
 import tarfile
 import zipfile
+from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +16,7 @@ from PIL import Image
 from derender.data import read_pictures
 from derender.data.stream import stream_of
 from derender.features import FeatureTable, embed_pictures, embed_to_file, embedding
+from derender.features.blocks import BlockEmbedder, in_order
 
 COUNT = 110
 
@@ -102,6 +105,27 @@ def test_the_table_is_that_of_the_set_in_memory(model, source, tmp_path, keep):
     assert done.examples[0].reason == "not a picture in a known format"
     assert pq.ParquetFile(tmp_path / "out.parquet").num_row_groups == -(-len(expected) // 32)
     assert not (tmp_path / "out.parquet.partial").exists()
+
+
+@pytest.mark.parametrize("keep", [False, True])
+def test_blocks_of_several_workers_make_the_same_table(model, source, tmp_path, keep):
+    expected = in_memory(model, source, tmp_path / "memory.parquet", keep_duplicates=keep)
+    workers = [BlockEmbedder(model, partial(stream_of, source), 16) for _ in range(2)]
+
+    def engine(stream, start, seen):
+        turns = enumerate(range(start, COUNT, 16))
+        blocks = [workers[turn % 3 == 1].embed(first) for turn, first in turns]
+        again = workers[0].embed(start)  # a worker may be given a block that another one lost
+        assert again.decoded.files == blocks[0].decoded.files
+        return nullcontext(in_order(blocks, seen, keep_duplicates=keep))
+
+    path = tmp_path / "out.parquet"
+    with stream_of(source) as stream:
+        done = embed_to_file(model, stream, path, batch_size=16, keep_duplicates=keep, engine=engine)
+    for worker in workers:
+        worker.close()
+    assert_same(path, expected)
+    assert (done.rows, done.skipped, done.copies) == (len(expected), 6, 4)
 
 
 @pytest.mark.parametrize("source", ["folder", "shards"], indirect=True)

@@ -55,6 +55,9 @@ class Looking:
         net.encode = net.encoder.forward  # type: ignore[assignment]
         self.nets = {"geometry": net}
 
+    def features(self, codes: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+        return codes
+
 
 @pytest.fixture
 def images(generator) -> torch.Tensor:

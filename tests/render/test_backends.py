@@ -1,4 +1,4 @@
-"""The Numba implementation against the definition, and as a good citizen of torch, threads and processes."""
+"""The fast implementations against the definition, and as good citizens of torch, threads and processes."""
 
 import math
 import os
@@ -8,17 +8,16 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
+from tests.render.devices import FAST, device_of, rasterize, render, sample, shade, warp
 from tests.render.scenes import FOV_DEG, scene, smooth_depth
 from tests.tolerances import assert_agrees
 from torch import Tensor
 
-from derender.render import available_backends, chosen_backend, render, shade, warp
-from derender.render.rasterize import numba_cpu as rasterize_numba
-from derender.render.rasterize import rasterize, reference
-from derender.render.sample import numba_cpu as sample_numba
-from derender.render.sample import sample
-from derender.scene.camera import focal_px, to_camera, unproject
+from derender.render import available_backends, chosen_backend
+from derender.render.rasterize import IMPLEMENTATIONS, reference
+from derender.scene.camera import focal_px, motion, to_camera, unproject
 
+fast = pytest.mark.parametrize("backend", FAST)
 needs_numba = pytest.mark.skipif("numba" not in available_backends(), reason="numba is not installed")
 
 
@@ -40,10 +39,10 @@ def gradients_with(
     return torch.autograd.grad(outputs, inputs, weights)
 
 
-def assert_backends_agree(values: tuple[Tensor, ...]) -> None:
+def assert_agrees_with_reference(fast_backend: str, values: tuple[Tensor, ...]) -> None:
     """Outputs and the gradient of each of render's four inputs."""
     kept = {}
-    for backend in ("reference", "numba"):
+    for backend in ("reference", fast_backend):
         inputs = [value.clone().requires_grad_() for value in values]
         before = [value.detach().clone() for value in inputs]
         result = render(*inputs, FOV_DEG, backend)
@@ -54,39 +53,39 @@ def assert_backends_agree(values: tuple[Tensor, ...]) -> None:
         kept[backend] |= {f"d/d {name}": gradient for name, gradient in zip(names, gradients, strict=True)}
         for value, original in zip(inputs, before, strict=True):
             assert torch.equal(value, original), "inputs must not be written to"
-    assert torch.equal(kept["numba"]["mask"], kept["reference"]["mask"])
+    assert torch.equal(kept[fast_backend]["mask"], kept["reference"]["mask"])
     for name, expected in kept["reference"].items():
-        assert_agrees(kept["numba"][name], expected, name)
+        assert_agrees(kept[fast_backend][name], expected, name)
 
 
-@needs_numba
+@fast
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize(
     ("count", "height", "width"), [(3, 17, 23), (1, 31, 12), (2, 2, 2), (5, 3, 9), (1, 48, 48)]
 )
-def test_backends_agree(count, height, width, dtype, generator, nan_filled_memory):
-    assert_backends_agree(scene(count, height, width, generator, dtype))
+def test_backends_agree(backend, count, height, width, dtype, generator, nan_filled_memory):
+    assert_agrees_with_reference(backend, scene(count, height, width, generator, dtype))
 
 
-@needs_numba
+@fast
 @pytest.mark.parametrize("degrees", [70, 85, 89, 89.9])
 @pytest.mark.parametrize("axis", [0, 1])
-def test_backends_agree_at_grazing_angles(degrees, axis, generator, nan_filled_memory):
+def test_backends_agree_at_grazing_angles(backend, degrees, axis, generator, nan_filled_memory):
     depth, albedo, light, pose = scene(2, 16, 21, generator, torch.float64)
     pose[:, axis] = math.radians(degrees)
-    assert_backends_agree((depth, albedo, light, pose))
+    assert_agrees_with_reference(backend, (depth, albedo, light, pose))
 
 
-@needs_numba
-def test_backends_agree_on_rough_depth_with_many_layers(generator, nan_filled_memory):
+@fast
+def test_backends_agree_on_rough_depth_with_many_layers(backend, generator):
     _, albedo, light, pose = scene(4, 19, 16, generator, torch.float64, turn_rad=math.pi)
     depth = 0.9 + 0.2 * torch.rand(4, 19, 16, generator=generator, dtype=torch.float64)
-    assert_backends_agree((depth, albedo, light, pose))
+    assert_agrees_with_reference(backend, (depth, albedo, light, pose))
 
 
-@needs_numba
+@fast
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_backends_choose_the_same_triangle(dtype, generator):
+def test_backends_choose_the_same_triangle(backend, dtype, generator):
     """Bit for bit, ties of the identity camera and of exact half pixels included."""
     depth, _, _, pose = scene(6, 20, 17, generator, dtype, turn_rad=1.5)
     pose[0] = 0
@@ -96,13 +95,15 @@ def test_backends_choose_the_same_triangle(dtype, generator):
     vertices, focal = to_camera(unproject(depth, FOV_DEG), pose), focal_px(17, FOV_DEG)
     expected = reference.rasterize(vertices, focal)[2]
     assert (expected >= 0).float().mean() > 0.2
-    assert torch.equal(rasterize_numba.rasterize(vertices, focal)[2].long(), expected)
+    chosen = IMPLEMENTATIONS[backend].rasterize(vertices.to(device_of(backend)), focal)[2]
+    assert torch.equal(chosen.cpu().long(), expected)
 
 
-@needs_numba
-def test_identity_camera_takes_the_first_triangle_of_each_vertex(generator):
+@fast
+def test_identity_camera_takes_the_first_triangle_of_each_vertex(backend, generator):
     vertices = unproject(smooth_depth(1, 6, 6, generator), FOV_DEG)
-    triangle = rasterize_numba.rasterize(vertices, focal_px(6, FOV_DEG))[2][0]
+    vertices = vertices.to(device_of(backend))
+    triangle = IMPLEMENTATIONS[backend].rasterize(vertices, focal_px(6, FOV_DEG))[2][0].cpu()
     # the vertex below and right of a cell is first met as that cell's lower triangle's corner
     v, u = torch.meshgrid(torch.arange(1, 6), torch.arange(1, 6), indexing="ij")
     assert torch.equal(triangle[1:, 1:].long(), 2 * ((v - 1) * 5 + u - 1) + 1)
@@ -118,10 +119,10 @@ def test_reference_gives_the_same_in_small_portions(generator, monkeypatch):
     assert torch.equal(parts.depth, whole.depth)
 
 
-@needs_numba
+@fast
 @pytest.mark.parametrize("channels", [1, 3, 5])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_sampling_agrees(channels, dtype, generator, nan_filled_memory):
+def test_sampling_agrees(backend, channels, dtype, generator, nan_filled_memory):
     """Also where the picture looked up and the picture made differ in size, and just beyond the border."""
     image = torch.randn(2, channels, 5, 8, generator=generator, dtype=dtype)
     uv = torch.rand(2, 9, 6, 2, generator=generator, dtype=dtype) * torch.tensor([7.0, 4.0], dtype=dtype)
@@ -129,9 +130,9 @@ def test_sampling_agrees(channels, dtype, generator, nan_filled_memory):
     mask = (torch.rand(2, 9, 6, generator=generator) > 0.3).to(dtype)
     mask[0, 0, :2] = 1
     kept = []
-    for backend in ("reference", "numba"):
+    for name in ("reference", backend):
         inputs = [image.clone().requires_grad_(), uv.clone().requires_grad_()]
-        colour = sample(*inputs, mask, backend)
+        colour = sample(*inputs, mask, name)
         kept.append((colour, *gradients_with(torch.Generator().manual_seed(1), (colour,), inputs)))
     for name, expected, actual in zip(("colour", "d/d image", "d/d uv"), *kept, strict=True):
         assert_agrees(actual, expected, name)
@@ -158,37 +159,45 @@ def test_sampling_ignores_what_stands_outside_the_mask(backend, generator):
         assert (gradient == 0).all()
 
 
-@needs_numba
-def test_operators_keep_torch_s_rules(generator):
-    depth, albedo, _, pose = scene(2, 5, 6, generator)
+@fast
+def test_operators_keep_torch_s_rules(backend, generator):
+    operators, device = torch.ops.derender, device_of(backend)
+    depth, albedo, _, pose = (value.to(device) for value in scene(2, 5, 6, generator))
     vertices = to_camera(unproject(depth, FOV_DEG), pose).requires_grad_()
-    uv, distance, triangle = rasterize_numba.rasterize(vertices, 20.0)
-    mask = (triangle >= 0).float()
-    torch.library.opcheck(torch.ops.derender.rasterize_numba.default, (vertices, 20.0))
-    torch.library.opcheck(
-        torch.ops.derender.rasterize_numba_backward.default,
-        (uv.detach(), distance.detach(), vertices.detach(), triangle, 20.0),
-    )
-    image, uv = albedo.requires_grad_(), uv.detach().requires_grad_()
-    torch.library.opcheck(torch.ops.derender.sample_numba.default, (image, uv, mask))
-    torch.library.opcheck(
-        torch.ops.derender.sample_numba_backward.default,
-        (torch.randn(2, 3, 5, 6, generator=generator), image.detach(), uv.detach(), mask),
-    )
-    assert sample_numba.sample(image, uv, mask).requires_grad
+    uv, distance, triangle = IMPLEMENTATIONS[backend].rasterize(vertices, 20.0)
+    assert uv.requires_grad and not triangle.requires_grad
+    mask, uv, points = (triangle >= 0).float(), uv.detach(), vertices.detach()
+    picture = torch.randn(2, 3, 5, 6, generator=generator).to(device)
+    lamp, (rotation, offset) = torch.rand(2, 5, generator=generator).to(device), motion(pose.double())
+    checks = {
+        "rasterize": (vertices, 20.0),
+        "rasterize_backward": (uv, distance.detach(), points, triangle, 20.0),
+        "sample": (albedo, uv, mask),
+        "sample_backward": (picture, albedo, uv, mask),
+        "shade": (depth, albedo, lamp, 20.0),
+        "shade_backward": (picture, depth, albedo, lamp, 20.0),
+        "warp": (albedo, depth, rotation, offset, 20.0),
+        "warp_backward": (picture, distance.detach(), albedo, depth, rotation, offset, triangle, 20.0),
+    }
+    for name, values in checks.items():
+        operator, _, direction = name.partition("_")
+        whole_name = f"{operator}_{backend}{'_' * bool(direction)}{direction}"
+        if not direction:
+            values = [v.detach().requires_grad_() if isinstance(v, Tensor) else v for v in values]
+        torch.library.opcheck(getattr(operators, whole_name).default, tuple(values))
 
 
-@needs_numba
-def test_compiles_without_graph_breaks():
+@fast
+def test_compiles_without_graph_breaks(backend):
     """In a process of its own: the type checks of the test run are Python that torch.compile cannot trace."""
-    code = """
+    code = f"""
 import torch
 from derender.render import render
 def loss(*inputs):
-    result = render(*inputs, 10.0, "numba")
+    result = render(*inputs, 10.0, {backend!r})
     return result.image.square().sum() + result.depth.sum()
 values = (1 + 0.01 * torch.rand(2, 7, 6), torch.rand(2, 3, 7, 6), torch.rand(2, 4), 0.2 * torch.rand(2, 6))
-inputs = [value.requires_grad_() for value in values]
+inputs = [value.to({device_of(backend)!r}).requires_grad_() for value in values]
 compiled = torch.compile(loss, backend="aot_eager", fullgraph=True)
 expected, actual = (torch.autograd.grad(function(*inputs), inputs) for function in (loss, compiled))
 for one, other in zip(expected, actual, strict=True):
@@ -260,35 +269,37 @@ def test_kernels_are_compiled_where_no_folder_can_cache_them():
     assert values.tolist() == [0, 1, 1, 1, 0]
 
 
-def test_importing_the_renderer_does_not_import_numba():
-    code = "import sys, derender.render; raise SystemExit('numba' in sys.modules)"
+def test_importing_the_renderer_does_not_import_its_compilers():
+    code = "import sys, derender.render; raise SystemExit(bool({'numba', 'triton'} & {*sys.modules}))"
     assert subprocess.run([sys.executable, "-c", code], timeout=120, check=False).returncode == 0
 
 
-@needs_numba
-def test_auto_takes_numba_on_the_cpu_and_the_reference_elsewhere():
-    assert chosen_backend("cpu") == chosen_backend(torch.device("cpu"), "auto") == "numba"
-    assert chosen_backend("cuda:0") == "reference"
-    assert chosen_backend("cpu", "reference") == "reference"
-
-
-def test_without_numba_auto_takes_the_reference_and_numba_is_an_error(monkeypatch):
-    monkeypatch.setattr(sys.modules["derender.render.rasterize"], "_numba_installed", lambda: False)
+def test_auto_takes_the_fastest_that_is_installed(monkeypatch):
+    package = sys.modules["derender.render.rasterize"]
+    for installed, on_cpu, on_cuda in ((True, "numba", "triton"), (False, "reference", "reference")):
+        monkeypatch.setattr(package, "_numba_installed", lambda installed=installed: installed)
+        monkeypatch.setattr(package, "triton_installed", lambda installed=installed: installed)
+        assert chosen_backend("cpu") == chosen_backend(torch.device("cpu"), "auto") == on_cpu
+        assert chosen_backend("cuda:0") == on_cuda
+        assert chosen_backend("mps") == "reference"
+        assert chosen_backend("cuda:0", "reference") == "reference"
     assert available_backends() == ("reference",)
-    assert chosen_backend("cpu") == "reference"
-    with pytest.raises(ValueError, match="needs the package numba"):
-        chosen_backend("cpu", "numba")
+    for backend, device in (("numba", "cpu"), ("triton", "cuda")):
+        with pytest.raises(ValueError, match=f"needs the package {backend}; install it"):
+            chosen_backend(device, backend)
 
 
 @pytest.mark.parametrize(
     ("device", "backend", "message"),
     [
         ("cpu", "fast", "unknown render backend 'fast'; choose one of auto, reference, numba, triton"),
-        ("cpu", "triton", "triton render backend is not in this version"),
-        ("cuda", "triton", "triton render backend is not in this version"),
-        pytest.param("cuda", "numba", "works on the CPU, the tensors are on cuda", marks=needs_numba),
+        ("cpu", "triton", "works on a CUDA device, the tensors are on cpu; use 'auto'"),
+        ("cuda", "numba", "works on the CPU, the tensors are on cuda"),
     ],
 )
-def test_impossible_backends_are_errors(device, backend, message):
+def test_impossible_backends_are_errors(device, backend, message, monkeypatch):
+    package = sys.modules["derender.render.rasterize"]
+    for name, value in (("_numba_installed", True), ("triton_installed", True), ("interpreted", False)):
+        monkeypatch.setattr(package, name, lambda value=value: value)
     with pytest.raises(ValueError, match=message):
         chosen_backend(device, backend)

@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from tests.render.devices import rasterize, render, render_scene, shade, warp
 from tests.render.scenes import (
     FOV_DEG,
     assert_empty_where_uncovered,
@@ -17,8 +18,7 @@ from tests.tolerances import assert_agrees
 from torch import Tensor
 from torch.autograd import gradcheck
 
-from derender.render import Rendering, available_backends, render, render_scene, shade, warp
-from derender.render.rasterize import rasterize
+from derender.render import Rendering, available_backends
 from derender.scene.camera import focal_px, rotation_matrix, to_camera, to_canonical, unproject
 from derender.scene.scene import Scene
 
@@ -40,7 +40,7 @@ def test_identity_camera_renders_the_canonical_image(backend, height, width, dty
     depth = 0.9 + 0.2 * torch.rand(2, height, width, generator=generator, dtype=dtype)
     _, albedo, light, _ = scene(2, height, width, generator, dtype)
     result = render(depth, albedo, light, torch.zeros(2, 6, dtype=dtype), FOV_DEG, backend)
-    canonical = shade(depth, albedo, light, FOV_DEG)
+    canonical = shade(depth, albedo, light, FOV_DEG, backend)
     assert (result.mask == 1).all()
     if dtype == torch.float32:  # rounded once, from float64: the very bits
         assert torch.equal(result.image, canonical)
@@ -171,7 +171,7 @@ def test_roll_turns_the_picture_clockwise(backend):
 def test_light_stays_with_the_canonical_frame(backend, generator):
     depth, albedo, light, _ = scene(1, 16, 16, generator, torch.float64)
     turned = render(depth, albedo, light, camera(ry=0.3), FOV_DEG, backend)
-    again = warp(shade(depth, albedo, light, FOV_DEG), depth, camera(ry=0.3), FOV_DEG, backend)
+    again = warp(shade(depth, albedo, light, FOV_DEG, backend), depth, camera(ry=0.3), FOV_DEG, backend)
     assert_agrees(turned.image, again.image)
 
 
@@ -253,7 +253,7 @@ def test_uncovered_pixels_are_empty_and_send_no_gradient(backend, generator):
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_cameras_that_turn_the_surface_away_are_survived(backend, view, dtype, generator):
     depth, albedo, light, _ = scene(1, 9, 8, generator, dtype)
-    image = shade(depth, albedo, light, FOV_DEG).requires_grad_()
+    image = shade(depth, albedo, light, FOV_DEG, backend).requires_grad_()
     vertices = to_camera(unproject(depth, FOV_DEG), camera(dtype, **view)).requires_grad_()
     seen = rasterize(vertices, focal_px(8, FOV_DEG), backend)
     assert_empty_where_uncovered(seen)

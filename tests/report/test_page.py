@@ -36,7 +36,7 @@ def full_page(text: str = "plain") -> str:
         blocks.facts({text: text}),
         blocks.definitions({text: text}),
         blocks.folded(text, blocks.prose(text)),
-        blocks.figure(blocks.image(picture(), text), text),
+        blocks.figure(blocks.wide(blocks.image(picture(), text), text), text),
         blocks.row_of([(blocks.film(films.animated_png([picture(1), picture(2)]), picture(), text), text)]),
         blocks.image_grid({text: [picture()]}, [text], text, {text: text}),
         blocks.table(table),

@@ -14,7 +14,7 @@ import derender
 from derender.data import PictureSet
 from derender.training import TrainingInterrupted, resolve, train
 from derender.training.checkpoint import WEIGHTS_FILE, load_checkpoint
-from derender.training.loop import Progress
+from derender.training.loop import Progress, _kept
 from derender.training.run_folder import read_config, read_metrics
 
 TINY = ["image_size=32", "width=8", "light_width=4", "perceptual=none", "batch_size=8", "checkpoint_every=32"]
@@ -74,7 +74,7 @@ def test_a_run_leaves_everything_named_in_the_design(pictures, tmp_path):
     kinds = [row["kind"] for row in read_metrics(run)]
     assert kinds.count("validation") == 4
     assert "train" in kinds
-    assert [progress.done for progress in seen] == list(range(8, 129, 8))
+    assert [progress.done for progress in seen if progress.phase == "train"] == list(range(8, 129, 8))
     assert not [path for path in run.rglob("*") if path.suffix in (".pkl", ".pt", ".pth")]
 
 
@@ -190,3 +190,15 @@ def test_a_checkpoint_that_cannot_be_written_leaves_the_old_one_whole(pictures, 
     assert sorted(path.name for path in (tmp_path / "run" / "checkpoints").iterdir()) == ["best", "last"]
     model = derender.Derenderer.seeded(config.model, 0)
     assert load_checkpoint(tmp_path / "run" / "checkpoints" / "last", model, None).images == 32
+
+
+def kept_at(interval: int, images: int, step: int = 16) -> list[int]:
+    """Where a state is kept, found step by step."""
+    stops = range(step, images + 1, step)
+    return [now for now in stops if _kept(now - step, now, interval, ended=now == images)]
+
+
+def test_states_are_kept_early_however_long_the_interval_is():
+    assert kept_at(20_000, 60_000) == [320, 640, 1_264, 2_512, 5_008, 10_000, 20_000, 40_000, 60_000]
+    assert kept_at(1_000, 3_200, step=100) == [500, 1_000, 2_000, 3_000, 3_200]
+    assert kept_at(32, 96) == [32, 64, 96]

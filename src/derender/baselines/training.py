@@ -23,7 +23,24 @@ from derender.baselines.autoencoder import (
     beta_vae_losses,
 )
 from derender.baselines.model import BaselineModel, BaselineSettings, saved_baseline
+from derender.baselines.ris.building import RisConfig
+from derender.baselines.ris.model import Ris, RisSettings
 from derender.baselines.simclr import Simclr, SimclrConfig, SimclrSettings, make_views, simclr_losses
+from derender.baselines.stylegan2.adversarial import (
+    ADVERSARIAL_TERMS,
+    Stylegan,
+    StyleganConfig,
+    adversarial_losses,
+)
+from derender.baselines.stylegan2.e4e import E4e, E4eSettings
+from derender.baselines.stylegan2.generator import GeneratorSettings
+from derender.baselines.stylegan2.inversion import (
+    REGULARISERS,
+    E4eConfig,
+    build_e4e,
+    inversion_losses,
+    perceptual_features,
+)
 from derender.baselines.supervised import Resnet18, Resnet18Settings, SupervisedConfig
 from derender.baselines.vqvae import Vqvae, VqvaeConfig, VqvaeSettings, vqvae_losses
 from derender.data.nearest import nearest
@@ -56,6 +73,9 @@ class TrainedBaseline:
         losses: makes the function of a batch, given the configuration and the device.
         shown: makes the function of a sample sheet, given the same.
         not_judged: losses that say nothing of held-out pictures.
+        build: makes the network of a configuration, where it takes more than the module's settings.
+        prepare: makes the function of a batch where that needs pictures to learn from first, given the
+            configuration, a file that keeps what was learnt, the pictures and the progress.
     """
 
     config: type[LoopSettings]
@@ -64,6 +84,8 @@ class TrainedBaseline:
     losses: Callable[[Any, torch.device], Losses]
     shown: Callable[[Any, torch.device], Shown]
     not_judged: tuple[str, ...] = ()
+    build: Callable[[Any], BaselineModel] | None = None
+    prepare: Callable[[Any, Path, Tensor, PhaseProgress], Losses] | None = None
 
 
 def _vqvae(config: VqvaeConfig, device: torch.device) -> Losses:
@@ -99,6 +121,25 @@ def _simclr_shown(config: SimclrConfig, device: torch.device) -> Shown:
     return shown
 
 
+def _stylegan2(config: StyleganConfig, device: torch.device) -> Losses:
+    return lambda model, images, generator, precision: adversarial_losses(
+        model, images, config.objective, generator, precision
+    )
+
+
+def _e4e(config: E4eConfig, device: torch.device) -> Losses:
+    return lambda model, images, generator, precision: inversion_losses(
+        model, images, config.objective, None, generator, precision
+    )
+
+
+def _e4e_prepared(config: E4eConfig, file: Path, images: Tensor, progress: PhaseProgress) -> Losses:
+    features = perceptual_features(config, file, images, progress)
+    return lambda model, images, generator, precision: inversion_losses(
+        model, images, config.objective, features, generator, precision
+    )
+
+
 def _own_pictures(config: LoopSettings, device: torch.device) -> Shown:
     return lambda model, images: model.shown(images)
 
@@ -110,17 +151,32 @@ TRAINED: dict[str, TrainedBaseline] = {
     "simclr": TrainedBaseline(SimclrConfig, Simclr, SimclrSettings, _simclr, _simclr_shown),
     "ae": TrainedBaseline(AutoencoderConfig, Autoencoder, AutoencoderSettings, _autoencoder, _own_pictures),
     "beta-vae": TrainedBaseline(BetaVaeConfig, BetaVae, AutoencoderSettings, _beta_vae, _own_pictures),
+    "stylegan2": TrainedBaseline(
+        StyleganConfig, Stylegan, GeneratorSettings, _stylegan2, _own_pictures, not_judged=ADVERSARIAL_TERMS
+    ),
+    "e4e": TrainedBaseline(
+        E4eConfig,
+        E4e,
+        E4eSettings,
+        _e4e,
+        _own_pictures,
+        not_judged=REGULARISERS,
+        build=build_e4e,
+        prepare=_e4e_prepared,
+    ),
 }
 
 
-CONFIGS: dict[str, type[LoopSettings] | type[SupervisedConfig]] = {
+CONFIGS: dict[str, type[LoopSettings] | type[SupervisedConfig] | type[RisConfig]] = {
     **{name: row.config for name, row in TRAINED.items()},
     "resnet18": SupervisedConfig,
+    "ris": RisConfig,
 }
 """Settings of a run of every baseline that is trained here."""
 MODULES: dict[str, tuple[type[BaselineModel], type[BaselineSettings]]] = {
     **{name: (row.module, row.settings) for name, row in TRAINED.items()},
     "resnet18": (Resnet18, Resnet18Settings),
+    "ris": (Ris, RisSettings),
 }
 """Module and settings of every baseline that lies in a folder of ours."""
 
@@ -142,7 +198,7 @@ def load_baseline(source: str | Path, name: str | None = None) -> BaselineModel:
     return saved_baseline(source, MODULES if name is None else {name: named_baseline(name, MODULES)})
 
 
-def read_any_config(path: Path) -> LoopSettings | SupervisedConfig:
+def read_any_config(path: Path) -> LoopSettings | SupervisedConfig | RisConfig:
     """The configuration of a run, whether it trained our model or a baseline."""
     tree = read_config_tree(path)
     name, ours = tree.get("baseline"), FinetuneConfig if "target" in tree else TrainConfig
@@ -173,7 +229,8 @@ class BaselineTask:
         """The untrained network; torch's global generator is left as it was."""
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.config.seed)
-            return self.row.module(self.config.model)
+            build = self.row.build
+            return self.row.module(self.config.model) if build is None else build(self.config)
 
     def step_module(
         self,
@@ -182,7 +239,10 @@ class BaselineTask:
         images: UInt8[Tensor, "n 3 h w"],
         progress: PhaseProgress,
     ) -> "BaselineStep":
-        return BaselineStep(model, self.row.losses(self.config, images.device))
+        prepare = self.row.prepare
+        if prepare is None:
+            return BaselineStep(model, self.row.losses(self.config, images.device))
+        return BaselineStep(model, prepare(self.config, run.perceptual, images, progress))
 
     def watch(self, memory: dict[str, Any]) -> "FiniteWatch":
         """Stops a run whose loss is no longer a number."""

@@ -13,6 +13,7 @@ import typer
 
 from derender import __version__
 from derender.cli import (
+    bench,
     compare,
     demo,
     doctor,
@@ -23,9 +24,12 @@ from derender.cli import (
     mesh,
     move,
     pictures,
+    report,
     search,
     synth,
     train,
+    view,
+    whiten,
 )
 
 app = typer.Typer(
@@ -56,7 +60,8 @@ def _options(
 
 
 for group in (
-    demo, doctor, train, embed, evaluate, explain, finetune, compare, pictures, move, mesh, search, synth
+    demo, doctor, train, whiten, embed, evaluate, explain, finetune, compare, report,
+    pictures, move, mesh, search, view, synth, bench,
 ):  # fmt: skip
     group.register(app)
 
@@ -88,6 +93,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except Exception as error:
         describe = getattr(error, "format_message", None)  # bad words; typer has several kinds
         if describe is None:
+            if not _speaks_of_errors():
+                return 1
             raise
         command = getattr(getattr(error, "ctx", None), "command_path", "derender")
         message = describe().strip()
@@ -97,8 +104,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
 
 
+def _speaks_of_errors() -> bool:
+    """Of processes that torchrun started together the first that fails says why, the others say nothing."""
+    if "LOCAL_WORLD_SIZE" not in os.environ:
+        return True
+    from derender.training.distributed import first_to_fail
+
+    return first_to_fail()
+
+
 def _complain(message: str) -> None:
-    sys.stderr.write(f"derender: {message}\n")
+    if _speaks_of_errors():
+        sys.stderr.write(f"derender: {message}\n")
 
 
 def _one_line(error: ValueError | OSError) -> str:

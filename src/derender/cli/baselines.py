@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from derender.settings import Settings
     from derender.training.loop import TrainResult
 
-TRAINED = ("vqvae", "simclr", "ae", "beta-vae", "resnet18")
+TRAINED = ("vqvae", "simclr", "ae", "beta-vae", "resnet18", "stylegan2", "e4e", "ris")
 CONTROLS = ("pixels", "pca", "hog", "noise")
 NAMES = (*TRAINED, "dinov2", "untrained", *CONTROLS)
 
@@ -31,6 +31,15 @@ BaselineFeatures = Annotated[
         "--features",
         help="Which of a baseline's features, with commas between.",
         metavar="A,B",
+        rich_help_panel=PANEL,
+    ),
+]
+BaselineCheckpoint = Annotated[
+    str | None,
+    typer.Option(
+        "--checkpoint",
+        help="Instead of --model, of e4e: a published file such as e4e_ffhq_encode.pt.",
+        metavar="FILE",
         rich_help_panel=PANEL,
     ),
 ]
@@ -82,10 +91,11 @@ def stored_config(run: Path, name: str) -> "Settings":
 
 def picture_size(config: Any) -> int:
     """The side of the pictures that a run takes, in pixels."""
+    from derender.baselines.ris.building import RisConfig
     from derender.baselines.supervised import SupervisedConfig
     from derender.training.config import TrainConfig
 
-    if isinstance(config, SupervisedConfig):
+    if isinstance(config, SupervisedConfig | RisConfig):
         return config.image_size
     return config.model.network.image_size if isinstance(config, TrainConfig) else config.model.image_size
 
@@ -94,35 +104,52 @@ def train_baseline(
     config: Any, pictures: "PictureSet", out: Path, *, resume: bool, **how: Any
 ) -> "TrainResult":
     """Train a baseline into a run folder."""
+    from derender.baselines.ris.building import RisConfig, ris_run
+    from derender.baselines.ris.model import Ris
     from derender.baselines.supervised import SupervisedConfig, supervised_run
     from derender.baselines.training import BaselineTask
     from derender.report.baseline_sheet import baseline_sheet
     from derender.training.loop import train_task
 
-    if isinstance(config, SupervisedConfig):
+    if isinstance(config, SupervisedConfig | RisConfig):
         if resume:
             raise ValueError(
-                "resnet18 trains in minutes and is not resumed: train it again into another --out"
+                f"{config.baseline} trains in minutes and is not resumed: train it again into another --out"
             )
+        if isinstance(config, RisConfig):
+            return ris_run(config, pictures, out, sample_sheet=baseline_sheet(Ris.shown), **how)
         return supervised_run(config, pictures, out, **how)
     task = BaselineTask(config)
     return train_task(task, pictures, out, resume=resume, sample_sheet=baseline_sheet(task.shown), **how)
 
 
 def open_baseline(
-    name: str, model: str | None, *, device: str, features: str | None, image_size: int, seed: int
+    name: str,
+    model: str | None,
+    *,
+    device: str,
+    features: str | None,
+    image_size: int,
+    seed: int,
+    checkpoint: str | None = None,
 ) -> Any:
     """A network that embeds; ``model`` is its run folder (dinov2: an id or a folder; untrained: ours)."""
     from derender.baselines.controls import untrained_twin
     from derender.baselines.training import load_baseline
     from derender.cli.models import chosen_device, open_model
 
+    if checkpoint is not None and (name != "e4e" or model is not None):
+        raise ValueError("--checkpoint is a published e4e file: give it with --baseline e4e and no --model")
     if name == "untrained":
         return untrained_twin(open_model(_needed(name, model), device), seed)
     if name == "dinov2":
         from derender.baselines.dinov2 import DEFAULT_ID, load_dinov2
 
         net = load_dinov2(model or DEFAULT_ID, image_size=image_size)
+    elif checkpoint is not None:
+        from derender.baselines.stylegan2.published import load_published_e4e
+
+        net = load_published_e4e(checkpoint)
     else:
         net = load_baseline(_needed(name, model), name)
     if features is not None:

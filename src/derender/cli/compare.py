@@ -1,18 +1,21 @@
 """`derender compare`: one of the paper's tables for the features and models a user has, beside the paper's
 numbers.
 
-What a table is stands as data in ``evaluation/tables.py``. A kind of table is a runner in ``RUNNERS``: it
-takes the table's part, the rows and the options and gives the tables to show and the numbers for JSON.
+What a table is stands as data in ``evaluation/tables.py``. A table of features has a runner in ``RUNNERS``,
+which takes the table's part, the rows and the options and gives the tables to show and the numbers for JSON.
+Segmentation trains nets and takes models alone.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from derender.cli import feature_rows, options
-from derender.cli.console import bar, say, show_scores, write_json
+from derender.cli import feature_rows, options, scoring
+from derender.cli.console import bar, say
+from derender.cli.evaluate.segment import Masks, MaskSource, segmented
+from derender.cli.gathered import gathered
 
 if TYPE_CHECKING:
     from derender.evaluation.feature_rows import FeatureRow
@@ -20,8 +23,11 @@ if TYPE_CHECKING:
     from derender.evaluation.tables import Part, TableSpec
     from derender.report.score_table import ScoreTable
 
+PAPER_VARIANTS = "joint,geometry,albedo,joint-frozen,random"
+
 Table = Annotated[
-    str, typer.Option("--table", help="clustering, identity, emotion, linear or cars: the paper's tables.")
+    str,
+    typer.Option("--table", help="clustering, identity, emotion, linear, segmentation or cars: the paper's."),
 ]
 Named = Annotated[
     list[str] | None,
@@ -37,6 +43,24 @@ Data = Annotated[
     str | None,
     typer.Option("--data", "-d", help="Pictures: of the models, and of the controls.", metavar="PATH"),
 ]
+Counts = Annotated[str, typer.Option("--counts", help="Labelled rows to learn from, with commas between.")]
+Seeds = Annotated[
+    int, typer.Option("--seeds", min=1, metavar="N", help="Draws of training rows; runs of each net.")
+]
+Epochs = Annotated[int, typer.Option("--epochs", min=1, metavar="N", help="Of segmentation nets.")]
+
+
+@dataclass(frozen=True)
+class Given:
+    """What is compared."""
+
+    features: Named = None
+    model: Models = None
+    data: Data = None
+    dataset: options.Dataset = "auto"
+    limit: options.Limit = None
+    factors: feature_rows.Factors = "geometry,albedo"
+    masks: Masks = None
 
 
 @dataclass(frozen=True)
@@ -46,6 +70,7 @@ class Choices:
     seeds: int
     counts: tuple[int, ...]
     method: str
+    epochs: int
     resamples: int
     seed: int
 
@@ -57,78 +82,111 @@ def register(app: typer.Typer) -> None:
     )(compare)
 
 
+@gathered
 def compare(
     table: Table,
-    features: Named = None,
-    model: Models = None,
-    data: Data = None,
-    dataset: options.Dataset = "auto",
-    limit: options.Limit = None,
-    factors: feature_rows.Factors = "geometry,albedo",
-    method: Annotated[str, typer.Option("--method", help="ward (the paper's), finch or k-means.")] = "ward",
-    counts: Annotated[
-        str, typer.Option("--counts", help="Labelled rows to learn from, with commas between.")
-    ] = "100,500,1000",
-    seeds: Annotated[int, typer.Option("--seeds", min=1, metavar="N", help="Draws of training rows.")] = 5,
+    given: Given,
+    computed: scoring.Computed,
+    published: scoring.Published,
+    method: scoring.Method = "ward",
+    counts: Counts = "100,500,1000",
+    seeds: Seeds = 5,
+    epochs: Epochs = 20,
     untrained_seeds: feature_rows.UntrainedSeeds = 3,
-    resamples: feature_rows.Resamples = 1_000,
-    seed: options.Seed = 0,
-    device: options.Device = "auto",
-    cache: feature_rows.Cache = None,
-    json_file: options.Json = None,
-    markdown: feature_rows.Markdown = None,
-    latex: feature_rows.Latex = None,
-    force: options.Force = False,
 ) -> None:
     """Several models and features under one protocol, beside the paper's own numbers."""
-    from derender.evaluation.feature_rows import check_rows
     from derender.evaluation.tables import table_named
 
-    spec, choices = (
-        table_named(table),
-        Choices(seeds, feature_rows.whole_numbers(counts, "--counts"), method, resamples, seed),
-    )
-    if spec.kind not in RUNNERS:
-        raise ValueError(f"table {table!r} has no command yet; there is {', '.join(RUNNERS)}")
-    feature_rows.refuse_to_replace(force, markdown, latex)
-    if not features and not model:
+    spec = table_named(table)
+    numbers = feature_rows.whole_numbers(counts, "--counts")
+    choices = Choices(seeds, numbers, method, epochs, computed.resamples, computed.seed)
+    published.check()
+    if not given.features and not given.model:
         raise ValueError("give --features NAME=FILE.parquet, or --model NAME=MODEL with --data D")
-    if model and data is None:
+    if given.model and given.data is None:
         raise ValueError("--model needs --data: the pictures to embed")
-    memory = feature_rows.memory_in(cache)
-    pictures = None if data is None else feature_rows.Pictures(data, dataset, limit)
-    chosen = feature_rows.factors_of(factors)
-    rows = feature_rows.rows_from_tables(feature_rows.named_paths(features or (), "--features"), chosen)
-    if model and pictures is not None:
-        named = feature_rows.named_paths(model, "--model")
-        rows += feature_rows.rows_from_models(named, pictures, chosen, device, memory)
+    memory = feature_rows.memory_in(computed.cache)
+    if spec.kind == "segment":
+        tables, values = run_segment(given, choices, computed.device, memory)
+    else:
+        if given.masks is not None:
+            raise ValueError(f"--masks goes with --table segmentation, not with {table}")
+        rows = gather_rows(given, computed, untrained_seeds, memory)
+        tables, values = run_parts(spec, rows, choices, memory)
+    told = {"table": spec.name, "number": spec.number, "parts": values}
+    published.show(tables, told, [scoring.remembered(memory)])
+
+
+def gather_rows(
+    given: Given, computed: scoring.Computed, untrained_seeds: int, memory: "Memory"
+) -> "list[FeatureRow]":
+    """Features from tables and models, then the controls that the pictures give."""
+    from derender.evaluation.feature_rows import check_rows
+
+    pictures = None if given.data is None else feature_rows.Pictures(given.data, given.dataset, given.limit)
+    chosen = feature_rows.factors_of(given.factors)
+    named = feature_rows.named_paths(given.features or (), "--features")
+    rows = feature_rows.rows_from_tables(named, chosen)
+    if given.model and pictures is not None:
+        models = feature_rows.named_paths(given.model, "--model")
+        rows += feature_rows.rows_from_models(models, pictures, chosen, computed.device, memory)
     check_rows(rows)
     if pictures is None:
         say("without --data there are no pixels, PCA and untrained encoder to compare with")
-    else:
-        settings = feature_rows.architecture(rows)
-        size = 64 if settings is None else settings.network.image_size
-        same = feature_rows.aligned(pictures.at(size), rows[0].tables[0].files)
-        taken = range(seed, seed + untrained_seeds)
-        rows += feature_rows.control_rows(same, settings, chosen, taken, device, memory)
+        return rows
+    settings = feature_rows.architecture(rows)
+    size = 64 if settings is None else settings.network.image_size
+    same = feature_rows.aligned(pictures.at(size), rows[0].tables[0].files)
+    taken = computed.from_seed(untrained_seeds)
+    return [*rows, *feature_rows.control_rows(same, settings, chosen, taken, computed.device, memory)]
 
+
+def run_parts(
+    spec: "TableSpec", rows: "list[FeatureRow]", choices: Choices, memory: "Memory"
+) -> "tuple[list[ScoreTable], dict[str, Any]]":
+    """Every question of a table that the labels answer."""
     parts = [part for part in spec.parts if part.columns(rows[0].tables[0])]
     if not parts:
         wanted = " or ".join(", ".join(part.labels) for part in spec.parts)
         have = ", ".join(rows[0].tables[0].labels) or "none"
         raise ValueError(
-            f"table {table!r} needs labels ({wanted}), the features have {have}: embed other data"
+            f"table {spec.name!r} needs labels ({wanted}), the features have {have}: embed other data"
         )
     tables: list[ScoreTable] = []
     values: dict[str, Any] = {}
     for part in parts:
         shown, values[part.name] = RUNNERS[spec.kind](spec, part, rows, choices, memory)
         tables += shown
-    for one in tables:
-        show_scores(one, json_file)
-    say(f"{memory.made} results computed, {memory.recalled} found")
-    write_json(json_file, {"table": spec.name, "number": spec.number, "parts": values})
-    feature_rows.write_tables(tables, markdown, latex)
+    return tables, values
+
+
+def run_segment(
+    given: Given, choices: Choices, device: str, memory: "Memory"
+) -> "tuple[list[ScoreTable], dict[str, Any]]":
+    """The table of segmentation, once for each model."""
+    from derender.evaluation.tables import SEGMENTATION
+
+    if given.features or not given.model or given.data is None:
+        raise ValueError(
+            "table 'segmentation' trains nets from a model's encoders, and features do not do: give --model "
+            "NAME=MODEL with --data D, pictures with masks"
+        )
+    pictures = MaskSource(given.data, given.masks, given.dataset, given.limit)
+    seeds = tuple(range(choices.seed, choices.seed + choices.seeds))
+    tables: list[ScoreTable] = []
+    values: dict[str, Any] = {}
+    for name, paths in feature_rows.named_paths(given.model, "--model").items():
+        if len(paths) > 1:
+            raise ValueError(f"two models have the name {name!r}: give each its own")
+        run = segmented(
+            paths[0], pictures, PAPER_VARIANTS, seeds, memory,
+            epochs=choices.epochs, batch_size=64, resamples=choices.resamples, device=device,
+        )  # fmt: skip
+        tables += [
+            replace(table, caption=f"{name}: {table.caption}") for table in (run.tables[-1], *run.tables[:-1])
+        ]
+        values[name] = {**run.found.numbers(), "differs": run.differs, "paper": SEGMENTATION.paper}
+    return tables, values
 
 
 def run_cluster(
@@ -179,12 +237,7 @@ def run_linear(
     from derender.evaluation.feature_rows import prepare
     from derender.evaluation.linear_compare import compare_linear
     from derender.evaluation.linear_task import choose_rows, task_of
-    from derender.report.tables_comparison import (
-        LINEAR_COLUMNS,
-        linear_part_table,
-        paper_linear_table,
-        verdict_table,
-    )
+    from derender.report.tables_comparison import linear_tables, paper_linear_table
 
     first = rows[0].tables[0]
     ready = prepare(rows, part.columns(first))
@@ -203,12 +256,10 @@ def run_linear(
             progress=report,
         )
     differs = part.differs(str(first.origin.get("layout", "unknown data")), len(task))
-    shown = [paper_linear_table(part.name, spec.number, part.paper, found, differs)]
-    for one in found.parts:
-        caption = f"{one.count:,} labelled rows, {one.head}: above the strongest control?"
-        shown += [linear_part_table(found, one), verdict_table(one.rows, LINEAR_COLUMNS, caption)]
+    shown = [paper_linear_table(part.name, spec.number, part.paper, found, differs), *linear_tables(found)]
     return shown, {**found.numbers(), "differs": differs, "paper": part.paper}
 
 
 Runner = Callable[..., "tuple[list[ScoreTable], Mapping[str, Any]]"]
 RUNNERS: dict[str, Runner] = {"cluster": run_cluster, "linear": run_linear}
+"""By kind of table; ``segment`` takes models instead of features."""

@@ -7,6 +7,7 @@ Leaves out what any single command does.
 import dataclasses
 import json
 import math
+import os
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -33,14 +34,21 @@ if TYPE_CHECKING:
 PLAIN_LINE_EVERY_SECONDS = 30.0
 
 
+def speaks() -> bool:
+    """Whether this process talks to the user: of those that torchrun starts together only the first does."""
+    return "LOCAL_WORLD_SIZE" not in os.environ or os.environ.get("RANK", "0") == "0"
+
+
 def say(text: str) -> None:
     """One note for the person at the terminal."""
-    Console(stderr=True, highlight=False, soft_wrap=True, markup=False).print(text)
+    if speaks():
+        Console(stderr=True, highlight=False, soft_wrap=True, markup=False).print(text)
 
 
 def result(text: str, json_file: str | None) -> None:
     """One line of result; it makes way on standard output where the JSON goes there."""
-    Console(stderr=json_file == "-", highlight=False, soft_wrap=True, markup=False).print(text)
+    if speaks():
+        Console(stderr=json_file == "-", highlight=False, soft_wrap=True, markup=False).print(text)
 
 
 @contextmanager
@@ -50,7 +58,7 @@ def bar(description: str, unit: str = "pictures") -> Iterator[Callable[..., None
     Where standard error is no terminal, a plain line appears every half minute instead.
     """
     console = Console(stderr=True)
-    if not console.is_terminal:
+    if not console.is_terminal or not speaks():
         yield _plain_lines(description, unit)
         return
     columns = (
@@ -115,7 +123,7 @@ def show_scores(scores: "ScoreTable", json_file: str | None) -> None:
 
 def write_json(target: str | None, values: Mapping[str, Any]) -> None:
     """What ``--json`` asks for: a file written whole, or standard output for ``-``; nothing for None."""
-    if target is None:
+    if target is None or not speaks():
         return
     text = json.dumps(plain(values), indent=1, ensure_ascii=False) + "\n"
     if target == "-":

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -9,6 +10,7 @@ import typer
 
 from derender.cli import options
 from derender.cli.baselines import (
+    BaselineCheckpoint,
     BaselineComponents,
     BaselineFeatures,
     BaselineImageSize,
@@ -24,6 +26,7 @@ if TYPE_CHECKING:
 
 NAMED = 5
 """So many unreadable pictures are named."""
+ENGINES = ("local", "ray")
 
 
 def register(app: typer.Typer) -> None:
@@ -42,6 +45,7 @@ def embed(
         ),
     ] = None,
     baseline: BaselineName = None,
+    checkpoint: BaselineCheckpoint = None,
     features: BaselineFeatures = None,
     image_size: BaselineImageSize = 64,
     components: BaselineComponents = 64,
@@ -51,6 +55,12 @@ def embed(
     limit: options.Limit = None,
     batch_size: options.BatchSize = 256,
     device: options.Device = "auto",
+    engine: Annotated[
+        str, typer.Option("--engine", help="local, or ray: on the machines of a Ray cluster.", metavar="NAME")
+    ] = "local",
+    workers: Annotated[
+        int | None, typer.Option("--workers", min=1, metavar="N", help="Of --engine ray; default: 2.")
+    ] = None,
     force: options.Force = False,
     json_file: options.Json = None,
 ) -> None:
@@ -60,8 +70,11 @@ def embed(
     that was stopped goes on where it was when the command is given again.
     """
     out_of_the_way(out, force)
+    _check_engine(engine, workers, part)
     from derender.cli.models import open_model
+    from derender.data.stream import stream_of
     from derender.features import embed_to_file
+    from derender.features.ray_engine import ray_engine
 
     if baseline is not None:
         from derender.cli.baselines import CONTROLS, checked, open_baseline, write_control
@@ -73,9 +86,12 @@ def embed(
             )  # fmt: skip
             return
         net = open_baseline(
-            baseline, model, device=device, features=features, image_size=image_size, seed=seed
-        )
-        origin = {"source": model, "baseline": baseline}
+            baseline, model, device=device, features=features, image_size=image_size, seed=seed,
+            checkpoint=checkpoint,
+        )  # fmt: skip
+        origin = {"source": model or checkpoint, "baseline": baseline}
+    elif checkpoint is not None:
+        raise ValueError("--checkpoint is a published e4e file: give it with --baseline e4e")
     elif model is None:
         raise ValueError("give --model RUN, or --baseline NAME (see derender embed --help)")
     else:
@@ -89,7 +105,13 @@ def embed(
             fresh=force,
             progress=report,
             origin=origin,
-        )
+            engine=None
+            if engine == "local"
+            else ray_engine(
+                net, partial(stream_of, data, dataset=dataset, limit=limit), workers=workers or 2,
+                batch_size=batch_size,
+            ),
+        )  # fmt: skip
         say(_account(done, source))
     sizes = ", ".join(f"{name} {size}" for name, size in done.factors.items())
     result(f"{done.rows:,} rows in {out}: {sizes}", json_file)
@@ -106,6 +128,17 @@ def embed(
             "resumed": done.resumed,
         },
     )
+
+
+def _check_engine(engine: str, workers: int | None, part: str) -> None:
+    from derender.data.nearest import nearest
+
+    if engine not in ENGINES:
+        raise ValueError(f"no engine {engine!r}{nearest(engine, ENGINES)}: choose {' or '.join(ENGINES)}")
+    if engine == "local" and workers is not None:
+        raise ValueError("--workers belongs to --engine ray: leave it out, every core is used")
+    if engine == "ray" and part != "all":
+        raise ValueError("--engine ray embeds all of a data set: leave --part out")
 
 
 @contextmanager

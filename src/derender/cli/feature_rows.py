@@ -167,11 +167,6 @@ class Source:
         assert self.pictures is not None
         return aligned(self.pictures.at(image_size), files)
 
-    def remembered(self) -> str:
-        """One line on what was computed and what was not."""
-        folder = "" if self.memory.folder is None else f" in {self.memory.folder}"
-        return f"{self.memory.made} results computed, {self.memory.recalled} found{folder}"
-
 
 def aligned(pictures: "PictureSet", files: Sequence[str]) -> "PictureSet":
     """The pictures with these names, in this order."""
@@ -239,8 +234,12 @@ def control_rows(
     seeds: Sequence[int],
     device: str,
     memory: "Memory",
+    fit_on: "PictureSet | None" = None,
 ) -> "list[FeatureRow]":
-    """An untrained encoder for each seed (if ``settings`` of an architecture are known), PCA and pixels."""
+    """An untrained encoder for each seed (if ``settings`` of an architecture are known), PCA and pixels.
+
+    PCA's components are those of ``fit_on``, by default of the pictures themselves.
+    """
     from derender.baselines.controls import pca_features, pixel_features
     from derender.cli.models import chosen_device
     from derender.evaluation.feature_rows import FeatureRow
@@ -254,13 +253,15 @@ def control_rows(
             table = embedded(twin, pictures, memory, f"untrained encoder {seed}")
             tables.append(replace(table, origin={**table.origin, "control": "untrained", "seed": seed}))
         rows.append(FeatureRow("untrained encoder", tuple(tables), factors, control=True))
-    components = max(1, min(64, len(pictures) // 4))  # whitening needs many more rows than components
+    fitted = pictures if fit_on is None else fit_on
+    components = max(1, min(64, len(fitted) // 4))  # whitening needs many more rows than components
+    apart = {} if fit_on is None else {"fit_on": fit_on.images}
     pca = remembered(
         memory,
         "pca",
-        {"images": pictures.images, "components": components},
+        {"images": pictures.images, "components": components, **apart},
         pictures,
-        lambda: pca_features(pictures, components=components),
+        lambda: pca_features(pictures, components=components, fit_on=fitted),
     )
     rows.append(FeatureRow(f"PCA ({components})", (pca,), control=True))
     rows.append(FeatureRow("pixels", (pixel_features(pictures),), control=True))

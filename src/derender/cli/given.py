@@ -1,6 +1,7 @@
 """What the commands that take pictures by name share: reading them, where their folders lie, finer scenes.
 
-A picture that cannot be read is left out and named at the end (exit code 2); the others are done.
+A picture that cannot be read is left out and named at the end (exit code 2); the others are done. One that is
+unlike what the model was validated on is done too, and named.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -142,12 +143,58 @@ def batch_that_fits(batch_size: int, size: int | None) -> int:
     return batch_size if size is None else max(1, min(batch_size, PIXELS_AT_ONCE // size**2))
 
 
-def finish(given: Given, out: Path, written: Sequence[Any], json_file: str | None, **more: Any) -> None:
-    """Name what was left out, say what was done, write the JSON; exit code 2 if something was left out."""
+def percentiles(source: str, net: "Derenderer", pictures: "Mapping[Path, np.ndarray]") -> dict[Path, float]:
+    """Each picture's reconstruction percentile; empty where the model has nothing to compare with.
+
+    It only informs: a file that is damaged is told and passed over.
+    """
+    import numpy as np
+
+    from derender.evaluation.oddness import reconstruction_percentile
+    from derender.model import model_folder
+    from derender.training.held_out_errors import read_errors
+
+    try:
+        held_out = read_errors(model_folder(source))
+    except (ValueError, OSError) as problem:
+        say(f"cannot tell odd pictures: {problem}")
+        return {}
+    if held_out is None:
+        return {}
+    found = reconstruction_percentile(net, np.stack(list(pictures.values())), held_out)
+    return dict(zip(pictures, found.tolist(), strict=True))
+
+
+def tell_odd(found: Mapping[Path, float]) -> None:
+    """Name every picture that the model renders again worse than nearly all it was validated on."""
+    from derender.evaluation.oddness import ODD_PERCENTILE
+
+    for path, percentile in found.items():
+        if percentile > ODD_PERCENTILE:
+            say(
+                f"{path}: reconstructed worse than {ODD_PERCENTILE:g} % of the pictures this model was "
+                "validated on; it may not be what the model knows"
+            )
+
+
+def finish(
+    given: Given,
+    out: Path,
+    written: Sequence[Any],
+    json_file: str | None,
+    odd: Mapping[Path, float] | None = None,
+    **more: Any,
+) -> None:
+    """Name what was left out or is odd, say what was done, write the JSON; exit code 2 if one was left out.
+
+    ``odd`` has the reconstruction percentile of each picture.
+    """
     for path, reason in given.refused.items():
         say(f"left out {path}: {reason}")
+    tell_odd(odd or {})
     count = "1 picture" if len(written) == 1 else f"{len(written):,} pictures"
     result(f"{count} in {out}", json_file)
-    write_json(json_file, {"out": out, "pictures": written, "refused": given.refused, **more})
+    told = {"reconstruction_percentile": {str(path): value for path, value in (odd or {}).items()}}
+    write_json(json_file, {"out": out, "pictures": written, "refused": given.refused, **told, **more})
     if given.refused:
         raise typer.Exit(2)

@@ -7,7 +7,16 @@ import typer
 
 from derender.cli import options
 from derender.cli.console import bar
-from derender.cli.given import PictureFiles, Size, Texture, finish, given_pictures, refining, scenes_of
+from derender.cli.given import (
+    PictureFiles,
+    Size,
+    Texture,
+    finish,
+    given_pictures,
+    percentiles,
+    refining,
+    scenes_of,
+)
 
 DEFAULT_SIZE = 128
 
@@ -66,7 +75,7 @@ def mesh(
                 }
             )
             report(len(written), len(given.folders))
-    finish(given, out, written, json_file)
+    finish(given, out, written, json_file, percentiles(model, net, given.pictures))
 
 
 def _border(columns: int, model_size: int, size: int) -> int:

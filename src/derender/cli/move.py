@@ -20,6 +20,7 @@ from derender.cli.given import (
     finish,
     given_pictures,
     one_picture,
+    percentiles,
     refining,
     scenes_of,
 )
@@ -208,6 +209,8 @@ class _Work:
         self.refine = refining(self.net, size, texture)
         self.given: Given = given_pictures(images, self.net.image_size, out, force)
         self.scenes = scenes_of(self.net, self.given, 64)
+        self.odd = percentiles(model, self.net, self.given.pictures)
+        self.model = model
 
     def other(self, path: Path) -> "tuple[Scene, dict[str, Any]]":
         """The scene of a further picture, and the picture as a labelled image."""
@@ -215,6 +218,7 @@ class _Work:
 
         picture = one_picture(path, self.net.image_size)
         (scene,) = scenes_of(self.net, Given({path: picture}, [], {}), 1)
+        self.odd |= percentiles(self.model, self.net, {path: picture})
         return self._finer(scene, path), {"the other": pictures(picture[None])[0]}
 
     def write(self, moved: "Callable[[Scene, dict[str, Any]], Moved]", json_file: str | None, seconds: float):
@@ -240,7 +244,7 @@ class _Work:
                 sheets.add(path.name, made.columns)
                 report(len(written), len(self.scenes))
         paths = write_sheets(sheets, self.out) if len(sheets) > 1 else []
-        finish(self.given, self.out, written, json_file, sheets=paths)
+        finish(self.given, self.out, written, json_file, self.odd, sheets=paths)
 
     def _finer(self, scene: "Scene", path: Path) -> "Scene":
         return scene if self.refine is None else self.refine(scene, [path])

@@ -13,6 +13,7 @@ from derender.cli.given import (
     batch_that_fits,
     finish,
     given_pictures,
+    percentiles,
     refining,
 )
 
@@ -62,4 +63,5 @@ def decompose(
             progress=report,
             keep=keep if sheet else None,
         )
-    finish(given, out, written, json_file, sheets=write_sheets(sheets, out))
+    odd = percentiles(model, net, given.pictures)
+    finish(given, out, written, json_file, odd, sheets=write_sheets(sheets, out))

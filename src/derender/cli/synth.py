@@ -7,7 +7,7 @@ from typing import Annotated, TypeVar
 import typer
 
 from derender.cli import options
-from derender.cli.console import bar, result, say, write_json
+from derender.cli.console import bar, result, write_json
 
 Kind = TypeVar("Kind")
 ImageSize = Annotated[
@@ -109,12 +109,11 @@ def faces(
     source = None if model is None else MorphableFaces.read(model)
     with bar("generating") as report:
         made = generator.generate(count, image_size, seed, settings, report, model=source)
-    say(f"writing to {out}")
-    with whole_folder(out) as folder:
+    with bar("writing") as report, whole_folder(out) as folder:
         if tracks:
-            write_tracks(made, folder)
+            write_tracks(made, folder, report)
         else:
-            write(made, folder, truth)
+            write(made, folder, truth, report)
     people = len(set(made.identity.tolist()))
     result(f"{count:,} faces of {people:,} people in {out}", json_file)
     facts = {"out": out, "count": count, "identities": people, "image_size": image_size, "seed": seed}
@@ -153,9 +152,8 @@ def cars(
     settings = changed(settings, [*asked, *(overrides or [])])
     with bar("generating") as report:
         made = generator.generate(count, image_size, seed, settings, report)
-    say(f"writing to {out}")
-    with whole_folder(out) as folder:
-        write(made, folder, truth)
+    with bar("writing") as report, whole_folder(out) as folder:
+        write(made, folder, truth, report)
     models = len(set(made.identity.tolist()))
     result(f"{count:,} pictures of {models:,} cars in {out}", json_file)
     facts = {"out": out, "count": count, "models": models, "image_size": image_size, "seed": seed}

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from derender.cli import options
-from derender.cli.console import bar, duration, result, say, write_json
+from derender.cli.console import bar, duration, result, say, speaks, write_json
 
 
 def register(app: typer.Typer) -> None:
@@ -23,15 +23,29 @@ def train(
     model: Annotated[
         str,
         typer.Option(
-            "--model", help="derender, or a baseline: vqvae, simclr, ae, beta-vae, resnet18.", metavar="NAME"
+            "--model",
+            help="derender, or a baseline: vqvae, simclr, ae, beta-vae, resnet18, stylegan2, e4e, ris.",
+            metavar="NAME",
         ),
     ] = "derender",
     preset: Annotated[
         str | None,
         typer.Option("--preset", help="faces, cars, cats, paper, or small for a CPU; default: faces."),
     ] = None,
+    start_from: Annotated[
+        str | None,
+        typer.Option(
+            "--start-from",
+            help="Begin with a trained model's weights: a run folder, a bundled name or a Hub id.",
+            metavar="MODEL",
+        ),
+    ] = None,
     loocc: Annotated[
         str | None, typer.Option("--loocc", help="Contrast over none, light, light+camera or all factors.")
+    ] = None,
+    generator: Annotated[
+        str | None,
+        typer.Option("--generator", help="Of e4e: the stylegan2 run, or its published .pt.", metavar="RUN"),
     ] = None,
     overrides: Annotated[
         list[str] | None,
@@ -48,7 +62,8 @@ def train(
     from derender.settings import Settings
     from derender.training.config import TrainConfig, resolve, to_yaml
 
-    settings_given = preset is not None or loocc is not None or bool(overrides)
+    overrides = [*(overrides or ()), *([] if generator is None else [f"generator={generator}"])]
+    settings_given = preset is not None or loocc is not None or start_from is not None or bool(overrides)
 
     def configuration() -> Settings:
         if resume and not settings_given and (out / "config.yaml").is_file():
@@ -59,7 +74,7 @@ def train(
             from derender.cli.baselines import baseline_config
 
             return baseline_config(model, overrides or [], preset=preset, loocc=loocc)
-        return resolve(preset or "faces", overrides or [], objective__loocc=loocc)
+        return resolve(preset or "faces", overrides or [], objective__loocc=loocc, start_from=start_from)
 
     config = configuration()
     if dry_run:
@@ -71,17 +86,19 @@ def train(
     from derender.cli.models import chosen_device
     from derender.data import read_pictures
     from derender.report.run import decomposition_sheet, run_page
+    from derender.training.distributed import first_then_others, leave, open_fabric
     from derender.training.loop import Progress
     from derender.training.loop import train as train_model
 
     if resume and not (out / "config.yaml").is_file():
         raise FileNotFoundError(f"no run to resume in {out} (no config.yaml): train without --resume first")
     accelerator = chosen_device(device)
-    if out.exists() and any(out.iterdir() if out.is_dir() else [out]) and not resume:
+    fabric = open_fabric(accelerator)
+    if speaks() and out.exists() and any(out.iterdir() if out.is_dir() else [out]) and not resume:
         raise FileExistsError(
             f"{out} exists and is not empty: add --resume to go on with that run, or choose another --out"
         )
-    with bar("reading") as report:
+    with first_then_others(fabric, local=True), bar("reading") as report:
         pictures = read_pictures(data, picture_size(config), dataset=dataset, limit=limit, progress=report)
     say(pictures.describe())
     if pictures.terms:
@@ -92,14 +109,19 @@ def train(
             if progress.phase == "train":
                 speed = f"{progress.images_per_second:.0f} pictures/s"
                 report(progress.done, progress.total, speed, description="training", unit="pictures")
-            else:
+            elif progress.phase == "perceptual":
                 report(progress.done, progress.total, description="perceptual features", unit="steps")
+            else:
+                report(progress.done, progress.total, description="whitening features", unit="pictures")
 
         how = {"resume": resume, "progress": show, "accelerator": accelerator}
         if isinstance(config, TrainConfig):
             trained = train_model(config, pictures, out, sample_sheet=decomposition_sheet, **how)
         else:
             trained = train_baseline(config, pictures, out, **how)
+    leave()
+    if not speaks():
+        return
     page = run_page(out).write(out / "report.html")
     for finding in trained.findings:
         say(f"{finding.sign}: {finding.text}; {finding.advice}")

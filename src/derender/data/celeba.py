@@ -6,15 +6,16 @@ the attributes must be there. Aligned pictures (``img_align_celeba``, 178 x 218)
 in the wild (``img_celeba``, any size) show a scene with a face in it, so each gets a square box about its
 face:
 
-- from ``list_landmarks_celeba.txt``, the box of CelebA-HQ without its rotation (Karras et al.,
+- from a list of the user's own (data/box_list.py), those boxes as they are;
+- else from ``list_landmarks_celeba.txt``, the box of CelebA-HQ without its rotation (Karras et al.,
   Progressive Growing of GANs, 2018, appendix C): with the eyes' middle E, their distance e, the middle of
   the mouth's corners M and m = |E - M|, the side is max(4 e, 3.6 m) and the middle E + 0.1 (E - M);
 - else from ``list_bbox_celeba.txt``, the square about the middle of the owners' box whose side is the
   box's longer one.
 
 unsup3d was trained on its own crops of the pictures in the wild. It publishes those boxes as a list, and
-not the rule behind them (github.com/elliottwu/unsup3d, issue 30), so these boxes resemble its crops and
-are not the same.
+not the rule behind them (github.com/elliottwu/unsup3d, issue 30): without that list in the folder the boxes
+resemble its crops and are not the same.
 """
 
 from collections.abc import Sequence
@@ -24,6 +25,7 @@ from pathlib import PurePosixPath
 import numpy as np
 from jaxtyping import Float32
 
+from derender.data.box_list import BOX_LISTS, read_box_list
 from derender.data.layout import Labels, Layout, Table, part_of, text_column
 from derender.data.source import Source
 
@@ -140,7 +142,7 @@ def _read_celeba(source: Source, subset: str | None) -> Table:
     identities = read_listing(source, "identity_CelebA")
     if identities is not None:
         labels["identity"] = text_column(identities.rows.get(name, [""])[0] for name in names)
-    boxes = _face_boxes(source, names) if in_the_wild else None
+    boxes = _face_boxes(source, files, names) if in_the_wild else None
     table = Table(files, labels, partition_of(source, names), boxes)
     return part_of(table, source, subset, "list_eval_partition.txt")
 
@@ -159,8 +161,11 @@ def _pictures(source: Source) -> tuple[tuple[str, ...], bool]:
     return source.pictures, False
 
 
-def _face_boxes(source: Source, names: Sequence[str]) -> Float32[np.ndarray, "n 4"]:
-    """A square about each face in the wild (left, top, right, bottom); NaN for a picture without a row."""
+def _face_boxes(source: Source, files: Sequence[str], names: Sequence[str]) -> Float32[np.ndarray, "n 4"]:
+    """A box about each face in the wild (left, top, right, bottom); NaN for a picture without a row."""
+    own = read_box_list(source, files)
+    if own is not None:
+        return own
     for stem, columns, square in (
         ("list_landmarks_celeba", _EYES_AND_MOUTH, _square_of_landmarks),
         ("list_bbox_celeba", _BOX, _square_of_box),
@@ -171,7 +176,8 @@ def _face_boxes(source: Source, names: Sequence[str]) -> Float32[np.ndarray, "n 
     raise ValueError(
         f"{source.path} holds CelebA's pictures in the wild (img_celeba), which are cropped to their "
         f"face, but neither list_landmarks_celeba.txt nor list_bbox_celeba.txt; the owners publish both "
-        f"at {HOME}"
+        f"at {HOME}. A list of your own may stand in for them: {BOX_LISTS[0]}, with rows of "
+        f"file,left,top,width,height"
     )
 
 

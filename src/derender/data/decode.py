@@ -97,7 +97,11 @@ def check_fit(fit: str) -> None:
 
 
 def decode(
-    encoded: bytes, image_size: int, fit: str = "crop", box: Float32[np.ndarray, "4"] | None = None
+    encoded: bytes,
+    image_size: int,
+    fit: str = "crop",
+    box: Float32[np.ndarray, "4"] | None = None,
+    pixel_limit: int = PIXEL_LIMIT,
 ) -> UInt8[np.ndarray, "3 s s"]:
     """Decode one picture; ``Unreadable`` if that cannot be done. Wrap many calls in ``quiet_pillow``."""
     if box is not None and not (np.isfinite(box).all() and (box[2:] > box[:2]).all()):
@@ -105,8 +109,8 @@ def decode(
     try:
         with Image.open(io.BytesIO(encoded), formats=_known_formats()) as opened:
             width, height = opened.size
-            if width * height > PIXEL_LIMIT:
-                raise Unreadable(f"{width} x {height} is more than {PIXEL_LIMIT // 10**6} million pixels")
+            if width * height > pixel_limit:
+                raise Unreadable(f"{width} x {height} is more than {pixel_limit // 10**6} million pixels")
             _reduce_while_decoding(opened, image_size, fit, box)
             if box is not None:
                 box = box * (opened.size[0] / width)

@@ -144,7 +144,7 @@ def run_demo(
     def training_report(progress: Progress) -> None:
         if progress.phase == "train":
             tell(STAGES[2], progress.done, progress.total, f"{progress.images_per_second:.0f} pictures/s")
-        else:
+        elif progress.phase == "perceptual":
             clock.lap(STAGES[1])
             tell(STAGES[1], progress.done, progress.total, "")
 

@@ -110,7 +110,7 @@ def compare_linear(
         for count, own in rows.train.items():
             answers: dict[str, np.ndarray] = {}
             for name, arrays in features.items():
-                answers[name] = _probe_runs(head, arrays, task, own, rows.test, seeds, settings, memory)
+                answers[name] = probe_runs(head, arrays, task, own, rows.test, seeds, settings, memory)
                 done += 1
                 if progress is not None:
                     progress(done, total)
@@ -122,7 +122,7 @@ def compare_linear(
     return LinearComparison(tuple(parts), task.kind, task.names, len(rows.test), dropped, tuple(seeds))
 
 
-def _probe_runs(
+def probe_runs(
     head: str,
     arrays: Sequence[np.ndarray],
     task: Task,

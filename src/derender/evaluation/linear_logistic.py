@@ -17,6 +17,7 @@ from scipy.special import expit, log_softmax, softmax
 PENALTIES = (1e-2, 1e-1, 1.0, 1e1, 1e2, 1e3)
 """C for rows whose mean squared length is 1: standardised features divided by the root of their number."""
 FOLDS = 5
+BLOCK_ROWS = 1_024
 
 
 @dataclass(frozen=True)
@@ -29,7 +30,9 @@ class Axes:
 
     def apply(self, features: np.ndarray) -> np.ndarray:
         """(N, D) features as (N, R)."""
-        return ((np.asarray(features, np.float64) - self.mean) / self.scale) @ self.rotation
+        blocks = [features[start : start + BLOCK_ROWS] for start in range(0, len(features), BLOCK_ROWS)]
+        turned = [((np.asarray(b, np.float64) - self.mean) / self.scale) @ self.rotation for b in blocks]
+        return np.concatenate(turned) if turned else np.zeros((0, self.rotation.shape[1]))
 
 
 def axes_of(features: np.ndarray) -> Axes:
@@ -73,7 +76,8 @@ def fit_logistic(
     """
     if len(features) < folds or folds < 2:
         raise ValueError(
-            f"{len(features)} rows cannot be cut into {folds} folds: ask for 2 to {len(features)}"
+            f"{len(features)} rows cannot be cut into {folds} folds: a penalty is chosen on {max(folds, 2)} "
+            "labelled rows or more; give more, or choose the linear or the k-NN head"
         )
     axes = axes_of(features)
     rows, labels, groups = axes.apply(features), np.asarray(targets, np.float64), targets.shape[1]
@@ -149,7 +153,8 @@ def solve_logistic(
 
 
 def _logits_of(design: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    return (design @ weights.reshape(len(weights), -1)).reshape(len(design), *weights.shape[1:])
+    problems = int(np.prod(weights.shape[1:]))  # constant features leave no axis: 0 weights, many problems
+    return (design @ weights.reshape(len(weights), problems)).reshape(len(design), *weights.shape[1:])
 
 
 def _slope(design: np.ndarray, residual: np.ndarray) -> np.ndarray:

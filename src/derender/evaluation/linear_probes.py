@@ -42,8 +42,7 @@ def probe(
         settings: of the paper's head.
         memory: where answers are kept.
     """
-    if head not in HEADS:
-        raise ValueError(f"unknown head {head!r}{nearest(head, HEADS)}; there is {', '.join(HEADS)}")
+    check_head(head)
     features = finite_rows(features, "a linear probe").astype(np.float32)
     inputs = {
         "features": features,
@@ -76,6 +75,12 @@ def probe(
         return {"probabilities": answers.astype(np.float32)}
 
     return (memory or Memory()).recall(f"probe-{head}", inputs, make)["probabilities"]
+
+
+def check_head(head: str) -> None:
+    """A kind of probe that is none is an error that names the nearest."""
+    if head not in HEADS:
+        raise ValueError(f"unknown head {head!r}{nearest(head, HEADS)}; there is {', '.join(HEADS)}")
 
 
 def nearest_answers(

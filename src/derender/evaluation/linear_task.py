@@ -97,15 +97,7 @@ def choose_rows(
         partition: the owners' split; where it has "test" rows, these are tested and no others.
         groups: (N,) labels that must not lie on both sides, such as identities.
     """
-    known = task.known
-    if partition is not None and (np.asarray(partition) == "test").any():
-        test = np.flatnonzero(known & (np.asarray(partition) == "test"))
-        pool = np.flatnonzero(known & (np.asarray(partition) != "test"))
-    else:
-        if not 0 < test_fraction < 1:
-            raise ValueError(f"the tested share must lie between 0 and 1, got {test_fraction}")
-        split = split_indices(files, (1 - test_fraction, 0.0, test_fraction), groups=groups)
-        test, pool = split.test[known[split.test]], split.train[known[split.train]]
+    pool, test = divide_rows(task, files, test_fraction=test_fraction, partition=partition, groups=groups)
     if not len(seeds):
         raise ValueError("a linear probe needs at least one seed")
     if not len(counts) or min(counts) < 2 or max(counts) > len(pool) or len(test) < 2:
@@ -115,6 +107,25 @@ def choose_rows(
         )
     orders = [np.random.default_rng(seed).permutation(pool) for seed in seeds]
     return Rows(test, {count: np.stack([order[:count] for order in orders]) for count in counts})
+
+
+def divide_rows(
+    task: Task,
+    files: Sequence[str],
+    *,
+    test_fraction: float = 0.5,
+    partition: np.ndarray | None = None,
+    groups: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Labelled rows that may be learned from, and those that are tested; arguments as in ``choose_rows``."""
+    known = task.known
+    if partition is not None and (np.asarray(partition) == "test").any():
+        tested = np.asarray(partition) == "test"
+        return np.flatnonzero(known & ~tested), np.flatnonzero(known & tested)
+    if not 0 < test_fraction < 1:
+        raise ValueError(f"the tested share must lie between 0 and 1, got {test_fraction}")
+    split = split_indices(files, (1 - test_fraction, 0.0, test_fraction), groups=groups)
+    return split.train[known[split.train]], split.test[known[split.test]]
 
 
 def _column(values: np.ndarray, name: str) -> tuple[list[Any], np.ndarray]:

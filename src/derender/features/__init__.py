@@ -2,7 +2,7 @@
 
 table: the value; parquet: its file; extract: model and pictures in, table out; transformer: the same for
     scikit-learn; embedding: any source to a file, never whole in memory (batches, parts: its halves);
-    search: nearest rows by one factor.
+    blocks, ray_engine: the same on many machines; search: nearest rows by one factor.
 """
 
 from derender.features.embedding import Embedded, embed_to_file

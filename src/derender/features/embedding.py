@@ -23,6 +23,7 @@ from derender.data.decode import READER_VERSION, quiet_pillow
 from derender.data.stream import Stream, ahead, decoded
 from derender.data.stream.collect import estimated_total
 from derender.features.batches import Batch, Rows, batches_of_chunks, batches_of_set
+from derender.features.blocks import Computed, Engine
 from derender.features.extract import (
     Progress,
     as_batch,
@@ -79,6 +80,7 @@ def embed_to_file(
     workers: int | None = None,
     progress: Progress | None = None,
     origin: Mapping[str, Any] | None = None,
+    engine: Engine | None = None,
 ) -> Embedded:
     """Run a model's encoders over a stream or set and write the table, going on where an earlier run stopped.
 
@@ -93,6 +95,7 @@ def embed_to_file(
         workers: decoding threads; by default one for each core.
         progress: called with (pictures done, estimated total) after every batch.
         origin: further facts for the table.
+        engine: who reads and computes a stream, if not this process (ray_engine.py).
 
     Raises:
         ValueError: no picture can be read, a feature is not finite, or the parts are of another run.
@@ -121,24 +124,31 @@ def embed_to_file(
     parts = Parts(path.with_name(f"{path.name}.partial"), plan, fresh=fresh)
     resumed = parts.so_far.rows
 
-    def chunks() -> AbstractContextManager[Iterator[Batch]]:
+    @contextmanager
+    def here() -> Iterator[Iterator[Computed]]:
         start = parts.so_far.following
         if isinstance(source, PictureSet):
-            return nullcontext(batches_of_set(source, batch_size, start))
-        pixels = decoded(source, model.image_size, fit=fit, start=start, workers=workers)
-        return ahead(batches_of_chunks(pixels, batch_size, parts.seen(), keep_duplicates=keep_duplicates), 2)
+            chunks = nullcontext(batches_of_set(source, batch_size, start))
+        else:
+            pixels = decoded(source, model.image_size, fit=fit, start=start, workers=workers)
+            copies = {"keep_duplicates": keep_duplicates}
+            chunks = ahead(batches_of_chunks(pixels, batch_size, parts.seen(), **copies), 2)
+        with quiet_pillow(), evaluating(model), chunks as batches:
+            yield (_computed(model, batch) for batch in batches)
+
+    def elsewhere() -> AbstractContextManager[Iterator[Computed]]:
+        assert engine is not None
+        if isinstance(source, PictureSet):
+            raise ValueError("one part of a split is embedded in this process: leave the engine out")
+        return engine(source, parts.so_far.following, parts.seen())
 
     try:
-        with quiet_pillow(), evaluating(model), chunks() as batches, _writing(parts) as add:
-            for batch in batches:
-                codes = {}
-                if batch.images is not None:
-                    codes = factor_codes(model, as_batch(batch.images, model.device))
-                    check_finite(codes, batch.rows.files)
-                add(batch.rows, codes)
+        with here() if engine is None else elsewhere() as computed, _writing(parts) as add:
+            for rows, codes, share in computed:
+                check_finite(codes, rows.files)
+                add(rows, codes)
                 if progress is not None:
-                    done = batch.rows.following
-                    progress(done, estimated_total(done, batch.share, limit))
+                    progress(rows.following, estimated_total(rows.following, share, limit))
     except Exception:
         parts.remove_if_empty()
         raise
@@ -152,6 +162,12 @@ def embed_to_file(
     if progress is not None:
         progress(parts.so_far.following, parts.so_far.following)
     return _finish(parts, path, source, facts, resumed)
+
+
+def _computed(model: Any, batch: Batch) -> Computed:
+    if batch.images is None:
+        return batch.rows, {}, batch.share
+    return batch.rows, factor_codes(model, as_batch(batch.images, model.device)), batch.share
 
 
 @contextmanager

@@ -19,9 +19,9 @@ T = TypeVar("T")
 
 
 def model_fingerprint(model: nn.Module) -> str:
-    """16 hexadecimal digits that change when a weight, its name or its shape changes."""
+    """16 hexadecimal digits that change when a weight or a buffer, its name or its shape changes."""
     digest = hashlib.sha256()
-    for name, value in sorted(model.state_dict().items()):
+    for name, value in sorted({**model.state_dict(), **dict(model.named_buffers())}.items()):
         array = value.detach().cpu().contiguous()
         digest.update(f"{name} {array.dtype} {tuple(array.shape)}".encode())
         digest.update(array.reshape(-1).view(torch.uint8).numpy())

@@ -79,7 +79,8 @@ def _at_features(
     encoder = model.nets[factor].encoder
     with torch.enable_grad():
         features = encoder.spatial(images).detach().requires_grad_()
-        answer = score(encoder.to_code(features).flatten(1), weight).sum()
+        code = encoder.to_code(features).flatten(1)
+        answer = score(model.features({factor: code})[factor], weight).sum()
         (gradient,) = torch.autograd.grad(answer, features)
     return features.detach(), gradient
 
@@ -94,7 +95,8 @@ def pixel_attribution(
     """|IG| of the pixels from a grey picture, summed over colours, and the relative completeness error."""
 
     def answer(pictures: Tensor, own: Tensor | None = None) -> Tensor:
-        return score(model.nets[factor].encode(pictures), own)
+        code = model.nets[factor].encode(pictures)
+        return score(model.features({factor: code})[factor], own)
 
     grey = torch.full_like(images[:1], GREY)
     with torch.enable_grad():

@@ -12,11 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from derender.render.rasterize import rasterize
-from derender.render.sample import sample
-from derender.scene.camera import focal_px, to_camera, unproject
-from derender.scene.light import lambert_shading
-from derender.scene.normals import normals_from_depth
+from derender.render import shading, warping
 from derender.scene.scene import Scene
 
 
@@ -44,7 +40,7 @@ def render(
     backend: str = "auto",
 ) -> Rendering:
     """Render a batch of canonical surfaces; gradients reach all four inputs (conventions as in ``Scene``)."""
-    return warp(shade(depth, albedo, light, fov_deg), depth, camera, fov_deg, backend)
+    return warp(shade(depth, albedo, light, fov_deg, backend), depth, camera, fov_deg, backend)
 
 
 def render_scene(scene: Scene, fov_deg: float = 10.0, backend: str = "auto") -> Rendering:
@@ -52,7 +48,9 @@ def render_scene(scene: Scene, fov_deg: float = 10.0, backend: str = "auto") -> 
     return render(scene.depth, scene.albedo, scene.light, scene.camera, fov_deg, backend)
 
 
-def shade(depth: Tensor, albedo: Tensor, light: Tensor, fov_deg: float = 10.0) -> Float[Tensor, "n 3 h w"]:
+def shade(
+    depth: Tensor, albedo: Tensor, light: Tensor, fov_deg: float = 10.0, backend: str = "auto"
+) -> Float[Tensor, "n 3 h w"]:
     """The canonical image: albedo times shading, before any camera. Shade once, warp to many cameras."""
     count, height, width = _map_size(depth)
     depth, albedo, light = _checked(
@@ -61,7 +59,7 @@ def shade(depth: Tensor, albedo: Tensor, light: Tensor, fov_deg: float = 10.0) -
         light=(light, (count, 4)),
     )
     with torch.autocast(depth.device.type, enabled=False):
-        return albedo * lambert_shading(normals_from_depth(depth, fov_deg), light)
+        return shading.shade(depth, albedo, light, fov_deg, backend)
 
 
 def warp(
@@ -76,16 +74,15 @@ def warp(
         camera=(camera, (count, 6)),
     )
     with torch.autocast(depth.device.type, enabled=False):
-        vertices = to_camera(unproject(depth.double(), fov_deg), camera.double())
-        seen = rasterize(vertices, focal_px(width, fov_deg), backend)
-        uv, mask = seen.uv.to(image.dtype), seen.mask.to(image.dtype)
-        return Rendering(sample(image, uv, mask, backend), seen.depth.to(image.dtype), mask)
+        return Rendering(*warping.warp(image, depth, camera, fov_deg, backend))
 
 
 def _map_size(depth: Tensor) -> tuple[int, int, int]:
     if depth.dim() != 3:
         raise ValueError(f"render: depth must have shape (N, H, W), got {tuple(depth.shape)}")
     count, height, width = depth.shape
+    if height < 2 or width < 2:
+        raise ValueError(f"render: depth maps need at least 2x2 pixels, got {height}x{width}")
     return count, height, width
 
 

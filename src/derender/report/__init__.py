@@ -13,4 +13,5 @@ score_table   scores beside controls as a value
 blocks, page  one self-contained HTML file
 files, moved  a decomposition, and sweeps and swaps, on disk
 run           the page of a training run
+viewer/       the page one can play with, and its server
 """

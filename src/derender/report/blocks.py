@@ -83,6 +83,13 @@ def image(source: Image.Image | bytes, alt: str, width: int | None = None) -> Ht
     return Html(f'<img alt="{escape(alt)}"{size} src="{_data_uri(content)}">')
 
 
+def wide(content: Html, alt: str) -> Html:
+    """An image with small parts: on a narrow screen it keeps a readable width and scrolls by itself."""
+    return Html(
+        f'<div class="scroll wide" tabindex="0" role="group" aria-label="{escape(alt)}">{content.text}</div>'
+    )
+
+
 def film(moving: bytes, still: Image.Image, alt: str, width: int | None = None) -> Html:
     """An animated image; readers who ask for reduced motion get ``still`` in its place."""
     uri = _data_uri(png_bytes(still))

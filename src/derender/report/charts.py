@@ -93,11 +93,14 @@ def bars(
 
 
 def side_by_side(
-    panels: Mapping[str, Callable[[Axes], None]], x_label: str, size: tuple[float, float]
+    panels: Mapping[str, Callable[[Axes], None]],
+    x_label: str,
+    size: tuple[float, float],
+    columns: int | None = None,
 ) -> tuple[str, bytes]:
     """Panels by title with one vertical axis, each drawn by its function, as SVG text and as PNG.
 
-    What the first panel labels is explained below them all.
+    What the first panel labels is explained below them all, in so many columns (by default in one line).
     """
     if not panels:
         raise ValueError("a chart needs at least one panel")
@@ -112,7 +115,7 @@ def side_by_side(
             axes.set_xlabel(x_label)
         handles, labels = drawn[0].get_legend_handles_labels()
         if handles:
-            figure.legend(handles, labels, loc="outside lower center", ncols=len(handles))
+            figure.legend(handles, labels, loc="outside lower center", ncols=columns or len(handles))
         stream = BytesIO()
         figure.savefig(stream, format="png", dpi=150, facecolor="white", metadata={"Software": None})
         return _svg(figure), stream.getvalue()

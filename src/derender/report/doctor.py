@@ -49,6 +49,16 @@ def doctor_page(pictures: PictureSet, found: Examination) -> Page:
     )
 
 
+def doctor_blocks(pictures: PictureSet, found: Examination) -> list[Html]:
+    """The same in short, for a section of another page: verdict and findings; pictures and numbers folded."""
+    return [
+        *_verdict(pictures, found),
+        *(_told(finding) for finding in found.findings if finding.level != "good"),
+        blocks.folded("Pictures that show it", *_shown(pictures, found)),
+        blocks.folded("The numbers", *_numbers(found), *_unreadable(pictures)),
+    ]
+
+
 def measure_table(found: Examination) -> ScoreTable:
     """Every measured number with its range and its limits."""
     columns = (

@@ -62,7 +62,7 @@ class Shown:
 def explanation_page(shown: Shown) -> Page:
     """One self-contained page."""
     found = shown.found
-    sections = [Section("Which factor answers", _shares(shown), "Shares")]
+    sections = [Section("Which factor answers", share_blocks(found, shown.chart), "Shares")]
     if shown.sheets:
         sections.append(Section("Where it was seen", _sheets(shown), "Maps"))
     if shown.checks:
@@ -91,8 +91,8 @@ def explanation_page(shown: Shown) -> Page:
     )
 
 
-def _shares(shown: Shown) -> list[Html]:
-    found = shown.found
+def share_blocks(found: Explanation, chart: str) -> list[Html]:
+    """Verdicts, the chart of the shares (SVG text) and their tables."""
     lines = [blocks.prose(line) for line in share_verdicts(found)]
     meaning = (
         "A probe answers from all factors at once. A factor's share is the sum of |integrated gradients| "
@@ -106,7 +106,7 @@ def _shares(shown: Shown) -> list[Html]:
     return [
         blocks.prose(meaning),
         *lines,
-        blocks.chart(shown.chart, "share of each factor by label", caption),
+        blocks.chart(chart, "share of each factor by label", caption),
         blocks.table(share_table(found)),
         blocks.table(drop_table(found)),
     ]

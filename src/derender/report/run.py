@@ -1,7 +1,12 @@
-"""The report of a training run, made from its folder alone: curves, samples, settings, versions."""
+"""The report of a training run: curves, samples, settings, versions and what failed, from its folder alone.
+
+With evidence (``evidence``: data, decompositions, films, scores, card, explanation) it tells that too.
+"""
 
 import json
 from collections.abc import Sequence
+from io import BytesIO
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +17,14 @@ from torch import Tensor
 from derender.baselines.training import read_any_config
 from derender.model import Derenderer
 from derender.report import blocks, charts
+from derender.report.evidence import Evidence
 from derender.report.figures import decomposition
 from derender.report.page import Page, Section
 from derender.settings import Settings
 from derender.training.config import TrainConfig, setting_names
 from derender.training.run_folder import RunFolder, read_metrics
 
-SHEETS_SHOWN = 4
+SHEETS_SHOWN, SHEET_PX = 4, 1080
 CHARTS = (
     ("l1", "L1", "Mean absolute difference between picture and rendering, inside the mask."),
     ("loss", "loss", "What is minimised; it can fall below zero, because confidence enters as a logarithm."),
@@ -34,8 +40,8 @@ def decomposition_sheet(model: Derenderer, pictures: Float[Tensor, "n 3 h w"]) -
     return decomposition(pictures, model.decompose(pictures), model.render, model.fov_deg).sheet()
 
 
-def run_page(folder: str | Path) -> Page:
-    """The page of a run folder, finished or not."""
+def run_page(folder: str | Path, evidence: Evidence | None = None) -> Page:
+    """The page of a run folder, finished or not, with what else was found out about its model."""
     run = RunFolder(Path(folder))
     config = read_any_config(run.path)
     charts_wanted = CHARTS if isinstance(config, TrainConfig) else BASELINE_CHARTS
@@ -43,9 +49,12 @@ def run_page(folder: str | Path) -> Page:
     environment = _read_environment(run.path / "environment.json")
     tree = config.model_dump(mode="json")
     settings = {name: _at(tree, name) for name in setting_names(type(config))}
+    evidence = evidence or Evidence(())
     sections = [
         Section("How it went", [*_course(metrics), *loss_charts(metrics, charts_wanted)], "Training"),
         Section("Held-out pictures through time", _samples(run), "Samples"),
+        *evidence.sections,
+        Section("What failed", _failures(run, config, metrics, evidence), "Failed"),
         Section(
             "Settings and versions",
             [blocks.folded("All settings", blocks.facts(settings)), blocks.facts(environment)],
@@ -58,6 +67,12 @@ def run_page(folder: str | Path) -> Page:
         [section for section in sections if section.blocks],
         f"derender {environment.get('derender', '')}".strip(),
     )
+
+
+def trained_pictures(folder: str | Path) -> int | None:
+    """How many pictures a run was given, those held out included; None where it does not say."""
+    count = _read_environment(Path(folder) / "environment.json").get("pictures")
+    return count if isinstance(count, int) else None
 
 
 def _subtitle(config: Settings) -> str:
@@ -96,14 +111,40 @@ def _course(metrics: Sequence[dict[str, Any]]) -> list[blocks.Html]:
     facts = {"pictures seen": f"{last['images']:,}", "minutes": f"{last.get('seconds', 0) / 60:.1f}"}
     if speeds:
         facts["pictures per second"] = f"{speeds[-1]:.0f}"
-    collapse = [row for row in metrics if row.get("kind") == "collapse"]
-    told = [
+    return [blocks.facts(facts), *_stopped(metrics)]
+
+
+def _stopped(metrics: Sequence[dict[str, Any]]) -> list[blocks.Html]:
+    """What the watcher said when it stopped the run; usually nothing."""
+    return [
         blocks.prose(blocks.strong("The watcher stopped this run. "), str(text))
-        for row in collapse
+        for row in metrics
+        if row.get("kind") == "collapse"
         for sign, text in row.items()
         if sign not in ("kind", "images", "seconds")
     ]
-    return [blocks.facts(facts), *told]
+
+
+def _failures(
+    run: RunFolder, config: Any, metrics: Sequence[dict[str, Any]], evidence: Evidence
+) -> list[blocks.Html]:
+    """Everything that went wrong, was cut short or could not be told."""
+    lines = _stopped(metrics)
+    seen, planned = (metrics[-1]["images"] if metrics else 0), getattr(config, "images", 0)
+    if seen < planned:
+        lines.append(
+            blocks.prose(
+                f"{seen:,} of {planned:,} planned pictures were seen: it was stopped (time limit, patience, "
+                "watcher or Ctrl-C), or is not done."
+            )
+        )
+    if not run.model.exists():
+        lines.append(blocks.prose("There is no saved model: no validation was reached."))
+    unread = sum(1 for row in metrics if any(isinstance(v, float) and not isfinite(v) for v in row.values()))
+    if unread:
+        lines.append(blocks.prose(f"{unread:,} logged rows hold a number that is not finite."))
+    lines += [blocks.prose(blocks.strong("Not on this page. "), reason) for reason in evidence.failed]
+    return lines or [blocks.prose("Nothing that was noticed.")]
 
 
 def _samples(run: RunFolder) -> list[blocks.Html]:
@@ -114,9 +155,21 @@ def _samples(run: RunFolder) -> list[blocks.Html]:
     made = []
     for sheet in sheets:
         seen = f"{int(sheet.stem):,}" if sheet.stem.isdigit() else sheet.stem
-        image = blocks.image(sheet.read_bytes(), f"decompositions after {seen} pictures")
-        made.append(blocks.figure(image, f"After {seen} pictures."))
+        alt = f"decompositions after {seen} pictures"
+        made.append(
+            blocks.figure(blocks.wide(blocks.image(_smaller(sheet), alt), alt), f"After {seen} pictures.")
+        )
     return made
+
+
+def _smaller(sheet: Path) -> bytes:
+    """A sheet as JPEG at most ``SHEET_PX`` wide: several lie on one page."""
+    stream = BytesIO()
+    with Image.open(sheet) as drawn:
+        small = drawn.convert("RGB")
+        small.thumbnail((SHEET_PX, 16 * SHEET_PX), Image.Resampling.LANCZOS)
+        small.save(stream, format="JPEG", quality=86)
+    return stream.getvalue()
 
 
 def _read_environment(file: Path) -> dict[str, Any]:

@@ -67,8 +67,17 @@ def linear_part_table(comparison: LinearComparison, part: LinearPart) -> ScoreTa
     return _scores_table(caption, part.rows, LINEAR_COLUMNS)
 
 
+def linear_tables(comparison: LinearComparison) -> list[ScoreTable]:
+    """Every head at every number of labels, each with its verdicts."""
+    tables = []
+    for part in comparison.parts:
+        caption = f"{part.count:,} labelled rows, {part.head}: above the strongest control?"
+        tables += [linear_part_table(comparison, part), verdict_table(part.rows, LINEAR_COLUMNS, caption)]
+    return tables
+
+
 def verdict_table(rows: Sequence[ScoredRow], columns: Mapping[str, Column], caption: str) -> ScoreTable:
-    """Which row is above the strongest control, score by score, and by how much."""
+    """Which row is above the strongest control, in each score named by a column, and by how much."""
     found = [
         Row(
             f"{row.name}: {columns[name].name}",
@@ -76,7 +85,7 @@ def verdict_table(rows: Sequence[ScoredRow], columns: Mapping[str, Column], capt
         )
         for row in rows
         for name, one in row.versus.items()
-        if isfinite(row.scores[name].low)
+        if name in columns and isfinite(row.scores[name].low)
     ]
     shown = (
         Column("difference", None, note="to the strongest control, on the same resamples"),
@@ -106,7 +115,11 @@ def paper_cluster_table(
     """Our rows over the paper's own lines, with a column that says what differs."""
     columns = (*(CLUSTER_COLUMNS[one] for one in ("accuracy", "f1")), INTERVAL, Column("data"))
     ours = [
-        Row(row.name, (*_values(row, ("accuracy", "f1")), _interval(row, "accuracy"), differs), row.control)
+        Row(
+            row.name,
+            (*_values(row, ("accuracy", "f1")), interval_text(row, "accuracy"), differs),
+            row.control,
+        )
         for row in comparison.rows
     ]
     theirs = [
@@ -160,8 +173,8 @@ def _scores_table(caption: str, rows: Sequence[ScoredRow], columns: Mapping[str,
             row.name,
             (
                 row.scores[first].value,
-                _interval(row, first),
-                row.scores[first].spread if isfinite(row.scores[first].spread) else None,
+                interval_text(row, first),
+                spread_value(row, first),
                 *_values(row, others),
             ),
             row.control,
@@ -175,7 +188,14 @@ def _values(row: ScoredRow, names: Sequence[str]) -> list[Cell]:
     return [row.scores[name].value for name in names]
 
 
-def _interval(row: ScoredRow, name: str) -> Cell:
+def spread_value(row: ScoredRow, name: str) -> Cell:
+    """The standard deviation over seeds of one score, None for a single run."""
+    spread = row.scores[name].spread
+    return spread if isfinite(spread) else None
+
+
+def interval_text(row: ScoredRow, name: str) -> Cell:
+    """The interval of one score, None where there is none."""
     one = row.scores[name]
     return f"{one.low:.3f}-{one.high:.3f}" if isfinite(one.low) else None
 

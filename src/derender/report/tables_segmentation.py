@@ -4,24 +4,9 @@ from math import isfinite
 
 from derender.evaluation.bootstrap import ScoredRow
 from derender.evaluation.segmentation import SegmentationComparison
-from derender.evaluation.tables import PaperRow
+from derender.evaluation.tables import SEGMENTATION
 from derender.report.score_table import Cell, Column, Row, ScoreTable
-
-PAPER: tuple[PaperRow, ...] = tuple(
-    PaperRow(
-        method,
-        "24,127 + 2,885 of CelebAMask-HQ, 64 x 64",
-        {"mean_iou": mean, "top10_iou": top, "pixel_accuracy": accuracy},
-    )
-    for method, mean, top, accuracy in (
-        ("Supervised (random init)", 0.3862, 0.5858, 0.8669),
-        ("Geometry Encoder", 0.4066, 0.5977, 0.8715),
-        ("Albedo Encoder", 0.3987, 0.5984, 0.8724),
-        ("Joint Encoders", 0.4390, 0.6221, 0.8781),
-        ("Joint Encoders Frozen", 0.3962, 0.5712, 0.8540),
-    )
-)
-"""Klinghoffer et al., ECCV 2022, Table 3."""
+from derender.report.tables_comparison import verdict_table
 
 SEGMENT_COLUMNS = {
     "mean_iou": Column("mIoU", "high", note="intersection over union, mean over classes, 0 to 1"),
@@ -38,30 +23,44 @@ _SHOWN = (
 )
 
 
+def segmentation_tables(found: SegmentationComparison, differs: str) -> list[ScoreTable]:
+    """Everything about a comparison: scores, verdicts, classes, and the paper's lines."""
+    scored = [row.scored for row in found.rows]
+    judged = any(row.versus for row in scored)
+    return [
+        segmentation_table(found),
+        *([verdict_table(scored, SEGMENT_COLUMNS, "above the strongest control?")] if judged else []),
+        class_table(found),
+        beside_the_paper(found, differs),
+    ]
+
+
 def segmentation_table(found: SegmentationComparison) -> ScoreTable:
     """A row for each net and control."""
     rows = [Row(row.scored.name, _cells(row.scored, row.trainable), row.scored.control) for row in found.rows]
     return ScoreTable(_caption(found), "net", _SHOWN, rows)
 
 
-def beside_the_paper(found: SegmentationComparison) -> ScoreTable:
-    """Our nets over the paper's lines, which were made on other pictures: the last column says which."""
+def beside_the_paper(found: SegmentationComparison, differs: str) -> ScoreTable:
+    """Our nets and controls over the paper's lines; the last column says what differs."""
     columns = (*SEGMENT_COLUMNS.values(), Column("data"))
-    ours = f"{found.n_train:,} + {found.n_test:,} pictures"
     rows = [
         Row(
             row.scored.name,
-            (*(row.scored.scores[name].value for name in SEGMENT_COLUMNS), ours),
+            (*(row.scored.scores[name].value for name in SEGMENT_COLUMNS), differs),
             row.scored.control,
         )
         for row in found.rows
-        if row.trainable
     ]
     rows += [
-        Row(f"paper: {one.method}", (*one.scores.values(), one.dataset), control=True, note="paper")
-        for one in PAPER
+        Row(
+            f"paper: {one.method}",
+            (*(one.scores[name] for name in SEGMENT_COLUMNS), one.dataset),
+            note="paper",
+        )
+        for one in SEGMENTATION.paper
     ]
-    return ScoreTable("beside the paper's Table 3", "net", columns, rows)
+    return ScoreTable("segmentation, beside the paper's Table 3", "net", columns, rows)
 
 
 def class_table(found: SegmentationComparison) -> ScoreTable:

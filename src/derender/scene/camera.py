@@ -64,10 +64,17 @@ def project(
     return torch.stack((u, v), dim=-1)
 
 
+def motion(camera: Float[Tensor, "n 6"]) -> tuple[Float[Tensor, "n 3 3"], Float[Tensor, "n 3"]]:
+    """Rotation R and offset o of canonical points: P_cam = R P + o."""
+    rotation, (x, y, z) = rotation_matrix(camera[:, :3]), OBJECT_CENTRE
+    turned_centre = rotation[..., 0] * x + rotation[..., 1] * y + rotation[..., 2] * z
+    moved_centre = torch.stack((camera[:, 3] + x, camera[:, 4] + y, camera[:, 5] + z), dim=-1)
+    return rotation, moved_centre - turned_centre
+
+
 def to_camera(points: Float[Tensor, "n *grid 3"], camera: Float[Tensor, "n 6"]) -> Float[Tensor, "n *grid 3"]:
     """Canonical frame to camera frame: P_cam = R (P - c) + c + t."""
-    rotation, centre = rotation_matrix(camera[:, :3]), points.new_tensor(OBJECT_CENTRE)
-    offset = centre + camera[:, 3:] - rotation @ centre
+    rotation, offset = motion(camera)
     moved = torch.baddbmm(offset[:, None], points.flatten(1, -2), rotation.transpose(1, 2))
     return moved.view(points.shape)
 

@@ -6,6 +6,8 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Generator, Tensor
 
+from derender.training.distributed import ALONE, Ranks
+
 _STREAMS = {"order": 1, "flip": 2, "perturb": 3}
 
 
@@ -41,14 +43,18 @@ class Batches:
                 f"set batch_size={max(2, len(self.images) // 2)} or bring more pictures"
             )
 
-    def at(self, position: int) -> Float[Tensor, "b 3 h w"]:
-        """The batch at a position of the run, counted in batches from 0, as float32 in 0..1."""
+    def at(self, position: int, ranks: Ranks = ALONE) -> Float[Tensor, "b 3 h w"]:
+        """The batch at a position of the run, counted in batches from 0, as float32 in 0..1.
+
+        Of several ``ranks`` each gets its own rows of the batch that one process would get.
+        """
         per_epoch = len(self.images) // self.batch_size
         epoch, within = divmod(position, per_epoch)
         order = torch.randperm(len(self.images), generator=random_stream(self.seed, "order", epoch))
-        rows = order[within * self.batch_size : (within + 1) * self.batch_size].to(self.images.device)
-        batch = self.images[rows].float() / 255
+        rows = ranks.own(order[within * self.batch_size : (within + 1) * self.batch_size])
+        batch = self.images[rows.to(self.images.device)].float() / 255
         if self.horizontal_flips:
             flip = torch.rand(self.batch_size, generator=random_stream(self.seed, "flip", position)) < 0.5
+            flip = ranks.own(flip)
             batch = torch.where(flip.to(batch.device)[:, None, None, None], batch.flip(-1), batch)
         return batch

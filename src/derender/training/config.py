@@ -11,6 +11,7 @@ import yaml
 from pydantic import Field, ValidationError
 
 from derender.data.nearest import nearest
+from derender.model import load
 from derender.presets import MODEL_PRESETS, ModelSettings, named_preset
 from derender.scene.perturb import PerturbSettings
 from derender.settings import Settings
@@ -42,6 +43,22 @@ class ObjectiveSettings(Settings):
     cycle_weight: float = Field(default=0.0, ge=0)  # light and camera read back from LOOCC's renderings; ours
     template_share: float = Field(default=0.0, ge=0, le=1)  # of the run: all share one shape and albedo; ours
     release_share: float = Field(default=0.0, ge=0, le=1)  # of the run: each gets its own bit by bit
+    perturb: PerturbSettings = PerturbSettings()
+
+
+class WhiteningSettings(Settings):
+    """How codes become features after training (networks/whitening.py); no pictures: features are codes."""
+
+    pictures: int = Field(default=2_000, ge=0)  # training pictures that are rendered again
+    views: int = Field(default=4, ge=1)  # renderings of each
+    directions: int = Field(default=64, ge=1)  # of each factor's code that are kept
+    shrinkage: float = Field(default=0.1, ge=0)  # share of the mean variance added to every direction's
+
+
+class FeatureSettings(Settings):
+    """What `derender whiten` can be told: how features are fitted, and what is changed for it."""
+
+    whitening: WhiteningSettings = WhiteningSettings()
     perturb: PerturbSettings = PerturbSettings()
 
 
@@ -79,8 +96,11 @@ class TrainConfig(LoopSettings):
     """One training run of our model, whole."""
 
     preset: str = "faces"
+    start_from: str | None = None  # a trained model whose weights the run begins with
+    accumulate: int = Field(default=1, ge=1)  # chunks of a batch: less memory, same losses, slower
     model: ModelSettings = ModelSettings()
     objective: ObjectiveSettings = ObjectiveSettings()
+    whitening: WhiteningSettings = WhiteningSettings()
 
 
 Config = TypeVar("Config", bound=Settings)
@@ -91,7 +111,11 @@ def _preset(name: str, **changes: Any) -> TrainConfig:
 
 
 PRESETS: dict[str, TrainConfig] = {
-    "paper": _preset("paper", objective=ObjectiveSettings(perceptual="vgg16", curvature_weight=0.0)),
+    "paper": _preset(
+        "paper",
+        objective=ObjectiveSettings(perceptual="vgg16", curvature_weight=0.0),
+        whitening=WhiteningSettings(pictures=0),
+    ),
     "faces": _preset("faces"),
     "cats": _preset("cats"),
     "cars": _preset(
@@ -115,11 +139,19 @@ def resolve(preset: str, overrides: Iterable[str] = (), **explicit: Any) -> Trai
 
     Keys are dotted (``optimiser.learning_rate``); a unique last part may stand alone (``learning_rate``).
     Values are read as YAML. In ``explicit`` dots are written as double underscores and None means not given.
+    With ``start_from`` the model is that model's, not the preset's, before overrides change it.
 
     Raises:
         ValueError: unknown preset or key (names the nearest), or a value that does not fit.
+        FileNotFoundError: there is no model to start from.
     """
-    return with_changes(named_preset(preset, PRESETS), overrides, **explicit)
+    overrides = list(overrides)
+    config = with_changes(named_preset(preset, PRESETS), overrides, **explicit)
+    if config.start_from is None:
+        return config
+    model = load(config.start_from).settings
+    row = named_preset(preset, PRESETS).model_copy(update={"model": model})
+    return with_changes(row, overrides, **explicit)
 
 
 def with_changes(config: Config, overrides: Iterable[str] = (), **explicit: Any) -> Config:

@@ -23,10 +23,13 @@ from derender.data import PictureSet, Split, split_indices
 from derender.training.allocator import freed_memory_kept
 from derender.training.batches import Batches, random_stream
 from derender.training.checkpoint import TrainState, load_checkpoint, save_checkpoint
+from derender.training.complete import complete_model
 from derender.training.config import TrainConfig
-from derender.training.derender_task import DerenderTask
+from derender.training.derender_task import DerenderTask, sharing_batches
 from derender.training.determinism import deterministic_algorithms
+from derender.training.distributed import Ranks, first_then_others, open_fabric, ranks_of, this_rank_writes
 from derender.training.interrupt import TrainingInterrupted, stop_on_signal
+from derender.training.progress import Progress, TrainResult
 from derender.training.run_folder import RunFolder, append_metrics, drop_metrics_after, reopen_run, start_run
 from derender.training.schedule import learning_rate
 from derender.training.step import Precision
@@ -38,50 +41,10 @@ from derender.training.watch import Finding
 SAMPLE_COUNT = 8
 LOG_EVERY_STEPS = 50
 MAX_VALIDATION_PICTURES = 1_000
+FIRST_KEPT_IMAGES = 300  # about when the first state of a run with long intervals is kept
 
 SampleSheet = Callable[[Any, Tensor], Image.Image]
 """Draws what a model makes of a few pictures."""
-
-
-@dataclass(frozen=True)
-class Progress:
-    """Where a run stands, for a progress bar.
-
-    Attributes:
-        phase: "perceptual" while perceptual features are learnt, then "train".
-        done, total: steps of the first phase, pictures of the second.
-        images_per_second: since the run was started or resumed.
-        terms: the latest losses by name.
-    """
-
-    phase: str
-    done: int
-    total: int
-    images_per_second: float = 0.0
-    terms: dict[str, float] | None = None
-
-
-@dataclass(frozen=True)
-class TrainResult:
-    """How a run ended.
-
-    Attributes:
-        folder: the run folder; `derender.load` takes it.
-        images: pictures seen.
-        seconds: time spent training, resumed parts included.
-        images_per_second: of this call.
-        validation: last validation losses by name.
-        stopped: "images", "minutes", "patience" or "collapse".
-        findings: what the watcher saw last; empty when nothing was wrong.
-    """
-
-    folder: Path
-    images: int
-    seconds: float
-    images_per_second: float
-    validation: dict[str, float]
-    stopped: str
-    findings: tuple[Finding, ...]
 
 
 def train(
@@ -109,8 +72,9 @@ def train(
         ValueError: pictures and configuration do not fit, or the run to resume has other settings.
         TrainingInterrupted: Ctrl-C or SIGTERM; the run can be resumed.
     """
-    return train_task(
-        DerenderTask(config),
+    begins = not (resume and RunFolder(Path(out)).last.exists())
+    result = train_task(
+        DerenderTask(config, begins),
         pictures,
         out,
         resume=resume,
@@ -118,6 +82,21 @@ def train(
         progress=progress,
         accelerator=accelerator,
     )
+    if this_rank_writes() and result.stopped != "collapse":
+        split = split_indices(pictures.files, config.split, seed=config.seed)
+        on_gpu = accelerator != "cpu" and torch.cuda.is_available()
+        with deterministic_algorithms(config.deterministic):
+            complete_model(
+                RunFolder(result.folder).model,
+                config,
+                np.ascontiguousarray(pictures.images[split.train]),
+                np.ascontiguousarray(pictures.images[split.validation[:MAX_VALIDATION_PICTURES]]),
+                device="cuda" if on_gpu else "cpu",
+                progress=lambda done, total: (progress or (lambda _: None))(
+                    Progress("features", done, total)
+                ),
+            )
+    return result
 
 
 def train_task(
@@ -148,7 +127,9 @@ def _train(
 ) -> TrainResult:
     config = task.config
     pictures.require(10)
-    fabric = Fabric(accelerator=accelerator, devices=1)
+    fabric = open_fabric(accelerator, all_learn=isinstance(task, DerenderTask) and task.all_learn)
+    ranks = ranks_of(fabric)
+    task = sharing_batches(task, ranks)
     split = split_indices(pictures.files, config.split, seed=config.seed)
     training = torch.from_numpy(np.ascontiguousarray(pictures.images[split.train]))
     held_out = torch.from_numpy(
@@ -157,16 +138,20 @@ def _train(
     batches = Batches(fabric.to_device(training), config.batch_size, config.seed, config.horizontal_flips)
 
     task.check()
-    if resume:
+    if not ranks.first:
+        run = RunFolder(out)
+    elif resume:
         run = reopen_run(out, config)
     else:
-        run = start_run(out, config, describe_data(pictures, split), str(fabric.device))
+        device = f"{ranks.count} x {fabric.device.type}" if ranks.count > 1 else str(fabric.device)
+        run = start_run(out, config, describe_data(pictures, split), device)
     model = task.build().to(fabric.device)
     if config.channels_last:
         model = model.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
-    step = task.step_module(
-        model, run, batches.images, lambda done, total: report(Progress("perceptual", done, total))
-    )
+    with first_then_others(fabric):
+        step = task.step_module(
+            model, run, batches.images, lambda done, total: report(Progress("perceptual", done, total))
+        )
     settings = config.optimiser
     optimiser = torch.optim.Adam(
         model.parameters(),
@@ -179,7 +164,8 @@ def _train(
     state = load_checkpoint(run.last, model, optimiser) if resume and run.last.exists() else TrainState()
     for group in optimiser.param_groups:
         group.update(betas=settings.betas, weight_decay=settings.weight_decay)
-    drop_metrics_after(run, state.images)
+    if ranks.first:
+        drop_metrics_after(run, state.images)
     watcher = task.watch(state.watcher) if config.watch else None
     memory = freed_memory_kept() if fabric.device.type == "cpu" else nullcontext()
     with memory:
@@ -188,6 +174,7 @@ def _train(
                 task,
                 run,
                 fabric,
+                ranks,
                 module,
                 wrapped,
                 batches,
@@ -207,6 +194,7 @@ class _Run:
     task: Task
     folder: RunFolder
     fabric: Fabric
+    ranks: Ranks
     module: nn.Module
     optimiser: torch.optim.Optimizer
     batches: Batches
@@ -220,11 +208,18 @@ class _Run:
     def __post_init__(self) -> None:
         self.config = self.task.config
         self.precision = network_precision(self.config.precision, self.fabric.device)
-        self.writer = SummaryWriter(str(self.folder.path / "tensorboard"), purge_step=self.state.images)
+        self.writer = None
+        if self.ranks.first:
+            self.writer = SummaryWriter(str(self.folder.path / "tensorboard"), purge_step=self.state.images)
 
     @property
     def model(self) -> nn.Module:
         return self.module.model  # type: ignore[return-value]
+
+    def close(self) -> None:
+        """Finish what is being written."""
+        if self.writer is not None:
+            self.writer.close()
 
     def save_model(self, *, overwrite: bool) -> None:
         """Write the model as others load it."""
@@ -239,7 +234,11 @@ class _Run:
             group["lr"] = rate
         noise = random_stream(config.seed, "perturb", position)
         result = compute_step(
-            self.module, self.batches.at(position), noise, self.precision, state.images / config.images
+            self.module,
+            self.batches.at(position, self.ranks),
+            noise,
+            self.precision,
+            state.images / config.images,
         )
         self.fabric.backward(result.total)
         self.optimiser.step()
@@ -254,7 +253,7 @@ class _Run:
         if not len(self.held_out):
             return
         self.validation = validate(
-            self.module, self.held_out, self.config, self.precision, self.task.outside_loss
+            self.module, self.held_out, self.config, self.precision, self.task.outside_loss, self.ranks
         )
         loss, best = self.validation["loss"], self.state.best_loss
         self.log("validation", self.validation)
@@ -262,12 +261,13 @@ class _Run:
             self.state.validations_since_best += 1
             return
         self.state.best_loss, self.state.validations_since_best = loss, 0
-        save_checkpoint(self.folder.best, self.model, self.optimiser, self.state)
-        self.save_model(overwrite=True)
+        if self.ranks.first:
+            save_checkpoint(self.folder.best, self.model, self.optimiser, self.state)
+            self.save_model(overwrite=True)
 
     def draw(self) -> None:
         """Write a sheet of held-out pictures taken apart."""
-        if self.sample_sheet is None or not len(self.held_out):
+        if self.sample_sheet is None or not len(self.held_out) or not self.ranks.first:
             return
         self.model.eval()
         with torch.no_grad():
@@ -277,6 +277,8 @@ class _Run:
 
     def checkpoint(self) -> None:
         """Keep everything a resumed run needs."""
+        if not self.ranks.first:
+            return
         self.state.watcher = self.watcher.memory() if self.watcher is not None else {}
         save_checkpoint(self.folder.last, self.model, self.optimiser, self.state)
         if not self.folder.model.exists():
@@ -284,6 +286,8 @@ class _Run:
 
     def log(self, kind: str, values: dict[str, Any]) -> None:
         state = self.state
+        if self.writer is None:
+            return
         append_metrics(
             self.folder, {"kind": kind, "images": state.images, "seconds": round(state.seconds, 2), **values}
         )
@@ -316,34 +320,36 @@ def _go_on(run: _Run, report: Callable[[Progress], None]) -> TrainResult:
             result = run.step()
             steps += 1
             elapsed = time.perf_counter() - began
-            state.seconds = seconds_before + elapsed
-            speed = (state.images - images_before) / elapsed
+            state.seconds, speed = seconds_before + elapsed, (state.images - images_before) / elapsed
             terms = None
             if steps % LOG_EVERY_STEPS == 1:
-                terms = {name: value.item() for name, value in result.terms.items()}
+                terms = run.ranks.mean({name: value.item() for name, value in result.terms.items()})
                 run.log("train", {**terms, "images_per_second": speed})
             report(Progress("train", state.images, config.images, speed, terms))
 
+            elapsed, stop_asked = run.ranks.largest(elapsed, signal_request.asked)
+            state.seconds = seconds_before + elapsed
             stopped = run.why_stop()
             if stopped == "collapse":
                 break
             healthy = run.watcher is None or not run.watcher.uneasy
             due = partial(_passed, before, state.images, ended=stopped is not None)
-            if due(config.validate_every) and healthy:
+            kept = partial(_kept, before, state.images, ended=stopped is not None)
+            if kept(config.validate_every) and healthy:
                 run.validate()
                 stopped = stopped or run.why_stop()
             if due(config.sample_every):
                 run.draw()
-            if (due(config.checkpoint_every) and healthy) or signal_request.asked:
+            if (kept(config.checkpoint_every) and healthy) or stop_asked:
                 run.checkpoint()
-            if signal_request.asked and stopped is None:
-                run.writer.close()
+            if stop_asked and stopped is None:
+                run.close()
                 raise TrainingInterrupted(
                     f"stopped after {state.images:,} pictures and saved; the same with --resume goes on"
                 )
     if stopped == "collapse":
         run.log("collapse", {finding.sign: finding.text for finding in run.findings})
-    run.writer.close()
+    run.close()
     speed = (state.images - images_before) / max(time.perf_counter() - began, 1e-9)
     return TrainResult(
         run.folder.path, state.images, state.seconds, speed, run.validation, stopped or "images", run.findings
@@ -373,3 +379,17 @@ def describe_data(pictures: PictureSet, split: Split) -> dict[str, Any]:
 def _passed(before: int, now: int, interval: int, *, ended: bool) -> bool:
     """Whether a multiple of ``interval`` lies in (before, now], or the run has ended."""
     return ended or now // interval > before // interval
+
+
+def _kept(before: int, now: int, interval: int, *, ended: bool) -> bool:
+    """Whether a state in (before, now] is to be kept: as ``_passed``, and at halves of the first interval.
+
+    Those (half, a quarter, ... down to ``FIRST_KEPT_IMAGES``) see to it that a collapse, which happens early
+    if at all, leaves a good state behind whatever the interval.
+    """
+    early = interval // 2
+    while early >= FIRST_KEPT_IMAGES:
+        if before < early <= now:
+            return True
+        early //= 2
+    return _passed(before, now, interval, ended=ended)

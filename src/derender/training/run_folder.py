@@ -20,6 +20,7 @@ from derender.whole import whole_file
 
 _MAY_CHANGE_ON_RESUME = (
     *("images", "minutes", "validate_every", "sample_every", "checkpoint_every", "patience", "watch"),
+    "accumulate",
     "optimiser",  # a run that the watcher stopped goes on with a smaller rate
 )
 _REPORTED_PACKAGES = ("derender", "torch", "numpy", "numba", "lightning-fabric", "safetensors", "pillow")

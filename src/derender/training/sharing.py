@@ -13,6 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from derender.training.config import ObjectiveSettings
+from derender.training.distributed import ALONE, Ranks
 
 
 def own_share(objective: ObjectiveSettings, done: float) -> float:
@@ -25,12 +26,19 @@ def own_share(objective: ObjectiveSettings, done: float) -> float:
 
 
 def share_codes(
-    codes: Mapping[str, Float[Tensor, "n _"]], names: Collection[str], own: float
+    codes: Mapping[str, Float[Tensor, "n _"]], names: Collection[str], own: float, ranks: Ranks = ALONE
 ) -> dict[str, Float[Tensor, "n _"]]:
-    """The codes of the named factors moved to their mean over the batch; ``own`` = 1 leaves all as it is."""
+    """The codes of the named factors moved to their mean over the batch, which ``ranks`` may share.
+
+    ``own`` = 1 leaves all as it is.
+    """
     if own >= 1:
         return dict(codes)
     return {
-        name: torch.lerp(code.mean(dim=0, keepdim=True).expand_as(code), code, own) if name in names else code
+        name: torch.lerp(_mean(code, ranks).expand_as(code), code, own) if name in names else code
         for name, code in codes.items()
     }
+
+
+def _mean(code: Float[Tensor, "n _"], ranks: Ranks) -> Float[Tensor, "1 _"]:
+    return ranks.gather(code).mean(dim=0, keepdim=True).to(code.dtype)

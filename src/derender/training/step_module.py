@@ -6,6 +6,7 @@ from torch import Generator, Tensor, nn
 from derender.model import Derenderer
 from derender.objectives.perceptual import PerceptualFeatures
 from derender.training.config import ObjectiveSettings
+from derender.training.distributed import ALONE, Ranks
 from derender.training.sharing import own_share
 from derender.training.step import Precision, training_step
 from derender.training.task import StepLosses
@@ -19,19 +20,44 @@ class Held:
 
 
 class StepModule(nn.Module):
-    """Model, objective and perceptual features; a batch goes in, the total and the result come out."""
+    """Model, objective and perceptual features; a batch goes in, the total and the result come out.
+
+    Args:
+        model: the model.
+        objective: what is minimised.
+        perceptual: features to compare, or None.
+        ranks: those that share the batches of training; held-out pictures are each judged by one of them.
+        chunks: see `training_step`.
+    """
 
     def __init__(
-        self, model: Derenderer, objective: ObjectiveSettings, perceptual: PerceptualFeatures | None
+        self,
+        model: Derenderer,
+        objective: ObjectiveSettings,
+        perceptual: PerceptualFeatures | None,
+        ranks: Ranks = ALONE,
+        chunks: int = 1,
     ):
         super().__init__()
         self.model, self.objective, self.perceptual = model, objective, perceptual
+        self.ranks, self.chunks = ranks, chunks
 
     def forward(
         self, images: Tensor, generator: Generator, precision: Precision, done: float | None = None
     ) -> tuple[Tensor, Held]:
         own = 1.0 if done is None else own_share(self.objective, done)
-        result = training_step(self.model, images, self.objective, self.perceptual, generator, precision, own)
+        ranks = ALONE if done is None else self.ranks
+        result = training_step(
+            self.model,
+            images,
+            self.objective,
+            self.perceptual,
+            generator,
+            precision,
+            own,
+            ranks,
+            self.chunks,
+        )
         return result.total, Held(result)
 
 

@@ -20,6 +20,7 @@ from derender.scene import Scene
 from derender.scene.light import lambert_shading
 from derender.scene.normals import normals_from_depth
 from derender.scene.ranges import SceneRanges
+from derender.training.distributed import ALONE, Ranks
 
 GRACE_IMAGES = 4_000  # a network that has just started has no geometry yet
 SLOW_GRACE_IMAGES = 14_000  # slow starts show pixel noise for longer, and recover
@@ -56,6 +57,7 @@ class Sign:
     text: str  # {value} is the measurement
     advice: str
     grace_images: int = GRACE_IMAGES
+    usual_images: int = 0  # how long a healthy run may show it
 
     def is_on(self, measured: float) -> bool:
         return measured > self.limit if self.above else measured < self.limit
@@ -81,6 +83,7 @@ SIGNS = (
         True,
         "depth jumps from pixel to pixel ({value:.2f} of its spread; a smooth surface has less than 0.3)",
         f"set curvature_weight=3, which removes stripes; {SLOWER}",
+        SLOW_GRACE_IMAGES,
         SLOW_GRACE_IMAGES,
     ),
     Sign(
@@ -144,6 +147,8 @@ class Watcher:
     averages: dict[str, float] = field(default_factory=dict)
     on_since: dict[str, int] = field(default_factory=dict)  # pictures seen when a sign came on
     last_images: int = 0
+    ranks: Ranks = ALONE  # those that share a batch; all see the same
+    uneasy: bool = False  # whether the latest batch or the averages show a fatal sign: no state to keep
 
     @classmethod
     def remembering(cls, ranges: SceneRanges, memory: Mapping[str, Any]) -> "Watcher":
@@ -158,25 +163,26 @@ class Watcher:
             "last_images": self.last_images,
         }
 
-    @property
-    def uneasy(self) -> bool:
-        """Whether a fatal sign is on, though perhaps not for long: such a state is no good checkpoint."""
-        return any(sign.name in self.on_since and sign.fatal for sign in SIGNS)
-
     def look(self, images: int, loss: float, scene: Scene) -> tuple[Finding, ...]:
         """What is wrong after ``images`` pictures, given the latest batch; usually nothing."""
         if not math.isfinite(loss):
+            self.uneasy = True
             return (
                 Finding("non-finite loss", f"the loss is {loss}", f"{SLOWER}; with bf16, try 32-true", True),
             )
         share = min(1.0, (images - self.last_images) / MEMORY_IMAGES)
         self.last_images = images
-        for name, value in measure(scene, self.ranges).items():
+        latest = self.ranks.mean(measure(scene, self.ranges))
+        for name, value in latest.items():
             before = self.averages.get(name, value)
             self.averages[name] = before + share * (value - before)
         findings = []
+        self.uneasy = False
         for sign in SIGNS:
             value = self.averages[sign.measure]
+            shown = sign.is_on(value) or sign.is_on(latest[sign.measure])
+            if sign.fatal and shown and images >= sign.usual_images:
+                self.uneasy = True
             if images < sign.grace_images or not sign.is_on(value):
                 self.on_since.pop(sign.name, None)
                 continue

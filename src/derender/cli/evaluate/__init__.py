@@ -5,7 +5,7 @@ One file per protocol; a new one gets a ``register`` of its own and a place in `
 
 import typer
 
-from derender.cli.evaluate import cluster, disentangle, geometry, linear, reconstruction, segment
+from derender.cli.evaluate import cluster, disentangle, geometry, linear, reconstruction, robustness, segment
 
 PROTOCOLS = (
     cluster,
@@ -14,6 +14,7 @@ PROTOCOLS = (
     disentangle,
     geometry,
     reconstruction,
+    robustness,
 )
 
 

@@ -5,8 +5,9 @@ from typing import Annotated
 
 import typer
 
-from derender.cli import options
-from derender.cli.console import bar, out_of_the_way, result, say, show_scores, write_json
+from derender.cli import options, scoring
+from derender.cli.console import bar, out_of_the_way, result, say
+from derender.cli.gathered import gathered
 
 
 def register(group: typer.Typer) -> None:
@@ -16,9 +17,11 @@ def register(group: typer.Typer) -> None:
     )(disentangle)
 
 
+@gathered
 def disentangle(
     model: options.Model,
     data: options.Data,
+    published: scoring.Published,
     out: Annotated[
         Path | None,
         typer.Option("--out", "-o", help="Draw all matrices into this picture.", metavar="FILE.png"),
@@ -39,8 +42,6 @@ def disentangle(
     batch_size: options.BatchSize = 64,
     seed: options.Seed = 0,
     device: options.Device = "auto",
-    force: options.Force = False,
-    json_file: options.Json = None,
 ) -> None:
     """Does each feature hold its own factor? Correlation, CKA, swap test; on rendered data DCI, MIG, SAP."""
     if dimensions not in ("lasso", "trees", "none"):
@@ -48,7 +49,8 @@ def disentangle(
     if out is not None:
         if out.suffix.lower() != ".png":
             raise ValueError(f"--out {out} must end in .png: the matrices are drawn as a PNG picture")
-        out_of_the_way(out, force)
+        out_of_the_way(out, published.force)
+    published.check()
     from derender.cli.models import open_model, part_of
     from derender.data import read_pictures
     from derender.evaluation.disentanglement import evaluate_disentanglement
@@ -71,11 +73,10 @@ def disentangle(
         )
     summary = tables.summary_table(card)
     truth = (tables.truth_table(card), tables.dimension_table(card), tables.factor_r2_table(card))
-    for table in (summary, *tables.swap_tables(card), *truth):
-        if table is not None:
-            show_scores(table, json_file)
-    for column, name in ((4, "swap test"), (5, "swap test, decoded")):
-        say(f"{name}: {summary.verdict(column)}")
+    shown = [summary, *tables.swap_tables(card), *(table for table in truth if table is not None)]
+    notes = [
+        f"{name}: {summary.verdict(column)}" for column, name in ((4, "swap test"), (5, "swap test, decoded"))
+    ]
     if out is not None:
         from derender.report.matrices import card_matrices, matrix_sheet
         from derender.whole import whole_file
@@ -83,13 +84,11 @@ def disentangle(
         sheet = matrix_sheet(card_matrices(card), f"{model}: {card.n_pictures:,} pictures")
         with whole_file(out) as temporary:
             sheet.save(temporary, "PNG")
-        result(f"matrices in {out}", json_file)
-    write_json(
-        json_file,
-        {
-            "pictures": card.n_pictures,
-            "features": dict(zip(card.features, card.dimensions, strict=True)),
-            "seeds": list(range(seed, seed + seeds)),
-            "rows": card.rows,
-        },
-    )
+        result(f"matrices in {out}", published.json_file)
+    values = {
+        "pictures": card.n_pictures,
+        "features": dict(zip(card.features, card.dimensions, strict=True)),
+        "seeds": list(range(seed, seed + seeds)),
+        "rows": card.rows,
+    }
+    published.show(shown, values, notes)

@@ -2,8 +2,9 @@
 
 import typer
 
-from derender.cli import options
-from derender.cli.console import bar, say, show_scores, write_json
+from derender.cli import options, scoring
+from derender.cli.console import bar
+from derender.cli.gathered import gathered
 
 
 def register(group: typer.Typer) -> None:
@@ -13,19 +14,21 @@ def register(group: typer.Typer) -> None:
     )(geometry)
 
 
+@gathered
 def geometry(
     model: options.Model,
     data: options.Data,
+    published: scoring.Published,
     limit: options.Limit = None,
     batch_size: options.BatchSize = 64,
     seed: options.Seed = 0,
     device: options.Device = "auto",
-    json_file: options.Json = None,
 ) -> None:
     """Is the geometry the true one? SIDE and MAD on rendered pictures with exact depth, beside controls.
 
     Data: a rendered set (as from derender synth), or folders image/ and depth/ with PNGs side by side.
     """
+    published.check()
     from derender.baselines.controls import untrained_twin
     from derender.cli.models import open_model
     from derender.data import read_ground_truth
@@ -39,16 +42,14 @@ def geometry(
     with bar("decomposing") as report:
         found = evaluate_geometry(net, truth, batch_size=batch_size, untrained=twin, progress=report)
     scores = geometry_table(found, len(truth))
-    show_scores(scores, json_file)
-    values = {"pictures": len(truth), "geometry": found}
+    tables, values = [scores], {"pictures": len(truth), "geometry": found}
     if truth.albedo is not None and truth.light is not None and truth.camera is not None:
         factors = evaluate_factors(net, truth, batch_size=batch_size)
         fresh = evaluate_factors(twin, truth, batch_size=batch_size)
-        show_scores(factor_table(factors, len(truth), fresh), json_file)
+        tables.append(factor_table(factors, len(truth), fresh))
         values |= {"factors": factors, "factors_untrained": fresh}
     again = evaluate_reconstruction(net, truth.images, batch_size=batch_size)
-    show_scores(reconstruction_table(again, len(truth)), json_file)
+    tables.append(reconstruction_table(again, len(truth)))
     values["reconstruction"] = again
-    say(f"depth is {scores.verdict(0)}")
-    say(f"normals are {scores.verdict(1)}")
-    write_json(json_file, values)
+    notes = [f"depth is {scores.verdict(0)}", f"normals are {scores.verdict(1)}"]
+    published.show(tables, values, notes)

@@ -1,12 +1,22 @@
 """`derender evaluate segment`: do pre-trained encoders help to find the parts of a face?"""
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from derender.cli import feature_rows, options
-from derender.cli.console import bar, result, say, show_scores, write_json
+from derender.cli import feature_rows, options, scoring
+from derender.cli.console import bar, result, say
+from derender.cli.gathered import gathered
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from derender.data import PictureSet
+    from derender.evaluation.memory import Memory
+    from derender.evaluation.segmentation import SegmentationComparison, SegmentationData
+    from derender.report.score_table import ScoreTable
 
 ALL = "joint,geometry,albedo,joint-frozen,random,joint-random,joint-random-frozen"
 
@@ -24,6 +34,7 @@ Variants = Annotated[
 ]
 Epochs = Annotated[int, typer.Option("--epochs", min=1, metavar="N", help="Of every net.")]
 Seeds = Annotated[int, typer.Option("--seeds", min=1, metavar="N", help="Runs of every net.")]
+BatchSize = Annotated[int, typer.Option("--batch-size", min=2, metavar="N", help="Of training.")]
 TestFraction = Annotated[
     float,
     typer.Option("--test-fraction", min=0.01, max=0.99, help="Tested, where the data have no partition."),
@@ -44,26 +55,24 @@ def register(group: typer.Typer) -> None:
     )(segment)
 
 
+@gathered
 def segment(
     model: options.Model,
     data: options.Data,
+    published: scoring.Published,
     masks: Masks = None,
     dataset: options.Dataset = "auto",
     limit: options.Limit = None,
     variants: Variants = ALL,
     epochs: Epochs = 20,
     seeds: Seeds = 3,
-    batch_size: Annotated[int, typer.Option("--batch-size", min=2, metavar="N", help="Of training.")] = 64,
+    batch_size: BatchSize = 64,
     test_fraction: TestFraction = 0.2,
     labelled: Labelled = None,
     resamples: feature_rows.Resamples = 1_000,
     seed: options.Seed = 0,
     device: options.Device = "auto",
     out: Out = None,
-    json_file: options.Json = None,
-    markdown: feature_rows.Markdown = None,
-    latex: feature_rows.Latex = None,
-    force: options.Force = False,
 ) -> None:
     """Do pre-trained U-Net encoders help segmentation? mIoU, mIoU of the ten best classes, pixel accuracy.
 
@@ -71,9 +80,67 @@ def segment(
     user's cache): the same command again goes on with the next run. Overlays show the pictures themselves:
     mind who is on them before you pass the folder on.
     """
+    published.check()
+    memory = feature_rows.memory_in(None if out is None else str(out / "runs"))
+    run = segmented(
+        model, MaskSource(data, masks, dataset, limit), variants, tuple(range(seed, seed + seeds)),
+        memory, epochs=epochs, batch_size=batch_size, test_fraction=test_fraction, labelled=labelled,
+        resamples=resamples, device=device,
+    )  # fmt: skip
+    if out is not None:
+        result(f"overlays {write_overlays(run, out)}", published.json_file)
+    values = {"model": model, "data": run.source, **run.found.numbers()}
+    published.show(run.tables, values, [scoring.remembered(memory, "runs")])
+
+
+@dataclass(frozen=True)
+class MaskSource:
+    """Where pictures and masks are read from."""
+
+    data: str
+    masks: str | None = None
+    dataset: str = "auto"
+    limit: int | None = None
+
+    def read(self, image_size: int) -> "tuple[PictureSet, np.ndarray, tuple[str, ...]]":
+        """Pictures, masks and the names of the classes."""
+        from derender.data import read_masks
+        from derender.data.mask_folder import read_mask_folder
+
+        own = {"dataset": self.dataset, "limit": self.limit}
+        with bar("reading") as report:
+            if self.masks is None:
+                return read_masks(self.data, image_size, progress=report, **own)
+            return read_mask_folder(self.data, self.masks, image_size, progress=report, **own)
+
+
+@dataclass(frozen=True)
+class Segmented:
+    """A comparison, what it was made on, and its tables."""
+
+    found: "SegmentationComparison"
+    divided: "SegmentationData"
+    source: str
+    differs: str
+    tables: "list[ScoreTable]"
+
+
+def segmented(
+    model: str,
+    pictures: MaskSource,
+    variants: str,
+    seeds: tuple[int, ...],
+    memory: "Memory",
+    *,
+    epochs: int,
+    batch_size: int,
+    resamples: int,
+    device: str,
+    test_fraction: float = 0.2,
+    labelled: int | None = None,
+) -> Segmented:
+    """Train every variant of a model's encoders on the masks, beside the controls."""
     from derender.cli.models import open_model
-    from derender.data import read_masks
-    from derender.evaluation.memory import content_hash
     from derender.evaluation.segmentation import (
         SegmentSettings,
         chosen_variants,
@@ -81,65 +148,44 @@ def segment(
         divide,
     )
     from derender.evaluation.segmentation.variants import check_encoders
-    from derender.report.page import write_whole
-    from derender.report.segmentation import segmentation_sheet
-    from derender.report.tables_comparison import verdict_table
-    from derender.report.tables_segmentation import (
-        SEGMENT_COLUMNS,
-        beside_the_paper,
-        class_table,
-        segmentation_table,
-    )
+    from derender.evaluation.tables import SEGMENTATION
+    from derender.report.tables_segmentation import segmentation_tables
 
-    feature_rows.refuse_to_replace(force, markdown, latex)
     wanted = chosen_variants([name.strip() for name in variants.split(",") if name.strip()])
     net = open_model(model, device)
     check_encoders(net, wanted, model)
-    with bar("reading") as report:
-        if masks is None:
-            read = read_masks(data, net.image_size, dataset=dataset, limit=limit, progress=report)
-        else:
-            from derender.data.mask_folder import read_mask_folder
-
-            read = read_mask_folder(
-                data, masks, net.image_size, dataset=dataset, limit=limit, progress=report
-            )
-    say(read.pictures.describe())
-    divided = divide(*read, test_fraction=test_fraction, split_seed=seed, labelled=labelled)
-    memory = feature_rows.memory_in(None if out is None else str(out / "runs"))
+    read = pictures.read(net.image_size)
+    say(read[0].describe())
+    divided = divide(*read, test_fraction=test_fraction, split_seed=seeds[0], labelled=labelled)
     with bar("training") as report:
         found = compare_segmentations(
             net,
             divided,
             wanted,
-            tuple(range(seed, seed + seeds)),
+            seeds,
             settings=SegmentSettings(epochs=epochs, batch_size=batch_size),
             resample_count=resamples,
             memory=memory,
             progress=report,
         )
-    tables = [segmentation_table(found)]
-    if any(row.scored.versus for row in found.rows):
-        caption = "above the strongest control?"
-        tables.append(verdict_table([row.scored for row in found.rows], SEGMENT_COLUMNS, caption))
-    tables += [class_table(found), beside_the_paper(found)]
-    for table in tables:
-        show_scores(table, json_file)
-    say(f"{memory.made} runs computed, {memory.recalled} found")
-    if out is not None:
-        answers = {row.scored.name: row.shown for row in found.rows if row.trainable}
-        pictures, truth = divided.images[found.shown], divided.masks[found.shown]
-        sheet = segmentation_sheet(pictures, truth, answers, found.classes)
-        mark = content_hash({"pictures": pictures, "mask": truth, **answers})[:8]  # other answers, other file
-        written = write_whole(out / f"overlays-{mark}.png", _png(sheet))
-        result(f"overlays {written}", json_file)
-    write_json(json_file, {"model": model, "data": read.pictures.source, **found.numbers()})
-    feature_rows.write_tables(tables, markdown, latex)
+    size = (
+        f"+ {found.n_test:,} pictures at {net.image_size} x {net.image_size}, {len(found.classes)} classes,"
+    )
+    differs = SEGMENTATION.differs(read[0].layout, found.n_train, size)
+    tables = segmentation_tables(found, differs)
+    return Segmented(found, divided, read[0].source, differs, tables)
 
 
-def _png(image) -> bytes:
-    import io
+def write_overlays(run: Segmented, out: Path) -> Path:
+    """The sheet of overlays; other answers are another file."""
+    from derender.evaluation.memory import content_hash
+    from derender.report.blocks import png_bytes
+    from derender.report.page import write_whole
+    from derender.report.segmentation import segmentation_sheet
 
-    stored = io.BytesIO()
-    image.save(stored, "PNG")
-    return stored.getvalue()
+    found = run.found
+    answers = {row.scored.name: row.shown for row in found.rows if row.trainable}
+    pictures, truth = run.divided.images[found.shown], run.divided.masks[found.shown]
+    sheet = segmentation_sheet(pictures, truth, answers, found.classes)
+    mark = content_hash({"pictures": pictures, "mask": truth, **answers})[:8]
+    return write_whole(out / f"overlays-{mark}.png", png_bytes(sheet))

@@ -11,7 +11,7 @@ Nothing is written to disk but decoded pixels, so names in archives can do no ha
 """
 
 from derender.data.stream.address import open_stream
-from derender.data.stream.decoding import Decoded, ahead, decoded
+from derender.data.stream.decoding import Decoded, ahead, decode_samples, decoded
 from derender.data.stream.labels import Kinds, column_of
 from derender.data.stream.listed import ListedStream, stream_of
 from derender.data.stream.sample import Sample, Stream
@@ -26,6 +26,7 @@ __all__ = [
     "Stream",
     "ahead",
     "column_of",
+    "decode_samples",
     "decoded",
     "open_stream",
     "stream_of",

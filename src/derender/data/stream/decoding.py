@@ -7,7 +7,7 @@ with the stream.
 
 import threading
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -72,7 +72,7 @@ def decoded(
     pool = ThreadPoolExecutor(cores, thread_name_prefix="decode")
     try:
         while chunk := list(islice(samples, CHUNK)):
-            waiting.append(pool.submit(_decode_chunk, start, chunk, image_size, fit))
+            waiting.append(pool.submit(decode_samples, start, chunk, image_size, fit))
             start += len(chunk)
             if len(waiting) > 2 * cores:
                 yield waiting.popleft().result()
@@ -137,7 +137,8 @@ def ahead(items: Iterable[T], depth: int = 4) -> Iterator[Iterator[T]]:
                 thread.join(_PATIENCE_SECONDS)
 
 
-def _decode_chunk(start: int, samples: list[Sample], image_size: int, fit: str) -> Decoded:
+def decode_samples(start: int, samples: Sequence[Sample], image_size: int, fit: str = "crop") -> Decoded:
+    """Decode consecutive samples, at least one, the first of them number ``start``, in this thread."""
     images = np.empty((len(samples), 3, image_size, image_size), np.uint8)
     return Decoded(
         start,

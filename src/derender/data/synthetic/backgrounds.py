@@ -3,6 +3,8 @@
 Colours are muted, as rooms and skies are; a strong colour is rare.
 """
 
+from functools import lru_cache
+
 import numpy as np
 from jaxtyping import Float32
 from numpy import ndarray
@@ -19,8 +21,8 @@ def draw_background(kind: str, generator: np.random.Generator, size: int) -> Flo
     knots = generator.random((_NOISE_CELLS, _NOISE_CELLS, 3), dtype=np.float32)
     if kind == "plain":
         return np.broadcast_to(ends[0], (size, size, 3)).copy()
-    across = np.linspace(-1.0, 1.0, size, dtype=np.float32)
     if kind == "gradient":
+        across = np.linspace(-1.0, 1.0, size, dtype=np.float32)
         at = 0.5 + 0.5 * (np.cos(angle) * across + np.sin(angle) * across[:, None]) / np.float32(np.sqrt(2.0))
         return ends[0] + (ends[1] - ends[0]) * at[..., None]
     knots = (
@@ -34,8 +36,14 @@ def draw_background(kind: str, generator: np.random.Generator, size: int) -> Flo
 
 def _stretch(knots: ndarray, size: int) -> ndarray:
     """Smooth interpolation of rows of knots to ``size`` rows."""
+    low, part = _between(size)
+    return knots[low] * (1.0 - part) + knots[low + 1] * part
+
+
+@lru_cache(maxsize=4)
+def _between(size: int) -> tuple[ndarray, ndarray]:
+    """The knot before each row, and how far the row is on its way to the next one."""
     at = np.linspace(0.0, _NOISE_CELLS - 1.0, size, dtype=np.float32)
     low = np.minimum(at.astype(int), _NOISE_CELLS - 2)
     part = at - low
-    part = (part * part * (3.0 - 2.0 * part))[:, None, None].astype(np.float32)
-    return knots[low] * (1.0 - part) + knots[low + 1] * part
+    return low, (part * part * (3.0 - 2.0 * part))[:, None, None].astype(np.float32)

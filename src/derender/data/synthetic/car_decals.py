@@ -18,7 +18,7 @@ Colour = tuple[float, float, float]
 Point = tuple[float, float]
 Bounds = tuple[float, float, float, float]
 Decal = tuple[float, ...]  # the numbers of one shape, as below
-POLYGON, RING, SPOKES, CHECKER = range(4)
+POLYGON, BOX, RING, SPOKES, CHECKER = range(5)
 MOST_CORNERS = 9
 # kind, multiplies, part, colour, bounds, then the shape's own numbers
 KIND, MULTIPLIES, PART, COLOUR, BOUNDS, SHAPE = 0, 1, 2, 3, 6, 10
@@ -83,7 +83,7 @@ def polygon(points: Sequence[Point] | ndarray, colour: Colour, part: str = "") -
 
 
 def box(u0: float, v0: float, u1: float, v1: float, colour: Colour, part: str = "") -> Decal:
-    return polygon([(u0, v0), (u1, v0), (u1, v1), (u0, v1)], colour, part)
+    return _decal(BOX, colour, part, (min(u0, u1), min(v0, v1), max(u0, u1), max(v0, v1)))
 
 
 def line(u0: float, v0: float, u1: float, v1: float, width: Point, shade: float = 0.6) -> Decal:

@@ -13,12 +13,11 @@ from numpy import ndarray
 
 from derender.data.synthetic.backgrounds import draw_background
 from derender.data.synthetic.car_settings import CarSettings, CarViewSettings
-from derender.data.synthetic.settings import LightSettings, Range
+from derender.data.synthetic.draws import clipped, either_side, light_angles, name_at, scaled
+from derender.data.synthetic.settings import LightSettings
 
 CANONICAL_ELEVATION_DEG = 42.5
 _GOLDEN = 0.6180339887498949
-_OTHER_DEG = 20.0  # with beyond_deg, the angle that is not beyond stays within this
-_YAW_SHARE = 0.6
 
 
 @dataclass(frozen=True)
@@ -41,8 +40,8 @@ def draw_car_picture(seed: int, index: int, image_size: int, settings: CarSettin
     normal = generator.standard_normal(3)
     uniform = generator.random(8)
     view = settings.view
-    elevation, azimuth = _scaled(view.elevation_deg, uniform[0]), _azimuth(view, uniform[1])
-    inplane = float(np.clip(view.inplane_sd_deg * normal[0], *view.inplane_deg))
+    elevation, azimuth = scaled(view.elevation_deg, uniform[0]), _azimuth(view, uniform[1])
+    inplane = clipped(view.inplane_sd_deg * normal[0], view.inplane_deg)
     kind = settings.backgrounds[int(uniform[7] * len(settings.backgrounds))]
     return CarDraw(
         model=settings.first_model + index // settings.pictures_per_model,
@@ -58,11 +57,8 @@ def draw_car_picture(seed: int, index: int, image_size: int, settings: CarSettin
 
 def class_of(seed: int, model: int, settings: CarSettings) -> str:
     """The class of a model. Shares are kept closely by any run of models: a golden-ratio sequence."""
-    names = list(settings.classes)
-    shares = np.cumsum([settings.classes[name] for name in names])
     start = np.random.default_rng([seed, 4]).random()
-    at = (start + model * _GOLDEN) % 1.0
-    return names[int(np.searchsorted(shares, at * shares[-1], side="right"))]
+    return name_at(settings.classes, (start + model * _GOLDEN) % 1.0)
 
 
 def view_rotation(elevation_deg: float, azimuth_deg: float, inplane_deg: float) -> Float64[ndarray, "3 3"]:
@@ -91,31 +87,12 @@ def euler_angles(rotation: Float64[ndarray, "3 3"]) -> Float64[ndarray, "3"]:
 
 def _azimuth(view: CarViewSettings, share: float) -> float:
     if view.azimuth_beyond_deg > 0:
-        return _either_side(view.azimuth_deg, view.azimuth_beyond_deg, share)
-    return _scaled(view.azimuth_deg, share)
+        return either_side(view.azimuth_deg, view.azimuth_beyond_deg, share)
+    return scaled(view.azimuth_deg, share)
 
 
 def _light(light: LightSettings, brightest: float, uniform: ndarray) -> Float32[ndarray, "4"]:
-    pitch, yaw = _scaled(light.pitch_deg, uniform[2]), _scaled(light.yaw_deg, uniform[3])
-    if light.beyond_deg > 0:
-        if uniform[4] < _YAW_SHARE:
-            yaw = _either_side(light.yaw_deg, light.beyond_deg, uniform[3])
-            pitch = _OTHER_DEG * (2.0 * uniform[2] - 1.0)
-        else:
-            pitch = _either_side(light.pitch_deg, light.beyond_deg, uniform[2])
-            yaw = _OTHER_DEG * (2.0 * uniform[3] - 1.0)
-    diffuse = _scaled(light.diffuse, uniform[1])
+    diffuse = scaled(light.diffuse, uniform[1])
     low, high = light.ambient
-    ambient = _scaled((low, max(low, min(high, brightest - diffuse))), uniform[0])
-    return np.array([ambient, diffuse, *np.deg2rad([pitch, yaw])], np.float32)
-
-
-def _either_side(ends: Range, beyond: float, share: float) -> float:
-    """Uniform over the two pieces of a range that lie at least ``beyond`` from 0."""
-    left, right = max(0.0, -beyond - ends[0]), max(0.0, ends[1] - beyond)
-    at = share * (left + right)
-    return ends[0] + at if at < left else beyond + (at - left)
-
-
-def _scaled(ends: Range, share: float) -> float:
-    return float(ends[0] + (ends[1] - ends[0]) * share)
+    ambient = scaled((low, max(low, min(high, brightest - diffuse))), uniform[0])
+    return np.array([ambient, diffuse, *light_angles(light, uniform[2:])], np.float32)

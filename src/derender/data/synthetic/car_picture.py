@@ -11,6 +11,7 @@ import numpy as np
 
 from derender.data.synthetic.car_decals import (
     BOUNDS,
+    BOX,
     CHECKER,
     COLOUR,
     KIND,
@@ -20,9 +21,10 @@ from derender.data.synthetic.car_decals import (
     RING,
     SHAPE,
 )
+from derender.data.synthetic.z_buffer import SAMPLES, fill_triangle, place_samples, store_colour
 from derender.render.numba_threads import kernel
 
-SAMPLES = 3
+_ALL = SAMPLES * SAMPLES
 
 
 @kernel
@@ -36,30 +38,24 @@ def draw_car(vertices, normals, chart, triangles, surface, colour, part, first, 
     surface (F,); colour to holes as in ``PaintTable``; rotation (3,3), translation (3,), light (5,) =
     ambient, diffuse and the direction in the camera frame, background (S,S,3) 0..1; image (3,S,S) uint8,
     depth (S,S), normal (S,S,3), albedo (3,S,S) uint8, mask (S,S), parts (S,S) uint8."""
-    count = vertices.shape[0]
-    point = np.empty((count, 3), np.float32)  # sample column, sample row, 1 / z
-    middle = np.float32(0.5) * (size - 1)
-    one, samples = np.float32(1.0), np.float32(SAMPLES)
-    for v in range(count):
-        x, y, z = vertices[v, 0], vertices[v, 1], vertices[v, 2]
-        w = one / (rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z + translation[2] + one)
-        u = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z + translation[0]
-        t = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z + translation[1]
-        point[v, 0] = samples * (focal_px * u * w + middle) + one
-        point[v, 1] = samples * (focal_px * t * w + middle) + one
-        point[v, 2] = w
     fine = size * SAMPLES
-    nearest = np.zeros((fine, fine), np.float32)  # 1 / z, larger is nearer, 0 is empty
+    points = np.empty((vertices.shape[0], 4), np.float32)
+    camera = np.empty((vertices.shape[0], 3), np.float32)
+    nearest = np.zeros((fine, fine), np.float32)
     owner = np.full((fine, fine), -1, np.int32)
+    place_samples(vertices, np.float32(0.0), rotation, translation, focal_px, size, camera, points)
     for f in range(triangles.shape[0]):
-        a, b, c = triangles[f, 0], triangles[f, 1], triangles[f, 2]
+        a, b, c = np.uint32(triangles[f, 0]), np.uint32(triangles[f, 1]), np.uint32(triangles[f, 2])
         k = surface[f]
         hole = first_hole[k + 1]
         for h in range(first_hole[k], first_hole[k + 1]):
             if _meets(chart, a, b, c, holes[h]):
                 hole = h
-        _draw_triangle(point, chart, a, b, c, f, holes, hole, hole < first_hole[k + 1], nearest, owner)
-    _shade(point, normals, chart, triangles, surface, colour, part, first, folded, decals, rotation, light,
+        if hole < first_hole[k + 1]:
+            _fill_around_hole(points, chart, a, b, c, f, holes[hole], nearest, owner)
+        else:
+            fill_triangle(points, a, b, c, f, nearest, owner)
+    _shade(points, normals, chart, triangles, surface, colour, part, first, folded, decals, rotation, light,
            background, owner, size, image, depth, normal, albedo, mask, parts)  # fmt: skip
 
 
@@ -95,200 +91,205 @@ def _meets(chart, a, b, c, hole):
 
 @kernel
 @no_type_check
-def _draw_triangle(point, chart, a, b, c, number, holes, hole, has_hole, nearest, owner):
-    """Z-buffer one triangle; one that is seen from behind or has no area is skipped, samples in a hole
-    too."""
-    ax, ay, aw = point[a, 0], point[a, 1], point[a, 2]
-    bx, by, bw = point[b, 0], point[b, 1], point[b, 2]
-    cx, cy, cw = point[c, 0], point[c, 1], point[c, 2]
-    area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
-    if area <= np.float32(1e-9):
+def _fill_around_hole(points, chart, a, b, c, number, hole, nearest, owner):
+    """As fill_triangle, sample by sample, leaving out those whose place on the chart lies in the hole."""
+    ax, ay, bx, by = points[a, 0], points[a, 1], points[b, 0], points[b, 1]
+    cx, cy = points[c, 0], points[c, 1]
+    if (bx - ax) * (cy - ay) <= (by - ay) * (cx - ax):
         return
-    fine = nearest.shape[0]
+    last = nearest.shape[0] - 1
     first_column = max(int(np.ceil(min(ax, bx, cx))), 0)
-    last_column = min(int(np.floor(max(ax, bx, cx))), fine - 1)
-    first_row = max(int(np.ceil(min(ay, by, cy))), 0)
-    last_row = min(int(np.floor(max(ay, by, cy))), fine - 1)
-    scale = np.float32(1.0) / area
-    for v in range(first_row, last_row + 1):
+    last_column = min(int(np.floor(max(ax, bx, cx))), last)
+    for v in range(max(int(np.ceil(min(ay, by, cy))), 0), min(int(np.floor(max(ay, by, cy))), last) + 1):
         for u in range(first_column, last_column + 1):
-            wa = (bx - u) * (cy - v) - (by - v) * (cx - u)
-            wb = (cx - u) * (ay - v) - (cy - v) * (ax - u)
-            wc = area - wa - wb
-            if wa >= 0.0 and wb >= 0.0 and wc >= 0.0:
-                w = (wa * aw + wb * bw + wc * cw) * scale
-                if w > nearest[v, u]:
-                    if has_hole:
-                        pa, pb, pc = wa * aw / w * scale, wb * bw / w * scale, wc * cw / w * scale
-                        p = pa * chart[a, 0] + pb * chart[b, 0] + pc * chart[c, 0] - holes[hole, 0]
-                        q = pa * chart[a, 1] + pb * chart[b, 1] + pc * chart[c, 1] - holes[hole, 1]
-                        if p * p + q * q < holes[hole, 2] * holes[hole, 2]:
-                            continue
-                    nearest[v, u] = w
-                    owner[v, u] = number
+            wa, wb, wc = _corners(points, a, b, c, np.float32(u), np.float32(v))
+            if min(wa, wb, wc) < np.float32(0.0):
+                continue
+            total = wa + wb + wc
+            p = (wa * chart[a, 0] + wb * chart[b, 0] + wc * chart[c, 0]) / total - hole[0]
+            q = (wa * chart[a, 1] + wb * chart[b, 1] + wc * chart[c, 1]) / total - hole[1]
+            z = (wa / points[a, 2] + wb / points[b, 2] + wc / points[c, 2]) / total
+            if z * nearest[v, u] < np.float32(1.0) and p * p + q * q >= hole[2] * hole[2]:
+                nearest[v, u] = np.float32(1.0) / z
+                owner[v, u] = number
 
 
 @kernel
 @no_type_check
-def _shade(point, facing, chart, triangles, surface, base, base_part, first, folded, decals, rotation, light,
+def _corners(points, a, b, c, column, row):
+    """Weights of a triangle's corners at a sample, with perspective, up to a common factor."""
+    ax, ay = points[a, 0] - column, points[a, 1] - row
+    bx, by = points[b, 0] - column, points[b, 1] - row
+    cx, cy = points[c, 0] - column, points[c, 1] - row
+    wa, wb, wc = bx * cy - by * cx, cx * ay - cy * ax, ax * by - ay * bx
+    return wa * points[a, 2], wb * points[b, 2], wc * points[c, 2]
+
+
+@kernel
+@no_type_check
+def _shade(points, facing, chart, triangles, surface, base, base_part, first, folded, decals, rotation, light,
            background, owner, size, image, depth, normal, albedo, mask, parts):  # fmt: skip
     # the light in the frame of the normals, so that these need not be turned
     lx = rotation[0, 0] * light[2] + rotation[1, 0] * light[3] + rotation[2, 0] * light[4]
     ly = rotation[0, 1] * light[2] + rotation[1, 1] * light[3] + rotation[2, 1] * light[4]
     lz = rotation[0, 2] * light[2] + rotation[1, 2] * light[3] + rotation[2, 2] * light[4]
-    white, half, share = np.float32(255.0), np.float32(0.5), np.float32(1.0 / SAMPLES**2)
-    weight = np.empty((SAMPLES * SAMPLES, 4), np.float32)  # of the triangle's corners; z
-    spot = np.empty((SAMPLES * SAMPLES, 2), np.float32)  # place on the chart
-    near = np.empty(decals.shape[0], np.int32)  # the shapes that may lie in this pixel
-    colour = np.empty(3, np.float32)
-    unit = np.empty(3, np.float32)
-    for i in range(size):
-        for j in range(size):
-            only = _locate(point, chart, triangles, surface, folded, owner, i, j, weight, spot)
-            count = _candidates(decals, first, spot, only, near) if only >= 0 else 0
-            red, green, blue = np.float32(0.0), np.float32(0.0), np.float32(0.0)
-            for s in range(SAMPLES * SAMPLES):
-                f = owner[SAMPLES * i + s // SAMPLES, SAMPLES * j + s % SAMPLES]
-                if f < 0:
-                    red += background[i, j, 0]
-                    green += background[i, j, 1]
-                    blue += background[i, j, 2]
+    one, zero, share = np.float32(1.0), np.float32(0.0), np.float32(1.0 / _ALL)
+    weight = np.empty((_ALL, 3), np.float32)  # of the corners of each sample's triangle
+    spot = np.zeros((2, _ALL), np.float32)  # place on the chart
+    of = np.empty(_ALL, np.int32)  # surface, -1 on the background
+    inside = np.empty(_ALL, np.bool_)
+    colour = np.empty((_ALL, 3), np.float32)
+    part = np.empty(_ALL, np.int32)
+    for i in range(np.uint32(size)):
+        for j in range(np.uint32(size)):
+            seen = _locate(points, chart, triangles, surface, folded, owner, i, j, weight, spot, of)
+            empty = np.float32(_ALL - seen)
+            red, green = empty * background[i, j, 0], empty * background[i, j, 1]
+            blue = empty * background[i, j, 2]
+            painted = -1
+            for s in range(np.uint32(_ALL if seen else 0)):
+                k = of[s]
+                if k < 0:
                     continue
-                a, b, c = triangles[f, 0], triangles[f, 1], triangles[f, 2]
+                if k != painted:
+                    painted = k
+                    _paint(
+                        decals,
+                        first[k],
+                        first[k + 1],
+                        base[k],
+                        base_part[k],
+                        spot,
+                        of,
+                        k,
+                        inside,
+                        colour,
+                        part,
+                    )
+                f = np.uint32(owner[SAMPLES * i + s // SAMPLES, SAMPLES * j + s % SAMPLES])
+                a, b, c = np.uint32(triangles[f, 0]), np.uint32(triangles[f, 1]), np.uint32(triangles[f, 2])
                 wa, wb, wc = weight[s, 0], weight[s, 1], weight[s, 2]
                 x = wa * facing[a, 0] + wb * facing[b, 0] + wc * facing[c, 0]
                 y = wa * facing[a, 1] + wb * facing[b, 1] + wc * facing[c, 1]
                 z = wa * facing[a, 2] + wb * facing[b, 2] + wc * facing[c, 2]
-                scale = np.float32(1.0) / max(np.sqrt(x * x + y * y + z * z), np.float32(1e-20))
-                lit = light[0] + light[1] * max(np.float32(0.0), (x * lx + y * ly + z * lz) * scale)
-                k = surface[f]
-                if only < 0:
-                    count = first[k + 1] - first[k]
-                    for d in range(count):
-                        near[d] = first[k] + d
-                seen = _paint(decals, near, count, spot[s, 0], spot[s, 1], base[k], base_part[k], colour)
-                red += min(colour[0] * lit, np.float32(1.0))
-                green += min(colour[1] * lit, np.float32(1.0))
-                blue += min(colour[2] * lit, np.float32(1.0))
-                if s == SAMPLES * SAMPLES // 2:
+                scale = one / max(np.sqrt(x * x + y * y + z * z), np.float32(1e-20))
+                lit = light[0] + light[1] * max(zero, (x * lx + y * ly + z * lz) * scale)
+                red += min(colour[s, 0] * lit, one)
+                green += min(colour[s, 1] * lit, one)
+                blue += min(colour[s, 2] * lit, one)
+                if s == _ALL // 2:
                     mask[i, j] = True
-                    depth[i, j] = weight[s, 3]
-                    parts[i, j] = seen
-                    unit[0], unit[1], unit[2] = x * scale, y * scale, z * scale
+                    depth[i, j] = one / (wa * points[a, 2] + wb * points[b, 2] + wc * points[c, 2])
+                    parts[i, j] = part[s]
+                    x, y, z = x * scale, y * scale, z * scale
                     for n in range(3):
-                        normal[i, j, n] = (
-                            rotation[n, 0] * unit[0] + rotation[n, 1] * unit[1] + rotation[n, 2] * unit[2]
-                        )
-                        albedo[n, i, j] = np.uint8(colour[n] * white + half)
-            image[0, i, j] = np.uint8(red * share * white + half)
-            image[1, i, j] = np.uint8(green * share * white + half)
-            image[2, i, j] = np.uint8(blue * share * white + half)
+                        normal[i, j, n] = rotation[n, 0] * x + rotation[n, 1] * y + rotation[n, 2] * z
+                    store_colour(albedo, i, j, colour[s, 0], colour[s, 1], colour[s, 2])
+            store_colour(image, i, j, red * share, green * share, blue * share)
 
 
 @kernel
 @no_type_check
-def _locate(point, chart, triangles, surface, folded, owner, i, j, weight, spot):
-    """Perspective-correct weights and chart place of a pixel's samples; its surface if it is one, else -1."""
-    only = -2
-    for s in range(SAMPLES * SAMPLES):
+def _locate(points, chart, triangles, surface, folded, owner, i, j, weight, spot, of):
+    """Fill in the weights, chart place and surface of a pixel's samples; how many are on the car."""
+    seen = 0
+    for s in range(np.uint32(_ALL)):
         v, u = SAMPLES * i + s // SAMPLES, SAMPLES * j + s % SAMPLES
-        f = owner[v, u]
-        if f < 0:
-            only = -1
+        of[s] = -1
+        if owner[v, u] < 0:
             continue
-        a, b, c = triangles[f, 0], triangles[f, 1], triangles[f, 2]
-        ax, ay, bx, by = point[a, 0], point[a, 1], point[b, 0], point[b, 1]
-        cx, cy = point[c, 0], point[c, 1]
-        wa = ((bx - u) * (cy - v) - (by - v) * (cx - u)) * point[a, 2]
-        wb = ((cx - u) * (ay - v) - (cy - v) * (ax - u)) * point[b, 2]
-        wc = ((ax - u) * (by - v) - (ay - v) * (bx - u)) * point[c, 2]
+        f = np.uint32(owner[v, u])
+        a, b, c = np.uint32(triangles[f, 0]), np.uint32(triangles[f, 1]), np.uint32(triangles[f, 2])
+        wa, wb, wc = _corners(points, a, b, c, np.float32(u), np.float32(v))
         scale = np.float32(1.0) / (wa + wb + wc)
         wa, wb, wc = wa * scale, wb * scale, wc * scale
         weight[s, 0], weight[s, 1], weight[s, 2] = wa, wb, wc
-        weight[s, 3] = ((bx - ax) * (cy - ay) - (by - ay) * (cx - ax)) * scale
         k = surface[f]
         p = wa * chart[a, 0] + wb * chart[b, 0] + wc * chart[c, 0]
-        spot[s, 0] = abs(p) if folded[k] else p
-        spot[s, 1] = wa * chart[a, 1] + wb * chart[b, 1] + wc * chart[c, 1]
-        if only == -2:
-            only = k
-        elif only != k:
-            only = -1
-    return only if only >= 0 else -1
+        spot[0, s] = abs(p) if folded[k] else p
+        spot[1, s] = wa * chart[a, 1] + wb * chart[b, 1] + wc * chart[c, 1]
+        of[s] = k
+        seen += 1
+    return seen
 
 
 @kernel
 @no_type_check
-def _candidates(decals, first, spot, surface, near):
-    """Fill ``near`` with the shapes of a surface whose bounds meet those of a pixel's samples; how many."""
-    low_p, high_p = spot[0, 0], spot[0, 0]
-    low_q, high_q = spot[0, 1], spot[0, 1]
-    for s in range(1, SAMPLES * SAMPLES):
-        low_p, high_p = min(low_p, spot[s, 0]), max(high_p, spot[s, 0])
-        low_q, high_q = min(low_q, spot[s, 1]), max(high_q, spot[s, 1])
-    count = 0
-    for d in range(first[surface], first[surface + 1]):
+def _paint(decals, first, end, base, base_part, spot, of, surface, inside, colour, part):
+    """Fill in colour and part of a pixel's samples on one surface, whose shapes are ``first`` to ``end``."""
+    low_p, high_p = np.float32(np.inf), -np.float32(np.inf)
+    low_q, high_q = low_p, high_p
+    for s in range(np.uint32(_ALL)):
+        if of[s] == surface:
+            low_p, high_p = min(low_p, spot[0, s]), max(high_p, spot[0, s])
+            low_q, high_q = min(low_q, spot[1, s]), max(high_q, spot[1, s])
+            colour[s, 0], colour[s, 1], colour[s, 2] = base[0], base[1], base[2]
+            part[s] = base_part
+    for d in range(np.uint32(first), np.uint32(end)):
         if (
-            high_p >= decals[d, BOUNDS]
-            and high_q >= decals[d, BOUNDS + 1]
-            and low_p <= decals[d, BOUNDS + 2]
-            and low_q <= decals[d, BOUNDS + 3]
+            high_p < decals[d, BOUNDS]
+            or high_q < decals[d, BOUNDS + 1]
+            or low_p > decals[d, BOUNDS + 2]
+            or low_q > decals[d, BOUNDS + 3]
         ):
-            near[count] = d
-            count += 1
-    return count
+            continue
+        _cover(decals[d], spot, inside)
+        red, green, blue = decals[d, COLOUR], decals[d, COLOUR + 1], decals[d, COLOUR + 2]
+        multiplies, named = decals[d, MULTIPLIES] > np.float32(0.0), decals[d, PART] >= np.float32(0.0)
+        for s in range(np.uint32(_ALL)):
+            if inside[s] and of[s] == surface:
+                if multiplies:
+                    colour[s, 0], colour[s, 1], colour[s, 2] = (
+                        colour[s, 0] * red,
+                        colour[s, 1] * green,
+                        colour[s, 2] * blue,
+                    )
+                else:
+                    colour[s, 0], colour[s, 1], colour[s, 2] = red, green, blue
+                if named:
+                    part[s] = int(decals[d, PART])
 
 
 @kernel
 @no_type_check
-def _paint(decals, near, count, p, q, base, part, colour):
-    """Colour at a place of a chart, and the part it belongs to."""
-    colour[0], colour[1], colour[2] = base[0], base[1], base[2]
-    for n in range(count):
-        d = near[n]
-        if _covers(decals, d, p, q):
-            if decals[d, PART] >= np.float32(0.0):
-                part = int(decals[d, PART])
-            for k in range(3):
-                over = decals[d, COLOUR + k]
-                colour[k] = colour[k] * over if decals[d, MULTIPLIES] > np.float32(0.0) else over
-    return part
-
-
-@kernel
-@no_type_check
-def _covers(decals, d, p, q):
-    """Whether shape d holds the point (p, q) of its chart."""
-    if (
-        p < decals[d, BOUNDS]
-        or q < decals[d, BOUNDS + 1]
-        or p > decals[d, BOUNDS + 2]
-        or q > decals[d, BOUNDS + 3]
-    ):
-        return False
-    kind = decals[d, KIND]
+def _cover(decal, spot, inside):
+    """Which of a pixel's samples a shape holds."""
+    u0, v0, u1, v1 = decal[BOUNDS], decal[BOUNDS + 1], decal[BOUNDS + 2], decal[BOUNDS + 3]
+    kind = decal[KIND]
     if kind == POLYGON:
-        inside = False
-        corners = int(decals[d, SHAPE])
-        before = corners - 1
+        inside[:] = False
+        corners = np.uint32(decal[SHAPE])
+        x0, y0 = decal[SHAPE + 2 * corners - 1], decal[SHAPE + 2 * corners]
         for k in range(corners):
-            x, y = decals[d, SHAPE + 1 + 2 * k], decals[d, SHAPE + 2 + 2 * k]
-            x0, y0 = decals[d, SHAPE + 1 + 2 * before], decals[d, SHAPE + 2 + 2 * before]
-            if (y > q) != (y0 > q) and p < (x0 - x) * (q - y) / (y0 - y) + x:
-                inside = not inside
-            before = k
-        return inside
+            x, y = decal[SHAPE + 1 + 2 * k], decal[SHAPE + 2 + 2 * k]
+            slope = (x0 - x) / (y0 - y) if y0 != y else np.float32(0.0)
+            for s in range(np.uint32(_ALL)):
+                q = spot[1, s]
+                crosses = ((y > q) != (y0 > q)) & (spot[0, s] < slope * (q - y) + x)
+                inside[s] = inside[s] ^ crosses
+            x0, y0 = x, y
+        return
+    for s in range(np.uint32(_ALL)):
+        p, q = spot[0, s], spot[1, s]
+        inside[s] = p >= u0 and q >= v0 and p <= u1 and q <= v1
+        if inside[s] and kind != BOX:
+            inside[s] = _covers(decal, kind, p, q)
+
+
+@kernel
+@no_type_check
+def _covers(decal, kind, p, q):
+    """Whether a ring, spokes or a chequered field hold a point within their bounds."""
     if kind == RING:
-        x = (p - decals[d, SHAPE]) / decals[d, SHAPE + 2]
-        y = (q - decals[d, SHAPE + 1]) / decals[d, SHAPE + 3]
+        x, y = (p - decal[SHAPE]) / decal[SHAPE + 2], (q - decal[SHAPE + 1]) / decal[SHAPE + 3]
         away = x * x + y * y
-        return away <= np.float32(1.0) and away >= decals[d, SHAPE + 4] * decals[d, SHAPE + 4]
+        return away <= np.float32(1.0) and away >= decal[SHAPE + 4] * decal[SHAPE + 4]
     if kind == CHECKER:
-        column = int(np.floor((p - decals[d, BOUNDS]) / decals[d, SHAPE]))
-        row = int(np.floor((q - decals[d, BOUNDS + 1]) / decals[d, SHAPE + 1]))
-        return (column + row) % 2 == int(decals[d, SHAPE + 2])
+        column = int(np.floor((p - decal[BOUNDS]) / decal[SHAPE]))
+        row = int(np.floor((q - decal[BOUNDS + 1]) / decal[SHAPE + 1]))
+        return (column + row) % 2 == int(decal[SHAPE + 2])
     away = np.sqrt(p * p + q * q)
-    if away < decals[d, SHAPE + 2] or away > decals[d, SHAPE + 3]:
+    if away < decal[SHAPE + 2] or away > decal[SHAPE + 3]:
         return False
-    turn = np.arctan2(q, p) / np.float32(2.0 * np.pi) * decals[d, SHAPE]
-    return turn - np.floor(turn) < decals[d, SHAPE + 1]
+    turn = np.arctan2(q, p) / np.float32(2.0 * np.pi) * decal[SHAPE]
+    return turn - np.floor(turn) < decal[SHAPE + 1]

@@ -6,21 +6,21 @@ names that the faces' have: "wide" is outside what "usual" ever shows."""
 
 from collections.abc import Mapping
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 
 from derender.data.synthetic.car_traits import CLASSES
-from derender.data.synthetic.settings import BACKGROUNDS, LightSettings, Range
+from derender.data.synthetic.settings import (
+    BACKGROUNDS,
+    LIGHTS,
+    LightSettings,
+    Range,
+    Shares,
+    check_beyond,
+    check_names,
+    check_range,
+    check_shares,
+)
 from derender.settings import Settings
-
-
-def _within(name: str, value: Range, low: float, high: float) -> None:
-    if not low <= value[0] <= value[1] <= high:
-        raise ValueError(f"{name} must be two numbers, low <= high, within {low}..{high}; got {value}")
-
-
-def _known(name: str, values: tuple[str, ...], known: tuple[str, ...]) -> None:
-    if not values or not set(values) <= set(known):
-        raise ValueError(f"{name} must be one or more of {', '.join(known)}; got {values}")
 
 
 class CarViewSettings(Settings):
@@ -46,25 +46,15 @@ class CarViewSettings(Settings):
             ("elevation_deg", 0.0, 90.0), ("azimuth_deg", -180.0, 180.0), ("inplane_deg", -180.0, 180.0),
             ("shift", -0.1, 0.1),
         ):  # fmt: skip
-            _within(f"view.{name}", getattr(self, name), low, high)
-        left, right = self.azimuth_deg
-        if (
-            self.azimuth_beyond_deg > 0
-            and not left <= -self.azimuth_beyond_deg <= self.azimuth_beyond_deg <= right
-        ):
-            raise ValueError(
-                f"view.azimuth_beyond_deg must lie within view.azimuth_deg {self.azimuth_deg} on both sides, "
-                f"got {self.azimuth_beyond_deg}"
-            )
+            check_range(f"view.{name}", getattr(self, name), low, high)
+        check_beyond("view.azimuth_beyond_deg", self.azimuth_beyond_deg, self.azimuth_deg)
         return self
 
 
 _USUAL_LIGHT = LightSettings(diffuse=(0.5, 1.0))
 CAR_LIGHTS: Mapping[str, LightSettings] = {
     "usual": _USUAL_LIGHT,
-    "wide": LightSettings(
-        yaw_deg=(-70, 70), pitch_deg=(-60, 60), beyond_deg=35, ambient=(0.05, 0.3), diffuse=(0.6, 1.0)
-    ),
+    "wide": LIGHTS["wide"],
     "frontal": LightSettings(yaw_deg=(0, 0), pitch_deg=(0, 0), ambient=(0.4, 0.4), diffuse=(0.6, 0.6)),
 }
 CAR_VIEWS: Mapping[str, CarViewSettings] = {
@@ -91,22 +81,14 @@ class CarSettings(Settings):
     light: LightSettings = _USUAL_LIGHT
     brightest: float = Field(default=1.3, ge=0.1, le=2)
     view: CarViewSettings = CarViewSettings()
-    classes: Mapping[str, float] = Field(default=dict.fromkeys(CLASSES, 1.0))
+    classes: Shares = Field(default=dict.fromkeys(CLASSES, 1.0))
     pictures_per_model: int = Field(default=4, ge=1)
     first_model: int = Field(default=0, ge=0)
     size: float = Field(default=0.198, gt=0.01, le=0.3)
     backgrounds: tuple[str, ...] = BACKGROUNDS
 
-    @field_validator("classes", mode="before")
-    @classmethod
-    def _shares(cls, value: object) -> object:
-        """A list of names means equal shares."""
-        return dict.fromkeys(value, 1.0) if isinstance(value, (list, tuple)) else value
-
     @model_validator(mode="after")
     def _possible(self) -> "CarSettings":
-        _known("classes", tuple(self.classes), tuple(CLASSES))
-        if min(self.classes.values()) < 0 or sum(self.classes.values()) <= 0:
-            raise ValueError(f"classes: shares must be 0 or more and not all 0, got {dict(self.classes)}")
-        _known("backgrounds", self.backgrounds, BACKGROUNDS)
+        check_shares("classes", self.classes, CLASSES)
+        check_names("backgrounds", self.backgrounds, BACKGROUNDS)
         return self

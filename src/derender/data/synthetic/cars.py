@@ -5,17 +5,14 @@ first ones, nor does the number of threads. Conventions are those of docs/conven
 development set: a car's bounding box is centred on (0, 0, 1), the canonical view is from straight ahead and
 42.5 degrees above."""
 
-import itertools
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import torch
 from jaxtyping import Float32, Float64
 from numpy import ndarray
 
+from derender.data.synthetic.batches import FOV_DEG, Maps, Row, check_request, make_set
 from derender.data.synthetic.car_decals import PARTS
 from derender.data.synthetic.car_draw import (
     CANONICAL_ELEVATION_DEG,
@@ -32,9 +29,6 @@ from derender.data.synthetic.car_traits import CarTraits, draw_traits
 from derender.data.synthetic.synthetic_set import SyntheticSet, camera_rotation_and_light
 from derender.scene.camera import focal_px
 
-FOV_DEG = 10.0
-_CHUNK = 16
-
 
 def generate(
     count: int,
@@ -49,31 +43,15 @@ def generate(
     ``labels`` has ``class``, ``style`` (body style), ``model`` (CLASS/NUMBER) and the turntable's angles in
     degrees; ``parts`` counts into ``car_decals.PARTS``; ``identity`` is the model's number."""
     settings = settings or CarSettings()
-    _check(count, image_size, seed, first)
-    out = _empty(count, image_size)
-    labels: list[dict[str, Any]] = []
-    traits: list[dict[str, float]] = []
+    check_request(count, image_size, seed, first)
 
-    def work(rows: slice) -> list[tuple[dict[str, Any], dict[str, float]]]:
-        draws = [
-            draw_car_picture(seed, first + i, image_size, settings) for i in range(rows.start, rows.stop)
-        ]
+    def work(indices: range, maps: Maps) -> list[tuple[Row, Row]]:
+        draws = [draw_car_picture(seed, index, image_size, settings) for index in indices]
         cars = {number: model_car(seed, number, settings) for number in sorted({d.model for d in draws})}
-        _pictures(
-            draws, [cars[d.model] for d in draws], image_size, {name: v[rows] for name, v in out.items()}
-        )
+        _pictures(draws, [cars[d.model] for d in draws], image_size, maps)
         return [(_labels(d, cars[d.model].traits), _traits(cars[d.model].traits)) for d in draws]
 
-    chunks = _chunks(first, count, settings.pictures_per_model, max(1, _CHUNK * 64 // image_size))
-    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
-        for rows, found in zip(chunks, pool.map(work, chunks), strict=True):
-            labels += [label for label, _ in found]
-            traits += [trait for _, trait in found]
-            if progress is not None:
-                progress(rows.stop, count)
-    return SyntheticSet(
-        **out, labels=_columns(labels), identity_traits=_columns(traits), part_names=PARTS, fov_deg=FOV_DEG
-    )
+    return make_set(work, count, image_size, first, settings.pictures_per_model, PARTS, progress)
 
 
 @dataclass(frozen=True)
@@ -100,8 +78,8 @@ def model_car(seed: int, number: int, settings: CarSettings | None = None) -> Mo
     )
 
 
-def _pictures(draws: list[CarDraw], cars: list[ModelCar], size: int, out: dict[str, ndarray]) -> None:
-    """Draw the pictures of one chunk into ``out``."""
+def _pictures(draws: list[CarDraw], cars: list[ModelCar], size: int, out: Maps) -> None:
+    """Draw the pictures of one batch into ``out``."""
     for n, (draw, car) in enumerate(zip(draws, cars, strict=True)):
         shift = shift_inside(car.vertices, draw.rotation, draw.shift)
         out["camera"][n] = *euler_angles(draw.rotation), *shift, 0.0
@@ -130,7 +108,7 @@ def shift_inside(
     return np.where(low < high, np.clip(shift, low, high), 0.5 * (low + high))
 
 
-def _labels(draw: CarDraw, car: CarTraits) -> dict[str, Any]:
+def _labels(draw: CarDraw, car: CarTraits) -> Row:
     return {
         "class": car.name,
         "style": car.style,
@@ -141,7 +119,7 @@ def _labels(draw: CarDraw, car: CarTraits) -> dict[str, Any]:
     }
 
 
-def _traits(car: CarTraits) -> dict[str, float]:
+def _traits(car: CarTraits) -> Row:
     names = ("length", "width", "height", "wheel", "soft")
     colours = {"paint": car.paint, "roof": car.roof, "glass": car.glass}
     return {name: getattr(car.shape, name) for name in names} | {
@@ -149,40 +127,3 @@ def _traits(car: CarTraits) -> dict[str, float]:
         for name, colour in colours.items()
         for channel, value in zip(("red", "green", "blue"), colour, strict=True)
     }
-
-
-def _chunks(first: int, count: int, per_model: int, most: int) -> list[slice]:
-    """Consecutive rows to work on together: whole models where they fit into ``most`` rows."""
-    whole = max(1, most // per_model) * per_model
-    starts = [0]
-    while starts[-1] < count:
-        in_block = (first + starts[-1]) % whole
-        starts.append(min(starts[-1] + min(whole - in_block, most), count))
-    return [slice(a, b) for a, b in itertools.pairwise(starts)]
-
-
-def _columns(rows: list[dict[str, Any]]) -> dict[str, ndarray]:
-    return {name: np.array([row[name] for row in rows]) for name in rows[0]}
-
-
-def _empty(count: int, size: int) -> dict[str, ndarray]:
-    return {
-        "images": np.zeros((count, 3, size, size), np.uint8),
-        "depth": np.zeros((count, size, size), np.float32),
-        "normal": np.zeros((count, size, size, 3), np.float32),
-        "albedo": np.zeros((count, 3, size, size), np.uint8),
-        "mask": np.zeros((count, size, size), bool),
-        "parts": np.zeros((count, size, size), np.uint8),
-        "light": np.zeros((count, 4), np.float32),
-        "camera": np.zeros((count, 6), np.float32),
-        "identity": np.zeros(count, np.int64),
-    }
-
-
-def _check(count: int, image_size: int, seed: int, first: int) -> None:
-    if count < 1:
-        raise ValueError(f"count must be 1 or more, got {count}")
-    if not 16 <= image_size <= 1024:
-        raise ValueError(f"image_size must be 16..1024 pixels, got {image_size}")
-    if seed < 0 or first < 0:
-        raise ValueError(f"seed and first must be 0 or more, got seed {seed}, first {first}")

@@ -12,11 +12,10 @@ from jaxtyping import Float32
 from numpy import ndarray
 
 from derender.data.synthetic.backgrounds import draw_background
+from derender.data.synthetic.draws import clipped, either_side, light_angles, name_at, scaled
 from derender.data.synthetic.face_expression import ACTIONS, EXPRESSIONS, LID_ACTIONS
 from derender.data.synthetic.settings import FaceSettings, LightSettings, Range, ViewSettings
 
-_OTHER_DEG = 20.0  # with beyond_deg, the angle that is not beyond stays within this
-_YAW_SHARE = 0.6
 _DRIFT = np.array([*np.deg2rad([8.0, 18.0, 5.0]), 0.005, 0.005, 0.0])  # how far a head moves within a track
 _JAW = ACTIONS.index("jaw_open")
 
@@ -49,11 +48,9 @@ def draw_face(seed: int, index: int, image_size: int, settings: FaceSettings) ->
     uniform = generator.random(8)
     ends = generator.random((2, 4))
     halves = generator.standard_normal((len(ACTIONS) + len(LID_ACTIONS), 2))
-    names = list(settings.expressions)
-    shares = np.cumsum([settings.expressions[name] for name in names])
-    name = names[int(np.searchsorted(shares, uniform[0] * shares[-1], side="right"))]
+    name = name_at(settings.expressions, uniform[0])
     along = frame / max(settings.frames - 1, 1) if settings.tracks else 0.0
-    strengths = np.array([[_scaled(settings.strength, share)] for share in ends[:, 3]])
+    strengths = np.array([[scaled(settings.strength, share)] for share in ends[:, 3]])
     strength = 0.0 if name == "neutral" else float(_moved(strengths, along)[0])
     weights = np.array([EXPRESSIONS[name].get(action, 0.0) for action in (*ACTIONS, *LID_ACTIONS)])
     sides = strength * weights[:, None] * (1.0 + settings.asymmetry * halves)
@@ -82,7 +79,7 @@ def draw_face(seed: int, index: int, image_size: int, settings: FaceSettings) ->
 def _camera(view: ViewSettings, normal: ndarray, uniform: ndarray) -> ndarray:
     yaw = _angle(view.yaw_deg, view.yaw_sd_deg, normal[1], uniform[1])
     if view.yaw_beyond_deg > 0:
-        yaw = _either_side(view.yaw_deg, view.yaw_beyond_deg, uniform[1])
+        yaw = either_side(view.yaw_deg, view.yaw_beyond_deg, uniform[1])
     rotation = np.deg2rad(
         [
             _angle(view.pitch_deg, view.pitch_sd_deg, normal[0], uniform[0]),
@@ -95,38 +92,17 @@ def _camera(view: ViewSettings, normal: ndarray, uniform: ndarray) -> ndarray:
 
 
 def _light(light: LightSettings, uniform: ndarray) -> Float32[ndarray, "4"]:
-    pitch, yaw = _scaled(light.pitch_deg, uniform[2]), _scaled(light.yaw_deg, uniform[3])
-    if light.beyond_deg > 0:
-        if uniform[4] < _YAW_SHARE:
-            yaw = _either_side(light.yaw_deg, light.beyond_deg, uniform[3])
-            pitch = _OTHER_DEG * (2.0 * uniform[2] - 1.0)
-        else:
-            pitch = _either_side(light.pitch_deg, light.beyond_deg, uniform[2])
-            yaw = _OTHER_DEG * (2.0 * uniform[3] - 1.0)
-    angles = np.deg2rad([pitch, yaw])
-    return np.array(
-        [_scaled(light.ambient, uniform[0]), _scaled(light.diffuse, uniform[1]), *angles], np.float32
-    )
+    ambient, diffuse = scaled(light.ambient, uniform[0]), scaled(light.diffuse, uniform[1])
+    return np.array([ambient, diffuse, *light_angles(light, uniform[2:])], np.float32)
 
 
 def _angle(ends: Range, sd: float | None, normal: float, uniform: float) -> float:
     """A normal about the middle, clipped at the ends; uniform without a spread."""
     if sd is None:
-        return _scaled(ends, uniform)
-    return float(np.clip(0.5 * (ends[0] + ends[1]) + sd * normal, *ends))
-
-
-def _either_side(ends: Range, beyond: float, share: float) -> float:
-    """Uniform over the two pieces of a range that lie at least ``beyond`` from 0."""
-    left, right = max(0.0, -beyond - ends[0]), max(0.0, ends[1] - beyond)
-    at = share * (left + right)
-    return ends[0] + at if at < left else beyond + (at - left)
+        return scaled(ends, uniform)
+    return clipped(0.5 * (ends[0] + ends[1]) + sd * normal, ends)
 
 
 def _moved(ends: ndarray, along: float) -> ndarray:
     """Between two draws, smoothly in time (0..1)."""
     return ends[0] + (ends[1] - ends[0]) * (along * along * (3.0 - 2.0 * along))
-
-
-def _scaled(ends: Range, share: float) -> float:
-    return float(ends[0] + (ends[1] - ends[0]) * share)

@@ -5,9 +5,10 @@ names: the random numbers behind each picture do not depend on it, so the same s
 another light. ``LIGHTS`` and ``VIEWS`` name whole sets of them: "wide" is outside what "usual" ever shows.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from typing import Annotated
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from derender.data.synthetic.face_expression import EXPRESSIONS
 from derender.settings import Settings
@@ -16,14 +17,38 @@ Range = tuple[float, float]
 BACKGROUNDS = ("plain", "gradient", "noise")
 
 
-def _within(name: str, value: Range, low: float, high: float) -> None:
+def check_range(name: str, value: Range, low: float, high: float) -> None:
+    """Raise ValueError unless the range lies within low..high."""
     if not low <= value[0] <= value[1] <= high:
         raise ValueError(f"{name} must be two numbers, low <= high, within {low}..{high}; got {value}")
 
 
-def _known(name: str, values: tuple[str, ...], known: tuple[str, ...]) -> None:
-    if not values or not set(values) <= set(known):
-        raise ValueError(f"{name} must be one or more of {', '.join(known)}; got {values}")
+def check_names(name: str, values: Iterable[str], known: Iterable[str]) -> None:
+    """Raise ValueError unless there are names and all are known."""
+    if not set(values) or not set(values) <= set(known):
+        raise ValueError(f"{name} must be one or more of {', '.join(known)}; got {tuple(values)}")
+
+
+def check_shares(name: str, shares: Mapping[str, float], known: Iterable[str]) -> None:
+    """Raise ValueError unless known names have shares of 0 or more, at least one of them above."""
+    check_names(name, shares, known)
+    if min(shares.values()) < 0 or sum(shares.values()) <= 0:
+        raise ValueError(f"{name}: shares must be 0 or more and not all 0, got {dict(shares)}")
+
+
+def check_beyond(name: str, beyond: float, ends: Range) -> None:
+    """Raise ValueError unless an angle above 0 lies within a range on both sides of 0."""
+    if beyond > 0 and not ends[0] <= -beyond <= beyond <= ends[1]:
+        kind = name.replace("_beyond", "")
+        raise ValueError(f"{name} must lie within {kind} {ends} on both sides, got {beyond}")
+
+
+def equal_shares(value: object) -> object:
+    """A list of names means equal shares."""
+    return dict.fromkeys(value, 1.0) if isinstance(value, (list, tuple)) else value
+
+
+Shares = Annotated[Mapping[str, float], BeforeValidator(equal_shares)]
 
 
 class LightSettings(Settings):
@@ -44,7 +69,7 @@ class LightSettings(Settings):
             ("ambient", 0, 1),
             ("diffuse", 0, 1),
         ):
-            _within(f"light.{name}", getattr(self, name), low, high)
+            check_range(f"light.{name}", getattr(self, name), low, high)
         return self
 
 
@@ -66,15 +91,8 @@ class ViewSettings(Settings):
     @model_validator(mode="after")
     def _possible(self) -> "ViewSettings":
         for name, limit in (("yaw_deg", 90.0), ("pitch_deg", 60.0), ("roll_deg", 180.0), ("shift", 0.1)):
-            _within(f"view.{name}", getattr(self, name), -limit, limit)
-        if (
-            self.yaw_beyond_deg > 0
-            and not self.yaw_deg[0] <= -self.yaw_beyond_deg <= self.yaw_beyond_deg <= self.yaw_deg[1]
-        ):
-            raise ValueError(
-                f"view.yaw_beyond_deg must lie within view.yaw_deg {self.yaw_deg} on both sides, "
-                f"got {self.yaw_beyond_deg}"
-            )
+            check_range(f"view.{name}", getattr(self, name), -limit, limit)
+        check_beyond("view.yaw_beyond_deg", self.yaw_beyond_deg, self.yaw_deg)
         return self
 
 
@@ -105,7 +123,7 @@ class FaceSettings(Settings):
     first_identity: int = Field(default=0, ge=0)  # other people from the same seed
     tracks: int = Field(default=0, ge=0)
     frames: int = Field(default=6, ge=1)
-    expressions: Mapping[str, float] = Field(default=dict.fromkeys(EXPRESSIONS, 1.0))  # name: share
+    expressions: Shares = Field(default=dict.fromkeys(EXPRESSIONS, 1.0))  # name: share
     strength: Range = (0.4, 1.05)
     asymmetry: float = Field(default=0.12, ge=0, le=1)  # sd by which the two halves of an expression differ
     gaze_px: float = Field(default=0.6, ge=0, le=3)  # sd of the irises' shift
@@ -113,22 +131,12 @@ class FaceSettings(Settings):
     skin_tone: Range = (0.0, 1.0)  # 0 fair .. 1 dark
     backgrounds: tuple[str, ...] = BACKGROUNDS
 
-    @field_validator("expressions", mode="before")
-    @classmethod
-    def _shares(cls, value: object) -> object:
-        """A list of names means equal shares."""
-        return dict.fromkeys(value, 1.0) if isinstance(value, (list, tuple)) else value
-
     @model_validator(mode="after")
     def _possible(self) -> "FaceSettings":
         for name, low, high in (("strength", 0.0, 1.5), ("age_years", 16.0, 100.0), ("skin_tone", 0.0, 1.0)):
-            _within(name, getattr(self, name), low, high)
-        _known("expressions", tuple(self.expressions), tuple(EXPRESSIONS))
-        if min(self.expressions.values()) < 0 or sum(self.expressions.values()) <= 0:
-            raise ValueError(
-                f"expressions: shares must be 0 or more and not all 0, got {dict(self.expressions)}"
-            )
-        _known("backgrounds", self.backgrounds, BACKGROUNDS)
+            check_range(name, getattr(self, name), low, high)
+        check_shares("expressions", self.expressions, EXPRESSIONS)
+        check_names("backgrounds", self.backgrounds, BACKGROUNDS)
         return self
 
     @property

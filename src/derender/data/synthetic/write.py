@@ -8,38 +8,53 @@ morphable-model sets has no counterpart here.
 """
 
 import csv
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, UInt8, UInt16
+import torch
+from jaxtyping import Float32, Float64, UInt8, UInt16
 from numpy import ndarray
 from PIL import Image
 
+from derender.data.synthetic.png import encode_png
 from derender.data.synthetic.synthetic_set import SyntheticSet, camera_rotation_and_light
 
 DEPTH_LOW, DEPTH_SPAN = 0.8, 0.4
-_FAST = 1  # PNG compression: a third larger than the default, three times as fast
+_MAPS = ("depth", "normal", "albedo", "mask", "masks")
 
 
-def write(synthetic: SyntheticSet, folder: Path | str, truth: bool = True) -> Path:
-    """Write the set into ``folder`` (made if missing, refused if it holds a set) and return that folder."""
+def write(
+    synthetic: SyntheticSet,
+    folder: Path | str,
+    truth: bool = True,
+    progress: Callable[[int, int], None] | None = None,
+) -> Path:
+    """Write the set into ``folder`` (made if missing, refused if it holds a set) and return that folder.
+
+    ``progress(done, count)`` is called as pictures are written.
+    """
     folder = _free(folder)
-    for name in ("images", *(("depth", "normal", "albedo", "mask", "masks") if truth else ())):
+    for name in ("images", *(_MAPS if truth else ())):
         (folder / name).mkdir(parents=True, exist_ok=True)
     files = [f"images/{i:06d}.jpg" for i in range(len(synthetic))]
-    for i, file in enumerate(files):
-        _save_picture(synthetic, i, folder / file)
+
+    def save(i: int) -> None:
+        _save_picture(synthetic, i, folder / files[i])
         if truth:
             for name, pixels in _encoded(synthetic, i).items():
-                Image.fromarray(np.ascontiguousarray(pixels)).save(
-                    folder / name / f"{i:06d}.png", compress_level=_FAST
-                )
+                (folder / name / f"{i:06d}.png").write_bytes(encode_png(np.ascontiguousarray(pixels)))
+
+    _on_threads(save, len(files), progress)
     if truth:
         (folder / "classes.txt").write_text("\n".join(synthetic.part_names) + "\n", encoding="utf-8")
     return _write_tables(synthetic, folder, files)
 
 
-def write_tracks(synthetic: SyntheticSet, folder: Path | str) -> Path:
+def write_tracks(
+    synthetic: SyntheticSet, folder: Path | str, progress: Callable[[int, int], None] | None = None
+) -> Path:
     """Write a set of tracks into ``folder``, one folder per identity and track; no maps are kept."""
     if "track" not in synthetic.labels:
         raise ValueError("these pictures are no tracks: generate them with the setting tracks above 0")
@@ -49,10 +64,18 @@ def write_tracks(synthetic: SyntheticSet, folder: Path | str) -> Path:
         f"tracks/id{synthetic.identity[i]:04d}/track_{track[i]:03d}/{frame[i]:03d}.jpg"
         for i in range(len(synthetic))
     ]
-    for i, file in enumerate(files):
-        (folder / file).parent.mkdir(parents=True, exist_ok=True)
-        _save_picture(synthetic, i, folder / file)
+    for parent in {(folder / file).parent for file in files}:
+        parent.mkdir(parents=True, exist_ok=True)
+    _on_threads(lambda i: _save_picture(synthetic, i, folder / files[i]), len(files), progress)
     return _write_tables(synthetic, folder, files)
+
+
+def _on_threads(save: Callable[[int], None], count: int, progress: Callable[[int, int], None] | None) -> None:
+    """Save pictures 0 to ``count`` on as many threads as computing uses."""
+    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+        for done, _ in enumerate(pool.map(save, range(count)), 1):
+            if progress is not None:
+                progress(done, count)
 
 
 def _free(folder: Path | str) -> Path:
@@ -78,7 +101,9 @@ def _encoded(synthetic: SyntheticSet, i: int) -> dict[str, ndarray]:
 
 
 def _write_tables(synthetic: SyntheticSet, folder: Path, files: list[str]) -> Path:
-    _write_table(folder / "params.csv", [_parameters(synthetic, i, file) for i, file in enumerate(files)])
+    rotation, seen = camera_rotation_and_light(synthetic.camera, synthetic.light)
+    rows = [_parameters(synthetic, i, file, rotation[i], seen[i]) for i, file in enumerate(files)]
+    _write_table(folder / "params.csv", rows)
     _write_table(folder / "identities.csv", _identities(synthetic))
     return folder
 
@@ -94,11 +119,17 @@ def encode_normal(normal: Float32[ndarray, "*shape 3"]) -> UInt8[ndarray, "*shap
     return np.round((normal.astype(np.float64) + 1.0) / 2.0 * 255).astype(np.uint8)
 
 
-def _parameters(synthetic: SyntheticSet, i: int, file: str) -> dict[str, str]:
+def _parameters(
+    synthetic: SyntheticSet,
+    i: int,
+    file: str,
+    rotation: Float64[ndarray, "3 3"],
+    seen: Float64[ndarray, "3"],
+) -> dict[str, str]:
+    """A row of params.csv; ``rotation`` goes to the camera's frame, where light comes from ``seen``."""
     ambient, diffuse, light_pitch, light_yaw = synthetic.light[i].astype(float)
     pitch, yaw, roll, tx, ty, _ = synthetic.camera[i].astype(float)
-    rotation, direction = camera_rotation_and_light(synthetic.camera[i : i + 1], synthetic.light[i : i + 1])
-    seen, light = direction[0], rotation[0].T @ direction[0]
+    light = rotation.T @ seen
     degrees = {
         "light_pitch": light_pitch, "light_yaw": light_yaw,
         "lx": light[0], "ly": light[1], "lz": light[2],

@@ -54,7 +54,7 @@ class FinetunedModel(nn.Module):
 
     def answer(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n outputs"]:
         """Probabilities for pictures in 0..1: of each label, or of every class."""
-        return probabilities(self.head(self.model.embed(images)), self.head.kind)
+        return probabilities(self.head(self.model.encode(images)), self.head.kind)
 
     def save(self, folder: str | Path, *, overwrite: bool = False) -> Path:
         """Write a folder that `derender.load` takes, the head beside the model; complete or not at all."""

@@ -228,7 +228,7 @@ class FinetuneStep(nn.Module):
             }
         else:
             with precision():
-                codes = self.model.model.embed(images)
+                codes = self.model.model.encode(images)
         head = self.model.head
         asked = target.weight * target_loss(head(codes), self.labels_of(images), head.kind)
         total = rendering + asked

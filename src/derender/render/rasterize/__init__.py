@@ -2,7 +2,7 @@
 
 The mesh has two triangles a cell; vertex (v, u) of the grid carries its own pixel coordinates. Three
 implementations share one signature: ``reference`` (plain torch, the definition), ``numba`` (CPU), ``triton``
-(CUDA, not in this version).
+(CUDA; on the CPU only in Triton's interpreter, for tests).
 
 Which triangle a pixel shows is decided in float64, identically in every implementation:
 * a triangle takes part if all its vertices have z > NEAR_Z and twice its area exceeds MIN_TWICE_AREA_PX2;
@@ -23,9 +23,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from derender.render.rasterize import numba_cpu, reference
+from derender.render.rasterize import numba_cpu, reference, triton_gpu
+from derender.render.triton_launch import interpreted, triton_installed
 
-BACKENDS = ("auto", "reference", "numba", "triton")
+IMPLEMENTATIONS = {"reference": reference, "numba": numba_cpu, "triton": triton_gpu}
+BACKENDS = ("auto", *IMPLEMENTATIONS)
 
 
 @dataclass(frozen=True)
@@ -50,16 +52,15 @@ def rasterize(vertices: Float[Tensor, "n h w 3"], focal_px: float, backend: str 
         raise ValueError(f"a grid mesh needs at least 2x2 vertices, got {height}x{width}")
     if not focal_px > 0:
         raise ValueError(f"the focal length must be positive, got {focal_px} pixels")
-    if chosen_backend(vertices.device, backend) == "numba":
-        uv, depth, triangle = numba_cpu.rasterize(vertices, focal_px)
-    else:
-        uv, depth, triangle = reference.rasterize(vertices, focal_px)
+    implementation = IMPLEMENTATIONS[chosen_backend(vertices.device, backend)]
+    uv, depth, triangle = implementation.rasterize(vertices, focal_px)
     return Fragments(uv, depth, (triangle >= 0).to(vertices.dtype))
 
 
 def available_backends() -> tuple[str, ...]:
-    """Names that ``backend=`` accepts on this machine, besides ``auto``."""
-    return ("reference", "numba") if _numba_installed() else ("reference",)
+    """Names that ``backend=`` accepts on this machine, besides ``auto``; ``triton`` for its GPU."""
+    triton = triton_installed() and (torch.cuda.is_available() or interpreted())
+    return ("reference", *["numba"] * _numba_installed(), *["triton"] * triton)
 
 
 def chosen_backend(device: torch.device | str, backend: str = "auto") -> str:
@@ -67,14 +68,23 @@ def chosen_backend(device: torch.device | str, backend: str = "auto") -> str:
     kind = torch.device(device).type
     if backend not in BACKENDS:
         raise ValueError(f"unknown render backend {backend!r}; choose one of {', '.join(BACKENDS)}")
-    if backend == "triton":
-        raise ValueError("the triton render backend is not in this version; use backend='auto'")
     if backend == "auto":
-        return "numba" if kind == "cpu" and _numba_installed() else "reference"
-    if backend == "numba" and not _numba_installed():
-        raise ValueError("the numba render backend needs the package numba; install it or use 'reference'")
+        best = {"cpu": "numba", "cuda": "triton"}.get(kind, "reference")
+        missing = not (_numba_installed() if best == "numba" else triton_installed())
+        return "reference" if missing else best
+    if backend == "reference":
+        return backend
+    if not (_numba_installed() if backend == "numba" else triton_installed()):
+        raise ValueError(
+            f"the {backend} render backend needs the package {backend}; install it or use 'reference'"
+        )
     if backend == "numba" and kind != "cpu":
         raise ValueError(f"the numba render backend works on the CPU, the tensors are on {kind}; use 'auto'")
+    if backend == "triton" and kind != "cuda" and not interpreted():
+        raise ValueError(
+            f"the triton render backend works on a CUDA device, the tensors are on {kind}; use 'auto', or "
+            "set TRITON_INTERPRET=1 before Python starts to try it on the CPU, slowly"
+        )
     return backend
 
 

@@ -9,7 +9,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from derender.render.rasterize import chosen_backend
-from derender.render.sample import numba_cpu, reference
+from derender.render.sample import numba_cpu, reference, triton_gpu
+
+IMPLEMENTATIONS = {"reference": reference, "numba": numba_cpu, "triton": triton_gpu}
 
 
 def sample(
@@ -19,5 +21,4 @@ def sample(
     backend: str = "auto",
 ) -> Float[Tensor, "n c h2 w2"]:
     """The image's value at each (u, v); 0 with no gradient where the mask is 0."""
-    implementation = numba_cpu if chosen_backend(image.device, backend) == "numba" else reference
-    return implementation.sample(image, uv, mask)
+    return IMPLEMENTATIONS[chosen_backend(image.device, backend)].sample(image, uv, mask)

@@ -1,0 +1,85 @@
+"""Highest resident memory of one training step, whole and in chunks (setting ``accumulate``), on a CPU.
+
+Each row runs in a process of its own: preset, LOOCC over light and camera, VGG's layers with random weights,
+one step (losses, gradients, Adam), and what the process held before it taken off. Losses must agree.
+
+    python benchmarks/step_memory.py --size 64 --batch 32 --chunks 1 4 16 --json step_memory.json
+"""
+
+import argparse
+import json
+import resource
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import torch
+from machine import describe_machine
+
+from derender.model import Derenderer
+from derender.objectives import Vgg16Features
+from derender.training.config import resolve
+from derender.training.step import training_step
+
+LOSS_TOLERANCE = 1e-4
+
+
+def peak_mb() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1e6 if sys.platform == "darwin" else 1e3)
+
+
+def one_step(preset: str, size: int, batch: int, chunks: int) -> dict[str, float | str]:
+    """The loss of one step, its highest memory in MB above what was held before, and its CPU seconds."""
+    config = resolve(preset, [f"image_size={size}", "loocc=light+camera"])
+    model = Derenderer.seeded(config.model, 0).to(memory_format=torch.channels_last)
+    torch.manual_seed(0)
+    vgg = Vgg16Features().to(memory_format=torch.channels_last)
+    optimiser = torch.optim.Adam(model.parameters(), fused=True)
+    images = torch.rand(batch, 3, size, size, generator=torch.Generator().manual_seed(0))
+    noise = torch.Generator().manual_seed(0)
+    before, began = peak_mb(), time.process_time()
+    loss = training_step(model, images, config.objective, vgg, noise, chunks=chunks).total
+    loss.backward()
+    optimiser.step()
+    return {
+        "preset": preset,
+        "size": size,
+        "batch": batch,
+        "chunks": chunks,
+        "loss": loss.item(),
+        "before_mb": before,
+        "step_mb": peak_mb() - before,
+        "cpu_seconds": time.process_time() - began,
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--preset", default="paper")
+    parser.add_argument("--size", type=int, default=64)
+    parser.add_argument("--batch", type=int, default=32)
+    parser.add_argument("--chunks", type=int, nargs="+", default=[1, 4, 16])
+    parser.add_argument("--one", type=int, help=argparse.SUPPRESS)
+    parser.add_argument("--json", type=Path, help="also write the numbers, machine and versions here")
+    options = parser.parse_args()
+    if options.one is not None:
+        print(json.dumps(one_step(options.preset, options.size, options.batch, options.one)))
+        return
+    rows = []
+    for chunks in options.chunks:
+        sizes = ["--preset", options.preset, "--size", str(options.size), "--batch", str(options.batch)]
+        sizes += ["--one", str(chunks)]
+        said = subprocess.run([sys.executable, __file__, *sizes], capture_output=True, text=True, check=True)
+        rows.append(json.loads(said.stdout))
+        print(", ".join(f"{name} {value}" for name, value in rows[-1].items()), flush=True)
+    apart = max(abs(row["loss"] / rows[0]["loss"] - 1) for row in rows)
+    if apart > LOSS_TOLERANCE:
+        raise SystemExit(f"the losses differ by {apart:.1e}: the numbers say nothing")
+    if options.json is not None:
+        result = {"benchmark": "step memory", "rows": rows, "machine": describe_machine()}
+        options.json.write_text(json.dumps(result, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

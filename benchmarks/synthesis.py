@@ -1,0 +1,103 @@
+"""Pictures a second of the generators of faces and cars, all ground truth included: in memory and on disk.
+
+First it is shown that one thread and all threads make the same bytes. Wall time says what a user waits, and
+is true on a quiet machine only; CPU time (of all threads together) moves less with other work. The load says
+which it was: the mean number of busy processes over the last minute, before and after.
+
+    .venv/bin/python benchmarks/synthesis.py --rounds 5 --json synthesis.json
+"""
+
+import argparse
+import hashlib
+import json
+import os
+import statistics
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from machine import describe_machine
+
+from derender.data.synthetic import SyntheticSet, cars, faces, write
+
+GENERATORS = {"faces": faces.generate, "cars": cars.generate}
+MAPS = ("images", "depth", "normal", "albedo", "mask", "parts", "light", "camera", "identity")
+
+
+def digest(made: SyntheticSet) -> str:
+    """One hash of every map."""
+    return hashlib.sha256(b"".join(getattr(made, name).tobytes() for name in MAPS)).hexdigest()
+
+
+def check_threads(generate: Callable[..., SyntheticSet], threads: int) -> None:
+    """Stop unless one thread makes the same bytes as all of them; the kernels are compiled on the way."""
+    found = set()
+    for number in (1, threads):
+        torch.set_num_threads(number)
+        found.add(digest(generate(64, seed=3)))
+    assert len(found) == 1, "the bytes depend on the number of threads"
+
+
+def rounds_of(work: Callable[[int], object], count: int, rounds: int) -> dict[str, float | list[float]]:
+    """Wall rate and CPU time of each round, its number given to ``work``; the middle and the best of them."""
+    rates, cpu_ms = [], []
+    for number in range(rounds):
+        wall, cpu = time.perf_counter(), time.process_time()
+        work(number)
+        rates.append(count / (time.perf_counter() - wall))
+        cpu_ms.append(1e3 * (time.process_time() - cpu) / count)
+    return {
+        "pictures_per_s": statistics.median(rates),
+        "pictures_per_s_rounds": rates,
+        "cpu_ms_per_picture": statistics.median(cpu_ms),
+        "cpu_ms_per_picture_best": min(cpu_ms),
+    }
+
+
+def measure(name: str, count: int, rounds: int, size: int, threads: int) -> dict[str, object]:
+    """One generator: on one thread, on all threads, and with all files written as the command does."""
+    generate = GENERATORS[name]
+
+    def in_memory(number: int) -> None:
+        generate(count, size, seed=number)
+
+    def to_disk(number: int) -> None:
+        with tempfile.TemporaryDirectory() as folder:
+            write(generate(count, size, seed=number), Path(folder) / "set")
+
+    check_threads(generate, threads)
+    torch.set_num_threads(1)
+    one = rounds_of(in_memory, count, rounds)
+    torch.set_num_threads(threads)
+    every = rounds_of(in_memory, count, rounds)
+    return {"one_thread": one, "all_threads": every, "all_threads_written": rounds_of(to_disk, count, rounds)}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Speed of the generators of faces and cars.")
+    parser.add_argument("--count", type=int, default=1024, help="pictures in a round")
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--image-size", type=int, default=64)
+    parser.add_argument("--threads", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--only", choices=list(GENERATORS))
+    parser.add_argument("--json", type=Path)
+    options = parser.parse_args()
+    load = [os.getloadavg()[0]]
+    results: dict[str, object] = {
+        name: measure(name, options.count, options.rounds, options.image_size, options.threads)
+        for name in GENERATORS
+        if options.only in (None, name)
+    }
+    load.append(os.getloadavg()[0])
+    results |= {"count": options.count, "image_size": options.image_size, "load": load}
+    results["machine"] = describe_machine() | {"threads": options.threads}
+    text = json.dumps(results, indent=1)
+    print(text)
+    if options.json:
+        options.json.write_text(text + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,148 @@
+"""Pictures per second of the viewer: one client, then many at once, each moving light and camera.
+
+The server runs in a process of its own, the clients in threads of another, on one machine and share its
+cores; the clients' time is small. Every answer is checked: a PNG of the right size, and not the one before.
+Ends by itself after ``--seconds`` for each number of clients.
+
+    .venv/bin/python benchmarks/view.py --clients 1 20 --size 64
+"""
+
+import argparse
+import http.client
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from math import sin
+from pathlib import Path
+from threading import Barrier
+
+import numpy as np
+from machine import describe_machine
+
+HEADERS = {"X-Derender-Page": "1"}
+PNG_SIZE = slice(16, 24)  # width and height in a PNG's head
+
+
+@dataclass(frozen=True)
+class Visit:
+    """What one client saw: seconds of each answer, and how many were refused."""
+
+    seconds: list[float]
+    refused: int
+
+
+def visit(host: str, port: int, number: int, size: int, seconds: float, together: Barrier) -> Visit:
+    """Open an example, wait for the other clients, then ask for it in ever other lights and views."""
+    connection = http.client.HTTPConnection(host, port, timeout=60)
+
+    def ask(path: str, body: object = None) -> tuple[int, bytes]:
+        connection.request("POST", path, json.dumps(body), HEADERS)
+        answer = connection.getresponse()
+        return answer.status, answer.read()
+
+    status, content = ask(f"/api/examples/{number % 8}")
+    assert status == 200, content
+    name = json.loads(content)["picture"]
+    together.wait()
+    taken: list[float] = []
+    refused, before, end = 0, b"", time.perf_counter() + seconds
+    while (began := time.perf_counter()) < end:
+        step = len(taken) + 100 * number
+        light = {
+            "ambient": 0.4,
+            "diffuse": 0.6,
+            "pitch_deg": 20 * sin(step / 7),
+            "yaw_deg": 60 * sin(step / 5),
+        }
+        camera = {"rotation_deg": [0, 30 * sin(step / 9), 0], "translation": [0, 0, 0]}
+        status, content = ask("/api/view", {"picture": name, "light": light, "camera": camera, "size": size})
+        if status != 200:
+            refused += 1
+            continue
+        assert content[PNG_SIZE] == (2 * size).to_bytes(4, "big") + size.to_bytes(4, "big")
+        assert content != before, "the light moved and the picture did not"
+        before = content
+        taken.append(time.perf_counter() - began)
+    connection.close()
+    return Visit(taken, refused)
+
+
+def cpu_seconds(process: subprocess.Popen) -> float:
+    """Processor time that the server has used, which other programs on the machine do not change."""
+    fields = Path(f"/proc/{process.pid}/stat").read_text().rsplit(")", 1)[1].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def memory_mb(process: subprocess.Popen) -> float:
+    """Resident memory of the server."""
+    status = Path(f"/proc/{process.pid}/status").read_text()
+    return int(status.split("VmRSS:")[1].split()[0]) / 1024
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--model", default="rendered-faces-64", help="which model (default rendered-faces-64)"
+    )
+    parser.add_argument(
+        "--clients", type=int, nargs="+", default=[1, 20], help="how many at once (default 1 20)"
+    )
+    parser.add_argument("--size", type=int, default=64, help="side of the pictures (default 64)")
+    parser.add_argument("--seconds", type=float, default=10, help="for each number of clients (default 10)")
+    parser.add_argument("--json", type=Path, help="also write the numbers, machine and versions here")
+    options = parser.parse_args()
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        told = Path(folder) / "told.json"
+        words = ["view", "--model", options.model, "--json", str(told), "--device", "cpu"]
+        server = subprocess.Popen([sys.executable, "-m", "derender", *words], stdout=subprocess.DEVNULL)
+        try:
+            while not told.exists():
+                assert server.poll() is None, "the viewer ended by itself"
+                time.sleep(0.2)
+            where = json.loads(told.read_text())
+            visit(
+                where["host"], where["port"], 0, options.size, 2, Barrier(1)
+            )  # compiles what is compiled once
+            for clients in options.clients:
+                before, together = cpu_seconds(server), Barrier(clients)
+                with ThreadPoolExecutor(clients) as pool:
+                    visits = [
+                        pool.submit(
+                            visit, where["host"], where["port"], n, options.size, options.seconds, together
+                        )
+                        for n in range(clients)
+                    ]
+                    found = [one.result() for one in visits]
+                seconds = np.concatenate([one.seconds for one in found])
+                row = {
+                    "clients": clients,
+                    "pictures_per_second": len(seconds) / options.seconds,
+                    "pictures_per_cpu_second": len(seconds) / (cpu_seconds(server) - before),
+                    "slowest_client_per_second": min(len(one.seconds) for one in found) / options.seconds,
+                    "median_ms": float(np.median(seconds) * 1e3),
+                    "p99_ms": float(np.quantile(seconds, 0.99) * 1e3),
+                    "refused": sum(one.refused for one in found),
+                    "server_mb": memory_mb(server),
+                }
+                rows.append(row)
+                print(", ".join(f"{name} {value:,.1f}" for name, value in row.items()), flush=True)
+        finally:
+            server.terminate()
+            server.wait(30)
+    machine = describe_machine()
+    print(", ".join(f"{name} {value}" for name, value in machine.items()))
+    if options.json is not None:
+        result = {"benchmark": "view", "size": options.size, "rows": rows, "machine": machine}
+        options.json.write_text(json.dumps(result, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

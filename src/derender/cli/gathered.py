@@ -1,0 +1,46 @@
+"""Options that several commands share, as one parameter: a dataclass whose fields are options.
+
+A command that asks for such a dataclass is shown to typer with the fields in its place, and called with the
+value. Leaves out which options there are.
+"""
+
+import functools
+import inspect
+from collections.abc import Callable
+from dataclasses import MISSING, fields, is_dataclass
+from typing import Any
+
+
+def gathered(command: Callable[..., None]) -> Callable[..., None]:
+    """The command with the fields of its dataclass parameters in their place, all given by name."""
+    groups: dict[str, type] = {}
+    shown: list[inspect.Parameter] = []
+    for parameter in inspect.signature(command).parameters.values():
+        if isinstance(parameter.annotation, type) and is_dataclass(parameter.annotation):
+            groups[parameter.name] = parameter.annotation
+            shown += [
+                _option(
+                    field.name,
+                    field.type,
+                    inspect.Parameter.empty if field.default is MISSING else field.default,
+                )
+                for field in fields(parameter.annotation)
+            ]
+        else:
+            shown.append(_option(parameter.name, parameter.annotation, parameter.default))
+
+    @functools.wraps(command)
+    def run(**given: Any) -> None:
+        taken = {
+            name: group(**{field.name: given.pop(field.name) for field in fields(group)})
+            for name, group in groups.items()
+        }
+        command(**given, **taken)
+
+    run.__signature__ = inspect.Signature(shown)  # type: ignore[attr-defined]
+    run.__annotations__ = {parameter.name: parameter.annotation for parameter in shown}
+    return run
+
+
+def _option(name: str, annotation: Any, default: Any) -> inspect.Parameter:
+    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)

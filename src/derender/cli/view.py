@@ -1,0 +1,152 @@
+"""`derender view`: the page one can play with, served on this machine."""
+
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from derender.cli import options
+from derender.cli.console import bar, result, say, write_json
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from derender.model import Derenderer
+    from derender.report.viewer.neighbours import Gallery
+    from derender.training.held_out_errors import HeldOutErrors
+
+NEEDED = ("starlette", "uvicorn")
+
+
+def register(app: typer.Typer) -> None:
+    app.command("view", epilog="Example: derender view --model rendered-faces-64 --port 8000")(view)
+
+
+def view(
+    model: options.Model,
+    images: Annotated[
+        list[Path] | None, typer.Argument(help="Pictures to begin with.", metavar="[IMAGE]...")
+    ] = None,
+    features: Annotated[
+        Path | None,
+        typer.Option(
+            "--features", "-f", help="A table by derender embed: nearest neighbours.", metavar="FILE.parquet"
+        ),
+    ] = None,
+    data: Annotated[
+        str | None,
+        typer.Option(
+            "--data", "-d", help="Where the table's pictures lie, if no longer where it says.", metavar="PATH"
+        ),
+    ] = None,
+    dataset: options.Dataset = "auto",
+    host: Annotated[
+        str,
+        typer.Option(
+            "--host", help="Address to listen on; others can reach any but this one.", metavar="ADDRESS"
+        ),
+    ] = "127.0.0.1",
+    port: Annotated[
+        int, typer.Option("--port", help="Port to listen on; 0 takes any free one.", metavar="N")
+    ] = 0,
+    keep: Annotated[
+        int, typer.Option("--keep", min=2, max=10_000, help="Opened pictures held in memory.", metavar="N")
+    ] = 64,
+    device: options.Device = "auto",
+    json_file: options.Json = None,
+) -> None:
+    """Serve a page: drop a picture, see its factors, drag light and camera, orbit, swap, search, save.
+
+    It listens on this machine only, keeps no picture on disk, and needs no network. Ctrl-C ends it.
+    """
+    _check_installed()
+    from derender.report.viewer.listener import address_of, listen
+
+    listener = listen(host, port)
+    try:
+        from derender.cli.models import open_model
+        from derender.report.viewer.app import Application, Viewer
+        from derender.report.viewer.examples import generated_examples, named_examples
+        from derender.report.viewer.guard import is_loopback
+        from derender.report.viewer.server import serve
+        from derender.report.viewer.shelf import Shelf
+        from derender.report.viewer.studio import Studio
+
+        net = open_model(model, device)
+        pictures = _readable(images or [], net.image_size)
+        gallery = None if features is None else _gallery(features, data, dataset, model, net)
+        if images:
+            examples = named_examples(pictures)
+        else:
+            with bar("rendering examples") as report:
+                examples = generated_examples(model, net.image_size, progress=report)
+        table = None if gallery is None else gallery.table
+        studio = Studio(net, Path(model).name, Shelf(keep), _held_out(model), table)
+        url = address_of(listener, host)
+        if not is_loopback(host):
+            say(f"warning: anyone who can reach {host} can use this page, and there is no password")
+        result(f"open {url} (Ctrl-C ends)", json_file)
+        write_json(json_file, {"url": url, "host": host, "port": listener.getsockname()[1], "model": model})
+        serve(Application(Viewer(studio, examples, gallery), host), listener)
+    except KeyboardInterrupt:
+        say("stopped")
+    finally:
+        listener.close()
+
+
+def _check_installed() -> None:
+    missing = [name for name in NEEDED if find_spec(name) is None]
+    if missing:
+        raise ValueError(f"the viewer needs {' and '.join(missing)}: pip install 'derender[view]'")
+
+
+def _readable(images: list[Path], size: int) -> "dict[Path, np.ndarray]":
+    """The pictures that can be read; those that cannot are named."""
+    from derender.cli.given import one_picture
+
+    read, problems = {}, {}
+    for path in dict.fromkeys(images):
+        try:
+            read[path] = one_picture(path, size)
+        except (ValueError, OSError) as problem:
+            problems[path] = " ".join(str(problem).split())
+    if problems and not read:
+        raise ValueError(next(iter(problems.values())))
+    for path, reason in problems.items():
+        say(f"left out {path}: {reason}")
+    return read
+
+
+def _gallery(features: Path, data: str | None, dataset: str, model: str, net: "Derenderer") -> "Gallery":
+    """The table, if this model made it."""
+    from derender.features import FeatureTable, model_fingerprint
+    from derender.report.viewer.neighbours import Gallery
+
+    table = FeatureTable.read(features)
+    made_by, weights = table.origin.get("weights"), model_fingerprint(net)
+    if made_by is None:
+        say(f"{features} does not say which model made it: cannot check that it was {model}")
+    elif made_by != weights:
+        raise ValueError(
+            f"{features} was made by another model (weights {made_by}, {model} has {weights}): "
+            "give that one, or make the table again with derender embed"
+        )
+    if not set(table.factors) & set(net.nets):
+        raise ValueError(f"{features} has none of the factors of {model}: make it again with derender embed")
+    gallery = Gallery(table, data, dataset)
+    if gallery.without_pictures:
+        say(f"neighbours are shown without pictures: {gallery.without_pictures}")
+    return gallery
+
+
+def _held_out(model: str) -> "HeldOutErrors | None":
+    """The errors stored with the model; None where there are none or they are damaged."""
+    from derender.model import model_folder
+    from derender.training.held_out_errors import read_errors
+
+    try:
+        return read_errors(model_folder(model))
+    except (ValueError, OSError) as problem:
+        say(f"cannot tell odd pictures: {problem}")
+        return None

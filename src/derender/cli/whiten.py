@@ -1,0 +1,79 @@
+"""`derender whiten`: a model's features, fitted to the pictures they will be used on."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from derender.cli import options
+from derender.cli.console import bar, result, say, write_json
+
+
+def register(app: typer.Typer) -> None:
+    app.command(
+        "whiten", epilog="Example: derender whiten --model rendered-faces-64 --data photos/ --out mine"
+    )(whiten)
+
+
+def whiten(
+    model: options.Model,
+    data: options.Data,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the model to make.", metavar="DIR")],
+    dataset: options.Dataset = "auto",
+    part: options.Part = "all",
+    limit: options.Limit = None,
+    overrides: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            help="pictures, views, directions or shrinkage; also what is perturbed, as perturb.light_deg.",
+            metavar="KEY=VALUE",
+        ),
+    ] = None,
+    seed: options.Seed = 0,
+    device: options.Device = "auto",
+    force: options.Force = False,
+    json_file: options.Json = None,
+) -> None:
+    """Write a copy of a model whose features move as little as can be with light and camera.
+
+    It is fitted to these pictures, without labels. Weights and scenes stay as they are. Training ends with
+    this by itself.
+    """
+    import torch
+
+    from derender.cli.models import open_model, part_of
+    from derender.data import read_pictures
+    from derender.training.config import FeatureSettings, with_changes
+    from derender.training.whitening import fit_whitening
+
+    if out.exists() and not force:
+        raise FileExistsError(f"{out} exists already: choose another --out or add --force")
+    settings = with_changes(FeatureSettings(), overrides or [])
+    if settings.whitening.pictures < 2:
+        raise ValueError("whitening needs 2 pictures or more: set pictures=2000, say")
+    net = open_model(model, device)
+    with bar("reading") as report:
+        pictures = read_pictures(data, net.image_size, dataset=dataset, limit=limit, progress=report)
+    chosen = part_of(pictures, part, model).require(2)
+    say(chosen.describe())
+    with bar("rendering again") as report:
+        net.whitening = fit_whitening(
+            net,
+            torch.from_numpy(chosen.images),
+            settings.whitening,
+            settings.perturb,
+            seed=seed,
+            progress=report,
+        )
+    folder = net.save(out, overwrite=force)
+    ratios = {name: net.whitening.get_buffer(f"{name}_ratios").tolist() for name in net.whitening.names}
+    for name, values in ratios.items():
+        kept = min(settings.whitening.directions, len(values))
+        clear = sum(value > 1 for value in values[:kept])
+        say(
+            f"{name}: {kept} of {len(values)} directions kept; in {clear} pictures differ more than one "
+            "picture does in other light and from other sides"
+        )
+    result(f"model {folder}", json_file)
+    write_json(json_file, {"model": folder, "pictures": len(chosen), "between_over_within": ratios})

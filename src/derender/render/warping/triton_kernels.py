@@ -1,0 +1,175 @@
+"""From a depth map and a camera's motion to the picture, in Triton; importing this module imports Triton.
+
+``project_depth`` finds where the surface's vertices land; the rasteriser's ``choose`` then decides what each
+pixel shows; ``show`` meets the pixel's ray with its triangle and looks the colour up, all in one lane.
+``show_backward`` is the derivative of ``show``. Points are never stored: a vertex is rotation times its ray
+times its depth, plus offset, in float64. Colours are computed in the picture's own dtype.
+"""
+
+from typing import no_type_check
+
+import triton
+import triton.language as tl
+
+from derender.render.rasterize.triton_kernels import NO_TRIANGLE, corners, meet, meet_backward, project
+from derender.render.sample.triton_kernels import cell, look_up, spread
+from derender.render.triton_parts import accumulate, float64, lanes, magnitude, note_largest
+
+
+@triton.jit
+@no_type_check
+def turned_ray(rotation, n, i, j, focal, height, width):
+    """The ray (x, y, 1) of pixel (i, j), and the same ray turned by image n's rotation."""
+    x = (j - (width - 1) * 0.5).to(tl.float64) / focal
+    y = (i - (height - 1) * 0.5).to(tl.float64) / focal
+    r = rotation + n * 9
+    turned_x = tl.load(r) * x + tl.load(r + 1) * y + tl.load(r + 2)
+    turned_y = tl.load(r + 3) * x + tl.load(r + 4) * y + tl.load(r + 5)
+    turned_z = tl.load(r + 6) * x + tl.load(r + 7) * y + tl.load(r + 8)
+    return x, y, turned_x, turned_y, turned_z
+
+
+@triton.jit
+@no_type_check
+def moved(distance, turned_x, turned_y, turned_z, offset, n):
+    """A surface point in the camera's frame."""
+    x = distance * turned_x + tl.load(offset + n * 3)
+    y = distance * turned_y + tl.load(offset + n * 3 + 1)
+    return x, y, distance * turned_z + tl.load(offset + n * 3 + 2)
+
+
+@triton.jit
+@no_type_check
+def project_depth(
+    depth, rotation, offset, us, vs, inverse_zs, focal_bits, height, width, BLOCK: tl.constexpr
+):
+    n, pixel, live = lanes(height * width, BLOCK)
+    place, focal = n * height * width + pixel, float64(focal_bits)
+    distance = tl.load(depth + place, mask=live, other=0).to(tl.float64)
+    _, _, tx, ty, tz = turned_ray(rotation, n, pixel // width, pixel % width, focal, height, width)
+    x, y, z = moved(distance, tx, ty, tz, offset, n)
+    project(x, y, z, focal, place, live, us, vs, inverse_zs, height, width)
+
+
+@triton.jit
+@no_type_check
+def show(
+    image, depth, rotation, offset, triangle, colour, seen_depth, mask, focal_bits, height, width,
+    CHANNELS: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Write colour, depth and mask; turn the mark of a pixel without triangle into -1."""
+    n, pixel, live = lanes(height * width, BLOCK)
+    base, focal = n * height * width, float64(focal_bits)
+    index = tl.load(triangle + base + pixel, mask=live, other=NO_TRIANGLE)
+    seen = index != NO_TRIANGLE
+    i0, j0, i1, j1, i2, j2 = corners(tl.where(seen, index, 0), width)
+    d0 = tl.load(depth + base + i0 * width + j0, mask=seen, other=0).to(tl.float64)
+    d1 = tl.load(depth + base + i1 * width + j1, mask=seen, other=0).to(tl.float64)
+    d2 = tl.load(depth + base + i2 * width + j2, mask=seen, other=0).to(tl.float64)
+    _, _, tx, ty, tz = turned_ray(rotation, n, i0, j0, focal, height, width)
+    x0, y0, z0 = moved(d0, tx, ty, tz, offset, n)
+    _, _, tx, ty, tz = turned_ray(rotation, n, i1, j1, focal, height, width)
+    x1, y1, z1 = moved(d1, tx, ty, tz, offset, n)
+    _, _, tx, ty, tz = turned_ray(rotation, n, i2, j2, focal, height, width)
+    x2, y2, z2 = moved(d2, tx, ty, tz, offset, n)
+    ray_x = (pixel % width - (width - 1) * 0.5).to(tl.float64) / focal
+    ray_y = (pixel // width - (height - 1) * 0.5).to(tl.float64) / focal
+    b0, b1, b2, _, _, _, _, _, _, _ = meet(ray_x, ray_y, x0, y0, z0, x1, y1, z1, x2, y2, z2, seen)
+    kind = image.dtype.element_ty
+    z = b0 * z0 + b1 * z1 + b2 * z2
+    tl.store(seen_depth + base + pixel, tl.where(seen, z, 0.0).to(kind), mask=live)
+    tl.store(mask + base + pixel, seen.to(kind), mask=live)
+    tl.store(triangle + base + pixel, tl.where(seen, index, -1), mask=live)
+    u = tl.where(seen, b0 * j0 + b1 * j1 + b2 * j2, 0.0).to(kind)
+    v = tl.where(seen, b0 * i0 + b1 * i1 + b2 * i2, 0.0).to(kind)
+    i, j, across, down = cell(u, v, height, width)
+    for channel in tl.static_range(CHANNELS):
+        plane = (n * CHANNELS + channel) * height * width
+        value, _, _ = look_up(image, plane + i * width + j, across, down, width, seen)
+        tl.store(colour + plane + pixel, tl.where(seen, value, 0.0), mask=live)
+
+
+@triton.jit
+@no_type_check
+def show_backward(
+    grad_colour, grad_depth_seen, image, depth, rotation, offset, triangle, grad_motion,
+    grad_image, grad_depth, units, largest, focal_bits, height, width,
+    CHANNELS: tl.constexpr, MODE: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Add derivatives by the image and the depth map; write each program's part (12) of those by the motion.
+
+    ``units`` and ``largest`` hold two numbers an image: for ``grad_image`` and for ``grad_depth``.
+    """
+    n, pixel, live = lanes(height * width, BLOCK)
+    base, focal = n * height * width, float64(focal_bits)
+    index = tl.load(triangle + base + pixel, mask=live, other=-1)
+    seen = index >= 0
+    i0, j0, i1, j1, i2, j2 = corners(tl.where(seen, index, 0), width)
+    place0, place1, place2 = base + i0 * width + j0, base + i1 * width + j1, base + i2 * width + j2
+    d0 = tl.load(depth + place0, mask=seen, other=0).to(tl.float64)
+    d1 = tl.load(depth + place1, mask=seen, other=0).to(tl.float64)
+    d2 = tl.load(depth + place2, mask=seen, other=0).to(tl.float64)
+    rx0, ry0, tx0, ty0, tz0 = turned_ray(rotation, n, i0, j0, focal, height, width)
+    x0, y0, z0 = moved(d0, tx0, ty0, tz0, offset, n)
+    rx1, ry1, tx1, ty1, tz1 = turned_ray(rotation, n, i1, j1, focal, height, width)
+    x1, y1, z1 = moved(d1, tx1, ty1, tz1, offset, n)
+    rx2, ry2, tx2, ty2, tz2 = turned_ray(rotation, n, i2, j2, focal, height, width)
+    x2, y2, z2 = moved(d2, tx2, ty2, tz2, offset, n)
+    ray_x = (pixel % width - (width - 1) * 0.5).to(tl.float64) / focal
+    ray_y = (pixel // width - (height - 1) * 0.5).to(tl.float64) / focal
+    b0, b1, b2, scale, x0, y0, x1, y1, x2, y2 = meet(ray_x, ray_y, x0, y0, z0, x1, y1, z1, x2, y2, z2, seen)
+
+    kind = image.dtype.element_ty
+    u = tl.where(seen, b0 * j0 + b1 * j1 + b2 * j2, 0.0).to(kind)
+    v = tl.where(seen, b0 * i0 + b1 * i1 + b2 * i2, 0.0).to(kind)
+    i, j, across, down = cell(u, v, height, width)
+    gu, gv = across * 0, down * 0
+    most = magnitude(gu, seen)
+    image_unit, depth_unit = tl.load(units + n * 2), tl.load(units + n * 2 + 1)
+    for channel in tl.static_range(CHANNELS):
+        plane = (n * CHANNELS + channel) * height * width
+        gradient = tl.load(grad_colour + plane + pixel, mask=seen, other=0)
+        at = plane + i * width + j
+        _, along_u, along_v = look_up(image, at, across, down, width, seen)
+        gu += gradient * along_u
+        gv += gradient * along_v
+        if MODE == 1:
+            most = tl.maximum(most, magnitude(gradient, seen))
+        else:
+            spread(grad_image, at, gradient, across, down, width, seen, image_unit, MODE)
+
+    gu, gv = gu.to(tl.float64), gv.to(tl.float64)
+    gz = tl.load(grad_depth_seen + base + pixel, mask=seen, other=0).to(tl.float64)
+    gb0 = gu * j0 + gv * i0 + gz * z0
+    gb1 = gu * j1 + gv * i1 + gz * z1
+    gb2 = gu * j2 + gv * i2 + gz * z2
+    gx0, gy0, gx1, gy1, gx2, gy2 = meet_backward(gb0, gb1, gb2, b0, b1, b2, scale, x0, y0, x1, y1, x2, y2)
+    gz0 = gz * b0 - ray_x * gx0 - ray_y * gy0
+    gz1 = gz * b1 - ray_x * gx1 - ray_y * gy1
+    gz2 = gz * b2 - ray_x * gx2 - ray_y * gy2
+    gd0 = gx0 * tx0 + gy0 * ty0 + gz0 * tz0
+    gd1 = gx1 * tx1 + gy1 * ty1 + gz1 * tz1
+    gd2 = gx2 * tx2 + gy2 * ty2 + gz2 * tz2
+    if MODE == 1:
+        note_largest(largest + n * 2, most)
+        most = tl.maximum(tl.maximum(magnitude(gd0, seen), magnitude(gd1, seen)), magnitude(gd2, seen))
+        note_largest(largest + n * 2 + 1, most)
+    else:
+        accumulate(grad_depth + place0, gd0, seen, depth_unit, MODE)
+        accumulate(grad_depth + place1, gd1, seen, depth_unit, MODE)
+        accumulate(grad_depth + place2, gd2, seen, depth_unit, MODE)
+        part = grad_motion + tl.program_id(0).to(tl.int64) * 12
+        sum_motion(part, gx0, gx1, gx2, d0, d1, d2, rx0, ry0, rx1, ry1, rx2, ry2, seen)
+        sum_motion(part + 4, gy0, gy1, gy2, d0, d1, d2, rx0, ry0, rx1, ry1, rx2, ry2, seen)
+        sum_motion(part + 8, gz0, gz1, gz2, d0, d1, d2, rx0, ry0, rx1, ry1, rx2, ry2, seen)
+
+
+@triton.jit
+@no_type_check
+def sum_motion(part, g0, g1, g2, d0, d1, d2, rx0, ry0, rx1, ry1, rx2, ry2, seen):
+    """Sums over the block that make one row of the rotation's gradient, and one number of the offset's."""
+    gd0, gd1, gd2 = g0 * d0, g1 * d1, g2 * d2
+    tl.store(part, tl.sum(tl.where(seen, gd0 * rx0 + gd1 * rx1 + gd2 * rx2, 0.0), 0))
+    tl.store(part + 1, tl.sum(tl.where(seen, gd0 * ry0 + gd1 * ry1 + gd2 * ry2, 0.0), 0))
+    tl.store(part + 2, tl.sum(tl.where(seen, gd0 + gd1 + gd2, 0.0), 0))
+    tl.store(part + 3, tl.sum(tl.where(seen, g0 + g1 + g2, 0.0), 0))

@@ -1,0 +1,270 @@
+"""The addresses of the page and what answers them, within bounds of size, time and number.
+
+Nothing in a request can name a file: the page's own files are read once at the start, pictures are known by
+names that the shelf made up, examples and rows by number. Bodies are read up to a limit; decoding and
+computing have one thread each, so that a heavy upload does not hold up the sliders of others.
+"""
+
+import asyncio
+import json
+from collections.abc import Awaitable, Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from importlib.resources import files
+from typing import Any
+
+from starlette.applications import Starlette
+from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import JSONResponse, Response
+from starlette.routing import Route
+
+from derender import __version__
+from derender.report.colours import pictures
+from derender.report.viewer.examples import Example
+from derender.report.viewer.guard import Guard
+from derender.report.viewer.intake import BODY_LIMIT_BYTES, PIXEL_LIMIT, pixels_of, too_large
+from derender.report.viewer.neighbours import Gallery
+from derender.report.viewer.questions import LARGEST_SIZE, NeighbourQuestion, Question, read_question
+from derender.report.viewer.refused import Refused
+from derender.report.viewer.studio import Studio, data_url
+
+BODY_SECONDS = 30.0
+WORK_SECONDS = 30.0
+QUESTION_LIMIT_BYTES = 10_000
+UPLOADS_AT_ONCE = 4
+WAITING_AT_MOST = 200
+DRAINED_AT_MOST_BYTES = 3 * BODY_LIMIT_BYTES
+"""So much of a body that is too large is still read and dropped, so that browsers see the answer."""
+
+THUMBNAIL = 64
+PAGE_FILES = {
+    "/": ("index.html", "text/html"),
+    "/view.css": ("view.css", "text/css"),
+    "/view.js": ("view.js", "text/javascript"),
+    "/surface.js": ("surface.js", "text/javascript"),
+}
+
+
+@dataclass
+class Viewer:
+    """What is shown.
+
+    Attributes:
+        studio: the model.
+        examples: pictures to begin with.
+        gallery: rows to find neighbours among, or None.
+    """
+
+    studio: Studio
+    examples: Sequence[Example] = ()
+    gallery: Gallery | None = None
+
+
+Answer = Callable[[Request], Awaitable[Response]]
+
+
+class Application:
+    """The answers, and the threads that work them out; an ASGI application as ``guarded``.
+
+    Args:
+        viewer: what is shown.
+        host: the address that the server listens on.
+        body_seconds: within which a body has to arrive.
+        work_seconds: within which an answer has to be there, waiting for others included.
+    """
+
+    def __init__(
+        self,
+        viewer: Viewer,
+        host: str = "127.0.0.1",
+        body_seconds: float = BODY_SECONDS,
+        work_seconds: float = WORK_SECONDS,
+    ):
+        self.viewer = viewer
+        self.body_seconds, self.work_seconds = body_seconds, work_seconds
+        self._computing = ThreadPoolExecutor(1, thread_name_prefix="view-compute")
+        self._decoding = ThreadPoolExecutor(1, thread_name_prefix="view-decode")
+        self._uploads = asyncio.Semaphore(UPLOADS_AT_ONCE)
+        self._waiting = 0
+        studio = viewer.studio
+        posts: dict[str, Answer] = {
+            "/api/pictures": self.open_upload,
+            "/api/examples/{number:int}": self.open_example,
+            "/api/rows/{number:int}": self.open_row,
+            "/api/factors": self.factors,
+            "/api/neighbours": self.neighbours,
+            "/api/view": partial(self.made, studio.view, "image/png"),
+            "/api/picture": partial(self.made, studio.picture, "image/png"),
+            "/api/panel": partial(self.made, studio.panel, "image/png"),
+            "/api/mesh": partial(self.made, studio.mesh, "model/gltf-binary"),
+            "/api/archive": partial(self.made, studio.archive, "application/zip"),
+            "/api/settings": self.settings,
+        }
+        routes = [
+            Route(path, partial(self.answered, answer), methods=["POST"]) for path, answer in posts.items()
+        ]
+        routes += [Route(path, _constant(*file), methods=["GET"]) for path, file in PAGE_FILES.items()]
+        routes.append(Route("/api/about", partial(self.answered, self.about), methods=["GET"]))
+        handlers: dict[Any, Any] = {HTTPException: _plain_error}
+        self.guarded = Guard(Starlette(routes=routes, exception_handlers=handlers), host)
+
+    def close(self) -> None:
+        """End the threads and let go of the gallery's source."""
+        self._computing.shutdown(cancel_futures=True)
+        self._decoding.shutdown(cancel_futures=True)
+        if self.viewer.gallery is not None:
+            self.viewer.gallery.close()
+
+    async def answered(self, answer: Answer, request: Request) -> Response:
+        """The answer, or a sentence that says why not."""
+        try:
+            return await answer(request)
+        except Refused as refused:
+            return JSONResponse({"error": refused.message}, refused.status)
+        except ClientDisconnect:
+            return Response(status_code=400)
+
+    async def about(self, request: Request) -> Response:
+        """What the page has to know to draw itself."""
+        studio, gallery = self.viewer.studio, self.viewer.gallery
+        ranges = studio.model.settings.ranges
+        own = studio.model.image_size
+        sizes = sorted({own, *(size for size in (128, 256, LARGEST_SIZE) if size > own)})
+        examples = [
+            {"name": example.name, "image": data_url(pictures(example.picture[None])[0])}
+            for example in self.viewer.examples
+        ]
+        table = None
+        if gallery is not None:
+            factors = [name for name in gallery.table.factors if name in studio.model.nets]
+            table = {"rows": len(gallery.table), "factors": factors, "note": gallery.without_pictures}
+        return JSONResponse(
+            {
+                "derender": __version__,
+                "model": studio.name,
+                "sizes": sizes,
+                "fov_deg": studio.model.fov_deg,
+                "rotation_deg": ranges.rotation_deg,
+                "translation": [ranges.translation_xy, ranges.translation_xy, max(ranges.translation_z, 0.1)],
+                "body_limit_bytes": BODY_LIMIT_BYTES,
+                "pixel_limit": PIXEL_LIMIT,
+                "kept": studio.shelf.limit,
+                "examples": examples,
+                "table": table,
+            }
+        )
+
+    async def open_upload(self, request: Request) -> Response:
+        """Take the picture in the body apart."""
+        async with self._uploads:
+            encoded = await self._body(request, BODY_LIMIT_BYTES)
+            size = self.viewer.studio.model.image_size
+            picture = await self._work(self._decoding, pixels_of, encoded, size)
+            del encoded
+        return await self._opened(picture)
+
+    async def open_example(self, request: Request) -> Response:
+        """Take one of the examples apart."""
+        number = request.path_params["number"]
+        if not 0 <= number < len(self.viewer.examples):
+            raise Refused(404, f"there is no example {number}")
+        return await self._opened(self.viewer.examples[number].picture)
+
+    async def open_row(self, request: Request) -> Response:
+        """Take the picture of one row of the table apart."""
+        gallery = self.viewer.gallery
+        if gallery is None:
+            raise Refused(404, "there is no table: start the viewer with --features FILE.parquet")
+        size = self.viewer.studio.model.image_size
+        picture = await self._work(self._decoding, gallery.picture, request.path_params["number"], size)
+        return await self._opened(picture)
+
+    async def factors(self, request: Request) -> Response:
+        """The maps of a picture, by name, as images inside JSON."""
+        question = read_question(Question, await self._body(request, QUESTION_LIMIT_BYTES))
+        maps = await self._work(self._computing, self.viewer.studio.maps, question)
+        return JSONResponse({name: data_url(image) for name, image in maps.items()})
+
+    async def settings(self, request: Request) -> Response:
+        """Light and camera as JSON."""
+        question = read_question(Question, await self._body(request, QUESTION_LIMIT_BYTES))
+        text = json.dumps(self.viewer.studio.settings(question), indent=1) + "\n"
+        return Response(text, media_type="application/json")
+
+    async def neighbours(self, request: Request) -> Response:
+        """The rows nearest to a picture by one factor, with their pictures where those are here."""
+        question = read_question(NeighbourQuestion, await self._body(request, QUESTION_LIMIT_BYTES))
+        found = await self._work(self._computing, self.viewer.studio.neighbours, question)
+        gallery = self.viewer.gallery
+        assert gallery is not None, "a studio with a table has a gallery"
+        rows = []
+        for row, distance in found:
+            image = await self._work(self._decoding, _thumbnail, gallery, row)
+            rows.append({**gallery.about(row), "distance": distance, "image": image})
+        return JSONResponse({"factor": question.factor, "rows": rows})
+
+    async def made(self, make: Callable[[Question], bytes], media_type: str, request: Request) -> Response:
+        """Bytes that the studio makes for a question."""
+        question = read_question(Question, await self._body(request, QUESTION_LIMIT_BYTES))
+        return Response(await self._work(self._computing, make, question), media_type=media_type)
+
+    async def _opened(self, picture: Any) -> Response:
+        return JSONResponse(await self._work(self._computing, self.viewer.studio.open, picture))
+
+    async def _work(self, pool: ThreadPoolExecutor, function: Callable[..., Any], *arguments: Any) -> Any:
+        """Have a thread do it, in turn; ``Refused`` (503) if too many wait or it takes too long."""
+        if self._waiting >= WAITING_AT_MOST:
+            raise Refused(503, "too many requests are waiting: try again in a moment")
+        self._waiting += 1
+        try:
+            job = asyncio.get_running_loop().run_in_executor(pool, function, *arguments)
+            return await asyncio.wait_for(job, self.work_seconds)
+        except TimeoutError as late:
+            raise Refused(503, "this took too long: try again, or choose a smaller size") from late
+        finally:
+            self._waiting -= 1
+
+    async def _body(self, request: Request, limit: int) -> bytes:
+        """The request's body; ``Refused`` if it is too large (413) or comes too slowly (408)."""
+        body = bytearray()
+        received = 0
+        try:
+            async with asyncio.timeout(self.body_seconds):
+                async for part in request.stream():
+                    received += len(part)
+                    if received > limit:
+                        body.clear()
+                    else:
+                        body += part
+                    if received > limit + DRAINED_AT_MOST_BYTES:
+                        break
+        except TimeoutError as late:
+            raise Refused(408, "the file came too slowly: try again") from late
+        if received > limit:
+            raise too_large() if limit == BODY_LIMIT_BYTES else Refused(413, "this request is too long")
+        return bytes(body)
+
+
+def _thumbnail(gallery: Gallery, row: int) -> str | None:
+    """A row's picture inside JSON, or None where it cannot be shown."""
+    try:
+        return data_url(pictures(gallery.picture(row, THUMBNAIL)[None])[0])
+    except Refused:
+        return None
+
+
+def _constant(name: str, media_type: str) -> Answer:
+    """An answer that is one of the page's own files, read now."""
+    content = (files("derender.report.viewer") / "page" / name).read_bytes()
+
+    async def answer(request: Request) -> Response:
+        return Response(content, media_type=media_type)
+
+    return answer
+
+
+async def _plain_error(request: Request, problem: HTTPException) -> Response:
+    """No such address, or not by this method."""
+    return JSONResponse({"error": problem.detail}, problem.status_code, headers=problem.headers)

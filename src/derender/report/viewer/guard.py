@@ -1,0 +1,126 @@
+"""Whom the server answers, and what browsers are told about its answers.
+
+A page on another site can make a visitor's browser send requests here. Three checks stop it: the Host header
+must name this machine and not a foreign name that was made to point here (DNS rebinding); a request that
+changes or computes something must come from the page itself (Origin, Sec-Fetch-Site) and carry a header that
+no form can send; and no answer may be framed, embedded, sniffed or stored. Leaves out passwords: who may
+reach the address may use the page.
+"""
+
+import ipaddress
+import json
+import socket
+
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+OWN_HEADER = "x-derender-page"
+SECURITY_HEADERS = {
+    "content-security-policy": (
+        "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
+        "img-src 'self' data: blob:; "
+        "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    ),
+    "cross-origin-opener-policy": "same-origin",
+    "cross-origin-resource-policy": "same-origin",
+    "x-content-type-options": "nosniff",
+    "x-frame-options": "DENY",
+    "referrer-policy": "no-referrer",
+    "cache-control": "no-store",
+}
+
+
+class Guard:
+    """Wraps an application; answers what it must not see by itself.
+
+    Args:
+        app: what is guarded.
+        host: the address that the server was told to listen on.
+    """
+
+    def __init__(self, app: ASGIApp, host: str):
+        self.app = app
+        self.host = host
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            return
+
+        async def send_guarded(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                headers = MutableHeaders(scope=message)
+                for name, value in SECURITY_HEADERS.items():
+                    headers[name] = value
+            await send(message)
+
+        refusal = self.refusal(scope["method"], scope["path"], Headers(scope=scope))
+        if refusal is None:
+            await self.app(scope, receive, send_guarded)
+            return
+        status, reason = refusal
+        body = json.dumps({"error": reason}).encode()
+        kind = [(b"content-type", b"application/json"), (b"connection", b"close")]
+        await send_guarded({"type": "http.response.start", "status": status, "headers": kind})
+        await send_guarded({"type": "http.response.body", "body": body})
+
+    def refusal(self, method: str, path: str, headers: Headers) -> tuple[int, str] | None:
+        """Status and reason why a request is not let through, or None."""
+        host = headers.get("host", "")
+        if len(headers.getlist("host")) != 1 or not allowed_host(host, self.host):
+            return 421, "this server is not known by that name: open it by the address it printed"
+        site = headers.get("sec-fetch-site", "same-origin")
+        reading = method in ("GET", "HEAD")
+        if site not in ("same-origin", "none") and not (reading and path == "/"):
+            return 403, "requests from other pages are refused"
+        if reading:
+            return None
+        origin = headers.get("origin")
+        if origin is not None and origin != f"http://{host}":
+            return 403, "requests from other pages are refused"
+        if OWN_HEADER not in headers:
+            return 403, "this request does not come from the page"
+        return None
+
+
+def allowed_host(header: str, bound: str) -> bool:
+    """Whether a Host header names this machine.
+
+    A server on a loopback address answers to loopback names only; one that was told to listen elsewhere also
+    to any numeric address (which no foreign name server can hand out), to the name it was given and to the
+    machine's own.
+    """
+    name = _name_of(header)
+    if name is None:
+        return False
+    if name == "localhost":
+        return True
+    address = _address(name)
+    if is_loopback(bound):
+        return address is not None and address.is_loopback
+    return address is not None or name in {bound.lower(), socket.gethostname().lower()}
+
+
+def is_loopback(host: str) -> bool:
+    """Whether an address can be reached from this machine only."""
+    address = _address(host)
+    return host.lower() == "localhost" or (address is not None and address.is_loopback)
+
+
+def _name_of(header: str) -> str | None:
+    """The name in ``name``, ``name:port``, ``[v6]`` or ``[v6]:port``; None for anything else."""
+    if header.startswith("["):
+        name, bracket, port = header[1:].partition("]")
+        port = port.removeprefix(":") if port.startswith(":") else ("x" if port else "")
+        name = name if bracket else ""
+    else:
+        name, _, port = header.partition(":")
+    if not name or (port and not (port.isascii() and port.isdigit())):
+        return None
+    return name.lower().rstrip(".")
+
+
+def _address(name: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
+    try:
+        return ipaddress.ip_address(name)
+    except ValueError:
+        return None

@@ -1,0 +1,44 @@
+"""What a saved model is given once its run has ended: whitening, and which errors are usual."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import UInt8
+
+from derender.model import WHITENING_FILE, load
+from derender.training.config import TrainConfig
+from derender.training.held_out_errors import store_errors
+from derender.training.whitening import fit_whitening
+
+
+def complete_model(
+    folder: Path,
+    config: TrainConfig,
+    training: UInt8[np.ndarray, "n 3 h w"],
+    held_out: UInt8[np.ndarray, "m 3 h w"],
+    *,
+    device: str | torch.device = "cpu",
+    progress: Callable[[int, int], None] | None = None,
+) -> None:
+    """Add whitening, fitted on training pictures, and reconstruction errors of held-out ones to a model.
+
+    Args:
+        folder: of the saved model.
+        config: of its run.
+        training, held_out: pictures at the model's size.
+        device: where to compute.
+        progress: called with (pictures done, pictures in all).
+    """
+    model = load(folder, device=device)
+    if config.whitening.pictures >= 2:
+        fit_whitening(
+            model,
+            torch.from_numpy(training),
+            config.whitening,
+            config.objective.perturb,
+            seed=config.seed,
+            progress=progress,
+        ).save(folder / WHITENING_FILE)
+    store_errors(folder, torch.from_numpy(held_out))

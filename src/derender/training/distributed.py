@@ -1,0 +1,211 @@
+"""Training on several devices: who has which pictures of a batch, and what must be known of all of them.
+
+Each rank (one process, one device) takes its rows of every batch. What couples the pictures of a batch goes
+through `Ranks`, with gradient where one is due, so that losses and gradients are those of one process with
+the whole batch: a rank's loss is its share of the whole, such that the mean over ranks is the loss of the
+batch, and DDP averages gradients accordingly. Processes are started by torchrun; their traffic is
+torch.distributed's, through Lightning Fabric's DDP strategy. Leaves out splitting a model over devices.
+"""
+
+import logging
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from inspect import signature
+from typing import Any
+
+import torch
+from jaxtyping import Shaped
+from lightning_fabric import Fabric
+from lightning_fabric.strategies.ddp import DDPStrategy
+from torch import Tensor, distributed
+from torch.autograd.function import once_differentiable
+from torch.nn.parallel import DistributedDataParallel
+
+
+@dataclass(frozen=True)
+class Ranks:
+    """This process among those that train together; every method is called by all of them, or by one alone.
+
+    Attributes:
+        rank: the number of this one, from 0.
+        count: how many there are.
+    """
+
+    rank: int = 0
+    count: int = 1
+
+    @property
+    def first(self) -> bool:
+        """Whether this process writes and speaks."""
+        return self.rank == 0
+
+    def check(self, batch_size: int) -> None:
+        """Every rank gets the same number of pictures, or ValueError."""
+        if batch_size % self.count:
+            raise ValueError(
+                f"batch_size {batch_size} cannot be shared evenly by {self.count} processes: set "
+                f"batch_size={max(batch_size // self.count, 1) * self.count}, or start another number of them"
+            )
+
+    def own(self, whole: Shaped[Tensor, "n ..."]) -> Shaped[Tensor, "m ..."]:
+        """This rank's rows of a batch."""
+        share = len(whole) // self.count
+        return whole[self.rank * share : (self.rank + 1) * share]
+
+    def gather(self, piece: Shaped[Tensor, "m ..."]) -> Shaped[Tensor, "n ..."]:
+        """The rows of all ranks in order; the gradient of every rank's loss flows back to the owner."""
+        if self.count == 1:
+            return piece
+        gathered: Any = _Gather.apply(piece.float() if piece.dtype in _HALF else piece, self)
+        return gathered
+
+    def part_of_mean(self, weight: Tensor) -> Tensor:
+        """What a mean weighted by ``weight``, taken over this rank's pictures, counts in that over all.
+
+        ``mean of (local mean x this)`` over ranks is the weighted mean over all pictures.
+        """
+        if self.count == 1:
+            return torch.ones((), device=weight.device)
+        local = weight.detach().float().sum()
+        total = local.clone()
+        distributed.all_reduce(total)
+        return torch.where(total > 0, local * self.count / total, torch.zeros_like(total))
+
+    def mean(self, values: Mapping[str, float]) -> dict[str, float]:
+        """Means over the ranks, by name; all have the same names."""
+        if self.count == 1:
+            return dict(values)
+        names = sorted(values)
+        summed = self._reduced([values[name] for name in names], distributed.ReduceOp.SUM)
+        means = dict(zip(names, summed, strict=True))
+        return {name: means[name] / self.count for name in values}
+
+    def sum(self, values: Mapping[str, float]) -> dict[str, float]:
+        """Sums over the ranks, by name; one that has nothing to add gives no names."""
+        if self.count == 1:
+            return dict(values)
+        gathered: list[Any] = [None] * self.count
+        distributed.all_gather_object(gathered, dict(values))
+        names = dict.fromkeys(name for one in gathered for name in one)
+        return {name: sum(one.get(name, 0.0) for one in gathered) for name in names}
+
+    def largest(self, *values: float) -> list[float]:
+        """Of each number the largest that any rank has."""
+        return self._reduced(values, distributed.ReduceOp.MAX)
+
+    def _reduced(self, values: Sequence[float], operation: Any) -> list[float]:
+        if self.count == 1:
+            return list(values)
+        device = "cuda" if distributed.get_backend() == "nccl" else "cpu"
+        tensor = torch.tensor(list(values), dtype=torch.float64, device=device)
+        distributed.all_reduce(tensor, operation)
+        return tensor.tolist()
+
+
+ALONE = Ranks()
+_HALF = (torch.bfloat16, torch.float16)
+
+
+class _Gather(torch.autograd.Function):
+    """All ranks' rows; backward sums what all ranks ask of this rank's rows."""
+
+    @staticmethod
+    def forward(ctx: Any, piece: Tensor, ranks: Ranks) -> Tensor:
+        ctx.ranks = ranks
+        pieces = [torch.empty_like(piece, memory_format=torch.contiguous_format) for _ in range(ranks.count)]
+        distributed.all_gather(pieces, piece.contiguous())
+        return torch.cat(pieces)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        summed = gradient.contiguous().clone()
+        distributed.all_reduce(summed)
+        return ctx.ranks.own(summed), None
+
+
+def started_together() -> int:
+    """How many processes torchrun started with this one; 1 without it."""
+    return int(os.environ.get("WORLD_SIZE", "1")) if "LOCAL_WORLD_SIZE" in os.environ else 1
+
+
+def open_fabric(accelerator: str, *, all_learn: bool = False) -> Fabric:
+    """One device; under torchrun one for each of its processes, joined when this returns.
+
+    Args:
+        accelerator: "auto", "cpu" or "cuda".
+        all_learn: whether every parameter gets a gradient in every step, which saves DDP a search.
+
+    Raises:
+        ValueError: nodes with different numbers of processes.
+    """
+    world = started_together()
+    if world == 1:
+        return Fabric(accelerator=accelerator, devices=1)
+    local = int(os.environ["LOCAL_WORLD_SIZE"])
+    if world % local:
+        raise ValueError(
+            f"{world} processes, {local} of them on this machine: start the same number on every machine "
+            "(torchrun --nproc-per-node)"
+        )
+    known = signature(DistributedDataParallel.__init__).parameters
+    buffers = "forward_sync_buffers" if "forward_sync_buffers" in known else "broadcast_buffers"
+    options: dict[str, Any] = {"find_unused_parameters": not all_learn, buffers: False}
+    strategy = DDPStrategy(**options)
+    fabric = Fabric(accelerator=accelerator, devices=local, num_nodes=world // local, strategy=strategy)
+    with _lightning_quiet():
+        fabric.launch()
+    return fabric
+
+
+@contextmanager
+def _lightning_quiet() -> Iterator[None]:
+    """Keep back what Lightning says of processes that find each other."""
+    logger = logging.getLogger("lightning_fabric")
+    before = logger.level
+    logger.setLevel(logging.WARNING)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
+
+
+def ranks_of(fabric: Fabric) -> Ranks:
+    """Where this process stands among those of a fabric."""
+    return Ranks(fabric.global_rank, fabric.world_size)
+
+
+@contextmanager
+def first_then_others(fabric: Fabric, *, local: bool = False) -> Iterator[None]:
+    """The first rank (``local``: of each machine) runs the block before the others do."""
+    if fabric.world_size == 1:
+        yield
+        return
+    with fabric.rank_zero_first(local=local):
+        yield
+
+
+def first_to_fail() -> bool:
+    """Whether no other process of this run has failed before; asked once, by one that is about to end.
+
+    The others then end silently: what they have to say is that the first one has gone.
+    """
+    if started_together() == 1 or not distributed.is_available():
+        return True
+    if not distributed.is_initialized():
+        return os.environ.get("RANK", "0") == "0"  # before they know of each other all fail alike
+    store = distributed.distributed_c10d._get_default_store()
+    return store.add("derender/failed", 1) == 1
+
+
+def leave() -> None:
+    """End the connection to the other processes, when all is done."""
+    if started_together() > 1 and distributed.is_available() and distributed.is_initialized():
+        distributed.destroy_process_group()
+
+
+def this_rank_writes() -> bool:
+    """Whether this process is the one that writes files: the only one, or the first of several."""
+    return not distributed.is_initialized() or distributed.get_rank() == 0

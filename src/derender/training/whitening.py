@@ -1,0 +1,93 @@
+"""What light and camera do to a trained model's codes, measured on its own renderings.
+
+Every picture is taken apart, rendered with other values of all its vector factors (light and camera), and
+encoded again, several times. This is LOOCC's perturbation, of all vector factors at once, used after training
+instead of during it. Leaves out the codes of the vector factors themselves, which are to move.
+"""
+
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Float, Shaped
+from torch import Generator, Tensor
+
+from derender.data.pictures import as_float
+from derender.model import Derenderer
+from derender.networks.whitening import Whitening, contrast
+from derender.scene import Scene
+from derender.scene.perturb import PerturbSettings
+from derender.training.config import WhiteningSettings
+from derender.training.step import fill_uncovered
+
+BATCH_SIZE = 128
+
+
+def fit_whitening(
+    model: Derenderer,
+    images: Shaped[Tensor, "n 3 h w"],
+    settings: WhiteningSettings,
+    perturb: PerturbSettings,
+    *,
+    seed: int = 0,
+    progress: Callable[[int, int], None] | None = None,
+) -> Whitening:
+    """The map from a trained model's codes of geometry and albedo to its features.
+
+    Args:
+        model: trained; left as it is.
+        images: what it was trained on, uint8 or float in 0..1; as many as the settings say are drawn.
+        settings: how many pictures and views, how many directions are kept.
+        perturb: how far light and camera are changed.
+        seed: of the draw.
+        progress: called with (pictures done, pictures in all).
+
+    Raises:
+        ValueError: fewer than two pictures.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    chosen = torch.randperm(len(images), generator=generator)[: settings.pictures]
+    names = [factor.name for factor in model.factors if factor.mirrored]
+    found: dict[str, list[Tensor]] = {name: [] for name in names}
+    was_training = model.training
+    model.eval()
+    try:
+        with torch.no_grad():
+            for start in range(0, len(chosen), BATCH_SIZE):
+                rows = chosen[start : start + BATCH_SIZE].to(images.device)
+                batch = as_float(images[rows]).to(model.device)
+                codes = model.encode(batch)
+                scene = model.decode(codes)
+                views = [codes]
+                for _ in range(settings.views):
+                    views.append(model.encode(_seen_otherwise(model, scene, batch, perturb, generator)))
+                for name in names:
+                    found[name].append(torch.stack([view[name].float() for view in views]).cpu())
+                if progress is not None:
+                    progress(min(start + BATCH_SIZE, len(chosen)), len(chosen))
+    finally:
+        model.train(was_training)
+    return Whitening(
+        {
+            name: contrast(torch.cat(parts, dim=1), settings.directions, settings.shrinkage)
+            for name, parts in found.items()
+        }
+    ).to(model.device)
+
+
+def _seen_otherwise(
+    model: Derenderer,
+    scene: Scene,
+    pictures: Float[Tensor, "n 3 h w"],
+    perturb: PerturbSettings,
+    generator: Generator,
+) -> Float[Tensor, "n 3 h w"]:
+    """The scenes rendered with other values of every vector factor; what nothing covers is filled."""
+    changed = {
+        factor.parameter: factor.perturb(
+            scene.parameters[factor.parameter], generator, perturb, model.settings.ranges
+        )
+        for factor in model.factors
+        if not factor.mirrored and factor.perturb is not None
+    }
+    rendering = model.render(scene.with_parameters(**changed))
+    return fill_uncovered(rendering.image, rendering.mask, pictures)

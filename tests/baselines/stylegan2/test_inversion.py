@@ -1,0 +1,155 @@
+"""The e4e encoder: which code sees what, its regularisers; and runs of a generator and of its inversion."""
+
+from contextlib import nullcontext
+
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from derender.baselines.stylegan2.e4e import E4e, E4eSettings, EncoderSettings
+from derender.baselines.stylegan2.generator import GeneratorSettings
+from derender.baselines.stylegan2.inversion import (
+    E4eConfig,
+    InversionObjective,
+    code_deltas,
+    inversion_losses,
+    open_generator,
+    released_codes,
+)
+from derender.baselines.training import CONFIGS, BaselineTask, load_baseline
+from derender.report.baseline_sheet import baseline_sheet
+from derender.training.checkpoint import WEIGHTS_FILE
+from derender.training.config import with_changes
+from derender.training.loop import train_task
+from derender.training.run_folder import read_metrics
+
+TINY = GeneratorSettings(image_size=32, style_size=6, mapping_layers=2, channel_base=64, channel_max=6)
+GENERATOR = ["image_size=32", "style_size=6", "mapping_layers=2", "channel_base=64", "channel_max=6"]
+ENCODER = ["image_size=32", "width=4", "units=[1,1,1,1]", "self_features_steps=2", "first_release=16"]
+COMMON = ["batch_size=8", "checkpoint_every=24", "validate_every=24", "sample_every=48", "deterministic=true"]
+
+
+@pytest.fixture(autouse=True)
+def _restore_determinism():
+    yield
+    torch.use_deterministic_algorithms(False)
+
+
+@pytest.fixture
+def model():
+    torch.manual_seed(0)
+    return E4e(E4eSettings(image_size=32, width=4, units=(1, 1, 1, 1), generator=TINY)).eval()
+
+
+def task(name: str, images: int, *more: str) -> BaselineTask:
+    return BaselineTask(with_changes(CONFIGS[name](), [*COMMON, *more, f"images={images}"]))
+
+
+@pytest.fixture(scope="module")
+def runs(blobs, tmp_path_factory):
+    """A finished run of a generator and one of its inversion."""
+    folder = tmp_path_factory.mktemp("runs")
+    for name, own in (
+        ("stylegan2", GENERATOR),
+        ("e4e", [*ENCODER, f"generator={folder / 'stylegan2'}"]),
+    ):
+        one = task(name, 48, *own)
+        train_task(one, blobs, folder / name, sample_sheet=baseline_sheet(one.shown))
+    torch.use_deterministic_algorithms(False)
+    return folder
+
+
+def test_the_codes_are_the_first_and_what_is_added(model, generator):
+    """Codes that are not released are the first; then 3 coarse, 4 middle, the rest fine."""
+    images = torch.rand(2, 3, 32, 32, generator=generator)
+    model.released.fill_(0)
+    first = model.invert(images)
+    assert torch.equal(first, first[:, :1].expand(-1, 8, -1))
+    model.released.fill_(2)
+    some = model.invert(images)
+    assert torch.equal(some[:, [0, 3, 7]], first[:, [0, 3, 7]])
+    assert not torch.equal(some[:, 1], first[:, 1]) and not torch.equal(some[:, 2], first[:, 2])
+    model.released.fill_(7)
+    whole = model.invert(images)
+    with torch.no_grad():
+        model.encoder.to_fine.bias.add_(1)
+    fine = [code for code in range(8) if not torch.equal(model.invert(images)[:, code], whole[:, code])]
+    assert fine == [7]
+    with torch.no_grad():
+        model.encoder.to_middle.bias.add_(1)
+    middle = [code for code in range(8) if not torch.equal(model.invert(images)[:, code], whole[:, code])]
+    assert middle == [3, 4, 5, 6, 7]  # fine maps are made from middle ones
+
+
+def test_the_mean_code_is_added(model, generator):
+    images = torch.rand(1, 3, 32, 32, generator=generator)
+    before = model.embed(images)["w+"]
+    model.centre.add_(2)
+    torch.testing.assert_close(model.embed(images)["w+"], before + 2)
+    assert before.shape == (1, 8 * 6)
+    with pytest.raises(ValueError, match=r"this e4e takes pictures of shape \(N, 3, 32, 32\)"):
+        model.embed(torch.rand(1, 3, 64, 64))
+
+
+def test_codes_are_released_one_by_one():
+    objective = InversionObjective(first_release=100, release_every=10)
+    assert [released_codes(objective, seen) for seen in (0, 99, 100, 109, 110, 500)] == [0, 0, 1, 1, 2, 41]
+
+
+def test_losses_are_zero_for_what_the_generator_made_from_its_mean_code(model, generator):
+    """With an encoder that says nothing the inversion is the mean code's picture."""
+    model.centre.copy_(torch.randn(6, generator=generator).expand(8, -1))
+    for head in model.encoder.heads:
+        head.linear.weight.data.zero_()
+    images = model.rebuild(model.centre[None]).detach().expand(2, -1, -1, -1)
+    terms = inversion_losses(model, images, InversionObjective(), None, generator, nullcontext)
+    for name in ("reconstruction", "delta", "prior"):
+        assert terms[name] < 1e-6, name
+    codes = torch.zeros(1, 3, 2)
+    codes[0, 1] = torch.tensor([3.0, 4.0])
+    assert code_deltas(codes) == pytest.approx(5, abs=1e-5)
+
+
+@pytest.mark.parametrize("name", ["stylegan2", "e4e"])
+def test_a_resumed_run_ends_with_the_very_weights_of_an_undisturbed_one(name, runs, blobs, tmp_path):
+    own = GENERATOR if name == "stylegan2" else [*ENCODER, f"generator={runs / 'stylegan2'}"]
+    train_task(task(name, 24, *own), blobs, tmp_path / "parts")
+    train_task(task(name, 48, *own), blobs, tmp_path / "parts", resume=True)
+    whole, parts = (
+        load_file(run / "checkpoints" / "last" / WEIGHTS_FILE) for run in (runs / name, tmp_path / "parts")
+    )
+    assert whole.keys() == parts.keys()
+    assert all(torch.equal(whole[key], parts[key]) for key in whole)
+
+
+def test_runs_leave_models_that_embed(runs, blobs):
+    images = torch.from_numpy(blobs.images[:5]).float() / 255
+    assert load_baseline(runs / "stylegan2").embed(images)["discriminator"].shape == (5, 6)
+    model = load_baseline(runs / "e4e")
+    assert isinstance(model, E4e) and model.embed(images)["w+"].shape == (5, 48)
+    generator = open_generator(runs / "stylegan2")
+    state = model.generator.state_dict()
+    assert all(torch.equal(value, state[key]) for key, value in generator.state_dict().items())
+    assert model.seen == 48 and not torch.equal(model.centre, torch.zeros_like(model.centre))
+    rows = read_metrics(runs / "e4e")
+    assert {"reconstruction", "perceptual", "delta", "prior", "l1"} <= rows[0].keys()
+    held_out = [row for row in rows if row["kind"] == "validation"][-1]
+    assert held_out["loss"] == pytest.approx(held_out["reconstruction"] + held_out["perceptual"])
+    judged = [row for row in read_metrics(runs / "stylegan2") if row["kind"] == "validation"][-1]
+    assert judged["loss"] == judged["energy"]
+
+
+def test_a_run_without_a_generator_is_refused_before_a_folder_is_made(runs, blobs, tmp_path):
+    for more, told in (
+        ([], "name the generator to invert, as in --set generator=RUN"),
+        ([f"generator={runs / 'e4e'}"], "holds the baseline 'e4e', asked for stylegan2"),
+        ([f"generator={tmp_path / 'none'}"], "no baseline at"),
+        ([f"generator={tmp_path / 'none.pt'}"], r"get stylegan2-ffhq-config-f\.pt"),
+    ):
+        with pytest.raises((ValueError, FileNotFoundError), match=told):
+            train_task(task("e4e", 48, *ENCODER, *more), blobs, tmp_path / "run")
+        assert not (tmp_path / "run").exists()
+    with pytest.raises(ValueError, match="32, 64, 128, 256"):
+        with_changes(E4eConfig(), ["image_size=48"])
+    with pytest.raises(ValueError, match="at least one unit"):
+        EncoderSettings(units=(1, 0, 1, 1))

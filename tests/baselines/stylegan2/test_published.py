@@ -1,0 +1,300 @@
+"""Published files: every key and shape by name, the numbers that come back, and files that are refused.
+
+No published file is at hand; the lists below are written out from the architecture (the published layout of
+stylegan2-pytorch and encoder4editing), by another way than the library's, and files are made from them.
+"""
+
+import os
+import pickle
+from argparse import Namespace
+
+import pytest
+import torch
+
+from derender.baselines.stylegan2.e4e import E4e, E4eSettings
+from derender.baselines.stylegan2.generator import Generator, GeneratorSettings, config_f
+from derender.baselines.stylegan2.layers import FILTER
+from derender.baselines.stylegan2.published import (
+    encoder_entries,
+    generator_entries,
+    load_published_e4e,
+    load_published_generator,
+)
+
+CONFIG_F = {4: 512, 8: 512, 16: 512, 32: 512, 64: 512, 128: 256, 256: 128, 512: 64, 1024: 32}
+LITTLE = {4: 6, 8: 6, 16: 6, 32: 3}
+
+
+def published_generator(widths, style=512, mapping=8):
+    """Names and shapes of ``g_ema`` in a file of stylegan2-pytorch, from the widths at each resolution."""
+    found = {}
+
+    def affine(name, inputs):
+        found[f"{name}.conv.modulation.weight"] = (inputs, style)
+        found[f"{name}.conv.modulation.bias"] = (inputs,)
+
+    def styled(name, inputs, outputs, blurred=False):
+        found[f"{name}.conv.weight"] = (1, outputs, inputs, 3, 3)
+        if blurred:
+            found[f"{name}.conv.blur.kernel"] = (4, 4)
+        affine(name, inputs)
+        found[f"{name}.noise.weight"] = (1,)
+        found[f"{name}.activate.bias"] = (outputs,)
+
+    def colours(name, inputs):
+        found[f"{name}.bias"] = (1, 3, 1, 1)
+        found[f"{name}.conv.weight"] = (1, 3, inputs, 1, 1)
+        affine(name, inputs)
+
+    for layer in range(1, mapping + 1):
+        found[f"style.{layer}.weight"], found[f"style.{layer}.bias"] = (style, style), (style,)
+    found["input.input"] = (1, widths[4], 4, 4)
+    styled("conv1", widths[4], widths[4])
+    colours("to_rgb1", widths[4])
+    found["noises.noise_0"] = (1, 1, 4, 4)
+    for step, size in enumerate(sorted(widths)[1:]):
+        styled(f"convs.{2 * step}", widths[size // 2], widths[size], blurred=True)
+        styled(f"convs.{2 * step + 1}", widths[size], widths[size])
+        colours(f"to_rgbs.{step}", widths[size])
+        found[f"to_rgbs.{step}.upsample.kernel"] = (4, 4)
+        for half in (1, 2):
+            found[f"noises.noise_{2 * step + half}"] = (1, 1, size, size)
+    return found
+
+
+def published_encoder(stages, heads, width=64, style=512, reduction=16):
+    """Names and shapes of ``encoder.*`` there, without the prefix; heads: (how many, their convolutions)."""
+    found = {"input_layer.0.weight": (width, 3, 3, 3), "input_layer.2.weight": (width,)}
+
+    def norm(name, channels):
+        for part in ("weight", "bias", "running_mean", "running_var"):
+            found[f"{name}.{part}"] = (channels,)
+        found[f"{name}.num_batches_tracked"] = ()
+
+    norm("input_layer.1", width)
+    before, number = width, 0
+    for stage, units in enumerate(stages):
+        after = width * 2**stage
+        for _ in range(units):
+            name = f"body.{number}"
+            if before != after:
+                found[f"{name}.shortcut_layer.0.weight"] = (after, before, 1, 1)
+                norm(f"{name}.shortcut_layer.1", after)
+            norm(f"{name}.res_layer.0", before)
+            found[f"{name}.res_layer.1.weight"] = (after, before, 3, 3)
+            found[f"{name}.res_layer.2.weight"] = (after,)
+            found[f"{name}.res_layer.3.weight"] = (after, after, 3, 3)
+            norm(f"{name}.res_layer.4", after)
+            found[f"{name}.res_layer.5.fc1.weight"] = (after // reduction, after, 1, 1)
+            found[f"{name}.res_layer.5.fc2.weight"] = (after, after // reduction, 1, 1)
+            before, number = after, number + 1
+    code = 0
+    for count, convolutions in heads:
+        for _ in range(count):
+            for index in range(convolutions):
+                inputs = before if index == 0 else style
+                found[f"styles.{code}.convs.{2 * index}.weight"] = (style, inputs, 3, 3)
+                found[f"styles.{code}.convs.{2 * index}.bias"] = (style,)
+            found[f"styles.{code}.linear.weight"] = (style, style)
+            found[f"styles.{code}.linear.bias"] = (style,)
+            code += 1
+    found["latlayer1.weight"], found["latlayer1.bias"] = (before, before // 2, 1, 1), (before,)
+    found["latlayer2.weight"], found["latlayer2.bias"] = (before, before // 4, 1, 1), (before,)
+    return found
+
+
+def filled(shapes, generator):
+    """Tensors of these shapes: filters as they are, everything else random."""
+    taps = 2 * torch.tensor(FILTER)
+    found = {}
+    for name, shape in shapes.items():
+        if name.endswith("num_batches_tracked"):
+            found[name] = torch.tensor(7)
+        elif name.endswith(".kernel"):
+            found[name] = torch.outer(taps, taps)
+        else:
+            found[name] = torch.rand(shape, generator=generator) + 0.1
+    return found
+
+
+@pytest.fixture
+def generator_weights(generator):
+    return filled(published_generator(LITTLE, style=8, mapping=2), generator)
+
+
+@pytest.fixture
+def e4e_content(generator):
+    """A small encoder for 64 pixels, of a generator of 32 pixels (8 codes)."""
+    encoder = published_encoder((2, 1, 3, 1), ((3, 2), (4, 3), (1, 4)), width=4, style=8, reduction=2)
+    decoder = published_generator(LITTLE, style=8, mapping=2)
+    state = {f"encoder.{name}": value for name, value in filled(encoder, generator).items()}
+    state |= {f"decoder.{name}": value for name, value in filled(decoder, generator).items()}
+    return {
+        "state_dict": state,
+        "latent_avg": torch.rand(8, 8, generator=generator),
+        "opts": Namespace(dataset_type="ffhq_encode", learning_rate=1e-4),
+    }
+
+
+def save(content, path):
+    torch.save(content, path)
+    return path
+
+
+@pytest.mark.parametrize(("size", "count"), [(1024, 171), (256, 135)])
+def test_the_generators_layout_is_the_published_one(size, count):
+    """Name by name and shape by shape; every tensor of ours is filled, none twice."""
+    widths = {side: width for side, width in CONFIG_F.items() if side <= size}
+    entries = list(generator_entries(config_f(size)))
+    wanted = published_generator(widths)
+    assert {entry.key: entry.shape for entry in entries} == wanted
+    assert len(entries) == len(wanted) == count
+    with torch.device("meta"):
+        ours = Generator(config_f(size)).state_dict()
+    names = [entry.name for entry in entries if entry.name is not None]
+    assert sorted(names) == sorted(ours)
+    for entry in entries:
+        if entry.name is not None:
+            assert ours[entry.name].numel() == torch.Size(entry.shape).numel(), entry.key
+
+
+@pytest.mark.parametrize(
+    ("size", "heads"), [(1024, ((3, 4), (4, 5), (11, 6))), (256, ((3, 4), (4, 5), (7, 6)))]
+)
+def test_the_encoders_layout_is_the_published_one(size, heads):
+    settings = E4eSettings(
+        image_size=256, width=64, units=(3, 4, 14, 3), reduction=16, generator=config_f(size)
+    )
+    entries = list(encoder_entries(settings))
+    assert {entry.key: entry.shape for entry in entries} == published_encoder((3, 4, 14, 3), heads)
+    with torch.device("meta"):
+        model = E4e(settings)
+    ours = model.encoder.state_dict()
+    assert sorted(str(entry.name) for entry in entries) == sorted(ours)
+    for entry in entries:
+        assert tuple(ours[str(entry.name)].shape) == entry.shape, entry.key
+    if size == 1024:
+        assert sum(value.numel() for value in model.encoder.parameters()) == 267_136_704
+        assert tuple(model.centre.shape) == (18, 512)
+
+
+def test_a_generator_file_becomes_ours(generator_weights, tmp_path):
+    path = save({"g_ema": generator_weights, "latent_avg": torch.zeros(8)}, tmp_path / "generator.pt")
+    net = load_published_generator(path)
+    assert net.settings == GeneratorSettings(
+        image_size=32, style_size=8, mapping_layers=2, channel_base=96, channel_max=6
+    )
+    assert torch.equal(net.convs[3].weight, generator_weights["convs.2.conv.weight"][0])
+    assert torch.equal(net.to_rgbs[0].bias, generator_weights["to_rgb1.bias"].flatten())
+    assert torch.equal(net.mapping.layers[1].bias, generator_weights["style.2.bias"])
+    assert torch.equal(net.fixed_noise()[6], generator_weights["noises.noise_6"])
+    assert net(torch.ones(1, 8), net.fixed_noise()).isfinite().all()
+
+
+def test_early_files_have_no_noise_maps(generator_weights, tmp_path):
+    kept = {name: value for name, value in generator_weights.items() if not name.startswith("noises")}
+    path = save({"g_ema": kept}, tmp_path / "generator.pt")
+    first, second = (load_published_generator(path).fixed_noise() for _ in range(2))
+    assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
+
+
+@pytest.mark.parametrize("zipped", [True, False], ids=["zip", "legacy"])
+def test_an_e4e_file_becomes_ours(e4e_content, tmp_path, zipped):
+    path = tmp_path / "e4e.pt"
+    torch.save(e4e_content, path, _use_new_zipfile_serialization=zipped)
+    model = load_published_e4e(path)
+    assert model.settings.units == (2, 1, 3, 1) and model.settings.width == 4
+    assert (model.image_size, model.settings.reduction, model.settings.generator.image_size) == (64, 2, 32)
+    state = e4e_content["state_dict"]
+    assert torch.equal(model.centre, e4e_content["latent_avg"])
+    assert torch.equal(
+        model.encoder.stages[2][1].excite.weight, state["encoder.body.4.res_layer.5.fc2.weight"]
+    )
+    assert torch.equal(model.generator.constant, state["decoder.input.input"])
+    found = model.embed(torch.rand(2, 3, 64, 64))["w+"]
+    assert found.shape == (2, 64) and not model.training
+
+
+def test_one_mean_code_serves_all_layers(e4e_content, tmp_path):
+    e4e_content["latent_avg"] = e4e_content["latent_avg"][0]
+    model = load_published_e4e(save(e4e_content, tmp_path / "e4e.pt"))
+    assert torch.equal(model.centre, e4e_content["latent_avg"].expand(8, -1))
+
+
+def changed(weights, **changes):
+    """The weights with some replaced; None leaves one out. Dots are written as double underscores."""
+    found = dict(weights)
+    for name, value in changes.items():
+        found.pop(name.replace("__", "."), None)
+        if value is not None:
+            found[name.replace("__", ".")] = value
+    return found
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"convs__1__activate__bias": None}, "it has no 'convs.1.activate.bias'"),
+        (
+            {"convs__1__activate__bias": torch.zeros(4)},
+            r"'convs.1.activate.bias' has shape \(4,\), expected \(6,\)",
+        ),
+        ({"convs__0__conv__blur__kernel": torch.ones(4, 4)}, "'convs.0.conv.blur.kernel' is not the filter"),
+        ({"extra": torch.zeros(1)}, "it has 'extra', which ours lacks"),
+        ({"input__input": None}, "has no 'input.input'"),
+        ({"style__1__weight": torch.zeros(3)}, "'style.1.weight' has shape"),
+    ],
+)
+def test_another_architecture_is_named_by_its_first_key(generator_weights, tmp_path, changes, told):
+    path = save({"g_ema": changed(generator_weights, **changes)}, tmp_path / "generator.pt")
+    with pytest.raises(ValueError, match=told):
+        load_published_generator(path)
+
+
+def test_a_generator_is_no_encoder(generator_weights, e4e_content, tmp_path):
+    generator_file = save({"g_ema": generator_weights}, tmp_path / "generator.pt")
+    encoder_file = save(e4e_content, tmp_path / "e4e.pt")
+    with pytest.raises(ValueError, match=r"no 'state_dict'.*e4e_ffhq_encode\.pt.*github\.com/omertov"):
+        load_published_e4e(generator_file)
+    with pytest.raises(ValueError, match=r"no 'g_ema'.*stylegan2-ffhq-config-f\.pt.*github\.com/rosinality"):
+        load_published_generator(encoder_file)
+    del e4e_content["state_dict"]["encoder.latlayer2.bias"]
+    with pytest.raises(ValueError, match=r"it has no 'encoder\.latlayer2\.bias'"):
+        load_published_e4e(save(e4e_content, encoder_file))
+
+
+class Attack:
+    """What a hostile pickle asks for."""
+
+    def __init__(self, command):
+        self.command = command
+
+    def __reduce__(self):
+        return os.system, (self.command,)
+
+
+@pytest.mark.parametrize("as_torch_file", [True, False])
+def test_a_file_that_wants_to_run_code_is_refused(tmp_path, as_torch_file):
+    path, trace = tmp_path / "e4e.pt", tmp_path / "it-ran"
+    content = {"state_dict": {}, "latent_avg": Attack(f"touch {trace}")}
+    if as_torch_file:
+        torch.save(content, path)
+    else:
+        path.write_bytes(pickle.dumps(content, protocol=2))
+    with pytest.raises(ValueError, match=r"wants to run code when it is read \(\w+\.system\): refused"):
+        load_published_e4e(path)
+    assert not trace.exists()
+
+
+def test_damaged_and_missing_files_are_one_clear_error(e4e_content, tmp_path):
+    path = save(e4e_content, tmp_path / "e4e.pt")
+    whole = path.read_bytes()
+    for damage in (whole[: len(whole) // 2], b"", b"not a pickle at all", b"\x80\x02}q\x00."):
+        path.write_bytes(damage)
+        with pytest.raises(ValueError, match=r"e4e\.pt (is damaged|has no 'state_dict')") as told:
+            load_published_e4e(path)
+        assert "\n" not in str(told.value)
+    with pytest.raises(FileNotFoundError, match=r"nothing is downloaded here; get e4e_ffhq_encode\.pt"):
+        load_published_e4e(tmp_path / "nowhere.pt")
+    with pytest.raises(ValueError, match="no weights by name"):
+        load_published_generator(save({"g_ema": [1, 2]}, path))

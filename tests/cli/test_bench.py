@@ -1,0 +1,33 @@
+"""`derender bench`: ratios of things that were shown to compute the same."""
+
+import json
+import time
+
+import pytest
+import torch
+
+from derender.cli import main
+from derender.cli.bench import Pair, _agree, measured
+
+
+def test_the_quick_bench_reports_every_pair_with_the_machine(tmp_path, capsys):
+    assert main(["bench", "--quick", "--json", str(tmp_path / "speed.json")]) == 0
+    found = json.loads((tmp_path / "speed.json").read_text())
+    assert [row["what"].split()[0] for row in found["rows"]] == ["rendering", "embedding", "Ward"]
+    for row in found["rows"]:
+        assert row["least"] <= row["ratio"] <= row["most"]
+        assert row["ours_per_second"] > 0
+    assert found["machine"]["packages"]["torch"] == torch.__version__
+    assert "Ward clustering" in capsys.readouterr().out
+
+
+def test_twice_the_work_in_the_same_time_is_a_ratio_of_two():
+    pair = Pair("a / b", "things", (20, 10), lambda: time.sleep(0.01), lambda: time.sleep(0.01))
+    row = measured(pair, rounds=3)
+    assert row["least"] <= row["ratio"] <= row["most"]
+    assert row["ratio"] == pytest.approx(2, rel=0.5)
+
+
+def test_what_differs_is_not_measured():
+    with pytest.raises(ValueError, match="the two sums differ by"):
+        _agree("sums", [(torch.ones(2), torch.tensor([1.0, 1.1]))])

@@ -1,0 +1,103 @@
+"""`derender evaluate robustness`: curves of generated and real pictures, charts, and ways to get it wrong."""
+
+import json
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from derender import Derenderer
+from derender.cli import main
+from derender.data.synthetic import FaceSettings, faces, write, write_tracks
+
+QUICK = ["--resamples", 20, "--untrained-seeds", 1, "--seeds", 2, "--angles", "0,40", "--cache"]
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory) -> Path:
+    net = Derenderer.from_preset("small", seed=0, image_size=32, width=4, light_width=4, code_size=8)
+    return net.save(tmp_path_factory.mktemp("robustness") / "model")
+
+
+@pytest.fixture(scope="module")
+def rendered(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("robustness") / "faces"
+    write(faces.generate(40, 32, 0, FaceSettings(pictures_per_identity=10)), folder)
+    return folder
+
+
+def run(capsys, *words: object) -> tuple[dict, str]:
+    capsys.readouterr()
+    assert main([*map(str, words), "--json", "-"]) == 0
+    told = capsys.readouterr()
+    return json.loads(told.out), told.err
+
+
+def test_generated_faces_by_angle_and_light(model, tmp_path, capsys):
+    words = ["evaluate", "robustness", "-m", model, "--people", 4, "--learned", 6, *QUICK, tmp_path / "cache"]
+    files = ["--out", tmp_path / "page.html", "--markdown", tmp_path / "t.md", "--latex", tmp_path / "t.tex"]
+    told, shown = run(capsys, *words, *files)
+    assert list(told["curves"]) == ["yaw", "light"] and told["how"] == "identity of generated faces"
+    names = ["geometry + albedo", "geometry", "albedo", "light", "camera"]
+    controls = ["untrained encoder", "PCA (6)", "pixels", "majority"]
+    rows = told["curves"]["yaw"]["accuracy"]
+    assert list(rows) == [*names, *controls] and [rows[name]["control"] for name in controls] == [True] * 4
+    assert rows["majority"]["scores"]["area"]["value"] == 0.25
+    assert told["curves"]["light"]["n_tested"] == [8, 8, 16] and told["n_learned"]["yaw"] == 19
+    assert "camera yaw: geometry + albedo: area" in shown
+    page = (tmp_path / "page.html").read_text()
+    assert "<svg" in page and "light from the side" in page and "Robustness to light and view" in page
+    assert (tmp_path / "t.tex").read_text().count(r"\begin{table}") == 6
+    assert "| geometry + albedo |" in (tmp_path / "t.md").read_text()
+    again, shown = run(capsys, *words, "--score", "balanced", "--out", tmp_path / "curves.png")
+    assert "0 results computed, 12 found" in shown and again["curves"] == told["curves"]
+    with Image.open(tmp_path / "curves.png") as chart:
+        assert chart.width > 800
+
+
+def test_pictures_rendered_again_and_pictures_of_known_angles(model, rendered, tmp_path, capsys):
+    words = ["evaluate", "robustness", "-m", model, "--axes", "light", *QUICK, "none", "-d", rendered]
+    told, _ = run(capsys, *words, "--label", "expression", "--min-count", 4, "--groups", "identity")
+    assert told["pictures"] == "render" and told["how"].endswith("rendered again")
+    tested = told["curves"]["light"]["n_tested"]
+    assert tested[0] == tested[1] and tested[2] == 2 * tested[0]
+    told, _ = run(capsys, *words, "--pictures", "truth", "--out", tmp_path / "curves.svg")
+    light = told["curves"]["light"]
+    assert told["kind"] == "classes" and len(light["levels_deg"]) == 4
+    assert light["levels_deg"] == sorted(light["levels_deg"]) and light["n_tested"][0] == light["n_tested"][1]
+    assert (tmp_path / "curves.svg").read_text().startswith("<svg")
+
+
+def test_tracks_in_light_that_nobody_trained_on(model, tmp_path, capsys):
+    folder = tmp_path / "tracks"
+    settings = FaceSettings(tracks=8, frames=2)
+    write_tracks(faces.generate(32, 32, 0, settings), folder)
+    words = ["evaluate", "robustness", "-m", model, "-d", folder, "--pictures", "truth", "--axes", "yaw"]
+    told, _ = run(capsys, *words, *QUICK, "none")
+    assert told["curves"]["yaw"]["n_tested"] == [4, 4, 6, 6, 4] and told["names"] == ["identity"]
+
+
+def test_bad_words(model, rendered, tmp_path, capsys):
+    def refused(*words: object) -> str:
+        capsys.readouterr()
+        whole = ["evaluate", "robustness", "-m", model, "--cache", "none", *words]
+        assert main([str(word) for word in whole]) == 2
+        return capsys.readouterr().err.strip().splitlines()[-1]
+
+    assert "no axis 'lihgt'; did you mean 'light'" in refused("--axes", "lihgt")
+    assert "two or more that grow" in refused("--angles", "30")
+    assert "within 0..60 degrees for pitch" in refused("--axes", "pitch")
+    assert "--angles 'wide' should read like" in refused("--angles", "wide")
+    assert "no label 'hairs'; did you mean 'hair'" in refused("--label", "hairs", "--people", 2)
+    assert "'facess' is unknown; did you mean 'faces'" in refused("--pictures", "facess")
+    assert "take no --data" in refused("--pictures", "cars", "-d", rendered)
+    assert "need --data" in refused("--pictures", "truth")
+    assert "are asked one --label" in refused("--attributes")
+    assert "unknown label 'smile'" in refused("-d", rendered, "-l", "smile")
+    assert "must end in .svg, .png, .html" in refused("--out", tmp_path / "curves.pdf")
+    taken = tmp_path / "taken.svg"
+    taken.write_text("mine")
+    assert "--force" in refused("--out", taken) and taken.read_text() == "mine"
+    assert "choose accuracy or balanced" in refused("--score", "f1")
+    assert "two models have the name 'a'" in refused("-m", f"a={model}", "-m", f"a={model}")
+    assert "unknown head 'svm'" in refused("--head", "svm")

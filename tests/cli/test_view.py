@@ -1,0 +1,151 @@
+"""`derender view` as a person meets it: what it prints, what it refuses, how it ends."""
+
+import json
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from derender import Derenderer
+from derender.cli import main
+
+SIZE = 32
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory) -> str:
+    """An untrained model of the smallest kind, saved."""
+    folder = tmp_path_factory.mktemp("view") / "model"
+    return str(Derenderer.from_preset("small", seed=0, image_size=SIZE, width=4, light_width=4).save(folder))
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("photos")
+    for number in range(3):
+        coarse = np.random.default_rng(number).integers(0, 256, (6, 6, 3), dtype=np.uint8)
+        Image.fromarray(coarse).resize((SIZE, SIZE)).save(folder / f"{number}.png")
+    return folder
+
+
+@pytest.fixture
+def refused(capsys):
+    """Run a command that must fail with exit code 2 and one line of complaint; gives that line."""
+
+    def call(*arguments: object) -> str:
+        capsys.readouterr()
+        assert main([str(argument) for argument in arguments]) == 2
+        last = capsys.readouterr().err.strip().splitlines()[-1]
+        assert last.startswith("derender: ")
+        return last
+
+    return call
+
+
+@pytest.fixture
+def served(monkeypatch):
+    """What would be served; the server itself does not run."""
+    found = []
+
+    def instead(application, listener):
+        found.append((application, listener.getsockname()))
+        application.close()
+
+    monkeypatch.setattr("derender.report.viewer.server.serve", instead)
+    return found
+
+
+def test_help_has_an_example(capsys):
+    assert main(["view", "--help"]) == 0
+    assert "Example: derender view" in " ".join(capsys.readouterr().out.split())
+
+
+def test_it_listens_on_this_machine_only(model, photos, served, tmp_path, capsys):
+    table, told = tmp_path / "F.parquet", tmp_path / "told.json"
+    assert main(["embed", "-m", model, "-d", str(photos), "-o", str(table)]) == 0
+    (photos / "no.jpg").write_text("<html>")
+    words = ["view", "-m", model, str(photos / "0.png"), str(photos / "no.jpg"), "-f", str(table)]
+    assert main([*words, "--json", str(told), "--keep", "7"]) == 0
+    (application, place) = served[0]
+    assert place[0] == "127.0.0.1"
+    viewer = application.viewer
+    assert [example.name for example in viewer.examples] == ["0.png"]
+    assert viewer.studio.shelf.limit == 7
+    assert len(viewer.gallery.table) == 3 and not viewer.gallery.without_pictures
+    assert json.loads(told.read_text())["url"] == f"http://127.0.0.1:{place[1]}/"
+    printed = capsys.readouterr()
+    assert f"open http://127.0.0.1:{place[1]}/" in printed.out
+    assert "left out" in printed.err and "no password" not in printed.err
+    (photos / "no.jpg").unlink()
+
+
+def test_listening_elsewhere_is_warned_of(model, photos, served, capsys):
+    assert main(["view", "-m", model, str(photos / "0.png"), "--host", "0.0.0.0"]) == 0
+    assert served[0][1][0] == "0.0.0.0"
+    assert "no password" in capsys.readouterr().err
+
+
+def test_a_port_in_use_is_one_error(model, refused):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        line = refused("view", "-m", model, "--port", port)
+    assert f"port {port} of 127.0.0.1 is in use: choose another --port" in line
+
+
+def test_what_is_refused(model, photos, refused, tmp_path):
+    assert "no address of this machine" in refused("view", "-m", model, "--host", "no such host")
+    assert "0..65535" in refused("view", "-m", model, "--port", 70_000)
+    assert "does not exist" in refused("view", "-m", model, tmp_path / "none.png")
+    assert "no model at" in refused("view", "-m", tmp_path / "none")
+    other = Derenderer.from_preset("small", seed=1, image_size=SIZE, width=4, light_width=4)
+    other.save(tmp_path / "other")
+    table = tmp_path / "F.parquet"
+    assert main(["embed", "-m", str(tmp_path / "other"), "-d", str(photos), "-o", str(table)]) == 0
+    assert "made by another model" in refused("view", "-m", model, "-f", table)
+
+
+def test_what_is_not_installed_is_named(model, refused, monkeypatch):
+    monkeypatch.setattr("derender.cli.view.find_spec", lambda name: None)
+    assert "pip install 'derender[view]'" in refused("view", "-m", model)
+
+
+def test_it_answers_until_ctrl_c(model, photos, tmp_path):
+    told = tmp_path / "told.json"
+    words = ["view", "-m", model, str(photos / "1.png"), "--json", str(told)]
+    with subprocess.Popen(
+        [sys.executable, "-m", "derender", *words],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=tmp_path,
+    ) as process:
+        try:
+            url = _url(process, told)
+            with urllib.request.urlopen(url, timeout=60) as page:
+                assert b"A picture taken apart" in page.read()
+            foreign = urllib.request.Request(url, headers={"Host": "rebound.example"})
+            with pytest.raises(urllib.error.HTTPError, match="421") as answer:
+                urllib.request.urlopen(foreign, timeout=60)
+            answer.value.close()
+            process.send_signal(signal.SIGINT)
+            _, said = process.communicate(timeout=60)
+        finally:
+            process.kill()
+    assert process.returncode == 0
+    assert said.strip() == "stopped"
+
+
+def _url(process: subprocess.Popen, told) -> str:
+    for _ in range(1200):
+        if told.exists():
+            return json.loads(told.read_text())["url"]
+        assert process.poll() is None, "it ended by itself"
+        time.sleep(0.1)
+    raise AssertionError("it did not start within two minutes")

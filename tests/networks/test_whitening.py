@@ -1,0 +1,88 @@
+"""Whitening: planted nuisance goes, planted identity stays; what is said of units and rank holds."""
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from derender.networks.whitening import Whitening, contrast
+
+VIEWS, PICTURES, SIZE = 5, 400, 12
+
+
+def planted(seed: int = 0) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Codes in which axes 0..2 say which picture it is and axes 3..5, far larger, how it was lit.
+
+    All axes are mixed by a rotation. Gives codes (views, pictures, size), the directions of the picture's and
+    of the light's axes.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    codes = 0.05 * torch.randn(VIEWS, PICTURES, SIZE, generator=generator)
+    codes[..., :3] += torch.randn(1, PICTURES, 3, generator=generator)
+    codes[..., 3:6] += 10 * torch.randn(VIEWS, PICTURES, 3, generator=generator)
+    rotation = torch.linalg.qr(torch.randn(SIZE, SIZE, generator=generator))[0]
+    return codes @ rotation, rotation[:3], rotation[3:6]
+
+
+def test_what_light_moves_is_shrunk_and_what_tells_pictures_apart_is_kept():
+    codes, told, lit = planted()
+    found = contrast(codes, directions=3, shrinkage=1e-6)
+    kept = (told @ found.map).norm(dim=1)
+    left = (lit @ found.map).norm(dim=1)
+    assert (kept > 10).all()  # 1 of identity counts 20 times the 0.05 that views move there
+    assert (left < 0.2).all()
+    assert found.ratios[:3].min() > 100 > 1 > found.ratios[3:].max()
+
+
+def test_renderings_of_one_picture_differ_by_one_in_every_kept_direction():
+    codes, _, _ = planted()
+    found = contrast(codes, directions=5, shrinkage=0.0)
+    features = (codes - found.mean) @ found.map
+    within = (features - features.mean(dim=0)).flatten(0, 1)
+    covariance = within.T @ within / (PICTURES * (VIEWS - 1))
+    values = torch.linalg.eigvalsh(covariance)
+    assert values[-5:] == pytest.approx(np.ones(5), abs=2e-3)
+    assert values[:-5].abs().max() < 1e-4
+    assert torch.linalg.matrix_rank(found.map, rtol=1e-4) == 5
+
+
+def test_an_affine_change_of_the_codes_changes_no_distance():
+    codes, _, _ = planted()
+    change = torch.randn(SIZE, SIZE, generator=torch.Generator().manual_seed(3)).double()
+    changed = (codes.double() @ change + 7).float()
+    one, two = (contrast(c.double(), 4, 0.0) for c in (codes, changed))
+    distances = [torch.pdist((c[0, :50] - f.mean) @ f.map) for c, f in ((codes, one), (changed, two))]
+    assert torch.allclose(*distances, rtol=2e-2)
+
+
+def test_codes_that_never_move_are_survived():
+    codes = torch.zeros(3, 10, 4)
+    found = contrast(codes, 2, 0.1)
+    assert torch.isfinite(found.map).all()
+    assert ((codes - found.mean) @ found.map).abs().max() == 0
+
+
+@pytest.mark.parametrize("shape", [(1, 10, 4), (3, 1, 4)])
+def test_one_view_or_one_picture_says_nothing(shape):
+    with pytest.raises(ValueError, match="at least 2 views of 2 pictures"):
+        contrast(torch.zeros(shape), 2, 0.1)
+
+
+def test_maps_are_read_as_they_were_written_and_leave_other_factors_alone(tmp_path):
+    codes, _, _ = planted()
+    whitening = Whitening({"geometry": contrast(codes, 3, 0.1)})
+    whitening.save(tmp_path / "whitening.safetensors")
+    again = Whitening.load(tmp_path / "whitening.safetensors")
+    given = {"geometry": codes[0], "light": codes[1]}
+    one, two = whitening(given), again(given)
+    assert torch.equal(one["geometry"], two["geometry"])
+    assert not torch.equal(one["geometry"], codes[0])
+    assert torch.equal(one["light"], codes[1])
+    assert whitening.state_dict() == {}  # a model's weights are the same with it and without
+
+
+def test_maps_that_do_not_fit_are_refused(tmp_path):
+    wrong = {"geometry_mean": torch.zeros(4), "geometry_map": torch.eye(3), "geometry_ratios": torch.ones(4)}
+    save_file(wrong, tmp_path / "w")
+    with pytest.raises(ValueError, match=r"geometry: a map of \(3, 3\) beside a mean of 4"):
+        Whitening.load(tmp_path / "w")

@@ -1,0 +1,104 @@
+"""The Triton kernels without a GPU, in Triton's interpreter, and the integer sums that make gradients repeat.
+
+The interpreter must be chosen before Triton is imported, so it gets a process of its own. With a GPU, or with
+TRITON_INTERPRET=1 in the environment, every test of this folder that takes a backend runs on Triton as well.
+"""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from tests.render.devices import render
+from tests.render.scenes import FOV_DEG, scene
+
+from derender.render import available_backends
+from derender.render.scattered_sums import ADD, ADD_INTEGERS, MEASURE, scattered_sums
+from derender.render.triton_launch import float64_bits, triton_installed
+
+ROOT = Path(__file__).resolve().parents[2]
+INTERPRETED = (
+    "test_backends_agree[3-17-23-dtype0-triton]",
+    "test_backends_agree[5-3-9-dtype1-triton]",
+    "test_backends_choose_the_same_triangle[dtype1-triton]",
+    "test_sampling_agrees[dtype0-3-triton]",
+)
+
+
+@pytest.mark.skipif(not triton_installed(), reason="triton is not installed")
+@pytest.mark.skipif("triton" in available_backends(), reason="Triton runs in this very process")
+def test_kernels_agree_with_the_definition_in_the_interpreter():
+    tests = [f"tests/render/test_backends.py::{name}" for name in INTERPRETED]
+    call = subprocess.run(
+        [sys.executable, "-m", "pytest", "-n", "0", "-p", "no:cacheprovider", *tests],
+        cwd=ROOT, env={**os.environ, "TRITON_INTERPRET": "1"}, capture_output=True, text=True, timeout=280,
+        check=False,
+    )  # fmt: skip
+    assert call.returncode == 0, call.stdout[-3000:] + call.stderr[-1000:]
+    assert f"{len(INTERPRETED)} passed" in call.stdout
+
+
+@pytest.mark.skipif("triton" not in available_backends(), reason="needs a GPU, or TRITON_INTERPRET=1")
+def test_gradients_repeat_bit_for_bit_where_asked_for(generator):
+    values = scene(2, 33, 40, generator)
+
+    def gradients() -> tuple[torch.Tensor, ...]:
+        inputs = [value.clone().requires_grad_() for value in values]
+        return torch.autograd.grad(render(*inputs, FOV_DEG, "triton").image.square().sum(), inputs)
+
+    torch.use_deterministic_algorithms(True)
+    try:
+        one, other = gradients(), gradients()
+    finally:
+        torch.use_deterministic_algorithms(False)
+    assert all(torch.equal(first, second) for first, second in zip(one, other, strict=True))
+
+
+def adding(values: torch.Tensor, order: torch.Tensor):
+    """What a kernel does that adds each image's values (N, H, W) into one number, in some order."""
+
+    def run(mode, units, largest, targets) -> None:
+        for n, summands in enumerate(values.flatten(1)[:, order].double()):
+            if mode == MEASURE:
+                largest[n, 0] = max(float64_bits(abs(float(summand))) for summand in summands)
+                continue
+            for summand in summands:
+                targets[0][n] += (
+                    torch.floor(summand * units[n, 0] + 0.5).long() if mode == ADD_INTEGERS else summand
+                )
+                assert mode in (ADD, ADD_INTEGERS)
+
+    return run
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e-200, 1e200])
+def test_integer_sums_have_no_order_and_lose_nothing_that_counts(scale, generator):
+    values = torch.randn(3, 4, 5, generator=generator, dtype=torch.float64) * scale
+    values[0] = 0
+    orders = [torch.randperm(20, generator=generator) for _ in range(2)]
+    torch.use_deterministic_algorithms(True)
+    try:
+        one, other = (
+            scattered_sums(adding(values, order), values, [(3,)], [torch.float64])[0] for order in orders
+        )
+    finally:
+        torch.use_deterministic_algorithms(False)
+    assert torch.equal(one, other)
+    assert one[0] == 0
+    expected = scattered_sums(adding(values, orders[0]), values, [(3,)], [torch.float64])[0]
+    assert torch.allclose(one, expected, rtol=0, atol=1e-15 * 20 * float(values.abs().max()))
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
+def test_a_summand_that_is_not_finite_spoils_its_own_image_alone(bad):
+    values = torch.ones(2, 2, 2)
+    values[1, 0, 1] = bad
+    torch.use_deterministic_algorithms(True)
+    try:
+        sums = scattered_sums(adding(values, torch.arange(4)), values, [(2,)], [torch.float32])[0]
+    finally:
+        torch.use_deterministic_algorithms(False)
+    assert sums[0] == 4
+    assert sums[1].isnan()

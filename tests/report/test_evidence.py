@@ -1,0 +1,61 @@
+"""What is told of a model with pictures at hand; a part that cannot be made is named, the others stand."""
+
+import numpy as np
+import pytest
+
+from derender import Derenderer
+from derender.data import PictureSet
+from derender.report.evidence import AtHand, gather, label_to_ask
+
+COUNT = 48
+
+
+@pytest.fixture(scope="module")
+def model() -> Derenderer:
+    return Derenderer.from_preset("small", seed=0, image_size=32, width=4, light_width=4).eval()
+
+
+@pytest.fixture(scope="module")
+def pictures() -> PictureSet:
+    """Coloured noise, brighter where the label says so; one name is markup."""
+    generator = np.random.default_rng(0)
+    bright = np.arange(COUNT) % 2
+    images = generator.integers(0, 156, (COUNT, 3, 4, 4)) + 100 * bright[:, None, None, None]
+    return PictureSet(
+        images.repeat(8, axis=2).repeat(8, axis=3).astype(np.uint8),
+        ("<script>.png", *(f"{number}.png" for number in range(1, COUNT))),
+        {"number": np.arange(COUNT), "tone": np.where(bright, "bright", "dark")},
+        source="noise",
+    )
+
+
+def test_everything_that_can_be_told_is_told_and_escaped(model, pictures):
+    pytest.importorskip("captum")
+    done = []
+    found = gather(AtHand(model, pictures, pictures, "All of them"), lambda *step: done.append(step))
+    assert [section.short for section in found.sections] == [
+        *("Data", "Taken apart", "Films", "Scores", "Card", "Explained")
+    ]
+    assert found.failed == [] and done == [(step, 6) for step in range(7)]
+    html = "".join(block.text for section in found.sections for block in section.blocks)
+    assert "<script>" not in html and "&lt;script&gt;.png" in html
+    for told in ("All of them", "mean picture", "no exact depth", "shuffled labels", "tone", "Swap test"):
+        assert told in html
+    assert html.count("prefers-reduced-motion") == 2
+
+
+def test_parts_that_cannot_be_made_are_named_with_their_reason(model, pictures):
+    few = pictures.select(slice(3))
+    found = gather(AtHand(model, few, few.select(slice(0)), "None"))
+    assert [section.short for section in found.sections] == ["Data"]
+    assert len(found.failed) == 5
+    assert "needs 1 pictures or more" in found.failed[0]
+    assert "no label of 2 to 12 classes" in found.failed[-1]
+
+
+def test_the_label_to_ask_has_few_classes_with_pictures_enough(pictures):
+    assert label_to_ask(pictures) == ("tone",)
+    names = np.array([f"id{number}" for number in range(COUNT)])
+    rare = np.where(np.arange(COUNT) < 5, "rare", "usual")
+    alone = PictureSet(pictures.images, pictures.files, {"identity": names, "rare": rare})
+    assert label_to_ask(alone) == ()

@@ -1,0 +1,53 @@
+"""Curves as tables and as a chart: what stands in which cell, and a line for each row."""
+
+import io
+
+import numpy as np
+from PIL import Image
+
+from derender.evaluation.bootstrap import ScoredRow, estimate, with_verdicts
+from derender.evaluation.robustness import CurveResult, RobustnessComparison
+from derender.report.robustness import area_table, curve_table, robustness_chart, robustness_page
+
+
+def made_up() -> RobustnessComparison:
+    """Features that fall from 0.9 to 0.5 beside a control that stays at 0.25."""
+
+    def row(name: str, control: bool, area: float, ends: tuple[float, float]) -> ScoredRow:
+        named = {"ordinary": ends[0], "area": area, "0 deg": ends[0], "40 deg": ends[1]}
+        drawn = np.linspace(-0.01, 0.01, 5)
+        scores = {key: estimate([value - 0.1, value + 0.1], value + drawn) for key, value in named.items()}
+        return ScoredRow(name, control, 2, scores)
+
+    rows = with_verdicts([row("albedo", False, 0.7, (0.9, 0.5)), row("majority", True, 0.25, (0.25, 0.25))])
+    curve = CurveResult("yaw", "camera yaw", (0.0, 40.0), (8, 8, 16), {"accuracy": rows})
+    return RobustnessComparison(
+        (curve,), "identity of generated faces", "classes", ("a", "b"), "logistic", {"yaw": 19}, 3, (0, 1)
+    )
+
+
+def test_tables_say_what_was_learned_tested_and_lost():
+    found = made_up()
+    area = area_table(found, found.curves[0], "accuracy")
+    assert area.caption == (
+        "camera yaw, 0 to 40 degrees: accuracy of 2 classes, identity of generated faces; logistic probes on "
+        "19 pictures, 8 to 16 tested, 2 seeds; 3 pictures without label left out"
+    )
+    cells = area.values()["albedo"]
+    assert [round(float(cells[name]), 3) for name in ("area", "ordinary", "at 40 deg", "lost")] == [
+        *(0.7, 0.9, 0.5, 0.2)
+    ]
+    assert area.best(0) == cells["area"] and area.best(5) is None  # to lose nothing is no merit by itself
+    assert [row.control for row in area.rows] == [False, True]
+    assert list(curve_table(found.curves[0], "accuracy").values()["majority"]) == ["0", "40"]
+
+
+def test_the_chart_and_the_page_show_every_row():
+    found = made_up()
+    svg, png = robustness_chart(found)
+    assert svg.startswith("<svg") and all(word in svg for word in ("albedo", "majority", "camera yaw"))
+    with Image.open(io.BytesIO(png)) as drawn:
+        assert drawn.width > drawn.height
+    page = robustness_page(found, "runs/faces").html()
+    assert "camera yaw: albedo has the area 0.700; camera yaw: majority has the area 0.250" in page
+    assert "camera yaw: above the strongest control?" in page

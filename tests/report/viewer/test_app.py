@@ -1,0 +1,185 @@
+"""Pictures come in, answers come out, and nothing but the page's own files is ever served."""
+
+import io
+import json
+import socket
+import time
+import zipfile
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+import trimesh
+
+from derender.report.viewer.app import Application, Viewer
+from derender.report.viewer.server import BoundedProtocol, serving
+from derender.report.viewer.shelf import Shelf
+from derender.report.viewer.studio import Studio
+
+LIGHT = {"ambient": 0.3, "diffuse": 0.7, "pitch_deg": 0.0, "yaw_deg": 0.0}
+FRONT = {"rotation_deg": [0, 0, 0], "translation": [0, 0, 0]}
+
+
+def test_about_says_what_there_is(client):
+    about = client.get("/api/about").json
+    assert about["model"] == "<b>tiny</b>"
+    assert about["sizes"] == [32, 128, 256, 512]
+    assert [example["name"] for example in about["examples"]] == ["<img src=x>"]
+    assert about["table"] is None
+
+
+def test_a_picture_is_taken_apart_and_shown(client):
+    found = client.opened(0)
+    assert set(found) == {"picture", "light", "camera", "l1", "percentile", "odd"}
+    assert 0 < found["l1"] < 1 and found["percentile"] is None and found["odd"] is False
+    own = client.post("/api/view", {"picture": found["picture"]})
+    assert (own.status, own.headers["content-type"]) == (200, "image/png")
+    assert own.image.shape == (32, 64, 4)
+    again = client.post("/api/view", {key: found[key] for key in ("picture", "light", "camera")})
+    assert np.abs(again.image.astype(int) - own.image).max() <= 1  # degrees and back
+
+
+def test_light_and_camera_move(client):
+    name = client.opened(0)["picture"]
+
+    def shown(light: dict, camera: dict | None = None) -> np.ndarray:
+        asked = {"picture": name, "light": {**LIGHT, **light}, "camera": camera or FRONT}
+        return client.post("/api/view", asked).image[:, :32].astype(float)
+
+    dark, bright = shown({"diffuse": 0.0, "ambient": 0.1}), shown({"diffuse": 0.0, "ambient": 1.0})
+    assert dark[..., :3].mean() < 0.3 * bright[..., :3].mean()
+    left, right = (
+        client.post("/api/view", {"picture": name, "light": {**LIGHT, "yaw_deg": yaw}}).image[:, 32:]
+        for yaw in (60.0, -60.0)
+    )
+    assert not np.array_equal(left, right)
+    moved = shown({}, {"rotation_deg": [0, 0, 0], "translation": [0.05, 0, 0]})
+    assert (moved[:, :8, 3] == 0).all() and (shown({})[..., 3] == 255).all()
+
+
+def test_factors_of_another_picture(client):
+    one, two = client.opened(1), client.opened(2)
+    asked = {"picture": one["picture"], "light": LIGHT, "camera": FRONT}
+    swapped = {**asked, "swaps": {"geometry": two["picture"], "albedo": two["picture"]}}
+    whole = client.post("/api/picture", {**asked, "picture": two["picture"]})
+    assert np.array_equal(client.post("/api/picture", swapped).image, whole.image)
+    maps, other = (client.post("/api/factors", question).json for question in (asked, swapped))
+    assert list(maps) == ["input", "reconstruction", "view", "depth", "normals", "albedo", "shading"]
+    changed = {name for name in maps if maps[name] != other[name]}
+    assert {"albedo", "depth", "normals"} <= changed and not changed & {"input", "reconstruction"}
+
+
+def test_exports_hold_what_they_promise(client):
+    asked = {"picture": client.opened(3)["picture"], "light": LIGHT, "camera": FRONT, "size": 64}
+    assert client.post("/api/picture", asked).image.shape == (64, 64, 4)
+    assert client.post("/api/panel", asked).image.shape[1] > 800
+    settings = client.post("/api/settings", asked).json
+    assert settings["light"] == LIGHT and settings["camera"] == FRONT and settings["size"] == 64
+    mesh = trimesh.load(io.BytesIO(client.post("/api/mesh", asked).body), file_type="glb", force="mesh")
+    assert len(mesh.faces) > 100
+    with zipfile.ZipFile(io.BytesIO(client.post("/api/archive", asked).body)) as archive:
+        assert archive.testzip() is None
+        assert {"panel.png", "albedo.png", "surface.glb", "settings.json"} <= set(archive.namelist())
+        assert json.loads(archive.read("settings.json")) == settings
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        *(
+            "/etc/passwd",
+            "/../../etc/passwd",
+            "/%2e%2e/%2e%2e/etc/passwd",
+            "//etc/passwd",
+            "/page/index.html",
+        ),
+        *(
+            "/view.js/../../app.py",
+            "/app.py",
+            "/view.js%00.png",
+            "/api/examples/../../etc/passwd",
+            "/file=/etc/passwd",
+        ),
+    ],
+)
+def test_no_path_is_served(client, path):
+    for method in ("GET", "POST"):
+        reply = client(method, path)
+        assert reply.status in (400, 404, 405)
+        assert b"root:" not in reply.body and b"import" not in reply.body
+
+
+@pytest.mark.parametrize(
+    ("asked", "words"),
+    [
+        ({}, "picture"),
+        ({"picture": "../../../../etc/passwd"}, "pattern"),
+        ({"picture": "a" * 22, "file": "/etc/passwd"}, "file"),
+        ({"picture": "a" * 22, "size": 100_000}, "size"),
+        ({"picture": "a" * 22, "size": "64"}, "size"),
+        ({"picture": "a" * 22, "swaps": {"pose": "a" * 22}}, "swaps"),
+        ({"picture": "a" * 22, "light": {**LIGHT, "yaw_deg": 1e9}}, "yaw_deg"),
+        ({"picture": "a" * 22, "light": {**LIGHT, "ambient": float("nan")}}, "ambient"),
+        ({"picture": "a" * 22, "camera": {**FRONT, "translation": [0, 0]}}, "translation"),
+    ],
+)
+def test_a_question_that_makes_no_sense_is_told_so(client, asked, words):
+    reply = client.post("/api/view", asked)
+    assert reply.status == 422
+    assert words in reply.error
+
+
+def test_bodies_that_are_no_question(client):
+    for body in (b"", b"[]", b"{", b"\xff\xfe", b"[" * 5000):
+        assert client.post("/api/view", body).status == 422
+    assert client.post("/api/view", b" " * 20_000).status == 413
+
+
+def test_pictures_that_are_not_there(client):
+    reply = client.post("/api/view", {"picture": "a" * 22})
+    assert (reply.status, "open it again" in reply.error) == (410, True)
+    assert client.post("/api/examples/7").status == 404
+    assert client.post("/api/rows/0").status == 404
+    assert (
+        client.post("/api/neighbours", {"picture": client.opened()["picture"], "factor": "albedo"}).status
+        == 404
+    )
+    first = client.opened(0)["picture"]
+    for seed in range(4):
+        client.opened(seed)
+    assert client.post("/api/view", {"picture": first}).status == 410
+
+
+def test_several_visitors_at_once_get_their_own_answers(client):
+    names = [client.opened(seed)["picture"] for seed in range(4)]
+    alone = [client.post("/api/view", {"picture": name}).body for name in names]
+    with ThreadPoolExecutor(4) as pool:
+        together = list(pool.map(lambda name: client.post("/api/view", {"picture": name}).body, names * 5))
+    assert together == alone * 5
+
+
+def test_who_is_slow_is_not_waited_for(model, monkeypatch):
+    monkeypatch.setattr(BoundedProtocol, "head_seconds", 0.3)
+    application = Application(Viewer(Studio(model, "tiny", Shelf(2))), body_seconds=0.3)
+    with serving(application) as url:
+        place = ("127.0.0.1", int(url.rsplit(":", 1)[1].strip("/")))
+        head = f"POST /api/pictures HTTP/1.1\r\nHost: 127.0.0.1:{place[1]}\r\nX-Derender-Page: 1\r\n"
+        for sent, answer in (
+            (b"", b""),
+            (head.encode(), b""),
+            (f"{head}Content-Length: 99\r\n\r\nabc".encode(), b"408"),
+        ):
+            with socket.create_connection(place, timeout=10) as connection:
+                began = time.monotonic()
+                connection.sendall(sent)
+                assert answer in connection.recv(4096)
+                assert time.monotonic() - began < 5
+
+
+def test_too_much_work_is_refused_not_queued_for_ever(model, picture, client):
+    application = Application(Viewer(Studio(model, "tiny", Shelf(2))), work_seconds=0.2)
+    asked = {"picture": application.viewer.studio.open(picture)["picture"]}
+    application._computing.submit(time.sleep, 1.0)
+    with serving(application) as url:
+        reply = type(client)(url).post("/api/view", asked)
+        assert (reply.status, "too long" in reply.error) == (503, True)

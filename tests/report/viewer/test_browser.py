@@ -1,0 +1,210 @@
+"""The page in a real browser: drop a file, drag a slider, the picture changes, the export downloads."""
+
+import io
+import json
+import os
+import shutil
+import zipfile
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from derender import load
+from derender.data.synthetic import faces
+from derender.features import FeatureTable, embed_images
+from derender.report.viewer.app import Application, Viewer
+from derender.report.viewer.examples import Example
+from derender.report.viewer.neighbours import Gallery
+from derender.report.viewer.server import serving
+from derender.report.viewer.shelf import Shelf
+from derender.report.viewer.studio import Studio
+
+playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+CHROMIUM = os.environ.get("DERENDER_CHROMIUM") or shutil.which("chromium") or shutil.which("google-chrome")
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no chromium here (DERENDER_CHROMIUM names one)")
+PATIENCE_MS = 60_000
+
+
+@pytest.fixture(scope="module")
+def rendered() -> np.ndarray:
+    return faces.generate(3, 64, seed=5).images
+
+
+@pytest.fixture(scope="module")
+def address(rendered) -> Iterator[str]:
+    model = load("rendered-faces-64")
+    table = FeatureTable(("a<b>.png", "b.png", "c.png"), embed_images(model, rendered))
+    examples = [Example(f"<i>face</i> {number}", picture) for number, picture in enumerate(rendered)]
+    viewer = Viewer(Studio(model, "rendered-faces-64", Shelf(3), table=table), examples, Gallery(table))
+    with serving(Application(viewer)) as url:
+        yield url
+
+
+@pytest.fixture(scope="module")
+def browser():
+    arguments = ["--no-sandbox", "--enable-unsafe-swiftshader"]
+    with playwright.sync_playwright() as driver:
+        running = driver.chromium.launch(executable_path=CHROMIUM, args=arguments)
+        yield running
+        running.close()
+
+
+@pytest.fixture
+def page(browser, address):
+    """The page, opened; at the end it must have asked nobody else and complained of nothing."""
+    context = browser.new_context(viewport={"width": 1200, "height": 900})
+    shown = context.new_page()
+    shown.set_default_timeout(PATIENCE_MS)
+    asked, wrong = [], []
+    shown.on("request", lambda request: asked.append(request.url))
+    shown.on("pageerror", lambda error: wrong.append(str(error)))
+    shown.goto(address)
+    shown.wait_for_selector("body[data-ready]")
+    yield shown
+    context.close()
+    assert not wrong
+    assert all(url.startswith((address, "data:", f"blob:{address}")) for url in asked)
+
+
+def pixels(page, selector: str) -> np.ndarray:
+    """What an element shows now."""
+    return np.asarray(Image.open(io.BytesIO(page.locator(selector).screenshot())).convert("RGB")).astype(
+        float
+    )
+
+
+def drawn(page) -> int:
+    return int(page.eval_on_selector("#view", "element => element.dataset.drawn"))
+
+
+def after_one_more(page, before: int) -> None:
+    page.wait_for_selector(f'#view:not([data-drawn="{before}"])')
+    page.wait_for_timeout(150)
+
+
+def set_slider(page, name: str, value: float) -> None:
+    before = drawn(page)
+    page.locator(f"#{name}").fill(str(value))
+    after_one_more(page, before)
+
+
+def png(picture: np.ndarray) -> bytes:
+    stream = io.BytesIO()
+    Image.fromarray(picture.transpose(1, 2, 0)).save(stream, format="PNG")
+    return stream.getvalue()
+
+
+def test_drop_a_file_drag_a_slider_save(page, rendered, tmp_path):
+    name = page.eval_on_selector("body", "element => element.dataset.ready")
+    drop = """(zone, [name, bytes]) => {
+      const given = new DataTransfer();
+      given.items.add(new File([new Uint8Array(bytes)], name, {type: "image/png"}));
+      zone.dispatchEvent(new DragEvent("drop", {dataTransfer: given, bubbles: true, cancelable: true}));
+    }"""
+    page.eval_on_selector("#drop", drop, ["<b>mine</b>.png", list(png(rendered[1]))])
+    page.wait_for_selector(f'body:not([data-ready="{name}"])')
+    assert page.inner_text("#status").startswith("<b>mine</b>.png: mean difference")
+
+    set_slider(page, "light-diffuse", 1.0)
+    set_slider(page, "light-yaw", 60)
+    left = pixels(page, "#view")
+    set_slider(page, "light-yaw", -60)
+    right = pixels(page, "#view")
+    half = left.shape[1] // 2  # yaw > 0 lights the left of the picture
+    change = left - right
+    assert change[:, : half // 2].mean() > 3 > -3 > change[:, -half // 2 :].mean()
+    assert np.abs(pixels(page, "#map-shading")).mean() > 1
+
+    with page.expect_download() as saved:
+        page.click("[data-save=archive]")
+    assert saved.value.suggested_filename == "_b_mine_b_-archive.zip"
+    saved.value.save_as(tmp_path / "all.zip")
+    with zipfile.ZipFile(tmp_path / "all.zip") as archive:
+        assert {"panel.png", "view.png", "surface.glb"} <= set(archive.namelist())
+        assert json.loads(archive.read("settings.json"))["light"]["yaw_deg"] == -60
+    with page.expect_download() as saved:
+        page.click("[data-save=picture]")
+    saved.value.save_as(tmp_path / "view.png")
+    with Image.open(tmp_path / "view.png") as picture:
+        assert picture.size == (64, 64)
+
+
+def test_orbit_swap_and_neighbours_by_keyboard(page):
+    assert page.eval_on_selector("#surface", "element => element.dataset.drawn") == "webgl"
+    page.locator("#surface").scroll_into_view_if_needed()
+    page.wait_for_timeout(300)
+    front = pixels(page, "#surface")
+    assert front.std() > 10  # something is drawn
+    page.focus("#surface")
+    for _ in range(5):
+        page.keyboard.press("ArrowRight")
+    page.wait_for_timeout(300)
+    assert np.abs(pixels(page, "#surface") - front).mean() > 3
+    page.keyboard.press("0")
+    page.wait_for_timeout(300)
+    assert np.abs(pixels(page, "#surface") - front).mean() < 1
+
+    page.click("#examples-second button:nth-child(3)")
+    page.wait_for_selector("#swaps:visible")
+    before, albedo = drawn(page), page.get_attribute("#map-albedo", "src")
+    page.focus("#swaps [name=albedo]")
+    page.keyboard.press("Space")
+    after_one_more(page, before)
+    page.wait_for_selector("#near-rows button")
+    assert page.get_attribute("#map-albedo", "src") != albedo
+
+    assert page.locator("#near-rows button").count() == 3
+    page.click('#near-factors [data-factor="albedo"]')
+    page.wait_for_selector('#near-rows button:first-child:has-text("c.png")')  # the second picture's own row
+    assert page.locator("#near-rows b, #examples i").count() == 0  # names are text
+
+
+def test_what_is_wrong_is_said_and_the_page_goes_on(page, rendered):
+    page.set_input_files(
+        "#file", {"name": "a.jpg", "mimeType": "image/jpeg", "buffer": b"<svg onload=alert(1)>"}
+    )
+    page.wait_for_selector("#status.wrong")
+    assert "not a picture" in page.inner_text("#status")
+    for number in (1, 2, 0):  # the shelf holds three: the first goes
+        page.set_input_files(
+            "#file-second",
+            {"name": f"{number}.png", "mimeType": "image/png", "buffer": png(rendered[number])},
+        )
+        page.wait_for_selector(f'#second[alt="second picture: {number}.png"]')
+    set_slider(page, "camera-yaw", 30)  # opens it again
+    assert "no longer kept" not in page.inner_text("#status")
+
+
+def test_it_fits_a_phone_and_follows_the_dark(browser, address):
+    context = browser.new_context(viewport={"width": 360, "height": 740}, color_scheme="dark", has_touch=True)
+    shown = context.new_page()
+    shown.set_default_timeout(PATIENCE_MS)
+    shown.goto(address)
+    shown.wait_for_selector("body[data-ready]")
+    wide = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
+    assert shown.evaluate(wide) == 0
+    assert shown.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(20, 22, 26)"
+    context.close()
+
+
+def test_without_webgl_the_server_draws_the_orbit(browser, address):
+    context = browser.new_context(viewport={"width": 900, "height": 900})
+    context.add_init_script(
+        "const get = HTMLCanvasElement.prototype.getContext;"
+        "HTMLCanvasElement.prototype.getContext = function (kind, ...more) "
+        "{ return kind === 'webgl2' ? null : get.call(this, kind, ...more); };"
+    )
+    shown = context.new_page()
+    shown.set_default_timeout(PATIENCE_MS)
+    shown.goto(address)
+    shown.wait_for_selector('#surface[data-drawn="server"][width="64"]')
+    shown.wait_for_timeout(500)
+    front = pixels(shown, "#surface")
+    shown.focus("#surface")
+    for _ in range(5):
+        shown.keyboard.press("ArrowRight")
+    shown.wait_for_timeout(1500)
+    assert front.std() > 10 and np.abs(pixels(shown, "#surface") - front).mean() > 3
+    context.close()

@@ -1,0 +1,79 @@
+"""Rows near to a picture, with pictures read from the table's own data and by number only."""
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from derender.data import read_pictures
+from derender.features import FeatureTable, embed_pictures
+from derender.report.viewer.app import Application, Viewer
+from derender.report.viewer.neighbours import Gallery
+from derender.report.viewer.refused import Refused
+from derender.report.viewer.server import serving
+from derender.report.viewer.shelf import Shelf
+from derender.report.viewer.studio import Studio
+
+SIZE = 32
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    place = tmp_path_factory.mktemp("rows")
+    for number in range(6):
+        coarse = np.random.default_rng(number).integers(0, 256, (6, 6, 3), dtype=np.uint8)
+        Image.fromarray(coarse).resize((SIZE, SIZE)).save(place / f"{number}.png")
+    return place
+
+
+@pytest.fixture(scope="module")
+def table(model, folder) -> FeatureTable:
+    return embed_pictures(model, read_pictures(folder, SIZE), origin={"data": str(folder)})
+
+
+def test_a_picture_of_the_table_is_its_own_neighbour(model, folder, table, client):
+    viewer = Viewer(Studio(model, "tiny", Shelf(2), table=table), gallery=Gallery(table))
+    with serving(Application(viewer)) as url:
+        visitor = type(client)(url)
+        assert visitor.get("/api/about").json["table"] == {
+            "rows": 6, "factors": ["geometry", "albedo", "light", "camera"], "note": "",
+        }  # fmt: skip
+        name = visitor.post("/api/pictures", (folder / "3.png").read_bytes()).json["picture"]
+        found = visitor.post("/api/neighbours", {"picture": name, "factor": "albedo", "k": 3}).json["rows"]
+        assert [found[0]["file"], found[0]["row"]] == ["3.png", 3]
+        assert found[0]["distance"] == pytest.approx(0, abs=1e-6)
+        assert [row["distance"] for row in found] == sorted(row["distance"] for row in found)
+        assert all(row["image"].startswith("data:image/png;base64,") for row in found)
+        other = visitor.post("/api/rows/4").json["picture"]
+        asked = {"picture": name, "swaps": {"albedo": other}, "factor": "albedo", "k": 1}
+        assert visitor.post("/api/neighbours", asked).json["rows"][0]["file"] == "4.png"
+        reply = visitor.post("/api/neighbours", {"picture": name, "factor": "albdo"})
+        assert (reply.status, "albedo" in reply.error) == (422, True)
+        assert visitor.post("/api/rows/6").status == 404
+
+
+def test_names_that_lead_out_of_the_data_are_not_followed(table, folder, tmp_path):
+    secret = tmp_path / "secret.png"
+    Image.new("RGB", (8, 8)).save(secret)
+    names = (str(secret), f"../{tmp_path.name}/secret.png", *table.files[2:])
+    gallery = Gallery(FeatureTable(names, table.factors, origin=table.origin), str(folder))
+    assert gallery.picture(2, 8).shape == (3, 8, 8)
+    for row in (0, 1, -1, 99):
+        with pytest.raises(Refused) as refused:
+            gallery.picture(row, 8)
+        assert refused.value.status == 404
+    gallery.close()
+
+
+def test_a_table_whose_pictures_are_gone_still_serves(table):
+    gone = Gallery(FeatureTable(table.files, table.factors, origin={"data": "no-such-folder/x"}))
+    assert "no-such-folder/x is not here" in gone.without_pictures
+    with pytest.raises(Refused, match="name its place with --data"):
+        gone.picture(0, 8)
+
+
+def test_another_data_set_is_refused(table, tmp_path):
+    Image.new("RGB", (8, 8)).save(tmp_path / "other.png")
+    with pytest.raises(ValueError, match=r"holds none of the table's pictures, such as '0.png'"):
+        Gallery(table, str(tmp_path))
+    with pytest.raises(ValueError, match="is not here"):
+        Gallery(table, str(tmp_path / "nowhere"))

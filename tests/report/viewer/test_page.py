@@ -1,0 +1,57 @@
+"""The page's own files: they need nothing from elsewhere, write no text as HTML, and name what they show."""
+
+import re
+from html.parser import HTMLParser
+from importlib.resources import files
+
+import pytest
+
+from derender.report.viewer.app import PAGE_FILES
+
+PAGE = {
+    name: (files("derender.report.viewer") / "page" / name).read_text() for name, _ in PAGE_FILES.values()
+}
+
+
+class Elements(HTMLParser):
+    """Every element with its attributes."""
+
+    def __init__(self, html: str):
+        super().__init__()
+        self.found: list[tuple[str, dict[str, str | None]]] = []
+        self.feed(html)
+
+    def handle_starttag(self, tag, attrs):
+        self.found.append((tag, dict(attrs)))
+
+
+def test_every_file_of_the_page_is_served(client):
+    for path, (name, kind) in PAGE_FILES.items():
+        reply = client.get(path)
+        assert reply.body.decode() == PAGE[name]
+        assert reply.headers["content-type"].startswith(kind)
+
+
+@pytest.mark.parametrize("name", PAGE)
+def test_nothing_comes_from_elsewhere(name):
+    assert not re.findall(r"https?://|//[a-z]+\.|@import|url\(", PAGE[name])
+
+
+@pytest.mark.parametrize("name", PAGE)
+def test_text_never_becomes_html(name):
+    bad = r"innerHTML|outerHTML|insertAdjacentHTML|document\.write|\beval\(|new Function|\son\w+=|javascript:"
+    assert not re.findall(bad, PAGE[name])
+
+
+def test_what_is_shown_and_what_is_pressed_has_a_name():
+    found = Elements(PAGE["index.html"]).found
+    for tag, attributes in found:
+        if tag == "img":
+            assert "alt" in attributes
+        if tag in ("canvas", "select") and attributes.get("id") != "size":
+            assert attributes["aria-label"]
+    identifiers = [attributes["id"] for _, attributes in found if "id" in attributes]
+    assert len(identifiers) == len(set(identifiers))
+    asked = set(re.findall(r'\$\("([\w-]+)"\)', PAGE["view.js"]))
+    assert asked - set(identifiers) == {"map-shading"}  # which the page makes itself
+    assert any(tag == "html" and attributes["lang"] == "en" for tag, attributes in found)

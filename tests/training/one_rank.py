@@ -1,0 +1,91 @@
+"""One of two processes of test_distributed.py: a step on half a batch, compared with the whole one.
+
+Everything runs in float64, where rounding cannot hide a difference. The first process writes what it found.
+"""
+
+import json
+import sys
+from functools import partial
+from pathlib import Path
+
+import torch
+from torch import distributed
+
+from derender.model import Derenderer
+from derender.objectives import SelfFeatures
+from derender.render import render_scene
+from derender.training.config import ObjectiveSettings, resolve
+from derender.training.distributed import ALONE, Ranks, leave, open_fabric, ranks_of
+from derender.training.step import training_step
+
+OBJECTIVE = ObjectiveSettings(loocc="all", cycle_weight=1.0, smoothness_weight=0.1)
+SIZES = ["image_size=32", "width=4", "light_width=4"]
+
+
+def step(model: Derenderer, images: torch.Tensor, own: float, ranks: Ranks):
+    """Terms and gradients of one step, averaged over ranks as DDP does."""
+    model.zero_grad(set_to_none=True)
+    noise = torch.Generator().manual_seed(3)
+    features = SelfFeatures((4, 8, 8)).double()
+    torch.manual_seed(0)
+    for parameter in features.parameters():
+        torch.nn.init.normal_(parameter, std=0.2)
+    result = training_step(
+        model, ranks.own(images), OBJECTIVE, features, noise, own=own, ranks=ranks, chunks=1 + (own < 1)
+    )
+    result.total.backward()
+    gradients = {name: p.grad for name, p in model.named_parameters() if p.grad is not None}
+    if ranks.count > 1:
+        for gradient in gradients.values():
+            distributed.all_reduce(gradient)
+            gradient /= ranks.count
+    return ranks.mean({name: term.item() for name, term in result.terms.items()}), gradients
+
+
+def largest_difference(own: float, ranks: Ranks) -> dict[str, float]:
+    """Of terms and gradients, each relative to its size: whole batch against shared batch."""
+    settings = resolve("small", SIZES).model
+    renderer = partial(render_scene, backend="reference")
+    model = Derenderer.seeded(settings, 0, renderer=renderer).double()
+    images = torch.rand(6, 3, 32, 32, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    images[:3, :, :16] *= 0.5  # the two halves are no copies in the mean
+    whole_terms, whole = step(model, images, own, ALONE)
+    terms, shared = step(model, images, own, ranks)
+    assert whole_terms.keys() == terms.keys()
+    assert whole.keys() == shared.keys()
+    return {
+        "terms": max(abs(terms[name] / value - 1) for name, value in whole_terms.items()),
+        "gradients": max(
+            float((shared[name] - value).abs().max() / value.abs().max().clamp(min=1e-12))
+            for name, value in whole.items()
+        ),
+        "loocc": whole_terms["loocc"],
+    }
+
+
+def gathered_rows(ranks: Ranks) -> dict[str, object]:
+    """What every rank gathers, and the gradient that comes back to this one."""
+    piece = torch.full((2, 1), float(ranks.rank), requires_grad=True)
+    whole = ranks.gather(piece)
+    (whole * (1 + ranks.rank) * torch.arange(4.0)[:, None]).sum().backward()
+    assert piece.grad is not None
+    back = ranks.gather(piece.grad)
+    return {"gathered": whole.flatten().tolist(), "gradient": back.flatten().tolist()}
+
+
+def main() -> None:
+    torch.Tensor.float = torch.Tensor.double
+    torch.set_num_threads(1)
+    ranks = ranks_of(open_fabric("cpu"))
+    found = {
+        "count": ranks.count,
+        **gathered_rows(ranks),
+        "steps": [largest_difference(own, ranks) for own in (1.0, 0.3)],
+    }
+    if ranks.first:
+        Path(sys.argv[1]).write_text(json.dumps(found))
+    leave()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,99 @@
+"""Errors of held-out pictures: measured as the evaluation measures them, kept with the model, read back."""
+
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from derender import Derenderer
+from derender.evaluation import reconstruction_scores
+from derender.training.held_out_errors import (
+    HeldOutErrors,
+    errors_of,
+    read_errors,
+    reconstruction_errors,
+    store_errors,
+    write_errors,
+)
+
+
+class Darker:
+    """Renders every picture a fifth darker, its left half only; black pictures not at all."""
+
+    device, training = torch.device("cpu"), False
+
+    def train(self, mode: bool = True) -> None:
+        self.training = mode
+
+    def eval(self) -> None:
+        self.training = False
+
+    def reconstruct(self, images):
+        mask = torch.zeros_like(images[:, 0])
+        mask[:, :, : images.shape[-1] // 2] = 1
+        mask = mask * (images.amax(dim=(1, 2, 3)) > 0).float()[:, None, None]
+        return SimpleNamespace(image=0.8 * images, mask=mask)
+
+
+@pytest.fixture
+def pictures() -> np.ndarray:
+    return np.random.default_rng(0).integers(0, 256, (30, 3, 32, 32), dtype=np.uint8)
+
+
+def test_errors_are_those_of_the_evaluation(pictures):
+    found = reconstruction_errors(Darker(), pictures, batch_size=7)
+    target = torch.from_numpy(pictures).float() / 255
+    rendering = Darker().reconstruct(target)
+    scores = reconstruction_scores(rendering.image, target, rendering.mask)
+    assert found == pytest.approx(scores.l1_each)
+    assert found[0] == pytest.approx(0.2 * target[0, :, :, :16].mean().item())
+
+
+def test_a_picture_into_which_nothing_is_rendered_counts_as_infinitely_wrong(pictures):
+    pictures[3] = 0
+    assert np.isinf(reconstruction_errors(Darker(), pictures)[3])
+    assert errors_of(Darker(), pictures).pictures == 29
+
+
+def test_quantiles_survive_the_file(pictures, tmp_path):
+    errors = errors_of(Darker(), pictures)
+    each = reconstruction_errors(Darker(), pictures)
+    assert errors.quantiles[[0, 50, 100]] == pytest.approx([each.min(), np.median(each), each.max()])
+    write_errors(tmp_path, errors)
+    again = read_errors(tmp_path)
+    assert again is not None and again.pictures == 30
+    assert again.quantiles == pytest.approx(errors.quantiles, rel=1e-5)
+
+
+def test_a_model_that_was_saved_anew_has_no_old_errors(tmp_path, pictures):
+    net = Derenderer.from_preset("small", seed=0, image_size=32, width=4, light_width=4)
+    folder = net.save(tmp_path / "model")
+    assert read_errors(folder) is None
+    stored = store_errors(folder, torch.from_numpy(pictures))
+    assert stored is not None and read_errors(folder) is not None
+    net.save(folder, overwrite=True)
+    assert read_errors(folder) is None
+
+
+def test_too_few_pictures_leave_nothing(tmp_path, pictures):
+    net = Derenderer.from_preset("small", seed=0, image_size=32, width=4, light_width=4)
+    folder = net.save(tmp_path / "model")
+    assert store_errors(folder, torch.from_numpy(pictures[:19])) is None
+    assert read_errors(folder) is None
+    with pytest.raises(ValueError, match="errors of 20 pictures or more"):
+        errors_of(net, pictures[:19])
+
+
+@pytest.mark.parametrize("damage", ["", "{", '{"format": 1}', "backwards", "newer"])
+def test_a_damaged_file_says_how_to_make_it_again(tmp_path, damage):
+    file = write_errors(tmp_path, HeldOutErrors(np.linspace(0, 1, 101), 50))
+    values = json.loads(file.read_text())
+    if damage == "backwards":
+        values["quantiles"].reverse()
+    if damage == "newer":
+        values["format"] = 2
+    file.write_text(json.dumps(values) if damage in ("backwards", "newer") else damage)
+    with pytest.raises(ValueError, match="evaluate reconstruction --store"):
+        read_errors(tmp_path)

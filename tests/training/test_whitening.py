@@ -1,0 +1,108 @@
+"""Whitening a trained model: features move less with light and camera than codes, and are saved with it."""
+
+import numpy as np
+import pytest
+import torch
+
+import derender
+from derender.data import PictureSet
+from derender.data.synthetic import faces
+from derender.features.extract import model_fingerprint
+from derender.model import WHITENING_FILE
+from derender.scene.perturb import PerturbSettings
+from derender.training import resolve, train
+from derender.training.config import WhiteningSettings
+from derender.training.whitening import fit_whitening
+
+SETTINGS = WhiteningSettings(pictures=200, views=3, directions=16)
+TINY = ["image_size=32", "width=8", "light_width=4", "code_size=16", "perceptual=none", "batch_size=8"]
+TINY += ["images=16", "warmup_images=0"]
+
+
+@pytest.fixture(scope="module")
+def model() -> derender.Derenderer:
+    return derender.load("rendered-faces-64")
+
+
+@pytest.fixture(scope="module")
+def images() -> torch.Tensor:
+    return torch.from_numpy(faces.generate(264, image_size=64, seed=5).images)
+
+
+def moved_by_light(model, images) -> dict[str, float]:
+    """How far features move when the light is exchanged, over how far apart two pictures are."""
+    with torch.no_grad():
+        scene = model.decompose(images.float() / 255)
+        other = scene.with_parameters(light=scene.light.roll(1, dims=0))
+        one, two = model.embed(model.render(scene).image), model.embed(model.render(other).image)
+    return {
+        name: float(
+            (one[name] - two[name]).norm(dim=1).mean() / (one[name] - one[name].roll(1, 0)).norm(dim=1).mean()
+        )
+        for name in ("geometry", "albedo")
+    }
+
+
+def test_light_moves_features_less_than_codes_on_pictures_that_were_not_seen(images):
+    model = derender.load("rendered-faces-64")
+    model.whitening = None
+    before = moved_by_light(model, images[200:])
+    model.whitening = fit_whitening(model, images[:200], SETTINGS, PerturbSettings(), seed=1)
+    after = moved_by_light(model, images[200:])
+    assert after["geometry"] < 0.9 * before["geometry"]
+    assert after["albedo"] < 0.9 * before["albedo"]
+
+
+def test_scenes_are_those_of_the_codes_and_light_and_camera_keep_theirs(images):
+    model = derender.load("rendered-faces-64")
+    model.whitening = fit_whitening(model, images[:50], SETTINGS, PerturbSettings())
+    pictures = images[:4].float() / 255
+    with torch.no_grad():
+        codes, features = model.encode(pictures), model.embed(pictures)
+        assert torch.equal(model.decompose(pictures).depth, model.decode(codes).depth)
+    assert features["geometry"].shape == codes["geometry"].shape
+    assert not torch.allclose(features["geometry"], codes["geometry"])
+    assert torch.equal(features["light"], codes["light"])
+    assert torch.equal(features["camera"], codes["camera"])
+
+
+def test_the_same_seed_gives_the_same_features(model, images):
+    one, two, other = (
+        fit_whitening(model, images[:60], SETTINGS, PerturbSettings(), seed=seed) for seed in (0, 0, 1)
+    )
+    assert torch.equal(one.get_buffer("geometry_map"), two.get_buffer("geometry_map"))
+    assert not torch.equal(one.get_buffer("geometry_map"), other.get_buffer("geometry_map"))
+
+
+@pytest.fixture(scope="module")
+def pictures() -> PictureSet:
+    made = np.random.default_rng(0).integers(0, 256, (40, 3, 32, 32), dtype=np.uint8)
+    return PictureSet(images=made, files=tuple(f"{i:03d}.png" for i in range(40)), source="made by the test")
+
+
+def test_a_run_ends_with_features_whitened_unless_told_not_to(pictures, tmp_path):
+    phases = []
+    run = train(resolve("small", TINY), pictures, tmp_path / "a", progress=lambda p: phases.append(p.phase))
+    assert phases[-1] == "features"
+    model = derender.load(run.folder)
+    assert model.whitening is not None
+    saved = derender.load(model.save(tmp_path / "copy"))
+    assert torch.equal(saved.whitening.get_buffer("albedo_map"), model.whitening.get_buffer("albedo_map"))
+    plain = train(resolve("small", [*TINY, "whitening.pictures=0"]), pictures, tmp_path / "b")
+    assert not (plain.folder / "model" / WHITENING_FILE).exists()
+    assert derender.load(plain.folder).whitening is None
+
+
+def test_a_table_knows_whether_its_features_were_whitened(images):
+    model = derender.load("rendered-faces-64")
+    model.whitening = None
+    before = model_fingerprint(model)
+    model.whitening = fit_whitening(model, images[:20], SETTINGS, PerturbSettings())
+    assert model_fingerprint(model) != before
+
+
+def test_damaged_whitening_is_named(model, tmp_path):
+    folder = model.save(tmp_path / "model")
+    (folder / WHITENING_FILE).write_bytes(b"not a safetensors file")
+    with pytest.raises(ValueError, match="is damaged"):
+        derender.load(folder)
