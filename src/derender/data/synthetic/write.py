@@ -8,8 +8,11 @@ morphable-model sets has no counterpart here.
 """
 
 import csv
+import errno
+import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -41,10 +44,10 @@ def write(
     files = [f"images/{i:06d}.jpg" for i in range(len(synthetic))]
 
     def save(i: int) -> None:
-        _save_picture(synthetic, i, folder / files[i])
+        _save_picture(synthetic, i, f"{folder}/{files[i]}")
         if truth:
             for name, pixels in _encoded(synthetic, i).items():
-                (folder / name / f"{i:06d}.png").write_bytes(encode_png(np.ascontiguousarray(pixels)))
+                _save_new(f"{folder}/{name}/{i:06d}.png", encode_png(np.ascontiguousarray(pixels)))
 
     _on_threads(save, len(files), progress)
     if truth:
@@ -66,7 +69,7 @@ def write_tracks(
     ]
     for parent in {(folder / file).parent for file in files}:
         parent.mkdir(parents=True, exist_ok=True)
-    _on_threads(lambda i: _save_picture(synthetic, i, folder / files[i]), len(files), progress)
+    _on_threads(lambda i: _save_picture(synthetic, i, f"{folder}/{files[i]}"), len(files), progress)
     return _write_tables(synthetic, folder, files)
 
 
@@ -85,8 +88,24 @@ def _free(folder: Path | str) -> Path:
     return folder
 
 
-def _save_picture(synthetic: SyntheticSet, i: int, path: Path) -> None:
-    Image.fromarray(synthetic.images[i].transpose(1, 2, 0)).save(path, quality=92, subsampling=0)
+def _save_picture(synthetic: SyntheticSet, i: int, path: str) -> None:
+    encoded = BytesIO()
+    Image.fromarray(synthetic.images[i].transpose(1, 2, 0)).save(encoded, "JPEG", quality=92, subsampling=0)
+    _save_new(path, encoded.getvalue())
+
+
+def _save_new(path: str, content: bytes) -> None:
+    """Write a file that is not there yet; for small files several times faster than opening it to replace it.
+
+    Raises:
+        FileExistsError: it is there.
+    """
+    file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0), 0o644)
+    try:
+        if os.write(file, content) != len(content):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), path)
+    finally:
+        os.close(file)
 
 
 def _encoded(synthetic: SyntheticSet, i: int) -> dict[str, ndarray]:
