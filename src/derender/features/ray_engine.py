@@ -33,8 +33,8 @@ def ray_engine(
         ValueError: Ray is not installed.
     """
     try:
-        import ray
-        import ray.data
+        import ray  # pyright: ignore[reportMissingImports]
+        import ray.data  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise ValueError(
             "--engine ray needs Ray: pip install 'derender[ray]', or leave --engine out"
