@@ -82,7 +82,20 @@ def test_a_clustering_table_beside_the_papers(tables, tmp_path, capsys):
     words = ["compare", "--table", "identity", "--features", f"good={tables['good']}"]
     words += ["--features", f"noise={tables['noise']}", "--features", f"noise={tables['noise2']}"]
     text = tmp_path / "table.md"
-    told = run(capsys, *words, *QUICK, tmp_path / "cache", "--markdown", text, "--latex", tmp_path / "t.tex")
+    told = run(
+        capsys,
+        *words,
+        *QUICK,
+        tmp_path / "cache",
+        "--markdown",
+        text,
+        "--latex",
+        tmp_path / "t.tex",
+        "--html",
+        tmp_path / "t.html",
+    )
+    page = (tmp_path / "t.html").read_text()
+    assert "<svg" in page and "good" in page and "noise" in page
     part = told["parts"]["identity"]
     assert told["number"] == 1 and list(part["rows"]) == ["good", "noise", "majority", "chance"]
     assert part["rows"]["good"]["scores"]["accuracy"]["value"] == 1

@@ -23,6 +23,10 @@ Label = Annotated[
     list[str] | None,
     typer.Option("--label", "-l", help="Label column; several for a mean over yes/no questions."),
 ]
+Html = Annotated[
+    str | None,
+    typer.Option("--html", help="Also write the tables as one page, with a chart each.", metavar="FILE"),
+]
 Attributes = Annotated[bool, typer.Option("--attributes", help="Ask every yes/no label.")]
 
 
@@ -69,23 +73,31 @@ class Published:
     json_file: options.Json = None
     markdown: feature_rows.Markdown = None
     latex: feature_rows.Latex = None
+    html: Html = None
     force: options.Force = False
 
     def check(self) -> None:
         """Refuse to write over tables, and into folders, before anything is computed."""
-        feature_rows.refuse_to_replace(self.force, self.markdown, self.latex)
+        feature_rows.refuse_to_replace(self.force, self.markdown, self.latex, self.html)
         feature_rows.refuse_to_replace(True, self.json_file)
 
     def show(
         self, tables: "Sequence[ScoreTable]", values: Mapping[str, Any], notes: Iterable[str] = ()
     ) -> None:
         """Show tables and notes, and write every form that was asked for."""
+        notes = list(notes)
         for table in tables:
             show_scores(table, self.json_file)
         for note in notes:
             say(note)
         write_json(self.json_file, values)
         feature_rows.write_tables(tables, self.markdown, self.latex)
+        if self.html is not None:
+            from derender.report.comparison import comparison_page
+
+            facts = {name: value for name, value in values.items() if isinstance(value, str | int | float)}
+            page = comparison_page("Scores beside their controls", tables, lead=". ".join(notes), facts=facts)
+            say(f"page {page.write(self.html)}")
 
 
 def remembered(memory: "Memory", what: str = "results") -> str:

@@ -85,6 +85,8 @@ def train(
     from derender.cli.baselines import picture_size, train_baseline
     from derender.cli.models import chosen_device
     from derender.data import read_pictures
+    from derender.report.evidence import Evidence, look_at_data
+    from derender.report.page import Section
     from derender.report.run import decomposition_sheet, run_page
     from derender.training.distributed import first_then_others, leave, open_fabric
     from derender.training.loop import Progress
@@ -122,7 +124,8 @@ def train(
     leave()
     if not speaks():
         return
-    page = run_page(out).write(out / "report.html")
+    examined = Evidence([Section("The data", look_at_data(pictures), "Data")])
+    page = run_page(out, examined).write(out / "report.html")
     for finding in trained.findings:
         say(f"{finding.sign}: {finding.text}; {finding.advice}")
     if trained.stopped == "collapse":
