@@ -99,7 +99,7 @@ def main() -> int:
             raise SystemExit(f"the pictures take {size:,} bytes, more than {MOST_BYTES:,}")
         shutil.rmtree(PICTURES, ignore_errors=True)
         shutil.copytree(drawn, PICTURES)
-    PAGE.write_text(page(asked.model, asked.label, asked.credit), encoding="utf-8")
+    PAGE.write_text(page(asked.model, asked.label, asked.credit, asked.data), encoding="utf-8")
     print(f"{PAGE} and {size / 1e6:.1f} MB of pictures")
     return 0
 
@@ -228,13 +228,14 @@ def mesh_picture(glb: Path, views_deg: Sequence[int] = (-55, 0, 55)) -> Image.Im
     return Image.open(stream).convert("RGB").quantize(256)
 
 
-def page(model: str, label: str, credit: str) -> str:
+def page(model: str, label: str, credit: str, data: str | None) -> str:
     """The text of docs/gallery.md."""
     name = Path(model).name
+    given = "" if data is None else f" --data {Path(data).name}"
     lines = [
         "# Gallery",
         f"Everything here was made from single pictures by the model `{name}`, with "
-        f"`python examples/gallery.py`.\n{credit} No picture was chosen: the faces are evenly spaced through "
+        f"`python examples/gallery.py{given}`.\n{credit} No picture was chosen: the faces are evenly spaced through "
         "the data.\nThe commands are told in [pictures.md](pictures.md) and [explain.md](explain.md).",
     ]
     for title, pictures, command in SHOWN:

@@ -89,10 +89,11 @@ def view(
         result(f"open {url} (Ctrl-C ends)", json_file)
         write_json(json_file, {"url": url, "host": host, "port": listener.getsockname()[1], "model": model})
         serve(Application(Viewer(studio, examples, gallery), host), listener)
-    except KeyboardInterrupt:
-        say("stopped")
+    except KeyboardInterrupt:  # where the shell has SIGINT ignored, the server ends without one
+        pass
     finally:
         listener.close()
+    say("stopped")
 
 
 def _check_installed() -> None:
