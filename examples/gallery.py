@@ -235,8 +235,9 @@ def page(model: str, label: str, credit: str, data: str | None) -> str:
     lines = [
         "# Gallery",
         f"Everything here was made from single pictures by the model `{name}`, with "
-        f"`python examples/gallery.py{given}`.\n{credit} No picture was chosen: the faces are evenly spaced through "
-        "the data.\nThe commands are told in [pictures.md](pictures.md) and [explain.md](explain.md).",
+        f"`python examples/gallery.py{given}`.\n{credit} No picture was chosen: the faces are evenly spaced "
+        "through the data.\nThe commands are told in [pictures.md](pictures.md) and "
+        "[explain.md](explain.md).",
     ]
     for title, pictures, command in SHOWN:
         lines.append(f"## {title}")
