@@ -190,42 +190,53 @@ def side_by_side(sources: Sequence[Path], target: Path, gap: int = 8) -> None:
     first.save(target, save_all=True, append_images=rest, duration=duration, loop=0)
 
 
-def mesh_picture(glb: Path, views_deg: Sequence[int] = (-55, 0, 55)) -> Image.Image:
+def mesh_picture(glb: Path, views_deg: Sequence[int] = (-55, 0, 55), side: int = 200) -> Image.Image:
     """The file as another program reads it: textured on the left, surface alone on the right of each view."""
-    import io
     from typing import Any
 
     import trimesh
-    from matplotlib.figure import Figure
-    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
     read: Any = trimesh.load(glb, force="mesh")
     texture = np.asarray(read.visual.material.baseColorTexture.convert("RGB")) / 255
     height, width = texture.shape[:2]
-    uv = read.visual.uv[read.faces].mean(axis=1)
+    share = inner_points(24)
+    places, uv, normals = (
+        (share @ np.asarray(values)[read.faces]).reshape(-1, values.shape[1])
+        for values in (read.vertices, read.visual.uv, read.vertex_normals)
+    )
     column = np.clip((uv[:, 0] * width).astype(int), 0, width - 1)
     row = np.clip(((1 - uv[:, 1]) * height).astype(int), 0, height - 1)
-    albedo = texture[row, column]
-    normals = read.vertex_normals[read.faces].mean(axis=1)
     lit = (0.25 + 0.75 * np.clip(normals @ np.array([0.4, 0.3, 0.87]), 0, 1))[:, None]
-    x, y, z = np.moveaxis(read.vertices[read.faces], -1, 0)
-    corners = np.stack((x, z, y), axis=-1)  # matplotlib's z is up, glTF's y
-    figure = Figure(figsize=(2.2 * 2 * len(views_deg), 2.4), dpi=90)
-    half = np.abs(read.vertices).max()
-    for place in range(2 * len(views_deg)):
-        view, plain = views_deg[place // 2], place % 2
-        axes: Any = figure.add_axes(
-            (place / (2 * len(views_deg)), 0, 1 / (2 * len(views_deg)), 1), projection="3d", proj_type="ortho"
-        )
-        colours = np.clip(lit * (np.full_like(albedo, 0.8) if plain else albedo), 0, 1)
-        axes.add_collection3d(Poly3DCollection(corners, facecolors=colours, edgecolors="none"))
-        axes.set(xlim=(-half, half), ylim=(-half, half), zlim=(-half, half))
-        axes.set_box_aspect((1, 1, 1), zoom=1.6)
-        axes.view_init(elev=5, azim=90 + view)
-        axes.set_axis_off()
-    stream = io.BytesIO()
-    figure.savefig(stream, format="png", facecolor="white")
-    return Image.open(stream).convert("RGB").quantize(256)
+    scale = 0.47 * side / np.abs(read.vertices[:, :2]).max()
+    tiles = []
+    for view in np.radians(views_deg):
+        right = places @ (np.cos(view), 0, -np.sin(view))
+        nearness = places @ (np.sin(view), 0, np.cos(view))
+        for colours in (lit * texture[row, column], np.repeat(0.85 * lit, 3, axis=1)):
+            tiles.append(seen(right * scale, places[:, 1] * scale, nearness, colours, side))
+    picture = np.clip(np.concatenate(tiles, axis=1), 0, 1)
+    return Image.fromarray((picture * 255).round().astype(np.uint8)).quantize(256)
+
+
+def inner_points(count: int) -> np.ndarray:
+    """(P, 3) shares of a triangle's corners, evenly over it."""
+    a, b = (axis.ravel() for axis in np.meshgrid(np.arange(count), np.arange(count)))
+    a, b = a[a + b < count] / (count - 1), b[a + b < count] / (count - 1)
+    return np.stack((a, b, 1 - a - b), axis=1)
+
+
+def seen(
+    x: np.ndarray, y: np.ndarray, nearness: np.ndarray, colours: np.ndarray, side: int, finer: int = 2
+) -> np.ndarray:
+    """(side, side, 3) picture on white of points, x right and y up from its middle: the nearest wins."""
+    large = side * finer
+    column = np.round(large / 2 + finer * x).astype(int)
+    row = np.round(large / 2 - finer * y).astype(int)
+    inside = (column >= 0) & (column < large) & (row >= 0) & (row < large)
+    back_to_front = np.flatnonzero(inside)[np.argsort(nearness[inside], kind="stable")]
+    canvas = np.ones((large, large, 3))
+    canvas[row[back_to_front], column[back_to_front]] = colours[back_to_front]
+    return canvas.reshape(side, finer, side, finer, 3).mean(axis=(1, 3))
 
 
 def page(model: str, label: str, credit: str, data: str | None) -> str:

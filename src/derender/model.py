@@ -11,13 +11,11 @@ from typing import Any
 
 import torch
 from jaxtyping import Float
-from pydantic import ValidationError
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from derender.networks import FACTORS, Factor, NetworkSettings
 from derender.networks.confidence import Confidence, ConfidenceNet
+from derender.networks.tensor_file import read_tensors, write_tensors
 from derender.networks.whitening import Whitening
 from derender.presets import MODEL_PRESETS, ModelSettings, named_preset
 from derender.render import Rendering, render_scene
@@ -90,12 +88,26 @@ class Derenderer(nn.Module):
         return next(self.parameters()).device
 
     def embed(self, images: Float[Tensor, "n 3 h w"]) -> dict[str, Float[Tensor, "n code"]]:
-        """One feature per factor for pictures in 0..1, by name: its code, whitened if that was fitted."""
-        return self.features(self.encode(images))
+        """One feature per factor for pictures in 0..1, by name: whitened if fitted, else its code."""
+        return self.encode(images) if self.whitening is None else self.features(self.read(images))
 
-    def features(self, codes: Mapping[str, Float[Tensor, "n code"]]) -> dict[str, Float[Tensor, "n code"]]:
-        """The features that belong to codes: what ``embed`` gives for the pictures they come from."""
-        return dict(codes) if self.whitening is None else self.whitening(codes)
+    def read(self, images: Float[Tensor, "n 3 h w"]) -> dict[str, Float[Tensor, "n _"]]:
+        """All that each encoder says of pictures in 0..1: its code, then its last spatial features."""
+        self._check(images)
+        return {factor.name: self.nets[factor.name].read(images) for factor in self.factors}  # type: ignore[operator]
+
+    def codes(self, readings: Mapping[str, Float[Tensor, "n _"]]) -> dict[str, Float[Tensor, "n code"]]:
+        """The codes that readings begin with: what ``encode`` gives for the pictures they come from."""
+        return {name: row[:, : self.settings.network.code_size] for name, row in readings.items()}
+
+    def features(self, readings: Mapping[str, Float[Tensor, "n _"]]) -> dict[str, Float[Tensor, "n code"]]:
+        """The features that belong to readings: what ``embed`` gives for the pictures they come from.
+
+        Raises:
+            ValueError: there are codes where features are made of whole readings.
+        """
+        own = {} if self.whitening is None else self.whitening(readings)
+        return self.codes(readings) | own
 
     def encode(self, images: Float[Tensor, "n 3 h w"]) -> dict[str, Float[Tensor, "n code"]]:
         """One code per factor for pictures in 0..1, by factor name: what ``decode`` takes."""
@@ -147,9 +159,8 @@ class Derenderer(nn.Module):
             "factors": [factor.name for factor in self.factors],
             "settings": self.settings.model_dump(mode="json"),
         }
-        weights = {name: value.detach().cpu().contiguous() for name, value in self.state_dict().items()}
         with whole_folder(folder) as temporary:
-            save_file(weights, temporary / WEIGHTS_FILE)
+            write_tensors(self.state_dict(), temporary / WEIGHTS_FILE)
             (temporary / CONFIG_FILE).write_text(json.dumps(config, indent=1))
             if self.whitening is not None:
                 self.whitening.save(temporary / WHITENING_FILE)
@@ -198,15 +209,26 @@ def load(
         )
     try:
         settings = ModelSettings.model_validate(config["settings"])
+        weights = read_tensors(folder / WEIGHTS_FILE)
+        with torch.device("meta"):  # sizes are compared before memory is taken for what the file only claims
+            _check_shapes(weights, Derenderer(settings, factors, renderer).state_dict())
         model = Derenderer(settings, factors, renderer)
-        model.load_state_dict(load_file(folder / WEIGHTS_FILE))
+        model.load_state_dict(weights)
         if (folder / WHITENING_FILE).is_file():
             model.whitening = Whitening.load(folder / WHITENING_FILE)
-    except (SafetensorError, ValidationError, RuntimeError, ValueError) as error:
+    except (RuntimeError, ValueError) as error:
         raise ValueError(
             f"{folder} is damaged ({str(error).splitlines()[0]}): copy or train the model again"
         ) from error
     return model.to(device).eval().requires_grad_(False)
+
+
+def _check_shapes(found: Mapping[str, Tensor], wanted: Mapping[str, Tensor]) -> None:
+    """The same names and shapes, or an error that names the first that differs."""
+    for name in sorted({*found, *wanted}):
+        shapes = [tuple(side[name].shape) if name in side else "nothing" for side in (found, wanted)]
+        if shapes[0] != shapes[1]:
+            raise ValueError(f"{name}: {shapes[0]} in {WEIGHTS_FILE}, {shapes[1]} by {CONFIG_FILE}")
 
 
 def bundled_models() -> tuple[str, ...]:
@@ -259,8 +281,10 @@ def _from_hub(repository: str) -> Path:
 def _read_config(folder: Path) -> dict[str, Any]:
     try:
         config = json.loads((folder / CONFIG_FILE).read_text())
-        version, complete = config["format"], {"factors", "settings"} <= set(config)
-    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError) as error:
+        version, complete = config["format"], isinstance(config.get("settings"), dict)
+        names = config.get("factors")
+        complete = complete and isinstance(names, list) and all(isinstance(name, str) for name in names)
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         raise ValueError(f"{folder / CONFIG_FILE} is damaged: copy or train the model again") from error
     if "baseline" in config:
         name = config["baseline"]

@@ -1,51 +1,195 @@
-"""Files and folders that appear whole or not at all.
+"""Files and folders that appear whole or not at all, and folders that know whether they still are.
 
 Both are written under another name beside their place and moved there at the end. A run that is killed, or a
-disk that is full, leaves what was there before.
+disk that is full, leaves what was there before. A sealed folder holds a checksum of each of its files, which
+tells a later reader of a bit that has changed; it is no protection against somebody who means harm.
 """
 
+import ctypes
+import json
 import os
 import shutil
 import tempfile
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 
 LONGEST_PREFIX = 80  # of a name's characters, so that the temporary name is no longer than file systems allow
+CHECKSUMS = "checksums.json"
+
+_PIECE_BYTES = 1 << 20
+_THIS_FOLDER, _EXCHANGE = -100, 2  # AT_FDCWD and RENAME_EXCHANGE of Linux
+
+
+class Damaged(ValueError):
+    """A file is not what was written: cut off, changed or gone."""
+
+
+class DamageNoticed(UserWarning):
+    """Something damaged was passed over, and the work goes on from what was there before it."""
 
 
 @contextmanager
-def whole_file(path: Path) -> Iterator[Path]:
-    """Give a temporary path to write to; it takes the place of ``path`` if nothing is raised."""
+def whole_file(path: Path, *, durable: bool = False) -> Iterator[Path]:
+    """Give a temporary path to write to; it takes the place of ``path`` if nothing is raised.
+
+    With ``durable`` the disk has the content before the name: losing power cannot leave an empty file.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=f".{path.name[:LONGEST_PREFIX]}-", dir=path.parent)
+    handle, name = tempfile.mkstemp(prefix=_prefix(path), dir=path.parent)
     os.close(handle)
     temporary = Path(name)
     try:
         yield temporary
         temporary.chmod(0o644)
+        if durable:
+            _to_disk(temporary)
         temporary.replace(path)
+        if durable:
+            _to_disk(path.parent)
     finally:
         temporary.unlink(missing_ok=True)
 
 
 @contextmanager
-def whole_folder(folder: Path) -> Iterator[Path]:
+def whole_folder(folder: Path, *, previous: Path | None = None) -> Iterator[Path]:
     """Give a temporary folder to fill; it takes the place of ``folder`` if nothing is raised.
 
-    The old folder is moved aside first and removed last, so that at every moment one of the two is whole.
+    The two are exchanged in one step where the system can (Linux); elsewhere the old one is moved aside
+    first, and a kill between the two moves leaves it there.
+
+    Args:
+        folder: what is replaced.
+        previous: what becomes of the old folder, which is deleted otherwise.
     """
     folder.parent.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name[:LONGEST_PREFIX]}-", dir=folder.parent))
+    temporary = Path(tempfile.mkdtemp(prefix=_prefix(folder), dir=folder.parent))
     try:
         yield temporary
         temporary.chmod(0o755)
-        if folder.exists():
-            old = Path(tempfile.mkdtemp(prefix=f".{folder.name[:LONGEST_PREFIX]}-old-", dir=folder.parent))
-            folder.rename(old / folder.name)
+        sealed = (temporary / CHECKSUMS).exists()
+        if not folder.exists():
             temporary.rename(folder)
-            shutil.rmtree(old, ignore_errors=True)
+        elif previous is None:
+            _exchange(temporary, folder)
         else:
-            temporary.rename(folder)
+            _make_way(previous, folder, temporary)
+        if sealed:
+            _to_disk(folder.parent)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+def remove_abandoned(path: Path) -> None:
+    """Delete what processes killed while writing this file or folder left; nobody may be writing."""
+    for entry in path.parent.iterdir() if path.parent.is_dir() else ():
+        if not entry.name.startswith(_prefix(path)):
+            continue
+        if entry.is_dir():
+            shutil.rmtree(entry, ignore_errors=True)
+        else:
+            entry.unlink(missing_ok=True)
+
+
+def seal(folder: Path) -> None:
+    """Note size and CRC-32 of every file in a folder beside them, and have the disk keep all of it."""
+    found = {file.name: measured(file) for file in sorted(folder.iterdir())}
+    (folder / CHECKSUMS).write_text(json.dumps({"crc32": found}))
+    for file in (*folder.iterdir(), folder):
+        _to_disk(file)
+
+
+def check_seal(folder: Path) -> None:
+    """Compare the files with what was noted.
+
+    Raises:
+        Damaged: one is missing or differs, or the note is; names the first.
+    """
+    try:
+        noted = json.loads((folder / CHECKSUMS).read_bytes())["crc32"]
+        rows = [(str(name), (int(size), int(checksum))) for name, (size, checksum) in noted.items()]
+    except FileNotFoundError as error:
+        raise Damaged(f"{CHECKSUMS} is missing") from error
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
+        raise Damaged(f"{CHECKSUMS} cannot be read") from error
+    for name, (size, checksum) in rows:
+        try:
+            found = measured(folder / Path(name).name)
+        except OSError as error:
+            raise Damaged(f"{name} is missing or cannot be read") from error
+        if found != (size, checksum):
+            how = "its checksum differs" if found[0] == size else f"{found[0]:,} of {size:,} bytes"
+            raise Damaged(f"{name} has changed since it was written: {how}")
+
+
+def _prefix(path: Path) -> str:
+    return f".{path.name[:LONGEST_PREFIX]}-"
+
+
+def measured(file: Path) -> tuple[int, int]:
+    """Size in bytes and CRC-32 of a file, read back piece by piece."""
+    size = checksum = 0
+    with file.open("rb") as stream:
+        while piece := stream.read(_PIECE_BYTES):
+            size += len(piece)
+            checksum = zlib.crc32(piece, checksum)
+    return size, checksum
+
+
+def _to_disk(path: Path) -> None:
+    """Wait until the disk has a file, or the names in a folder; where folders cannot be opened, go on."""
+    try:
+        handle = os.open(path, os.O_RDONLY)
+    except PermissionError:  # a folder on Windows
+        return
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _make_way(previous: Path, folder: Path, temporary: Path) -> None:
+    """``temporary`` becomes ``folder``, that becomes ``previous``; one of the latter two is always there."""
+    if _exchanged(temporary, folder):
+        if previous.exists():
+            _exchange(temporary, previous)
+        else:
+            temporary.rename(previous)
+        return
+    shutil.rmtree(previous, ignore_errors=True)
+    folder.rename(previous)
+    temporary.rename(folder)
+
+
+def _exchange(one: Path, other: Path) -> None:
+    """Two folders take each other's place: in one step where that can be, else in three."""
+    if _exchanged(one, other):
+        return
+    aside = Path(tempfile.mkdtemp(prefix=_prefix(other), dir=other.parent))
+    other.rename(aside / other.name)
+    one.rename(other)
+    (aside / other.name).rename(one)
+    aside.rmdir()
+
+
+def _exchanged(one: Path, other: Path) -> bool:
+    """Whether the system could exchange the two in one step."""
+    rename = _system_exchange()
+    return (
+        rename is not None
+        and rename(_THIS_FOLDER, os.fsencode(one), _THIS_FOLDER, os.fsencode(other), _EXCHANGE) == 0
+    )
+
+
+@cache
+def _system_exchange() -> "ctypes._NamedFuncPointer | None":
+    """Linux's renameat2, where the C library has it."""
+    try:
+        function = ctypes.CDLL(None, use_errno=True).renameat2
+    except (OSError, AttributeError, TypeError):
+        return None
+    function.argtypes = (ctypes.c_int, ctypes.c_char_p, ctypes.c_int, ctypes.c_char_p, ctypes.c_uint)
+    function.restype = ctypes.c_int
+    return function

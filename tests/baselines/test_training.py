@@ -63,7 +63,7 @@ def weights(run) -> dict[str, torch.Tensor]:
 def test_a_run_leaves_what_ours_leave_and_makes_a_table(name, runs, blobs, tmp_path):
     run = runs / name
     assert read_any_config(run) == task(name, 48).config
-    assert {path.name for path in (run / "checkpoints").iterdir()} == {"last", "best"}
+    assert {path.name for path in (run / "checkpoints").iterdir()} == {"last", "previous", "best"}
     assert [row["kind"] for row in read_metrics(run)] == ["train", "validation", "validation"]
     with Image.open(run / "samples" / "000000048.png") as sheet:
         columns = 5 if name == "simclr" else 2

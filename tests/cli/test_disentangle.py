@@ -41,6 +41,7 @@ def rendered(tmp_path_factory, made) -> Path:
 def test_the_card_is_printed_drawn_and_written(model, rendered, tmp_path, capsys):
     out = tmp_path / "card.png"
     words = ["evaluate", "disentangle", "-m", model, "-d", rendered, "--seeds", "1", "--swap-pictures", "4"]
+    words += ["--cache", tmp_path / "cache"]
     text, typeset = tmp_path / "card.md", tmp_path / "card.tex"
     files = ["--json", "-", "--markdown", text, "--latex", typeset]
     assert main([str(word) for word in [*words, "--out", out, *files]]) == 0
@@ -56,6 +57,12 @@ def test_the_card_is_printed_drawn_and_written(model, rendered, tmp_path, capsys
         assert words_shown in shown.err
     with Image.open(out) as sheet:
         assert sheet.width > 900
+    low, high = scores["swap"]["ratio_95"]
+    assert low < scores["swap"]["ratio"] < high and "resampled" not in scores["swap"]
+    assert "5 results computed, 0 found" in shown.err
+    assert main([str(word) for word in [*words, "--json", "-"]]) == 0
+    again = capsys.readouterr()
+    assert json.loads(again.out) == told and "0 results computed, 5 found" in again.err
 
 
 def test_bad_words(model, rendered, tmp_path, capsys):
@@ -88,13 +95,24 @@ def test_geometry_of_pictures_beside_depth_maps(model, made, tmp_path, capsys):
     write(made, own)
     for data in (tmp_path / "pairs", own):
         words = ["evaluate", "geometry", "-m", model, "-d", data, "--limit", "6", "--json", "-"]
+        words += ["--cache", tmp_path / "cache", "--resamples", "50"]
         assert main([str(word) for word in words]) == 0
         results.append(json.loads(capsys.readouterr().out))
+    assert main([str(word) for word in [*words, "--markdown", tmp_path / "geometry.md"]]) == 0
+    again = capsys.readouterr()
+    assert json.loads(again.out) == results[1] and "0 results computed, 4 found" in again.err
+    assert "| prediction | SIDE x 100 ↓ | 95 % | MAD ↓ | 95 % |" in (tmp_path / "geometry.md").read_text()
     pairs, ours = results
     assert pairs["pictures"] == 6 and "factors" not in pairs and "factors_untrained" in ours
     for row in ("model", "average_depth", "plane", "untrained"):
         assert pairs["geometry"][row]["side"] == pytest.approx(ours["geometry"][row]["side"], rel=0.02)
     assert pairs["geometry"]["plane"]["side"] > pairs["geometry"]["average_depth"]["side"]
     assert pairs["reconstruction"]["model"]["ssim"] is not None
+    side = ours["intervals"]["geometry"]["model"]["scores"]["side"]
+    assert side["value"] == pytest.approx(ours["geometry"]["model"]["side"])
+    assert side["low"] <= side["value"] <= side["high"]
+    rows = ours["intervals"]["reconstruction"]
+    assert list(rows) == ["model", "mean picture", "PCA (1)", "untrained model"]
+    assert rows["model"]["versus"]["l1"]["rival"] in rows
     assert 0 < ours["factors"]["albedo"] <= ours["factors"]["albedo_global"]
     assert ours["factors"]["light_aligned"]["mean_deg"] <= ours["factors"]["light"]["mean_deg"] + 1

@@ -58,8 +58,17 @@ def why(model, data, tmp_path_factory) -> tuple[Path, dict]:
         "2",
     ]
     words += ["--clusters", "2", "--pair", "dark/00.png", "dark/02.png", "--json", folder / "why.json"]
+    words += ["--markdown", folder / "why.md", "--latex", folder / "why.tex"]
     assert main([str(word) for word in [*words, "--out", folder / "why"]]) == 0
     return folder / "why", json.loads((folder / "why.json").read_text())
+
+
+def test_tables_are_written_as_text(why):
+    folder, _ = why
+    text, typeset = (folder.with_suffix(form).read_text() for form in (".md", ".tex"))
+    assert text.count("| :--- |") == typeset.count(r"\begin{table}") == 5
+    assert "| *shuffled labels* |" in text and r"\textit{untrained" in typeset
+    assert "| cluster 0 |" in text and "dark/00.png and dark/02.png" in text
 
 
 def test_the_folder_holds_page_chart_maps_and_probe(why):

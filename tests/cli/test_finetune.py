@@ -54,13 +54,20 @@ def test_from_a_run_to_features_and_scores(run, faces, tmp_path, capsys, refused
         "--json",
         numbers,
     ]
+    text, typeset, page = (tmp_path / f"scores.{form}" for form in ("md", "tex", "html"))
+    words += ["--markdown", text, "--latex", typeset, "--html", page]
     assert main([str(word) for word in words]) == 0
     shown = capsys.readouterr()
     assert (
         "20 labelled pictures learned, 8 held out" in " ".join(shown.out.split()) and "against" in shown.err
     )
     told = json.loads(numbers.read_text())["scores"]
-    assert list(told["rows"]) == ["fine-tuned", "frozen, logistic", "frozen, paper's head", "majority"]
+    frozen = ["frozen, logistic", "frozen, paper's head"]
+    controls = ["untrained encoder, logistic", "PCA (6), logistic", "pixels, logistic", "majority"]
+    assert list(told["rows"]) == ["fine-tuned", *frozen, *controls]
+    assert "| *pixels, logistic* |" in text.read_text()
+    assert r"\textit{frozen, paper's head}" in typeset.read_text()
+    assert "<table" in page.read_text()
     assert told["kind"] == "classes" and told["n_train"] == 20
     config = yaml.safe_load((out / "config.yaml").read_text())
     assert config["start"] == str(run) and config["target"]["weight"] == 2

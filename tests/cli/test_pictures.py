@@ -73,7 +73,7 @@ def test_relight_sweeps_and_says_which_light(model, photos, tmp_path):
     assert main(["relight", "-m", model, *names, "-o", str(out), *words, "--json", str(told)]) == 0
     assert sorted(path.name for path in out.iterdir()) == ["0", "1", "sheet.png"]
     stills = json.loads((out / "0" / "moved.json").read_text())["stills"]
-    assert [still["label"] for still in stills] == ["yaw -30°", "yaw +0°", "yaw +30°"]
+    assert [still["label"] for still in stills] == ["yaw -30°", "yaw 0°", "yaw +30°"]
     assert [round(np.degrees(still["light"][3])) for still in stills] == [-30, 0, 30]
     with Image.open(out / "1" / "still-02.png") as still:
         assert still.size == (40, 40)
@@ -143,14 +143,22 @@ def test_decompose_at_another_size_with_a_sheet(model, photos, tmp_path):
         assert sheet.height > 2 * 128 and albedo.size == (48, 48)
 
 
-def test_search_with_a_picture_finds_its_own_row(table, model, photos, tmp_path, capsys):
+def test_search_with_a_picture_of_the_table(table, model, photos, tmp_path, capsys):
+    """It is not found itself, whatever its name, unless copies are asked for."""
     sheet, told = tmp_path / "sheet.png", tmp_path / "told.json"
+    renamed = shutil.copy(photos / "4.png", tmp_path / "mine.png")
     words = ["--model", model, "-k", "3", "--out", str(sheet), "--json", str(told)]
-    assert main(["search", "-f", table, "--like", str(photos / "4.png"), *words]) == 0
+    assert main(["search", "-f", table, "--like", renamed, *words]) == 0
+    answer = json.loads(told.read_text())
+    assert answer["same_picture"] == ["4.png"] and len(answer["found"]) == 3
+    assert "4.png" not in {row["file"] for row in answer["found"]}
+    distances = [row["distance"] for row in answer["found"]]
+    assert distances == sorted(distances) and distances[0] > 1e-5
+    assert "left out as the very same picture: 4.png (--copies" in capsys.readouterr().err
+    assert main(["search", "-f", table, "--like", renamed, *words, "--copies", "--force"]) == 0
     found = json.loads(told.read_text())["found"]
     assert found[0]["file"] == "4.png" and len(found) == 3
     assert found[0]["distance"] == pytest.approx(0, abs=1e-5)
-    assert [row["distance"] for row in found] == sorted(row["distance"] for row in found)
     with Image.open(sheet) as drawn:
         assert drawn.width > 4 * 160
     assert "4.png" in capsys.readouterr().out

@@ -28,7 +28,7 @@ def test_a_copy_with_other_features_and_the_same_scenes(folder, tmp_path, capsys
     assert code == 0
     said = json.loads(capsys.readouterr().out)
     assert said["pictures"] == 24
-    assert len(said["between_over_within"]["geometry"]) == 256
+    assert len(said["between_over_within"]["geometry"]) == 8
     one, two = derender.load("rendered-faces-64"), derender.load(tmp_path / "mine")
     assert torch.linalg.matrix_rank(two.whitening.get_buffer("albedo_map"), rtol=1e-3) == 8
     picture = torch.rand(1, 3, 64, 64)

@@ -44,6 +44,8 @@ def test_the_interval_of_a_share_is_the_known_one():
 def test_centred_resamples_lie_about_the_value():
     found = estimate([0.5], np.array([0.6, 0.7, 0.8]), centred=True)
     assert (found.low + found.high) / 2 == pytest.approx(0.5) and found.low < 0.5 < found.high
+    assert estimate([0.95], np.array([0.6, 0.7, 0.8]), centred=True, most=1.0).high == pytest.approx(0.9975)
+    assert estimate([0.99], np.array([0.1, 0.7, 0.8, 0.9]), centred=True, most=1.0).high == 1
 
 
 def test_paired_differences_see_what_separate_intervals_do_not():

@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from derender.evaluation import evaluate_reconstruction, mean_picture, reconstruction_scores
+from derender.evaluation.reconstruction import component_count, from_components
 
 
 def test_known_differences_give_known_scores():
@@ -67,3 +68,15 @@ def test_the_mean_of_many_pictures_is_exact_and_of_none_an_error():
     np.testing.assert_allclose(mean_picture(images), 0.75)
     with pytest.raises(ValueError, match="no pictures"):
         mean_picture(images[:0])
+
+
+def test_components_copy_what_lies_in_their_span():
+    """Pictures of two varying numbers come back from two components or more, others only nearly."""
+    generator = np.random.default_rng(0)
+    basis, mixed = generator.uniform(0, 1, (2, 3, 4, 4)), generator.uniform(0, 1, (40, 2))
+    images = (np.einsum("nk,kchw->nchw", mixed, basis) * 127).round().astype(np.uint8)
+    again = from_components(images, images)
+    assert again.shape == images.shape and component_count(40) == 10
+    assert (again - torch.from_numpy(images / 255)).abs().max() < 0.01
+    noise = generator.integers(0, 256, images.shape, dtype=np.uint8)
+    assert (from_components(noise, images) - torch.from_numpy(noise / 255)).abs().mean() > 0.1

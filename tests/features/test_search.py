@@ -5,7 +5,7 @@ import pytest
 from sklearn.neighbors import NearestNeighbors
 
 from derender.features import FeatureTable, search
-from derender.features.search import nearest
+from derender.features.search import nearest, same_picture
 
 
 @pytest.fixture
@@ -54,6 +54,17 @@ def test_equal_rows_come_in_order_and_zero_rows_are_apart():
     assert found.rows.tolist() == [[1, 2, 4, 0]]
     assert found.distances.tolist() == [[0, 0, 0, 1]]
     assert nearest(table, np.array([2.0, 0]), "f", 99).rows.tolist() == [[1, 2, 4, 0, 3]]
+
+
+def test_the_same_picture_is_alike_in_every_factor(table, monkeypatch):
+    monkeypatch.setattr(search, "BLOCK_ROWS", 64)
+    for rows in table.factors.values():
+        rows[250] = rows[17] * (1 + 1e-6)  # a copy, rounded otherwise
+    table.factors["light"][33] = table.factors["light"][17]  # another face in the same light
+    codes = {name: rows[17] for name, rows in table.factors.items()}
+    assert same_picture(table, codes).tolist() == [17, 250]
+    assert same_picture(table, {"light": codes["light"]}).tolist() == [17, 33, 250]
+    assert same_picture(table, {"albedo": codes["light"]}).tolist() == []
 
 
 @pytest.mark.parametrize(

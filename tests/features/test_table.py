@@ -96,7 +96,7 @@ def test_a_write_that_dies_half_way_leaves_the_old_file_and_no_rest(tmp_path, mo
     path = make().write(tmp_path / "t.parquet")
     before = path.read_bytes()
 
-    def dies(table, where):
+    def dies(table, where, **options):
         Path(where).write_bytes(b"half")
         raise OSError("no space left on device")
 

@@ -17,6 +17,7 @@ from derender.interpretation.cam import (
 from derender.interpretation.probe import Probe
 from derender.interpretation.sanity import sanity_check, similarity, spearman
 from derender.model import Derenderer
+from derender.networks.encoders import reading
 from derender.presets import MODEL_PRESETS
 
 SIZE, CODE = 32, 6
@@ -53,10 +54,14 @@ class Looking:
         net = nn.Module()
         net.encoder = QuadrantEncoder(where)
         net.encode = net.encoder.forward  # type: ignore[assignment]
+        net.read = lambda images: reading(net.encode(images), net.encoder.spatial(images))  # type: ignore[assignment]
         self.nets = {"geometry": net}
 
-    def features(self, codes: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-        return codes
+    def features(self, readings: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+        return {
+            name: said[:, : self.nets[name].encoder.to_code[0].out_channels]
+            for name, said in readings.items()
+        }
 
 
 @pytest.fixture

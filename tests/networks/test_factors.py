@@ -40,6 +40,19 @@ def test_level_depth_loses_its_slope_from_top_to_bottom_and_nothing_else(generat
     )
 
 
+def test_a_flat_map_leans_back_by_the_angle_asked_for():
+    leaning = SceneRanges(lean_deg=30.0, border_share=0, level_depth=True)
+    depth = depth_from_raw(torch.zeros(1, 1, 64, 64), leaning)[0]
+    height = depth[31:33] * torch.tensor([[0.5], [-0.5]]) / (63 / 2 / math.tan(math.radians(5)))
+    lean = (depth[31] - depth[32]) / (height[0] - height[1])  # away for every unit up, in the middle
+    torch.testing.assert_close(
+        lean, torch.full((64,), math.tan(math.radians(30))), rtol=2e-3, atol=0, check_dtype=False
+    )
+    assert (depth[:-1] > depth[1:]).all()
+    upright = depth_from_raw(torch.zeros(1, 1, 64, 64), SceneRanges(border_share=0, level_depth=True))
+    torch.testing.assert_close(depth + depth.flip(0), 2 * upright[0])
+
+
 def test_cars_hold_the_border_deeper():
     depth = depth_from_raw(torch.zeros(1, 1, 64, 64), SceneRanges(border_depth=1.08))
     assert depth[0, 0, 0].item() == pytest.approx(1.08)

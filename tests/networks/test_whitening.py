@@ -31,7 +31,10 @@ def test_what_light_moves_is_shrunk_and_what_tells_pictures_apart_is_kept():
     left = (lit @ found.map).norm(dim=1)
     assert (kept > 10).all()  # 1 of identity counts 20 times the 0.05 that views move there
     assert (left < 0.2).all()
-    assert found.ratios[:3].min() > 100 > 1 > found.ratios[3:].max()
+    every = contrast(codes, directions=SIZE, shrinkage=1e-6).ratios
+    assert len(every) == SIZE
+    assert every[:3].min() > 100 > 1 > every[3:].max()
+    torch.testing.assert_close(found.ratios, every[:3])
 
 
 def test_renderings_of_one_picture_differ_by_one_in_every_kept_direction():
@@ -53,6 +56,37 @@ def test_an_affine_change_of_the_codes_changes_no_distance():
     one, two = (contrast(c.double(), 4, 0.0) for c in (codes, changed))
     distances = [torch.pdist((c[0, :50] - f.mean) @ f.map) for c, f in ((codes, one), (changed, two))]
     assert torch.allclose(*distances, rtol=2e-2)
+
+
+def test_readings_longer_than_the_code_give_features_of_its_size_and_tell_what_the_code_does_not():
+    told, _, _ = planted(0)
+    code, _, lit = planted(1)
+    code = code - code @ lit.T @ lit  # the code itself is told apart by other pictures' axes
+    found = contrast(torch.cat([code, told], dim=2), 6, 1e-6, size=SIZE)
+    assert found.map.shape == (2 * SIZE, SIZE)
+    features = (torch.cat([code, told], dim=2) - found.mean) @ found.map
+    assert torch.linalg.matrix_rank(features.flatten(0, 1), rtol=1e-4) == 6
+    within = (features - features.mean(dim=0)).flatten(0, 1)
+    assert torch.linalg.eigvalsh(within.T @ within)[-6:].max() < 1.1 * PICTURES * (VIEWS - 1)
+    assert (features.mean(dim=0)[:, None] - features.mean(dim=0)).norm(dim=2).median() > 20
+
+
+def test_features_stand_in_the_place_of_the_code_that_they_are_nearest_to():
+    codes = torch.randn(3, 200, 4, generator=torch.Generator().manual_seed(0)) * torch.tensor(
+        [1.0, 2.0, 3.0, 4.0]
+    )
+    codes = codes.mean(dim=0) + 0.1 * torch.randn(3, 200, 4, generator=torch.Generator().manual_seed(1))
+    found = contrast(codes, 4, 0.0)
+    features = ((codes - found.mean) @ found.map).flatten(0, 1)
+    together = torch.corrcoef(torch.cat([codes.flatten(0, 1), features], dim=1).T)[:4, 4:]
+    assert (together.diagonal() > 0.95).all()
+    assert (together - torch.diag(together.diagonal())).abs().max() < 0.3
+
+
+def test_codes_where_readings_are_needed_are_refused():
+    whitening = Whitening({"geometry": contrast(planted()[0], 3, 0.1)})
+    with pytest.raises(ValueError, match="features of geometry are made of 12 numbers, got 7"):
+        whitening({"geometry": torch.zeros(2, 7)})
 
 
 def test_codes_that_never_move_are_survived():
@@ -77,7 +111,7 @@ def test_maps_are_read_as_they_were_written_and_leave_other_factors_alone(tmp_pa
     one, two = whitening(given), again(given)
     assert torch.equal(one["geometry"], two["geometry"])
     assert not torch.equal(one["geometry"], codes[0])
-    assert torch.equal(one["light"], codes[1])
+    assert one.keys() == {"geometry"}
     assert whitening.state_dict() == {}  # a model's weights are the same with it and without
 
 

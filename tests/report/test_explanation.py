@@ -1,8 +1,11 @@
 """Overlays and tables of an explanation."""
 
+from io import BytesIO
+
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from derender.interpretation import cluster_shares, pair_parts
 from derender.interpretation.sanity import Similarity
@@ -52,6 +55,14 @@ def test_tables_of_groups_hold_the_parts():
     assert clusters["cluster 0"]["pictures"] == 10
     shares = [clusters["cluster 0"][name] for name in features]
     assert sum(float(share) for share in shares) == pytest.approx(1)
+
+
+def test_a_chart_as_a_picture_has_a_ground_and_as_svg_has_none():
+    svg, png = side_by_side({"light": lambda axes: axes.barh([0], [0.5])}, "share", (3, 2))
+    with Image.open(BytesIO(png)) as picture:
+        corner, alpha = picture.convert("RGBA").getpixel((1, 1)), picture.convert("RGBA").getchannel("A")
+    assert corner == (255, 255, 255, 255) and alpha.getextrema() == (255, 255)
+    assert "#ffffff" not in svg and "currentColor" in svg
 
 
 def test_a_chart_of_no_panels_is_refused_and_names_are_safe():

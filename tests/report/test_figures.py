@@ -148,6 +148,7 @@ def test_another_light_comes_from_the_other_side_and_another_view_turns_back():
     scene = bump()
     light, camera = under_another_light(scene).light, from_another_view(scene).camera
     assert (light[:, 3].sign() == torch.tensor([1.0, 1.0, -1.0])).all()
+    torch.testing.assert_close(light[:, :2].sum(dim=1), scene.light[:, :2].sum(dim=1))  # as bright
     assert (camera[:, 1] - scene.camera[:, 1]).abs() == pytest.approx([radians(35)] * 3)
     assert camera[0, 1] > scene.camera[0, 1] and camera[2, 1] < scene.camera[2, 1]
     assert torch.equal(scene.light, bump().light)

@@ -97,7 +97,7 @@ def test_borders_steps_and_scraps_are_left_out():
     scene = nosed()
     depth = scene.depth.clone()
     depth[:, :, :2] = depth[:, :, -2:] = 1.04  # the model's border
-    depth[:, 20:, :] += 0.05  # a step, and beyond it a scrap
+    depth[:, 20:, :] += 0.15  # a step, and beyond it a scrap
     whole = mesh_of(scene, FOV_DEG)
     cut = mesh_of(scene.with_parameters(depth=depth), FOV_DEG, border_columns=2)
     assert len(cut.vertices) == 20 * 20 and len(cut.faces) == 2 * 19 * 19
@@ -107,12 +107,23 @@ def test_borders_steps_and_scraps_are_left_out():
     assert len(np.unique(cut.faces)) == len(cut.vertices) < len(whole.vertices)
 
 
+def test_a_steep_flank_inside_makes_no_hole():
+    scene = nosed()
+    depth = scene.depth.clone()
+    depth[:, 8:14, 8:14] -= 0.1  # a tower with walls at more than 85 degrees
+    whole = mesh_of(scene.with_parameters(depth=depth), FOV_DEG)
+    assert whole.trimmed == 0 and len(whole.faces) == 2 * (SIZE - 1) ** 2
+    depth[:, :8, 8:14] -= 0.1  # now they reach the rim: the tower stands apart
+    cut = mesh_of(scene.with_parameters(depth=depth), FOV_DEG)
+    assert cut.trimmed > 0.1 and np.ptp(cut.vertices[:, 2]) < 0.04
+
+
 def test_bad_meshes():
     scene = nosed()
     with pytest.raises(ValueError, match="a mesh shows one scene, got 2"):
         mesh_of(scene[[0, 0]], FOV_DEG)
     jagged = scene.with_parameters(depth=1 + 0.2 * (torch.arange(SIZE) % 2).expand(1, SIZE, SIZE))
-    with pytest.raises(ValueError, match="nothing of this surface is seen at less than 80 degrees"):
+    with pytest.raises(ValueError, match="nothing of this surface is seen at less than 85 degrees"):
         mesh_of(jagged, FOV_DEG)
     with pytest.raises(ValueError, match="unknown format 'glbb'; did you mean 'glb'"):
         mesh_files(mesh_of(scene, FOV_DEG), "a", "glbb")

@@ -40,6 +40,13 @@ def test_light_goes_from_the_right_of_the_picture_to_its_left():
     assert float(left[1]) == pytest.approx(float(right[1]), abs=1e-3)
 
 
+def test_light_that_goes_round_is_as_strong_as_asked():
+    for strength in (0.0, 0.7, 1.6):
+        lights = sweeps.lights_around(sweeps.stills(3), 50, strength=strength)
+        torch.testing.assert_close(lights[:, :2].sum(dim=1), torch.full((3,), strength))
+        assert (lights[:, 0] <= lights[:, 1]).all()
+
+
 def test_light_between_two_lights():
     start, end = torch.tensor([0.2, 0.4, 0.0, -0.3]), torch.tensor([0.6, 0.2, 0.2, 0.3])
     path = sweeps.lights_between(sweeps.stills(3), start, end)
@@ -91,6 +98,7 @@ def test_drawing_in_parts_changes_nothing(monkeypatch):
         (lambda: sweeps.stills(1), "2 stills or more"),
         (lambda: sweeps.there_and_back(1), "2 frames or more"),
         (lambda: sweeps.lights_around(sweeps.stills(2), 90), "reach must lie between -90 and 90"),
+        (lambda: sweeps.lights_around(sweeps.stills(2), 9, strength=-1), "strength of a light must be 0"),
         (lambda: sweeps.cameras_around(sweeps.stills(2), 10, 95), "pitch must lie between"),
         (lambda: sweeps.varied(ball(), light=torch.zeros(2, 4), camera=torch.zeros(3, 6)), r"\[2, 3\]"),
         (lambda: sweeps.swapped(ball(), ball()[[0, 0]], "light"), "takes from one scene, got 2"),

@@ -14,8 +14,9 @@ import derender
 from derender.data import PictureSet
 from derender.training import TrainingInterrupted, resolve, train
 from derender.training.checkpoint import WEIGHTS_FILE, load_checkpoint
-from derender.training.loop import Progress, _kept
+from derender.training.loop import Progress
 from derender.training.run_folder import read_config, read_metrics
+from derender.training.schedule import kept
 
 TINY = ["image_size=32", "width=8", "light_width=4", "perceptual=none", "batch_size=8", "checkpoint_every=32"]
 TINY += [
@@ -69,7 +70,7 @@ def test_a_run_leaves_everything_named_in_the_design(pictures, tmp_path):
     assert environment["data"]["pictures"] == 60
     assert environment["packages"]["torch"]
     assert sorted(path.name for path in (run / "samples").iterdir()) == ["000000064.png", "000000128.png"]
-    assert {path.name for path in (run / "checkpoints").iterdir()} == {"last", "best"}
+    assert {path.name for path in (run / "checkpoints").iterdir()} == {"last", "previous", "best"}
     assert derender.load(run).embed(torch.rand(2, 3, 32, 32))["geometry"].shape == (2, 256)
     kinds = [row["kind"] for row in read_metrics(run)]
     assert kinds.count("validation") == 4
@@ -154,7 +155,7 @@ def test_a_damaged_checkpoint_is_named(pictures, tmp_path):
     train(config, pictures, tmp_path / "run")
     file = tmp_path / "run" / "checkpoints" / "last" / WEIGHTS_FILE
     file.write_bytes(file.read_bytes()[:1000])
-    with pytest.raises(ValueError, match="damaged or of another model"):
+    with pytest.raises(ValueError, match=r"damaged \(model\.safetensors .*1,000 of .*no whole one before it"):
         train(resolve("small", [*TINY, "images=64"]), pictures, tmp_path / "run", resume=True)
 
 
@@ -195,7 +196,7 @@ def test_a_checkpoint_that_cannot_be_written_leaves_the_old_one_whole(pictures, 
 def kept_at(interval: int, images: int, step: int = 16) -> list[int]:
     """Where a state is kept, found step by step."""
     stops = range(step, images + 1, step)
-    return [now for now in stops if _kept(now - step, now, interval, ended=now == images)]
+    return [now for now in stops if kept(now - step, now, interval, ended=now == images)]
 
 
 def test_states_are_kept_early_however_long_the_interval_is():

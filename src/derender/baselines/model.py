@@ -12,11 +12,10 @@ from typing import Any, ClassVar
 import torch
 from jaxtyping import Float
 from pydantic import ValidationError
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from derender.data.nearest import nearest
+from derender.networks.tensor_file import read_tensors, write_tensors
 from derender.settings import Settings
 from derender.training.weights import fit_weights
 from derender.whole import whole_folder
@@ -94,9 +93,8 @@ class BaselineModel(nn.Module):
         if folder.exists() and not overwrite:
             raise FileExistsError(f"{folder} exists already: choose another folder or pass overwrite=True")
         config = {"format": FORMAT, "baseline": self.name, "settings": self.settings.model_dump(mode="json")}
-        weights = {name: value.detach().cpu().contiguous() for name, value in self.state_dict().items()}
         with whole_folder(folder) as temporary:
-            save_file(weights, temporary / WEIGHTS_FILE)
+            write_tensors(self.state_dict(), temporary / WEIGHTS_FILE)
             (temporary / CONFIG_FILE).write_text(json.dumps(config, indent=1))
         return folder
 
@@ -131,11 +129,13 @@ def saved_baseline(source: str | Path, kinds: Kinds) -> BaselineModel:
         ) from error
     model = module(settings)
     try:
-        fit_weights(model, load_file(folder / WEIGHTS_FILE))
-    except (SafetensorError, OSError) as error:
+        weights = read_tensors(folder / WEIGHTS_FILE)
+    except (ValueError, OSError) as error:
         raise ValueError(
             f"{folder / WEIGHTS_FILE} is damaged ({error}): copy or train the model again"
         ) from error
+    try:
+        fit_weights(model, weights)
     except ValueError as error:
         raise ValueError(f"{folder / WEIGHTS_FILE} is of another architecture: {error}") from error
     return model.eval().requires_grad_(False)
@@ -167,7 +167,7 @@ def _config_of(folder: Path) -> dict[str, Any]:
     try:
         config = json.loads(file.read_text())
         version, whole = config["format"], isinstance(config.get("settings"), dict)
-    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         raise ValueError(f"{file} is damaged: copy or train the model again") from error
     if not isinstance(version, int) or version > FORMAT:
         raise ValueError(

@@ -31,6 +31,7 @@ from derender.cli import (
     view,
     whiten,
 )
+from derender.cli.console import damage_said, visible
 
 app = typer.Typer(
     name="derender",
@@ -71,9 +72,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     try:
         command = typer.main.get_command(app)
-        with command.make_context(
-            "derender", arguments
-        ) as context:  # typer's own main hides what Ctrl-C said
+        with (
+            command.make_context("derender", arguments) as context,  # typer's own main hides what Ctrl-C said
+            damage_said(),
+        ):
             command.invoke(context)
         sys.stdout.flush()
         return 0
@@ -115,7 +117,7 @@ def _speaks_of_errors() -> bool:
 
 def _complain(message: str) -> None:
     if _speaks_of_errors():
-        sys.stderr.write(f"derender: {message}\n")
+        sys.stderr.write(f"derender: {visible(message)}\n")
 
 
 def _one_line(error: ValueError | OSError) -> str:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from derender.cli.console import bar, result, say, write_json
+from derender.cli.console import bar, result, say_pictures, write_json
 
 if TYPE_CHECKING:
     from derender.data import PictureSet
@@ -179,7 +179,7 @@ def write_control(
         pictures = read_pictures(data, image_size, dataset=dataset, limit=limit, progress=report)
     chosen = part_of(pictures, part, model)
     fit_on = pictures if part == "all" else part_of(pictures, "train", model)
-    say(chosen.describe())
+    say_pictures(chosen)
     with bar("describing") as report:
         table = control_features(name, chosen, fit_on, components=components, seed=seed, progress=report)
     table.write(out)

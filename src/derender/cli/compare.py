@@ -8,6 +8,7 @@ Segmentation trains nets and takes models alone.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -26,8 +27,38 @@ if TYPE_CHECKING:
 PAPER_VARIANTS = "joint,geometry,albedo,joint-frozen,random"
 
 Table = Annotated[
-    str,
+    str | None,
     typer.Option("--table", help="clustering, identity, emotion, linear, segmentation or cars: the paper's."),
+]
+PANEL = "Many methods on many data sets"
+PlanFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--plan", help="Train, embed and score what this YAML or TOML file says.", metavar="FILE",
+        rich_help_panel=PANEL,
+    ),
+]  # fmt: skip
+PlanOut = Annotated[
+    Path | None,
+    typer.Option(
+        "--out", "-o", help="Of --plan: folder for runs, tables and pictures; the same goes on with it.",
+        metavar="DIR", rich_help_panel=PANEL,
+    ),
+]  # fmt: skip
+Workers = Annotated[
+    int,
+    typer.Option("--workers", min=1, help="Of --plan: jobs at a time.", metavar="N", rich_help_panel=PANEL),
+]
+Minutes = Annotated[
+    float | None,
+    typer.Option(
+        "--minutes", min=0, help="Of --plan: stop then, and score what is there.", metavar="M",
+        rich_help_panel=PANEL,
+    ),
+]  # fmt: skip
+DryRun = Annotated[
+    bool,
+    typer.Option("--dry-run", help="Of --plan: say what is to be done, and stop.", rich_help_panel=PANEL),
 ]
 Named = Annotated[
     list[str] | None,
@@ -64,6 +95,17 @@ class Given:
 
 
 @dataclass(frozen=True)
+class Planned:
+    """A comparison by plan."""
+
+    plan: PlanFile = None
+    out: PlanOut = None
+    workers: Workers = 1
+    minutes: Minutes = None
+    dry_run: DryRun = False
+
+
+@dataclass(frozen=True)
 class Choices:
     """How a table is made, whatever its kind."""
 
@@ -75,6 +117,10 @@ class Choices:
     seed: int
 
 
+UNASKED = (None, "ward", "100,500,1000", 5, 20, 3, scoring.Computed())
+"""The command's own options where nobody gave them."""
+
+
 def register(app: typer.Typer) -> None:
     app.command(
         "compare",
@@ -84,17 +130,45 @@ def register(app: typer.Typer) -> None:
 
 @gathered
 def compare(
-    table: Table,
     given: Given,
     computed: scoring.Computed,
     published: scoring.Published,
+    planned: Planned,
+    table: Table = None,
     method: scoring.Method = "ward",
     counts: Counts = "100,500,1000",
     seeds: Seeds = 5,
     epochs: Epochs = 20,
     untrained_seeds: feature_rows.UntrainedSeeds = 3,
 ) -> None:
-    """Several models and features under one protocol, beside the paper's own numbers."""
+    """Several models and features under one protocol, beside the paper's own numbers.
+
+    With --plan: many methods, trained here on the same pictures, on many data sets and protocols.
+    """
+    if planned.plan is not None:
+        from derender.cli.plan.command import by_plan
+
+        own = replace(given, features=given.features or None, model=given.model or None)
+        rest = (table, method, counts, seeds, epochs, untrained_seeds, replace(computed, device="auto"))
+        if (own, replace(published, json_file=None), rest) != (Given(), scoring.Published(), UNASKED):
+            raise ValueError(
+                "--plan says what is compared and how, and --out gets every form of its tables: beside them "
+                "go --workers, --minutes, --dry-run, --device and --json alone"
+            )
+        by_plan(
+            planned.plan,
+            planned.out,
+            workers=planned.workers,
+            minutes=planned.minutes,
+            device=computed.device,
+            dry_run=planned.dry_run,
+            json_file=published.json_file,
+        )
+        return
+    if planned != Planned():
+        raise ValueError("--out, --workers, --minutes and --dry-run go with --plan FILE")
+    if table is None:
+        raise ValueError("give --table NAME with --model or --features, or --plan FILE with --out DIR")
     from derender.evaluation.tables import table_named
 
     spec = table_named(table)

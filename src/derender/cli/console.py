@@ -10,6 +10,7 @@ import math
 import os
 import sys
 import time
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -28,8 +29,14 @@ from rich.progress import (
 from rich.table import Table
 from rich.text import Text
 
+from derender.whole import DamageNoticed
+
 if TYPE_CHECKING:
+    from derender.data import PictureSet
     from derender.report.score_table import ScoreTable
+
+NAMED = 5
+"""So many unreadable pictures are named."""
 
 PLAIN_LINE_EVERY_SECONDS = 30.0
 
@@ -42,13 +49,44 @@ def speaks() -> bool:
 def say(text: str) -> None:
     """One note for the person at the terminal."""
     if speaks():
-        Console(stderr=True, highlight=False, soft_wrap=True, markup=False).print(text)
+        Console(stderr=True, highlight=False, soft_wrap=True, markup=False).print(visible(text))
+
+
+def visible(text: str, kept: str = "\n") -> str:
+    """Text with control characters as escapes: a file's name must not steer the terminal."""
+    return "".join(char if char in kept or char.isprintable() else repr(char)[1:-1] for char in text)
+
+
+def say_pictures(pictures: "PictureSet") -> None:
+    """What was read, and the first of what was left out by name."""
+    say(pictures.describe())
+    for row in pictures.skipped[:NAMED]:
+        say(f"skipped {visible(row.file, '')}: {row.reason}")
+    if len(pictures.skipped) > NAMED:
+        say(f"and {len(pictures.skipped) - NAMED:,} more (derender doctor --json FILE names all)")
+
+
+@contextmanager
+def damage_said() -> Iterator[None]:
+    """Within the block the library's warnings of passed-over damage are notes at the terminal."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", DamageNoticed)
+        show = warnings.showwarning
+
+        def say_or_show(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
+            if issubclass(category, DamageNoticed):
+                say(str(message))
+            else:
+                show(message, category, *where, **more)
+
+        warnings.showwarning = say_or_show
+        yield
 
 
 def result(text: str, json_file: str | None) -> None:
     """One line of result; it makes way on standard output where the JSON goes there."""
     if speaks():
-        Console(stderr=json_file == "-", highlight=False, soft_wrap=True, markup=False).print(text)
+        Console(stderr=json_file == "-", highlight=False, soft_wrap=True, markup=False).print(visible(text))
 
 
 @contextmanager

@@ -17,15 +17,13 @@ from derender.cli.baselines import (
     BaselineName,
     BaselineSeed,
 )
-from derender.cli.console import bar, out_of_the_way, result, say, write_json
+from derender.cli.console import NAMED, bar, out_of_the_way, result, say, say_pictures, visible, write_json
 
 if TYPE_CHECKING:
     from derender.data import PictureSet
     from derender.data.stream import Stream
     from derender.features import Embedded
 
-NAMED = 5
-"""So many unreadable pictures are named."""
 ENGINES = ("local", "ray")
 
 
@@ -157,7 +155,7 @@ def _opened(
 
     with bar("reading") as report:
         pictures = read_pictures(data, image_size, dataset=dataset, limit=limit, progress=report)
-    say(pictures.describe())
+    say_pictures(pictures)
     if pictures.terms:
         say(f"on its owners' terms: {pictures.terms}")
     yield part_of(pictures, part, model)
@@ -173,5 +171,5 @@ def _account(done: "Embedded", source: "Stream | PictureSet") -> str:
         parts.append(f"{done.skipped:,} skipped")
     if done.copies:
         parts.append(f"{done.copies:,} identical copies dropped")
-    lines = [", ".join(parts), *(f"skipped {row.file}: {row.reason}" for row in done.examples[:NAMED])]
-    return "\n".join(lines)
+    named = (f"skipped {visible(row.file, '')}: {row.reason}" for row in done.examples[:NAMED])
+    return "\n".join([", ".join(parts), *named])

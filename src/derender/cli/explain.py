@@ -5,8 +5,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from derender.cli import feature_rows, options
-from derender.cli.console import bar, result, say, show_scores, write_json
+from derender.cli import options, scoring
+from derender.cli.console import bar, result, say_pictures
+from derender.cli.gathered import gathered
 
 if TYPE_CHECKING:
     from derender.data import PictureSet
@@ -26,9 +27,11 @@ def register(app: typer.Typer) -> None:
     )(explain)
 
 
+@gathered
 def explain(
     model: options.Model,
     data: options.Data,
+    published: scoring.Published,
     label: Annotated[
         list[str] | None,
         typer.Option("--label", "-l", help="Label column; several if each has two values."),
@@ -83,15 +86,13 @@ def explain(
     batch_size: options.BatchSize = 256,
     seed: options.Seed = 0,
     device: options.Device = "auto",
-    force: options.Force = False,
-    json_file: options.Json = None,
 ) -> None:
     """Which factor made the answer, and where was it seen? Shares, maps, and controls for both."""
-    if out is not None and out.exists() and not force:
+    if out is not None and out.exists() and not published.force:
         raise FileExistsError(f"{out} exists already: choose another --out, or add --force to replace it")
     if bool(label) == attributes:
         raise ValueError("give either --label NAME (may be repeated) or --attributes")
-    feature_rows.refuse_to_replace(force, json_file)
+    published.check()
     from derender.cli.models import open_model, part_of
     from derender.data import read_pictures
     from derender.evaluation.tables import attribute_columns
@@ -105,7 +106,7 @@ def explain(
     with bar("reading") as report:
         pictures = read_pictures(data, net.image_size, dataset=dataset, limit=limit, progress=report)
     pictures = part_of(pictures, part, model)
-    say(pictures.describe())
+    say_pictures(pictures)
     both = None if pair is None else tuple(_row_of(pictures, name) for name in pair)
     with bar("embedding") as report:
         table = embed_pictures(net, pictures, batch_size=batch_size, progress=report)
@@ -126,24 +127,23 @@ def explain(
     checks: list[Similarity] = []
     if out is not None:
         checks = _write(out, net, model, pictures, task, split, found, sheets, rows, seeds, apart, alike)
-    for one in (
+    shown = [
         tables.share_table(found),
         tables.drop_table(found),
         *([tables.sanity_table(checks)] if checks else []),
         *([] if apart is None else [tables.cluster_share_table(apart)]),
         *([] if alike is None else [tables.pair_table(*alike)]),
-    ):
-        show_scores(one, json_file)
-    for line in tables.share_verdicts(found):
-        say(line)
-    for name in tables.untrusted(checks):
-        say(f"not to be trusted, fresh weights give the same map: {name}")
+    ]
+    notes = [
+        *tables.share_verdicts(found),
+        *(f"not to be trusted, fresh weights give the same map: {name}" for name in tables.untrusted(checks)),
+    ]
     if out is None:
-        say("add --out DIR for the page, the chart and maps over pictures")
+        notes.append("add --out DIR for the page, the chart and maps over pictures")
     else:
-        result(f"report {out / 'explain.html'}", json_file)
+        result(f"report {out / 'explain.html'}", published.json_file)
     values = {**found.numbers(), "source": data, "sanity": checks, "clusters": apart, "out": out}
-    write_json(json_file, {**values, "pair": None if alike is None else alike[0]})
+    published.show(shown, {**values, "pair": None if alike is None else alike[0]}, notes)
 
 
 def _row_of(pictures: "PictureSet", name: str) -> int:

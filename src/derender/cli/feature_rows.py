@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from derender.cli.console import bar, say
+from derender.cli.console import bar, say, say_pictures
 
 if TYPE_CHECKING:
     from derender.data import PictureSet
@@ -28,6 +28,7 @@ ControlData = Annotated[
     str | None,
     typer.Option("--data", "-d", help="Pictures: of the model, or of the table for its controls."),
 ]
+DEFAULT_FACTORS = "geometry,albedo"
 Factors = Annotated[str, typer.Option("--factors", help="Features to use, with commas between, or all.")]
 MeanBy = Annotated[
     list[str] | None,
@@ -52,6 +53,15 @@ Cache = Annotated[
         metavar="DIR",
     ),
 ]  # fmt: skip
+WhitenOn = Annotated[
+    str | None,
+    typer.Option(
+        "--whiten-on",
+        help="Also: codes not whitened, and controls whitened by the model's renderings of these pictures "
+        "(give those it was trained on).",
+        metavar="PATH",
+    ),
+]
 UntrainedSeeds = Annotated[
     int, typer.Option("--untrained-seeds", min=1, metavar="N", help="Untrained encoders to average over.")
 ]
@@ -81,6 +91,13 @@ def named_paths(values: Sequence[str], option: str) -> dict[str, list[str]]:
             raise ValueError(f"{option} {value!r} should read NAME=PATH")
         found.setdefault(name, []).append(path)
     return found
+
+
+def model_facts(model: Any) -> dict[str, Any]:
+    """What decides a model's renderings and features, for what is remembered of them."""
+    from derender.features import model_fingerprint
+
+    return {"weights": model_fingerprint(model), "model": model.settings.model_dump(mode="json")}
 
 
 def factors_of(text: str) -> tuple[str, ...] | None:
@@ -134,6 +151,7 @@ class Source:
         limit: int | None,
         device: str,
         cache: str | None,
+        whiten_on: str | None = None,
     ):
         if (features is None) == (model is None):
             raise ValueError("give either --features FILE, or --model M with --data D")
@@ -141,6 +159,12 @@ class Source:
             raise ValueError("--model needs --data: the pictures to embed")
         self.features, self.model, self.device, self.memory = features, model, device, memory_in(cache)
         self.pictures = None if data is None else Pictures(data, dataset, limit)
+        self.whiten_on = whiten_on
+        if whiten_on is not None and model is None:
+            raise ValueError(
+                "--whiten-on renders pictures again, which a table of features cannot: give --model M with "
+                "--data D"
+            )
 
     def row_name(self, factors: str) -> str:
         """What the first row is called."""
@@ -151,6 +175,11 @@ class Source:
         chosen, name = factors_of(factors), self.row_name(factors)
         if self.features is not None:
             rows = rows_from_tables({name: [self.features]}, chosen)
+            table = rows[0].tables[0]
+            if chosen is not None and rows[0].factors is None:
+                if factors != DEFAULT_FACTORS:
+                    table.concatenate(chosen)  # says which factor there is not
+                rows = [replace(rows[0], name=" + ".join(table.factors))]
         else:
             assert self.model is not None and self.pictures is not None
             rows = rows_from_models({name: [self.model]}, self.pictures, chosen, self.device, self.memory)
@@ -160,7 +189,14 @@ class Source:
         settings = architecture(rows)
         size = 64 if settings is None else settings.network.image_size
         pictures = self.pictures_of(size, rows[0].tables[0].files)
-        return [*rows, *control_rows(pictures, settings, chosen, seeds, self.device, self.memory)]
+        controls = control_rows(pictures, settings, chosen, seeds, self.device, self.memory)
+        if self.whiten_on is None:
+            return [*rows, *controls]
+        from derender.cli.whitened_rows import whitened_rows
+
+        more = whitened_rows(self, pictures, factors, seeds, self.whiten_on)
+        ours = [row for row in more if not row.control]
+        return [*rows, *ours, *controls, *(row for row in more if row.control)]
 
     def pictures_of(self, image_size: int, files: Sequence[str]) -> "PictureSet":
         """The pictures of a table's rows, in their order."""
@@ -222,7 +258,7 @@ class Pictures:
                 pictures = read_pictures(
                     self.data, image_size, dataset=self.dataset, limit=self.limit, progress=report
                 )
-            say(pictures.describe())
+            say_pictures(pictures)
             self._read[image_size] = pictures
         return self._read[image_size]
 

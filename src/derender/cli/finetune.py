@@ -5,8 +5,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from derender.cli import options
-from derender.cli.console import bar, duration, result, say, show_scores, write_json
+from derender.cli import options, scoring
+from derender.cli.console import bar, duration, result, say, say_pictures, write_json
+from derender.cli.gathered import gathered
 
 if TYPE_CHECKING:
     from derender.data import PictureSet
@@ -21,11 +22,13 @@ def register(app: typer.Typer) -> None:
     )(finetune)
 
 
+@gathered
 def finetune(
     data: options.Data,
     out: Annotated[
         Path, typer.Option("--out", "-o", help="Run folder to make, or to go on with.", metavar="RUN")
     ],
+    published: scoring.Published,
     label: Annotated[
         list[str] | None,
         typer.Option("--label", "-l", help="Label column to learn; several if each has two values."),
@@ -66,7 +69,6 @@ def finetune(
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the run in --out.")] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Show all settings and stop.")] = False,
     device: options.Device = "auto",
-    json_file: options.Json = None,
 ) -> None:
     """Train the encoders with a head on labels and with the rendering objective at once, then score them.
 
@@ -75,6 +77,7 @@ def finetune(
     """
     from derender.cli.models import chosen_device, open_model
 
+    published.check()
     used = {
         "--label": label, "--attributes": attributes, "--preset": preset, "--weight": weight,
         "--rendering-weight": rendering_weight, "--labelled": labelled, "--factors": factors,
@@ -105,8 +108,8 @@ def finetune(
     if dry_run:
         from derender.training.config import to_yaml
 
-        result(to_yaml(config).rstrip(), json_file)
-        write_json(json_file, config.model_dump(mode="json"))
+        result(to_yaml(config).rstrip(), published.json_file)
+        write_json(published.json_file, config.model_dump(mode="json"))
         return
 
     from derender.data import read_pictures
@@ -114,15 +117,14 @@ def finetune(
     from derender.report.run import decomposition_sheet, run_page
     from derender.report.tables_finetuning import finetuning_table
     from derender.training.loop import Progress, train_task
+    from derender.training.run_folder import refuse_taken
 
-    if out.exists() and any(out.iterdir() if out.is_dir() else [out]) and not resume:
-        raise FileExistsError(
-            f"{out} exists and is not empty: add --resume to go on with that run, or choose another --out"
-        )
+    if not resume:
+        refuse_taken(out)
     with bar("reading") as report:
         size = config.model.network.image_size
         pictures = read_pictures(data, size, dataset=dataset, limit=limit, progress=report)
-    say(pictures.describe())
+    say_pictures(pictures)
     if attributes:
         config = _changed(config, target__labels=_attributes(pictures))
     task = FinetuneTask(config, pictures.images, target_of(pictures, config), start)
@@ -153,15 +155,14 @@ def finetune(
     with bar("scoring", "heads") as report:
         found = score_finetuned(load_finetuned(out, device=accelerator), task, progress=report)
     table = finetuning_table(found, config.start or "fresh weights")
-    show_scores(table, json_file)
-    for name, one in found.versus.items():
-        say(
-            f"{name.replace('_', ' ')}: {one.value:+.3f} ({one.low:+.3f} to {one.high:+.3f}) "
-            f"against {one.rival}, {'above it' if one.above else 'not above it'}"
-        )
-    result(f"model {trained.folder}", json_file)
-    result(f"report {page}", json_file)
-    write_json(json_file, {"run": trained, "report": page, "scores": found.numbers()})
+    notes = [
+        f"{name.replace('_', ' ')}: {one.value:+.3f} ({one.low:+.3f} to {one.high:+.3f}) "
+        f"against {one.rival}, {'above it' if one.above else 'not above it'}"
+        for name, one in found.versus.items()
+    ]
+    result(f"model {trained.folder}", published.json_file)
+    result(f"report {page}", published.json_file)
+    published.show([table], {"run": trained, "report": page, "scores": found.numbers()}, notes)
 
 
 def _config(

@@ -37,8 +37,11 @@ def mesh(
     size: Size = DEFAULT_SIZE,
     texture: Texture = "model",
     grazing: Annotated[
-        float, typer.Option("--grazing", help="Leave out cells turned further from the viewer, in degrees.")
-    ] = 80.0,
+        float,
+        typer.Option(
+            "--grazing", help="Cut the rim off where it is turned further from the viewer, in degrees."
+        ),
+    ] = 85.0,
     device: options.Device = "auto",
     force: options.Force = False,
     json_file: options.Json = None,

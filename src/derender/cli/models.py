@@ -11,10 +11,17 @@ PARTS = ("all", "train", "validation", "test")
 
 
 def open_model(source: str, device: str) -> "Derenderer":
-    """Load a model onto a device named as in ``chosen_device``."""
+    """Load a model onto a device named as in ``chosen_device``; weights that are no numbers are an error."""
     from derender.model import load
 
-    return load(source, device=chosen_device(device))
+    model = load(source, device=chosen_device(device))
+    for name, value in model.state_dict().items():
+        if value.is_floating_point() and not bool(value.isfinite().all()):
+            raise ValueError(
+                f"{source} has weights that are no numbers (first {name}): its training went wrong or the "
+                "file is damaged; take another checkpoint or train again"
+            )
+    return model
 
 
 def chosen_device(device: str) -> str:

@@ -61,6 +61,10 @@ def relight(
         float, typer.Option("--reach", help="How far to the sides the light goes, in degrees.")
     ] = 60.0,
     pitch: Annotated[float, typer.Option("--pitch", help="Light from above, in degrees.")] = 10.0,
+    strength: Annotated[
+        float,
+        typer.Option("--strength", min=0, max=10, help="How many times as strong as the picture's own."),
+    ] = 1.0,
     stills: Count = 7,
     size: Size = DEFAULT_SIZE,
     texture: Texture = "model",
@@ -73,7 +77,8 @@ def relight(
 ) -> None:
     """Write strips and films of pictures in other lights: round from right to left, or to that of --like.
 
-    A light is relative to the object, not to the camera: it falls on the same side of every face.
+    A light is relative to the object, not to the camera: it falls on the same side of every face. Going
+    round, it is as strong as the picture's own, a third of it from everywhere.
     """
     from derender.report import sweeps
 
@@ -82,7 +87,8 @@ def relight(
         before: dict[str, Any] = {}
 
         def lights(t: "Tensor", scene: "Scene") -> dict[str, "Tensor"]:
-            return {"light": sweeps.lights_around(t, reach, pitch)}
+            own = float(scene.light[0, :2].sum())
+            return {"light": sweeps.lights_around(t, reach, pitch, strength * own)}
 
         lights(sweeps.stills(2), work.scenes[0])  # angles out of range are refused before anything is drawn
     else:
@@ -183,7 +189,12 @@ def _angles(reach_deg: float, stills: int) -> Callable[[float], str]:
     if reach_deg <= 0:
         raise ValueError(f"--reach must be above 0 degrees, got {reach_deg:g}")
     decimals = max(0, ceil(-log10(2 * reach_deg / (stills - 1))))
-    return lambda angle_deg: f"yaw {angle_deg:+.{decimals}f}°"
+
+    def written(angle_deg: float) -> str:
+        number = f"{angle_deg:+.{decimals}f}"
+        return f"yaw {number if float(number) else number[1:]}°"
+
+    return written
 
 
 class _Work:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from derender.cli import options
-from derender.cli.console import bar, out_of_the_way, result, say, write_json
+from derender.cli.console import bar, out_of_the_way, result, say, say_pictures, write_json
 
 if TYPE_CHECKING:
     from derender.data import GroundTruth, PictureSet
@@ -96,7 +96,7 @@ def _evidence(
     with bar("reading") as progress:
         size = EXAMINED_PX if net is None else net.image_size
         pictures = read_pictures(data, size, dataset=dataset, limit=limit, progress=progress)
-    say(pictures.describe())
+    say_pictures(pictures)
     for name in labels:
         pictures.label(name)
     if net is None:

@@ -44,6 +44,7 @@ class Asked:
     factors: feature_rows.Factors = "geometry,albedo"
     min_count: feature_rows.MinCount = 1
     max_count: feature_rows.MaxCount = None
+    whiten_on: feature_rows.WhitenOn = None
 
 
 @dataclass(frozen=True)
@@ -58,8 +59,9 @@ class Computed:
     def source(self, asked: Asked) -> "feature_rows.Source":
         """The features that were asked for."""
         return feature_rows.Source(
-            asked.features, asked.model, asked.data, asked.dataset, asked.limit, self.device, self.cache
-        )
+            asked.features, asked.model, asked.data, asked.dataset, asked.limit, self.device, self.cache,
+            asked.whiten_on,
+        )  # fmt: skip
 
     def from_seed(self, count: int) -> range:
         """So many seeds, from ``seed`` on."""

@@ -8,7 +8,7 @@ import typer
 from rich.markup import escape
 
 from derender.cli import options
-from derender.cli.console import bar, out_of_the_way, say, write_json
+from derender.cli.console import bar, out_of_the_way, say, visible, write_json
 
 if TYPE_CHECKING:
     import numpy as np
@@ -41,6 +41,9 @@ def search(
     metric: Annotated[
         str, typer.Option("--metric", help="Distance: cosine or euclidean.", metavar="NAME")
     ] = "cosine",
+    copies: Annotated[
+        bool, typer.Option("--copies", help="Find the picture itself too, and copies of it.")
+    ] = False,
     model: Annotated[
         str | None,
         typer.Option("--model", "-m", help="The model that made the table: for a picture.", metavar="MODEL"),
@@ -64,14 +67,16 @@ def search(
         out_of_the_way(out, force)
         if out.suffix.lower() != ".png":
             raise ValueError(f"{out} is no PNG: give --out a name that ends in .png")
-    from derender.features import FeatureTable, named
-    from derender.features.search import nearest
+    from derender.features import FeatureTable
+    from derender.features.search import nearest, same_picture
 
-    table = FeatureTable.read(features)
-    named(table.factors, factor, "factor")
-    query, own_row = _query(table, features, like, factor, model, device)
-    exclude = () if own_row is None else (own_row,)
-    found = nearest(table, query, factor, k, metric=metric, exclude=exclude)
+    table = FeatureTable.read(features, only=factor)
+    codes, own_row = _query(table, features, like, factor, model, device)
+    itself = same_picture(table, codes).tolist()
+    hidden = [] if copies else itself
+    if len(hidden) == len(table):
+        raise ValueError(f"{features} has no row but {like} itself: add --copies to find that")
+    found = nearest(table, codes[factor], factor, k, metric=metric, exclude=hidden)
     rows, distances = found.rows[0].tolist(), found.distances[0].tolist()
     labels = [name for name in table.labels if name != "partition"][:LABELS_SHOWN]
     where = f"in {features} ({len(table):,} rows)"
@@ -90,7 +95,11 @@ def search(
         json_file,
     )
     if len(rows) < k:
-        say(f"the table has no more than {len(rows):,} other rows")
+        say(f"the table has no more than {len(rows):,} {'rows' if copies else 'other rows'}")
+    others = [table.files[row] for row in hidden if row != own_row]
+    if others:
+        more = f" and {len(others) - 1:,} more" if len(others) > 1 else ""
+        say(f"left out as the very same picture: {others[0]}{more} (--copies finds it)")
     if out is not None:
         _draw(out, table, rows, distances, like, own_row, data, dataset, f"nearest by {factor}")
         say(f"drawn in {out}")
@@ -101,6 +110,7 @@ def search(
             "factor": factor,
             "metric": metric,
             "table": features,
+            "same_picture": [table.files[row] for row in itself],
             "found": [
                 {
                     "row": row,
@@ -126,25 +136,25 @@ def _show(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], jso
             column, justify="right" if column in ("", "distance") else "left", header_style="dim"
         )
     for row in rows:
-        table.add_row(*map(escape, row))
+        table.add_row(*(escape(visible(cell, "")) for cell in row))
     console = Console(stderr=json_file == "-", highlight=False)
     if not console.is_terminal:
         widest = console.options.update(max_width=10_000)
         console.width = max(console.width, console.measure(table, options=widest).maximum)
-    console.print(title, markup=False, soft_wrap=True)
+    console.print(visible(title), markup=False, soft_wrap=True)
     console.print(table, crop=False)
 
 
 def _query(
     table: "FeatureTable", features: str, like: str, factor: str, model: str | None, device: str
-) -> "tuple[np.ndarray, int | None]":
-    """The feature to look for, and the row it has in the table if it is one of its rows.
+) -> "tuple[dict[str, np.ndarray], int | None]":
+    """The features to look for by factor, and the row they have in the table if it is one of its rows.
 
     With a model the name means a file first; without one it means a row.
     """
     row = table.files.index(like) if like in table.files else None
     if row is not None and (model is None or not Path(like).is_file()):
-        return table.factors[factor][row], row
+        return {name: rows[row] for name, rows in table.factors.items()}, row
     if model is None:
         from derender.data.nearest import nearest as did_you_mean
 
@@ -169,7 +179,7 @@ def _query(
     codes = embed_images(net, one_picture(Path(like), net.image_size)[None])
     if factor not in codes:
         raise ValueError(f"{model} makes no {factor!r}; it makes {', '.join(codes)}")
-    return codes[factor][0], None
+    return {name: rows[0] for name, rows in codes.items()}, None
 
 
 def _draw(

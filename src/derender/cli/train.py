@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from derender.cli import options
-from derender.cli.console import bar, duration, result, say, speaks, write_json
+from derender.cli.console import bar, duration, result, say, say_pictures, speaks, write_json
 
 
 def register(app: typer.Typer) -> None:
@@ -91,18 +91,17 @@ def train(
     from derender.training.distributed import first_then_others, leave, open_fabric
     from derender.training.loop import Progress
     from derender.training.loop import train as train_model
+    from derender.training.run_folder import refuse_taken
 
     if resume and not (out / "config.yaml").is_file():
         raise FileNotFoundError(f"no run to resume in {out} (no config.yaml): train without --resume first")
     accelerator = chosen_device(device)
     fabric = open_fabric(accelerator)
-    if speaks() and out.exists() and any(out.iterdir() if out.is_dir() else [out]) and not resume:
-        raise FileExistsError(
-            f"{out} exists and is not empty: add --resume to go on with that run, or choose another --out"
-        )
+    if speaks() and not resume:
+        refuse_taken(out)
     with first_then_others(fabric, local=True), bar("reading") as report:
         pictures = read_pictures(data, picture_size(config), dataset=dataset, limit=limit, progress=report)
-    say(pictures.describe())
+    say_pictures(pictures)
     if pictures.terms:
         say(f"on its owners' terms: {pictures.terms}")
     with bar("training") as report:

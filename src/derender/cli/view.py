@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from derender.cli import options
-from derender.cli.console import bar, result, say, write_json
+from derender.cli.console import result, say, write_json
 
 if TYPE_CHECKING:
     import numpy as np
@@ -67,7 +67,7 @@ def view(
     try:
         from derender.cli.models import open_model
         from derender.report.viewer.app import Application, Viewer
-        from derender.report.viewer.examples import generated_examples, named_examples
+        from derender.report.viewer.examples import named_examples, rendered_examples
         from derender.report.viewer.guard import is_loopback
         from derender.report.viewer.server import serve
         from derender.report.viewer.shelf import Shelf
@@ -76,11 +76,7 @@ def view(
         net = open_model(model, device)
         pictures = _readable(images or [], net.image_size)
         gallery = None if features is None else _gallery(features, data, dataset, model, net)
-        if images:
-            examples = named_examples(pictures)
-        else:
-            with bar("rendering examples") as report:
-                examples = generated_examples(model, net.image_size, progress=report)
+        examples = named_examples(pictures) if images else rendered_examples(model, net.image_size)
         table = None if gallery is None else gallery.table
         studio = Studio(net, Path(model).name, Shelf(keep), _held_out(model), table)
         url = address_of(listener, host)

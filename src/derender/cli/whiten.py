@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from derender.cli import options
-from derender.cli.console import bar, result, say, write_json
+from derender.cli.console import bar, result, say, say_pictures, write_json
 
 
 def register(app: typer.Typer) -> None:
@@ -26,7 +26,7 @@ def whiten(
         list[str] | None,
         typer.Option(
             "--set",
-            help="pictures, views, directions or shrinkage; also what is perturbed, as perturb.light_deg.",
+            help="pictures, views, spatial, directions, shrinkage; what is perturbed, as perturb.light_deg.",
             metavar="KEY=VALUE",
         ),
     ] = None,
@@ -56,7 +56,7 @@ def whiten(
     with bar("reading") as report:
         pictures = read_pictures(data, net.image_size, dataset=dataset, limit=limit, progress=report)
     chosen = part_of(pictures, part, model).require(2)
-    say(chosen.describe())
+    say_pictures(chosen)
     with bar("rendering again") as report:
         net.whitening = fit_whitening(
             net,
@@ -69,11 +69,10 @@ def whiten(
     folder = net.save(out, overwrite=force)
     ratios = {name: net.whitening.get_buffer(f"{name}_ratios").tolist() for name in net.whitening.names}
     for name, values in ratios.items():
-        kept = min(settings.whitening.directions, len(values))
-        clear = sum(value > 1 for value in values[:kept])
+        clear = sum(value > 1 for value in values)
         say(
-            f"{name}: {kept} of {len(values)} directions kept; in {clear} pictures differ more than one "
-            "picture does in other light and from other sides"
+            f"{name}: {len(values)} directions kept; in {clear} pictures differ more than one does in other "
+            "light and from other sides"
         )
     result(f"model {folder}", json_file)
     write_json(json_file, {"model": folder, "pictures": len(chosen), "between_over_within": ratios})

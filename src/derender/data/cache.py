@@ -72,20 +72,21 @@ def read_cache(file: Path, expected: str, image_size: int) -> Cached | None:
                 return None
             stream.seek(end - length)
             note = json.loads(stream.read(length))
+        found, checksum, further = note["fingerprint"], note["checksum"], note.get("further", {})
         loaded = Loaded(
             tuple(note["files"]),
             tuple(Skipped(**row) for row in note["skipped"]),
             tuple(Duplicate(**row) for row in note["duplicates"]),
         )
-    except (OSError, ValueError, LookupError, TypeError):
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
         return None
     count = len(loaded.files)
-    if note["fingerprint"] != expected or end - length != count * 3 * image_size * image_size or not count:
+    if found != expected or end - length != count * 3 * image_size * image_size or not count:
         return None
     images = np.memmap(file, np.uint8, mode="c", shape=(count, 3, image_size, image_size))
-    if sample_checksum(images) != note["checksum"]:
+    if sample_checksum(images) != checksum:
         return None
-    return Cached(images, loaded, note.get("further", {}))
+    return Cached(images, loaded, further)
 
 
 @contextmanager

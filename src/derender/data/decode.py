@@ -10,6 +10,7 @@ picture) cuts out a part first; it is moved and shrunk as far as needed to lie i
 """
 
 import io
+import logging
 import struct
 import threading
 import warnings
@@ -138,6 +139,7 @@ def quiet_pillow() -> Iterator[None]:
 @cache
 def _known_formats() -> tuple[str, ...]:
     """Those of our formats that this build of Pillow opens (AVIF may lack); never PostScript and the like."""
+    logging.getLogger("PIL").addHandler(logging.NullHandler())  # what is wrong with a file is raised, too
     Image.init()
     return tuple(form for form in _FORMATS if form in Image.OPEN)
 

@@ -12,8 +12,10 @@ import io
 import json
 import os
 import stat
+import struct
 import time
 import zipfile
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,6 +30,10 @@ REMEMBERED_FROM = 50_000
 """Folders with this many files or more are remembered."""
 
 SAMPLED = 1_000
+_DAMAGED = (
+    *(OSError, ValueError, LookupError, TypeError, AttributeError, EOFError, RuntimeError),
+    *(zipfile.BadZipFile, zlib.error, struct.error),
+)
 _SETTLED_NS = 2_000_000_000  # what changed a moment ago may change again within one tick of the disk's clock
 
 
@@ -158,7 +164,7 @@ def recall(file: Path, root: str, is_picture: Callable[[str], bool]) -> Remember
             tuple((path, why) for path, why in note["faults"]),
             tuple((path, changed) for path, changed in note["folders"]),
         )
-    except (OSError, ValueError, LookupError, TypeError, EOFError, zipfile.BadZipFile):
+    except _DAMAGED:
         return None
     settled = note["made_ns"] - _SETTLED_NS
     for path, changed in listing.folders:

@@ -8,6 +8,7 @@ archives are not opened.
 """
 
 import lzma
+import stat
 import struct
 import zipfile
 import zlib
@@ -165,7 +166,8 @@ class ZipSource(Source):
         for member in self._archive.infolist():
             file = member.filename.replace("\\", "/")
             parts = file.split("/")
-            if member.is_dir() or any(is_hidden(part) for part in parts if part not in ("", ".", "..")):
+            hidden = any(is_hidden(part) for part in parts if part not in ("", ".", ".."))
+            if hidden or not file or member.is_dir():
                 continue
             if file.startswith("/") or ".." in parts or ":" in parts[0]:
                 skipped.append(Skipped(file, "unsafe name in the zip (absolute or with ..)"))
@@ -233,11 +235,18 @@ def is_picture(file: str) -> bool:
 
 
 def read_bounded(path: Path) -> bytes:
-    """A file's content, or ValueError when it is larger than ``FILE_LIMIT_BYTES``."""
-    size = path.stat().st_size
+    """A file's content; ValueError when it is no regular file or larger than ``FILE_LIMIT_BYTES``."""
+    status = path.stat()
+    if not stat.S_ISREG(status.st_mode):  # a pipe may never end, a device never does
+        raise ValueError("not a regular file")
+    size = status.st_size
     if size > FILE_LIMIT_BYTES:
         raise ValueError(f"file of {size >> 20:,} MiB is larger than {FILE_LIMIT_BYTES >> 20:,} MiB")
-    return path.read_bytes()
+    with path.open("rb") as stream:
+        content = stream.read(size + 1)
+    if len(content) > size:
+        raise ValueError("the file grew while it was read")
+    return content
 
 
 def is_hidden(name: str) -> bool:

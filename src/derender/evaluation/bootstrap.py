@@ -7,7 +7,7 @@ corrections for many comparisons: of twenty rows that are no better than a contr
 better by chance.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -38,7 +38,8 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Difference:
-    """A score less that of the strongest control, on the same resamples.
+    """A score less that of the strongest control, on the same resamples; where lower is better the other way
+    round, so that above 0 is better.
 
     Attributes:
         rival: the strongest control's name.
@@ -92,7 +93,9 @@ def resamples(n_rows: int, count: int = RESAMPLES, seed: int = 0) -> Iterator[np
         yield np.bincount(drawn.ravel(), minlength=size * n_rows).reshape(size, n_rows).astype(np.float32)
 
 
-def estimate(runs: Sequence[float], resampled: np.ndarray, *, centred: bool = False) -> Estimate:
+def estimate(
+    runs: Sequence[float], resampled: np.ndarray, *, centred: bool = False, most: float = np.inf
+) -> Estimate:
     """The mean over runs with its percentile interval.
 
     Args:
@@ -100,10 +103,11 @@ def estimate(runs: Sequence[float], resampled: np.ndarray, *, centred: bool = Fa
         resampled: (B,) the mean over runs on each resample.
         centred: move the resamples so that their mean is the value. Scores of clusters need it: a row drawn
             twice agrees with itself, which makes every resample look purer than the rows are.
+        most: the score's largest value, which no moved resample exceeds.
     """
     value = float(np.mean(runs))
     if centred:
-        resampled = resampled - resampled.mean() + value
+        resampled = np.minimum(resampled - resampled.mean() + value, most)
     low, high = _interval(resampled)
     spread = float(np.std(runs, ddof=1)) if len(runs) > 1 else float("nan")
     return Estimate(value, low, high, spread, resampled)
@@ -114,30 +118,36 @@ def constant(value: float, count: int = RESAMPLES, spread: float = float("nan"))
     return Estimate(value, float("nan"), float("nan"), spread, np.full(count, value))
 
 
-def difference(ours: Estimate, rivals: Mapping[str, Estimate]) -> Difference:
-    """Ours against the highest of the rivals; higher is better.
+def difference(ours: Estimate, rivals: Mapping[str, Estimate], *, lower: bool = False) -> Difference:
+    """Ours against the best of the rivals; higher is better, or with ``lower`` lower.
 
     Where ours has no interval the difference has none, and is not called above.
     """
     if not rivals:
         raise ValueError("there is no control to compare with: give at least one")
-    name = max(rivals, key=lambda rival: rivals[rival].value)
-    low, high = _interval(ours.resampled - rivals[name].resampled)
+    sign = -1 if lower else 1
+    known = [rival for rival, one in rivals.items() if not np.isnan(one.value)] or list(rivals)
+    name = max(known, key=lambda rival: sign * rivals[rival].value)
+    low, high = _interval(sign * (ours.resampled - rivals[name].resampled))
     if np.isnan(ours.low):
         low = high = float("nan")
-    return Difference(name, ours.value - rivals[name].value, low, high, above=low > 0)
+    return Difference(name, sign * (ours.value - rivals[name].value), low, high, above=low > 0)
 
 
-def with_verdicts(rows: Sequence[ScoredRow]) -> tuple[ScoredRow, ...]:
-    """The rows, those that are no controls compared with the strongest control, score by score."""
+def with_verdicts(rows: Sequence[ScoredRow], *, lower: Collection[str] = ()) -> tuple[ScoredRow, ...]:
+    """The rows, those that are no controls compared with the strongest control, score by score.
+
+    Scores named in ``lower`` are better where they are lower.
+    """
     controls = [row for row in rows if row.control]
 
     def judged(row: ScoredRow) -> ScoredRow:
         if row.control or not controls:
             return row
         versus = {
-            name: difference(ours, {c.name: c.scores[name] for c in controls if name in c.scores})
+            name: difference(ours, rivals, lower=name in lower)
             for name, ours in row.scores.items()
+            if (rivals := {c.name: c.scores[name] for c in controls if name in c.scores})
         }
         return ScoredRow(row.name, row.control, row.runs, row.scores, versus)
 

@@ -161,7 +161,9 @@ class _Cells:
 def _row(name: str, plain: np.ndarray, resampled: np.ndarray, control: bool) -> ScoredRow:
     """From (runs, labels, 5) scores and (runs, B, 5) resampled ones."""
     scores = {
-        score: estimate(plain[:, :, at].mean(axis=1).tolist(), resampled[:, :, at].mean(axis=0), centred=True)
+        score: estimate(
+            plain[:, :, at].mean(axis=1).tolist(), resampled[:, :, at].mean(axis=0), centred=True, most=1.0
+        )
         for at, score in enumerate(SCORES)
     }
     return ScoredRow(name, control, len(plain), scores)
@@ -204,5 +206,10 @@ def _numbered(values: np.ndarray, name: str) -> np.ndarray:
         raise ValueError(
             f"clustering needs at least two classes, the {int(known.sum())} labelled rows of {name!r} have "
             f"{classes.max(initial=-1) + 1}: choose another label column"
+        )
+    if classes.max() + 1 == known.sum():
+        raise ValueError(
+            f"every one of the {int(known.sum())} labelled rows of {name!r} is a class of its own: choose a "
+            "label column whose values repeat"
         )
     return classes

@@ -16,6 +16,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from derender.data import GroundTruth
+from derender.evaluation.bootstrap import RESAMPLES, ScoredRow
+from derender.evaluation.picture_scores import picture_rows
 from derender.features import Progress, map_batches
 from derender.scene.camera import rotation_matrix
 from derender.scene.light import light_direction
@@ -49,6 +51,9 @@ class FactorResult:
         light_aligned: of the predictions after the best rotation of all of them at once; its control is
             ``light_control`` too, since a rotation brings any constant to the mean direction.
         camera, camera_control: of the predictions, and of a camera that never turns.
+        albedo_each, albedo_global_each: (N,) of the predictions per picture, NaN where prediction and truth
+            share no pixel.
+        albedo_control_each, albedo_global_control_each: (N,) of the mean true albedo.
     """
 
     albedo: float
@@ -60,6 +65,10 @@ class FactorResult:
     light_aligned: AngleScores
     camera: AngleScores
     camera_control: AngleScores
+    albedo_each: np.ndarray
+    albedo_global_each: np.ndarray
+    albedo_control_each: np.ndarray
+    albedo_global_control_each: np.ndarray
 
 
 def albedo_error(
@@ -147,17 +156,53 @@ def evaluate_factors(
         raise ValueError("prediction and truth share no pixel in any picture: check the camera or the masks")
     constant = (albedo_true.sum(dim=0) / mask_true.sum(dim=0).clamp_min(1)).expand_as(albedo_true)
     direction = _light_in_camera(light_true, camera_true)
+    own, own_global = torch.full((2, len(albedo)), torch.nan, dtype=torch.float64)
+    own[seen] = albedo_error(albedo[seen], albedo_true[seen], both[seen])
+    own_global[seen] = albedo_error(albedo[seen], albedo_true[seen], both[seen], one_scale=True)
+    fixed = albedo_error(constant, albedo_true, mask_true)
+    fixed_global = albedo_error(constant, albedo_true, mask_true, one_scale=True)
     return FactorResult(
-        albedo=albedo_error(albedo[seen], albedo_true[seen], both[seen]).mean().item(),
-        albedo_control=albedo_error(constant, albedo_true, mask_true).mean().item(),
-        albedo_global=albedo_error(albedo[seen], albedo_true[seen], both[seen], one_scale=True).mean().item(),
-        albedo_global_control=albedo_error(constant, albedo_true, mask_true, one_scale=True).mean().item(),
+        albedo=own.nanmean().item(),
+        albedo_control=fixed.mean().item(),
+        albedo_global=own_global.nanmean().item(),
+        albedo_global_control=fixed_global.mean().item(),
         light=light_error(light, camera, light_true, camera_true),
         light_control=_between(direction.mean(dim=0).expand_as(direction), direction),
         light_aligned=light_error(light, camera, light_true, camera_true, aligned=True),
         camera=camera_error(camera, camera_true),
         camera_control=camera_error(torch.zeros_like(camera_true), camera_true),
+        albedo_each=own.numpy(),
+        albedo_global_each=own_global.numpy(),
+        albedo_control_each=fixed.numpy(),
+        albedo_global_control_each=fixed_global.numpy(),
     )
+
+
+def factor_rows(
+    result: FactorResult, untrained: FactorResult | None = None, resample_count: int = RESAMPLES
+) -> tuple[ScoredRow, ...]:
+    """The model beside the best constant answers and an untrained model, with intervals; lower is better."""
+
+    def each(one: FactorResult) -> dict[str, np.ndarray]:
+        angles = {"light": one.light, "aligned": one.light_aligned, "camera": one.camera}
+        return {
+            "albedo": one.albedo_each,
+            "albedo_global": one.albedo_global_each,
+            **{name: scores.each_deg for name, scores in angles.items()},
+        }
+
+    light = result.light_control.each_deg
+    constant = {
+        "albedo": result.albedo_control_each,
+        "albedo_global": result.albedo_global_control_each,
+        "light": light,
+        "aligned": light,
+        "camera": result.camera_control.each_deg,
+    }
+    scores = {"model": each(result), "constant answer": constant}
+    if untrained is not None:
+        scores["untrained model"] = each(untrained)
+    return picture_rows(scores, list(scores)[1:], lower=list(constant), resample_count=resample_count)
 
 
 def _predictions(

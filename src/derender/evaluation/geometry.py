@@ -22,6 +22,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from derender.data import GroundTruth
+from derender.evaluation.bootstrap import RESAMPLES, ScoredRow
+from derender.evaluation.picture_scores import picture_rows
 from derender.features import Progress, map_batches
 from derender.scene.normals import normals_from_depth
 
@@ -180,6 +182,15 @@ def evaluate_geometry(
     average, plane = geometry_controls(truth, model.fov_deg)
     fresh = None if untrained is None else score(untrained, None)
     return GeometryResult(score(model, progress), average, plane, fresh)
+
+
+def geometry_rows(result: GeometryResult, resample_count: int = RESAMPLES) -> tuple[ScoredRow, ...]:
+    """The model beside its controls, ``side`` and ``mad_deg`` with intervals; lower is better."""
+    named = {"model": result.model, "average depth": result.average_depth, "plane": result.plane}
+    if result.untrained is not None:
+        named["untrained model"] = result.untrained
+    scores = {name: {"side": one.side_each, "mad_deg": one.mad_deg_each} for name, one in named.items()}
+    return picture_rows(scores, list(named)[1:], lower=("side", "mad_deg"), resample_count=resample_count)
 
 
 def _truth(truth: GroundTruth) -> tuple[Tensor, Tensor, Tensor | None]:

@@ -125,7 +125,15 @@ def divide_rows(
     if not 0 < test_fraction < 1:
         raise ValueError(f"the tested share must lie between 0 and 1, got {test_fraction}")
     split = split_indices(files, (1 - test_fraction, 0.0, test_fraction), groups=groups)
-    return split.train[known[split.train]], split.test[known[split.test]]
+    learn, test = split.train[known[split.train]], split.test[known[split.test]]
+    if groups is not None and task.kind == "classes" and len(learn) and len(test):
+        learned, tested = (np.any(task.targets[rows] > 0, axis=0) for rows in (learn, test))
+        if not (learned & tested).any():
+            raise ValueError(
+                f"none of the {int(tested.sum())} classes tested is learned from: rows of a group stay on "
+                "one side, and these groups hold whole classes; choose other --groups, or none"
+            )
+    return learn, test
 
 
 def _column(values: np.ndarray, name: str) -> tuple[list[Any], np.ndarray]:

@@ -6,7 +6,9 @@ features or settings are another file. A table that was interrupted goes on wher
 
 import hashlib
 import json
+import struct
 import zipfile
+import zlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -16,6 +18,13 @@ import numpy as np
 from derender.whole import whole_file
 
 Arrays = dict[str, np.ndarray]
+NAMES = "names of all arrays"
+"""Stands beside the arrays in a file: one that a damaged directory of the zip hides is missed."""
+
+_DAMAGED = (
+    *(OSError, ValueError, EOFError, LookupError, RuntimeError),
+    *(zipfile.BadZipFile, zlib.error, struct.error),
+)
 
 
 class Memory:
@@ -48,7 +57,7 @@ class Memory:
             return found
         arrays = make()
         with whole_file(file) as temporary, temporary.open("wb") as stream:
-            np.savez(stream, **arrays)  # pyright: ignore[reportArgumentType]
+            np.savez(stream, **arrays, **{NAMES: np.array(list(arrays))})  # pyright: ignore[reportArgumentType]
         self.made += 1
         return arrays
 
@@ -71,6 +80,10 @@ def _read(file: Path) -> Arrays | None:
     """The arrays of a file; None if there is none or it is damaged (it is made again then)."""
     try:
         with file.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
-            return {name: stored[name] for name in stored.files}
-    except (FileNotFoundError, zipfile.BadZipFile, ValueError, EOFError, KeyError):
+            arrays = {name: stored[name] for name in stored.files}
+        if not all(isinstance(values, np.ndarray) for values in arrays.values()):
+            return None
+        names = arrays.pop(NAMES).tolist() if NAMES in arrays else list(arrays)
+        return arrays if arrays and sorted(names) == sorted(arrays) else None
+    except _DAMAGED:
         return None

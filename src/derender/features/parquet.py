@@ -15,6 +15,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from derender.data.nearest import nearest
 from derender.whole import whole_file
 
 FORMAT = 1
@@ -35,8 +36,8 @@ def write_columns(path: Path, content: Columns) -> None:
     """Write a parquet file; at ``path`` stands the old file or the whole new one, never half of it."""
     if path.is_dir():
         raise ValueError(f"{path} is a folder: name a file to write, such as {path / 'features.parquet'}")
-    with whole_file(path) as temporary:
-        pq.write_table(as_arrow(content), temporary)
+    with whole_file(path, durable=True) as temporary:
+        pq.write_table(as_arrow(content), temporary, write_page_checksum=True)
 
 
 def write_row_groups(path: Path, groups: Iterable[Columns]) -> int:
@@ -46,11 +47,13 @@ def write_row_groups(path: Path, groups: Iterable[Columns]) -> int:
     ``write_columns``: the file reads the same.
     """
     rows, writer = 0, None
-    with whole_file(path) as temporary:
+    with whole_file(path, durable=True) as temporary:
         try:
             for group in groups:
                 table = as_arrow(group)
-                writer = writer or pq.ParquetWriter(temporary, table.schema, use_dictionary=_repeating(group))
+                writer = writer or pq.ParquetWriter(
+                    temporary, table.schema, use_dictionary=_repeating(group), write_page_checksum=True
+                )
                 writer.write_table(table.cast(writer.schema))
                 rows += len(table)
                 del table
@@ -91,12 +94,18 @@ def factor_column(values: np.ndarray) -> pa.Array:
     return pa.FixedSizeListArray.from_arrays(flat, values.shape[1])
 
 
-def read_columns(path: Path) -> Columns:
-    """Read a feature table's file, ours or a similar one made elsewhere."""
+def read_columns(path: Path, only: str | None = None) -> Columns:
+    """Read a feature table's file, ours or a similar one made elsewhere: all its factors, or ``only`` one."""
     if not path.is_file():
         raise FileNotFoundError(f"no feature table at {path}: make one with 'derender embed --out {path}'")
     try:
-        table = pq.ParquetFile(path).read()
+        opened = pq.ParquetFile(path, page_checksum_verification=True)
+        names = _factor_names(opened.schema_arrow, path)
+        if only is not None and only not in names:
+            there = ", ".join(names) or "none"
+            raise ValueError(f"unknown factor {only!r}{nearest(only, names)}; there is {there}")
+        left_out = () if only is None else [name for name in names if name != only]
+        table = opened.read([name for name in opened.schema_arrow.names if name not in left_out])
     except (pa.ArrowException, OSError) as error:
         raise ValueError(f"{path} is not a readable parquet file: make it with 'derender embed'") from error
     if "file" not in table.column_names:
@@ -104,8 +113,7 @@ def read_columns(path: Path) -> Columns:
         raise ValueError(f"{path} has no column 'file' (it has {found}): add one with the pictures' names")
     described = _described(table.schema.metadata, path)
     others = [name for name in table.column_names if name != "file"]
-    lists = [name for name in others if _is_list(table.schema.field(name).type)]
-    factors = described.get("factors", lists)
+    factors = [name for name in names if name not in left_out]
     labels = described.get("labels", [name for name in others if name not in factors])
     if not factors:
         raise ValueError(f"{path} has no column of lists, so no features: make it with 'derender embed'")
@@ -118,6 +126,12 @@ def read_columns(path: Path) -> Columns:
         {name: _label(table.column(name)) for name in labels},
         described.get("origin", {}),
     )
+
+
+def _factor_names(schema: pa.Schema, path: Path) -> Sequence[str]:
+    """What the metadata calls factors; without ours, the columns of lists."""
+    lists = [name for name in schema.names if name != "file" and _is_list(schema.field(name).type)]
+    return _described(schema.metadata, path).get("factors", lists)
 
 
 def _described(metadata: Mapping[bytes, bytes] | None, path: Path) -> dict[str, Any]:

@@ -1,12 +1,15 @@
 """A feature table that is not finished: a folder of parts, each written whole, for a later run to go on with.
 
 ``plan.json`` says what is being made; a part holds some thousand rows, what a resumed run has to know of them
-(positions, digests of pixels), and where to go on. Labels that came with a stream stay as JSON until their
+(positions, digests of pixels), and where to go on. The checksum of a part stands in its name: one that is
+damaged or missing is made again, with those after it. Labels that came with a stream stay as JSON until their
 kinds are known, at the end.
 """
 
 import json
+import re
 import shutil
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,13 +24,14 @@ from derender.data.stream import Kinds, SeenPixels, column_of
 from derender.data.stream.labels import Kind
 from derender.features.batches import Rows
 from derender.features.parquet import Columns, factor_column
-from derender.whole import whole_file
+from derender.whole import Damaged, DamageNoticed, measured, whole_file
 
 PLAN = "plan.json"
 LISTED_SKIPPED = 20
 """So many unreadable pictures of each part are remembered by name; all are counted."""
 
 _KEY = b"derender part"
+_NAME = re.compile(r"part-(\d{6})(?:-([0-9a-f]{8}))?\.parquet")  # earlier versions wrote no checksum
 _OURS = ("file", "position", "digest", "partition", "labels")
 
 
@@ -70,20 +74,19 @@ class Parts:
             raise ValueError(f"{folder} is in the way: delete it")
         found = _plan_of(folder)
         if folder.exists() and found != plan:
-            if not fresh and any(folder.iterdir()):
+            if not fresh and any(not _begun(entry.name) for entry in folder.iterdir()):
                 differs = [name for name in plan if (found or {}).get(name) != plan[name]]
+                how = f"that was made otherwise (differs in {', '.join(differs) or 'its version'})"
                 raise ValueError(
-                    f"{folder} holds an unfinished table that was made otherwise (differs in "
-                    f"{', '.join(differs) or 'its version'}): delete that folder, "
-                    "or add --force to begin anew"
+                    f"{folder} holds an unfinished table {how if found else f'without a sound {PLAN}'}: "
+                    "delete that folder, or add --force to begin anew"
                 )
             shutil.rmtree(folder)
         folder.mkdir(parents=True, exist_ok=True)
         with whole_file(folder / PLAN) as temporary:
             temporary.write_text(json.dumps(plan))
-        self.files = sorted(folder.glob("part-*.parquet"))
-        for file in self.files:
-            self._join(_note_of(pq.read_schema(file)))
+        self.files: list[Path] = []
+        self._join_all(sorted(folder.glob("part-*.parquet")))
 
     def seen(self) -> SeenPixels:
         """The pixels of every row there is."""
@@ -119,9 +122,10 @@ class Parts:
         for name in factors[0] if factors else ():
             columns[f"factor {name}"] = factor_column(np.concatenate([codes[name] for codes in factors]))
         table = pa.table(columns).replace_schema_metadata({_KEY: json.dumps(note).encode()})
-        file = self.folder / f"part-{len(self.files):06d}.parquet"
-        with whole_file(file) as temporary:
+        with whole_file(self.folder / "writing.parquet", durable=True) as temporary:
             pq.write_table(table, temporary, use_dictionary=False)
+            name = f"part-{len(self.files):06d}-{measured(temporary)[1]:08x}.parquet"
+        file = (self.folder / "writing.parquet").rename(self.folder / name)
         del table, columns
         pa.default_memory_pool().release_unused()
         self.files.append(file)
@@ -161,6 +165,22 @@ class Parts:
             self.remove()
         return not self.files
 
+    def _join_all(self, files: list[Path]) -> None:
+        """Take up parts in order, up to the first that is not as it was written; that and later ones go."""
+        for number, file in enumerate(files):
+            try:
+                self._join(_checked_note(file, number))
+                self.files.append(file)
+            except Damaged as problem:
+                warnings.warn(
+                    f"{file} is damaged ({problem}): going on from the {self.so_far.rows:,} rows before it",
+                    DamageNoticed,
+                    stacklevel=2,
+                )
+                for rest in files[number:]:
+                    rest.unlink()
+                return
+
     def _labels(self, table: pa.Table) -> dict[str, np.ndarray]:
         rows = [json.loads(text) if text else {} for text in table["labels"].to_pylist()]
         labels = {}
@@ -185,6 +205,11 @@ def _packed(labels: Mapping[str, Any]) -> str:
     return json.dumps(dict(labels), ensure_ascii=False) if labels else ""
 
 
+def _begun(name: str) -> bool:
+    """Whether a file is what a run leaves that was killed before its first part."""
+    return name.startswith((PLAN, f".{PLAN}", "writing.parquet", ".writing.parquet"))
+
+
 def _plan_of(folder: Path) -> dict[str, Any] | None:
     try:
         plan = json.loads((folder / PLAN).read_text())
@@ -193,5 +218,17 @@ def _plan_of(folder: Path) -> dict[str, Any] | None:
     return plan if isinstance(plan, dict) else None
 
 
-def _note_of(schema: pa.Schema) -> dict[str, Any]:
-    return json.loads((schema.metadata or {})[_KEY])
+def _checked_note(file: Path, number: int) -> dict[str, Any]:
+    """What a part says of itself; ``Damaged`` if it is not the part of this number, as it was written."""
+    name = _NAME.fullmatch(file.name)
+    if name is None or int(name[1]) != number:
+        raise Damaged(f"part {number} is missing")
+    if name[2] is not None and measured(file)[1] != int(name[2], 16):
+        raise Damaged("its checksum differs")
+    try:
+        note = json.loads((pq.read_schema(file).metadata or {})[_KEY])
+        examples = [Skipped(*row) for row in note["examples"]]
+        Progressed(note["following"], note["rows"], note["skipped"], examples, note["copies"])
+    except (pa.ArrowException, OSError, ValueError, LookupError, TypeError) as error:
+        raise Damaged("it cannot be read") from error
+    return note

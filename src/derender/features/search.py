@@ -5,7 +5,7 @@ Exact: every row is compared, in blocks, with one matrix product each, in float6
 in the table's order. Leaves out approximate indices, which pay from some ten million rows on.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +18,8 @@ METRICS = ("cosine", "euclidean")
 BLOCK_ROWS = 4096
 NUMBERS_AT_ONCE = 1 << 23
 """So many distances are held at a time (64 MB)."""
+SAME_PICTURE = 1e-3
+"""Largest relative difference, in every factor, of one picture embedded twice (batches and devices round)."""
 
 
 @dataclass(frozen=True)
@@ -85,6 +87,29 @@ def nearest(
             found[number] = _smallest(row, count)
             distances[number] = row[found[number]]
     return Neighbours(found, distances)
+
+
+def same_picture(table: FeatureTable, codes: Mapping[str, np.ndarray]) -> Int64[np.ndarray, " m"]:
+    """Rows that are a picture itself, or copies of it under other names: alike in every factor they share.
+
+    Args:
+        table: what is searched.
+        codes: (D,) features of the picture by factor; factors that the table lacks are passed over.
+
+    Returns:
+        rows in the table's order, none where picture and table share no factor.
+    """
+    shared = [name for name in codes if name in table.factors]
+    rows = np.arange(len(table) if shared else 0)
+    for name in shared:
+        query = np.asarray(codes[name], dtype=np.float64)
+        near = np.empty(len(rows), bool)
+        for start in range(0, len(rows), BLOCK_ROWS):
+            part = slice(start, start + BLOCK_ROWS)
+            away = np.linalg.norm(table.factors[name][rows[part]] - query, axis=1)
+            near[part] = away <= SAME_PICTURE * np.linalg.norm(query)
+        rows = rows[near]
+    return rows.astype(np.int64)
 
 
 def _distances(query: np.ndarray, rows: np.ndarray, metric: str) -> np.ndarray:

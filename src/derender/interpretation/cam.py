@@ -20,6 +20,7 @@ from torch.nn.functional import interpolate
 from derender.data.nearest import nearest
 from derender.interpretation.probe import Probe
 from derender.interpretation.shares import captum_attr
+from derender.networks.encoders import reading
 
 METHODS = ("grad-cam", "hires-cam", "pixels")
 GREY = 0.5
@@ -79,8 +80,8 @@ def _at_features(
     encoder = model.nets[factor].encoder
     with torch.enable_grad():
         features = encoder.spatial(images).detach().requires_grad_()
-        code = encoder.to_code(features).flatten(1)
-        answer = score(model.features({factor: code})[factor], weight).sum()
+        said = reading(encoder.to_code(features).flatten(1), features)
+        answer = score(model.features({factor: said})[factor], weight).sum()
         (gradient,) = torch.autograd.grad(answer, features)
     return features.detach(), gradient
 
@@ -95,8 +96,8 @@ def pixel_attribution(
     """|IG| of the pixels from a grey picture, summed over colours, and the relative completeness error."""
 
     def answer(pictures: Tensor, own: Tensor | None = None) -> Tensor:
-        code = model.nets[factor].encode(pictures)
-        return score(model.features({factor: code})[factor], own)
+        said = model.nets[factor].read(pictures)
+        return score(model.features({factor: said})[factor], own)
 
     grey = torch.full_like(images[:1], GREY)
     with torch.enable_grad():

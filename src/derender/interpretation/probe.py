@@ -22,6 +22,7 @@ from derender.data.nearest import nearest
 from derender.evaluation.linear_head import PAPER_HEAD, HeadSettings, head_loss
 from derender.evaluation.linear_logistic import axes_of, fit_logistic, solve_logistic
 from derender.evaluation.linear_task import Task
+from derender.networks.tensor_file import disk_errors
 from derender.whole import whole_folder
 
 HEADS = ("logistic", "linear")
@@ -108,7 +109,8 @@ class Probe:
         facts: dict[str, Any] = {"format": FORMAT, "kind": self.kind, "names": list(self.names)}
         facts |= {"sizes": [[name, size] for name, size in self.sizes.items()], "head": self.head}
         with whole_folder(folder) as temporary:
-            save_file({"weight": self.weight, "bias": self.bias}, temporary / WEIGHTS_FILE)
+            with disk_errors(temporary / WEIGHTS_FILE):
+                save_file({"weight": self.weight, "bias": self.bias}, temporary / WEIGHTS_FILE)
             (temporary / CONFIG_FILE).write_text(json.dumps(facts, indent=1))
         return folder
 

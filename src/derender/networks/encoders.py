@@ -4,13 +4,16 @@ Source: unsup3d's networks as pinned in the paper's appendix; the U-Net encoder 
 swaps in for segmentation. No convolution has a bias. Input pictures are 0..1 and are moved to -1..1 here.
 """
 
+import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.nn.functional import adaptive_avg_pool2d
 
 from derender.networks.norm_relu import NormReLU
 from derender.networks.settings import NetworkSettings
 
 CHANNELS_PER_GROUP = 4
+MAX_PLACES = 2048  # numbers of spatial features in a reading
 
 
 def stage_widths(first: int, stages: int) -> list[int]:
@@ -21,6 +24,18 @@ def stage_widths(first: int, stages: int) -> list[int]:
 def norm_relu(channels: int, slope: float = 0.0) -> NormReLU:
     """GroupNorm with four channels a group (16, 32, 64 groups for 64, 128, 256 channels) and a rectifier."""
     return NormReLU(channels, channels // CHANNELS_PER_GROUP, slope)
+
+
+def reading(code: Float[Tensor, "n code"], spatial: Float[Tensor, "n channels y x"]) -> Float[Tensor, "n _"]:
+    """All that an encoder says of pictures: the code, then the last spatial features, row by row.
+
+    Spatial features are averaged over 2x2 places, then over all, where they are more than 2,048 numbers.
+    """
+    side = spatial.shape[-1]
+    while side > 1 and spatial.shape[1] * side**2 > MAX_PLACES:
+        side //= 2
+    pooled = spatial if side == spatial.shape[-1] else adaptive_avg_pool2d(spatial, side)
+    return torch.cat([code, pooled.flatten(1)], dim=1)
 
 
 class Encoder(nn.Module):

@@ -4,6 +4,7 @@ Training, features and evaluation go through these rows only, so that a fifth fa
 highlight, say) is a new row and a renderer that uses it, and nothing else changes.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -13,7 +14,7 @@ from torch import Generator, Tensor, nn
 from torch.nn.functional import pad
 
 from derender.networks.decoders import MapDecoder, VectorDecoder
-from derender.networks.encoders import Encoder, UNetEncoder
+from derender.networks.encoders import Encoder, UNetEncoder, reading
 from derender.networks.settings import NetworkSettings
 from derender.scene.perturb import PerturbSettings, exchange, perturb_camera, perturb_light
 from derender.scene.ranges import SceneRanges
@@ -30,6 +31,11 @@ class FactorNet(nn.Module):
     def encode(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n code"]:
         """The factor's feature, one row per picture (pictures in 0..1)."""
         return self.encoder(images)
+
+    def read(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n _"]:
+        """The feature, followed by the encoder's last spatial features (pictures in 0..1)."""
+        spatial = self.encoder.spatial(images)  # type: ignore[operator]
+        return reading(self.encoder.to_code(spatial).flatten(1), spatial)  # type: ignore[operator]
 
     def decode(self, code: Float[Tensor, "n code"]) -> Tensor:
         """The factor's raw value, before its range is applied."""
@@ -66,6 +72,8 @@ def depth_from_raw(raw: Float[Tensor, "n 1 h w"], ranges: SceneRanges) -> Float[
     centred = (raw - raw.mean(dim=(1, 2, 3), keepdim=True)).squeeze(1)
     if ranges.level_depth:
         centred = level(centred)
+    if ranges.lean_deg:
+        centred = centred + leaning_back(centred.shape[-2:], ranges, centred.device)
     middle, half = (ranges.depth_max + ranges.depth_min) / 2, (ranges.depth_max - ranges.depth_min) / 2
     depth = middle + half * centred.tanh()
     columns = ranges.border_columns(depth.shape[-1])
@@ -84,6 +92,17 @@ def level(values: Float[Tensor, "n h w"]) -> Float[Tensor, "n h w"]:
     window = along[:, None] * across
     slope = (window * down * values).sum(dim=(1, 2)) / (window * down.square()).sum()
     return values - slope[:, None, None] * down
+
+
+def leaning_back(
+    size: tuple[int, int] | torch.Size, ranges: SceneRanges, device: torch.device | str = "cpu"
+) -> Float[Tensor, "h 1"]:
+    """What is added before the tanh so that a flat map leans back by ``lean_deg`` degrees in its middle."""
+    height, width = size
+    focal = (width - 1) / 2 / math.tan(math.radians(ranges.fov_deg) / 2)
+    up = ((height - 1) / 2 - torch.arange(height, device=device)) / focal
+    half = (ranges.depth_max - ranges.depth_min) / 2
+    return math.tan(math.radians(ranges.lean_deg)) * up[:, None] / half
 
 
 def albedo_from_raw(raw: Float[Tensor, "n 3 h w"], ranges: SceneRanges) -> Float[Tensor, "n 3 h w"]:

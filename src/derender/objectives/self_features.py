@@ -10,10 +10,9 @@ import json
 from pathlib import Path
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 from torch import nn
 
+from derender.networks.tensor_file import read_described, write_tensors
 from derender.objectives.frozen import PerceptualFeatures
 
 DEFAULT_WIDTHS = (16, 32, 64)
@@ -32,25 +31,25 @@ class SelfFeatures(PerceptualFeatures):
 
     def save(self, path: Path | str) -> None:
         """Write weights, scale and widths to one safetensors file."""
-        tensors = {name: value.detach().cpu().contiguous() for name, value in self.state_dict().items()}
-        save_file(tensors, path, metadata={"kind": self.kind, "widths": json.dumps(self.widths)})
+        about = {"kind": self.kind, "widths": json.dumps(self.widths)}
+        write_tensors(self.state_dict(), path, about)
 
 
 def load_self_features(path: Path | str) -> SelfFeatures:
     """Read what ``SelfFeatures.save`` wrote."""
     try:
-        with safe_open(path, framework="pt") as file:
-            metadata = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118, not a mapping
-    except (SafetensorError, OSError) as problem:
-        raise ValueError(f"features in {path} cannot be read ({problem}); train them again") from problem
+        tensors, metadata = read_described(path)
+    except (ValueError, OSError) as problem:
+        raise ValueError(f"the perceptual features in {path} cannot be read ({problem})") from problem
     if metadata.get("kind") != SelfFeatures.kind or "widths" not in metadata:
         raise ValueError(f"{path} holds no self-trained perceptual features; something else wrote it")
-    net = SelfFeatures(tuple(json.loads(metadata["widths"])))
     try:
+        net = SelfFeatures(tuple(json.loads(metadata["widths"])))
         net.load_state_dict(tensors)
-    except RuntimeError as problem:
-        raise ValueError(f"{path} does not fit its own widths; train the features again") from problem
+    except (RuntimeError, ValueError, TypeError) as problem:
+        raise ValueError(
+            f"{path} does not fit its own widths; delete it, and they are learnt again"
+        ) from problem
     return net
 
 

@@ -7,6 +7,7 @@ never downloads.
 
 import pickle
 import zipfile
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +27,7 @@ WHERE_TO_GET_IT = (
 # what the readers raise on bytes that are not theirs, the last three from torch.load's restricted unpickler
 _DAMAGED = (
     zipfile.BadZipFile,
+    zlib.error,
     SafetensorError,
     pickle.UnpicklingError,
     RuntimeError,

@@ -22,6 +22,7 @@ _STYLE: dict[Any, Any] = {
     "svg.hashsalt": "derender",
     "font.family": "sans-serif",
     "font.size": 10,
+    "text.parse_math": False,  # names of classes and files are no formulas
     "text.color": _INK,
     "axes.edgecolor": _INK,
     "axes.labelcolor": _INK,
@@ -116,9 +117,11 @@ def side_by_side(
         handles, labels = drawn[0].get_legend_handles_labels()
         if handles:
             figure.legend(handles, labels, loc="outside lower center", ncols=columns or len(handles))
+        svg = _svg(figure)
+        figure.patch.set(facecolor="white", alpha=1)  # a picture file has no page behind it
         stream = BytesIO()
-        figure.savefig(stream, format="png", dpi=150, facecolor="white", metadata={"Software": None})
-        return _svg(figure), stream.getvalue()
+        figure.savefig(stream, format="png", dpi=150, metadata={"Software": None})
+        return svg, stream.getvalue()
 
 
 def _axes(size: tuple[float, float]) -> tuple[Figure, Axes]:

@@ -22,6 +22,7 @@ def comparison_page(
     lead: str = "",
     facts: Mapping[str, object] | None = None,
     failed: Sequence[str] = (),
+    picture: str | None = None,
 ) -> Page:
     """A self-contained page.
 
@@ -31,13 +32,15 @@ def comparison_page(
         lead: one or two sentences under the heading.
         facts: what was compared and how: models, data, seeds, settings.
         failed: a sentence for whatever is missing, with the reason.
+        picture: SVG text that stands over the tables; the first of them then has no chart of its own.
     """
     if not tables:
         raise ValueError("a comparison needs at least one table")
     sections = [
-        Section(f"{number}. {table.caption}", [*chart_of(table), blocks.table(table)], _short(number, table))
+        Section(f"{number}. {table.caption}", [*_above(number, table, picture), blocks.table(table)],
+                _short(number, table))
         for number, table in enumerate(tables, 1)
-    ]
+    ]  # fmt: skip
     missing = [blocks.prose(reason) for reason in failed]
     sections.append(
         Section("What failed", missing or [blocks.prose("Nothing that was noticed.")], "Failed"),
@@ -63,6 +66,15 @@ def chart_of(table: ScoreTable) -> list[Html]:
         alt = f"{column.name} of {', '.join(f'{name} {column.text(v)}' for name, v in values.items())}"
         return [blocks.chart(svg, alt, f"{column.name}; what learned nothing is grey.")]
     return []
+
+
+def _above(number: int, table: ScoreTable, picture: str | None) -> list[Html]:
+    """What stands over a table: its chart, or over the first the picture that was given."""
+    if picture is None or number > 1:
+        return chart_of(table)
+    return [
+        blocks.chart(picture, table.caption, "What learned nothing is grey; whiskers are 95 % intervals.")
+    ]
 
 
 def _short(number: int, table: ScoreTable) -> str:

@@ -174,7 +174,7 @@ def card(hand: AtHand) -> list[Html]:
         matrix_sheet(card_matrices(found)), "matrices of the features: correlation, CKA, swap test"
     )
     return [
-        blocks.prose(f"Swap test: {summary.verdict(4)}. Decoded: {summary.verdict(5)}."),
+        blocks.prose(f"Swap test: {summary.verdict(4)}. Decoded: {summary.verdict(6)}."),
         blocks.table(summary),
         *(blocks.table(table) for table in swap_tables(found)),
         blocks.folded("Matrices", sheet),

@@ -20,7 +20,7 @@ from derender.scene import Scene
 from derender.scene.light import lambert_shading
 from derender.scene.normals import normals_from_depth
 
-OTHER_LIGHT = {"ambient": 0.3, "diffuse": 0.7, "yaw_rad": radians(40), "pitch_rad": radians(10)}
+OTHER_LIGHT = {"ambient_share": 0.3, "yaw_rad": radians(40), "pitch_rad": radians(10)}
 OTHER_VIEW_TURN_RAD = radians(35)
 COLUMN_MEANING = {
     "input": "the picture the model was given",
@@ -94,12 +94,13 @@ def decomposition(
 
 
 def under_another_light(scene: Scene) -> Scene:
-    """The scenes with a strong light from the side opposite to their own."""
+    """The scenes with a light as strong as their own, most of it from the opposite side."""
     light = scene.light
     side = torch.where(light[:, 3] > 0, -1.0, 1.0)
     other = torch.empty_like(light)
-    other[:, 0] = OTHER_LIGHT["ambient"]
-    other[:, 1] = OTHER_LIGHT["diffuse"]
+    strength = light[:, 0] + light[:, 1]
+    other[:, 0] = OTHER_LIGHT["ambient_share"] * strength
+    other[:, 1] = strength - other[:, 0]
     other[:, 2] = OTHER_LIGHT["pitch_rad"]
     other[:, 3] = OTHER_LIGHT["yaw_rad"] * side
     return scene.with_parameters(light=other)

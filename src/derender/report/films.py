@@ -17,16 +17,18 @@ from PIL import Image
 
 from derender.render import Rendering
 from derender.report.colours import Images, on_background, pictures
+from derender.report.sweeps import AMBIENT_SHARE
 from derender.scene import Scene
 
 
 def relighting(
     scene: Scene, render: Callable[[Scene], Rendering], frames: int = 24, reach_deg: float = 45
 ) -> Images:
-    """One scene while its light goes round once, ``reach_deg`` off the axis; a loop."""
+    """One scene while a light as strong as its own goes round once, ``reach_deg`` off the axis; a loop."""
     repeated = _repeated(scene, frames)
     light = repeated.light.clone()
-    light[:, 0], light[:, 1] = 0.35, 0.65
+    strength = light[:, 0] + light[:, 1]
+    light[:, 0], light[:, 1] = AMBIENT_SHARE * strength, (1 - AMBIENT_SHARE) * strength
     for frame in range(frames):
         angle = 2 * pi * frame / frames
         light[frame, 2] = radians(reach_deg) * 0.6 * cos(angle)

@@ -5,8 +5,9 @@ mesh x is right, y UP, z towards the viewer and normals point outward, as in glT
 along +z. That is half a turn about x, (x, y, z) -> (x, -y, 1 - z): handedness stays, and the object's centre
 (0, 0, 1) becomes the origin. Lengths stay scene units. Texture coordinates have their origin at the texture's
 lower left corner. Cells of the pixel grid that are no surface are left out: the border columns that the model
-holds at one depth, cells seen at a grazing angle (on a grid a jump in depth is one), and scraps that hang
-together with the rest nowhere. Leaves out closing the back, and files (``mesh_files``).
+holds at one depth, cells seen at a grazing angle (on a grid a jump in depth is one) where they reach the
+rim, and scraps that hang together with the rest nowhere. A steep flank inside the surface stays: without it
+the surface would have holes. Leaves out closing the back, and files (``mesh_files``).
 """
 
 from dataclasses import dataclass
@@ -24,7 +25,7 @@ from derender.scene import Scene
 from derender.scene.camera import unproject
 from derender.scene.normals import normals_from_depth
 
-GRAZING_DEG = 80.0
+GRAZING_DEG = 85.0
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,8 @@ def mesh_of(scene: Scene, fov_deg: float, border_columns: int = 0, grazing_deg: 
         scene: one scene.
         fov_deg: horizontal field of view.
         border_columns: pixel columns at each side that the model holds at one depth; they are left out.
-        grazing_deg: cells whose surface is turned further from the viewer are left out.
+        grazing_deg: cells whose surface is turned further from the viewer are left out, but for those that
+            the rest of the surface encloses.
 
     Raises:
         ValueError: there are several scenes, or nothing of the surface is left.
@@ -67,7 +69,7 @@ def mesh_of(scene: Scene, fov_deg: float, border_columns: int = 0, grazing_deg: 
     points = unproject(depth, fov_deg)[0]
     inside = torch.ones(height - 1, width - 1, dtype=torch.bool)
     inside[:, :border_columns] = inside[:, width - 1 - border_columns :] = False
-    kept = _largest_piece((inside & _facing(points, grazing_deg)).numpy())
+    kept = _whole_piece((inside & _facing(points, grazing_deg)).numpy())
     if not kept.any():
         raise ValueError(
             f"nothing of this surface is seen at less than {grazing_deg:g} degrees: allow more, or see "
@@ -102,13 +104,13 @@ def _facing(points: Float[Tensor, "h w 3"], grazing_deg: float) -> Tensor:
     return facing
 
 
-def _largest_piece(cells: np.ndarray) -> np.ndarray:
-    """The largest set of cells that hang together by their sides."""
+def _whole_piece(cells: np.ndarray) -> np.ndarray:
+    """The largest set of cells that hang together by their sides, with the holes in it filled."""
     pieces = np.zeros(cells.shape, np.int32)
     ndimage.label(cells, output=pieces)
-    if pieces.max() <= 1:
-        return cells
-    return pieces == 1 + np.argmax(np.bincount(pieces.ravel())[1:])
+    if pieces.max() > 1:
+        cells = pieces == 1 + np.argmax(np.bincount(pieces.ravel())[1:])
+    return np.asarray(ndimage.binary_fill_holes(cells))
 
 
 def _faces(cells: np.ndarray, width: int) -> np.ndarray:

@@ -199,14 +199,25 @@ def factor_table(result: FactorResult, pictures: int, untrained: FactorResult | 
     return ScoreTable(f"Albedo, light and camera on {pictures:,} pictures", "prediction", columns, rows)
 
 
-def reconstruction_table(result: ReconstructionResult, pictures: int) -> ScoreTable:
-    """How well pictures are rendered again, beside the mean picture inside the same masks."""
+def reconstruction_table(result: ReconstructionResult, pictures: int, components: str = "PCA") -> ScoreTable:
+    """How well pictures are rendered again, beside the controls that were scored.
+
+    ``components`` is what the row of principal components is called.
+    """
     columns = (
         Column("L1", "low", 4, "mean absolute difference inside the mask, 0 to 1, best 0"),
         Column("PSNR", "high", 2, "peak signal-to-noise ratio in decibels"),
         Column("SSIM", "high", note="structural similarity of windows inside the mask, at most 1"),
         Column("coverage", None, note="share of all pixels inside the mask"),
     )
-    both = (("model", result.model), ("mean picture", result.mean_picture))
-    rows = [Row(name, (s.l1, s.psnr_db, s.ssim, s.coverage), name != "model") for name, s in both]
+    scored = {"model": result.model, "mean picture": result.mean_picture}
+    if result.components is not None:
+        scored[components] = result.components
+    if result.untrained is not None:
+        scored["untrained model"] = result.untrained
+    notes = {"untrained model": "same networks, fresh weights, inside its own mask"}
+    rows = [
+        Row(name, (s.l1, s.psnr_db, s.ssim, s.coverage), name != "model", notes.get(name, ""))
+        for name, s in scored.items()
+    ]
     return ScoreTable(f"Reconstruction of {pictures:,} pictures", "prediction", columns, rows)

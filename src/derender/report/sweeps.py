@@ -6,7 +6,7 @@ is turned. Leaves out drawing (``sheets``) and files (``moved``).
 """
 
 from collections.abc import Callable
-from math import cos, pi, radians
+from math import cos, inf, pi, radians
 
 import torch
 from jaxtyping import Float
@@ -16,7 +16,8 @@ from derender.render import Rendering
 from derender.report.colours import Images, pictures
 from derender.scene import Scene
 
-AMBIENT, DIFFUSE = 0.35, 0.65
+AMBIENT_SHARE = 0.35
+"""Of the strength of a light that goes round; the rest is diffuse."""
 FRAMES_AT_ONCE = 8
 
 
@@ -34,11 +35,19 @@ def there_and_back(frames: int) -> Float[Tensor, " k"]:
     return torch.tensor([(1 - cos(2 * pi * frame / frames)) / 2 for frame in range(frames)])
 
 
-def lights_around(t: Float[Tensor, " k"], reach_deg: float, pitch_deg: float = 0.0) -> Float[Tensor, "k 4"]:
-    """Lights from the right of the picture (t = 0) to its left (t = 1), ``reach_deg`` off the axis."""
+def lights_around(
+    t: Float[Tensor, " k"], reach_deg: float, pitch_deg: float = 0.0, strength: float = 1.0
+) -> Float[Tensor, "k 4"]:
+    """Lights from the right of the picture (t = 0) to its left (t = 1), ``reach_deg`` off the axis.
+
+    ``strength`` is ambient plus diffuse light; with its own light's, a picture stays as bright as it is.
+    """
     _within("reach", reach_deg, 90)
     _within("pitch", pitch_deg, 90)
-    light = torch.tensor([AMBIENT, DIFFUSE, radians(pitch_deg), 0.0]).repeat(len(t), 1)
+    if not 0 <= strength < inf:
+        raise ValueError(f"the strength of a light must be 0 or more, got {strength}: give such a number")
+    ambient = AMBIENT_SHARE * strength
+    light = torch.tensor([ambient, strength - ambient, radians(pitch_deg), 0.0]).repeat(len(t), 1)
     light[:, 3] = radians(reach_deg) * (2 * t - 1)
     return light
 

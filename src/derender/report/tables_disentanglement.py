@@ -5,14 +5,18 @@ Leaves out computing anything (``derender.evaluation.disentanglement``) and the 
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from derender.evaluation.disentanglement import DisentanglementCard, FeatureScores
+from derender.evaluation.disentanglement import DisentanglementCard, FeatureScores, swap_interval
 from derender.report.score_table import Column, Row, ScoreTable
 
 Reading = Callable[[FeatureScores], float | None]
 
+SWAP_INTERVAL = Column(
+    "95 %", note="interval of the swap test's number before it, over resamples of the pictures"
+)
 _BETWEEN: tuple[tuple[Column, Reading], ...] = (
     (
         Column("PCC image", note="Pearson between two vectors of a picture, -1 to 1, best 0"),
@@ -47,7 +51,18 @@ def summary_table(card: DisentanglementCard) -> ScoreTable:
         f"Disentanglement: {', '.join(card.features)} of {card.n_pictures:,} pictures, mean over "
         f"{_seeds(card)} of all pairs; low correlation alone proves nothing, read it with the swap test"
     )
-    return _table(card, caption, _BETWEEN)
+    table = _table(card, caption, _BETWEEN)
+    columns = [*table.columns[:5], SWAP_INTERVAL, table.columns[5], SWAP_INTERVAL]
+    rows = []
+    for row in table.rows:
+        tests = [scores.swap for scores in card.rows.get(row.name, ()) if scores.swap is not None]
+        both = [_ends(ends) for ends in swap_interval(tests)] if tests else [None, None]
+        rows.append(replace(row, cells=[*row.cells[:5], both[0], row.cells[5], both[1]]))
+    return replace(table, columns=columns, rows=rows)
+
+
+def _ends(ends: tuple[float, float]) -> str | None:
+    return f"{ends[0]:.2f}-{ends[1]:.2f}" if np.isfinite(ends).all() else None
 
 
 def truth_table(card: DisentanglementCard) -> ScoreTable | None:

@@ -24,6 +24,9 @@ class SceneRanges(Settings):
         default=2 / 64, ge=0, lt=0.5
     )  # share of the width, each side, held at border_depth
     level_depth: bool = False  # take each map's slope from top to bottom away: only the camera tilts; ours
+    lean_deg: float = Field(
+        default=0.0, gt=-80, lt=80
+    )  # by how much the top of every depth map starts out further away than upright, seen from above; ours
     ambient: tuple[float, float] = (0.0, 1.0)
     diffuse: tuple[float, float] = (0.0, 1.0)
     light_deg: float = Field(default=45.0, gt=0, lt=90)  # light pitch and yaw lie in +- this

@@ -1,10 +1,12 @@
 """Checkpoints: weights, optimiser and counters, in files that hold no code.
 
-A checkpoint is a folder. It is written beside the old one and then takes its place, so that a run killed at
-any moment leaves a whole checkpoint behind.
+A checkpoint is a folder. It is written beside the old one, read back, and then takes its place, so that a
+run killed at any moment leaves a whole checkpoint behind; beside the last checkpoint of a run the one before
+it is kept. Every file has a checksum.
 """
 
 import json
+import warnings
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,9 +16,11 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
+from derender.networks.tensor_file import disk_errors
 from derender.training.weights import fit_weights
-from derender.whole import whole_folder
+from derender.whole import CHECKSUMS, Damaged, DamageNoticed, check_seal, seal, whole_folder
 
+FORMAT = 1
 WEIGHTS_FILE, OPTIMISER_FILE, STATE_FILE = "model.safetensors", "optimiser.safetensors", "state.json"
 
 
@@ -39,16 +43,65 @@ class TrainState:
     watcher: dict[str, Any] = field(default_factory=dict)
 
 
+class DamagedCheckpoint(Damaged):
+    """A file of a checkpoint is cut off, changed or missing; ``reason`` says which and how."""
+
+    def __init__(self, folder: Path, reason: str):
+        super().__init__(
+            f"the checkpoint {folder} is damaged ({reason}), and there is no whole one before it: delete "
+            f"{folder.parent} to begin this run again with --resume, or train in another folder"
+        )
+        self.reason = reason
+
+
 def save_checkpoint(
-    folder: Path, model: nn.Module, optimiser: torch.optim.Optimizer, state: TrainState
+    folder: Path,
+    model: nn.Module,
+    optimiser: torch.optim.Optimizer,
+    state: TrainState,
+    *,
+    previous: Path | None = None,
 ) -> None:
-    """Write a checkpoint to ``folder``, replacing the one that is there only once the new one is whole."""
+    """Write a checkpoint to ``folder``, which takes the old one's place once it has been read back.
+
+    The old one becomes ``previous`` where that is given, and is deleted otherwise.
+    """
     weights = {name: value.detach().cpu().contiguous() for name, value in model.state_dict().items()}
     tensors, groups = _flatten(optimiser.state_dict())
-    with whole_folder(folder) as temporary:
-        save_file(weights, temporary / WEIGHTS_FILE)
-        save_file(tensors, temporary / OPTIMISER_FILE)
-        (temporary / STATE_FILE).write_text(json.dumps({"state": asdict(state), "groups": groups}))
+    with whole_folder(folder, previous=previous) as temporary:
+        for file, values in ((WEIGHTS_FILE, weights), (OPTIMISER_FILE, tensors)):
+            with disk_errors(temporary / file):
+                save_file(values, temporary / file)
+        described = {"format": FORMAT, "state": asdict(state), "groups": groups}
+        (temporary / STATE_FILE).write_text(json.dumps(described))
+        seal(temporary)
+        _check_written(temporary / WEIGHTS_FILE, weights)
+        _check_written(temporary / OPTIMISER_FILE, tensors)
+
+
+def resume_from(
+    last: Path, previous: Path, model: nn.Module, optimiser: torch.optim.Optimizer
+) -> tuple[TrainState, str | None]:
+    """Load the last checkpoint of a run, or the one before it where the last is damaged or gone.
+
+    Gives the counters (of a run that has no checkpoint yet: zeros), and a sentence where it was not the last
+    one, which is warned of, too.
+
+    Raises:
+        ValueError: both are damaged, or they are of another model.
+    """
+    if not last.exists() and not previous.exists():
+        return TrainState(), None
+    try:
+        return load_checkpoint(last, model, optimiser), None
+    except (DamagedCheckpoint, FileNotFoundError) as problem:
+        if not previous.exists():
+            raise
+        what = f"is damaged ({problem.reason})" if isinstance(problem, DamagedCheckpoint) else "is missing"
+    state = load_checkpoint(previous, model, optimiser)
+    note = f"{last} {what}: going on from the checkpoint before it, of {state.images:,} pictures"
+    warnings.warn(note, DamageNoticed, stacklevel=2)
+    return state, note
 
 
 def load_checkpoint(folder: Path, model: nn.Module, optimiser: torch.optim.Optimizer | None) -> TrainState:
@@ -56,33 +109,73 @@ def load_checkpoint(folder: Path, model: nn.Module, optimiser: torch.optim.Optim
 
     Raises:
         FileNotFoundError: there is none.
-        ValueError: it is damaged, or of another model.
+        DamagedCheckpoint: a file of it is cut off, changed or missing.
+        ValueError: it is of another model, or of a newer version.
     """
-    if not (folder / STATE_FILE).is_file():
+    if not folder.is_dir():
         raise FileNotFoundError(
             f"no checkpoint in {folder}: train without --resume, or give the run's own folder"
         )
+    stored, weights, moments = _read(folder, with_optimiser=optimiser is not None)
     try:
-        stored = json.loads((folder / STATE_FILE).read_text())
         state = TrainState(**stored["state"])
-        fit_weights(model, load_file(folder / WEIGHTS_FILE))
+        fit_weights(model, weights)
         if optimiser is not None:
-            optimiser.load_state_dict(_unflatten(load_file(folder / OPTIMISER_FILE), stored["groups"]))
+            optimiser.load_state_dict(moments)
             _lay_out_like_parameters(optimiser)
-    except (
-        ValueError,
-        KeyError,
-        TypeError,
-        SafetensorError,
-        RuntimeError,
-        OSError,
-    ) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+    except (ValueError, KeyError, TypeError, RuntimeError) as error:
         raise ValueError(
-            f"the checkpoint {folder} is damaged or of another model ({reason}): "
-            "delete it to fall back on checkpoints/best, or train again"
+            f"the checkpoint {folder} is of another model ({_first_line(error)}): "
+            "resume with the settings it was made with, or train in another folder"
         ) from error
     return state
+
+
+def _read(folder: Path, *, with_optimiser: bool) -> tuple[dict[str, Any], dict[str, Tensor], dict[str, Any]]:
+    """State, weights and the optimiser's state of a checkpoint, its checksums compared."""
+    try:
+        stored = json.loads((folder / STATE_FILE).read_text())
+        version = stored.get("format", 0)
+        if version or (folder / CHECKSUMS).exists():  # those of format 0 were not sealed
+            check_seal(folder)
+        if not isinstance(version, int) or version <= FORMAT:
+            tensors = load_file(folder / OPTIMISER_FILE) if with_optimiser else {}
+            return stored, load_file(folder / WEIGHTS_FILE), _unflatten(tensors, stored["groups"])
+    except _DAMAGE as error:
+        raise DamagedCheckpoint(folder, _first_line(error)) from error
+    raise ValueError(
+        f"the checkpoint {folder} was made in format {version}, this version reads up to {FORMAT}: "
+        "update derender"
+    )
+
+
+_DAMAGE = (
+    ValueError,
+    RecursionError,
+    LookupError,
+    TypeError,
+    AttributeError,
+    SafetensorError,
+    OSError,
+)
+"""What readers raise on files that are not as they were written."""
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).splitlines()[0] if str(error) else type(error).__name__
+
+
+def _check_written(file: Path, tensors: dict[str, Tensor]) -> None:
+    """What stands in the file is what was to be written, or an error."""
+    found = load_file(file)
+    if found.keys() != tensors.keys() or not all(_same(found[name], tensors[name]) for name in found):
+        raise OSError(f"{file} reads back other than it was written: check the disk; the old one is kept")
+
+
+def _same(one: Tensor, other: Tensor) -> bool:
+    """Whether two tensors are the same, bit for bit."""
+    pair = [value.contiguous().reshape(-1).view(torch.uint8) for value in (one, other)]
+    return one.dtype == other.dtype and one.shape == other.shape and torch.equal(*pair)
 
 
 def _lay_out_like_parameters(optimiser: torch.optim.Optimizer) -> None:

@@ -5,6 +5,7 @@ Source: the paper, Sec. 4 and its published settings; where the two differ (lear
 """
 
 from collections.abc import Iterable, Mapping
+from reprlib import Repr
 from typing import Any, Literal, TypeVar, overload
 
 import yaml
@@ -49,9 +50,10 @@ class ObjectiveSettings(Settings):
 class WhiteningSettings(Settings):
     """How codes become features after training (networks/whitening.py); no pictures: features are codes."""
 
-    pictures: int = Field(default=2_000, ge=0)  # training pictures that are rendered again
+    pictures: int = Field(default=3_000, ge=0)  # training pictures that are rendered again
     views: int = Field(default=4, ge=1)  # renderings of each
-    directions: int = Field(default=64, ge=1)  # of each factor's code that are kept
+    spatial: bool = True  # read the encoder's last spatial features beside the code
+    directions: int = Field(default=128, ge=1)  # of each factor that are kept, at most as many as its code
     shrinkage: float = Field(default=0.1, ge=0)  # share of the mean variance added to every direction's
 
 
@@ -104,6 +106,9 @@ class TrainConfig(LoopSettings):
 
 
 Config = TypeVar("Config", bound=Settings)
+
+_SHORT = Repr()
+_SHORT.maxstring = _SHORT.maxother = 200  # a few lines of YAML can stand for gigabytes of text
 
 
 def _preset(name: str, **changes: Any) -> TrainConfig:
@@ -182,7 +187,7 @@ def config_from_tree(tree: Mapping[str, Any], kind: type[Settings] = TrainConfig
         key = ".".join(str(part) for part in first["loc"])
         if first["type"] == "extra_forbidden":
             raise ValueError(f"unknown setting {key!r}{nearest(key, setting_names(kind))}") from error
-        raise ValueError(f"setting {key!r}: {first['msg']}, got {first['input']!r}") from error
+        raise ValueError(f"setting {key!r}: {first['msg']}, got {_SHORT.repr(first['input'])}") from error
 
 
 def to_yaml(config: Settings) -> str:
@@ -227,7 +232,7 @@ def _read_value(text: str) -> Any:
     """YAML, and numbers such as 1e-4 that YAML 1.1 takes for words."""
     try:
         value = yaml.safe_load(text)
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise ValueError(
             f"cannot read the value {text!r}: write a number, a word, true, false or [a, b]"
         ) from error

@@ -22,7 +22,7 @@ from torch.utils.tensorboard.writer import SummaryWriter
 from derender.data import PictureSet, Split, split_indices
 from derender.training.allocator import freed_memory_kept
 from derender.training.batches import Batches, random_stream
-from derender.training.checkpoint import TrainState, load_checkpoint, save_checkpoint
+from derender.training.checkpoint import TrainState, resume_from, save_checkpoint
 from derender.training.complete import complete_model
 from derender.training.config import TrainConfig
 from derender.training.derender_task import DerenderTask, sharing_batches
@@ -31,17 +31,17 @@ from derender.training.distributed import Ranks, first_then_others, open_fabric,
 from derender.training.interrupt import TrainingInterrupted, stop_on_signal
 from derender.training.progress import Progress, TrainResult
 from derender.training.run_folder import RunFolder, append_metrics, drop_metrics_after, reopen_run, start_run
-from derender.training.schedule import learning_rate
+from derender.training.schedule import kept, learning_rate, passed
 from derender.training.step import Precision
 from derender.training.step_module import compute_step
 from derender.training.task import SavedModel, StepLosses, Task, Watch
 from derender.training.validate import validate
 from derender.training.watch import Finding
+from derender.whole import whole_file
 
 SAMPLE_COUNT = 8
 LOG_EVERY_STEPS = 50
 MAX_VALIDATION_PICTURES = 1_000
-FIRST_KEPT_IMAGES = 300  # about when the first state of a run with long intervals is kept
 
 SampleSheet = Callable[[Any, Tensor], Image.Image]
 """Draws what a model makes of a few pictures."""
@@ -72,7 +72,7 @@ def train(
         ValueError: pictures and configuration do not fit, or the run to resume has other settings.
         TrainingInterrupted: Ctrl-C or SIGTERM; the run can be resumed.
     """
-    begins = not (resume and RunFolder(Path(out)).last.exists())
+    begins = not (resume and RunFolder(Path(out)).resumable)
     result = train_task(
         DerenderTask(config, begins),
         pictures,
@@ -161,11 +161,15 @@ def _train(
         fused=True,
     )
     module, wrapped = fabric.setup(step, optimiser)
-    state = load_checkpoint(run.last, model, optimiser) if resume and run.last.exists() else TrainState()
+    state, note = TrainState(), None
+    if resume:
+        state, note = resume_from(run.last, run.previous, model, optimiser)
     for group in optimiser.param_groups:
         group.update(betas=settings.betas, weight_decay=settings.weight_decay)
     if ranks.first:
         drop_metrics_after(run, state.images)
+        if note is not None:
+            append_metrics(run, {"kind": "note", "images": state.images, "text": note})
     watcher = task.watch(state.watcher) if config.watch else None
     memory = freed_memory_kept() if fabric.device.type == "cpu" else nullcontext()
     with memory:
@@ -182,6 +186,7 @@ def _train(
                 watcher,
                 sample_sheet,
                 state,
+                fell_back=note is not None,
             ),
             report,
         )
@@ -204,6 +209,7 @@ class _Run:
     state: TrainState
     validation: dict[str, float] = field(default_factory=dict)
     findings: tuple[Finding, ...] = ()
+    fell_back: bool = False  # the last checkpoint is damaged: it is not to become the previous one
 
     def __post_init__(self) -> None:
         self.config = self.task.config
@@ -273,14 +279,17 @@ class _Run:
         with torch.no_grad():
             sheet = self.sample_sheet(self.model, self.held_out[:SAMPLE_COUNT].float() / 255)
         self.model.train()
-        sheet.save(self.folder.samples / f"{self.state.images:09d}.png")
+        with whole_file(self.folder.samples / f"{self.state.images:09d}.png") as temporary:
+            sheet.save(temporary, format="PNG")
 
     def checkpoint(self) -> None:
         """Keep everything a resumed run needs."""
         if not self.ranks.first:
             return
         self.state.watcher = self.watcher.memory() if self.watcher is not None else {}
-        save_checkpoint(self.folder.last, self.model, self.optimiser, self.state)
+        previous = None if self.fell_back else self.folder.previous
+        save_checkpoint(self.folder.last, self.model, self.optimiser, self.state, previous=previous)
+        self.fell_back = False
         if not self.folder.model.exists():
             self.save_model(overwrite=False)
 
@@ -333,14 +342,14 @@ def _go_on(run: _Run, report: Callable[[Progress], None]) -> TrainResult:
             if stopped == "collapse":
                 break
             healthy = run.watcher is None or not run.watcher.uneasy
-            due = partial(_passed, before, state.images, ended=stopped is not None)
-            kept = partial(_kept, before, state.images, ended=stopped is not None)
-            if kept(config.validate_every) and healthy:
+            due = partial(passed, before, state.images, ended=stopped is not None)
+            keep = partial(kept, before, state.images, ended=stopped is not None)
+            if keep(config.validate_every) and healthy:
                 run.validate()
                 stopped = stopped or run.why_stop()
             if due(config.sample_every):
                 run.draw()
-            if (kept(config.checkpoint_every) and healthy) or stop_asked:
+            if (keep(config.checkpoint_every) and healthy) or stop_asked:
                 run.checkpoint()
             if stop_asked and stopped is None:
                 run.close()
@@ -374,22 +383,3 @@ def describe_data(pictures: PictureSet, split: Split) -> dict[str, Any]:
         "skipped": len(pictures.skipped),
         "duplicates": len(pictures.duplicates),
     }
-
-
-def _passed(before: int, now: int, interval: int, *, ended: bool) -> bool:
-    """Whether a multiple of ``interval`` lies in (before, now], or the run has ended."""
-    return ended or now // interval > before // interval
-
-
-def _kept(before: int, now: int, interval: int, *, ended: bool) -> bool:
-    """Whether a state in (before, now] is to be kept: as ``_passed``, and at halves of the first interval.
-
-    Those (half, a quarter, ... down to ``FIRST_KEPT_IMAGES``) see to it that a collapse, which happens early
-    if at all, leaves a good state behind whatever the interval.
-    """
-    early = interval // 2
-    while early >= FIRST_KEPT_IMAGES:
-        if before < early <= now:
-            return True
-        early //= 2
-    return _passed(before, now, interval, ended=ended)

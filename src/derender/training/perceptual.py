@@ -1,5 +1,6 @@
 """The perceptual features of a run: learnt or loaded once, kept in its folder, the same after a resume."""
 
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,7 +10,7 @@ from torch import Tensor
 from derender.objectives.perceptual import PerceptualFeatures, build_perceptual
 from derender.objectives.self_features import SelfFeatures, load_self_features
 from derender.training.config import TrainConfig
-from derender.whole import whole_file
+from derender.whole import DamageNoticed, whole_file
 
 
 def prepare_perceptual(
@@ -26,7 +27,12 @@ def prepare_perceptual(
     if objective.perceptual == "none" or objective.perceptual_weight == 0:
         return None
     if objective.perceptual == "self" and file.exists():
-        return load_self_features(file).to(images.device)
+        try:
+            return load_self_features(file).to(images.device)
+        except ValueError as problem:
+            warnings.warn(
+                f"{problem}: they are learnt again, from the same seed", DamageNoticed, stacklevel=2
+            )
     features = build_perceptual(
         objective.perceptual,
         images,

@@ -1,6 +1,7 @@
 """What a run leaves on disk, and the rules under which a folder may be written.
 
-config.yaml, environment.json, metrics.jsonl, samples/, checkpoints/{last,best}, model/, tensorboard/.
+config.yaml, environment.json, metrics.jsonl, samples/, checkpoints/ (last, the previous one, best), model/,
+tensorboard/.
 """
 
 import json
@@ -16,13 +17,14 @@ import yaml
 
 from derender.settings import Settings
 from derender.training.config import Config, TrainConfig, config_from_tree, to_yaml
-from derender.whole import whole_file
+from derender.whole import remove_abandoned, whole_file
 
 _MAY_CHANGE_ON_RESUME = (
     *("images", "minutes", "validate_every", "sample_every", "checkpoint_every", "patience", "watch"),
     "accumulate",
     "optimiser",  # a run that the watcher stopped goes on with a smaller rate
 )
+_BEGUN = ("environment.json", ".environment.json-", ".config.yaml-")  # there before config.yaml
 _REPORTED_PACKAGES = ("derender", "torch", "numpy", "numba", "lightning-fabric", "safetensors", "pillow")
 
 
@@ -49,6 +51,16 @@ class RunFolder:
         return self.path / "checkpoints" / "last"
 
     @property
+    def previous(self) -> Path:
+        """The checkpoint before the last."""
+        return self.path / "checkpoints" / "previous"
+
+    @property
+    def resumable(self) -> bool:
+        """Whether there is a checkpoint to go on from."""
+        return self.last.exists() or self.previous.exists()
+
+    @property
     def best(self) -> Path:
         return self.path / "checkpoints" / "best"
 
@@ -67,15 +79,29 @@ def start_run(path: Path, config: Settings, data: dict[str, Any], device: str) -
     Raises:
         FileExistsError: the folder is not empty.
     """
-    if path.exists() and (not path.is_dir() or any(path.iterdir())):
-        raise FileExistsError(
-            f"{path} exists and is not empty: add --resume to go on with that run, or choose another --out"
-        )
+    refuse_taken(path)
     run = RunFolder(path)
     run.samples.mkdir(parents=True, exist_ok=True)
-    write_text(run.config, to_yaml(config))
     write_text(path / "environment.json", json.dumps({**environment(device), "data": data}, indent=1))
+    write_text(run.config, to_yaml(config))
     return run
+
+
+def refuse_taken(path: Path) -> None:
+    """A place for a new run that holds anything is an error, but for what a run leaves that hardly began.
+
+    Raises:
+        FileExistsError: the folder is not empty.
+    """
+    if not path.exists():
+        return
+    for entry in path.iterdir() if path.is_dir() else [path]:
+        empty = entry.name == "samples" and entry.is_dir() and not any(entry.iterdir())
+        if not empty and not entry.name.startswith(_BEGUN):
+            raise FileExistsError(
+                f"{path} exists and is not empty: add --resume to go on with that run, "
+                "or choose another --out"
+            )
 
 
 def reopen_run(path: Path, config: Settings) -> RunFolder:
@@ -97,6 +123,8 @@ def reopen_run(path: Path, config: Settings) -> RunFolder:
             f"{path} was trained with another {key} ({stored[key]}, now {asked[key]}): "
             "resume with the same settings, or start a new run in another folder"
         )
+    for written in (run.last, run.best, run.model, run.config, run.metrics, run.perceptual):
+        remove_abandoned(written)
     write_text(run.config, to_yaml(config))
     return run
 
@@ -125,7 +153,7 @@ def read_config_tree(path: Path) -> dict[str, Any]:
     file = path / "config.yaml"
     try:
         tree = yaml.safe_load(file.read_text())
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise ValueError(f"{file} is damaged: restore it, or start a new run in another folder") from error
     if not isinstance(tree, dict):
         raise ValueError(f"{file} is damaged: restore it, or start a new run in another folder")

@@ -5,7 +5,7 @@ encoded again, several times. This is LOOCC's perturbation, of all vector factor
 instead of during it. Leaves out the codes of the vector factors themselves, which are to move.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import torch
 from jaxtyping import Float, Shaped
@@ -21,6 +21,9 @@ from derender.training.step import fill_uncovered
 
 BATCH_SIZE = 128
 
+Describe = Callable[[Float[Tensor, "n 3 h w"]], Mapping[str, Float[Tensor, "n _"]]]
+"""Readings by name of pictures in 0..1: the code, then what else there is."""
+
 
 def fit_whitening(
     model: Derenderer,
@@ -28,17 +31,22 @@ def fit_whitening(
     settings: WhiteningSettings,
     perturb: PerturbSettings,
     *,
+    describe: Describe | None = None,
+    size: int | None = None,
     seed: int = 0,
     progress: Callable[[int, int], None] | None = None,
 ) -> Whitening:
-    """The map from a trained model's codes of geometry and albedo to its features.
+    """The map from what a trained model reads of geometry and albedo to its features.
 
     Args:
         model: trained; left as it is.
         images: what it was trained on, uint8 or float in 0..1; as many as the settings say are drawn.
         settings: how many pictures and views, how many directions are kept.
         perturb: how far light and camera are changed.
-        seed: of the draw.
+        describe: whose readings are measured on the model's renderings, all of them; by default the model's
+            own of geometry and albedo.
+        size: of the features; by default that of the model's code, or of all that ``describe`` says.
+        seed: of the draw; the same pictures and renderings whoever describes them.
         progress: called with (pictures done, pictures in all).
 
     Raises:
@@ -46,8 +54,11 @@ def fit_whitening(
     """
     generator = torch.Generator().manual_seed(seed)
     chosen = torch.randperm(len(images), generator=generator)[: settings.pictures]
-    names = [factor.name for factor in model.factors if factor.mirrored]
-    found: dict[str, list[Tensor]] = {name: [] for name in names}
+    if not len(chosen):
+        raise ValueError("whitening needs at least 2 pictures, got 0")
+    own = [factor.name for factor in model.factors if factor.mirrored]
+    say = describe or (model.read if settings.spatial else model.encode)
+    found: dict[str, list[Tensor]] = {}
     was_training = model.training
     model.eval()
     try:
@@ -55,20 +66,24 @@ def fit_whitening(
             for start in range(0, len(chosen), BATCH_SIZE):
                 rows = chosen[start : start + BATCH_SIZE].to(images.device)
                 batch = as_float(images[rows]).to(model.device)
-                codes = model.encode(batch)
-                scene = model.decode(codes)
-                views = [codes]
-                for _ in range(settings.views):
-                    views.append(model.encode(_seen_otherwise(model, scene, batch, perturb, generator)))
-                for name in names:
-                    found[name].append(torch.stack([view[name].float() for view in views]).cpu())
+                scene = model.decompose(batch)
+                views = [say(batch)]
+                views += [
+                    say(_seen_otherwise(model, scene, batch, perturb, generator))
+                    for _ in range(settings.views)
+                ]
+                for name in own if describe is None else views[0]:
+                    joined = torch.stack([view[name].float() for view in views]).cpu()
+                    found.setdefault(name, []).append(joined)
                 if progress is not None:
                     progress(min(start + BATCH_SIZE, len(chosen)), len(chosen))
     finally:
         model.train(was_training)
+    if describe is None:
+        size = model.settings.network.code_size
     return Whitening(
         {
-            name: contrast(torch.cat(parts, dim=1), settings.directions, settings.shrinkage)
+            name: contrast(torch.cat(parts, dim=1), settings.directions, settings.shrinkage, size)
             for name, parts in found.items()
         }
     ).to(model.device)

@@ -15,6 +15,7 @@ from derender.baselines.stylegan2.adversarial import (
     path_lengths,
     path_penalty,
     r1_penalty,
+    r1_weight_of,
 )
 from derender.baselines.stylegan2.generator import GeneratorSettings
 
@@ -52,16 +53,36 @@ def test_r1_of_a_linear_score_is_half_its_squared_slope(generator):
     torch.testing.assert_close(found, score[1].weight.square().sum() / 2)
 
 
+def test_r1_weighs_by_size_and_batch_unless_told(model, generator):
+    by_size = AdversarialObjective()
+    assert r1_weight_of(by_size, 1024, 32) == pytest.approx(6.5536)
+    assert r1_weight_of(by_size, 64, 32) == pytest.approx(0.0256)
+    assert r1_weight_of(AdversarialObjective(r1_weight=0.0), 64, 32) == 0
+    images = torch.rand(4, 3, 8, 8, generator=generator)
+    found = []
+    for objective in (by_size, AdversarialObjective(r1_weight=3.0)):
+        model.steps.zero_()
+        found.append(adversarial_losses(model, images, objective, generator, nullcontext)["r1"])
+    torch.testing.assert_close(found[1], 3 / (2e-4 * 64 / 4) * found[0])
+
+
 def test_path_lengths_are_those_of_the_jacobian(model, generator):
-    net, w = model.learner, torch.randn(2, TINY.codes, 6, generator=generator)
+    """One column for each number of W+, by central differences of the pictures."""
+    net, w = model.learner.double(), torch.randn(2, TINY.codes, 6, generator=generator, dtype=torch.float64)
     state = generator.get_state()
     found = path_lengths(net, w, generator)
     generator.set_state(state)
     noise = net.random_noise(2, generator)
-    direction = torch.randn(2, 3, 8, 8, generator=generator) / 8
-    jacobian = torch.autograd.functional.jacobian(lambda x: net(x, noise), w)
-    pulled = torch.einsum("nchw,nchwmkd->mkd", direction, jacobian)
-    torch.testing.assert_close(found, pulled.square().sum(dim=2).mean(dim=1).sqrt(), rtol=1e-4, atol=1e-6)
+    direction = torch.randn(2, 3, 8, 8, generator=generator).double() / 8
+    numbers = TINY.codes * 6
+    steps = 1e-5 * torch.eye(numbers, dtype=torch.float64).reshape(numbers, TINY.codes, 6)
+    with torch.no_grad():
+        for picture in range(2):
+            here = [level[picture : picture + 1] for level in noise]
+            after, before = (net(w[picture] + sign * steps, here) for sign in (1, -1))
+            pulled = ((after - before) / 2e-5 * direction[picture]).sum(dim=(1, 2, 3))
+            wanted = (pulled.square().sum() / TINY.codes).sqrt()
+            torch.testing.assert_close(found[picture].detach(), wanted, rtol=1e-6, atol=0.0)
 
 
 def test_path_penalty_moves_its_mean_towards_the_lengths(model, generator):

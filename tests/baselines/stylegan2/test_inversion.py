@@ -25,8 +25,9 @@ from derender.training.run_folder import read_metrics
 
 TINY = GeneratorSettings(image_size=32, style_size=6, mapping_layers=2, channel_base=64, channel_max=6)
 GENERATOR = ["image_size=32", "style_size=6", "mapping_layers=2", "channel_base=64", "channel_max=6"]
-ENCODER = ["image_size=32", "width=4", "units=[1,1,1,1]", "self_features_steps=2", "first_release=16"]
-COMMON = ["batch_size=8", "checkpoint_every=24", "validate_every=24", "sample_every=48", "deterministic=true"]
+REGULARISED = ["r1_every=3", "path_every=2"]  # in both halves of a run of four steps
+ENCODER = ["image_size=32", "width=4", "units=[1,1,1,1]", "self_features_steps=2", "first_release=8"]
+COMMON = ["batch_size=8", "checkpoint_every=16", "validate_every=16", "sample_every=32", "deterministic=true"]
 
 
 @pytest.fixture(autouse=True)
@@ -50,10 +51,10 @@ def runs(blobs, tmp_path_factory):
     """A finished run of a generator and one of its inversion."""
     folder = tmp_path_factory.mktemp("runs")
     for name, own in (
-        ("stylegan2", GENERATOR),
+        ("stylegan2", [*GENERATOR, *REGULARISED]),
         ("e4e", [*ENCODER, f"generator={folder / 'stylegan2'}"]),
     ):
-        one = task(name, 48, *own)
+        one = task(name, 32, *own)
         train_task(one, blobs, folder / name, sample_sheet=baseline_sheet(one.shown))
     torch.use_deterministic_algorithms(False)
     return folder
@@ -112,9 +113,9 @@ def test_losses_are_zero_for_what_the_generator_made_from_its_mean_code(model, g
 
 @pytest.mark.parametrize("name", ["stylegan2", "e4e"])
 def test_a_resumed_run_ends_with_the_very_weights_of_an_undisturbed_one(name, runs, blobs, tmp_path):
-    own = GENERATOR if name == "stylegan2" else [*ENCODER, f"generator={runs / 'stylegan2'}"]
-    train_task(task(name, 24, *own), blobs, tmp_path / "parts")
-    train_task(task(name, 48, *own), blobs, tmp_path / "parts", resume=True)
+    own = [*GENERATOR, *REGULARISED] if name == "stylegan2" else [*ENCODER, f"generator={runs / 'stylegan2'}"]
+    train_task(task(name, 16, *own), blobs, tmp_path / "parts")
+    train_task(task(name, 32, *own), blobs, tmp_path / "parts", resume=True)
     whole, parts = (
         load_file(run / "checkpoints" / "last" / WEIGHTS_FILE) for run in (runs / name, tmp_path / "parts")
     )
@@ -130,7 +131,7 @@ def test_runs_leave_models_that_embed(runs, blobs):
     generator = open_generator(runs / "stylegan2")
     state = model.generator.state_dict()
     assert all(torch.equal(value, state[key]) for key, value in generator.state_dict().items())
-    assert model.seen == 48 and not torch.equal(model.centre, torch.zeros_like(model.centre))
+    assert model.seen == 32 and not torch.equal(model.centre, torch.zeros_like(model.centre))
     rows = read_metrics(runs / "e4e")
     assert {"reconstruction", "perceptual", "delta", "prior", "l1"} <= rows[0].keys()
     held_out = [row for row in rows if row["kind"] == "validation"][-1]
@@ -147,7 +148,7 @@ def test_a_run_without_a_generator_is_refused_before_a_folder_is_made(runs, blob
         ([f"generator={tmp_path / 'none.pt'}"], r"get stylegan2-ffhq-config-f\.pt"),
     ):
         with pytest.raises((ValueError, FileNotFoundError), match=told):
-            train_task(task("e4e", 48, *ENCODER, *more), blobs, tmp_path / "run")
+            train_task(task("e4e", 32, *ENCODER, *more), blobs, tmp_path / "run")
         assert not (tmp_path / "run").exists()
     with pytest.raises(ValueError, match="32, 64, 128, 256"):
         with_changes(E4eConfig(), ["image_size=48"])

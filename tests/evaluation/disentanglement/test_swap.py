@@ -31,14 +31,17 @@ class Reader(torch.nn.Module):
         super().__init__()
         self.mix, self.covered, self.frozen, self.seen = mix, covered, frozen, []
 
-    def encode(self, images):
+    def read(self, images):
         rows = [images[:, 0, row] * (0 if self.frozen and row == 2 else 1) for row in range(3)]
         mean = torch.stack(rows).sum(dim=0)
         names = (factor.name for factor in FACTORS)
         return {name: (1 - self.mix) * row + self.mix * mean for name, row in zip(names, rows, strict=True)}
 
-    def features(self, codes):
-        return codes
+    def codes(self, readings):
+        return readings
+
+    def features(self, readings):
+        return readings
 
     def decode(self, codes):
         depth = codes["geometry"][:, None].expand(-1, 4, 4)

@@ -141,7 +141,9 @@ def test_it_learns_beside_the_controls_and_leaves_its_start_alone(pictures, tmp_
         "accuracy"
     ].rival != "fine-tuned"
     table = finetuning_table(found, "fresh weights").values()
-    assert list(table) == ["fine-tuned", "frozen, logistic", "frozen, paper's head", "majority"]
+    controls = ["untrained encoder, logistic", "PCA (6), logistic", "pixels, logistic", "majority"]
+    assert list(table) == ["fine-tuned", "frozen, logistic", "frozen, paper's head", *controls]
+    assert rows["pixels, logistic"] > 0.9  # brightness is in the pixels themselves
     assert all(torch.equal(value, before[name]) for name, value in start.state_dict().items())
     assert not any(parameter.requires_grad for parameter in start.parameters())
     changed = derender.load(tmp_path / "run").state_dict()

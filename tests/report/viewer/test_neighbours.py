@@ -6,6 +6,7 @@ from PIL import Image
 
 from derender.data import read_pictures
 from derender.features import FeatureTable, embed_pictures
+from derender.features.search import nearest
 from derender.report.viewer.app import Application, Viewer
 from derender.report.viewer.neighbours import Gallery
 from derender.report.viewer.refused import Refused
@@ -30,7 +31,7 @@ def table(model, folder) -> FeatureTable:
     return embed_pictures(model, read_pictures(folder, SIZE), origin={"data": str(folder)})
 
 
-def test_a_picture_of_the_table_is_its_own_neighbour(model, folder, table, client):
+def test_neighbours_of_a_picture_of_the_table(model, folder, table, client):
     viewer = Viewer(Studio(model, "tiny", Shelf(2), table=table), gallery=Gallery(table))
     with serving(Application(viewer)) as url:
         visitor = type(client)(url)
@@ -39,13 +40,16 @@ def test_a_picture_of_the_table_is_its_own_neighbour(model, folder, table, clien
         }  # fmt: skip
         name = visitor.post("/api/pictures", (folder / "3.png").read_bytes()).json["picture"]
         found = visitor.post("/api/neighbours", {"picture": name, "factor": "albedo", "k": 3}).json["rows"]
-        assert [found[0]["file"], found[0]["row"]] == ["3.png", 3]
-        assert found[0]["distance"] == pytest.approx(0, abs=1e-6)
+        rows = table.factors["albedo"]
+        first = nearest(table, rows[3], "albedo", 1, exclude=[3])  # itself is no neighbour
+        assert [found[0]["row"], found[0]["file"]] == [first.rows[0, 0], f"{first.rows[0, 0]}.png"]
+        assert found[0]["distance"] == pytest.approx(first.distances[0, 0], abs=1e-5)
         assert [row["distance"] for row in found] == sorted(row["distance"] for row in found)
         assert all(row["image"].startswith("data:image/png;base64,") for row in found)
         other = visitor.post("/api/rows/4").json["picture"]
         asked = {"picture": name, "swaps": {"albedo": other}, "factor": "albedo", "k": 1}
-        assert visitor.post("/api/neighbours", asked).json["rows"][0]["file"] == "4.png"
+        second = nearest(table, rows[4], "albedo", 1, exclude=[4])
+        assert visitor.post("/api/neighbours", asked).json["rows"][0]["row"] == second.rows[0, 0]
         reply = visitor.post("/api/neighbours", {"picture": name, "factor": "albdo"})
         assert (reply.status, "albedo" in reply.error) == (422, True)
         assert visitor.post("/api/rows/6").status == 404

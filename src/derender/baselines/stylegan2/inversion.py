@@ -40,8 +40,8 @@ class InversionObjective(Settings):
 
     generator: str | None = None  # run folder of a stylegan2, or a published .pt file
     perceptual_weight: float = Field(default=0.8, ge=0)
-    delta_weight: float = Field(default=2e-4, ge=0)
-    prior_weight: float = Field(default=1e-3, ge=0)
+    delta_weight: float = Field(default=5e-5, ge=0)  # the original's 2e-4, whose pictures are -1..1
+    prior_weight: float = Field(default=1e-4, ge=0)  # a random code is about 42 (squared) from the mean code
     first_release: int = Field(default=10_000, ge=0)  # pictures until then all layers share one code
     release_every: int = Field(default=2_000, ge=1)  # pictures from one code to the next
     self_features_steps: int = Field(default=600, ge=1)

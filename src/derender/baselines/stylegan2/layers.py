@@ -12,7 +12,7 @@ from typing import Literal
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.nn.functional import conv2d, conv_transpose2d, leaky_relu, linear, pad
+from torch.nn.functional import conv2d, conv_transpose2d, leaky_relu, linear
 
 FILTER = (0.125, 0.375, 0.375, 0.125)
 """Binomial taps that every change of resolution goes through; they add up to 1."""
@@ -34,21 +34,19 @@ def upfirdn(
     As scipy.signal.upfirdn along each axis; ``padding`` is counted after the zeros, before and behind, and
     cuts where it is negative. Zeros lie outside.
     """
-    n, channels, height, width = images.shape
-    if up > 1:
-        images = pad(images.reshape(n, channels, height, 1, width, 1), (0, up - 1, 0, 0, 0, up - 1))
-        images = images.reshape(n, channels, height * up, width * up)
-    images = pad(images, (*padding, *padding))
-    return _filtered(_filtered(images, taps, 3, down), taps, 2, down)
+    down_rows, along_rows = (_band(side, taps, up, down, padding) for side in images.shape[2:])
+    return down_rows.T @ (images @ along_rows)
 
 
-def _filtered(images: Tensor, taps: Tensor, axis: int, down: int) -> Tensor:
-    """Every ``down``-th value of the convolution along one axis, where the taps lie wholly inside."""
-    last = images.shape[axis] - len(taps) + 1
-    around = (slice(None),) * axis
-    shifts = (images[(*around, slice(start, start + last, down))] for start in range(len(taps)))
-    found, *others = (shift * tap for shift, tap in zip(shifts, taps.flip(0).unbind(), strict=True))
-    return sum(others, found)
+def _band(
+    side: int, taps: Float[Tensor, " k"], up: int, down: int, padding: tuple[int, int]
+) -> Float[Tensor, "side outputs"]:
+    """The resampling of one axis as a matrix; on a CPU a product is faster than shifted sums."""
+    outputs = (side * up + sum(padding) - len(taps)) // down + 1
+    starts = down * torch.arange(outputs, device=taps.device) - padding[0]
+    tap = len(taps) - 1 + starts - up * torch.arange(side, device=taps.device)[:, None]
+    inside = (tap >= 0) & (tap < len(taps))
+    return torch.where(inside, taps[tap.clamp(0, len(taps) - 1)], 0.0)
 
 
 def upsample(images: Float[Tensor, "n c h w"], taps: Float[Tensor, " k"]) -> Float[Tensor, "n c h2 w2"]:
@@ -182,13 +180,13 @@ class EqualConv(nn.Module):
 
     def forward(self, images: Float[Tensor, "n i h w"]) -> Float[Tensor, "n o h2 w2"]:
         weight = self.weight / sqrt(self.weight[0].numel())
-        kernel = weight.shape[-1]
+        kernel, bias = weight.shape[-1], self.bias
+        if bias is not None:
+            weight, bias = GAIN * weight, GAIN * bias  # as well as behind the activation, and cheaper
         if self.down:
             around = len(FILTER) - 2 + kernel - 1
             images = upfirdn(images, self.taps, padding=((around + 1) // 2, around // 2))
-            found = conv2d(images, weight, stride=2)
+            found = conv2d(images, weight, bias, stride=2)
         else:
-            found = conv2d(images, weight, padding=kernel // 2)
-        if self.bias is None:
-            return found
-        return leaky_relu(found + self.bias[:, None, None], SLOPE) * GAIN
+            found = conv2d(images, weight, bias, padding=kernel // 2)
+        return found if bias is None else leaky_relu(found, SLOPE)

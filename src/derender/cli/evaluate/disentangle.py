@@ -5,8 +5,8 @@ from typing import Annotated
 
 import typer
 
-from derender.cli import options, scoring
-from derender.cli.console import bar, out_of_the_way, result, say
+from derender.cli import feature_rows, options, scoring
+from derender.cli.console import bar, out_of_the_way, result, say_pictures
 from derender.cli.gathered import gathered
 
 
@@ -42,6 +42,7 @@ def disentangle(
     batch_size: options.BatchSize = 64,
     seed: options.Seed = 0,
     device: options.Device = "auto",
+    cache: feature_rows.Cache = None,
 ) -> None:
     """Does each feature hold its own factor? Correlation, CKA, swap test; on rendered data DCI, MIG, SAP."""
     if dimensions not in ("lasso", "trees", "none"):
@@ -56,11 +57,11 @@ def disentangle(
     from derender.evaluation.disentanglement import evaluate_disentanglement
     from derender.report import tables_disentanglement as tables
 
-    net = open_model(model, device)
+    net, memory = open_model(model, device), feature_rows.memory_in(cache)
     with bar("reading") as report:
         pictures = read_pictures(data, net.image_size, dataset=dataset, limit=limit, progress=report)
     pictures = part_of(pictures, part, model)
-    say(pictures.describe())
+    say_pictures(pictures)
     with bar("scoring", "steps") as report:
         card = evaluate_disentanglement(
             net,
@@ -69,14 +70,15 @@ def disentangle(
             dimensions=None if dimensions == "none" else dimensions,
             swap_pictures=swap_pictures,
             batch_size=batch_size,
+            memory=memory,
             progress=report,
         )
     summary = tables.summary_table(card)
     truth = (tables.truth_table(card), tables.dimension_table(card), tables.factor_r2_table(card))
     shown = [summary, *tables.swap_tables(card), *(table for table in truth if table is not None)]
-    notes = [
-        f"{name}: {summary.verdict(column)}" for column, name in ((4, "swap test"), (5, "swap test, decoded"))
-    ]
+    places = {column.name: place for place, column in enumerate(summary.columns)}
+    told = (("swap", "swap test"), ("decoded", "swap test, decoded"))
+    notes = [f"{name}: {summary.verdict(places[column])}" for column, name in told]
     if out is not None:
         from derender.report.matrices import card_matrices, matrix_sheet
         from derender.whole import whole_file
@@ -89,6 +91,6 @@ def disentangle(
         "pictures": card.n_pictures,
         "features": dict(zip(card.features, card.dimensions, strict=True)),
         "seeds": list(range(seed, seed + seeds)),
-        "rows": card.rows,
+        "rows": card.numbers(),
     }
-    published.show(shown, values, notes)
+    published.show(shown, values, [*notes, scoring.remembered(memory)])

@@ -4,9 +4,12 @@ from typing import Annotated
 
 import typer
 
-from derender.cli import options, scoring
-from derender.cli.console import bar, say
+from derender.cli import feature_rows, options, scoring
+from derender.cli.console import bar, say, say_pictures
 from derender.cli.gathered import gathered
+
+FITTED = 2_000  # pictures that give the principal components
+RECONSTRUCTION_SHOWN = {"L1": ("l1", 1.0), "PSNR": ("psnr_db", 1.0), "SSIM": ("ssim", 1.0)}
 
 
 def register(group: typer.Typer) -> None:
@@ -32,27 +35,59 @@ def reconstruction(
             help="Keep the errors with the model, to tell odd pictures: give pictures it did not see.",
         ),
     ] = False,
+    resamples: feature_rows.Resamples = 1_000,
+    seed: options.Seed = 0,
     device: options.Device = "auto",
+    cache: feature_rows.Cache = None,
 ) -> None:
-    """How well are pictures rendered again? L1, PSNR and SSIM inside the mask, beside the mean picture."""
+    """How well are pictures rendered again? L1, PSNR and SSIM inside the mask, beside controls.
+
+    These are the mean picture, 64 principal components of the pixels, and an untrained model.
+    """
     published.check()
+    import numpy as np
+
+    from derender.baselines.controls import untrained_twin
     from derender.cli.models import open_model, part_of
     from derender.data import read_pictures
-    from derender.evaluation import evaluate_reconstruction, mean_picture
+    from derender.evaluation import ReconstructionResult, evaluate_reconstruction, mean_picture
+    from derender.evaluation.memory_values import recall_value
+    from derender.evaluation.reconstruction import component_count, reconstruction_rows
     from derender.model import model_folder
     from derender.report.score_table import reconstruction_table
+    from derender.report.tables_pictures import picture_verdicts, with_intervals
     from derender.training.held_out_errors import errors_of, write_errors
 
     net = open_model(model, device)
     with bar("reading") as report:
         pictures = read_pictures(data, net.image_size, dataset=dataset, limit=limit, progress=report)
+    say_pictures(pictures)
     chosen = part_of(pictures, part, model)
-    mean = mean_picture((pictures if part == "all" else part_of(pictures, "train", model)).images)
+    fitted = (pictures if part == "all" else part_of(pictures, "train", model)).images
+    memory = feature_rows.memory_in(cache)
+    components = fitted[np.linspace(0, len(fitted) - 1, min(len(fitted), FITTED)).astype(int)]
+    inputs = {
+        **feature_rows.model_facts(net), "images": chosen.images, "fitted": fitted, "seed": seed,
+    }  # fmt: skip
     with bar("rendering") as report:
-        found = evaluate_reconstruction(net, chosen.images, mean=mean, batch_size=batch_size, progress=report)
-    scores = reconstruction_table(found, len(chosen))
-    values = {"pictures": len(chosen), "part": part, "reconstruction": found}
-    published.show([scores], values, [f"the model is {scores.verdict(0)}"])
+        found = recall_value(
+            memory, "reconstruction", inputs, ReconstructionResult,
+            lambda: evaluate_reconstruction(
+                net, chosen.images, mean=mean_picture(fitted), components_of=components,
+                untrained=untrained_twin(net, seed), batch_size=batch_size, progress=report,
+            ),
+        )  # fmt: skip
+    name = f"PCA ({component_count(len(components))})"
+    scores = reconstruction_table(found, len(chosen), name)
+    rows = reconstruction_rows(found, len(components), resamples)
+    values = {
+        "pictures": len(chosen), "part": part, "reconstruction": found,
+        "intervals": {row.name: row.numbers() for row in rows},
+    }  # fmt: skip
+    notes = picture_verdicts(rows[0], RECONSTRUCTION_SHOWN, scores.columns)
+    published.show(
+        [with_intervals(scores, rows, RECONSTRUCTION_SHOWN)], values, [*notes, scoring.remembered(memory)]
+    )
     if store:
         kept = write_errors(model_folder(model), errors_of(net, chosen.images, batch_size))
         say(f"errors of {len(chosen):,} pictures kept in {kept}")

@@ -18,6 +18,9 @@ The nose tip (the front-most vertex of the mean) is brought to z = 0.947 as in t
 not look around and lids do not move unless the expressions say so.
 """
 
+import struct
+import zipfile
+import zlib
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -35,6 +38,10 @@ from derender.data.synthetic.settings import FaceSettings
 _PICTURE_WIDTH = 2.0 * float(np.tan(np.deg2rad(5.0)))  # scene units across the picture at z = 1
 _LIMIT = 2.5
 _REQUIRED = ("mean", "triangles", "components", "std")
+_DAMAGED = (
+    *(OSError, ValueError, AttributeError, LookupError, EOFError, RuntimeError),
+    *(zipfile.BadZipFile, zlib.error, struct.error),
+)
 _SKIN = MASK_CLASSES.index("skin")
 
 
@@ -72,7 +79,7 @@ class MorphableFaces:
         try:
             with np.load(path, allow_pickle=False) as archive:
                 arrays = {name: archive[name] for name in archive.files}
-        except (OSError, ValueError, AttributeError) as problem:
+        except _DAMAGED as problem:
             raise ValueError(f"{path} cannot be read as .npz: {problem}") from problem
         try:
             return _checked(arrays)

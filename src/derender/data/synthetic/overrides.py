@@ -30,7 +30,7 @@ def changed(settings: Kind, overrides: Iterable[str]) -> Kind:
             raise ValueError(f"unknown setting {key.strip()!r}; there are {', '.join(_names(tree))}")
         try:
             branch[last] = yaml.safe_load(text)
-        except yaml.YAMLError as error:
+        except (yaml.YAMLError, ValueError, RecursionError) as error:
             raise ValueError(f"cannot read the value {text!r} of {key.strip()}") from error
     try:
         return type(settings).model_validate(tree)

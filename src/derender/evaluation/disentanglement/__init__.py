@@ -13,6 +13,7 @@ from derender.evaluation.disentanglement.card import (
     evaluate_disentanglement,
     random_pixels,
     shuffled_rows,
+    swap_interval,
 )
 from derender.evaluation.disentanglement.ground_truth_scores import (
     GroundTruthScores,
@@ -58,6 +59,7 @@ __all__ = [
     "random_pixels",
     "shuffled_rows",
     "similarity",
+    "swap_interval",
     "swap_test",
     "true_factors",
 ]

@@ -7,19 +7,24 @@ untrained one have it alone. Without true factors among the labels that part is 
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from functools import cache
 from typing import Any
 
 import numpy as np
 
 from derender.baselines.controls import untrained_twin
 from derender.data import PictureSet
+from derender.evaluation.bootstrap import LEVEL
 from derender.evaluation.disentanglement.ground_truth_scores import GroundTruthScores, ground_truth_scores
 from derender.evaluation.disentanglement.pearson import PearsonScores, correlation_matrix, pearson
 from derender.evaluation.disentanglement.similarity import SimilarityScores, similarity
 from derender.evaluation.disentanglement.swap import SwapScores, swap_test
-from derender.evaluation.disentanglement.true_factors import true_factors
-from derender.features import embed_images
+from derender.evaluation.disentanglement.true_factors import TrueFactor, true_factors
+from derender.evaluation.memory import Memory
+from derender.evaluation.memory_values import recall_value
+from derender.features import embed_images, model_fingerprint
+from derender.features.table import check_finite
 
 MODEL, UNTRAINED, SHUFFLED, PIXELS = "model", "untrained encoder", "shuffled rows", "random pixels"
 MIN_PICTURES = 20
@@ -60,6 +65,21 @@ class DisentanglementCard:
     dimensions: tuple[int, ...]
     n_pictures: int
 
+    def numbers(self) -> dict[str, Any]:
+        """Every score of every row and seed as JSON takes it; no matrix of all dimensions, no resamples."""
+
+        def told(scores: FeatureScores) -> dict[str, Any]:
+            parts = {field.name: getattr(scores, field.name) for field in fields(scores)}
+            swap = scores.swap
+            if swap is not None:
+                shown = {field.name: getattr(swap, field.name) for field in fields(swap)}
+                del shown["resampled"]
+                ends = swap_interval([swap])
+                parts["swap"] = {**shown, "ratio_95": ends[0], "ratio_parameters_95": ends[1]}
+            return parts
+
+        return {name: [told(scores) for scores in results] for name, results in self.rows.items()}
+
 
 def evaluate_disentanglement(
     model: Any,
@@ -69,6 +89,7 @@ def evaluate_disentanglement(
     dimensions: str | None = "lasso",
     swap_pictures: int = 256,
     batch_size: int = 64,
+    memory: Memory | None = None,
     progress: Callable[[int, int], object] | None = None,
 ) -> DisentanglementCard:
     """Fill the card.
@@ -82,18 +103,41 @@ def evaluate_disentanglement(
             None leaves them out.
         swap_pictures: at most so many pictures, drawn anew for each seed, go through the swap test.
         batch_size: pictures at a time; changes speed and memory only.
+        memory: where the scores of each row and seed are kept.
         progress: called with (steps done, steps in all).
     """
     count = pictures.require(MIN_PICTURES, "the disentanglement card").images.shape[0]
     if not seeds:
         raise ValueError("the card needs at least one seed")
-    features = embed_images(model, pictures.images, batch_size=batch_size)
     factors = true_factors(pictures.labels)
+    kept = memory or Memory()
+    inputs = _inputs(model, pictures, factors) if kept.folder is not None else {}
+
+    @cache
+    def features() -> dict[str, np.ndarray]:
+        found = embed_images(model, pictures.images, batch_size=batch_size)
+        check_finite(found, pictures.files)
+        return found
+
+    @cache
+    def fresh(seed: int) -> tuple[Any, dict[str, np.ndarray]]:
+        twin = untrained_twin(model, seed)
+        return twin, embed_images(twin, pictures.images, batch_size=batch_size)
+
+    def whole() -> dict[str, np.ndarray]:
+        lengths = np.array([values.shape[1] for values in features().values()])
+        return {
+            "names": np.array(list(features())),
+            "sizes": lengths,
+            "correlations": correlation_matrix(features()),
+        }
+
+    found = kept.recall("card-correlations", inputs, whole)
+    sizes = dict(zip(found["names"].tolist(), found["sizes"].tolist(), strict=True))
     rows: dict[str, list[FeatureScores]] = {name: [] for name in (MODEL, UNTRAINED, SHUFFLED, PIXELS)}
     done, total = 0, len(seeds) * len(rows)
 
-    def add(name: str, blocks: Mapping[str, np.ndarray], seed: int, net: Any = None) -> None:
-        nonlocal done
+    def scored(blocks: Mapping[str, np.ndarray], seed: int, net: Any = None) -> FeatureScores:
         swap = None
         if net is not None:
             chosen = np.sort(np.random.default_rng(seed).permutation(count)[:swap_pictures])
@@ -101,22 +145,46 @@ def evaluate_disentanglement(
         truth = None
         if len(factors) >= 2:
             truth = ground_truth_scores(blocks, factors, dimensions=dimensions, seed=seed)
-        rows[name].append(FeatureScores(pearson(blocks), similarity(blocks, seed=seed), truth, swap))
-        done += 1
-        if progress is not None:
-            progress(done, total)
+        return FeatureScores(pearson(blocks), similarity(blocks, seed=seed), truth, swap)
 
-    sizes = {name: values.shape[1] for name, values in features.items()}
+    made: dict[str, Callable[[int], FeatureScores]] = {
+        MODEL: lambda seed: scored(features(), seed, model),
+        UNTRAINED: lambda seed: scored(fresh(seed)[1], seed, fresh(seed)[0]),
+        SHUFFLED: lambda seed: scored(shuffled_rows(features(), seed), seed),
+        PIXELS: lambda seed: scored(random_pixels(pictures.images, sizes, seed), seed),
+    }
     for seed in seeds:
-        add(MODEL, features, seed, model)
-        twin = untrained_twin(model, seed)
-        fresh = embed_images(twin, pictures.images, batch_size=batch_size)
-        add(UNTRAINED, fresh, seed, twin)
-        add(SHUFFLED, shuffled_rows(features, seed), seed)
-        add(PIXELS, random_pixels(pictures.images, sizes, seed), seed)
-    return DisentanglementCard(
-        tuple(features), rows, correlation_matrix(features), tuple(sizes.values()), count
-    )
+        for name, make in made.items():
+            how = {"row": name, "seed": seed, "dimensions": dimensions, "swap_pictures": swap_pictures}
+            one = recall_value(
+                kept, "card", {**inputs, **how}, FeatureScores, lambda make=make, seed=seed: make(seed)
+            )
+            rows[name].append(one)
+            done += 1
+            if progress is not None:
+                progress(done, total)
+        fresh.cache_clear()
+    return DisentanglementCard(tuple(sizes), rows, found["correlations"], tuple(sizes.values()), count)
+
+
+def swap_interval(tests: Sequence[SwapScores]) -> tuple[tuple[float, float], tuple[float, float]]:
+    """The 95 % intervals of the mean over seeds of the swap test's ratio, of features and of decoded
+    parameters; NaN where a ratio is not known."""
+    drawn = np.mean([test.resampled for test in tests], axis=0)
+    if not len(drawn) or not np.isfinite(drawn).all():
+        return (np.nan, np.nan), (np.nan, np.nan)
+    low, high = np.quantile(drawn, [(1 - LEVEL) / 2, (1 + LEVEL) / 2], axis=0)
+    return (float(low[0]), float(high[0])), (float(low[1]), float(high[1]))
+
+
+def _inputs(model: Any, pictures: PictureSet, factors: Sequence[TrueFactor]) -> dict[str, Any]:
+    """What decides the card, besides seeds and options."""
+    return {
+        "weights": model_fingerprint(model),
+        "settings": model.settings.model_dump(mode="json"),
+        "images": pictures.images,
+        **{f"factor {factor.name}": factor.values for factor in factors},
+    }
 
 
 def shuffled_rows(features: Mapping[str, np.ndarray], seed: int) -> dict[str, np.ndarray]:

@@ -17,7 +17,7 @@ of training (training/step.py). Leaves out whether a swapped picture looks right
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -25,6 +25,7 @@ import torch
 from torch import Tensor
 
 from derender.data import as_float
+from derender.evaluation.bootstrap import RESAMPLES, resamples
 from derender.features import Progress
 from derender.scene import Scene
 from derender.scene.perturb import derangement
@@ -47,6 +48,7 @@ class SwapScores:
         ratio, ratio_parameters: mean of the diagonal over mean of the rest; 1 where nothing is disentangled,
             more is better.
         n_pictures: how many pictures each number is a mean of.
+        resampled: (B, 2) ``ratio`` and ``ratio_parameters`` on resamples of the pictures, for intervals.
     """
 
     factors: tuple[str, ...]
@@ -58,6 +60,7 @@ class SwapScores:
     ratio: float
     ratio_parameters: float
     n_pictures: int
+    resampled: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)), repr=False)
 
 
 def swap_test(
@@ -98,12 +101,16 @@ def swap_test(
             plain = _seen_again(model, scenes, images, parameters, batch_size, report)
             moved, moved_parameters = np.zeros((2, len(names), len(names)))
             moved_pixels, arrived = np.zeros((2, len(names)))
-            apart = {key: _distance(value, value[donor]) or math.nan for key, value in plain.items()}
+            apart_each = {key: _distances(value, value[donor]) for key, value in plain.items()}
+            apart = {key: float(each.mean()) or math.nan for key, each in apart_each.items()}
+            moves: dict[str, list[np.ndarray]] = {key: [] for key in plain}
             for row, name in enumerate(names):
                 value = scenes.parameters[parameters[name]]
                 exchanged = scenes.with_parameters(**{parameters[name]: value[donor]})
                 seen = _seen_again(model, exchanged, images, parameters, batch_size, report)
-                far = {key: _distance(seen[key], plain[key]) / apart[key] for key in plain}
+                for key in plain:
+                    moves[key].append(_distances(seen[key], plain[key]))
+                far = {key: float(moves[key][-1].mean()) / apart[key] for key in plain}
                 moved[row] = [far[f"feature {other}"] for other in names]
                 moved_parameters[row] = [far[f"parameter {other}"] for other in names]
                 moved_pixels[row] = far["pixels"]
@@ -123,7 +130,32 @@ def swap_test(
         diagonal_over_rest(moved),
         diagonal_over_rest(moved_parameters),
         len(images),
+        np.stack(
+            [
+                _resampled(
+                    [moves[f"{kind} {name}"] for name in names], [apart_each[f"{kind} {n}"] for n in names]
+                )
+                for kind in ("feature", "parameter")
+            ],
+            axis=1,
+        ),
     )
+
+
+def _resampled(moves: list[list[np.ndarray]], apart: list[np.ndarray]) -> np.ndarray:
+    """(B,) mean of the diagonal over mean of the rest on resamples of the pictures.
+
+    Args:
+        moves: for every column, for every row, (N,) how far each picture's feature moved.
+        apart: for every column, (N,) how far each picture is from its donor.
+    """
+    weights = np.concatenate(list(resamples(len(apart[0]), RESAMPLES))).astype(np.float64)
+    between = np.stack([weights @ each for each in apart])  # (columns, B)
+    moved = np.stack([[weights @ each for each in column] for column in moves])  # (columns, rows, B)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = moved / between[:, None]
+        own = np.eye(len(apart), dtype=bool)
+        return share[own].mean(axis=0) / share[~own].mean(axis=0)
 
 
 def diagonal_over_rest(moved: np.ndarray) -> float:
@@ -141,9 +173,9 @@ def _decompose(model: Any, images: np.ndarray, batch_size: int) -> tuple[Scene, 
     """Scenes of pictures and the features they were decoded from, on the CPU."""
     scenes, codes = [], []
     for start in range(0, len(images), batch_size):
-        code = model.encode(as_float(images[start : start + batch_size]).to(model.device))
-        scenes.append(model.decode(code).to("cpu"))
-        codes.append({name: value.float().cpu() for name, value in model.features(code).items()})
+        readings = model.read(as_float(images[start : start + batch_size]).to(model.device))
+        scenes.append(model.decode(model.codes(readings)).to("cpu"))
+        codes.append({name: value.float().cpu() for name, value in model.features(readings).items()})
     joined = {name: torch.cat([scene.parameters[name] for scene in scenes]) for name in scenes[0].parameters}
     return Scene.from_parameters(joined), {name: torch.cat([c[name] for c in codes]) for name in codes[0]}
 
@@ -163,8 +195,8 @@ def _seen_again(
         rendering = model.render(scenes[rows].to(model.device))
         pictures = as_float(images[rows]).to(model.device)
         shown = fill_uncovered(rendering.image.float(), rendering.mask.float(), pictures)
-        codes = model.encode(shown)
-        decoded, features = model.decode(codes).parameters, model.features(codes)
+        readings = model.read(shown)
+        decoded, features = model.decode(model.codes(readings)).parameters, model.features(readings)
         part = {f"feature {name}": features[name] for name in parameters}
         part |= {f"parameter {name}": decoded[parameter] for name, parameter in parameters.items()}
         parts.append({key: value.float().cpu() for key, value in (part | {"pixels": shown}).items()})
@@ -172,6 +204,11 @@ def _seen_again(
     return {key: torch.cat([part[key] for part in parts]) for key in parts[0]}
 
 
+def _distances(a: Tensor, b: Tensor) -> np.ndarray:
+    """(N,) Euclidean distances of rows."""
+    return (a.double() - b.double()).flatten(1).norm(dim=1).numpy(force=True)
+
+
 def _distance(a: Tensor, b: Tensor) -> float:
     """Mean over rows of the Euclidean distance."""
-    return (a.double() - b.double()).flatten(1).norm(dim=1).mean().item()
+    return float(_distances(a, b).mean())

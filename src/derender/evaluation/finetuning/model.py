@@ -6,12 +6,11 @@ from pathlib import Path
 
 import torch
 from jaxtyping import Float
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from derender.evaluation.linear_head import probabilities
 from derender.model import Derenderer, load
+from derender.networks.tensor_file import read_tensors, write_tensors
 from derender.whole import whole_folder
 
 HEAD_FILE, HEAD_CONFIG_FILE = "head.safetensors", "head.json"
@@ -61,11 +60,10 @@ class FinetunedModel(nn.Module):
         folder = Path(folder)
         if folder.exists() and not overwrite:
             raise FileExistsError(f"{folder} exists already: choose another folder or pass overwrite=True")
-        head = {name: value.detach().cpu().contiguous() for name, value in self.head.state_dict().items()}
         about = {"factors": self.head.factors, "kind": self.head.kind, "names": self.head.names}
         with whole_folder(folder) as temporary:
             self.model.save(temporary, overwrite=True)
-            save_file(head, temporary / HEAD_FILE)
+            write_tensors(self.head.state_dict(), temporary / HEAD_FILE)
             (temporary / HEAD_CONFIG_FILE).write_text(json.dumps(about, indent=1))
         return folder
 
@@ -85,7 +83,7 @@ def load_finetuned(source: str | Path, *, device: str | torch.device = "cpu") ->
         about = json.loads((folder / HEAD_CONFIG_FILE).read_text())
         width = model.settings.network.code_size * len(about["factors"])
         head = TargetHead(about["factors"], width, about["kind"], about["names"])
-        head.load_state_dict(load_file(folder / HEAD_FILE))
-    except (OSError, ValueError, KeyError, TypeError, RuntimeError, SafetensorError) as error:
+        head.load_state_dict(read_tensors(folder / HEAD_FILE))
+    except (OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
         raise ValueError(f"the head in {folder} is damaged: copy or train the model again") from error
     return FinetunedModel(model, head.to(device)).eval().requires_grad_(False)

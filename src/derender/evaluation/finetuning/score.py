@@ -1,7 +1,8 @@
-"""Joint training on held-out pictures, beside heads on the frozen features it began with, and the majority.
+"""Joint training on held-out pictures, beside heads on the frozen features it began with, and controls.
 
 The test part of the run's own split is scored; neither training nor the choice of weights saw it. The heads
-on frozen features (the paper's, and penalised logistic regression) learn from the very same labels.
+on frozen features (the paper's, and penalised logistic regression) learn from the very same labels, and so
+does the regression on features of an untrained encoder, on principal components and on pixels.
 """
 
 from dataclasses import dataclass
@@ -9,6 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from derender.baselines.controls import pca_features, pixel_features, untrained_twin
+from derender.data import PictureSet
 from derender.evaluation.bootstrap import RESAMPLES, Difference, ScoredRow, difference
 from derender.evaluation.finetuning.model import FinetunedModel
 from derender.evaluation.finetuning.task import FinetuneTask
@@ -24,8 +27,9 @@ class FinetuneScores:
     """Held-out scores.
 
     Attributes:
-        rows: ``fine-tuned``, both heads on frozen features, ``majority``; accuracy, balanced_accuracy and
-            average_precision (0..1, best 1) of each, the first two with intervals.
+        rows: ``fine-tuned``, both heads on frozen features, logistic regression on an untrained encoder's
+            features, on principal components of the training part, and on pixels, ``majority``; accuracy,
+            balanced_accuracy and average_precision (0..1, best 1) of each, the first two with intervals.
         versus: by score, the fine-tuned model against the best of the others.
         kind, names: of the task.
         n_train, n_test: labelled pictures learned from, and tested.
@@ -75,27 +79,47 @@ def score_finetuned(
     codes = embed_images(start, task.images[rows])
     frozen = np.concatenate([codes[name] for name in task.config.target.factors], axis=1)
     asked = Task(target.asked.kind, target.asked.names, target.asked.targets[rows])
-    count = len(train)
+    count, seed = len(train), task.config.seed
+    who = Rows(np.arange(count, len(rows)), {count: np.arange(count)[None]})
     found = compare_linear(
         {LOGISTIC: [frozen]},
         asked,
-        Rows(np.arange(count, len(rows)), {count: np.arange(count)[None]}),
-        (task.config.seed,),
+        who,
+        (seed,),
         heads=("logistic", "linear"),
         finetuned={JOINT: {count: answers[None]}},
         resample_count=resample_count,
         progress=progress,
     )
     by_head = {part.head: part.rows for part in found.parts}
+    controls = _controls(start, task, rows)
+    known = compare_linear(
+        {name: [values] for name, values in controls.items()},
+        asked, who, (seed,), heads=("logistic",), resample_count=resample_count,
+    ).parts[0].rows  # fmt: skip
     joint, majority = by_head["fine-tuned"]
     heads = [
         ScoredRow(name, True, 1, by_head[head][0].scores)
         for name, head in ((LOGISTIC, "logistic"), (PAPER_HEAD, "linear"))
     ]
     ours = ScoredRow(JOINT, False, 1, joint.scores)
-    others = (*heads, ScoredRow(MAJORITY, True, 1, majority.scores))
+    quiet = [ScoredRow(f"{row.name}, logistic", True, 1, row.scores) for row in known[: len(controls)]]
+    others = (*heads, *quiet, ScoredRow(MAJORITY, True, 1, majority.scores))
     versus = {
         name: difference(ours.scores[name], {row.name: row.scores[name] for row in others})
         for name in ("accuracy", "balanced_accuracy")
     }
     return FinetuneScores((ours, *others), versus, asked.kind, asked.names, count, len(test))
+
+
+def _controls(start: Any, task: FinetuneTask, rows: np.ndarray) -> dict[str, np.ndarray]:
+    """(R, D) features that learned nothing, of some rows of the task's pictures."""
+    twin, train = untrained_twin(start, task.config.seed), task.target.split.train
+    shown, fitted = (PictureSet(task.images[some], tuple(map(str, some.tolist()))) for some in (rows, train))
+    codes = embed_images(twin, shown.images)
+    components = max(1, min(64, len(fitted) // 4))
+    return {
+        "untrained encoder": np.concatenate([codes[name] for name in task.config.target.factors], axis=1),
+        f"PCA ({components})": pca_features(shown, components=components, fit_on=fitted).concatenate(),
+        "pixels": pixel_features(shown).concatenate(),
+    }

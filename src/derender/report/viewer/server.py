@@ -16,16 +16,19 @@ from derender.report.viewer.app import Application
 from derender.report.viewer.listener import address_of, listen
 
 HEAD_SECONDS = 10.0
+TAKING_SECONDS = 30.0
 KEEP_ALIVE_SECONDS = 30
 CONNECTIONS_AT_MOST = 256
 HEAD_LIMIT_BYTES = 16_384
 
 
 class BoundedProtocol(H11Protocol):
-    """uvicorn's protocol, which also ends connections whose request's head does not arrive in time."""
+    """uvicorn's protocol, which also ends who sends no head, or a body without end, or takes no answer."""
 
     head_seconds = HEAD_SECONDS
+    taking_seconds = TAKING_SECONDS
     _head_timer: asyncio.TimerHandle | None = None
+    _taking_timer: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
@@ -37,7 +40,26 @@ class BoundedProtocol(H11Protocol):
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._forget_head()
+        self._forget_taking()
         super().connection_lost(exc)
+
+    def on_response_complete(self) -> None:
+        super().on_response_complete()
+        if self.conn.their_state is h11.SEND_BODY:  # answered before its end, which may never come
+            self.transport.close()
+
+    def pause_writing(self) -> None:
+        super().pause_writing()
+        self._taking_timer = self.loop.call_later(self.taking_seconds, self.transport.abort)
+
+    def resume_writing(self) -> None:
+        self._forget_taking()
+        super().resume_writing()
+
+    def _forget_taking(self) -> None:
+        if self._taking_timer is not None:
+            self._taking_timer.cancel()
+            self._taking_timer = None
 
     def _watch_head(self) -> None:
         if self.conn.their_state is not h11.IDLE:

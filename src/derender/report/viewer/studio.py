@@ -22,7 +22,7 @@ from derender import __version__
 from derender.data import as_float
 from derender.evaluation.oddness import ODD_PERCENTILE, percentile_of
 from derender.features import FeatureTable, named
-from derender.features.search import nearest
+from derender.features.search import nearest, same_picture
 from derender.model import Derenderer
 from derender.report import colours
 from derender.report.mesh import mesh_of
@@ -61,11 +61,11 @@ class Studio:
     def open(self, picture: UInt8[np.ndarray, "3 s s"]) -> dict[str, Any]:
         """Take a picture apart and keep it; gives its name, its light and camera, how well it is rebuilt."""
         with torch.inference_mode():
-            codes = self.model.encode(as_float(picture[None]).to(self.model.device))
-            scene = self.model.decode(codes).to("cpu")
+            readings = self.model.read(as_float(picture[None]).to(self.model.device))
+            scene = self.model.decode(self.model.codes(readings)).to("cpu")
             errors = reconstruction_errors(self.model, picture[None])
         l1 = float(errors[0])
-        rows = {name: code[0].float().cpu().numpy() for name, code in self.model.features(codes).items()}
+        rows = {name: code[0].float().cpu().numpy() for name, code in self.model.features(readings).items()}
         name = self.shelf.put(TakenApart(picture, scene, rows, l1))
         percentile = None if self.held_out is None else float(percentile_of(errors, self.held_out)[0])
         return {
@@ -164,14 +164,15 @@ class Studio:
         }
 
     def neighbours(self, question: NeighbourQuestion) -> list[tuple[int, float]]:
-        """Rows of the table nearest by one factor (of the picture that gives it), and their distances."""
+        """Rows nearest by one factor of the picture that gives it, and distances; not that picture itself."""
         if self.table is None:
             raise Refused(404, "there is no table to look in: start the viewer with --features FILE.parquet")
         other = dict(question.swaps).get(question.factor, question.picture)  # type: ignore[call-overload]
         codes = self.shelf.get(other).codes
         try:
             code = named(codes, question.factor, "factor")
-            found = nearest(self.table, code, question.factor, question.k)
+            itself = same_picture(self.table, codes)
+            found = nearest(self.table, code, question.factor, question.k, exclude=itself.tolist())
         except ValueError as problem:
             raise Refused(422, str(problem)) from problem
         return list(zip(found.rows[0].tolist(), found.distances[0].tolist(), strict=True))

@@ -1,0 +1,75 @@
+"""What `derender compare --plan` does, from the file to the last word."""
+
+from collections import Counter
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from derender.cli.console import result, say, show_scores, write_json
+
+if TYPE_CHECKING:
+    from derender.cli.plan.jobs import Place
+    from derender.cli.plan.settings import Plan
+
+
+def by_plan(
+    file: Path,
+    out: Path | None,
+    *,
+    workers: int,
+    minutes: float | None,
+    device: str,
+    dry_run: bool,
+    json_file: str | None,
+) -> None:
+    """Do a plan, or go on with it, and show the one table of each protocol."""
+    from derender.cli.plan.jobs import Place
+    from derender.cli.plan.outcome import write_outcome
+    from derender.cli.plan.running import run_plan
+    from derender.cli.plan.settings import read_plan
+    from derender.training.config import to_yaml
+    from derender.whole import whole_file
+
+    plan = read_plan(file)
+    if dry_run:
+        tell(plan, None if out is None else Place(out), json_file)
+        return
+    if out is None:
+        raise ValueError("--plan needs --out DIR: a folder for runs, tables and pictures")
+    if out.exists() and not out.is_dir():
+        raise ValueError(f"{out} is a file: give --out the name of a folder")
+    if out.is_dir() and any(out.iterdir()) and not (out / "plan.yaml").is_file():
+        raise ValueError(f"{out} is not empty and holds no comparison: choose another --out")
+    with whole_file(out / "plan.yaml") as temporary:
+        temporary.write_text(to_yaml(plan))
+    place = Place(out)
+    try:
+        notes = run_plan(plan, place, workers=workers, minutes=minutes, device=device, say=say)
+    except KeyboardInterrupt as stop:
+        raise KeyboardInterrupt("stopped and saved; the same command goes on where it stopped") from stop
+    outcome = write_outcome(plan, place, notes)
+    for table in outcome.tables:
+        show_scores(table, json_file)
+    for sentence in outcome.failed:
+        say(f"failed: {sentence}")
+    for sentence in outcome.missing:
+        say(f"missing: {sentence}")
+    if outcome.missing:
+        say("the budget is used; the same command goes on where it stopped")
+    for written in outcome.files:
+        result(str(written), json_file)
+    values = {"out": out, "files": outcome.files, "failed": outcome.failed, "missing": outcome.missing}
+    write_json(json_file, {**values, "tables": [table.values() for table in outcome.tables]})
+
+
+def tell(plan: "Plan", place: "Place | None", json_file: str | None) -> None:
+    """Every job and how it ended the last time."""
+    from derender.cli.plan.jobs import jobs_of
+
+    told = {}
+    for job in jobs_of(plan):
+        note = None if place is None else place.note(job)
+        told[job.name] = "to do" if note is None else note.state
+    for name, state in told.items():
+        result(f"{name}: {state}", json_file)
+    say(", ".join(f"{count} {state}" for state, count in Counter(told.values()).items()))
+    write_json(json_file, {"jobs": told, "plan": plan.model_dump(mode="json")})

@@ -1,0 +1,73 @@
+"""Named tensors in a safetensors file that carries its own checksum.
+
+The CRC-32 of names, kinds, shapes and values stands in the file's metadata, so that a bit that has changed is
+an error and not another model. Files made elsewhere carry none and are read as they are.
+"""
+
+import os
+import re
+import zlib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+CHECKSUM = "crc32"
+
+
+def write_tensors(
+    tensors: Mapping[str, Tensor], file: str | Path, metadata: Mapping[str, str] | None = None
+) -> None:
+    """Write tensors, on whatever device, with their checksum; ``metadata`` is kept beside it."""
+    plain = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
+    with disk_errors(file):
+        save_file(plain, file, metadata={**(metadata or {}), CHECKSUM: checksum(plain)})
+
+
+@contextmanager
+def disk_errors(file: str | Path) -> Iterator[None]:
+    """Turn what safetensors raises when a disk is full or a folder is closed into the system's own error."""
+    try:
+        yield
+    except SafetensorError as error:
+        number = re.search(r"os error (\d+)", str(error))
+        if number is None:
+            raise
+        raise OSError(int(number[1]), os.strerror(int(number[1])), str(file)) from error
+
+
+def read_tensors(file: str | Path) -> dict[str, Tensor]:
+    """The tensors of a safetensors file, on the CPU.
+
+    Raises:
+        ValueError: it is damaged or no such file.
+        OSError: it is missing or cannot be opened.
+    """
+    return read_described(file)[0]
+
+
+def read_described(file: str | Path) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """As ``read_tensors``, with the file's metadata."""
+    try:
+        with safe_open(file, framework="pt") as stored:
+            metadata = dict(stored.metadata() or {})
+            tensors = {name: stored.get_tensor(name) for name in stored.keys()}  # noqa: SIM118, not a mapping
+    except (SafetensorError, RuntimeError, ValueError, LookupError, TypeError, AttributeError) as error:
+        raise ValueError(f"{Path(file).name} is cut off or no safetensors file ({error})") from error
+    if metadata.get(CHECKSUM, checksum(tensors)) != checksum(tensors):
+        raise ValueError(f"{Path(file).name} has changed since it was written: its checksum differs")
+    return tensors, metadata
+
+
+def checksum(tensors: Mapping[str, Tensor]) -> str:
+    """Eight hexadecimal digits that change with any name, kind, shape or bit."""
+    found = 0
+    for name, value in sorted(tensors.items()):
+        found = zlib.crc32(f"{name} {value.dtype} {tuple(value.shape)}\0".encode(), found)
+        if value.numel():
+            found = zlib.crc32(value.contiguous().reshape(-1).view(torch.uint8).numpy().data, found)
+    return f"{found:08x}"

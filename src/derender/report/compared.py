@@ -1,0 +1,270 @@
+"""Many methods on many data sets: one table and one picture for each protocol, with what every row cost.
+
+Rows are methods and controls, columns data sets. Under the one table each data set has its own, with every
+score, its interval and the row's cost. What failed or is missing says so in its place. Leaves out computing
+(``derender.cli.plan``).
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from math import isfinite
+from textwrap import shorten
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from derender.evaluation.bootstrap import Difference, Estimate, ScoredRow
+from derender.report.charts import SERIES, side_by_side
+from derender.report.score_table import Cell, Column, Row, ScoreTable
+from derender.report.tables_comparison import (
+    CLUSTER_COLUMNS,
+    INTERVAL,
+    LINEAR_COLUMNS,
+    PROBES,
+    SPREAD,
+    interval_text,
+    spread_value,
+    verdict_table,
+)
+
+LONGEST_REASON = 60  # characters of it in a cell; the page and the Markdown say it whole
+CONTROL_COLOUR = "#94a3b8"
+SUMMARY_HEAD = "logistic"  # the head of the linear protocol that the one table shows
+METHODS = {"ward": "Ward clustering", "finch": "FINCH clustering", "k-means": "k-means"}
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What a row cost on one data set; None where there is nothing to tell.
+
+    Attributes:
+        parameters: of all its networks.
+        seconds: of training, resumed parts included; mean over seeds.
+        images: pictures seen in it, repeats counted.
+        numbers: that describe a picture.
+        embedding_seconds: for one picture.
+    """
+
+    parameters: int | None = None
+    seconds: float | None = None
+    images: int | None = None
+    numbers: int | None = None
+    embedding_seconds: float | None = None
+
+
+@dataclass(frozen=True)
+class Scores:
+    """One question under one protocol (and one head at one number of labels, for the linear one).
+
+    Attributes:
+        name: of the data set, and of the question if it has several.
+        protocol: "cluster" or "linear".
+        about: rows, classes and the like, in words.
+        rows: methods and controls.
+        costs: by row.
+        absent: by method, why it is not among the rows.
+        head, count: of the linear protocol.
+    """
+
+    name: str
+    protocol: str
+    about: str
+    rows: Sequence[ScoredRow]
+    costs: Mapping[str, Cost] = field(default_factory=dict)
+    absent: Mapping[str, str] = field(default_factory=dict)
+    head: str = ""
+    count: int = 0
+
+    @property
+    def columns(self) -> Mapping[str, Column]:
+        """The protocol's scores."""
+        return CLUSTER_COLUMNS if self.protocol == "cluster" else LINEAR_COLUMNS
+
+
+COST_COLUMNS = (
+    Column("numbers", None, note="that describe a picture"),
+    Column("parameters", None, note="of all networks that were trained"),
+    Column("pictures seen", None, note="in training, repeats counted"),
+    Column("training, s", None, 0, note="wall time of the training loop, whatever else the machine did"),
+    Column("ms a picture", None, 2, note="to embed, likewise"),
+)
+
+
+def scores_from(
+    question: Mapping[str, Any], costs: Mapping[str, Cost], absent: Mapping[str, str]
+) -> list[Scores]:
+    """The scores of a question as JSON keeps them: one of clusters, or one for each head and count."""
+    name = str(question["name"])
+    if question["protocol"] == "cluster":
+        labels = question["labels"]
+        what = (
+            f"{next(iter(labels.values()))} classes of {next(iter(labels))}"
+            if len(labels) == 1
+            else f"mean of {len(labels)} labels"
+        )
+        about = f"{METHODS[question['method']]}, {question['n_rows']:,} rows, {what}"
+        return [Scores(name, "cluster", about, rows_from(question["rows"]), costs, absent)]
+    kind = "classes" if question["kind"] == "classes" else "yes/no labels"
+    found = []
+    for part in question["parts"]:
+        about = (
+            f"{PROBES.get(part['head'], part['head'])}, {part['labels']:,} labelled rows, "
+            f"{question['n_test']:,} tested, {len(question['names'])} {kind}, {len(question['seeds'])} seeds"
+        )
+        rows = rows_from(part["rows"])
+        found.append(Scores(name, "linear", about, rows, costs, absent, part["head"], part["labels"]))
+    return found
+
+
+def rows_from(values: Mapping[str, Any]) -> list[ScoredRow]:
+    """Rows as JSON keeps them: without resamples, null for what is no number."""
+    nothing = np.empty(0)
+
+    def numbers(one: Mapping[str, Any]) -> dict[str, Any]:
+        return {part: float("nan") if value is None else value for part, value in one.items()}
+
+    return [
+        ScoredRow(
+            name,
+            row["control"],
+            row["runs"],
+            {score: Estimate(**numbers(one), resampled=nothing) for score, one in row["scores"].items()},
+            {score: Difference(**numbers(one)) for score, one in row["versus"].items()},
+        )
+        for name, row in values.items()
+    ]
+
+
+def protocol_table(scores: Sequence[Scores], methods: Sequence[str]) -> ScoreTable:
+    """The one table: a row for each method and control, two scores for each data set, and the cost.
+
+    Args:
+        scores: of one protocol; of the linear one those with ``SUMMARY_HEAD`` are shown.
+        methods: in order; controls come after them.
+    """
+    shown = _shown(scores)
+    first, second = ("accuracy", "nmi") if shown[0].protocol == "cluster" else ("balanced_accuracy", None)
+    columns: list[Column] = []
+    for one in shown:
+        head = one.name if one.protocol == "cluster" else f"{one.name}, {one.count:,} labels"
+        columns.append(Column(f"{head}: {one.columns[first].name}", "high", note=one.about))
+        if second is not None:
+            columns.append(Column("NMI", "high"))
+    by_name = [{row.name: row for row in one.rows} for one in shown]
+    controls = list(dict.fromkeys(name for rows in by_name for name in rows if name not in methods))
+    rows = []
+    for name in (*methods, *controls):
+        cells: list[Cell] = []
+        for one, found in zip(shown, by_name, strict=True):
+            row = found.get(name)
+            if row is None:
+                cells.append(one.absent[name].partition(":")[0] if name in one.absent else None)
+            else:
+                cells.append(row.scores[first].value)
+            if second is not None:
+                cells.append(None if row is None else row.scores[second].value)
+        control = any(found[name].control for found in by_name if name in found)
+        rows.append(Row(name, (*cells, *_cells(_together(shown, name))), control))
+    caption = "Clustering" if shown[0].protocol == "cluster" else f"Few labels, {PROBES[shown[0].head]}"
+    caption += ": all data sets; training time is the sum over training sets"
+    return ScoreTable(caption, "features", (*columns, *COST_COLUMNS), rows)
+
+
+def set_tables(one: Scores, methods: Sequence[str]) -> list[ScoreTable]:
+    """One data set's own table, with every score, interval and cost, and who is above the controls."""
+    columns, (first, *others) = one.columns, one.columns
+    found = {row.name: row for row in one.rows}
+    rows = []
+    for name in (*methods, *(name for name in found if name not in methods)):
+        cost = _cells(one.costs.get(name, Cost()))
+        if name in found:
+            row = found[name]
+            values = (row.scores[score].value for score in others)
+            scored = (row.scores[first].value, interval_text(row, first), spread_value(row, first), *values)
+            rows.append(Row(name, (*scored, *cost), row.control))
+        elif name in one.absent:
+            why = shorten(one.absent[name], LONGEST_REASON, placeholder=" ...")
+            rows.append(Row(name, (why, None, None, *(None for _ in others), *cost)))
+    shown = (columns[first], INTERVAL, SPREAD, *(columns[name] for name in others), *COST_COLUMNS)
+    verdict = verdict_table(one.rows, columns, f"{one.name}, above the strongest control? {one.about}")
+    return [ScoreTable(f"{one.name}: {one.about}", "features", shown, rows), verdict]
+
+
+def protocol_picture(scores: Sequence[Scores], methods: Sequence[str]) -> tuple[str, bytes]:
+    """A panel of bars for each data set, methods in colour, controls grey, as SVG text and as PNG.
+
+    Whiskers are 95 % intervals. Of the linear protocol the largest number of labels is shown.
+    """
+    shown = _shown(scores)
+    if shown[0].protocol == "linear":
+        most = {one.name: max(other.count for other in shown if other.name == one.name) for one in shown}
+        shown = [one for one in shown if one.count == most[one.name]]
+    score = "accuracy" if shown[0].protocol == "cluster" else "balanced_accuracy"
+    every = list(dict.fromkeys((*methods, *(row.name for one in shown for row in one.rows))))
+    panels = {
+        f"{one.name}, {one.count:,} labels" if one.count else one.name: _panel(one, every, score)
+        for one in shown
+    }
+    size = (max(7.2, 1.6 + 2.1 * len(panels)), 0.9 + 0.3 * len(every))
+    return side_by_side(panels, one_word(shown[0].columns[score].name), size)
+
+
+def one_word(score: str) -> str:
+    """What stands under a picture."""
+    return {"balanced": "balanced accuracy"}.get(score, score)
+
+
+def _panel(one: Scores, names: Sequence[str], score: str) -> Any:
+    found = {row.name: row for row in one.rows}
+
+    def draw(axes: Axes) -> None:
+        for place, name in enumerate(reversed(names)):
+            row = found.get(name)
+            if row is None:
+                why = one.absent[name].partition(":")[0] if name in one.absent else ""
+                axes.barh(name, 0)
+                axes.annotate(why, (0, place), xytext=(3, 0), textcoords="offset points", va="center",
+                              fontsize=8, alpha=0.75)  # fmt: skip
+                continue
+            estimate = row.scores[score]
+            axes.barh(name, estimate.value, color=CONTROL_COLOUR if row.control else SERIES[0], height=0.66)
+            if isfinite(estimate.low):
+                axes.plot(
+                    [estimate.low, estimate.high], [name, name], color="#010203", alpha=0.6, linewidth=1
+                )
+        axes.tick_params(axis="y", length=0)
+        axes.grid(True, axis="x")
+        axes.set_axisbelow(True)
+
+    return draw
+
+
+def _shown(scores: Sequence[Scores]) -> list[Scores]:
+    """What the one table and the picture show."""
+    if not scores:
+        raise ValueError("there is nothing to show: no data set was scored")
+    heads = [one.head for one in scores]
+    head = SUMMARY_HEAD if SUMMARY_HEAD in heads else heads[0]
+    return [one for one in scores if one.head == head]
+
+
+def _together(scores: Sequence[Scores], name: str) -> Cost:
+    """A method's cost over several data sets: trainings that several share count once."""
+    costs = [one.costs[name] for one in scores if name in one.costs]
+    if not costs:
+        return Cost()
+    trained = {(cost.seconds, cost.images) for cost in costs if cost.seconds is not None}
+    embedding = [cost.embedding_seconds for cost in costs if cost.embedding_seconds is not None]
+    return Cost(
+        next((cost.parameters for cost in costs if cost.parameters is not None), None),
+        sum(seconds for seconds, _ in trained if seconds is not None) if trained else None,
+        next((cost.images for cost in costs if cost.images is not None), None),
+        next((cost.numbers for cost in costs if cost.numbers is not None), None),
+        float(np.mean(embedding)) if embedding else None,
+    )
+
+
+def _cells(cost: Cost) -> tuple[Cell, ...]:
+    each = None if cost.embedding_seconds is None else 1_000 * cost.embedding_seconds
+    return (cost.numbers, cost.parameters, cost.images, cost.seconds, each)

@@ -1,0 +1,194 @@
+"""A plan from file to tables: what it leaves, kill -9 in the middle, the end of the budget, workers."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from derender.cli import main
+from derender.cli.plan import embedding, running, training
+from derender.cli.plan.jobs import Place, jobs_of
+from derender.cli.plan.settings import read_plan
+from derender.training import loop
+
+PLAN = """
+images: 64
+image_size: 32
+settings: {batch_size: 16, checkpoint_every: 16, validate_every: 64, watch: true}
+train:
+  colours: {data: PEOPLE}
+methods:
+  ae: {settings: {image_size: 32, width: 4, code_size: 8}}
+  hog:
+  gone: {kind: ae, runs: {colours: PEOPLE/none}}
+score:
+  people: {data: PEOPLE, trained_on: colours, label: class}
+untrained_seeds: 1
+resamples: 10
+"""
+KILLED = """
+import os, signal, sys
+from derender.cli import main
+from derender.training import loop
+
+kept = loop._Run.checkpoint
+
+def killed(run):
+    kept(run)
+    if run.state.images == 32:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+loop._Run.checkpoint = killed
+main(sys.argv[1:])
+"""
+
+
+@pytest.fixture(scope="module")
+def plan(tmp_path_factory) -> Path:
+    """Forty pictures of four made-up people, told apart by their colour, and a plan that scores them."""
+    folder, rng = tmp_path_factory.mktemp("plan"), np.random.default_rng(0)
+    for row in range(40):
+        colour = np.array([[200, 40, 40], [40, 200, 40], [40, 40, 200], [200, 200, 40]])[row % 4]
+        pixels = np.clip(colour + rng.integers(-30, 30, (32, 32, 3)), 0, 255).astype(np.uint8)
+        (folder / "people" / "abcd"[row % 4]).mkdir(parents=True, exist_ok=True)
+        Image.fromarray(pixels).save(folder / "people" / "abcd"[row % 4] / f"{row:03d}.png")
+    (folder / "plan.yaml").write_text(PLAN.replace("PEOPLE", str(folder / "people")))
+    return folder / "plan.yaml"
+
+
+@pytest.fixture(scope="module")
+def whole(plan) -> Path:
+    """The plan's folder after one uninterrupted call."""
+    assert main(["compare", "--plan", str(plan), "--out", str(plan.parent / "whole")]) == 0
+    return plan.parent / "whole"
+
+
+def scores(out: Path) -> dict:
+    """Every score of the clustering table."""
+    told = json.loads((out / "clustering.json").read_text())
+    return {one["name"]: one["rows"] for one in told["questions"]}
+
+
+def test_one_table_and_one_picture_with_controls_costs_and_what_failed(whole):
+    told = json.loads((whole / "clustering.json").read_text())
+    (question,) = told["questions"]
+    assert list(question["rows"]) == [
+        "ae",
+        "hog",
+        "untrained encoder",
+        "PCA (10)",
+        "pixels",
+        "majority",
+        "chance",
+    ]
+    assert question["rows"]["pixels"]["scores"]["accuracy"]["value"] == 1
+    cost = question["costs"]["ae"]
+    assert (
+        cost["images"] == 64 and cost["seconds"] > 0 and cost["parameters"] > 1_000 and cost["numbers"] == 8
+    )
+    assert question["costs"]["untrained encoder"]["parameters"] > cost["parameters"]
+    assert question["absent"]["gone"].startswith("failed: no baseline at") and "gone" in told["failed"][0]
+    text = (whole / "clustering.md").read_text()
+    assert "| gone | failed | - |" in text and "Failed or missing" in text and "*majority*" in text
+    assert (whole / "clustering.tex").read_text().count(r"\begin{table}") == 3
+    page = (whole / "clustering.html").read_text()
+    assert page.count("<svg") == 2 and "One training seed each" in page
+    assert (whole / "clustering.svg").read_text().startswith("<svg")
+    with Image.open(whole / "clustering.png") as picture:
+        assert picture.size[0] > 500
+
+
+def test_the_same_command_again_does_nothing_twice(plan, whole, capsys):
+    before, weights = scores(whole), whole / "runs" / "colours" / "ae" / "model" / "model.safetensors"
+    at = weights.stat().st_mtime_ns
+    assert main(["compare", "--plan", str(plan), "--out", str(whole)]) == 0
+    said = capsys.readouterr().err
+    assert "train gone on colours: failed" in said  # tried again: it may have come
+    assert "train ae" not in said and "score people" not in said
+    assert scores(whole) == before and weights.stat().st_mtime_ns == at
+
+
+def test_killed_in_the_middle_it_ends_with_the_very_table(plan, whole):
+    out = plan.parent / "killed"
+    words = ["compare", "--plan", str(plan), "--out", str(out)]
+    done = subprocess.run([sys.executable, "-c", KILLED, *words], capture_output=True, timeout=250)
+    assert done.returncode == -signal.SIGKILL
+    assert training.run_progress(out / "runs" / "colours" / "ae")["images"] == 32
+    assert not (out / "clustering.json").exists()
+    assert main(words) == 0
+    assert scores(out) == scores(whole)
+
+
+def test_the_budget_ends_a_training_and_leaves_tables(plan, whole, monkeypatch, capsys):
+    out = plan.parent / "budget"
+    words = ["compare", "--plan", str(plan), "--out", str(out)]
+    now, step = [0.0], loop._Run.step
+
+    def slow_step(run: loop._Run) -> object:
+        now[0] += 60
+        return step(run)
+
+    clock = SimpleNamespace(time=lambda: now[0], perf_counter=time.perf_counter)
+    with monkeypatch.context() as patch:  # every step takes a minute
+        patch.setattr(loop._Run, "step", slow_step)
+        for module in (running, embedding, training):
+            patch.setattr(module, "time", clock)
+        assert main([*words, "--minutes", "1.5"]) == 0
+    said = capsys.readouterr().err
+    assert "the budget is used; the same command goes on where it stopped" in said
+    assert training.run_progress(out / "runs" / "colours" / "ae")["images"] == 32
+    assert "missing: train ae on colours: the budget was used before it was trained (32 of 64" in said
+    told = json.loads((out / "clustering.json").read_text())
+    assert "ae" not in told["questions"][0]["rows"] and "pixels" in told["questions"][0]["rows"]
+    assert told["questions"][0]["absent"]["ae"].startswith("missing: ")
+    assert main(words) == 0
+    assert scores(out) == scores(whole)
+
+
+def test_worker_processes_do_the_same(plan, whole):
+    few = plan.parent / "few.yaml"
+    text = plan.read_text()
+    few.write_text(text[: text.index("  ae:")] + "  hog:\n" + text[text.index("score:") :])
+    out = plan.parent / "workers"
+    assert main(["compare", "--plan", str(few), "--out", str(out), "--workers", "2"]) == 0
+    assert scores(out)["people"]["hog"]["scores"] == scores(whole)["people"]["hog"]["scores"]
+
+
+def test_a_worker_that_was_killed_costs_itself_alone(plan, tmp_path):
+    place = Place(tmp_path)
+    standing = running._Standing(read_plan(plan), place, "cpu", None, print)
+    job = jobs_of(standing.plan)[0]
+    note = running._left_nothing(standing, job, -signal.SIGKILL)
+    assert note.state == "failed" and "was killed by SIGKILL" in note.why and place.note(job) == note
+
+
+def test_two_at_once_in_one_folder_are_refused(plan, tmp_path, capsys):
+    with running._alone(tmp_path / "out"):
+        (tmp_path / "out" / "plan.yaml").write_text("")
+        assert main(["compare", "--plan", str(plan), "--out", str(tmp_path / "out")]) == 2
+    assert "another derender compare works in" in capsys.readouterr().err
+
+
+def test_what_does_not_go_together_is_one_line(plan, tmp_path, capsys):
+    def refused(*words: object) -> str:
+        assert main(["compare", *map(str, words)]) == 2
+        return capsys.readouterr().err.strip().splitlines()[-1]
+
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "letter.txt").write_text("mine")
+    assert "holds no comparison" in refused("--plan", plan, "--out", tmp_path / "mine")
+    assert [file.name for file in (tmp_path / "mine").iterdir()] == ["letter.txt"]
+    assert "is a file" in refused("--plan", plan, "--out", plan)
+    assert "--plan needs --out" in refused("--plan", plan)
+    assert "--plan says what is compared" in refused("--plan", plan, "--table", "identity")
+    assert "--plan says what is compared" in refused("--plan", plan, "--seeds", "2")
+    assert "go with --plan FILE" in refused("--table", "identity", "--workers", "2")
+    assert "give --table NAME" in refused()
+    assert "no plan at" in refused("--plan", tmp_path / "none.yaml", "--out", tmp_path / "o")

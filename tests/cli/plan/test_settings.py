@@ -1,0 +1,103 @@
+"""What a plan may say, and that everything else is one clear line before anything is trained."""
+
+from pathlib import Path
+
+import pytest
+
+from derender.cli.plan.jobs import jobs_of
+from derender.cli.plan.settings import read_plan
+
+GOOD = """
+images: 1000
+seeds: 2
+settings: {precision: bf16-mixed}
+train:
+  faces: {data: faces.zip, split: [0.9, 0.05, 0.05]}
+  cars: {data: cars.zip::train}
+methods:
+  ours: {settings: {loocc: light+camera}, settings_on: {cars: {curvature_weight: 2}}}
+  codes: {like: ours, whitened: false}
+  small vqvae: {kind: vqvae, settings: {width: 416, learning_rate: 1e-4}}
+  hog:
+  pixels:
+score:
+  lfw: {data: lfw.zip, trained_on: faces, table: identity}
+  police: {data: cars.zip::test, trained_on: cars, label: class, protocols: [cluster, linear]}
+"""
+
+
+@pytest.fixture
+def written(tmp_path):
+    def write(text: str, name: str = "plan.yaml") -> Path:
+        (tmp_path / name).write_text(text)
+        return tmp_path / name
+
+    return write
+
+
+def test_every_training_gets_the_plans_pictures_split_and_seed(written):
+    plan = read_plan(written(GOOD))
+    ours = plan.configuration("ours", "cars", 1)
+    assert (ours.images, ours.seed, ours.precision) == (1000, 1, "bf16-mixed")
+    assert (ours.objective.loocc, ours.objective.curvature_weight) == ("light+camera", 2)
+    assert plan.configuration("ours", "faces", 0).objective.curvature_weight == 3
+    vqvae = plan.configuration("small vqvae", "faces", 0)
+    assert (vqvae.model.width, vqvae.optimiser.learning_rate) == (416, 1e-4)
+    assert vqvae.split == (0.9, 0.05, 0.05)
+
+
+def test_jobs_share_trainings_and_come_after_what_they_need(written):
+    jobs = jobs_of(read_plan(written(GOOD)))
+    names = [job.name for job in jobs]
+    assert len(set(names)) == len(names) == len({job.slug for job in jobs})
+    assert sum(job.kind == "train" for job in jobs) == 2 * 2 * 2  # methods, training sets, seeds
+    embeddings = [job for job in jobs if job.kind == "embed" and job.where == "lfw"]
+    wanted = [(name, seed) for name in ("ours", "codes", "small vqvae") for seed in (0, 1)]
+    assert [(job.method, job.seed) for job in embeddings] == [*wanted, ("hog", 0)]
+    assert embeddings[0].after == embeddings[2].after  # codes are of the same runs
+    for place, job in enumerate(jobs):
+        assert all(one in jobs[:place] for one in job.after)
+
+
+def test_toml_says_the_same(written):
+    text = """
+methods = ["hog"]
+[score.lfw]
+data = "lfw.zip"
+label = "identity"
+"""
+    plan = read_plan(written(text, "plan.toml"))
+    assert plan.score["lfw"].label == ("identity",) and [job.kind for job in jobs_of(plan)] == [
+        "embed",
+        "score",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        ("images: 1000", "image: 1000", "unknown setting 'image'; did you mean 'images'"),
+        ("small vqvae: {kind: vqvae", "x: {kind: vqvea", "no known kind; did you mean 'vqvae'"),
+        ("like: ours", "like: our", "unknown like 'our'; did you mean 'ours'"),
+        ("width: 416", "widht: 416", "unknown setting 'widht'; did you mean 'model.width'"),
+        ("width: 416", "seed: 3", "seed is the plan's own"),
+        ("{precision: bf16-mixed}", "{precision: bf17}", "setting 'precision'"),
+        ("trained_on: faces", "trained_on: face", "unknown training set 'face'; did you mean 'faces'"),
+        (", trained_on: faces", "", "score 'lfw' needs trained_on: 'ours'"),
+        ("table: identity", "table: identities", "unknown table 'identities'; did you mean 'identity'"),
+        ("table: identity", "table: segmentation", "segmentation trains nets of its own"),
+        ("table: identity", "table: identity, label: x", "needs a table (identity, emotion, ...) or a label"),
+        ("table: identity", "table: identity, min_count: 3", "go with label, not with table"),
+        ("trained_on: faces", "trained_on: faces, part: test", "is of faces.zip, the pictures of 'faces'"),
+        ("data: lfw.zip", "data: faces.zip, part: test", "part goes with seeds: 1"),
+        ("  lfw:", "  ../lfw:", "cannot be a folder's"),
+        ("  hog:", "  hog: {settings: {a: 1}}", "(hog) is not trained here"),
+        ("whitened: false", "whitened: false, model: x", "it takes features and whitened alone"),
+        ("score:", "score: [", "cannot be read as a plan"),
+    ],
+)
+def test_a_mistake_is_one_line(written, old, new, told):
+    assert old in GOOD
+    with pytest.raises(ValueError, match=r"plan\.yaml") as error:
+        read_plan(written(GOOD.replace(old, new, 1)))
+    assert told in str(error.value)

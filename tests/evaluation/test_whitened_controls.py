@@ -1,0 +1,63 @@
+"""Controls whitened by the lender: its own model as in training, others by the same rule."""
+
+import numpy as np
+import pytest
+import torch
+
+from derender.data import PictureSet
+from derender.data.synthetic import faces
+from derender.evaluation.memory import Memory
+from derender.evaluation.whitened_controls import Lender, component_count, whitened, whitened_components
+from derender.features import embed_images
+from derender.model import Derenderer
+from derender.training.config import FeatureSettings, WhiteningSettings
+from derender.training.whitening import fit_whitening
+
+SETTINGS = FeatureSettings(whitening=WhiteningSettings(pictures=40, views=2, directions=6))
+
+
+@pytest.fixture(scope="module")
+def images() -> np.ndarray:
+    return faces.generate(48, 32, 0).images
+
+
+@pytest.fixture(scope="module")
+def lender(images) -> Lender:
+    return Lender(net(0), images[:40], SETTINGS)
+
+
+def net(seed: int) -> Derenderer:
+    return Derenderer.from_preset("small", seed=seed, image_size=32, width=4, light_width=4, code_size=12)
+
+
+def test_the_lender_whitens_itself_as_training_does(lender):
+    found = whitened(lender, lender.model).whitening
+    expected = fit_whitening(
+        lender.model, torch.from_numpy(lender.images), SETTINGS.whitening, SETTINGS.perturb, seed=lender.seed
+    )
+    assert found is not None and sorted(found.names) == ["albedo", "geometry"]
+    for name, value in expected.named_buffers():
+        torch.testing.assert_close(found.get_buffer(name), value)
+    assert lender.model.whitening is None
+
+
+def test_another_encoder_is_whitened_by_its_own_codes_of_the_lenders_renderings(lender, images):
+    other = net(1)
+    found = whitened(lender, other)
+    features, codes = (embed_images(one, images) for one in (found, other))
+    assert np.linalg.matrix_rank(features["geometry"]) <= 6 < np.linalg.matrix_rank(codes["geometry"])
+    np.testing.assert_allclose(features["light"], codes["light"], rtol=1e-5)
+    own = whitened(lender, lender.model).whitening
+    assert own is not None and found.whitening is not None
+    assert not torch.allclose(found.whitening.get_buffer("geometry_map"), own.get_buffer("geometry_map"))
+
+
+def test_components_are_whitened_and_remembered(lender, images, tmp_path):
+    pictures = PictureSet(images[40:], tuple("abcdefgh"))
+    assert component_count(lender.images) == 10
+    keeping = Lender(lender.model, lender.images, SETTINGS, memory=Memory(tmp_path))
+    one, two = (whitened_components(keeping, pictures).factors["pca"] for _ in range(2))
+    assert keeping.memory is not None and (keeping.memory.made, keeping.memory.recalled) == (1, 1)
+    np.testing.assert_array_equal(one, two)
+    assert one.shape == (8, 10) and np.linalg.matrix_rank(one) <= 6
+    np.testing.assert_allclose(one, whitened_components(lender, pictures).factors["pca"], rtol=1e-5)

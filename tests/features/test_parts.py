@@ -1,0 +1,92 @@
+"""An unfinished table of which a part is damaged is made again from there, and the user is told."""
+
+import numpy as np
+import pytest
+
+from derender.data import PictureSet
+from derender.features import FeatureTable, embed_to_file, embedding
+from derender.whole import DamageNoticed
+
+
+@pytest.fixture
+def pictures() -> PictureSet:
+    images = np.random.default_rng(0).integers(0, 256, (60, 3, 8, 8), dtype=np.uint8)
+    return PictureSet(images, tuple(f"{number}.png" for number in range(60)), source="made")
+
+
+@pytest.fixture
+def stopped(model, pictures, tmp_path, monkeypatch):
+    """A table of which six parts of eight rows were written when Ctrl-C came."""
+    monkeypatch.setattr(embedding, "PART_ROWS", 8)
+
+    def press_ctrl_c(done: int, total: int) -> None:
+        if done >= 48:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        embed_to_file(model, pictures, tmp_path / "F.parquet", batch_size=8, progress=press_ctrl_c)
+    return sorted((tmp_path / "F.parquet.partial").glob("part-*"))
+
+
+def flipped(file) -> None:
+    content = bytearray(file.read_bytes())
+    content[len(content) // 2] ^= 1
+    file.write_bytes(content)
+
+
+@pytest.mark.parametrize(
+    ("damage", "words"),
+    [
+        (flipped, "its checksum differs"),
+        (lambda file: file.write_bytes(file.read_bytes()[:-1]), "its checksum differs"),
+        (lambda file: file.write_bytes(b""), "its checksum differs"),
+        (lambda file: file.unlink(), "part 2 is missing"),
+        (
+            lambda file: file.rename(file.with_name("part-000002.parquet")).write_bytes(b"PAR1"),
+            "it cannot be read",
+        ),
+    ],
+)
+def test_a_damaged_part_is_made_again_with_those_after_it(model, pictures, stopped, tmp_path, damage, words):
+    assert len(stopped) == 6
+    damage(stopped[2])
+    with pytest.warns(DamageNoticed, match=rf"damaged \({words}\): going on from the 16 rows before it"):
+        done = embed_to_file(model, pictures, tmp_path / "F.parquet", batch_size=8)
+    assert (done.resumed, done.rows) == (16, 60)
+    whole = embed_to_file(model, pictures, tmp_path / "whole.parquet", batch_size=8)
+    one, other = (FeatureTable.read(tmp_path / name) for name in ("F.parquet", "whole.parquet"))
+    assert one.files == other.files and whole.resumed == 0
+    assert all(np.array_equal(one.factors[name], other.factors[name]) for name in other.factors)
+    assert not list(tmp_path.glob("*.partial"))
+
+
+def test_what_a_run_leaves_that_was_killed_before_its_first_part_is_no_obstacle(model, pictures, tmp_path):
+    folder = tmp_path / "F.parquet.partial"
+    folder.mkdir()
+    (folder / ".plan.json-abc").write_text("{")
+    (folder / "plan.json").write_text('{"other": 1}')
+    (folder / ".writing.parquet-x").write_bytes(b"PAR1")
+    assert embed_to_file(model, pictures, tmp_path / "F.parquet").rows == 60
+
+
+def test_parts_without_a_sound_plan_are_told_of(model, pictures, stopped, tmp_path):
+    (stopped[0].parent / "plan.json").write_text("{")
+    with pytest.raises(ValueError, match=r"unfinished table without a sound plan\.json: delete that folder"):
+        embed_to_file(model, pictures, tmp_path / "F.parquet", batch_size=8)
+
+
+@pytest.mark.parametrize("at", [0.2, 0.4, 0.6])
+def test_a_changed_byte_in_a_finished_table_is_an_error_and_not_another_number(model, pictures, tmp_path, at):
+    file = tmp_path / "F.parquet"
+    embed_to_file(model, pictures, file)
+    wanted = FeatureTable.read(file)
+    content = bytearray(file.read_bytes())
+    content[int(at * len(content))] ^= 16
+    file.write_bytes(content)
+    try:
+        found = FeatureTable.read(file)
+    except ValueError as problem:
+        assert "not a readable parquet file" in str(problem) or str(file) in str(problem)
+        return
+    assert found.files == wanted.files
+    assert all(np.array_equal(found.factors[name], wanted.factors[name]) for name in wanted.factors)

@@ -1,0 +1,87 @@
+"""One table and one picture of many data sets: what failed keeps its place, shared trainings count once."""
+
+from derender.report.compared import Cost, protocol_picture, protocol_table, scores_from, set_tables
+
+NAN = None
+
+
+def question(name: str, **accuracies: float) -> dict:
+    def row(value: float, control: bool) -> dict:
+        one = {"value": value, "low": value - 0.1, "high": value + 0.1, "spread": NAN}
+        scores = dict.fromkeys(("accuracy", "f1", "nmi", "hungarian", "ari"), one)
+        rival = {"rival": "pixels", "value": 0.1, "low": 0.05, "high": 0.2, "above": True}
+        versus = {} if control else {"accuracy": rival}
+        return {"control": control, "runs": 1, "scores": scores, "versus": versus}
+
+    rows = {name: row(value, name == "pixels") for name, value in accuracies.items()}
+    return {
+        "name": name,
+        "protocol": "cluster",
+        "method": "ward",
+        "labels": {"class": 3},
+        "n_rows": 9,
+        "rows": rows,
+    }
+
+
+def test_rows_are_methods_then_controls_and_what_failed_keeps_its_place():
+    costs = {"ours": Cost(10, 5.0, 64, 8, 0.001)}
+    absent = {"vqvae": "failed: it was stopped by the watcher after a while, because of a hollow depth"}
+    scores = [
+        *scores_from(question("lfw", ours=0.5, pixels=0.2), costs, absent),
+        *scores_from(
+            question("cars", ours=0.6, vqvae=0.4, pixels=0.3), {"ours": Cost(10, 7.0, 64, 8, 0.003)}, {}
+        ),
+        *scores_from(question("utk", ours=0.7, pixels=0.3), costs, {"vqvae": "missing: the budget"}),
+    ]
+    table = protocol_table(scores, ["ours", "vqvae"])
+    assert [row.name for row in table.rows] == ["ours", "vqvae", "pixels"]
+    assert [row.control for row in table.rows] == [False, False, True]
+    values = dict(zip((column.name for column in table.columns), table.rows[0].cells, strict=True))
+    assert (values["lfw: accuracy"], values["cars: accuracy"], values["numbers"]) == (0.5, 0.6, 8)
+    assert values["training, s"] == 12  # lfw and utk share a run
+    assert abs(values["ms a picture"] - 5 / 3) < 1e-9
+    assert table.rows[1].cells[:6] == ("failed", None, 0.4, 0.4, "missing", None)
+    assert table.best(0) == 0.5
+    own, verdicts = set_tables(scores[0], ["ours", "vqvae"])
+    assert own.rows[1].cells[0].startswith("failed: it was stopped") and len(own.rows[1].cells[0]) <= 60
+    assert own.rows[0].cells[:3] == (0.5, "0.400-0.600", None)
+    assert [row.name for row in verdicts.rows] == ["ours: accuracy"]
+    svg, png = protocol_picture(scores, ["ours", "vqvae"])
+    assert all(word in svg for word in ("lfw", "cars", "utk", "vqvae", "failed", "missing"))
+    assert png.startswith(b"\x89PNG")
+
+
+def test_few_labels_show_one_head_and_the_most_labels():
+    def part(head: str, labels: int, value: float) -> dict:
+        one = {"value": value, "low": NAN, "high": NAN, "spread": NAN}
+        scores = dict.fromkeys(("accuracy", "balanced_accuracy", "average_precision"), one)
+        return {
+            "head": head,
+            "labels": labels,
+            "rows": {"ours": {"control": False, "runs": 1, "scores": scores, "versus": {}}},
+        }
+
+    parts = [part(head, labels, 0.5) for head in ("linear", "logistic") for labels in (100, 500)]
+    told = {
+        "name": "celeba",
+        "protocol": "linear",
+        "kind": "labels",
+        "names": ["a", "b"],
+        "n_test": 5,
+        "seeds": [0],
+    }
+    scores = scores_from({**told, "parts": parts}, {}, {})
+    assert [(one.head, one.count) for one in scores] == [
+        ("linear", 100),
+        ("linear", 500),
+        ("logistic", 100),
+        ("logistic", 500),
+    ]
+    table = protocol_table(scores, ["ours"])
+    assert [column.name for column in table.columns[:2]] == [
+        "celeba, 100 labels: balanced",
+        "celeba, 500 labels: balanced",
+    ]
+    svg, _ = protocol_picture(scores, ["ours"])
+    assert "celeba, 500 labels" in svg and "celeba, 100 labels" not in svg

@@ -1,0 +1,136 @@
+"""What arrives by hand: bodies without end, lengths that lie, smuggled requests, answers nobody takes."""
+
+import socket
+import time
+
+import pytest
+
+from derender.report.viewer.app import DRAINED_AT_MOST_BYTES, Application, Viewer
+from derender.report.viewer.intake import BODY_LIMIT_BYTES
+from derender.report.viewer.server import BoundedProtocol, serving
+from derender.report.viewer.shelf import Shelf
+from derender.report.viewer.studio import Studio
+
+CHUNKED = "Transfer-Encoding: chunked\r\n"
+
+
+def connected(url: str) -> socket.socket:
+    return socket.create_connection(place(url), timeout=10)
+
+
+def place(url: str) -> tuple[str, int]:
+    return "127.0.0.1", int(url.rsplit(":", 1)[1].strip("/"))
+
+
+def head(url: str, path: str = "/api/pictures", more: str = "") -> bytes:
+    host = f"127.0.0.1:{place(url)[1]}"
+    return f"POST {path} HTTP/1.1\r\nHost: {host}\r\nX-Derender-Page: 1\r\n{more}\r\n".encode()
+
+
+def answered(connection: socket.socket) -> bytes:
+    """Everything until the server ends the connection or says no more for a second."""
+    connection.settimeout(1)
+    found = b""
+    try:
+        while part := connection.recv(65536):
+            found += part
+    except (TimeoutError, ConnectionResetError):
+        pass
+    return found
+
+
+def test_a_chunked_body_without_end_is_cut_off(client):
+    piece = bytes(1 << 20)
+    chunk = f"{len(piece):x}\r\n".encode() + piece + b"\r\n"
+    sent = 0
+    with connected(client.url) as connection:
+        connection.sendall(head(client.url, more=CHUNKED))
+        with pytest.raises((ConnectionError, TimeoutError)):
+            while sent < 1 << 30:
+                connection.sendall(chunk)
+                sent += len(piece)
+        assert sent <= BODY_LIMIT_BYTES + DRAINED_AT_MOST_BYTES + (32 << 20)  # what sockets hold in between
+    assert client.get("/api/about").status == 200
+
+
+def test_an_address_that_reads_no_body_is_not_sent_one_for_ever(client):
+    for method, path in (("GET", "/"), ("POST", "/nothing/here")):
+        request = head(client.url, path, CHUNKED).replace(b"POST", method.encode(), 1)
+        with connected(client.url) as connection:
+            connection.sendall(request)
+            with pytest.raises(ConnectionError):
+                for _ in range(1 << 14):
+                    connection.sendall(b"10000\r\n" + bytes(1 << 16) + b"\r\n")
+    assert client.get("/api/about").status == 200
+
+
+def test_a_body_shorter_than_it_says_ends_in_time(model, client):
+    application = Application(Viewer(Studio(model, "tiny", Shelf(2))), body_seconds=0.3)
+    with serving(application) as url, connected(url) as connection:
+        connection.sendall(head(url, more="Content-Length: 1000000\r\n") + b"few")
+        assert b" 408 " in answered(connection)
+
+
+def test_a_length_above_the_limit_is_refused_without_waiting_for_the_bytes(model):
+    application = Application(Viewer(Studio(model, "tiny", Shelf(2))), body_seconds=0.3)
+    with serving(application) as url, connected(url) as connection:
+        connection.sendall(head(url, more=f"Content-Length: {1 << 60}\r\n") + bytes(1000))
+        assert b" 408 " in answered(connection) or b" 413 " in answered(connection)
+
+
+def test_what_follows_a_short_body_is_a_request_of_its_own_and_has_to_prove_itself(client):
+    smuggled = b"POST /api/examples/0 HTTP/1.1\r\nHost: evil.example\r\nContent-Length: 0\r\n\r\n"
+    with connected(client.url) as connection:
+        connection.sendall(head(client.url, "/api/view", "Content-Length: 2\r\n") + b"{}" + smuggled)
+        found = answered(connection)
+    assert found.count(b"HTTP/1.1 ") == 2
+    assert b" 422 " in found or b" 400 " in found
+    assert b" 421 " in found
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        "Content-Length: 2\r\nContent-Length: 30\r\n",
+        "Content-Length: -1\r\n",
+        "Content-Length: 2x\r\n",
+        "Content-Length: 5\r\nTransfer-Encoding: chunked\r\nTransfer-Encoding: identity\r\n",
+        "Host: evil.example\r\n",
+        "X-Long: " + "a" * 100_000 + "\r\n",
+        "Broken\r\n",
+        "X: a\0b\r\n",
+    ],
+)
+def test_heads_that_say_two_things_are_refused(client, more):
+    with connected(client.url) as connection:
+        try:
+            connection.sendall(head(client.url, "/api/view", more) + b"{}")
+            found = answered(connection)
+        except ConnectionError:
+            found = b"HTTP/1.1 400 "
+    assert found.split(b" ")[1] in (b"400", b"421", b"422"), found[:200]
+    assert client.get("/api/about").status == 200
+
+
+def test_broken_chunks_are_refused(client):
+    for chunk in (b"zz\r\nab\r\n0\r\n\r\n", b"-1\r\nab\r\n", b"fffffffffffffffffffff\r\nab"):
+        with connected(client.url) as connection:
+            connection.sendall(head(client.url, "/api/view", CHUNKED) + chunk)
+            found = answered(connection)
+        assert b" 200 " not in found
+    assert client.get("/api/about").status == 200
+
+
+def test_answers_nobody_takes_end_the_connection(model, monkeypatch, client):
+    monkeypatch.setattr(BoundedProtocol, "taking_seconds", 0.3)
+    with serving(Application(Viewer(Studio(model, "tiny", Shelf(2))))) as url:
+        request = f"GET /view.js HTTP/1.1\r\nHost: 127.0.0.1:{place(url)[1]}\r\n\r\n".encode()
+        with socket.socket() as connection:
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+            connection.settimeout(10)
+            connection.connect(place(url))
+            with pytest.raises(ConnectionError):
+                for _ in range(100):  # far more than sockets hold
+                    connection.sendall(request * 50)
+                    time.sleep(0.05)
+        assert type(client)(url).get("/api/about").status == 200

@@ -1,0 +1,127 @@
+"""Names that are markup or formulas, in every kind of report: one script, the page's own, and no handler."""
+
+import json
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from derender.data.doctor import examine
+from derender.data.pictures import PictureSet
+from derender.data.source import Skipped
+from derender.evaluation.bootstrap import ScoredRow, estimate, with_verdicts
+from derender.evaluation.linear_task import Rows, task_of
+from derender.evaluation.robustness import CurveResult, RobustnessComparison
+from derender.interpretation import cluster_shares, explain_labels, pair_parts
+from derender.report import charts
+from derender.report.comparison import comparison_page
+from derender.report.doctor import doctor_page
+from derender.report.explanation import Shown, explanation_page
+from derender.report.page import Page
+from derender.report.robustness import robustness_page
+from derender.report.run import run_page
+from derender.report.score_table import Column, Row, ScoreTable
+from derender.report.share_chart import share_chart
+from derender.training.config import resolve
+from derender.training.run_folder import append_metrics, start_run
+
+EVIL = [
+    "<script>alert(1)</script>",
+    "</script><img src=x onerror=alert(2)>",
+    '" onload="alert(3)',
+    "$\\frac$ & ]]>",
+]
+
+
+class Elements(HTMLParser):
+    """Every element with its attributes."""
+
+    def __init__(self, html: str):
+        super().__init__()
+        self.found: list[tuple[str, dict[str, str | None]]] = []
+        self.feed(html)
+
+    def handle_starttag(self, tag, attrs):
+        self.found.append((tag, dict(attrs)))
+
+
+def harmless(page: Page, evil: str) -> None:
+    """Look for what a browser could run or fetch."""
+    html = page.html()
+    found = Elements(html).found
+    assert [tag for tag, _ in found].count("script") == 1
+    for tag, attributes in found:
+        assert tag not in ("iframe", "object", "embed", "base", "form")
+        assert not [name for name in attributes if name.startswith("on")], (tag, attributes)
+        assert all(
+            (attributes.get(name) or "").startswith(("data:", "#"))
+            for name in ("src", "href")
+            if name in attributes
+        )
+    assert "<" not in evil or evil not in html  # quotes may stand in text, where they end nothing
+
+
+def made_table(evil: str) -> ScoreTable:
+    rows = [Row(evil, [0.5, evil], note=evil), Row(f"{evil} 2", [0.25, "b"], control=True)]
+    return ScoreTable(evil, evil, [Column(evil, "high", note=evil), Column("more")], rows)
+
+
+@pytest.mark.parametrize("evil", EVIL)
+def test_comparison(evil):
+    harmless(comparison_page(evil, [made_table(evil)], lead=evil, facts={evil: evil}), evil)
+
+
+@pytest.mark.parametrize("evil", EVIL)
+def test_run(evil, tmp_path):
+    run = start_run(tmp_path / "run", resolve("small"), {evil: evil, "pictures": evil}, evil)
+    text = run.config.read_text()
+    run.config.write_text(text.replace("preset: small", f"preset: {json.dumps(evil)}"))
+    for images in (8, 16):
+        append_metrics(
+            run, {"kind": "train", "images": images, "seconds": 1.0, evil: 0.5, "l1": 0.5 / images}
+        )
+        append_metrics(run, {"kind": evil, "images": images, "text": evil})
+        append_metrics(run, {"kind": "note", "images": images, "text": evil})
+    append_metrics(run, {"kind": "collapse", "images": 16, evil: evil})
+    harmless(run_page(run.path), evil)
+
+
+@pytest.mark.parametrize("evil", EVIL)
+def test_doctor(evil):
+    images = np.random.default_rng(0).integers(0, 256, (24, 3, 32, 32), dtype=np.uint8)
+    images[1] = images[0]
+    names = tuple(f"{evil}{number}.png" for number in range(24))
+    labels = {evil: np.array([evil, "b"] * 12)}
+    pictures = PictureSet(images, names, labels, source=evil, skipped=(Skipped(evil, evil),))
+    harmless(doctor_page(pictures, examine(pictures)), evil)
+
+
+@pytest.mark.parametrize("evil", EVIL)
+def test_robustness(evil):
+    drawn = np.linspace(-0.01, 0.01, 5)
+    named = {"ordinary": 0.9, "area": 0.7, "0 deg": 0.9, "40 deg": 0.5}
+    scores = {key: estimate([value - 0.1, value + 0.1], value + drawn) for key, value in named.items()}
+    rows = with_verdicts([ScoredRow(evil, False, 2, scores), ScoredRow(f"{evil} 2", True, 2, scores)])
+    curve = CurveResult("yaw", evil, (0.0, 40.0), (8, 8, 16), {"accuracy": rows})
+    found = RobustnessComparison((curve,), evil, "classes", (evil, "b"), "logistic", {"yaw": 19}, 3, (0, 1))
+    harmless(robustness_page(found, evil), evil)
+
+
+@pytest.mark.parametrize("evil", EVIL)
+def test_explanation(evil):
+    generator = np.random.default_rng(0)
+    features = {name: generator.standard_normal((90, 3)).astype(np.float32) for name in ("geometry", "light")}
+    classes = np.where(features["light"][:, 0] > 0, evil, "b")
+    rows = Rows(np.arange(60, 90), {40: np.arange(40)[None]})
+    found = explain_labels(features, task_of({evil: classes}), rows, seeds=(0,))
+    sheets = {evil: {"grad-cam": Image.new("RGB", (8, 8))}}
+    pair = pair_parts(features, 0, 1), (evil, evil)
+    clusters = cluster_shares(features, np.arange(90) % 2)
+    shown = Shown(found, share_chart(found)[0], evil, evil, sheets=sheets, clusters=clusters, pair=pair)
+    harmless(explanation_page(shown), evil)
+
+
+def test_a_name_with_dollars_is_text_and_no_formula():
+    svg = charts.bars({"$\\frac$": 1.0, "cost $5 to $9": 2.0}, "x", ["$\\frac$"], ("$a_", 0.5))
+    assert "$\\frac$" in svg and "cost $5 to $9" in svg and "$a_" in svg

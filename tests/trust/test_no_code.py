@@ -1,0 +1,224 @@
+"""Nothing that is read is ever run: no call that could do it stands in the sources, files that try fail."""
+
+import ast
+import json
+import pickle
+import resource
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import save_file
+
+import derender
+from derender.baselines.stylegan2.published import read_weights
+from derender.baselines.training import load_baseline
+from derender.data.listing import recall
+from derender.evaluation.memory import Memory
+from derender.features import FeatureTable
+from derender.objectives.vgg import _read_weights
+from derender.training import resolve
+from derender.training.run_folder import read_config_tree
+
+PACKAGE = Path(derender.__file__).parent
+SOURCES = sorted(PACKAGE.rglob("*.py"))
+
+NEVER = {
+    *(
+        "pickle.load",
+        "pickle.loads",
+        "pickle.dumps",
+        "pickle.Unpickler",
+        "marshal.load",
+        "marshal.loads",
+        "shelve.open",
+        "joblib.load",
+    ),
+    *("dill.load", "dill.loads", "cloudpickle.load", "cloudpickle.loads", "pandas.read_pickle"),
+    *("yaml.load", "yaml.full_load", "yaml.unsafe_load", "yaml.load_all", "jsonpickle.decode"),
+    *("eval", "exec", "compile", "__import__", "os.system", "os.popen", "runpy.run_path"),
+    *("shutil.unpack_archive", "torch.hub.load", "torch.jit.load"),
+}
+NEVER_METHODS = {"extract", "extractall", "read_pickle", "full_load", "unsafe_load"}
+BETWEEN_OWN_PROCESSES = {"features/ray_engine.py": {"pickle.loads", "pickle.dumps"}}
+"""What our actors hand back through Ray, which sends pickles between its processes anyhow; never a file."""
+
+NEEDED = {"torch.load": ("weights_only", True), "np.load": ("allow_pickle", False)}
+
+
+def dotted(node: ast.expr) -> str:
+    parts: list[str] = []
+    while isinstance(node, ast.Attribute):
+        parts.append(node.attr)
+        node = node.value
+    return (
+        ".".join(reversed([*parts, node.id]))
+        if isinstance(node, ast.Name)
+        else f"?.{parts[0] if parts else ''}"
+    )
+
+
+def dangers(tree: ast.AST) -> list[str]:
+    """Calls that can run what a file says, with their lines."""
+    found = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and node.module in (
+            "pickle",
+            "marshal",
+            "shelve",
+            "dill",
+            "joblib",
+        ):
+            found.append(f"{node.lineno}: from {node.module} import")
+        if not isinstance(node, ast.Call):
+            continue
+        name = dotted(node.func)
+        given = {word.arg: word.value.value for word in node.keywords if isinstance(word.value, ast.Constant)}
+        method = node.func.attr if isinstance(node.func, ast.Attribute) else ""
+        if name in NEVER or method in NEVER_METHODS:
+            found.append(f"{node.lineno}: {name}")
+        elif name in NEEDED and given.get(NEEDED[name][0]) is not NEEDED[name][1]:
+            found.append(f"{node.lineno}: {name} without {NEEDED[name][0]}={NEEDED[name][1]}")
+        elif (
+            name.endswith("from_pretrained")
+            and "library" in name
+            and given.get("use_safetensors") is not True
+        ):
+            found.append(f"{node.lineno}: {name} without use_safetensors=True")
+        elif given.get("shell") or given.get("trust_remote_code") or given.get("allow_pickle"):
+            found.append(f"{node.lineno}: {name} with shell, trust_remote_code or allow_pickle")
+    return found
+
+
+def test_no_source_has_a_call_that_runs_what_a_file_says():
+    found = {}
+    for path in SOURCES:
+        name = path.relative_to(PACKAGE).as_posix()
+        allowed = BETWEEN_OWN_PROCESSES.get(name, set())
+        left = [one for one in dangers(ast.parse(path.read_text())) if one.split(": ")[1] not in allowed]
+        if left:
+            found[name] = left
+    assert not found
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "pickle.load(f)",
+        "from pickle import loads",
+        "torch.load(f)",
+        "torch.load(f, weights_only=False)",
+        "np.load(f)",
+        "np.load(f, allow_pickle=True)",
+        "yaml.load(f, Loader)",
+        "archive.extractall(folder)",
+        "eval(text)",
+        "subprocess.run(text, shell=True)",
+        "library.Net.from_pretrained(source)",
+    ],
+)
+def test_such_calls_are_seen(source):
+    assert dangers(ast.parse(source))
+
+
+class Bomb:
+    """Unpickling it makes a file."""
+
+    def __init__(self, file: Path):
+        self.file = file
+
+    def __reduce__(self):
+        return Path.touch, (self.file,)
+
+
+@pytest.fixture
+def canary(tmp_path):
+    """A file that exists once somebody has run what a file said."""
+    file = tmp_path / "executed"
+    yield file
+    assert not file.exists(), "code from a file was run"
+
+
+def test_the_bomb_goes_off_where_pickles_are_read(tmp_path):
+    pickle.loads(pickle.dumps(Bomb(tmp_path / "executed")))
+    assert (tmp_path / "executed").exists()
+
+
+def test_weights_that_are_pickles_run_nothing(canary, tmp_path):
+    bomb = {"weight": torch.zeros(1), "more": Bomb(canary)}
+    torch.save(bomb, tmp_path / "e4e.pt")
+    with pytest.raises(ValueError, match="wants to run code when it is read"):
+        read_weights(tmp_path / "e4e.pt", "the published file")
+    torch.save(bomb, tmp_path / "vgg16.pth")
+    with pytest.raises(ValueError, match=r"vgg16\.pth cannot be read"):
+        _read_weights(tmp_path / "vgg16.pth")
+    np.savez(tmp_path / "vgg16.npz", weight=np.array([Bomb(canary)], object))
+    with pytest.raises(ValueError, match=r"vgg16\.npz cannot be read"):
+        _read_weights(tmp_path / "vgg16.npz")
+
+
+def test_model_folders_with_pickles_in_them_run_nothing(canary, tmp_path):
+    model = derender.Derenderer.from_preset("small", seed=0, image_size=32, width=8, light_width=4)
+    folder = model.save(tmp_path / "model")
+    pickled = pickle.dumps(Bomb(canary))
+    (folder / "pytorch_model.bin").write_bytes(pickled)
+    assert derender.load(folder).image_size == 32
+    for name in ("model.safetensors", "whitening.safetensors", "config.json"):
+        whole = (folder / name).read_bytes() if (folder / name).exists() else None
+        (folder / name).write_bytes(pickled)
+        with pytest.raises(ValueError, match="damaged"):
+            derender.load(folder)
+        (folder / name).unlink() if whole is None else (folder / name).write_bytes(whole)
+    with pytest.raises(ValueError, match="is a pickle, which can run code"):
+        load_baseline(folder / "pytorch_model.bin")
+
+
+def test_tables_and_caches_with_pickles_in_them_run_nothing(canary, tmp_path):
+    (tmp_path / "F.parquet").write_bytes(pickle.dumps(Bomb(canary)))
+    with pytest.raises(ValueError, match="not a readable parquet file"):
+        FeatureTable.read(tmp_path / "F.parquet")
+    bomb = np.array([Bomb(canary)], object)
+    memory = Memory(tmp_path)
+    memory.recall("kind", {"a": 1}, lambda: {"found": np.zeros(2)})
+    (file,) = tmp_path.glob("kind-*.npz")
+    np.savez(file, found=bomb)
+    assert memory.recall("kind", {"a": 1}, lambda: {"found": np.ones(2)})["found"].tolist() == [1, 1]
+    np.savez(tmp_path / "listing.npz", note=bomb, names=bomb, stamps=bomb)
+    assert recall(tmp_path / "listing.npz", str(tmp_path), lambda name: True) is None
+
+
+def test_configurations_run_nothing(canary, tmp_path):
+    told = f'!!python/object/apply:pathlib.Path.touch [!!python/object/apply:pathlib.PosixPath ["{canary}"]]'
+    (tmp_path / "config.yaml").write_text(f"preset: {told}\n")
+    with pytest.raises(ValueError, match="is damaged"):
+        read_config_tree(tmp_path)
+    with pytest.raises(ValueError, match="cannot read the value"):
+        resolve("small", [f"preset={told}"])
+
+
+def test_safetensors_with_other_sizes_than_they_say_are_refused(tmp_path):
+    model = derender.Derenderer.from_preset("small", seed=0, image_size=32, width=8, light_width=4)
+    folder = model.save(tmp_path / "model")
+    content = bytearray((folder / "model.safetensors").read_bytes())
+    content[:8] = (1 << 62).to_bytes(8, "little")
+    (folder / "model.safetensors").write_bytes(content)
+    with pytest.raises(ValueError, match="damaged"):
+        derender.load(folder)
+    save_file({"nets.geometry.encoder.weight": torch.zeros(3)}, folder / "model.safetensors")
+    with pytest.raises(ValueError, match="damaged"):
+        derender.load(folder)
+
+
+def test_a_configuration_that_claims_a_giant_takes_no_memory(tmp_path):
+    model = derender.Derenderer.from_preset("small", seed=0, image_size=32, width=8, light_width=4)
+    folder = model.save(tmp_path / "model")
+    config = json.loads((folder / "config.json").read_text())
+    for name, size in (("width", 1 << 16), ("code_size", 1 << 40), ("light_width", 1 << 20)):
+        changed = {**config["settings"]["network"], name: size}
+        told = {**config, "settings": {**config["settings"], "network": changed}}
+        (folder / "config.json").write_text(json.dumps(told))
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        with pytest.raises(ValueError, match="is damaged"):
+            derender.load(folder)
+        assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200_000  # kB
