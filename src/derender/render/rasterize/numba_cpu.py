@@ -7,6 +7,8 @@ Registered with torch.library, so that ``torch.compile`` sees one opaque operato
 import torch
 from torch import Tensor
 
+from derender.render.rasterize.operator import connect, empty_outputs
+
 
 def rasterize(vertices: Tensor, focal_px: float) -> tuple[Tensor, Tensor, Tensor]:
     """uv (N, H, W, 2), depth (N, H, W) and the visible triangle (N, H, W), -1 where there is none."""
@@ -18,16 +20,11 @@ def _forward(vertices: Tensor, focal_px: float) -> tuple[Tensor, Tensor, Tensor]
     from derender.render.numba_threads import array, over_images
     from derender.render.rasterize import numba_kernels
 
-    outputs = uv, depth, triangle = _empty_outputs(vertices)
+    outputs = uv, depth, triangle = empty_outputs(vertices)
     points, count = array(vertices), len(vertices)
     over_images(numba_kernels.choose, count, points, focal_px, array(triangle))
     over_images(numba_kernels.intersect, count, points, focal_px, array(triangle), array(uv), array(depth))
     return outputs
-
-
-@_forward.register_fake
-def _(vertices: Tensor, focal_px: float) -> tuple[Tensor, Tensor, Tensor]:
-    return _empty_outputs(vertices)
 
 
 @torch.library.custom_op("derender::rasterize_numba_backward", mutates_args=(), device_types="cpu")
@@ -43,29 +40,4 @@ def _backward(
     return grad_vertices
 
 
-@_backward.register_fake
-def _(grad_uv: Tensor, grad_depth: Tensor, vertices: Tensor, triangle: Tensor, focal_px: float) -> Tensor:
-    return vertices.new_empty(vertices.shape)
-
-
-def _setup_context(ctx, inputs, output) -> None:
-    ctx.focal_px = inputs[1]
-    ctx.mark_non_differentiable(output[2])
-    ctx.save_for_backward(inputs[0], output[2])
-
-
-def _differentiate(ctx, grad_uv: Tensor, grad_depth: Tensor, _) -> tuple[Tensor, None]:
-    vertices, triangle = ctx.saved_tensors
-    return _backward(grad_uv, grad_depth, vertices, triangle, ctx.focal_px), None
-
-
-_forward.register_autograd(_differentiate, setup_context=_setup_context)
-
-
-def _empty_outputs(vertices: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    size = vertices.shape[:3]
-    return (
-        vertices.new_empty((*size, 2)),
-        vertices.new_empty(size),
-        vertices.new_empty(size, dtype=torch.int32),
-    )
+connect(_forward, _backward)

@@ -7,6 +7,7 @@ bit for bit in every run; backward too where torch is told to use deterministic 
 import torch
 from torch import Tensor
 
+from derender.render.rasterize.operator import connect, empty_outputs
 from derender.render.scattered_sums import scattered_sums
 from derender.render.triton_launch import TRIANGLES_PER_PROGRAM, float64_bits, launch
 
@@ -47,14 +48,9 @@ def _forward(vertices: Tensor, focal_px: float) -> tuple[Tensor, Tensor, Tensor]
     screen = one, torch.empty_like(one), torch.empty_like(one)
     launch(triton_kernels.project_vertices, vertices, pixels, vertices, *screen, focal, height, width)
     triangle = choose_triangles(screen)
-    uv, depth, _ = _empty_outputs(vertices)
+    uv, depth, _ = empty_outputs(vertices)
     launch(triton_kernels.intersect, vertices, pixels, vertices, triangle, uv, depth, focal, height, width)
     return uv, depth, triangle
-
-
-@_forward.register_fake
-def _(vertices: Tensor, focal_px: float) -> tuple[Tensor, Tensor, Tensor]:
-    return _empty_outputs(vertices)
 
 
 @torch.library.custom_op("derender::rasterize_triton_backward", mutates_args=(), device_types=("cuda", "cpu"))
@@ -76,29 +72,4 @@ def _backward(
     return grad_vertices.to(vertices.dtype)
 
 
-@_backward.register_fake
-def _(grad_uv: Tensor, grad_depth: Tensor, vertices: Tensor, triangle: Tensor, focal_px: float) -> Tensor:
-    return vertices.new_empty(vertices.shape)
-
-
-def _setup_context(ctx, inputs, output) -> None:
-    ctx.focal_px = inputs[1]
-    ctx.mark_non_differentiable(output[2])
-    ctx.save_for_backward(inputs[0], output[2])
-
-
-def _differentiate(ctx, grad_uv: Tensor, grad_depth: Tensor, _) -> tuple[Tensor, None]:
-    vertices, triangle = ctx.saved_tensors
-    return _backward(grad_uv, grad_depth, vertices, triangle, ctx.focal_px), None
-
-
-_forward.register_autograd(_differentiate, setup_context=_setup_context)
-
-
-def _empty_outputs(vertices: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    size = vertices.shape[:3]
-    return (
-        vertices.new_empty((*size, 2)),
-        vertices.new_empty(size),
-        vertices.new_empty(size, dtype=torch.int32),
-    )
+connect(_forward, _backward)

@@ -7,6 +7,7 @@ image repeats bit for bit where torch is told to use deterministic algorithms; t
 import torch
 from torch import Tensor
 
+from derender.render.sample.operator import connect, empty_colour
 from derender.render.scattered_sums import scattered_sums
 from derender.render.triton_launch import launch
 
@@ -20,7 +21,7 @@ def sample(image: Tensor, uv: Tensor, mask: Tensor) -> Tensor:
 def _forward(image: Tensor, uv: Tensor, mask: Tensor) -> Tensor:
     from derender.render.sample import triton_kernels
 
-    colour = _empty_colour(image, mask)
+    colour = empty_colour(image, mask)
     image, uv, mask = image.contiguous(), uv.contiguous(), mask.contiguous()
     _, channels, height, width = image.shape
     pixels = mask.shape[1] * mask.shape[2]
@@ -29,11 +30,6 @@ def _forward(image: Tensor, uv: Tensor, mask: Tensor) -> Tensor:
         CHANNELS=channels,
     )  # fmt: skip
     return colour
-
-
-@_forward.register_fake
-def _(image: Tensor, uv: Tensor, mask: Tensor) -> Tensor:
-    return _empty_colour(image, mask)
 
 
 @torch.library.custom_op("derender::sample_triton_backward", mutates_args=(), device_types=("cuda", "cpu"))
@@ -55,21 +51,4 @@ def _backward(grad: Tensor, image: Tensor, uv: Tensor, mask: Tensor) -> tuple[Te
     return grad_image, grad_uv
 
 
-@_backward.register_fake
-def _(grad: Tensor, image: Tensor, uv: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
-    return image.new_empty(image.shape), uv.new_empty(uv.shape)
-
-
-def _setup_context(ctx, inputs, output) -> None:
-    ctx.save_for_backward(*inputs)
-
-
-def _differentiate(ctx, grad: Tensor) -> tuple[Tensor, Tensor, None]:
-    return *_backward(grad, *ctx.saved_tensors), None
-
-
-_forward.register_autograd(_differentiate, setup_context=_setup_context)
-
-
-def _empty_colour(image: Tensor, mask: Tensor) -> Tensor:
-    return image.new_empty((*image.shape[:2], *mask.shape[1:]))
+connect(_forward, _backward)

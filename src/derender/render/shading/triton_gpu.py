@@ -7,6 +7,7 @@ same bits, forward and backward.
 import torch
 from torch import Tensor
 
+from derender.render.shading.operator import connect
 from derender.render.triton_launch import PIXELS_PER_PROGRAM, float64_bits, launch, programs_per_image
 
 
@@ -27,11 +28,6 @@ def _forward(depth: Tensor, albedo: Tensor, lamp: Tensor, focal_px: float) -> Te
         depth, albedo, lamp, image, float64_bits(focal_px), height, width, CHANNELS=channels,
     )  # fmt: skip
     return image
-
-
-@_forward.register_fake
-def _(depth: Tensor, albedo: Tensor, lamp: Tensor, focal_px: float) -> Tensor:
-    return albedo.new_empty(albedo.shape)
 
 
 @torch.library.custom_op("derender::shade_triton_backward", mutates_args=(), device_types=("cuda", "cpu"))
@@ -56,20 +52,4 @@ def _backward(
     return grad_depth, grad_albedo, grad_lamp.sum(1)
 
 
-@_backward.register_fake
-def _(
-    grad: Tensor, depth: Tensor, albedo: Tensor, lamp: Tensor, focal_px: float
-) -> tuple[Tensor, Tensor, Tensor]:
-    return depth.new_empty(depth.shape), albedo.new_empty(albedo.shape), lamp.new_empty(lamp.shape)
-
-
-def _setup_context(ctx, inputs, output) -> None:
-    *values, ctx.focal_px = inputs
-    ctx.save_for_backward(*values)
-
-
-def _differentiate(ctx, grad: Tensor) -> tuple[Tensor | None, ...]:
-    return *_backward(grad, *ctx.saved_tensors, ctx.focal_px), None
-
-
-_forward.register_autograd(_differentiate, setup_context=_setup_context)
+connect(_forward, _backward)

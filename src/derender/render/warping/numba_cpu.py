@@ -7,6 +7,7 @@ number of threads.
 import torch
 from torch import Tensor
 
+from derender.render.warping.operator import connect, empty_gradients, empty_outputs
 from derender.scene.camera import focal_px
 
 
@@ -24,17 +25,10 @@ def _forward(
     from derender.render.numba_threads import array, over_images
     from derender.render.warping import numba_kernels
 
-    outputs = _empty_outputs(image, depth)
+    outputs = empty_outputs(image, depth)
     inputs = [array(value) for value in (image, depth, rotation, offset)]
     over_images(numba_kernels.forward, len(image), *inputs, focal, *(array(value) for value in outputs))
     return outputs
-
-
-@_forward.register_fake
-def _(
-    image: Tensor, depth: Tensor, rotation: Tensor, offset: Tensor, focal: float
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    return _empty_outputs(image, depth)
 
 
 @torch.library.custom_op("derender::warp_numba_backward", mutates_args=(), device_types="cpu")
@@ -45,7 +39,7 @@ def _backward(
     from derender.render.numba_threads import array, over_images
     from derender.render.warping import numba_kernels
 
-    gradients = _empty_gradients(image, depth, rotation, offset)
+    gradients = empty_gradients(image, depth, rotation, offset)
     inputs = (grad_colour, grad_depth_seen, image, depth, rotation, offset)
     over_images(
         numba_kernels.backward, len(image),
@@ -54,38 +48,4 @@ def _backward(
     return gradients
 
 
-@_backward.register_fake
-def _(
-    grad_colour: Tensor, grad_depth_seen: Tensor, image: Tensor, depth: Tensor, rotation: Tensor,
-    offset: Tensor, triangle: Tensor, focal: float,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
-    return _empty_gradients(image, depth, rotation, offset)
-
-
-def _setup_context(ctx, inputs, output) -> None:
-    *values, ctx.focal = inputs
-    ctx.mark_non_differentiable(output[2], output[3])
-    ctx.save_for_backward(*values, output[3])
-
-
-def _differentiate(ctx, grad_colour: Tensor, grad_depth: Tensor, *_) -> tuple[Tensor | None, ...]:
-    return *_backward(grad_colour, grad_depth, *ctx.saved_tensors, ctx.focal), None
-
-
-_forward.register_autograd(_differentiate, setup_context=_setup_context)
-
-
-def _empty_outputs(image: Tensor, depth: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    return (
-        image.new_empty(image.shape),
-        depth.new_empty(depth.shape),
-        depth.new_empty(depth.shape),
-        depth.new_empty(depth.shape, dtype=torch.int32),
-    )
-
-
-def _empty_gradients(
-    image: Tensor, depth: Tensor, rotation: Tensor, offset: Tensor
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    image, depth, rotation, offset = (v.new_empty(v.shape) for v in (image, depth, rotation, offset))
-    return image, depth, rotation, offset
+connect(_forward, _backward)

@@ -10,6 +10,7 @@ from torch import Tensor
 from derender.render.rasterize.triton_gpu import choose_triangles
 from derender.render.scattered_sums import scattered_sums
 from derender.render.triton_launch import PIXELS_PER_PROGRAM, float64_bits, launch, programs_per_image
+from derender.render.warping.operator import connect, empty_outputs
 from derender.scene.camera import focal_px
 
 
@@ -26,7 +27,7 @@ def _forward(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     from derender.render.warping import triton_kernels
 
-    outputs = _empty_outputs(image, depth)[:3]
+    outputs = empty_outputs(image, depth)[:3]
     image, depth, rotation, offset = (value.contiguous() for value in (image, depth, rotation, offset))
     _, channels, height, width = image.shape
     bits, pixels = float64_bits(focal), height * width
@@ -40,13 +41,6 @@ def _forward(
         image, depth, *motion, triangle, *outputs, bits, height, width, CHANNELS=channels,
     )  # fmt: skip
     return *outputs, triangle
-
-
-@_forward.register_fake
-def _(
-    image: Tensor, depth: Tensor, rotation: Tensor, offset: Tensor, focal: float
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    return _empty_outputs(image, depth)
 
 
 @torch.library.custom_op("derender::warp_triton_backward", mutates_args=(), device_types=("cuda", "cpu"))
@@ -78,33 +72,4 @@ def _backward(
     return grad_image, grad_depth.to(depth.dtype), motion[..., :3].contiguous(), motion[..., 3].contiguous()
 
 
-@_backward.register_fake
-def _(
-    grad_colour: Tensor, grad_depth_seen: Tensor, image: Tensor, depth: Tensor, rotation: Tensor,
-    offset: Tensor, triangle: Tensor, focal: float,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
-    values = image, depth, rotation, offset
-    image, depth, rotation, offset = (value.new_empty(value.shape) for value in values)
-    return image, depth, rotation, offset
-
-
-def _setup_context(ctx, inputs, output) -> None:
-    *values, ctx.focal = inputs
-    ctx.mark_non_differentiable(output[2], output[3])
-    ctx.save_for_backward(*values, output[3])
-
-
-def _differentiate(ctx, grad_colour: Tensor, grad_depth: Tensor, *_) -> tuple[Tensor | None, ...]:
-    return *_backward(grad_colour, grad_depth, *ctx.saved_tensors, ctx.focal), None
-
-
-_forward.register_autograd(_differentiate, setup_context=_setup_context)
-
-
-def _empty_outputs(image: Tensor, depth: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    return (
-        image.new_empty(image.shape),
-        depth.new_empty(depth.shape),
-        depth.new_empty(depth.shape),
-        depth.new_empty(depth.shape, dtype=torch.int32),
-    )
+connect(_forward, _backward)
