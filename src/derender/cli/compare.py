@@ -7,7 +7,7 @@ Segmentation trains nets and takes models alone.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -277,15 +277,7 @@ def run_cluster(
     )
 
     first = rows[0].tables[0]
-    columns = part.columns(first)
-    tracks = part.name == "identity" and "track" in first.labels
-    ready = prepare(
-        rows,
-        columns,
-        mean_by=(*columns, "track") if tracks else (),
-        min_count=1 if tracks or part.max_count is None else part.min_count,
-        max_count=None if tracks else part.max_count,
-    )
+    ready = prepare(rows, part.columns(first), **asdict(part.rows(first)))
     found = compare_clusterings(
         ready.features,
         ready.labels,

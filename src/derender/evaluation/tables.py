@@ -33,6 +33,15 @@ class PaperRow:
 
 
 @dataclass(frozen=True)
+class RowRules:
+    """Which rows a question is asked of; see ``feature_rows.prepare``."""
+
+    mean_by: tuple[str, ...] = ()
+    min_count: int = 1
+    max_count: int | None = None
+
+
+@dataclass(frozen=True)
 class Part:
     """One question of a table.
 
@@ -59,6 +68,12 @@ class Part:
         if self.labels == (ATTRIBUTES,):
             return attribute_columns(table)
         return next(((name,) for name in self.labels if name in table.labels), ())
+
+    def rows(self, table: FeatureTable) -> RowRules:
+        """Which rows of a table are asked: the mean over each track where people have tracks."""
+        if self.name == "identity" and "track" in table.labels:
+            return RowRules((*self.columns(table), "track"))
+        return RowRules() if self.max_count is None else RowRules((), self.min_count, self.max_count)
 
     def differs(self, layout: str, n_rows: int, rows: str = "rows") -> str:
         """What to know before comparing a result on these data with the paper's."""

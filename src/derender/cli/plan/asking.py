@@ -1,6 +1,6 @@
 """One scored set of a plan: every question asked of the features of all methods at once, beside controls."""
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 from derender.cli import feature_rows
@@ -9,7 +9,7 @@ from derender.cli.plan.embedding import scored_pictures
 from derender.cli.plan.jobs import Job, Note, Place
 from derender.cli.plan.settings import OURS, Plan
 from derender.evaluation.memory import Memory, content_hash
-from derender.evaluation.tables import ATTRIBUTES, Part, attribute_columns, table_named
+from derender.evaluation.tables import ATTRIBUTES, RowRules, attribute_columns, table_named
 
 if TYPE_CHECKING:
     from derender.evaluation.feature_rows import FeatureRow
@@ -23,14 +23,12 @@ class Question:
     Attributes:
         name: of the scored set, and of the question where it has several.
         columns: the labels.
-        mean_by, min_count, max_count: see ``evaluation.feature_rows.prepare``.
+        rules: which rows.
     """
 
     name: str
     columns: tuple[str, ...]
-    mean_by: tuple[str, ...] = ()
-    min_count: int = 1
-    max_count: int | None = None
+    rules: RowRules
 
 
 def scoring_key(plan: Plan, job: Job, notes: dict[Job, Note]) -> str:
@@ -56,23 +54,17 @@ def questions(plan: Plan, name: str, table: "FeatureTable") -> list[Question]:
             raise ValueError(f"{scored.data} has no yes/no label; it has {', '.join(table.labels) or 'none'}")
         for column in (*columns, *scored.mean_by):
             table.label(column)
-        return [Question(name, tuple(columns), scored.mean_by, scored.min_count, scored.max_count)]
+        rules = RowRules(scored.mean_by, scored.min_count, scored.max_count)
+        return [Question(name, tuple(columns), rules)]
     parts = [part for part in table_named(scored.table).parts if part.columns(table)]
     if not parts:
         have = ", ".join(table.labels) or "none"
         raise ValueError(f"table {scored.table!r} needs other labels than {scored.data} has ({have})")
     several = len(parts) > 1
-    return [part_question(part, table, f"{name} {part.name}" if several else name) for part in parts]
-
-
-def part_question(part: Part, table: "FeatureTable", name: str) -> Question:
-    """A question of the paper's tables: features are averaged over each track where there are tracks."""
-    columns = part.columns(table)
-    if part.name == "identity" and "track" in table.labels:
-        return Question(name, columns, mean_by=(*columns, "track"))
-    if part.max_count is None:
-        return Question(name, columns)
-    return Question(name, columns, (), part.min_count, part.max_count)
+    return [
+        Question(f"{name} {part.name}" if several else name, part.columns(table), part.rows(table))
+        for part in parts
+    ]
 
 
 def score_job(plan: Plan, place: Place, job: Job, *, device: str) -> Note:
@@ -140,13 +132,7 @@ def _ask(
     from derender.evaluation.linear_compare import compare_linear
     from derender.evaluation.linear_task import choose_rows, task_of
 
-    ready = prepare(
-        rows,
-        question.columns,
-        mean_by=question.mean_by,
-        min_count=question.min_count,
-        max_count=question.max_count,
-    )
+    ready = prepare(rows, question.columns, **asdict(question.rules))
     if protocol == "cluster":
         found: Any = compare_clusterings(
             ready.features,
