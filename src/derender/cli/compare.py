@@ -254,7 +254,7 @@ def run_segment(
             raise ValueError(f"two models have the name {name!r}: give each its own")
         run = segmented(
             paths[0], pictures, PAPER_VARIANTS, seeds, memory,
-            epochs=choices.epochs, batch_size=64, resamples=choices.resamples, device=device,
+            epochs=choices.epochs, resamples=choices.resamples, device=device,
         )  # fmt: skip
         tables += [
             replace(table, caption=f"{name}: {table.caption}") for table in (run.tables[-1], *run.tables[:-1])

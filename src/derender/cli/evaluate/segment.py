@@ -34,7 +34,12 @@ Variants = Annotated[
 ]
 Epochs = Annotated[int, typer.Option("--epochs", min=1, metavar="N", help="Of every net.")]
 Seeds = Annotated[int, typer.Option("--seeds", min=1, metavar="N", help="Runs of every net.")]
-BatchSize = Annotated[int, typer.Option("--batch-size", min=2, metavar="N", help="Of training.")]
+BatchSize = Annotated[
+    int | None,
+    typer.Option(
+        "--batch-size", min=2, metavar="N", help="Of training; default: 64, fewer where pictures are few."
+    ),
+]
 TestFraction = Annotated[
     float,
     typer.Option("--test-fraction", min=0.01, max=0.99, help="Tested, where the data have no partition."),
@@ -66,7 +71,7 @@ def segment(
     variants: Variants = ALL,
     epochs: Epochs = 20,
     seeds: Seeds = 3,
-    batch_size: BatchSize = 64,
+    batch_size: BatchSize = None,
     test_fraction: TestFraction = 0.2,
     labelled: Labelled = None,
     resamples: feature_rows.Resamples = 1_000,
@@ -133,7 +138,7 @@ def segmented(
     memory: "Memory",
     *,
     epochs: int,
-    batch_size: int,
+    batch_size: int | None = None,
     resamples: int,
     device: str,
     test_fraction: float = 0.2,

@@ -122,6 +122,7 @@ def compare_segmentations(
         ValueError: the model has no U-Net encoders, or pictures of another size.
     """
     settings, memory = settings or SegmentSettings(), memory or Memory()
+    settings = settings.model_copy(update={"batch_size": settings.batch_for(len(data.train))})
     check_encoders(model, variants)
     side = data.images.shape[-1]
     if side != model.image_size:

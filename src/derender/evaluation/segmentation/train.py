@@ -2,7 +2,8 @@
 
 Source: Klinghoffer et al., ECCV 2022, Sec. 4.7: Adam 2e-4 with betas 0.5 and 0.999, 20 epochs. Neither the
 loss nor the batch size is stated: cross-entropy, every pixel alike, and 64, that of the paper's other
-trainings. Leaves out augmentation, class weights and early stopping: the last weights are scored.
+trainings, or fewer where there are few pictures, for 20 epochs of ten steps each train nothing. Leaves out
+augmentation, class weights and early stopping: the last weights are scored.
 """
 
 from collections.abc import Callable
@@ -19,17 +20,23 @@ from derender.networks.unet import SegmentationNet
 from derender.settings import Settings
 from derender.training.allocator import freed_memory_kept
 
+LARGEST_BATCH, SMALLEST_BATCH, STEPS_AN_EPOCH = 64, 4, 80
+
 StepProgress = Callable[[int, float], object]
 """Called with (pictures seen, loss) after every step."""
 
 
 class SegmentSettings(Settings):
-    """How a net is trained."""
+    """How a net is trained; without a batch size, ``batch_for`` decides."""
 
     learning_rate: float = Field(default=2e-4, gt=0)
     betas: tuple[float, float] = (0.5, 0.999)
     epochs: int = Field(default=20, ge=1)
-    batch_size: int = Field(default=64, ge=2)
+    batch_size: int | None = Field(default=None, ge=2)
+
+    def batch_for(self, pictures: int) -> int:
+        """Pictures a step: 64, but fewer (4 at least) where an epoch would have less than 80 steps."""
+        return self.batch_size or min(LARGEST_BATCH, max(SMALLEST_BATCH, pictures // STEPS_AN_EPOCH))
 
 
 def train_segmenter(
@@ -45,12 +52,13 @@ def train_segmenter(
     learning = [parameter for parameter in net.parameters() if parameter.requires_grad]
     optimiser = torch.optim.Adam(learning, lr=settings.learning_rate, betas=settings.betas, fused=True)
     generator, seen, means = torch.Generator().manual_seed(seed), 0, []
+    batch_size = settings.batch_for(len(data.train))
     with freed_memory_kept() if device.type == "cpu" else nullcontext():
         for _ in range(settings.epochs):
             order = data.train[torch.randperm(len(data.train), generator=generator).numpy()]
             total = 0.0
-            for start in range(0, len(order), settings.batch_size):
-                rows = order[start : start + settings.batch_size]
+            for start in range(0, len(order), batch_size):
+                rows = order[start : start + batch_size]
                 images = as_float(data.images[rows]).to(device, memory_format=torch.channels_last)
                 truth = torch.from_numpy(data.masks[rows]).to(device).long()
                 loss = cross_entropy(net(images), truth)
