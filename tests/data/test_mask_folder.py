@@ -39,6 +39,14 @@ def test_masks_lie_beside_their_pictures(folders, write, tmp_path):
     assert named.classes == ("sky", "wall", "floor", "door") and (named.masks == masks).all()
 
 
+def test_names_of_classes_beside_the_folder_of_masks(folders, tmp_path):
+    """`derender synth` writes them there; those among the masks come first."""
+    (tmp_path / "classes.txt").write_text("sea\nsand\nrock\n")
+    assert read_mask_folder(*folders, 4).classes == ("sea", "sand", "rock")
+    (tmp_path / "masks" / "classes.txt").write_text("sky\nwall\nfloor\n")
+    assert read_mask_folder(*folders, 4).classes == ("sky", "wall", "floor")
+
+
 def test_values_are_never_mixed(folders, write, tmp_path):
     checks = (np.indices((64, 64)).sum(axis=0) % 2 * 7).astype(np.uint8)
     write("masks/a/1.png", checks)

@@ -1,7 +1,8 @@
 """Pictures of any layout with masks from another folder or zip: one of class numbers for each, named alike.
 
-The mask of ``a/b.jpg`` is ``a/b.png``, or the only ``b.png`` there is. A file ``classes.txt`` beside the
-masks names the classes, one a line, the first being number 0; without it they are called after their numbers.
+The mask of ``a/b.jpg`` is ``a/b.png``, or the only ``b.png`` there is. A file ``classes.txt`` among the
+masks, or beside their folder as `derender synth` writes it, names the classes, one a line, the first being
+number 0; without it they are called after their numbers.
 Leaves out colours as classes, and a number for pixels without a class. Masks in CelebAMask-HQ's layouts need
 none of this: masks.py.
 """
@@ -91,11 +92,15 @@ def _read(source: Source, name: str) -> Image.Image:
 
 
 def _class_names(source: Source, masks: UInt8[np.ndarray, "n s s"], files: list[str]) -> tuple[str, ...]:
-    listed = source.named(CLASSES_FILE)
     largest = masks.max(axis=(1, 2))
-    if listed is None:
+    listed, beside = source.named(CLASSES_FILE), source.path.parent / CLASSES_FILE
+    if listed is not None:
+        text = source.read_text(listed)
+    elif source.path.is_dir() and beside.is_file():
+        listed, text = str(beside), beside.read_text(encoding="utf-8", errors="replace")
+    else:
         return tuple(f"class {number}" for number in range(int(largest.max()) + 1))
-    names = tuple(line.strip() for line in source.read_text(listed).splitlines() if line.strip())
+    names = tuple(line.strip() for line in text.splitlines() if line.strip())
     if int(largest.max()) >= len(names):
         file = files[int(largest.argmax())]
         raise ValueError(
