@@ -8,6 +8,8 @@ how many of the forty trees of the obvious way are really built; fewer are scale
 """
 
 import argparse
+import importlib
+import importlib.util
 import json
 import resource
 import sys
@@ -17,6 +19,7 @@ from pathlib import Path
 import numpy as np
 from machine import describe_machine
 from scipy.cluster.hierarchy import linkage
+from sklearn.cluster import AgglomerativeClustering
 from sklearn.metrics import adjusted_rand_score
 
 from derender.evaluation.clustering_finch import finch
@@ -80,6 +83,21 @@ def agreement(features: np.ndarray) -> dict[str, float]:
     return result
 
 
+def one_tree(features: np.ndarray) -> dict[str, float | str]:
+    """CPU seconds of one tree: derender's, and those of the peers that are installed, heights compared."""
+    expected = linkage(features, "ward")
+    result: dict[str, float | str] = {"ours": seconds(ward_tree, features)[0]}
+    result["SciPy"] = seconds(linkage, features, "ward")[0]
+    result["scikit-learn"] = seconds(AgglomerativeClustering(2, linkage="ward").fit, features)[0]
+    if importlib.util.find_spec("fastcluster") is None:
+        return {**result, "fastcluster": "not installed"}
+    fastcluster = importlib.import_module("fastcluster")
+    for name in ("linkage", "linkage_vector"):
+        result[f"fastcluster.{name}"], tree = seconds(getattr(fastcluster, name), features, "ward")
+        assert np.allclose(tree[:, 2], expected[:, 2]), f"fastcluster.{name} gives another tree"
+    return result
+
+
 def large(rows: int, dimensions: int) -> dict[str, float | int]:
     """One tree of many rows: CPU time and the process's largest memory."""
     features = features_of(rows, dimensions)
@@ -110,12 +128,14 @@ def main() -> None:
         results = {
             "rows": options.rows,
             "agreement": agreement(features),
+            "one_tree_cpu_s": one_tree(features),
             "forty_attributes": forty_attributes(features, options.trees),
         }
     results["machine"] = describe_machine()
     text = json.dumps(results, indent=1)
     print(text)
     if options.json:
+        options.json.parent.mkdir(parents=True, exist_ok=True)
         options.json.write_text(text + "\n")
 
 

@@ -1,8 +1,9 @@
-"""Where a number was measured: processor, threads, versions and commit."""
+"""Where and when a number was measured: processor, threads, versions, commit and day."""
 
 import os
 import platform
 import subprocess
+import time
 from importlib.metadata import version
 from pathlib import Path
 
@@ -23,6 +24,7 @@ def describe_machine() -> dict[str, str | int]:
         "numba": version("numba"),
         "derender": version("derender"),
         "commit": commit(),
+        "date": time.strftime("%Y-%m-%d"),
     }
 
 

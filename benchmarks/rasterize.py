@@ -8,13 +8,12 @@ First checks that both agree in outputs and gradients on the benchmark's own inp
 
 import argparse
 import json
-import platform
-import subprocess
 import time
 from collections.abc import Callable
 from pathlib import Path
 
 import torch
+from machine import describe_machine
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
@@ -68,12 +67,6 @@ def first_call_s() -> float:
     seen = rasterize(points, focal_px(4, FOV_DEG), "numba")
     (seen.uv.sum() + seen.depth.sum()).backward()
     return time.perf_counter() - start
-
-
-def commit() -> str:
-    here = Path(__file__).parent
-    call = subprocess.run(["git", "rev-parse", "HEAD"], cwd=here, capture_output=True, text=True, check=False)
-    return call.stdout.strip() or "unknown"
 
 
 def main() -> None:
@@ -137,9 +130,8 @@ def main() -> None:
         print(f"{name:28} {ms['reference']:10.3f} {ms['numba']:8.3f} {ratio:6.1f}x {difference:11.1e}")
     if arguments.json:
         settings = {key: value for key, value in vars(arguments).items() if key != "json"}
-        machine = {"processor": platform.processor() or platform.machine(), "system": platform.platform()}
-        versions = {"python": platform.python_version(), "torch": torch.__version__, "commit": commit()}
-        report = {**settings, **machine, **versions, "first_call_s": compile_s, "rows": rows}
+        report = {**settings, "first_call_s": compile_s, "rows": rows, "machine": describe_machine()}
+        arguments.json.parent.mkdir(parents=True, exist_ok=True)
         arguments.json.write_text(json.dumps(report, indent=2) + "\n")
 
 

@@ -116,6 +116,7 @@ def main() -> None:
         print(f"{way}: {speed:.1f} pictures/s, start of the workers included")
     if options.json is not None:
         result = {"benchmark": "ray embedding", "killed": len(killed), "pictures_per_second": speeds}
+        options.json.parent.mkdir(parents=True, exist_ok=True)
         options.json.write_text(json.dumps({**result, "machine": describe_machine()}, indent=1) + "\n")
 
 

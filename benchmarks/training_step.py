@@ -226,6 +226,7 @@ def main() -> None:
             "rows": [asdict(row) for row in rows],
             "machine": machine,
         }
+        options.json.parent.mkdir(parents=True, exist_ok=True)
         options.json.write_text(json.dumps(result, indent=1) + "\n")
 
 

@@ -1,7 +1,7 @@
-"""docs/gallery.md and its pictures, made anew by one command from rendered faces and a trained model.
+"""docs/gallery.md and its pictures, made anew by one command from rendered faces and cars and trained models.
 
-    python examples/gallery.py                                          # faces of `derender synth`
-    python examples/gallery.py --data faces.zip::test --label expression # other rendered faces
+    python examples/gallery.py                                          # faces and cars of `derender synth`
+    python examples/gallery.py --data faces.zip::test --label expression --cars cars.zip::test # other ones
 
 Every picture is what a command wrote; the page says which. Only rendered data belongs in a gallery: show no
 picture of a real person. The whole folder of pictures is replaced, and kept under 4 MB.
@@ -11,7 +11,7 @@ import argparse
 import shutil
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -73,8 +73,17 @@ SHOWN = (
         },
         "explain --model {model} --data faces/ --label {label} --out why/",
     ),
+    (
+        "Cars, by the model `cars-64`",
+        {
+            "cars.png": "Four cars: input, reconstruction, depth, normals, albedo, shading, another light, "
+            "another view",
+            "cars.gif": "Two cars turning from side to side",
+        },
+        "rotate --model cars-64 car*.png --out turned/",
+    ),
 )
-CREDIT_OWN = "The faces are drawn by `derender synth faces` and show nobody."
+CREDIT_OWN = "Faces and cars are drawn by `derender synth` and show nobody."
 
 
 def main() -> int:
@@ -85,21 +94,26 @@ def main() -> int:
     )
     words.add_argument("--data", help="rendered faces; by default derender synth makes them")
     words.add_argument("--label", default="expression", help="the label that is explained")
-    words.add_argument("--credit", default=CREDIT_OWN, help="where the faces come from, for the page")
+    words.add_argument("--cars", help="rendered cars; by default derender synth makes them")
+    words.add_argument("--credit", default=CREDIT_OWN, help="where faces and cars come from, for the page")
     asked = words.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         work = Path(folder)
         data = asked.data or str(work / "made")
         if asked.data is None:
             run("synth", "faces", "--out", data, "--count", str(SEARCHED), "--no-truth")
-        faces = some_faces(data, work / "faces")
-        drawn = draw(asked.model, data, asked.label, faces, work)
+        cars = asked.cars or str(work / "made-cars")
+        if asked.cars is None:
+            run("synth", "cars", "--out", cars, "--count", str(FACES))
+        drawn = draw(asked.model, data, asked.label, some_pictures(data, work / "faces", "face"), work)
+        draw_cars(some_pictures(cars, work / "cars", "car"), work, drawn)
         size = sum(picture.stat().st_size for picture in drawn.iterdir())
         if size > MOST_BYTES:
             raise SystemExit(f"the pictures take {size:,} bytes, more than {MOST_BYTES:,}")
         shutil.rmtree(PICTURES, ignore_errors=True)
         shutil.copytree(drawn, PICTURES)
-    PAGE.write_text(page(asked.model, asked.label, asked.credit, asked.data), encoding="utf-8")
+    given = {"data": asked.data, "cars": asked.cars}
+    PAGE.write_text(page(asked.model, asked.label, asked.credit, given), encoding="utf-8")
     print(f"{PAGE} and {size / 1e6:.1f} MB of pictures")
     return 0
 
@@ -111,7 +125,7 @@ def run(*arguments: str) -> None:
         raise SystemExit(code)
 
 
-def some_faces(data: str, folder: Path) -> list[str]:
+def some_pictures(data: str, folder: Path, thing: str) -> list[str]:
     """A few pictures of the data, evenly chosen, as files."""
     from derender.data import read_pictures
 
@@ -119,7 +133,7 @@ def some_faces(data: str, folder: Path) -> list[str]:
     folder.mkdir()
     names = []
     for number, picture in enumerate(pictures.images, 1):
-        names.append(str(folder / f"face {number}.png"))
+        names.append(str(folder / f"{thing} {number}.png"))
         Image.fromarray(np.moveaxis(picture, 0, -1)).save(names[-1])
     return names
 
@@ -157,15 +171,26 @@ def draw(model: str, data: str, label: str, faces: Sequence[str], work: Path) ->
     return out
 
 
+def draw_cars(cars: Sequence[str], work: Path, out: Path) -> None:
+    """The same for cars, in short."""
+    given = ("--model", "cars-64")
+    run("decompose", *given, *cars, "--sheet", "--out", str(work / "cars-apart"))
+    keep(work / "cars-apart" / "sheet.png", out / "cars.png")
+    run("rotate", *given, *cars[:2], *FILM, "--out", str(work / "cars-turned"))
+    films = [work / "cars-turned" / Path(name).stem / "film.gif" for name in cars[:2]]
+    side_by_side(films, out / "cars.gif")
+
+
 def keep(source: Path, target: Path, width: int = 1100) -> None:
-    """A picture at most so wide, with 256 colours."""
+    """A picture at most so wide, with 256 colours, dithered: depth and normals show no steps."""
     with Image.open(source) as picture:
         drawn = picture.convert("RGBA")
     small = Image.new("RGB", drawn.size, "white")
     small.paste(drawn, mask=drawn)
     if small.width > width:
         small = small.resize((width, round(small.height * width / small.width)), Image.Resampling.LANCZOS)
-    small.quantize(256, dither=Image.Dither.FLOYDSTEINBERG).save(target, optimize=True)
+    colours = small.quantize(256)  # which are chosen without dithering, whatever is asked
+    small.quantize(palette=colours, dither=Image.Dither.FLOYDSTEINBERG).save(target, optimize=True)
 
 
 def side_by_side(sources: Sequence[Path], target: Path, gap: int = 8) -> None:
@@ -239,14 +264,14 @@ def seen(
     return canvas.reshape(side, finer, side, finer, 3).mean(axis=(1, 3))
 
 
-def page(model: str, label: str, credit: str, data: str | None) -> str:
+def page(model: str, label: str, credit: str, sources: Mapping[str, str | None]) -> str:
     """The text of docs/gallery.md."""
     name = Path(model).name
-    given = "" if data is None else f" --data {Path(data).name}"
+    given = "".join(f" --{word} {Path(source).name}" for word, source in sources.items() if source)
     lines = [
         "# Gallery",
-        f"Everything here was made from single pictures by the model `{name}`, with "
-        f"`python examples/gallery.py{given}`.\n{credit} No picture was chosen: the faces are evenly spaced "
+        f"Everything here was made from single pictures by the models `{name}` and `cars-64`, with "
+        f"`python examples/gallery.py{given}`.\n{credit} No picture was chosen: they are evenly spaced "
         "through the data.\nThe commands are told in [pictures.md](pictures.md) and "
         "[explain.md](explain.md).",
     ]

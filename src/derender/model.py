@@ -7,6 +7,7 @@ Training lives in training/, scores in evaluation/; the model knows neither.
 import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
@@ -16,10 +17,14 @@ from torch import Tensor, nn
 from derender.networks import FACTORS, Factor, NetworkSettings
 from derender.networks.confidence import Confidence, ConfidenceNet
 from derender.networks.tensor_file import read_tensors, write_tensors
+from derender.networks.unsup3d import read_checkpoint
 from derender.networks.whitening import Whitening
 from derender.presets import MODEL_PRESETS, ModelSettings, named_preset
+from derender.pretrained import hub
+from derender.pretrained.card import CARD_FILE, model_card, with_metadata
 from derender.render import Rendering, render_scene
 from derender.scene import Scene
+from derender.scene.ranges import SceneRanges
 from derender.whole import whole_folder
 
 FORMAT = 1
@@ -54,6 +59,7 @@ class Derenderer(nn.Module):
         )
         self.nets["confidence"] = ConfidenceNet(self.settings.network)
         self.whitening: Whitening | None = None  # fitted after training (training/whitening.py)
+        self.source: Path | None = None  # the folder these weights were loaded from
 
     @classmethod
     def from_preset(cls, name: str, *, seed: int | None = None, **network: Any) -> "Derenderer":
@@ -87,8 +93,21 @@ class Derenderer(nn.Module):
     def device(self) -> torch.device:
         return next(self.parameters()).device
 
+    @classmethod
+    def from_unsup3d(cls, file: str | Path, ranges: SceneRanges | None = None) -> "Derenderer":
+        """A model with the weights of an unsup3d checkpoint (``.pth``); nothing in the file is run.
+
+        Sizes are read off the file; ``ranges`` are what it was trained with, by default unsup3d's for faces
+        and cats. Without a confidence net in the file, which only training asks for, ours is fresh.
+        """
+        network, weights = read_checkpoint(file)
+        model = cls(ModelSettings(network=network, ranges=ranges or SceneRanges()))
+        model.load_state_dict(model.state_dict() | weights)
+        return model.eval().requires_grad_(False)
+
     def embed(self, images: Float[Tensor, "n 3 h w"]) -> dict[str, Float[Tensor, "n code"]]:
         """One feature per factor for pictures in 0..1, by name: whitened if fitted, else its code."""
+        _refuse_not_finite(images)
         return self.encode(images) if self.whitening is None else self.features(self.read(images))
 
     def read(self, images: Float[Tensor, "n 3 h w"]) -> dict[str, Float[Tensor, "n _"]]:
@@ -128,6 +147,7 @@ class Derenderer(nn.Module):
 
     def decompose(self, images: Float[Tensor, "n 3 h w"]) -> Scene:
         """Geometry, albedo, light and camera of pictures in 0..1."""
+        _refuse_not_finite(images)
         return self.decode(self.encode(images))
 
     def render(self, scene: Scene) -> Rendering:
@@ -154,17 +174,102 @@ class Derenderer(nn.Module):
         folder = Path(folder)
         if folder.exists() and not overwrite:
             raise FileExistsError(f"{folder} exists already: choose another folder or pass overwrite=True")
+        with whole_folder(folder) as temporary:
+            self._write(temporary)
+        return folder
+
+    def save_pretrained(
+        self,
+        folder: str | Path,
+        *,
+        card: str | None = None,
+        data: str | None = None,
+        licence: str | None = None,
+        scores: str | None = None,
+        overwrite: bool = False,
+    ) -> Path:
+        """As ``save``, with what a model is given away with: a card (README.md) and its held-out errors.
+
+        Both are those of the folder it was loaded from, as long as its weights are. Otherwise the card is
+        ``card``, or is made of ``data`` (what it was trained on), ``licence`` and ``scores``.
+        """
+        folder = Path(folder)
+        if folder.exists() and not overwrite:
+            raise FileExistsError(f"{folder} exists already: choose another folder or pass overwrite=True")
+        beside = self._beside()
+        card = card or self._card(beside, folder.name, data=data, licence=licence, scores=scores)
+        with whole_folder(folder) as temporary:
+            self._write(temporary)
+            (temporary / CARD_FILE).write_text(with_metadata(card, licence), encoding="utf-8")
+            if ERRORS_FILE in beside:
+                (temporary / ERRORS_FILE).write_text(beside[ERRORS_FILE], encoding="utf-8")
+        return folder
+
+    def push_to_hub(
+        self,
+        repository: str,
+        *,
+        card: str | None = None,
+        data: str | None = None,
+        licence: str | None = None,
+        scores: str | None = None,
+        private: bool = False,
+        token: str | None = None,
+    ) -> str:
+        """Put the model on the Hugging Face Hub as ``save_pretrained`` writes it; gives its address.
+
+        Raises:
+            ValueError: nobody says what it was trained on and under what licence.
+            PermissionError, ConnectionError: the Hub refuses, or cannot be reached.
+        """
+        beside = self._beside()
+        if not (card or (data and licence) or CARD_FILE in beside):
+            raise ValueError(
+                "this model has no card: say what it was trained on and what it may be used for, "
+                "push_to_hub(..., data=..., licence=...), or pass card="
+            )
+        card = card or self._card(beside, repository, data=data, licence=licence, scores=scores)
+        with TemporaryDirectory() as place:
+            folder = self.save_pretrained(Path(place) / "model", card=card, licence=licence)
+            return hub.upload(folder, repository, private=private, token=token)
+
+    @classmethod
+    def from_pretrained(cls, source: str | Path, **rows: Any) -> "Derenderer":
+        """`load` under the name that users of the Hub know."""
+        return load(source, **rows)
+
+    def _write(self, folder: Path) -> None:
         config = {
             "format": FORMAT,
             "factors": [factor.name for factor in self.factors],
             "settings": self.settings.model_dump(mode="json"),
         }
-        with whole_folder(folder) as temporary:
-            write_tensors(self.state_dict(), temporary / WEIGHTS_FILE)
-            (temporary / CONFIG_FILE).write_text(json.dumps(config, indent=1))
-            if self.whitening is not None:
-                self.whitening.save(temporary / WHITENING_FILE)
-        return folder
+        write_tensors(self.state_dict(), folder / WEIGHTS_FILE)
+        (folder / CONFIG_FILE).write_text(json.dumps(config, indent=1))
+        if self.whitening is not None:
+            self.whitening.save(folder / WHITENING_FILE)
+
+    def _card(self, beside: Mapping[str, str], title: str, **told: str | None) -> str:
+        """The card that lies beside the weights, unless something else is told of them."""
+        if CARD_FILE in beside and not any(told.values()):
+            return beside[CARD_FILE]
+        return model_card(title, self.settings, **told, held_out=beside.get(ERRORS_FILE))
+
+    def _beside(self) -> dict[str, str]:
+        """Card and held-out errors of the folder it was loaded from, if its weights still are those."""
+        if self.source is None or not (self.source / WEIGHTS_FILE).is_file():
+            return {}
+        stored, own = read_tensors(self.source / WEIGHTS_FILE), self.state_dict()
+        if (self.source / WHITENING_FILE).is_file():
+            stored |= read_tensors(self.source / WHITENING_FILE)
+        if self.whitening is not None:
+            own |= dict(self.whitening.named_buffers())
+        if stored.keys() != own.keys() or any(
+            not torch.equal(stored[name].to(value), value) for name, value in own.items()
+        ):
+            return {}
+        files = (self.source / name for name in (CARD_FILE, ERRORS_FILE))
+        return {file.name: file.read_text(encoding="utf-8") for file in files if file.is_file()}
 
     def _check(self, images: Tensor) -> None:
         size = self.image_size
@@ -220,7 +325,18 @@ def load(
         raise ValueError(
             f"{folder} is damaged ({str(error).splitlines()[0]}): copy or train the model again"
         ) from error
+    model.source = folder
     return model.to(device).eval().requires_grad_(False)
+
+
+def _refuse_not_finite(images: Tensor) -> None:
+    """NaN or infinity in pictures is an error; not looked for on other devices, which would have to wait."""
+    if images.device.type != "cpu" or torch.compiler.is_compiling() or bool(images.isfinite().all()):
+        return
+    first = int(images.isfinite().flatten(1).all(dim=1).int().argmin())
+    raise ValueError(
+        f"picture {first} of {len(images)} holds values that are not finite: give numbers in 0..1"
+    )
 
 
 def _check_shapes(found: Mapping[str, Tensor], wanted: Mapping[str, Tensor]) -> None:
@@ -254,28 +370,11 @@ def model_folder(source: str | Path) -> Path:
     if source in bundled_models():
         return PRETRAINED / source
     if isinstance(source, str) and source.count("/") == 1 and not source.startswith((".", "/", "~")):
-        return _from_hub(source)
+        return hub.download(source, (CONFIG_FILE, WEIGHTS_FILE, WHITENING_FILE, ERRORS_FILE, CARD_FILE))
     raise FileNotFoundError(
         f"no model at {source}: give a run folder, a saved folder, a Hub id 'owner/name', or one of those "
         f"that come with derender ({', '.join(bundled_models())})"
     )
-
-
-def _from_hub(repository: str) -> Path:
-    from huggingface_hub import snapshot_download
-    from huggingface_hub.errors import HfHubHTTPError, HFValidationError, LocalEntryNotFoundError
-
-    try:
-        return Path(
-            snapshot_download(
-                repository, allow_patterns=[CONFIG_FILE, WEIGHTS_FILE, WHITENING_FILE, ERRORS_FILE]
-            )
-        )
-    except (HfHubHTTPError, HFValidationError, LocalEntryNotFoundError, OSError) as error:
-        raise FileNotFoundError(
-            f"no folder {repository} here, and the Hub gave nothing under that id ({type(error).__name__}): "
-            "check the path or the id, and the network"
-        ) from error
 
 
 def _read_config(folder: Path) -> dict[str, Any]:

@@ -70,6 +70,10 @@ def test_embed_then_cluster_as_with_our_own(run, faces, tmp_path, capsys):
     cluster = ["evaluate", "cluster", "--features", table_file, "--label", "class", "--factors", "pooled"]
     assert main([str(word) for word in cluster]) == 0
     assert "pooled" in capsys.readouterr().out
+    assert main([str(word) for word in [*cluster, "--data", faces, "--resamples", 2]]) == 0
+    shown = capsys.readouterr().out
+    assert "pixels" in shown and "PCA (6)" in shown
+    assert "untrained" not in shown  # what is not known: an untrained encoder like a VQ-VAE's
 
 
 @pytest.mark.parametrize(("name", "size"), [("pixels", 3072), ("pca", 4), ("hog", 324), ("noise", 4)])

@@ -18,7 +18,10 @@ def test_the_quick_bench_reports_every_pair_with_the_machine(tmp_path, capsys):
         assert row["least"] <= row["ratio"] <= row["most"]
         assert row["ours_per_second"] > 0
     assert found["machine"]["packages"]["torch"] == torch.__version__
-    assert "Ward clustering" in capsys.readouterr().out
+    waiting = found["waiting"]
+    assert 0 < waiting["share"] < 1 and 0 < waiting["share_unaided"] < 1 and waiting["seconds"] > 0
+    said = capsys.readouterr().out
+    assert "Ward clustering" in said and "spent waiting for data" in said
 
 
 def test_twice_the_work_in_the_same_time_is_a_ratio_of_two():

@@ -1,6 +1,7 @@
 """`derender explain`: a folder with page, chart, maps and probe, numbers as JSON, bad words refused."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,10 @@ import pytest
 from PIL import Image
 
 from derender.cli import main
+from derender.cli.explain import _split
+from derender.features import FeatureTable
 from derender.interpretation import load_probe
+from derender.interpretation.question import question
 from derender.model import Derenderer
 from derender.presets import MODEL_PRESETS
 
@@ -126,3 +130,13 @@ def test_bad_words(model, data, why, tmp_path, capsys):
     capsys.readouterr()
     assert main(["explain", "-m", str(model), "-d", str(flat), "-l", "class"]) == 2
     assert "has no labels, and an explanation needs" in capsys.readouterr().err
+
+
+def test_pictures_that_are_all_their_owners_test_part_are_split_here():
+    labels = {"class": np.array(["a", "b"] * 20), "partition": np.array(["test"] * 40)}
+    table = FeatureTable(tuple(map(str, range(40))), {"geometry": np.eye(40)}, labels)
+    rows = _split(question(labels, ["class"]), table, 10, range(2), None)
+    assert len(rows.test) >= 10 and rows.train[10].shape == (2, 10)
+    owners = {**labels, "partition": np.array(["train"] * 30 + ["test"] * 10)}
+    rows = _split(question(owners, ["class"]), replace(table, labels=owners), 10, range(1), None)
+    assert rows.test.tolist() == list(range(30, 40))

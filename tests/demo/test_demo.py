@@ -78,7 +78,7 @@ def test_page_shows_every_column_and_number(told, html):
         "plane",
     ):
         assert word in html
-    assert html.count("<img") >= 2 * 8 + 2 * 7 + 2
+    assert html.count("<img") >= 2 * 8 + 2 * 7 + 2 + 4 * 5
     assert not re.search(r'(?:src|href|srcset)="(?!data:|#)', html)
 
 
@@ -112,3 +112,22 @@ def test_command_writes_page_and_numbers(tmp_path, monkeypatch, capsys):
     assert (tmp_path / "derender-demo" / "report.html").stat().st_size > 20_000
     numbers = json.loads((tmp_path / "numbers.json").read_text())
     assert numbers["geometry"]["plane"]["MAD"] > 0 and numbers["clustering"]["pixels"]["accuracy"] > 0
+
+
+def test_the_model_that_comes_along_stands_beside_and_is_named(told, html):
+    result, _ = told
+    assert "The model that comes with derender" in html
+    assert html.count("by rendered-faces-64: the light goes round") == 4
+    for column in ("reconstruction", "normals", "albedo", "another view"):
+        assert f"{column}, rendered-faces-64: rendered face 7" in html
+    assert result.shipped_geometry is None and "beside" not in score_tables(result)  # 32 pixels, not 64
+
+
+def test_both_models_are_scored_on_the_same_faces(told):
+    result, _ = told
+    geometry = result.geometry
+    better = replace(geometry, model=replace(geometry.model, side=0.001))
+    table = score_tables(replace(result, shipped_geometry=better))["beside"]
+    assert [row.name for row in table.rows][:2] == ["this run", "rendered-faces-64"]
+    assert table.rows[0].cells[0] == 100 * geometry.model.side and table.rows[1].cells[0] == 0.1
+    assert not table.rows[1].control

@@ -1,5 +1,7 @@
 """A comparison's page: every table with its chart, settings, and what is missing; all text escaped."""
 
+from dataclasses import replace
+
 import pytest
 
 from derender.report.comparison import chart_of, comparison_page
@@ -29,6 +31,12 @@ def test_page_has_every_table_a_chart_settings_and_what_failed():
     assert EVIL not in html and "&lt;script&gt;" in html
     assert "http://" not in html.replace("http://www.w3.org/", "") and "https://" not in html
     assert "Clustering &amp; more" in html
+
+
+def test_a_long_caption_is_cut_between_words_in_the_navigation():
+    table = replace(scores(0.5), caption="same, Ward clustering, 64 rows, 4 classes of class")
+    html = comparison_page("One", [table]).html()
+    assert ">1 same, Ward clustering, 64 rows, 4…</a>" in html
 
 
 def test_without_failures_the_page_says_so():

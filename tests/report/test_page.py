@@ -129,6 +129,14 @@ def test_table_marks_the_best_and_gives_numbers_to_sort_by():
     assert ">1,200<" in html and '<tr class="control">' in html
 
 
+def test_a_sentence_in_a_cell_may_break_and_a_short_word_may_not():
+    long = "failed: the weights are not here, fetch them once"
+    table = ScoreTable("scores", "features", [Column("why")], [Row("a", [long]), Row("b", ["0.1-0.2"])])
+    html = blocks.table(table).text
+    assert f'<td class="words">{long}</td>' in html and "<td>0.1-0.2</td>" in html
+    assert ".numbers td.words { white-space: normal;" in full_page()
+
+
 def test_grid_and_image_reject_what_does_not_fit():
     with pytest.raises(ValueError, match="same number of images"):
         blocks.image_grid({"a": [picture()], "b": []}, ["x"], "")

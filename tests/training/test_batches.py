@@ -1,9 +1,12 @@
 """Batches are a function of seed and position; the learning rate one of pictures seen."""
 
+import threading
+
 import pytest
 import torch
 
-from derender.training.batches import Batches, random_stream
+from derender.training import batches as batches_module
+from derender.training.batches import Batches, Reader, random_stream
 from derender.training.config import OptimiserSettings
 from derender.training.schedule import learning_rate
 
@@ -35,6 +38,16 @@ def test_a_position_always_gives_the_same_batch():
     assert not torch.equal(one.at(9), Batches(images, 5, 8, True).at(9))
 
 
+def test_rows_of_a_larger_set_are_batched_as_if_they_were_copied(monkeypatch):
+    rows = torch.arange(1, 40, 3).numpy()
+    part = Batches(numbered(40), 4, 3, True, rows)
+    copied = Batches(numbered(40)[rows], 4, 3, True)
+    assert all(torch.equal(part.at(position), copied.at(position)) for position in range(7))
+    assert torch.equal(part.sample(), copied.sample())
+    monkeypatch.setattr(batches_module, "SAMPLED", 5)
+    assert part.sample()[:, 0, 0, 1].tolist() == [1, 10, 19, 28, 37]
+
+
 def test_about_half_of_the_pictures_are_mirrored():
     batches = Batches(numbered(200), 100, 0, True)
     batch = torch.cat([batches.at(i) for i in range(10)])
@@ -47,6 +60,47 @@ def test_a_batch_larger_than_the_set_is_refused():
         ValueError, match="batch_size 64 is more than the 12 training pictures: set batch_size=6"
     ):
         Batches(numbered(12), 64, 0, True)
+
+
+def test_a_reader_gives_the_same_batches_in_any_order():
+    batches = Batches(numbered(12), 4, 3, True)
+    reader = Reader(batches)
+    for position in (0, 1, 2, 3, 7, 8, 2):
+        assert torch.equal(reader.at(position), batches.at(position))
+    reader.close()
+
+
+class SlowDisk(Batches):
+    """Reading takes five seconds of a clock that nothing else moves; in a thread it takes nobody's time."""
+
+    def read(self, position, *ranks):
+        if threading.current_thread() is threading.main_thread():
+            CLOCK[0] += 5
+        elif position == 3:  # read ahead, and still not there when it is asked for
+            ASKED.wait(10)
+            CLOCK[0] += 2
+        return super().read(position, *ranks)
+
+
+CLOCK, ASKED = [0.0], threading.Event()
+
+
+def test_waiting_is_what_was_not_read_ahead(monkeypatch):
+    def clock() -> float:
+        if read_ahead.is_set():
+            ASKED.set()
+        return CLOCK[0]
+
+    read_ahead = threading.Event()
+    monkeypatch.setattr(batches_module.time, "perf_counter", clock)
+    reader, waited = Reader(SlowDisk(numbered(12), 4, 3, False)), []
+    for position in (0, 1, 2, 3, 9):
+        if position == 3:
+            read_ahead.set()
+        reader.at(position)
+        waited.append(reader.waited_s)
+    reader.close()
+    assert waited == [5, 5, 5, 7, 12]
 
 
 def test_streams_differ_by_purpose_and_position_and_repeat():

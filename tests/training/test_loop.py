@@ -1,18 +1,22 @@
 """The training loop: what a run leaves behind, exact resume, early stop, interruption, refusals."""
 
+import dataclasses
 import json
 import os
 import signal
+import time
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 from safetensors.torch import load_file
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import derender
 from derender.data import PictureSet
 from derender.training import TrainingInterrupted, resolve, train
+from derender.training.batches import Batches
 from derender.training.checkpoint import WEIGHTS_FILE, load_checkpoint
 from derender.training.loop import Progress
 from derender.training.run_folder import read_config, read_metrics
@@ -79,10 +83,40 @@ def test_a_run_leaves_everything_named_in_the_design(pictures, tmp_path):
     assert not [path for path in run.rglob("*") if path.suffix in (".pkl", ".pt", ".pth")]
 
 
+def test_the_share_of_waiting_for_pictures_is_told(pictures, tmp_path, monkeypatch):
+    read, seen = Batches.read, []
+
+    def slow(batches, *where):
+        time.sleep(0.1)
+        return read(batches, *where)
+
+    monkeypatch.setattr(Batches, "read", slow)
+    result = train(resolve("small", [*TINY, "images=16"]), pictures, tmp_path / "run", progress=seen.append)
+    (row,) = [row for row in read_metrics(tmp_path / "run") if row["kind"] == "train"]
+    assert 0.09 < row["waiting"] * row["seconds"] <= row["seconds"]  # nobody could read the first one ahead
+    assert 0 < result.waiting < 1
+    assert seen[0].waiting == row["waiting"]
+    events = EventAccumulator(str(tmp_path / "run" / "tensorboard")).Reload()
+    assert events.Scalars("train/waiting")[0].value == pytest.approx(row["waiting"])
+
+
 def test_training_lowers_the_loss(pictures, tmp_path):
     train(resolve("small", [*TINY, "images=416", "watch=false"]), pictures, tmp_path / "run")
     losses = [row["l1"] for row in read_metrics(tmp_path / "run") if row["kind"] == "train"]
     assert losses[-1] < 0.9 * losses[0], losses
+
+
+def test_a_mapped_set_is_trained_on_where_it_lies_and_gives_the_same_weights(pictures, tmp_path, monkeypatch):
+    (tmp_path / "pictures").write_bytes(pictures.images.tobytes())
+    images = np.memmap(tmp_path / "pictures", np.uint8, mode="c", shape=pictures.images.shape)
+    held, sizes = dataclasses.replace(pictures, images=images), []
+    read = Batches.read
+    monkeypatch.setattr(Batches, "read", lambda self, *at: sizes.append(len(self.images)) or read(self, *at))
+    config = resolve("small", [*TINY, "images=32"])
+    train(config, held, tmp_path / "mapped")
+    train(config, pictures, tmp_path / "copied")
+    assert_same_weights(tmp_path / "mapped", tmp_path / "copied")
+    assert sizes[0] == 60 > sizes[-1]
 
 
 @pytest.mark.parametrize("loocc", ["none", "light+camera"])

@@ -3,14 +3,16 @@
     python tests/trust/fuzz.py --inputs 100000 --seed 0
 
 A reader may refuse an input with ValueError or OSError, which the command line tells in one line; anything
-else that escapes, and an input that takes longer than ``SLOW_SECONDS``, is a finding. Each kind of finding is
-told once, with the number of the input, from which the same seed makes it again.
+else that escapes, an input that takes longer than ``SLOW_SECONDS``, and one that makes the process ask for
+``LARGE_BYTES`` more than before, is a finding. The whole process may take ``ADDRESS_BYTES``. Each kind of
+finding is told once, with the number of the input, from which the same seed makes it again.
 """
 
 import argparse
 import io
 import json
 import random
+import resource
 import sys
 import tarfile
 import tempfile
@@ -47,6 +49,8 @@ from derender.whole import CHECKSUMS
 
 REFUSALS = (ValueError, OSError)
 SLOW_SECONDS = 5.0
+LARGE_BYTES = 2**30
+ADDRESS_BYTES = 14 * 2**30  # a page may claim 2 GiB, which is reserved, not used; torch maps a few by itself
 TINY = ("image_size=32", "width=4", "light_width=4")
 
 
@@ -232,11 +236,18 @@ def overrides() -> st.SearchStrategy[list[str]]:
     """Settings as ``--set`` takes them."""
     key = (
         st.sampled_from(setting_names())
+        | st.sampled_from(setting_names())
+        | st.sampled_from(setting_names())
         | st.sampled_from(["model", "objective", "optimiser", "", ".", "a.b.c", "betas.0"])
         | st.text(max_size=12)
     )
+    small = st.sampled_from(
+        ["0", "1", "2", "0.5", "1e-4", "true", "false", "none", "light", "[0.8, 0.1, 0.1]"]
+    )
     value = (
-        WORDS
+        small
+        | small
+        | WORDS
         | PLAIN.map(lambda tree: yaml.safe_dump(tree, default_flow_style=True, width=10**6).strip())
         | st.text(max_size=20)
     )
@@ -410,12 +421,15 @@ def fuzz(target: Target, inputs: int, number: int) -> Found:
 
     def one(value: Any) -> None:
         found.inputs += 1
+        before = peak_bytes()
         began = time.process_time()
         try:
             target.read(value)
             found.accepted += 1
-        except REFUSALS:
-            pass
+        except REFUSALS as refused:
+            if isinstance(refused.__cause__, MemoryError):
+                found.times["memory"] += 1
+                found.findings.setdefault("memory", f"{refused.__cause__} <- {value!r:.300}")
         except Exception as escaped:
             where = traceback.extract_tb(escaped.__traceback__)
             ours = [
@@ -425,6 +439,9 @@ def fuzz(target: Target, inputs: int, number: int) -> Found:
             kind = f"{type(escaped).__name__} at {Path(frame.filename).name}:{frame.lineno}"
             found.times[kind] += 1
             found.findings.setdefault(kind, f"{' '.join(str(escaped).split())[:200]} <- {value!r:.300}")
+        if peak_bytes() - before > LARGE_BYTES:
+            found.times["large"] += 1
+            found.findings.setdefault("large", f"{peak_bytes() - before:,} bytes more <- {value!r:.300}")
         took = time.process_time() - began
         found.slowest = max(found.slowest, took)
 
@@ -441,6 +458,11 @@ def fuzz(target: Target, inputs: int, number: int) -> Found:
     return found
 
 
+def peak_bytes() -> int:
+    """The most memory that this process has held so far."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+
+
 @contextmanager
 def quiet() -> Iterator[None]:
     with warnings.catch_warnings():
@@ -451,6 +473,7 @@ def quiet() -> Iterator[None]:
 def run(given_: argparse.Namespace) -> int:
     """The script."""
     total = findings = 0
+    resource.setrlimit(resource.RLIMIT_AS, (ADDRESS_BYTES, ADDRESS_BYTES))
     with tempfile.TemporaryDirectory() as place, quiet():
         for target in targets(Path(place)):
             if given_.only and given_.only not in target.name:

@@ -47,6 +47,7 @@ from derender.data.nearest import nearest
 from derender.training.batches import random_stream
 from derender.training.config import LoopSettings, TrainConfig
 from derender.training.finetune_config import FinetuneConfig
+from derender.training.finite import first_not_finite
 from derender.training.run_folder import RunFolder, read_config, read_config_tree
 from derender.training.step import Precision
 from derender.training.step_module import Held
@@ -287,7 +288,11 @@ class FiniteWatch:
         loss = result.total.item()
         if isfinite(loss):
             return ()
-        return (Finding("non-finite loss", f"the loss is {loss}", "use a smaller learning_rate", True),)
+        broken = first_not_finite(result.terms.items())
+        first = "" if broken is None else f"; the first term that is not finite is {broken!r}"
+        return (
+            Finding("non-finite loss", f"the loss is {loss}{first}", "use a smaller learning_rate", True),
+        )
 
     def memory(self) -> dict[str, Any]:
         """Nothing: a finite loss leaves nothing to remember."""

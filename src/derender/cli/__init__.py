@@ -21,6 +21,7 @@ from derender.cli import (
     evaluate,
     explain,
     finetune,
+    importing,
     mesh,
     move,
     pictures,
@@ -61,7 +62,8 @@ def _options(
 
 
 for group in (
-    demo, doctor, train, whiten, embed, evaluate, explain, finetune, compare, report,
+    demo, doctor, train, whiten, embed, evaluate, explain, finetune, importing, compare,
+    report,
     pictures, move, mesh, search, view, synth, bench,
 ):  # fmt: skip
     group.register(app)

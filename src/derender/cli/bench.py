@@ -1,14 +1,17 @@
 """`derender bench`: speed on this machine, as ratios of two things measured in turns in one run.
 
-Of every pair it is first checked that both compute the same; a pair that does not is an error. Leaves out
+Of every pair it is first checked that both compute the same; a pair that does not is an error. Beside them
+stands the share of its time that training waits for pictures of a mapped file. Leaves out
 peers that are not installed with derender: those are in benchmarks/.
 """
 
 import statistics
+import tempfile
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -55,15 +58,23 @@ def bench(
         for done, make in enumerate(pairs):
             rows.append(measured(make(quick), rounds))
             report(done + 1, len(pairs), rows[-1]["what"])
+        waited = waiting(quick)
     for row in rows:
         result(
             f"{row['what']}: {row['ratio']:.2f}x ({row['ours_per_second']:,.1f} against "
             f"{row['theirs_per_second']:,.1f} {row['unit']}/s; rounds {row['least']:.2f}..{row['most']:.2f})",
             json_file,
         )
+    result(
+        f"training, preset small, pictures in a mapped file: {waited['share']:.2%} of "
+        f"{waited['seconds']:.1f} s spent waiting for data "
+        f"({waited['share_unaided']:.2%} without reading ahead)",
+        json_file,
+    )
     from derender.training.run_folder import environment
 
-    write_json(json_file, {"rounds": rounds, "quick": quick, "rows": rows, "machine": environment("cpu")})
+    found = {"rows": rows, "waiting": waited, "machine": environment("cpu")}
+    write_json(json_file, {"rounds": rounds, "quick": quick, **found})
 
 
 def measured(pair: Pair, rounds: int) -> dict[str, Any]:
@@ -116,21 +127,11 @@ def embedding(quick: bool) -> Pair:
     import torch
 
     from derender.features import embed_images
-    from derender.model import Derenderer
-    from derender.training.config import resolve
-    from derender.training.step import training_step
 
     count = 8 if quick else 32
-    config = resolve("small", ["perceptual=none", "loocc=light+camera"])
-    model = Derenderer.seeded(config.model, 0).to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
+    model, step = _training()
     images = torch.rand(count, 3, 64, 64, generator=torch.Generator().manual_seed(0))
-    pixels = images.numpy()
-
-    def train() -> None:
-        noise = torch.Generator().manual_seed(0)
-        training_step(model, images, config.objective, None, noise).total.backward()
-        model.zero_grad(set_to_none=True)
-
+    pixels, train = images.numpy(), partial(step, images)
     with torch.no_grad():
         direct = model.embed(images)
     codes = embed_images(model, pixels, batch_size=count)
@@ -160,6 +161,54 @@ def clustering(quick: bool) -> Pair:
         f"Ward clustering of {count:,} rows: derender / scikit-learn", "rows", (count, count),
         lambda: cut(ward_tree(features), 8), partial(peer.fit_predict, features),
     )  # fmt: skip
+
+
+def waiting(quick: bool) -> dict[str, float]:
+    """How much of the time of some training steps goes by until their pictures are there.
+
+    Beside it, from the same file, what reading each batch only when it is needed would take.
+    """
+    import numpy as np
+    import torch
+
+    from derender.training.batches import Batches, Reader
+
+    steps, batch, pictures = (4, 8, 256) if quick else (40, 32, 8_192)
+    _, step = _training()
+    with tempfile.TemporaryDirectory() as folder:
+        file, shape = Path(folder) / "pictures", (pictures, 3, 64, 64)
+        file.write_bytes(np.random.default_rng(0).integers(0, 256, shape, dtype=np.uint8).tobytes())
+        images = torch.from_numpy(np.memmap(file, np.uint8, mode="c", shape=shape))
+        batches = Batches(images, batch, seed=0, horizontal_flips=True)
+        unaided = sum(_seconds(partial(batches.read, position)) for position in range(steps))
+        reader = Reader(batches)
+        step(reader.at(0))
+        before, began = reader.waited_s, time.perf_counter()
+        for position in range(1, steps):
+            step(reader.at(position))
+        took, waited = time.perf_counter() - began, reader.waited_s - before
+        reader.close()
+        del images, batches, reader  # the file is mapped until nobody holds it
+    return {"seconds": took, "share": waited / took, "share_unaided": unaided / (took + unaided)}
+
+
+def _training() -> tuple[Any, Callable[[Any], None]]:
+    """A small model, and a function that takes one training step with pictures but for the update."""
+    import torch
+
+    from derender.model import Derenderer
+    from derender.training.config import resolve
+    from derender.training.step import training_step
+
+    config = resolve("small", ["perceptual=none", "loocc=light+camera"])
+    model = Derenderer.seeded(config.model, 0).to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
+
+    def step(images: torch.Tensor) -> None:
+        noise = torch.Generator().manual_seed(0)
+        training_step(model, images, config.objective, None, noise).total.backward()
+        model.zero_grad(set_to_none=True)
+
+    return model, step
 
 
 def _agree(what: str, pairs: Iterable[tuple[Any, Any]]) -> None:

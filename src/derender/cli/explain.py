@@ -163,8 +163,16 @@ def _split(
     wanted = count or max(2, min(LEARNED_MOST, int(LEARNED_SHARE * task.known.sum())))
     sides = table.label(groups) if groups else None
     return choose_rows(
-        task, table.files, (wanted,), draws, partition=table.labels.get("partition"), groups=sides
+        task, table.files, (wanted,), draws, partition=_owners_split(task, table), groups=sides
     )
+
+
+def _owners_split(task: "Task", table: "FeatureTable") -> Any:
+    """The split of the data's owners, unless all that carries a label here is their test part."""
+    partition = table.labels.get("partition")
+    if partition is None or (partition[task.known] == "test").all():
+        return None
+    return partition
 
 
 def _untrained(net: "Derenderer", pictures: "PictureSet", draws: range, batch_size: int) -> list[Any]:

@@ -330,13 +330,16 @@ def remembered(
 
 
 def architecture(rows: "Sequence[FeatureRow]") -> Any:
-    """The model settings that the first row's table was made with; None if it does not say."""
+    """The model settings of the first table that a model of ours made; None if there is none."""
     from pydantic import ValidationError
 
+    from derender.model import Derenderer
     from derender.presets import ModelSettings
 
     for row in rows:
-        stored = row.tables[0].origin.get("settings")
+        origin = row.tables[0].origin
+        ours = origin.get("model", Derenderer.__name__) == Derenderer.__name__
+        stored = origin.get("settings") if ours else None
         if stored is not None and not row.control:
             try:
                 return ModelSettings.model_validate(stored)

@@ -177,6 +177,14 @@ def tell_odd(found: Mapping[Path, float]) -> None:
             )
 
 
+def tell_percentiles(found: Mapping[Path, float]) -> None:
+    """Say where the pictures lie among those the model was validated on; nothing where that is not known."""
+    if found:
+        low, high = round(min(found.values())), round(max(found.values()))
+        span = f"{low}" if low == high else f"{low} to {high}"
+        say(f"rendered again worse than {span} % of the pictures this model was validated on")
+
+
 def finish(
     given: Given,
     out: Path,
@@ -191,6 +199,7 @@ def finish(
     """
     for path, reason in given.refused.items():
         say(f"left out {path}: {reason}")
+    tell_percentiles(odd or {})
     tell_odd(odd or {})
     count = "1 picture" if len(written) == 1 else f"{len(written):,} pictures"
     result(f"{count} in {out}", json_file)

@@ -101,7 +101,7 @@ def relight(
 
     def moved(scene: "Scene", own: dict[str, Any]) -> "Moved":
         def label(place: float, row: int, values: "Tensor") -> str:
-            return angle(degrees(values[row, 3])) if like is None else f"{place:.0%} of its light"
+            return f"light {angle(degrees(values[row, 3]))}" if like is None else f"{place:.0%} of its light"
 
         return _swept(work, scene, {**own, **before}, lights, label, stills, frames)
 
@@ -138,7 +138,7 @@ def rotate(
 
     def moved(scene: "Scene", own: dict[str, Any]) -> "Moved":
         def label(place: float, row: int, values: "Tensor") -> str:
-            return angle(degrees(values[row, 1]))
+            return f"yaw {angle(degrees(values[row, 1]))}"
 
         return _swept(work, scene, own, cameras, label, stills, frames)
 
@@ -192,7 +192,7 @@ def _angles(reach_deg: float, stills: int) -> Callable[[float], str]:
 
     def written(angle_deg: float) -> str:
         number = f"{angle_deg:+.{decimals}f}"
-        return f"yaw {number if float(number) else number[1:]}°"
+        return f"{number if float(number) else number[1:]}°"
 
     return written
 

@@ -108,7 +108,8 @@ def train(
 
         def show(progress: Progress) -> None:
             if progress.phase == "train":
-                speed = f"{progress.images_per_second:.0f} pictures/s"
+                waited = f"{progress.waiting:.1%} waiting for data"
+                speed = f"{progress.images_per_second:.0f} pictures/s, {waited}"
                 report(progress.done, progress.total, speed, description="training", unit="pictures")
             elif progress.phase == "perceptual":
                 report(progress.done, progress.total, description="perceptual features", unit="steps")
@@ -129,7 +130,10 @@ def train(
         say(f"{finding.sign}: {finding.text}; {finding.advice}")
     if trained.stopped == "collapse":
         say("training on is pointless: what is left is the last good checkpoint and model, if any")
-    say(f"{trained.images:,} pictures in {duration(trained.seconds)}; stopped by: {trained.stopped}")
+    waited = f"{trained.waiting:.1%} of it waiting for data"
+    say(
+        f"{trained.images:,} pictures in {duration(trained.seconds)}, {waited}; stopped by: {trained.stopped}"
+    )
     result(f"model {trained.folder}", json_file)
     result(f"report {page}", json_file)
     write_json(json_file, {"run": trained, "report": page})

@@ -165,6 +165,10 @@ class ZipSource(Source):
         skipped: list[Skipped] = []
         for member in self._archive.infolist():
             file = member.filename.replace("\\", "/")
+            if _ordinary(file) and not member.flag_bits & 1:
+                if not file.endswith("/"):
+                    self._members[printable(file)] = member
+                continue
             parts = file.split("/")
             hidden = any(is_hidden(part) for part in parts if part not in ("", ".", ".."))
             if hidden or not file or member.is_dir():
@@ -247,6 +251,12 @@ def read_bounded(path: Path) -> bytes:
     if len(content) > size:
         raise ValueError("the file grew while it was read")
     return content
+
+
+def _ordinary(file: str) -> bool:
+    """Whether a zip's name is plainly neither hidden nor unsafe; most are, and a zip may have a million."""
+    odd = not file or file.startswith((".", "/")) or "/." in file or ":" in file or "__MACOSX" in file
+    return not odd
 
 
 def is_hidden(name: str) -> bool:

@@ -199,8 +199,15 @@ def _rows(source: Source, file: str) -> tuple[list[str], Sequence[Mapping[str, s
     import pyarrow as pa
     import pyarrow.parquet as pq
 
+    from derender.data.parquet_claims import false_claim
+
     try:
-        table = pq.read_table(io.BytesIO(source.read(file)))
+        content = source.read(file)
+        opened = pq.ParquetFile(io.BytesIO(content))
+        problem = false_claim(opened, len(content))
+        if problem is not None:
+            raise ValueError(f"{file} in {source.path} is damaged ({problem}): restore it")
+        table = opened.read()
     except (pa.ArrowException, OSError) as problem:
         raise ValueError(f"{file} in {source.path} is no Parquet table ({problem})") from problem
     nested = _not_cells(table.schema)

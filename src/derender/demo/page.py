@@ -10,6 +10,7 @@ import torch
 
 from derender import __version__
 from derender.data import as_float
+from derender.demo.shipped import beside_table, shipped_blocks
 from derender.demo.story import STAGES, DemoResult
 from derender.evaluation.geometry import predicted_depth
 from derender.presets import MODEL_PRESETS
@@ -55,6 +56,7 @@ def demo_page(result: DemoResult) -> Page:
             Section("What came out", _summary(result, tables), "Summary"),
             Section("Faces it never saw, taken apart", _decomposed(drawn), "Taken apart"),
             Section("Move the light, turn the head", _films(result, scene), "Moved"),
+            Section("The model that comes with derender", shipped_blocks(result, rows), "Beside it"),
             Section("Is the geometry real?", _geometry(result, rows, tables), "Geometry"),
             Section("Who is who, without labels", _clusters(result, tables["clustering"]), "Clusters"),
             Section("How it was trained", _training(result), "Training"),
@@ -68,8 +70,10 @@ def score_tables(result: DemoResult) -> dict[str, ScoreTable]:
     """Every table of the page by name."""
     pictures = len(result.truth)
     controls = list(result.clustering)[1:]
+    beside = {} if result.shipped_geometry is None else {"beside": beside_table(result)}
     return {
         "geometry": geometry_table(result.geometry, pictures),
+        **beside,
         "factors": factor_table(result.factors, pictures),
         "reconstruction": reconstruction_table(result.reconstruction, pictures),
         "clustering": clustering_table(result.clustering, controls),

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from derender.evaluation.clustering_methods import clusterings
 from derender.evaluation.clustering_scores import (
     SEEDS,
     ClusterScores,
@@ -18,7 +19,6 @@ from derender.evaluation.clustering_scores import (
     cluster_scores,
     encoded,
 )
-from derender.evaluation.clustering_ward import cut, ward_tree
 from derender.features import FeatureTable, missing
 
 
@@ -47,7 +47,7 @@ class ClusteringResult:
 
 def ward(features: np.ndarray, n_clusters: int) -> np.ndarray:
     """Ward clustering of (N, D) features into ``n_clusters``: (N,) integers."""
-    return cut(ward_tree(features), n_clusters)
+    return clusterings(features, (n_clusters,), "ward")[n_clusters]
 
 
 def evaluate_clustering(

@@ -4,7 +4,8 @@ Source: Sarfraz, Sharma and Stiefelhagen, CVPR 2019 (the paper's appendix uses i
 its nearest other row; the connected parts are the clusters; their means are the rows of the next level. As
 in the authors' package `finch-clust`, a level that takes away at most one cluster, or leaves only one, ends
 the hierarchy. Written anew because that package holds several N x N arrays (1.6 GB each for 20,000 rows)
-and approximates above; here neighbours are exact in bounded memory. Tests compare the two. Leaves out that
+and approximates above; here neighbours are exact in bounded memory up to 100,000 rows, and come from near
+cells above (evaluation/neighbours.py). Tests compare the two. Leaves out that
 package's cut of long links, which has no effect in it (SciPy takes a stored zero for a link).
 """
 
@@ -87,7 +88,7 @@ def _linked(nearest: np.ndarray) -> np.ndarray:
 def _means(features: np.ndarray, partition: np.ndarray) -> np.ndarray:
     sizes = np.bincount(partition)
     member = csr_array((np.ones(len(partition)), (partition, np.arange(len(partition)))))
-    return member @ features / sizes[:, None]
+    return (member @ features / sizes[:, None]).astype(features.dtype, copy=False)
 
 
 def _merged(features: np.ndarray, partition: np.ndarray, merges: int, metric: Metric) -> np.ndarray:

@@ -2,21 +2,36 @@
 
 ``ward`` and ``finch`` build one hierarchy and cut it, so forty attributes cost one tree; ``k-means``
 (scikit-learn, Euclidean, ten starts) fits anew for each number. Ward is Euclidean as in the paper, FINCH
-cosine as in its paper.
+cosine as in its paper. Above ``EXACT_ROWS`` rows all are approximate, and ``approximation`` says how.
 """
 
 from collections.abc import Iterable
 
 import numpy as np
-from sklearn.cluster import KMeans
+from sklearn.cluster import KMeans, MiniBatchKMeans
 
 from derender.data.nearest import nearest
+from derender.evaluation import neighbours
 from derender.evaluation.clustering_finch import FinchHierarchy, finch, finch_clusters
 from derender.evaluation.clustering_ward import cut, ward_tree
+from derender.evaluation.clustering_ward_cells import LEAVES, LeafTree, cut_leaves, ward_in_cells
 from derender.evaluation.memory import Memory
 from derender.evaluation.neighbours import finite_rows
 
 METHODS = ("ward", "finch", "k-means")
+_MINI_BATCH = 16_384
+
+
+def approximation(method: str, n_rows: int) -> str:
+    """What is not exact about a method with so many rows, in a few words; "" where all is."""
+    if n_rows <= neighbours.EXACT_ROWS:
+        return ""
+    how = {
+        "ward": f"Ward inside cells of near rows, then over the {LEAVES:,} clusters they leave",
+        "finch": "nearest rows are looked for in near cells only",
+        "k-means": f"mini-batches of {_MINI_BATCH:,} rows",
+    }[method]
+    return f"{n_rows:,} rows are more than {neighbours.EXACT_ROWS:,}, so {method} is approximate: {how}"
 
 
 def clusterings(
@@ -39,6 +54,10 @@ def clusterings(
     memory, wanted = memory or Memory(), sorted(set(counts))
     features = finite_rows(features, "clustering")
     _check(method, wanted, len(features))
+    many = len(features) > neighbours.EXACT_ROWS
+    if method == "ward" and many:
+        found = memory.recall("ward-cells", {"features": features}, lambda: vars(ward_in_cells(features)))
+        return {count: cut_leaves(LeafTree(**found), count) for count in wanted}
     if method == "ward":
         tree = memory.recall("ward", {"features": features}, lambda: {"tree": ward_tree(features)})["tree"]
         return {count: cut(tree, count) for count in wanted}
@@ -66,8 +85,11 @@ def finch_hierarchy(features: np.ndarray, memory: Memory | None = None) -> Finch
 
 
 def _k_means(features: np.ndarray, count: int, seed: int) -> dict[str, np.ndarray]:
-    means = KMeans(count, n_init=10, random_state=seed)  # pyright: ignore[reportArgumentType]
-    fitted = means.fit(features.astype(np.float32))
+    if len(features) > neighbours.EXACT_ROWS:
+        means = MiniBatchKMeans(count, n_init=10, batch_size=_MINI_BATCH, random_state=seed)  # pyright: ignore[reportArgumentType]
+    else:
+        means = KMeans(count, n_init=10, random_state=seed)  # pyright: ignore[reportArgumentType]
+    fitted = means.fit(features.astype(np.float32, copy=False))
     return {"clusters": np.asarray(fitted.labels_, np.int64)}
 
 

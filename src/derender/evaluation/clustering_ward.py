@@ -15,17 +15,19 @@ FLOAT64_ROWS = 20_000  # above, nearest neighbours are looked up in float32; hei
 COMPACT_AT = 0.1  # share of merged-away rows at which they are removed
 
 
-def ward_tree(features: np.ndarray) -> np.ndarray:
+def ward_tree(features: np.ndarray, sizes: np.ndarray | None = None) -> np.ndarray:
     """Ward's tree over the rows of (N, D) features: (N-1, 4) merges in SciPy's form, to be cut.
+
+    With ``sizes``, (N,), each row is the mean of so many.
 
     Columns: the two clusters merged (rows are 0..N-1, the k-th merge makes N+k), the distance at which
     (sqrt(2ab/(a+b)) times the distance of the means, as SciPy), the number of rows. The means of N rows are
     all it holds, and one block of distances.
     """
-    means = finite_rows(features, "Ward clustering")
+    means = finite_rows(features, "Ward clustering").astype(np.float64, copy=False)
     means = means - means.mean(axis=0)  # keeps the distances, and more of their digits
     count = len(means)
-    sizes = np.ones(count)
+    sizes = np.ones(count) if sizes is None else np.array(sizes, np.float64)
     dtype = np.float64 if count <= FLOAT64_ROWS else np.float32
     cluster = np.arange(count)  # the cluster's number, of each place
     height = np.zeros(count)  # at which it was made

@@ -67,10 +67,14 @@ def evaluating(model: Any) -> Iterator[None]:
 
 
 def as_batch(images: np.ndarray, device: torch.device) -> Tensor:
-    """Pictures, uint8 or float in 0..1, as a float32 tensor of 0..1 on a device; bytes travel as bytes."""
+    """Pictures, uint8 or float in 0..1, as a float32 tensor of 0..1 on a device; bytes travel as bytes.
+
+    Channels lie together in memory, which convolutions and normalisation are fastest with.
+    """
     array = np.array(images)
     tensor = torch.from_numpy(array).to(device)
-    return as_float(tensor) if array.dtype == np.uint8 else tensor.float()
+    pictures = as_float(tensor) if array.dtype == np.uint8 else tensor.float()
+    return pictures.contiguous(memory_format=torch.channels_last)
 
 
 def factor_codes(model: Any, batch: Tensor) -> dict[str, np.ndarray]:

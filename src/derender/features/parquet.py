@@ -16,6 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from derender.data.nearest import nearest
+from derender.data.parquet_claims import false_claim
 from derender.whole import whole_file
 
 FORMAT = 1
@@ -100,6 +101,9 @@ def read_columns(path: Path, only: str | None = None) -> Columns:
         raise FileNotFoundError(f"no feature table at {path}: make one with 'derender embed --out {path}'")
     try:
         opened = pq.ParquetFile(path, page_checksum_verification=True)
+        problem = false_claim(opened, path.stat().st_size)
+        if problem is not None:
+            raise ValueError(f"{path} is damaged ({problem}): make it again with 'derender embed'")
         names = _factor_names(opened.schema_arrow, path)
         if only is not None and only not in names:
             there = ", ".join(names) or "none"

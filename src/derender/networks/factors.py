@@ -7,6 +7,7 @@ highlight, say) is a new row and a renderer that uses it, and nothing else chang
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 
 import torch
 from jaxtyping import Float
@@ -16,6 +17,7 @@ from torch.nn.functional import pad
 from derender.networks.decoders import MapDecoder, VectorDecoder
 from derender.networks.encoders import Encoder, UNetEncoder, reading
 from derender.networks.settings import NetworkSettings
+from derender.scene.constants import kept
 from derender.scene.perturb import PerturbSettings, exchange, perturb_camera, perturb_light
 from derender.scene.ranges import SceneRanges
 
@@ -123,9 +125,14 @@ def light_from_raw(raw: Float[Tensor, "n 4"], ranges: SceneRanges) -> Float[Tens
 
 def camera_from_raw(raw: Float[Tensor, "n 6"], ranges: SceneRanges) -> Float[Tensor, "n 6"]:
     """Rotation (radians) and translation from numbers in -1..1."""
-    rotation = torch.deg2rad(torch.tensor(ranges.rotation_deg))
-    scale = [rotation.item()] * 3 + [ranges.translation_xy] * 2 + [ranges.translation_z]
-    return raw.float() * torch.tensor(scale, device=raw.device)
+    scale = [_radians(ranges.rotation_deg)] * 3 + [ranges.translation_xy] * 2 + [ranges.translation_z]
+    return raw.float() * kept(tuple(scale), raw.device, torch.float32)
+
+
+@cache
+def _radians(angle_deg: float) -> float:
+    """As torch rounds it in float32."""
+    return torch.deg2rad(torch.tensor(angle_deg)).item()
 
 
 def map_net(channels: int, initial_scale: float = 1.0) -> Callable[[NetworkSettings], FactorNet]:

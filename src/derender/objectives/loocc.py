@@ -53,7 +53,8 @@ def loocc_loss(
         raise ValueError("LOOCC needs the codes of at least one factor, got none")
     if set(names) != set(features_again):
         raise ValueError(f"both encodings need the same factors, got {names} and {tuple(features_again)}")
-    if len(perturbed) and not NOTHING_LEFT_OUT <= int(perturbed.min()) <= int(perturbed.max()) < len(names):
+    asked = len(perturbed) > 0 and perturbed.device.type == "cpu"  # elsewhere asking would stop the device
+    if asked and not NOTHING_LEFT_OUT <= int(perturbed.min()) <= int(perturbed.max()) < len(names):
         allowed = f"-1..{len(names) - 1} ({', '.join(names)})"
         raise ValueError(f"perturbed must lie in {allowed}, got {perturbed.tolist()}")
     totals, counts = [], []
@@ -92,10 +93,10 @@ def _directions(codes: Float[Tensor, "n d"]) -> Float[Tensor, "n d"]:
     """Unit vectors, safe for any magnitude: each code is first divided by its largest entry.
 
     The divisor is taken as a constant; a direction does not depend on the length, so the gradient is still
-    exact.
+    exact. What is no number stays none: it must not pass for a code without a direction.
     """
     largest = codes.detach().abs().amax(dim=1, keepdim=True)
-    has_direction = largest > _NO_DIRECTION
+    has_direction = ~(largest <= _NO_DIRECTION)
     codes = torch.where(has_direction, codes, 0.0) / torch.where(has_direction, largest, 1.0)
     length = torch.where(has_direction, codes, 1.0).norm(dim=1, keepdim=True)
     return codes / length

@@ -101,6 +101,11 @@ def _trained(
         schedule.step()
         if progress is not None:
             progress(step + 1, steps, loss.item())
+    if not all(bool(value.isfinite().all()) for value in layers.state_dict().values()):
+        raise ValueError(
+            f"learning perceptual features ended in weights that are no numbers after {steps} steps: give "
+            "another seed, or perceptual=none"
+        )
     net = SelfFeatures(settings.widths)
     net.features.load_state_dict(without_normalisation(layers.cpu().eval(), settings.widths).state_dict())
     rows = torch.randperm(len(images), generator=generator)[:_CALIBRATION_PICTURES]

@@ -16,6 +16,8 @@ from PIL import Image
 from derender.report.colours import Images, same_length
 from derender.report.score_table import Cell, Column, ScoreTable
 
+LONGEST_WORD = 24  # characters of a cell that is kept on one line
+
 
 @dataclass(frozen=True)
 class Html:
@@ -184,7 +186,8 @@ def _head(column: Column) -> str:
 
 def _cell(cell: Cell, column: Column, best: float | None, largest: float) -> str:
     if isinstance(cell, str):
-        return f"<td>{escape(cell)}</td>"
+        words = ' class="words"' if len(cell) > LONGEST_WORD else ""  # a sentence may break
+        return f"<td{words}>{escape(cell)}</td>"
     if cell is None or not isfinite(cell):
         return '<td class="none">-</td>'
     kind = ' class="best"' if best is not None and cell == best else ""

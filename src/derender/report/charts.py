@@ -16,24 +16,25 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
 SERIES = ("#3b82f6", "#f59e0b", "#10b981", "#ec4899", "#8b5cf6", "#64748b")
-_INK = "#010203"  # stands for currentColor until the SVG text is written
+INK = "#010203"
+"""Stands for currentColor until the SVG text is written: the colour of the page's text, light or dark."""
 _STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",
     "svg.hashsalt": "derender",
     "font.family": "sans-serif",
     "font.size": 10,
     "text.parse_math": False,  # names of classes and files are no formulas
-    "text.color": _INK,
-    "axes.edgecolor": _INK,
-    "axes.labelcolor": _INK,
+    "text.color": INK,
+    "axes.edgecolor": INK,
+    "axes.labelcolor": INK,
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.linewidth": 0.6,
-    "xtick.color": _INK,
-    "ytick.color": _INK,
+    "xtick.color": INK,
+    "ytick.color": INK,
     "xtick.major.width": 0.6,
     "ytick.major.width": 0.6,
-    "grid.color": _INK,
+    "grid.color": INK,
     "grid.alpha": 0.12,
     "grid.linewidth": 0.7,
     "legend.frameon": False,
@@ -55,7 +56,7 @@ def curves(
         for (name, (x, y)), colour in zip(series.items(), _cycle(len(series)), strict=True):
             axes.plot(x, y, color=colour, linewidth=1.8, label=name, marker="o" if len(x) < 2 else None)
         for name, level in (levels or {}).items():
-            axes.axhline(level, color=_INK, alpha=0.55, linewidth=1, linestyle=(0, (4, 3)))
+            axes.axhline(level, color=INK, alpha=0.55, linewidth=1, linestyle=(0, (4, 3)))
             axes.annotate(name, (1, level), xycoords=("axes fraction", "data"), xytext=(-2, 3),
                           textcoords="offset points", ha="right", fontsize=9, alpha=0.75)  # fmt: skip
         axes.set_xlabel(x_label)
@@ -85,7 +86,7 @@ def bars(
         axes.bar_label(drawn, fmt="%.3g", padding=4, fontsize=9)
         axes.margins(x=0.12)
         if level is not None:
-            axes.axvline(level[1], color=_INK, alpha=0.6, linewidth=1, linestyle=(0, (4, 3)))
+            axes.axvline(level[1], color=INK, alpha=0.6, linewidth=1, linestyle=(0, (4, 3)))
             axes.annotate(level[0], (level[1], 1), xycoords=("data", "axes fraction"), xytext=(0, 2),
                           textcoords="offset points", ha="center", fontsize=9, alpha=0.75)  # fmt: skip
         axes.set_xlabel(x_label)
@@ -150,7 +151,7 @@ def _svg(figure: Figure) -> str:
     text = stream.getvalue()
     text = text[text.index("<svg") :]
     text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
-    text = text.replace(_INK, "currentColor")
+    text = text.replace(INK, "currentColor")
     text = re.sub(r'(<svg[^>]*?) width="[^"]*"', r"\1", text, count=1)
     text = re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", text, count=1)
     text = re.sub(r"font: ([\d.]+)px [^;\"]*", r"font-size: \1px", text)

@@ -5,6 +5,7 @@ Leaves out computing anything (``derender.evaluation``).
 
 from collections.abc import Mapping, Sequence
 from math import isfinite
+from textwrap import shorten
 
 from derender import __version__
 from derender.report import blocks, charts
@@ -80,4 +81,4 @@ def _above(number: int, table: ScoreTable, picture: str | None) -> list[Html]:
 def _short(number: int, table: ScoreTable) -> str:
     """The table's name in the navigation."""
     head = table.caption.partition(":")[0].partition(";")[0]
-    return f"{number} {head[:LONGEST_HEAD]}".strip()
+    return f"{number} {shorten(head, LONGEST_HEAD, placeholder='…')}".strip()

@@ -117,7 +117,8 @@ def _sheets(shown: Shown) -> list[Html]:
         blocks.prose(
             "Each map shows where one factor's encoder saw evidence for the label, the others held. It is "
             "scaled by its own largest value: brightness says where, the percentage how much. A grey "
-            "picture has no evidence for the label in that factor. Pixels show evidence of either sign."
+            "picture has no evidence for the label in that factor. Pixels show evidence of either sign. All "
+            "pictures shown carry the label; p is the probability that the probe gives it."
         )
     ]
     for label, sheets in shown.sheets.items():

@@ -27,7 +27,12 @@ from derender.training.run_folder import RunFolder, read_metrics
 SHEETS_SHOWN, SHEET_PX = 4, 1080
 CHARTS = (
     ("l1", "L1", "Mean absolute difference between picture and rendering, inside the mask."),
-    ("loss", "loss", "What is minimised; it can fall below zero, because confidence enters as a logarithm."),
+    (
+        "loss",
+        "loss",
+        "What is minimised, on held-out pictures. With a confidence net it can fall below zero: the "
+        "logarithm of sigma is part of it.",
+    ),
 )
 BASELINE_CHARTS = (
     ("l1", "L1", "Mean absolute difference between picture and reconstruction."),

@@ -7,9 +7,12 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from derender.interpretation import Explanation
-from derender.report.charts import SERIES, side_by_side
+from derender.report.charts import INK, SERIES, side_by_side
 
-MARKS = {"shuffled labels": ("|", "#64748b"), "untrained encoder": ("x", "#b45309")}
+MARKS = {
+    "shuffled labels": "|",
+    "untrained encoder": "x",
+}  # in the page's ink: seen on every bar, light or dark
 
 
 def share_chart(found: Explanation) -> tuple[str, bytes]:
@@ -24,14 +27,11 @@ def share_chart(found: Explanation) -> tuple[str, bytes]:
             below = np.fmax(share - model.low[:, factor], spread)
             above = np.fmax(model.high[:, factor] - share, spread)
             axes.barh(places, share, height=0.7, color=SERIES[factor % len(SERIES)], alpha=0.85)
-            axes.errorbar(
-                share, places, xerr=np.stack((below, above)), fmt="none", ecolor="#475569", elinewidth=1
-            )
+            axes.errorbar(share, places, xerr=np.stack((below, above)), fmt="none", ecolor=INK, elinewidth=1)
             for row in controls:
-                mark, colour = MARKS[row.name]
                 axes.plot(
-                    _mean(row.shares)[:, factor], places, mark,
-                    color=colour, markersize=7, markeredgewidth=1.6, label=row.name,
+                    _mean(row.shares)[:, factor], places, MARKS[row.name],
+                    color=INK, markersize=7, markeredgewidth=1.6, label=row.name,
                 )  # fmt: skip
             axes.set_yticks(places, [_short(name) for name in found.names])
             axes.set_ylim(-0.7, len(places) - 0.3)

@@ -115,7 +115,8 @@ def cluster_share_table(found: ClusterShares) -> ScoreTable:
             ratio, chance = found.ratio[cluster, place], found.chance[cluster, place]
             cells += [float(found.share[cluster, place]), f"{ratio:.3f} ({chance:.3f})"]
         rows.append(Row(f"cluster {name}", cells))
-    return ScoreTable("What set each cluster apart", "cluster", columns, rows)
+    caption = "What set each cluster apart: parts of the squared distance, ratios of variances (by chance)"
+    return ScoreTable(caption, "cluster", columns, rows)
 
 
 def pair_table(found: PairParts, names: tuple[str, str]) -> ScoreTable:

@@ -12,6 +12,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from derender.scene.constants import constant
+
 OBJECT_CENTRE = (0.0, 0.0, 1.0)
 
 
@@ -83,7 +85,7 @@ def to_canonical(
     points: Float[Tensor, "n *grid 3"], camera: Float[Tensor, "n 6"]
 ) -> Float[Tensor, "n *grid 3"]:
     """Camera frame to canonical frame, the inverse of ``to_camera``."""
-    rotation, centre = rotation_matrix(camera[:, :3]), points.new_tensor(OBJECT_CENTRE)
+    rotation, centre = rotation_matrix(camera[:, :3]), constant(OBJECT_CENTRE, points)
     offset = centre - ((centre + camera[:, 3:])[:, None] @ rotation)[:, 0]
     moved = torch.baddbmm(offset[:, None], points.flatten(1, -2), rotation)
     return moved.view(points.shape)

@@ -16,6 +16,7 @@ from jaxtyping import Float, Int64, Shaped
 from pydantic import Field
 from torch import Generator, Tensor
 
+from derender.scene.constants import constant, kept
 from derender.scene.ranges import SceneRanges
 from derender.scene.scene import Scene
 from derender.settings import Settings
@@ -93,7 +94,7 @@ def choose_factors(n: int, candidates: Sequence[int], generator: Generator) -> I
     if not candidates:
         raise ValueError("no factor to choose from; name at least one that may be perturbed")
     drawn = torch.randint(len(candidates), (n,), generator=generator, device=generator.device)
-    return torch.tensor(tuple(candidates), device=generator.device)[drawn]
+    return kept(tuple(candidates), generator.device, torch.int64)[drawn]
 
 
 PHYSICAL: Mapping[str, Perturbation] = {
@@ -145,8 +146,8 @@ def _uniform_about(
     A value outside the bounds is first brought to the nearest one. The result keeps its gradient to the
     value.
     """
-    low, high = value.new_tensor(bounds).unbind(dim=1)
-    half_width = value.new_tensor(changes)
+    low, high = constant(tuple(bounds), value).unbind(dim=1)
+    half_width = constant(tuple(changes), value)
     inside = torch.minimum(torch.maximum(value, low), high)
     start = torch.maximum(inside - half_width, low)
     end = torch.minimum(inside + half_width, high)

@@ -1,12 +1,20 @@
 """Which pictures make up each batch: a pure function of seed and position, so that a run resumes exactly."""
 
+import time
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import lru_cache
 
+import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int64, UInt8
 from torch import Generator, Tensor
 
+from derender.training.config import LoopSettings
 from derender.training.distributed import ALONE, Ranks
+
+SAMPLED = 65_536
+"""So many pictures of a memory-mapped set are drawn from where a few of all are wanted."""
 
 _STREAMS = {"order": 1, "flip": 2, "perturb": 3}
 
@@ -22,39 +30,126 @@ def random_stream(seed: int, purpose: str, position: int) -> Generator:
 
 @dataclass(frozen=True)
 class Batches:
-    """Batches of a training set that lies on the device as bytes.
+    """Batches of a training set that lies on the device as bytes, or in a file that is mapped into memory.
 
     Attributes:
         images: (N, 3, H, W) uint8.
-        batch_size: pictures in every batch; at most N.
+        batch_size: pictures in every batch; at most as many as there are.
         seed: of the order and the flips.
         horizontal_flips: whether each picture is mirrored with probability one half.
+        rows: which of the images are the training set; None: all. Saves a copy of those that are.
     """
 
     images: UInt8[Tensor, "n 3 h w"]
     batch_size: int
     seed: int
     horizontal_flips: bool
+    rows: Int64[np.ndarray, " k"] | None = None
 
     def __post_init__(self) -> None:
-        if self.batch_size > len(self.images):
+        if self.batch_size > len(self):
             raise ValueError(
-                f"batch_size {self.batch_size} is more than the {len(self.images)} training pictures: "
-                f"set batch_size={max(2, len(self.images) // 2)} or bring more pictures"
+                f"batch_size {self.batch_size} is more than the {len(self)} training pictures: "
+                f"set batch_size={max(2, len(self) // 2)} or bring more pictures"
             )
+
+    def __len__(self) -> int:
+        return len(self.images) if self.rows is None else len(self.rows)
+
+    def sample(self) -> UInt8[Tensor, "n 3 h w"]:
+        """All training pictures; of a mapped set at most ``SAMPLED``, evenly spread, in memory."""
+        return self.images if self.rows is None else torch.from_numpy(_spread(self.images.numpy(), self.rows))
 
     def at(self, position: int, ranks: Ranks = ALONE) -> Float[Tensor, "b 3 h w"]:
         """The batch at a position of the run, counted in batches from 0, as float32 in 0..1.
 
         Of several ``ranks`` each gets its own rows of the batch that one process would get.
         """
-        per_epoch = len(self.images) // self.batch_size
+        return self.ready(self.read(position, ranks), position, ranks)
+
+    def read(self, position: int, ranks: Ranks = ALONE) -> UInt8[Tensor, "b 3 h w"]:
+        """The pictures of that batch as they lie in memory: what may have to wait for a disk; one thread."""
+        per_epoch = len(self) // self.batch_size
         epoch, within = divmod(position, per_epoch)
-        order = torch.randperm(len(self.images), generator=random_stream(self.seed, "order", epoch))
+        order = _order(len(self), self.seed, epoch)
         rows = ranks.own(order[within * self.batch_size : (within + 1) * self.batch_size])
-        batch = self.images[rows.to(self.images.device)].float() / 255
+        if self.images.device.type != "cpu":
+            return self.images[rows.to(self.images.device)]
+        chosen = rows.numpy() if self.rows is None else self.rows[rows.numpy()]
+        return torch.from_numpy(np.take(self.images.numpy(), chosen, axis=0))
+
+    def ready(
+        self, pictures: UInt8[Tensor, "b 3 h w"], position: int, ranks: Ranks = ALONE
+    ) -> Float[Tensor, "b 3 h w"]:
+        """What ``read`` gave for this position as float32 in 0..1, some pictures mirrored."""
+        batch = pictures.float() / 255
         if self.horizontal_flips:
             flip = torch.rand(self.batch_size, generator=random_stream(self.seed, "flip", position)) < 0.5
             flip = ranks.own(flip)
             batch = torch.where(flip.to(batch.device)[:, None, None, None], batch.flip(-1), batch)
         return batch
+
+
+def batches_of(
+    images: UInt8[np.ndarray, "n 3 h w"],
+    rows: Int64[np.ndarray, " k"],
+    config: LoopSettings,
+    device: torch.device,
+) -> Batches:
+    """Batches of these rows: on the device, or left in the file where they lie mapped and train on a CPU."""
+    stay = isinstance(images, np.memmap) and device.type == "cpu"
+    lying = torch.from_numpy(images if stay else np.ascontiguousarray(images[rows])).to(device)
+    kept = rows if stay else None
+    return Batches(lying, config.batch_size, config.seed, config.horizontal_flips, kept)
+
+
+def some_of(images: UInt8[np.ndarray, "n 3 h w"], rows: Int64[np.ndarray, " k"]) -> np.ndarray:
+    """These pictures; of a mapped set at most ``SAMPLED``, evenly spread: (m, 3, H, W) in memory."""
+    if isinstance(images, np.memmap):
+        return _spread(images, rows)
+    return np.ascontiguousarray(images[rows])
+
+
+def _spread(images: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    if len(rows) > SAMPLED:
+        rows = rows[np.linspace(0, len(rows) - 1, SAMPLED).astype(np.int64)]
+    return np.ascontiguousarray(images[rows])
+
+
+class Reader:
+    """Takes batches in order; the next one is read in another thread while the present one is computed.
+
+    On another device than the CPU the pictures lie there already, and nothing is read ahead.
+
+    Attributes:
+        waited_s: seconds spent waiting for pictures, of all batches so far.
+    """
+
+    def __init__(self, batches: Batches, ranks: Ranks = ALONE):
+        self.batches, self.ranks, self.waited_s = batches, ranks, 0.0
+        on_cpu = batches.images.device.type == "cpu"
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="batch") if on_cpu else None
+        self._next: tuple[int, Future[Tensor]] | None = None
+
+    def at(self, position: int) -> Float[Tensor, "b 3 h w"]:
+        """What ``Batches.at`` gives; asked for in order it is there already."""
+        began = time.perf_counter()
+        if self._next is not None and self._next[0] == position:
+            pictures = self._next[1].result()
+        else:
+            pictures = self.batches.read(position, self.ranks)
+        self.waited_s += time.perf_counter() - began
+        if self._thread is not None:
+            self._next = position + 1, self._thread.submit(self.batches.read, position + 1, self.ranks)
+        return self.batches.ready(pictures, position, self.ranks)
+
+    def close(self) -> None:
+        """End the thread."""
+        if self._thread is not None:
+            self._thread.shutdown(cancel_futures=True)
+
+
+@lru_cache(maxsize=2)
+def _order(count: int, seed: int, epoch: int) -> Tensor:
+    """The order of an epoch; a million numbers are not drawn again for every batch of it."""
+    return torch.randperm(count, generator=random_stream(seed, "order", epoch))

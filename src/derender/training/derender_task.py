@@ -11,6 +11,7 @@ from derender.model import Derenderer, load
 from derender.objectives import load_vgg16
 from derender.training.config import TrainConfig
 from derender.training.distributed import ALONE, Ranks
+from derender.training.finite import first_not_finite, stages_of
 from derender.training.perceptual import prepare_perceptual
 from derender.training.run_folder import RunFolder
 from derender.training.step import StepResult
@@ -112,8 +113,11 @@ class SceneWatch:
 
     def look(self, images: int, result: StepResult) -> tuple[Finding, ...]:
         """What is wrong with the scenes of this batch; usually nothing."""
-        loss = self.watcher.ranks.mean({"loss": result.total.item()})["loss"]
-        return self.watcher.look(images, loss, result.scene)
+        broken = first_not_finite(stages_of(result))
+        shared = self.watcher.ranks.mean({"loss": result.total.item(), "broken": float(broken is not None)})
+        if shared["broken"] and broken is None:
+            broken = "that of another rank"
+        return self.watcher.look(images, shared["loss"], result.scene, broken)
 
     def memory(self) -> dict[str, Any]:
         """What a resumed run needs."""

@@ -25,6 +25,10 @@ FEWEST = 20
 """Of fewer pictures nothing is kept: their largest error says little."""
 
 
+class NotFinite(ValueError):
+    """A model renders what is no number."""
+
+
 @dataclass(frozen=True)
 class HeldOutErrors:
     """The reconstruction errors of pictures a model was validated on.
@@ -41,7 +45,11 @@ class HeldOutErrors:
 def reconstruction_errors(
     model: Any, images: UInt8[np.ndarray, "n 3 h w"] | UInt8[Tensor, "n 3 h w"], batch_size: int = 64
 ) -> Float[np.ndarray, " n"]:
-    """Masked L1 (0..1, best 0) of each picture; infinite where the model renders nothing into the picture."""
+    """Masked L1 (0..1, best 0) of each picture; infinite where the model renders nothing into the picture.
+
+    Raises:
+        NotFinite: a reconstruction is no number.
+    """
     pictures = torch.as_tensor(np.array(images) if isinstance(images, np.ndarray) else images)
     was_training = model.training
     model.eval()
@@ -58,7 +66,13 @@ def reconstruction_errors(
                 errors.append(torch.where(covered > 0, inside / covered, inf).cpu())
     finally:
         model.train(was_training)
-    return torch.cat(errors).numpy()
+    found = torch.cat(errors).numpy()
+    if np.isnan(found).any():
+        raise NotFinite(
+            f"the reconstructions of {int(np.isnan(found).sum())} of {len(found)} pictures are no numbers: "
+            "the model's training went wrong"
+        )
+    return found
 
 
 def errors_of(
@@ -81,6 +95,8 @@ def store_errors(folder: Path, held_out: UInt8[Tensor, "n 3 h w"]) -> HeldOutErr
     """
     try:
         errors = errors_of(load(folder, device=held_out.device), held_out)
+    except NotFinite:
+        raise
     except ValueError:
         return None
     write_errors(folder, errors)

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from functools import partial
+from math import isfinite
 from pathlib import Path
 from typing import Any, cast
 
@@ -19,18 +20,26 @@ from PIL import Image
 from torch import Tensor, nn
 from torch.utils.tensorboard.writer import SummaryWriter
 
-from derender.data import PictureSet, Split, split_indices
+from derender.data import PictureSet, split_indices
 from derender.training.allocator import freed_memory_kept
-from derender.training.batches import Batches, random_stream
+from derender.training.batches import Batches, Reader, batches_of, random_stream, some_of
 from derender.training.checkpoint import TrainState, resume_from, save_checkpoint
 from derender.training.complete import complete_model
 from derender.training.config import TrainConfig
 from derender.training.derender_task import DerenderTask, sharing_batches
 from derender.training.determinism import deterministic_algorithms
 from derender.training.distributed import Ranks, first_then_others, open_fabric, ranks_of, this_rank_writes
+from derender.training.finite import broken_gradient, not_finite
 from derender.training.interrupt import TrainingInterrupted, stop_on_signal
 from derender.training.progress import Progress, TrainResult
-from derender.training.run_folder import RunFolder, append_metrics, drop_metrics_after, reopen_run, start_run
+from derender.training.run_folder import (
+    RunFolder,
+    append_metrics,
+    describe_data,
+    drop_metrics_after,
+    reopen_run,
+    start_run,
+)
 from derender.training.schedule import kept, learning_rate, passed
 from derender.training.step import Precision
 from derender.training.step_module import compute_step
@@ -89,7 +98,7 @@ def train(
             complete_model(
                 RunFolder(result.folder).model,
                 config,
-                np.ascontiguousarray(pictures.images[split.train]),
+                some_of(pictures.images, split.train),
                 np.ascontiguousarray(pictures.images[split.validation[:MAX_VALIDATION_PICTURES]]),
                 device="cuda" if on_gpu else "cpu",
                 progress=lambda done, total: (progress or (lambda _: None))(
@@ -131,11 +140,10 @@ def _train(
     ranks = ranks_of(fabric)
     task = sharing_batches(task, ranks)
     split = split_indices(pictures.files, config.split, seed=config.seed)
-    training = torch.from_numpy(np.ascontiguousarray(pictures.images[split.train]))
     held_out = torch.from_numpy(
         np.ascontiguousarray(pictures.images[split.validation[:MAX_VALIDATION_PICTURES]])
     )
-    batches = Batches(fabric.to_device(training), config.batch_size, config.seed, config.horizontal_flips)
+    batches = batches_of(pictures.images, split.train, config, fabric.device)
 
     task.check()
     if not ranks.first:
@@ -150,7 +158,7 @@ def _train(
         model = model.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
     with first_then_others(fabric):
         step = task.step_module(
-            model, run, batches.images, lambda done, total: report(Progress("perceptual", done, total))
+            model, run, batches.sample(), lambda done, total: report(Progress("perceptual", done, total))
         )
     settings = config.optimiser
     optimiser = torch.optim.Adam(
@@ -214,6 +222,7 @@ class _Run:
     def __post_init__(self) -> None:
         self.config = self.task.config
         self.precision = network_precision(self.config.precision, self.fabric.device)
+        self.reader = Reader(self.batches, self.ranks)
         self.writer = None
         if self.ranks.first:
             self.writer = SummaryWriter(str(self.folder.path / "tensorboard"), purge_step=self.state.images)
@@ -224,6 +233,7 @@ class _Run:
 
     def close(self) -> None:
         """Finish what is being written."""
+        self.reader.close()
         if self.writer is not None:
             self.writer.close()
 
@@ -241,17 +251,21 @@ class _Run:
         noise = random_stream(config.seed, "perturb", position)
         result = compute_step(
             self.module,
-            self.batches.at(position, self.ranks),
+            self.reader.at(position),
             noise,
             self.precision,
             state.images / config.images,
         )
         self.fabric.backward(result.total)
-        self.optimiser.step()
+        broken = broken_gradient(self.model)
+        if broken is None:
+            self.optimiser.step()
         self.optimiser.zero_grad(set_to_none=True)
         state.images += config.batch_size
         if self.watcher is not None:
             self.findings = self.watcher.look(state.images, result)
+        if broken is not None and not any(finding.fatal for finding in self.findings):
+            self.findings = (*self.findings, not_finite(broken))
         return result
 
     def validate(self) -> None:
@@ -263,6 +277,9 @@ class _Run:
         )
         loss, best = self.validation["loss"], self.state.best_loss
         self.log("validation", self.validation)
+        if not isfinite(loss):
+            self.findings = (*self.findings, not_finite("the loss of held-out pictures"))
+            return
         if best is not None and not loss < best:
             self.state.validations_since_best += 1
             return
@@ -330,11 +347,12 @@ def _go_on(run: _Run, report: Callable[[Progress], None]) -> TrainResult:
             steps += 1
             elapsed = time.perf_counter() - began
             state.seconds, speed = seconds_before + elapsed, (state.images - images_before) / elapsed
+            waiting = run.reader.waited_s / elapsed
             terms = None
             if steps % LOG_EVERY_STEPS == 1:
                 terms = run.ranks.mean({name: value.item() for name, value in result.terms.items()})
-                run.log("train", {**terms, "images_per_second": speed})
-            report(Progress("train", state.images, config.images, speed, terms))
+                run.log("train", {**terms, "images_per_second": speed, "waiting": waiting})
+            report(Progress("train", state.images, config.images, speed, terms, waiting))
 
             elapsed, stop_asked = run.ranks.largest(elapsed, signal_request.asked)
             state.seconds = seconds_before + elapsed
@@ -346,7 +364,9 @@ def _go_on(run: _Run, report: Callable[[Progress], None]) -> TrainResult:
             keep = partial(kept, before, state.images, ended=stopped is not None)
             if keep(config.validate_every) and healthy:
                 run.validate()
-                stopped = stopped or run.why_stop()
+                stopped = run.why_stop() or stopped
+                if stopped == "collapse":
+                    break
             if due(config.sample_every):
                 run.draw()
             if (keep(config.checkpoint_every) and healthy) or stop_asked:
@@ -359,9 +379,16 @@ def _go_on(run: _Run, report: Callable[[Progress], None]) -> TrainResult:
     if stopped == "collapse":
         run.log("collapse", {finding.sign: finding.text for finding in run.findings})
     run.close()
-    speed = (state.images - images_before) / max(time.perf_counter() - began, 1e-9)
+    took = max(time.perf_counter() - began, 1e-9)
     return TrainResult(
-        run.folder.path, state.images, state.seconds, speed, run.validation, stopped or "images", run.findings
+        run.folder.path,
+        state.images,
+        state.seconds,
+        (state.images - images_before) / took,
+        run.validation,
+        stopped or "images",
+        run.findings,
+        run.reader.waited_s / took,
     )
 
 
@@ -370,16 +397,3 @@ def network_precision(precision: str, device: torch.device) -> Precision:
     if precision == "32-true":
         return nullcontext
     return partial(torch.autocast, device.type, torch.bfloat16)
-
-
-def describe_data(pictures: PictureSet, split: Split) -> dict[str, Any]:
-    """What a run was trained on, for its environment.json."""
-    return {
-        "layout": pictures.layout,
-        "pictures": len(pictures),
-        "train": len(split.train),
-        "validation": len(split.validation),
-        "test": len(split.test),
-        "skipped": len(pictures.skipped),
-        "duplicates": len(pictures.duplicates),
-    }

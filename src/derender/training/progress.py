@@ -16,6 +16,7 @@ class Progress:
         done, total: steps of the first phase, pictures of the others.
         images_per_second: since the run was started or resumed.
         terms: the latest losses by name.
+        waiting: share of the time, since the run was started or resumed, spent waiting for pictures, 0..1.
     """
 
     phase: str
@@ -23,6 +24,7 @@ class Progress:
     total: int
     images_per_second: float = 0.0
     terms: dict[str, float] | None = None
+    waiting: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -37,6 +39,7 @@ class TrainResult:
         validation: last validation losses by name.
         stopped: "images", "minutes", "patience" or "collapse".
         findings: what the watcher saw last; empty when nothing was wrong.
+        waiting: share of this call's time spent waiting for pictures, 0..1.
     """
 
     folder: Path
@@ -46,3 +49,4 @@ class TrainResult:
     validation: dict[str, float]
     stopped: str
     findings: tuple[Finding, ...]
+    waiting: float = 0.0

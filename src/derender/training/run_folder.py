@@ -10,20 +10,26 @@ import subprocess
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from reprlib import Repr
 from typing import Any, overload
 
 import torch
 import yaml
 
+from derender.data import PictureSet, Split
 from derender.settings import Settings
 from derender.training.config import Config, TrainConfig, config_from_tree, to_yaml
 from derender.whole import remove_abandoned, whole_file
+
+FORMAT = 1
+"""Of config.yaml, which says so in its first line; one that does not is of this format, too."""
 
 _MAY_CHANGE_ON_RESUME = (
     *("images", "minutes", "validate_every", "sample_every", "checkpoint_every", "patience", "watch"),
     "accumulate",
     "optimiser",  # a run that the watcher stopped goes on with a smaller rate
 )
+_SHORT = Repr()
 _BEGUN = ("environment.json", ".environment.json-", ".config.yaml-")  # there before config.yaml
 _REPORTED_PACKAGES = ("derender", "torch", "numpy", "numba", "lightning-fabric", "safetensors", "pillow")
 
@@ -83,7 +89,7 @@ def start_run(path: Path, config: Settings, data: dict[str, Any], device: str) -
     run = RunFolder(path)
     run.samples.mkdir(parents=True, exist_ok=True)
     write_text(path / "environment.json", json.dumps({**environment(device), "data": data}, indent=1))
-    write_text(run.config, to_yaml(config))
+    write_text(run.config, f"format: {FORMAT}\n{to_yaml(config)}")
     return run
 
 
@@ -125,7 +131,7 @@ def reopen_run(path: Path, config: Settings) -> RunFolder:
         )
     for written in (run.last, run.best, run.model, run.config, run.metrics, run.perceptual):
         remove_abandoned(written)
-    write_text(run.config, to_yaml(config))
+    write_text(run.config, f"format: {FORMAT}\n{to_yaml(config)}")
     return run
 
 
@@ -149,7 +155,11 @@ def read_config(path: Path, kind: type[Settings] = TrainConfig) -> Settings:
 
 
 def read_config_tree(path: Path) -> dict[str, Any]:
-    """The configuration of a run as plain values, whatever it trained."""
+    """The configuration of a run as plain values, whatever it trained.
+
+    Raises:
+        ValueError: it is damaged, or of a newer version.
+    """
     file = path / "config.yaml"
     try:
         tree = yaml.safe_load(file.read_text())
@@ -157,6 +167,12 @@ def read_config_tree(path: Path) -> dict[str, Any]:
         raise ValueError(f"{file} is damaged: restore it, or start a new run in another folder") from error
     if not isinstance(tree, dict):
         raise ValueError(f"{file} is damaged: restore it, or start a new run in another folder")
+    version = tree.pop("format", FORMAT)
+    if not isinstance(version, int) or version > FORMAT:
+        raise ValueError(
+            f"{file} was written in format {_SHORT.repr(version)}, this version reads up to {FORMAT}: "
+            "update derender"
+        )
     return tree
 
 
@@ -193,6 +209,19 @@ def environment(device: str) -> dict[str, Any]:
         "device": device,
         "packages": {name: _version(name) for name in _REPORTED_PACKAGES},
         "commit": _commit(),
+    }
+
+
+def describe_data(pictures: PictureSet, split: Split) -> dict[str, Any]:
+    """What a run was trained on, for its environment.json."""
+    return {
+        "layout": pictures.layout,
+        "pictures": len(pictures),
+        "train": len(split.train),
+        "validation": len(split.validation),
+        "test": len(split.test),
+        "skipped": len(pictures.skipped),
+        "duplicates": len(pictures.duplicates),
     }
 
 

@@ -39,6 +39,7 @@ class StepResult:
         scene: the scenes predicted for the batch.
         rendering: their renderings, without the twins.
         codes: the pictures' features by factor, with gradient, for an objective beside this one.
+        confidence: what the confidence net says, where it is used.
     """
 
     total: Tensor
@@ -46,6 +47,7 @@ class StepResult:
     scene: Scene
     rendering: Rendering
     codes: dict[str, Tensor]
+    confidence: Confidence | None
 
 
 def training_step(
@@ -123,7 +125,7 @@ def training_step(
     reported = {name: term.detach() for name, term in terms.items()}
     reported["l1"] = part * masked_l1(straight, images, covered).detach()
     shown = Rendering(image=straight, depth=rendering.depth[:count], mask=rendering.mask[:count])
-    return StepResult(total, reported, scene, shown, codes)
+    return StepResult(total, reported, scene, shown, codes, confidence)
 
 
 def perturb_one_factor(

@@ -163,13 +163,16 @@ class Watcher:
             "last_images": self.last_images,
         }
 
-    def look(self, images: int, loss: float, scene: Scene) -> tuple[Finding, ...]:
-        """What is wrong after ``images`` pictures, given the latest batch; usually nothing."""
-        if not math.isfinite(loss):
+    def look(self, images: int, loss: float, scene: Scene, broken: str | None = None) -> tuple[Finding, ...]:
+        """What is wrong after ``images`` pictures, given the latest batch; usually nothing.
+
+        ``broken`` names the first stage that gave a value that is no number, if one did.
+        """
+        if broken is not None or not math.isfinite(loss):
             self.uneasy = True
-            return (
-                Finding("non-finite loss", f"the loss is {loss}", f"{SLOWER}; with bf16, try 32-true", True),
-            )
+            first = "" if broken is None else f"; the first value that is not finite is {broken}"
+            text = f"the loss is {loss:.4g}{first}"
+            return (Finding("non-finite loss", text, f"{SLOWER}; with bf16, try 32-true", True),)
         share = min(1.0, (images - self.last_images) / MEMORY_IMAGES)
         self.last_images = images
         latest = self.ranks.mean(measure(scene, self.ranges))

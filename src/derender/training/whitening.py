@@ -50,7 +50,7 @@ def fit_whitening(
         progress: called with (pictures done, pictures in all).
 
     Raises:
-        ValueError: fewer than two pictures.
+        ValueError: fewer than two pictures, or readings that are no numbers.
     """
     generator = torch.Generator().manual_seed(seed)
     chosen = torch.randperm(len(images), generator=generator)[: settings.pictures]
@@ -65,14 +65,23 @@ def fit_whitening(
         with torch.no_grad():
             for start in range(0, len(chosen), BATCH_SIZE):
                 rows = chosen[start : start + BATCH_SIZE].to(images.device)
-                batch = as_float(images[rows]).to(model.device)
+                drawn = images[rows]
+                batch = (as_float(drawn) if drawn.dtype == torch.uint8 else drawn.float()).to(model.device)
                 scene = model.decompose(batch)
                 views = [say(batch)]
                 views += [
                     say(_seen_otherwise(model, scene, batch, perturb, generator))
                     for _ in range(settings.views)
                 ]
-                for name in own if describe is None else views[0]:
+                names = own if describe is None else tuple(views[0])
+                for view in views:  # the pictures first: of a broken rendering every reading is broken
+                    broken = [name for name in names if not bool(view[name].isfinite().all())]
+                    if broken:
+                        raise ValueError(
+                            f"whitening: what is read of {broken[0]} is not finite in pictures {start} to "
+                            f"{start + len(rows) - 1} of those drawn: the model's training went wrong"
+                        )
+                for name in names:
                     joined = torch.stack([view[name].float() for view in views]).cpu()
                     found.setdefault(name, []).append(joined)
                 if progress is not None:

@@ -1,24 +1,31 @@
-"""The faces that the page begins with are such as the bundled models know."""
+"""The pictures that the page begins with are such as the bundled models know."""
 
 import numpy as np
+import pytest
 
 from derender import load
 from derender.evaluation.oddness import ODD_PERCENTILE, reconstruction_percentile
-from derender.model import model_folder
+from derender.model import bundled_models, model_folder
 from derender.report.viewer.examples import named_examples, rendered_examples
 from derender.training.held_out_errors import read_errors
 
 
-def test_rendered_faces_are_known_to_the_model_and_differ():
-    examples = rendered_examples("rendered-faces-64", 64)
+@pytest.mark.parametrize(("model", "thing"), [("rendered-faces-64", "face"), ("cars-64", "car")])
+def test_rendered_examples_are_known_to_the_model_and_differ(model, thing):
+    examples = rendered_examples(model, 64)
+    assert examples[0].name == f"rendered {thing} 1"
     stacked = np.stack([example.picture for example in examples])
     assert stacked.shape == (8, 3, 64, 64) and stacked.dtype == np.uint8
     assert len({example.name for example in examples}) == 8
     assert len({picture.tobytes() for picture in stacked}) == 8
-    net, errors = load("rendered-faces-64"), read_errors(model_folder("rendered-faces-64"))
+    net, errors = load(model), read_errors(model_folder(model))
     assert errors is not None
     found = reconstruction_percentile(net, stacked, errors)
     assert (found <= ODD_PERCENTILE).all() and np.median(found) < 80
+
+
+def test_every_bundled_model_has_examples():
+    assert all(rendered_examples(name, 64) for name in bundled_models())
 
 
 def test_other_models_and_sizes(tmp_path):

@@ -35,6 +35,7 @@ def cluster(
 
     from derender.evaluation.clustering_compare import compare_clusterings
     from derender.evaluation.clustering_levels import finch_levels
+    from derender.evaluation.clustering_methods import approximation
     from derender.evaluation.feature_rows import prepare
     from derender.report.tables_comparison import (
         CLUSTER_COLUMNS,
@@ -65,8 +66,11 @@ def cluster(
             )
         tables.append(finch_table(rows[0].name, levels[rows[0].name], found.labels[names[0]]))
     notes = [verdict(found.rows[0], "accuracy")]
+    if approximate := approximation(method, found.n_rows):
+        notes.append(approximate)
     if ready.n_dropped:
         by = ", ".join((*names, *(mean_by or ())))
         notes.append(f"{ready.n_dropped:,} rows without a label of {by} left out")
-    values = {**found.numbers(), "n_dropped_before": ready.n_dropped, "finch": levels}
+    more = {"approximation": approximate, "n_dropped_before": ready.n_dropped, "finch": levels}
+    values = {**found.numbers(), **more}
     published.show(tables, values, [*notes, scoring.remembered(source.memory)])

@@ -30,6 +30,7 @@ from derender.objectives.perceptual import PerceptualFeatures
 from derender.scene import Scene
 from derender.training.derender_task import DerenderTask
 from derender.training.finetune_config import FinetuneConfig
+from derender.training.finite import first_not_finite
 from derender.training.perceptual import prepare_perceptual
 from derender.training.run_folder import RunFolder
 from derender.training.sharing import own_share
@@ -188,10 +189,14 @@ class FinetuneWatch:
     def look(self, images: int, result: FinetuneLosses) -> tuple[Finding, ...]:
         """What is wrong with this batch; usually nothing."""
         loss = result.total.item()
+        stages = [] if result.scene is None else list(result.scene.parameters.items())
+        broken = first_not_finite([*stages, *result.terms.items()])
         if result.scene is None:
-            wrong = Finding("non-finite loss", f"the loss is {loss}", "use a smaller learning_rate", True)
+            first = "" if broken is None else f"; the first term that is not finite is {broken!r}"
+            text = f"the loss is {loss}{first}"
+            wrong = Finding("non-finite loss", text, "use a smaller learning_rate", True)
             return () if isfinite(loss) else (wrong,)
-        return self.watcher.look(images, loss, result.scene)
+        return self.watcher.look(images, loss, result.scene, broken)
 
     def memory(self) -> dict[str, Any]:
         """What a resumed run needs."""

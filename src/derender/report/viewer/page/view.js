@@ -135,7 +135,7 @@ const refreshNeighbours = newest(async () => {
     const words = [row.file, ...Object.entries(row.labels).map(([name, value]) => `${name}: ${value}`)];
     const button = pictureButton(row.image, `Open ${row.file}, distance ${row.distance.toFixed(3)}`, () => openFirst(`api/rows/${row.row}`, row.file, row.image));
     button.title = words.join("\n");
-    for (const text of [row.distance.toFixed(3), row.file]) {
+    for (const text of [row.distance.toFixed(3), row.file.split("/").pop()]) {
       const line = document.createElement("span");
       line.textContent = text;
       button.append(line);
@@ -361,7 +361,7 @@ function connect() {
 function buildNeighbours() {
   if (!about.table || !about.table.factors.length) return;
   $("near").hidden = false;
-  $("near-note").textContent = `Among ${about.table.rows.toLocaleString("en")} pictures.${about.table.note ? ` No pictures: ${about.table.note}.` : " Choose one to take it apart."}`;
+  $("near-note").textContent = `Among ${about.table.rows.toLocaleString("en")} pictures, by cosine distance.${about.table.note ? ` No pictures: ${about.table.note}.` : " Choose one to take it apart."}`;
   about.table.factors.forEach((factor, place) => {
     const button = document.createElement("button");
     button.type = "button";

@@ -1,0 +1,138 @@
+"""The rows of the regression table in docs/performance.md that follow from benchmarks/results.
+
+Prints Markdown: day and commit, machine, what was measured, the ratio (or seconds, or megabytes). A file that
+is missing or of another form is named and passed over.
+
+    python benchmarks/regressions.py
+"""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+RESULTS = Path(__file__).parent / "results"
+
+
+def training_step(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    for row in found["rows"][1:]:
+        yield f"training step, {row['name']} / literal", f"{row['ratio']:.2f}x"
+
+
+def rasterize(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    for row in found["rows"]:
+        yield f"{row['part']}, torch / Numba", f"{row['ratio']:.1f}x"
+
+
+def rasterize_peers(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    for row in found["rows"]:
+        what = f"rasterise both ways, {row['maps']} maps of {row['size']}x{row['size']}"
+        ours = row["milliseconds"]["derender, Numba"]["both ways"]
+        for name, check in row["checks"].items():
+            if name != "derender, Numba":
+                note = "" if check["exact"] else f" (not exact: gradient off by {check['gradient_off']:.0%})"
+                yield f"{what}, {name}{note} / ours", f"{row['milliseconds'][name]['both ways'] / ours:.1f}x"
+
+
+def embedding(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    for way, ratio in found["against_training"].items():
+        if way != "training step":
+            yield f"{way} / training step, preset paper ({found['clock']} clock)", f"{ratio:.1f}x"
+
+
+def embedding_memory(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    for row in found["rows"]:
+        yield f"memory of embedding {row['pictures']:,} pictures", f"{row['peak_mb']:,.0f} MB"
+
+
+def step_memory(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    for row in found["rows"]:
+        what = f"memory of a step, {row['size']} px, batch {row['batch']}, {row['chunks']} chunks"
+        yield what, f"{row['mb_per_picture']:,.0f} MB a picture"
+
+
+def reading(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    for kind, row in found["starts"].items():
+        later = min(one["known_s"] for one in row["later"])
+        what = f"{kind} of {row['files']:,} known, first start and later"
+        yield what, f"{row['first']['known_s']:.1f} s, {later:.1f} s"
+
+
+def clustering(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    forty = found["forty_attributes"]
+    yield (
+        f"forty attributes from one tree of {found['rows']:,} rows / a tree for each",
+        f"{forty['ratio']:.0f}x",
+    )
+    yield "the same / SciPy's tree for each", f"{forty['ratio_to_scipy']:.0f}x"
+    for name, taken in found["one_tree_cpu_s"].items():
+        if name != "ours" and not isinstance(taken, str):
+            ratio = taken / found["one_tree_cpu_s"]["ours"]
+            yield f"one tree of {found['rows']:,} rows, CPU seconds, {name} / ours", f"{ratio:.2f}x"
+
+
+def clustering_million(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    for row in found["checked"]:
+        indices = [row[name] for name in row if name.startswith("ward_ari_") and name[9:].isdigit()]
+        yield (
+            f"Ward by cells against exact, {row['rows']:,} rows, ARI",
+            f"{min(indices):.2f}..{max(indices):.2f}",
+        )
+        yield f"nearest rows that cells find, {row['rows']:,} rows", f"{row['nearest_found']:.1%}"
+    for row in found["runs"]:
+        rows = found["table"]["rows"]
+        yield f"evaluate cluster, {rows:,} rows of 512, {row['method']}", f"{row['seconds']:.0f} s"
+
+
+def bench(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    for row in found["rows"]:
+        yield f"derender bench: {row['what']}", f"{row['ratio']:.2f}x ({row['least']:.2f}..{row['most']:.2f})"
+    yield "derender bench: training waits for data", f"{found['waiting']['share']:.2%}"
+
+
+def ray_embedding(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    for way, speed in found["pictures_per_second"].items():
+        yield f"embedding, {way}, start included", f"{speed:.0f} pictures/s"
+
+
+def torchrun_resume(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    for way, apart in found["differences"].items():
+        yield f"torchrun: {way}, largest difference from one process", f"{apart:.1e}"
+
+
+def gpu(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    for row in found["aims"]:
+        yield f"on the GPU: {row['what']} (aim {row['aim']})", str(row["got"])
+
+
+READERS = {
+    **{f"{one.__name__}": one for one in (training_step, rasterize, rasterize_peers, embedding, bench)},
+    **{f"{one.__name__}": one for one in (embedding_memory, step_memory, reading, clustering, gpu)},
+    **{f"{one.__name__}": one for one in (clustering_million, ray_embedding, torchrun_resume)},
+    "clustering_how_far": clustering_million,
+    "clustering_how_far_50000": clustering_million,
+}
+
+
+def main() -> None:
+    print("| date, commit | machine | what | result |\n|---|---|---|---|")
+    for name, reader in READERS.items():
+        file = RESULTS / f"{name}.json"
+        try:
+            found = json.loads(file.read_text())
+            rows = list(reader(found))
+        except FileNotFoundError:
+            print(f"<!-- {file.name} is not there -->")
+            continue
+        except (LookupError, TypeError, ValueError) as problem:
+            print(f"<!-- {file.name} cannot be read: {type(problem).__name__} {problem} -->")
+            continue
+        machine = found.get("machine", found)
+        when = f"{machine.get('date', '')}, {machine.get('commit', '')}".strip(", ")
+        where = f"{machine.get('cores', '?')} cores, {machine.get('processor', machine.get('device', '?'))}"
+        for what, result in rows:
+            print(f"| {when} | {where} | {what} | {result} |")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,167 @@
+"""The weights in a checkpoint of unsup3d (Wu et al., CVPR 2020), as those of our networks.
+
+The networks are the same (the paper's appendix), their tensors have other names. So they are told apart by
+net (``netD`` depth, ``netA`` albedo, ``netL`` light, ``netV`` view, ``netC`` confidence) and, within one, by
+order: the n-th tensor of theirs becomes the n-th of ours, and every shape is compared. Two things are
+converted: 1x1 convolutions become linear layers, and light comes as (ambient, diffuse, x, y) where ours has
+pitch, y, first. The file is a pickle, read with torch's reader for weights: objects of kinds it does not know
+become empty ones, no code is imported or run. Leaves out optimisers, and the ranges, which no file holds.
+"""
+
+import pickle
+import re
+import warnings
+from collections.abc import Mapping
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.serialization import safe_globals
+
+from derender.networks.confidence import ConfidenceNet
+from derender.networks.factors import FACTORS
+from derender.networks.settings import IMAGE_SIZES, NetworkSettings
+
+NETS = {"netD": "geometry", "netA": "albedo", "netL": "light", "netV": "camera", "netC": "confidence"}
+OPTIONAL = "netC"
+LIGHT_ROWS = [0, 1, 3, 2]
+"""Ambient, diffuse, pitch, yaw out of ambient, diffuse, x, y: x is the tangent of yaw, y that of pitch."""
+MOST_UNKNOWN = 50
+"""Kinds of objects in one file."""
+
+
+class Empty:
+    """Stands for an object that is not read: takes anything, does nothing."""
+
+    def __new__(cls, *_: Any, **__: Any) -> "Empty":
+        return super().__new__(cls)
+
+    def __init__(self, *_: Any, **__: Any) -> None:
+        pass
+
+    def __setstate__(self, _: Any) -> None:
+        pass
+
+
+def read_checkpoint(file: str | Path) -> tuple[NetworkSettings, dict[str, Tensor]]:
+    """Sizes of the networks, and their tensors by the names that a `Derenderer`'s state has.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it cannot be read, or is no such checkpoint; the first tensor that differs is named.
+    """
+    file = Path(file)
+    if not file.exists():
+        raise FileNotFoundError(f"{file} does not exist: give the .pth file that unsup3d wrote")
+    content = _loaded(file)
+    if not isinstance(content, Mapping):
+        raise ValueError(
+            f"{file} holds {type(content).__name__}, no checkpoint of unsup3d: expected netD and others"
+        )
+    theirs = {net: _tensors(content, net) for net in NETS}
+    missing = [net for net, tensors in theirs.items() if not tensors and net != OPTIONAL]
+    if missing:
+        holds = ", ".join(sorted(map(str, content))[:8]) or "nothing"
+        raise ValueError(f"{file} is no checkpoint of unsup3d: it has no {missing[0]} (it holds {holds})")
+    settings = _sizes(theirs, file)
+    weights: dict[str, Tensor] = {}
+    for net, module in _modules(settings).items():
+        if theirs[net]:
+            weights |= _renamed(theirs[net], module, net, file)
+    key = next(name for name in reversed(weights) if name.startswith("nets.light."))
+    weights[key] = weights[key][LIGHT_ROWS]
+    return settings, weights
+
+
+def _loaded(file: Path) -> Any:
+    """What the file holds, with an empty object for whatever is neither tensor nor plain value."""
+    with ExitStack() as known:
+        known.enter_context(warnings.catch_warnings())
+        warnings.simplefilter("ignore")  # of torch, about how a file was pickled
+        for _ in range(MOST_UNKNOWN):
+            try:
+                return torch.load(file, map_location="cpu", weights_only=True)
+            except pickle.UnpicklingError as error:
+                unknown = re.search(r"Unsupported global: GLOBAL (\S+) was", str(error))
+                if unknown is None:
+                    raise ValueError(
+                        f"{file} is damaged, no file of torch, or wants to run code when read: not opened"
+                    ) from error
+                name = unknown[1] if "." in unknown[1] else f"builtins.{unknown[1]}"
+                known.enter_context(safe_globals([(Empty, name)]))
+            except (RuntimeError, EOFError, ValueError, LookupError, TypeError, AttributeError) as error:
+                said = str(error).splitlines()[0] if str(error) else type(error).__name__
+                raise ValueError(
+                    f"{file} is damaged or no file of torch ({said}): download it again"
+                ) from error
+    raise ValueError(f"{file} holds more than {MOST_UNKNOWN} kinds of objects: no checkpoint of unsup3d")
+
+
+def _tensors(content: Mapping[Any, Any], net: str) -> dict[str, Tensor]:
+    """The tensors of one net in their order, whether it is an entry of its own or a prefix."""
+    entry = content.get(net)
+    if isinstance(entry, Mapping):
+        return {str(name): value for name, value in entry.items() if isinstance(value, Tensor)}
+    start = f"{net}."
+    return {
+        str(name).removeprefix(start): value
+        for name, value in content.items()
+        if str(name).startswith(start) and isinstance(value, Tensor)
+    }
+
+
+def _sizes(theirs: Mapping[str, Mapping[str, Tensor]], file: Path) -> NetworkSettings:
+    """Read off the first and last convolutions of depth and light."""
+    shapes = {net: [tuple(value.shape) for value in tensors.values()] for net, tensors in theirs.items()}
+    depth, light = shapes["netD"], shapes["netL"]
+    try:
+        told = {
+            "width": depth[0][0],
+            "light_width": light[0][0],
+            "code_size": light[-1][1],
+            "image_size": 4 * 2 ** (len(light) - 2),
+        }
+        if shapes[OPTIONAL]:  # the first layer there that narrows is the one to the code
+            told["confidence_code_size"] = next(
+                shape[0] for shape in shapes[OPTIONAL] if len(shape) == 4 and shape[0] < shape[1]
+            )
+        if told["image_size"] not in IMAGE_SIZES:
+            raise ValueError(f"light has {len(light)} layers")
+        return NetworkSettings(**told)
+    except (IndexError, ValueError, StopIteration) as error:
+        raise ValueError(
+            f"{file} has networks of another kind than unsup3d's ({error}): not imported"
+        ) from error
+
+
+def _modules(settings: NetworkSettings) -> dict[str, nn.Module]:
+    """Our networks without memory, by the names of theirs."""
+    with torch.device("meta"):
+        ours: dict[str, nn.Module] = {factor.name: factor.build(settings) for factor in FACTORS}
+        ours["confidence"] = ConfidenceNet(settings)
+    return {net: ours[name] for net, name in NETS.items()}
+
+
+def _renamed(theirs: Mapping[str, Tensor], module: nn.Module, net: str, file: Path) -> dict[str, Tensor]:
+    """The n-th tensor of theirs under the name of the n-th of ours."""
+    found: dict[str, Tensor] = {}
+    wanted = list(module.state_dict().items())
+    for (name, value), (ours, like) in zip(theirs.items(), wanted, strict=False):
+        fits = value.shape == like.shape or value.shape == (*like.shape, 1, 1)
+        if not fits:
+            raise ValueError(
+                f"{file}: {net} has {name} of shape {tuple(value.shape)} where {tuple(like.shape)} is "
+                f"expected (our {ours}): this is another architecture"
+            )
+        if not bool(value.isfinite().all()):
+            raise ValueError(
+                f"{file}: {net} has {name} with values that are no numbers: its training went wrong"
+            )
+        found[f"nets.{NETS[net]}.{ours}"] = value.detach().reshape(like.shape).float()
+    if len(theirs) != len(wanted):
+        raise ValueError(
+            f"{file}: {net} has {len(theirs)} tensors, expected {len(wanted)}: this is another architecture"
+        )
+    return found

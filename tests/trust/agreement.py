@@ -1,0 +1,130 @@
+"""Trains the same tiny model in several ways of computing and tells how far they drift apart.
+
+    python tests/trust/agreement.py --steps 200
+
+float32 with the numba kernels is what the others are held against: float32 with the plain torch kernels
+(other sums, same definition), networks in bfloat16, and networks through torch.compile. The same weights,
+pictures and perturbations go into each; a training is chaotic, so what must agree stands in ``BOUNDS``.
+"""
+
+import argparse
+import sys
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from derender.data.synthetic import faces
+from derender.model import Derenderer
+from derender.render import render_scene
+from derender.training.batches import random_stream
+from derender.training.config import ObjectiveSettings
+from derender.training.step import training_step
+
+SIZE, BATCH, PICTURES = 32, 4, 64
+OBJECTIVE = ObjectiveSettings(perceptual="none", loocc="light+camera")
+
+
+@dataclass(frozen=True)
+class Way:
+    """One way of computing a step.
+
+    Attributes:
+        name: of the way.
+        backend: of the renderer.
+        precision: a context for the networks.
+        compiled: the backend of torch.compile for every encoder and decoder, "" for none.
+    """
+
+    name: str
+    backend: str = "numba"
+    precision: Callable[[], AbstractContextManager] = nullcontext
+    compiled: str = ""
+
+
+FLOAT32 = Way("float32, numba")
+WAYS = (
+    Way("float32, reference", backend="reference"),
+    Way("bf16, numba", precision=partial(torch.autocast, "cpu", torch.bfloat16)),
+    Way("float32, compiled", compiled="aot_eager"),
+)
+BOUNDS = {
+    "float32, reference": (1e-5, 0.02),
+    "bf16, numba": (0.02, 0.10),
+    "float32, compiled": (1e-5, 0.02),
+}
+"""How far the L1 may be, relative to float32: that of the first step, and the mean of the last tenth."""
+
+
+@dataclass(frozen=True)
+class Course:
+    """The L1 of every step."""
+
+    l1: Tensor
+
+    @property
+    def end(self) -> float:
+        """Mean L1 of the last tenth."""
+        return float(self.l1[-max(1, len(self.l1) // 10) :].mean())
+
+
+def course(way: Way, steps: int, seed: int = 0) -> Course:
+    """Train for some steps."""
+    pictures = torch.from_numpy(faces.generate(PICTURES, image_size=SIZE, seed=seed).images).float() / 255
+    model = Derenderer.from_preset("small", seed=seed, image_size=SIZE, width=8, light_width=4, code_size=32)
+    model.renderer = partial(render_scene, backend=way.backend)
+    if way.compiled:
+        for net in model.nets.values():
+            for part in ("encoder", "decoder"):
+                if hasattr(net, part):
+                    setattr(net, part, torch.compile(getattr(net, part), backend=way.compiled))
+    optimiser = torch.optim.Adam(model.parameters(), lr=3e-4)
+    l1 = []
+    for step in range(steps):
+        rows = torch.randperm(PICTURES, generator=torch.Generator().manual_seed(step))[:BATCH]
+        noise = random_stream(seed, "perturb", step)
+        result = training_step(model, pictures[rows], OBJECTIVE, None, noise, way.precision)
+        optimiser.zero_grad(set_to_none=True)
+        result.total.backward()
+        optimiser.step()
+        l1.append(result.terms["l1"])
+    return Course(torch.stack(l1).double())
+
+
+def drift(found: Course, expected: Course) -> tuple[float, float, float]:
+    """Relative differences of the L1: in the first step, the largest, of the mean of the last tenth."""
+    apart = (found.l1 - expected.l1).abs() / expected.l1
+    return float(apart[0]), float(apart.max()), abs(found.end - expected.end) / expected.end
+
+
+def run(given: argparse.Namespace) -> int:
+    """The script."""
+    expected = course(FLOAT32, given.steps)
+    print(
+        f"{given.steps} steps of {BATCH} pictures of {SIZE} x {SIZE}; L1 {expected.l1[0]:.4f} at first, ",
+        end="",
+    )
+    print(f"{expected.end:.4f} in the last tenth with {FLOAT32.name}")
+    print("| way | L1 of the first step | largest of all | mean of the last tenth | within |")
+    print("| --- | ---: | ---: | ---: | --- |", flush=True)
+    failed = 0
+    for way in WAYS:
+        first, largest, end = drift(course(way, given.steps), expected)
+        within = first <= BOUNDS[way.name][0] and end <= BOUNDS[way.name][1]
+        failed += not within
+        print(
+            f"| {way.name} | {first:.1e} | {largest:.1e} | {end:.1e} | {'yes' if within else 'NO'} |",
+            flush=True,
+        )
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--steps", type=int, default=200)
+    sys.exit(run(parser.parse_args()))

@@ -1,0 +1,274 @@
+"""NaN and infinity put into every stage in turn: each is caught, and what is said names the stage."""
+
+from collections.abc import Callable
+from math import inf, isnan, nan
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+
+from derender.baselines.training import BaselineLosses, FiniteWatch
+from derender.data import PictureSet
+from derender.features.extract import embed_pictures
+from derender.model import Derenderer
+from derender.networks.confidence import Confidence
+from derender.networks.whitening import Contrast, Whitening
+from derender.objectives import self_training
+from derender.objectives.self_features import SelfFeatures
+from derender.objectives.self_training import SelfTraining
+from derender.render import Rendering
+from derender.scene import Scene
+from derender.scene.perturb import PerturbSettings
+from derender.training import resolve, train
+from derender.training.config import ObjectiveSettings, WhiteningSettings
+from derender.training.derender_task import DerenderTask, SceneWatch
+from derender.training.finite import broken_gradient, first_not_finite
+from derender.training.held_out_errors import NotFinite, errors_of
+from derender.training.step import training_step
+from derender.training.watch import Finding, Watcher
+from derender.training.whitening import fit_whitening
+
+SIZE = 32
+MIDDLE = SIZE // 2
+NETS = {"geometry": "depth", "albedo": "albedo", "light": "light", "camera": "camera"}
+
+
+@pytest.fixture
+def model() -> Derenderer:
+    return Derenderer.from_preset("small", seed=0, image_size=SIZE, width=4, light_width=4, code_size=16)
+
+
+@pytest.fixture
+def images(generator) -> Tensor:
+    return torch.rand(4, 3, SIZE, SIZE, generator=generator)
+
+
+def spoiled(values: Tensor, bad: float) -> Tensor:
+    """One number of the first row replaced, of a map one in the middle."""
+    changed = values.clone()
+    middle = [side // 2 for side in values.shape[2:]]
+    changed[(0, 0, *middle)] = bad
+    return changed
+
+
+def spoil(module: nn.Module, bad: float, call: int | None = None) -> None:
+    """From now on a module gives a bad number, each time or only the n-th."""
+    calls = 0
+
+    def hook(_: nn.Module, __: object, output: Tensor) -> Tensor:
+        nonlocal calls
+        calls += 1
+        return spoiled(output, bad) if call in (None, calls) else output
+
+    module.register_forward_hook(hook)
+
+
+def what_is_said(model: Derenderer, images: Tensor, perceptual: nn.Module | None = None) -> str:
+    """What the watcher of a training says of one step; it has to end the run."""
+    objective = ObjectiveSettings(loocc="light+camera", perceptual="self" if perceptual else "none")
+    result = training_step(model, images, objective, perceptual, torch.Generator().manual_seed(0))  # type: ignore[arg-type]
+    watch = SceneWatch(Watcher(model.settings.ranges))
+    findings = watch.look(len(images), result)
+    assert watch.uneasy and findings and findings[0].fatal
+    return findings[0].text
+
+
+def test_a_sound_step_raises_nothing(model, images):
+    result = training_step(model, images, ObjectiveSettings(perceptual="none"), None, torch.Generator())
+    result.total.backward()
+    assert SceneWatch(Watcher(model.settings.ranges)).look(4, result) == ()
+    assert broken_gradient(model) is None
+
+
+@pytest.mark.parametrize("bad", [nan, inf, -inf])
+@pytest.mark.parametrize("factor", NETS)
+def test_each_encoder(model, images, factor, bad):
+    spoil(model.nets[factor].encoder, bad)
+    assert f"the first value that is not finite is the code of {factor}" in what_is_said(model, images)
+
+
+@pytest.mark.parametrize("bad", [nan, inf, -inf])
+@pytest.mark.parametrize("factor", NETS)
+def test_each_decoder(model, images, factor, bad):
+    spoil(model.nets[factor].decoder, bad)
+    if factor != "albedo" or isnan(bad):
+        assert f"is the predicted {NETS[factor]}" in what_is_said(model, images)
+    else:  # a squashed infinity is a number: black or white
+        albedo = model.decompose(images).albedo
+        assert albedo[0, 0, MIDDLE, MIDDLE] == (1 if bad > 0 else 0)
+
+
+@pytest.mark.parametrize("bad", [nan, inf])
+@pytest.mark.parametrize("name", list(Confidence.__dataclass_fields__))
+def test_the_confidence_net(model, images, name, bad):
+    def hook(_: nn.Module, __: object, output: Confidence) -> Confidence:
+        maps = dict(vars(output))
+        maps[name] = maps[name].clone()
+        maps[name][0, 0, 3, 3] = bad
+        return Confidence(**maps)
+
+    model.nets["confidence"].register_forward_hook(hook)
+    assert f"is the {name} confidence" in what_is_said(model, images)
+
+
+@pytest.mark.parametrize("bad", [nan, inf])
+@pytest.mark.parametrize("name", ["image", "depth", "mask"])
+def test_the_rendering(model, images, name, bad):
+    plain = model.renderer
+
+    def renderer(scene: Scene, fov_deg: float) -> Rendering:
+        found = dict(vars(plain(scene, fov_deg)))
+        found[name] = found[name].clone()
+        found[name][(0, 0, MIDDLE, MIDDLE) if name == "image" else (0, MIDDLE, MIDDLE)] = bad
+        return Rendering(**found)
+
+    model.renderer = renderer
+    assert f"is the rendered {name}" in what_is_said(model, images)
+
+
+@pytest.mark.parametrize("bad", [nan, inf])
+def test_perceptual_features(model, images, bad):
+    features = SelfFeatures((4, 4, 4))
+    features.register_forward_hook(
+        lambda _, __, output: torch.full_like(output, bad) if output.requires_grad else output
+    )
+    assert "is the loss term 'perceptual'" in what_is_said(model, images, features)
+
+
+@pytest.mark.parametrize("bad", [nan, inf])
+def test_loocc(model, images, bad):
+    spoil(model.nets["albedo"].encoder, bad, call=2)  # of the perturbed renderings
+    assert "is the loss term 'loocc'" in what_is_said(model, images)
+
+
+def test_a_depth_that_is_no_number_leaves_the_loss_finite_and_is_seen_all_the_same(model, images):
+    spoil(model.nets["geometry"].decoder, nan)
+    objective = ObjectiveSettings(perceptual="none", curvature_weight=0, confidence=False)
+    result = training_step(model, images, objective, None, torch.Generator().manual_seed(0))
+    (finding,) = SceneWatch(Watcher(model.settings.ranges)).look(4, result)
+    assert "the predicted depth" in finding.text
+    assert result.total.isfinite()
+
+
+@pytest.mark.parametrize("bad", [nan, inf])
+def test_every_gradient(model, images, bad):
+    result = training_step(model, images, ObjectiveSettings(perceptual="none"), None, torch.Generator())
+    result.total.backward()
+    learning = {name: value for name, value in model.named_parameters() if value.grad is not None}
+    assert {name.split(".")[1] for name in learning} == {*NETS, "confidence"}
+    for name, value in learning.items():
+        assert value.grad is not None
+        kept = value.grad.clone()
+        value.grad.view(-1)[-1] = bad
+        assert broken_gradient(model) == f"the gradient of {name}"
+        value.grad.copy_(kept)
+    assert broken_gradient(model) is None
+
+
+def test_a_sum_that_overflows_is_no_broken_gradient(model):
+    for value in model.parameters():
+        value.grad = torch.full_like(value, 3e38)
+    assert broken_gradient(model) is None
+
+
+def test_first_not_finite_names_the_first():
+    good, bad = torch.ones(2), torch.tensor([1.0, inf])
+    assert first_not_finite([]) is None
+    assert first_not_finite([("a", good), ("b", bad), ("c", bad)]) == "b"
+
+
+def picture_set(count: int = 20) -> PictureSet:
+    pixels = np.random.default_rng(0).integers(0, 256, (count, 3, SIZE, SIZE), dtype=np.uint8)
+    return PictureSet(images=pixels, files=tuple(f"{number:03d}.png" for number in range(count)))
+
+
+def run_of(spoiler: Callable[[Derenderer], None], folder, monkeypatch, *settings: str) -> tuple[Finding, ...]:
+    """Train with a model that is spoiled as it is built; gives what ended the run. No file may hold a NaN."""
+    build = DerenderTask.build
+
+    def built(task: DerenderTask) -> Derenderer:
+        model = build(task)
+        spoiler(model)
+        return model
+
+    monkeypatch.setattr(DerenderTask, "build", built)
+    tiny = (f"image_size={SIZE}", "width=4", "light_width=4", "batch_size=4", "images=12", "perceptual=none")
+    result = train(resolve("small", (*tiny, "whitening.pictures=0", *settings)), picture_set(), folder)
+    assert result.stopped == "collapse"
+    assert not list(folder.rglob("model.safetensors"))
+    return result.findings
+
+
+@pytest.mark.parametrize("watch", ["true", "false"])
+def test_a_gradient_that_is_no_number_ends_a_run_before_it_is_used(tmp_path, monkeypatch, watch):
+    trained: list[Derenderer] = []
+
+    def spoiler(model: Derenderer) -> None:
+        trained.append(model)
+        model.nets["light"].decoder.register_full_backward_hook(
+            lambda _, inputs, __: tuple(torch.full_like(one, nan) for one in inputs)
+        )
+
+    (finding,) = run_of(spoiler, tmp_path / "run", monkeypatch, f"watch={watch}")
+    assert finding.fatal and "the gradient of nets.light.encoder" in finding.text
+    assert all(bool(value.isfinite().all()) for value in trained[0].parameters())
+
+
+def test_held_out_pictures_that_are_rendered_as_no_numbers_end_a_run(tmp_path, monkeypatch):
+    def spoiler(model: Derenderer) -> None:
+        def hook(net: nn.Module, _: object, output: Tensor) -> Tensor:
+            return output if net.training else torch.full_like(output, nan)
+
+        model.nets["albedo"].decoder.register_forward_hook(hook)
+
+    (finding,) = run_of(spoiler, tmp_path / "run", monkeypatch)
+    assert "the loss of held-out pictures is not finite" in finding.text
+
+
+@pytest.mark.parametrize("bad", [nan, inf])
+def test_pictures(model, images, bad):
+    for use in (model.embed, model.decompose, model.reconstruct):
+        with pytest.raises(ValueError, match=r"picture 0 of 4 holds values that are not finite"):
+            use(spoiled(images, bad))
+
+
+def test_what_perceptual_features_learn(monkeypatch):
+    plain = self_training.nt_xent
+    monkeypatch.setattr(self_training, "nt_xent", lambda *given: plain(*given) * nan)
+    pixels = torch.randint(0, 256, (8, 3, SIZE, SIZE), dtype=torch.uint8)
+    settings = SelfTraining(widths=(4, 4, 4), batch=4)
+    with pytest.raises(ValueError, match="learning perceptual features ended in weights that are no numbers"):
+        self_training.train_self_features(pixels, seed=0, steps=3, settings=settings)
+
+
+@pytest.mark.parametrize("factor", ["geometry", "albedo"])
+def test_whitening(model, images, factor):
+    spoil(model.nets[factor].encoder.convolutions, nan)
+    with pytest.raises(ValueError, match=f"whitening: what is read of {factor} is not finite in pictures 0"):
+        fit_whitening(model, images, WhiteningSettings(views=1), PerturbSettings())
+
+
+@pytest.mark.parametrize("bad", [nan, inf])
+@pytest.mark.parametrize("stage", ["encoder", "whitening"])
+def test_embedding(model, stage, bad):
+    if stage == "encoder":
+        spoil(model.nets["albedo"].encoder, bad)
+    else:
+        width = model.read(torch.zeros(1, 3, SIZE, SIZE))["albedo"].shape[1]
+        maps = {"albedo": Contrast(torch.zeros(width), torch.full((width, 16), bad), torch.ones(16))}
+        model.whitening = Whitening(maps)
+    with pytest.raises(ValueError, match=r"factor 'albedo' is not finite in \d+ of 20 rows, first in 000"):
+        embed_pictures(model, picture_set(), batch_size=20)
+
+
+def test_held_out_errors(model):
+    spoil(model.nets["albedo"].decoder, nan)
+    with pytest.raises(NotFinite, match="the reconstructions of 20 of 20 pictures are no numbers"):
+        errors_of(model, picture_set().images, batch_size=1)
+
+
+def test_baselines():
+    terms = {"l1": torch.tensor(0.1), "commitment": torch.tensor(nan)}
+    (finding,) = FiniteWatch().look(4, BaselineLosses(torch.tensor(nan), terms))
+    assert finding.fatal and "the first term that is not finite is 'commitment'" in finding.text

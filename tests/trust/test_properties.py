@@ -1,0 +1,180 @@
+"""Laws that hold whatever the numbers are: scale, order, names, mirror images, and the way of computing."""
+
+import importlib.util
+import math
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from sklearn.metrics import adjusted_rand_score
+
+from derender.evaluation.clustering_methods import clusterings
+from derender.evaluation.clustering_scores import cluster_scores
+from derender.evaluation.linear_probes import probe
+from derender.evaluation.linear_task import task_of
+from derender.model import Derenderer
+from derender.objectives.loocc import loocc_loss, nt_xent
+from derender.objectives.reconstruction import depth_curvature, depth_smoothness, masked_l1, photometric_loss
+from derender.render import render
+from derender.scene.camera import rotation_matrix
+
+_spec = importlib.util.spec_from_file_location("agreement", Path(__file__).with_name("agreement.py"))
+assert _spec is not None and _spec.loader is not None
+agreement = sys.modules["agreement"] = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(agreement)
+
+
+def rows_of(count: int = 60, width: int = 5, groups: int = 3) -> np.ndarray:
+    """Groups that overlap, of clear numbers: no tie decides."""
+    numbers = np.random.default_rng(3)
+    return numbers.normal(size=(count, width)) + 3 * np.eye(width)[np.arange(count) % groups]
+
+
+@pytest.mark.parametrize("method", ["ward", "finch", "k-means"])
+@pytest.mark.parametrize("factor", [1e-3, 7.0, 4096.0])
+def test_clusters_do_not_see_the_scale_of_features(method, factor):
+    rows = rows_of()
+    plain, scaled = clusterings(rows, (3, 5), method), clusterings(factor * rows, (3, 5), method)
+    for count in (3, 5):
+        assert adjusted_rand_score(plain[count], scaled[count]) == 1
+
+
+@pytest.mark.parametrize("method", ["ward", "finch", "k-means"])
+def test_clusters_do_not_see_the_order_or_the_signs_of_dimensions(method):
+    rows = rows_of()
+    turned = rows[:, ::-1] * np.array([1, -1, 1, -1, -1])
+    plain, other = (
+        clusterings(rows, (4,), method)[4],
+        clusterings(np.ascontiguousarray(turned), (4,), method)[4],
+    )
+    assert adjusted_rand_score(plain, other) == pytest.approx(1)
+
+
+@pytest.mark.parametrize("method", ["ward", "k-means"])
+def test_euclidean_clusters_do_not_see_where_the_origin_is(method):
+    rows = rows_of()
+    plain, moved = clusterings(rows, (4,), method)[4], clusterings(rows + 5.0, (4,), method)[4]
+    assert adjusted_rand_score(plain, moved) == 1
+
+
+@settings(deadline=None)
+@given(
+    st.lists(st.tuples(st.integers(0, 3), st.integers(0, 3)), min_size=1, max_size=30),
+    st.permutations(range(4)),
+)
+def test_two_sided_scores_do_not_care_which_side_is_which(pairs, names):
+    """NMI, ARI and the matched share are symmetric, and a class's name is no number."""
+    one, other = (np.array(side) for side in zip(*pairs, strict=True))
+    straight, crossed = cluster_scores(one, other), cluster_scores(other, one)
+    renamed = cluster_scores(np.array(names)[one], other)
+    for name in ("nmi", "ari", "hungarian"):
+        assert getattr(crossed, name) == pytest.approx(getattr(straight, name), abs=1e-12)
+        assert getattr(renamed, name) == pytest.approx(getattr(straight, name), abs=1e-12)
+    assert renamed.accuracy == pytest.approx(straight.accuracy)
+
+
+@pytest.mark.parametrize("head", ["logistic", "k-NN"])
+def test_probes_do_not_see_the_scale_of_all_features_nor_the_order_of_dimensions(head):
+    """The paper's head sees both: it is trained for a few steps on features as they are."""
+    rows = rows_of(80).astype(np.float32)
+    task = task_of({"group": np.array(list("abc"))[np.arange(80) % 3]})
+    learned, tested = np.arange(40)[None], np.arange(40, 80)
+    plain = probe(head, rows, task, learned, tested, (0,))
+    for other in (256 * rows, rows[:, ::-1]):
+        np.testing.assert_allclose(probe(head, other, task, learned, tested, (0,)), plain, atol=2e-4)
+
+
+def test_logistic_probes_do_not_see_the_scale_of_each_feature():
+    rows = rows_of(80).astype(np.float32)
+    task = task_of({"yes": (np.arange(80) % 3 == 0).astype(np.int8)})
+    learned, tested = np.arange(40)[None], np.arange(40, 80)
+    plain, scaled = (
+        probe("logistic", values, task, learned, tested, (0,))
+        for values in (rows, rows * np.array([1e-2, 1, 64, 5, 1e3], np.float32))
+    )
+    np.testing.assert_allclose(scaled, plain, atol=2e-4)
+
+
+@settings(deadline=None)
+@given(st.tuples(st.floats(-3.1, 3.1), st.floats(-1.5, 1.5), st.floats(-3.1, 3.1)))
+def test_angles_come_back_from_their_rotation(angles):
+    turned = rotation_matrix(torch.tensor(angles, dtype=torch.float64))
+    x = math.atan2(turned[2, 1], turned[2, 2])
+    y = -math.asin(max(-1.0, min(1.0, float(turned[2, 0]))))
+    z = math.atan2(turned[1, 0], turned[0, 0])
+    np.testing.assert_allclose((x, y, z), angles, atol=1e-8)
+
+
+def bumpy_scene(count: int = 3, height: int = 14, width: int = 17) -> list[torch.Tensor]:
+    """Depth, albedo, light and camera that no mirror leaves alone."""
+    numbers = torch.Generator().manual_seed(1)
+    y, x = torch.meshgrid(torch.linspace(-1, 1, height), torch.linspace(-1, 1, width), indexing="ij")
+    depth = 1 + 0.03 * torch.sin(2 * x + y) + 0.02 * x[None] * torch.rand(count, 1, 1, generator=numbers)
+    albedo = torch.rand(count, 3, height, width, generator=numbers)
+    light = torch.rand(count, 4, generator=numbers) * torch.tensor([0.5, 0.5, 0.4, 0.4])
+    camera = 0.2 * torch.rand(count, 6, generator=numbers) - 0.1
+    return [value.double() for value in (depth, albedo, light, camera * torch.tensor([1, 1, 1, 0.1, 0.1, 0]))]
+
+
+def mirrored(depth, albedo, light, camera):
+    """The scene in a mirror whose plane is x = 0: what turns about y or z, or moves along x, turns round."""
+    turned = camera * torch.tensor([1, -1, -1, -1, 1, 1], dtype=camera.dtype)
+    return depth.flip(-1), albedo.flip(-1), light * torch.tensor([1, 1, 1, -1.0], dtype=light.dtype), turned
+
+
+def test_a_mirrored_scene_costs_what_the_scene_costs():
+    """Every loss of a picture and its scene is that of their mirror images, but for the cells' diagonals."""
+    scene = bumpy_scene()
+    picture = torch.rand(3, 3, 14, 17, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
+    sigma = torch.rand(3, 1, 14, 17, dtype=torch.float64, generator=torch.Generator().manual_seed(3)) + 0.1
+    straight, twin = render(*scene, backend="reference"), render(*mirrored(*scene), backend="reference")
+    both = straight.mask * twin.mask.flip(-1)
+    assert both.mean() > 0.5
+    assert float(((straight.image - twin.image.flip(-1)).abs().amax(1) * both).max()) < 0.02
+    for loss in (
+        lambda image, target, mask, spread: masked_l1(image, target, mask),
+        photometric_loss,
+    ):
+        one = loss(straight.image, picture, both, sigma)
+        other = loss(twin.image, picture.flip(-1), both.flip(-1), sigma.flip(-1))
+        assert float(one) == pytest.approx(float(other), rel=2e-3)
+    for term in (depth_smoothness, depth_curvature):
+        assert float(term(scene[0])) == pytest.approx(float(term(scene[0].flip(-1))), rel=1e-12)
+
+
+def test_a_model_mirrors_maps_and_nothing_else_and_twice_is_once():
+    model = Derenderer.from_preset("small", seed=0, image_size=32, width=4, light_width=4, code_size=16)
+    with torch.no_grad():
+        scene = model.decompose(torch.rand(2, 3, 32, 32, generator=torch.Generator().manual_seed(0)))
+    twin, back = model.mirror(scene), model.mirror(model.mirror(scene))
+    for name, value in scene.parameters.items():
+        assert torch.equal(back.parameters[name], value)
+        expected = value.flip(-1) if name in ("depth", "albedo") else value
+        assert torch.equal(twin.parameters[name], expected)
+
+
+def test_loocc_sees_no_order_of_pictures_no_scale_and_no_side(generator):
+    one, other = (
+        {name: torch.rand(6, 4, generator=generator, dtype=torch.float64) for name in "ab"} for _ in range(2)
+    )
+    left_out = torch.tensor([0, 1, 0, 1, -1, 0])
+    plain = loocc_loss(one, other, left_out)
+    order = torch.randperm(6, generator=generator)
+    shuffled = [{name: code[order] for name, code in side.items()} for side in (one, other)]
+    torch.testing.assert_close(loocc_loss(*shuffled, left_out[order]), plain)
+    torch.testing.assert_close(loocc_loss(other, one, left_out), plain)
+    scaled = {name: 1e3 * code for name, code in one.items()}
+    torch.testing.assert_close(loocc_loss(scaled, other, left_out), plain)
+    torch.testing.assert_close(nt_xent(one["a"], 7 * other["a"], 0.5), nt_xent(one["a"], other["a"], 0.5))
+
+
+@pytest.mark.parametrize("way", [way for way in agreement.WAYS if not way.compiled], ids=lambda way: way.name)
+def test_ways_of_computing_agree_over_a_few_steps(way):
+    """Those that the type checks of the test run allow; the script has torch.compile, too, and more steps."""
+    first, _, end = agreement.drift(agreement.course(way, 2), agreement.course(agreement.FLOAT32, 2))
+    assert first <= agreement.BOUNDS[way.name][0]
+    assert end <= agreement.BOUNDS[way.name][1]

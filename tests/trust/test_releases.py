@@ -1,0 +1,193 @@
+"""What earlier releases saved is read as it was meant; what later ones save is refused in one clear line."""
+
+import importlib.util
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+import torch
+
+import derender
+from derender.baselines.training import load_baseline
+from derender.data.cache import _MARK, read_cache
+from derender.data.pictures import read_pictures
+from derender.features import FeatureTable, missing
+from derender.interpretation.probe import Probe, load_probe
+from derender.model import CONFIG_FILE, ERRORS_FILE
+from derender.training.checkpoint import STATE_FILE, TrainState, load_checkpoint
+from derender.training.config import config_from_tree
+from derender.training.held_out_errors import read_errors
+from derender.training.run_folder import read_config, read_config_tree, read_metrics
+from derender.whole import CHECKSUMS, seal
+
+RELEASES = Path(__file__).with_name("releases")
+VERSIONS = sorted(folder.name for folder in RELEASES.iterdir() if (folder / "expected.json").is_file())
+LARGEST_BYTES = 250_000
+_spec = importlib.util.spec_from_file_location("releases_make", RELEASES / "make.py")
+assert _spec is not None and _spec.loader is not None
+make = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(make)
+
+
+@pytest.fixture(params=VERSIONS)
+def release(request) -> Path:
+    return RELEASES / request.param
+
+
+@pytest.fixture
+def copy(tmp_path) -> Path:
+    """The newest release's files, to be changed."""
+    return Path(shutil.copytree(RELEASES / VERSIONS[-1], tmp_path / "release"))
+
+
+def expected(release: Path, what: str):
+    return json.loads((release / "expected.json").read_text())[what]
+
+
+def test_there_is_a_release_and_it_is_small():
+    assert VERSIONS
+    for version in VERSIONS:
+        assert sum(f.stat().st_size for f in (RELEASES / version).rglob("*") if f.is_file()) < LARGEST_BYTES
+
+
+def test_its_model_gives_the_numbers_it_gave(release):
+    """To 1e-3 of the largest: sums in another order change less, another definition changes far more."""
+    found = make.numbers_of(derender.load(release / "model"))
+    wanted = expected(release, "model")
+    assert found.keys() == wanted.keys()
+    for name, values in wanted.items():
+        actual, values = np.array(found[name]), np.array(values)
+        assert actual.shape == values.shape and np.abs(values).max() > 0, name
+        assert np.abs(actual - values).max() <= 1e-3 * np.abs(values).max(), name
+
+
+def test_its_model_has_whitening(release):
+    model = derender.load(release / "model")
+    codes, features = model.encode(make.pictures()), model.embed(make.pictures())
+    assert model.whitening is not None
+    assert not torch.allclose(codes["geometry"], features["geometry"])
+    assert torch.equal(codes["light"], features["light"])
+
+
+def test_its_feature_table_holds_what_was_written(release):
+    found, wanted = FeatureTable.read(release / "table.parquet"), make.table()
+    assert found.files == wanted.files and dict(found.origin) == dict(wanted.origin)
+    assert list(found.factors) == list(wanted.factors) and list(found.labels) == list(wanted.labels)
+    for name, values in wanted.factors.items():
+        np.testing.assert_array_equal(found.factors[name], values)
+    for name, values in wanted.labels.items():
+        there = ~missing(values)
+        np.testing.assert_array_equal(~missing(found.labels[name]), there)
+        assert found.labels[name][there].tolist() == values[there].tolist()
+
+
+def test_its_checkpoint_goes_on(release):
+    net, optimiser = make.learner()
+    state = load_checkpoint(release / "checkpoint", net, optimiser)
+    assert state == TrainState(640, 1.5, 0.25, 2, {"a": {"b": 1}})
+    for name, value in net.state_dict().items():
+        assert value.tolist() == expected(release, "weights")[name]
+    assert [float(entry["step"]) for entry in optimiser.state.values()] == [1.0] * 4
+    assert tuple(optimiser.param_groups[0]["betas"]) == (0.8, 0.9)
+    before = net.state_dict()["0.weight"].clone()
+    net(torch.ones(1, 3)).sum().backward()
+    optimiser.step()
+    assert not torch.equal(net.state_dict()["0.weight"], before)
+
+
+def test_the_configuration_and_metrics_of_its_run_are_read(release):
+    assert read_config(release / "run") == config_from_tree(expected(release, "config"))
+    assert read_metrics(release / "run") == [{"kind": "train", "images": 640, "l1": 0.125}]
+
+
+def later(file: Path, **change) -> None:
+    """A JSON file of the next format."""
+    content = json.loads(file.read_text())
+    file.write_text(json.dumps({**content, "format": content["format"] + 1, **change}))
+
+
+def test_a_model_from_the_future(copy):
+    later(copy / "model" / CONFIG_FILE)
+    with pytest.raises(ValueError, match="saved in format 2, this version reads up to 1: update derender"):
+        derender.load(copy / "model")
+
+
+def test_a_baseline_from_the_future(copy):
+    later(copy / "model" / CONFIG_FILE, baseline="ae")
+    with pytest.raises(ValueError, match="saved in format 2, this version reads up to 1: update derender"):
+        load_baseline(copy / "model")
+
+
+def test_a_feature_table_from_the_future(copy):
+    file = copy / "table.parquet"
+    table = pq.read_table(file)
+    described = json.loads(table.schema.metadata[b"derender"])
+    told = json.dumps({**described, "format": described["format"] + 1}).encode()
+    pq.write_table(table.replace_schema_metadata({b"derender": told}), file)
+    with pytest.raises(ValueError, match="has format 2, this version reads up to 1: update derender"):
+        FeatureTable.read(file)
+
+
+def test_a_checkpoint_from_the_future(copy):
+    folder = copy / "checkpoint"
+    later(folder / STATE_FILE, something="new")
+    (folder / CHECKSUMS).unlink()
+    seal(folder)
+    with pytest.raises(ValueError, match="was made in format 2, this version reads up to 1: update derender"):
+        load_checkpoint(folder, *make.learner())
+
+
+def test_a_run_from_the_future(copy):
+    """Its format speaks before a setting that nobody knows yet does."""
+    file = copy / "run" / "config.yaml"
+    text = file.read_text()
+    assert text.startswith("format: 1\n")
+    file.write_text(text.replace("format: 1", "format: 2") + "invented_later: 3\n")
+    with pytest.raises(ValueError, match="written in format 2, this version reads up to 1: update derender"):
+        read_config(copy / "run")
+    for odd in ("[1]", "'1'", "null", "1.5", "{}"):
+        file.write_text(text.replace("format: 1", f"format: {odd}"))
+        with pytest.raises(ValueError, match="was written in format"):
+            read_config_tree(copy / "run")
+
+
+def test_a_run_from_before_formats_were_counted(copy):
+    file = copy / "run" / "config.yaml"
+    file.write_text(file.read_text().removeprefix("format: 1\n"))
+    assert read_config(copy / "run").optimiser.learning_rate == 2e-4
+
+
+def test_held_out_errors_from_the_future(copy):
+    values = {"format": 2, "pictures": 30, "quantiles": [0.1] * 101}
+    (copy / "model" / ERRORS_FILE).write_text(json.dumps(values))
+    with pytest.raises(ValueError, match="is damaged or of a newer version: make it again with"):
+        read_errors(copy / "model")
+
+
+def test_a_probe_from_the_future(tmp_path):
+    probe = Probe("classes", ("a", "b"), {"f": 3}, np.zeros((2, 3), np.float32), np.zeros(2, np.float32))
+    folder = probe.save(tmp_path / "probe")
+    assert load_probe(folder).names == ("a", "b")
+    later(folder / "probe.json")
+    with pytest.raises(ValueError, match="format 2 is newer than this version of derender"):
+        load_probe(folder)
+
+
+def test_a_cache_from_the_future_is_made_again(tmp_path):
+    from PIL import Image
+
+    pictures = tmp_path / "pictures"
+    pictures.mkdir()
+    for number in range(2):
+        Image.new("RGB", (8, 8), (40 * number, 9, 9)).save(pictures / f"{number}.png")
+    rows = read_pictures(pictures, 8, cache=tmp_path / "kept", workers=1).images
+    (file,) = (tmp_path / "kept").iterdir()
+    whole = file.read_bytes()
+    assert whole.endswith(_MARK) and _MARK.endswith(b"1\n")
+    file.write_bytes(whole[: -len(_MARK)] + _MARK.replace(b"1\n", b"2\n"))
+    assert read_cache(file, "any", 8) is None
+    assert (read_pictures(pictures, 8, cache=tmp_path / "kept", workers=1).images == rows).all()
+    assert file.read_bytes().endswith(_MARK)
