@@ -161,6 +161,9 @@ def test_missing_source_names_the_nearest(tree):
     folder = tree(["1.png"], name="UTKFace")
     with pytest.raises(ValueError, match=r"utkfaces does not exist; did you mean 'UTKFace'\?"):
         open_source(folder.parent / "utkfaces")
+    (folder / "11.py").touch()
+    with pytest.raises(ValueError, match=r"11\.pn does not exist; did you mean '1\.png'\?"):
+        open_source(folder / "11.pn")
     with pytest.raises(ValueError, match="does not exist; nor does its folder"):
         open_source(folder.parent / "no" / "where")
 

@@ -274,10 +274,16 @@ def _escaped(name: str) -> str:
 
 
 def nearest_sibling(path: Path) -> str:
+    """For "does not exist": a folder, archive or picture beside it that is called nearly so."""
     parent = path.absolute().parent
     if not parent.is_dir():
         return f"; nor does its folder {parent}"
     try:
-        return nearest(path.name, sorted(entry.name for entry in parent.iterdir()))
+        beside = sorted(entry.name for entry in parent.iterdir() if _may_hold_pictures(entry))
     except OSError:
         return ""
+    return nearest(path.name, beside)
+
+
+def _may_hold_pictures(path: Path) -> bool:
+    return is_picture(path.name) or path.suffix.lower() in (".zip", ".tar") or path.is_dir()
