@@ -87,6 +87,8 @@ def test_the_folder_holds_page_chart_maps_and_probe(why):
         "Whether the maps can be trusted",
         "most alike in",
         "shuffled labels",
+        'alt="the picture dark/00.png"',
+        'alt="the picture dark/02.png"',
     ):
         assert word in page
     assert "http://" not in page.replace("http://www.w3.org", "") and "<script src" not in page

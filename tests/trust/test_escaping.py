@@ -17,7 +17,7 @@ from derender.interpretation import cluster_shares, explain_labels, pair_parts
 from derender.report import charts
 from derender.report.comparison import comparison_page
 from derender.report.doctor import doctor_page
-from derender.report.explanation import Shown, explanation_page
+from derender.report.explanation import Pair, Shown, explanation_page
 from derender.report.page import Page
 from derender.report.robustness import robustness_page
 from derender.report.run import run_page
@@ -116,7 +116,7 @@ def test_explanation(evil):
     rows = Rows(np.arange(60, 90), {40: np.arange(40)[None]})
     found = explain_labels(features, task_of({evil: classes}), rows, seeds=(0,))
     sheets = {evil: {"grad-cam": Image.new("RGB", (8, 8))}}
-    pair = pair_parts(features, 0, 1), (evil, evil)
+    pair = Pair(pair_parts(features, 0, 1), (evil, evil), np.zeros((2, 3, 8, 8), np.uint8))
     clusters = cluster_shares(features, np.arange(90) % 2)
     shown = Shown(found, share_chart(found)[0], evil, evil, sheets=sheets, clusters=clusters, pair=pair)
     harmless(explanation_page(shown), evil)

@@ -13,9 +13,10 @@ if TYPE_CHECKING:
     from derender.data import PictureSet
     from derender.evaluation.linear_task import Rows, Task
     from derender.features import FeatureTable
-    from derender.interpretation import ClusterShares, Explanation, PairParts
+    from derender.interpretation import ClusterShares, Explanation
     from derender.interpretation.sanity import Similarity
     from derender.model import Derenderer
+    from derender.report.explanation import Pair
 
 LEARNED_SHARE, LEARNED_MOST = 0.4, 500
 
@@ -123,7 +124,7 @@ def explain(
             untrained=untrained, seeds=draws, head=head, output=output, baseline=baseline, progress=report,
         )  # fmt: skip
     apart = None if clusters is None else _clusters(table, clusters, seed)
-    alike = None if both is None or pair is None else _pair(table, both, pair, seed)
+    alike = None if both is None or pair is None else _pair(table, pictures, both, pair, seed)
     checks: list[Similarity] = []
     if out is not None:
         checks = _write(out, net, model, pictures, task, split, found, sheets, rows, seeds, apart, alike)
@@ -132,7 +133,7 @@ def explain(
         tables.drop_table(found),
         *([tables.sanity_table(checks)] if checks else []),
         *([] if apart is None else [tables.cluster_share_table(apart)]),
-        *([] if alike is None else [tables.pair_table(*alike)]),
+        *([] if alike is None else [tables.pair_table(alike.parts, alike.names)]),
     ]
     notes = [
         *tables.share_verdicts(found),
@@ -143,7 +144,7 @@ def explain(
     else:
         result(f"report {out / 'explain.html'}", published.json_file)
     values = {**found.numbers(), "source": data, "sanity": checks, "clusters": apart, "out": out}
-    published.show(shown, {**values, "pair": None if alike is None else alike[0]}, notes)
+    published.show(shown, {**values, "pair": None if alike is None else alike.parts}, notes)
 
 
 def _row_of(pictures: "PictureSet", name: str) -> int:
@@ -195,17 +196,18 @@ def _clusters(table: "FeatureTable", count: int, seed: int) -> "ClusterShares":
 
 
 def _pair(
-    table: "FeatureTable", both: tuple[int, ...], names: tuple[str, str], seed: int
-) -> "tuple[PairParts, tuple[str, str]]":
+    table: "FeatureTable", pictures: "PictureSet", both: tuple[int, ...], names: tuple[str, str], seed: int
+) -> "Pair":
     from derender.interpretation import pair_parts
+    from derender.report.explanation import Pair
 
-    return pair_parts(table.factors, both[0], both[1], seed=seed), names
+    return Pair(pair_parts(table.factors, both[0], both[1], seed=seed), names, pictures.images[list(both)])
 
 
 def _write(
     out: Path, net: "Derenderer", model: str, pictures: "PictureSet", task: "Task", split: "Rows",
     found: "Explanation", sheets: int, rows: int, seeds: int,
-    apart: "ClusterShares | None", alike: "tuple[PairParts, tuple[str, str]] | None",
+    apart: "ClusterShares | None", alike: "Pair | None",
 ) -> "list[Similarity]":  # fmt: skip
     """The folder, whole or not at all; gives how the maps stood their test."""
     from derender.report.explanation import Shown, explanation_page

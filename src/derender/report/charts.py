@@ -65,7 +65,7 @@ def curves(
         axes.margins(x=0.01)
         axes.xaxis.set_major_formatter(FuncFormatter(_spoken))
         if len(series) > 1:
-            axes.legend(loc="upper right", ncols=min(len(series), 3))
+            figure.legend(loc="outside upper left", ncols=min(len(series), 3))  # seen where charts scroll
         return _svg(figure)
 
 
@@ -117,7 +117,7 @@ def side_by_side(
             axes.set_xlabel(x_label)
         handles, labels = drawn[0].get_legend_handles_labels()
         if handles:
-            figure.legend(handles, labels, loc="outside lower center", ncols=columns or len(handles))
+            figure.legend(handles, labels, loc="outside lower left", ncols=columns or len(handles))
         svg = _svg(figure)
         figure.patch.set(facecolor="white", alpha=1)  # a picture file has no page behind it
         stream = BytesIO()

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
 from PIL import Image
 
 import derender
@@ -34,6 +35,24 @@ METHOD_MEANING = {
 }
 
 
+NAMED, PAIR_WIDTH = 6, 160
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two pictures, and what makes them alike.
+
+    Attributes:
+        parts: of their distance and cosine.
+        names: of their files.
+        images: (2, 3, H, W) uint8.
+    """
+
+    parts: PairParts
+    names: tuple[str, str]
+    images: np.ndarray
+
+
 @dataclass(frozen=True)
 class Shown:
     """What a page is made of.
@@ -46,7 +65,7 @@ class Shown:
         sheets: label to method to sheet of maps.
         checks: how maps answered to random weights.
         clusters: parts of each cluster, if any were asked for.
-        pair: parts of one pair and the names of its pictures, if asked for.
+        pair: if asked for.
     """
 
     found: Explanation
@@ -56,7 +75,7 @@ class Shown:
     sheets: Mapping[str, Mapping[str, Image.Image]] = field(default_factory=dict)
     checks: Sequence[Similarity] = ()
     clusters: ClusterShares | None = None
-    pair: tuple[PairParts, tuple[str, str]] | None = None
+    pair: Pair | None = None
 
 
 def explanation_page(shown: Shown) -> Page:
@@ -78,11 +97,16 @@ def explanation_page(shown: Shown) -> Page:
             blocks.table(cluster_share_table(shown.clusters)),
         ]
     if shown.pair is not None:
-        groups.append(blocks.table(pair_table(*shown.pair)))
+        groups += _pair(shown.pair)
     if groups:
         sections.append(Section("What groups pictures", groups, "Groups"))
     count = len(found.names)
-    asked = f"{count} yes/no labels" if found.kind == "labels" and count > 1 else ", ".join(found.names[:6])
+    more = f" and {count - NAMED} more" if count > NAMED else ""
+    asked = (
+        f"{count} yes/no labels"
+        if found.kind == "labels" and count > 1
+        else ", ".join(found.names[:NAMED]) + more
+    )
     return Page(
         "Which factor made the answer",
         f"{shown.model} on {shown.source}: {asked}.",
@@ -126,6 +150,19 @@ def _sheets(shown: Shown) -> list[Html]:
             image = blocks.image(sheet, f"{method} maps of {label}")
             parts.append(blocks.figure(image, f"{label}, {method}: {METHOD_MEANING[method]}"))
     return parts
+
+
+def _pair(pair: Pair) -> list[Html]:
+    faces = [
+        (blocks.image(Image.fromarray(image.transpose(1, 2, 0)), f"the picture {name}", PAIR_WIDTH), name)
+        for name, image in zip(pair.names, pair.images, strict=True)
+    ]
+    meaning = (
+        "The squared distance and the cosine of two pictures' features are sums of parts by factor, exactly; "
+        "parts depend on how large a factor's features are. What does not: the cosine of each factor alone, "
+        "and how many of the data's random pairs lie farther apart in it (alike; 1: all of them)."
+    )
+    return [blocks.prose(meaning), blocks.row_of(faces), blocks.table(pair_table(pair.parts, pair.names))]
 
 
 def _checks(rows: Sequence[Similarity]) -> list[Html]:
