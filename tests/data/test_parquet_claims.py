@@ -8,7 +8,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from derender.data.parquet_claims import ALWAYS_ALLOWED_BYTES, false_claim
+from derender.data.parquet_claims import ALWAYS_ALLOWED_BYTES, check_lists, checked_footer
 from derender.data.source import open_source
 from derender.data.tables import _rows
 from derender.features import FeatureTable
@@ -49,7 +49,13 @@ def with_claims(content: bytes, old: int, new: int, which: list[int] | None = No
 
 
 def claim(content: bytes) -> str | None:
-    return false_claim(pq.ParquetFile(io.BytesIO(content)), len(content))
+    stream = io.BytesIO(content)
+    try:
+        footer = checked_footer(stream, len(content))
+        check_lists(footer, pq.ParquetFile(stream).schema_arrow, len(content))
+    except ValueError as problem:
+        return str(problem)
+    return None
 
 
 def damaged(content: bytes, old: int, new: int) -> dict[int, bytes]:

@@ -199,17 +199,18 @@ def _rows(source: Source, file: str) -> tuple[list[str], Sequence[Mapping[str, s
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    from derender.data.parquet_claims import false_claim
+    from derender.data.parquet_claims import check_lists, checked_footer
 
     try:
         content = source.read(file)
+        footer = checked_footer(io.BytesIO(content), len(content))
         opened = pq.ParquetFile(io.BytesIO(content))
-        problem = false_claim(opened, len(content))
-        if problem is not None:
-            raise ValueError(f"{file} in {source.path} is damaged ({problem}): restore it")
+        check_lists(footer, opened.schema_arrow, len(content))
         table = opened.read()
     except (pa.ArrowException, OSError) as problem:
         raise ValueError(f"{file} in {source.path} is no Parquet table ({problem})") from problem
+    except ValueError as problem:
+        raise ValueError(f"{file} in {source.path} is damaged ({problem}): restore it") from problem
     nested = _not_cells(table.schema)
     if nested:
         raise ValueError(

@@ -16,7 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from derender.data.nearest import nearest
-from derender.data.parquet_claims import false_claim
+from derender.data.parquet_claims import check_lists, checked_footer
 from derender.whole import whole_file
 
 FORMAT = 1
@@ -100,10 +100,16 @@ def read_columns(path: Path, only: str | None = None) -> Columns:
     if not path.is_file():
         raise FileNotFoundError(f"no feature table at {path}: make one with 'derender embed --out {path}'")
     try:
+        size = path.stat().st_size
+        with path.open("rb") as file:
+            footer = checked_footer(file, size)
         opened = pq.ParquetFile(path, page_checksum_verification=True)
-        problem = false_claim(opened, path.stat().st_size)
-        if problem is not None:
-            raise ValueError(f"{path} is damaged ({problem}): make it again with 'derender embed'")
+        check_lists(footer, opened.schema_arrow, size)
+    except (pa.ArrowException, OSError) as error:
+        raise ValueError(f"{path} is not a readable parquet file: make it with 'derender embed'") from error
+    except ValueError as error:
+        raise ValueError(f"{path} is damaged ({error}): make it again with 'derender embed'") from error
+    try:
         names = _factor_names(opened.schema_arrow, path)
         if only is not None and only not in names:
             there = ", ".join(names) or "none"
