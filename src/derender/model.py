@@ -22,13 +22,12 @@ from derender.networks.whitening import Whitening
 from derender.presets import MODEL_PRESETS, ModelSettings, named_preset
 from derender.pretrained import hub
 from derender.pretrained.card import CARD_FILE, model_card, with_metadata
+from derender.pretrained.saved import CONFIG_FILE, FORMAT, WEIGHTS_FILE, check_shapes, read_config
 from derender.render import Rendering, render_scene
 from derender.scene import Scene
 from derender.scene.ranges import SceneRanges
 from derender.whole import whole_folder
 
-FORMAT = 1
-WEIGHTS_FILE, CONFIG_FILE = "model.safetensors", "config.json"
 WHITENING_FILE = "whitening.safetensors"  # a model may lack it
 ERRORS_FILE = "held_out_errors.json"  # written and read by training/held_out_errors.py; a model may lack it
 PRETRAINED = Path(__file__).parent / "pretrained"
@@ -111,9 +110,23 @@ class Derenderer(nn.Module):
         return self.encode(images) if self.whitening is None else self.features(self.read(images))
 
     def read(self, images: Float[Tensor, "n 3 h w"]) -> dict[str, Float[Tensor, "n _"]]:
-        """All that each encoder says of pictures in 0..1: its code, then its last spatial features."""
+        """All that each encoder says of pictures in 0..1: its code, then its last spatial features.
+
+        Where features are made of it, what it says of the mirror image follows.
+        """
         self._check(images)
-        return {factor.name: self.nets[factor.name].read(images) for factor in self.factors}  # type: ignore[operator]
+        return {factor.name: self.read_factor(factor.name, images) for factor in self.factors}
+
+    def read_factor(self, name: str, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n _"]:
+        """``read`` for one factor."""
+        own = self.nets[name].read(images)  # type: ignore[operator]
+        if not self.mirrors(name):
+            return own
+        return torch.cat([own, self.nets[name].read(images.flip(-1))], dim=1)  # type: ignore[operator]
+
+    def mirrors(self, name: str) -> bool:
+        """Whether a factor's feature is made of a picture and its mirror image."""
+        return self.whitening is not None and self.whitening.mirrored and name in self.whitening.names
 
     def codes(self, readings: Mapping[str, Float[Tensor, "n _"]]) -> dict[str, Float[Tensor, "n code"]]:
         """The codes that readings begin with: what ``encode`` gives for the pictures they come from."""
@@ -305,7 +318,7 @@ def load(
         ValueError: what is there is damaged, or made with other factors or by a newer version.
     """
     folder = model_folder(source)
-    config = _read_config(folder)
+    config = read_config(folder)
     names = [factor.name for factor in factors]
     if config["factors"] != names:
         raise ValueError(
@@ -316,7 +329,7 @@ def load(
         settings = ModelSettings.model_validate(config["settings"])
         weights = read_tensors(folder / WEIGHTS_FILE)
         with torch.device("meta"):  # sizes are compared before memory is taken for what the file only claims
-            _check_shapes(weights, Derenderer(settings, factors, renderer).state_dict())
+            check_shapes(weights, Derenderer(settings, factors, renderer).state_dict())
         model = Derenderer(settings, factors, renderer)
         model.load_state_dict(weights)
         if (folder / WHITENING_FILE).is_file():
@@ -337,14 +350,6 @@ def _refuse_not_finite(images: Tensor) -> None:
     raise ValueError(
         f"picture {first} of {len(images)} holds values that are not finite: give numbers in 0..1"
     )
-
-
-def _check_shapes(found: Mapping[str, Tensor], wanted: Mapping[str, Tensor]) -> None:
-    """The same names and shapes, or an error that names the first that differs."""
-    for name in sorted({*found, *wanted}):
-        shapes = [tuple(side[name].shape) if name in side else "nothing" for side in (found, wanted)]
-        if shapes[0] != shapes[1]:
-            raise ValueError(f"{name}: {shapes[0]} in {WEIGHTS_FILE}, {shapes[1]} by {CONFIG_FILE}")
 
 
 def bundled_models() -> tuple[str, ...]:
@@ -375,26 +380,3 @@ def model_folder(source: str | Path) -> Path:
         f"no model at {source}: give a run folder, a saved folder, a Hub id 'owner/name', or one of those "
         f"that come with derender ({', '.join(bundled_models())})"
     )
-
-
-def _read_config(folder: Path) -> dict[str, Any]:
-    try:
-        config = json.loads((folder / CONFIG_FILE).read_text())
-        version, complete = config["format"], isinstance(config.get("settings"), dict)
-        names = config.get("factors")
-        complete = complete and isinstance(names, list) and all(isinstance(name, str) for name in names)
-    except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
-        raise ValueError(f"{folder / CONFIG_FILE} is damaged: copy or train the model again") from error
-    if "baseline" in config:
-        name = config["baseline"]
-        raise ValueError(
-            f"{folder} holds the baseline {name!r}, not our model: add --baseline {name}, or load it with "
-            "derender.baselines.training.load_baseline"
-        )
-    if not isinstance(version, int) or version > FORMAT:
-        raise ValueError(
-            f"{folder} was saved in format {version}, this version reads up to {FORMAT}: update derender"
-        )
-    if not complete:
-        raise ValueError(f"{folder / CONFIG_FILE} is damaged: copy or train the model again")
-    return config

@@ -1,5 +1,7 @@
 """Maps over the picture: where a network looks, what changes them, exact sums."""
 
+import copy
+
 import numpy as np
 import pytest
 import torch
@@ -18,6 +20,7 @@ from derender.interpretation.probe import Probe
 from derender.interpretation.sanity import sanity_check, similarity, spearman
 from derender.model import Derenderer
 from derender.networks.encoders import reading
+from derender.networks.whitening import Contrast, Whitening
 from derender.presets import MODEL_PRESETS
 
 SIZE, CODE = 32, 6
@@ -56,6 +59,12 @@ class Looking:
         net.encode = net.encoder.forward  # type: ignore[assignment]
         net.read = lambda images: reading(net.encode(images), net.encoder.spatial(images))  # type: ignore[assignment]
         self.nets = {"geometry": net}
+
+    def mirrors(self, name: str) -> bool:
+        return False
+
+    def read_factor(self, name: str, images: torch.Tensor) -> torch.Tensor:
+        return self.nets[name].read(images)
 
     def features(self, readings: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
         return {
@@ -137,6 +146,23 @@ def test_maps_do_not_change_shape_with_the_scale_of_the_probe(model, probe, imag
     for method in METHODS:
         maps = [to_one(saliency(method, model, images, "geometry", p, [0, 1, 0])) for p in (probe, louder)]
         torch.testing.assert_close(*maps, rtol=1e-3, atol=1e-5)
+
+
+def test_features_of_both_sides_give_a_mirrored_picture_the_mirrored_map(model, probe, images):
+    width, names = model.read(images[:1])["geometry"].shape[1], ("geometry", "albedo")
+    draw = torch.Generator().manual_seed(0)
+    maps = {
+        name: Contrast(torch.zeros(width), torch.randn(width, CODE, generator=draw), torch.ones(CODE))
+        for name in names
+    }
+    mirroring = copy.deepcopy(model)
+    mirroring.whitening = Whitening(maps, mirrored=True)
+    for method in METHODS:
+        own, mirror = (
+            saliency(method, mirroring, one, "albedo", probe, [0, 1, 0]) for one in (images, images.flip(-1))
+        )
+        torch.testing.assert_close(own, mirror.flip(-1), rtol=1e-3, atol=1e-5)
+        assert not torch.allclose(own, own.flip(-1), rtol=1e-2)
 
 
 def test_new_weights_change_the_map_and_the_same_weights_do_not(model, probe, images):

@@ -66,6 +66,30 @@ def test_scenes_are_those_of_the_codes_and_light_and_camera_keep_theirs(images):
     assert torch.equal(features["camera"], codes["camera"])
 
 
+def test_a_mirror_image_has_the_features_of_the_picture_unless_told_otherwise(images, tmp_path):
+    model = derender.load("rendered-faces-64")
+    pictures = images[:6].float() / 255
+    for mirrored in (True, False):
+        settings = SETTINGS.model_copy(update={"mirrored": mirrored, "pictures": 40})
+        model.whitening = fit_whitening(model, images, settings, PerturbSettings())
+        again = derender.load(model.save(tmp_path / str(mirrored)))
+        with torch.no_grad():
+            one, two, kept = model.embed(pictures), model.embed(pictures.flip(-1)), again.embed(pictures)
+        for name in ("geometry", "albedo"):
+            assert torch.allclose(one[name], two[name], atol=1e-4) is mirrored
+            assert torch.equal(kept[name], one[name])
+        assert not torch.allclose(one["camera"], two["camera"], atol=1e-2)
+
+
+def test_fitting_anew_does_not_depend_on_the_features_there_were(images):
+    model = derender.load("rendered-faces-64")
+    found = []
+    for _ in range(2):
+        model.whitening = fit_whitening(model, images[:30], SETTINGS, PerturbSettings())
+        found.append(model.whitening.get_buffer("albedo_map"))
+    assert torch.equal(*found)
+
+
 def test_the_same_seed_gives_the_same_features(model, images):
     one, two, other = (
         fit_whitening(model, images[:60], SETTINGS, PerturbSettings(), seed=seed) for seed in (0, 0, 1)

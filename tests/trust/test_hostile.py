@@ -4,9 +4,8 @@ What a command does with a folder and with files it is given is tried on one of 
 tries every command.
 """
 
-import importlib.util
+import importlib
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -17,17 +16,13 @@ from derender.cli import main
 from derender.data import Unreadable, read_picture, read_pictures
 from derender.data.source import FolderSource
 
-SCRIPT = Path(__file__).with_name("hostile.py")
-
 
 @pytest.fixture(scope="module")
 def corpus(tmp_path_factory):
     """The corpus, every format cut off at each sixteenth, and the module that made it."""
-    spec = importlib.util.spec_from_file_location("hostile", SCRIPT)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["hostile"] = module
-    spec.loader.exec_module(module)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(Path(__file__).parent))
+        module = importlib.import_module("hostility.files")
     return module, module.write_hostile(tmp_path_factory.mktemp("made") / "hostile")
 
 

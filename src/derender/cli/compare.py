@@ -301,27 +301,22 @@ def run_linear(
 ) -> "tuple[list[ScoreTable], Mapping[str, Any]]":
     """One question of a linear table."""
     from derender.evaluation.feature_rows import prepare
-    from derender.evaluation.linear_compare import compare_linear
-    from derender.evaluation.linear_task import choose_rows, task_of
+    from derender.evaluation.linear_compare import compare_prepared
     from derender.report.tables_comparison import linear_tables, paper_linear_table
 
     first = rows[0].tables[0]
     ready = prepare(rows, part.columns(first))
-    task = task_of(ready.labels)
     draws = tuple(range(choices.seed, choices.seed + choices.seeds))
-    split = choose_rows(task, ready.files, choices.counts, draws, partition=ready.partition)
     with bar("probing", "probes") as report:
-        found = compare_linear(
-            ready.features,
-            task,
-            split,
+        found = compare_prepared(
+            ready,
+            choices.counts,
             draws,
-            controls=ready.controls,
             resample_count=choices.resamples,
             memory=memory,
             progress=report,
         )
-    differs = part.differs(str(first.origin.get("layout", "unknown data")), len(task))
+    differs = part.differs(str(first.origin.get("layout", "unknown data")), len(ready.files))
     shown = [paper_linear_table(part.name, spec.number, part.paper, found, differs), *linear_tables(found)]
     return shown, {**found.numbers(), "differs": differs, "paper": part.paper}
 

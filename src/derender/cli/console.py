@@ -193,6 +193,11 @@ def out_of_the_way(path: Path, force: bool) -> None:
     """Refuse to write over an existing file unless told to."""
     if path.is_dir():
         raise IsADirectoryError(f"{path} is a folder: give --out the name of a file")
+    nothing_there(path, force)
+
+
+def nothing_there(path: Path, force: bool) -> None:
+    """Refuse to write over an existing file or folder unless told to."""
     if path.exists() and not force:
         raise FileExistsError(f"{path} exists already: choose another --out, or add --force to replace it")
 

@@ -89,8 +89,8 @@ def explain(
     device: options.Device = "auto",
 ) -> None:
     """Which factor made the answer, and where was it seen? Shares, maps, and controls for both."""
-    if out is not None and out.exists() and not published.force:
-        raise FileExistsError(f"{out} exists already: choose another --out, or add --force to replace it")
+    if out is not None:
+        nothing_there(out, published.force)
     if bool(label) == attributes:
         raise ValueError("give either --label NAME (may be repeated) or --attributes")
     published.check()

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from derender.cli import options
-from derender.cli.console import result, say, write_json
+from derender.cli.console import nothing_there, result, say, write_json
 
 PRESETS = ("faces", "cats", "cars")
 
@@ -21,7 +21,7 @@ def import_checkpoint(
     checkpoint: Annotated[
         Path, typer.Argument(help="The .pth file that unsup3d wrote.", metavar="CHECKPOINT")
     ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the model to make.", metavar="DIR")],
+    out: options.OutModel,
     preset: Annotated[
         str, typer.Option("--preset", help=f"What it was trained on: {', '.join(PRESETS)}.")
     ] = "faces",
@@ -37,8 +37,7 @@ def import_checkpoint(
     json_file: options.Json = None,
 ) -> None:
     """Write a model of ours with the weights of an unsup3d checkpoint. Nothing in the file is run."""
-    if out.exists() and not force:
-        raise FileExistsError(f"{out} exists already: choose another --out or add --force")
+    nothing_there(out, force)
     from derender.model import Derenderer
     from derender.networks.unsup3d import NETS
     from derender.presets import MODEL_PRESETS, named_preset

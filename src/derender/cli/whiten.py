@@ -1,12 +1,11 @@
 """`derender whiten`: a model's features, fitted to the pictures they will be used on."""
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from derender.cli import options
-from derender.cli.console import bar, result, say, say_pictures, write_json
+from derender.cli.console import bar, nothing_there, result, say, say_pictures, write_json
 
 
 def register(app: typer.Typer) -> None:
@@ -18,7 +17,7 @@ def register(app: typer.Typer) -> None:
 def whiten(
     model: options.Model,
     data: options.Data,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the model to make.", metavar="DIR")],
+    out: options.OutModel,
     dataset: options.Dataset = "auto",
     part: options.Part = "all",
     limit: options.Limit = None,
@@ -26,7 +25,8 @@ def whiten(
         list[str] | None,
         typer.Option(
             "--set",
-            help="pictures, views, spatial, directions, shrinkage; what is perturbed, as perturb.light_deg.",
+            help="pictures, views, spatial, mirrored, directions, shrinkage; what is perturbed, as "
+            "perturb.light_deg.",
             metavar="KEY=VALUE",
         ),
     ] = None,
@@ -47,8 +47,7 @@ def whiten(
     from derender.training.config import FeatureSettings, with_changes
     from derender.training.whitening import fit_whitening
 
-    if out.exists() and not force:
-        raise FileExistsError(f"{out} exists already: choose another --out or add --force")
+    nothing_there(out, force)
     settings = with_changes(FeatureSettings(), overrides or [])
     if settings.whitening.pictures < 2:
         raise ValueError("whitening needs 2 pictures or more: set pictures=2000, say")

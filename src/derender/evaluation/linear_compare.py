@@ -19,10 +19,11 @@ from derender.evaluation.bootstrap import (
     resamples,
     with_verdicts,
 )
+from derender.evaluation.feature_rows import Prepared
 from derender.evaluation.linear_head import PAPER_HEAD, HeadSettings
 from derender.evaluation.linear_probes import HEADS, majority_answers, probe
 from derender.evaluation.linear_scores import SCORES, count_scores, linear_scores
-from derender.evaluation.linear_task import Rows, Task
+from derender.evaluation.linear_task import Rows, Task, choose_rows, task_of
 from derender.evaluation.memory import Memory
 
 Progress = Callable[[int, int], object]
@@ -64,6 +65,29 @@ class LinearComparison:
             for part in self.parts
         ]
         return {**sizes, "parts": parts}
+
+
+def compare_prepared(
+    ready: Prepared,
+    counts: Sequence[int],
+    seeds: Sequence[int],
+    *,
+    resample_count: int = RESAMPLES,
+    memory: Memory | None = None,
+    progress: Progress | None = None,
+) -> LinearComparison:
+    """Ask rows that were put side by side for all their labels, in their owners' split where there is one."""
+    task = task_of(ready.labels)
+    return compare_linear(
+        ready.features,
+        task,
+        choose_rows(task, ready.files, counts, seeds, partition=ready.partition),
+        seeds,
+        controls=ready.controls,
+        resample_count=resample_count,
+        memory=memory,
+        progress=progress,
+    )
 
 
 def compare_linear(

@@ -98,10 +98,16 @@ def whitened_components(
     axes = torch.from_numpy(components.T.copy()).float()
 
     def describe(batch: Float[Tensor, "n 3 h w"]) -> dict[str, Tensor]:
-        return {"pca": (batch.detach().cpu().float().flatten(1) - mean) @ axes}
+        return {"pca": projected(batch.detach().cpu().float().flatten(1))}
+
+    def projected(flat: Float[Tensor, "n pixel"]) -> Float[Tensor, "n component"]:
+        return (flat - mean) @ axes
 
     whitening = _fitted(lender, describe, f"pca {count}", progress)
-    codes = torch.from_numpy((_flat(pictures.images) - pca.mean_) @ components.T).float()
+    seen = [pictures.images]
+    if whitening.mirrored:
+        seen.append(pictures.images[..., ::-1])
+    codes = torch.cat([projected(torch.from_numpy(_flat(one))) for one in seen], dim=1)
     origin = {"control": "pca", "components": count, "whitened": True, "fitted_on": len(lender.images)}
     return control_table(pictures, "pca", whitening({"pca": codes})["pca"].numpy(), origin)
 
@@ -137,7 +143,8 @@ def _fitted(
         {
             name: Contrast(*(torch.from_numpy(kept[f"{name}_{part}"]) for part in ("mean", "map", "ratios")))
             for name in names
-        }
+        },
+        mirrored=settings.whitening.mirrored,
     )
 
 

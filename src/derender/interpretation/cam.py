@@ -58,7 +58,9 @@ def saliency(
     features, gradient = _at_features(model, images, factor, weight)
     if method == "grad-cam":
         gradient = gradient.mean(dim=(2, 3), keepdim=True)
-    return (gradient * features).sum(dim=1).relu()
+    maps = (gradient * features).sum(dim=1)
+    own, mirror = maps[: len(images)], maps[len(images) :]
+    return (own + mirror.flip(-1) if len(mirror) else own).relu()
 
 
 def factor_weights(probe: Probe, factor: str, targets: Sequence[int] | np.ndarray) -> Float[Tensor, "n code"]:
@@ -75,12 +77,18 @@ def score(code: Float[Tensor, "n c"], weight: Tensor | None) -> Float[Tensor, " 
 
 def _at_features(
     model: Any, images: Tensor, factor: str, weight: Tensor | None
-) -> tuple[Float[Tensor, "n c y x"], Float[Tensor, "n c y x"]]:
-    """The last spatial features of an encoder, and the gradient of the answer there."""
-    encoder = model.nets[factor].encoder
+) -> tuple[Float[Tensor, "m c y x"], Float[Tensor, "m c y x"]]:
+    """The last spatial features of an encoder, and the gradient of the answer there.
+
+    Where the feature is made of pictures and their mirror images, those of the mirror images follow.
+    """
+    encoder, mirrors = model.nets[factor].encoder, model.mirrors(factor)
+    seen = torch.cat([images, images.flip(-1)]) if mirrors else images
     with torch.enable_grad():
-        features = encoder.spatial(images).detach().requires_grad_()
+        features = encoder.spatial(seen).detach().requires_grad_()
         said = reading(encoder.to_code(features).flatten(1), features)
+        if mirrors:
+            said = torch.cat(said.chunk(2), dim=1)
         answer = score(model.features({factor: said})[factor], weight).sum()
         (gradient,) = torch.autograd.grad(answer, features)
     return features.detach(), gradient
@@ -96,7 +104,7 @@ def pixel_attribution(
     """|IG| of the pixels from a grey picture, summed over colours, and the relative completeness error."""
 
     def answer(pictures: Tensor, own: Tensor | None = None) -> Tensor:
-        said = model.nets[factor].read(pictures)
+        said = model.read_factor(factor, pictures)
         return score(model.features({factor: said})[factor], own)
 
     grey = torch.full_like(images[:1], GREY)

@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from derender.networks.tensor_file import read_tensors, write_tensors
 from derender.whole import whole_file
 
+_MIRRORED = "reads_mirror_image"  # a file without it is of a model that reads pictures as they are alone
 _NEVER_SINGULAR = 1e-9  # share of the mean variance that is added at least: Cholesky's root must exist
 
 
@@ -36,16 +37,58 @@ class Contrast:
     ratios: Float[Tensor, " directions"]
 
 
-def contrast(
-    readings: Float[Tensor, "views n reading"], directions: int, shrinkage: float, size: int | None = None
-) -> Contrast:
+class Spread:
+    """How readings differ within pictures and between them, summed up batch by batch.
+
+    Attributes:
+        views, count: readings of each picture, and pictures so far.
+    """
+
+    def __init__(self) -> None:
+        self.views = self.count = 0
+        self._within = self._centres = self._centre = torch.zeros((), dtype=torch.float64)
+
+    @classmethod
+    def of(cls, readings: Float[Tensor, "views n reading"]) -> "Spread":
+        """Of readings that are all there."""
+        spread = cls()
+        spread.add(readings)
+        return spread
+
+    def add(self, readings: Float[Tensor, "views n reading"]) -> None:
+        """More pictures, each with as many views as those before."""
+        self.views = len(readings)
+        self.count += readings.shape[1]
+        centres = readings.double().mean(dim=0)
+        apart = (readings - centres.to(readings)).flatten(0, 1)
+        self._within = self._within + (apart.T @ apart).double()
+        self._centres = self._centres + centres.T @ centres
+        self._centre = self._centre + centres.sum(dim=0)
+
+    @property
+    def mean(self) -> Float[Tensor, " reading"]:
+        """Of the pictures' centres."""
+        return self._centre / self.count
+
+    @property
+    def within(self) -> Float[Tensor, "reading reading"]:
+        """Covariance of a picture's readings, the mean over pictures, unbiased."""
+        return self._within / (self.count * (self.views - 1))
+
+    @property
+    def between(self) -> Float[Tensor, "reading reading"]:
+        """Covariance of the pictures' centres."""
+        return self._centres / self.count - torch.outer(self.mean, self.mean)
+
+
+def contrast(spread: Spread, directions: int, shrinkage: float, size: int | None = None) -> Contrast:
     """The map that makes the mean variance within pictures 1 in every kept direction.
 
     Features are turned so that each is as near as can be to the number of the code in its place, which
     changes no distance.
 
     Args:
-        readings: of ``n`` pictures, each seen ``views`` times; the code stands first.
+        spread: of readings in which the code stands first.
         directions: how many are kept, those with the largest ratio between over within; at most ``size``.
         shrinkage: how much of the mean variance within is added to every direction's, so that a direction
             that hardly moved in these pictures is not taken for one that never moves.
@@ -54,19 +97,15 @@ def contrast(
     Raises:
         ValueError: fewer than two views or pictures.
     """
-    views, count, width = readings.shape
+    if spread.views < 2 or spread.count < 2:
+        raise ValueError(
+            f"whitening needs at least 2 views of 2 pictures, got {spread.views} of {spread.count}"
+        )
+    mean, within, between = spread.mean, spread.within, spread.between
+    width = len(mean)
     size = size or width
-    if views < 2 or count < 2:
-        raise ValueError(f"whitening needs at least 2 views of 2 pictures, got {views} of {count}")
-    values = readings.double()
-    centres = values.mean(dim=0)
-    mean = centres.mean(dim=0)
-    within = _covariance((values - centres).flatten(0, 1)) * views / (views - 1)
-    between = _covariance(centres - mean)
     floor = within.diagonal().mean().clamp(min=torch.finfo(torch.float32).tiny)
-    within = within + max(shrinkage, _NEVER_SINGULAR) * floor * torch.eye(
-        width, dtype=values.dtype, device=values.device
-    )
+    within = within + max(shrinkage, _NEVER_SINGULAR) * floor * torch.eye(width).to(within)
     ratios, kept = _most_told_apart(between, within, min(directions, size, width))
     left, _, right = torch.linalg.svd(kept.T @ (within + between)[:, :size], full_matrices=False)
     return Contrast(mean.float(), (kept @ left @ right).float(), ratios.float())
@@ -75,12 +114,16 @@ def contrast(
 class Whitening(nn.Module):
     """The maps of some factors, applied to readings by name; gives the features of those factors alone.
 
-    A map of fewer rows than the reading has takes the reading's beginning: the code.
+    A map of fewer rows than the reading has takes the reading's beginning: the code. ``mirrored`` maps take
+    the mean of a picture's reading and its mirror image's, which follows the first.
     """
 
-    def __init__(self, contrasts: Mapping[str, Contrast]):
+    def __init__(self, contrasts: Mapping[str, Contrast], *, mirrored: bool = False):
         super().__init__()
         self.names = tuple(contrasts)
+        self.mirrored = mirrored
+        if mirrored:
+            self.register_buffer(_MIRRORED, torch.ones(1), persistent=False)
         for name, found in contrasts.items():
             self.register_buffer(f"{name}_mean", found.mean, persistent=False)
             self.register_buffer(f"{name}_map", found.map, persistent=False)
@@ -91,11 +134,14 @@ class Whitening(nn.Module):
 
     def _whitened(self, name: str, reading: Float[Tensor, "n _"]) -> Float[Tensor, "n code"]:
         mean, chart = self.get_buffer(f"{name}_mean"), self.get_buffer(f"{name}_map")
-        if reading.shape[1] < len(mean):
+        wanted = len(mean) * (2 if self.mirrored else 1)
+        if reading.shape[1] < wanted:
             raise ValueError(
-                f"features of {name} are made of {len(mean):,} numbers, got {reading.shape[1]:,}: "
+                f"features of {name} are made of {wanted:,} numbers, got {reading.shape[1]:,}: "
                 "give what model.read gives, not codes"
             )
+        if self.mirrored:
+            reading = reading.unflatten(1, (2, -1)).mean(dim=1)
         return (reading[:, : len(mean)].float() - mean) @ chart
 
     def save(self, file: Path) -> None:
@@ -122,7 +168,7 @@ class Whitening(nn.Module):
             if chart.ndim != 2 or len(chart) != len(mean) or ratios.ndim != 1:
                 raise ValueError(f"{name}: a map of {tuple(chart.shape)} beside a mean of {len(mean)}")
             found[name] = Contrast(mean, chart, ratios)
-        return cls(found)
+        return cls(found, mirrored=_MIRRORED in tensors)
 
 
 def _most_told_apart(between: Tensor, within: Tensor, count: int) -> tuple[Tensor, Tensor]:
@@ -136,7 +182,3 @@ def _most_told_apart(between: Tensor, within: Tensor, count: int) -> tuple[Tenso
         between.cpu().numpy(), within.cpu().numpy(), subset_by_index=[width - count, width - 1]
     )
     return tuple(torch.from_numpy(found.copy()).to(within).flip(-1) for found in (ratios, directions))  # type: ignore[return-value]
-
-
-def _covariance(centred: Float[Tensor, "n d"]) -> Float[Tensor, "d d"]:
-    return centred.T @ centred / len(centred)

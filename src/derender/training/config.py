@@ -53,6 +53,7 @@ class WhiteningSettings(Settings):
     pictures: int = Field(default=3_000, ge=0)  # training pictures that are rendered again
     views: int = Field(default=4, ge=1)  # renderings of each
     spatial: bool = True  # read the encoder's last spatial features beside the code
+    mirrored: bool = True  # read the picture's mirror image beside it
     directions: int = Field(default=128, ge=1)  # of each factor that are kept, at most as many as its code
     shrinkage: float = Field(default=0.1, ge=0)  # share of the mean variance added to every direction's
 

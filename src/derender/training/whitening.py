@@ -1,8 +1,9 @@
 """What light and camera do to a trained model's codes, measured on its own renderings.
 
 Every picture is taken apart, rendered with other values of all its vector factors (light and camera), and
-encoded again, several times. This is LOOCC's perturbation, of all vector factors at once, used after training
-instead of during it. Leaves out the codes of the vector factors themselves, which are to move.
+encoded again, several times; mirror images count as views, too, for the object is symmetric. This is LOOCC's
+perturbation, of all vector factors at once, used after training instead of during it. Leaves out the codes of
+the vector factors themselves, which are to move.
 """
 
 from collections.abc import Callable, Mapping
@@ -13,7 +14,7 @@ from torch import Generator, Tensor
 
 from derender.data.pictures import as_float
 from derender.model import Derenderer
-from derender.networks.whitening import Whitening, contrast
+from derender.networks.whitening import Spread, Whitening, contrast
 from derender.scene import Scene
 from derender.scene.perturb import PerturbSettings
 from derender.training.config import WhiteningSettings
@@ -58,9 +59,10 @@ def fit_whitening(
         raise ValueError("whitening needs at least 2 pictures, got 0")
     own = [factor.name for factor in model.factors if factor.mirrored]
     say = describe or (model.read if settings.spatial else model.encode)
-    found: dict[str, list[Tensor]] = {}
-    was_training = model.training
+    found: dict[str, Spread] = {}
+    was_training, was_whitened = model.training, model.whitening
     model.eval()
+    model.whitening = None  # readings as they are
     try:
         with torch.no_grad():
             for start in range(0, len(chosen), BATCH_SIZE):
@@ -68,11 +70,13 @@ def fit_whitening(
                 drawn = images[rows]
                 batch = (as_float(drawn) if drawn.dtype == torch.uint8 else drawn.float()).to(model.device)
                 scene = model.decompose(batch)
-                views = [say(batch)]
-                views += [
-                    say(_seen_otherwise(model, scene, batch, perturb, generator))
-                    for _ in range(settings.views)
+                shown = [batch]
+                shown += [
+                    _seen_otherwise(model, scene, batch, perturb, generator) for _ in range(settings.views)
                 ]
+                views = [say(one) for one in shown]
+                if settings.mirrored:
+                    views += [say(one.flip(-1)) for one in shown]
                 names = own if describe is None else tuple(views[0])
                 for view in views:  # the pictures first: of a broken rendering every reading is broken
                     broken = [name for name in names if not bool(view[name].isfinite().all())]
@@ -82,19 +86,21 @@ def fit_whitening(
                             f"{start + len(rows) - 1} of those drawn: the model's training went wrong"
                         )
                 for name in names:
-                    joined = torch.stack([view[name].float() for view in views]).cpu()
-                    found.setdefault(name, []).append(joined)
+                    joined = torch.stack([view[name].float() for view in views])
+                    found.setdefault(name, Spread()).add(joined)
                 if progress is not None:
                     progress(min(start + BATCH_SIZE, len(chosen)), len(chosen))
     finally:
         model.train(was_training)
+        model.whitening = was_whitened
     if describe is None:
         size = model.settings.network.code_size
     return Whitening(
         {
-            name: contrast(torch.cat(parts, dim=1), settings.directions, settings.shrinkage, size)
-            for name, parts in found.items()
-        }
+            name: contrast(spread, settings.directions, settings.shrinkage, size)
+            for name, spread in found.items()
+        },
+        mirrored=settings.mirrored,
     ).to(model.device)
 
 

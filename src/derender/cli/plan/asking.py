@@ -129,8 +129,7 @@ def _ask(
 ) -> dict[str, Any]:
     from derender.evaluation.clustering_compare import compare_clusterings
     from derender.evaluation.feature_rows import prepare
-    from derender.evaluation.linear_compare import compare_linear
-    from derender.evaluation.linear_task import choose_rows, task_of
+    from derender.evaluation.linear_compare import compare_prepared
 
     ready = prepare(rows, question.columns, **asdict(question.rules))
     if protocol == "cluster":
@@ -145,15 +144,6 @@ def _ask(
         numbers = found.numbers()
         numbers.pop("per_label")
         return {"protocol": protocol, **numbers}
-    task, draws = task_of(ready.labels), tuple(range(plan.draws))
-    split = choose_rows(task, ready.files, plan.counts, draws, partition=ready.partition)
-    found = compare_linear(
-        ready.features,
-        task,
-        split,
-        draws,
-        controls=ready.controls,
-        resample_count=plan.resamples,
-        memory=memory,
-    )
+    draws = tuple(range(plan.draws))
+    found = compare_prepared(ready, plan.counts, draws, resample_count=plan.resamples, memory=memory)
     return {"protocol": protocol, **found.numbers()}
