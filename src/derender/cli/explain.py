@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from derender.cli import options, scoring
-from derender.cli.console import bar, result, say_pictures
+from derender.cli.console import bar, nothing_there, result, say_pictures
 from derender.cli.gathered import gathered
 
 if TYPE_CHECKING:

@@ -41,7 +41,5 @@ Part = Annotated[
 Seed = Annotated[int, typer.Option("--seed", min=0, metavar="N", help="Same seed, same result.")]
 Force = Annotated[bool, typer.Option("--force", help="Replace what is there.")]
 OutFolder = Annotated[Path, typer.Option("--out", "-o", help="Folder to write to.", metavar="DIR")]
-OutModel = Annotated[
-    Path, typer.Option("--out", "-o", help="Folder for the model to make.", metavar="DIR")
-]
+OutModel = Annotated[Path, typer.Option("--out", "-o", help="Folder for the model to make.", metavar="DIR")]
 Device = Annotated[str, typer.Option("--device", help="cpu, cuda, or auto.", metavar="NAME")]
