@@ -1,0 +1,214 @@
+"""Pictures that are broken, odd or meant to do harm, made on the spot, and an archive of the kind."""
+
+import io
+import os
+import struct
+import zipfile
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageCms
+
+NAMES = [
+    "ÄÖ ß 日本.png",
+    "two\nlines.png",
+    "quote\"'.png",
+    "tab\there.png",
+    "-rf.png",
+    "a" * 240 + ".png",
+    "<script>.png",
+]
+
+
+@dataclass(frozen=True)
+class Hostile:
+    """What was written.
+
+    Attributes:
+        folder: where.
+        readable: names of files that are pictures, odd as they may be.
+        unreadable: names of files that have to be skipped and named.
+    """
+
+    folder: Path
+    readable: tuple[str, ...]
+    unreadable: tuple[str, ...]
+
+
+def smooth(size: tuple[int, int] = (48, 40), seed: int = 0) -> Image.Image:
+    """A picture that differs with the seed."""
+    small = np.random.default_rng(seed).integers(0, 256, (5, 5, 3), dtype=np.uint8)
+    return Image.fromarray(small).resize(size)
+
+
+def encoded(picture: Image.Image, form: str, **options: object) -> bytes:
+    stream = io.BytesIO()
+    picture.save(stream, format=form, **options)
+    return stream.getvalue()
+
+
+def png_chunk(kind: bytes, content: bytes) -> bytes:
+    return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+
+
+def png_that_says(width: int, height: int) -> bytes:
+    """A small PNG file that claims this size; its data would unpack to 10 MB of zeros."""
+    head = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    data = zlib.compress(bytes(10_000_000), 9)
+    return (
+        b"\x89PNG\r\n\x1a\n" + png_chunk(b"IHDR", head) + png_chunk(b"IDAT", data) + png_chunk(b"IEND", b"")
+    )
+
+
+def png_with_endless_text() -> bytes:
+    """A whole PNG whose compressed comment unpacks to 100 MB."""
+    whole = encoded(smooth(seed=90), "PNG")
+    text = png_chunk(b"zTXt", b"Comment\0\0" + zlib.compress(bytes(100_000_000), 9))
+    return whole[:33] + text + whole[33:]
+
+
+def float_tiff(value: float) -> bytes:
+    values = np.full((20, 20), 0.5, np.float32)
+    values[3, 4] = value
+    return encoded(Image.fromarray(values), "TIFF")
+
+
+def odd_pictures() -> dict[str, bytes]:
+    """Files that are pictures, by name."""
+    rotated = Image.Exif()
+    rotated[0x0112] = 6
+    damaged_exif = b"Exif\0\0II*\0\xff\xff\xff\xff" + bytes(20)
+    frames = [smooth(seed=number) for number in range(10, 14)]
+    animated = {"save_all": True, "append_images": frames[1:]}
+    profile = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    deep = np.random.default_rng(1).integers(0, 65536, (30, 30)).astype(np.uint16)
+    found = {
+        "plain.jpg": encoded(smooth(seed=1), "JPEG"),
+        "jpeg named.png": encoded(smooth(seed=2), "JPEG"),
+        "png named.jpg": encoded(smooth(seed=3), "PNG"),
+        "animated.gif": encoded(frames[0], "GIF", **animated),
+        "animated.webp": encoded(smooth(seed=15), "WEBP", **animated),
+        "animated.png": encoded(smooth(seed=16), "PNG", **animated),
+        "cmyk.jpg": encoded(smooth(seed=17).convert("CMYK"), "JPEG"),
+        "grey.bmp": encoded(smooth(seed=18).convert("L"), "BMP"),
+        "bilevel.tif": encoded(smooth(seed=19).convert("1"), "TIFF"),
+        "deep.png": encoded(Image.fromarray(deep), "PNG"),
+        "deep.tif": encoded(Image.fromarray(deep // 2), "TIFF"),
+        "float.tif": float_tiff(0.25),
+        "rotated.jpg": encoded(smooth(seed=20), "JPEG", exif=rotated),
+        "damaged exif.jpg": encoded(smooth(seed=21), "JPEG", exif=damaged_exif),
+        "profile.png": encoded(smooth(seed=22), "PNG", icc_profile=profile),
+        "damaged profile.png": encoded(smooth(seed=23), "PNG", icc_profile=b"nonsense"),
+        "palette.gif": encoded(smooth(seed=24).convert("P"), "GIF", transparency=3),
+        "transparent.png": encoded(smooth(seed=25).convert("RGBA"), "PNG"),
+        "one pixel.png": encoded(smooth((1, 1), 26), "PNG"),
+        "wide.png": encoded(smooth((30_000, 10), 27), "PNG"),
+        "tall.jpg": encoded(smooth((10, 30_000), 28), "JPEG"),
+    }
+    return {**found, **{name: encoded(smooth(seed=40 + row), "PNG") for row, name in enumerate(NAMES)}}
+
+
+def broken_pictures(steps: int = 16) -> dict[str, bytes]:
+    """Files that are no usable pictures, by name; cut off after every ``1/steps`` of five formats."""
+    found = {
+        "empty.png": b"",
+        "text.jpg": b"this is a letter",
+        "page.png": b"<html><script>alert(1)</script></html>",
+        "postscript.jpg": b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n",
+        "zeros.jpg": bytes(5_000),
+        "nan.tif": float_tiff(float("nan")),
+        "infinite.tif": float_tiff(float("inf")),
+        "negative.tif": float_tiff(-1.0),
+        "bomb.png": png_that_says(60_000, 60_000),
+        "bomb below the limit.png": png_that_says(13_000, 13_000),
+        "no size.png": png_that_says(0, 0),
+        "endless text.png": png_with_endless_text(),
+    }
+    whole = {
+        "jpg": encoded(smooth((300, 200), 60), "JPEG", quality=95),
+        "png": encoded(smooth((90, 70), 61), "PNG"),
+        "bmp": encoded(smooth((30, 20), 62), "BMP"),
+        "tif": encoded(smooth((60, 40), 63), "TIFF"),
+        "webp": encoded(smooth((90, 70), 64), "WEBP"),
+    }
+    for kind, content in whole.items():
+        for step in range(1, steps):
+            found[f"cut {step:02d} of {steps}.{kind}"] = content[: len(content) * step // steps]
+    return found
+
+
+def write_hostile(folder: Path, steps: int = 16) -> Hostile:
+    """Write all of it to a folder, with links that lead nowhere or in circles, a pipe and a closed file."""
+    folder.mkdir(parents=True)
+    odd, broken = odd_pictures(), broken_pictures(steps)
+    for name, content in {**odd, **broken}.items():
+        (folder / name).write_bytes(content)
+    (folder / "to itself.png").symlink_to("to itself.png")
+    (folder / "to nowhere.png").symlink_to("gone.png")
+    (folder / "round").symlink_to(folder, target_is_directory=True)
+    (folder / "folder.png").mkdir()
+    os.mkfifo(folder / "pipe.png")
+    special = ["to itself.png", "to nowhere.png", "pipe.png"]
+    if os.geteuid():  # root may read anything
+        (folder / "closed.png").write_bytes(encoded(smooth(seed=70), "PNG"))
+        (folder / "closed.png").chmod(0)
+        special.append("closed.png")
+    (folder / os.fsdecode(b"not utf8 \xff.png")).write_bytes(encoded(smooth(seed=71), "PNG"))
+    return Hostile(folder, (*odd, "not utf8 \\xff.png"), (*broken, *special))
+
+
+def write_hostile_zip(file: Path) -> Path:
+    """A zip with unsafe names, a symbolic link, an encrypted member and one that claims a terabyte."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    picture = encoded(smooth(seed=80), "PNG")
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        for number in range(4):
+            archive.writestr(f"good/{number}.png", encoded(smooth(seed=81 + number), "PNG"))
+        for name in (
+            "../outside.png",
+            "/absolute.png",
+            "a/../../outside.png",
+            "C:/windows.png",
+            "..\\back.png",
+        ):
+            archive.writestr(name, picture)
+        link = zipfile.ZipInfo("link.png")
+        link.create_system, link.external_attr = 3, 0o120777 << 16
+        archive.writestr(link, "/etc/passwd")
+        archive.writestr("encrypted.png", picture)
+        archive.writestr("huge.png", picture)
+    content = bytearray(file.read_bytes())
+    for name, change in (
+        ("encrypted.png", lambda at: content.__setitem__(at + 8, content[at + 8] | 1)),
+        (
+            "huge.png",
+            lambda at: content.__setitem__(slice(at + 24, at + 28), struct.pack("<I", (1 << 32) - 2)),
+        ),
+    ):
+        at = content.rfind(b"PK\x01\x02", 0, content.rfind(name.encode()))
+        change(at)
+    file.write_bytes(content)
+    return file
+
+
+def labelled(folder: Path, hostile: Hostile) -> tuple[Path, int]:
+    """The same files in two classes, with 12 plain pictures each; and how many of them cannot be read."""
+    for number, name in enumerate(("a", "b")):
+        (folder / name).mkdir(parents=True)
+        for row in range(12):
+            (folder / name / f"plain {row}.png").write_bytes(
+                encoded(smooth(seed=500 + 2 * row + number), "PNG")
+            )
+        for file in (*hostile.readable, *hostile.unreadable):
+            source = hostile.folder / file
+            if source.is_file() and len(file) < 200:
+                (folder / name / file).write_bytes(source.read_bytes())
+    return folder, 2 * sum((hostile.folder / file).is_file() for file in hostile.unreadable)
+
+
+def named_in(said: str, names: tuple[str, ...]) -> list[str]:
+    """The names that are not told of; white space within them counts as one space."""
+    flat = " ".join(said.split())
+    return [name for name in names if " ".join(name.split()) not in flat]

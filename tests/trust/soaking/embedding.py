@@ -1,0 +1,49 @@
+"""Embeds the same pictures again and again in one process, by every way of the Python API, until SIGTERM.
+
+    python tests/trust/soaking/embedding.py FOLDER MODEL
+
+FOLDER holds data/ and data.zip; tables go to its tables/, decoded pictures to its cache/.
+"""
+
+import signal
+import sys
+import time
+from pathlib import Path
+
+from derender.data import read_pictures
+from derender.data.stream import stream_of
+from derender.features import DisentangledFeatures, FeatureTable, embed_to_file
+from derender.model import load
+from derender.whole import whole_file
+
+PAUSE_SECONDS = 1.0
+
+
+def embed_until_told(folder: Path, model: str) -> None:
+    """Pass after pass; one that SIGTERM stops is begun again and ended, so that no parts are left."""
+    net, out, passes = load(model), folder / "tables" / "again.parquet", 0
+    features = DisentangledFeatures(net)
+    try:
+        while True:
+            source = folder / ("data.zip" if passes % 2 else "data")
+            with stream_of(source) as stream:
+                rows = embed_to_file(net, stream, out, fresh=True).rows
+            pictures = read_pictures(source, net.image_size, cache=folder / "cache")
+            rows += embed_to_file(net, pictures, out, fresh=True).rows
+            table = FeatureTable.read(out)
+            width = features.transform(pictures.images[:32]).shape[1]
+            due = sum(table.factors[name].shape[1] for name in ("geometry", "albedo"))
+            if rows != 2 * len(table) or width != due:
+                raise RuntimeError(f"{rows} rows, {len(table)} in the table; {width} numbers, not {due}")
+            passes += 1
+            with whole_file(folder / "passes.txt") as temporary:
+                temporary.write_text(str(passes))
+            time.sleep(PAUSE_SECONDS)
+    except KeyboardInterrupt:
+        with stream_of(folder / "data") as stream:
+            embed_to_file(net, stream, out, fresh=True)
+
+
+if __name__ == "__main__":
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    embed_until_told(Path(sys.argv[1]), sys.argv[2])
