@@ -7,21 +7,22 @@ is missing or of another form is named and passed over.
 """
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 RESULTS = Path(__file__).parent / "results"
+Reader = Callable[[dict[str, Any]], Iterator[tuple[str, str]]]
+
+
+def by_row(what: str, result: str) -> Reader:
+    """A reader of files that hold one figure a row."""
+    return lambda found: ((what.format(**row), result.format(**row)) for row in found["rows"])
 
 
 def training_step(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
     for row in found["rows"][1:]:
         yield f"training step, {row['name']} / literal", f"{row['ratio']:.2f}x"
-
-
-def rasterize(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
-    for row in found["rows"]:
-        yield f"{row['part']}, torch / Numba", f"{row['ratio']:.1f}x"
 
 
 def rasterize_peers(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
@@ -38,17 +39,6 @@ def embedding(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
     for way, ratio in found["against_training"].items():
         if way != "training step":
             yield f"{way} / training step, preset paper ({found['clock']} clock)", f"{ratio:.1f}x"
-
-
-def embedding_memory(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
-    for row in found["rows"]:
-        yield f"memory of embedding {row['pictures']:,} pictures", f"{row['peak_mb']:,.0f} MB"
-
-
-def step_memory(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
-    for row in found["rows"]:
-        what = f"memory of a step, {row['size']} px, batch {row['batch']}, {row['chunks']} chunks"
-        yield what, f"{row['mb_per_picture']:,.0f} MB a picture"
 
 
 def reading(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
@@ -105,10 +95,22 @@ def gpu(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
         yield f"on the GPU: {row['what']} (aim {row['aim']})", str(row["got"])
 
 
-READERS = {
-    **{f"{one.__name__}": one for one in (training_step, rasterize, rasterize_peers, embedding, bench)},
-    **{f"{one.__name__}": one for one in (embedding_memory, step_memory, reading, clustering, gpu)},
-    **{f"{one.__name__}": one for one in (clustering_million, ray_embedding, torchrun_resume)},
+READERS: dict[str, Reader] = {
+    "training_step": training_step,
+    "rasterize": by_row("{part}, torch / Numba", "{ratio:.1f}x"),
+    "rasterize_peers": rasterize_peers,
+    "embedding": embedding,
+    "bench": bench,
+    "embedding_memory": by_row("memory of embedding {pictures:,} pictures", "{peak_mb:,.0f} MB"),
+    "step_memory": by_row(
+        "memory of a step, {size} px, batch {batch}, {chunks} chunks", "{mb_per_picture:,.0f} MB a picture"
+    ),
+    "reading": reading,
+    "clustering": clustering,
+    "gpu": gpu,
+    "clustering_million": clustering_million,
+    "ray_embedding": ray_embedding,
+    "torchrun_resume": torchrun_resume,
     "clustering_how_far": clustering_million,
     "clustering_how_far_50000": clustering_million,
 }

@@ -184,7 +184,7 @@ def _exchanged(one: Path, other: Path) -> bool:
 
 
 @cache
-def _system_exchange() -> "ctypes._NamedFuncPointer | None":
+def _system_exchange() -> Callable[[int, bytes, int, bytes, int], int] | None:
     """Linux's renameat2, where the C library has it."""
     try:
         function = ctypes.CDLL(None, use_errno=True).renameat2
