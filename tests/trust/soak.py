@@ -317,8 +317,8 @@ def told(soak: Soak, verdicts: dict[str, dict[str, Verdict]]) -> str:
         "",
         soak.answers.markdown(),
         "",
-        f"{soak.images:,} pictures trained on with {soak.validations} validations; {soak.commands} embeddings "
-        f"by command, {soak.passes:,} passes in one process. Odd connections that ended: {held or 'none'}.",
+        f"{soak.images:,} pictures trained on with {soak.validations} validations; {soak.commands} times "
+        f"embedded by command, {soak.passes:,} passes in one process. Odd connections that ended: {held or 'none'}.",
         "",
         *(f"FAULT: {fault}" for fault in soak.faults),
         *(f"FAULT of a client: {sentence}" for sentence in soak.answers.said),
