@@ -115,12 +115,14 @@ class Outcome:
 
 
 class Workshop:
-    """A copy of the package in which one file at a time is changed, and its caches."""
+    """A copy of package and tests in which one file at a time is changed, and its caches."""
 
     def __init__(self, folder: Path):
         self.folder, self.package = folder, folder / "src" / "derender"
         self.compiled = folder / "compiled"
-        shutil.copytree(SOURCE, self.package, ignore=shutil.ignore_patterns("__pycache__"))
+        for name in ("src", "tests"):
+            shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copy(ROOT / "pyproject.toml", folder)
 
     def run(self, file: str, seconds: float, *, stale: set[str], mutant: Mutant | None = None) -> Outcome:
         """Run the tests of a file, with a mutant or without; kernels of stale folders are compiled anew."""
@@ -129,15 +131,16 @@ class Workshop:
         shutil.copytree(self.warm(file), self.compiled, ignore=unusable)
         note = self.folder / "failed"
         note.unlink(missing_ok=True)
+        changed, kept = self.package / file, self.folder / "kept"
+        shutil.copy2(changed, kept)
         if mutant is not None:
-            (self.package / file).write_text(mutant.text)
+            changed.write_text(mutant.text)
         began = time.monotonic()
         child = os.fork()
         if child == 0:
             self._child(tests_of(file), note, triton=group_of(file) == "triton", write=mutant is None)
         code = waited(child, seconds)
-        if mutant is not None:
-            shutil.copy2(SOURCE / file, self.package / file)
+        shutil.copy2(kept, changed)  # with its time, by which caches know it
         return Outcome(code, time.monotonic() - began, note.read_text() if note.exists() else "")
 
     def warm(self, file: str) -> Path:
@@ -156,6 +159,7 @@ class Workshop:
             resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
             os.environ |= {
                 "PYTHONPATH": str(self.package.parent),
+                "DERENDER_SHARED": os.environ.get("DERENDER_SHARED", str(ROOT.parent / "shared")),
                 "NUMBA_CACHE_DIR": str(self.compiled),
                 "HYPOTHESIS_STORAGE_DIRECTORY": str(self.folder / "hypothesis"),
             }
@@ -166,8 +170,8 @@ class Workshop:
             elsewhere = [
                 path for path in sys.path if Path(path) not in (SOURCE.parent, Path(__file__).parent)
             ]
-            sys.path[:] = [str(self.package.parent), str(ROOT), *elsewhere]
-            os.chdir(ROOT)
+            sys.path[:] = [str(self.package.parent), str(self.folder), *elsewhere]
+            os.chdir(self.folder)
             options = ["-x", "-q", "--tb=short", "-p", "no:cacheprovider", "-p", "no:xdist"]
             options += ["-W", "ignore::pytest.PytestAssertRewriteWarning"]
             options += ["-k", "triton"] if triton else ["-k", f"not {IN_A_PROCESS_OF_ITS_OWN}"]

@@ -152,7 +152,7 @@ class Soak:
         self.run("embed", *self.embedding("shown.parquet"))
         view = ("view", "--model", MODEL, "--features", str(self.places["tables"] / "shown.parquet"))
         again = (str(Path(__file__).parent / "soaking" / "embedding.py"), str(self.folder), MODEL)
-        checkpoint = self.places["run"] / "checkpoints" / "last"
+        checkpoint = self.places["run"] / "checkpoints" / "previous"
         for name, arguments, sign in (
             ("view", ("-m", "derender", *view, "--device", "cpu", "--json", str(said)), said),
             ("embed, one process", again, self.folder / "passes.txt"),
@@ -318,7 +318,7 @@ def told(soak: Soak, verdicts: dict[str, dict[str, Verdict]]) -> str:
         soak.answers.markdown(),
         "",
         f"{soak.images:,} pictures trained on with {soak.validations} validations; {soak.commands} times "
-        f"embedded by command, {soak.passes:,} passes in one process. Odd connections that ended: {held or 'none'}.",
+        f"embedded by command, {soak.passes:,} passes in one process. Odd lines ended: {held or 'none'}.",
         "",
         *(f"FAULT: {fault}" for fault in soak.faults),
         *(f"FAULT of a client: {sentence}" for sentence in soak.answers.said),
