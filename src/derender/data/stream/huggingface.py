@@ -7,8 +7,10 @@ are, other columns are not read. Nothing but the rows in hand is kept. The libra
 Not tried against the Hub itself: what is tested are folders in the forms in which the Hub keeps data sets.
 """
 
+import importlib
 import os
 from collections.abc import Iterator
+from contextlib import suppress
 from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
@@ -150,11 +152,10 @@ def _commit(identifier: str, revision: str | None, source: str) -> str:
 
 def _transport_error() -> type[Exception]:
     """What the Hub's client raises where there is no network; it changed its transport more than once."""
-    try:
-        import httpx2 as transport  # pyright: ignore[reportMissingImports]
-    except ImportError:
-        import httpx as transport  # pyright: ignore[reportMissingImports]
-    return transport.HTTPError
+    for name in ("httpx2", "httpx"):
+        with suppress(ImportError):
+            return importlib.import_module(name).HTTPError
+    return OSError  # that of requests is one
 
 
 def _load(source: str, place: str | Path, config: str | None, revision: str | None) -> dict[str, Any]:
