@@ -3,8 +3,9 @@
 Before any clock runs every peer is held against derender's definition in plain torch: the same pixels hit
 (a few at borders aside, which then count nowhere), the same points there, and the same gradient for random
 cotangents. Where a ray meets an edge of the mesh, both its triangles are right and their gradients differ:
-such pixels carry no cotangent, and their share is told. A peer whose gradient is off by more than 1 % is timed, and said to be off; it is no rival for
-the ratio. Then all take turns; a time is the median over rounds. Peers that are not installed are named.
+such pixels carry no cotangent, and their share is told. A peer whose gradient is off by more than 1 % is
+timed, and said to be off; it is no rival for the ratio. Then all take turns; a time is the median over
+rounds. Peers that are not installed are named.
 
     python benchmarks/rasterize_peers.py --sizes 64 256 --json benchmarks/results/rasterize_peers.json
 """
@@ -60,7 +61,7 @@ def held_against(peer: Peer, expected: Peer, vertices: Tensor) -> dict[str, Any]
 
 
 def edge_distance(uv: Tensor) -> Tensor:
-    """How far points of the grid (..., 2) are from the nearest edge of its triangles, along u or v: 0..1/3."""
+    """How far points of the grid (..., 2) lie from the nearest edge of its triangles along an axis; 0..1/3."""
     u, v = (uv % 1).unbind(-1)
     return torch.stack((u, 1 - u, v, 1 - v, (u + v - 1).abs())).amin(dim=0)
 
