@@ -61,7 +61,7 @@ def held_against(peer: Peer, expected: Peer, vertices: Tensor) -> dict[str, Any]
 
 
 def edge_distance(uv: Tensor) -> Tensor:
-    """How far of the grid (..., 2) is from the nearest edge of its triangles along an axis; 0..1/3."""
+    """How far points (..., 2) of the grid lie from its triangles' nearest edge along an axis; 0..1/3."""
     u, v = (uv % 1).unbind(-1)
     return torch.stack((u, 1 - u, v, 1 - v, (u + v - 1).abs())).amin(dim=0)
 
