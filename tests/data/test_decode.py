@@ -67,6 +67,8 @@ def test_palette_with_transparent_colour(encoded):
 @pytest.mark.parametrize("form", ["PNG", "TIFF", "PPM"])
 def test_sixteen_bits_are_scaled_not_clipped(encoded, form):
     picture = Image.fromarray(RAMP.astype(np.uint16) * 257)
+    if form == "PPM":
+        picture = picture.convert("I")  # which every version of Pillow writes as 16 bits there
     np.testing.assert_array_equal(read_picture(encoded(picture, form), 12), np.stack([RAMP] * 3))
 
 

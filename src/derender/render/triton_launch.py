@@ -11,7 +11,6 @@ import importlib.util
 import os
 import struct
 from contextlib import nullcontext
-from functools import cache
 from typing import Any
 
 import torch
@@ -25,9 +24,11 @@ TRIANGLES_PER_PROGRAM = 32
 """One warp: lanes wait for the largest triangle among them, so there should be few."""
 
 
-@cache
+_TRITON = importlib.util.find_spec("triton") is not None  # here, as torch 2.6 cannot trace it
+
+
 def triton_installed() -> bool:
-    return importlib.util.find_spec("triton") is not None
+    return _TRITON
 
 
 def interpreted() -> bool:

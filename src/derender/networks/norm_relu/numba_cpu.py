@@ -5,13 +5,13 @@ input and each group's mean and deviation: the normalised values are not kept.
 """
 
 import importlib.util
-from functools import cache
 
 import torch
 from torch import Tensor
 
 SPAN = 256  # numbers in a row of the kernels' inner loops, at most
 WORTHWHILE = 1 << 18  # numbers from which on a pass over memory costs more than calling the operator
+_NUMBA = importlib.util.find_spec("numba") is not None  # here, as torch 2.6 cannot trace it
 
 
 def suits(values: Tensor, weight: Tensor) -> bool:
@@ -22,7 +22,7 @@ def suits(values: Tensor, weight: Tensor) -> bool:
         and values.dtype == weight.dtype
         and values.dtype in (torch.float32, torch.float64)
         and values.is_contiguous(memory_format=torch.channels_last)
-        and _numba_installed()
+        and _NUMBA
     )
 
 
@@ -115,8 +115,3 @@ def _rows(values: Tensor):
     while 2 * together * channels <= SPAN and (height * width) % (2 * together) == 0:
         together *= 2
     return values.detach().permute(0, 2, 3, 1).reshape(count, -1, together * channels).numpy()
-
-
-@cache
-def _numba_installed() -> bool:
-    return importlib.util.find_spec("numba") is not None

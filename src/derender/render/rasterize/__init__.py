@@ -17,7 +17,6 @@ ray meets the triangle's plane. Nothing flows at occlusion edges.
 
 import importlib.util
 from dataclasses import dataclass
-from functools import cache
 
 import torch
 from jaxtyping import Float
@@ -28,6 +27,7 @@ from derender.render.triton_launch import interpreted, triton_installed
 
 IMPLEMENTATIONS = {"reference": reference, "numba": numba_cpu, "triton": triton_gpu}
 BACKENDS = ("auto", *IMPLEMENTATIONS)
+_NUMBA = importlib.util.find_spec("numba") is not None  # here, as torch 2.6 cannot trace it
 
 
 @dataclass(frozen=True)
@@ -88,6 +88,5 @@ def chosen_backend(device: torch.device | str, backend: str = "auto") -> str:
     return backend
 
 
-@cache
 def _numba_installed() -> bool:
-    return importlib.util.find_spec("numba") is not None
+    return _NUMBA
