@@ -154,6 +154,17 @@ def test_frozen_whatever_the_model_around_does(generator):
     assert gradient.abs().sum() > 0
 
 
+def test_vgg_is_calibrated_on_the_first_256_pictures_or_keeps_scale_1(monkeypatch):
+    def weights(_: object) -> Tiny:
+        return Tiny(torch.Generator().manual_seed(3))
+
+    monkeypatch.setattr("derender.objectives.perceptual.load_vgg16", weights)
+    images = (torch.rand(258, 3, 6, 8, generator=torch.Generator().manual_seed(0)) * 255).byte()
+    expected = weights(None).calibrate_(images[:256].float() / 255).scale
+    assert torch.equal(build_perceptual("vgg16", images).scale, expected)
+    assert build_perceptual("vgg16").scale == 1
+
+
 def test_the_factory_knows_its_kinds(generator, tmp_path):
     images = (torch.rand(4, 3, 32, 32, generator=generator) * 255).byte()
     assert build_perceptual("none") is None

@@ -1,5 +1,7 @@
 """The self-trained features: exact correspondences, exact folding, determinism, and that they learn."""
 
+from dataclasses import FrozenInstanceError
+
 import pytest
 import torch
 from safetensors.torch import save_file
@@ -8,6 +10,7 @@ from torch.nn import functional
 
 from derender.objectives.self_features import SelfFeatures, load_self_features, trunk, without_normalisation
 from derender.objectives.self_training import (
+    DEFAULT_STEPS,
     SelfTraining,
     photometric_augmentation,
     train_self_features,
@@ -145,6 +148,39 @@ def test_calibrated_on_its_own_pictures(generator):
     spread = (found - found.mean(dim=(0, 2, 3), keepdim=True)).square().mean().sqrt()
     assert spread.item() == pytest.approx(1, rel=1e-4)
     assert found.shape == (20, 16, 32 // net.stride, 32 // net.stride) and net.channels == 16
+
+
+def test_at_most_256_pictures_are_calibrated_on(monkeypatch, generator):
+    counts = []
+    monkeypatch.setattr(SelfFeatures, "calibrate_", lambda net, images: counts.append(len(images)))
+    images = as_bytes(torch.rand(300, 3, 16, 16, generator=generator))
+    for some in (images, images[:20]):
+        train_self_features(some, seed=0, steps=1, settings=QUICK)
+    assert counts == [256, 20]
+
+
+def test_the_defaults_are_those_that_results_were_measured_with(generator):
+    assert vars(SelfTraining()) == {
+        "widths": (16, 32, 64),
+        "batch": 32,
+        "places": 16,
+        "crop": 40,
+        "projection": 64,
+        "temperature": 0.2,
+        "learning_rate": 3e-3,
+        "weight_decay": 1e-4,
+    }
+    assert DEFAULT_STEPS == 600
+    net, images = SelfFeatures(), torch.rand(1, 3, 8, 8, generator=generator)
+    assert (net.widths, net.channels, net.stride) == ((16, 32, 64), 64, 4)
+    torch.testing.assert_close(net(images), net.features((images - 0.5) / 0.25))
+
+
+def test_views_and_settings_are_values(generator):
+    pair = two_views(torch.rand(2, 3, 32, 32, generator=generator), 24, 4, 2, generator)
+    for value, name in ((pair, "first"), (SelfTraining(), "batch")):
+        with pytest.raises(FrozenInstanceError):
+            setattr(value, name, getattr(value, name))
 
 
 def test_save_and_load_give_the_same_features(tmp_path, generator):

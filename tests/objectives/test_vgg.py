@@ -6,10 +6,11 @@ import torch
 from safetensors.torch import save_file
 from torch.nn import functional
 
-from derender.objectives.vgg import IMAGENET_MEAN, IMAGENET_STD, Vgg16Features, load_vgg16
+from derender.objectives.vgg import Vgg16Features, load_vgg16
 
 NUMBERS = (0, 2, 5, 7, 10, 12, 14)
 CHANNELS = (3, 64, 64, 128, 128, 256, 256, 256)
+MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet, as torchvision's weights expect
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +29,7 @@ def weights():
 
 def relu3_3(weights, images):
     """Configuration D of Simonyan & Zisserman written out, up to the third convolution of block three."""
-    x = (images - torch.tensor(IMAGENET_MEAN).view(3, 1, 1)) / torch.tensor(IMAGENET_STD).view(3, 1, 1)
+    x = (images - torch.tensor(MEAN).view(3, 1, 1)) / torch.tensor(STD).view(3, 1, 1)
     for block in ((0, 2), (5, 7), (10, 12, 14)):
         if block[0] > 0:
             x = functional.max_pool2d(x, 2)

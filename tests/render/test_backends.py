@@ -1,5 +1,6 @@
 """The fast implementations against the definition, and as good citizens of torch, threads and processes."""
 
+import importlib.util
 import math
 import os
 import subprocess
@@ -15,6 +16,7 @@ from torch import Tensor
 
 from derender.render import available_backends, chosen_backend
 from derender.render.rasterize import IMPLEMENTATIONS, reference
+from derender.render.triton_launch import triton_installed
 from derender.scene.camera import focal_px, motion, to_camera, unproject
 
 fast = pytest.mark.parametrize("backend", FAST)
@@ -51,6 +53,7 @@ def assert_agrees_with_reference(fast_backend: str, values: tuple[Tensor, ...]) 
         kept[backend] = {"image": result.image, "depth": result.depth, "mask": result.mask}
         names = ("depth", "albedo", "light", "camera")
         kept[backend] |= {f"d/d {name}": gradient for name, gradient in zip(names, gradients, strict=True)}
+        assert not result.mask.requires_grad
         for value, original in zip(inputs, before, strict=True):
             assert torch.equal(value, original), "inputs must not be written to"
     assert torch.equal(kept[fast_backend]["mask"], kept["reference"]["mask"])
@@ -100,6 +103,23 @@ def test_backends_choose_the_same_triangle(backend, dtype, generator):
 
 
 @fast
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_rasterizing_agrees(backend, dtype, generator, nan_filled_memory):
+    """Coordinates, depth and the gradient of every vertex, where layers hide each other."""
+    depth, _, _, pose = scene(3, 9, 14, generator, dtype, turn_rad=1.2)
+    vertices = to_camera(unproject(depth, FOV_DEG), pose)
+    kept = []
+    for name in ("reference", backend):
+        points = vertices.clone().requires_grad_()
+        seen = rasterize(points, focal_px(14, FOV_DEG), name)
+        outputs = (seen.uv, seen.depth)
+        kept.append((*outputs, *gradients_with(torch.Generator().manual_seed(1), outputs, [points])))
+    assert 0.2 < (kept[0][1] > 0).float().mean() < 1
+    for name, expected, actual in zip(("uv", "depth", "d/d vertices"), *kept, strict=True):
+        assert_agrees(actual, expected, name)
+
+
+@fast
 def test_identity_camera_takes_the_first_triangle_of_each_vertex(backend, generator):
     vertices = unproject(smooth_depth(1, 6, 6, generator), FOV_DEG)
     vertices = vertices.to(device_of(backend))
@@ -123,12 +143,13 @@ def test_reference_gives_the_same_in_small_portions(generator, monkeypatch):
 @pytest.mark.parametrize("channels", [1, 3, 5])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_sampling_agrees(backend, channels, dtype, generator, nan_filled_memory):
-    """Also where the picture looked up and the picture made differ in size, and just beyond the border."""
+    """Also where both pictures differ in size, at whole pixels, and just beyond the border."""
     image = torch.randn(2, channels, 5, 8, generator=generator, dtype=dtype)
     uv = torch.rand(2, 9, 6, 2, generator=generator, dtype=dtype) * torch.tensor([7.0, 4.0], dtype=dtype)
     uv[0, 0, 0], uv[0, 0, 1] = torch.tensor([-1e-4, 4 + 1e-4]), torch.tensor([7 + 1e-4, -1e-4])
+    uv[1, 0] = torch.tensor([[0.0, 0.0], [1.0, 1.0], [2.0, 3.0], [6.0, 3.0], [7.0, 4.0], [1.0, 4.0]])
     mask = (torch.rand(2, 9, 6, generator=generator) > 0.3).to(dtype)
-    mask[0, 0, :2] = 1
+    mask[0, 0, :2] = mask[1, 0] = 1
     kept = []
     for name in ("reference", backend):
         inputs = [image.clone().requires_grad_(), uv.clone().requires_grad_()]
@@ -272,6 +293,11 @@ def test_kernels_are_compiled_where_no_folder_can_cache_them():
 def test_importing_the_renderer_does_not_import_its_compilers():
     code = "import sys, derender.render; raise SystemExit(bool({'numba', 'triton'} & {*sys.modules}))"
     assert subprocess.run([sys.executable, "-c", code], timeout=120, check=False).returncode == 0
+
+
+def test_what_can_be_imported_counts_as_installed():
+    assert ("numba" in available_backends()) == (importlib.util.find_spec("numba") is not None)
+    assert triton_installed() == (importlib.util.find_spec("triton") is not None)
 
 
 def test_auto_takes_the_fastest_that_is_installed(monkeypatch):

@@ -1,6 +1,7 @@
 """What any correct renderer does: known answers in closed form and laws, on every backend."""
 
 import math
+from dataclasses import FrozenInstanceError
 
 import pytest
 import torch
@@ -189,6 +190,26 @@ def test_render_scene_is_render(backend, generator):
         assert torch.equal(getattr(one, name), getattr(other, name))
 
 
+def test_the_field_of_view_is_ten_degrees_where_none_is_given(backend, generator):
+    depth, albedo, light, pose = values = scene(1, 6, 7, generator)
+    expected = render(*values, 10.0, backend).image
+    assert torch.equal(render(*values, backend=backend).image, expected)
+    assert torch.equal(render_scene(Scene(*values), backend=backend).image, expected)
+    canonical = shade(depth, albedo, light, backend=backend)
+    assert torch.equal(warp(canonical, depth, pose, backend=backend).image, expected)
+    assert not torch.equal(render(*values, 11.0, backend).image, expected)
+    assert not torch.equal(shade(depth, albedo, light, 11.0, backend), canonical)
+
+
+def test_what_is_seen_is_a_value(backend, generator):
+    depth, _, _, pose = scene(1, 4, 5, generator)
+    picture = warp(torch.rand(1, 2, 4, 5, generator=generator), depth, pose, FOV_DEG, backend)
+    fragments = rasterize(unproject(depth, FOV_DEG), 20.0, backend)
+    for value in (picture, fragments):
+        with pytest.raises(FrozenInstanceError):
+            value.mask = value.depth
+
+
 def test_images_of_a_batch_do_not_mix(backend, generator):
     values = scene(5, 9, 7, generator)
     whole = render(*values, FOV_DEG, backend)
@@ -300,6 +321,22 @@ def test_a_mesh_without_area_shows_nothing(backend):
     assert_empty_where_uncovered(seen)
     (gradient,) = torch.autograd.grad(seen.uv.sum() + seen.depth.sum(), points)
     assert (gradient == 0).all()
+
+
+@pytest.mark.parametrize(("beyond_px", "covered"), [(0.08, True), (0.12, False)])
+@pytest.mark.parametrize("side", ["left", "right", "top", "bottom"])
+def test_a_large_triangle_reaches_a_ten_thousandth_beyond_its_edge(backend, side, beyond_px, covered):
+    """Two triangles some thousand pixels large, one edge just short of one of the picture's four pixels."""
+    short = torch.tensor([-1000.0, 1 - beyond_px], dtype=torch.float64)
+    short = 1 - short.flip(0) if side in ("left", "top") else short
+    other, focal = torch.tensor([-1000.0, 1000.0], dtype=torch.float64), 10.0
+    u, v = (short, other) if side in ("left", "right") else (other, short)
+    v, u = torch.meshgrid(v, u, indexing="ij")
+    points = torch.stack(((u - 0.5) / focal, (v - 0.5) / focal, torch.ones_like(u)), dim=-1)
+    expected = torch.ones(2, 2, dtype=torch.float64)
+    line = 0 if side in ("left", "top") else 1
+    expected.select(1 if side in ("left", "right") else 0, line).fill_(float(covered))
+    assert torch.equal(rasterize(points[None], focal, backend).mask[0], expected)
 
 
 def test_folded_mesh_takes_the_first_triangle_within_the_tie_tolerance(backend):

@@ -13,24 +13,27 @@ import pytest
 import torch
 from tests.render.devices import render
 from tests.render.scenes import FOV_DEG, scene
+from tests.tolerances import assert_agrees
 
-from derender.render import available_backends
+from derender.render import available_backends, triton_launch
 from derender.render.scattered_sums import ADD, ADD_INTEGERS, MEASURE, scattered_sums
-from derender.render.triton_launch import float64_bits, triton_installed
+from derender.render.triton_launch import float64_bits, interpreted, triton_installed
 
 ROOT = Path(__file__).resolve().parents[2]
 INTERPRETED = (
-    "test_backends_agree[3-17-23-dtype0-triton]",
-    "test_backends_agree[5-3-9-dtype1-triton]",
-    "test_backends_choose_the_same_triangle[dtype1-triton]",
-    "test_sampling_agrees[dtype0-3-triton]",
+    "test_backends.py::test_backends_agree[3-17-23-dtype0-triton]",
+    "test_backends.py::test_backends_agree[5-3-9-dtype1-triton]",
+    "test_backends.py::test_backends_choose_the_same_triangle[dtype1-triton]",
+    "test_backends.py::test_rasterizing_agrees[dtype0-triton]",
+    "test_backends.py::test_sampling_agrees[dtype0-3-triton]",
+    "test_triton.py::test_several_programs_for_an_image_change_nothing",
 )
 
 
 @pytest.mark.skipif(not triton_installed(), reason="triton is not installed")
 @pytest.mark.skipif("triton" in available_backends(), reason="Triton runs in this very process")
 def test_kernels_agree_with_the_definition_in_the_interpreter():
-    tests = [f"tests/render/test_backends.py::{name}" for name in INTERPRETED]
+    tests = [f"tests/render/{name}" for name in INTERPRETED]
     call = subprocess.run(
         [sys.executable, "-m", "pytest", "-n", "0", "-p", "no:cacheprovider", *tests],
         cwd=ROOT, env={**os.environ, "TRITON_INTERPRET": "1"}, capture_output=True, text=True, timeout=280,
@@ -38,6 +41,20 @@ def test_kernels_agree_with_the_definition_in_the_interpreter():
     )  # fmt: skip
     assert call.returncode == 0, call.stdout[-3000:] + call.stderr[-1000:]
     assert f"{len(INTERPRETED)} passed" in call.stdout
+
+
+@pytest.mark.skipif(not (triton_installed() and interpreted()), reason="needs TRITON_INTERPRET=1")
+def test_several_programs_for_an_image_change_nothing(monkeypatch, generator):
+    """In the interpreter one program has room for a whole small image; on a GPU many share it."""
+    monkeypatch.setattr(triton_launch, "INTERPRETED_BLOCK", 16)
+    values, kept = scene(2, 4, 5, generator, torch.float64), []
+    for backend in ("reference", "triton"):
+        inputs = [value.clone().requires_grad_() for value in values]
+        result = render(*inputs, FOV_DEG, backend)
+        gradients = torch.autograd.grad(result.image.square().sum() + result.depth.square().sum(), inputs)
+        kept.append((result.image, result.depth, *gradients))
+    for expected, actual in zip(*kept, strict=True):
+        assert_agrees(actual, expected)
 
 
 @pytest.mark.skipif("triton" not in available_backends(), reason="needs a GPU, or TRITON_INTERPRET=1")
@@ -73,22 +90,25 @@ def adding(values: torch.Tensor, order: torch.Tensor):
     return run
 
 
+@pytest.mark.parametrize("shape", [(3,), (3, 2, 2)])
 @pytest.mark.parametrize("scale", [1.0, 1e-200, 1e200])
-def test_integer_sums_have_no_order_and_lose_nothing_that_counts(scale, generator):
+def test_integer_sums_have_no_order_and_lose_nothing_that_counts(scale, shape, generator):
     values = torch.randn(3, 4, 5, generator=generator, dtype=torch.float64) * scale
     values[0] = 0
+    values[2] *= 1e-9  # each image by a unit of its own
     orders = [torch.randperm(20, generator=generator) for _ in range(2)]
     torch.use_deterministic_algorithms(True)
     try:
         one, other = (
-            scattered_sums(adding(values, order), values, [(3,)], [torch.float64])[0] for order in orders
+            scattered_sums(adding(values, order), values, [shape], [torch.float64])[0] for order in orders
         )
     finally:
         torch.use_deterministic_algorithms(False)
     assert torch.equal(one, other)
-    assert one[0] == 0
-    expected = scattered_sums(adding(values, orders[0]), values, [(3,)], [torch.float64])[0]
-    assert torch.allclose(one, expected, rtol=0, atol=1e-15 * 20 * float(values.abs().max()))
+    assert (one[0] == 0).all()
+    expected = scattered_sums(adding(values, orders[0]), values, [shape], [torch.float64])[0]
+    for sums, right, summands in zip(one, expected, values, strict=True):
+        assert torch.allclose(sums, right, rtol=0, atol=1e-15 * 20 * float(summands.abs().max()))
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])

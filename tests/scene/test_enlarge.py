@@ -87,6 +87,9 @@ def test_light_camera_and_size_are_kept():
 def test_what_cannot_be_enlarged():
     with pytest.raises(ValueError, match="16x16 cannot be shown at 8x8: give 16 or more"):
         at_size(hill(16), 8)
+    assert at_size(hill(4), 8).depth.shape == (1, 8, 8)
+    with pytest.raises(ValueError, match="3x3 cannot be shown at 8x8: give 4 or more"):
+        at_size(hill(3), 8)
     flat = hill(16)
     narrow = Scene(flat.depth[:, :, :8], flat.albedo[..., :8], flat.light, flat.camera)
     with pytest.raises(ValueError, match="only square scenes can be enlarged, got 16x8"):

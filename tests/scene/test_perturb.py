@@ -199,12 +199,17 @@ def test_a_choice_that_does_not_fit_is_refused(generator):
     scene = scenes(3, generator)
     with pytest.raises(ValueError, match="names 2 images, the scene holds 3"):
         perturb_scene(scene, torch.tensor([2, 3]), generator)
-    with pytest.raises(ValueError, match=r"-1\.\.3 \(depth, albedo, light, camera\)"):
-        perturb_scene(scene, torch.tensor([2, 3, 4]), generator)
+    for impossible in (4, -2):
+        with pytest.raises(ValueError, match=r"-1\.\.3 \(depth, albedo, light, camera\)"):
+            perturb_scene(scene, torch.tensor([2, 3, impossible]), generator)
 
 
-def test_settings_refuse_negative_sizes_and_unknown_names():
-    with pytest.raises(ValueError, match="ambient"):
-        PerturbSettings(ambient=-0.1)
+def test_settings_are_the_papers_and_refuse_negative_sizes_and_unknown_names():
+    sizes = {"ambient": 0.5, "diffuse": 0.5, "light_deg": 45, "camera_pitch_deg": 22.5, "camera_yaw_deg": 45}
+    assert PerturbSettings().model_dump() == sizes
+    for name in sizes:
+        assert getattr(PerturbSettings(**{name: 0.0}), name) == 0
+        with pytest.raises(ValueError, match=name):
+            PerturbSettings(**{name: -0.1})
     with pytest.raises(ValueError, match="embient"):
         PerturbSettings.model_validate({"embient": 0.1})

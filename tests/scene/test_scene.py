@@ -1,5 +1,7 @@
 """Scene: one value that carries every parameter, extras included, and refuses unknown names."""
 
+from dataclasses import FrozenInstanceError
+
 import pytest
 import torch
 
@@ -52,6 +54,11 @@ def test_unknown_and_missing_parameters_are_named(scene):
         scene.with_parameters(ligth=torch.zeros(3, 4))
     with pytest.raises(ValueError, match="missing: camera"):
         Scene.from_parameters({"depth": scene.depth, "albedo": scene.albedo, "light": scene.light})
+
+
+def test_a_scene_is_a_value(scene):
+    with pytest.raises(FrozenInstanceError):
+        scene.depth = torch.zeros(3, 4, 5)
 
 
 def test_extras_are_added_and_detach_reaches_them(scene):

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 ADD, MEASURE, ADD_INTEGERS = 0, 1, 2
-"""What a kernel is asked to do, as in ``triton_parts``."""
+"""What a kernel is asked to do: its ``MODE``."""
 
 LARGEST_SUM = 2.0**62
 SMALLEST_SUMMAND = 1e-280

@@ -11,8 +11,6 @@ from typing import no_type_check
 import triton
 import triton.language as tl
 
-ADD, MEASURE, ADD_INTEGERS = tl.constexpr(0), tl.constexpr(1), tl.constexpr(2)
-
 
 @triton.jit
 @no_type_check
