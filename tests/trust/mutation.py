@@ -6,12 +6,13 @@
 ``mutants.py`` makes the mutants. Each stands in a copy of the package that a forked child, which has torch
 and numba ready, puts before the real one; compiled kernels that the mutant is part of are compiled anew, in a
 folder of its own. It is killed if a test fails, or by time if the tests take five times as long as without
-it. Files for Triton are tested in Triton's interpreter. Survivors that are equivalent stand, with the reason,
-in ``equivalent_mutants.yaml``. Finished mutants in the journal are not tried again; survivors are with
-``--again``. Exit code 1 if less than 85 % of what is not equivalent was killed.
+it. Files for Triton are tested in Triton's interpreter. Survivors that no test can kill stand, with the
+reason, in ``equivalent_mutants.yaml``. Finished mutants in the journal are not tried again; with ``--again``
+the other survivors are. Exit code 1 if less than 85 % of what is not equivalent was killed.
 """
 
 import argparse
+import functools
 import importlib
 import json
 import os
@@ -50,6 +51,9 @@ ALSO_READY = (
     "safetensors.torch",
 )
 """Imported before children are made; some of it imports Triton, too early where its interpreter is needed."""
+
+LISTED = ("file", "where", "before", "after")
+"""By which a mutant is known in the list of equivalent ones."""
 
 TIMES, LEAST_SECONDS, MEMORY = 5, 60, 16 << 30
 WANTED = 0.85
@@ -238,9 +242,15 @@ def results(workshop: Workshop, mutants: Sequence[Mutant]) -> Iterator[dict[str,
         yield entry
 
 
-def equivalents() -> dict[tuple[str, str, str, str], str]:
+@functools.cache
+def equivalents() -> dict[tuple[str, ...], str]:
     listed = yaml.safe_load(Path(__file__).with_name("equivalent_mutants.yaml").read_text()) or []
-    return {(row["file"], row["where"], row["before"], row["after"]): row["why"] for row in listed}
+    return {tuple(row[name] for name in LISTED): row["why"] for row in listed}
+
+
+def equivalent(row: dict[str, Any]) -> str:
+    """Why no test can kill it; "" for one that is not listed."""
+    return equivalents().get(tuple(row[name] for name in LISTED), "")
 
 
 def table(rows: list[dict[str, Any]], counts: dict[str, int]) -> str:
@@ -298,7 +308,8 @@ def main() -> int:
         for line in arguments.journal.read_text().splitlines():
             entry = json.loads(line)
             known[entry["key"]] = entry
-    settled = {key for key, entry in known.items() if entry["result"] != "survived" or not arguments.again}
+    again = {key for key, entry in known.items() if entry["result"] == "survived" and not equivalent(entry)}
+    settled = known.keys() - (again if arguments.again else set())
     left = [mutant for mutant in chosen if mutant.key not in settled]
     numba.njit(lambda value: value + 1)(1.0)  # children find the compiler ready
     with tempfile.TemporaryDirectory(prefix="mutants-") as folder:
@@ -319,14 +330,12 @@ def told(
     chosen: list[Mutant], known: dict[str, dict[str, Any]], counts: dict[str, int], to: Path | None
 ) -> int:
     """Print the table and the survivors; the exit code."""
-    same = equivalents()
     rows = []
     for mutant in chosen:
-        why = same.get((mutant.file, mutant.where, mutant.before, mutant.after))
         row = {**known[mutant.key], "line": mutant.line}
-        rows.append(
-            {**row, "result": "equivalent", "why": why} if why and row["result"] == "survived" else row
-        )
+        if row["result"] == "survived" and equivalent(row):
+            row |= {"result": "equivalent", "why": equivalent(row)}
+        rows.append(row)
     print(table(rows, counts))
     for row in rows:
         if row["result"] in ("survived", "equivalent"):

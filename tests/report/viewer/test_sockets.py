@@ -2,10 +2,12 @@
 
 import socket
 import time
+from contextlib import ExitStack
 
 import pytest
 
-from derender.report.viewer.app import DRAINED_AT_MOST_BYTES, Application, Viewer
+from derender.report.viewer import app
+from derender.report.viewer.app import DRAINED_AT_MOST_BYTES, UPLOADS_AT_ONCE, Application, Viewer
 from derender.report.viewer.intake import BODY_LIMIT_BYTES
 from derender.report.viewer.server import BoundedProtocol, serving
 from derender.report.viewer.shelf import Shelf
@@ -69,6 +71,33 @@ def test_a_body_shorter_than_it_says_ends_in_time(model, client):
     with serving(application) as url, connected(url) as connection:
         connection.sendall(head(url, more="Content-Length: 1000000\r\n") + b"few")
         assert b" 408 " in answered(connection)
+
+
+def test_uploads_that_stall_hold_up_no_other(model):
+    application = Application(Viewer(Studio(model, "tiny", Shelf(2))), body_seconds=60)
+    with serving(application) as url, ExitStack() as stalled:
+        for _ in range(2 * UPLOADS_AT_ONCE):
+            connection = stalled.enter_context(connected(url))
+            connection.sendall(head(url, more="Content-Length: 1000000\r\n") + b"few")
+        with connected(url) as connection:  # answered after the others were heard
+            connection.sendall(head(url, "/api/about", "Connection: close\r\n").replace(b"POST", b"GET", 1))
+            assert b" 200 " in answered(connection)
+        with connected(url) as connection:
+            connection.sendall(head(url, more="Content-Length: 10\r\nConnection: close\r\n") + b"no picture")
+            assert b" 415 " in connection.recv(100)
+
+
+def test_large_uploads_take_turns_and_none_is_lost(model, monkeypatch):
+    monkeypatch.setattr(app, "SMALL_UPLOAD_BYTES", 1_000)
+    application = Application(Viewer(Studio(model, "tiny", Shelf(2))))
+    with serving(application) as url, ExitStack() as stalled:
+        begun = [stalled.enter_context(connected(url)) for _ in range(3 * UPLOADS_AT_ONCE)]
+        for connection in begun:
+            connection.sendall(head(url, more="Content-Length: 100000\r\n") + bytes(50_000))
+        for connection in begun:
+            connection.sendall(bytes(50_000))
+        for connection in begun:
+            assert b" 415 " in connection.recv(100)
 
 
 def test_a_length_above_the_limit_is_refused_without_waiting_for_the_bytes(model):

@@ -9,6 +9,7 @@ import asyncio
 import json
 from collections.abc import Awaitable, Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import AsyncExitStack
 from dataclasses import dataclass
 from functools import partial
 from importlib.resources import files
@@ -34,6 +35,9 @@ BODY_SECONDS = 30.0
 WORK_SECONDS = 30.0
 QUESTION_LIMIT_BYTES = 10_000
 UPLOADS_AT_ONCE = 4
+SMALL_UPLOAD_BYTES = 500_000
+"""Uploads that have come no further take no place among those: one that stalls early holds up no other."""
+
 WAITING_AT_MOST = 200
 DRAINED_AT_MOST_BYTES = 3 * BODY_LIMIT_BYTES
 """So much of a body that is too large is still read and dropped, so that browsers see the answer."""
@@ -158,8 +162,8 @@ class Application:
 
     async def open_upload(self, request: Request) -> Response:
         """Take the picture in the body apart."""
-        async with self._uploads:
-            encoded = await self._body(request, BODY_LIMIT_BYTES)
+        async with AsyncExitStack() as place:
+            encoded = await self._body(request, BODY_LIMIT_BYTES, place)
             size = self.viewer.studio.model.image_size
             picture = await self._work(self._decoding, pixels_of, encoded, size)
             del encoded
@@ -226,14 +230,26 @@ class Application:
         finally:
             self._waiting -= 1
 
-    async def _body(self, request: Request, limit: int) -> bytes:
-        """The request's body; ``Refused`` if it is too large (413) or comes too slowly (408)."""
+    async def _body(self, request: Request, limit: int, place: AsyncExitStack | None = None) -> bytes:
+        """The request's body; ``Refused`` if it is too large (413) or comes too slowly (408).
+
+        Args:
+            request: whose body.
+            limit: most bytes that are kept.
+            place: takes one of the places for large uploads once the body is no longer small; waiting for
+                it is not counted as slowness.
+        """
         body = bytearray()
         received = 0
         try:
-            async with asyncio.timeout(self.body_seconds):
+            async with asyncio.timeout(self.body_seconds) as clock:
                 async for part in request.stream():
                     received += len(part)
+                    if place is not None and received > SMALL_UPLOAD_BYTES:
+                        clock.reschedule(None)
+                        await place.enter_async_context(self._uploads)
+                        clock.reschedule(asyncio.get_running_loop().time() + self.body_seconds)
+                        place = None
                     if received > limit:
                         body.clear()
                     else:
