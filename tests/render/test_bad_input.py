@@ -71,3 +71,4 @@ def test_parts_refuse_too():
         rasterize(torch.ones(1, 1, 4, 3), 10.0)
     with pytest.raises(ValueError, match="focal length must be positive"):
         rasterize(torch.ones(1, 4, 4, 3), 0.0)
+    assert rasterize(torch.ones(1, 4, 4, 3), 0.5).depth.shape == (1, 4, 4)
