@@ -170,7 +170,7 @@ class Workshop:
             os.environ |= {"TRITON_INTERPRET": "1"} if triton else {}
             os.environ |= {} if write else {"PYTHONDONTWRITEBYTECODE": "1"}
             sys.dont_write_bytecode = not write
-            numba.config.CACHE_DIR = str(self.compiled)  # pyright: ignore[reportPrivateImportUsage]
+            numba.config.CACHE_DIR = str(self.compiled)  # pyright: ignore
             elsewhere = [
                 path for path in sys.path if Path(path) not in (SOURCE.parent, Path(__file__).parent)
             ]
