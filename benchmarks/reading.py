@@ -4,21 +4,29 @@ Made-up sets of tiny files lie in a temporary folder: a folder of class folders,
 a command does before the first picture is decoded: list, recognise the layout, read labels, ask every file's
 size and time of change (``fingerprint``). The first start has no index to go by, later ones have the
 remembered one where there is one. Every start runs in a process of its own; imports are not counted. First it
-is shown that an added, a removed and a changed file are seen. Files stay in the system's cache.
+is shown that an added, a removed and a changed file are seen, in a folder and in a zip that are just large
+enough to be remembered; and that as many members of the zip as ``--read`` says, drawn at random, are those
+that Python's own reader reads, with both times.
+Files stay in the system's cache. A million small files take 4 GB; ``--place`` keeps the sets for another run.
 
-    python benchmarks/reading.py --files 200000 --zip 1000000 --shards 200000
+    python benchmarks/reading.py --files 1000000 --zip 1000000 --shards 100000
 """
 
 import argparse
 import io
 import json
 import os
+import random
+import resource
+import shutil
 import subprocess
 import sys
 import tarfile
 import tempfile
 import time
 import zipfile
+from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +35,9 @@ from PIL import Image
 
 from derender.data.cache import fingerprint
 from derender.data.inventory import take_inventory
+from derender.data.listing import REMEMBERED_FROM
 from derender.data.pictures import read_pictures
+from derender.data.source import open_source
 
 CLASSES = 20
 SETTLED_SECONDS = 2.5  # what changed a moment ago is never trusted (data/listing.py)
@@ -67,6 +77,11 @@ def make_shards(folder: Path, count: int, in_one: int = 10_000) -> None:
                     tar.addfile(info, io.BytesIO(content))
 
 
+def most_memory_mb() -> float:
+    """The highest resident memory of this process so far, imports included."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
 def start(source: Path) -> dict[str, Any]:
     """Seconds until a folder or zip is known, and what is known of it."""
     began, cpu = time.perf_counter(), time.process_time()
@@ -76,6 +91,7 @@ def start(source: Path) -> dict[str, Any]:
     return {
         "files": len(found.table.files), "mark": mark, "listed_s": listed,
         "known_s": time.perf_counter() - began, "cpu_s": time.process_time() - cpu,
+        "memory_mb": most_memory_mb(),
     }  # fmt: skip
 
 
@@ -87,6 +103,7 @@ def start_shards(source: Path) -> dict[str, Any]:
     return {
         "files": len(pictures), "mark": str(total),
         "known_s": time.perf_counter() - began, "cpu_s": time.process_time() - cpu,
+        "memory_mb": most_memory_mb(),
     }  # fmt: skip
 
 
@@ -98,9 +115,10 @@ def in_a_process_of_its_own(source: Path, cache: Path) -> dict[str, Any]:
     return json.loads(said.stdout)
 
 
-def changes_are_seen(folder: Path, cache: Path) -> None:
-    """A file added, removed or written over alters what is known; the end undoes it all."""
-    before = in_a_process_of_its_own(folder, cache)
+def changes_of_a_folder_are_seen(root: Path, cache: Path) -> None:
+    """A file added, removed or written over alters what is known of a folder that is just large enough."""
+    folder = root / "some"
+    make_folder(folder, REMEMBERED_FROM)
     file, other = folder / "class00" / "0000000.png", folder / "class01" / "new.png"
     content = file.read_bytes()
     steps = (
@@ -108,15 +126,57 @@ def changes_are_seen(folder: Path, cache: Path) -> None:
         ("removed", other.unlink, 0),
         ("written over", lambda: file.write_bytes(content + b"\0"), 0),
     )
+    compare(folder, cache, steps)
+    shutil.rmtree(folder)
+
+
+def changes_of_a_zip_are_seen(root: Path, cache: Path) -> None:
+    """The same for members of a zip."""
+    file = root / "some.zip"
+    make_zip(file, REMEMBERED_FROM)
+
+    def rewrite(last: dict[str, bytes]) -> None:
+        make_zip(file, REMEMBERED_FROM - 1)
+        with zipfile.ZipFile(file, "a") as archive:
+            for name, content in last.items():
+                archive.writestr(name, content)
+
+    name = f"class{(REMEMBERED_FROM - 1) % CLASSES:02d}/{REMEMBERED_FROM - 1:07d}.png"
+    steps = (
+        ("added", lambda: rewrite({name: tiny(0), "class01/new.png": tiny(0)}), 1),
+        ("removed", lambda: rewrite({name: tiny(0)}), 0),
+        ("written over", lambda: rewrite({name: tiny(1)}), 0),
+    )
+    compare(file, cache, steps)
+    file.unlink()
+
+
+def compare(source: Path, cache: Path, steps: tuple[tuple[str, Callable[[], object], int], ...]) -> None:
+    """After each step as many files more are known as it says, and the mark is another where one changed."""
+    before = in_a_process_of_its_own(source, cache)
     for what, change, more in steps:
         change()
         time.sleep(SETTLED_SECONDS)  # so that the index of the next step is one that would be trusted
-        after = in_a_process_of_its_own(folder, cache)
+        after = in_a_process_of_its_own(source, cache)
         if after["files"] != before["files"] + more or (
             what != "removed" and after["mark"] == before["mark"]
         ):
-            raise SystemExit(f"a file that was {what} went unnoticed: nothing was measured")
-    file.write_bytes(content)
+            raise SystemExit(f"{source}: a file that was {what} went unnoticed: nothing was measured")
+
+
+def reading_of_members(file: Path, count: int) -> dict[str, float]:
+    """Microseconds of processor time to read a member drawn at random, here and with Python's reader."""
+    with open_source(file) as source, zipfile.ZipFile(file) as archive:
+        names = random.Random(0).choices(source.files, k=count)
+        expected = [archive.read(name) for name in names]  # and the file is in the system's cache
+        took = []
+        for read in (source.read, archive.read):
+            began = time.process_time()
+            contents = [read(name) for name in names]
+            took.append((time.process_time() - began) / count * 1e6)
+            if contents != expected:
+                raise SystemExit(f"{file}: not the bytes that Python's reader gives")
+    return {"members": count, "ours_us": took[0], "pythons_us": took[1]}
 
 
 def starts(source: Path, cache: Path) -> dict[str, Any]:
@@ -133,6 +193,8 @@ def main() -> None:
     parser.add_argument("--files", type=int, default=200_000, help="files in the folder")
     parser.add_argument("--zip", type=int, default=1_000_000, help="members of the zip")
     parser.add_argument("--shards", type=int, default=200_000, help="samples in the shards")
+    parser.add_argument("--read", type=int, default=20_000, help="members of the zip to read")
+    parser.add_argument("--place", type=Path, help="make the sets here and leave them; those there are used")
     parser.add_argument("--start", type=Path, help=argparse.SUPPRESS)
     parser.add_argument("--json", type=Path, help="also write the numbers, machine and versions here")
     options = parser.parse_args()
@@ -141,25 +203,36 @@ def main() -> None:
         print(json.dumps(known(options.start)))
         return
     results: dict[str, Any] = {}
-    with tempfile.TemporaryDirectory() as name:
-        root, cache = Path(name), Path(name) / "cache"
-        if options.files:
-            make_folder(root / "folder", options.files)
+    with (
+        nullcontext(options.place) if options.place else tempfile.TemporaryDirectory() as name,
+        tempfile.TemporaryDirectory() as kept,
+    ):
+        root, cache = Path(name), Path(kept)
+        for kind, count, file, make in (
+            ("folder", options.files, root / "folder", make_folder),
+            ("zip", options.zip, root / "many.zip", make_zip),
+            ("shards", options.shards, root / "shards", make_shards),
+        ):
+            if not count:
+                continue
+            if not file.exists():
+                make(file, count)
+            if kind == "folder":
+                changes_of_a_folder_are_seen(Path(kept), cache)
+            elif kind == "zip":
+                changes_of_a_zip_are_seen(Path(kept), cache)
+            for index in cache.glob("*.listing"):
+                index.unlink()
             time.sleep(SETTLED_SECONDS)
-            changes_are_seen(root / "folder", cache)
-            for kept in cache.glob("*.listing"):
-                kept.unlink()
-            time.sleep(SETTLED_SECONDS)
-            results["folder"] = starts(root / "folder", cache)
-        if options.zip:
-            make_zip(root / "many.zip", options.zip)
-            results["zip"] = starts(root / "many.zip", cache)
-        if options.shards:
-            make_shards(root / "shards", options.shards)
-            results["shards"] = starts(root / "shards", cache)
+            results[kind] = starts(file, cache)
+            if kind == "zip":
+                results[kind]["reading"] = reading_of_members(file, options.read)
     for kind, row in results.items():
-        later = " and ".join(f"{one['known_s']:.2f}" for one in row["later"])
-        print(f"{kind} of {row['files']:,}: first start {row['first']['known_s']:.2f} s, later {later} s")
+        each = (row["first"], *row["later"])
+        wall = ", ".join(f"{one['known_s']:.2f}" for one in each)
+        cpu = ", ".join(f"{one['cpu_s']:.2f}" for one in each)
+        print(f"{kind} of {row['files']:,}: first start and later ones {wall} s; processor {cpu} s")
+        print(f"  at most {max(one['memory_mb'] for one in each):,.0f} MB in memory")
     if options.json is not None:
         options.json.parent.mkdir(parents=True, exist_ok=True)
         result = {"benchmark": "reading", "starts": results, "machine": describe_machine()}

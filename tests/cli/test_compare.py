@@ -33,6 +33,20 @@ def model(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
+def smiling(people, tmp_path_factory) -> Path:
+    """Some of the pictures, labelled as CelebA's are."""
+    folder = tmp_path_factory.mktemp("compare") / "celeba"
+    (folder / "img_align_celeba").mkdir(parents=True)
+    lines = ["24", "smiles bald rare"]
+    for row, file in enumerate(sorted(people.rglob("*.png"))[::2][:24]):
+        name = f"{row:06d}.png"
+        (folder / "img_align_celeba" / name).write_bytes(file.read_bytes())
+        lines.append(f"{name} {1 if row % 2 else -1} -1 {1 if row == 5 else -1}")
+    (folder / "list_attr_celeba.txt").write_text("\n".join(lines))
+    return folder
+
+
+@pytest.fixture(scope="module")
 def tables(tmp_path_factory) -> dict[str, Path]:
     """Feature tables with yes/no attributes and identities, one that knows them and two that do not."""
     folder, rng = tmp_path_factory.mktemp("tables"), np.random.default_rng(0)
@@ -131,13 +145,40 @@ def test_a_model_is_embedded_once_beside_its_untrained_twins(model, people, tmp_
     assert knn["rows"]["pixels"]["scores"]["accuracy"]["value"] > 0.5 and told["kind"] == "classes"
     assert (tuned["head"], list(tuned["rows"])) == (
         "fine-tuned",
-        ["geometry + albedo", "untrained encoder", "majority"],
+        ["geometry + albedo", "untrained encoder", "PCA (16)", "pixels", "majority"],
     )
+    head = ["evaluate", "linear", "-m", model, "-d", people, "--label", "class", "--counts", "20"]
+    head = run(capsys, *head, "--heads", "linear", "--seeds", "2", "--epochs", "1", *QUICK, tmp_path)
+    alone = head["parts"][0]["rows"]
+    assert tuned["rows"]["pixels"]["scores"] == alone["pixels"]["scores"]  # there is nothing else to train
     clustered = ["evaluate", "cluster", "-m", model, "-d", people, "--label", "class", *QUICK, tmp_path]
     assert main([str(word) for word in [*clustered, "--method", "finch"]]) == 0
     shown = capsys.readouterr()
     assert "FINCH on geometry + albedo: partitions found, 4 classes" in " ".join(shown.out.split())
     assert "5 results computed, 8 found" in shown.err  # embeddings and PCA, and the levels' own trees
+
+
+def test_the_papers_linear_table_frozen_and_fine_tuned(smiling, model, tmp_path, capsys, refused):
+    words = ["compare", "--table", "linear", "-m", f"ours={model}", "-d", smiling, "--counts", "10"]
+    words += ["--finetune", "--seeds", "1", "--resamples", "20", "--untrained-seeds", "1"]
+    told = run(capsys, *words, "--cache", tmp_path)
+    part = told["parts"]["attributes"]
+    assert part["names"] == ["smiles"]  # one is never so, one is so once
+    names = ["ours", "untrained encoder", "PCA (6)", "pixels", "majority"]
+    assert [(one["head"], list(one["rows"])) for one in part["parts"]] == [
+        (head, names) for head in ("linear", "logistic", "k-NN", "fine-tuned")
+    ]
+    frozen, *_, tuned = (one["rows"] for one in part["parts"])
+    assert tuned["pixels"]["scores"] == frozen["pixels"]["scores"]
+    assert tuned["ours"]["scores"] != frozen["ours"]["scores"]
+    assert main([*map(str, words), "--cache", str(tmp_path)]) == 0
+    shown = capsys.readouterr()
+    assert "0 results computed" in shown.err and "10 fine-tuned" in shown.out
+    assert "left out, with fewer than 2 rows of one of their answers: bald, rare" in " ".join(
+        shown.err.split()
+    )
+    wrong = ("compare", "--table", "identity", "-m", model, "-d", smiling, "--finetune")
+    assert "give --table linear with --model" in refused(*wrong)
 
 
 def test_controls_for_a_table_made_before(model, people, tmp_path, capsys):

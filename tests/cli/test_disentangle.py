@@ -49,7 +49,7 @@ def test_the_card_is_printed_drawn_and_written(model, rendered, tmp_path, capsys
     shown = capsys.readouterr()
     told = json.loads(shown.out)
     assert told["pictures"] == 24 and told["features"]["geometry"] == 12 and told["seeds"] == [0]
-    assert list(told["rows"]) == ["model", "untrained encoder", "shuffled rows", "random pixels"]
+    assert list(told["rows"]) == ["model", "untrained encoder", "shuffled rows", "random pixels", "PCA"]
     scores = told["rows"]["model"][0]
     assert len(scores["swap"]["moved"]) == 4 and scores["truth"]["factors"][:2] == ["ambient", "diffuse"]
     assert told["rows"]["random pixels"][0]["swap"] is None
@@ -59,10 +59,10 @@ def test_the_card_is_printed_drawn_and_written(model, rendered, tmp_path, capsys
         assert sheet.width > 900
     low, high = scores["swap"]["ratio_95"]
     assert low < scores["swap"]["ratio"] < high and "resampled" not in scores["swap"]
-    assert "5 results computed, 0 found" in shown.err
+    assert "6 results computed, 0 found" in shown.err
     assert main([str(word) for word in [*words, "--json", "-"]]) == 0
     again = capsys.readouterr()
-    assert json.loads(again.out) == told and "0 results computed, 5 found" in again.err
+    assert json.loads(again.out) == told and "0 results computed, 6 found" in again.err
 
 
 def test_bad_words(model, rendered, tmp_path, capsys):

@@ -55,7 +55,7 @@ def test_from_a_run_to_features_and_scores(run, faces, tmp_path, capsys, refused
         numbers,
     ]
     text, typeset, page = (tmp_path / f"scores.{form}" for form in ("md", "tex", "html"))
-    words += ["--markdown", text, "--latex", typeset, "--html", page]
+    words += ["--markdown", text, "--latex", typeset, "--html", page, "--cache", tmp_path / "cache"]
     assert main([str(word) for word in words]) == 0
     shown = capsys.readouterr()
     assert (
@@ -76,8 +76,12 @@ def test_from_a_run_to_features_and_scores(run, faces, tmp_path, capsys, refused
     table = tmp_path / "t.parquet"
     assert main(["embed", "-m", str(out), "-d", str(faces), "--part", "test", "--out", str(table)]) == 0
     assert FeatureTable.read(table).factors["geometry"].shape == (8, 256)
-    assert main(["finetune", "-d", str(faces), "--out", str(out), "--resume"]) == 0
-    assert "16 pictures in" in capsys.readouterr().err
+    again = ["finetune", "-d", faces, "--out", out, "--resume", "--cache", tmp_path / "cache"]
+    capsys.readouterr()
+    assert main([str(word) for word in [*again, "--json", "-"]]) == 0
+    shown = capsys.readouterr()
+    assert "16 pictures in" in shown.err and "0 results computed, 9 found" in shown.err
+    assert json.loads(shown.out)["scores"] == told
     assert "leave out --weight" in refused("finetune", "-d", faces, "--out", out, "--resume", "--weight", 3)
     assert "go on with derender finetune --resume" in refused("train", "-d", faces, "--out", out, "--resume")
     assert "go on with derender train --resume" in refused("finetune", "-d", faces, "--out", run, "--resume")
@@ -85,7 +89,8 @@ def test_from_a_run_to_features_and_scores(run, faces, tmp_path, capsys, refused
 
 def test_from_fresh_weights_by_labels_alone(faces, tmp_path, capsys):
     words = ["finetune", "--preset", "small", "-d", faces, "--label", "expression", "--out", tmp_path / "run"]
-    words += ["--rendering-weight", 0, "--factors", "albedo,light", *settings(*TINY, *STEPS)]
+    words += ["--rendering-weight", 0, "--factors", "albedo,light", "--cache", "none"]
+    words += settings(*TINY, *STEPS)
     assert main([str(word) for word in words]) == 0
     assert "frozen features of fresh weights" in " ".join(capsys.readouterr().out.split())
     assert main([*map(str, words), "--dry-run", "--json", "-"]) == 0

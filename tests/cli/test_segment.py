@@ -83,7 +83,7 @@ def test_the_papers_table_beside_the_papers_numbers(parts, tmp_path, capsys, ref
         "subset: 13 + 3 pictures at 32 x 32, 19 classes"
     )
     names = ["joint encoders", "geometry encoder", "albedo encoder", "joint encoders, frozen", "random start"]
-    names += ["each place's class", "pixel colour", "most frequent class"]
+    names += ["each place's class", "pixel colour", "PCA", "most frequent class"]
     assert list(ours["rows"]) == names and len(ours["paper"]) == 5
     first = text.read_text().split("\n\n")[1]
     assert [line.split(" | ")[0] for line in first.splitlines()[2:]] == [

@@ -47,6 +47,14 @@ def test_link_loops_end_and_linked_folders_are_read_once(tree):
         assert source.files == ("a/1.png", "b/2.png")
 
 
+def test_hard_links_are_files_of_their_own(tree):
+    folder = tree(["a/1.png"])
+    os.link(folder / "a" / "1.png", folder / "a" / "2.png")
+    with open_source(folder) as source:
+        assert source.files == ("a/1.png", "a/2.png")
+        assert source.read("a/1.png") == source.read("a/2.png")
+
+
 def test_linked_folder_outside_is_read(tree):
     outside = tree(["1.png"], name="outside")
     folder = tree(["2.png"])
@@ -172,6 +180,17 @@ def test_other_files_are_refused(tmp_path):
     (tmp_path / "faces.tar").write_bytes(b"x" * 2000)
     with pytest.raises(ValueError, match=r"faces\.tar is no folder, zip or picture .* unpack"):
         open_source(tmp_path / "faces.tar")
+
+
+def test_a_zip_by_another_name_and_a_pipe(tree, tmp_path):
+    path = tree(["1.png"], zipped=True).rename(tmp_path / "comic.cbz")
+    with open_source(path) as source:
+        assert source.files == ("1.png",)
+    path.write_bytes(path.read_bytes()[:-1])
+    os.mkfifo(tmp_path / "pipe.zip")
+    for other in (path, tmp_path / "pipe.zip"):
+        with pytest.raises(ValueError, match="is no folder, zip or picture"):
+            open_source(other)
 
 
 def test_text_must_be_utf8(tree):

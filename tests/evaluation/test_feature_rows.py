@@ -62,6 +62,10 @@ def test_classes_are_chosen_by_size():
             [row("a", table(settings={"width": 4}), table(settings={"width": 8}))],
             "row 'a' mixes features of different models .* give each model its own name",
         ),
+        (
+            [row("a", table(model="SimCLR"), table(model="VQVAE"))],
+            "row 'a' mixes features of different models .another kind",
+        ),
     ],
 )
 def test_tables_that_do_not_fit_are_refused(rows, message):

@@ -49,6 +49,19 @@ def test_renderings_of_one_picture_differ_by_one_in_every_kept_direction():
     assert torch.linalg.matrix_rank(found.map, rtol=1e-4) == 5
 
 
+def test_at_evenness_one_pictures_differ_alike_in_every_kept_direction():
+    codes, _, _ = planted()
+    readings = codes.double()
+    for evenness in (0.0, 0.5, 1.0):
+        found = contrast(Spread.of(codes), 5, 0.0, evenness=evenness)
+        features = (readings - found.mean) @ found.map.double()
+        within = (features - features.mean(dim=0)).flatten(0, 1)
+        total = within.T @ within / (PICTURES * (VIEWS - 1)) + torch.cov(features.mean(0).T, correction=0)
+        variances = torch.linalg.eigvalsh(total)[-5:].numpy()
+        expected = (1 + found.ratios.double()) ** (1 - evenness) * 2**evenness
+        assert variances == pytest.approx(expected.sort().values.numpy(), rel=1e-3)
+
+
 def test_an_affine_change_of_the_codes_changes_no_distance():
     codes, _, _ = planted()
     change = torch.randn(SIZE, SIZE, generator=torch.Generator().manual_seed(3)).double()

@@ -219,19 +219,32 @@ def aligned(pictures: "PictureSet", files: Sequence[str]) -> "PictureSet":
 
 
 def chosen_labels(
-    rows: "Sequence[FeatureRow]", label: Sequence[str] | None, attributes: bool
+    rows: "Sequence[FeatureRow]", label: Sequence[str] | None, attributes: bool, least: int = 1
 ) -> tuple[str, ...]:
-    """Label columns by name, or every yes/no column."""
-    from derender.evaluation.tables import attribute_columns
-
+    """Label columns by name, or every yes/no column that has ``least`` rows of either answer."""
     table = rows[0].tables[0]
     if bool(label) == attributes:
         raise ValueError("give either --label NAME (may be repeated) or --attributes")
-    names = attribute_columns(table) if attributes else tuple(dict.fromkeys(label or ()))
-    if not names:
-        raise ValueError(f"there is no yes/no label; there is {', '.join(table.labels) or 'no label'}")
+    if attributes:
+        return asked_attributes(table, least)
+    names = tuple(dict.fromkeys(label or ()))
     for name in names:
         table.label(name)
+    return names
+
+
+def asked_attributes(table: "FeatureTable", least: int = 1) -> tuple[str, ...]:
+    """Every yes/no column that has ``least`` rows of either answer; says which have not."""
+    from derender.evaluation.tables import attribute_columns
+
+    there, names = attribute_columns(table), attribute_columns(table, least)
+    if not there:
+        raise ValueError(f"there is no yes/no label; there is {', '.join(table.labels) or 'no label'}")
+    rows = "no row" if least == 1 else f"fewer than {least} rows"
+    if not names:
+        raise ValueError(f"every yes/no label has {rows} of one of its answers: give more pictures")
+    if left := [name for name in there if name not in names]:
+        say(f"left out, with {rows} of one of their answers: {', '.join(left)}")
     return names
 
 

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from derender.cli import options, scoring
+from derender.cli import feature_rows, options, scoring
 from derender.cli.console import bar, duration, result, say, say_pictures, write_json
 from derender.cli.gathered import gathered
 
@@ -69,6 +69,7 @@ def finetune(
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the run in --out.")] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Show all settings and stop.")] = False,
     device: options.Device = "auto",
+    cache: feature_rows.Cache = None,
 ) -> None:
     """Train the encoders with a head on labels and with the rendering objective at once, then score them.
 
@@ -152,8 +153,9 @@ def finetune(
     say(f"{trained.images:,} pictures in {duration(trained.seconds)}; stopped by: {trained.stopped}")
     if not (out / "model").is_dir():
         raise ValueError(f"{out} kept no model: training collapsed before the first held-out score")
+    memory = feature_rows.memory_in(cache)
     with bar("scoring", "heads") as report:
-        found = score_finetuned(load_finetuned(out, device=accelerator), task, progress=report)
+        found = score_finetuned(load_finetuned(out, device=accelerator), task, memory=memory, progress=report)
     table = finetuning_table(found, config.start or "fresh weights")
     notes = [
         f"{name.replace('_', ' ')}: {one.value:+.3f} ({one.low:+.3f} to {one.high:+.3f}) "
@@ -162,7 +164,8 @@ def finetune(
     ]
     result(f"model {trained.folder}", published.json_file)
     result(f"report {page}", published.json_file)
-    published.show([table], {"run": trained, "report": page, "scores": found.numbers()}, notes)
+    values = {"run": trained, "report": page, "scores": found.numbers()}
+    published.show([table], values, [*notes, scoring.remembered(memory)])
 
 
 def _config(

@@ -21,13 +21,13 @@ def train(
         Path, typer.Option("--out", "-o", help="Run folder to make, or to go on with.", metavar="RUN")
     ],
     model: Annotated[
-        str,
+        str | None,
         typer.Option(
             "--model",
-            help="derender, or a baseline: vqvae, simclr, ae, beta-vae, resnet18, stylegan2, e4e, ris.",
+            help="Instead of derender: vqvae, simclr, ae, beta-vae, resnet18, stylegan2, e4e or ris.",
             metavar="NAME",
         ),
-    ] = "derender",
+    ] = None,
     preset: Annotated[
         str | None,
         typer.Option("--preset", help="faces, cars, cats, paper, or small for a CPU; default: faces."),
@@ -47,6 +47,12 @@ def train(
         str | None,
         typer.Option("--generator", help="Of e4e: the stylegan2 run, or its published .pt.", metavar="RUN"),
     ] = None,
+    config_file: Annotated[
+        Path | None,
+        typer.Option(
+            "--config", help="Settings in YAML, such as a run's; other options come after.", metavar="FILE"
+        ),
+    ] = None,
     overrides: Annotated[
         list[str] | None,
         typer.Option("--set", help="Change one setting; may be repeated.", metavar="KEY=VALUE"),
@@ -60,9 +66,20 @@ def train(
 ) -> None:
     """Learn to take pictures apart, from a folder of unlabelled pictures of one kind of thing."""
     from derender.settings import Settings
-    from derender.training.config import TrainConfig, resolve, to_yaml
+    from derender.training.config import TrainConfig, as_overrides, resolve, to_yaml
 
     overrides = [*(overrides or ()), *([] if generator is None else [f"generator={generator}"])]
+    if config_file is not None:
+        from derender.training.run_folder import read_settings
+
+        told = read_settings(config_file)
+        trains, base = str(told.pop("baseline", "derender")), told.pop("preset", None)
+        for option, given, found in (("--model", model, trains), ("--preset", preset, base)):
+            if None not in (given, found) and given != found:
+                raise ValueError(f"{config_file} is for {found}, not for {given}: leave out {option}")
+        model, preset = trains, preset if base is None else str(base)
+        overrides = [*as_overrides(told), *overrides]
+    model = model or "derender"
     settings_given = preset is not None or loocc is not None or start_from is not None or bool(overrides)
 
     def configuration() -> Settings:

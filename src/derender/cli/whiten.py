@@ -25,8 +25,8 @@ def whiten(
         list[str] | None,
         typer.Option(
             "--set",
-            help="pictures, views, spatial, mirrored, directions, shrinkage; what is perturbed, as "
-            "perturb.light_deg.",
+            help="pictures, views, spatial, mirrored, directions, shrinkage, evenness; what is perturbed, "
+            "as perturb.light_deg.",
             metavar="KEY=VALUE",
         ),
     ] = None,

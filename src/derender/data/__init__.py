@@ -1,6 +1,8 @@
 """Pictures in: folders, zips and published data sets, decoded once into one array.
 
 source      files of a folder (listing: of a very large one, remembered), a zip, or one picture
+zip_directory, zip_member, zip_listing  a zip's members without an object for each, read at their places
+names       which names count; kept: what is remembered between starts
 stream/     what comes one after another: WebDataset shards, Hugging Face data sets
 layout      what a data set's layout is; registry lists them, one or a few in a file: celeba, celebamask,
             emotions, faces, tracks, cars, rendered, tables, folders

@@ -66,7 +66,8 @@ def _mask_names(source: Source, pictures: Sequence[str]) -> list[str]:
 
 def _pictures(source: Source, subset: str | None = None) -> tuple[str, ...]:
     for folder in _PICTURE_FOLDERS:
-        files = tuple(file for file in source.pictures if f"/{file}".rsplit("/", 2)[1] == folder)
+        likely = (file for file in source.pictures if f"{folder}/" in file)
+        files = tuple(file for file in likely if f"/{file}".rsplit("/", 2)[1] == folder)
         if files:
             inside = pictures_of(source, subset)
             return files if subset is None else tuple(sorted(set(files) & set(inside)))

@@ -36,8 +36,12 @@ _LFW_PARTS = {"peopleDevTrain.txt": "train", "peopleDevTest.txt": "test"}
 _LFW_HOME = "https://vis-www.cs.umass.edu/lfw/"
 
 
+def _name(file: str) -> str:
+    return file.rpartition("/")[2]
+
+
 def _share(files: tuple[str, ...], pattern: re.Pattern[str], whole_path: bool) -> float:
-    matched = sum(1 for file in files if pattern.match(file if whole_path else PurePosixPath(file).name))
+    matched = sum(1 for file in files if pattern.match(file if whole_path else _name(file)))
     return matched / len(files) if files else 0.0
 
 
@@ -50,7 +54,7 @@ def _read_utkface(source: Source, subset: str | None) -> Table:
     files = pictures_of(source, subset)
     ages, genders, races = [], [], []
     for file in files:
-        found = _UTK_NAME.match(PurePosixPath(file).name)
+        found = _UTK_NAME.match(_name(file))
         age = float(found["age"]) if found else np.nan
         ages.append(age if age <= _UTK_OLDEST else np.nan)
         genders.append(_coded(found["gender"] if found else None, _UTK_GENDERS))
@@ -88,7 +92,7 @@ def _read_lfw(source: Source, subset: str | None) -> Table:
     emotions = source.named("emotions.csv")
     if emotions is not None:
         by_name = {row["file"]: row["emotion"] for row in read_csv(source, emotions, ("file", "emotion"))}
-        labels["emotion"] = text_column(by_name.get(PurePosixPath(file).name, "") for file in files)
+        labels["emotion"] = text_column(by_name.get(_name(file), "") for file in files)
     if partition is None:
         return Table(files, labels)
     table = Table(files, labels, text_column(partition.get(person, "") for person in people))

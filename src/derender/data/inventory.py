@@ -49,6 +49,7 @@ def take_inventory(source: str | Path, *, dataset: str = "auto", subset: str | N
         table = layout.read(opened, subset)
         if not table.files:
             raise ValueError(_nothing_found(opened))
+        opened.remember()
     except BaseException:
         opened.close()
         raise

@@ -7,15 +7,9 @@ over in place, under their old names, therefore go unnoticed; below ``REMEMBERED
 remembered and every file is looked at. Listings lie in the cache folder; deleting one there does no harm.
 """
 
-import hashlib
-import io
-import json
 import os
 import stat
-import struct
 import time
-import zipfile
-import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,17 +17,12 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Int64
 
-import derender
-from derender.whole import whole_file
+from derender.data.kept import Kept, keep, read_kept
 
 REMEMBERED_FROM = 50_000
 """Folders with this many files or more are remembered."""
 
 SAMPLED = 1_000
-_DAMAGED = (
-    *(OSError, ValueError, LookupError, TypeError, AttributeError, EOFError, RuntimeError),
-    *(zipfile.BadZipFile, zlib.error, struct.error),
-)
 _SETTLED_NS = 2_000_000_000  # what changed a moment ago may change again within one tick of the disk's clock
 
 
@@ -50,6 +39,10 @@ class Listing:
     files: tuple[str, ...]
     faults: tuple[tuple[str, str], ...]
     folders: tuple[tuple[str, int], ...]
+
+    def in_order(self, key: Callable[[str], str]) -> "Listing":
+        """The same with the files sorted by what ``key`` makes of them."""
+        return Listing(tuple(sorted(self.files, key=key)), self.faults, self.folders)
 
 
 @dataclass(frozen=True)
@@ -120,62 +113,35 @@ def stamps_of(root: str, files: tuple[str, ...]) -> Int64[np.ndarray, "n 2"]:
     return stamps
 
 
-def listing_file(cache: Path, root: Path) -> Path:
-    """Where the listing of a folder is kept."""
-    key = hashlib.sha256(str(root.resolve()).encode("utf-8", "surrogateescape")).hexdigest()
-    return cache / f"{root.resolve().name[:40]}-{key[:16]}.listing"
-
-
 def remember(file: Path, listing: Listing, stamps: Int64[np.ndarray, "n 2"], layout: str) -> None:
-    """Keep a listing. What is not kept is only slower next time, so a full or missing disk is no error."""
-    note = json.dumps(
-        {
-            "version": derender.__version__,
-            "made_ns": time.time_ns(),
-            "folders": listing.folders,
-            "faults": listing.faults,
-            "layout": layout,
-        }
-    ).encode()
-    names = "\0".join(listing.files).encode("utf-8", "surrogateescape")
-    try:
-        with whole_file(file) as temporary, temporary.open("wb") as stream:
-            np.savez(
-                stream,
-                note=np.frombuffer(note, np.uint8),
-                names=np.frombuffer(names, np.uint8),
-                stamps=stamps,
-            )
-    except OSError:
-        return
+    """Keep a listing; that nothing can be kept is no error."""
+    note = {
+        "made_ns": time.time_ns(),
+        "folders": listing.folders,
+        "faults": listing.faults,
+        "layout": layout,
+    }
+    keep(file, Kept(listing.files, stamps, note))
 
 
 def recall(file: Path, root: str, is_picture: Callable[[str], bool]) -> Remembered | None:
     """The listing that is kept, if the folder still is as it says, else None."""
-    try:
-        content = np.load(io.BytesIO(file.read_bytes()), allow_pickle=False)
-        note = json.loads(content["note"].tobytes())
-        names = content["names"].tobytes().decode("utf-8", "surrogateescape")
-        stamps = content["stamps"]
-        if note["version"] != derender.__version__:
-            return None
-        listing = Listing(
-            tuple(names.split("\0")),
-            tuple((path, why) for path, why in note["faults"]),
-            tuple((path, changed) for path, changed in note["folders"]),
-        )
-    except _DAMAGED:
+    kept = read_kept(file)
+    if kept is None or "folders" not in kept.note:
         return None
+    files, stamps, note = kept.names, kept.array, kept.note
+    listing = Listing(
+        files,
+        tuple((path, why) for path, why in note["faults"]),
+        tuple((path, changed) for path, changed in note["folders"]),
+    )
     settled = note["made_ns"] - _SETTLED_NS
     for path, changed in listing.folders:
         if changed > settled or _stamp(f"{root}/{path}")[1] != changed:
             return None
-    files = listing.files
     checked = {row for row, path in enumerate(files) if not is_picture(path)}
     checked |= set(np.linspace(0, len(files) - 1, SAMPLED).astype(int).tolist())
-    if len(stamps) != len(files) or any(
-        _stamp(f"{root}/{files[row]}") != tuple(stamps[row]) for row in checked
-    ):
+    if any(_stamp(f"{root}/{files[row]}") != tuple(stamps[row].tolist()) for row in checked):
         return None
     return Remembered(listing, stamps, note["layout"])
 

@@ -31,11 +31,9 @@ _IMAGE, _DEPTH = "image", "depth"
 
 def pairs_of(source: Source) -> dict[str, str]:
     """Picture to depth map, for every picture in a folder ``image`` with a map in the folder beside it."""
-    known, found = set(source.files), {}
-    for file in source.pictures:
-        path = PurePosixPath(file)
-        if path.parent.name != _IMAGE:
-            continue
+    pictured = _pictured(source)
+    known, found = set(source.files) if pictured else set(), {}
+    for path, file in pictured:
         folder = path.parent.parent / _DEPTH
         for stem in (path.stem.replace(_IMAGE, _DEPTH), path.stem):
             name = str(folder / f"{stem}.png")
@@ -43,6 +41,12 @@ def pairs_of(source: Source) -> dict[str, str]:
                 found[file] = name
                 break
     return found
+
+
+def _pictured(source: Source) -> list[tuple[PurePosixPath, str]]:
+    """The pictures in folders ``image``."""
+    likely = ((PurePosixPath(file), file) for file in source.pictures if f"{_IMAGE}/" in file)
+    return [(path, file) for path, file in likely if path.parent.name == _IMAGE]
 
 
 def subset_of(file: str) -> str:
@@ -102,7 +106,7 @@ def _shrunk(
 
 def _is_paired(source: Source) -> bool:
     """Every picture in a folder ``image`` has its depth map, and there is at least one."""
-    pictured = [file for file in source.pictures if PurePosixPath(file).parent.name == _IMAGE]
+    pictured = _pictured(source)
     return bool(pictured) and len(pairs_of(source)) == len(pictured)
 
 

@@ -53,9 +53,9 @@ _TRACK = re.compile(r"(?:.*/)?tracks/(?P<identity>[^/]+)/(?P<track>[^/]+)/(?P<fr
 
 def subsets_of(source: Source) -> dict[str, str]:
     """Folder of each params.csv that has an images folder beside it, by the folder's name ("" at the top)."""
-    tables = [PurePosixPath(file) for file in source.files if f"/{file}".endswith("/params.csv")]
-    if not tables:
+    if source.named("params.csv") is None:
         return {}
+    tables = [PurePosixPath(file) for file in source.files if f"/{file}".endswith("/params.csv")]
     pictured = {
         PurePosixPath(file).parent.parent for file in source.files if f"/{file}".rsplit("/", 2)[1] == "images"
     }

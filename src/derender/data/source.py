@@ -9,44 +9,33 @@ archives are not opened.
 
 import lzma
 import stat
-import struct
-import zipfile
 import zlib
 from abc import ABC, abstractmethod
 from bisect import bisect_left
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from threading import Lock
 
 import numpy as np
+from jaxtyping import Int64
 
 from derender.data import listing
-from derender.data.listing import list_files, listing_file, recall, remember, stamps_of
+from derender.data.kept import kept_file
+from derender.data.listing import list_files, recall, remember, stamps_of
+from derender.data.names import SUFFIXES, is_hidden, is_picture, printable
 from derender.data.nearest import nearest
 from derender.data.places import cache_folder
-
-SUFFIXES = (
-    *(".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".webp", ".avif", ".bmp", ".gif"),
-    *(".tif", ".tiff", ".ppm", ".pgm", ".pnm"),
-)
-"""File names that end in one of these are taken for pictures."""
+from derender.data.zip_directory import is_zip, read_directory
+from derender.data.zip_listing import digest_of, list_zip, recall_zip, remember_zip
+from derender.data.zip_member import Member, read_member
 
 FILE_LIMIT_BYTES = 512 << 20
 """No single file larger than this is read: a bound on memory, and on what a zip bomb can unpack to."""
 
-# What the zip reader raises on damaged archives (found by feeding it such). NotImplementedError, for
-# a way of packing that Python does not know, is a RuntimeError; names that are not text give a ValueError.
-_ZIP_ERRORS = (
-    zipfile.BadZipFile,
-    OSError,
-    RuntimeError,
-    ValueError,
-    EOFError,
-    OverflowError,
-    struct.error,
-    zlib.error,
-    lzma.LZMAError,
-)
+# What unpacking raises on damaged members (found by feeding it such).
+_UNPACKING_ERRORS = (OSError, ValueError, EOFError, zlib.error, lzma.LZMAError)
 
 
 @dataclass(frozen=True)
@@ -80,6 +69,13 @@ class Source(ABC):
     def stamp(self, file: str) -> tuple[int, int]:
         """Two numbers that change when the file's content does: size, and checksum or time of change."""
 
+    def stamps(self, files: Sequence[str]) -> Int64[np.ndarray, "n 2"]:
+        """The stamps of many files, a row for each."""
+        return np.array([self.stamp(file) for file in files], np.int64).reshape(-1, 2)
+
+    def remember(self) -> None:  # noqa: B027  (most forget)
+        """Keep in the cache folder what makes the next start of a very large source fast."""
+
     @cached_property
     def pictures(self) -> tuple[str, ...]:
         """The files with a picture's suffix."""
@@ -104,14 +100,22 @@ class Source(ABC):
             ) from problem
 
     def named(self, name: str) -> str | None:
-        """The first file with this base name, shallowest first, or None."""
+        """The first file that is no picture with this base name, shallowest first, or None."""
         return self._by_name.get(name)
 
     @cached_property
     def _by_name(self) -> dict[str, str]:
-        """The first file of each base name, shallowest first."""
-        deepest_first = sorted(self.files, key=lambda file: (file.count("/"), file), reverse=True)
+        """The first file of each base name, shallowest first; without pictures, which may be millions."""
+        others = [file for file in self.files if not is_picture(file)]
+        deepest_first = sorted(others, key=lambda file: (file.count("/"), file), reverse=True)
         return {file.rpartition("/")[2]: file for file in deepest_first}
+
+    def _rows_of(self, files: Sequence[str]) -> list[int] | slice:
+        """The places of files in ``self.files``."""
+        if files == self.files:
+            return slice(None)
+        row_of = {file: row for row, file in enumerate(self.files)}
+        return [row_of[file] for file in files]
 
 
 class FolderSource(Source):
@@ -119,15 +123,14 @@ class FolderSource(Source):
 
     def __init__(self, folder: Path):
         self.path = folder
-        self._kept = listing_file(cache_folder(), folder)
+        self._kept = kept_file(cache_folder(), folder, "listing")
         self._stamps: np.ndarray | None = None
         known = recall(self._kept, str(folder), is_picture)
         if known is None:
-            found = list_files(str(folder), is_hidden)
-            self._listing = replace(found, files=tuple(sorted(found.files, key=printable)))
+            self._listing = list_files(str(folder), is_hidden).in_order(printable)
         else:
             self._listing, self._stamps, self.recognised = known.listing, known.stamps, known.layout
-        self.files = tuple(printable(file) for file in self._listing.files)
+        self.files = tuple(map(printable, self._listing.files))
         self._real = {
             name: file for name, file in zip(self.files, self._listing.files, strict=True) if name is not file
         }
@@ -138,67 +141,79 @@ class FolderSource(Source):
         return read_bounded(self.path / self._real.get(file, file))
 
     def stamp(self, file: str) -> tuple[int, int]:
+        stamps = self._known_stamps()
+        if stamps is None:
+            status = (self.path / self._real.get(file, file)).stat()
+            return status.st_size, status.st_mtime_ns
+        size, changed = stamps[bisect_left(self.files, file)].tolist()
+        return size, changed
+
+    def stamps(self, files: Sequence[str]) -> Int64[np.ndarray, "n 2"]:
+        stamps = self._known_stamps()
+        return super().stamps(files) if stamps is None else stamps[self._rows_of(files)]
+
+    def _known_stamps(self) -> np.ndarray | None:
+        """The stamps of all files of a very large folder, asked for once and remembered."""
         if self._stamps is None and len(self.files) >= listing.REMEMBERED_FROM:
             self._stamps = stamps_of(str(self.path), self._listing.files)
             remember(self._kept, self._listing, self._stamps, self.recognised)
-        if self._stamps is None:
-            status = (self.path / self._real.get(file, file)).stat()
-            return status.st_size, status.st_mtime_ns
-        size, changed = self._stamps[bisect_left(self.files, file)].tolist()
-        return size, changed
+        return self._stamps
 
 
 class ZipSource(Source):
-    """The members of a zip archive, read in place."""
+    """The members of a zip archive, read in place; the list of a very large one is remembered."""
 
     def __init__(self, path: Path):
         self.path = path
+        self._lock = Lock()
         self._stream = path.open("rb")
         try:
-            self._archive = zipfile.ZipFile(self._stream)
-        except _ZIP_ERRORS as problem:
+            directory = read_directory(self._stream)
+            self._digest = digest_of(directory)
+            self._kept = kept_file(cache_folder(), path, "listing")
+            known = recall_zip(self._kept, self._digest)
+            self._listing = list_zip(directory) if known is None else known.listing
+        except (OSError, ValueError) as problem:
             self._stream.close()
             raise ValueError(
                 f"{path} is damaged or not a whole zip file ({problem}); download or copy it again"
             ) from problem
-        self._members: dict[str, zipfile.ZipInfo] = {}
-        skipped: list[Skipped] = []
-        for member in self._archive.infolist():
-            file = member.filename.replace("\\", "/")
-            if _ordinary(file) and not member.flag_bits & 1:
-                if not file.endswith("/"):
-                    self._members[printable(file)] = member
-                continue
-            parts = file.split("/")
-            hidden = any(is_hidden(part) for part in parts if part not in ("", ".", ".."))
-            if hidden or not file or member.is_dir():
-                continue
-            if file.startswith("/") or ".." in parts or ":" in parts[0]:
-                skipped.append(Skipped(file, "unsafe name in the zip (absolute or with ..)"))
-            elif member.flag_bits & 1:
-                skipped.append(Skipped(file, "encrypted in the zip"))
-            else:
-                self._members[printable(file)] = member
-        self.files = tuple(sorted(self._members))
-        self.skipped = tuple(sorted(skipped, key=lambda row: row.file))
+        self._remembered = None if known is None else known.layout
+        self.recognised = self._remembered or ""
+        self.files = self._listing.files
+        self.skipped = tuple(Skipped(file, reason) for file, reason in self._listing.faults)
 
     def read(self, file: str) -> bytes:
-        member = self._members[file]
-        if member.file_size > FILE_LIMIT_BYTES:
+        member = Member(*self._listing.members[self._row(file)].item())
+        if member.size > FILE_LIMIT_BYTES:
             raise ValueError(
-                f"unpacks to {member.file_size >> 20:,} MiB, more than {FILE_LIMIT_BYTES >> 20:,} MiB"
+                f"unpacks to {member.size >> 20:,} MiB, more than {FILE_LIMIT_BYTES >> 20:,} MiB"
             )
         try:
-            return self._archive.read(member)
-        except _ZIP_ERRORS as problem:
+            return read_member(self._stream, self._lock, member, file)
+        except _UNPACKING_ERRORS as problem:
             raise ValueError(f"cannot be unpacked: {problem}") from problem
 
     def stamp(self, file: str) -> tuple[int, int]:
-        member = self._members[file]
-        return member.file_size, member.CRC
+        member = self._listing.members[self._row(file)]
+        return int(member["size"]), int(member["crc"])
+
+    def stamps(self, files: Sequence[str]) -> Int64[np.ndarray, "n 2"]:
+        members = self._listing.members[self._rows_of(files)]
+        return np.stack([members["size"], members["crc"].astype(np.int64)], axis=1)
+
+    def remember(self) -> None:
+        if len(self.files) >= listing.REMEMBERED_FROM and self._remembered != self.recognised:
+            remember_zip(self._kept, self._digest, self._listing, self.recognised)
+            self._remembered = self.recognised
+
+    def _row(self, file: str) -> int:
+        row = bisect_left(self.files, file)
+        if row == len(self.files) or self.files[row] != file:
+            raise ValueError(f"{file} is not in {self.path}")
+        return row
 
     def close(self) -> None:
-        self._archive.close()
         self._stream.close()
 
 
@@ -225,17 +240,11 @@ def open_source(path: Path) -> Source:
         return FolderSource(path)
     if path.suffix.lower() in SUFFIXES:
         return FileSource(path)
-    if zipfile.is_zipfile(path) or path.suffix.lower() == ".zip":
+    if path.is_file() and (path.suffix.lower() == ".zip" or is_zip(path)):
         return ZipSource(path)
     raise ValueError(
         f"{path} is no folder, zip or picture ({' '.join(SUFFIXES)}); unpack other archives into a folder"
     )
-
-
-def is_picture(file: str) -> bool:
-    """Whether the name has a picture's suffix."""
-    stem, dot, suffix = file.rpartition("/")[2].rpartition(".")
-    return bool(stem) and f"{dot}{suffix}".lower() in SUFFIXES
 
 
 def read_bounded(path: Path) -> bytes:
@@ -251,26 +260,6 @@ def read_bounded(path: Path) -> bytes:
     if len(content) > size:
         raise ValueError("the file grew while it was read")
     return content
-
-
-def _ordinary(file: str) -> bool:
-    """Whether a zip's name is plainly neither hidden nor unsafe; most are, and a zip may have a million."""
-    odd = not file or file.startswith((".", "/")) or "/." in file or ":" in file or "__MACOSX" in file
-    return not odd
-
-
-def is_hidden(name: str) -> bool:
-    return name.startswith(".") or name == "__MACOSX"
-
-
-def printable(name: str) -> str:
-    """The name with bytes that are not UTF-8 as backslash escapes, so that it can be stored anywhere."""
-    return name if name.isascii() else _escaped(name)
-
-
-def _escaped(name: str) -> str:
-    escaped = name.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
-    return name if escaped == name else escaped
 
 
 def nearest_sibling(path: Path) -> str:

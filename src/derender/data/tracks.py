@@ -30,9 +30,13 @@ def _is_tracks(source: Source) -> bool:
     """A list of tracks, or numbered frames in numbered tracks throughout, of two people or more."""
     if _lists(source):
         return bool(source.pictures)
-    found = [_NUMBERED.fullmatch(file) for file in source.pictures]
-    people = {match["identity"] for match in found if match} - PARTITION_NAMES.keys()
-    return all(found) and len(people) > 1
+    people: set[str] = set()
+    for file in source.pictures:
+        match = _NUMBERED.fullmatch(file)
+        if match is None:
+            return False
+        people.add(match["identity"])
+    return len(people - PARTITION_NAMES.keys()) > 1
 
 
 def _lists(source: Source) -> dict[str, str]:

@@ -142,10 +142,11 @@ def _check_same_model(name: str, first: FeatureTable, other: FeatureTable) -> No
     sizes = [
         {factor: values.shape[1] for factor, values in table.factors.items()} for table in (first, other)
     ]
-    settings = [table.origin.get("settings") for table in (first, other)]
-    controls = [table.origin.get("control") for table in (first, other)]
-    if sizes[0] != sizes[1] or settings[0] != settings[1] or controls[0] != controls[1]:
+    made_by = [
+        [table.origin.get(name) for name in ("model", "settings", "control")] for table in (first, other)
+    ]
+    if sizes[0] != sizes[1] or made_by[0] != made_by[1]:
         raise ValueError(
-            f"row {name!r} mixes features of different models (other factors, sizes or settings): several "
-            "tables of one name are runs of the same model; give each model its own name"
+            f"row {name!r} mixes features of different models (another kind, factors, sizes or settings): "
+            "several tables of one name are runs of the same model; give each model its own name"
         )

@@ -95,7 +95,7 @@ def choose_rows(
         seeds: each draws its own training rows.
         test_fraction: share of the rows that is tested.
         partition: the owners' split; where it has "test" rows, these are tested and no others.
-        groups: (N,) labels that must not lie on both sides, such as identities.
+        groups: (N,) labels that must not lie on both sides, such as identities; rows without one stand alone.
     """
     pool, test = divide_rows(task, files, test_fraction=test_fraction, partition=partition, groups=groups)
     if not len(seeds):
@@ -152,6 +152,6 @@ def _column(values: np.ndarray, name: str) -> tuple[list[Any], np.ndarray]:
     if (numbers == rarest).sum() < 2:
         raise ValueError(
             f"class {distinct[rarest]!r} of label {name!r} has one row, which cannot be both learned and "
-            "tested: leave it out (--min-count 2)"
+            "tested: leave this class out (where there is --min-count, give 2), or choose another label"
         )
     return distinct, numbers

@@ -49,7 +49,7 @@ def nearest_rows(points: np.ndarray, metric: Metric = "cosine") -> tuple[np.ndar
     """For each of (N, D) rows the nearest other row, (N,) integers, and the distance to it, (N,).
 
     Cosine distance is 1 - cosine, 0..2. Euclidean distance is not squared. Above ``EXACT_ROWS`` rows some
-    are not the nearest: docs/evaluation.md says how many.
+    are not the nearest: docs/scale.md says how many.
     """
     points = prepared(points, metric)
     if len(points) > EXACT_ROWS:

@@ -100,9 +100,13 @@ class TableSpec:
     parts: tuple[Part, ...] = field(default=())
 
 
-def attribute_columns(table: FeatureTable) -> tuple[str, ...]:
-    """Yes/no label columns (int8 with 1, 0 and -1 for unknown)."""
-    return tuple(name for name, values in table.labels.items() if np.asarray(values).dtype == np.int8)
+def attribute_columns(table: FeatureTable, least: int = 0) -> tuple[str, ...]:
+    """Yes/no label columns (int8 with 1, 0 and -1 for unknown) that have ``least`` rows of either answer."""
+    return tuple(
+        name
+        for name, values in table.labels.items()
+        if values.dtype == np.int8 and min((values == 0).sum(), (values == 1).sum()) >= least
+    )
 
 
 def table_named(name: str) -> TableSpec:

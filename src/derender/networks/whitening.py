@@ -2,9 +2,9 @@
 
 Linear discriminant analysis without labels: the classes are pictures, their members the same scene rendered
 in other light and from other sides. Directions in which the renderings of one picture differ are divided by
-how much they differ; of the result the directions in which pictures differ most are kept. Distances between
-features are then counted in units of what light and camera alone would do. Leaves out how the renderings are
-made (training/whitening.py).
+how much they differ; of the result the directions in which pictures differ most are kept, counted in units of
+what light and camera alone would do, and made more even: a few directions must not drown the others. Leaves
+out how the renderings are made (training/whitening.py).
 """
 
 from collections.abc import Mapping
@@ -81,8 +81,14 @@ class Spread:
         return self._centres / self.count - torch.outer(self.mean, self.mean)
 
 
-def contrast(spread: Spread, directions: int, shrinkage: float, size: int | None = None) -> Contrast:
-    """The map that makes the mean variance within pictures 1 in every kept direction.
+def contrast(
+    spread: Spread,
+    directions: int,
+    shrinkage: float,
+    size: int | None = None,
+    evenness: float = 0.0,
+) -> Contrast:
+    """The map that makes the mean variance within pictures 1 in every kept direction, or evens out the whole.
 
     Features are turned so that each is as near as can be to the number of the code in its place, which
     changes no distance.
@@ -93,6 +99,8 @@ def contrast(spread: Spread, directions: int, shrinkage: float, size: int | None
         shrinkage: how much of the mean variance within is added to every direction's, so that a direction
             that hardly moved in these pictures is not taken for one that never moves.
         size: of the code, and of the features; by default that of the readings.
+        evenness: 0..1. At 0 a direction in which pictures differ more counts for more; at 1 all count alike:
+            like one in which pictures differ as much as the renderings of one of them do.
 
     Raises:
         ValueError: fewer than two views or pictures.
@@ -107,6 +115,7 @@ def contrast(spread: Spread, directions: int, shrinkage: float, size: int | None
     floor = within.diagonal().mean().clamp(min=torch.finfo(torch.float32).tiny)
     within = within + max(shrinkage, _NEVER_SINGULAR) * floor * torch.eye(width).to(within)
     ratios, kept = _most_told_apart(between, within, min(directions, size, width))
+    kept = kept * (2 / (1 + ratios)) ** (evenness / 2)  # 1 within and as much between are the 2
     left, _, right = torch.linalg.svd(kept.T @ (within + between)[:, :size], full_matrices=False)
     return Contrast(mean.float(), (kept @ left @ right).float(), ratios.float())
 

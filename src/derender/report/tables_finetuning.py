@@ -32,4 +32,6 @@ def finetuning_table(found: FinetuneScores, began: str) -> ScoreTable:
         f"{what}: {found.n_train:,} labelled pictures learned, {found.n_test:,} held out; "
         f"frozen features of {began}"
     )
+    if found.n_unlabelled:
+        caption += f"; {found.n_unlabelled:,} pictures without label never asked"
     return ScoreTable(caption, "trained on labels", columns, rows)

@@ -4,6 +4,7 @@ Source: the paper, Sec. 4 and its published settings; where the two differ (lear
 1e-4 with weight decay 5e-4 in the settings) the settings hold, because the larger rate collapses.
 """
 
+import json
 from collections.abc import Iterable, Mapping
 from reprlib import Repr
 from typing import Any, Literal, TypeVar, overload
@@ -56,6 +57,7 @@ class WhiteningSettings(Settings):
     mirrored: bool = True  # read the picture's mirror image beside it
     directions: int = Field(default=128, ge=1)  # of each factor that are kept, at most as many as its code
     shrinkage: float = Field(default=0.1, ge=0)  # share of the mean variance added to every direction's
+    evenness: float = Field(default=0.5, ge=0, le=1)  # 0: what tells pictures apart best counts most
 
 
 class FeatureSettings(Settings):
@@ -196,6 +198,11 @@ def to_yaml(config: Settings) -> str:
     return yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
 
 
+def as_overrides(tree: Mapping[str, Any]) -> list[str]:
+    """Plain values, nested or with dotted keys, as the ``key=value`` that ``with_changes`` takes."""
+    return [f"{key}={json.dumps(value)}" for key, value in _leaves(tree).items()]
+
+
 def setting_names(kind: type[Settings] = TrainConfig) -> list[str]:
     """Every setting by its dotted name."""
     return list(_leaves(kind().model_dump(mode="json")))
@@ -204,7 +211,8 @@ def setting_names(kind: type[Settings] = TrainConfig) -> list[str]:
 def _leaves(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     found: dict[str, Any] = {}
     for key, value in tree.items():
-        found |= _leaves(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
+        name = f"{prefix}{key}"
+        found |= _leaves(value, f"{name}.") if isinstance(value, dict) else {name: value}
     return found
 
 

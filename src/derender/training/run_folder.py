@@ -161,12 +161,29 @@ def read_config_tree(path: Path) -> dict[str, Any]:
         ValueError: it is damaged, or of a newer version.
     """
     file = path / "config.yaml"
+    return _settings_tree(file, f"{file} is damaged: restore it, or start a new run in another folder")
+
+
+def read_settings(file: Path) -> dict[str, Any]:
+    """Settings that somebody wrote down, or those of a run folder, as plain values.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it holds something else, or is of a newer version.
+    """
+    file = file / "config.yaml" if file.is_dir() else file
+    if not file.is_file():
+        raise FileNotFoundError(f"no settings in {file}: give a YAML file, such as a run's config.yaml")
+    return _settings_tree(file, f"{file} holds no settings: write YAML, one key: value a line")
+
+
+def _settings_tree(file: Path, otherwise: str) -> dict[str, Any]:
     try:
-        tree = yaml.safe_load(file.read_text())
+        tree = yaml.safe_load(file.read_text(encoding="utf-8"))
     except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise ValueError(f"{file} is damaged: restore it, or start a new run in another folder") from error
+        raise ValueError(otherwise) from error
     if not isinstance(tree, dict):
-        raise ValueError(f"{file} is damaged: restore it, or start a new run in another folder")
+        raise ValueError(otherwise)
     version = tree.pop("format", FORMAT)
     if not isinstance(version, int) or version > FORMAT:
         raise ValueError(

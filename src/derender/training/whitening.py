@@ -97,7 +97,7 @@ def fit_whitening(
         size = model.settings.network.code_size
     return Whitening(
         {
-            name: contrast(spread, settings.directions, settings.shrinkage, size)
+            name: contrast(spread, settings.directions, settings.shrinkage, size, settings.evenness)
             for name, spread in found.items()
         },
         mirrored=settings.mirrored,

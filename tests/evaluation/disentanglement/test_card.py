@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from derender.data import PictureSet
-from derender.evaluation.disentanglement import evaluate_disentanglement, random_pixels, shuffled_rows
+from derender.evaluation.disentanglement import dealt, evaluate_disentanglement, random_pixels, shuffled_rows
 from derender.model import Derenderer
 from derender.presets import MODEL_PRESETS
 
@@ -33,13 +33,15 @@ def test_the_card_holds_the_model_and_every_control_and_repeats_itself():
     card = evaluate_disentanglement(
         net, pictures, seeds=(0, 1), swap_pictures=8, progress=lambda done, total: steps.append((done, total))
     )
-    assert list(card.rows) == ["model", "untrained encoder", "shuffled rows", "random pixels"]
-    assert all(len(results) == 2 for results in card.rows.values()) and steps[-1] == (8, 8)
+    assert list(card.rows) == ["model", "untrained encoder", "shuffled rows", "random pixels", "PCA"]
+    assert all(len(results) == 2 for results in card.rows.values()) and steps[-1] == (10, 10)
     assert card.features == ("geometry", "albedo", "light", "camera") and card.dimensions == (16,) * 4
     assert card.correlations.shape == (64, 64) and card.n_pictures == 60
-    ours, untrained, shuffled, pixels = (results[0] for results in card.rows.values())
+    ours, untrained, shuffled, pixels, pca = (results[0] for results in card.rows.values())
     assert ours.swap is not None and ours.swap.n_pictures == 8 and untrained.swap is not None
-    assert shuffled.swap is None and pixels.swap is None
+    assert shuffled.swap is None and pixels.swap is None and pca.swap is None
+    assert pca.pearson.mean_per_dimension < 1e-5  # components do not correlate, and that says nothing:
+    assert pca.truth is not None and pca.truth.by_feature.informativeness > 0.8
     assert ours.truth is not None and ours.truth.by_dimension is not None and shuffled.truth is not None
     assert ours.truth.by_feature.informativeness > 0.8 > 0.2 > shuffled.truth.by_feature.informativeness
     assert ours.similarity.mean_cross_r2 > 0.5 > 0.1 > shuffled.similarity.mean_cross_r2
@@ -73,3 +75,7 @@ def test_controls_are_what_they_say():
     drawn = np.concatenate([blocks["a"][0], blocks["b"][0]]) * 255
     assert len(np.unique(drawn.round())) == 8 and drawn.max() < 12
     assert sum(values.shape[1] for values in random_pixels(images, {"a": 256, "b": 256}, 0).values()) == 12
+    components = np.arange(10.0).reshape(2, 5)
+    parts = dealt(components, ["a", "b"], 0)
+    assert [values.shape for values in parts.values()] == [(2, 3), (2, 2)]
+    assert sorted(np.concatenate([values[0] for values in parts.values()])) == [0, 1, 2, 3, 4]

@@ -9,6 +9,7 @@ from derender.evaluation.disentanglement import (
     dci,
     ground_truth_scores,
     importance,
+    left_out,
     mutual_information,
     true_factors,
 )
@@ -174,10 +175,20 @@ def test_labels_of_a_rendered_set_become_factors_and_others_do_not():
     assert found[2].targets().shape == (ROWS, 3) and (found[2].targets().sum(axis=1) == 1).all()
     assert found[2].select(found[2].values != 1).values.max() == 1
     assert true_factors({"identity": CLASSES.astype(str), "age": labels["age"]}) == []
+    assert left_out(labels) == {
+        "diffuse": "1 of 600 values are missing",
+        "shift x": "one value for all pictures",
+        "identity": "600 classes of 600 pictures",
+    }
+    assert left_out({**labels, "class": np.full(ROWS, "car")})["class"] == "one class only"
+    assert left_out({"identity": CLASSES.astype(str), "camera_tx": labels["camera_tx"]}) == {}
 
 
 def test_bad_input():
     with pytest.raises(ValueError, match="two features and two true factors, got 1 and 4"):
         ground_truth_scores({"light": NUMBERS}, FACTORS)
+    broken = {"light": np.where(NUMBERS > 0.99, np.nan, NUMBERS), "camera": NUMBERS}
+    with pytest.raises(ValueError, match=r"feature 'light': \d+ of 600 rows are not finite"):
+        ground_truth_scores(broken, FACTORS)
     with pytest.raises(ValueError, match="unknown method 'forest': choose lasso or trees"):
         importance(NUMBERS, FACTORS, "forest")

@@ -66,6 +66,9 @@ def test_dead_dimensions_and_constant_vectors_are_left_out_and_counted():
 
 
 def test_bad_input():
+    broken = {"a": np.ones((6, 2)), "b": np.full((6, 2), np.inf)}
+    with pytest.raises(ValueError, match="feature 'b': 6 of 6 rows are not finite"):
+        pearson(broken)
     blocks = features()
     with pytest.raises(ValueError, match="two features or more"):
         pearson({"a": blocks["light"]})

@@ -103,6 +103,9 @@ def test_cross_prediction_has_a_direction():
 
 
 def test_bad_input():
+    broken = {"a": np.ones((6, 2)), "b": np.full((6, 2), np.inf)}
+    with pytest.raises(ValueError, match="feature 'b': 6 of 6 rows are not finite"):
+        similarity(broken)
     with pytest.raises(ValueError, match="same 4 rows or more, got 9 and 8"):
         linear_cka(normal(9, 2), normal(8, 2), unbiased=True)
     with pytest.raises(ValueError, match="9 rows of features but 8 rows of targets"):

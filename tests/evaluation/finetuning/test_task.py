@@ -18,6 +18,7 @@ from derender.evaluation.finetuning import (
     target_of,
 )
 from derender.evaluation.finetuning.task import RENDERING_TERMS
+from derender.evaluation.memory import Memory
 from derender.report.run import run_page
 from derender.report.tables_finetuning import finetuning_table
 from derender.training.batches import random_stream
@@ -134,7 +135,16 @@ def test_it_learns_beside_the_controls_and_leaves_its_start_alone(pictures, tmp_
         one.build().model.nets["albedo"].decoder.last.weight, before["nets.albedo.decoder.last.weight"]
     )
     train_task(one, pictures, tmp_path / "run")
-    found = score_finetuned(load_finetuned(tmp_path / "run"), one, resample_count=50)
+    tuned, first, second = load_finetuned(tmp_path / "run"), Memory(tmp_path / "m"), Memory(tmp_path / "m")
+    found = score_finetuned(tuned, one, resample_count=50, memory=first)
+    again = score_finetuned(tuned, one, resample_count=50, memory=second)
+    assert str(again.numbers()) == str(found.numbers()) and found.n_unlabelled == 0
+    assert (second.made, second.recalled) == (0, first.made) and first.made == 9
+    targets = one.target.asked.targets.copy()
+    targets[one.target.split.train[:3]] = -1
+    fewer = replace(one, target=replace(one.target, asked=replace(one.target.asked, targets=targets)))
+    some = score_finetuned(tuned, fewer, resample_count=50, memory=second)
+    assert some.n_unlabelled == 3 and "3 pictures without label" in finetuning_table(some, "fresh").caption
     rows = {row.name: row.scores["balanced_accuracy"].value for row in found.rows}
     assert rows["fine-tuned"] > 0.9 and rows["majority"] == 0.5
     assert (found.kind, found.n_train, found.n_test) == ("labels", 24, 24) and found.versus[
@@ -188,6 +198,10 @@ def test_bad_input_is_named_before_a_folder_is_made(pictures, tmp_path):
         target_of(pictures, config(labels=("same",)))
     with pytest.raises(ValueError, match="'shade' has 3 classes and cannot be asked together"):
         target_of(pictures, config(labels=("shade", "dark")))
+    shade = np.full(60, "high")
+    shade[target_of(pictures, config()).split.train] = "low"
+    with pytest.raises(ValueError, match="48 labelled pictures to learn from have one class of shade only"):
+        target_of(replace(pictures, labels={"shade": shade}), config())
     with pytest.raises(ValueError, match="48 with shade: set labelled=48 or fewer"):
         target_of(pictures, config(target__labelled=49))
     with pytest.raises(ValueError, match="no factor 'geomtry'; did you mean 'geometry'"):

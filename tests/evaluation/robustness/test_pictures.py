@@ -103,6 +103,9 @@ def test_a_rendered_trial_changes_the_angle_alone():
         assert not turned[at].light[:, 2].any()
         assert torch.allclose(turned[at].camera, own.camera)
     assert trial.task.targets[trial.curves[1].tested[1]].ravel().tolist() == [0, 1, 0, 1]
+    groups = np.array(["a", "a", "b", "b", "", "", "", "c"])  # the fifth is learned from, the seventh tested
+    apart = rendered_trial(model, pictures, task, learn, test, (YAW,), (0, 40), groups=groups)
+    assert apart.unit[0] == apart.unit[1] != apart.unit[2] and len(set(apart.unit[:8].tolist())) == 6
 
 
 def own_of(model, images):

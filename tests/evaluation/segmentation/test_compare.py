@@ -21,7 +21,12 @@ from derender.evaluation.segmentation import (
     segmentation_scores,
     train_segmenter,
 )
-from derender.evaluation.segmentation.controls import by_colour, most_frequent, most_frequent_at_place
+from derender.evaluation.segmentation.controls import (
+    by_colour,
+    by_components,
+    most_frequent,
+    most_frequent_at_place,
+)
 from derender.report.tables_segmentation import (
     beside_the_paper,
     class_table,
@@ -46,6 +51,10 @@ def test_controls_answer_what_they_may_know(data):
     blind = replace(data, images=np.full_like(data.images, 90))
     assert (by_colour(blind) == most_frequent(data)).all()
     assert colours.shape == truth.shape and colours.dtype == np.uint8
+    components = by_components(data)
+    assert components.shape == truth.shape and components.dtype == np.uint8
+    assert judged(components, data).mean_iou > judged(place, data).mean_iou + 0.05  # it sees where bands end
+    assert (by_components(blind) == place).all()  # without a picture, how often a class is at a place
 
 
 @pytest.mark.parametrize("name", ["joint", "joint-frozen", "random"])
@@ -114,7 +123,7 @@ def test_a_comparison_goes_on_where_it_stopped(data, model, tmp_path, before):
         assert (one.shown == two.shown).all() and (one.losses == two.losses).all()
     names = [row.scored.name for row in found.rows]
     assert names[:2] == ["albedo encoder", "random start"] and "each place's class" in names
-    assert [row.scored.control for row in found.rows] == [False, True, True, True, True]
+    assert [row.scored.control for row in found.rows] == [False, True, True, True, True, True]
     assert found.rows[0].scored.runs == 2 and found.rows[0].losses.shape == (2, 1)
     assert found.test_share.sum() == pytest.approx(1) and found.test_share[3] == 0
     changed = Memory(tmp_path)

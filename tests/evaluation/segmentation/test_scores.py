@@ -37,6 +37,18 @@ def test_a_class_that_no_mask_shows_is_left_out_for_every_answer():
     assert found.mean_iou == 0.75 == found.top10_iou
 
 
+def test_the_masks_themselves_score_best_and_shuffled_pixels_chance():
+    """Answers dealt at random agree by the classes' shares p: accuracy sum p^2, IoU p / (2 - p)."""
+    random = np.random.default_rng(2)
+    share = np.array([0.6, 0.3, 0.1])
+    masks = random.choice(3, (20, 64, 64), p=share).astype(np.uint8)
+    best = scores(masks, masks, 3)
+    assert (best.mean_iou, best.top10_iou, best.pixel_accuracy) == (1, 1, 1)
+    found = scores(random.permutation(masks.ravel()).reshape(masks.shape), masks, 3)
+    assert found.class_iou == pytest.approx(share / (2 - share), abs=0.01)
+    assert found.pixel_accuracy == pytest.approx((share**2).sum(), abs=0.01)
+
+
 def test_they_are_torchmetrics_own():
     random = np.random.default_rng(0)
     masks = random.integers(0, 19, (70, 6, 5)).astype(np.uint8)

@@ -64,7 +64,7 @@ def cluster(
             levels[row.name] = finch_levels(
                 ready.features[row.name][0], ready.labels[names[0]], source.memory
             )
-        tables.append(finch_table(rows[0].name, levels[rows[0].name], found.labels[names[0]]))
+            tables.append(finch_table(row.name, levels[row.name], found.labels[names[0]]))
     notes = [verdict(found.rows[0], "accuracy")]
     if approximate := approximation(method, found.n_rows):
         notes.append(approximate)

@@ -54,7 +54,7 @@ def disentangle(
     published.check()
     from derender.cli.models import open_model, part_of
     from derender.data import read_pictures
-    from derender.evaluation.disentanglement import evaluate_disentanglement
+    from derender.evaluation.disentanglement import evaluate_disentanglement, left_out
     from derender.report import tables_disentanglement as tables
 
     net, memory = open_model(model, device), feature_rows.memory_in(cache)
@@ -79,6 +79,8 @@ def disentangle(
     places = {column.name: place for place, column in enumerate(summary.columns)}
     told = (("swap", "swap test"), ("decoded", "swap test, decoded"))
     notes = [f"{name}: {summary.verdict(places[column])}" for column, name in told]
+    unasked = left_out(pictures.labels)
+    notes += [f"left out of the true factors: {name} ({why})" for name, why in unasked.items()]
     if out is not None:
         from derender.report.matrices import card_matrices, matrix_sheet
         from derender.whole import whole_file
@@ -91,6 +93,7 @@ def disentangle(
         "pictures": card.n_pictures,
         "features": dict(zip(card.features, card.dimensions, strict=True)),
         "seeds": list(range(seed, seed + seeds)),
+        "left_out": unasked,
         "rows": card.numbers(),
     }
     published.show(shown, values, [*notes, scoring.remembered(memory)])

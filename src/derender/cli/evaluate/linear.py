@@ -58,9 +58,10 @@ def linear(
     for head in chosen:
         check_head(head)
     rows = source.rows(asked.factors, computed.from_seed(untrained_seeds))
-    names = feature_rows.chosen_labels(rows, asked.label, asked.attributes)
+    names = feature_rows.chosen_labels(rows, asked.label, asked.attributes, least=2)
 
-    from derender.cli.finetuned import finetuned_answers
+    from derender.cli.finetuned import all_finetuned
+    from derender.cli.models import open_model
     from derender.evaluation.feature_rows import prepare
     from derender.evaluation.linear_compare import compare_linear
     from derender.evaluation.linear_head import HeadSettings
@@ -89,7 +90,12 @@ def linear(
     settings = HeadSettings(epochs=epochs)
     tuned = None
     if finetune:
-        tuned = finetuned_answers(source, ready.files, task, split, draws, asked.factors, settings)
+        assert asked.model is not None
+        tuned = all_finetuned(
+            {source.row_name(asked.factors): [open_model(asked.model, source.device)]},
+            lambda size: source.pictures_of(size, ready.files).images,
+            ready, task, split, draws, feature_rows.factors_of(asked.factors), settings, source.memory,
+        )  # fmt: skip
     with bar("probing", "probes") as report:
         found = compare_linear(
             ready.features,

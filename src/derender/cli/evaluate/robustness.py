@@ -221,7 +221,7 @@ def make_trial(
     pictures = feature_rows.Pictures(shown.data, shown.dataset, shown.limit).at(net.image_size)
     columns = FeatureTable(pictures.files, {"none": np.zeros((len(pictures), 1))}, table_labels(pictures))
     row = FeatureRow("pictures", (columns,))
-    names = feature_rows.chosen_labels([row], default_label(shown, columns), shown.attributes)
+    names = feature_rows.chosen_labels([row], default_label(shown, columns), shown.attributes, least=2)
     groups = [shown.groups] if shown.groups else []
     ready = prepare([row], names, min_count=shown.min_count, max_count=shown.max_count, keep=groups)
     pictures = feature_rows.aligned(pictures, ready.files)

@@ -10,6 +10,7 @@ card                    all of it beside controls, over seeds
 from derender.evaluation.disentanglement.card import (
     DisentanglementCard,
     FeatureScores,
+    dealt,
     evaluate_disentanglement,
     random_pixels,
     shuffled_rows,
@@ -32,7 +33,7 @@ from derender.evaluation.disentanglement.pearson import (
 from derender.evaluation.disentanglement.ridge import fit_predict, held_out, r_squared
 from derender.evaluation.disentanglement.similarity import SimilarityScores, linear_cka, similarity
 from derender.evaluation.disentanglement.swap import SwapScores, diagonal_over_rest, swap_test
-from derender.evaluation.disentanglement.true_factors import TrueFactor, true_factors
+from derender.evaluation.disentanglement.true_factors import TrueFactor, left_out, true_factors
 
 __all__ = [
     "DisentanglementCard",
@@ -45,12 +46,14 @@ __all__ = [
     "TrueFactor",
     "correlation_matrix",
     "dci",
+    "dealt",
     "diagonal_over_rest",
     "evaluate_disentanglement",
     "fit_predict",
     "ground_truth_scores",
     "held_out",
     "importance",
+    "left_out",
     "linear_cka",
     "mutual_information",
     "pearson",

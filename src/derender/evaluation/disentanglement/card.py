@@ -1,9 +1,10 @@
 """The disentanglement card: every score of this folder for one model beside its controls, over several seeds.
 
 Controls: the same networks untrained (fresh weights for each seed); the model's own features with the rows of
-each factor shuffled by themselves, which is what chance gives; and random pixel values dealt into as many
-blocks as there are features, which no encoder has seen. The swap test needs a decoder, so the model and the
-untrained one have it alone. Without true factors among the labels that part is left out.
+each factor shuffled by themselves, which is what chance gives; and random pixel values, and whitened
+principal components, dealt into as many blocks as there are features, which no encoder has seen. The swap
+test needs a decoder, so the model and the untrained one have it alone. Without true factors among the labels
+that part is left out. A majority's answer has no features; it is the chance of every class.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -13,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from derender.baselines.controls import untrained_twin
+from derender.baselines.controls import pca_features, untrained_twin
 from derender.data import PictureSet
 from derender.evaluation.bootstrap import LEVEL
 from derender.evaluation.disentanglement.ground_truth_scores import GroundTruthScores, ground_truth_scores
@@ -27,6 +28,7 @@ from derender.features import embed_images, model_fingerprint
 from derender.features.table import check_finite
 
 MODEL, UNTRAINED, SHUFFLED, PIXELS = "model", "untrained encoder", "shuffled rows", "random pixels"
+COMPONENTS = "PCA"
 MIN_PICTURES = 20
 
 
@@ -124,6 +126,11 @@ def evaluate_disentanglement(
         twin = untrained_twin(model, seed)
         return twin, embed_images(twin, pictures.images, batch_size=batch_size)
 
+    @cache
+    def components() -> np.ndarray:
+        wanted = max(len(sizes), min(64, count // 4))
+        return pca_features(pictures, components=wanted).concatenate()
+
     def whole() -> dict[str, np.ndarray]:
         lengths = np.array([values.shape[1] for values in features().values()])
         return {
@@ -134,7 +141,9 @@ def evaluate_disentanglement(
 
     found = kept.recall("card-correlations", inputs, whole)
     sizes = dict(zip(found["names"].tolist(), found["sizes"].tolist(), strict=True))
-    rows: dict[str, list[FeatureScores]] = {name: [] for name in (MODEL, UNTRAINED, SHUFFLED, PIXELS)}
+    rows: dict[str, list[FeatureScores]] = {
+        name: [] for name in (MODEL, UNTRAINED, SHUFFLED, PIXELS, COMPONENTS)
+    }
     done, total = 0, len(seeds) * len(rows)
 
     def scored(blocks: Mapping[str, np.ndarray], seed: int, net: Any = None) -> FeatureScores:
@@ -152,6 +161,7 @@ def evaluate_disentanglement(
         UNTRAINED: lambda seed: scored(fresh(seed)[1], seed, fresh(seed)[0]),
         SHUFFLED: lambda seed: scored(shuffled_rows(features(), seed), seed),
         PIXELS: lambda seed: scored(random_pixels(pictures.images, sizes, seed), seed),
+        COMPONENTS: lambda seed: scored(dealt(components(), list(sizes), seed), seed),
     }
     for seed in seeds:
         for name, make in made.items():
@@ -209,3 +219,9 @@ def random_pixels(images: np.ndarray, sizes: Mapping[str, int], seed: int) -> di
         blocks[name] = flat[:, taken].astype(np.float32) / 255
         start += len(taken)
     return blocks
+
+
+def dealt(components: np.ndarray, names: Sequence[str], seed: int) -> dict[str, np.ndarray]:
+    """(N, D) principal components dealt at random into one block for each name, of D / names each."""
+    chosen = np.array_split(np.random.default_rng(seed).permutation(components.shape[1]), len(names))
+    return {name: components[:, taken] for name, taken in zip(names, chosen, strict=True)}

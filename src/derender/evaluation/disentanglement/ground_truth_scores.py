@@ -24,7 +24,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from derender.evaluation.disentanglement.importance import importance
-from derender.evaluation.disentanglement.ridge import held_out, r_squared
+from derender.evaluation.disentanglement.ridge import finite, held_out, r_squared
 from derender.evaluation.disentanglement.true_factors import TrueFactor
 
 BINS = 20
@@ -98,6 +98,7 @@ def ground_truth_scores(
     """
     if len(factors) < 2 or len(blocks) < 2:
         raise ValueError(f"needs two features and two true factors, got {len(blocks)} and {len(factors)}")
+    blocks = {name: finite(values, f"feature {name!r}") for name, values in blocks.items()}
     everything = np.concatenate(list(blocks.values()), axis=1)
     found = [_predicted(x, factors, folds, seed) for x in (*blocks.values(), everything)]
     raw = np.array([[score for score, _, _ in row] for row in found])

@@ -21,6 +21,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from derender.evaluation.disentanglement.ridge import finite
+
 
 @dataclass(frozen=True)
 class PearsonScores:
@@ -86,7 +88,7 @@ def correlation_matrix(factors: Mapping[str, np.ndarray]) -> np.ndarray:
 
 
 def _checked(factors: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    blocks = {name: np.asarray(values, np.float64) for name, values in factors.items()}
+    blocks = {name: finite(values, f"feature {name!r}") for name, values in factors.items()}
     lengths = {len(values) for values in blocks.values()}
     if len(blocks) < 2:
         raise ValueError("a correlation between features needs two features or more")

@@ -22,7 +22,7 @@ def held_out(x: np.ndarray, y: np.ndarray, *, folds: int = 5, seed: int = 0) -> 
         folds: how many parts the rows are dealt into.
         seed: of the deal.
     """
-    x, y = np.asarray(x, np.float64), np.asarray(y, np.float64)
+    x, y = finite(x, "the features"), finite(y, "the targets")
     if len(x) != len(y):
         raise ValueError(f"{len(x)} rows of features but {len(y)} rows of targets: give one target per row")
     predicted = np.empty_like(y)
@@ -31,6 +31,15 @@ def held_out(x: np.ndarray, y: np.ndarray, *, folds: int = 5, seed: int = 0) -> 
         train[test] = False
         predicted[test] = fit_predict(x[train], y[train], x[test])
     return predicted
+
+
+def finite(values: np.ndarray, what: str) -> np.ndarray:
+    """The rows as float64, or an error that says how many hold something that is no finite number."""
+    values = np.asarray(values, np.float64)
+    bad = int((~np.isfinite(values.reshape(len(values), -1)).all(axis=1)).sum()) if len(values) else 0
+    if bad:
+        raise ValueError(f"{what}: {bad} of {len(values)} rows are not finite: drop them or check the model")
+    return values
 
 
 def fold_of(n_rows: int, folds: int, seed: int) -> list[np.ndarray]:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from derender.evaluation.disentanglement.ridge import held_out, r_squared
+from derender.evaluation.disentanglement.ridge import finite, held_out, r_squared
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ def similarity(factors: Mapping[str, np.ndarray], *, folds: int = 5, seed: int =
         folds: of the cross-prediction.
         seed: of the deal into folds.
     """
-    blocks = {name: np.asarray(values, np.float64) for name, values in factors.items()}
+    blocks = {name: finite(values, f"feature {name!r}") for name, values in factors.items()}
     names, count = list(blocks), len(blocks)
     biased, unbiased, cross = np.full((3, count, count), np.nan)
     for i, a in enumerate(names):
@@ -80,7 +80,7 @@ def similarity(factors: Mapping[str, np.ndarray], *, folds: int = 5, seed: int =
 
 
 def _centred(values: np.ndarray) -> np.ndarray:
-    values = np.asarray(values, np.float64)
+    values = finite(values, "a feature")
     centred = values - values.mean(axis=0)
     level = np.abs(values).max(axis=0, initial=0)
     return np.where(np.abs(centred).max(axis=0, initial=0) <= 1e-9 * level, 0.0, centred)

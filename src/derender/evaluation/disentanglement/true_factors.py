@@ -67,16 +67,31 @@ def true_factors(labels: Mapping[str, np.ndarray]) -> list[TrueFactor]:
     classes than a fifth of the rows: such classes are names of single pictures. Unless a column of light or
     camera is there, the set is not a rendered one and nothing is given.
     """
-    found = []
-    for label, (name, features) in _KNOWN.items():
-        if label not in labels or missing(labels[label]).any():
-            continue
-        values = np.asarray(labels[label])
-        if values.dtype.kind == "f":
-            if np.ptp(values) > 1e-9:
-                found.append(TrueFactor(name, values.astype(np.float64), False, features))
-            continue
-        classes = np.unique(values.astype(str), return_inverse=True)[1]
-        if 2 <= classes.max() + 1 <= len(values) / 5:
-            found.append(TrueFactor(name, classes, True, features))
+    found = [one for label in _KNOWN if isinstance(one := _read(labels, label), TrueFactor)]
     return found if any(not factor.is_class for factor in found) else []
+
+
+def left_out(labels: Mapping[str, np.ndarray]) -> dict[str, str]:
+    """The factors of a rendered scene that are among the labels and left out by ``true_factors``, and why."""
+    if not true_factors(labels):
+        return {}
+    return {_KNOWN[label][0]: one for label in _KNOWN if isinstance(one := _read(labels, label), str)}
+
+
+def _read(labels: Mapping[str, np.ndarray], label: str) -> TrueFactor | str | None:
+    """The factor that a label holds, or why it is left out; None where there is no such label."""
+    if label not in labels:
+        return None
+    name, features = _KNOWN[label]
+    if absent := int(missing(labels[label]).sum()):
+        return f"{absent:,} of {len(labels[label]):,} values are missing"
+    values = np.asarray(labels[label])
+    if values.dtype.kind == "f":
+        if np.ptp(values) > 1e-9:
+            return TrueFactor(name, values.astype(np.float64), False, features)
+        return "one value for all pictures"
+    classes = np.unique(values.astype(str), return_inverse=True)[1]
+    count = int(classes.max()) + 1
+    if 2 <= count <= len(values) / 5:
+        return TrueFactor(name, classes, True, features)
+    return "one class only" if count < 2 else f"{count:,} classes of {len(values):,} pictures"

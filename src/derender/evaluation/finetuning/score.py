@@ -17,7 +17,8 @@ from derender.evaluation.finetuning.model import FinetunedModel
 from derender.evaluation.finetuning.task import FinetuneTask
 from derender.evaluation.linear_compare import Progress, compare_linear
 from derender.evaluation.linear_task import Rows, Task
-from derender.features import embed_images, map_batches
+from derender.evaluation.memory import Memory
+from derender.features import embed_images, map_batches, model_fingerprint
 
 JOINT, LOGISTIC, PAPER_HEAD, MAJORITY = "fine-tuned", "frozen, logistic", "frozen, paper's head", "majority"
 
@@ -33,6 +34,7 @@ class FinetuneScores:
         versus: by score, the fine-tuned model against the best of the others.
         kind, names: of the task.
         n_train, n_test: labelled pictures learned from, and tested.
+        n_unlabelled: pictures of the run without any of the labels: rendered, never asked.
     """
 
     rows: tuple[ScoredRow, ...]
@@ -41,6 +43,7 @@ class FinetuneScores:
     names: tuple[str, ...]
     n_train: int
     n_test: int
+    n_unlabelled: int
 
     def numbers(self) -> dict[str, Any]:
         """Everything as JSON takes it."""
@@ -48,7 +51,7 @@ class FinetuneScores:
             name: {part: getattr(one, part) for part in ("rival", "value", "low", "high", "above")}
             for name, one in self.versus.items()
         }
-        sizes = {name: getattr(self, name) for name in ("kind", "names", "n_train", "n_test")}
+        sizes = {name: getattr(self, name) for name in ("kind", "names", "n_train", "n_test", "n_unlabelled")}
         return {**sizes, "rows": {row.name: row.numbers() for row in self.rows}, "versus": versus}
 
 
@@ -57,9 +60,10 @@ def score_finetuned(
     task: FinetuneTask,
     *,
     resample_count: int = RESAMPLES,
+    memory: Memory | None = None,
     progress: Progress | None = None,
 ) -> FinetuneScores:
-    """Score a trained model on the task's test part.
+    """Score a trained model on the task's test part; what took long is kept in ``memory``.
 
     Raises:
         ValueError: no tested picture has a label.
@@ -72,12 +76,18 @@ def score_finetuned(
             f"the test part has {len(test)} pictures with a label, two are needed to score: "
             "bring more pictures, or set a larger test share in split="
         )
-    images, answered = task.images[test], lambda batch: tuned.answer(batch).cpu().numpy()
-    answers = np.concatenate(map_batches(answered, tuned, images, batch_size=256))
-    rows = np.concatenate([train, test])
+    memory, rows = memory or Memory(), np.concatenate([train, test])
+
+    def answered() -> dict[str, np.ndarray]:
+        parts = map_batches(
+            lambda batch: tuned.answer(batch).cpu().numpy(), tuned, task.images[test], batch_size=256
+        )
+        return {"answers": np.concatenate(parts)}
+
+    inputs = {"weights": model_fingerprint(tuned), "kind": target.asked.kind, "images": task.images[test]}
+    answers = memory.recall("finetuned-answers", inputs, answered)["answers"]
     start = (task.start if task.start is not None else task.build().model).to(tuned.device)
-    codes = embed_images(start, task.images[rows])
-    frozen = np.concatenate([codes[name] for name in task.config.target.factors], axis=1)
+    frozen = _codes(start, task, rows, memory)
     asked = Task(target.asked.kind, target.asked.names, target.asked.targets[rows])
     count, seed = len(train), task.config.seed
     who = Rows(np.arange(count, len(rows)), {count: np.arange(count)[None]})
@@ -89,13 +99,14 @@ def score_finetuned(
         heads=("logistic", "linear"),
         finetuned={JOINT: {count: answers[None]}},
         resample_count=resample_count,
+        memory=memory,
         progress=progress,
     )
     by_head = {part.head: part.rows for part in found.parts}
-    controls = _controls(start, task, rows)
+    controls = _controls(start, task, rows, memory)
     known = compare_linear(
         {name: [values] for name, values in controls.items()},
-        asked, who, (seed,), heads=("logistic",), resample_count=resample_count,
+        asked, who, (seed,), heads=("logistic",), resample_count=resample_count, memory=memory,
     ).parts[0].rows  # fmt: skip
     joint, majority = by_head["fine-tuned"]
     heads = [
@@ -109,17 +120,29 @@ def score_finetuned(
         name: difference(ours.scores[name], {row.name: row.scores[name] for row in others})
         for name in ("accuracy", "balanced_accuracy")
     }
-    return FinetuneScores((ours, *others), versus, asked.kind, asked.names, count, len(test))
+    unlabelled = int((~target.asked.known).sum())
+    return FinetuneScores((ours, *others), versus, asked.kind, asked.names, count, len(test), unlabelled)
 
 
-def _controls(start: Any, task: FinetuneTask, rows: np.ndarray) -> dict[str, np.ndarray]:
+def _codes(model: Any, task: FinetuneTask, rows: np.ndarray, memory: Memory) -> np.ndarray:
+    """(R, D) features of some rows of the task's pictures, those that the head reads side by side."""
+    inputs = {"weights": model_fingerprint(model), "images": task.images[rows]}
+    codes = memory.recall("embedding", inputs, lambda: embed_images(model, task.images[rows]))
+    return np.concatenate([codes[name] for name in task.config.target.factors], axis=1)
+
+
+def _controls(start: Any, task: FinetuneTask, rows: np.ndarray, memory: Memory) -> dict[str, np.ndarray]:
     """(R, D) features that learned nothing, of some rows of the task's pictures."""
     twin, train = untrained_twin(start, task.config.seed), task.target.split.train
     shown, fitted = (PictureSet(task.images[some], tuple(map(str, some.tolist()))) for some in (rows, train))
-    codes = embed_images(twin, shown.images)
     components = max(1, min(64, len(fitted) // 4))
+    pca = memory.recall(
+        "pca",
+        {"images": shown.images, "components": components, "fit_on": fitted.images},
+        lambda: dict(pca_features(shown, components=components, fit_on=fitted).factors),
+    )["pca"]
     return {
-        "untrained encoder": np.concatenate([codes[name] for name in task.config.target.factors], axis=1),
-        f"PCA ({components})": pca_features(shown, components=components, fit_on=fitted).concatenate(),
+        "untrained encoder": _codes(twin, task, rows, memory),
+        f"PCA ({components})": pca,
         "pixels": pixel_features(shown).concatenate(),
     }

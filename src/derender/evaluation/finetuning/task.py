@@ -88,6 +88,13 @@ def target_of(pictures: PictureSet, config: FinetuneConfig) -> Target:
             f"the training part has {len(labelled)} pictures with {', '.join(target.labels)} to learn from: "
             "bring more labelled pictures"
         )
+    known = asked.targets[labelled]
+    varied = (known == 1).any(axis=0) & ((known == 0).any(axis=0))
+    if not varied.any():
+        raise ValueError(
+            f"the {len(labelled)} labelled pictures to learn from have one class of "
+            f"{', '.join(target.labels)} only: use more of them, or another seed"
+        )
     visible = np.full_like(asked.targets, -1)
     for rows in (labelled, split.validation):
         visible[rows] = asked.targets[rows]

@@ -18,7 +18,7 @@ from derender.evaluation.linear_task import Task
 from derender.evaluation.memory import Memory
 from derender.evaluation.robustness.axes import Axis, checked_levels, either_side
 from derender.evaluation.robustness.trial import Curve, Trial
-from derender.features import map_batches, model_fingerprint
+from derender.features import map_batches, missing, model_fingerprint
 from derender.training.step import fill_uncovered
 
 Progress = Callable[[int, int], object]
@@ -46,7 +46,8 @@ def rendered_trial(
         task: what is asked of each picture.
         learn, test: rows of the pictures that are learned from and tested.
         axes, levels: what is turned, and how far (degrees).
-        groups: (N,) labels whose pictures are resampled together, such as identities; else each by itself.
+        groups: (N,) labels whose pictures are resampled together, such as identities; a picture without
+            one, and all where no groups are given, by itself.
         batch_size: pictures at a time; changes speed and memory only.
         memory: where renderings are kept.
         progress: called with (pictures taken apart, pictures in all).
@@ -66,7 +67,7 @@ def rendered_trial(
 
     images = (memory or Memory()).recall("rendered", inputs, make)["images"]
     shown = np.concatenate((rows, np.tile(test, len(asked))))
-    number = np.arange(len(pictures)) if groups is None else np.unique(groups, return_inverse=True)[1]
+    number = np.arange(len(pictures)) if groups is None else _numbered(groups)
     ordinary = len(learn) + np.arange(len(test))
     curves, at = [], len(rows)
     for axis in axes:
@@ -81,6 +82,14 @@ def rendered_trial(
     return Trial(
         images, asked_of, number[shown].astype(np.int64), tuple(curves), how, int((~task.known).sum())
     )
+
+
+def _numbered(groups: np.ndarray) -> np.ndarray:
+    """(N,) numbers of the groups; a row without one has its own number, as it stands alone in the split."""
+    alone = missing(groups)
+    found = np.unique(groups.astype(str), return_inverse=True)[1]
+    found[alone] = len(found) + np.flatnonzero(alone)
+    return found
 
 
 def _rendered(

@@ -7,6 +7,7 @@ what made it, so that an interrupted comparison goes on with the next run.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -165,9 +166,14 @@ def compare_segmentations(
             if progress is not None:
                 progress(done, total, name)
         rows.append((variant.title, not variant.pretrained, runs, trainable))
+    apart = Memory(memory.folder)  # controls are kept as well, but are no runs
     for title, control in CONTROLS.items():
-        drawn = seeds if title == "pixel colour" else seeds[:1]
-        rows.append((title, True, [_judged(control(data, seed), data, shown) for seed in drawn], 0))
+        drawn, runs = seeds if title == "pixel colour" else seeds[:1], []
+        for seed in drawn:
+            inputs = {"data": content, "seed": seed, "classes": len(data.classes), "control": title}
+            made = partial(_judged_control, control, data, seed, shown)
+            runs.append(apart.recall("segment-control", inputs, made))
+        rows.append((title, True, runs, 0))
     scored = with_verdicts([_scored(title, control, runs, weights) for title, control, runs, _ in rows])
     return SegmentationComparison(
         tuple(_row(one, runs, trainable) for one, (_, _, runs, trainable) in zip(scored, rows, strict=True)),
@@ -187,6 +193,12 @@ def _judged(answers: np.ndarray, data: SegmentationData, shown: np.ndarray) -> d
     """What is kept of a run's answers for the tested pictures."""
     counts = count_pixels(answers, data.masks[data.test], len(data.classes))
     return {"counts": counts.astype(np.int32), "shown": answers[np.searchsorted(data.test, shown)]}
+
+
+def _judged_control(
+    control: Callable[..., np.ndarray], data: SegmentationData, seed: int, shown: np.ndarray
+) -> dict[str, np.ndarray]:
+    return _judged(control(data, seed), data, shown)
 
 
 def _scored(

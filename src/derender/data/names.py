@@ -1,0 +1,30 @@
+"""Which names of files count: what looks like a picture, what is hidden, how odd bytes are written down."""
+
+SUFFIXES = (
+    *(".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".webp", ".avif", ".bmp", ".gif"),
+    *(".tif", ".tiff", ".ppm", ".pgm", ".pnm"),
+)
+"""File names that end in one of these are taken for pictures."""
+
+_SUFFIXES = frozenset(SUFFIXES)
+
+
+def is_picture(file: str) -> bool:
+    """Whether the name has a picture's suffix; nothing but a suffix is no picture's name."""
+    dot = file.rfind(".")
+    return dot > 0 and file[dot - 1] != "/" and file[dot:].lower() in _SUFFIXES
+
+
+def is_hidden(name: str) -> bool:
+    """Whether a file or folder of this name is left out."""
+    return name.startswith(".") or name == "__MACOSX"
+
+
+def printable(name: str) -> str:
+    """The name with bytes that are not UTF-8 as backslash escapes, so that it can be stored anywhere."""
+    return name if name.isascii() else _escaped(name)
+
+
+def _escaped(name: str) -> str:
+    escaped = name.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
+    return name if escaped == name else escaped

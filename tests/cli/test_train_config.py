@@ -1,0 +1,101 @@
+"""`derender train --config`: settings from a file are those of the command line, and yield to it."""
+
+from pathlib import Path
+
+import pytest
+import yaml
+
+from derender.cli import main
+from derender.cli.plan.settings import read_plan
+from derender.training.config import resolve
+
+EXAMPLES = Path(__file__).parents[2] / "examples" / "runs"
+RUNS = ["rendered-faces", "faces", "cars", "cars-colours"]
+
+
+@pytest.fixture
+def settings(capsys):
+    """All settings that `derender train` would run with."""
+
+    def said(*arguments: str | Path) -> dict:
+        code = main(["train", "--data", "nowhere", "--out", "nowhere/run", "--dry-run", *map(str, arguments)])
+        found = capsys.readouterr()
+        assert code == 0, found.err
+        return yaml.safe_load(found.out)
+
+    return said
+
+
+def test_a_file_says_what_set_says_and_set_comes_after(settings, tmp_path):
+    file = tmp_path / "mine.yaml"
+    file.write_text(
+        "preset: small\nimages: 5000\nobjective: {loocc: light}\nmodel.ranges: {border_depth: 1.08}\n"
+    )
+    by_hand = resolve("small", ["images=5000", "border_depth=1.08"], objective__loocc="light")
+    assert settings("--config", file) == by_hand.model_dump(mode="json")
+    changed = settings("--config", file, "--set", "images=70", "--loocc", "all")
+    assert (changed["images"], changed["objective"]["loocc"]) == (70, "all")
+    assert changed["model"]["ranges"]["border_depth"] == 1.08
+
+
+def test_the_settings_of_a_run_make_the_same_run(settings, tmp_path):
+    run = tmp_path / "run"
+    run.mkdir()
+    asked = resolve("small", ["images=4321", "learning_rate=2e-4", "split=[0.5, 0.3, 0.2]"])
+    tree = {"format": 1, **asked.model_dump(mode="json")}
+    (run / "config.yaml").write_text(yaml.safe_dump(tree, sort_keys=False))
+    for given in (run, run / "config.yaml"):
+        assert settings("--config", given) == asked.model_dump(mode="json")
+
+
+def test_a_baselines_settings_train_that_baseline(settings, tmp_path):
+    own = settings("--model", "ae", "--set", "images=99")
+    (tmp_path / "ae.yaml").write_text(yaml.safe_dump(own))
+    assert own["baseline"] == "ae"
+    assert settings("--config", tmp_path / "ae.yaml") == own
+
+
+@pytest.mark.parametrize(
+    ("text", "more", "message"),
+    [
+        ("preset: small", ["--preset", "paper"], "is for small, not for paper: leave out --preset"),
+        ("baseline: vqvae", ["--model", "ae"], "is for vqvae, not for ae: leave out --model"),
+        ("[1, 2]", [], "holds no settings"),
+        ("{a: ", [], "holds no settings"),
+        ("images: many", [], "setting 'images'"),
+        ("imagse: 5", [], "unknown setting 'imagse'"),
+        ("format: 99", [], "update derender"),
+        ("preset: 3", [], "preset"),
+    ],
+)
+def test_what_is_no_settings_is_one_clear_line(tmp_path, capsys, text, more, message):
+    file = tmp_path / "bad.yaml"
+    file.write_text(text)
+    assert (
+        main(["train", "--data", "nowhere", "--out", str(tmp_path / "run"), "--config", str(file), *more])
+        == 2
+    )
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_file_that_is_not_there_is_named(tmp_path, capsys):
+    gone = tmp_path / "gone.yaml"
+    assert main(["train", "--data", "nowhere", "--out", str(tmp_path / "run"), "--config", str(gone)]) == 2
+    assert f"no settings in {gone}" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_the_runs_of_the_models_that_come_along_can_be_made_again(settings, name):
+    found = settings("--config", EXAMPLES / f"{name}.yaml")
+    assert found["preset"] == "small"
+    assert found["objective"]["loocc"] == "light+camera"
+    asked = yaml.safe_load((EXAMPLES / f"{name}.yaml").read_text())
+    assert found["images"] == asked["images"]
+
+
+def test_the_plan_that_asks_what_loocc_brings_can_be_read():
+    plan = read_plan(EXAMPLES / "loocc.yaml")
+    kinds = [method.settings.get("loocc") for name, method in plan.methods.items() if name != "vqvae"]
+    assert kinds == ["none", "light", "light+camera", "all"]
+    assert plan.seeds == 3

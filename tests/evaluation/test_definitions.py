@@ -1,0 +1,53 @@
+"""docs/evaluation.md: every column that a table prints is defined there, every function it names is there."""
+
+import ast
+import importlib
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+PAGE = (ROOT / "docs" / "evaluation.md").read_text()
+TABLES = (
+    *("tables_comparison", "tables_disentanglement", "tables_segmentation"),
+    *("tables_pictures", "score_table", "robustness"),
+)
+
+
+def columns(module: str) -> set[str]:
+    """Names of the columns that a module of tables makes."""
+    tree = ast.parse((ROOT / "src" / "derender" / "report" / f"{module}.py").read_text())
+    calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call) and node.args]
+    named = [call.args[0] for call in calls if isinstance(call.func, ast.Name) and call.func.id == "Column"]
+    return {one.value for one in named if isinstance(one, ast.Constant) and isinstance(one.value, str)}
+
+
+def defined(name: str) -> bool:
+    """Whether a table of the page has a row of this name, or its text has it in bold or as code."""
+    word = re.escape(name)
+    return re.search(rf"^\| {word}( \||,)|\| {word} \||\*\*{word}\*\*|`{word}`", PAGE, re.M) is not None
+
+
+@pytest.mark.parametrize("module", TABLES)
+def test_every_column_is_defined(module):
+    found = columns(module)
+    assert found, f"{module} makes no column: is it still where tables are made?"
+    assert sorted(name for name in found if not defined(name)) == []
+
+
+def test_a_column_that_is_nowhere_is_missed():
+    assert not defined("no such score") and not defined("accurac")
+
+
+def test_functions_on_arrays_are_exported():
+    section = PAGE.split("### On arrays")[1].split("Pinned by")[0]
+    cells = [line.split("|")[2] for line in section.splitlines() if line.startswith("|")][2:]
+    assert len(cells) == 12
+    for cell in cells:
+        module = importlib.import_module("derender.evaluation")
+        for word in re.findall(r"`([\w.]+)`", cell):
+            if "." in word:
+                folder, word = word.split(".")
+                module = importlib.import_module(f"derender.evaluation.{folder}")
+            assert callable(getattr(module, word)) and word in module.__all__, word
