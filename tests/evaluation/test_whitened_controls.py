@@ -1,5 +1,7 @@
 """Controls whitened by the lender: its own model as in training, others by the same rule."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -39,6 +41,15 @@ def test_the_lender_whitens_itself_as_training_does(lender):
     for name, value in expected.named_buffers():
         torch.testing.assert_close(found.get_buffer(name), value)
     assert lender.model.whitening is None
+
+
+def test_features_there_are_already_change_nothing(lender, images):
+    fitted = whitened(lender, lender.model)
+    assert fitted.whitening is not None and fitted.whitening.mirrored
+    again = whitened(replace(lender, model=fitted), fitted)
+    expected = embed_images(fitted, images)
+    for name, feature in embed_images(again, images).items():
+        np.testing.assert_array_equal(feature, expected[name])
 
 
 def test_another_encoder_is_whitened_by_its_own_codes_of_the_lenders_renderings(lender, images):

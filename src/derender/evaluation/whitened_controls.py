@@ -59,21 +59,15 @@ def whitened(lender: Lender, encoder: Derenderer, progress: Progress | None = No
     """
     names = [factor.name for factor in encoder.factors if factor.mirrored]
     spatial, size = lender.settings.whitening.spatial, encoder.settings.network.code_size
+    found = copy.deepcopy(encoder).eval()
+    found.whitening = None  # it would have pictures read with their mirror images, which are views here
 
     def describe(pictures: Float[Tensor, "n 3 h w"]) -> dict[str, Tensor]:
-        said = (encoder.read if spatial else encoder.encode)(pictures.to(encoder.device))
+        said = (found.read if spatial else found.encode)(pictures.to(found.device))
         return {name: said[name] for name in names}
 
-    found = copy.deepcopy(encoder)
-    found.whitening = None
-    mark = model_fingerprint(found)
-    was_training = encoder.training
-    encoder.eval()
-    try:
-        found.whitening = _fitted(lender, describe, mark, progress, size).to(encoder.device)
-    finally:
-        encoder.train(was_training)
-    return found
+    found.whitening = _fitted(lender, describe, model_fingerprint(found), progress, size).to(found.device)
+    return found.train(encoder.training)
 
 
 def component_count(images: np.ndarray) -> int:
