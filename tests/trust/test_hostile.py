@@ -4,8 +4,10 @@ What a command does with a folder and with files it is given is tried on one of 
 tries every command.
 """
 
+import errno
 import importlib
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -127,6 +129,31 @@ def test_a_file_that_goes_between_listing_and_reading_is_skipped(corpus, tmp_pat
     pictures = read_pictures(tmp_path, 16)
     assert pictures.files == ("0.png", "2.png")
     assert [row.file for row in pictures.skipped] == ["1.png"]
+
+
+def test_files_and_folders_without_permission_are_skipped_and_named(corpus, tmp_path, monkeypatch):
+    """Refused by hand, since whoever runs the tests may be allowed to read everything."""
+    module, _ = corpus
+    (tmp_path / "closed").mkdir()
+    for number, name in enumerate(("0.png", "1.png", "closed/2.png", "3.png")):
+        (tmp_path / name).write_bytes(module.encoded(module.smooth(seed=number), "PNG"))
+
+    def refusing(function):
+        def refused(path, *rest):
+            if Path(path).name in ("1.png", "closed"):
+                raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+            return function(path, *rest)
+
+        return refused
+
+    monkeypatch.setattr(Path, "open", refusing(Path.open))
+    monkeypatch.setattr(os, "scandir", refusing(os.scandir))
+    pictures = read_pictures(tmp_path, 16)
+    assert pictures.files == ("0.png", "3.png")
+    assert {row.file: row.reason for row in pictures.skipped} == {
+        "1.png": f"cannot be read: {os.strerror(errno.EACCES)}",
+        "closed": f"folder cannot be listed: {os.strerror(errno.EACCES)}",
+    }
 
 
 def test_names_cannot_steer_the_terminal(corpus, model, tmp_path, capsys):

@@ -339,7 +339,7 @@ def _go_on(run: _Run, report: Callable[[Progress], None]) -> TrainResult:
     """Train from where the run stands until something ends it."""
     config, state = run.config, run.state
     began, images_before, seconds_before = time.perf_counter(), state.images, state.seconds
-    stopped, steps, healthy_at = run.why_stop(), 0, state.images
+    stopped, steps = run.why_stop(), 0
     with stop_on_signal() as signal_request:
         while stopped is None:
             before = state.images
@@ -361,8 +361,7 @@ def _go_on(run: _Run, report: Callable[[Progress], None]) -> TrainResult:
                 break
             healthy = run.watcher is None or not run.watcher.uneasy
             due = partial(passed, before, state.images, ended=stopped is not None)
-            keep = partial(kept, healthy_at, state.images, ended=stopped is not None)
-            healthy_at = state.images if healthy else healthy_at  # so what falls due in between is done after
+            keep = partial(kept, before, state.images, ended=stopped is not None)
             if keep(config.validate_every) and healthy:
                 run.validate()
                 stopped = run.why_stop() or stopped

@@ -3,6 +3,7 @@
 questions   what a page may ask, checked
 refused     an answer that is no, with its HTTP status
 shelf       the pictures that were opened last, taken apart, in memory only
+bodies      what arrives, within one bound for all uploads
 intake      bytes from a stranger to pixels
 examples    pictures to begin with
 neighbours  rows of a feature table near to a picture, with their pictures

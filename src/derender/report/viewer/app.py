@@ -1,20 +1,22 @@
 """The addresses of the page and what answers them, within bounds of size, time and number.
 
 Nothing in a request can name a file: the page's own files are read once at the start, pictures are known by
-names that the shelf made up, examples and rows by number. Bodies are read up to a limit; decoding and
-computing have one thread each, so that a heavy upload does not hold up the sliders of others.
+names that the shelf made up, examples and rows by number. Bodies are read up to a limit, and all uploads
+together keep no more than another; decoding and computing have one thread each, so that a heavy upload does
+not hold up the sliders of others.
 """
 
 import asyncio
 import json
 from collections.abc import Awaitable, Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AsyncExitStack
 from dataclasses import dataclass
 from functools import partial
 from importlib.resources import files
 from typing import Any
 
+import numpy as np
+from jaxtyping import UInt8
 from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect, Request
@@ -23,20 +25,20 @@ from starlette.routing import Route
 
 from derender import __version__
 from derender.report.colours import pictures
+from derender.report.viewer.bodies import Body, Uploads
 from derender.report.viewer.examples import Example
 from derender.report.viewer.guard import Guard
 from derender.report.viewer.intake import BODY_LIMIT_BYTES, PIXEL_LIMIT, pixels_of, too_large
 from derender.report.viewer.neighbours import Gallery
-from derender.report.viewer.questions import LARGEST_SIZE, NeighbourQuestion, Question, read_question
+from derender.report.viewer.questions import LARGEST_SIZE, NeighbourQuestion, Q, Question, read_question
 from derender.report.viewer.refused import Refused
 from derender.report.viewer.studio import Studio, data_url
 
 BODY_SECONDS = 30.0
 WORK_SECONDS = 30.0
 QUESTION_LIMIT_BYTES = 10_000
-UPLOADS_AT_ONCE = 4
-SMALL_UPLOAD_BYTES = 500_000
-"""Uploads that have come no further take no place among those: one that stalls early holds up no other."""
+UPLOADS_LIMIT_BYTES = 10 * BODY_LIMIT_BYTES
+"""Of all uploads together that arrive or wait to be decoded."""
 
 WAITING_AT_MOST = 200
 DRAINED_AT_MOST_BYTES = 3 * BODY_LIMIT_BYTES
@@ -90,7 +92,7 @@ class Application:
         self.body_seconds, self.work_seconds = body_seconds, work_seconds
         self._computing = ThreadPoolExecutor(1, thread_name_prefix="view-compute")
         self._decoding = ThreadPoolExecutor(1, thread_name_prefix="view-decode")
-        self._uploads = asyncio.Semaphore(UPLOADS_AT_ONCE)
+        self._uploads = Uploads(UPLOADS_LIMIT_BYTES)
         self._waiting = 0
         studio = viewer.studio
         posts: dict[str, Answer] = {
@@ -162,11 +164,10 @@ class Application:
 
     async def open_upload(self, request: Request) -> Response:
         """Take the picture in the body apart."""
-        async with AsyncExitStack() as place:
-            encoded = await self._body(request, BODY_LIMIT_BYTES, place)
+        with self._uploads.one() as body:
+            await self._receive(request, body, BODY_LIMIT_BYTES)
             size = self.viewer.studio.model.image_size
-            picture = await self._work(self._decoding, pixels_of, encoded, size)
-            del encoded
+            picture = await self._work(self._decoding, _decoded, body, size)
         return await self._opened(picture)
 
     async def open_example(self, request: Request) -> Response:
@@ -187,19 +188,19 @@ class Application:
 
     async def factors(self, request: Request) -> Response:
         """The maps of a picture, by name, as images inside JSON."""
-        question = read_question(Question, await self._body(request, QUESTION_LIMIT_BYTES))
+        question = await self._question(request, Question)
         maps = await self._work(self._computing, self.viewer.studio.maps, question)
         return JSONResponse({name: data_url(image) for name, image in maps.items()})
 
     async def settings(self, request: Request) -> Response:
         """Light and camera as JSON."""
-        question = read_question(Question, await self._body(request, QUESTION_LIMIT_BYTES))
+        question = await self._question(request, Question)
         text = json.dumps(self.viewer.studio.settings(question), indent=1) + "\n"
         return Response(text, media_type="application/json")
 
     async def neighbours(self, request: Request) -> Response:
         """The rows nearest to a picture by one factor, with their pictures where those are here."""
-        question = read_question(NeighbourQuestion, await self._body(request, QUESTION_LIMIT_BYTES))
+        question = await self._question(request, NeighbourQuestion)
         found = await self._work(self._computing, self.viewer.studio.neighbours, question)
         gallery = self.viewer.gallery
         assert gallery is not None, "a studio with a table has a gallery"
@@ -211,7 +212,7 @@ class Application:
 
     async def made(self, make: Callable[[Question], bytes], media_type: str, request: Request) -> Response:
         """Bytes that the studio makes for a question."""
-        question = read_question(Question, await self._body(request, QUESTION_LIMIT_BYTES))
+        question = await self._question(request, Question)
         return Response(await self._work(self._computing, make, question), media_type=media_type)
 
     async def _opened(self, picture: Any) -> Response:
@@ -230,37 +231,33 @@ class Application:
         finally:
             self._waiting -= 1
 
-    async def _body(self, request: Request, limit: int, place: AsyncExitStack | None = None) -> bytes:
-        """The request's body; ``Refused`` if it is too large (413) or comes too slowly (408).
+    async def _question(self, request: Request, kind: type[Q]) -> Q:
+        body = Body()
+        await self._receive(request, body, QUESTION_LIMIT_BYTES)
+        return read_question(kind, bytes(body.content))
 
-        Args:
-            request: whose body.
-            limit: most bytes that are kept.
-            place: takes one of the places for large uploads once the body is no longer small; waiting for
-                it is not counted as slowness.
-        """
-        body = bytearray()
-        received = 0
+    async def _receive(self, request: Request, body: Body, limit: int) -> None:
+        """Fill ``body``; ``Refused`` if it is too large (413), too slow (408) or had to make room (503)."""
         try:
-            async with asyncio.timeout(self.body_seconds) as clock:
+            async with asyncio.timeout(self.body_seconds):
                 async for part in request.stream():
-                    received += len(part)
-                    if place is not None and received > SMALL_UPLOAD_BYTES:
-                        clock.reschedule(None)
-                        await place.enter_async_context(self._uploads)
-                        clock.reschedule(asyncio.get_running_loop().time() + self.body_seconds)
-                        place = None
-                    if received > limit:
-                        body.clear()
-                    else:
-                        body += part
-                    if received > limit + DRAINED_AT_MOST_BYTES:
+                    body.take(part)
+                    if body.received > limit:
+                        body.drop()
+                    self._uploads.make_room()
+                    if body.received > limit + DRAINED_AT_MOST_BYTES:
                         break
         except TimeoutError as late:
             raise Refused(408, "the file came too slowly: try again") from late
-        if received > limit:
+        if body.received > limit:
             raise too_large() if limit == BODY_LIMIT_BYTES else Refused(413, "this request is too long")
-        return bytes(body)
+        if body.dropped:
+            raise Refused(503, "too many files are arriving at once: try again in a moment")
+        body.whole = True
+
+
+def _decoded(body: Body, size: int) -> UInt8[np.ndarray, "3 s s"]:
+    return pixels_of(bytes(body.content), size)
 
 
 def _thumbnail(gallery: Gallery, row: int) -> str | None:
