@@ -131,7 +131,7 @@ def _fitted(
         )
         return {name: value.cpu().numpy() for name, value in found.named_buffers()}
 
-    kept = (lender.memory or Memory()).recall("whitening", inputs, make)
+    kept = (lender.memory or Memory()).recall("lent whitening", inputs, make)
     names = [name.removesuffix("_map") for name in kept if name.endswith("_map")]
     return Whitening(
         {
