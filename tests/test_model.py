@@ -9,6 +9,7 @@ import torch
 
 import derender
 from derender.data import read_ground_truth
+from derender.data.checks import check_pictures
 from derender.evaluation import evaluate_geometry
 from derender.model import CONFIG_FILE, PRETRAINED, WEIGHTS_FILE, Derenderer, bundled_models, load
 from derender.networks import FACTORS, Factor
@@ -106,7 +107,7 @@ def test_mirrored_scene_seen_from_the_mirrored_side_is_the_mirrored_picture(mode
 )
 def test_wrong_pictures_are_named(model, shape, dtype, message):
     with pytest.raises(ValueError, match=message):
-        model._check(torch.zeros(shape, dtype=dtype))
+        check_pictures(torch.zeros(shape, dtype=dtype), model.image_size)
 
 
 def test_same_seed_same_weights_and_the_global_generator_is_left_alone():

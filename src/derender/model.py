@@ -14,24 +14,47 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from derender.data.checks import check_pictures, refuse_not_finite
 from derender.networks import FACTORS, Factor, NetworkSettings
 from derender.networks.confidence import Confidence, ConfidenceNet
+from derender.networks.fitting import STEPS, Fitted, Fitting, coordinates_of
 from derender.networks.tensor_file import read_tensors, write_tensors
 from derender.networks.unsup3d import read_checkpoint
 from derender.networks.whitening import Whitening
 from derender.presets import MODEL_PRESETS, ModelSettings, named_preset
 from derender.pretrained import hub
 from derender.pretrained.card import CARD_FILE, model_card, with_metadata
-from derender.pretrained.saved import CONFIG_FILE, FORMAT, WEIGHTS_FILE, check_shapes, read_config
+from derender.pretrained.folders import PRETRAINED, bundled_models, model_folder, texts_beside
+from derender.pretrained.saved import (
+    CONFIG_FILE,
+    ERRORS_FILE,
+    FITTING_FILE,
+    FORMAT,
+    WEIGHTS_FILE,
+    WHITENING_FILE,
+    check_shapes,
+    read_config,
+)
 from derender.render import Rendering, render_scene
 from derender.scene import Scene
 from derender.scene.ranges import SceneRanges
 from derender.whole import whole_folder
 
-WHITENING_FILE = "whitening.safetensors"  # a model may lack it
-ERRORS_FILE = "held_out_errors.json"  # written and read by training/held_out_errors.py; a model may lack it
-PRETRAINED = Path(__file__).parent / "pretrained"
 Renderer = Callable[[Scene, float], Rendering]
+
+__all__ = [
+    "CONFIG_FILE",
+    "ERRORS_FILE",
+    "FITTING_FILE",
+    "PRETRAINED",
+    "WEIGHTS_FILE",
+    "WHITENING_FILE",
+    "Derenderer",
+    "Renderer",
+    "bundled_models",
+    "load",
+    "model_folder",
+]
 
 
 class Derenderer(nn.Module):
@@ -58,6 +81,7 @@ class Derenderer(nn.Module):
         )
         self.nets["confidence"] = ConfidenceNet(self.settings.network)
         self.whitening: Whitening | None = None  # fitted after training (training/whitening.py)
+        self.fitting: Fitting | None = None  # made after training (training/fitting.py)
         self.source: Path | None = None  # the folder these weights were loaded from
 
     @classmethod
@@ -105,17 +129,27 @@ class Derenderer(nn.Module):
         return model.eval().requires_grad_(False)
 
     def embed(self, images: Float[Tensor, "n 3 h w"]) -> dict[str, Float[Tensor, "n code"]]:
-        """One feature per factor for pictures in 0..1, by name: whitened if fitted, else its code."""
-        _refuse_not_finite(images)
-        return self.encode(images) if self.whitening is None else self.features(self.read(images))
+        """One feature per factor for pictures in 0..1, by name: whitened if fitted, else its code.
+
+        Coordinates of the fitted scene follow in a model whose fitting makes steps.
+        """
+        refuse_not_finite(images)
+        if self.whitening is None and not self.fits_scenes:
+            return self.encode(images)
+        return self.features(self.read(images))
 
     def read(self, images: Float[Tensor, "n 3 h w"]) -> dict[str, Float[Tensor, "n _"]]:
         """All that each encoder says of pictures in 0..1: its code, then its last spatial features.
 
-        Where features are made of it, what it says of the mirror image follows.
+        Where features are made of it, what it says of the mirror image follows. The fitted scene's
+        coordinates, where they are part of features, have keys of their own (`coordinates_of`).
         """
-        self._check(images)
-        return {factor.name: self.read_factor(factor.name, images) for factor in self.factors}
+        check_pictures(images, self.image_size)
+        found = {factor.name: self.read_factor(factor.name, images) for factor in self.factors}
+        if self.fits_scenes:
+            fitted = self._fitted(images, self.decode(self.codes(found))).coordinates
+            found |= {coordinates_of(name): value for name, value in fitted.items()}
+        return found
 
     def read_factor(self, name: str, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n _"]:
         """``read`` for one factor."""
@@ -130,7 +164,8 @@ class Derenderer(nn.Module):
 
     def codes(self, readings: Mapping[str, Float[Tensor, "n _"]]) -> dict[str, Float[Tensor, "n code"]]:
         """The codes that readings begin with: what ``encode`` gives for the pictures they come from."""
-        return {name: row[:, : self.settings.network.code_size] for name, row in readings.items()}
+        size, names = self.settings.network.code_size, {factor.name for factor in self.factors}
+        return {name: row[:, :size] for name, row in readings.items() if name in names}
 
     def features(self, readings: Mapping[str, Float[Tensor, "n _"]]) -> dict[str, Float[Tensor, "n code"]]:
         """The features that belong to readings: what ``embed`` gives for the pictures they come from.
@@ -139,11 +174,18 @@ class Derenderer(nn.Module):
             ValueError: there are codes where features are made of whole readings.
         """
         own = {} if self.whitening is None else self.whitening(readings)
-        return self.codes(readings) | own
+        found = self.codes(readings) | own
+        if self.fitting is None:
+            return found
+        fitted = {name: readings[coordinates_of(name)] for name in found if coordinates_of(name) in readings}
+        return found | {
+            name: torch.cat([found[name], self.fitting.features(value)], dim=1)
+            for name, value in fitted.items()
+        }
 
     def encode(self, images: Float[Tensor, "n 3 h w"]) -> dict[str, Float[Tensor, "n code"]]:
         """One code per factor for pictures in 0..1, by factor name: what ``decode`` takes."""
-        self._check(images)
+        check_pictures(images, self.image_size)
         return {factor.name: self.nets[factor.name].encode(images) for factor in self.factors}  # type: ignore[operator]
 
     def decode(self, codes: Mapping[str, Float[Tensor, "n code"]]) -> Scene:
@@ -160,8 +202,34 @@ class Derenderer(nn.Module):
 
     def decompose(self, images: Float[Tensor, "n 3 h w"]) -> Scene:
         """Geometry, albedo, light and camera of pictures in 0..1."""
-        _refuse_not_finite(images)
+        refuse_not_finite(images)
         return self.decode(self.encode(images))
+
+    @property
+    def fits_scenes(self) -> bool:
+        """Whether features are made of fitted scenes, too."""
+        return self.fitting is not None and self.fitting.settings.steps > 0
+
+    def fit_scenes(self, images: Float[Tensor, "n 3 h w"], steps: int = STEPS) -> Fitted:
+        """Scenes of pictures in 0..1, fitted to them by rendering from what ``decompose`` says on.
+
+        Slower than ``decompose`` by a hundred times, nearer to the picture, and right in light and views in
+        which encoders were not trained.
+
+        Raises:
+            ValueError: the model has not been given what this needs (``derender whiten``).
+        """
+        scene = self.decompose(images)
+        if self.fitting is None:
+            raise ValueError(
+                "this model cannot fit scenes yet: derender whiten --model MODEL --data PICTURES --out NEW "
+                "makes a copy that can"
+            )
+        return self._fitted(images, scene, steps)
+
+    def _fitted(self, images: Tensor, scene: Scene, steps: int | None = None) -> Fitted:
+        assert self.fitting is not None
+        return self.fitting.fit(images, scene, self.render, steps)
 
     def render(self, scene: Scene) -> Rendering:
         """Pictures of scenes, with the model's field of view."""
@@ -173,7 +241,7 @@ class Derenderer(nn.Module):
 
     def confidence(self, images: Float[Tensor, "n 3 h w"]) -> Confidence:
         """Where the reconstruction is expected to fail (used in training)."""
-        self._check(images)
+        check_pictures(images, self.image_size)
         return self.nets["confidence"](images)
 
     def mirror(self, scene: Scene) -> Scene:
@@ -261,6 +329,8 @@ class Derenderer(nn.Module):
         (folder / CONFIG_FILE).write_text(json.dumps(config, indent=1))
         if self.whitening is not None:
             self.whitening.save(folder / WHITENING_FILE)
+        if self.fitting is not None:
+            self.fitting.save(folder / FITTING_FILE)
 
     def _card(self, beside: Mapping[str, str], title: str, **told: str | None) -> str:
         """The card that lies beside the weights, unless something else is told of them."""
@@ -270,31 +340,10 @@ class Derenderer(nn.Module):
 
     def _beside(self) -> dict[str, str]:
         """Card and held-out errors of the folder it was loaded from, if its weights still are those."""
-        if self.source is None or not (self.source / WEIGHTS_FILE).is_file():
-            return {}
-        stored, own = read_tensors(self.source / WEIGHTS_FILE), self.state_dict()
-        if (self.source / WHITENING_FILE).is_file():
-            stored |= read_tensors(self.source / WHITENING_FILE)
-        if self.whitening is not None:
-            own |= dict(self.whitening.named_buffers())
-        if stored.keys() != own.keys() or any(
-            not torch.equal(stored[name].to(value), value) for name, value in own.items()
-        ):
-            return {}
-        files = (self.source / name for name in (CARD_FILE, ERRORS_FILE))
-        return {file.name: file.read_text(encoding="utf-8") for file in files if file.is_file()}
-
-    def _check(self, images: Tensor) -> None:
-        size = self.image_size
-        if images.ndim != 4 or images.shape[1:] != (3, size, size):
-            raise ValueError(
-                f"this model takes pictures of shape (N, 3, {size}, {size}), got {tuple(images.shape)}: "
-                f"read them with derender.data.read_pictures(..., image_size={size}) or resize them"
-            )
-        if not images.is_floating_point():
-            raise ValueError(
-                f"pictures must be floating point in 0..1, got {images.dtype}: divide uint8 by 255"
-            )
+        own = self.state_dict()
+        for part in (self.whitening, self.fitting):
+            own |= {} if part is None else part.tensors()
+        return texts_beside(self.source, own)
 
 
 def load(
@@ -334,49 +383,11 @@ def load(
         model.load_state_dict(weights)
         if (folder / WHITENING_FILE).is_file():
             model.whitening = Whitening.load(folder / WHITENING_FILE)
+        if (folder / FITTING_FILE).is_file():
+            model.fitting = Fitting.load(folder / FITTING_FILE)
     except (RuntimeError, ValueError) as error:
         raise ValueError(
             f"{folder} is damaged ({str(error).splitlines()[0]}): copy or train the model again"
         ) from error
     model.source = folder
     return model.to(device).eval().requires_grad_(False)
-
-
-def _refuse_not_finite(images: Tensor) -> None:
-    """NaN or infinity in pictures is an error; not looked for on other devices, which would have to wait."""
-    if images.device.type != "cpu" or torch.compiler.is_compiling() or bool(images.isfinite().all()):
-        return
-    first = int(images.isfinite().flatten(1).all(dim=1).int().argmin())
-    raise ValueError(
-        f"picture {first} of {len(images)} holds values that are not finite: give numbers in 0..1"
-    )
-
-
-def bundled_models() -> tuple[str, ...]:
-    """Names of the trained models that come with derender; each has a card, ``pretrained/NAME/README.md``."""
-    return tuple(sorted(folder.parent.name for folder in PRETRAINED.glob(f"*/{CONFIG_FILE}")))
-
-
-def model_folder(source: str | Path) -> Path:
-    """The folder that ``load`` reads for this source.
-
-    Raises:
-        FileNotFoundError: nothing is there.
-    """
-    folder = Path(source)
-    for candidate in (folder, folder / "model"):
-        if (candidate / CONFIG_FILE).is_file() and (candidate / WEIGHTS_FILE).is_file():
-            return candidate
-    if folder.exists():
-        raise FileNotFoundError(
-            f"{folder} holds no model (expected {CONFIG_FILE} and {WEIGHTS_FILE} here or in 'model'): "
-            "give a run folder made by 'derender train' or a folder made by model.save"
-        )
-    if source in bundled_models():
-        return PRETRAINED / source
-    if isinstance(source, str) and source.count("/") == 1 and not source.startswith((".", "/", "~")):
-        return hub.download(source, (CONFIG_FILE, WEIGHTS_FILE, WHITENING_FILE, ERRORS_FILE, CARD_FILE))
-    raise FileNotFoundError(
-        f"no model at {source}: give a run folder, a saved folder, a Hub id 'owner/name', or one of those "
-        f"that come with derender ({', '.join(bundled_models())})"
-    )

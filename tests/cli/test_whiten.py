@@ -54,3 +54,71 @@ def test_settings_that_make_no_sense_are_named(folder, tmp_path, capsys, setting
     assert run(folder, tmp_path / "mine", "--set", setting) == 2
     assert said in capsys.readouterr().err
     assert not (tmp_path / "mine").exists()
+
+
+SMALL = ("--set", "pictures=8", "--set", "views=1", "--set", "spatial=false", "--set", "directions=8")
+SMALL += ("--set", "examples=12")
+
+
+def test_features_of_fitted_scenes_when_steps_are_asked_for(folder, tmp_path, capsys):
+    made = tmp_path / "fitted"
+    assert run(folder, made, *SMALL, "--set", "coordinates=10", "--set", "steps=3", "--set", "weight=2") == 0
+    model = derender.load(made)
+    assert model.fits_scenes and model.fitting.settings.weight == 2
+    assert {name: size.shape[1] for name, size in model.embed(torch.rand(1, 3, 64, 64)).items()} == {
+        "geometry": 256, "albedo": 256, "light": 256, "camera": 256
+    }  # fmt: skip
+    table = tmp_path / "table.parquet"
+    given = ["embed", "-m", str(made), "-d", str(folder), "-o", str(table)]
+    assert main(given) == 0
+    assert main([*given, "--force", "--fit-steps", "0", "--json", "-"]) == 0
+    assert '"geometry": 246' in capsys.readouterr().out
+
+
+def test_scenes_that_cannot_be_fitted_are_told_before_anything_is_written(folder, tmp_path, capsys):
+    model = derender.load("rendered-faces-64")
+    model.fitting = None
+    model.save(tmp_path / "plain")
+    for command in (
+        ["embed", "-m", str(tmp_path / "plain"), "-d", str(folder), "-o", str(tmp_path / "t.parquet")],
+        ["decompose", "-m", str(tmp_path / "plain"), str(folder / "0.png"), "-o", str(tmp_path / "apart")],
+    ):
+        assert main([*command, "--fit-steps", "5"]) == 2
+        said = capsys.readouterr().err
+        assert "cannot fit scenes yet" in said and "derender whiten" in said
+    assert not (tmp_path / "t.parquet").exists() and not (tmp_path / "apart").exists()
+
+
+@pytest.mark.parametrize("command", ["decompose", "relight", "rotate", "mesh"])
+def test_pictures_are_made_of_fitted_scenes(folder, tmp_path, command):
+    assert run(folder, tmp_path / "model", *SMALL, "--set", "coordinates=10") == 0
+    given = [command, "-m", str(tmp_path / "model"), str(folder / "0.png")]
+    extra = ["--film", "none"] if command in ("relight", "rotate") else []
+    for name, steps in (("plain", []), ("fitted", ["--fit-steps", "12"])):
+        assert main([*given, *extra, "-o", str(tmp_path / name), *steps]) == 0
+    one, two = (sorted(path for path in (tmp_path / name / "0").iterdir()) for name in ("plain", "fitted"))
+    assert [path.name for path in one] == [path.name for path in two]
+    assert any(a.read_bytes() != b.read_bytes() for a, b in zip(one, two, strict=True))
+
+
+def test_a_table_of_fitted_scenes_is_searched_as_it_was_made(folder, tmp_path, capsys):
+    model, table = tmp_path / "model", tmp_path / "table.parquet"
+    assert run(folder, model, *SMALL, "--set", "coordinates=10") == 0
+    assert not derender.load(model).fits_scenes
+    given = ["-m", str(model)]
+    assert main(["embed", *given, "-d", str(folder), "-o", str(table), "--fit-steps", "3"]) == 0
+    assert derender.FeatureTable.read(table).factors["geometry"].shape == (24, 266)
+    asked = [
+        "search",
+        "--features",
+        str(table),
+        "--like",
+        str(folder / "3.png"),
+        *given,
+        "--factor",
+        "geometry",
+    ]
+    capsys.readouterr()
+    assert main([*asked, "--copies", "--json", "-"]) == 0
+    found = json.loads(capsys.readouterr().out)["found"]
+    assert found[0]["file"] == "3.png" and found[0]["distance"] == pytest.approx(0, abs=1e-4)

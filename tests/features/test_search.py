@@ -81,3 +81,15 @@ def test_the_same_picture_is_alike_in_every_factor(table, monkeypatch):
 def test_bad_questions(table, query, factor, more, message):
     with pytest.raises(ValueError, match=message):
         nearest(table, query, factor, **more)
+
+
+def test_a_fitted_picture_is_itself_though_rounding_grew_on_its_way():
+    draw = np.random.default_rng(3)
+    geometry, light = draw.normal(size=(4, 8)).astype(np.float32), draw.normal(size=(4, 3)).astype(np.float32)
+    again = {"geometry": geometry[2] * 1.1, "light": light[2]}
+    names = ("a", "b", "c", "d")
+    read = FeatureTable(names, {"geometry": geometry, "light": light})
+    fitted = FeatureTable(names, {"geometry": geometry, "light": light}, {}, {"fit_steps": 60})
+    assert same_picture(read, again).tolist() == []
+    assert same_picture(fitted, again).tolist() == [2]
+    assert same_picture(fitted, {**again, "light": light[2] * 1.1}).tolist() == []  # light is read as ever

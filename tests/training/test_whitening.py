@@ -19,9 +19,16 @@ TINY = ["image_size=32", "width=8", "light_width=4", "code_size=16", "perceptual
 TINY += ["images=16", "warmup_images=0"]
 
 
+def read_only() -> derender.Derenderer:
+    """The bundled model, its features made of what its encoders say alone."""
+    model = derender.load("rendered-faces-64")
+    model.fitting = None
+    return model
+
+
 @pytest.fixture(scope="module")
 def model() -> derender.Derenderer:
-    return derender.load("rendered-faces-64")
+    return read_only()
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +51,7 @@ def moved_by_light(model, images) -> dict[str, float]:
 
 
 def test_light_moves_features_less_than_codes_on_pictures_that_were_not_seen(images):
-    model = derender.load("rendered-faces-64")
+    model = read_only()
     model.whitening = None
     before = moved_by_light(model, images[200:])
     model.whitening = fit_whitening(model, images[:200], SETTINGS, PerturbSettings(), seed=1)
@@ -54,7 +61,7 @@ def test_light_moves_features_less_than_codes_on_pictures_that_were_not_seen(ima
 
 
 def test_scenes_are_those_of_the_codes_and_light_and_camera_keep_theirs(images):
-    model = derender.load("rendered-faces-64")
+    model = read_only()
     model.whitening = fit_whitening(model, images[:50], SETTINGS, PerturbSettings())
     pictures = images[:4].float() / 255
     with torch.no_grad():
@@ -67,7 +74,7 @@ def test_scenes_are_those_of_the_codes_and_light_and_camera_keep_theirs(images):
 
 
 def test_a_mirror_image_has_the_features_of_the_picture_unless_told_otherwise(images, tmp_path):
-    model = derender.load("rendered-faces-64")
+    model = read_only()
     pictures = images[:6].float() / 255
     for mirrored in (True, False):
         settings = SETTINGS.model_copy(update={"mirrored": mirrored, "pictures": 40})
@@ -82,7 +89,7 @@ def test_a_mirror_image_has_the_features_of_the_picture_unless_told_otherwise(im
 
 
 def test_fitting_anew_does_not_depend_on_the_features_there_were(images):
-    model = derender.load("rendered-faces-64")
+    model = read_only()
     found = []
     for _ in range(2):
         model.whitening = fit_whitening(model, images[:30], SETTINGS, PerturbSettings())
@@ -118,7 +125,7 @@ def test_a_run_ends_with_features_whitened_unless_told_not_to(pictures, tmp_path
 
 
 def test_a_table_knows_whether_its_features_were_whitened(images):
-    model = derender.load("rendered-faces-64")
+    model = read_only()
     model.whitening = None
     before = model_fingerprint(model)
     model.whitening = fit_whitening(model, images[:20], SETTINGS, PerturbSettings())

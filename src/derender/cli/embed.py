@@ -52,6 +52,7 @@ def embed(
     part: options.Part = "all",
     limit: options.Limit = None,
     batch_size: options.BatchSize = 256,
+    fit_steps: options.FitSteps = None,
     device: options.Device = "auto",
     engine: Annotated[
         str, typer.Option("--engine", help="local, or ray: on the machines of a Ray cluster.", metavar="NAME")
@@ -93,7 +94,7 @@ def embed(
     elif model is None:
         raise ValueError("give --model RUN, or --baseline NAME (see derender embed --help)")
     else:
-        net, origin = open_model(model, device), {"source": model}
+        net, origin = open_model(model, device, fit_steps), {"source": model}
     with _opened(data, dataset, part, limit, model, net.image_size) as source, bar("embedding") as report:
         done = embed_to_file(
             net,

@@ -106,9 +106,14 @@ def scenes_of(net: "Derenderer", given: Given, batch_size: int) -> "list[Scene]"
 
 
 def refining(
-    net: "Derenderer", size: int | None, texture: str
+    net: "Derenderer",
+    size: int | None,
+    texture: str,
+    fit_steps: int | None = None,
+    source: str = "this model",
 ) -> "Callable[[Scene, Sequence[Path]], Scene] | None":
-    """What makes scenes finer: enlarges them, and takes albedo from the pictures; None for neither."""
+    """What makes scenes finer: fits, enlarges, takes albedo from the pictures; None for none of it."""
+    from derender.cli.models import fitting_of
     from derender.data import as_float
     from derender.data.nearest import nearest
     from derender.report.texture import picture_albedo, picture_on_grid
@@ -121,12 +126,16 @@ def refining(
     side = net.image_size if size is None else size
     if side < net.image_size:
         raise ValueError(f"--size {side} is below the model's {net.image_size}: give that or more")
-    if side == net.image_size and texture == "model":
+    fitting = fitting_of(net, source) if fit_steps else None
+    if side == net.image_size and texture == "model" and fitting is None:
         return None
 
     def refine(scene: "Scene", sources: Sequence[Path]) -> "Scene":
         import numpy as np
 
+        if fitting is not None:
+            own = as_float(np.stack([one_picture(path, net.image_size) for path in sources])).to(scene.depth)
+            scene = fitting.fit(own, scene, net.render, fit_steps).scene
         scene = at_size(scene, side)
         if texture == "model":
             return scene

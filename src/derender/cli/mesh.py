@@ -36,6 +36,7 @@ def mesh(
     ] = "glb",
     size: Size = DEFAULT_SIZE,
     texture: Texture = "model",
+    fit_steps: options.FitSteps = None,
     grazing: Annotated[
         float,
         typer.Option(
@@ -56,7 +57,7 @@ def mesh(
     if not 0 < grazing <= 90:
         raise ValueError(f"--grazing must lie above 0 and up to 90 degrees, got {grazing:g}")
     net = open_model(model, device)
-    refine = refining(net, size, texture)
+    refine = refining(net, size, texture, fit_steps, model)
     given = given_pictures(images, net.image_size, out, force, sheet=False)
     border = _border(net.settings.ranges.border_columns(net.image_size), net.image_size, size)
     written = []

@@ -3,15 +3,23 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from derender.cli.console import say
+
 if TYPE_CHECKING:
     from derender.data import PictureSet
+    from derender.evaluation.fitted import FittedModel
+    from derender.features import FeatureTable
     from derender.model import Derenderer
+    from derender.networks.fitting import Fitting
 
 PARTS = ("all", "train", "validation", "test")
 
 
-def open_model(source: str, device: str) -> "Derenderer":
-    """Load a model onto a device named as in ``chosen_device``; weights that are no numbers are an error."""
+def open_model(source: str, device: str, fit_steps: int | None = None) -> "Derenderer":
+    """Load a model onto a device named as in ``chosen_device``; weights that are no numbers are an error.
+
+    With ``fit_steps`` its features are made of scenes fitted in so many steps (0: of none).
+    """
     from derender.model import load
 
     model = load(source, device=chosen_device(device))
@@ -21,7 +29,45 @@ def open_model(source: str, device: str) -> "Derenderer":
                 f"{source} has weights that are no numbers (first {name}): its training went wrong or the "
                 "file is damaged; take another checkpoint or train again"
             )
+    if fit_steps is not None and (fit_steps or model.fitting is not None):
+        fitting_of(model, source).set_steps(fit_steps)
     return model
+
+
+def with_fitted_scenes(model: "Derenderer", source: str, steps: int | None) -> "Derenderer | FittedModel":
+    """The model, or with steps one whose scenes are fitted in so many."""
+    from derender.evaluation.fitted import FittedModel
+
+    if not steps:
+        return model
+    fitting_of(model, source)
+    return FittedModel(model, steps)
+
+
+def check_maker(model: "Derenderer", source: str, table: "FeatureTable", path: str | Path) -> None:
+    """Bring a model to as many steps of fitting as a table was made with; another model's is an error."""
+    from derender.features import model_fingerprint
+
+    if model.fitting is not None and isinstance(steps := table.origin.get("fit_steps"), int):
+        model.fitting.set_steps(max(0, steps))
+    made_by, weights = table.origin.get("weights"), model_fingerprint(model)
+    if made_by is None:
+        say(f"{path} does not say which model made it: cannot check that it was {source}")
+    elif made_by != weights:
+        raise ValueError(
+            f"{path} was made by another model (weights {made_by}, {source} has {weights}): "
+            "give that one, or make the table again with derender embed"
+        )
+
+
+def fitting_of(model: "Derenderer", source: str) -> "Fitting":
+    """What a model fits scenes with, or an error that says how to make it."""
+    if model.fitting is None:
+        raise ValueError(
+            f"{source} cannot fit scenes yet: derender whiten --model {source} --data PICTURES --out NEW "
+            "makes a copy that can"
+        )
+    return model.fitting
 
 
 def chosen_device(device: str) -> str:

@@ -68,6 +68,7 @@ def relight(
     stills: Count = 7,
     size: Size = DEFAULT_SIZE,
     texture: Texture = "model",
+    fit_steps: options.FitSteps = None,
     film: Film = "gif,mp4",
     frames: Frames = 48,
     seconds: Seconds = 4.0,
@@ -82,7 +83,7 @@ def relight(
     """
     from derender.report import sweeps
 
-    work = _Work(images, model, out, size, texture, film, device, force)
+    work = _Work(images, model, out, size, texture, film, device, force, fit_steps)
     if like is None:
         before: dict[str, Any] = {}
 
@@ -119,6 +120,7 @@ def rotate(
     stills: Count = 7,
     size: Size = DEFAULT_SIZE,
     texture: Texture = "model",
+    fit_steps: options.FitSteps = None,
     film: Film = "gif,mp4",
     frames: Frames = 48,
     seconds: Seconds = 4.0,
@@ -129,7 +131,7 @@ def rotate(
     """Write strips and films of pictures turned from one side to the other, in their own light."""
     from derender.report import sweeps
 
-    work = _Work(images, model, out, size, texture, film, device, force)
+    work = _Work(images, model, out, size, texture, film, device, force, fit_steps)
 
     def cameras(t: "Tensor", scene: "Scene") -> dict[str, "Tensor"]:
         return {"camera": sweeps.cameras_around(t, reach, pitch)}
@@ -159,6 +161,7 @@ def swap(
     ] = None,
     size: Size = DEFAULT_SIZE,
     texture: Texture = "model",
+    fit_steps: options.FitSteps = None,
     device: options.Device = "auto",
     force: options.Force = False,
     json_file: options.Json = None,
@@ -168,7 +171,7 @@ def swap(
     from derender.report.moved import Moved
     from derender.report.sweeps import drawn, swapped
 
-    work = _Work(images, model, out, size, texture, "none", device, force)
+    work = _Work(images, model, out, size, texture, "none", device, force, fit_steps)
     parameters = {row.name: row.parameter for row in work.net.factors}
     wanted = {name: named(parameters, name, "factor") for name in factor or parameters}
     other, before = work.other(source)
@@ -210,6 +213,7 @@ class _Work:
         film: str,
         device: str,
         force: bool,
+        fit_steps: int | None,
     ):
         from derender.cli.models import open_model
         from derender.report.moved import film_kinds
@@ -217,7 +221,7 @@ class _Work:
         self.films = film_kinds(film)
         self.out = out
         self.net: Derenderer = open_model(model, device)
-        self.refine = refining(self.net, size, texture)
+        self.refine = refining(self.net, size, texture, fit_steps, model)
         self.given: Given = given_pictures(images, self.net.image_size, out, force)
         self.scenes = scenes_of(self.net, self.given, 64)
         self.odd = percentiles(model, self.net, self.given.pictures)

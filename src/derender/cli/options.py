@@ -43,3 +43,10 @@ Force = Annotated[bool, typer.Option("--force", help="Replace what is there.")]
 OutFolder = Annotated[Path, typer.Option("--out", "-o", help="Folder to write to.", metavar="DIR")]
 OutModel = Annotated[Path, typer.Option("--out", "-o", help="Folder for the model to make.", metavar="DIR")]
 Device = Annotated[str, typer.Option("--device", help="cpu, cuda, or auto.", metavar="NAME")]
+FitSteps = Annotated[
+    int | None,
+    typer.Option(
+        "--fit-steps", min=0, metavar="N",
+        help="Fit each scene to its picture by rendering, in so many steps (60, say; slow).",
+    ),
+]  # fmt: skip

@@ -30,6 +30,7 @@ def decompose(
     out: options.OutFolder,
     size: OwnSize = None,
     texture: Texture = "model",
+    fit_steps: options.FitSteps = None,
     sheet: Annotated[
         bool, typer.Option("--sheet", help="Also draw all pictures below each other as sheet.png.")
     ] = False,
@@ -45,7 +46,7 @@ def decompose(
     from derender.report.sheets import Sheets, write_sheets
 
     net = open_model(model, device)
-    refine = refining(net, size, texture)
+    refine = refining(net, size, texture, fit_steps, model)
     given = given_pictures(images, net.image_size, out, force, sheet=sheet)
     sheets, names = Sheets(), iter(given.pictures)
 

@@ -164,18 +164,11 @@ def _query(
         )
         raise ValueError(f"{features} has no row {like!r}{hint}; its first is {table.files[0]!r}")
     from derender.cli.given import one_picture
-    from derender.cli.models import open_model
-    from derender.features import embed_images, model_fingerprint
+    from derender.cli.models import check_maker, open_model
+    from derender.features import embed_images
 
     net = open_model(model, device)
-    made_by, weights = table.origin.get("weights"), model_fingerprint(net)
-    if made_by is None:
-        say(f"{features} does not say which model made it: cannot check that it was {model}")
-    elif made_by != weights:
-        raise ValueError(
-            f"{features} was made by another model (weights {made_by}, {model} has {weights}): "
-            "give that one, or make the table again with derender embed"
-        )
+    check_maker(net, model, table, features)
     codes = embed_images(net, one_picture(Path(like), net.image_size)[None])
     if factor not in codes:
         raise ValueError(f"{model} makes no {factor!r}; it makes {', '.join(codes)}")

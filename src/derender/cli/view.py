@@ -117,18 +117,12 @@ def _readable(images: list[Path], size: int) -> "dict[Path, np.ndarray]":
 
 def _gallery(features: Path, data: str | None, dataset: str, model: str, net: "Derenderer") -> "Gallery":
     """The table, if this model made it."""
-    from derender.features import FeatureTable, model_fingerprint
+    from derender.cli.models import check_maker
+    from derender.features import FeatureTable
     from derender.report.viewer.neighbours import Gallery
 
     table = FeatureTable.read(features)
-    made_by, weights = table.origin.get("weights"), model_fingerprint(net)
-    if made_by is None:
-        say(f"{features} does not say which model made it: cannot check that it was {model}")
-    elif made_by != weights:
-        raise ValueError(
-            f"{features} was made by another model (weights {made_by}, {model} has {weights}): "
-            "give that one, or make the table again with derender embed"
-        )
+    check_maker(net, model, table, features)
     if not set(table.factors) & set(net.nets):
         raise ValueError(f"{features} has none of the factors of {model}: make it again with derender embed")
     gallery = Gallery(table, data, dataset)

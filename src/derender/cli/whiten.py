@@ -25,8 +25,9 @@ def whiten(
         list[str] | None,
         typer.Option(
             "--set",
-            help="pictures, views, spatial, mirrored, directions, shrinkage, evenness; what is perturbed, "
-            "as perturb.light_deg.",
+            help="pictures, views, spatial, mirrored, directions, shrinkage, evenness; examples, "
+            "coordinates, steps, prior, tolerance, weight of fitting; what is perturbed, as "
+            "perturb.light_deg.",
             metavar="KEY=VALUE",
         ),
     ] = None,
@@ -38,14 +39,14 @@ def whiten(
     """Write a copy of a model whose features move as little as can be with light and camera.
 
     It is fitted to these pictures, without labels. Weights and scenes stay as they are. Training ends with
-    this by itself.
+    this by itself. With --set steps=60 features are also made of scenes fitted to each picture by rendering.
     """
     import torch
 
     from derender.cli.models import open_model, part_of
     from derender.data import read_pictures
     from derender.training.config import FeatureSettings, with_changes
-    from derender.training.whitening import fit_whitening
+    from derender.training.features import make_features
 
     nothing_there(out, force)
     settings = with_changes(FeatureSettings(), overrides or [])
@@ -57,14 +58,8 @@ def whiten(
     chosen = part_of(pictures, part, model).require(2)
     say_pictures(chosen)
     with bar("rendering again") as report:
-        net.whitening = fit_whitening(
-            net,
-            torch.from_numpy(chosen.images),
-            settings.whitening,
-            settings.perturb,
-            seed=seed,
-            progress=report,
-        )
+        make_features(net, torch.from_numpy(chosen.images), settings, seed=seed, progress=report)
+    assert net.whitening is not None
     folder = net.save(out, overwrite=force)
     ratios = {name: net.whitening.get_buffer(f"{name}_ratios").tolist() for name in net.whitening.names}
     for name, values in ratios.items():

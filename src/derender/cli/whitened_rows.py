@@ -41,7 +41,7 @@ def whitened_rows(
     rows = []
     if net.whitening is not None:
         bare = copy.deepcopy(net)
-        bare.whitening = None
+        bare.whitening = bare.fitting = None
         rows.append(FeatureRow(f"{name}, not whitened", (embedded(bare, pictures, memory, "codes"),), chosen))
     with bar("rendering again") as report:
         again = whitened(lender, net, report)
@@ -72,5 +72,5 @@ def whitening_settings(model: str) -> "FeatureSettings":
     if (Path(model) / "config.yaml").is_file():
         config = read_any_config(Path(model))
         if isinstance(config, TrainConfig):
-            return FeatureSettings(whitening=config.whitening, perturb=config.objective.perturb)
+            return config.features
     return FeatureSettings()

@@ -60,6 +60,7 @@ def whitened(lender: Lender, encoder: Derenderer, progress: Progress | None = No
     names = [factor.name for factor in encoder.factors if factor.mirrored]
     spatial, size = lender.settings.whitening.spatial, encoder.settings.network.code_size
     found = copy.deepcopy(encoder).eval()
+    fitting, found.fitting = found.fitting, None
     found.whitening = None  # it would have pictures read with their mirror images, which are views here
 
     def describe(pictures: Float[Tensor, "n 3 h w"]) -> dict[str, Tensor]:
@@ -67,6 +68,7 @@ def whitened(lender: Lender, encoder: Derenderer, progress: Progress | None = No
         return {name: said[name] for name in names}
 
     found.whitening = _fitted(lender, describe, model_fingerprint(found), progress, size).to(found.device)
+    found.fitting = fitting
     return found.train(encoder.training)
 
 
@@ -112,7 +114,7 @@ def _fitted(
     """The whitening of what ``describe`` says of the lender's renderings, remembered."""
     settings = lender.settings
     bare = copy.deepcopy(lender.model)
-    bare.whitening = None
+    bare.whitening = bare.fitting = None
     inputs = {
         "renders": model_fingerprint(bare), "images": lender.images, "describes": f"{mark} {size}",
         "seed": lender.seed, "settings": settings.model_dump(mode="json"),

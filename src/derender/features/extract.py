@@ -134,6 +134,8 @@ def model_facts(model: Any, source: str, layout: str) -> dict[str, Any]:
         "data": source,
         "layout": layout,
     }
+    if getattr(model, "fitting", None) is not None:
+        facts["fit_steps"] = model.fitting.settings.steps
     if hasattr(model, "settings"):
         facts["settings"] = model.settings.model_dump(mode="json")
     return facts

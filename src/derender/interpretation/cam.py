@@ -71,8 +71,11 @@ def factor_weights(probe: Probe, factor: str, targets: Sequence[int] | np.ndarra
 
 
 def score(code: Float[Tensor, "n c"], weight: Tensor | None) -> Float[Tensor, " n"]:
-    """A factor's part of the logit, or half the squared length of its feature."""
-    return code.square().sum(dim=1) / 2 if weight is None else (code * weight).sum(dim=1)
+    """A factor's part of the logit, or half the squared length of its feature.
+
+    Where the probe knows coordinates of fitted scenes, too, the part that encoders read comes first, alone.
+    """
+    return code.square().sum(dim=1) / 2 if weight is None else (code * weight[:, : code.shape[1]]).sum(dim=1)
 
 
 def _at_features(

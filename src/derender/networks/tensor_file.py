@@ -17,6 +17,8 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 CHECKSUM = "crc32"
+UNIT = ".unit"
+"""A tensor of bytes is in the unit that lies beside it under its name and this: read as their product."""
 
 
 def write_tensors(
@@ -26,6 +28,7 @@ def write_tensors(
     plain = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
     with disk_errors(file):
         save_file(plain, file, metadata={**(metadata or {}), CHECKSUM: checksum(plain)})
+    Path(file).chmod(0o644)  # safetensors lets nobody else read what it writes
 
 
 @contextmanager
@@ -60,7 +63,28 @@ def read_described(file: str | Path) -> tuple[dict[str, Tensor], dict[str, str]]
         raise ValueError(f"{Path(file).name} is cut off or no safetensors file ({error})") from error
     if metadata.get(CHECKSUM, checksum(tensors)) != checksum(tensors):
         raise ValueError(f"{Path(file).name} has changed since it was written: its checksum differs")
-    return tensors, metadata
+    return _unpacked(tensors), metadata
+
+
+def packed(value: Tensor, along: int) -> tuple[Tensor, Tensor]:
+    """A tensor as bytes, and their unit: a 127th of the largest number of each slice along one axis."""
+    others = [axis for axis in range(value.ndim) if axis != along]
+    unit = value.abs().amax(dim=others, keepdim=True).clamp(min=torch.finfo(torch.float32).tiny) / 127
+    return (value / unit).round().to(torch.int8), unit.float()
+
+
+def _unpacked(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    plain = {name: value for name, value in tensors.items() if not name.endswith(UNIT)}
+    for name, unit in tensors.items():
+        if not name.endswith(UNIT):
+            continue
+        value = plain.get(name.removesuffix(UNIT))
+        if value is None or value.dtype != torch.int8 or value.ndim != unit.ndim:
+            raise ValueError(f"{name} is the unit of nothing that is there")
+        if any(one not in (1, size) for one, size in zip(unit.shape, value.shape, strict=True)):
+            raise ValueError(f"{name} does not fit: {tuple(unit.shape)} beside {tuple(value.shape)}")
+        plain[name.removesuffix(UNIT)] = value.float() * unit.float()
+    return plain
 
 
 def checksum(tensors: Mapping[str, Tensor]) -> str:

@@ -153,10 +153,14 @@ class Whitening(nn.Module):
             reading = reading.unflatten(1, (2, -1)).mean(dim=1)
         return (reading[:, : len(mean)].float() - mean) @ chart
 
+    def tensors(self) -> dict[str, Tensor]:
+        """What ``save`` writes, by name."""
+        return dict(self.named_buffers())
+
     def save(self, file: Path) -> None:
         """Write the maps; complete or not at all."""
         with whole_file(file) as temporary:
-            write_tensors(dict(self.named_buffers()), temporary)
+            write_tensors(self.tensors(), temporary)
 
     @classmethod
     def load(cls, file: Path) -> "Whitening":

@@ -1,4 +1,4 @@
-"""What a saved model is given once its run has ended: whitening, and which errors are usual."""
+"""What a saved model is given once its run has ended: whitening, fitting, and which errors are usual."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -7,10 +7,10 @@ import numpy as np
 import torch
 from jaxtyping import UInt8
 
-from derender.model import WHITENING_FILE, load
+from derender.model import FITTING_FILE, WHITENING_FILE, load
 from derender.training.config import TrainConfig
+from derender.training.features import make_features
 from derender.training.held_out_errors import store_errors
-from derender.training.whitening import fit_whitening
 
 
 def complete_model(
@@ -22,7 +22,7 @@ def complete_model(
     device: str | torch.device = "cpu",
     progress: Callable[[int, int], None] | None = None,
 ) -> None:
-    """Add whitening, fitted on training pictures, and reconstruction errors of held-out ones to a model.
+    """Add whitening and fitting, made of training pictures, and errors of held-out ones to a model.
 
     Args:
         folder: of the saved model.
@@ -32,13 +32,9 @@ def complete_model(
         progress: called with (pictures done, pictures in all).
     """
     model = load(folder, device=device)
-    if config.whitening.pictures >= 2:
-        fit_whitening(
-            model,
-            torch.from_numpy(training),
-            config.whitening,
-            config.objective.perturb,
-            seed=config.seed,
-            progress=progress,
-        ).save(folder / WHITENING_FILE)
+    make_features(model, torch.from_numpy(training), config.features, seed=config.seed, progress=progress)
+    if model.whitening is not None:
+        model.whitening.save(folder / WHITENING_FILE)
+    if model.fitting is not None:
+        model.fitting.save(folder / FITTING_FILE)
     store_errors(folder, torch.from_numpy(held_out))

@@ -14,6 +14,7 @@ from pydantic import Field, ValidationError
 
 from derender.data.nearest import nearest
 from derender.model import load
+from derender.networks.fitting import FittingSettings
 from derender.presets import MODEL_PRESETS, ModelSettings, named_preset
 from derender.scene.perturb import PerturbSettings
 from derender.settings import Settings
@@ -64,6 +65,7 @@ class FeatureSettings(Settings):
     """What `derender whiten` can be told: how features are fitted, and what is changed for it."""
 
     whitening: WhiteningSettings = WhiteningSettings()
+    fitting: FittingSettings = FittingSettings()
     perturb: PerturbSettings = PerturbSettings()
 
 
@@ -106,6 +108,12 @@ class TrainConfig(LoopSettings):
     model: ModelSettings = ModelSettings()
     objective: ObjectiveSettings = ObjectiveSettings()
     whitening: WhiteningSettings = WhiteningSettings()
+    fitting: FittingSettings = FittingSettings()
+
+    @property
+    def features(self) -> FeatureSettings:
+        """How features are made once training has ended."""
+        return FeatureSettings(whitening=self.whitening, fitting=self.fitting, perturb=self.objective.perturb)
 
 
 Config = TypeVar("Config", bound=Settings)

@@ -60,9 +60,9 @@ def fit_whitening(
     own = [factor.name for factor in model.factors if factor.mirrored]
     say = describe or (model.read if settings.spatial else model.encode)
     found: dict[str, Spread] = {}
-    was_training, was_whitened = model.training, model.whitening
+    was_training, was_whitened, was_fitting = model.training, model.whitening, model.fitting
     model.eval()
-    model.whitening = None  # readings as they are
+    model.whitening = model.fitting = None  # readings as they are
     try:
         with torch.no_grad():
             for start in range(0, len(chosen), BATCH_SIZE):
@@ -92,9 +92,9 @@ def fit_whitening(
                     progress(min(start + BATCH_SIZE, len(chosen)), len(chosen))
     finally:
         model.train(was_training)
-        model.whitening = was_whitened
+        model.whitening, model.fitting = was_whitened, was_fitting
     if describe is None:
-        size = model.settings.network.code_size
+        size = size or model.settings.network.code_size
     return Whitening(
         {
             name: contrast(spread, settings.directions, settings.shrinkage, size, settings.evenness)

@@ -33,6 +33,7 @@ def geometry(
     published: scoring.Published,
     limit: options.Limit = None,
     batch_size: options.BatchSize = 64,
+    fit_steps: options.FitSteps = None,
     resamples: feature_rows.Resamples = 1_000,
     seed: options.Seed = 0,
     device: options.Device = "auto",
@@ -45,7 +46,7 @@ def geometry(
     published.check()
     from derender.baselines.controls import untrained_twin
     from derender.cli.evaluate.reconstruction import RECONSTRUCTION_SHOWN
-    from derender.cli.models import open_model
+    from derender.cli.models import open_model, with_fitted_scenes
     from derender.data import read_ground_truth
     from derender.evaluation import (
         FactorResult,
@@ -65,12 +66,13 @@ def geometry(
     net = open_model(model, device)
     truth = read_ground_truth(data, limit=limit, image_size=net.image_size)
     twin, memory = untrained_twin(net, seed), feature_rows.memory_in(cache)
-    inputs = {**feature_rows.model_facts(net), **truth_facts(truth), "seed": seed}
+    inputs = {**feature_rows.model_facts(net), **truth_facts(truth), "seed": seed, "fitted": fit_steps or 0}
+    scored_net = with_fitted_scenes(net, model, fit_steps)
     with bar("decomposing") as report:
         found = recall_value(
             memory, "geometry", inputs, GeometryResult,
             lambda: evaluate_geometry(
-                net, truth, batch_size=batch_size, untrained=twin, progress=report
+                scored_net, truth, batch_size=batch_size, untrained=twin, progress=report
             ),
         )  # fmt: skip
     scores, scored = geometry_table(found, len(truth)), geometry_rows(found, resamples)
@@ -84,7 +86,7 @@ def geometry(
                 memory, f"factors-{name}", inputs, FactorResult,
                 lambda one=one: evaluate_factors(one, truth, batch_size=batch_size),
             )
-            for name, one in (("model", net), ("untrained", twin))
+            for name, one in (("model", scored_net), ("untrained", twin))
         )  # fmt: skip
         shown, rows = factor_table(factors, len(truth), fresh), factor_rows(factors, fresh, resamples)
         tables.append(with_intervals(shown, rows, FACTORS_SHOWN))
@@ -94,7 +96,7 @@ def geometry(
     again = recall_value(
         memory, "reconstruction", inputs, ReconstructionResult,
         lambda: evaluate_reconstruction(
-            net, truth.images, components_of=truth.images, untrained=twin, batch_size=batch_size
+            scored_net, truth.images, components_of=truth.images, untrained=twin, batch_size=batch_size
         ),
     )  # fmt: skip
     name = f"PCA ({component_count(len(truth))})"

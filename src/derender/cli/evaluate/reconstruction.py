@@ -28,6 +28,7 @@ def reconstruction(
     part: options.Part = "all",
     limit: options.Limit = None,
     batch_size: options.BatchSize = 64,
+    fit_steps: options.FitSteps = None,
     store: Annotated[
         bool,
         typer.Option(
@@ -48,7 +49,7 @@ def reconstruction(
     import numpy as np
 
     from derender.baselines.controls import untrained_twin
-    from derender.cli.models import open_model, part_of
+    from derender.cli.models import open_model, part_of, with_fitted_scenes
     from derender.data import read_pictures
     from derender.evaluation import ReconstructionResult, evaluate_reconstruction, mean_picture
     from derender.evaluation.memory_values import recall_value
@@ -68,12 +69,14 @@ def reconstruction(
     components = fitted[np.linspace(0, len(fitted) - 1, min(len(fitted), FITTED)).astype(int)]
     inputs = {
         **feature_rows.model_facts(net), "images": chosen.images, "fitted": fitted, "seed": seed,
+        "fit_steps": fit_steps or 0,
     }  # fmt: skip
+    scored = with_fitted_scenes(net, model, fit_steps)
     with bar("rendering") as report:
         found = recall_value(
             memory, "reconstruction", inputs, ReconstructionResult,
             lambda: evaluate_reconstruction(
-                net, chosen.images, mean=mean_picture(fitted), components_of=components,
+                scored, chosen.images, mean=mean_picture(fitted), components_of=components,
                 untrained=untrained_twin(net, seed), batch_size=batch_size, progress=report,
             ),
         )  # fmt: skip

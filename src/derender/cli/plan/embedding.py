@@ -86,7 +86,7 @@ def opened(plan: Plan, name: str, source: str | None, device: str) -> Any:
             raise ValueError(f"method {name!r} has neither runs nor a model")
         net = open_model(source, device)
         if not method.whitened:
-            net.whitening = None
+            net.whitening = net.fitting = None
         return net
     return open_baseline(
         kind,

@@ -1,0 +1,217 @@
+"""Scenes fitted to their pictures: from where the encoders left them, downhill through the renderer.
+
+Analysis by synthesis at the time of use. Geometry and albedo move within a morphable model of what the
+trained model says of its training pictures (networks/morphable.py), light and camera freely, so that the
+rendering comes near the picture; the further a coordinate is from usual, the more it costs. Encoders know the
+light and views they were trained in; the renderer holds in any. Leaves out the parameters of further factors,
+which stay as they were read.
+"""
+
+import json
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from pydantic import Field, ValidationError, model_validator
+from torch import Tensor, nn
+
+from derender.networks.morphable import MorphableMaps
+from derender.networks.tensor_file import read_described, write_tensors
+from derender.render import Rendering
+from derender.scene import Scene
+from derender.settings import Settings
+from derender.whole import whole_file
+
+PARAMETERS = {"geometry": "depth", "albedo": "albedo"}
+"""Factors that are fitted within the morphable model, and what they fill."""
+
+STEPS = 60
+"""As many as are worth it: twice as many bring the error down by 2 % more."""
+
+_COORDINATE_RATE, _LIGHT_RATE = 0.1, 0.03  # how far a step goes: standard deviations; shares and radians
+_ROTATION_RATE, _TRANSLATION_RATE = 0.01, 0.003  # radians, scene units
+_LATE, _LATE_RATE = 0.6, 0.3  # from this share of the steps on rates are multiplied by this
+_START_LIMIT = 2.5  # standard deviations; a reading beyond is where encoders do not know
+_LIGHT_LIMIT, _ROTATION_LIMIT = math.radians(80), math.radians(75)
+_BRIGHTNESS = (0.02, 1.2)  # of ambient and diffuse light; pictures may be lit more than the ranges say
+_NOISE = 0.03  # mean absolute error, 0..1, that counts as much as coordinates of 1
+_BEYOND = 0.1  # what an error beyond the tolerance still counts
+
+
+def coordinates_of(factor: str) -> str:
+    """The key under which readings hold a factor's fitted coordinates."""
+    return f"{factor} fitted"
+
+
+class FittingSettings(Settings):
+    """How scenes are fitted to pictures (networks/fitting.py); no examples: they cannot be."""
+
+    examples: int = Field(default=2_000, ge=0)  # training pictures whose maps the morphable model is made of
+    coordinates: int = Field(default=64, ge=1)  # of geometry, and of albedo
+    steps: int = Field(
+        default=0, ge=0, le=10_000
+    )  # of every picture when features are made; 0: features are read only
+    prior: float = Field(default=0.1, ge=0)  # how much unusual coordinates cost
+    tolerance: float = Field(default=0.15, gt=0)  # error of a pixel beyond which it hardly counts more
+    weight: float = Field(default=1.0, ge=0)  # length of the fitted coordinates beside that of what is read
+
+    @model_validator(mode="after")
+    def _possible(self) -> "FittingSettings":
+        if self.steps and self.examples < 2:
+            raise ValueError(f"{self.steps} steps need 2 examples or more, got {self.examples}")
+        return self
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """Scenes fitted to pictures.
+
+    Attributes:
+        scene: what was found.
+        coordinates: by factor (geometry, albedo), in standard deviations of the training pictures' maps.
+        before, after: (N,) mean absolute error where the surface is seen, each pixel's error limited softly.
+    """
+
+    scene: Scene
+    coordinates: dict[str, Float[Tensor, "n k"]]
+    before: Float[Tensor, " n"]
+    after: Float[Tensor, " n"]
+
+
+class Fitting(nn.Module):
+    """What a model needs to fit scenes: the morphable model, how, and the length of features made of it.
+
+    Args:
+        maps: of depth and albedo.
+        settings: how.
+        length: what a coordinate is multiplied by in a feature.
+    """
+
+    def __init__(self, maps: MorphableMaps, settings: FittingSettings, length: float = 1.0):
+        super().__init__()
+        self.maps = maps
+        self.register_buffer("length", torch.tensor(float(length)), persistent=False)
+        self.settings = settings
+
+    @property
+    def settings(self) -> FittingSettings:
+        """How; exchange it to change how many steps are made."""
+        return self._settings
+
+    @settings.setter
+    def settings(self, settings: FittingSettings) -> None:
+        self._settings = settings
+        told = torch.tensor([settings.steps, settings.prior, settings.tolerance], dtype=torch.float64)
+        self.register_buffer("told", told, persistent=False)  # part of what a model's fingerprint is made of
+
+    def set_steps(self, steps: int) -> None:
+        """So many steps from now on; 0: features are read only."""
+        self.settings = FittingSettings.model_validate(self.settings.model_dump() | {"steps": steps})
+
+    def features(self, coordinates: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
+        """Coordinates in the unit of what is read beside them."""
+        return coordinates * self.get_buffer("length")
+
+    def fit(
+        self,
+        pictures: Float[Tensor, "n 3 h w"],
+        scene: Scene,
+        render: Callable[[Scene], Rendering],
+        steps: int | None = None,
+    ) -> Fitted:
+        """Fit scenes to pictures, each by itself.
+
+        Args:
+            pictures: in 0..1.
+            scene: where to begin, at the pictures' size.
+            render: gives pictures of scenes, with gradients.
+            steps: of Adam; by default the settings'.
+        """
+        steps = self.settings.steps if steps is None else steps
+        if steps < 1:
+            raise ValueError(f"fitting needs 1 step or more, got {steps}")
+        with torch.inference_mode(False), torch.enable_grad():
+            own = scene.map(lambda value: value.detach().clone())
+            return self._fitted(pictures.detach().clone(), own, render, steps)
+
+    def _fitted(
+        self, pictures: Tensor, scene: Scene, render: Callable[[Scene], Rendering], steps: int
+    ) -> Fitted:
+        coordinates = {
+            factor: self.maps.coordinates(parameter, scene.parameters[parameter].float()).clamp(
+                -_START_LIMIT, _START_LIMIT
+            )
+            for factor, parameter in PARAMETERS.items()
+        }
+        light, (rotation, translation) = scene.light.float(), scene.camera.float().split(3, dim=1)
+        moved = [*coordinates.values(), light, rotation, translation]
+        rates = [_COORDINATE_RATE] * len(coordinates) + [_LIGHT_RATE, _ROTATION_RATE, _TRANSLATION_RATE]
+        for value in moved:
+            value.requires_grad_()
+        optimiser = torch.optim.Adam(
+            [{"params": [value], "lr": rate} for value, rate in zip(moved, rates, strict=True)],
+            betas=(0.9, 0.95),
+        )
+
+        def shown() -> tuple[Scene, Tensor]:
+            depth, albedo = (self.maps.maps(PARAMETERS[name], value) for name, value in coordinates.items())
+            camera = torch.cat([rotation, translation], dim=1)
+            found = Scene(depth, albedo.clamp(0, 1), light, camera, scene.extra)
+            return found, self._error(pictures, render(found))
+
+        before = None
+        for step in range(steps):
+            for group, rate in zip(optimiser.param_groups, rates, strict=True):
+                group["lr"] = rate * (_LATE_RATE if step >= _LATE * steps else 1.0)
+            error = shown()[1]
+            before = error.detach() if before is None else before
+            usual = torch.stack([value.square().mean(dim=1) for value in coordinates.values()]).sum(dim=0)
+            optimiser.zero_grad(set_to_none=True)
+            (error / _NOISE + self.settings.prior * usual).sum().backward()
+            optimiser.step()
+            with torch.no_grad():
+                light[:, :2].clamp_(*_BRIGHTNESS)
+                light[:, 2:].clamp_(-_LIGHT_LIMIT, _LIGHT_LIMIT)
+                rotation.clamp_(-_ROTATION_LIMIT, _ROTATION_LIMIT)
+        with torch.no_grad():
+            found, after = shown()
+        assert before is not None
+        return Fitted(
+            found.detach(), {name: value.detach() for name, value in coordinates.items()}, before, after
+        )
+
+    def _error(self, pictures: Tensor, rendering: Rendering) -> Float[Tensor, " n"]:
+        apart = (rendering.image - pictures).abs().mean(dim=1)
+        beyond = (apart - self.settings.tolerance).clamp(min=0)
+        seen = rendering.mask.flatten(1)
+        return ((apart - (1 - _BEYOND) * beyond).flatten(1) * seen).sum(dim=1) / seen.sum(dim=1).clamp(min=1)
+
+    def tensors(self) -> dict[str, Tensor]:
+        """What ``save`` writes, by name."""
+        return dict(self.named_buffers())
+
+    def save(self, file: Path) -> None:
+        """Write it; complete or not at all."""
+        with whole_file(file) as temporary:
+            write_tensors(self.tensors(), temporary, {"settings": self.settings.model_dump_json()})
+
+    @classmethod
+    def load(cls, file: Path) -> "Fitting":
+        """Read what ``save`` wrote.
+
+        Raises:
+            ValueError: it is damaged, or tensors are missing or do not fit each other.
+        """
+        tensors, told = read_described(file)
+        try:
+            settings = FittingSettings.model_validate(json.loads(told["settings"]))
+            means, axes = (
+                {name: tensors[f"maps.{name}_{part}"] for name in PARAMETERS.values()}
+                for part in ("mean", "axes")
+            )
+            return cls(MorphableMaps(means, axes), settings, float(tensors["length"]))
+        except (KeyError, json.JSONDecodeError, ValidationError, RuntimeError) as error:
+            raise ValueError(f"{Path(file).name} holds no fitting ({str(error).splitlines()[0]})") from error

@@ -1,0 +1,51 @@
+"""What makes features of a trained model: whitening, then what fits scenes to pictures."""
+
+from collections.abc import Callable
+
+from jaxtyping import Shaped
+from torch import Tensor
+
+from derender.model import Derenderer
+from derender.networks.fitting import PARAMETERS
+from derender.training.config import FeatureSettings
+from derender.training.fitting import make_fitting
+from derender.training.whitening import fit_whitening
+
+
+def make_features(
+    model: Derenderer,
+    images: Shaped[Tensor, "n 3 h w"],
+    settings: FeatureSettings,
+    *,
+    seed: int = 0,
+    progress: Callable[[int, int], None] | None = None,
+) -> None:
+    """Give a model its whitening and its fitting, as far as the settings ask for them; in place.
+
+    A feature keeps the size of the code: where fitted coordinates are part of it, what is read has the rest.
+
+    Args:
+        model: trained.
+        images: what it was trained on, uint8 or float in 0..1.
+        settings: how.
+        seed: of the pictures that are drawn.
+        progress: called with (pictures done, pictures in all), once for each of the two.
+
+    Raises:
+        ValueError: too few pictures, or more fitted coordinates than a feature has numbers.
+    """
+    size = model.settings.network.code_size
+    model.fitting = None
+    if settings.fitting.steps:
+        size -= settings.fitting.coordinates
+        if size < 1:
+            raise ValueError(
+                f"{settings.fitting.coordinates} fitted coordinates leave none of a feature's "
+                f"{model.settings.network.code_size} numbers to what is read: set coordinates lower"
+            )
+    if settings.whitening.pictures >= 2:
+        model.whitening = fit_whitening(
+            model, images, settings.whitening, settings.perturb, size=size, seed=seed, progress=progress
+        )
+    if settings.fitting.examples >= 2 and PARAMETERS.keys() <= {factor.name for factor in model.factors}:
+        model.fitting = make_fitting(model, images, settings.fitting, seed=seed, progress=progress)

@@ -1,0 +1,46 @@
+"""Tensors on disk: bytes with a unit come back as numbers, what does not fit is refused, others may read."""
+
+import stat
+
+import pytest
+import torch
+
+from derender.networks.tensor_file import UNIT, packed, read_tensors, write_tensors
+
+
+@pytest.mark.parametrize("along", [0, 1])
+def test_packed_numbers_are_off_by_half_a_unit_of_their_slice_at_most(tmp_path, along):
+    value = torch.randn(40, 30, generator=torch.Generator().manual_seed(0))
+    value *= torch.logspace(-6, 3, value.shape[along]).unsqueeze(1 - along)
+    bytes_, unit = packed(value, along)
+    write_tensors({"map": bytes_, f"map{UNIT}": unit, "mean": value[0]}, tmp_path / "t.safetensors")
+    found = read_tensors(tmp_path / "t.safetensors")
+    assert set(found) == {"map", "mean"} and found["map"].dtype == torch.float32
+    assert bool(((found["map"] - value).abs() <= 0.501 * unit).all())
+    assert torch.equal(found["mean"], value[0])
+
+
+def test_nothing_but_zeros_stays_zero(tmp_path):
+    bytes_, unit = packed(torch.zeros(3, 4), 1)
+    write_tensors({"a": bytes_, f"a{UNIT}": unit}, tmp_path / "t.safetensors")
+    assert torch.equal(read_tensors(tmp_path / "t.safetensors")["a"], torch.zeros(3, 4))
+
+
+@pytest.mark.parametrize(
+    ("tensors", "said"),
+    [
+        ({"a.unit": torch.ones(1, 1)}, "the unit of nothing"),
+        ({"a": torch.ones(2, 2), "a.unit": torch.ones(1, 2)}, "the unit of nothing"),
+        ({"a": torch.ones(2, 2, dtype=torch.int8), "a.unit": torch.ones(2)}, "the unit of nothing"),
+        ({"a": torch.ones(2, 2, dtype=torch.int8), "a.unit": torch.ones(1, 3)}, "does not fit"),
+    ],
+)
+def test_units_that_do_not_fit_are_refused(tmp_path, tensors, said):
+    write_tensors(tensors, tmp_path / "t.safetensors")
+    with pytest.raises(ValueError, match=said):
+        read_tensors(tmp_path / "t.safetensors")
+
+
+def test_others_may_read_what_is_written(tmp_path):
+    write_tensors({"a": torch.ones(2)}, tmp_path / "t.safetensors")
+    assert stat.S_IMODE((tmp_path / "t.safetensors").stat().st_mode) == 0o644
