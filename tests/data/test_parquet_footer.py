@@ -104,8 +104,15 @@ def test_every_changed_byte_is_refused_or_read_and_never_more_than_that(table):
 
 
 def test_nested_without_end_is_refused():
-    for nested in (b"\x1c" * 5_000, b"\x19\x1c" * 5_000, b"\x1b\x01\xcc" * 5_000):
-        with pytest.raises(ValueError):
+    lists = b"\x19" * 5_000
+    for nested in (
+        b"\x1c" * 5_000,
+        b"\x19\x1c" * 5_000,
+        b"\x1b\x01\xcc" * 5_000,
+        lists,
+        b"\x1b" + b"\1\xbb" * 5_000,
+    ):
+        with pytest.raises(ValueError, match="nested too deeply"):
             footer_of(b"PAR1" + nested + len(nested).to_bytes(4, "little") + b"PAR1")
 
 

@@ -151,6 +151,20 @@ COLLAPSING = [
 COLLAPSING += ["learning_rate=5e-3", "weight_decay=0", "warmup_images=0", "final_rate=1", "images=20000"]
 
 
+@pytest.mark.parametrize(
+    "memory",
+    [
+        {"averages": {"bulge": "0"}},
+        {"on_since": [3]},
+        {"last_images": None},
+        {"uneasy_since": 3},
+    ],
+)
+def test_a_memory_that_no_watcher_gave_is_refused(memory):
+    with pytest.raises(ValueError, match="does not hold what the collapse detector remembers"):
+        Watcher.remembering(RANGES, memory)
+
+
 def test_a_real_collapse_is_caught_within_20000_images_while_its_loss_still_falls(tmp_path, monkeypatch):
     """With the intervals of the preset: the last good state must be there without anybody asking for it.
 

@@ -4,9 +4,10 @@
 
 Each attempt is a process of its own that runs one command as a user would. It is ended by SIGKILL, SIGTERM,
 Ctrl-C, a full disk or an exception, at a moment drawn at random: half of the moments anywhere in the command,
-half just when a file is being written. What lies on disk is checked after each, and the command is given
-again until it comes through; the result must then be that of an undisturbed run, bit for bit. The disk is a
-small tmpfs that is filled up where one may be mounted (root); elsewhere a limit on the size of files.
+half just when a file is being written. A comparison writes faster than one can look: it stops itself in the
+midst of a file drawn at random, and is ended there. What lies on disk is checked after each, and the command
+is given again until it comes through; the result must then be that of an undisturbed run, bit for bit. The
+disk is a small tmpfs, filled up, where one may be mounted (root); elsewhere a limit on the size of files.
 """
 
 import argparse
@@ -71,6 +72,7 @@ def undisturbed(command: Command, folder: Path, place: Place) -> dict[str, bytes
     if code != CAME_THROUGH:
         raise RuntimeError(f"{command.name} does not come through undisturbed:\n{place.log.read_text()}")
     place.seconds = time.monotonic() - began
+    place.writes = int(record.read_text().splitlines()[0])
     place.bytes = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
     return command.result(folder)
 

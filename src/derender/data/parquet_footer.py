@@ -122,8 +122,6 @@ class _Reader:
         self.content, self.place = content, 0
 
     def struct(self, depth: int = 0) -> dict[int, Any]:
-        if depth > DEEPEST:
-            raise ValueError("a footer nested too deeply")
         fields: dict[int, Any] = {}
         number = 0
         while True:
@@ -135,6 +133,8 @@ class _Reader:
             fields[number] = kind == _TRUE if kind in (_TRUE, _FALSE) else self.value(kind, depth + 1)
 
     def value(self, kind: int, depth: int) -> Any:
+        if depth > DEEPEST:
+            raise ValueError("a footer nested too deeply")
         if kind in _INTEGERS:
             return self.integer()
         if kind == _BINARY:
@@ -155,13 +155,13 @@ class _Reader:
         head = self.byte()
         count = head >> 4 if head >> 4 < 15 else self.varint()
         self.room(count)
-        return [self.value(head & 15, depth) for _ in range(count)]
+        return [self.value(head & 15, depth + 1) for _ in range(count)]
 
     def pairs(self, depth: int) -> list[tuple[Any, Any]]:
         count = self.varint()
         kinds = self.byte() if count else 0
         self.room(count)
-        return [(self.value(kinds >> 4, depth), self.value(kinds & 15, depth)) for _ in range(count)]
+        return [(self.value(kinds >> 4, depth + 1), self.value(kinds & 15, depth + 1)) for _ in range(count)]
 
     def integer(self) -> int:
         coded = self.varint()

@@ -6,6 +6,7 @@ it is kept. Every file has a checksum.
 """
 
 import json
+import math
 import warnings
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -118,9 +119,11 @@ def load_checkpoint(folder: Path, model: nn.Module, optimiser: torch.optim.Optim
         )
     stored, weights, moments = _read(folder, with_optimiser=optimiser is not None)
     try:
+        _check_counters(stored["state"])
         state = TrainState(**stored["state"])
         fit_weights(model, weights)
         if optimiser is not None:
+            _check_moments(optimiser, moments)
             optimiser.load_state_dict(moments)
             _lay_out_like_parameters(optimiser)
     except (ValueError, KeyError, TypeError, RuntimeError) as error:
@@ -148,6 +151,43 @@ def _read(folder: Path, *, with_optimiser: bool) -> tuple[dict[str, Any], dict[s
         "update derender"
     )
 
+
+def _check_counters(noted: dict[str, Any]) -> None:
+    """Counters that no run could have noted are a ValueError."""
+    noted = {**asdict(TrainState()), **noted}
+    counts = [noted["images"], noted["validations_since_best"]]
+    if not all(type(count) is int and 0 <= count < 1 << 62 for count in counts):
+        raise ValueError(f"pictures and validations must be counts, got {counts}")
+    numbers = [noted["seconds"], 0.0 if noted["best_loss"] is None else noted["best_loss"]]
+    if not all(type(number) in (int, float) and abs(number) < math.inf for number in numbers):
+        raise ValueError(f"seconds and the best loss must be finite numbers, got {numbers}")
+    if type(noted["watcher"]) is not dict:
+        raise ValueError("what the collapse detector remembers must be a table")
+
+
+def _check_moments(optimiser: torch.optim.Optimizer, moments: dict[str, Any]) -> None:
+    """A state that is not of these parameters is a ValueError: a fused step goes by their size alone.
+
+    How a step is computed is taken from the optimiser, not from the file.
+    """
+    own = optimiser.state_dict()["param_groups"]
+    parameters = [parameter for group in optimiser.param_groups for parameter in group["params"]]
+    for index, entries in moments["state"].items():
+        if not 0 <= index < len(parameters) or entries.keys() != {"step", *_MOMENTS}:
+            raise ValueError(f"the optimiser's state {index} holds {', '.join(sorted(entries))}")
+        wanted = {"step": torch.Size(), **dict.fromkeys(_MOMENTS, parameters[index].shape)}
+        for name, value in entries.items():
+            if value.shape != wanted[name]:
+                raise ValueError(
+                    f"{index}.{name} has shape {tuple(value.shape)}, expected {tuple(wanted[name])}"
+                )
+    moments["param_groups"] = [
+        {**mine, "params": theirs["params"]}
+        for mine, theirs in zip(own, moments["param_groups"], strict=True)
+    ]
+
+
+_MOMENTS = ("exp_avg", "exp_avg_sq")  # Adam's
 
 _DAMAGE = (
     ValueError,

@@ -152,8 +152,22 @@ class Watcher:
 
     @classmethod
     def remembering(cls, ranges: SceneRanges, memory: Mapping[str, Any]) -> "Watcher":
-        """A watcher that goes on where ``memory`` was taken; an empty one starts fresh."""
-        return cls(ranges, **memory)
+        """A watcher that goes on where ``memory`` was taken; an empty one starts fresh.
+
+        Raises:
+            ValueError: that is no memory of a watcher.
+        """
+        try:
+            watcher = cls(ranges, **memory)
+            numbers = [watcher.last_images, *watcher.averages.values(), *watcher.on_since.values()]
+            if all(type(number) in (int, float) for number in numbers):
+                return watcher
+        except (TypeError, AttributeError):
+            pass
+        raise ValueError(
+            "the checkpoint does not hold what the collapse detector remembers: resume with watch=false, "
+            "or train in another folder"
+        )
 
     def memory(self) -> dict[str, Any]:
         """What a resumed run needs."""

@@ -1,10 +1,12 @@
 """Every reader, with whole files to start from, and what it may refuse an input with."""
 
+import io
 import json
 import os
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +27,7 @@ import derender
 from derender.data import read_pictures
 from derender.data.cache import cache_file, read_cache
 from derender.data.decode import decode, quiet_pillow
+from derender.data.parquet_claims import checked_footer
 from derender.data.source import open_source
 from derender.evaluation.memory import Memory
 from derender.features import FeatureTable
@@ -32,9 +35,11 @@ from derender.training import resolve
 from derender.training.checkpoint import TrainState, load_checkpoint, save_checkpoint
 from derender.training.config import config_from_tree, to_yaml
 from derender.training.run_folder import read_config_tree, read_metrics
+from derender.training.watch import Watcher
 from derender.whole import CHECKSUMS
 
 REFUSALS = (ValueError, OSError)
+TEXT = partial(str, encoding="utf-8", errors="surrogateescape")
 TINY = ("image_size=32", "width=4", "light_width=4")
 
 
@@ -47,12 +52,16 @@ class Target:
         share: of all inputs.
         inputs: how inputs are made.
         read: gives one to the reader.
+        wholes: good files, as bytes, for a search that starts from them; none where it is not fed bytes.
+        given: makes an input of bytes.
     """
 
     name: str
     share: float
     inputs: st.SearchStrategy[Any]
     read: Callable[[Any], object]
+    wholes: Sequence[bytes] = ()
+    given: Callable[[bytes], Any] = bytes
 
 
 def targets(place: Path) -> Iterator[Target]:
@@ -70,8 +79,15 @@ def targets(place: Path) -> Iterator[Target]:
         | bytes_like(to_yaml(config).encode()).map(lambda content: content.decode("utf-8", "surrogateescape"))
         | WORDS.map(lambda word: f"preset: {word}\n")
     )
-    yield Target("config (YAML)", 0.02, documents, config_text)
-    yield Target("config (--set)", 0.3, overrides(), lambda chosen: resolve("small", chosen))
+    yield Target("config (YAML)", 0.02, documents, config_text, [to_yaml(config).encode()], TEXT)
+    yield Target(
+        "config (--set)",
+        0.28,
+        overrides(),
+        lambda chosen: resolve("small", chosen),
+        ["\0".join(TINY).encode(), b"optimiser.betas=[0.9, 0.99]\0objective.perceptual=none"],
+        lambda content: TEXT(content).split("\0"),
+    )
 
     table = place / "F.parquet"
     FeatureTable(
@@ -85,7 +101,15 @@ def targets(place: Path) -> Iterator[Target]:
         table.write_bytes(content)
         FeatureTable.read(table)
 
-    yield Target("FeatureTable (parquet)", 0.25, bytes_like(table.read_bytes()), table_bytes)
+    written = table.read_bytes()
+    yield Target("FeatureTable (parquet)", 0.25, bytes_like(written), table_bytes, [written])
+    footer = written[-8 - int.from_bytes(written[-8:-4], "little") : -8]
+
+    def footer_bytes(content: bytes) -> None:
+        whole = b"".join((written[: -8 - len(footer)], content, len(content).to_bytes(4, "little"), b"PAR1"))
+        checked_footer(io.BytesIO(whole), len(whole))
+
+    yield Target("footer (parquet)", 0.02, bytes_like(footer), footer_bytes, [footer])
 
     model = derender.Derenderer.seeded(config.model, 0)
     folder = model.save(place / "model")
@@ -105,17 +129,21 @@ def targets(place: Path) -> Iterator[Target]:
         derender.load(folder)
 
     header = weights[: 8 + int.from_bytes(weights[:8], "little")]
-    yield Target("model (JSON)", 0.03, json_text(described), model_config)
+    yield Target(
+        "model (JSON)", 0.03, json_text(described), model_config, [json.dumps(described).encode()], TEXT
+    )
     yield Target(
         "model (safetensors)",
         0.01,
         bytes_like(header).map(lambda head: head + weights[len(header) :]) | bytes_like(weights),
         model_weights,
+        [header],
+        lambda head: head + weights[len(header) :],
     )
 
     torch.manual_seed(0)
     net = torch.nn.Linear(3, 2)
-    optimiser = torch.optim.Adam(net.parameters())
+    optimiser = torch.optim.Adam(net.parameters(), fused=True)
     net(torch.ones(1, 3)).sum().backward()
     optimiser.step()
     kept = place / "last"
@@ -131,12 +159,28 @@ def targets(place: Path) -> Iterator[Target]:
             (kept / CHECKSUMS).unlink()
             state = (kept / "state.json").read_bytes()
             (kept / "state.json").write_bytes(state.replace(b'"format": 1, ', b""))
-        load_checkpoint(kept, net, optimiser)
+        state = load_checkpoint(kept, net, optimiser)
+        Watcher.remembering(config.model.ranges, state.watcher)
+        optimiser.step()  # with what was read
 
     change = st.sampled_from(sorted(files)).flatmap(
         lambda name: st.tuples(st.just(name), bytes_like(files[name]), st.booleans())
     )
-    yield Target("checkpoint", 0.04, change, checkpoint)
+    names = sorted(files)
+
+    def of_a_checkpoint(content: bytes) -> tuple[str, bytes, bool]:
+        """The first byte chooses a file, which stands without a checksum that would end the search."""
+        name = names[content[0] % len(names)] if content else names[0]
+        return name, content[1:], name == CHECKSUMS
+
+    yield Target(
+        "checkpoint",
+        0.04,
+        change,
+        checkpoint,
+        [bytes([number]) + files[name] for number, name in enumerate(names)],
+        of_a_checkpoint,
+    )
 
     archive = place / "a.zip"
 
@@ -149,23 +193,15 @@ def targets(place: Path) -> Iterator[Target]:
                 except REFUSALS:
                     continue
 
-    yield Target(
-        "zip",
-        0.14,
-        bytes_like(
-            packed(zipfile.ZIP_DEFLATED),
-            packed(zipfile.ZIP_STORED),
-            packed(zipfile.ZIP_BZIP2),
-            packed(zipfile.ZIP_LZMA),
-        ),
-        zip_bytes,
-    )
+    kinds = (zipfile.ZIP_DEFLATED, zipfile.ZIP_STORED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA)
+    zips = [packed(kind) for kind in kinds]
+    yield Target("zip", 0.14, bytes_like(*zips), zip_bytes, zips)
 
     def data_set(content: bytes) -> None:
         archive.write_bytes(content)
         read_pictures(archive, 8, workers=1)
 
-    yield Target("data set in a zip", 0.005, bytes_like(packed(zipfile.ZIP_DEFLATED)), data_set)
+    yield Target("data set in a zip", 0.005, bytes_like(zips[0]), data_set, zips[:1])
 
     shard = place / "s.tar"
 
@@ -173,7 +209,7 @@ def targets(place: Path) -> Iterator[Target]:
         shard.write_bytes(content)
         read_pictures(shard, 8, workers=1, cache=place / "cache")
 
-    yield Target("data set in a tar shard", 0.005, bytes_like(tarred()), shard_bytes)
+    yield Target("data set in a tar shard", 0.005, bytes_like(tarred()), shard_bytes, [tarred()])
 
     def picture(content: bytes) -> None:
         with quiet_pillow():
@@ -189,7 +225,8 @@ def targets(place: Path) -> Iterator[Target]:
         remembered.write_bytes(content)
         assert memory.recall("kind", {"a": 1}, lambda: {"found": np.zeros(2)})
 
-    yield Target("remembered results (npz)", 0.02, bytes_like(remembered.read_bytes()), memory_bytes)
+    kept_results = remembered.read_bytes()
+    yield Target("remembered results (npz)", 0.02, bytes_like(kept_results), memory_bytes, [kept_results])
 
     pictures = place / "pictures"
     pictures.mkdir()
@@ -205,11 +242,12 @@ def targets(place: Path) -> Iterator[Target]:
         read_cache(rows, "fingerprint", 8)
         read_pictures(pictures, 8, cache=place / "rows", workers=1)
 
-    yield Target("decoded pictures (cache)", 0.005, bytes_like(rows.read_bytes()), rows_bytes)
+    cached = rows.read_bytes()
+    yield Target("decoded pictures (cache)", 0.005, bytes_like(cached), rows_bytes, [cached])
 
     def metrics(content: bytes) -> None:
         (place / "metrics.jsonl").write_bytes(content)
         read_metrics(place)
 
     lines = b'{"kind": "train", "images": 8, "l1": 0.1}\n{"kind": "validation", "images": 8}\n'
-    yield Target("metrics of a run", 0.015, bytes_like(lines), metrics)
+    yield Target("metrics of a run", 0.015, bytes_like(lines), metrics, [lines])

@@ -46,6 +46,7 @@ def run_child(
     file_limit: int | None = None,
     raise_after: float | None = None,
     record: Path | None = None,
+    hold: tuple[int, int] | None = None,
 ) -> int:
     """Start the command in a process of its own; gives its number.
 
@@ -54,7 +55,8 @@ def run_child(
         log: takes what it says.
         file_limit: no file may be longer, in bytes.
         raise_after: seconds after which an exception is raised in it.
-        record: takes the names of the modules it has imported in the end.
+        record: takes the names of the modules it has imported in the end, and how many files it has written.
+        hold: stops itself in the midst of writing a file: in the writing of this number, after so many calls.
     """
     log.write_text("")
     child = os.fork()
@@ -76,9 +78,11 @@ def run_child(
             timer = threading.Timer(raise_after, inject, (main_thread, ctypes.py_object(Injected)))
             timer.daemon = True
             timer.start()
+        writes = Writes(hold)
+        sys.addaudithook(writes.seen)
         code = main(arguments)
         if record is not None:
-            record.write_text("\n".join(sys.modules))
+            record.write_text("\n".join((str(writes.begun), *sys.modules)))
     except Injected:
         code = INJECTED
     except BaseException:
@@ -93,9 +97,44 @@ def run_child(
 
 def preload(modules: Path) -> None:
     """Import what a command needed: later processes begin with it, and are killed at work."""
-    for name in modules.read_text().splitlines():
+    for name in modules.read_text().splitlines()[1:]:
         if name.split(".")[0] in PRELOADED:
             importlib.import_module(name)
+
+
+class Writes:
+    """Counts files and folders written under another name, and stops the process in the midst of one.
+
+    Attributes:
+        begun: how many there were.
+        hold: the number of the one to stop in, and after how many calls; at the latest when it gets its name.
+    """
+
+    def __init__(self, hold: tuple[int, int] | None = None):
+        self.begun, self.calls, self.hold, self.midst = 0, 0, hold, False
+
+    def seen(self, event: str, _: object) -> None:
+        """Hears of every file that is touched."""
+        if event in ("tempfile.mkstemp", "tempfile.mkdtemp"):
+            self.begun += 1
+            if self.hold is not None and self.begun == self.hold[0]:
+                self.midst = True
+                sys.setprofile(self.called)
+        elif event == "os.rename" and self.midst:
+            self.stop()
+
+    def called(self, frame: object, event: str, _: object) -> None:
+        """Hears of every call within the writing."""
+        if event in ("call", "c_call"):
+            self.calls += 1
+            if self.hold is not None and self.calls >= self.hold[1]:
+                self.stop()
+
+    def stop(self) -> None:
+        if self.midst:
+            self.midst = False
+            sys.setprofile(None)
+            os.kill(os.getpid(), signal.SIGSTOP)
 
 
 class Injected(Exception):
@@ -147,6 +186,12 @@ def waited(child: int, seconds: float, stop: Callable[[], bool]) -> int | None:
     return None
 
 
+def stopped(child: int) -> bool:
+    """Whether it has stopped itself."""
+    status = Path(f"/proc/{child}/stat").read_text()
+    return status.rpartition(")")[2].split()[0] == "T"
+
+
 @dataclass
 class Place:
     """Where a command is killed.
@@ -158,6 +203,7 @@ class Place:
         numbers: draws causes' moments.
         seconds: how long the command takes undisturbed.
         bytes: what it leaves undisturbed.
+        writes: how many files it writes undisturbed.
     """
 
     disk: Path
@@ -166,6 +212,7 @@ class Place:
     numbers: random.Random
     seconds: float = 0.0
     bytes: int = 0
+    writes: int = 0
 
 
 def attempt(command: Command, folder: Path, place: Place, cause: str) -> tuple[int, bool]:
@@ -178,16 +225,23 @@ def attempt(command: Command, folder: Path, place: Place, cause: str) -> tuple[i
     elif cause == "full disk":
         limit = numbers.randrange(1, 60_000)
     raise_after = moment if cause == "exception" else None
-    child = run_child(command.arguments(folder), place.log, file_limit=limit, raise_after=raise_after)
+    hold = None
+    if cause in SIGNALS and at_write and command.quick:
+        hold = numbers.randint(1, place.writes), round(10 ** numbers.uniform(0.5, 3))
+    child = run_child(
+        command.arguments(folder), place.log, file_limit=limit, raise_after=raise_after, hold=hold
+    )
     code, writing = None, False
     if cause in SIGNALS:
-        code = waited(child, moment, lambda: False)
+        if hold is None:
+            code = waited(child, moment, lambda: False)
         if code is None and at_write:
-            code = waited(child, 120, lambda: being_written(folder))
-            time.sleep(numbers.uniform(0, 0.003))
+            code = waited(child, 120, lambda: stopped(child) if hold else being_written(folder))
+            time.sleep(0 if hold else numbers.uniform(0, 0.003))
         writing = code is None and being_written(folder)
         if code is None:
             os.kill(child, SIGNALS[cause])
+            os.kill(child, signal.SIGCONT)
     code = waited(child, 600, lambda: False) if code is None else code
     filler.unlink(missing_ok=True)
     if code is None:
