@@ -385,6 +385,7 @@ def load(
             model.whitening = Whitening.load(folder / WHITENING_FILE)
         if (folder / FITTING_FILE).is_file():
             model.fitting = Fitting.load(folder / FITTING_FILE)
+            model.fitting.check_size(model.image_size)
     except (RuntimeError, ValueError) as error:
         raise ValueError(
             f"{folder} is damaged ({str(error).splitlines()[0]}): copy or train the model again"

@@ -9,7 +9,8 @@ import derender
 from derender.data.synthetic import faces
 from derender.features.extract import model_fingerprint
 from derender.model import FITTING_FILE
-from derender.networks.fitting import FittingSettings, coordinates_of
+from derender.networks.fitting import Fitting, FittingSettings, coordinates_of
+from derender.networks.morphable import MorphableMaps
 from derender.training.config import FeatureSettings, with_changes
 from derender.training.features import make_features
 from derender.training.fitting import make_fitting
@@ -86,6 +87,15 @@ def test_saved_with_the_model(model, images, tmp_path):
     (tmp_path / "fitted" / FITTING_FILE).write_bytes(b"{}")
     with pytest.raises(ValueError, match="is damaged"):
         derender.load(tmp_path / "fitted")
+
+
+def test_maps_of_another_size_are_refused_when_a_model_is_loaded(tmp_path):
+    small = derender.Derenderer.from_preset("small", image_size=32, width=8, light_width=4, code_size=16)
+    maps = {"depth": torch.rand(4, 64, 64), "albedo": torch.rand(4, 3, 64, 64)}
+    small.fitting = Fitting(MorphableMaps.of(maps, 2), FittingSettings())
+    small.save(tmp_path / "small")
+    with pytest.raises(ValueError, match=r"is damaged \(it fits depth of \(64, 64\)"):
+        derender.load(tmp_path / "small")
 
 
 def test_a_model_without_it_says_how_to_get_it(images):

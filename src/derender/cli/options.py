@@ -46,7 +46,7 @@ Device = Annotated[str, typer.Option("--device", help="cpu, cuda, or auto.", met
 FitSteps = Annotated[
     int | None,
     typer.Option(
-        "--fit-steps", min=0, metavar="N",
+        "--fit-steps", min=0, max=10_000, metavar="N",
         help="Fit each scene to its picture by rendering, in so many steps (60, say; slow).",
     ),
 ]  # fmt: skip

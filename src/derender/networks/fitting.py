@@ -107,6 +107,13 @@ class Fitting(nn.Module):
         told = torch.tensor([settings.steps, settings.prior, settings.tolerance], dtype=torch.float64)
         self.register_buffer("told", told, persistent=False)  # part of what a model's fingerprint is made of
 
+    def check_size(self, size: int) -> None:
+        """Maps of another size than a model's pictures are an error."""
+        for name, expected in (("depth", (size, size)), ("albedo", (3, size, size))):
+            found = tuple(self.maps.get_buffer(f"{name}_mean").shape)
+            if found != expected:
+                raise ValueError(f"it fits {name} of {found}, the model's is {expected}")
+
     def set_steps(self, steps: int) -> None:
         """So many steps from now on; 0: features are read only."""
         self.settings = FittingSettings.model_validate(self.settings.model_dump() | {"steps": steps})

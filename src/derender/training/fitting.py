@@ -11,11 +11,11 @@ from torch import Tensor
 
 from derender.data.pictures import as_float
 from derender.model import Derenderer
-from derender.networks.fitting import PARAMETERS, STEPS, Fitting, FittingSettings
+from derender.networks.fitting import PARAMETERS, Fitting, FittingSettings
 from derender.networks.morphable import MorphableMaps
 
 BATCH_SIZE = 128
-MEASURED = 256  # pictures that are fitted to learn how long fitted coordinates are
+MEASURED = 256  # pictures that are fitted to learn how long fitted coordinates are, where features hold them
 
 
 def make_fitting(
@@ -73,7 +73,10 @@ def make_fitting(
     maps = MorphableMaps.of({name: torch.cat(parts) for name, parts in found.items()}, settings.coordinates)
     fitting = Fitting(maps, settings).to(model.device)
     said = float(squares / len(chosen))
-    own = _mean_square(model, fitting, images[chosen[:MEASURED].to(images.device)])
+    if settings.steps:
+        own = _mean_square(model, fitting, images[chosen[:MEASURED].to(images.device)])
+    else:  # as read every coordinate varies by 1
+        own = float(sum(maps.size(parameter) for parameter in PARAMETERS.values()))
     fitting.get_buffer("length").fill_(settings.weight * (said / own) ** 0.5 if own else 0.0)
     return fitting
 
@@ -85,7 +88,7 @@ def _mean_square(model: Derenderer, fitting: Fitting, images: Shaped[Tensor, "n 
         batch = _pictures(images[start : start + BATCH_SIZE], model)
         with torch.no_grad():
             scene = model.decompose(batch)
-        fitted = fitting.fit(batch, scene, model.render, fitting.settings.steps or STEPS)
+        fitted = fitting.fit(batch, scene, model.render, fitting.settings.steps)
         total += sum(float(value.double().square().sum()) for value in fitted.coordinates.values())
     return total / len(images)
 
