@@ -1,5 +1,7 @@
 """The linear protocol: rows, the paper's head, penalised regression and scores against oracles; controls."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 import torch
@@ -12,7 +14,7 @@ from sklearn.neighbors import KNeighborsClassifier
 from derender.evaluation.linear_compare import compare_linear
 from derender.evaluation.linear_head import HeadSettings, train_heads
 from derender.evaluation.linear_logistic import axes_of, fit_logistic, solve_logistic
-from derender.evaluation.linear_probes import HEADS, majority_answers, nearest_answers, probe
+from derender.evaluation.linear_probes import HEADS, PROBES, majority_answers, nearest_answers, probe
 from derender.evaluation.linear_scores import count_scores, linear_scores
 from derender.evaluation.linear_task import Task, choose_rows, task_of
 from derender.evaluation.memory import Memory
@@ -187,7 +189,19 @@ def test_each_label_gets_the_penalty_that_plain_cross_validation_chooses():
         np.testing.assert_allclose(answers[:, label], final.predict_proba(standard[60:])[:, 1], atol=1e-3)
 
 
-@pytest.mark.parametrize("head", HEADS)
+def test_a_centred_head_does_not_see_where_features_lie():
+    features, columns = problem(80)
+    task, rows, tested = task_of(columns), np.stack([np.arange(30), np.arange(10, 40)]), np.arange(40, 80)
+    ask = partial(probe, task=task, rows=rows, tested=tested, seeds=(0, 1), settings=QUICK)
+    straight, moved = ask("centred", features), ask("centred", features + 3)
+    np.testing.assert_allclose(moved, straight, atol=1e-4)
+    assert np.abs(ask("linear", features + 3) - ask("linear", features)).max() > 0.1
+    mean = features[rows[1]].mean(axis=0)
+    alone = probe("linear", features - mean, task, rows[1:], tested, (1,), settings=QUICK)
+    np.testing.assert_allclose(straight[1], alone[0], atol=1e-5)
+
+
+@pytest.mark.parametrize("head", PROBES)
 def test_nothing_of_the_test_part_reaches_what_is_learned(head):
     """Other features and labels for some of the tested rows leave the answers for all others as they were."""
     features, columns = problem(80)

@@ -1,7 +1,8 @@
 """Kinds of probe by name, with one signature: features and training rows in, probabilities out.
 
-``linear`` is the paper's head, ``logistic`` a penalised regression, ``k-NN`` the ten nearest by cosine of
-centred features, ``majority`` the share of each value among the training rows, which knows no picture.
+``linear`` is the paper's head, ``centred`` the same on features whose mean over the training rows is 0,
+``logistic`` a penalised regression, ``k-NN`` the ten nearest by cosine of centred features, ``majority`` the
+share of each value among the training rows, which knows no picture.
 """
 
 from collections.abc import Sequence
@@ -16,7 +17,9 @@ from derender.evaluation.memory import Memory
 from derender.evaluation.neighbours import finite_rows
 
 HEADS = ("linear", "logistic", "k-NN")
+PROBES = ("linear", "centred", "logistic", "k-NN")
 NEIGHBOURS = 10
+_PAPERS = ("linear", "centred")
 
 
 def probe(
@@ -33,7 +36,7 @@ def probe(
     """Learn from some rows and answer for others, once for each seed: (S, T, A) float32 probabilities.
 
     Args:
-        head: "linear", "logistic" or "k-NN".
+        head: one of ``PROBES``.
         features: (N, D), finite.
         task: what is asked of the N rows.
         rows: (S, n) training rows.
@@ -51,14 +54,15 @@ def probe(
         "rows": rows,
         "tested": tested,
         "seeds": list(seeds),
-        "settings": settings.model_dump() if head == "linear" else {},
+        "settings": settings.model_dump() if head in _PAPERS else {},
     }
 
     def make() -> dict[str, np.ndarray]:
-        if head == "linear":
+        if head in _PAPERS:
             answers = train_heads(
-                features, task.targets, rows, tested, kind=task.kind, seeds=seeds, settings=settings
-            )
+                features, task.targets, rows, tested,
+                kind=task.kind, seeds=seeds, settings=settings, centred=head == "centred",
+            )  # fmt: skip
         elif head == "logistic":
             answers = np.stack(
                 [
@@ -79,8 +83,8 @@ def probe(
 
 def check_head(head: str) -> None:
     """A kind of probe that is none is an error that names the nearest."""
-    if head not in HEADS:
-        raise ValueError(f"unknown head {head!r}{nearest(head, HEADS)}; there is {', '.join(HEADS)}")
+    if head not in PROBES:
+        raise ValueError(f"unknown head {head!r}{nearest(head, PROBES)}; there is {', '.join(PROBES)}")
 
 
 def nearest_answers(

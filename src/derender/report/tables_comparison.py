@@ -29,6 +29,7 @@ INTERVAL = Column("95 %", note="interval of the first score over resamples of th
 SPREAD = Column("±", note="standard deviation of the first score over seeds")
 PROBES = {
     "linear": "the paper's head, frozen features",
+    "centred": "the paper's head, frozen features, centred",
     "logistic": "penalised logistic regression",
     "k-NN": "10 nearest neighbours",
     "fine-tuned": "the paper's head, encoders trained too",

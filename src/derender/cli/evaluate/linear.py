@@ -11,7 +11,13 @@ from derender.cli.gathered import gathered
 Counts = Annotated[
     str, typer.Option("--counts", help="Numbers of labelled rows to learn from, with commas between.")
 ]
-Heads = Annotated[str, typer.Option("--heads", help="Probes: linear (the paper's), logistic, k-NN.")]
+Heads = Annotated[
+    str,
+    typer.Option(
+        "--heads",
+        help="Probes: linear (the paper's), centred (the same on features of mean 0), logistic, k-NN.",
+    ),
+]
 Seeds = Annotated[int, typer.Option("--seeds", min=1, metavar="N", help="Draws of training rows.")]
 TestFraction = Annotated[
     float, typer.Option("--test-fraction", min=0.01, max=0.99, help="Share of the rows that is tested.")

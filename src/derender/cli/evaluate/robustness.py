@@ -51,7 +51,7 @@ Tested = Annotated[
     int, typer.Option("--tested", min=1, metavar="N", help="Generated pictures of each tested at each angle.")
 ]
 Seeds = Annotated[int, typer.Option("--seeds", min=1, metavar="N", help="Draws of what is learned from.")]
-Head = Annotated[str, typer.Option("--head", help="Probe: logistic, linear (the paper's) or k-NN.")]
+Head = Annotated[str, typer.Option("--head", help="Probe: logistic, linear (the paper's), centred or k-NN.")]
 Score = Annotated[str, typer.Option("--score", help="Shown: accuracy or balanced. --json has both.")]
 Groups = Annotated[
     str | None,

@@ -123,7 +123,7 @@ def compare_robustness(
         trial: who learns, who is tested.
         seeds: (S,) draws of what is learned from.
         controls: names of the features that learned nothing.
-        head: kind of probe (``linear_probes.HEADS``).
+        head: kind of probe (``linear_probes.PROBES``).
         settings: of the paper's head.
         resample_count: bootstrap resamples of the units.
         seed: of the resamples.
