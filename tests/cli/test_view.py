@@ -62,6 +62,10 @@ def served(monkeypatch):
     return found
 
 
+def test_a_model_that_cannot_fit_scenes_is_told_how_it_could(model, refused):
+    assert "cannot fit scenes yet: derender whiten" in refused("view", "--model", model, "--fit-steps", 5)
+
+
 def test_help_has_an_example(capsys):
     assert main(["view", "--help"]) == 0
     assert "Example: derender view" in " ".join(capsys.readouterr().out.split())

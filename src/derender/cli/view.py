@@ -53,6 +53,7 @@ def view(
     keep: Annotated[
         int, typer.Option("--keep", min=2, max=10_000, help="Opened pictures held in memory.", metavar="N")
     ] = 64,
+    fit_steps: options.FitSteps = None,
     device: options.Device = "auto",
     json_file: options.Json = None,
 ) -> None:
@@ -65,7 +66,7 @@ def view(
 
     listener = listen(host, port)
     try:
-        from derender.cli.models import open_model
+        from derender.cli.models import fitting_of, open_model
         from derender.report.viewer.app import Application, Viewer
         from derender.report.viewer.examples import named_examples, rendered_examples
         from derender.report.viewer.guard import is_loopback
@@ -74,11 +75,13 @@ def view(
         from derender.report.viewer.studio import Studio
 
         net = open_model(model, device)
+        if fit_steps:
+            fitting_of(net, model)
         pictures = _readable(images or [], net.image_size)
         gallery = None if features is None else _gallery(features, data, dataset, model, net)
         examples = named_examples(pictures) if images else rendered_examples(model, net.image_size)
         table = None if gallery is None else gallery.table
-        studio = Studio(net, Path(model).name, Shelf(keep), _held_out(model), table)
+        studio = Studio(net, Path(model).name, Shelf(keep), _held_out(model), table, fit_steps or 0)
         url = address_of(listener, host)
         if not is_loopback(host):
             say(f"warning: anyone who can reach {host} can use this page, and there is no password")

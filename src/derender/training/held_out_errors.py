@@ -58,12 +58,7 @@ def reconstruction_errors(
         with torch.inference_mode():
             for batch in pictures.split(batch_size):
                 target = as_float(batch.to(model.device))
-                rendering = model.reconstruct(target)
-                mask = rendering.mask.double()
-                off = (rendering.image.double() - target.double()).abs().mean(dim=1)
-                inside = torch.where(mask > 0, mask * off, 0.0).sum(dim=(1, 2))
-                covered = mask.sum(dim=(1, 2))
-                errors.append(torch.where(covered > 0, inside / covered, inf).cpu())
+                errors.append(masked_l1(model.reconstruct(target), target).cpu())
     finally:
         model.train(was_training)
     found = torch.cat(errors).numpy()
@@ -73,6 +68,15 @@ def reconstruction_errors(
             "the model's training went wrong"
         )
     return found
+
+
+def masked_l1(rendering: Any, target: Float[Tensor, "n 3 h w"]) -> Float[Tensor, " n"]:
+    """Mean absolute error where each rendering shows something, 0..1, best 0; infinite where nothing."""
+    mask = rendering.mask.double()
+    off = (rendering.image.double() - target.double()).abs().mean(dim=1)
+    inside = torch.where(mask > 0, mask * off, 0.0).sum(dim=(1, 2))
+    covered = mask.sum(dim=(1, 2))
+    return torch.where(covered > 0, inside / covered, inf)
 
 
 def errors_of(

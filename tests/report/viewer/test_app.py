@@ -11,10 +11,14 @@ import numpy as np
 import pytest
 import trimesh
 
+from derender import load
+from derender.data.synthetic import faces
+from derender.model import model_folder
 from derender.report.viewer.app import Application, Viewer
 from derender.report.viewer.server import BoundedProtocol, serving
 from derender.report.viewer.shelf import Shelf
 from derender.report.viewer.studio import Studio
+from derender.training.held_out_errors import read_errors
 
 LIGHT = {"ambient": 0.3, "diffuse": 0.7, "pitch_deg": 0.0, "yaw_deg": 0.0}
 FRONT = {"rotation_deg": [0, 0, 0], "translation": [0, 0, 0]}
@@ -30,13 +34,26 @@ def test_about_says_what_there_is(client):
 
 def test_a_picture_is_taken_apart_and_shown(client):
     found = client.opened(0)
-    assert set(found) == {"picture", "light", "camera", "l1", "percentile", "odd"}
+    assert set(found) == {"picture", "light", "camera", "l1", "l1_as_read", "percentile", "odd"}
     assert 0 < found["l1"] < 1 and found["percentile"] is None and found["odd"] is False
+    assert found["l1_as_read"] is None
     own = client.post("/api/view", {"picture": found["picture"]})
     assert (own.status, own.headers["content-type"]) == (200, "image/png")
     assert own.image.shape == (32, 64, 4)
     again = client.post("/api/view", {key: found[key] for key in ("picture", "light", "camera")})
     assert np.abs(again.image.astype(int) - own.image).max() <= 1  # degrees and back
+
+
+def test_a_fitted_scene_is_nearer_to_the_picture():
+    model, face = load("rendered-faces-64"), faces.generate(1, 64, seed=5).images[0]
+    held_out = read_errors(model_folder("rendered-faces-64"))
+    read, fitted = (
+        Studio(model, "faces", held_out=held_out, fit_steps=steps).open(face) for steps in (0, 10)
+    )
+    assert fitted["l1_as_read"] == pytest.approx(read["l1"])
+    assert fitted["l1"] < 0.9 * read["l1"]
+    assert fitted["percentile"] == read["percentile"] is not None  # of what encoders say
+    assert fitted["light"] != read["light"] and fitted["camera"] != read["camera"]
 
 
 def test_light_and_camera_move(client):

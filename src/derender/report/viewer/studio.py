@@ -9,6 +9,7 @@ import base64
 import io
 import json
 import zipfile
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from math import ceil, isfinite
 from typing import Any
@@ -17,6 +18,7 @@ import numpy as np
 import torch
 from jaxtyping import UInt8
 from PIL import Image
+from torch import Tensor
 
 from derender import __version__
 from derender.data import as_float
@@ -35,7 +37,7 @@ from derender.scene import Scene
 from derender.scene.enlarge import at_size
 from derender.scene.light import lambert_shading
 from derender.scene.normals import normals_from_depth
-from derender.training.held_out_errors import HeldOutErrors, reconstruction_errors
+from derender.training.held_out_errors import HeldOutErrors, masked_l1, reconstruction_errors
 
 ENLARGED_BORDER = 1  # enlarging smooths the step at the model's border over one more column
 
@@ -50,6 +52,7 @@ class Studio:
         shelf: where opened pictures are kept.
         held_out: reconstruction errors that were stored with the model; None if there are none.
         table: features to look for neighbours in; None for none.
+        fit_steps: of each scene to its picture (``model.fit_scenes``); 0 shows what encoders say.
     """
 
     model: Derenderer
@@ -57,14 +60,15 @@ class Studio:
     shelf: Shelf = field(default_factory=Shelf)
     held_out: HeldOutErrors | None = None
     table: FeatureTable | None = None
+    fit_steps: int = 0
 
     def open(self, picture: UInt8[np.ndarray, "3 s s"]) -> dict[str, Any]:
         """Take a picture apart and keep it; gives its name, its light and camera, how well it is rebuilt."""
         with torch.inference_mode():
-            readings = self.model.read(as_float(picture[None]).to(self.model.device))
-            scene = self.model.decode(self.model.codes(readings)).to("cpu")
+            images = as_float(picture[None]).to(self.model.device)
+            readings = self.model.read(images)
             errors = reconstruction_errors(self.model, picture[None])
-        l1 = float(errors[0])
+        scene, l1 = self._scene_of(images, readings)
         rows = {name: code[0].float().cpu().numpy() for name, code in self.model.features(readings).items()}
         name = self.shelf.put(TakenApart(picture, scene, rows, l1))
         percentile = None if self.held_out is None else float(percentile_of(errors, self.held_out)[0])
@@ -73,9 +77,19 @@ class Studio:
             "light": Light.of(scene.light[0]).model_dump(),
             "camera": Camera.of(scene.camera[0]).model_dump(),
             "l1": l1 if isfinite(l1) else None,
+            "l1_as_read": float(errors[0]) if self.fit_steps and isfinite(errors[0]) else None,
             "percentile": percentile,
             "odd": percentile is not None and percentile > ODD_PERCENTILE,
         }
+
+    def _scene_of(self, images: Tensor, readings: Mapping[str, Tensor]) -> tuple[Scene, float]:
+        """What is shown of a picture, and its masked L1."""
+        with torch.inference_mode():
+            if self.fit_steps:
+                scene = self.model.fit_scenes(images, self.fit_steps).scene
+            else:
+                scene = self.model.decode(self.model.codes(readings))
+            return scene.to("cpu"), float(masked_l1(self.model.render(scene), images)[0])
 
     def scene(self, question: Question) -> Scene:
         """The scene that is asked for, at its size."""

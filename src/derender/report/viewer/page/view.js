@@ -11,8 +11,8 @@ const NAMES = {
   shading: "what the light adds",
 };
 const LIGHT = [
-  ["ambient", "ambient", 0, 1, 0.01, ""],
-  ["diffuse", "diffuse", 0, 1, 0.01, ""],
+  ["ambient", "ambient", 0, 1.2, 0.01, ""],
+  ["diffuse", "diffuse", 0, 1.2, 0.01, ""],
   ["pitch_deg", "pitch", -80, 80, 1, "°"],
   ["yaw_deg", "yaw", -80, 80, 1, "°"],
 ];
@@ -239,7 +239,8 @@ async function openFirst(source, name, image = null, button = null) {
     for (const kind of ["light", "camera"]) asFound(kind);
     showSliders();
     press("examples", button);
-    const error = first.l1 === null ? "the model renders nothing into it" : `mean difference ${first.l1.toFixed(3)} where the surface is seen`;
+    const asRead = first.l1_as_read === null ? "" : `; ${first.l1_as_read.toFixed(3)} as read, before it was fitted`;
+    const error = first.l1 === null ? "the model renders nothing into it" : `mean difference ${first.l1.toFixed(3)} where the surface is seen${asRead}`;
     const beaten = first.percentile >= 100 ? "any" : `${Math.floor(first.percentile)} %`;
     const rank = first.percentile === null ? "" : `, more than for ${beaten} of the pictures the model was checked on`;
     say(`${name}: ${error}${rank}.`);
