@@ -92,6 +92,23 @@ def test_frozen_encoders_keep_weights_and_statistics_while_the_decoder_learns():
         assert any(not torch.equal(value, each.decoder.state_dict()[name]) for name, value in decoder.items())
 
 
+def test_statistics_are_kept_while_weights_learn_where_asked_for():
+    net = SegmentationNet([encoder(0)], CLASSES, kept_statistics=True).train()
+    before = {name: value.clone() for name, value in net.encoders.state_dict().items()}
+    optimiser = torch.optim.Adam([p for p in net.parameters() if p.requires_grad], lr=1e-2)
+    images = torch.rand(4, 3, 32, 32)
+    alone, together = net.encoders[0].spatial(images[:1]), net.encoders[0].spatial(images)[:1]
+    assert torch.allclose(alone, together, atol=1e-5)  # nobody's features hang on who else is in the batch
+    net(images).square().mean().backward()
+    optimiser.step()
+    after = net.encoders.state_dict()
+    same = {name for name in before if torch.equal(before[name], after[name])}
+    assert same == {
+        name for name in before if "running" in name or "num_batches" in name or "to_code" in name
+    }
+    assert not net.encoders.training and net.decoder.training
+
+
 def test_encoders_of_different_widths_are_refused():
     with pytest.raises(ValueError, match=r"same widths, got \[\(4, 8, 16, 32\), \(8, 16, 32, 64\)\]"):
         SegmentationNet([encoder(0), encoder(1, width=8)], CLASSES)

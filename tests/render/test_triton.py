@@ -27,6 +27,7 @@ INTERPRETED = (
     "test_backends.py::test_rasterizing_agrees[dtype0-triton]",
     "test_backends.py::test_sampling_agrees[dtype0-3-triton]",
     "test_triton.py::test_several_programs_for_an_image_change_nothing",
+    "test_triton.py::test_where_nothing_is_added_repeatable_gradients_are_nothing",
 )
 
 
@@ -71,6 +72,23 @@ def test_gradients_repeat_bit_for_bit_where_asked_for(generator):
     finally:
         torch.use_deterministic_algorithms(False)
     assert all(torch.equal(first, second) for first, second in zip(one, other, strict=True))
+
+
+@pytest.mark.skipif("triton" not in available_backends(), reason="needs a GPU, or TRITON_INTERPRET=1")
+def test_where_nothing_is_added_repeatable_gradients_are_nothing(generator):
+    values, kept = scene(1, 6, 9, generator), []
+    for backend in ("reference", "triton"):
+        inputs = [value.clone().requires_grad_() for value in values]
+        torch.use_deterministic_algorithms(backend == "triton")
+        try:
+            seen = render(*inputs, FOV_DEG, backend).image[..., :3]  # the rest of the pixels ask for nothing
+            kept.append(torch.autograd.grad(seen.square().sum(), inputs)[:2])
+        finally:
+            torch.use_deterministic_algorithms(False)
+    for expected, actual in zip(*kept, strict=True):
+        assert (expected == 0).any()
+        assert (actual[expected == 0] == 0).all()
+        assert_agrees(actual, expected)
 
 
 def adding(values: torch.Tensor, order: torch.Tensor):

@@ -42,11 +42,22 @@ class UNetDecoder(nn.Module):
 class SegmentationNet(nn.Module):
     """Pictures in 0..1 to one logit a class and pixel, from U-Net encoders and a fresh decoder.
 
-    A frozen net's encoders never change: their weights take no gradient, and their BatchNorm uses and keeps
-    the statistics they came with, in training too.
+    Args:
+        encoders: of one width; their features are joined in this order.
+        outputs: classes.
+        frozen: encoders never change: weights take no gradient, and statistics are kept.
+        kept_statistics: the encoders' BatchNorm uses and keeps the statistics it came with, in training too:
+            those of a batch of two pictures say little.
     """
 
-    def __init__(self, encoders: Sequence[UNetEncoder], outputs: int, *, frozen: bool = False):
+    def __init__(
+        self,
+        encoders: Sequence[UNetEncoder],
+        outputs: int,
+        *,
+        frozen: bool = False,
+        kept_statistics: bool = False,
+    ):
         super().__init__()
         widths = {tuple(encoder.widths) for encoder in encoders}
         if len(widths) != 1:
@@ -57,11 +68,11 @@ class SegmentationNet(nn.Module):
         for encoder in encoders:
             encoder.to_code.requires_grad_(False)  # the code takes no part here
         self.decoder = UNetDecoder(widths.pop(), len(encoders), outputs)
-        self.frozen = frozen
+        self.frozen, self.kept_statistics = frozen, frozen or kept_statistics
 
     def train(self, mode: bool = True) -> "SegmentationNet":
         super().train(mode)
-        if self.frozen:
+        if self.kept_statistics:
             self.encoders.eval()
         return self
 

@@ -90,6 +90,9 @@ def test_where_the_weights_come_from(data, model, before):
     for alike in (("geometry", "albedo", "random"), ("joint", "joint-frozen", "joint-random")):
         decoders = [built[name].decoder.to_outputs.weight for name in alike]
         assert all(torch.equal(decoders[0], other) for other in decoders)
+    assert {name for name, net in built.items() if net.kept_statistics} == {
+        "joint", "geometry", "albedo", "joint-frozen", "joint-random-frozen"
+    }  # fmt: skip
     other = build_variant(model, VARIANTS["random"], data, seed=4)
     assert not torch.equal(other.encoders[0].levels[0][0].weight, starts("random")[0])
 

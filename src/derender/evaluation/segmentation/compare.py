@@ -146,6 +146,7 @@ def compare_segmentations(
             inputs = {
                 "start": model_fingerprint(net), "frozen": variant.frozen, "data": content, "seed": seed,
                 "settings": settings.model_dump(mode="json"), "classes": len(data.classes),
+                **({"statistics": "kept"} if net.kept_statistics and not net.frozen else {}),
             }  # fmt: skip
 
             def make(

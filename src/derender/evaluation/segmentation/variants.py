@@ -1,8 +1,9 @@
 """The nets that are compared: which encoders, where their weights come from, and whether they are frozen.
 
 Source: Klinghoffer et al., ECCV 2022, Table 3. Its only control is one encoder from fresh weights, while its
-best row joins two: two fresh encoders, trained and frozen, are ours. A fresh encoder that is frozen first
-gets the BatchNorm statistics of the training pictures, as a trained one comes with those of its own.
+best row joins two: two fresh encoders, trained and frozen, are ours. A pre-trained encoder keeps its
+BatchNorm statistics while its weights learn, since few labelled pictures make small batches, whose own say
+little; a fresh one has none to keep. A fresh encoder that is frozen gets those of the training pictures.
 """
 
 import copy
@@ -32,7 +33,8 @@ class Variant:
         title: as shown.
         factors: whose encoders, joined in this order.
         pretrained: whether with the model's weights; otherwise fresh ones of the same shape.
-        frozen: whether only the decoder learns.
+        frozen: whether only the decoder learns; otherwise pre-trained encoders learn with their BatchNorm
+            statistics kept.
     """
 
     title: str
@@ -88,7 +90,9 @@ def build_variant(model: Any, variant: Variant, data: SegmentationData, seed: in
             for encoder in encoders:
                 _start_afresh(encoder)
         torch.manual_seed(decoder_seed)
-        net = SegmentationNet(encoders, len(data.classes), frozen=variant.frozen)
+        net = SegmentationNet(
+            encoders, len(data.classes), frozen=variant.frozen, kept_statistics=variant.pretrained
+        )
     net = net.to(model.device)
     if variant.frozen and not variant.pretrained:
         for encoder in encoders:
