@@ -63,6 +63,18 @@ def test_a_location_counts_by_the_share_of_its_pixels_that_the_mask_keeps():
     assert perceptual_loss(prediction, target, mask.bool(), None).item() == pytest.approx(expected)
 
 
+def test_every_picture_has_a_mask_of_its_own(generator):
+    prediction, target = torch.rand(2, 2, 5, 4, 4, generator=generator)
+    sigma = 0.3 + torch.rand(2, 1, 4, 4, generator=generator)
+    mask = torch.zeros(2, 4, 4)
+    mask[0, :, :2], mask[1, :, 1:] = 1, 1
+    each = [
+        perceptual_loss(*(value[n : n + 1] for value in (prediction, target, mask, sigma))) for n in (0, 1)
+    ]
+    together = perceptual_loss(prediction, target, mask, sigma)
+    assert together.item() == pytest.approx((8 * each[0] + 12 * each[1]).item() / 20, rel=1e-5)
+
+
 def test_gradients_with_respect_to_features_and_sigma(generator):
     prediction, target, sigma = feature_maps(generator, c=2, h=2, w=2)
     mask = (torch.rand(2, 6, 6, generator=generator) < 0.5).double()
