@@ -146,7 +146,7 @@ def run(given: argparse.Namespace) -> int:
         commands = {
             "train": lambda: train_command(data, given.images),
             "embed": lambda: embed_command(
-                Path("rendered-faces-64"), made_pictures(Path(place) / "more", 120)
+                Path("rendered-faces-64"), made_pictures(Path(place) / "more", given.pictures)
             ),
             "compare": lambda: compare_command(
                 [
@@ -170,6 +170,7 @@ if __name__ == "__main__":
     parser.add_argument("--kills", type=int, default=30, help="of each command")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--images", type=int, default=96, help="pictures seen in a training")
+    parser.add_argument("--pictures", type=int, default=120, help="embedded")
     parser.add_argument("--no-mount", action="store_true", help="limit the size of files instead")
     parser.add_argument("--what", default="train,embed,compare")
     sys.exit(run(parser.parse_args()))

@@ -211,7 +211,7 @@ def test_a_seal_names_what_has_changed(tmp_path):
 
 def test_a_killed_embedding_is_resumed_to_the_same_table(tmp_path):
     """Three real kills; the script makes as many as it is told, and kills training and comparing too."""
-    told = ["--what", "embed", "--kills", "3", "--seed", "1", "--no-mount"]
+    told = ["--what", "embed", "--kills", "3", "--seed", "1", "--no-mount", "--pictures", "24"]
     done = subprocess.run(
         [sys.executable, str(ROOT / "tests" / "trust" / "kills.py"), *told],
         capture_output=True,
