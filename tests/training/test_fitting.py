@@ -45,6 +45,16 @@ def test_the_rendering_comes_nearer_to_the_picture(model, images):
     assert apart[1] < apart[0]
 
 
+def test_light_and_camera_stay_where_something_is_seen(model, monkeypatch):
+    for rate in ("_LIGHT_RATE", "_ROTATION_RATE", "_TRANSLATION_RATE"):
+        monkeypatch.setattr(f"derender.networks.fitting.{rate}", 1.0)
+    scene = model.fit_scenes(torch.rand(4, 3, 64, 64, generator=torch.Generator().manual_seed(0)), 8).scene
+    assert scene.light[:, :2].min() >= 0.02 and scene.light[:, :2].max() <= 1.2
+    assert scene.light[:, 2:].abs().rad2deg().max() <= 80.001
+    assert scene.camera[:, :3].abs().rad2deg().max() <= 75.001
+    assert scene.camera[:, 3:].abs().max() == pytest.approx(0.4)  # held there, and no further
+
+
 def test_fitted_coordinates_follow_what_is_read(model, images):
     pictures = images[:4].float() / 255
     fitted, readings = model.embed(pictures), model.read(pictures)

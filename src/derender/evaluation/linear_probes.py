@@ -17,7 +17,11 @@ from derender.evaluation.memory import Memory
 from derender.evaluation.neighbours import finite_rows
 
 HEADS = ("linear", "logistic", "k-NN")
+"""Asked where none are named."""
+
 PROBES = ("linear", "centred", "logistic", "k-NN")
+"""All there are."""
+
 NEIGHBOURS = 10
 _PAPERS = ("linear", "centred")
 

@@ -36,6 +36,7 @@ _ROTATION_RATE, _TRANSLATION_RATE = 0.01, 0.003  # radians, scene units
 _LATE, _LATE_RATE = 0.6, 0.3  # from this share of the steps on rates are multiplied by this
 _START_LIMIT = 2.5  # standard deviations; a reading beyond is where encoders do not know
 _LIGHT_LIMIT, _ROTATION_LIMIT = math.radians(80), math.radians(75)
+_TRANSLATION_LIMIT = 0.4  # scene units; beyond, little is left in the picture
 _BRIGHTNESS = (0.02, 1.2)  # of ambient and diffuse light; pictures may be lit more than the ranges say
 _NOISE = 0.03  # mean absolute error, 0..1, that counts as much as coordinates of 1
 _BEYOND = 0.1  # what an error beyond the tolerance still counts
@@ -183,6 +184,7 @@ class Fitting(nn.Module):
                 light[:, :2].clamp_(*_BRIGHTNESS)
                 light[:, 2:].clamp_(-_LIGHT_LIMIT, _LIGHT_LIMIT)
                 rotation.clamp_(-_ROTATION_LIMIT, _ROTATION_LIMIT)
+                translation.clamp_(-_TRANSLATION_LIMIT, _TRANSLATION_LIMIT)
         with torch.no_grad():
             found, after = shown()
         assert before is not None

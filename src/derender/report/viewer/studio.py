@@ -9,7 +9,6 @@ import base64
 import io
 import json
 import zipfile
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from math import ceil, isfinite
 from typing import Any
@@ -18,7 +17,6 @@ import numpy as np
 import torch
 from jaxtyping import UInt8
 from PIL import Image
-from torch import Tensor
 
 from derender import __version__
 from derender.data import as_float
@@ -68,7 +66,12 @@ class Studio:
             images = as_float(picture[None]).to(self.model.device)
             readings = self.model.read(images)
             errors = reconstruction_errors(self.model, picture[None])
-        scene, l1 = self._scene_of(images, readings)
+            if self.fit_steps:
+                scene = self.model.fit_scenes(images, self.fit_steps).scene
+                shown = masked_l1(self.model.render(scene), images)
+            else:
+                scene, shown = self.model.decode(self.model.codes(readings)), errors
+        scene, l1 = scene.to("cpu"), float(shown[0])
         rows = {name: code[0].float().cpu().numpy() for name, code in self.model.features(readings).items()}
         name = self.shelf.put(TakenApart(picture, scene, rows, l1))
         percentile = None if self.held_out is None else float(percentile_of(errors, self.held_out)[0])
@@ -81,15 +84,6 @@ class Studio:
             "percentile": percentile,
             "odd": percentile is not None and percentile > ODD_PERCENTILE,
         }
-
-    def _scene_of(self, images: Tensor, readings: Mapping[str, Tensor]) -> tuple[Scene, float]:
-        """What is shown of a picture, and its masked L1."""
-        with torch.inference_mode():
-            if self.fit_steps:
-                scene = self.model.fit_scenes(images, self.fit_steps).scene
-            else:
-                scene = self.model.decode(self.model.codes(readings))
-            return scene.to("cpu"), float(masked_l1(self.model.render(scene), images)[0])
 
     def scene(self, question: Question) -> Scene:
         """The scene that is asked for, at its size."""
