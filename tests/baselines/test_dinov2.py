@@ -1,5 +1,6 @@
 """DINOv2 is read from a folder or the cache, as safetensors only, and describes as transformers does."""
 
+import json
 import pickle
 
 import pytest
@@ -77,3 +78,14 @@ def test_pickles_other_networks_and_other_architectures_are_refused(saved, tmp_p
     Dinov2Config(**{**TINY, "num_hidden_layers": 3}).save_pretrained(deeper)
     with pytest.raises(ValueError, match=r"of another architecture: it has no 'encoder\.layer\.2"):
         load_dinov2(str(deeper))
+
+
+def test_weights_in_parts_cannot_name_files_outside_their_folder(saved, tmp_path):
+    _, net = saved
+    folder, outside = tmp_path / "parts", tmp_path / "outside"
+    net.save_pretrained(outside)
+    net.config.save_pretrained(folder)
+    names = dict.fromkeys(net.state_dict(), "../outside/model.safetensors")
+    (folder / "model.safetensors.index.json").write_text(json.dumps({"metadata": {}, "weight_map": names}))
+    with pytest.raises(ValueError, match=r"parts has no model\.safetensors: .*weights in several parts"):
+        load_dinov2(str(folder))

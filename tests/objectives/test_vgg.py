@@ -6,7 +6,10 @@ import torch
 from safetensors.torch import save_file
 from torch.nn import functional
 
+from derender.networks.torch_file import reads_safely
 from derender.objectives.vgg import Vgg16Features, load_vgg16
+
+PICKLED = pytest.mark.skipif(not reads_safely(), reason="this PyTorch is not trusted with pickles")
 
 NUMBERS = (0, 2, 5, 7, 10, 12, 14)
 CHANNELS = (3, 64, 64, 128, 128, 256, 256, 256)
@@ -49,7 +52,7 @@ def write(weights, path):
     return path
 
 
-@pytest.mark.parametrize("suffix", [".npz", ".safetensors", ".pth"])
+@pytest.mark.parametrize("suffix", [".npz", ".safetensors", pytest.param(".pth", marks=PICKLED)])
 def test_every_container_gives_the_features_by_definition(weights, tmp_path, generator, suffix):
     net = load_vgg16(write(weights, tmp_path / f"vgg{suffix}"))
     images = torch.rand(2, 3, 16, 24, generator=generator)
@@ -93,12 +96,16 @@ def test_weights_that_do_not_fit_are_named(weights, tmp_path):
     wrong = {**weights, "features.0.weight": torch.zeros(64, 1, 3, 3)}
     with pytest.raises(ValueError, match=r"features\.0\.weight in .* has shape \(64, 1, 3, 3\)"):
         load_vgg16(write(wrong, tmp_path / "wrong.npz"))
+
+
+@PICKLED
+def test_a_file_without_names_is_refused(tmp_path):
     torch.save(torch.zeros(3), tmp_path / "tensor.pth")
     with pytest.raises(ValueError, match="holds no named weights"):
         load_vgg16(tmp_path / "tensor.pth")
 
 
-@pytest.mark.parametrize("suffix", [".npz", ".safetensors", ".pth"])
+@pytest.mark.parametrize("suffix", [".npz", ".safetensors", pytest.param(".pth", marks=PICKLED)])
 def test_damaged_files_are_refused_in_one_sentence(tmp_path, suffix):
     path = tmp_path / f"damaged{suffix}"
     path.write_bytes(b"this is not a weight file")

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from derender.baselines.extras import optional
-from derender.baselines.model import PICKLES, BaselineModel, BaselineSettings
+from derender.baselines.model import PICKLES, WEIGHTS_FILE, BaselineModel, BaselineSettings
 
 DEFAULT_ID = "facebook/dinov2-small"
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
@@ -64,6 +64,11 @@ def load_dinov2(source: str = DEFAULT_ID, *, image_size: int = 64, enlarged: int
     if Path(source).suffix.lower() in PICKLES:
         raise ValueError(
             f"{source} is a pickle, which can run code when it is read: give a folder with model.safetensors"
+        )
+    if Path(source).is_dir() and not (Path(source) / WEIGHTS_FILE).is_file():
+        raise ValueError(  # an index of shards could name files outside the folder (CVE-2026-75104)
+            f"{source} has no {WEIGHTS_FILE}: give a folder with config.json and the weights in that one "
+            "file; weights in several parts and pickles are not opened"
         )
     library = optional("transformers", "the baseline dinov2")
     try:

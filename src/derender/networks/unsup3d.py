@@ -23,6 +23,7 @@ from torch.serialization import safe_globals
 from derender.networks.confidence import ConfidenceNet
 from derender.networks.factors import FACTORS
 from derender.networks.settings import IMAGE_SIZES, NetworkSettings
+from derender.networks.torch_file import refuse_old_torch
 
 NETS = {"netD": "geometry", "netA": "albedo", "netL": "light", "netV": "camera", "netC": "confidence"}
 OPTIONAL = "netC"
@@ -77,6 +78,7 @@ def read_checkpoint(file: str | Path) -> tuple[NetworkSettings, dict[str, Tensor
 
 def _loaded(file: Path) -> Any:
     """What the file holds, with an empty object for whatever is neither tensor nor plain value."""
+    refuse_old_torch(file)
     with ExitStack() as known:
         known.enter_context(warnings.catch_warnings())
         warnings.simplefilter("ignore")  # of torch, about how a file was pickled

@@ -16,6 +16,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import nn
 
+from derender.networks.torch_file import refuse_old_torch
 from derender.objectives.frozen import PerceptualFeatures
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
@@ -104,6 +105,7 @@ def _read_weights(path: Path) -> object:
             case ".safetensors":
                 return load_file(path)
             case ".pth" | ".pt":
+                refuse_old_torch(path)
                 return torch.load(path, map_location="cpu", weights_only=True)
     except _DAMAGED as problem:
         raise ValueError(f"VGG16 weights in {path} cannot be read ({problem})") from problem

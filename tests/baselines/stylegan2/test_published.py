@@ -20,6 +20,9 @@ from derender.baselines.stylegan2.published import (
     load_published_e4e,
     load_published_generator,
 )
+from derender.networks.torch_file import reads_safely
+
+pytestmark = pytest.mark.skipif(not reads_safely(), reason="this PyTorch is not trusted with pickles")
 
 CONFIG_F = {4: 512, 8: 512, 16: 512, 32: 512, 64: 512, 128: 256, 256: 128, 512: 64, 1024: 32}
 LITTLE = {4: 6, 8: 6, 16: 6, 32: 3}

@@ -24,6 +24,7 @@ from torch import Tensor
 from derender.baselines.stylegan2.e4e import E4e, E4eSettings
 from derender.baselines.stylegan2.generator import Generator, GeneratorSettings, style_layers
 from derender.baselines.stylegan2.layers import FILTER
+from derender.networks.torch_file import refuse_old_torch
 
 GENERATOR_FILE = (
     "stylegan2-ffhq-config-f.pt (linked from the READMEs of https://github.com/rosinality/stylegan2-pytorch "
@@ -187,6 +188,7 @@ def read_weights(path: str | Path, wanted: str) -> Mapping[str, Any]:
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"no file {path}: nothing is downloaded here; get {wanted} and give its path")
+    refuse_old_torch(path)
     try:
         with torch.serialization.safe_globals([Namespace]), warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # of unusual pickles: what is wrong is said below
