@@ -1,0 +1,64 @@
+"""A version that a listed advisory reaches is pinned or allowed only where the list says why."""
+
+import importlib.util
+from pathlib import Path
+
+import pytest
+from packaging.specifiers import SpecifierSet
+from packaging.version import Version
+
+SCRIPT = Path(__file__).with_name("advisories.py")
+spec = importlib.util.spec_from_file_location("advisories", SCRIPT)
+assert spec is not None and spec.loader is not None
+advisories = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(advisories)
+
+_, FOUND = advisories.looked_up()
+JUDGED = advisories.versions()
+
+
+def test_every_package_was_looked_up_and_no_other_stands_there():
+    assert not JUDGED.keys() - FOUND.keys(), "look these up and write them into tests/trust/advisories.yaml"
+
+
+def test_what_an_advisory_reaches_is_answered():
+    unanswered = [
+        f"{name} {version} ({kind}): {one.id}, fixed in {one.fixed}"
+        for name, kinds in JUDGED.items()
+        for kind, version in kinds.items()
+        for one in FOUND[name].reaching(version)
+        if not FOUND[name].answer
+    ]
+    assert not unanswered, "raise the version, or write an answer into tests/trust/advisories.yaml"
+
+
+def test_answers_are_of_packages_that_need_one():
+    needless = [
+        name
+        for name, one in FOUND.items()
+        if one.answer and not any(one.reaching(version) for version in JUDGED[name].values())
+    ]
+    assert not needless
+
+
+@pytest.mark.parametrize(
+    "affected, reached, free",
+    [
+        (("<2.10.0",), ["2.6.0", "2.9.1"], ["2.10.0", "2.13.0+cpu"]),
+        (("<5.29.6", ">=6.0.0a0,<6.33.5"), ["4.25.9", "6.1"], ["5.29.6", "6.33.5", "7.0"]),
+    ],
+)
+def test_ranges_hold_what_they_say(affected, reached, free):
+    one = advisories.Advisory("X-1", (), tuple(map(SpecifierSet, affected)), None, None, "", "")
+    assert all(one.reaches(Version(version)) for version in reached)
+    assert not any(one.reaches(Version(version)) for version in free)
+
+
+def test_an_old_pin_would_be_found():
+    ids = {one.id for one in FOUND["pillow"].reaching(Version("12.2.0"))}
+    assert "CVE-2026-112398" in ids and "CVE-2026-42308" not in ids
+    assert not FOUND["pillow"].reaching(JUDGED["pillow"]["tested"])
+
+
+def test_the_page_is_current():
+    assert advisories.PAGE.read_text() == advisories.page(), "run: python tests/trust/advisories.py"
