@@ -69,6 +69,7 @@ def test_half_precision_weights_are_used_in_float32(weights, tmp_path, generator
     torch.testing.assert_close(net(images), relu3_3(widened, images), rtol=1e-4, atol=1e-5)
 
 
+@PICKLED
 def test_torch_hubs_cache_is_found_and_never_filled(weights, tmp_path, monkeypatch):
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
     monkeypatch.setattr(torch.hub, "load_state_dict_from_url", lambda *a, **k: pytest.fail("downloads"))
