@@ -29,6 +29,7 @@ from derender.cli import (
     search,
     synth,
     train,
+    unet,
     view,
     whiten,
 )
@@ -62,7 +63,7 @@ def _options(
 
 
 for group in (
-    demo, doctor, train, whiten, embed, evaluate, explain, finetune, importing, compare,
+    demo, doctor, train, whiten, unet, embed, evaluate, explain, finetune, importing, compare,
     report,
     pictures, move, mesh, search, view, synth, bench,
 ):  # fmt: skip

@@ -86,7 +86,7 @@ def _trained(
         optimiser, settings.learning_rate, total_steps=steps + 1, pct_start=0.2, cycle_momentum=False
     )
     batch = min(settings.batch, len(images))
-    order = _endless_order(len(images), generator)
+    order = endless_order(len(images), generator)
     for step in range(steps):
         rows = torch.tensor([next(order) for _ in range(batch)])
         pictures = images[rows].to(device).float() / 255
@@ -212,7 +212,7 @@ def _at(codes: Float[Tensor, "n c h w"], places: Int64[Tensor, "n p"]) -> Float[
     return codes.gather(2, places.unsqueeze(1).expand(-1, codes.shape[1], -1)).transpose(1, 2).flatten(0, 1)
 
 
-def _endless_order(count: int, generator: Generator) -> Iterator[int]:
+def endless_order(count: int, generator: Generator) -> Iterator[int]:
     """Row numbers, each epoch a new permutation."""
     while True:
         yield from torch.randperm(count, generator=generator).tolist()

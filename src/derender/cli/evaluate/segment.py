@@ -81,7 +81,7 @@ def segment(
 ) -> None:
     """Do pre-trained U-Net encoders help segmentation? mIoU, mIoU of the ten best classes, pixel accuracy.
 
-    The model must have been trained with --set encoder=unet. Runs are kept in --out (without it, in the
+    The model must have U-Net encoders: derender unet makes a copy that has. Runs are kept in --out (without it, in the
     user's cache): the same command again goes on with the next run. Overlays show the pictures themselves:
     mind who is on them before you pass the folder on.
     """

@@ -73,7 +73,7 @@ def check_encoders(model: Any, variants: Mapping[str, Variant], source: str = "t
         if not isinstance(encoder, UNetEncoder):
             raise ValueError(
                 f"{source} has no U-Net encoder for {factor}, and segmentation needs its skip features: "
-                "train one with derender train --set encoder=unet"
+                "make one with derender unet, or train one with derender train --set encoder=unet"
             )
 
 

@@ -1,0 +1,134 @@
+"""U-Net encoders taught by a model: what is said by pixel, what they learn of it, what stays as it was."""
+
+import pytest
+import torch
+
+import derender
+from derender.data.synthetic import faces
+from derender.networks.encoders import UNetEncoder
+from derender.networks.settings import NetworkSettings
+from derender.presets import ModelSettings
+from derender.scene.ranges import SceneRanges
+from derender.training.unets import (
+    CHANNELS,
+    Said,
+    TeachingSettings,
+    _masked_error,
+    _seen_otherwise,
+    said_of,
+    teach_unets,
+)
+
+SIZES = NetworkSettings(image_size=32, width=8, light_width=4, code_size=16)
+
+
+@pytest.fixture(scope="module")
+def model():
+    ranges = SceneRanges(border_depth=1.06)
+    return derender.Derenderer.seeded(ModelSettings(network=SIZES, ranges=ranges), seed=3).eval()
+
+
+@pytest.fixture(scope="module")
+def images():
+    return torch.randint(
+        0, 256, (24, 3, 32, 32), generator=torch.Generator().manual_seed(1), dtype=torch.uint8
+    )
+
+
+SHORT = TeachingSettings(images=480, batch_size=8, unet_width=4, learning_rate=3e-3)
+
+
+@pytest.fixture(scope="module")
+def taught(model, images):
+    return teach_unets(model, images, SHORT, seed=5)
+
+
+def test_seen_from_the_front_each_pixel_lies_where_it_is(model, images):
+    pictures = images[:3].float() / 255
+    scene = model.decompose(pictures)
+    facing = scene.with_parameters(camera=torch.zeros_like(scene.camera))
+    model_facing = derender.Derenderer(model.settings)
+    model_facing.load_state_dict(model.state_dict())
+    model_facing.eval().decode = lambda codes: facing
+    said = said_of(model_facing, pictures)
+    line = torch.linspace(-1, 1, 32)
+    inside = said.mask.bool()
+    assert inside.float().mean() > 0.8
+    across, down = said.maps["geometry"][:, 0], said.maps["geometry"][:, 1]
+    torch.testing.assert_close(across[inside], line.expand(3, 32, 32)[inside], atol=1e-3, rtol=0)
+    torch.testing.assert_close(down[inside], line.view(32, 1).expand(3, 32, 32)[inside], atol=1e-3, rtol=0)
+    depth = said.maps["geometry"][:, 2] * 0.1 + 1
+    torch.testing.assert_close(depth[inside], facing.depth[inside], atol=1e-4, rtol=0)
+    shown = said.maps["albedo"].permute(0, 2, 3, 1)
+    torch.testing.assert_close(shown[inside], facing.albedo.permute(0, 2, 3, 1)[inside], atol=1e-3, rtol=0)
+
+
+def test_pictures_and_what_is_said_of_them_move_together(model, images):
+    pictures = images[:8].float() / 255
+    line = torch.linspace(-1, 1, 32).expand(8, 32, 32)
+    maps = {"geometry": torch.stack([line, line.mT, line * 0], dim=1), "albedo": pictures.clone()}
+    said = Said(maps, torch.ones(8, 32, 32), {})
+    shown, moved, mask = _seen_otherwise(pictures, said, 2, torch.Generator().manual_seed(0))
+    torch.testing.assert_close(shown[:2], pictures[:2], atol=1e-5, rtol=0)
+    torch.testing.assert_close(moved["geometry"][:2], maps["geometry"][:2], atol=1e-5, rtol=0)
+    assert not torch.allclose(shown[2:], pictures[2:], atol=0.1)
+    inside = mask[2:].bool()
+    # lit otherwise, a picture is an affine function of the albedo that moved with it
+    for picture, albedo, kept in zip(shown[2:], moved["albedo"][2:], inside, strict=True):
+        seen, meant = picture[0][kept], albedo[0][kept]
+        within = (seen > 0.02) & (seen < 0.98)
+        together = torch.corrcoef(torch.stack([seen[within], meant[within]]))[0, 1]
+        assert together > 0.999
+    steps = moved["geometry"][:, 0].diff(dim=2)[mask[:, :, 1:].bool() & mask[:, :, :-1].bool()]
+    assert (steps > 0).all(), "of a mirror image the other side is meant: places go on from left to right"
+
+
+def test_the_copy_has_unets_and_all_else_stays(model, taught, images):
+    copy = taught.model
+    assert copy.settings.network.encoder == "unet" and copy.settings.ranges == model.settings.ranges
+    assert all(isinstance(copy.nets[name].encoder, UNetEncoder) for name in CHANNELS)
+    fresh = tuple(f"nets.{name}.encoder." for name in CHANNELS)
+    theirs, ours = model.state_dict(), copy.state_dict()
+    kept = [name for name in theirs if not name.startswith(fresh)]
+    assert kept and all(torch.equal(ours[name], theirs[name]) for name in kept)
+    assert not copy.training and not any(value.requires_grad for value in copy.parameters())
+    assert copy.embed(images[:2].float() / 255)["geometry"].shape == (2, 16)
+
+
+def test_it_learns_what_the_model_says():
+    model = derender.load("rendered-faces-64")
+    images = torch.from_numpy(faces.generate(48, image_size=64, seed=9).images)
+    settings = TeachingSettings(images=960, batch_size=16, unet_width=4, learning_rate=5e-3)
+    taught = teach_unets(model, images, settings)
+    hardly = teach_unets(model, images, settings.model_copy(update={"images": 16}))
+    assert taught.errors["place"] < 0.65 * hardly.errors["place"]
+    assert taught.errors["albedo"] < 0.65 * hardly.errors["albedo"]
+    assert taught.errors["depth"] < 0.8 * hardly.errors["depth"]
+    pictures = images.float() / 255
+    theirs, ours, none = (one.encode(pictures)["albedo"] for one in (model, taught.model, hardly.model))
+    assert (ours - theirs).square().mean() < 0.97 * (none - theirs).square().mean()
+    before = taught.errors["reconstruction before"]
+    assert before == hardly.errors["reconstruction before"] < taught.errors["reconstruction"]
+
+
+def test_the_same_seed_teaches_the_same_and_nothing_else_is_touched(model, images, taught):
+    before, state = torch.random.get_rng_state(), {k: v.clone() for k, v in model.state_dict().items()}
+    again = teach_unets(model, images, SHORT, seed=5)
+    assert torch.equal(torch.random.get_rng_state(), before)
+    assert all(torch.equal(value, state[name]) for name, value in model.state_dict().items())
+    assert all(torch.equal(v, taught.model.state_dict()[k]) for k, v in again.model.state_dict().items())
+    assert again.errors == taught.errors
+
+
+def test_only_covered_pixels_count():
+    told, truth = torch.zeros(1, 2, 2, 2), torch.ones(1, 2, 2, 2)
+    truth[..., 0] = 5
+    mask = torch.tensor([[[0.0, 1.0], [0.0, 1.0]]])
+    assert float(_masked_error(told, truth, mask)) == 1
+
+
+def test_what_cannot_be_taught_is_named(model, images):
+    with pytest.raises(ValueError, match="2 pictures or more of 32 pixels, got 1 of 32"):
+        teach_unets(model, images[:1])
+    with pytest.raises(ValueError, match="got 24 of 16"):
+        teach_unets(model, images[..., :16, :16])
