@@ -132,3 +132,11 @@ def test_what_cannot_be_taught_is_named(model, images):
         teach_unets(model, images[:1])
     with pytest.raises(ValueError, match="got 24 of 16"):
         teach_unets(model, images[..., :16, :16])
+
+
+def test_weights_that_are_no_numbers_are_an_error(model, images):
+    broken = derender.Derenderer(model.settings)
+    broken.load_state_dict(model.state_dict())
+    next(broken.nets["albedo"].decoder.parameters()).data.fill_(float("nan"))
+    with pytest.raises(ValueError, match="no numbers after 16 pictures"):
+        teach_unets(broken.eval(), images, SHORT.model_copy(update={"images": 16}))

@@ -68,6 +68,7 @@ def commands(place: Path, data: Path) -> dict[str, tuple[list[str], int]]:
         "report": (["report", run, *reads[2:], "--force"], 0),
         "finetune": (["finetune", *train, *label, "--model", run, "--out", str(place / "tuned")], 0),
         "whiten": (["whiten", *reads, "--set", "pictures=8", "--out", str(place / "white")], 0),
+        "unet": (["unet", *reads, "--set", "images=16", "--out", str(place / "unet")], 0),
         "embed": (["embed", *reads, "--out", str(place / "F.parquet")], 0),
         "evaluate cluster": (["evaluate", "cluster", *reads, *label, *few], 0),
         "evaluate linear": (["evaluate", "linear", *reads, *label, *few, *once], 0),
