@@ -8,6 +8,7 @@ from PIL import Image
 
 import derender
 from derender.cli import main
+from derender.data import read_pictures
 from derender.data.synthetic import faces
 
 
@@ -122,3 +123,29 @@ def test_a_table_of_fitted_scenes_is_searched_as_it_was_made(folder, tmp_path, c
     assert main([*asked, "--copies", "--json", "-"]) == 0
     found = json.loads(capsys.readouterr().out)["found"]
     assert found[0]["file"] == "3.png" and found[0]["distance"] == pytest.approx(0, abs=1e-4)
+
+
+def test_mean_only_moves_features_to_a_mean_of_zero_and_no_distance(folder, tmp_path, capsys):
+    assert run(folder, tmp_path / "mine", "--mean-only") == 0
+    one, two = derender.load("rendered-faces-64"), derender.load(tmp_path / "mine")
+    images = torch.from_numpy(read_pictures(folder, 64).images).float() / 255
+    before, after = (model.features(model.read(images))["albedo"][:, :192] for model in (one, two))
+    assert before.mean(dim=0).norm() > 0.05 * before.std(dim=0).norm()
+    assert after.mean(dim=0).norm() < 1e-4 * before.norm(dim=1).mean()
+    torch.testing.assert_close(torch.cdist(after, after), torch.cdist(before, before), atol=1e-2, rtol=1e-3)
+    assert run(folder, tmp_path / "other", "--mean-only", "--set", "views=2") == 2
+    assert "leave out --set views=2" in capsys.readouterr().err
+    two.whitening = None
+    two.save(tmp_path / "codes")
+    refused = [
+        "whiten",
+        "-m",
+        str(tmp_path / "codes"),
+        "-d",
+        str(folder),
+        "-o",
+        str(tmp_path / "x"),
+        "--mean-only",
+    ]
+    assert main(refused) == 2
+    assert "not whitened" in capsys.readouterr().err

@@ -31,6 +31,13 @@ def whiten(
             metavar="KEY=VALUE",
         ),
     ] = None,
+    mean_only: Annotated[
+        bool,
+        typer.Option(
+            "--mean-only",
+            help="Keep the model's own directions; take only the mean of its features from these pictures.",
+        ),
+    ] = False,
     seed: options.Seed = 0,
     device: options.Device = "auto",
     force: options.Force = False,
@@ -47,18 +54,26 @@ def whiten(
     from derender.data import read_pictures
     from derender.training.config import FeatureSettings, with_changes
     from derender.training.features import make_features
+    from derender.training.whitening import recentre
 
     nothing_there(out, force)
     settings = with_changes(FeatureSettings(), overrides or [])
     if settings.whitening.pictures < 2:
         raise ValueError("whitening needs 2 pictures or more: set pictures=2000, say")
+    if mean_only and overrides:
+        raise ValueError(f"with --mean-only nothing is fitted: leave out --set {overrides[0]}")
     net = open_model(model, device)
     with bar("reading") as report:
         pictures = read_pictures(data, net.image_size, dataset=dataset, limit=limit, progress=report)
     chosen = part_of(pictures, part, model).require(2)
     say_pictures(chosen)
-    with bar("rendering again") as report:
-        make_features(net, torch.from_numpy(chosen.images), settings, seed=seed, progress=report)
+    images = torch.from_numpy(chosen.images)
+    if mean_only:
+        with bar("reading pictures") as report:
+            net.whitening = recentre(net, images, progress=report)
+    else:
+        with bar("rendering again") as report:
+            make_features(net, images, settings, seed=seed, progress=report)
     assert net.whitening is not None
     folder = net.save(out, overwrite=force)
     ratios = {name: net.whitening.get_buffer(f"{name}_ratios").tolist() for name in net.whitening.names}

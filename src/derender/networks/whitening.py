@@ -143,6 +143,11 @@ class Whitening(nn.Module):
 
     def _whitened(self, name: str, reading: Float[Tensor, "n _"]) -> Float[Tensor, "n code"]:
         mean, chart = self.get_buffer(f"{name}_mean"), self.get_buffer(f"{name}_map")
+        return (self.taken(name, reading) - mean) @ chart
+
+    def taken(self, name: str, reading: Float[Tensor, "n _"]) -> Float[Tensor, "n taken"]:
+        """What the map is applied to: the reading's beginning, or the mean of it and its mirror image's."""
+        mean = self.get_buffer(f"{name}_mean")
         wanted = len(mean) * (2 if self.mirrored else 1)
         if reading.shape[1] < wanted:
             raise ValueError(
@@ -151,7 +156,17 @@ class Whitening(nn.Module):
             )
         if self.mirrored:
             reading = reading.unflatten(1, (2, -1)).mean(dim=1)
-        return (reading[:, : len(mean)].float() - mean) @ chart
+        return reading[:, : len(mean)].float()
+
+    def recentred(self, means: Mapping[str, Float[Tensor, " taken"]]) -> "Whitening":
+        """The same maps about other means of what is ``taken``, by name; distances stay as they are."""
+        contrasts = {
+            name: Contrast(
+                means[name].float(), self.get_buffer(f"{name}_map"), self.get_buffer(f"{name}_ratios")
+            )
+            for name in self.names
+        }
+        return Whitening(contrasts, mirrored=self.mirrored)
 
     def tensors(self) -> dict[str, Tensor]:
         """What ``save`` writes, by name."""

@@ -104,6 +104,37 @@ def fit_whitening(
     ).to(model.device)
 
 
+@torch.no_grad()
+def recentre(
+    model: Derenderer,
+    images: Shaped[Tensor, "n 3 h w"],
+    *,
+    progress: Callable[[int, int], None] | None = None,
+) -> Whitening:
+    """The model's own whitening about the mean of these pictures, uint8 or float in 0..1; the model stays.
+
+    Features of pictures of another kind than those it was fitted to have another mean, on which a penalised
+    or hardly trained head leans; nothing else about them changes.
+
+    Raises:
+        ValueError: the model's features are not whitened.
+    """
+    whitening = model.whitening
+    if whitening is None:
+        raise ValueError("its features are codes, which are not whitened: leave out --mean-only")
+    totals: dict[str, Tensor] = {}
+    for start in range(0, len(images), BATCH_SIZE):
+        drawn = images[start : start + BATCH_SIZE]
+        batch = (as_float(drawn) if drawn.dtype == torch.uint8 else drawn.float()).to(model.device)
+        for name in whitening.names:
+            total = whitening.taken(name, model.read_factor(name, batch)).double().sum(dim=0)
+            totals[name] = totals[name] + total if name in totals else total
+        if progress is not None:
+            progress(min(start + BATCH_SIZE, len(images)), len(images))
+    means = {name: total / len(images) for name, total in totals.items()}
+    return whitening.recentred(means).to(model.device)
+
+
 def _seen_otherwise(
     model: Derenderer,
     scene: Scene,

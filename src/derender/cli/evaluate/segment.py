@@ -81,9 +81,9 @@ def segment(
 ) -> None:
     """Do pre-trained U-Net encoders help segmentation? mIoU, mIoU of the ten best classes, pixel accuracy.
 
-    The model must have U-Net encoders: derender unet makes a copy that has. Runs are kept in --out (without it, in the
-    user's cache): the same command again goes on with the next run. Overlays show the pictures themselves:
-    mind who is on them before you pass the folder on.
+    The model must have U-Net encoders: derender unet makes a copy that has. Runs are kept in --out (without
+    it, in the user's cache): the same command again goes on with the next run. Overlays show the pictures
+    themselves: mind who is on them before you pass the folder on.
     """
     published.check()
     memory = feature_rows.memory_in(None if out is None else str(out / "runs"))
