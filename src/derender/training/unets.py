@@ -12,6 +12,7 @@ encoders stay.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from jaxtyping import Float, UInt8
@@ -49,7 +50,7 @@ class TeachingSettings(Settings):
     weight_decay: float = Field(default=1e-4, ge=0)
     code_weight: float = Field(default=0.1, ge=0)
     unet_width: int = Field(default=16, ge=1)
-    precision: str = Field(default="32-true", pattern="^(32-true|bf16-mixed)$")
+    precision: Literal["32-true", "bf16-mixed"] = "32-true"  # of what learns alone
 
 
 DEFAULT_TEACHING = TeachingSettings()
