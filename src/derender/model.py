@@ -19,6 +19,7 @@ from derender.networks import FACTORS, Factor, NetworkSettings
 from derender.networks.confidence import Confidence, ConfidenceNet
 from derender.networks.fitting import STEPS, Fitted, Fitting, coordinates_of
 from derender.networks.tensor_file import read_tensors, write_tensors
+from derender.networks.unet import pixel_decoder
 from derender.networks.unsup3d import read_checkpoint
 from derender.networks.whitening import Whitening
 from derender.presets import MODEL_PRESETS, ModelSettings, named_preset
@@ -80,6 +81,8 @@ class Derenderer(nn.Module):
             {factor.name: factor.build(self.settings.network) for factor in self.factors}
         )
         self.nets["confidence"] = ConfidenceNet(self.settings.network)
+        taught = self.settings.network.unet_decoder
+        self.unet_decoder = pixel_decoder(self.settings.network) if taught else None  # training/unets.py
         self.whitening: Whitening | None = None  # fitted after training (training/whitening.py)
         self.fitting: Fitting | None = None  # made after training (training/fitting.py)
         self.source: Path | None = None  # the folder these weights were loaded from

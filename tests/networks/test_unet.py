@@ -7,7 +7,7 @@ import torch
 
 from derender.networks import NetworkSettings
 from derender.networks.encoders import UNetEncoder
-from derender.networks.unet import SegmentationNet, UNetDecoder
+from derender.networks.unet import SegmentationNet, UNetDecoder, pixel_decoder
 
 WIDTH, CLASSES = 4, 5
 
@@ -107,6 +107,27 @@ def test_statistics_are_kept_while_weights_learn_where_asked_for():
         name for name in before if "running" in name or "num_batches" in name or "to_code" in name
     }
     assert not net.encoders.training and net.decoder.training
+
+
+def test_a_decoder_that_has_learnt_is_taken_but_for_its_last_layer():
+    learnt = pixel_decoder(NetworkSettings(image_size=32, encoder="unet", unet_width=WIDTH))
+    before = {name: value.clone() for name, value in learnt.state_dict().items()}
+    pair = [encoder(0), encoder(1)]
+    net = SegmentationNet(pair, CLASSES, kept_statistics=True, decoder=learnt).train()
+    taken = {name: value.clone() for name, value in net.decoder.state_dict().items()}
+    ends = {"to_outputs.weight", "to_outputs.bias"}
+    assert all(torch.equal(before[name], taken[name]) for name in before.keys() - ends)
+    assert taken["to_outputs.weight"].shape == (CLASSES, WIDTH, 1, 1)
+    optimiser = torch.optim.Adam([p for p in net.parameters() if p.requires_grad], lr=1e-2)
+    net(torch.rand(4, 3, 32, 32)).square().mean().backward()
+    optimiser.step()
+    after = net.decoder.state_dict()
+    still = {name for name in taken if torch.equal(taken[name], after[name])}
+    statistics = {name for name in taken if "running" in name or "num_batches" in name}
+    assert still == {name for name in statistics if name.startswith(("convolve.1.", "convolve.2."))}
+    assert len(net.decoder.convolve) == 3
+    assert all(torch.equal(value, before[name]) for name, value in learnt.state_dict().items())
+    assert not any(parameter.requires_grad for parameter in learnt.parameters())
 
 
 def test_encoders_of_different_widths_are_refused():

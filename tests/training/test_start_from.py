@@ -55,6 +55,20 @@ def test_ranges_may_be_changed_but_other_networks_cannot_take_the_weights(start)
         DerenderTask(wider).build()
 
 
+def test_a_taught_decoder_is_left_behind(tmp_path):
+    settings = resolve("small", [*TINY, "encoder=unet", "unet_width=4"]).model
+    network = settings.network.model_copy(update={"unet_decoder": True})
+    taught = derender.Derenderer.seeded(settings.model_copy(update={"network": network}), seed=3)
+    taught.save(tmp_path / "taught")
+    config = resolve("small", SHORT, start_from=str(tmp_path / "taught"))
+    begun = DerenderTask(config).build()
+    assert begun.unet_decoder is None and config.model.network.encoder == "unet"
+    weights = taught.state_dict()
+    assert all(torch.equal(value, weights[name]) for name, value in begun.state_dict().items())
+    with pytest.raises(ValueError, match="rendering trains none, derender unet teaches one"):
+        resolve("small", ["unet_decoder=true"])
+
+
 def test_nothing_to_start_from_is_said_at_once():
     with pytest.raises(FileNotFoundError, match="no model at nowhere"):
         resolve("small", start_from="nowhere")

@@ -7,10 +7,10 @@ import derender
 from derender.data.synthetic import faces
 from derender.networks.encoders import UNetEncoder
 from derender.networks.settings import NetworkSettings
+from derender.networks.unet import PIXEL_CHANNELS, UNetDecoder
 from derender.presets import ModelSettings
 from derender.scene.ranges import SceneRanges
 from derender.training.unets import (
-    CHANNELS,
     Said,
     TeachingSettings,
     _masked_error,
@@ -33,6 +33,13 @@ def images():
     return torch.randint(
         0, 256, (24, 3, 32, 32), generator=torch.Generator().manual_seed(1), dtype=torch.uint8
     )
+
+
+def said_jointly(model, images) -> torch.Tensor:
+    """What the decoder over both encoders says of each pixel of pictures."""
+    pictures = images.float() / 255
+    levels = zip(*(model.nets[name].encoder.skips(pictures) for name in PIXEL_CHANNELS), strict=True)
+    return model.unet_decoder([torch.cat(level, dim=1) for level in levels])
 
 
 SHORT = TeachingSettings(images=480, batch_size=8, unet_width=4, learning_rate=3e-3)
@@ -86,13 +93,19 @@ def test_pictures_and_what_is_said_of_them_move_together(model, images):
 def test_the_copy_has_unets_and_all_else_stays(model, taught, images):
     copy = taught.model
     assert copy.settings.network.encoder == "unet" and copy.settings.ranges == model.settings.ranges
-    assert all(isinstance(copy.nets[name].encoder, UNetEncoder) for name in CHANNELS)
-    fresh = tuple(f"nets.{name}.encoder." for name in CHANNELS)
+    assert all(isinstance(copy.nets[name].encoder, UNetEncoder) for name in PIXEL_CHANNELS)
+    fresh = tuple(f"nets.{name}.encoder." for name in PIXEL_CHANNELS)
     theirs, ours = model.state_dict(), copy.state_dict()
     kept = [name for name in theirs if not name.startswith(fresh)]
     assert kept and all(torch.equal(ours[name], theirs[name]) for name in kept)
     assert not copy.training and not any(value.requires_grad for value in copy.parameters())
     assert copy.embed(images[:2].float() / 255)["geometry"].shape == (2, 16)
+
+
+def test_the_decoder_is_saved_with_the_copy(taught, images, tmp_path):
+    again = derender.load(taught.model.save(tmp_path / "copy"))
+    assert said_jointly(again, images).shape == (24, 6, 32, 32)
+    torch.testing.assert_close(said_jointly(again, images), said_jointly(taught.model, images))
 
 
 def test_it_learns_what_the_model_says():
@@ -101,14 +114,35 @@ def test_it_learns_what_the_model_says():
     settings = TeachingSettings(images=960, batch_size=16, unet_width=4, learning_rate=5e-3)
     taught = teach_unets(model, images, settings)
     hardly = teach_unets(model, images, settings.model_copy(update={"images": 16}))
-    assert taught.errors["place"] < 0.65 * hardly.errors["place"]
+    assert taught.errors["place"] < 0.75 * hardly.errors["place"]
     assert taught.errors["albedo"] < 0.65 * hardly.errors["albedo"]
     assert taught.errors["depth"] < 0.8 * hardly.errors["depth"]
     pictures = images.float() / 255
+    said = said_of(model, pictures)
+    maps = torch.cat([*said.maps.values()], dim=1)
+    ours, none = (_masked_error(said_jointly(one.model, images), maps, said.mask) for one in (taught, hardly))
+    assert ours < 0.8 * none, "the decoder over both learns it, too"
     theirs, ours, none = (one.encode(pictures)["albedo"] for one in (model, taught.model, hardly.model))
     assert (ours - theirs).square().mean() < 0.97 * (none - theirs).square().mean()
     before = taught.errors["reconstruction before"]
     assert before == hardly.errors["reconstruction before"] < taught.errors["reconstruction"]
+
+
+def test_the_decoder_does_not_change_what_the_encoders_learn(model, images, taught, monkeypatch):
+    """Another decoder over both, the same encoders."""
+    forward = UNetDecoder.forward
+    six = sum(PIXEL_CHANNELS.values())
+
+    def otherwise(decoder, skips):
+        found = forward(decoder, skips)
+        return 3 * found if found.shape[1] == six else found
+
+    monkeypatch.setattr(UNetDecoder, "forward", otherwise)
+    other = teach_unets(model, images, SHORT, seed=5).model.state_dict()
+    ours = taught.model.state_dict()
+    own = [name for name in ours if name.startswith("unet_decoder.")]
+    assert any(not torch.equal(ours[name], other[name]) for name in own)
+    assert all(torch.equal(value, other[name]) for name, value in ours.items() if name not in own)
 
 
 def test_the_same_seed_teaches_the_same_and_nothing_else_is_touched(model, images, taught):

@@ -38,8 +38,8 @@ def unet(
     """Write a copy of a model whose geometry and albedo encoders are U-Nets, for segmentation.
 
     They learn, without labels, what the model says of these pictures, pixel by pixel: where on the thing each
-    lies, how deep it is, its albedo. derender evaluate segment begins with them. The copy takes pictures
-    apart less well than the model does, and its features are codes.
+    lies, how deep it is, its albedo; so does a decoder over both. derender evaluate segment begins with them.
+    The copy takes pictures apart less well than the model does, and its features are codes.
     """
     import torch
 

@@ -21,6 +21,11 @@ def stage_widths(first: int, stages: int) -> list[int]:
     return [first * min(2**stage, 8) for stage in range(stages)]
 
 
+def unet_widths(settings: NetworkSettings) -> list[int]:
+    """Channels at each level of a U-Net, finest first, doubling down to 4x4 pixels."""
+    return [settings.unet_width * 2**level for level in range(settings.stages + 1)]
+
+
 def norm_relu(channels: int, slope: float = 0.0) -> NormReLU:
     """GroupNorm with four channels a group (16, 32, 64 groups for 64, 128, 256 channels) and a rectifier."""
     return NormReLU(channels, channels // CHANNELS_PER_GROUP, slope)
@@ -75,7 +80,7 @@ class UNetEncoder(nn.Module):
 
     def __init__(self, settings: NetworkSettings, code_size: int):
         super().__init__()
-        widths = [settings.unet_width * 2**level for level in range(settings.stages + 1)]
+        widths = unet_widths(settings)
         self.levels = nn.ModuleList(
             double_convolution(previous, channels)
             for previous, channels in zip([3, *widths], widths, strict=False)

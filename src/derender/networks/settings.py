@@ -13,7 +13,8 @@ class NetworkSettings(Settings):
     """Sizes of the networks; the defaults are the paper's.
 
     The geometry and albedo nets start at ``width`` channels and double to 8x that; light and camera
-    start at ``light_width``. ``unet_width`` counts only where ``encoder`` is "unet".
+    start at ``light_width``. ``unet_width`` counts only where ``encoder`` is "unet"; ``unet_decoder`` says
+    that a decoder over the U-Nets of geometry and albedo comes along, which ``derender unet`` teaches.
     """
 
     image_size: int = 64
@@ -23,6 +24,7 @@ class NetworkSettings(Settings):
     confidence_code_size: int = Field(default=128, ge=1)
     encoder: Literal["conv", "unet"] = "conv"
     unet_width: int = Field(default=16, ge=1)
+    unet_decoder: bool = False
 
     @field_validator("image_size")
     @classmethod

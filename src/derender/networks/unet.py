@@ -6,14 +6,23 @@ stacking their features at each skip. The features of the centre are joined in t
 encoder's centre enters once. Leaves out cropping: convolutions are padded.
 """
 
-from collections.abc import Sequence
+import copy
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from derender.networks.encoders import UNetEncoder, double_convolution
+from derender.networks.encoders import UNetEncoder, double_convolution, unet_widths
+from derender.networks.settings import NetworkSettings
+
+PIXEL_CHANNELS: Mapping[str, int] = {"geometry": 3, "albedo": 3}
+"""What a taught decoder says of every pixel, by the factor whose encoder is joined: place on the thing across
+and down, and depth; red, green, blue (training/unets.py)."""
+
+LEVELS_KEPT = 2
+"""Of a decoder that has learnt, finest first, whose BatchNorm keeps its statistics."""
 
 
 class UNetDecoder(nn.Module):
@@ -38,9 +47,24 @@ class UNetDecoder(nn.Module):
             features = convolve(torch.cat([skip, up(features)], dim=1))
         return self.to_outputs(features)
 
+    def with_outputs(self, outputs: int) -> "UNetDecoder":
+        """A copy that ends in a fresh layer of so many outputs and learns."""
+        decoder = copy.deepcopy(self).requires_grad_(True)
+        decoder.to_outputs = nn.Conv2d(
+            self.to_outputs.in_channels, outputs, 1, device=self.to_outputs.weight.device
+        )
+        return decoder
+
+
+def pixel_decoder(settings: NetworkSettings) -> UNetDecoder:
+    """The decoder over the U-Nets of geometry and albedo that a model may have; rendering never asks it."""
+    return UNetDecoder(
+        unet_widths(settings), len(PIXEL_CHANNELS), sum(PIXEL_CHANNELS.values())
+    ).requires_grad_(False)
+
 
 class SegmentationNet(nn.Module):
-    """Pictures in 0..1 to one logit a class and pixel, from U-Net encoders and a fresh decoder.
+    """Pictures in 0..1 to one logit a class and pixel, from U-Net encoders and a decoder over all of them.
 
     Args:
         encoders: of one width; their features are joined in this order.
@@ -48,6 +72,9 @@ class SegmentationNet(nn.Module):
         frozen: encoders never change: weights take no gradient, and statistics are kept.
         kept_statistics: the encoders' BatchNorm uses and keeps the statistics it came with, in training too:
             those of a batch of two pictures say little.
+        decoder: one that has learnt over these encoders, of which all but the last layer is taken; where
+            statistics are kept, its two finest levels keep theirs, too, while coarser ones, which have most
+            to learn anew, take each batch's. Without it the decoder is fresh.
     """
 
     def __init__(
@@ -57,6 +84,7 @@ class SegmentationNet(nn.Module):
         *,
         frozen: bool = False,
         kept_statistics: bool = False,
+        decoder: UNetDecoder | None = None,
     ):
         super().__init__()
         widths = {tuple(encoder.widths) for encoder in encoders}
@@ -67,13 +95,19 @@ class SegmentationNet(nn.Module):
         self.encoders = nn.ModuleList(encoders).requires_grad_(not frozen)
         for encoder in encoders:
             encoder.to_code.requires_grad_(False)  # the code takes no part here
-        self.decoder = UNetDecoder(widths.pop(), len(encoders), outputs)
+        fresh = decoder is None
+        self.decoder = (
+            UNetDecoder(widths.pop(), len(encoders), outputs) if fresh else decoder.with_outputs(outputs)
+        )
         self.frozen, self.kept_statistics = frozen, frozen or kept_statistics
+        self.fresh_decoder = fresh
 
     def train(self, mode: bool = True) -> "SegmentationNet":
         super().train(mode)
         if self.kept_statistics:
             self.encoders.eval()
+            if not self.fresh_decoder:
+                self.decoder.convolve[-LEVELS_KEPT:].eval()
         return self
 
     def forward(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n outputs h w"]:

@@ -10,7 +10,7 @@ from reprlib import Repr
 from typing import Any, Literal, TypeVar, overload
 
 import yaml
-from pydantic import Field, ValidationError
+from pydantic import Field, ValidationError, field_validator
 
 from derender.data.nearest import nearest
 from derender.model import load
@@ -110,6 +110,13 @@ class TrainConfig(LoopSettings):
     whitening: WhiteningSettings = WhiteningSettings()
     fitting: FittingSettings = FittingSettings()
 
+    @field_validator("model")
+    @classmethod
+    def _without_decoder(cls, value: ModelSettings) -> ModelSettings:
+        if value.network.unet_decoder:
+            raise ValueError("network.unet_decoder: rendering trains none, derender unet teaches one")
+        return value
+
     @property
     def features(self) -> FeatureSettings:
         """How features are made once training has ended."""
@@ -155,7 +162,8 @@ def resolve(preset: str, overrides: Iterable[str] = (), **explicit: Any) -> Trai
 
     Keys are dotted (``optimiser.learning_rate``); a unique last part may stand alone (``learning_rate``).
     Values are read as YAML. In ``explicit`` dots are written as double underscores and None means not given.
-    With ``start_from`` the model is that model's, not the preset's, before overrides change it.
+    With ``start_from`` the model is that model's (a taught decoder aside), not the preset's, before overrides
+    change it.
 
     Raises:
         ValueError: unknown preset or key (names the nearest), or a value that does not fit.
@@ -166,6 +174,7 @@ def resolve(preset: str, overrides: Iterable[str] = (), **explicit: Any) -> Trai
     if config.start_from is None:
         return config
     model = load(config.start_from).settings
+    model = model.model_copy(update={"network": model.network.model_copy(update={"unet_decoder": False})})
     row = named_preset(preset, PRESETS).model_copy(update={"model": model})
     return with_changes(row, overrides, **explicit)
 

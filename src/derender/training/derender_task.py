@@ -56,7 +56,8 @@ class DerenderTask:
         start = self.config.start_from
         if start is not None and self.begins:
             try:
-                fit_weights(model, load(start).state_dict())
+                weights = load(start).state_dict()
+                fit_weights(model, {k: v for k, v in weights.items() if not k.startswith("unet_decoder.")})
             except ValueError as error:
                 raise ValueError(
                     f"cannot start from {start}: {error}; leave its network settings as they are"

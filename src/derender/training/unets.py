@@ -3,8 +3,9 @@
 Segmentation needs features at every resolution, and training by rendering reaches a U-Net's fine levels only
 through a code of 1x1 pixels. A trained model knows more of every pixel that its surface covers: where on the
 thing it lies, how deep it is, what colour the thing has there. The geometry encoder learns the first two, the
-albedo encoder the last, each through the expanding half of a U-Net that is thrown away; pictures and what is
-said of them are zoomed, moved and mirrored together. Both also learn the model's own codes of pictures as
+albedo encoder the last, each through the expanding half of a U-Net that is thrown away; a decoder over both,
+which is kept, learns all of it from their features without changing them. Pictures and what is said of them
+are zoomed, moved and mirrored together. Both also learn the model's own codes of pictures as
 they are, so that the copy takes pictures apart, too. Needs no labels. Leaves out light and camera, whose
 encoders stay.
 """
@@ -23,13 +24,10 @@ from torch.nn.functional import affine_grid, grid_sample
 from derender.data.pictures import as_float
 from derender.model import Derenderer
 from derender.networks.encoders import UNetEncoder
-from derender.networks.unet import UNetDecoder
+from derender.networks.unet import PIXEL_CHANNELS, UNetDecoder
 from derender.objectives.self_training import endless_order
 from derender.render.renderer import warp
 from derender.settings import Settings
-
-CHANNELS = {"geometry": 3, "albedo": 3}
-"""What is learnt of every pixel, by factor: place across, place down, depth; red, green, blue."""
 
 ZOOM = (0.7, 1.25)
 SHIFT = 0.15
@@ -44,7 +42,7 @@ Progress = Callable[[int, int], object]
 class TeachingSettings(Settings):
     """How long and how fast the encoders learn; ``images`` counts a picture as often as it is seen."""
 
-    images: int = Field(default=48_000, ge=1)
+    images: int = Field(default=96_000, ge=1)
     batch_size: int = Field(default=32, ge=2)
     learning_rate: float = Field(default=1e-3, gt=0)
     weight_decay: float = Field(default=1e-4, ge=0)
@@ -74,7 +72,7 @@ class Said:
 
 @dataclass(frozen=True)
 class Taught:
-    """A model with U-Net encoders, and how well they learnt.
+    """A model with U-Net encoders and a decoder over both, and how well the encoders learnt.
 
     Attributes:
         model: the copy, evaluated and without features of its own (whitening, fitting).
@@ -94,7 +92,7 @@ def teach_unets(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> Taught:
-    """A copy of a trained model whose geometry and albedo encoders are U-Nets that learnt from it.
+    """A copy of a trained model with U-Net encoders of geometry and albedo and a decoder that learnt from it.
 
     The same seed gives the same weights on the same machine and thread count; torch's global random state is
     neither read nor changed, and the model stays as it is.
@@ -108,14 +106,17 @@ def teach_unets(
             f"teaching needs 2 pictures or more of {model.image_size} pixels, got {len(images)} of "
             f"{images.shape[-1]}"
         )
-    lacking = [name for name in CHANNELS if name not in model.nets]
+    lacking = [name for name in PIXEL_CHANNELS if name not in model.nets]
     if lacking:
         raise ValueError(f"the model has no {lacking[0]}: only the paper's factors can be taught")
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         student = _with_unets(model, settings.unet_width)
         heads = nn.ModuleDict(
-            {name: UNetDecoder(_encoder(student, name).widths, 1, count) for name, count in CHANNELS.items()}
+            {
+                name: UNetDecoder(_encoder(student, name).widths, 1, count)
+                for name, count in PIXEL_CHANNELS.items()
+            }
         ).to(model.device)
     _learn(model, student, heads, images, settings, Generator().manual_seed(seed), progress)
     if not all(bool(value.isfinite().all()) for value in student.state_dict().values()):
@@ -127,12 +128,13 @@ def teach_unets(
 
 
 def _with_unets(model: Derenderer, width: int) -> Derenderer:
-    """The model with fresh U-Net encoders of geometry and albedo, all else as it was."""
-    network = model.settings.network.model_copy(update={"encoder": "unet", "unet_width": width})
+    """The model with fresh U-Net encoders of geometry and albedo and a decoder, all else as it was."""
+    fresh_parts = {"encoder": "unet", "unet_width": width, "unet_decoder": True}
+    network = model.settings.network.model_copy(update=fresh_parts)
     student = Derenderer(
         model.settings.model_copy(update={"network": network}), model.factors, model.renderer
     )
-    fresh = tuple(f"nets.{name}.encoder." for name in CHANNELS)
+    fresh = ("unet_decoder.", *(f"nets.{name}.encoder." for name in PIXEL_CHANNELS))
     kept = {name: value for name, value in model.state_dict().items() if not name.startswith(fresh)}
     student.load_state_dict(student.state_dict() | kept)
     return student.to(model.device).requires_grad_(False)
@@ -153,8 +155,11 @@ def _learn(
     generator: Generator,
     progress: Progress | None,
 ) -> None:
-    """Train the student's encoders and the heads in place."""
-    learning = nn.ModuleList([*(_encoder(student, name) for name in CHANNELS), heads])
+    """Train the student's encoders and decoder and the heads in place."""
+    joint = student.unet_decoder
+    assert joint is not None
+    alone = nn.ModuleList([*(_encoder(student, name) for name in PIXEL_CHANNELS), heads])
+    learning = nn.ModuleList([alone, joint])
     learning.requires_grad_(True).train().to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
     optimiser = torch.optim.AdamW(
         learning.parameters(), settings.learning_rate, weight_decay=settings.weight_decay
@@ -176,29 +181,28 @@ def _learn(
         shown = shown.contiguous(memory_format=torch.channels_last)
         loss = shown.new_zeros(())
         with torch.autocast(device, torch.bfloat16, enabled=settings.precision == "bf16-mixed"):
-            found = {name: _answers(student, heads, name, shown) for name in CHANNELS}
-        for name, (told, codes) in found.items():
-            loss = loss + _masked_error(told.float(), maps[name], mask)
-            apart = (codes[:straight].float() - said.codes[name][:straight]) / spread[name]
+            skips = {name: _encoder(student, name).skips(shown) for name in PIXEL_CHANNELS}
+            told = {name: heads[name](levels) for name, levels in skips.items()}
+            codes = {name: _encoder(student, name).to_code(levels[-1]) for name, levels in skips.items()}
+            told_jointly = joint(
+                [torch.cat(level, dim=1).detach() for level in zip(*skips.values(), strict=True)]
+            )
+        own = told_jointly.float().split([*PIXEL_CHANNELS.values()], dim=1)
+        for name, jointly in zip(PIXEL_CHANNELS, own, strict=True):
+            loss = loss + _masked_error(told[name].float(), maps[name], mask)
+            loss = loss + _masked_error(jointly, maps[name], mask)
+            apart = (codes[name].flatten(1)[:straight].float() - said.codes[name][:straight]) / spread[name]
             loss = loss + settings.code_weight * apart.square().mean()
         optimiser.zero_grad(set_to_none=True)
         loss.backward()
-        nn.utils.clip_grad_norm_(learning.parameters(), 1.0)
+        for part in learning:  # each by itself: encoders learn as if there were no decoder over both
+            nn.utils.clip_grad_norm_(part.parameters(), 1.0)
         optimiser.step()
         schedule.step()
         if progress is not None:
             progress(min((step + 1) * batch, settings.images), settings.images)
     learning.eval().requires_grad_(False)
     student.eval()
-
-
-def _answers(
-    student: Derenderer, heads: nn.ModuleDict, name: str, pictures: Float[Tensor, "n 3 h w"]
-) -> tuple[Tensor, Tensor]:
-    """Maps and codes that one encoder says of pictures."""
-    encoder = _encoder(student, name)
-    skips = encoder.skips(pictures)
-    return heads[name](skips), encoder.to_code(skips[-1]).flatten(1)
 
 
 @torch.no_grad()
@@ -236,7 +240,7 @@ def _seen_otherwise(
     shown = grid_sample(pictures, grid, padding_mode="reflection", align_corners=False)
     shown = (shown * contrast.to(device) + brightness.to(device)).clamp(0, 1)
     joined = torch.cat([*said.maps.values(), said.mask.unsqueeze(1)], dim=1)
-    *maps, mask = grid_sample(joined, grid, align_corners=False).split([*CHANNELS.values(), 1], dim=1)
+    *maps, mask = grid_sample(joined, grid, align_corners=False).split([*PIXEL_CHANNELS.values(), 1], dim=1)
     found = dict(zip(said.maps, maps, strict=True))
     found["geometry"][:, 0] *= side.to(device).view(-1, 1, 1)  # of the mirror image the other side is meant
     return shown, found, (mask[:, 0] > 0.99).float()
@@ -253,7 +257,7 @@ def _code_spread(model: Derenderer, images: UInt8[Tensor, "n 3 h w"]) -> dict[st
     """How much each number of the codes varies, at least a tenth of their mean spread."""
     with torch.no_grad():
         codes = model.encode(as_float(images).to(model.device))
-    spread = {name: codes[name].std(dim=0) for name in CHANNELS}
+    spread = {name: codes[name].std(dim=0) for name in PIXEL_CHANNELS}
     return {name: value.clamp(min=0.1 * float(value.mean()) + 1e-6) for name, value in spread.items()}
 
 
@@ -264,7 +268,7 @@ def _errors(
     """Mean absolute errors over pictures as they are; of ``Taught``."""
     pictures = as_float(images).to(model.device)
     said = said_of(model, pictures)
-    told = {name: heads[name](_encoder(student, name).skips(pictures)) for name in CHANNELS}
+    told = {name: heads[name](_encoder(student, name).skips(pictures)) for name in PIXEL_CHANNELS}
     geometry, place = said.maps["geometry"], (model.image_size - 1) / 2
     found = {
         "place": place * float(_masked_error(told["geometry"][:, :2], geometry[:, :2], said.mask)),

@@ -32,7 +32,8 @@ def data() -> SegmentationData:
 
 @pytest.fixture(scope="session")
 def model() -> Derenderer:
-    sizes = {"image_size": 32, "width": 4, "light_width": 4, "encoder": "unet", "unet_width": 4}
+    unets = {"encoder": "unet", "unet_width": 4, "unet_decoder": True}
+    sizes = {"image_size": 32, "width": 4, "light_width": 4, **unets}
     return Derenderer.from_preset("small", seed=0, **sizes).eval().requires_grad_(False)
 
 

@@ -27,6 +27,7 @@ from derender.evaluation.segmentation.controls import (
     most_frequent,
     most_frequent_at_place,
 )
+from derender.evaluation.segmentation.variants import usual_variants
 from derender.report.tables_segmentation import (
     beside_the_paper,
     class_table,
@@ -57,7 +58,7 @@ def test_controls_answer_what_they_may_know(data):
     assert (by_components(blind) == place).all()  # without a picture, how often a class is at a place
 
 
-@pytest.mark.parametrize("name", ["joint", "joint-frozen", "random"])
+@pytest.mark.parametrize("name", ["joint-whole", "joint", "joint-frozen", "random"])
 def test_a_net_learns_and_leaves_the_model_alone(name, data, model, before):
     net = build_variant(model, VARIANTS[name], data, seed=0)
     told = []
@@ -82,7 +83,7 @@ def test_where_the_weights_come_from(data, model, before):
     assert torch.equal(starts("geometry")[0], ours["geometry"]) and torch.equal(
         starts("albedo")[0], ours["albedo"]
     )
-    for name in ("joint", "joint-frozen"):
+    for name in ("joint-whole", "joint", "joint-frozen"):
         assert torch.equal(starts(name)[0], ours["geometry"]) and torch.equal(starts(name)[1], ours["albedo"])
     fresh = [*starts("random"), *starts("joint-random"), *starts("joint-random-frozen")]
     assert not any(torch.equal(one, two) for one in fresh for two in ours.values())
@@ -90,8 +91,11 @@ def test_where_the_weights_come_from(data, model, before):
     for alike in (("geometry", "albedo", "random"), ("joint", "joint-frozen", "joint-random")):
         decoders = [built[name].decoder.to_outputs.weight for name in alike]
         assert all(torch.equal(decoders[0], other) for other in decoders)
+    first = {name: net.decoder.upsample[0].weight for name, net in built.items()}
+    own = model.unet_decoder.upsample[0].weight
+    assert [name for name, weight in first.items() if torch.equal(weight, own)] == ["joint-whole"]
     assert {name for name, net in built.items() if net.kept_statistics} == {
-        "joint", "geometry", "albedo", "joint-frozen", "joint-random-frozen"
+        "joint-whole", "joint", "geometry", "albedo", "joint-frozen", "joint-random-frozen"
     }  # fmt: skip
     other = build_variant(model, VARIANTS["random"], data, seed=4)
     assert not torch.equal(other.encoders[0].levels[0][0].weight, starts("random")[0])
@@ -166,6 +170,12 @@ def test_the_split_is_the_datas_own_or_by_name():
     assert few.test.tolist() == hashed.test.tolist()
 
 
+def test_all_that_a_model_has_is_compared_unless_something_is_named(model):
+    without = Derenderer.from_preset("small", seed=0, image_size=32, encoder="unet", unet_width=4)
+    assert list(usual_variants(model)) == list(VARIANTS)
+    assert set(VARIANTS) - set(usual_variants(without)) == {"joint-whole"}
+
+
 def test_bad_input_is_named(data, model):
     pictures, masks = bands(20)
     with pytest.raises(ValueError, match=r"show one class only \(wall\)"):
@@ -179,6 +189,11 @@ def test_bad_input_is_named(data, model):
     plain = Derenderer.from_preset("small", seed=0, image_size=32, width=4, light_width=4)
     with pytest.raises(ValueError, match=r"no U-Net encoder for geometry.*--set encoder=unet"):
         compare_segmentations(plain, data, chosen_variants(["geometry"]), (0,))
+    without = Derenderer.from_preset("small", seed=0, image_size=32, encoder="unet", unet_width=4)
+    with pytest.raises(
+        ValueError, match="the model has no U-Net decoder: make a copy that has with derender"
+    ):
+        compare_segmentations(without, data, chosen_variants(["joint-whole"]), (0,))
     large = replace(
         data, images=np.zeros((40, 3, 64, 64), np.uint8), masks=data.masks.repeat(2, axis=1).repeat(2, axis=2)
     )

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from derender.evaluation.segmentation import SegmentationComparison, SegmentationData
     from derender.report.score_table import ScoreTable
 
-ALL = "joint,geometry,albedo,joint-frozen,random,joint-random,joint-random-frozen"
-
 Masks = Annotated[
     str | None,
     typer.Option(
@@ -29,8 +27,11 @@ Masks = Annotated[
     ),
 ]
 Variants = Annotated[
-    str,
-    typer.Option("--variants", help="Nets to train, with commas between; the first is what is asked."),
+    str | None,
+    typer.Option(
+        "--variants",
+        help="Nets to train, with commas between; the first is what is asked. Default: all there are.",
+    ),
 ]
 Epochs = Annotated[int, typer.Option("--epochs", min=1, metavar="N", help="Of every net.")]
 Seeds = Annotated[int, typer.Option("--seeds", min=1, metavar="N", help="Runs of every net.")]
@@ -68,7 +69,7 @@ def segment(
     masks: Masks = None,
     dataset: options.Dataset = "auto",
     limit: options.Limit = None,
-    variants: Variants = ALL,
+    variants: Variants = None,
     epochs: Epochs = 20,
     seeds: Seeds = 3,
     batch_size: BatchSize = None,
@@ -133,7 +134,7 @@ class Segmented:
 def segmented(
     model: str,
     pictures: MaskSource,
-    variants: str,
+    variants: str | None,
     seeds: tuple[int, ...],
     memory: "Memory",
     *,
@@ -144,7 +145,7 @@ def segmented(
     test_fraction: float = 0.2,
     labelled: int | None = None,
 ) -> Segmented:
-    """Train every variant of a model's encoders on the masks, beside the controls."""
+    """Train every variant of a model's encoders on the masks, beside the controls; None: all it has."""
     from derender.cli.models import open_model
     from derender.evaluation.segmentation import (
         SegmentSettings,
@@ -152,12 +153,14 @@ def segmented(
         compare_segmentations,
         divide,
     )
-    from derender.evaluation.segmentation.variants import check_encoders
+    from derender.evaluation.segmentation.variants import check_encoders, usual_variants
     from derender.evaluation.tables import SEGMENTATION
     from derender.report.tables_segmentation import segmentation_tables
 
-    wanted = chosen_variants([name.strip() for name in variants.split(",") if name.strip()])
+    named = None if variants is None else [name.strip() for name in variants.split(",") if name.strip()]
+    wanted = {} if named is None else chosen_variants(named)
     net = open_model(model, device)
+    wanted = wanted or usual_variants(net)
     check_encoders(net, wanted, model)
     read = pictures.read(net.image_size)
     say(read[0].describe())

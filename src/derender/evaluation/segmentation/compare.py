@@ -25,6 +25,7 @@ from derender.evaluation.segmentation.scores import (
 from derender.evaluation.segmentation.train import SegmentSettings, answer, train_segmenter
 from derender.evaluation.segmentation.variants import Variant, build_variant, check_encoders
 from derender.features import model_fingerprint
+from derender.networks.unet import LEVELS_KEPT
 
 SHOWN = 8
 
@@ -147,6 +148,7 @@ def compare_segmentations(
                 "start": model_fingerprint(net), "frozen": variant.frozen, "data": content, "seed": seed,
                 "settings": settings.model_dump(mode="json"), "classes": len(data.classes),
                 **({"statistics": "kept"} if net.kept_statistics and not net.frozen else {}),
+                **({} if net.fresh_decoder else {"levels kept": LEVELS_KEPT}),
             }  # fmt: skip
 
             def make(

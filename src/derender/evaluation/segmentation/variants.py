@@ -4,6 +4,7 @@ Source: Klinghoffer et al., ECCV 2022, Table 3. Its only control is one encoder 
 best row joins two: two fresh encoders, trained and frozen, are ours. A pre-trained encoder keeps its
 BatchNorm statistics while its weights learn, since few labelled pictures make small batches, whose own say
 little; a fresh one has none to keep. A fresh encoder that is frozen gets those of the training pictures.
+The paper's decoder is always fresh; one net begins with the decoder that was taught beside the encoders.
 """
 
 import copy
@@ -35,16 +36,20 @@ class Variant:
         pretrained: whether with the model's weights; otherwise fresh ones of the same shape.
         frozen: whether only the decoder learns; otherwise pre-trained encoders learn with their BatchNorm
             statistics kept.
+        decoder: whether the decoder, too, begins with the model's weights (all but its last layer); otherwise
+            it is fresh.
     """
 
     title: str
     factors: tuple[str, ...]
     pretrained: bool
     frozen: bool
+    decoder: bool = False
 
 
 _ONE, _BOTH = ("geometry",), ("geometry", "albedo")
 VARIANTS: Mapping[str, Variant] = {
+    "joint-whole": Variant("joint, decoder too", _BOTH, pretrained=True, frozen=False, decoder=True),
     "joint": Variant("joint encoders", _BOTH, pretrained=True, frozen=False),
     "geometry": Variant("geometry encoder", _ONE, pretrained=True, frozen=False),
     "albedo": Variant("albedo encoder", ("albedo",), pretrained=True, frozen=False),
@@ -66,6 +71,12 @@ def chosen_variants(names: Sequence[str]) -> dict[str, Variant]:
     return {name: VARIANTS[name] for name in dict.fromkeys(names)}
 
 
+def usual_variants(model: Any) -> dict[str, Variant]:
+    """All that can be made of a model: those that begin with a taught decoder only where it has one."""
+    has = getattr(model, "unet_decoder", None) is not None
+    return {name: variant for name, variant in VARIANTS.items() if has or not variant.decoder}
+
+
 def check_encoders(model: Any, variants: Mapping[str, Variant], source: str = "the model") -> None:
     """Raise ValueError where the model has no U-Net encoder for a factor that a variant needs."""
     for factor in sorted({factor for variant in variants.values() for factor in variant.factors}):
@@ -75,6 +86,8 @@ def check_encoders(model: Any, variants: Mapping[str, Variant], source: str = "t
                 f"{source} has no U-Net encoder for {factor}, and segmentation needs its skip features: "
                 "make one with derender unet, or train one with derender train --set encoder=unet"
             )
+    if any(variant.decoder for variant in variants.values()) and getattr(model, "unet_decoder", None) is None:
+        raise ValueError(f"{source} has no U-Net decoder: make a copy that has with derender unet")
 
 
 def build_variant(model: Any, variant: Variant, data: SegmentationData, seed: int) -> SegmentationNet:
@@ -91,7 +104,11 @@ def build_variant(model: Any, variant: Variant, data: SegmentationData, seed: in
                 _start_afresh(encoder)
         torch.manual_seed(decoder_seed)
         net = SegmentationNet(
-            encoders, len(data.classes), frozen=variant.frozen, kept_statistics=variant.pretrained
+            encoders,
+            len(data.classes),
+            frozen=variant.frozen,
+            kept_statistics=variant.pretrained,
+            decoder=model.unet_decoder if variant.decoder else None,
         )
     net = net.to(model.device)
     if variant.frozen and not variant.pretrained:
