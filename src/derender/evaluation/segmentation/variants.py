@@ -78,7 +78,7 @@ def usual_variants(model: Any) -> dict[str, Variant]:
 
 
 def check_encoders(model: Any, variants: Mapping[str, Variant], source: str = "the model") -> None:
-    """Raise ValueError where the model has no U-Net encoder for a factor that a variant needs."""
+    """Raise ValueError where the model lacks a U-Net encoder, or the taught decoder, that a variant needs."""
     for factor in sorted({factor for variant in variants.values() for factor in variant.factors}):
         encoder = getattr(model.nets[factor], "encoder", None) if factor in model.nets else None
         if not isinstance(encoder, UNetEncoder):
