@@ -3,8 +3,11 @@
 import dataclasses
 import json
 import os
+import re
+import shutil
 import signal
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +17,7 @@ from safetensors.torch import load_file
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import derender
+from derender.cli import main
 from derender.data import PictureSet
 from derender.training import TrainingInterrupted, resolve, train
 from derender.training.batches import Batches
@@ -21,6 +25,7 @@ from derender.training.checkpoint import WEIGHTS_FILE, load_checkpoint
 from derender.training.loop import Progress
 from derender.training.run_folder import read_config, read_metrics
 from derender.training.schedule import kept
+from derender.whole import DamageNoticed
 
 TINY = ["image_size=32", "width=8", "light_width=4", "perceptual=none", "batch_size=8", "checkpoint_every=32"]
 TINY += [
@@ -159,6 +164,83 @@ def test_patience_ends_a_run_that_no_longer_improves(pictures, tmp_path):
     result = train(config, pictures, tmp_path / "run")
     assert result.stopped == "patience"
     assert result.images <= 32 * 8
+
+
+@pytest.fixture(scope="module")
+def worsening(pictures, tmp_path_factory):
+    """A finished run that ends worse than it was: its rate is far too large."""
+    folder = tmp_path_factory.mktemp("worsening") / "run"
+    result = train(resolve("small", WORSENING), pictures, folder)
+    assert 0 < result.model_images < result.images == 96
+    return folder, result
+
+
+WORSENING = [*TINY, "images=96", "learning_rate=0.03", "watch=false", "whitening.pictures=0"]
+
+
+def model_of(run) -> dict[str, torch.Tensor]:
+    return load_file(run / "model" / "model.safetensors")
+
+
+def assert_model_is_of(run, checkpoint: str):
+    kept_weights, wanted = model_of(run), load_file(run / "checkpoints" / checkpoint / WEIGHTS_FILE)
+    assert all(torch.equal(wanted[name], value) for name, value in kept_weights.items())
+
+
+def test_the_model_is_of_the_best_validation_and_the_result_says_of_which(worsening):
+    folder, result = worsening
+    best = load_checkpoint(folder / "checkpoints" / "best", derender.load(folder), None)
+    assert best.images == result.model_images
+    assert_model_is_of(folder, "best")
+    with pytest.raises(AssertionError):
+        assert_model_is_of(folder, "last")
+
+
+def test_the_command_says_of_which_weights_the_model_is(worsening, tmp_path, capsys):
+    made = np.random.default_rng(0).integers(0, 256, (60, 4, 4, 3), dtype=np.uint8).repeat(8, 1).repeat(8, 2)
+    (tmp_path / "folder").mkdir()
+    for number, picture in enumerate(made):
+        Image.fromarray(picture).save(tmp_path / "folder" / f"{number:03d}.png")
+    told = [part for setting in [*WORSENING, "split=[0.8,0.2,0]"] for part in ("--set", setting)]
+    told += ["--preset", "small", "--data", str(tmp_path / "folder"), "--out", str(tmp_path / "run")]
+    assert main(["train", *told]) == 0
+    said = " ".join(capsys.readouterr().err.split())
+    assert re.search(r"the model has the weights of (32|64) pictures, the best on held-out ones", said)
+    assert main(["train", *told, "--set", "keep=last", "--resume"]) == 0
+    assert "the model has the weights" not in capsys.readouterr().err
+    assert_model_is_of(tmp_path / "run", "last")
+
+
+def test_keep_last_gives_the_weights_of_the_end(worsening, pictures, tmp_path):
+    result = train(resolve("small", [*WORSENING, "keep=last"]), pictures, tmp_path / "run")
+    assert result.model_images == result.images == 96
+    assert_same_weights(tmp_path / "run", worsening[0])
+    assert_model_is_of(tmp_path / "run", "last")
+
+
+def test_a_finished_run_gives_its_other_weights_when_resumed(worsening, pictures, tmp_path):
+    run = Path(shutil.copytree(worsening[0], tmp_path / "run"))
+    last = train(resolve("small", [*WORSENING, "keep=last"]), pictures, run, resume=True)
+    assert last.model_images == last.images == 96
+    assert_model_is_of(run, "last")
+    best = train(resolve("small", WORSENING), pictures, run, resume=True)
+    assert best.model_images == worsening[1].model_images
+    assert_model_is_of(run, "best")
+
+
+def test_a_resumed_run_whose_best_checkpoint_is_damaged_leaves_the_model_alone(worsening, pictures, tmp_path):
+    run = Path(shutil.copytree(worsening[0], tmp_path / "run"))
+    before = model_of(run)
+    (run / "checkpoints" / "best" / WEIGHTS_FILE).write_bytes(b"cut off")
+    with pytest.warns(DamageNoticed, match="best is damaged or missing: .*model stays as it is"):
+        assert train(resolve("small", WORSENING), pictures, run, resume=True).model_images is None
+    assert all(torch.equal(before[name], value) for name, value in model_of(run).items())
+
+
+def test_a_run_without_held_out_pictures_keeps_its_last_weights(pictures, tmp_path):
+    config = resolve("small", [*WORSENING, "split=[1,0,0]"])
+    assert train(config, pictures, tmp_path / "run").model_images == 96
+    assert_model_is_of(tmp_path / "run", "last")
 
 
 def test_minutes_end_a_run(pictures, tmp_path):

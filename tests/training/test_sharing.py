@@ -60,3 +60,16 @@ def test_the_step_follows_the_run_and_validation_does_not(model, generator):
     torch.testing.assert_close(depth(None), model.decompose(images).depth)
     torch.testing.assert_close(depth(0.3), depth(None))
     assert (depth(None)[0] != depth(None)[1]).any()
+
+
+def test_loocc_and_its_cycle_begin_after_their_share_of_the_run(model, generator):
+    images = torch.rand(4, 3, 32, 32, generator=generator)
+    late = OBJECTIVE.model_copy(update={"loocc": "light+camera", "cycle_weight": 1.0, "loocc_after": 0.5})
+    module = StepModule(model, late, None)
+
+    def terms(done):
+        return compute_step(module, images, generator, nullcontext, done).terms.keys()
+
+    without = compute_step(StepModule(model, OBJECTIVE, None), images, generator, nullcontext, 0.49).terms
+    assert terms(0.49) == without.keys()
+    assert terms(0.5) == terms(None) == terms(0.49) | {"loocc", "cycle"}

@@ -43,6 +43,7 @@ class ObjectiveSettings(Settings):
     loocc: LooccKind = "none"
     loocc_weight: float = Field(default=0.01, ge=0)
     loocc_temperature: float = Field(default=0.5, gt=0)
+    loocc_after: float = Field(default=0.0, ge=0, le=1)  # share of the run before LOOCC and its cycle; ours
     cycle_weight: float = Field(default=0.0, ge=0)  # light and camera read back from LOOCC's renderings; ours
     template_share: float = Field(default=0.0, ge=0, le=1)  # of the run: all share one shape and albedo; ours
     release_share: float = Field(default=0.0, ge=0, le=1)  # of the run: each gets its own bit by bit
@@ -90,6 +91,7 @@ class LoopSettings(Settings):
     sample_every: int = Field(default=20_000, ge=1)  # pictures between sample sheets
     checkpoint_every: int = Field(default=20_000, ge=1)  # pictures between checkpoints
     patience: int = Field(default=10, ge=1)  # validations without improvement before stopping
+    keep: Literal["best", "last"] = "best"  # the model: of the best validation, or of the last checkpoint
     horizontal_flips: bool = True
     split: tuple[float, float, float] = (0.8, 0.1, 0.1)  # train, validation, test
     precision: Literal["32-true", "bf16-mixed"] = "32-true"  # networks only; geometry is always float32

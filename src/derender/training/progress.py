@@ -40,6 +40,7 @@ class TrainResult:
         stopped: "images", "minutes", "patience" or "collapse".
         findings: what the watcher saw last; empty when nothing was wrong.
         waiting: share of this call's time spent waiting for pictures, 0..1.
+        model_images: pictures that the weights of the kept model had seen; None where that is not known.
     """
 
     folder: Path
@@ -50,3 +51,4 @@ class TrainResult:
     stopped: str
     findings: tuple[Finding, ...]
     waiting: float = 0.0
+    model_images: int | None = None

@@ -25,7 +25,7 @@ FORMAT = 1
 """Of config.yaml, which says so in its first line; one that does not is of this format, too."""
 
 _MAY_CHANGE_ON_RESUME = (
-    *("images", "minutes", "validate_every", "sample_every", "checkpoint_every", "patience", "watch"),
+    *("images", "minutes", "validate_every", "sample_every", "checkpoint_every", "patience", "watch", "keep"),
     "accumulate",
     "optimiser",  # a run that the watcher stopped goes on with a smaller rate
 )

@@ -45,12 +45,15 @@ class StepModule(nn.Module):
     def forward(
         self, images: Tensor, generator: Generator, precision: Precision, done: float | None = None
     ) -> tuple[Tensor, Held]:
-        own = 1.0 if done is None else own_share(self.objective, done)
+        objective = self.objective
+        if done is not None and done < objective.loocc_after:
+            objective = objective.model_copy(update={"loocc": "none"})
+        own = 1.0 if done is None else own_share(objective, done)
         ranks = ALONE if done is None else self.ranks
         result = training_step(
             self.model,
             images,
-            self.objective,
+            objective,
             self.perceptual,
             generator,
             precision,
