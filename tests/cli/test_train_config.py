@@ -94,8 +94,9 @@ def test_the_runs_of_the_models_that_come_along_can_be_made_again(settings, name
     assert found["images"] == asked["images"]
 
 
-def test_the_plan_that_asks_what_loocc_brings_can_be_read():
-    plan = read_plan(EXAMPLES / "loocc.yaml")
-    kinds = [method.settings.get("loocc") for name, method in plan.methods.items() if name != "vqvae"]
+@pytest.mark.parametrize("name", ["loocc", "loocc-late"])
+def test_the_plans_that_ask_what_loocc_brings_can_be_read(name):
+    plan = read_plan(EXAMPLES / f"{name}.yaml")
+    kinds = [method.settings["loocc"] for method in plan.methods.values() if "loocc" in method.settings]
     assert kinds == ["none", "light", "light+camera", "all"]
     assert plan.seeds == 3
