@@ -94,7 +94,7 @@ def test_the_runs_of_the_models_that_come_along_can_be_made_again(settings, name
     assert found["images"] == asked["images"]
 
 
-@pytest.mark.parametrize("name", ["loocc", "loocc-late"])
+@pytest.mark.parametrize("name", ["loocc", "loocc-late", "paper"])
 def test_the_plans_that_ask_what_loocc_brings_can_be_read(name):
     plan = read_plan(EXAMPLES / f"{name}.yaml")
     kinds = [method.settings["loocc"] for method in plan.methods.values() if "loocc" in method.settings]
