@@ -1,5 +1,6 @@
 """A run's page is made from its folder alone, also from one that broke off."""
 
+import pytest
 from PIL import Image
 
 from derender.report.run import loss_charts, run_page
@@ -26,6 +27,15 @@ def test_page_of_a_run_shows_curves_samples_settings_and_what_failed(tmp_path):
     assert "The watcher stopped this run." in html and "depth is &lt;flat&gt;" in html
     assert "After 32 pictures." in html and "After 96 pictures." in html
     assert "<dt>seed</dt><dd>7</dd>" in html and "<dt>pictures</dt><dd>12</dd>" in html
+
+
+@pytest.mark.parametrize(("keep", "told"), [("best", True), ("last", False)])
+def test_the_page_says_of_which_weights_the_model_is(tmp_path, keep, told):
+    run = start_run(tmp_path / "run", resolve("small", [f"keep={keep}"]), {}, "cpu")
+    for images, loss in ((32, 1.0), (64, 0.5), (96, 0.75)):
+        append_metrics(run, {"kind": "validation", "images": images, "seconds": 1.0, "loss": loss})
+    said = "<dt>weights of the model</dt><dd>after 64 pictures, the best on held-out ones</dd>"
+    assert (said in run_page(run.path).html()) == told
 
 
 def test_only_first_last_and_evenly_chosen_samples_are_shown(tmp_path):

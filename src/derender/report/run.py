@@ -56,7 +56,7 @@ def run_page(folder: str | Path, evidence: Evidence | None = None) -> Page:
     settings = {name: _at(tree, name) for name in setting_names(type(config))}
     evidence = evidence or Evidence(())
     sections = [
-        Section("How it went", [*_course(metrics), *loss_charts(metrics, charts_wanted)], "Training"),
+        Section("How it went", [*_course(metrics, config), *loss_charts(metrics, charts_wanted)], "Training"),
         Section("Held-out pictures through time", _samples(run), "Samples"),
         *evidence.sections,
         Section("What failed", _failures(run, config, metrics, evidence), "Failed"),
@@ -108,7 +108,7 @@ def loss_charts(
     return charts_made
 
 
-def _course(metrics: Sequence[dict[str, Any]]) -> list[blocks.Html]:
+def _course(metrics: Sequence[dict[str, Any]], config: Settings) -> list[blocks.Html]:
     if not metrics:
         return [blocks.prose("Nothing was logged yet.")]
     last = metrics[-1]
@@ -116,6 +116,10 @@ def _course(metrics: Sequence[dict[str, Any]]) -> list[blocks.Html]:
     facts = {"pictures seen": f"{last['images']:,}", "minutes": f"{last.get('seconds', 0) / 60:.1f}"}
     if speeds:
         facts["pictures per second"] = f"{speeds[-1]:.0f}"
+    judged = [row for row in metrics if row.get("kind") == "validation" and _number(row.get("loss"))]
+    if judged and getattr(config, "keep", None) == "best":
+        best = min(judged, key=lambda row: row["loss"])
+        facts["weights of the model"] = f"after {best['images']:,} pictures, the best on held-out ones"
     return [blocks.facts(facts), *_stopped(metrics)]
 
 
