@@ -118,9 +118,21 @@ def test_a_decoder_that_has_learnt_is_taken_but_for_its_last_layer():
     ends = {"to_outputs.weight", "to_outputs.bias"}
     assert all(torch.equal(before[name], taken[name]) for name in before.keys() - ends)
     assert taken["to_outputs.weight"].shape == (CLASSES, WIDTH, 1, 1)
+    encoders = {name: value.clone() for name, value in net.encoders.state_dict().items()}
     optimiser = torch.optim.Adam([p for p in net.parameters() if p.requires_grad], lr=1e-2)
-    net(torch.rand(4, 3, 32, 32)).square().mean().backward()
+    images = torch.rand(4, 3, 32, 32)
+    alone, together = net.encoders[0].skips(images[:1]), net.encoders[0].skips(images)
+    hangs = [not torch.allclose(one, all_[:1], atol=1e-5) for one, all_ in zip(alone, together, strict=True)]
+    assert hangs == [False, False, True, True]  # on who else is in the batch
+    net(images).square().mean().backward()
     optimiser.step()
+    same = {name for name, value in net.encoders.state_dict().items() if torch.equal(value, encoders[name])}
+    assert same == {
+        name
+        for name in encoders
+        if "to_code" in name
+        or (name[2:10] in ("levels.0", "levels.1") and not name.endswith(("weight", "bias")))
+    }
     after = net.decoder.state_dict()
     still = {name for name in taken if torch.equal(taken[name], after[name])}
     statistics = {name for name in taken if "running" in name or "num_batches" in name}
@@ -128,6 +140,7 @@ def test_a_decoder_that_has_learnt_is_taken_but_for_its_last_layer():
     assert len(net.decoder.convolve) == 3
     assert all(torch.equal(value, before[name]) for name, value in learnt.state_dict().items())
     assert not any(parameter.requires_grad for parameter in learnt.parameters())
+    assert not any(part.training for part in net.eval().modules())
 
 
 def test_encoders_of_different_widths_are_refused():

@@ -7,8 +7,9 @@ encoder's centre enters once. Leaves out cropping: convolutions are padded.
 """
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
+from typing import cast
 
 import torch
 from jaxtyping import Float
@@ -22,7 +23,7 @@ PIXEL_CHANNELS: Mapping[str, int] = {"geometry": 3, "albedo": 3}
 and down, and depth; red, green, blue (training/unets.py)."""
 
 LEVELS_KEPT = 2
-"""Of a decoder that has learnt, finest first, whose BatchNorm keeps its statistics."""
+"""Of encoders and a decoder that learnt together, finest first, whose BatchNorm keeps its statistics."""
 
 
 class UNetDecoder(nn.Module):
@@ -73,8 +74,8 @@ class SegmentationNet(nn.Module):
         kept_statistics: the encoders' BatchNorm uses and keeps the statistics it came with, in training too:
             those of a batch of two pictures say little.
         decoder: one that has learnt over these encoders, of which all but the last layer is taken; where
-            statistics are kept, its two finest levels keep theirs, too, while coarser ones, which have most
-            to learn anew, take each batch's. Without it the decoder is fresh.
+            statistics are kept, its two finest levels and the encoders' keep theirs, while coarser ones,
+            which have most to learn anew, take each batch's. Without it the decoder is fresh.
     """
 
     def __init__(
@@ -104,10 +105,13 @@ class SegmentationNet(nn.Module):
 
     def train(self, mode: bool = True) -> "SegmentationNet":
         super().train(mode)
-        if self.kept_statistics:
+        if self.kept_statistics and (self.frozen or self.fresh_decoder):
             self.encoders.eval()
-            if not self.fresh_decoder:
-                self.decoder.convolve[-LEVELS_KEPT:].eval()
+        elif self.kept_statistics:
+            for encoder in cast(Iterable[UNetEncoder], self.encoders):
+                encoder.levels[:LEVELS_KEPT].eval()
+        if self.kept_statistics and not self.fresh_decoder:
+            self.decoder.convolve[-LEVELS_KEPT:].eval()
         return self
 
     def forward(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n outputs h w"]:

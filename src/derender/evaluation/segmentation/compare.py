@@ -25,7 +25,7 @@ from derender.evaluation.segmentation.scores import (
 from derender.evaluation.segmentation.train import SegmentSettings, answer, train_segmenter
 from derender.evaluation.segmentation.variants import Variant, build_variant, check_encoders
 from derender.features import model_fingerprint
-from derender.networks.unet import LEVELS_KEPT
+from derender.networks.unet import LEVELS_KEPT, SegmentationNet
 
 SHOWN = 8
 
@@ -147,8 +147,7 @@ def compare_segmentations(
             inputs = {
                 "start": model_fingerprint(net), "frozen": variant.frozen, "data": content, "seed": seed,
                 "settings": settings.model_dump(mode="json"), "classes": len(data.classes),
-                **({"statistics": "kept"} if net.kept_statistics and not net.frozen else {}),
-                **({} if net.fresh_decoder else {"levels kept": LEVELS_KEPT}),
+                **_statistics(net),
             }  # fmt: skip
 
             def make(
@@ -190,6 +189,13 @@ def compare_segmentations(
         settings,
         shown,
     )
+
+
+def _statistics(net: SegmentationNet) -> dict[str, Any]:
+    """How the net's BatchNorm differs from that of fresh parts, for the name of a finished run."""
+    if not net.fresh_decoder:
+        return {"decoder": "learnt", "levels kept": LEVELS_KEPT}
+    return {"statistics": "kept"} if net.kept_statistics and not net.frozen else {}
 
 
 def _judged(answers: np.ndarray, data: SegmentationData, shown: np.ndarray) -> dict[str, np.ndarray]:

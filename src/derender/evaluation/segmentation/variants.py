@@ -4,7 +4,8 @@ Source: Klinghoffer et al., ECCV 2022, Table 3. Its only control is one encoder 
 best row joins two: two fresh encoders, trained and frozen, are ours. A pre-trained encoder keeps its
 BatchNorm statistics while its weights learn, since few labelled pictures make small batches, whose own say
 little; a fresh one has none to keep. A fresh encoder that is frozen gets those of the training pictures.
-The paper's decoder is always fresh; one net begins with the decoder that was taught beside the encoders.
+The paper's decoder is always fresh; one net begins with the decoder that was taught beside the encoders, and
+keeps statistics at its finest levels only.
 """
 
 import copy
