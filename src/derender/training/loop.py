@@ -5,14 +5,13 @@ weights, optimiser and counters to go on where it stopped.
 """
 
 import time
-import warnings
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from functools import partial
 from math import isfinite
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
@@ -24,13 +23,7 @@ from torch.utils.tensorboard.writer import SummaryWriter
 from derender.data import PictureSet, split_indices
 from derender.training.allocator import freed_memory_kept
 from derender.training.batches import Batches, Reader, batches_of, random_stream, some_of
-from derender.training.checkpoint import (
-    DamagedCheckpoint,
-    TrainState,
-    load_checkpoint,
-    resume_from,
-    save_checkpoint,
-)
+from derender.training.checkpoint import TrainState, resume_from, save_checkpoint
 from derender.training.complete import complete_model
 from derender.training.config import TrainConfig
 from derender.training.derender_task import DerenderTask, sharing_batches
@@ -38,6 +31,7 @@ from derender.training.determinism import deterministic_algorithms
 from derender.training.distributed import Ranks, first_then_others, open_fabric, ranks_of, this_rank_writes
 from derender.training.finite import broken_gradient, not_finite
 from derender.training.interrupt import TrainingInterrupted, stop_on_signal
+from derender.training.kept_model import KeptModel
 from derender.training.progress import Progress, TrainResult
 from derender.training.run_folder import (
     RunFolder,
@@ -50,10 +44,10 @@ from derender.training.run_folder import (
 from derender.training.schedule import kept, learning_rate, passed
 from derender.training.step import Precision
 from derender.training.step_module import compute_step
-from derender.training.task import SavedModel, StepLosses, Task, Watch
+from derender.training.task import StepLosses, Task, Watch
 from derender.training.validate import validate
 from derender.training.watch import Finding
-from derender.whole import DamageNoticed, whole_file
+from derender.whole import whole_file
 
 SAMPLE_COUNT = 8
 LOG_EVERY_STEPS = 50
@@ -225,12 +219,12 @@ class _Run:
     validation: dict[str, float] = field(default_factory=dict)
     findings: tuple[Finding, ...] = ()
     fell_back: bool = False  # the last checkpoint is damaged: it is not to become the previous one
-    model_images: int | None = None  # seen by the model that was written; None: this process wrote none
 
     def __post_init__(self) -> None:
         self.config = self.task.config
         self.precision = network_precision(self.config.precision, self.fabric.device)
         self.reader = Reader(self.batches, self.ranks)
+        self.kept = KeptModel(self.folder, self.model, self.config.keep)
         self.writer = None
         if self.ranks.first:
             self.writer = SummaryWriter(str(self.folder.path / "tensorboard"), purge_step=self.state.images)
@@ -244,11 +238,6 @@ class _Run:
         self.reader.close()
         if self.writer is not None:
             self.writer.close()
-
-    def save_model(self, *, overwrite: bool) -> None:
-        """Write the model as others load it."""
-        self.model_images = self.state.images
-        cast(SavedModel, self.model).save(self.folder.model, overwrite=overwrite)
 
     def step(self) -> StepLosses:
         """One batch: losses, gradients, update, watcher."""
@@ -295,24 +284,7 @@ class _Run:
         self.state.best_loss, self.state.validations_since_best = loss, 0
         if self.ranks.first:
             save_checkpoint(self.folder.best, self.model, self.optimiser, self.state)
-            if self.config.keep == "best":
-                self.save_model(overwrite=True)
-
-    def settle(self) -> None:
-        """See to it that the model is the one that was asked for: a resumed run may be asked for another."""
-        if not self.ranks.first:
-            return
-        if self.config.keep == "last" or self.state.best_loss is None:
-            if self.model_images != self.state.images:
-                self.save_model(overwrite=True)
-        elif self.model_images is None:
-            try:
-                self.model_images = load_checkpoint(self.folder.best, self.model, None).images
-            except (DamagedCheckpoint, FileNotFoundError):
-                note = f"{self.folder.best} is damaged or missing: {self.folder.model} stays as it is"
-                warnings.warn(note, DamageNoticed, stacklevel=2)
-                return
-            cast(SavedModel, self.model).save(self.folder.model, overwrite=True)
+            self.kept.at_best(self.state.images)
 
     def draw(self) -> None:
         """Write a sheet of held-out pictures taken apart."""
@@ -333,8 +305,7 @@ class _Run:
         previous = None if self.fell_back else self.folder.previous
         save_checkpoint(self.folder.last, self.model, self.optimiser, self.state, previous=previous)
         self.fell_back = False
-        if self.config.keep == "last" or not self.folder.model.exists():
-            self.save_model(overwrite=True)
+        self.kept.at_checkpoint(self.state.images)
 
     def log(self, kind: str, values: dict[str, Any]) -> None:
         state = self.state
@@ -404,8 +375,8 @@ def _go_on(run: _Run, report: Callable[[Progress], None]) -> TrainResult:
                 )
     if stopped == "collapse":
         run.log("collapse", {finding.sign: finding.text for finding in run.findings})
-    else:
-        run.settle()
+    elif run.ranks.first:
+        run.kept.at_end(state)
     run.close()
     took = max(time.perf_counter() - began, 1e-9)
     return TrainResult(
@@ -417,7 +388,7 @@ def _go_on(run: _Run, report: Callable[[Progress], None]) -> TrainResult:
         stopped or "images",
         run.findings,
         run.reader.waited_s / took,
-        run.model_images,
+        run.kept.images,
     )
 
 
