@@ -151,10 +151,10 @@ def train(
     say(
         f"{trained.images:,} pictures in {duration(trained.seconds)}, {waited}; stopped by: {trained.stopped}"
     )
-    if trained.model_images not in (None, trained.images):
+    if trained.stopped != "collapse" and trained.model_images not in (None, trained.images):
         say(
             f"the model has the weights of {trained.model_images:,} pictures, the best on held-out ones; "
-            "for those of the end: --resume --set keep=last"
+            "for those of the end: the same command with --resume --set keep=last"
         )
     result(f"model {trained.folder}", json_file)
     result(f"report {page}", json_file)
