@@ -1,11 +1,12 @@
 """What the commands that take pictures by name share: reading them, where their folders lie, finer scenes.
 
 A picture that cannot be read is left out and named at the end (exit code 2); the others are done. One that is
-unlike what the model was validated on is done too, and named.
+unlike what the model was validated on is done too, and named. With ``--frame auto`` a picture is the part of
+the file that the model renders again best (training/framing.py), wherever it is read.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
 
     from derender.model import Derenderer
     from derender.scene import Scene
+    from derender.training.framing import Framing
 
 PictureFiles = Annotated[list[Path], typer.Argument(help="Pictures to take apart.", metavar="IMAGE...")]
 Size = Annotated[
@@ -37,7 +39,15 @@ Texture = Annotated[
         metavar="model|original",
     ),
 ]  # fmt: skip
+Frame = Annotated[
+    str,
+    typer.Option(
+        "--frame", help="auto: the part of each picture that the model renders again best.",
+        metavar="whole|auto",
+    ),
+]  # fmt: skip
 TEXTURES = ("model", "original")
+FRAMES = ("whole", "auto")
 PIXELS_AT_ONCE = 1 << 22
 
 
@@ -56,7 +66,47 @@ class Given:
     refused: Mapping[Path, str]
 
 
-def given_pictures(images: Sequence[Path], size: int, out: Path, force: bool, *, sheet: bool = True) -> Given:
+def check_frame(frame: str) -> bool:
+    """Whether pictures are to be framed; an unknown word is an error that names the known ones."""
+    from derender.data.nearest import nearest
+
+    if frame not in FRAMES:
+        raise ValueError(f"unknown --frame {frame!r}{nearest(frame, FRAMES)}: choose {' or '.join(FRAMES)}")
+    return frame == "auto"
+
+
+class PictureReader:
+    """Pictures by name, each whole or, with ``auto``, the part of it that a model renders again best.
+
+    Attributes:
+        net: the model.
+        framings: the part of every picture looked at so far.
+    """
+
+    def __init__(self, net: "Derenderer", frame: str = "whole"):
+        self.net, self.auto = net, check_frame(frame)
+        self.framings: dict[Path, Framing] = {}
+
+    def __call__(self, path: Path, size: int) -> "np.ndarray":
+        """(3, size, size) uint8; a file that is no picture is a ValueError or OSError that says so."""
+        return self._framed(path, size) if self.auto else one_picture(path, size)
+
+    def _framed(self, path: Path, size: int) -> "np.ndarray":
+        import torch
+
+        from derender.training.framing import as_bytes, each_framing
+
+        if path not in self.framings:
+            looked_at = torch.from_numpy(one_picture(path, 2 * self.net.image_size)[None])
+            (self.framings[path],) = each_framing(self.net, looked_at)
+        framing = self.framings[path]
+        larger = torch.from_numpy(one_picture(path, round(size / framing.side))[None])
+        return as_bytes(framing.cut(larger, size))[0].numpy()
+
+
+def given_pictures(
+    images: Sequence[Path], read: PictureReader, out: Path, force: bool, *, sheet: bool = True
+) -> Given:
     """Read the pictures, and refuse to write over what an earlier command left."""
     from derender.report.files import folder_names
     from derender.report.sheets import sheet_paths
@@ -65,7 +115,7 @@ def given_pictures(images: Sequence[Path], size: int, out: Path, force: bool, *,
     refused: dict[Path, str] = {}
     for path in dict.fromkeys(images):
         try:
-            readable[path] = one_picture(path, size)
+            readable[path] = read(path, read.net.image_size)
         except (ValueError, OSError) as problem:
             refused[path] = " ".join(str(problem).split())
     if not readable:
@@ -106,7 +156,7 @@ def scenes_of(net: "Derenderer", given: Given, batch_size: int) -> "list[Scene]"
 
 
 def refining(
-    net: "Derenderer",
+    read: PictureReader,
     size: int | None,
     texture: str,
     fit_steps: int | None = None,
@@ -119,6 +169,7 @@ def refining(
     from derender.report.texture import picture_albedo, picture_on_grid
     from derender.scene.enlarge import at_size
 
+    net = read.net
     if texture not in TEXTURES:
         raise ValueError(
             f"unknown texture {texture!r}{nearest(texture, TEXTURES)}: choose {' or '.join(TEXTURES)}"
@@ -134,12 +185,12 @@ def refining(
         import numpy as np
 
         if fitting is not None:
-            own = as_float(np.stack([one_picture(path, net.image_size) for path in sources])).to(scene.depth)
+            own = as_float(np.stack([read(path, net.image_size) for path in sources])).to(scene.depth)
             scene = fitting.fit(own, scene, net.render, fit_steps).scene
         scene = at_size(scene, side)
         if texture == "model":
             return scene
-        pixels = as_float(np.stack([one_picture(path, side) for path in sources])).to(scene.depth)
+        pixels = as_float(np.stack([read(path, side) for path in sources])).to(scene.depth)
         if side != net.image_size:
             pixels = picture_on_grid(pixels, net.image_size)
         return scene.with_parameters(albedo=picture_albedo(pixels, scene, net.fov_deg))
@@ -174,15 +225,16 @@ def percentiles(source: str, net: "Derenderer", pictures: "Mapping[Path, np.ndar
     return dict(zip(pictures, found.tolist(), strict=True))
 
 
-def tell_odd(found: Mapping[Path, float]) -> None:
+def tell_odd(found: Mapping[Path, float], framed: bool = False) -> None:
     """Name every picture that the model renders again worse than nearly all it was validated on."""
     from derender.evaluation.oddness import ODD_PERCENTILE
 
+    hint = "" if framed else ", or not as it knows it (--frame auto looks for the part that it knows)"
     for path, percentile in found.items():
         if percentile > ODD_PERCENTILE:
             say(
                 f"{path}: reconstructed worse than {ODD_PERCENTILE:g} % of the pictures this model was "
-                "validated on; it may not be what the model knows"
+                f"validated on; it may not be what the model knows{hint}"
             )
 
 
@@ -196,6 +248,7 @@ def tell_percentiles(found: Mapping[Path, float]) -> None:
 
 def finish(
     given: Given,
+    read: PictureReader,
     out: Path,
     written: Sequence[Any],
     json_file: str | None,
@@ -209,10 +262,28 @@ def finish(
     for path, reason in given.refused.items():
         say(f"left out {path}: {reason}")
     tell_percentiles(odd or {})
-    tell_odd(odd or {})
+    tell_odd(odd or {}, read.auto)
     count = "1 picture" if len(written) == 1 else f"{len(written):,} pictures"
     result(f"{count} in {out}", json_file)
-    told = {"reconstruction_percentile": {str(path): value for path, value in (odd or {}).items()}}
+    told: dict[str, Any] = {
+        "reconstruction_percentile": {str(path): value for path, value in (odd or {}).items()}
+    }
+    if read.auto:
+        told["framing"] = {str(path): asdict(framing) for path, framing in read.framings.items()}
+        say(_framed_account(read))
     write_json(json_file, {"out": out, "pictures": written, "refused": given.refused, **told, **more})
     if given.refused:
         raise typer.Exit(2)
+
+
+def _framed_account(read: PictureReader) -> str:
+    """How many pictures are shown in part, and how small the parts are."""
+    from derender.training.framing import WHOLE
+
+    sides = [framing.side for framing in read.framings.values() if framing != WHOLE]
+    if not sides:
+        return "every picture is shown whole: no part of any is rendered again clearly better"
+    return (
+        f"{len(sides):,} of {len(read.framings):,} pictures are shown in part, {min(sides):.0%} to "
+        f"{max(sides):.0%} of their side"
+    )

@@ -8,7 +8,9 @@ import typer
 from derender.cli import options
 from derender.cli.console import bar
 from derender.cli.given import (
+    Frame,
     PictureFiles,
+    PictureReader,
     Size,
     Texture,
     finish,
@@ -37,6 +39,7 @@ def mesh(
     size: Size = DEFAULT_SIZE,
     texture: Texture = "model",
     fit_steps: options.FitSteps = None,
+    frame: Frame = "whole",
     grazing: Annotated[
         float,
         typer.Option(
@@ -57,8 +60,9 @@ def mesh(
     if not 0 < grazing <= 90:
         raise ValueError(f"--grazing must lie above 0 and up to 90 degrees, got {grazing:g}")
     net = open_model(model, device)
-    refine = refining(net, size, texture, fit_steps, model)
-    given = given_pictures(images, net.image_size, out, force, sheet=False)
+    read = PictureReader(net, frame)
+    refine = refining(read, size, texture, fit_steps, model)
+    given = given_pictures(images, read, out, force, sheet=False)
     border = _border(net.settings.ranges.border_columns(net.image_size), net.image_size, size)
     written = []
     with bar("meshing") as report:
@@ -79,7 +83,7 @@ def mesh(
                 }
             )
             report(len(written), len(given.folders))
-    finish(given, out, written, json_file, percentiles(model, net, given.pictures))
+    finish(given, read, out, written, json_file, percentiles(model, net, given.pictures))
 
 
 def _border(columns: int, model_size: int, size: int) -> int:

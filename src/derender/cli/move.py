@@ -13,13 +13,14 @@ import typer
 from derender.cli import options
 from derender.cli.console import bar
 from derender.cli.given import (
+    Frame,
     Given,
     PictureFiles,
+    PictureReader,
     Size,
     Texture,
     finish,
     given_pictures,
-    one_picture,
     percentiles,
     refining,
     scenes_of,
@@ -69,6 +70,7 @@ def relight(
     size: Size = DEFAULT_SIZE,
     texture: Texture = "model",
     fit_steps: options.FitSteps = None,
+    frame: Frame = "whole",
     film: Film = "gif,mp4",
     frames: Frames = 48,
     seconds: Seconds = 4.0,
@@ -83,7 +85,7 @@ def relight(
     """
     from derender.report import sweeps
 
-    work = _Work(images, model, out, size, texture, film, device, force, fit_steps)
+    work = _Work(images, model, out, size, texture, film, device, force, fit_steps, frame)
     if like is None:
         before: dict[str, Any] = {}
 
@@ -121,6 +123,7 @@ def rotate(
     size: Size = DEFAULT_SIZE,
     texture: Texture = "model",
     fit_steps: options.FitSteps = None,
+    frame: Frame = "whole",
     film: Film = "gif,mp4",
     frames: Frames = 48,
     seconds: Seconds = 4.0,
@@ -131,7 +134,7 @@ def rotate(
     """Write strips and films of pictures turned from one side to the other, in their own light."""
     from derender.report import sweeps
 
-    work = _Work(images, model, out, size, texture, film, device, force, fit_steps)
+    work = _Work(images, model, out, size, texture, film, device, force, fit_steps, frame)
 
     def cameras(t: "Tensor", scene: "Scene") -> dict[str, "Tensor"]:
         return {"camera": sweeps.cameras_around(t, reach, pitch)}
@@ -162,6 +165,7 @@ def swap(
     size: Size = DEFAULT_SIZE,
     texture: Texture = "model",
     fit_steps: options.FitSteps = None,
+    frame: Frame = "whole",
     device: options.Device = "auto",
     force: options.Force = False,
     json_file: options.Json = None,
@@ -171,7 +175,7 @@ def swap(
     from derender.report.moved import Moved
     from derender.report.sweeps import drawn, swapped
 
-    work = _Work(images, model, out, size, texture, "none", device, force, fit_steps)
+    work = _Work(images, model, out, size, texture, "none", device, force, fit_steps, frame)
     parameters = {row.name: row.parameter for row in work.net.factors}
     wanted = {name: named(parameters, name, "factor") for name in factor or parameters}
     other, before = work.other(source)
@@ -214,6 +218,7 @@ class _Work:
         device: str,
         force: bool,
         fit_steps: int | None,
+        frame: str,
     ):
         from derender.cli.models import open_model
         from derender.report.moved import film_kinds
@@ -221,8 +226,9 @@ class _Work:
         self.films = film_kinds(film)
         self.out = out
         self.net: Derenderer = open_model(model, device)
-        self.refine = refining(self.net, size, texture, fit_steps, model)
-        self.given: Given = given_pictures(images, self.net.image_size, out, force)
+        self.read = PictureReader(self.net, frame)
+        self.refine = refining(self.read, size, texture, fit_steps, model)
+        self.given: Given = given_pictures(images, self.read, out, force)
         self.scenes = scenes_of(self.net, self.given, 64)
         self.odd = percentiles(model, self.net, self.given.pictures)
         self.model = model
@@ -231,7 +237,7 @@ class _Work:
         """The scene of a further picture, and the picture as a labelled image."""
         from derender.report.colours import pictures
 
-        picture = one_picture(path, self.net.image_size)
+        picture = self.read(path, self.net.image_size)
         (scene,) = scenes_of(self.net, Given({path: picture}, [], {}), 1)
         self.odd |= percentiles(self.model, self.net, {path: picture})
         return self._finer(scene, path), {"the other": pictures(picture[None])[0]}
@@ -259,7 +265,7 @@ class _Work:
                 sheets.add(path.name, made.columns)
                 report(len(written), len(self.scenes))
         paths = write_sheets(sheets, self.out) if len(sheets) > 1 else []
-        finish(self.given, self.out, written, json_file, self.odd, sheets=paths)
+        finish(self.given, self.read, self.out, written, json_file, self.odd, sheets=paths)
 
     def _finer(self, scene: "Scene", path: Path) -> "Scene":
         return scene if self.refine is None else self.refine(scene, [path])

@@ -7,8 +7,10 @@ import typer
 from derender.cli import options
 from derender.cli.console import bar
 from derender.cli.given import (
+    Frame,
     OwnSize,
     PictureFiles,
+    PictureReader,
     Texture,
     batch_that_fits,
     finish,
@@ -31,6 +33,7 @@ def decompose(
     size: OwnSize = None,
     texture: Texture = "model",
     fit_steps: options.FitSteps = None,
+    frame: Frame = "whole",
     sheet: Annotated[
         bool, typer.Option("--sheet", help="Also draw all pictures below each other as sheet.png.")
     ] = False,
@@ -46,8 +49,9 @@ def decompose(
     from derender.report.sheets import Sheets, write_sheets
 
     net = open_model(model, device)
-    refine = refining(net, size, texture, fit_steps, model)
-    given = given_pictures(images, net.image_size, out, force, sheet=sheet)
+    read = PictureReader(net, frame)
+    refine = refining(read, size, texture, fit_steps, model)
+    given = given_pictures(images, read, out, force, sheet=sheet)
     sheets, names = Sheets(), iter(given.pictures)
 
     def keep(drawn: Decomposition) -> None:
@@ -65,4 +69,4 @@ def decompose(
             keep=keep if sheet else None,
         )
     odd = percentiles(model, net, given.pictures)
-    finish(given, out, written, json_file, odd, sheets=write_sheets(sheets, out))
+    finish(given, read, out, written, json_file, odd, sheets=write_sheets(sheets, out))

@@ -8,6 +8,7 @@ import typer
 
 from derender.cli import options
 from derender.cli.console import result, say, write_json
+from derender.cli.given import Frame, check_frame
 
 if TYPE_CHECKING:
     import numpy as np
@@ -54,6 +55,7 @@ def view(
         int, typer.Option("--keep", min=2, max=10_000, help="Opened pictures held in memory.", metavar="N")
     ] = 64,
     fit_steps: options.FitSteps = None,
+    frame: Frame = "whole",
     device: options.Device = "auto",
     json_file: options.Json = None,
 ) -> None:
@@ -62,6 +64,7 @@ def view(
     It listens on this machine only, keeps no picture on disk, and needs no network. Ctrl-C ends it.
     """
     _check_installed()
+    framed = check_frame(frame)
     from derender.report.viewer.listener import address_of, listen
 
     listener = listen(host, port)
@@ -72,16 +75,16 @@ def view(
         from derender.report.viewer.guard import is_loopback
         from derender.report.viewer.server import serve
         from derender.report.viewer.shelf import Shelf
-        from derender.report.viewer.studio import Studio
+        from derender.report.viewer.studio import Studio, reading_size
 
         net = open_model(model, device)
         if fit_steps:
             fitting_of(net, model)
-        pictures = _readable(images or [], net.image_size)
+        pictures = _readable(images or [], reading_size(net, framed))
         gallery = None if features is None else _gallery(features, data, dataset, model, net)
         examples = named_examples(pictures) if images else rendered_examples(model, net.image_size)
         table = None if gallery is None else gallery.table
-        studio = Studio(net, Path(model).name, Shelf(keep), _held_out(model), table, fit_steps or 0)
+        studio = Studio(net, Path(model).name, Shelf(keep), _held_out(model), table, fit_steps or 0, framed)
         url = address_of(listener, host)
         if not is_loopback(host):
             say(f"warning: anyone who can reach {host} can use this page, and there is no password")

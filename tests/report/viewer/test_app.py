@@ -15,9 +15,11 @@ from derender import load
 from derender.data.synthetic import faces
 from derender.model import model_folder
 from derender.report.viewer.app import Application, Viewer
+from derender.report.viewer.examples import rendered_examples
 from derender.report.viewer.server import BoundedProtocol, serving
 from derender.report.viewer.shelf import Shelf
 from derender.report.viewer.studio import Studio
+from derender.training.framing import Framing
 from derender.training.held_out_errors import read_errors
 
 LIGHT = {"ambient": 0.3, "diffuse": 0.7, "pitch_deg": 0.0, "yaw_deg": 0.0}
@@ -34,7 +36,7 @@ def test_about_says_what_there_is(client):
 
 def test_a_picture_is_taken_apart_and_shown(client):
     found = client.opened(0)
-    assert set(found) == {"picture", "light", "camera", "l1", "l1_as_read", "percentile", "odd"}
+    assert set(found) == {"picture", "light", "camera", "l1", "l1_as_read", "percentile", "side", "odd"}
     assert 0 < found["l1"] < 1 and found["percentile"] is None and found["odd"] is False
     assert found["l1_as_read"] is None
     own = client.post("/api/view", {"picture": found["picture"]})
@@ -200,3 +202,17 @@ def test_too_much_work_is_refused_not_queued_for_ever(model, picture, client):
     with serving(application) as url:
         reply = type(client)(url).post("/api/view", asked)
         assert (reply.status, "too long" in reply.error) == (503, True)
+
+
+def test_a_wider_picture_is_shown_in_the_part_that_the_model_knows():
+    model, face = load("rendered-faces-64"), rendered_examples("rendered-faces-64", 64)[3].picture
+    wide = np.random.default_rng(0).integers(0, 256, (3, 8, 8), dtype=np.uint8).repeat(16, 1).repeat(16, 2)
+    left, top, side = Framing(0.5, 0.0, 0.2).corner(128)
+    wide[:, top : top + side, left : left + side] = face
+    framed, whole = Studio(model, "faces", framed=True), Studio(model, "faces")
+    assert (framed.reading_size, whole.reading_size) == (128, 64)
+    found = framed.open(wide)
+    assert found["side"] == 0.5
+    np.testing.assert_array_equal(framed.shelf.get(found["picture"]).picture, face)
+    assert found["l1"] == pytest.approx(whole.open(face)["l1"])
+    assert framed.open(face)["side"] == 1.0  # of the model's own size: as it is

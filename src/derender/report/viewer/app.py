@@ -166,7 +166,7 @@ class Application:
         """Take the picture in the body apart."""
         with self._uploads.one() as body:
             await self._receive(request, body, BODY_LIMIT_BYTES)
-            size = self.viewer.studio.model.image_size
+            size = self.viewer.studio.reading_size
             picture = await self._work(self._decoding, _decoded, body, size)
         return await self._opened(picture)
 

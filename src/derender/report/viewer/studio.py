@@ -35,9 +35,15 @@ from derender.scene import Scene
 from derender.scene.enlarge import at_size
 from derender.scene.light import lambert_shading
 from derender.scene.normals import normals_from_depth
+from derender.training.framing import as_bytes, each_framing
 from derender.training.held_out_errors import HeldOutErrors, masked_l1, reconstruction_errors
 
 ENLARGED_BORDER = 1  # enlarging smooths the step at the model's border over one more column
+
+
+def reading_size(model: Derenderer, framed: bool) -> int:
+    """Side at which pictures are read: twice the model's where the best part of each is looked for."""
+    return model.image_size * (2 if framed else 1)
 
 
 @dataclass
@@ -51,6 +57,7 @@ class Studio:
         held_out: reconstruction errors that were stored with the model; None if there are none.
         table: features to look for neighbours in; None for none.
         fit_steps: of each scene to its picture (``model.fit_scenes``); 0 shows what encoders say.
+        framed: whether of a picture larger than the model's the part is taken that it renders again best.
     """
 
     model: Derenderer
@@ -59,9 +66,21 @@ class Studio:
     held_out: HeldOutErrors | None = None
     table: FeatureTable | None = None
     fit_steps: int = 0
+    framed: bool = False
+
+    @property
+    def reading_size(self) -> int:
+        """Side of the pictures that ``open`` should be given."""
+        return reading_size(self.model, self.framed)
 
     def open(self, picture: UInt8[np.ndarray, "3 s s"]) -> dict[str, Any]:
         """Take a picture apart and keep it; gives its name, its light and camera, how well it is rebuilt."""
+        side = 1.0
+        if self.framed and picture.shape[-1] != self.model.image_size:
+            larger = torch.from_numpy(picture[None])
+            (framing,) = each_framing(self.model, larger)
+            side = framing.side
+            picture = as_bytes(framing.cut(larger, self.model.image_size))[0].numpy()
         with torch.inference_mode():
             images = as_float(picture[None]).to(self.model.device)
             readings = self.model.read(images)
@@ -82,6 +101,7 @@ class Studio:
             "l1": l1 if isfinite(l1) else None,
             "l1_as_read": float(errors[0]) if self.fit_steps and isfinite(errors[0]) else None,
             "percentile": percentile,
+            "side": side,
             "odd": percentile is not None and percentile > ODD_PERCENTILE,
         }
 

@@ -243,7 +243,8 @@ async function openFirst(source, name, image = null, button = null) {
     const error = first.l1 === null ? "the model renders nothing into it" : `mean difference ${first.l1.toFixed(3)} where the surface is seen${asRead}`;
     const beaten = first.percentile >= 100 ? "any" : `${Math.floor(first.percentile)} %`;
     const rank = first.percentile === null ? "" : `, more than for ${beaten} of the pictures the model was checked on`;
-    say(`${name}: ${error}${rank}.`);
+    const part = first.side === 1 ? "" : ` Shown is the part of it that the model renders again best, ${Math.round(100 * first.side)} % of its side.`;
+    say(`${name}: ${error}${rank}.${part}`);
     $("odd").hidden = !first.odd;
     $("odd").textContent = "This picture is rendered again worse than nearly all the model was checked on: it may not be what the model knows. Read its factors with care.";
     $("work").hidden = false;

@@ -1,0 +1,71 @@
+"""`--frame auto`: commands that take pictures by name show a model the part that it knows."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from derender.cli import main
+from derender.report.viewer.examples import rendered_examples
+from derender.training.framing import Framing
+
+KNOWN = "rendered-faces-64"
+TRUE = Framing(0.7, 0.1, 0.2)
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory) -> Path:
+    """Two rendered faces: one as the model knows it, one small and off the middle of a wider picture."""
+    folder = tmp_path_factory.mktemp("framing")
+    near, far = (example.picture.transpose(1, 2, 0) for example in rendered_examples(KNOWN, 64)[2:4])
+    Image.fromarray(near).save(folder / "near.png")
+    left, top, side = TRUE.corner(200)
+    coarse = np.random.default_rng(0).integers(0, 256, (6, 6, 3), dtype=np.uint8)
+    wide = Image.fromarray(coarse).resize((200, 200), Image.Resampling.BICUBIC)
+    wide.paste(Image.fromarray(far).resize((side, side), Image.Resampling.LANCZOS), (left, top))
+    wide.save(folder / "wide.png")
+    return folder
+
+
+def _run(command: str, photos: Path, out: Path, *words: str) -> dict:
+    names = [str(photos / "near.png"), str(photos / "wide.png")]
+    told = out.parent / f"{out.name}.json"
+    assert main([command, "-m", KNOWN, *names, "-o", str(out), "--json", str(told), *words]) == 0
+    return json.loads(told.read_text())
+
+
+def test_the_part_is_found_told_and_drawn(photos, tmp_path, capsys):
+    whole = _run("decompose", photos, tmp_path / "whole")
+    assert "--frame auto looks for the part" in capsys.readouterr().err and "framing" not in whole
+    found = _run("decompose", photos, tmp_path / "framed", "--frame", "auto")
+    said = capsys.readouterr().err
+    assert "1 of 2 pictures are shown in part" in said and "--frame auto" not in said
+    near, wide = (found["framing"][str(photos / name)] for name in ("near.png", "wide.png"))
+    assert near == {"side": 1.0, "across": 0.0, "down": 0.0}
+    odd, percentile = (one["reconstruction_percentile"][str(photos / "wide.png")] for one in (whole, found))
+    assert odd == 100 and percentile < 99
+    shown = np.asarray(Image.open(tmp_path / "framed" / "wide" / "input.png").convert("RGB"), float)
+    face = rendered_examples(KNOWN, 64)[3].picture.transpose(1, 2, 0)
+    assert Framing(**wide) == TRUE
+    assert np.abs(shown - face).mean() < 6
+    beside = np.asarray(Image.open(tmp_path / "whole" / "near" / "input.png"))
+    np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "framed" / "near" / "input.png")), beside)
+
+
+def test_detail_films_and_meshes_are_of_the_same_part(photos, tmp_path):
+    words = ["--frame", "auto", "--texture", "original"]
+    few = ["--stills", "2", "--film", "none"]
+    relit = _run("relight", photos, tmp_path / "relit", *words, *few, "--like", str(photos / "wide.png"))
+    meshes = _run("mesh", photos, tmp_path / "meshes", *words)
+    assert relit["framing"] == meshes["framing"]
+    assert relit["framing"][str(photos / "wide.png")]["side"] < 1
+
+
+def test_another_word_is_refused(photos, tmp_path, capsys):
+    for command in ("decompose", "rotate", "mesh"):
+        words = [command, "-m", KNOWN, str(photos / "near.png"), "-o", str(tmp_path / "out")]
+        assert main([*words, "--frame", "atuo"]) == 2
+        assert "unknown --frame 'atuo'; did you mean 'auto'?" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,118 @@
+"""The part of a picture that a model should be shown."""
+
+import numpy as np
+import pytest
+import torch
+from torch.nn.functional import interpolate
+
+import derender
+from derender.report.viewer.examples import rendered_examples
+from derender.training.framing import (
+    WHOLE,
+    Framing,
+    as_bytes,
+    common_framing,
+    each_framing,
+    framing_errors,
+    framings,
+)
+
+TRUE = Framing(0.7, 0.1, 0.2)
+
+
+@pytest.fixture(scope="module")
+def model() -> derender.Derenderer:
+    return derender.load("rendered-faces-64")
+
+
+@pytest.fixture(scope="module")
+def faces_known() -> torch.Tensor:
+    """Five rendered faces that the model was tested on, (5, 3, 64, 64) in 0..1."""
+    examples = rendered_examples("rendered-faces-64", 64)[:5]
+    return torch.from_numpy(np.stack([example.picture for example in examples])).float() / 255
+
+
+@pytest.fixture(scope="module")
+def laid_in(faces_known) -> torch.Tensor:
+    """The same, each smaller and off the middle of a larger picture with something else around it."""
+    size = 160
+    coarse = torch.rand(5, 3, 6, 6, generator=torch.Generator().manual_seed(0))
+    canvas = interpolate(coarse, size=(size, size), mode="bicubic").clamp(0, 1)
+    left, top, side = TRUE.corner(size)
+    canvas[:, :, top : top + side, left : left + side] = interpolate(
+        faces_known, size=(side, side), mode="bilinear"
+    )
+    return as_bytes(canvas)
+
+
+def test_the_part_that_holds_what_the_model_knows_is_found(model, laid_in):
+    found = each_framing(model, laid_in)
+    near = [
+        abs(one.side - 0.7) < 0.11 and abs(one.across - 0.1) + abs(one.down - 0.2) < 0.21 for one in found
+    ]
+    assert sum(near) == 5
+    common = common_framing(model, laid_in)
+    assert abs(common.side - TRUE.side) < 0.11
+    assert abs(common.across - TRUE.across) + abs(common.down - TRUE.down) < 0.11
+
+
+def test_what_the_model_knows_as_it_is_stays_whole(model, faces_known):
+    assert common_framing(model, as_bytes(faces_known)) == WHOLE
+    assert each_framing(model, as_bytes(faces_known)).count(WHOLE) >= 4
+
+
+def test_the_part_is_rendered_again_better(model, laid_in):
+    whole, part = framing_errors(model, laid_in, [WHOLE, TRUE])
+    assert (part < 0.7 * whole).all()
+
+
+def test_errors_are_shares_of_the_pictures_variance(model, faces_known):
+    bytes_ = as_bytes(faces_known)
+    pictures = bytes_.float() / 255
+    with torch.inference_mode():
+        seen = model.reconstruct(pictures)
+    (found,) = framing_errors(model, bytes_, [WHOLE], batch_size=3)
+    for row in range(5):
+        inside = seen.mask[row] > 0
+        target, drawn = pictures[row][:, inside].numpy(), seen.image[row][:, inside].numpy()
+        variance = ((target - target.mean(axis=1, keepdims=True)) ** 2).sum()
+        assert found[row] == pytest.approx(((target - drawn) ** 2).sum() / variance, rel=1e-3)
+
+
+def test_a_plain_picture_and_one_with_nothing_in_it_have_an_answer(model, monkeypatch):
+    plain = torch.full((2, 3, 128, 128), 90, dtype=torch.uint8)
+    assert np.isfinite(framing_errors(model, plain, [WHOLE, TRUE])).all()
+    reconstruct = model.reconstruct
+
+    def nothing(pictures):
+        seen = reconstruct(pictures)
+        return type(seen)(seen.image * 0, seen.depth, seen.mask * 0)
+
+    monkeypatch.setattr(model, "reconstruct", nothing)
+    assert np.isinf(framing_errors(model, plain, [WHOLE, TRUE])).all()
+    assert each_framing(model, plain) == [WHOLE, WHOLE]
+
+
+def test_every_part_that_is_tried_lies_inside_the_picture():
+    tried = framings()
+    assert tried[0] == WHOLE and len(set(tried)) == len(tried) > 100
+    for framing in tried:
+        for size in (64, 128, 101):
+            left, top, side = framing.corner(size)
+            assert left >= 0 and top >= 0 and side >= 1 and max(left, top) + side <= size
+
+
+@pytest.mark.parametrize(
+    "numbers", [(0.0,), (1.1,), (0.7, 0.4), (0.7, 0, -0.4), (float("nan"),), (0.5, float("nan"))]
+)
+def test_a_part_beyond_the_picture_is_refused(numbers):
+    with pytest.raises(ValueError, match="inside the picture"):
+        Framing(*numbers)
+
+
+def test_a_cut_of_the_right_size_is_the_pixels_themselves():
+    picture = torch.randint(0, 256, (1, 3, 80, 80), dtype=torch.uint8)
+    part = Framing(0.8, -0.2, 0.2).cut(picture, 64)
+    assert torch.equal(as_bytes(part), picture[:, :, 16:, :64])
+    assert torch.equal(as_bytes(WHOLE.cut(picture, 80)), picture)
+    assert Framing(0.5).cut(picture, 64).shape == (1, 3, 64, 64)
