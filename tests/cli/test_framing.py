@@ -41,7 +41,7 @@ def test_the_part_is_found_told_and_drawn(photos, tmp_path, capsys):
     assert "--frame auto looks for the part" in capsys.readouterr().err and "framing" not in whole
     found = _run("decompose", photos, tmp_path / "framed", "--frame", "auto")
     said = capsys.readouterr().err
-    assert "1 of 2 pictures are shown in part" in said and "--frame auto" not in said
+    assert "shown in part, 70 % of their side: 1 of 2 pictures" in said and "--frame auto" not in said
     near, wide = (found["framing"][str(photos / name)] for name in ("near.png", "wide.png"))
     assert near == {"side": 1.0, "across": 0.0, "down": 0.0}
     odd, percentile = (one["reconstruction_percentile"][str(photos / "wide.png")] for one in (whole, found))

@@ -283,7 +283,6 @@ def _framed_account(read: PictureReader) -> str:
     sides = [framing.side for framing in read.framings.values() if framing != WHOLE]
     if not sides:
         return "every picture is shown whole: no part of any is rendered again clearly better"
-    return (
-        f"{len(sides):,} of {len(read.framings):,} pictures are shown in part, {min(sides):.0%} to "
-        f"{max(sides):.0%} of their side"
-    )
+    low, high = round(100 * min(sides)), round(100 * max(sides))
+    span = f"{low} %" if low == high else f"{low} to {high} %"
+    return f"shown in part, {span} of their side: {len(sides):,} of {len(read.framings):,} pictures"
