@@ -94,10 +94,10 @@ class PictureReader:
     def _framed(self, path: Path, size: int) -> "np.ndarray":
         import torch
 
-        from derender.training.framing import as_bytes, each_framing
+        from derender.training.framing import READ_LARGER, as_bytes, each_framing
 
         if path not in self.framings:
-            looked_at = torch.from_numpy(one_picture(path, 2 * self.net.image_size)[None])
+            looked_at = torch.from_numpy(one_picture(path, READ_LARGER * self.net.image_size)[None])
             (self.framings[path],) = each_framing(self.net, looked_at)
         framing = self.framings[path]
         larger = torch.from_numpy(one_picture(path, round(size / framing.side))[None])

@@ -25,6 +25,9 @@ FARTHEST = {"across": 0.2, "down": 0.3}
 GAIN = 0.8
 """A part is taken where its error is below this share of the whole picture's."""
 
+READ_LARGER = 2
+"""How many times the model's size pictures should have where parts are looked for."""
+
 _LEAST_VARIANCE = 1e-4
 
 
@@ -93,7 +96,7 @@ def framing_errors(
 
     Args:
         model: with ``reconstruct``, ``device`` and ``image_size``, in evaluation mode.
-        images: square pictures, best of twice the model's size or more.
+        images: square pictures, best of ``READ_LARGER`` times the model's size or more.
         tried: parts.
         batch_size: parts rendered at a time; changes speed and memory only.
     """

@@ -35,15 +35,15 @@ from derender.scene import Scene
 from derender.scene.enlarge import at_size
 from derender.scene.light import lambert_shading
 from derender.scene.normals import normals_from_depth
-from derender.training.framing import as_bytes, each_framing
+from derender.training.framing import READ_LARGER, as_bytes, each_framing
 from derender.training.held_out_errors import HeldOutErrors, masked_l1, reconstruction_errors
 
 ENLARGED_BORDER = 1  # enlarging smooths the step at the model's border over one more column
 
 
 def reading_size(model: Derenderer, framed: bool) -> int:
-    """Side at which pictures are read: twice the model's where the best part of each is looked for."""
-    return model.image_size * (2 if framed else 1)
+    """Side at which pictures are read, in pixels: larger where the best part of each is looked for."""
+    return model.image_size * (READ_LARGER if framed else 1)
 
 
 @dataclass
