@@ -25,6 +25,7 @@ from derender.cli import (
     mesh,
     move,
     pictures,
+    refine,
     report,
     search,
     synth,
@@ -63,7 +64,7 @@ def _options(
 
 
 for group in (
-    demo, doctor, train, whiten, unet, embed, evaluate, explain, finetune, importing, compare,
+    demo, doctor, train, whiten, refine, unet, embed, evaluate, explain, finetune, importing, compare,
     report,
     pictures, move, mesh, search, view, synth, bench,
 ):  # fmt: skip

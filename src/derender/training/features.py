@@ -7,6 +7,7 @@ from torch import Tensor
 
 from derender.model import Derenderer
 from derender.networks.fitting import PARAMETERS
+from derender.networks.morphable import MorphableMaps
 from derender.training.config import FeatureSettings
 from derender.training.fitting import make_fitting
 from derender.training.whitening import fit_whitening
@@ -18,7 +19,8 @@ def make_features(
     settings: FeatureSettings,
     *,
     seed: int = 0,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Callable[[int, int], object] | None = None,
+    maps: MorphableMaps | None = None,
 ) -> None:
     """Give a model its whitening and its fitting, as far as the settings ask for them; in place.
 
@@ -30,6 +32,7 @@ def make_features(
         settings: how.
         seed: of the pictures that are drawn.
         progress: called with (pictures done, pictures in all), once for each of the two.
+        maps: to fit scenes within, by default made of what the model says.
 
     Raises:
         ValueError: too few pictures, or more fitted coordinates than a feature has numbers.
@@ -48,4 +51,4 @@ def make_features(
             model, images, settings.whitening, settings.perturb, size=size, seed=seed, progress=progress
         )
     if settings.fitting.examples >= 2 and PARAMETERS.keys() <= {factor.name for factor in model.factors}:
-        model.fitting = make_fitting(model, images, settings.fitting, seed=seed, progress=progress)
+        model.fitting = make_fitting(model, images, settings.fitting, seed=seed, progress=progress, maps=maps)

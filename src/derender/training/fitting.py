@@ -24,7 +24,8 @@ def make_fitting(
     settings: FittingSettings,
     *,
     seed: int = 0,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Callable[[int, int], object] | None = None,
+    maps: MorphableMaps | None = None,
 ) -> Fitting:
     """The morphable model of what a model says of pictures, and the length of features made of fitted scenes.
 
@@ -34,6 +35,7 @@ def make_fitting(
         settings: how many examples and coordinates, and how scenes are fitted later.
         seed: of the draw.
         progress: called with (pictures done, pictures in all).
+        maps: a morphable model that is there already; by default one is made.
 
     Raises:
         ValueError: fewer than two pictures, maps that are no numbers, or a model without geometry and albedo.
@@ -56,21 +58,24 @@ def make_fitting(
             for start in range(0, len(chosen), BATCH_SIZE):
                 batch = _pictures(images[chosen[start : start + BATCH_SIZE].to(images.device)], model)
                 scene, features = model.decompose(batch), model.embed(batch)
-                for parameter, maps in found.items():
+                for parameter, kept in found.items():
                     said = scene.parameters[parameter].float().cpu()
                     if not bool(said.isfinite().all()):
                         raise ValueError(
                             f"fitting: {parameter} is not finite in pictures {start} to "
                             f"{start + len(batch) - 1} of those drawn: the model's training went wrong"
                         )
-                    maps.append(said)
+                    if maps is None:
+                        kept.append(said)
                 squares += sum(features[name].double().square().sum().cpu() for name in PARAMETERS)
                 if progress is not None:
                     progress(min(start + BATCH_SIZE, len(chosen)), len(chosen))
     finally:
         model.train(was_training)
         model.fitting = was_fitting
-    maps = MorphableMaps.of({name: torch.cat(parts) for name, parts in found.items()}, settings.coordinates)
+    if maps is None:
+        examples = {name: torch.cat(parts) for name, parts in found.items()}
+        maps = MorphableMaps.of(examples, settings.coordinates)
     fitting = Fitting(maps, settings).to(model.device)
     said = float(squares / len(chosen))
     if settings.steps:

@@ -35,7 +35,7 @@ def fit_whitening(
     describe: Describe | None = None,
     size: int | None = None,
     seed: int = 0,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Callable[[int, int], object] | None = None,
 ) -> Whitening:
     """The map from what a trained model reads of geometry and albedo to its features.
 
@@ -109,7 +109,7 @@ def recentre(
     model: Derenderer,
     images: Shaped[Tensor, "n 3 h w"],
     *,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Callable[[int, int], object] | None = None,
 ) -> Whitening:
     """The model's own whitening about the mean of these pictures, uint8 or float in 0..1; the model stays.
 

@@ -61,6 +61,7 @@ def commands(place: Path, data: Path) -> dict[str, tuple[list[str], int]]:
     small = [text for setting in TINY_RUN for text in ("--set", setting)]
     train = ["--data", str(data), "--device", "cpu", *small]
     few = ["--resamples", "20"]
+    taught = [f"--set={text}" for text in ("images=16", "fitted=8", "fit_steps=2", "whitening.pictures=8")]
     label, once, run = ["--label", "class"], ["--counts", "20", "--seeds", "1"], str(place / "run")
     return {
         "doctor": (["doctor", str(data)], 0),
@@ -68,6 +69,7 @@ def commands(place: Path, data: Path) -> dict[str, tuple[list[str], int]]:
         "report": (["report", run, *reads[2:], "--force"], 0),
         "finetune": (["finetune", *train, *label, "--model", run, "--out", str(place / "tuned")], 0),
         "whiten": (["whiten", *reads, "--set", "pictures=8", "--out", str(place / "white")], 0),
+        "refine": (["refine", *reads, *taught, "--out", str(place / "refined")], 0),
         "unet": (["unet", *reads, "--set", "images=16", "--out", str(place / "unet")], 0),
         "embed": (["embed", *reads, "--out", str(place / "F.parquet")], 0),
         "evaluate cluster": (["evaluate", "cluster", *reads, *label, *few], 0),

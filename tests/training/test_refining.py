@@ -1,0 +1,147 @@
+"""Encoders that learn what fitting finds: what they come nearer to, what stays, what is refused."""
+
+import pytest
+import torch
+
+import derender
+from derender.data.synthetic import faces
+from derender.render import Rendering
+from derender.scene import Scene
+from derender.training.refining import (
+    FACTORS,
+    RefineConfig,
+    RefiningSettings,
+    _fit,
+    _lesson,
+    _Unit,
+    refine,
+)
+
+LESSONS = RefiningSettings(
+    images=480, batch_size=16, learning_rate=5e-4, fit_steps=8, rendered=0.25, worst=0, picture_weight=0
+)
+SHORT = RefineConfig.model_validate(
+    {
+        "refining": LESSONS.model_dump(),
+        "whitening": {"pictures": 16, "views": 2, "directions": 8},
+        "fitting": {"examples": 16},
+    }
+)
+
+
+def changed(**refining) -> RefineConfig:
+    return SHORT.model_copy(update={"refining": LESSONS.model_copy(update=refining)})
+
+
+@pytest.fixture(scope="module")
+def model():
+    return derender.load("rendered-faces-64")
+
+
+@pytest.fixture(scope="module")
+def images():
+    return torch.from_numpy(faces.generate(16, image_size=64, seed=9).images)
+
+
+@pytest.fixture(scope="module")
+def refined(model, images):
+    """Taught by few pictures of a kind the model does not know, and measured on the same."""
+    return refine(model, images, images, SHORT, seed=5)
+
+
+def test_what_is_read_comes_nearer_to_what_fitting_finds(refined):
+    for name in ("depth", "albedo", "light", "camera"):
+        gap = refined.gaps[name]
+        assert gap["now"] < 0.8 * gap["before"], name
+    assert refined.errors["fitted"] < refined.errors["now"] < refined.errors["before"]
+
+
+def test_pictures_are_asked_to_render_again(model, images, refined):
+    asked = refine(model, images, images, changed(picture_weight=3.0), seed=5)
+    assert asked.errors["before"] == refined.errors["before"]
+    assert asked.errors["now"] < 0.97 * refined.errors["now"]
+
+
+def test_the_same_seed_teaches_the_same_and_nothing_else_is_touched(model, images):
+    before = {name: value.clone() for name, value in model.state_dict().items()}
+    state = torch.random.get_rng_state()
+    one, again = (refine(model, images, images, changed(images=48), seed=5) for _ in range(2))
+    assert torch.equal(torch.random.get_rng_state(), state)
+    assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())
+    assert again.errors == one.errors and again.gaps == one.gaps
+    ours = one.model.state_dict()
+    assert all(torch.equal(value, ours[name]) for name, value in again.model.state_dict().items())
+    other = refine(model, images, images, changed(images=48), seed=6).model.state_dict()
+    assert any(not torch.equal(value, ours[name]) for name, value in other.items())
+
+
+def test_the_confidence_net_stays_and_the_linear_model_is_the_same(model, refined, images):
+    theirs, ours = model.state_dict(), refined.model.state_dict()
+    taught = tuple(f"nets.{name}." for name in FACTORS)
+    kept = [name for name in theirs if not name.startswith(taught)]
+    assert kept and all(torch.equal(ours[name], theirs[name]) for name in kept)
+    assert not refined.model.training and not any(p.requires_grad for p in refined.model.parameters())
+    assert model.fitting is not None and refined.model.fitting is not None
+    for name, value in model.fitting.maps.state_dict().items():
+        assert torch.equal(value, refined.model.fitting.maps.state_dict()[name])
+    features = refined.model.embed(images[:3].float() / 255)
+    assert features["geometry"].shape == (3, 256)
+
+
+def test_features_are_made_as_the_settings_say(model, images):
+    fitting = SHORT.fitting.model_copy(update={"steps": 3, "weight": 2.0, "coordinates": 5})
+    own = refine(model, images, images[:2], changed(images=32).model_copy(update={"fitting": fitting})).model
+    assert own.fitting is not None and own.fitting.settings.steps == 3
+    features = own.embed(images[:3].float() / 255)
+    assert features["geometry"].shape == (3, 256), "64 coordinates of the model's own maps, not 5"
+
+
+def test_renderings_come_with_the_scene_they_show(model, images):
+    pictures = images[:16].float() / 255
+    fitted = _fit(model, images[:16], 2, None)
+    meant = fitted.scene(model.fitting.maps)
+    half = changed(rendered=0.5, exchanged=0.5)
+    shown, scene = _lesson(model, pictures, meant, half, torch.Generator().manual_seed(0))
+    assert shown.shape == pictures.shape and len(scene) == 16
+    made: Rendering = model.render(scene[:8])
+    seen = made.mask.bool()[:, None].expand_as(made.image)
+    torch.testing.assert_close(shown[:8][seen], made.image.clamp(0, 1)[seen], atol=1e-4, rtol=0)
+    assert not torch.allclose(scene.camera[:8], meant.camera[:8], atol=0.05)
+    torch.testing.assert_close(scene.depth[:4], meant.depth[:4].roll(1, 0))
+    torch.testing.assert_close(scene.depth[4:8], meant.depth[4:8])
+    torch.testing.assert_close(scene.albedo[:8], meant.albedo[:8])
+    mirrored = (shown[8:] == pictures[8:].flip(-1)).flatten(1).all(dim=1)
+    straight = (shown[8:] == pictures[8:]).flatten(1).all(dim=1)
+    assert mirrored.any() and straight.any() and (mirrored | straight).all()
+    torch.testing.assert_close(scene.camera[8:, 1][mirrored], -meant.camera[8:, 1][mirrored])
+    torch.testing.assert_close(scene.light[8:][straight], meant.light[8:][straight])
+
+
+def test_the_unit_is_the_spread_of_fitted_scenes(model, images):
+    pictures = images[:16].float() / 255
+    meant = _fit(model, images[:16], 2, None).scene(model.fitting.maps)
+    unit = _Unit(model, pictures, meant)
+    mean = Scene(*(value.mean(dim=0, keepdim=True).expand_as(value) for value in meant.parameters.values()))
+    gaps = unit.gaps(mean, meant)
+    assert all(float(gap) == pytest.approx(1, abs=1e-3) for gap in gaps.values())
+    assert float(unit.apart(mean, meant)) == pytest.approx(5, abs=1e-2)
+    assert float(unit.apart(meant, meant)) == 0
+    moved = meant.with_parameters(camera=meant.camera + torch.tensor([0, 0, 0, 0, 0, 1.0]))
+    assert float(unit.gaps(moved, meant)["camera"]) == 0, "the model cannot say how near the camera is"
+
+
+def test_what_cannot_be_refined_is_named(model, images):
+    with pytest.raises(ValueError, match="2 pictures or more of 64 pixels and one held out, got 1 of 64"):
+        refine(model, images[:1], images[1:])
+    with pytest.raises(ValueError, match="and one held out, got 16 of 64 and 0"):
+        refine(model, images, images[:0])
+    with pytest.raises(ValueError, match="cannot fit scenes yet"):
+        refine(derender.load("cars-64"), images[:4], images[4:])
+
+
+def test_weights_that_are_no_numbers_are_an_error(model, images):
+    broken = derender.load("rendered-faces-64")
+    broken.nets["confidence"].requires_grad_(False)
+    next(broken.nets["confidence"].parameters()).fill_(float("nan"))
+    with pytest.raises(ValueError, match="no numbers after 32 pictures"):
+        refine(broken, images, images, changed(images=32, fit_steps=1))
