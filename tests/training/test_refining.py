@@ -6,7 +6,6 @@ import torch
 import derender
 from derender.data.synthetic import faces
 from derender.render import Rendering
-from derender.scene import Scene
 from derender.training.refining import (
     FACTORS,
     RefineConfig,
@@ -121,7 +120,7 @@ def test_the_unit_is_the_spread_of_fitted_scenes(model, images):
     pictures = images[:16].float() / 255
     meant = _fit(model, images[:16], 2, None).scene(model.fitting.maps)
     unit = _Unit(model, pictures, meant)
-    mean = Scene(*(value.mean(dim=0, keepdim=True).expand_as(value) for value in meant.parameters.values()))
+    mean = meant.map(lambda value: value.mean(dim=0, keepdim=True).expand_as(value))
     gaps = unit.gaps(mean, meant)
     assert all(float(gap) == pytest.approx(1, abs=1e-3) for gap in gaps.values())
     assert float(unit.apart(mean, meant)) == pytest.approx(5, abs=1e-2)
