@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from derender.cli.console import say
+from derender.cli.console import bar, say, say_pictures
 
 if TYPE_CHECKING:
     from derender.data import PictureSet
@@ -79,6 +79,19 @@ def chosen_device(device: str) -> str:
     if device == "cuda" and not torch.cuda.is_available():
         raise ValueError("no CUDA device here: choose --device cpu")
     return "cuda" if device != "cpu" and torch.cuda.is_available() else "cpu"
+
+
+def pictures_for(
+    net: "Derenderer", model: str, data: str, *, dataset: str, part: str, limit: int | None, fewest: int
+) -> "PictureSet":
+    """A data set's pictures at a model's size, of one part of its split; says what they are."""
+    from derender.data import read_pictures
+
+    with bar("reading") as report:
+        pictures = read_pictures(data, net.image_size, dataset=dataset, limit=limit, progress=report)
+    chosen = part_of(pictures, part, model).require(fewest)
+    say_pictures(chosen)
+    return chosen
 
 
 def part_of(pictures: "PictureSet", part: str, model: str | None) -> "PictureSet":

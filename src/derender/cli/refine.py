@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from derender.cli import options
-from derender.cli.console import bar, nothing_there, result, say, say_pictures, write_json
+from derender.cli.console import bar, nothing_there, result, say, write_json
 
 
 def register(app: typer.Typer) -> None:
@@ -27,8 +27,8 @@ def refine(
         typer.Option(
             "--set",
             help="images (how many are seen), batch_size, learning_rate, fitted (pictures), fit_steps, "
-            "worst, rendered, exchanged; what is perturbed, as perturb.light_deg; for features what "
-            "derender whiten takes.",
+            "worst, rendered, exchanged, picture_weight; what is perturbed, as perturb.light_deg; for "
+            "features what derender whiten takes.",
             metavar="KEY=VALUE",
         ),
     ] = None,
@@ -45,8 +45,8 @@ def refine(
     """
     import torch
 
-    from derender.cli.models import fitting_of, open_model, part_of
-    from derender.data import read_pictures, split_indices
+    from derender.cli.models import fitting_of, open_model, pictures_for
+    from derender.data import split_indices
     from derender.training.config import with_changes
     from derender.training.held_out_errors import store_errors
     from derender.training.refining import RefineConfig, refine
@@ -55,10 +55,7 @@ def refine(
     config = with_changes(RefineConfig(), overrides or [])
     net = open_model(model, device)
     fitting_of(net, model)
-    with bar("reading") as report:
-        pictures = read_pictures(data, net.image_size, dataset=dataset, limit=limit, progress=report)
-    chosen = part_of(pictures, part, model).require(10)
-    say_pictures(chosen)
+    chosen = pictures_for(net, model, data, dataset=dataset, part=part, limit=limit, fewest=10)
     split = split_indices(chosen.files, (0.9, 0.1, 0.0), seed=seed)
     images = torch.from_numpy(chosen.images)
     own, held_out = images[split.train], images[split.validation]

@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from derender.cli import options
-from derender.cli.console import bar, nothing_there, result, say, say_pictures, write_json
+from derender.cli.console import bar, nothing_there, result, say, write_json
 
 
 def register(app: typer.Typer) -> None:
@@ -43,18 +43,14 @@ def unet(
     """
     import torch
 
-    from derender.cli.models import open_model, part_of
-    from derender.data import read_pictures
+    from derender.cli.models import open_model, pictures_for
     from derender.training.config import with_changes
     from derender.training.unets import TeachingSettings, teach_unets
 
     nothing_there(out, force)
     settings = with_changes(TeachingSettings(), overrides or [])
     net = open_model(model, device)
-    with bar("reading") as report:
-        pictures = read_pictures(data, net.image_size, dataset=dataset, limit=limit, progress=report)
-    chosen = part_of(pictures, part, model).require(2)
-    say_pictures(chosen)
+    chosen = pictures_for(net, model, data, dataset=dataset, part=part, limit=limit, fewest=2)
     with bar("teaching") as report:
         taught = teach_unets(net, torch.from_numpy(chosen.images), settings, seed=seed, progress=report)
     folder = taught.model.save(out, overwrite=force)

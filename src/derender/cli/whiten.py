@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from derender.cli import options
-from derender.cli.console import bar, nothing_there, result, say, say_pictures, write_json
+from derender.cli.console import bar, nothing_there, result, say, write_json
 
 
 def register(app: typer.Typer) -> None:
@@ -50,8 +50,7 @@ def whiten(
     """
     import torch
 
-    from derender.cli.models import open_model, part_of
-    from derender.data import read_pictures
+    from derender.cli.models import open_model, pictures_for
     from derender.training.config import FeatureSettings, with_changes
     from derender.training.features import make_features
     from derender.training.whitening import recentre
@@ -63,10 +62,7 @@ def whiten(
     if mean_only and overrides:
         raise ValueError(f"with --mean-only nothing is fitted: leave out --set {overrides[0]}")
     net = open_model(model, device)
-    with bar("reading") as report:
-        pictures = read_pictures(data, net.image_size, dataset=dataset, limit=limit, progress=report)
-    chosen = part_of(pictures, part, model).require(2)
-    say_pictures(chosen)
+    chosen = pictures_for(net, model, data, dataset=dataset, part=part, limit=limit, fewest=2)
     images = torch.from_numpy(chosen.images)
     if mean_only:
         with bar("reading pictures") as report:
