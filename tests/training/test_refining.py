@@ -144,3 +144,10 @@ def test_weights_that_are_no_numbers_are_an_error(model, images):
     next(broken.nets["confidence"].parameters()).fill_(float("nan"))
     with pytest.raises(ValueError, match="no numbers after 32 pictures"):
         refine(broken, images, images, changed(images=32, fit_steps=1))
+
+
+def test_fits_that_are_no_numbers_are_an_error(images):
+    broken = derender.load("rendered-faces-64")
+    next(broken.nets["light"].parameters()).fill_(float("nan"))
+    with pytest.raises(ValueError, match="what fitting finds is no number"):
+        refine(broken, images, images, changed(images=32, fit_steps=1))

@@ -120,7 +120,9 @@ def refine(
     generator = Generator().manual_seed(seed)
     rows = torch.randperm(len(images), generator=generator)[: settings.fitted]
     fitted = _fit(model, images[rows], settings.fit_steps, progress)
-    clear = fitted.error <= fitted.error.quantile(1 - settings.worst)
+    clear = (fitted.error <= fitted.error.quantile(1 - settings.worst)).cpu()
+    if not clear.any():
+        raise ValueError("what fitting finds is no number: the model's training went wrong")
     student = deepcopy(model)
     student.whitening = student.fitting = student.source = None
     _learn(student, images[rows[clear]], maps, fitted[clear], config, generator, progress)
