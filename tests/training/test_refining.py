@@ -11,6 +11,7 @@ from derender.training.refining import (
     RefineConfig,
     RefiningSettings,
     _fit,
+    _Fits,
     _lesson,
     _Unit,
     refine,
@@ -146,8 +147,19 @@ def test_weights_that_are_no_numbers_are_an_error(model, images):
         refine(broken, images, images, changed(images=32, fit_steps=1))
 
 
-def test_fits_that_are_no_numbers_are_an_error(images):
+def test_a_model_that_finds_no_scene_is_an_error(images):
     broken = derender.load("rendered-faces-64")
-    next(broken.nets["light"].parameters()).fill_(float("nan"))
-    with pytest.raises(ValueError, match="what fitting finds is no number"):
+    for weights in broken.nets["light"].parameters():
+        weights.fill_(float("nan"))
+    with pytest.raises(ValueError, match="fitting finds no scene of any picture"):
         refine(broken, images, images, changed(images=32, fit_steps=1))
+
+
+def test_only_clear_fits_teach():
+    """The worst, those that are no numbers and those that show nothing are left out."""
+    error = torch.tensor([0.02, 0.03, 0.0, 0.01, 0.5])
+    light = torch.rand(5, 4)
+    light[3, 1] = float("nan")
+    fits = _Fits(torch.rand(5, 3), torch.rand(5, 3), light, torch.rand(5, 6), error)
+    assert fits.clear(0.2).tolist() == [True, True, False, False, False]
+    assert fits.clear(0).tolist() == [True, True, False, False, True]

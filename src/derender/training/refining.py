@@ -14,7 +14,7 @@ from copy import deepcopy
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from pydantic import Field
 from torch import Generator, Tensor, nn
 
@@ -120,9 +120,9 @@ def refine(
     generator = Generator().manual_seed(seed)
     rows = torch.randperm(len(images), generator=generator)[: settings.fitted]
     fitted = _fit(model, images[rows], settings.fit_steps, progress)
-    clear = (fitted.error <= fitted.error.quantile(1 - settings.worst)).cpu()
+    clear = fitted.clear(settings.worst).cpu()
     if not clear.any():
-        raise ValueError("what fitting finds is no number: the model's training went wrong")
+        raise ValueError("fitting finds no scene of any picture: the model's training went wrong")
     student = deepcopy(model)
     student.whitening = student.fitting = student.source = None
     _learn(student, images[rows[clear]], maps, fitted[clear], config, generator, progress)
@@ -149,6 +149,14 @@ class _Fits:
 
     def __getitem__(self, rows: Tensor | slice) -> "_Fits":
         return _Fits(*(value[rows] for value in vars(self).values()))
+
+    def clear(self, worst: float) -> Bool[Tensor, " n"]:
+        """All but the share with the largest errors, and those that are no numbers or out of the picture."""
+        finite = torch.stack(
+            [value.isfinite().reshape(len(value), -1).all(dim=1) for value in vars(self).values()]
+        )
+        found = finite.all(dim=0) & (self.error > 0)  # where nothing is seen there is no error
+        return found & (self.error <= self.error.quantile(1 - worst))
 
     def scene(self, maps: MorphableMaps) -> Scene:
         depth, albedo = maps.maps("depth", self.geometry), maps.maps("albedo", self.albedo)
