@@ -136,7 +136,7 @@ def test_bundled_cards_travel(tmp_path, fake):
     derender.load("rendered-faces-64").push_to_hub("me/again")
     folder = fake.place / "me" / "again"
     card = (folder / "README.md").read_text()
-    assert card.startswith("---\n") and "SIDE 0.817e-2" in card
+    assert card.startswith("---\n") and "SIDE 0.786e-2" in card
     assert json.loads((folder / ERRORS_FILE).read_text())["pictures"] > 0
     assert (folder / "whitening.safetensors").exists()
 
