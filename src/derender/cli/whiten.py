@@ -25,9 +25,9 @@ def whiten(
         list[str] | None,
         typer.Option(
             "--set",
-            help="pictures, views, spatial, mirrored, directions, shrinkage, evenness; examples, "
-            "coordinates, steps, prior, tolerance, weight of fitting; what is perturbed, as "
-            "perturb.light_deg.",
+            help="pictures, views, spatial, mirrored, directions, shrinkage, evenness, frames and how far "
+            "they go, as reframe.farther; examples, coordinates, steps, prior, tolerance, weight of "
+            "fitting; what is perturbed, as perturb.light_deg.",
             metavar="KEY=VALUE",
         ),
     ] = None,

@@ -12,11 +12,12 @@ from torch import Generator, Tensor
 
 from derender.training.config import LoopSettings
 from derender.training.distributed import ALONE, Ranks
+from derender.training.reframe import DEFAULT_FRAMES, ReframeSettings, draw_frames, shown_in
 
 SAMPLED = 65_536
 """So many pictures of a memory-mapped set are drawn from where a few of all are wanted."""
 
-_STREAMS = {"order": 1, "flip": 2, "perturb": 3}
+_STREAMS = {"order": 1, "flip": 2, "perturb": 3, "frame": 4}
 
 
 def random_stream(seed: int, purpose: str, position: int) -> Generator:
@@ -38,6 +39,7 @@ class Batches:
         seed: of the order and the flips.
         horizontal_flips: whether each picture is mirrored with probability one half.
         rows: which of the images are the training set; None: all. Saves a copy of those that are.
+        reframed, reframe: the share of pictures that are shown in another frame, and how far it is moved.
     """
 
     images: UInt8[Tensor, "n 3 h w"]
@@ -45,6 +47,8 @@ class Batches:
     seed: int
     horizontal_flips: bool
     rows: Int64[np.ndarray, " k"] | None = None
+    reframed: float = 0.0
+    reframe: ReframeSettings = DEFAULT_FRAMES
 
     def __post_init__(self) -> None:
         if self.batch_size > len(self):
@@ -81,12 +85,16 @@ class Batches:
     def ready(
         self, pictures: UInt8[Tensor, "b 3 h w"], position: int, ranks: Ranks = ALONE
     ) -> Float[Tensor, "b 3 h w"]:
-        """What ``read`` gave for this position as float32 in 0..1, some pictures mirrored."""
+        """What ``read`` gave for this position as float32 in 0..1, some pictures mirrored or framed anew."""
         batch = pictures.float() / 255
         if self.horizontal_flips:
             flip = torch.rand(self.batch_size, generator=random_stream(self.seed, "flip", position)) < 0.5
             flip = ranks.own(flip)
             batch = torch.where(flip.to(batch.device)[:, None, None, None], batch.flip(-1), batch)
+        if self.reframed:
+            generator = random_stream(self.seed, "frame", position)
+            frames = draw_frames(self.batch_size, generator, self.reframe, self.reframed)
+            batch = shown_in(batch, ranks.own(frames))
         return batch
 
 
@@ -100,7 +108,9 @@ def batches_of(
     stay = isinstance(images, np.memmap) and device.type == "cpu"
     lying = torch.from_numpy(images if stay else np.ascontiguousarray(images[rows])).to(device)
     kept = rows if stay else None
-    return Batches(lying, config.batch_size, config.seed, config.horizontal_flips, kept)
+    return Batches(
+        lying, config.batch_size, config.seed, config.horizontal_flips, kept, config.reframed, config.reframe
+    )
 
 
 def some_of(images: UInt8[np.ndarray, "n 3 h w"], rows: Int64[np.ndarray, " k"]) -> np.ndarray:

@@ -18,6 +18,7 @@ from derender.networks.fitting import FittingSettings
 from derender.presets import MODEL_PRESETS, ModelSettings, named_preset
 from derender.scene.perturb import PerturbSettings
 from derender.settings import Settings
+from derender.training.reframe import DEFAULT_FRAMES, ReframeSettings
 
 LooccKind = Literal["none", "light", "light+camera", "all"]
 
@@ -60,6 +61,8 @@ class WhiteningSettings(Settings):
     directions: int = Field(default=128, ge=1)  # of each factor that are kept, at most as many as its code
     shrinkage: float = Field(default=0.1, ge=0)  # share of the mean variance added to every direction's
     evenness: float = Field(default=0.5, ge=0, le=1)  # 0: what tells pictures apart best counts most
+    frames: int = Field(default=0, ge=0)  # times each picture is also shown in another frame
+    reframe: ReframeSettings = DEFAULT_FRAMES
 
 
 class FeatureSettings(Settings):
@@ -93,6 +96,8 @@ class LoopSettings(Settings):
     patience: int = Field(default=10, ge=1)  # validations without improvement before stopping
     keep: Literal["best", "last"] = "best"  # the model: of the best validation, or of the last checkpoint
     horizontal_flips: bool = True
+    reframed: float = Field(default=0.0, ge=0, le=1)  # share of the pictures shown in another frame
+    reframe: ReframeSettings = DEFAULT_FRAMES
     split: tuple[float, float, float] = (0.8, 0.1, 0.1)  # train, validation, test
     precision: Literal["32-true", "bf16-mixed"] = "32-true"  # networks only; geometry is always float32
     channels_last: bool = True

@@ -1,9 +1,10 @@
 """What light and camera do to a trained model's codes, measured on its own renderings.
 
 Every picture is taken apart, rendered with other values of all its vector factors (light and camera), and
-encoded again, several times; mirror images count as views, too, for the object is symmetric. This is LOOCC's
-perturbation, of all vector factors at once, used after training instead of during it. Leaves out the codes of
-the vector factors themselves, which are to move.
+encoded again, several times; mirror images count as views, too, for the object is symmetric, and, where asked
+for, the picture itself in other frames, as from a camera that was moved. This is LOOCC's perturbation, of all
+vector factors at once, used after training instead of during it. Leaves out the codes of the vector factors
+themselves, which are to move.
 """
 
 from collections.abc import Callable, Mapping
@@ -18,6 +19,7 @@ from derender.networks.whitening import Spread, Whitening, contrast
 from derender.scene import Scene
 from derender.scene.perturb import PerturbSettings
 from derender.training.config import WhiteningSettings
+from derender.training.reframe import draw_frames, shown_in
 from derender.training.step import fill_uncovered
 
 BATCH_SIZE = 128
@@ -42,7 +44,7 @@ def fit_whitening(
     Args:
         model: trained; left as it is.
         images: what it was trained on, uint8 or float in 0..1; as many as the settings say are drawn.
-        settings: how many pictures and views, how many directions are kept.
+        settings: how many pictures, views and frames, how many directions are kept.
         perturb: how far light and camera are changed.
         describe: whose readings are measured on the model's renderings, all of them; by default the model's
             own of geometry and albedo.
@@ -74,6 +76,8 @@ def fit_whitening(
                 shown += [
                     _seen_otherwise(model, scene, batch, perturb, generator) for _ in range(settings.views)
                 ]
+                for _ in range(settings.frames):
+                    shown.append(shown_in(batch, draw_frames(len(batch), generator, settings.reframe)))
                 views = [say(one) for one in shown]
                 if settings.mirrored:
                     views += [say(one.flip(-1)) for one in shown]

@@ -1,0 +1,100 @@
+"""Pictures in other frames: what moves where, how many, and that features can learn to disregard it."""
+
+import pytest
+import torch
+from torch import Tensor
+
+import derender
+from derender.data.synthetic import faces
+from derender.scene.perturb import PerturbSettings
+from derender.training.batches import Batches
+from derender.training.config import WhiteningSettings
+from derender.training.distributed import Ranks
+from derender.training.reframe import ReframeSettings, draw_frames, shown_in
+from derender.training.whitening import fit_whitening
+
+STILL = {"nearer": 1, "farther": 1, "shift": 0, "roll_deg": 0}
+
+
+def spot(row: int, column: int) -> Tensor:
+    """A dark picture of 33 pixels with one bright pixel, whose middle is pixel (16, 16)."""
+    image = torch.zeros(1, 3, 33, 33)
+    image[:, :, row, column] = 1
+    return image
+
+
+def brightest(image: Tensor) -> tuple[int, int]:
+    return divmod(int(image[0, 0].flatten().argmax()), image.shape[-1])
+
+
+def moves(**changes: float) -> Tensor:
+    settings = ReframeSettings(**{**STILL, **changes})
+    return draw_frames(400, torch.Generator().manual_seed(0), settings)
+
+
+def test_frames_stay_within_their_bounds_and_reach_them():
+    zoomed, shifted, turned = moves(nearer=1.5, farther=1.25), moves(shift=0.2), moves(roll_deg=10)
+    assert 0.66 < zoomed[:, 0, 0].min() < 0.69 and 1.23 < zoomed[:, 0, 0].max() < 1.25
+    assert torch.equal(zoomed[:, 0, 0], zoomed[:, 1, 1]) and zoomed[:, 0, 1].abs().max() == 0
+    assert all(0.19 < shifted[:, axis, 2].abs().max() <= 0.2 for axis in (0, 1))
+    degrees = torch.rad2deg(torch.atan2(turned[:, 1, 0], turned[:, 0, 0]))
+    assert 9.7 < degrees.max() < 10.01 and -10.01 < degrees.min() < -9.7
+    assert turned[:, :, 2].abs().max() == 0
+
+
+def test_a_frame_says_where_its_pixels_lie_in_the_picture():
+    larger = torch.tensor([[[2.0, 0, 0], [0, 2.0, 0]]])  # shows twice as much: the spot moves inwards
+    assert brightest(shown_in(spot(16, 24), larger)) == (16, 20)
+    beside = torch.tensor([[[1.0, 0, 8 / 16.5], [0, 1.0, 0]]])  # looks 8 pixels to the right
+    assert brightest(shown_in(spot(16, 24), beside)) == (16, 16)
+    quarter = torch.tensor([[[0.0, -1.0, 0], [1.0, 0, 0]]])
+    assert brightest(shown_in(spot(16, 24), quarter)) == (8, 16)
+
+
+def test_beyond_the_edge_lies_the_reflection():
+    images = torch.rand(1, 3, 8, 8, generator=torch.Generator().manual_seed(1))
+    aside = shown_in(images, torch.tensor([[[1.0, 0, 0.5], [0, 1.0, 0]]]))  # two pixels to the right
+    assert torch.allclose(aside[..., :6], images[..., 2:], atol=1e-5)
+    assert torch.allclose(aside[..., 6:], images[..., 6:].flip(-1), atol=1e-5)
+
+
+def test_the_share_that_is_not_framed_anew_stays_bit_for_bit():
+    images = torch.rand(300, 3, 8, 8, generator=torch.Generator().manual_seed(2))
+    frames = draw_frames(300, torch.Generator().manual_seed(0), ReframeSettings(), share=0.25)
+    same = (shown_in(images, frames) == images).flatten(1).all(dim=1)
+    assert 0.68 < same.float().mean() < 0.82
+
+
+def test_batches_are_framed_anew_the_same_way_every_time_and_on_several_devices():
+    images = torch.randint(0, 256, (12, 3, 8, 8), generator=torch.Generator().manual_seed(3)).byte()
+    plain, framed = (Batches(images, 6, seed=3, horizontal_flips=True, reframed=share) for share in (0, 1.0))
+    whole = framed.at(5)
+    assert torch.equal(whole, framed.at(5))
+    assert not torch.equal(whole, plain.at(5))
+    pieces = torch.cat([framed.at(5, Ranks(rank, 2)) for rank in range(2)])
+    assert torch.allclose(pieces, whole, atol=1e-6)
+
+
+@pytest.mark.parametrize("wrong", [{"farther": 0.5}, {"shift": -0.1}, {"roll_deg": 400}])
+def test_impossible_frames_are_refused(wrong):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        ReframeSettings(**wrong)
+
+
+def test_frames_as_views_make_features_move_less_with_the_frame():
+    images = torch.from_numpy(faces.generate(264, image_size=64, seed=5).images)
+    model = derender.load("faces-64")
+    model.fitting = None
+    unseen = images[200:].float() / 255
+    moved = shown_in(unseen, draw_frames(64, torch.Generator().manual_seed(9), ReframeSettings()))
+    found = {}
+    for frames in (0, 2):
+        settings = WhiteningSettings(pictures=200, views=2, directions=16, frames=frames)
+        model.whitening = fit_whitening(model, images[:200], settings, PerturbSettings())
+        with torch.no_grad():
+            one, two = model.embed(unseen), model.embed(moved)
+        found[frames] = {
+            name: float((one[name] - two[name]).norm(dim=1).mean() / one[name].std(dim=0).norm())
+            for name in ("geometry", "albedo")
+        }
+    assert all(found[2][name] < 0.9 * found[0][name] for name in found[2])
