@@ -19,6 +19,7 @@ from derender.training.watch import SIGNS, Watcher, measure
 
 RANGES = SceneRanges()
 STEP = 500
+BATCH = 16
 
 
 def healthy_scene(count: int = 4, size: int = 64) -> Scene:
@@ -67,7 +68,7 @@ def kept_images(run: Path) -> int:
 
 
 def watch(scene: Scene, images: int, watcher: Watcher | None = None) -> list[str]:
-    watcher = watcher or Watcher(RANGES)
+    watcher = watcher or Watcher(RANGES, BATCH)
     findings = ()
     for seen in range(STEP, images + 1, STEP):
         findings = watcher.look(seen, 0.1, scene)
@@ -90,7 +91,7 @@ def test_each_failure_is_found_within_20000_images_but_not_at_once(sign):
 
 @pytest.mark.parametrize("sign", FAILED_SCENES)
 def test_findings_say_what_is_seen_and_what_to_change(sign):
-    watcher = Watcher(RANGES)
+    watcher = Watcher(RANGES, BATCH)
     for seen in range(STEP, 20_001, STEP):
         findings = watcher.look(seen, 0.1, FAILED_SCENES[sign])
     found = next(finding for finding in findings if finding.sign == sign)
@@ -99,8 +100,16 @@ def test_findings_say_what_is_seen_and_what_to_change(sign):
     assert len(found.advice) > 20
 
 
+def test_large_batches_are_given_as_many_updates_not_as_many_pictures():
+    torn = FAILED_SCENES["torn depth"]
+    assert "torn depth" in watch(torn, 18_500)
+    assert watch(torn, 70_000, Watcher(RANGES, 4 * BATCH)) == []
+    assert "torn depth" in watch(torn, 74_000, Watcher(RANGES, 4 * BATCH))
+    assert "torn depth" in watch(torn, 18_500, Watcher(RANGES, 2))
+
+
 def test_a_failure_that_passes_is_forgiven():
-    watcher = Watcher(RANGES)
+    watcher = Watcher(RANGES, BATCH)
     failed = FAILED_SCENES["view at its bound"]
     for seen in range(STEP, 6_001, STEP):
         watcher.look(seen, 0.1, failed)
@@ -113,16 +122,16 @@ def test_a_failure_that_passes_is_forgiven():
 
 @pytest.mark.parametrize("loss", [math.nan, math.inf])
 def test_a_loss_that_is_no_number_is_fatal_at_once(loss):
-    (finding,) = Watcher(RANGES).look(16, loss, healthy_scene())
+    (finding,) = Watcher(RANGES, BATCH).look(16, loss, healthy_scene())
     assert finding.fatal
     assert finding.sign == "non-finite loss"
 
 
 def test_a_watcher_goes_on_from_its_memory():
     failed = FAILED_SCENES["view at its bound"]
-    first = Watcher(RANGES)
+    first = Watcher(RANGES, BATCH)
     assert watch(failed, 7_000, first) == []
-    second = Watcher.remembering(RANGES, first.memory())
+    second = Watcher.remembering(RANGES, BATCH, first.memory())
     (finding,) = second.look(9_000, 0.1, failed)
     assert finding.sign == "view at its bound"
 
@@ -162,7 +171,7 @@ COLLAPSING += ["learning_rate=5e-3", "weight_decay=0", "warmup_images=0", "final
 )
 def test_a_memory_that_no_watcher_gave_is_refused(memory):
     with pytest.raises(ValueError, match="does not hold what the collapse detector remembers"):
-        Watcher.remembering(RANGES, memory)
+        Watcher.remembering(RANGES, BATCH, memory)
 
 
 def test_a_real_collapse_is_caught_within_20000_images_while_its_loss_still_falls(tmp_path, monkeypatch):

@@ -68,7 +68,7 @@ def what_is_said(model: Derenderer, images: Tensor, perceptual: nn.Module | None
     """What the watcher of a training says of one step; it has to end the run."""
     objective = ObjectiveSettings(loocc="light+camera", perceptual="self" if perceptual else "none")
     result = training_step(model, images, objective, perceptual, torch.Generator().manual_seed(0))  # type: ignore[arg-type]
-    watch = SceneWatch(Watcher(model.settings.ranges))
+    watch = SceneWatch(Watcher(model.settings.ranges, 4))
     findings = watch.look(len(images), result)
     assert watch.uneasy and findings and findings[0].fatal
     return findings[0].text
@@ -77,7 +77,7 @@ def what_is_said(model: Derenderer, images: Tensor, perceptual: nn.Module | None
 def test_a_sound_step_raises_nothing(model, images):
     result = training_step(model, images, ObjectiveSettings(perceptual="none"), None, torch.Generator())
     result.total.backward()
-    assert SceneWatch(Watcher(model.settings.ranges)).look(4, result) == ()
+    assert SceneWatch(Watcher(model.settings.ranges, 4)).look(4, result) == ()
     assert broken_gradient(model) is None
 
 
@@ -146,7 +146,7 @@ def test_a_depth_that_is_no_number_leaves_the_loss_finite_and_is_seen_all_the_sa
     spoil(model.nets["geometry"].decoder, nan)
     objective = ObjectiveSettings(perceptual="none", curvature_weight=0, confidence=False)
     result = training_step(model, images, objective, None, torch.Generator().manual_seed(0))
-    (finding,) = SceneWatch(Watcher(model.settings.ranges)).look(4, result)
+    (finding,) = SceneWatch(Watcher(model.settings.ranges, 4)).look(4, result)
     assert "the predicted depth" in finding.text
     assert result.total.isfinite()
 

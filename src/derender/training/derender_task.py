@@ -82,7 +82,7 @@ class DerenderTask:
 
     def watch(self, memory: dict[str, Any]) -> "SceneWatch":
         """The collapse detector."""
-        watcher = Watcher.remembering(self.config.model.ranges, memory)
+        watcher = Watcher.remembering(self.config.model.ranges, self.config.batch_size, memory)
         watcher.ranks = self.ranks
         return SceneWatch(watcher)
 

@@ -4,7 +4,8 @@ Unsupervised geometry can fail in ways that reconstruction does not show: depth 
 into stripes or stuck at its bounds, every camera at its limit, albedo that simply is the picture. Each sign
 below is a number measured on training batches, smoothed, and compared with a limit; a sign that stays on for
 a while is a finding.
-The limits were set on healthy and collapsed runs (docs/log.md).
+The limits were set on healthy and collapsed runs (docs/log.md), the times below on runs with batches of 16:
+a network recovers by updates, so with larger batches it is given as many updates, not as many pictures.
 """
 
 import math
@@ -22,6 +23,7 @@ from derender.scene.normals import normals_from_depth
 from derender.scene.ranges import SceneRanges
 from derender.training.distributed import ALONE, Ranks
 
+USUAL_BATCH = 16
 GRACE_IMAGES = 4_000  # a network that has just started has no geometry yet
 SLOW_GRACE_IMAGES = 14_000  # slow starts show pixel noise for longer, and recover
 PERSISTENCE_IMAGES = 4_000  # how long a sign must stay on
@@ -140,10 +142,12 @@ class Watcher:
 
     Args:
         ranges: bounds of the scene.
+        batch_size: pictures in every update.
         memory: what `memory()` gave in the run that is resumed.
     """
 
     ranges: SceneRanges
+    batch_size: int
     averages: dict[str, float] = field(default_factory=dict)
     on_since: dict[str, int] = field(default_factory=dict)  # pictures seen when a sign came on
     last_images: int = 0
@@ -151,14 +155,14 @@ class Watcher:
     uneasy: bool = False  # whether the latest batch or the averages show a fatal sign: no state to keep
 
     @classmethod
-    def remembering(cls, ranges: SceneRanges, memory: Mapping[str, Any]) -> "Watcher":
+    def remembering(cls, ranges: SceneRanges, batch_size: int, memory: Mapping[str, Any]) -> "Watcher":
         """A watcher that goes on where ``memory`` was taken; an empty one starts fresh.
 
         Raises:
             ValueError: that is no memory of a watcher.
         """
         try:
-            watcher = cls(ranges, **memory)
+            watcher = cls(ranges, batch_size, **memory)
             numbers = [watcher.last_images, *watcher.averages.values(), *watcher.on_since.values()]
             if all(type(number) in (int, float) for number in numbers):
                 return watcher
@@ -187,7 +191,8 @@ class Watcher:
             first = "" if broken is None else f"; the first value that is not finite is {broken}"
             text = f"the loss is {loss:.4g}{first}"
             return (Finding("non-finite loss", text, f"{SLOWER}; with bf16, try 32-true", True),)
-        share = min(1.0, (images - self.last_images) / MEMORY_IMAGES)
+        longer = max(1.0, self.batch_size / USUAL_BATCH)
+        share = min(1.0, (images - self.last_images) / (longer * MEMORY_IMAGES))
         self.last_images = images
         latest = self.ranks.mean(measure(scene, self.ranges))
         for name, value in latest.items():
@@ -198,13 +203,13 @@ class Watcher:
         for sign in SIGNS:
             value = self.averages[sign.measure]
             shown = sign.is_on(value) or sign.is_on(latest[sign.measure])
-            if sign.fatal and shown and images >= sign.usual_images:
+            if sign.fatal and shown and images >= longer * sign.usual_images:
                 self.uneasy = True
-            if images < sign.grace_images or not sign.is_on(value):
+            if images < longer * sign.grace_images or not sign.is_on(value):
                 self.on_since.pop(sign.name, None)
                 continue
             since = self.on_since.setdefault(sign.name, images)
-            if images - since >= PERSISTENCE_IMAGES:
+            if images - since >= longer * PERSISTENCE_IMAGES:
                 findings.append(Finding(sign.name, sign.text.format(value=value), sign.advice, sign.fatal))
         return tuple(findings)
 

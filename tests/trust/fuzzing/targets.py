@@ -160,7 +160,7 @@ def targets(place: Path) -> Iterator[Target]:
             state = (kept / "state.json").read_bytes()
             (kept / "state.json").write_bytes(state.replace(b'"format": 1, ', b""))
         state = load_checkpoint(kept, net, optimiser)
-        Watcher.remembering(config.model.ranges, state.watcher)
+        Watcher.remembering(config.model.ranges, config.batch_size, state.watcher)
         optimiser.step()  # with what was read
 
     change = st.sampled_from(sorted(files)).flatmap(

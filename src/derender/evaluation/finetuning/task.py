@@ -164,7 +164,7 @@ class FinetuneTask:
 
     def watch(self, memory: dict[str, Any]) -> "FinetuneWatch":
         """The collapse detector."""
-        return FinetuneWatch(Watcher.remembering(self.config.model.ranges, memory))
+        return FinetuneWatch(Watcher.remembering(self.config.model.ranges, self.config.batch_size, memory))
 
 
 @dataclass(frozen=True)
