@@ -31,6 +31,7 @@ from derender.pretrained.saved import (
     ERRORS_FILE,
     FITTING_FILE,
     FORMAT,
+    SPLIT_FILE,
     WEIGHTS_FILE,
     WHITENING_FILE,
     check_shapes,
@@ -272,9 +273,10 @@ class Derenderer(nn.Module):
         scores: str | None = None,
         overwrite: bool = False,
     ) -> Path:
-        """As ``save``, with what a model is given away with: a card (README.md) and its held-out errors.
+        """As ``save``, with what a model is given away with: a card (README.md), its held-out errors and the
+        split of its training.
 
-        Both are those of the folder it was loaded from, as long as its weights are. Otherwise the card is
+        They are those of the folder it was loaded from, as long as its weights are. Otherwise the card is
         ``card``, or is made of ``data`` (what it was trained on), ``licence`` and ``scores``.
         """
         folder = Path(folder)
@@ -285,8 +287,9 @@ class Derenderer(nn.Module):
         with whole_folder(folder) as temporary:
             self._write(temporary)
             (temporary / CARD_FILE).write_text(with_metadata(card, licence), encoding="utf-8")
-            if ERRORS_FILE in beside:
-                (temporary / ERRORS_FILE).write_text(beside[ERRORS_FILE], encoding="utf-8")
+            for name in (ERRORS_FILE, SPLIT_FILE):
+                if name in beside:
+                    (temporary / name).write_text(beside[name], encoding="utf-8")
         return folder
 
     def push_to_hub(

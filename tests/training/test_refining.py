@@ -5,6 +5,7 @@ import torch
 
 import derender
 from derender.data.synthetic import faces
+from derender.objectives.reconstruction import masked_l1
 from derender.render import Rendering
 from derender.training.refining import (
     FACTORS,
@@ -16,7 +17,9 @@ from derender.training.refining import (
     _Unit,
     refine,
 )
+from derender.training.reframe import ReframeSettings, shown_in
 
+FRAMES = ReframeSettings(nearer=1.15, farther=1.9, shift=0.25)
 LESSONS = RefiningSettings(
     images=480, batch_size=16, learning_rate=5e-4, fit_steps=8, rendered=0.25, worst=0, picture_weight=0
 )
@@ -117,10 +120,43 @@ def test_renderings_come_with_the_scene_they_show(model, images):
     torch.testing.assert_close(scene.light[8:][straight], meant.light[8:][straight])
 
 
-def test_the_unit_is_the_spread_of_fitted_scenes(model, images):
+def framed(**refining) -> RefineConfig:
+    """Lessons half of which are shown in other frames."""
+    return changed(reframed=0.5, **refining).model_copy(update={"reframe": FRAMES})
+
+
+def test_pictures_in_other_frames_come_with_the_camera_that_sees_them_so(model, images):
     pictures = images[:16].float() / 255
     meant = _fit(model, images[:16], 2, None).scene(model.fitting.maps)
-    unit = _Unit(model, pictures, meant)
+    shown, scene = _lesson(model, pictures, meant, framed(rendered=0), torch.Generator().manual_seed(0))
+    away = scene.camera[:, 5] - meant.camera[:, 5]
+    moved = away.abs() > 1e-6
+    assert 3 < moved.sum() < 13
+    assert 0.5 < away.max() < 0.9 and away.min() > 1 / 1.15 - 1.01
+    mirrored = shown.flip(-1)
+    as_it_is = [(one[~moved] == pictures[~moved]).flatten(1).all(dim=1) for one in (shown, mirrored)]
+    assert (as_it_is[0] | as_it_is[1]).all()
+    again = model.render(scene)
+    errors = [masked_l1(again.image[rows], shown[rows], again.mask[rows]) for rows in (moved, ~moved)]
+    assert errors[0] < 1.3 * errors[1], "the moved scenes render the framed pictures"
+    still = model.render(scene.with_parameters(camera=scene.camera * torch.tensor([1, 1, 1, 0, 0, 0])))
+    assert masked_l1(still.image[moved], shown[moved], still.mask[moved]) > 1.35 * errors[0]
+
+
+def test_a_copy_taught_so_steps_back_from_smaller_faces(model, images):
+    taught = refine(model, images, images, framed(images=1600, rendered=0, fit_steps=8), seed=5).model
+    assert taught.settings.ranges.translation_z == pytest.approx(0.9 / 0.75)
+    assert model.settings.ranges.translation_z == 0
+    pictures = images.float() / 255
+    smaller = shown_in(pictures, torch.tensor([[[1.7, 0, 0], [0, 1.7, 0]]]).expand(len(pictures), 2, 3))
+    near, far = (taught.decompose(one).camera[:, 5] for one in (pictures, smaller))
+    assert (far > near).float().mean() > 0.9
+    assert float(far.mean() - near.mean()) > 0.08, "what few lessons teach of 0.7"
+
+
+def test_the_unit_is_the_spread_of_fitted_scenes(model, images):
+    meant = _fit(model, images[:16], 2, None).scene(model.fitting.maps)
+    unit = _Unit(model, meant)
     mean = meant.map(lambda value: value.mean(dim=0, keepdim=True).expand_as(value))
     gaps = unit.gaps(mean, meant)
     assert all(float(gap) == pytest.approx(1, abs=1e-3) for gap in gaps.values())

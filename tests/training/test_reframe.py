@@ -10,7 +10,7 @@ from derender.scene.perturb import PerturbSettings
 from derender.training.batches import Batches
 from derender.training.config import WhiteningSettings
 from derender.training.distributed import Ranks
-from derender.training.reframe import ReframeSettings, draw_frames, shown_in
+from derender.training.reframe import ReframeSettings, draw_frames, shown_in, strange_surroundings
 from derender.training.whitening import fit_whitening
 
 STILL = {"nearer": 1, "farther": 1, "shift": 0, "roll_deg": 0}
@@ -56,6 +56,28 @@ def test_beyond_the_edge_lies_the_reflection():
     aside = shown_in(images, torch.tensor([[[1.0, 0, 0.5], [0, 1.0, 0]]]))  # two pixels to the right
     assert torch.allclose(aside[..., :6], images[..., 2:], atol=1e-5)
     assert torch.allclose(aside[..., 6:], images[..., 6:].flip(-1), atol=1e-5)
+
+
+def test_beyond_the_edge_can_lie_what_is_given():
+    images, around = torch.rand(2, 1, 3, 8, 8, generator=torch.Generator().manual_seed(1))
+    aside = torch.tensor([[[1.0, 0, 0.5], [0, 1.0, 0]]])  # two pixels to the right
+    shown = shown_in(images, aside, around)
+    assert torch.equal(shown[..., 6:], around[..., 6:])
+    assert torch.equal(shown[..., :6], shown_in(images, aside)[..., :6])
+    whole = torch.tensor([[[1.0, 0, 0], [0, 1.0, 0]]])
+    assert torch.equal(shown_in(images, whole, around), images)
+
+
+def test_strange_surroundings_are_the_neighbours_in_large_patches():
+    generator = torch.Generator().manual_seed(4)
+    images = torch.rand(3, 3, 32, 32, generator=generator)
+    drawn = [strange_surroundings(images, generator) for _ in range(60)]
+    for around in drawn:
+        assert around.shape == images.shape
+        assert torch.allclose(around.mean(dim=(2, 3)), images.roll(1, 0).mean(dim=(2, 3)), atol=0.05)
+    varied = torch.stack([around.std(dim=(2, 3)).mean() for around in drawn])
+    assert varied.min() < 1e-6, "one patch is one colour"
+    assert 0.03 < varied.max() < 0.6 * images.std()
 
 
 def test_the_share_that_is_not_framed_anew_stays_bit_for_bit():

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from derender.features import FeatureTable
     from derender.model import Derenderer
     from derender.networks.fitting import Fitting
+    from derender.pretrained.split_record import SplitRecord
 
 PARTS = ("all", "train", "validation", "test")
 
@@ -95,18 +96,41 @@ def pictures_for(
 
 
 def part_of(pictures: "PictureSet", part: str, model: str | None) -> "PictureSet":
-    """The pictures of one part of the split that the run ``model`` was trained with."""
+    """The pictures of one part of the split of ``model``: a run, or a model that was saved from one."""
     if part not in PARTS:
         raise ValueError(f"unknown part {part!r}: choose {', '.join(PARTS)}")
     if part == "all":
         return pictures
-    from derender.baselines.training import read_any_config
     from derender.data import split_indices
 
     if model is None:
         raise ValueError("--part needs --model: the run whose split it is")
-    if not (Path(model) / "config.yaml").is_file():
+    record = split_of(model)
+    if record is None:
         raise ValueError(f"{model} is no run folder and records no split: use --part all")
-    config = read_any_config(Path(model))
-    split = split_indices(pictures.files, config.split, seed=config.seed)
+    split = split_indices(pictures.files, record.shares, seed=record.seed)
     return pictures.select(getattr(split, part)).require(1, f"the {part} part")
+
+
+def split_of(model: str) -> "SplitRecord | None":
+    """The split of a run, or of the run that a saved model comes from; None where nothing says it."""
+    from derender.baselines.training import read_any_config
+    from derender.pretrained.folders import model_folder
+    from derender.pretrained.split_record import SplitRecord, read_split
+
+    if (Path(model) / "config.yaml").is_file():
+        config = read_any_config(Path(model))
+        return SplitRecord(config.split, config.seed)
+    try:
+        return read_split(model_folder(model))
+    except FileNotFoundError:
+        return None
+
+
+def keep_split(folder: Path, model: str) -> None:
+    """Keep with a copy of ``model`` the split of its training, if that is known."""
+    from derender.pretrained.split_record import write_split
+
+    record = split_of(model)
+    if record is not None:
+        write_split(folder, record)

@@ -27,8 +27,9 @@ def refine(
         typer.Option(
             "--set",
             help="images (how many are seen), batch_size, learning_rate, fitted (pictures), fit_steps, "
-            "worst, rendered, exchanged, picture_weight; what is perturbed, as perturb.light_deg; for "
-            "features what derender whiten takes.",
+            "worst, rendered, exchanged, picture_weight, reframed (share shown in other frames, as "
+            "reframe.farther=1.9, for models of pictures framed otherwise), strange; what is perturbed, as "
+            "perturb.light_deg; for features what derender whiten takes.",
             metavar="KEY=VALUE",
         ),
     ] = None,
@@ -45,7 +46,7 @@ def refine(
     """
     import torch
 
-    from derender.cli.models import fitting_of, open_model, pictures_for
+    from derender.cli.models import fitting_of, keep_split, open_model, pictures_for
     from derender.data import split_indices
     from derender.training.config import with_changes
     from derender.training.held_out_errors import store_errors
@@ -63,6 +64,8 @@ def refine(
         refined = refine(net, own, held_out, config, seed=seed, progress=report)
     folder = refined.model.save(out, overwrite=force)
     store_errors(folder, held_out)
+    if part == "train":  # other pictures taught, too, so nobody could say which did not
+        keep_split(folder, model)
     errors = refined.errors
     say(
         f"{len(held_out)} pictures that taught nothing: rendered again with an error of {errors['now']:.4f}, "

@@ -43,7 +43,7 @@ def unet(
     """
     import torch
 
-    from derender.cli.models import open_model, pictures_for
+    from derender.cli.models import keep_split, open_model, pictures_for
     from derender.training.config import with_changes
     from derender.training.unets import TeachingSettings, teach_unets
 
@@ -54,6 +54,8 @@ def unet(
     with bar("teaching") as report:
         taught = teach_unets(net, torch.from_numpy(chosen.images), settings, seed=seed, progress=report)
     folder = taught.model.save(out, overwrite=force)
+    if part == "train":  # other pictures taught, too, so nobody could say which did not
+        keep_split(folder, model)
     errors = taught.errors
     say(
         f"mean errors against what {model} says: place {errors['place']:.2f} pixels, depth "

@@ -50,7 +50,7 @@ def whiten(
     """
     import torch
 
-    from derender.cli.models import open_model, pictures_for
+    from derender.cli.models import keep_split, open_model, pictures_for
     from derender.training.config import FeatureSettings, with_changes
     from derender.training.features import make_features
     from derender.training.whitening import recentre
@@ -72,6 +72,7 @@ def whiten(
             make_features(net, images, settings, seed=seed, progress=report)
     assert net.whitening is not None
     folder = net.save(out, overwrite=force)
+    keep_split(folder, model)
     ratios = {name: net.whitening.get_buffer(f"{name}_ratios").tolist() for name in net.whitening.names}
     for name, values in ratios.items():
         clear = sum(value > 1 for value in values)

@@ -9,7 +9,14 @@ from torch import Tensor
 from derender.networks.tensor_file import read_tensors
 from derender.pretrained import hub
 from derender.pretrained.card import CARD_FILE
-from derender.pretrained.saved import CONFIG_FILE, ERRORS_FILE, FITTING_FILE, WEIGHTS_FILE, WHITENING_FILE
+from derender.pretrained.saved import (
+    CONFIG_FILE,
+    ERRORS_FILE,
+    FITTING_FILE,
+    SPLIT_FILE,
+    WEIGHTS_FILE,
+    WHITENING_FILE,
+)
 
 PRETRAINED = Path(__file__).parent
 
@@ -37,8 +44,8 @@ def model_folder(source: str | Path) -> Path:
     if source in bundled_models():
         return PRETRAINED / source
     if isinstance(source, str) and source.count("/") == 1 and not source.startswith((".", "/", "~")):
-        files = (CONFIG_FILE, WEIGHTS_FILE, WHITENING_FILE, FITTING_FILE, ERRORS_FILE, CARD_FILE)
-        return hub.download(source, files)
+        weights = (CONFIG_FILE, WEIGHTS_FILE, WHITENING_FILE, FITTING_FILE)
+        return hub.download(source, (*weights, ERRORS_FILE, SPLIT_FILE, CARD_FILE))
     raise FileNotFoundError(
         f"no model at {source}: give a run folder, a saved folder, a Hub id 'owner/name', or one of those "
         f"that come with derender ({', '.join(bundled_models())})"
@@ -46,7 +53,7 @@ def model_folder(source: str | Path) -> Path:
 
 
 def texts_beside(folder: Path | None, tensors: Mapping[str, Tensor]) -> dict[str, str]:
-    """Card and held-out errors of a saved folder, by file, if these tensors are what its files hold."""
+    """Card, held-out errors and split of a saved folder, by file, if its files hold these tensors."""
     if folder is None or not (folder / WEIGHTS_FILE).is_file():
         return {}
     stored: dict[str, Tensor] = {}
@@ -56,5 +63,5 @@ def texts_beside(folder: Path | None, tensors: Mapping[str, Tensor]) -> dict[str
         not torch.equal(stored[name].to(value), value) for name, value in tensors.items()
     ):
         return {}
-    files = (folder / name for name in (CARD_FILE, ERRORS_FILE))
+    files = (folder / name for name in (CARD_FILE, ERRORS_FILE, SPLIT_FILE))
     return {file.name: file.read_text(encoding="utf-8") for file in files if file.is_file()}

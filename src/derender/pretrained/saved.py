@@ -11,6 +11,7 @@ FORMAT = 1
 WEIGHTS_FILE, CONFIG_FILE = "model.safetensors", "config.json"
 WHITENING_FILE, FITTING_FILE = "whitening.safetensors", "fitting.safetensors"  # a model may lack them
 ERRORS_FILE = "held_out_errors.json"  # written and read by training/held_out_errors.py; a model may lack it
+SPLIT_FILE = "split.json"  # written and read by pretrained/split_record.py; a model may lack it
 
 
 def read_config(folder: Path) -> dict[str, Any]:

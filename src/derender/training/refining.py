@@ -4,7 +4,9 @@ Fitting (networks/fitting.py) brings a scene nearer to its picture than encoders
 long. Here scenes are fitted to the training pictures once, and a copy of the model learns to read them: from
 the pictures, and from renderings of the fitted scenes in other light, from other sides and with another's
 geometry, whose scenes are known exactly. So what optimisation finds is amortised; that the scenes read from
-pictures render them again is asked for, too. Needs no labels. Leaves out models with further factors, and the
+pictures render them again is asked for, too. Shown in other frames (``reframed``), pictures teach where their
+camera stands, which rendering alone does not: a decoder draws a small thing sooner than a camera learns to
+step back. Needs no labels. Leaves out models with further factors, and the
 confidence net, which stays.
 """
 
@@ -25,11 +27,19 @@ from derender.networks.morphable import MorphableMaps
 from derender.objectives.reconstruction import masked_l1
 from derender.objectives.self_training import endless_order
 from derender.scene import Scene
+from derender.scene.frame import ranges_for_frames, seen_in_frame
 from derender.scene.mirror import seen_in_mirror
 from derender.scene.perturb import PerturbSettings, perturb_camera, perturb_light
 from derender.settings import Settings
 from derender.training.config import FeatureSettings
 from derender.training.features import make_features
+from derender.training.reframe import (
+    DEFAULT_FRAMES,
+    ReframeSettings,
+    draw_frames,
+    shown_in,
+    strange_surroundings,
+)
 from derender.training.step import concatenate, fill_uncovered
 
 FACTORS = {**PARAMETERS, "light": "light", "camera": "camera"}
@@ -52,15 +62,21 @@ class RefiningSettings(Settings):
     rendered: float = Field(default=0.5, ge=0, le=1)  # share of a batch that are renderings
     exchanged: float = Field(default=0.5, ge=0, le=1)  # share of those with another's geometry
     picture_weight: float = Field(default=1.0, ge=0)  # of the error of pictures rendered again
+    reframed: float = Field(default=0.0, ge=0, le=1)  # share of a batch that is shown in other frames
+    strange: float = Field(default=0.5, ge=0, le=1)  # share of those beyond whose edge lies another picture
 
 
 class RefineConfig(FeatureSettings):
-    """All that `derender refine` can be told; ``perturb`` is how far its renderings differ, too."""
+    """All that `derender refine` can be told; ``perturb`` is how far its renderings differ, too.
+
+    ``reframe`` are the frames of the ``refining.reframed``; the copy's camera gets the room that they need.
+    """
 
     refining: RefiningSettings = RefiningSettings()
     perturb: PerturbSettings = PerturbSettings(
         ambient=1, diffuse=1, light_deg=90, camera_pitch_deg=30, camera_yaw_deg=60
     )
+    reframe: ReframeSettings = DEFAULT_FRAMES
 
 
 @dataclass(frozen=True)
@@ -125,6 +141,8 @@ def refine(
         raise ValueError("fitting finds no scene of any picture: the model's training went wrong")
     student = deepcopy(model)
     student.whitening = student.fitting = student.source = None
+    if settings.reframed:
+        _give_room(student, config.reframe)
     _learn(student, images[rows[clear]], maps, fitted[clear], config, generator, progress)
     if not all(bool(value.isfinite().all()) for value in student.state_dict().values()):
         raise ValueError(
@@ -186,6 +204,18 @@ def _fit(model: Derenderer, images: UInt8[Tensor, "n 3 h w"], steps: int, progre
     return _Fits(*(torch.cat(part) for part in zip(*parts, strict=True)))
 
 
+def _give_room(student: Derenderer, reframe: ReframeSettings) -> None:
+    """Widen the ranges of its camera's position so that scenes in such frames can be said."""
+    ranges = ranges_for_frames(
+        student.settings.ranges,
+        student.image_size,
+        nearer=reframe.nearer,
+        farther=reframe.farther,
+        shift=reframe.shift,
+    )
+    student.settings = student.settings.model_copy(update={"ranges": ranges})
+
+
 def _learn(
     student: Derenderer,
     images: UInt8[Tensor, "n 3 h w"],
@@ -205,7 +235,8 @@ def _learn(
     schedule = torch.optim.lr_scheduler.OneCycleLR(
         optimiser, settings.learning_rate, total_steps=steps + 1, pct_start=0.05, cycle_momentum=False
     )
-    unit = _Unit(student, as_float(images[:_MEASURED]).to(student.device), fitted[:_MEASURED].scene(maps))
+    seen, scenes = as_float(images[:_MEASURED]).to(student.device), fitted[:_MEASURED].scene(maps)
+    unit = _Unit(student, _reframed(seen, scenes, student, config, Generator().manual_seed(0))[1])
     order = endless_order(len(images), generator)
     for step in range(steps):
         rows = torch.tensor([next(order) for _ in range(batch)])
@@ -256,9 +287,28 @@ def _lesson(
     mirrored[:rendered] = False  # their light and view are any already
     twin = seen_in_mirror(scene)
     shown = _either(mirrored, shown.flip(-1), shown)
-    return shown, scene.with_parameters(
+    scene = scene.with_parameters(
         **{name: _either(mirrored, twin.parameters[name], value) for name, value in scene.parameters.items()}
     )
+    return _reframed(shown, scene, model, config, generator)
+
+
+def _reframed(
+    pictures: Float[Tensor, "n 3 h w"],
+    scene: Scene,
+    model: Derenderer,
+    config: RefineConfig,
+    generator: Generator,
+) -> tuple[Float[Tensor, "n 3 h w"], Scene]:
+    """Pictures and their scenes, a share of both in other frames."""
+    settings = config.refining
+    if not settings.reframed:
+        return pictures, scene
+    frames = draw_frames(len(pictures), generator, config.reframe, settings.reframed)
+    strange = torch.rand(len(pictures), generator=generator) < settings.strange
+    around = strange_surroundings(pictures, generator)
+    shown = _either(strange, shown_in(pictures, frames, around), shown_in(pictures, frames))
+    return shown, seen_in_frame(scene, frames, model.settings.ranges.fov_deg)
 
 
 def _either(rows: Tensor, one: Tensor, other: Tensor) -> Tensor:
@@ -271,10 +321,9 @@ class _Unit:
     Numbers that the model cannot change (a translation whose range is 0) do not count.
     """
 
-    def __init__(self, model: Derenderer, pictures: Float[Tensor, "n 3 h w"], fitted: Scene):
+    def __init__(self, model: Derenderer, fitted: Scene):
         with torch.no_grad():
-            read = model.decompose(pictures).parameters
-            self.able = {name: (read[name] != read[name][:1]).any(dim=0) for name in ("light", "camera")}
+            self.able = {name: _able(model, name, fitted.parameters[name]) for name in ("light", "camera")}
             self.spread = {name: _mean_deviation(value) for name, value in fitted.parameters.items()}
             self.slope = _mean_deviation(_slopes(fitted.depth)).mean()
 
@@ -290,6 +339,15 @@ class _Unit:
         """The sum of the gaps, and that of the slopes of depth, which make the shading."""
         slopes = (_slopes(found.depth) - _slopes(meant.depth)).abs().mean() / self.slope
         return torch.stack([*self.gaps(found, meant).values(), slopes]).sum()
+
+
+def _able(model: Derenderer, name: str, values: Float[Tensor, "n k"]) -> Bool[Tensor, " k"]:
+    """Which numbers of a factor the model's ranges let it change."""
+    (factor,) = (factor for factor in model.factors if factor.name == name)
+    least, most = (
+        factor.to_parameter(torch.full_like(values[:1], end), model.settings.ranges) for end in (-1.0, 1.0)
+    )
+    return (least != most)[0]
 
 
 def _slopes(depth: Float[Tensor, "n h w"]) -> Float[Tensor, "n d"]:
@@ -308,7 +366,7 @@ def _compared(
     """Errors and gaps of ``Refined``."""
     pictures = as_float(images).to(model.device)
     meant = model.fit_scenes(pictures, steps).scene
-    unit = _Unit(model, pictures, meant)
+    unit = _Unit(model, meant)
     read = {"before": model.decompose(pictures), "now": student.decompose(pictures)}
     errors = {}
     for name, scene in {**read, "fitted": meant}.items():

@@ -1,7 +1,8 @@
 """Pictures as a camera would have taken them from nearer or farther, beside the middle, or turned.
 
 A model knows the framing it was trained in, and users' pictures have others. Unlike light and view, another
-frame of a picture needs no rendering: what it shows is right. Beyond the picture's edge lies its reflection.
+frame of a picture needs no rendering: what it shows is right, and where its camera stands is known
+(scene/frame.py). Beyond the picture's edge lies its reflection, or another picture in large patches.
 Leaves out which framing suits a picture that is read (training/framing.py).
 """
 
@@ -11,7 +12,7 @@ import torch
 from jaxtyping import Float
 from pydantic import Field
 from torch import Generator, Tensor
-from torch.nn.functional import affine_grid, grid_sample
+from torch.nn.functional import adaptive_avg_pool2d, affine_grid, grid_sample, interpolate
 
 from derender.settings import Settings
 
@@ -50,10 +51,27 @@ def draw_frames(
     return torch.where(stays.view(-1, 1, 1), _WHOLE, frames)
 
 
-def shown_in(images: Float[Tensor, "n 3 h w"], frames: Float[Tensor, "n 2 3"]) -> Float[Tensor, "n 3 h w"]:
-    """Each picture in its frame, bilinear; one whose frame changes nothing comes back bit for bit."""
+def shown_in(
+    images: Float[Tensor, "n 3 h w"],
+    frames: Float[Tensor, "n 2 3"],
+    around: Float[Tensor, "n 3 h w"] | None = None,
+) -> Float[Tensor, "n 3 h w"]:
+    """Each picture in its frame, bilinear; one whose frame changes nothing comes back bit for bit.
+
+    ``around`` is what is shown where a frame reaches beyond its picture, which else is reflected.
+    """
     frames = frames.to(images)
     grid = affine_grid(frames, list(images.shape), align_corners=False)
     moved = grid_sample(images, grid, padding_mode="reflection", align_corners=False)
+    if around is not None:
+        beyond = (grid.abs() > 1).any(dim=-1)[:, None]
+        moved = torch.where(beyond, around, moved)
     stays = (frames == _WHOLE.to(images)).flatten(1).all(dim=1)
     return torch.where(stays.view(-1, 1, 1, 1), images, moved)
+
+
+def strange_surroundings(images: Float[Tensor, "n 3 h w"], generator: Generator) -> Float[Tensor, "n 3 h w"]:
+    """For each picture another of the batch in large patches, from one to eight a side (drawn once)."""
+    patches = int(torch.randint(1, 9, (), generator=generator))
+    coarse = adaptive_avg_pool2d(images.roll(1, 0), patches)
+    return interpolate(coarse, images.shape[-2:], mode="bilinear", align_corners=False)

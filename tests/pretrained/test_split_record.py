@@ -1,0 +1,89 @@
+"""The split of a model's training stays with copies of it: what it has not seen can still be asked."""
+
+import json
+
+import pytest
+from PIL import Image
+
+import derender
+from derender.cli import main
+from derender.cli.models import keep_split, part_of, split_of
+from derender.data import read_pictures
+from derender.data.synthetic import faces
+from derender.model import SPLIT_FILE
+from derender.pretrained.split_record import SplitRecord, read_split, write_split
+from derender.training.config import TrainConfig
+from derender.training.run_folder import start_run
+
+RECORD = SplitRecord((0.5, 0.2, 0.3), 4)
+
+
+@pytest.fixture(scope="module")
+def pictures(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("faces")
+    for index, picture in enumerate(faces.generate(30, image_size=64, seed=9).images):
+        Image.fromarray(picture.transpose(1, 2, 0)).save(folder / f"{index}.png")
+    return str(folder)
+
+
+@pytest.fixture
+def run(tmp_path):
+    """A run folder as training leaves it: its configuration and a model."""
+    folder = start_run(tmp_path / "run", TrainConfig(split=RECORD.shares, seed=RECORD.seed), {}, "cpu").path
+    derender.load("rendered-faces-64").save(folder / "model")
+    return folder
+
+
+def test_what_is_written_is_read(tmp_path):
+    assert read_split(tmp_path) is None
+    write_split(tmp_path, RECORD)
+    assert read_split(tmp_path) == RECORD
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "{",
+        "[]",
+        '{"format": 2, "shares": [1, 0, 0], "seed": 0}',
+        '{"format": 1, "shares": [1, 1, 1], "seed": 0}',
+    ],
+)
+def test_a_damaged_file_is_named(tmp_path, text):
+    (tmp_path / SPLIT_FILE).write_text(text)
+    with pytest.raises(ValueError, match=r"split\.json is damaged or of a newer version"):
+        read_split(tmp_path)
+
+
+def test_copies_of_copies_have_the_parts_of_the_run(run, pictures, tmp_path):
+    assert split_of(str(run)) == RECORD
+    for copy, of in (("white", "run"), ("again", "white")):
+        told = ["whiten", "-m", str(tmp_path / of), "-d", pictures, "-o", str(tmp_path / copy)]
+        assert main([*told, "--set", "pictures=8", "--set", "views=1", "--set", "directions=4"]) == 0
+    every = read_pictures(pictures, 64)
+    for part in ("train", "validation", "test"):
+        asked = [set(part_of(every, part, str(tmp_path / name)).files) for name in ("run", "white", "again")]
+        assert asked[0] == asked[1] == asked[2] and 0 < len(asked[0]) < 30
+
+
+def test_what_learnt_from_all_pictures_has_no_parts(run, pictures, tmp_path, capsys):
+    short = ["images=16", "batch_size=8", "fitted=8", "fit_steps=1", "whitening.pictures=0"]
+    sets = [word for setting in short for word in ("--set", setting)]
+    for part in ("all", "train"):
+        told = ["refine", "-m", str(run), "-d", pictures, "-o", str(tmp_path / part), "--part", part]
+        assert main([*told, *sets]) == 0
+    assert split_of(str(tmp_path / "all")) is None and split_of(str(tmp_path / "train")) == RECORD
+    capsys.readouterr()
+    asked = ["evaluate", "reconstruction", "-m", str(tmp_path / "all"), "-d", pictures, "--part", "test"]
+    assert main(asked) == 2
+    assert "records no split: use --part all" in capsys.readouterr().err
+
+
+def test_it_goes_with_weights_that_are_given_away(tmp_path):
+    model = derender.load("rendered-faces-64")
+    model.save(tmp_path / "own")
+    write_split(tmp_path / "own", RECORD)
+    given = derender.load(tmp_path / "own").save_pretrained(tmp_path / "given", data="heads", licence="MIT")
+    assert json.loads((given / SPLIT_FILE).read_text())["seed"] == 4
+    keep_split(given, str(tmp_path / "nowhere"))
+    assert read_split(given) == RECORD, "a model that says nothing takes nothing away"
