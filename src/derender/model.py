@@ -164,7 +164,7 @@ class Derenderer(nn.Module):
 
     def mirrors(self, name: str) -> bool:
         """Whether a factor's feature is made of a picture and its mirror image."""
-        return self.whitening is not None and self.whitening.mirrored and name in self.whitening.names
+        return self.whitening is not None and name in self.whitening.mirrored
 
     def codes(self, readings: Mapping[str, Float[Tensor, "n _"]]) -> dict[str, Float[Tensor, "n code"]]:
         """The codes that readings begin with: what ``encode`` gives for the pictures they come from."""

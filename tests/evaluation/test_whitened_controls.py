@@ -38,8 +38,8 @@ def test_the_lender_whitens_itself_as_training_does(lender):
         lender.model, torch.from_numpy(lender.images), SETTINGS.whitening, SETTINGS.perturb, seed=lender.seed
     )
     assert found is not None and sorted(found.names) == ["albedo", "geometry"]
-    for name, value in expected.named_buffers():
-        torch.testing.assert_close(found.get_buffer(name), value)
+    for name, value in found.named_buffers():
+        torch.testing.assert_close(expected.get_buffer(name), value)
     assert lender.model.whitening is None
 
 

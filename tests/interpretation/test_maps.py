@@ -156,7 +156,7 @@ def test_features_of_both_sides_give_a_mirrored_picture_the_mirrored_map(model, 
         for name in names
     }
     mirroring = copy.deepcopy(model)
-    mirroring.whitening = Whitening(maps, mirrored=True)
+    mirroring.whitening = Whitening(maps, mirrored=maps)
     for method in METHODS:
         own, mirror = (
             saliency(method, mirroring, one, "albedo", probe, [0, 1, 0]) for one in (images, images.flip(-1))

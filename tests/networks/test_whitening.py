@@ -151,10 +151,35 @@ def test_sums_over_batches_are_those_of_all_at_once():
 def test_mirrored_maps_take_the_mean_of_both_readings():
     codes = planted()[0]
     found = contrast(Spread.of(codes), 3, 0.1)
-    plain, both = Whitening({"geometry": found}), Whitening({"geometry": found}, mirrored=True)
+    plain, both = Whitening({"geometry": found}), Whitening({"geometry": found}, mirrored=["geometry"])
     own, mirror = codes[0], codes[1]
     expected = (plain({"geometry": own})["geometry"] + plain({"geometry": mirror})["geometry"]) / 2
     got = both({"geometry": torch.cat([own, mirror], dim=1)})["geometry"]
     torch.testing.assert_close(got, expected, rtol=1e-4, atol=1e-5)
     with pytest.raises(ValueError, match="give what model"):
         both({"geometry": own})
+
+
+def test_of_several_maps_each_is_read_again_as_it_was_written(tmp_path):
+    codes = planted()[0]
+    maps = {name: contrast(Spread.of(codes), 3, 0.1) for name in ("geometry", "light")}
+    for mirrored in (["geometry"], ["geometry", "light"], []):
+        written = Whitening(maps, mirrored=mirrored)
+        written.save(tmp_path / "whitening.safetensors")
+        again = Whitening.load(tmp_path / "whitening.safetensors")
+        assert again.mirrored == written.mirrored == set(mirrored)
+        readings = {
+            name: torch.cat([codes[0], codes[1]], dim=1) if name in mirrored else codes[0] for name in maps
+        }
+        for name, feature in written(readings).items():
+            assert torch.equal(again(readings)[name], feature)
+
+
+def test_directions_count_by_how_much_of_them_is_the_pictures_own():
+    spread = Spread.of(planted()[0])
+    plain, weighted = contrast(spread, 3, 0.1), contrast(spread, 3, 0.1, power=2)
+    before, after = ((found.map.T @ spread.between.float() @ found.map) for found in (plain, weighted))
+    own = plain.ratios / (1 + plain.ratios)
+    kept, shrunk = (torch.linalg.eigvalsh(matrix).flip(0)[:3] for matrix in (before, after))
+    torch.testing.assert_close(shrunk, kept * own**4, rtol=1e-3, atol=1e-5)
+    torch.testing.assert_close(contrast(spread, 3, 0.1, power=0).map, plain.map)

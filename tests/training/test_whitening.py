@@ -7,12 +7,13 @@ import torch
 import derender
 from derender.data import PictureSet
 from derender.data.synthetic import faces
+from derender.evaluation.disentanglement.swap import swap_test
 from derender.features.extract import model_fingerprint
 from derender.model import WHITENING_FILE
 from derender.scene.perturb import PerturbSettings
 from derender.training import resolve, train
 from derender.training.config import WhiteningSettings
-from derender.training.whitening import fit_whitening
+from derender.training.whitening import BATCH_SIZE, fit_whitening
 
 SETTINGS = WhiteningSettings(pictures=200, views=3, directions=16)
 TINY = ["image_size=32", "width=8", "light_width=4", "code_size=16", "perceptual=none", "batch_size=8"]
@@ -60,17 +61,47 @@ def test_light_moves_features_less_than_codes_on_pictures_that_were_not_seen(ima
     assert after["albedo"] < 0.9 * before["albedo"]
 
 
-def test_scenes_are_those_of_the_codes_and_light_and_camera_keep_theirs(images):
+def test_scenes_are_those_of_the_codes(images):
     model = read_only()
     model.whitening = fit_whitening(model, images[:50], SETTINGS, PerturbSettings())
     pictures = images[:4].float() / 255
     with torch.no_grad():
         codes, features = model.encode(pictures), model.embed(pictures)
         assert torch.equal(model.decompose(pictures).depth, model.decode(codes).depth)
-    assert features["geometry"].shape == codes["geometry"].shape
-    assert not torch.allclose(features["geometry"], codes["geometry"])
+    for name, feature in features.items():
+        assert feature.shape == codes[name].shape
+        assert not torch.allclose(feature, codes[name])
+
+
+def test_light_and_camera_keep_their_codes_where_that_is_asked_for(images):
+    model = read_only()
+    settings = SETTINGS.model_copy(update={"vectors": False})
+    others = fit_whitening(model, images[:50], SETTINGS, PerturbSettings())
+    model.whitening = fit_whitening(model, images[:50], settings, PerturbSettings())
+    for name in ("geometry_map", "albedo_map"):
+        assert torch.equal(model.whitening.get_buffer(name), others.get_buffer(name))
+    with torch.no_grad():
+        codes, features = model.encode(images[:4] / 255), model.embed(images[:4] / 255)
     assert torch.equal(features["light"], codes["light"])
     assert torch.equal(features["camera"], codes["camera"])
+
+
+def test_light_and_camera_follow_other_factors_less_than_codes_on_pictures_that_were_not_seen(images):
+    model = read_only()
+    model.whitening = None
+    before = swap_test(model, images[200:].numpy()).moved
+    model.whitening = fit_whitening(model, images[:200], SETTINGS, PerturbSettings(), seed=1)
+    after = swap_test(model, images[200:].numpy()).moved
+    for place in (2, 3):
+        others = np.arange(4) != place
+        assert after[others, place].mean() < 0.8 * before[others, place].mean()
+        assert after[place, place] > 0.95 * before[place, place]
+
+
+def test_a_batch_of_one_picture_has_nobody_to_exchange_with(images):
+    model = read_only()
+    found = fit_whitening(model, images[: BATCH_SIZE + 1], SETTINGS, PerturbSettings())
+    assert bool(found.get_buffer("camera_map").isfinite().all())
 
 
 def test_a_mirror_image_has_the_features_of_the_picture_unless_told_otherwise(images, tmp_path):

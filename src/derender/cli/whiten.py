@@ -25,9 +25,9 @@ def whiten(
         list[str] | None,
         typer.Option(
             "--set",
-            help="pictures, views, spatial, mirrored, directions, shrinkage, evenness, frames and how far "
-            "they go, as reframe.farther; examples, coordinates, steps, prior, tolerance, weight of "
-            "fitting; what is perturbed, as perturb.light_deg.",
+            help="pictures, views, spatial, mirrored, directions, shrinkage, evenness, vectors, "
+            "vector_power, frames and how far they go, as reframe.farther; examples, coordinates, steps, "
+            "prior, tolerance, weight of fitting; what is perturbed, as perturb.light_deg.",
             metavar="KEY=VALUE",
         ),
     ] = None,
@@ -43,7 +43,7 @@ def whiten(
     force: options.Force = False,
     json_file: options.Json = None,
 ) -> None:
-    """Write a copy of a model whose features move as little as can be with light and camera.
+    """Write a copy of a model whose features move as little as can be with other factors.
 
     It is fitted to these pictures, without labels. Weights and scenes stay as they are. Training ends with
     this by itself. With --set steps=60 features are also made of scenes fitted to each picture by rendering.
@@ -77,8 +77,8 @@ def whiten(
     for name, values in ratios.items():
         clear = sum(value > 1 for value in values)
         say(
-            f"{name}: {len(values)} directions kept; in {clear} pictures differ more than one does in other "
-            "light and from other sides"
+            f"{name}: {len(values)} directions kept; in {clear} pictures differ more than one does where "
+            "other factors change"
         )
     result(f"model {folder}", json_file)
     write_json(json_file, {"model": folder, "pictures": len(chosen), "between_over_within": ratios})

@@ -140,7 +140,7 @@ def _fitted(
             name: Contrast(*(torch.from_numpy(kept[f"{name}_{part}"]) for part in ("mean", "map", "ratios")))
             for name in names
         },
-        mirrored=settings.whitening.mirrored,
+        mirrored=names if settings.whitening.mirrored else (),
     )
 
 

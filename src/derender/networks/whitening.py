@@ -1,13 +1,13 @@
-"""Readings to features: what light and camera move is shrunk, what tells pictures apart is kept; ours.
+"""Readings to features: what other factors move is shrunk, what tells pictures apart is kept; ours.
 
 Linear discriminant analysis without labels: the classes are pictures, their members the same scene rendered
-in other light and from other sides. Directions in which the renderings of one picture differ are divided by
-how much they differ; of the result the directions in which pictures differ most are kept, counted in units of
-what light and camera alone would do, and made more even: a few directions must not drown the others. Leaves
-out how the renderings are made (training/whitening.py).
+with this factor left as it is and others changed. Directions in which the renderings of one picture differ
+are divided by how much they differ; of the result the directions in which pictures differ most are kept,
+counted in units of what those others alone would do, and made more even: a few directions must not drown the
+others. Leaves out how the renderings are made (training/whitening.py).
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,6 +19,7 @@ from derender.networks.tensor_file import read_tensors, write_tensors
 from derender.whole import whole_file
 
 _MIRRORED = "reads_mirror_image"  # a file without it is of a model that reads pictures as they are alone
+_ALONE = "_alone"  # after a name: this one is read of pictures as they are, though others are not
 _NEVER_SINGULAR = 1e-9  # share of the mean variance that is added at least: Cholesky's root must exist
 
 
@@ -87,6 +88,7 @@ def contrast(
     shrinkage: float,
     size: int | None = None,
     evenness: float = 0.0,
+    power: float = 0.0,
 ) -> Contrast:
     """The map that makes the mean variance within pictures 1 in every kept direction, or evens out the whole.
 
@@ -101,6 +103,8 @@ def contrast(
         size: of the code, and of the features; by default that of the readings.
         evenness: 0..1. At 0 a direction in which pictures differ more counts for more; at 1 all count alike:
             like one in which pictures differ as much as the renderings of one of them do.
+        power: of each direction's repeatability, between / (between + within), by which it is weighted: what
+            would be expected of the picture itself, at 1 the posterior mean. At 0 all that is kept is alike.
 
     Raises:
         ValueError: fewer than two views or pictures.
@@ -116,6 +120,8 @@ def contrast(
     within = within + max(shrinkage, _NEVER_SINGULAR) * floor * torch.eye(width).to(within)
     ratios, kept = _most_told_apart(between, within, min(directions, size, width))
     kept = kept * (2 / (1 + ratios)) ** (evenness / 2)  # 1 within and as much between are the 2
+    own = ratios.clamp(min=torch.finfo(torch.float32).tiny)
+    kept = kept * (own / (1 + own)) ** power
     left, _, right = torch.linalg.svd(kept.T @ (within + between)[:, :size], full_matrices=False)
     return Contrast(mean.float(), (kept @ left @ right).float(), ratios.float())
 
@@ -123,17 +129,19 @@ def contrast(
 class Whitening(nn.Module):
     """The maps of some factors, applied to readings by name; gives the features of those factors alone.
 
-    A map of fewer rows than the reading has takes the reading's beginning: the code. ``mirrored`` maps take
-    the mean of a picture's reading and its mirror image's, which follows the first.
+    A map of fewer rows than the reading has takes the reading's beginning: the code. Maps of names in
+    ``mirrored`` take the mean of a picture's reading and its mirror image's, which follows the first.
     """
 
-    def __init__(self, contrasts: Mapping[str, Contrast], *, mirrored: bool = False):
+    def __init__(self, contrasts: Mapping[str, Contrast], *, mirrored: Collection[str] = ()):
         super().__init__()
         self.names = tuple(contrasts)
-        self.mirrored = mirrored
-        if mirrored:
+        self.mirrored = frozenset(mirrored) & frozenset(contrasts)
+        if self.mirrored:
             self.register_buffer(_MIRRORED, torch.ones(1), persistent=False)
         for name, found in contrasts.items():
+            if self.mirrored and name not in self.mirrored:
+                self.register_buffer(f"{name}{_ALONE}", torch.ones(1), persistent=False)
             self.register_buffer(f"{name}_mean", found.mean, persistent=False)
             self.register_buffer(f"{name}_map", found.map, persistent=False)
             self.register_buffer(f"{name}_ratios", found.ratios, persistent=False)
@@ -148,13 +156,14 @@ class Whitening(nn.Module):
     def taken(self, name: str, reading: Float[Tensor, "n _"]) -> Float[Tensor, "n taken"]:
         """What the map is applied to: the reading's beginning, or the mean of it and its mirror image's."""
         mean = self.get_buffer(f"{name}_mean")
-        wanted = len(mean) * (2 if self.mirrored else 1)
+        mirrored = name in self.mirrored
+        wanted = len(mean) * (2 if mirrored else 1)
         if reading.shape[1] < wanted:
             raise ValueError(
                 f"features of {name} are made of {wanted:,} numbers, got {reading.shape[1]:,}: "
                 "give what model.read gives, not codes"
             )
-        if self.mirrored:
+        if mirrored:
             reading = reading.unflatten(1, (2, -1)).mean(dim=1)
         return reading[:, : len(mean)].float()
 
@@ -196,7 +205,8 @@ class Whitening(nn.Module):
             if chart.ndim != 2 or len(chart) != len(mean) or ratios.ndim != 1:
                 raise ValueError(f"{name}: a map of {tuple(chart.shape)} beside a mean of {len(mean)}")
             found[name] = Contrast(mean, chart, ratios)
-        return cls(found, mirrored=_MIRRORED in tensors)
+        alone = {name for name in found if f"{name}{_ALONE}" in tensors or _MIRRORED not in tensors}
+        return cls(found, mirrored=found.keys() - alone)
 
 
 def _most_told_apart(between: Tensor, within: Tensor, count: int) -> tuple[Tensor, Tensor]:

@@ -61,6 +61,8 @@ class WhiteningSettings(Settings):
     directions: int = Field(default=128, ge=1)  # of each factor that are kept, at most as many as its code
     shrinkage: float = Field(default=0.1, ge=0)  # share of the mean variance added to every direction's
     evenness: float = Field(default=0.5, ge=0, le=1)  # 0: what tells pictures apart best counts most
+    vectors: bool = True  # light and camera have features of their own; else those are their codes
+    vector_power: float = Field(default=3.0, ge=0)  # of repeatability, by which their directions are weighted
     frames: int = Field(default=0, ge=0)  # times each picture is also shown in another frame
     reframe: ReframeSettings = DEFAULT_FRAMES
 

@@ -1,13 +1,14 @@
-"""What light and camera do to a trained model's codes, measured on its own renderings.
+"""What other factors do to a trained model's codes, measured on its own renderings.
 
-Every picture is taken apart, rendered with other values of all its vector factors (light and camera), and
-encoded again, several times; mirror images count as views, too, for the object is symmetric, and, where asked
-for, the picture itself in other frames, as from a camera that was moved. This is LOOCC's perturbation, of all
-vector factors at once, used after training instead of during it. Leaves out the codes of the vector factors
-themselves, which are to move.
+For geometry and albedo every picture is taken apart, rendered with other values of all its vector factors
+(light and camera), and encoded again, several times; mirror images count as views, too, for the object is
+symmetric, and, where asked for, the picture itself in other frames, as from a camera that was moved. This is
+LOOCC's perturbation, of all vector factors at once, used after training instead of during it. For each vector
+factor everything but that factor is changed: maps are another picture's. Leaves out changing one map under
+the other, which takes from features what tells things apart (docs/log.md).
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 import torch
 from jaxtyping import Float, Shaped
@@ -15,6 +16,7 @@ from torch import Generator, Tensor
 
 from derender.data.pictures import as_float
 from derender.model import Derenderer
+from derender.networks import Factor
 from derender.networks.whitening import Spread, Whitening, contrast
 from derender.scene import Scene
 from derender.scene.perturb import PerturbSettings
@@ -39,7 +41,7 @@ def fit_whitening(
     seed: int = 0,
     progress: Callable[[int, int], object] | None = None,
 ) -> Whitening:
-    """The map from what a trained model reads of geometry and albedo to its features.
+    """The map from what a trained model reads to its features.
 
     Args:
         model: trained; left as it is.
@@ -60,8 +62,12 @@ def fit_whitening(
     if not len(chosen):
         raise ValueError("whitening needs at least 2 pictures, got 0")
     own = [factor.name for factor in model.factors if factor.mirrored]
+    moving = tuple(factor for factor in model.factors if not factor.mirrored)
+    vectors = moving if describe is None and settings.vectors else ()
+    others = torch.Generator().manual_seed(seed)  # of their own: what they draw changes no other feature
     say = describe or (model.read if settings.spatial else model.encode)
     found: dict[str, Spread] = {}
+    alone: dict[str, Spread] = {}
     was_training, was_whitened, was_fitting = model.training, model.whitening, model.fitting
     model.eval()
     model.whitening = model.fitting = None  # readings as they are
@@ -74,7 +80,8 @@ def fit_whitening(
                 scene = model.decompose(batch)
                 shown = [batch]
                 shown += [
-                    _seen_otherwise(model, scene, batch, perturb, generator) for _ in range(settings.views)
+                    _seen_otherwise(model, scene, batch, moving, perturb, generator)
+                    for _ in range(settings.views)
                 ]
                 for _ in range(settings.frames):
                     shown.append(shown_in(batch, draw_frames(len(batch), generator, settings.reframe)))
@@ -92,6 +99,15 @@ def fit_whitening(
                 for name in names:
                     joined = torch.stack([view[name].float() for view in views])
                     found.setdefault(name, Spread()).add(joined)
+                for factor in vectors if len(batch) > 1 else ():  # one alone has nobody to exchange with
+                    rest = [other for other in model.factors if other.name != factor.name]
+                    shown = [batch]
+                    shown += [
+                        _seen_otherwise(model, scene, batch, rest, perturb, others)
+                        for _ in range(settings.views)
+                    ]
+                    codes = [model.nets[factor.name].encode(one).float() for one in shown]  # type: ignore[operator]
+                    alone.setdefault(factor.name, Spread()).add(torch.stack(codes))
                 if progress is not None:
                     progress(min(start + BATCH_SIZE, len(chosen)), len(chosen))
     finally:
@@ -99,13 +115,15 @@ def fit_whitening(
         model.whitening, model.fitting = was_whitened, was_fitting
     if describe is None:
         size = size or model.settings.network.code_size
-    return Whitening(
-        {
-            name: contrast(spread, settings.directions, settings.shrinkage, size, settings.evenness)
-            for name, spread in found.items()
-        },
-        mirrored=settings.mirrored,
-    ).to(model.device)
+    contrasts = {
+        name: contrast(spread, settings.directions, settings.shrinkage, size, settings.evenness)
+        for name, spread in found.items()
+    }
+    contrasts |= {
+        name: contrast(spread, len(spread.mean), settings.shrinkage, power=settings.vector_power)
+        for name, spread in alone.items()
+    }
+    return Whitening(contrasts, mirrored=found if settings.mirrored else ()).to(model.device)
 
 
 @torch.no_grad()
@@ -143,16 +161,17 @@ def _seen_otherwise(
     model: Derenderer,
     scene: Scene,
     pictures: Float[Tensor, "n 3 h w"],
+    changing: Iterable[Factor],
     perturb: PerturbSettings,
     generator: Generator,
 ) -> Float[Tensor, "n 3 h w"]:
-    """The scenes rendered with other values of every vector factor; what nothing covers is filled."""
+    """The scenes rendered with other values of these factors; what nothing covers is filled."""
     changed = {
         factor.parameter: factor.perturb(
             scene.parameters[factor.parameter], generator, perturb, model.settings.ranges
         )
-        for factor in model.factors
-        if not factor.mirrored and factor.perturb is not None
+        for factor in changing
+        if factor.perturb is not None
     }
     rendering = model.render(scene.with_parameters(**changed))
     return fill_uncovered(rendering.image, rendering.mask, pictures)
