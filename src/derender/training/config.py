@@ -58,7 +58,7 @@ class WhiteningSettings(Settings):
     views: int = Field(default=4, ge=1)  # renderings of each
     spatial: bool = True  # read the encoder's last spatial features beside the code
     mirrored: bool = True  # read the picture's mirror image beside it
-    directions: int = Field(default=128, ge=1)  # of each factor that are kept, at most as many as its code
+    directions: int = Field(default=128, ge=1)  # kept of geometry and albedo each, at most the code's size
     shrinkage: float = Field(default=0.1, ge=0)  # share of the mean variance added to every direction's
     evenness: float = Field(default=0.5, ge=0, le=1)  # 0: what tells pictures apart best counts most
     vectors: bool = True  # light and camera have features of their own; else those are their codes

@@ -4,8 +4,8 @@ For geometry and albedo every picture is taken apart, rendered with other values
 (light and camera), and encoded again, several times; mirror images count as views, too, for the object is
 symmetric, and, where asked for, the picture itself in other frames, as from a camera that was moved. This is
 LOOCC's perturbation, of all vector factors at once, used after training instead of during it. For each vector
-factor everything but that factor is changed: maps are another picture's. Leaves out changing one map under
-the other, which takes from features what tells things apart (docs/log.md).
+factor everything but that factor is changed: maps are another picture's. Leaves out changing one map beside
+the other, which brought nothing (docs/log.md).
 """
 
 from collections.abc import Callable, Iterable, Mapping
