@@ -12,7 +12,15 @@ from derender.training.held_out_errors import read_errors
 
 SHORT = [
     f"--set={setting}"
-    for setting in ("images=16", "batch_size=8", "fitted=8", "fit_steps=1", "whitening.pictures=8", "views=1")
+    for setting in (
+        "images=16",
+        "batch_size=8",
+        "fitted=8",
+        "fit_steps=1",
+        "whitening.pictures=8",
+        "views=1",
+        "spatial=false",
+    )
 ]
 
 

@@ -25,7 +25,8 @@ def run(folder, out, *extra) -> int:
 
 
 def test_a_copy_with_other_features_and_the_same_scenes(folder, tmp_path, capsys):
-    code = run(folder, tmp_path / "mine", "--set", "views=2", "--set", "directions=8", "--json", "-")
+    few = ("--set", "views=2", "--set", "directions=8", "--set", "spatial=false")
+    code = run(folder, tmp_path / "mine", *few, "--json", "-")
     assert code == 0
     said = json.loads(capsys.readouterr().out)
     assert said["pictures"] == 24

@@ -16,6 +16,7 @@ from derender.training.config import TrainConfig
 from derender.training.run_folder import start_run
 
 RECORD = SplitRecord((0.5, 0.2, 0.3), 4)
+COPIES = ("run", "white", "again", "small")
 
 
 @pytest.fixture(scope="module")
@@ -59,11 +60,13 @@ def test_copies_of_copies_have_the_parts_of_the_run(run, pictures, tmp_path):
     assert split_of(str(run)) == RECORD
     for copy, of in (("white", "run"), ("again", "white")):
         told = ["whiten", "-m", str(tmp_path / of), "-d", pictures, "-o", str(tmp_path / copy)]
-        assert main([*told, "--set", "pictures=8", "--set", "views=1", "--set", "directions=4"]) == 0
+        told += ["--set", "pictures=8", "--set", "views=1", "--set", "directions=4", "--set", "spatial=false"]
+        assert main(told) == 0
+    assert main(["pack", "-m", str(tmp_path / "run"), "-o", str(tmp_path / "small")]) == 0
     every = read_pictures(pictures, 64)
     for part in ("train", "validation", "test"):
-        asked = [set(part_of(every, part, str(tmp_path / name)).files) for name in ("run", "white", "again")]
-        assert asked[0] == asked[1] == asked[2] and 0 < len(asked[0]) < 30
+        asked = [set(part_of(every, part, str(tmp_path / name)).files) for name in COPIES]
+        assert asked[0] == asked[1] == asked[2] == asked[3] and 0 < len(asked[0]) < 30
 
 
 def test_what_learnt_from_all_pictures_has_no_parts(run, pictures, tmp_path, capsys):

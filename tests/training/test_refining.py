@@ -26,7 +26,7 @@ LESSONS = RefiningSettings(
 SHORT = RefineConfig.model_validate(
     {
         "refining": LESSONS.model_dump(),
-        "whitening": {"pictures": 16, "views": 2, "directions": 8},
+        "whitening": {"pictures": 16, "views": 2, "directions": 8, "spatial": False},
         "fitting": {"examples": 16},
     }
 )

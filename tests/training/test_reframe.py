@@ -111,7 +111,9 @@ def test_frames_as_views_make_features_move_less_with_the_frame():
     moved = shown_in(unseen, draw_frames(64, torch.Generator().manual_seed(9), ReframeSettings()))
     found = {}
     for frames in (0, 2):
-        settings = WhiteningSettings(pictures=200, views=2, directions=16, frames=frames)
+        settings = WhiteningSettings(
+            pictures=200, views=2, directions=16, frames=frames, spatial=False, vectors=False
+        )
         model.whitening = fit_whitening(model, images[:200], settings, PerturbSettings())
         with torch.no_grad():
             one, two = model.embed(unseen), model.embed(moved)

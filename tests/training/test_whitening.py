@@ -15,7 +15,8 @@ from derender.training import resolve, train
 from derender.training.config import WhiteningSettings
 from derender.training.whitening import BATCH_SIZE, fit_whitening
 
-SETTINGS = WhiteningSettings(pictures=200, views=3, directions=16, vectors=False)
+WITH_PLACES = WhiteningSettings(pictures=200, views=3, directions=16, vectors=False)
+SETTINGS = WITH_PLACES.model_copy(update={"spatial": False})  # of codes alone, which is much quicker
 WITH_VECTORS = SETTINGS.model_copy(update={"vectors": True, "views": 2})
 TINY = ["image_size=32", "width=8", "light_width=4", "code_size=16", "perceptual=none", "batch_size=8"]
 TINY += ["images=16", "warmup_images=0"]
@@ -56,7 +57,7 @@ def test_light_moves_features_less_than_codes_on_pictures_that_were_not_seen(ima
     model = read_only("faces-64")  # codes of albedo of the other follow light little as they are
     model.whitening = None
     before = moved_by_light(model, images[200:])
-    model.whitening = fit_whitening(model, images[:200], SETTINGS, PerturbSettings(), seed=1)
+    model.whitening = fit_whitening(model, images[:200], WITH_PLACES, PerturbSettings(), seed=1)
     after = moved_by_light(model, images[200:])
     assert after["geometry"] < 0.9 * before["geometry"]
     assert after["albedo"] < 0.9 * before["albedo"]
@@ -110,7 +111,7 @@ def test_a_mirror_image_has_the_features_of_the_picture_unless_told_otherwise(im
     model = read_only()
     pictures = images[:6].float() / 255
     for mirrored in (True, False):
-        settings = SETTINGS.model_copy(update={"mirrored": mirrored, "pictures": 40})
+        settings = WITH_PLACES.model_copy(update={"mirrored": mirrored, "pictures": 40})
         model.whitening = fit_whitening(model, images, settings, PerturbSettings())
         again = derender.load(model.save(tmp_path / str(mirrored)))
         with torch.no_grad():

@@ -24,6 +24,7 @@ from derender.cli import (
     importing,
     mesh,
     move,
+    pack,
     pictures,
     refine,
     report,
@@ -64,7 +65,7 @@ def _options(
 
 
 for group in (
-    demo, doctor, train, whiten, refine, unet, embed, evaluate, explain, finetune, importing, compare,
+    demo, doctor, train, whiten, refine, unet, pack, embed, evaluate, explain, finetune, importing, compare,
     report,
     pictures, move, mesh, search, view, synth, bench,
 ):  # fmt: skip

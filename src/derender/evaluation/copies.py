@@ -1,0 +1,55 @@
+"""How near a copy of a model comes to the model: its features and its renderings of the same pictures.
+
+Rounding weights moves every feature a little; the unit is how far two of these pictures are apart. What a
+score makes of that is asked of the copy itself (a cut of a tree may turn on one picture).
+"""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from derender.evaluation.reconstruction import evaluate_reconstruction
+from derender.features import Progress, embed_images
+
+if TYPE_CHECKING:
+    from derender.model import Derenderer
+
+
+@dataclass(frozen=True)
+class CopyCost:
+    """What changed.
+
+    Attributes:
+        moved: by factor, how far a picture's feature moved, mean over pictures, over how far two pictures'
+            features are apart (root mean square); 0: not at all.
+        l1, l1_before: mean absolute error of the pictures rendered again, 0..1, inside each one's mask.
+    """
+
+    moved: dict[str, float]
+    l1: float
+    l1_before: float
+
+
+def copy_cost(
+    model: "Derenderer", copy: "Derenderer", images: np.ndarray, *, progress: Progress | None = None
+) -> CopyCost:
+    """Compare a copy of a model with it on uint8 pictures (N, 3, H, W).
+
+    Raises:
+        ValueError: fewer than two pictures, or other factors.
+    """
+    if len(images) < 2:
+        raise ValueError(f"two pictures or more are needed to compare models, got {len(images)}")
+    names = [[factor.name for factor in one.factors] for one in (model, copy)]
+    if names[0] != names[1]:
+        raise ValueError(f"the models have other factors: {', '.join(names[0])}; {', '.join(names[1])}")
+    before = embed_images(model, images, progress=progress)
+    after = embed_images(copy, images)
+    moved = {}
+    for name in names[0]:
+        own, other = (np.asarray(one[name], np.float64) for one in (before, after))
+        apart = np.sqrt(2 * own.var(axis=0, ddof=1).sum())  # of two pictures drawn at random
+        moved[name] = float(np.linalg.norm(own - other, axis=1).mean() / apart) if apart else 0.0
+    errors = [evaluate_reconstruction(one, images).model.l1 for one in (copy, model)]
+    return CopyCost(moved, *errors)

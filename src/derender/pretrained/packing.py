@@ -1,0 +1,110 @@
+"""A saved model in fewer bytes: weights in half precision, large maps in bytes with a unit for each slice.
+
+Written are the files of `saved.py`, which every version that knows bytes reads. Leaves out what rounding
+costs; evaluation/copies.py measures it.
+"""
+
+import re
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from torch import Tensor
+
+from derender.networks.tensor_file import UNIT, packed, read_described, write_tensors
+from derender.pretrained.card import CARD_FILE
+from derender.pretrained.folders import model_folder
+from derender.pretrained.saved import (
+    CONFIG_FILE,
+    ERRORS_FILE,
+    FITTING_FILE,
+    SPLIT_FILE,
+    WEIGHTS_FILE,
+    WHITENING_FILE,
+    read_config,
+)
+from derender.whole import whole_folder
+
+KINDS = ("bytes", "float16")
+"""How the large maps of whitening and fitting are kept; weights are kept in float16 by both."""
+
+_LARGE = re.compile(r"\w+_map|maps\.\w+_axes")
+_TEXTS = (CARD_FILE, ERRORS_FILE, SPLIT_FILE)
+
+
+@dataclass(frozen=True)
+class Packed:
+    """What was written.
+
+    Attributes:
+        folder: where.
+        before, after: bytes of the tensors' files, by file.
+    """
+
+    folder: Path
+    before: dict[str, int]
+    after: dict[str, int]
+
+
+def pack_model(
+    source: str | Path, folder: str | Path, *, maps: str = "bytes", overwrite: bool = False
+) -> Packed:
+    """Write a model in fewer bytes, with what lies beside its weights; complete or not at all.
+
+    Args:
+        source: what `derender.load` takes.
+        folder: to write.
+        maps: "bytes", a 127th of the largest number of each slice apart, or "float16".
+        overwrite: replace what is there.
+
+    Raises:
+        FileExistsError: something is there.
+        FileNotFoundError: no model is at ``source``.
+        ValueError: it is damaged, or a weight is no number of half precision.
+    """
+    if maps not in KINDS:
+        raise ValueError(f"unknown kind of maps {maps!r}: choose {' or '.join(KINDS)}")
+    folder, own = Path(folder), model_folder(source)
+    if folder.exists() and not overwrite:
+        raise FileExistsError(f"{folder} exists already: choose another folder or pass overwrite=True")
+    read_config(own)
+    before, after = {}, {}
+    with whole_folder(folder) as temporary:
+        for name in (WEIGHTS_FILE, WHITENING_FILE, FITTING_FILE):
+            if not (own / name).is_file():
+                continue
+            tensors, told = read_described(own / name)
+            small = _halved(tensors) if name == WEIGHTS_FILE else _maps_packed(tensors, maps)
+            write_tensors(small, temporary / name, told)
+            before[name], after[name] = ((place / name).stat().st_size for place in (own, temporary))
+        for name in (CONFIG_FILE, *_TEXTS):
+            if (own / name).is_file():
+                shutil.copyfile(own / name, temporary / name)
+    return Packed(folder, before, after)
+
+
+def _halved(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    return {
+        name: _half(name, value) if value.is_floating_point() else value for name, value in tensors.items()
+    }
+
+
+def _maps_packed(tensors: Mapping[str, Tensor], kind: str) -> dict[str, Tensor]:
+    small = dict(tensors)
+    for name in filter(_LARGE.fullmatch, tensors):
+        if kind == "bytes":
+            small[name], small[name + UNIT] = packed(tensors[name].float(), along=0)
+        else:
+            small[name] = _half(name, tensors[name])
+    return small
+
+
+def _half(name: str, value: Tensor) -> Tensor:
+    half = value.half()
+    if not bool(half.isfinite().all()):
+        raise ValueError(
+            f"{name} has numbers that half precision cannot hold (beyond 65,504, or NaN), so this model "
+            "cannot be packed: its training went wrong, train it again"
+        )
+    return half

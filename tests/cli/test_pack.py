@@ -1,0 +1,126 @@
+"""`derender pack`: fewer bytes, nearly the same model, what lies beside it; refusals."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from safetensors import safe_open
+
+import derender
+from derender.cli import main
+from derender.data.synthetic import faces
+from derender.evaluation.copies import copy_cost
+from derender.model import load
+from derender.networks.tensor_file import CHECKSUM
+from derender.pretrained.packing import pack_model
+
+FILES = ("model.safetensors", "whitening.safetensors", "fitting.safetensors")
+
+
+@pytest.fixture(scope="module")
+def unpacked(tmp_path_factory):
+    """Weights and maps of no round numbers, saved in float32 as training does; features are not fitted."""
+    model = load("rendered-faces-64")
+    model.fitting.set_steps(0)
+    generator = torch.Generator().manual_seed(0)
+    for value in (*model.parameters(), *model.whitening.buffers(), *model.fitting.buffers()):
+        if value.is_floating_point() and value.ndim > 1:
+            value.mul_(1 + 1e-3 * torch.randn(value.shape, generator=generator))
+    return model.save_pretrained(tmp_path_factory.mktemp("unpacked") / "model", data="faces", licence="MIT")
+
+
+@pytest.fixture(scope="module")
+def pictures():
+    return faces.generate(12, image_size=64, seed=4).images
+
+
+def bytes_of(folder):
+    return sum((folder / name).stat().st_size for name in FILES)
+
+
+def checksums(folder):
+    found = {}
+    for name in FILES:
+        with safe_open(folder / name, framework="pt") as stored:
+            found[name] = stored.metadata()[CHECKSUM]
+    return found
+
+
+def test_a_copy_takes_half_the_bytes_and_says_nearly_the_same(unpacked, pictures, tmp_path, capsys):
+    folder = tmp_path / "pictures"
+    folder.mkdir()
+    for index, picture in enumerate(pictures):
+        Image.fromarray(picture.transpose(1, 2, 0)).save(folder / f"{index}.png")
+    code = main(["pack", "-m", str(unpacked), "-o", str(tmp_path / "p"), "-d", str(folder), "--json", "-"])
+    assert code == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["bytes"] == {"before": bytes_of(unpacked), "after": bytes_of(tmp_path / "p")}
+    assert said["bytes"]["after"] < 0.52 * said["bytes"]["before"]
+    assert said["pictures"] == 12
+    assert all(0 < share < 0.05 for share in said["cost"]["moved"].values())
+    assert said["cost"]["l1"] == pytest.approx(said["cost"]["l1_before"], rel=0.01)
+
+
+def test_its_cost_is_that_of_the_features_it_gives(unpacked, pictures, tmp_path):
+    pack_model(unpacked, tmp_path / "p")
+    one, two = load(unpacked), load(tmp_path / "p")
+    with torch.no_grad():
+        batch = torch.from_numpy(pictures).float() / 255
+        features = [model.embed(batch)["camera"].double() for model in (one, two)]
+    pairs = torch.cdist(features[0], features[0]).square().sum() / (12 * 11)
+    moved = (features[0] - features[1]).norm(dim=1).mean() / pairs.sqrt()
+    assert copy_cost(one, two, pictures).moved["camera"] == pytest.approx(float(moved), rel=1e-3)
+    assert set(copy_cost(one, one, pictures).moved.values()) == {0.0}
+
+
+def test_card_errors_and_split_go_along(tmp_path):
+    packed = pack_model("faces-64", tmp_path / "p").folder
+    own = load("faces-64").source
+    assert own is not None
+    for name in ("README.md", "held_out_errors.json", "split.json", "config.json"):
+        assert (packed / name).read_bytes() == (own / name).read_bytes()
+
+
+def test_a_packed_model_is_packed_to_itself(unpacked, tmp_path):
+    assert checksums(pack_model("faces-64", tmp_path / "again").folder) == checksums(load("faces-64").source)
+    first = pack_model(unpacked, tmp_path / "one").folder
+    assert checksums(pack_model(first, tmp_path / "two").folder) == checksums(first)
+
+
+def test_maps_in_half_precision_move_features_less(unpacked, pictures, tmp_path):
+    coarse = pack_model(unpacked, tmp_path / "bytes")
+    fine = pack_model(unpacked, tmp_path / "halves", maps="float16")
+    assert bytes_of(coarse.folder) < bytes_of(fine.folder) < bytes_of(unpacked)
+    whole = derender.load(unpacked)
+    moved = [copy_cost(whole, load(made.folder), pictures).moved["light"] for made in (coarse, fine)]
+    assert moved[1] < moved[0]
+
+
+@pytest.mark.parametrize("value", [1e6, float("nan")])
+def test_weights_beyond_half_precision_are_refused(tmp_path, value):
+    model = load("rendered-faces-64")
+    with torch.no_grad():
+        next(model.nets["light"].parameters()).view(-1)[0] = value
+    folder = model.save(tmp_path / "odd")
+    with pytest.raises(ValueError, match="half precision"):
+        pack_model(folder, tmp_path / "p")
+    assert not (tmp_path / "p").exists()
+
+
+def test_what_is_there_is_not_replaced_unasked(unpacked, tmp_path, capsys):
+    (tmp_path / "mine").mkdir()
+    assert main(["pack", "-m", str(unpacked), "-o", str(tmp_path / "mine")]) == 2
+    assert "add --force" in capsys.readouterr().err
+    with pytest.raises(FileExistsError):
+        pack_model(unpacked, tmp_path / "mine")
+
+
+def test_unknown_kinds_of_maps_and_one_picture_are_refused(unpacked, pictures, tmp_path, capsys):
+    assert main(["pack", "-m", str(unpacked), "-o", str(tmp_path / "p"), "--maps", "int4"]) == 2
+    assert "choose bytes or float16" in capsys.readouterr().err
+    assert not (tmp_path / "p").exists()
+    model = load(unpacked)
+    with pytest.raises(ValueError, match="two pictures"):
+        copy_cost(model, model, np.asarray(pictures[:1]))
