@@ -111,7 +111,7 @@ def test_a_mirror_image_has_the_features_of_the_picture_unless_told_otherwise(im
     model = read_only()
     pictures = images[:6].float() / 255
     for mirrored in (True, False):
-        settings = WITH_PLACES.model_copy(update={"mirrored": mirrored, "pictures": 40})
+        settings = WITH_PLACES.model_copy(update={"mirrored": mirrored, "pictures": 40, "spatial": mirrored})
         model.whitening = fit_whitening(model, images, settings, PerturbSettings())
         again = derender.load(model.save(tmp_path / str(mirrored)))
         with torch.no_grad():
