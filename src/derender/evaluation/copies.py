@@ -36,6 +36,8 @@ def copy_cost(
 ) -> CopyCost:
     """Compare a copy of a model with it on uint8 pictures (N, 3, H, W).
 
+    ``progress`` is called with (features made, features to make), two of each picture.
+
     Raises:
         ValueError: fewer than two pictures, or other factors.
     """
@@ -44,11 +46,17 @@ def copy_cost(
     names = [[factor.name for factor in one.factors] for one in (model, copy)]
     if names[0] != names[1]:
         raise ValueError(f"the models have other factors: {', '.join(names[0])}; {', '.join(names[1])}")
-    before = embed_images(model, images, progress=progress)
-    after = embed_images(copy, images)
+    passes = []
+    for number, one in enumerate((model, copy)):
+
+        def report(done: int, of: int, number: int = number) -> None:
+            if progress is not None:
+                progress(number * of + done, 2 * of)
+
+        passes.append(embed_images(one, images, progress=report))
     moved = {}
     for name in names[0]:
-        own, other = (np.asarray(one[name], np.float64) for one in (before, after))
+        own, other = (np.asarray(one[name], np.float64) for one in passes)
         apart = np.sqrt(2 * own.var(axis=0, ddof=1).sum())  # of two pictures drawn at random
         moved[name] = float(np.linalg.norm(own - other, axis=1).mean() / apart) if apart else 0.0
     errors = [evaluate_reconstruction(one, images).model.l1 for one in (copy, model)]
