@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from torch.nn.functional import grid_sample
 
 import derender
 from derender.data.synthetic import faces
@@ -68,6 +69,22 @@ def test_seen_from_the_front_each_pixel_lies_where_it_is(model, images):
     torch.testing.assert_close(depth[inside], facing.depth[inside], atol=1e-4, rtol=0)
     shown = said.maps["albedo"].permute(0, 2, 3, 1)
     torch.testing.assert_close(shown[inside], facing.albedo.permute(0, 2, 3, 1)[inside], atol=1e-3, rtol=0)
+
+
+def test_depth_does_not_say_how_far_the_camera_stands(model, images):
+    pictures = images[:3].float() / 255
+    scene = model.decompose(pictures)
+    away = derender.Derenderer(model.settings)
+    away.load_state_dict(model.state_dict())
+    camera = torch.tensor([0, 0, 0, 0, 0, 0.5]).expand(3, 6)
+    away.eval().decode = lambda codes: scene.with_parameters(camera=camera)
+    said = said_of(away, pictures)
+    inside = said.mask.bool()
+    assert 0.2 < inside.float().mean() < 0.7, "seen from 1.5 times as far"
+    across, down, depth = said.maps["geometry"].unbind(dim=1)
+    places = torch.stack([across, down], dim=-1)
+    there = grid_sample(scene.depth[:, None], places, align_corners=True, padding_mode="border")[:, 0]
+    torch.testing.assert_close(depth[inside] * 0.1 + 1, there[inside], atol=2e-3, rtol=0)
 
 
 def test_pictures_and_what_is_said_of_them_move_together(model, images):

@@ -60,7 +60,8 @@ class Said:
 
     Attributes:
         maps: by factor; geometry (N, 3, H, W) is the place on the thing (-1..1 across and down) and the depth
-            (-1..1 over the model's range), albedo (N, 3, H, W) 0..1; 0 where nothing is covered.
+            (-1..1 over the model's range, the camera's own distance taken off), albedo (N, 3, H, W) 0..1; 0
+            where nothing is covered.
         mask: (N, H, W) 1 where the surface is seen.
         codes: by factor, (N, code).
     """
@@ -215,7 +216,8 @@ def said_of(model: Derenderer, pictures: Float[Tensor, "n 3 h w"]) -> Said:
     places = torch.stack(torch.meshgrid(line, line, indexing="xy")).expand(len(pictures), -1, -1, -1)
     seen = warp(torch.cat([places, scene.albedo], dim=1), scene.depth, scene.camera, model.fov_deg)
     middle, half = (ranges.depth_max + ranges.depth_min) / 2, (ranges.depth_max - ranges.depth_min) / 2
-    depth = (seen.depth - middle) / half * seen.mask
+    away = scene.camera[:, 5, None, None]  # how far the camera stands is said by its own factor
+    depth = (seen.depth - away - middle) / half * seen.mask
     geometry = torch.cat([seen.image[:, :2], depth.unsqueeze(1)], dim=1)
     return Said({"geometry": geometry, "albedo": seen.image[:, 2:]}, seen.mask, codes)
 
