@@ -25,7 +25,7 @@ test: $(STAMP)  ## every test, ruff and pyright; ARGS="-k render" narrows it dow
 format: $(STAMP)  ## ruff: formatting and the fixes it is sure of
 	@$(BIN)/ruff format . && $(BIN)/ruff check --fix .
 
-bench: $(STAMP)  ## the speed tables of docs/results.md
+bench: $(STAMP)  ## the speed tables of docs/performance.md
 	@$(BIN)/python benchmarks/rasterize.py
 	@$(BIN)/python benchmarks/training_step.py $(ARGS)
 
