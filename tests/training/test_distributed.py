@@ -112,7 +112,7 @@ def test_two_processes_train_one_run_that_one_process_can_go_on_with(folder, tmp
     for row, same in zip(rows, expected, strict=True):
         for name in same.keys() - {"kind", "images", "seconds", "images_per_second", "waiting"}:
             # loose on purpose: Adam's first steps have the size of the rate however small a gradient is
-            assert row[name] == pytest.approx(same[name], rel=1e-3, abs=1e-4), (row["images"], name)
+            assert row[name] == pytest.approx(same[name], rel=3e-3, abs=1e-4), (row["images"], name)
 
 
 def test_what_fails_in_all_processes_is_said_once(folder, tmp_path):

@@ -17,11 +17,11 @@ from typing import Any
 
 import torch
 from jaxtyping import Shaped
-from lightning_fabric import Fabric
-from lightning_fabric.strategies.ddp import DDPStrategy
 from torch import Tensor, distributed
 from torch.autograd.function import once_differentiable
 from torch.nn.parallel import DistributedDataParallel
+
+from derender.training.fabric import DDPStrategy, Fabric
 
 
 @dataclass(frozen=True)

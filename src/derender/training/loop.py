@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from lightning_fabric import Fabric
 from PIL import Image
 from torch import Tensor, nn
 from torch.utils.tensorboard.writer import SummaryWriter
@@ -29,6 +28,7 @@ from derender.training.config import TrainConfig
 from derender.training.derender_task import DerenderTask, sharing_batches
 from derender.training.determinism import deterministic_algorithms
 from derender.training.distributed import Ranks, first_then_others, open_fabric, ranks_of, this_rank_writes
+from derender.training.fabric import Fabric
 from derender.training.finite import broken_gradient, not_finite
 from derender.training.interrupt import TrainingInterrupted, stop_on_signal
 from derender.training.kept_model import KeptModel
