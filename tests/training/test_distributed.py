@@ -5,6 +5,7 @@ import os
 import socket
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -61,6 +62,15 @@ def two_processes(*arguments: str) -> list[tuple[int, str]]:
     return [(process.returncode, words) for process, words in zip(running, said, strict=True)]
 
 
+@pytest.fixture
+def one_thread() -> Iterator[None]:
+    """As many threads as each of the two processes has: sums of several are rounded otherwise."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
 def settings(*changes: str) -> list[str]:
     return [part for change in (*TINY, *changes) for part in ("--set", change)]
 
@@ -88,6 +98,7 @@ def test_two_processes_have_the_losses_and_gradients_of_one_with_the_whole_batch
         assert step["gradients"] < 1e-9, step
 
 
+@pytest.mark.usefixtures("one_thread")
 def test_two_processes_train_one_run_that_one_process_can_go_on_with(folder, tmp_path):
     run = tmp_path / "shared"
     command = ["-m", "derender", "train", "--data", str(folder), "--preset", "small", "--device", "cpu"]
@@ -112,7 +123,7 @@ def test_two_processes_train_one_run_that_one_process_can_go_on_with(folder, tmp
     for row, same in zip(rows, expected, strict=True):
         for name in same.keys() - {"kind", "images", "seconds", "images_per_second", "waiting"}:
             # loose on purpose: Adam's first steps have the size of the rate however small a gradient is
-            assert row[name] == pytest.approx(same[name], rel=3e-3, abs=1e-4), (row["images"], name)
+            assert row[name] == pytest.approx(same[name], rel=1e-3, abs=1e-4), (row["images"], name)
 
 
 def test_what_fails_in_all_processes_is_said_once(folder, tmp_path):

@@ -144,14 +144,14 @@ def test_pictures_in_other_frames_come_with_the_camera_that_sees_them_so(model, 
 
 
 def test_a_copy_taught_so_steps_back_from_smaller_faces(model, images):
-    taught = refine(model, images, images, framed(images=1120, rendered=0, fit_steps=8), seed=5).model
+    taught = refine(model, images, images, framed(images=1600, rendered=0, fit_steps=8), seed=5).model
     assert taught.settings.ranges.translation_z == pytest.approx(0.9 / 0.75)
     assert model.settings.ranges.translation_z == 0
     pictures = images.float() / 255
     smaller = shown_in(pictures, torch.tensor([[[1.7, 0, 0], [0, 1.7, 0]]]).expand(len(pictures), 2, 3))
     near, far = (taught.decompose(one).camera[:, 5] for one in (pictures, smaller))
     assert (far > near).float().mean() > 0.9
-    assert float(far.mean() - near.mean()) > 0.05, "what few lessons teach of 0.7"
+    assert float(far.mean() - near.mean()) > 0.08, "what few lessons teach of 0.7"
 
 
 def test_the_unit_is_the_spread_of_fitted_scenes(model, images):

@@ -1,4 +1,6 @@
-"""Lightning Fabric, without torchmetrics, which it imports to read a version number and uses for nothing.
+"""Lightning Fabric, without torchmetrics, which it imports to read a version number.
+
+Only its detection of spikes computes with torchmetrics, imports it then, and is not used here.
 
 With torchmetrics come SciPy's signal processing and models of text: more than two of the six seconds of
 processor time that importing Fabric takes on a small machine, in every process of a training.
