@@ -1,0 +1,33 @@
+"""The shipped models give the outputs that were recorded: codes, features, scenes, renderings, fits."""
+
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+import pytest
+from safetensors.numpy import load_file
+
+_spec = importlib.util.spec_from_file_location(
+    "record_outputs", Path(__file__).with_name("record_outputs.py")
+)
+assert _spec is not None and _spec.loader is not None
+record = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(record)
+
+LARGEST_DIFFERENCE = 1e-5  # of the largest value of each output
+
+
+@pytest.mark.parametrize("name", record.PICTURES)
+def test_a_shipped_model_gives_its_recorded_outputs(name):
+    expected = load_file(record.FOLDER / f"{name}.safetensors")
+    np.testing.assert_allclose(
+        record.pictures_of(name).numpy()[..., ::8, ::8], expected.pop("pictures"), atol=1e-6,
+        err_msg="the generated pictures have changed, so nothing can be said of the model",
+    )  # fmt: skip
+    found = record.outputs_of(name)
+    assert found.keys() == expected.keys()
+    for key, value in expected.items():
+        assert found[key].shape == value.shape, key
+        scale = max(1.0, float(np.abs(value).max()))
+        apart = float(np.abs(found[key] - value).max())
+        assert apart <= LARGEST_DIFFERENCE * scale, f"{key}: {apart:.2g} of {scale:.2g}"
