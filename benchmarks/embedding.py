@@ -32,8 +32,7 @@ from PIL import Image
 from torch import nn
 from training_step import CONFIG, OurStep
 
-from derender.data import as_float
-from derender.data.stream import Sample, Stream, stream_of
+from derender.data import Sample, Stream, as_float, stream_of
 from derender.features import FeatureTable, embed_images, embed_to_file
 from derender.model import Derenderer
 from derender.objectives import Vgg16Features

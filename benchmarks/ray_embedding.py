@@ -23,7 +23,7 @@ import torch
 from machine import describe_machine
 from PIL import Image
 
-from derender.data.stream import stream_of
+from derender.data import stream_of
 from derender.features import FeatureTable, embed_to_file
 from derender.features.ray_engine import ray_engine
 from derender.model import Derenderer

@@ -33,11 +33,9 @@ from typing import Any
 from machine import describe_machine
 from PIL import Image
 
+from derender.data import open_source, read_pictures, take_inventory
 from derender.data.cache import fingerprint
-from derender.data.inventory import take_inventory
 from derender.data.listing import REMEMBERED_FROM
-from derender.data.pictures import read_pictures
-from derender.data.source import open_source
 
 CLASSES = 20
 SETTLED_SECONDS = 2.5  # what changed a moment ago is never trusted (data/listing.py)

@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from derender.data.celebamask import MASK_CLASSES
+from derender.data import MASK_CLASSES
 from derender.whole import whole_file
 
 EXPRESSIONS = {

@@ -8,8 +8,7 @@ import pytest
 import torch
 
 import derender
-from derender.data import read_ground_truth
-from derender.data.checks import check_pictures
+from derender.data import check_pictures, read_ground_truth
 from derender.evaluation import evaluate_geometry
 from derender.model import CONFIG_FILE, PRETRAINED, WEIGHTS_FILE, Derenderer, bundled_models, load
 from derender.networks import FACTORS, Factor

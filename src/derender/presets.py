@@ -8,7 +8,7 @@ How each is trained stands in training/config.py under the same names.
 from collections.abc import Mapping
 from typing import TypeVar
 
-from derender.data.nearest import nearest
+from derender.data import suggestion
 from derender.networks.settings import NetworkSettings
 from derender.scene.ranges import SceneRanges
 from derender.settings import Settings
@@ -35,5 +35,5 @@ MODEL_PRESETS: dict[str, ModelSettings] = {
 def named_preset(name: str, presets: Mapping[str, T]) -> T:
     """The preset of that name, or an error that names the nearest one."""
     if name not in presets:
-        raise ValueError(f"no preset {name!r}{nearest(name, presets)}: choose one of {', '.join(presets)}")
+        raise ValueError(f"no preset {name!r}{suggestion(name, presets)}: choose one of {', '.join(presets)}")
     return presets[name]

@@ -13,8 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 from PIL import Image
 
-from derender.data import read_pictures
-from derender.data.stream import stream_of
+from derender.data import read_pictures, stream_of
 from derender.features import FeatureTable, embed_pictures, embed_to_file, embedding
 from derender.features.blocks import BlockEmbedder, in_order
 

@@ -4,9 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from derender.data import PictureSet, Skipped
 from derender.data.doctor import examine
-from derender.data.pictures import PictureSet
-from derender.data.source import Skipped
 from derender.report.doctor import doctor_page, measure_table
 
 

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from derender.data import PictureSet, Skipped
 from derender.data.doctor import examine
-from derender.data.pictures import PictureSet
-from derender.data.source import Skipped
 from derender.evaluation.bootstrap import ScoredRow, estimate, with_verdicts
 from derender.evaluation.linear_task import Rows, task_of
 from derender.evaluation.robustness import CurveResult, RobustnessComparison

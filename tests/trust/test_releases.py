@@ -12,8 +12,8 @@ import torch
 
 import derender
 from derender.baselines.training import load_baseline
+from derender.data import read_pictures
 from derender.data.cache import _MARK, read_cache
-from derender.data.pictures import read_pictures
 from derender.features import FeatureTable, missing
 from derender.interpretation.probe import Probe, load_probe
 from derender.model import CONFIG_FILE, ERRORS_FILE

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from pydantic import ValidationError
 from torch import Tensor, nn
 
-from derender.data.nearest import nearest
+from derender.data import suggestion
 from derender.networks.tensor_file import read_tensors, write_tensors
 from derender.settings import Settings
 from derender.training.weights import fit_weights
@@ -80,7 +80,7 @@ class BaselineModel(nn.Module):
         for name in names:
             if name not in self.features:
                 raise ValueError(
-                    f"{self.name} has no feature {name!r}{nearest(name, self.features)}; "
+                    f"{self.name} has no feature {name!r}{suggestion(name, self.features)}; "
                     f"it has {', '.join(self.features)}"
                 )
         if not names:

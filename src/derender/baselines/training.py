@@ -43,7 +43,7 @@ from derender.baselines.stylegan2.inversion import (
 )
 from derender.baselines.supervised import Resnet18, Resnet18Settings, SupervisedConfig
 from derender.baselines.vqvae import Vqvae, VqvaeConfig, VqvaeSettings, vqvae_losses
-from derender.data.nearest import nearest
+from derender.data import suggestion
 from derender.training.batches import random_stream
 from derender.training.config import LoopSettings, TrainConfig
 from derender.training.finetune_config import FinetuneConfig
@@ -185,7 +185,7 @@ MODULES: dict[str, tuple[type[BaselineModel], type[BaselineSettings]]] = {
 def named_baseline(name: str, rows: Mapping[str, Row]) -> Row:
     """The entry of that name, or an error that names the nearest one."""
     if name not in rows:
-        raise ValueError(f"no baseline {name!r}{nearest(name, rows)}: choose one of {', '.join(rows)}")
+        raise ValueError(f"no baseline {name!r}{suggestion(name, rows)}: choose one of {', '.join(rows)}")
     return rows[name]
 
 

@@ -208,10 +208,10 @@ def control_features(
 
 def checked(name: str) -> str:
     """The name if there is such a baseline, else an error that names the nearest one."""
-    from derender.data.nearest import nearest
+    from derender.data import suggestion
 
     if name not in NAMES:
-        raise ValueError(f"no baseline {name!r}{nearest(name, NAMES)}: choose one of {', '.join(NAMES)}")
+        raise ValueError(f"no baseline {name!r}{suggestion(name, NAMES)}: choose one of {', '.join(NAMES)}")
     return name
 
 

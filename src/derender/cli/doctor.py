@@ -63,7 +63,7 @@ def doctor(
 
 
 def _refuse_one_file(data: str) -> None:
-    from derender.data.source import is_picture
+    from derender.data import is_picture
 
     if Path(data).is_file() and is_picture(data):
         raise ValueError(
@@ -73,9 +73,8 @@ def _refuse_one_file(data: str) -> None:
 
 def _originals(data: str, pictures: "PictureSet", dataset: str) -> "Originals | None":
     """Sizes of the files where they can be asked for by name; a stream's cannot."""
-    from derender.data import take_inventory
+    from derender.data import parse_source, take_inventory
     from derender.data.doctor import EXAMINED_PX, measure_originals
-    from derender.data.inventory import parse_source
 
     if not parse_source(data)[0].exists():
         return None

@@ -20,8 +20,7 @@ from derender.cli.baselines import (
 from derender.cli.console import NAMED, bar, out_of_the_way, result, say, say_pictures, visible, write_json
 
 if TYPE_CHECKING:
-    from derender.data import PictureSet
-    from derender.data.stream import Stream
+    from derender.data import PictureSet, Stream
     from derender.features import Embedded
 
 ENGINES = ("local", "ray")
@@ -71,7 +70,7 @@ def embed(
     out_of_the_way(out, force)
     _check_engine(engine, workers, part)
     from derender.cli.models import open_model
-    from derender.data.stream import stream_of
+    from derender.data import stream_of
     from derender.features import embed_to_file
     from derender.features.ray_engine import ray_engine
 
@@ -130,10 +129,10 @@ def embed(
 
 
 def _check_engine(engine: str, workers: int | None, part: str) -> None:
-    from derender.data.nearest import nearest
+    from derender.data import suggestion
 
     if engine not in ENGINES:
-        raise ValueError(f"no engine {engine!r}{nearest(engine, ENGINES)}: choose {' or '.join(ENGINES)}")
+        raise ValueError(f"no engine {engine!r}{suggestion(engine, ENGINES)}: choose {' or '.join(ENGINES)}")
     if engine == "local" and workers is not None:
         raise ValueError("--workers belongs to --engine ray: leave it out, every core is used")
     if engine == "ray" and part != "all":
@@ -145,8 +144,7 @@ def _opened(
     data: str, dataset: str, part: str, limit: int | None, model: str | None, image_size: int
 ) -> "Iterator[Stream | PictureSet]":
     """The pictures as a stream; those of one part of a split, which has to know them all first, as a set."""
-    from derender.data import read_pictures
-    from derender.data.stream import stream_of
+    from derender.data import read_pictures, stream_of
 
     if part == "all":
         with stream_of(data, dataset=dataset, limit=limit) as stream:

@@ -148,10 +148,10 @@ def explain(
 
 
 def _row_of(pictures: "PictureSet", name: str) -> int:
-    from derender.data.nearest import nearest
+    from derender.data import suggestion
 
     if name not in pictures.files:
-        raise ValueError(f"{pictures.source} has no picture {name!r}{nearest(name, pictures.files)}")
+        raise ValueError(f"{pictures.source} has no picture {name!r}{suggestion(name, pictures.files)}")
     return pictures.files.index(name)
 
 

@@ -68,10 +68,12 @@ class Given:
 
 def check_frame(frame: str) -> bool:
     """Whether pictures are to be framed; an unknown word is an error that names the known ones."""
-    from derender.data.nearest import nearest
+    from derender.data import suggestion
 
     if frame not in FRAMES:
-        raise ValueError(f"unknown --frame {frame!r}{nearest(frame, FRAMES)}: choose {' or '.join(FRAMES)}")
+        raise ValueError(
+            f"unknown --frame {frame!r}{suggestion(frame, FRAMES)}: choose {' or '.join(FRAMES)}"
+        )
     return frame == "auto"
 
 
@@ -134,8 +136,7 @@ def given_pictures(
 
 def one_picture(path: Path, size: int) -> "np.ndarray":
     """One picture; a path that leads nowhere is an error that says so."""
-    from derender.data import read_picture
-    from derender.data.source import nearest_sibling
+    from derender.data import nearest_sibling, read_picture
 
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist{nearest_sibling(path)}")
@@ -164,15 +165,14 @@ def refining(
 ) -> "Callable[[Scene, Sequence[Path]], Scene] | None":
     """What makes scenes finer: fits, enlarges, takes albedo from the pictures; None for none of it."""
     from derender.cli.models import fitting_of
-    from derender.data import as_float
-    from derender.data.nearest import nearest
+    from derender.data import as_float, suggestion
     from derender.report.texture import picture_albedo, picture_on_grid
     from derender.scene.enlarge import at_size
 
     net = read.net
     if texture not in TEXTURES:
         raise ValueError(
-            f"unknown texture {texture!r}{nearest(texture, TEXTURES)}: choose {' or '.join(TEXTURES)}"
+            f"unknown texture {texture!r}{suggestion(texture, TEXTURES)}: choose {' or '.join(TEXTURES)}"
         )
     side = net.image_size if size is None else size
     if side < net.image_size:

@@ -156,12 +156,10 @@ def _query(
     if row is not None and (model is None or not Path(like).is_file()):
         return {name: rows[row] for name, rows in table.factors.items()}, row
     if model is None:
-        from derender.data.nearest import nearest as did_you_mean
+        from derender.data import suggestion
 
         known = table.files if len(table) <= 2_000 else ()
-        hint = (
-            "; to search with a picture, add --model" if Path(like).is_file() else did_you_mean(like, known)
-        )
+        hint = "; to search with a picture, add --model" if Path(like).is_file() else suggestion(like, known)
         raise ValueError(f"{features} has no row {like!r}{hint}; its first is {table.files[0]!r}")
     from derender.cli.given import one_picture
     from derender.cli.models import check_maker, open_model
@@ -219,9 +217,7 @@ def _pictures_of(files: Sequence[str], source: str, dataset: str) -> "dict[str, 
     """The pictures of these names, by name, as far as they can be read; nothing else is decoded."""
     if not source:
         raise ValueError("the table does not say where its pictures lie: give --data, or leave out --out")
-    from derender.data import Unreadable
-    from derender.data.decode import decode, quiet_pillow
-    from derender.data.stream import stream_of
+    from derender.data import Unreadable, decode, quiet_pillow, stream_of
 
     missing, read = set(files), {}
     with stream_of(source, dataset=dataset) as stream, bar("finding pictures") as report, quiet_pillow():

@@ -19,7 +19,7 @@ from jaxtyping import Float32
 from PIL import Image
 
 from derender.data.decode import DECODER_ERRORS
-from derender.data.nearest import nearest
+from derender.data.names import suggestion
 from derender.data.source import Source
 
 BOX_LISTS = ("boxes.csv", "boxes.txt", "celeba_crop_bbox.txt", "celeba_crop_bbox.csv")
@@ -54,8 +54,8 @@ def read_box_list(source: Source, files: Sequence[str]) -> Float32[np.ndarray, "
     if missing:
         raise ValueError(
             f"{where} has no row for {missing[0]} ({len(missing):,} of {len(files):,} pictures have none"
-            f"{nearest(missing[0], rows) if len(rows) < _MOST_OPENED else ''}); add the rows, or move these "
-            f"pictures or the list out of the folder"
+            f"{suggestion(missing[0], rows) if len(rows) < _MOST_OPENED else ''}); add the rows, or move "
+            f"these pictures or the list out of the folder"
         )
     opened = min(len(files), _MOST_OPENED)
     for at in (i * len(files) // opened for i in range(opened)):

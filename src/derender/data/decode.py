@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 from PIL import Image
 
-from derender.data.nearest import nearest
+from derender.data.names import suggestion
 from derender.data.source import read_bounded
 
 READER_VERSION = 1
@@ -94,7 +94,7 @@ def read_picture(
 def check_fit(fit: str) -> None:
     """An unknown ``fit`` is an error that names the known ones."""
     if fit not in FITS:
-        raise ValueError(f"unknown fit {fit!r}{nearest(fit, FITS)} (known: {', '.join(FITS)})")
+        raise ValueError(f"unknown fit {fit!r}{suggestion(fit, FITS)} (known: {', '.join(FITS)})")
 
 
 def decode(

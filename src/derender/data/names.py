@@ -1,4 +1,7 @@
-"""Which names of files count: what looks like a picture, what is hidden, how odd bytes are written down."""
+"""Which names of files count, and the known name that an unknown one probably meant."""
+
+from collections.abc import Iterable
+from difflib import get_close_matches
 
 SUFFIXES = (
     *(".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".webp", ".avif", ".bmp", ".gif"),
@@ -28,3 +31,10 @@ def printable(name: str) -> str:
 def _escaped(name: str) -> str:
     escaped = name.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
     return name if escaped == name else escaped
+
+
+def suggestion(name: str, known: Iterable[str]) -> str:
+    """``"; did you mean 'x'?"`` for the closest known name, or an empty string when nothing is close."""
+    by_lower = {candidate.lower(): candidate for candidate in known}
+    close = get_close_matches(name.lower(), by_lower, n=1, cutoff=0.5)
+    return f"; did you mean {by_lower[close[0]]!r}?" if close else ""

@@ -5,10 +5,12 @@ Readers reserve memory for as many rows as the footer names: one changed byte of
 """
 
 from io import BufferedIOBase
-
-import pyarrow as pa
+from typing import TYPE_CHECKING
 
 from derender.data.parquet_footer import BOOLEAN, FLOAT, INT32, INT96, Footer, read_footer
+
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 ALWAYS_ALLOWED_BYTES = 512 * 2**20
 MOST_EXPANSION = 1000
@@ -49,12 +51,14 @@ def checked_footer(file: BufferedIOBase, size: int) -> Footer:
     return claimed
 
 
-def check_lists(footer: Footer, schema: pa.Schema, size: int) -> None:
+def check_lists(footer: Footer, schema: "pa.Schema", size: int) -> None:
     """Lists of a fixed length, of which a footer counts nothing, against the size of the file.
 
     Raises:
         ValueError: they would take too much.
     """
+    import pyarrow as pa
+
     widest = [kind.list_size for kind in schema.types if pa.types.is_fixed_size_list(kind)]
     _bounded(4 * footer.rows * sum(widest), size)
 

@@ -15,7 +15,7 @@ from derender.data.duplicates import Duplicate
 from derender.data.inventory import Inventory, take_inventory
 from derender.data.layout import Labels, count_unknown
 from derender.data.loading import Loaded, Progress, load_into
-from derender.data.nearest import nearest
+from derender.data.names import suggestion
 from derender.data.places import cache_folder
 from derender.data.source import Skipped
 from derender.data.stream.address import open_stream
@@ -81,7 +81,7 @@ class PictureSet:
         if name not in self.labels:
             known = f"it has {', '.join(self.labels)}" if self.labels else "it has no labels"
             raise ValueError(
-                f"{self.source} ({self.layout}) has no label {name!r}{nearest(name, self.labels)}; {known}"
+                f"{self.source} ({self.layout}) has no label {name!r}{suggestion(name, self.labels)}; {known}"
             )
         return self.labels[name]
 

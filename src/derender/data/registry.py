@@ -10,7 +10,7 @@ from derender.data.emotions import RAFDB
 from derender.data.faces import FACES
 from derender.data.folders import FOLDERS
 from derender.data.layout import Layout
-from derender.data.nearest import nearest
+from derender.data.names import suggestion
 from derender.data.paired import PAIRED
 from derender.data.rendered import RENDERED
 from derender.data.source import Source
@@ -37,7 +37,7 @@ def layout_named(name: str) -> Layout:
         if layout.name == name.lower():
             return layout
     known = [layout.name for layout in LAYOUTS]
-    raise ValueError(f"unknown data set {name!r}{nearest(name, known)} (known: auto, {', '.join(known)})")
+    raise ValueError(f"unknown data set {name!r}{suggestion(name, known)} (known: auto, {', '.join(known)})")
 
 
 def recognise(source: Source) -> Layout:

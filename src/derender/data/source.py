@@ -24,8 +24,7 @@ from jaxtyping import Int64
 from derender.data import listing
 from derender.data.kept import kept_file
 from derender.data.listing import list_files, recall, remember, stamps_of
-from derender.data.names import SUFFIXES, is_hidden, is_picture, printable
-from derender.data.nearest import nearest
+from derender.data.names import SUFFIXES, is_hidden, is_picture, printable, suggestion
 from derender.data.places import cache_folder
 from derender.data.zip_directory import is_zip, read_directory
 from derender.data.zip_listing import digest_of, list_zip, recall_zip, remember_zip
@@ -271,7 +270,7 @@ def nearest_sibling(path: Path) -> str:
         beside = sorted(entry.name for entry in parent.iterdir() if _may_hold_pictures(entry))
     except OSError:
         return ""
-    return nearest(path.name, beside)
+    return suggestion(path.name, beside)
 
 
 def _may_hold_pictures(path: Path) -> bool:

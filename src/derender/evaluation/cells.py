@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float32, Int64
 from threadpoolctl import threadpool_limits
 
-from derender.data.loading import usable_cores
+from derender.data import usable_cores
 
 T = TypeVar("T")
 

@@ -10,7 +10,7 @@ from collections.abc import Iterable
 import numpy as np
 from sklearn.cluster import KMeans, MiniBatchKMeans
 
-from derender.data.nearest import nearest
+from derender.data import suggestion
 from derender.evaluation import neighbours
 from derender.evaluation.clustering_finch import FinchHierarchy, finch, finch_clusters
 from derender.evaluation.clustering_ward import cut, ward_tree
@@ -96,7 +96,7 @@ def _k_means(features: np.ndarray, count: int, seed: int) -> dict[str, np.ndarra
 def _check(method: str, counts: list[int], n_rows: int) -> None:
     if method not in METHODS:
         raise ValueError(
-            f"unknown method {method!r}{nearest(method, METHODS)}; there is {', '.join(METHODS)}"
+            f"unknown method {method!r}{suggestion(method, METHODS)}; there is {', '.join(METHODS)}"
         )
     for count in counts:
         if not 1 <= count <= n_rows:

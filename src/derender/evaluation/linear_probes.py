@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from derender.data.nearest import nearest
+from derender.data import suggestion
 from derender.evaluation.linear_head import PAPER_HEAD, HeadSettings, train_heads
 from derender.evaluation.linear_logistic import fit_logistic
 from derender.evaluation.linear_task import Task
@@ -88,7 +88,7 @@ def probe(
 def check_head(head: str) -> None:
     """A kind of probe that is none is an error that names the nearest."""
     if head not in PROBES:
-        raise ValueError(f"unknown head {head!r}{nearest(head, PROBES)}; there is {', '.join(PROBES)}")
+        raise ValueError(f"unknown head {head!r}{suggestion(head, PROBES)}; there is {', '.join(PROBES)}")
 
 
 def nearest_answers(

@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from derender.data.nearest import nearest
+from derender.data import suggestion
 from derender.features import FeatureTable
 
 ATTRIBUTES = "attributes"
@@ -112,7 +112,7 @@ def attribute_columns(table: FeatureTable, least: int = 0) -> tuple[str, ...]:
 def table_named(name: str) -> TableSpec:
     """One of ``TABLES``; an unknown name is an error that names the nearest."""
     if name not in TABLES:
-        raise ValueError(f"unknown table {name!r}{nearest(name, TABLES)}; there is {', '.join(TABLES)}")
+        raise ValueError(f"unknown table {name!r}{suggestion(name, TABLES)}; there is {', '.join(TABLES)}")
     return TABLES[name]
 
 

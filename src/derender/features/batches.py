@@ -10,9 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Int64, UInt8
 
-from derender.data import PictureSet, Skipped, Unreadable
-from derender.data.stream import Decoded, SeenPixels
-from derender.data.stream.sample import Value
+from derender.data import Decoded, PictureSet, SeenPixels, Skipped, Unreadable, Value
 
 
 @dataclass(frozen=True)

@@ -15,9 +15,16 @@ from typing import Any
 import numpy as np
 import torch
 
-from derender.data import Skipped, Unreadable
-from derender.data.decode import quiet_pillow
-from derender.data.stream import Decoded, Sample, SeenPixels, Stream, decode_samples
+from derender.data import (
+    Decoded,
+    Sample,
+    SeenPixels,
+    Skipped,
+    Stream,
+    Unreadable,
+    decode_samples,
+    quiet_pillow,
+)
 from derender.features.batches import Rows
 from derender.features.extract import as_batch, evaluating, factor_codes
 

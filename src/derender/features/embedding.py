@@ -17,11 +17,17 @@ import numpy as np
 import PIL
 import torch
 
-from derender.data import PictureSet, Skipped
-from derender.data.cache import sample_checksum
-from derender.data.decode import READER_VERSION, quiet_pillow
-from derender.data.stream import Stream, ahead, decoded
-from derender.data.stream.collect import estimated_total
+from derender.data import (
+    READER_VERSION,
+    PictureSet,
+    Skipped,
+    Stream,
+    ahead,
+    decoded,
+    estimated_total,
+    quiet_pillow,
+    sample_checksum,
+)
 from derender.features.batches import Batch, Rows, batches_of_chunks, batches_of_set
 from derender.features.blocks import Computed, Engine
 from derender.features.extract import (

@@ -15,8 +15,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from derender.data.nearest import nearest
-from derender.data.parquet_claims import check_lists, checked_footer
+from derender.data import check_lists, checked_footer, suggestion
 from derender.whole import whole_file
 
 FORMAT = 1
@@ -113,7 +112,7 @@ def read_columns(path: Path, only: str | None = None) -> Columns:
         names = _factor_names(opened.schema_arrow, path)
         if only is not None and only not in names:
             there = ", ".join(names) or "none"
-            raise ValueError(f"unknown factor {only!r}{nearest(only, names)}; there is {there}")
+            raise ValueError(f"unknown factor {only!r}{suggestion(only, names)}; there is {there}")
         left_out = () if only is None else [name for name in names if name != only]
         table = opened.read([name for name in opened.schema_arrow.names if name not in left_out])
     except (pa.ArrowException, OSError) as error:

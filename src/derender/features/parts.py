@@ -19,9 +19,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from derender.data import Skipped
-from derender.data.stream import Kinds, SeenPixels, column_of
-from derender.data.stream.labels import Kind
+from derender.data import Kind, Kinds, SeenPixels, Skipped, column_of
 from derender.features.batches import Rows
 from derender.features.parquet import Columns, factor_column
 from derender.whole import Damaged, DamageNoticed, measured, whole_file

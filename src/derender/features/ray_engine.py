@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from itertools import islice
 from typing import Any
 
-from derender.data.stream import SeenPixels, Stream
+from derender.data import SeenPixels, Stream
 from derender.features.blocks import Block, BlockEmbedder, Computed, Engine, OpenStream, in_order
 
 

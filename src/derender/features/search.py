@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from derender.data.nearest import nearest as did_you_mean
+from derender.data import suggestion
 from derender.features.table import FeatureTable, named
 from derender.networks.fitting import PARAMETERS
 
@@ -64,7 +64,7 @@ def nearest(
     query = np.atleast_2d(np.asarray(query, dtype=np.float64))
     if metric not in METRICS:
         raise ValueError(
-            f"unknown metric {metric!r}{did_you_mean(metric, METRICS)}; there is {', '.join(METRICS)}"
+            f"unknown metric {metric!r}{suggestion(metric, METRICS)}; there is {', '.join(METRICS)}"
         )
     if query.ndim != 2 or query.shape[1] != rows.shape[1]:
         raise ValueError(

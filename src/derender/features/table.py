@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from derender.data.nearest import nearest
+from derender.data import suggestion
 from derender.features.parquet import Columns, read_columns, write_columns
 
 
@@ -31,7 +31,7 @@ def named(values: Mapping[str, Any], name: str, kind: str) -> Any:
     """``values[name]``; an unknown name is an error that names the nearest."""
     if name not in values:
         have = ", ".join(values) or "none"
-        raise ValueError(f"unknown {kind} {name!r}{nearest(name, values)}; there is {have}")
+        raise ValueError(f"unknown {kind} {name!r}{suggestion(name, values)}; there is {have}")
     return values[name]
 
 

@@ -17,7 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from derender.data.nearest import nearest
+from derender.data import suggestion
 from derender.interpretation.probe import Probe
 from derender.interpretation.shares import captum_attr
 from derender.networks.encoders import reading
@@ -48,7 +48,7 @@ def saliency(
     """
     if method not in METHODS:
         raise ValueError(
-            f"unknown method {method!r}{nearest(method, METHODS)}; there is {', '.join(METHODS)}"
+            f"unknown method {method!r}{suggestion(method, METHODS)}; there is {', '.join(METHODS)}"
         )
     weight = None if probe is None else factor_weights(probe, factor, targets).to(images)
     if weight is not None and len(weight) != len(images):

@@ -18,7 +18,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 from scipy.special import expit, softmax
 
-from derender.data.nearest import nearest
+from derender.data import suggestion
 from derender.evaluation.linear_head import PAPER_HEAD, HeadSettings, head_loss
 from derender.evaluation.linear_logistic import axes_of, fit_logistic, solve_logistic
 from derender.evaluation.linear_task import Task
@@ -96,7 +96,7 @@ class Probe:
         """The place of a label or class; an unknown name is an error that names the nearest."""
         if name not in self.names:
             raise ValueError(
-                f"the probe was not asked about {name!r}{nearest(name, self.names)}; "
+                f"the probe was not asked about {name!r}{suggestion(name, self.names)}; "
                 f"it knows {', '.join(self.names)}"
             )
         return self.names.index(name)
@@ -160,7 +160,7 @@ def fit_probe(
         settings: of the paper's head.
     """
     if head not in HEADS:
-        raise ValueError(f"unknown head {head!r}{nearest(head, HEADS)}; there is {', '.join(HEADS)}")
+        raise ValueError(f"unknown head {head!r}{suggestion(head, HEADS)}; there is {', '.join(HEADS)}")
     sizes = {name: values.shape[1] for name, values in features.items()}
     x = np.concatenate(list(features.values()), axis=1)[rows]
     fitted = _logistic(x, task, rows, seed) if head == "logistic" else _paper(x, task, rows, seed, settings)

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from derender.data.nearest import nearest
+from derender.data import suggestion
 from derender.evaluation.linear_task import Task, task_of
 from derender.features import missing
 
@@ -44,7 +44,7 @@ def question(
     for name in names:
         if name not in labels:
             raise ValueError(
-                f"{source} has no label {name!r}{nearest(name, labels)}; there is {', '.join(labels)}"
+                f"{source} has no label {name!r}{suggestion(name, labels)}; there is {', '.join(labels)}"
             )
     columns = {name: without_rare(in_bins(np.asarray(labels[name]), bins), min_count) for name in names}
     for name, values in columns.items():
@@ -56,7 +56,7 @@ def question(
             )
         if len(set(known.tolist())) < 2:
             others = [other for other in labels if other != name and _classes(labels[other]) > 1]
-            close = nearest(name, others)
+            close = suggestion(name, others)
             raise ValueError(
                 f"every labelled picture of {source} has {name} {known[0]}, so there is nothing to tell "
                 f"apart{close}; labels with two classes or more: {', '.join(others) or 'none'}"

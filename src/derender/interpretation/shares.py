@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from derender.data.nearest import nearest
+from derender.data import suggestion
 from derender.interpretation.probe import Probe
 
 OUTPUTS = ("logit", "probability")
@@ -58,7 +58,7 @@ def integrated_gradients(
     """
     if output not in OUTPUTS:
         raise ValueError(
-            f"unknown output {output!r}{nearest(output, OUTPUTS)}; there is {', '.join(OUTPUTS)}"
+            f"unknown output {output!r}{suggestion(output, OUTPUTS)}; there is {', '.join(OUTPUTS)}"
         )
     if features.ndim != 2 or features.shape[1] != probe.weight.shape[1]:
         raise ValueError(f"the probe takes features (N, {probe.weight.shape[1]}), got {features.shape}")

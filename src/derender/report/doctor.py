@@ -11,11 +11,11 @@ import numpy as np
 from PIL import Image
 
 from derender import __version__
+from derender.data import PictureSet
 from derender.data.doctor import Examination, Finding
 from derender.data.doctor.counting import count_of
 from derender.data.doctor.estimate import Estimate
 from derender.data.doctor.limits import LIMITS
-from derender.data.pictures import PictureSet
 from derender.report import blocks, colours
 from derender.report.blocks import Html
 from derender.report.page import Page, Section

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from derender.data.nearest import nearest
+from derender.data import suggestion
 from derender.report.mesh import Mesh
 
 FORMATS = ("glb", "obj")
@@ -30,7 +30,7 @@ def mesh_files(mesh: Mesh, name: str, form: str = "glb") -> dict[str, bytes]:
 def checked_format(form: str) -> str:
     """The format itself; an unknown one is an error that names the nearest."""
     if form not in FORMATS:
-        raise ValueError(f"unknown format {form!r}{nearest(form, FORMATS)}; there is {', '.join(FORMATS)}")
+        raise ValueError(f"unknown format {form!r}{suggestion(form, FORMATS)}; there is {', '.join(FORMATS)}")
     return form
 
 

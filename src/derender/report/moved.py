@@ -12,7 +12,7 @@ from typing import Any
 
 from PIL import Image
 
-from derender.data.nearest import nearest
+from derender.data import suggestion
 from derender.report.colours import Images
 from derender.report.films import gif, mp4
 from derender.report.panel import GridLayout, labelled_grid
@@ -59,7 +59,7 @@ def film_kinds(text: str) -> tuple[str, ...]:
     for kind in kinds:
         if kind not in FILMS:
             raise ValueError(
-                f"unknown kind of film {kind!r}{nearest(kind, FILMS)}; there is {', '.join(FILMS)}, none"
+                f"unknown kind of film {kind!r}{suggestion(kind, FILMS)}; there is {', '.join(FILMS)}, none"
             )
     return kinds
 

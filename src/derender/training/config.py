@@ -12,7 +12,7 @@ from typing import Any, Literal, TypeVar, overload
 import yaml
 from pydantic import Field, ValidationError, field_validator
 
-from derender.data.nearest import nearest
+from derender.data import suggestion
 from derender.model import load
 from derender.networks.fitting import FittingSettings
 from derender.presets import MODEL_PRESETS, ModelSettings, named_preset
@@ -215,7 +215,7 @@ def config_from_tree(tree: Mapping[str, Any], kind: type[Settings] = TrainConfig
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"])
         if first["type"] == "extra_forbidden":
-            raise ValueError(f"unknown setting {key!r}{nearest(key, setting_names(kind))}") from error
+            raise ValueError(f"unknown setting {key!r}{suggestion(key, setting_names(kind))}") from error
         raise ValueError(f"setting {key!r}: {first['msg']}, got {_SHORT.repr(first['input'])}") from error
 
 
@@ -252,7 +252,7 @@ def _full_key(key: str, tree: Mapping[str, Any]) -> str:
     if ending:
         raise ValueError(f"{key!r} could mean {' or '.join(ending)}: write it in full")
     short = {name.rsplit(".", 1)[-1]: name for name in names}
-    guess = nearest(key, names) or nearest(key.rsplit(".", 1)[-1], short)
+    guess = suggestion(key, names) or suggestion(key.rsplit(".", 1)[-1], short)
     raise ValueError(f"unknown setting {key!r}{guess}: 'derender train --dry-run' lists all of them")
 
 

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Shaped
 from torch import Tensor
 
-from derender.data.pictures import as_float
+from derender.data import as_float
 from derender.model import Derenderer
 from derender.networks.fitting import PARAMETERS, Fitting, FittingSettings
 from derender.networks.morphable import MorphableMaps

@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float, UInt8
 from pydantic import Field
 from torch import Generator, Tensor, nn
 
-from derender.data.pictures import as_float
+from derender.data import as_float
 from derender.model import Derenderer
 from derender.networks.fitting import PARAMETERS, STEPS
 from derender.networks.morphable import MorphableMaps

@@ -21,7 +21,7 @@ from pydantic import Field
 from torch import Generator, Tensor, nn
 from torch.nn.functional import affine_grid, grid_sample
 
-from derender.data.pictures import as_float
+from derender.data import as_float
 from derender.model import Derenderer
 from derender.networks.encoders import UNetEncoder
 from derender.networks.unet import PIXEL_CHANNELS, UNetDecoder

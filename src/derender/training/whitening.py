@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float, Shaped
 from torch import Generator, Tensor
 
-from derender.data.pictures import as_float
+from derender.data import as_float
 from derender.model import Derenderer
 from derender.networks import Factor
 from derender.networks.whitening import Spread, Whitening, contrast

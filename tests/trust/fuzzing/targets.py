@@ -24,11 +24,8 @@ from fuzzing.inputs import (
 from hypothesis import strategies as st
 
 import derender
-from derender.data import read_pictures
+from derender.data import checked_footer, decode, open_source, quiet_pillow, read_pictures
 from derender.data.cache import cache_file, read_cache
-from derender.data.decode import decode, quiet_pillow
-from derender.data.parquet_claims import checked_footer
-from derender.data.source import open_source
 from derender.evaluation.memory import Memory
 from derender.features import FeatureTable
 from derender.training import resolve

@@ -10,8 +10,7 @@ import sys
 import time
 from pathlib import Path
 
-from derender.data import read_pictures
-from derender.data.stream import stream_of
+from derender.data import read_pictures, stream_of
 from derender.features import DisentangledFeatures, FeatureTable, embed_to_file
 from derender.model import load
 from derender.whole import whole_file

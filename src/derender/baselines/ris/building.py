@@ -33,8 +33,7 @@ from derender.baselines.ris.model import Ris, RisSettings
 from derender.baselines.stylegan2.e4e import E4e, E4eSettings
 from derender.baselines.stylegan2.generator import Generator
 from derender.baselines.stylegan2.published import load_published_e4e
-from derender.data import PictureSet, read_masks, split_indices
-from derender.data.mask_folder import read_mask_folder
+from derender.data import PictureSet, read_mask_folder, read_masks, split_indices
 from derender.settings import Settings
 from derender.training.batches import random_stream
 from derender.training.loop import SAMPLE_COUNT, Progress, SampleSheet, TrainResult, describe_data

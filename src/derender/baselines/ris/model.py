@@ -14,7 +14,7 @@ from torch.nn.functional import adaptive_avg_pool2d
 from derender.baselines.model import BaselineModel
 from derender.baselines.ris.catalogue import POSE, nearest_cluster, transfer
 from derender.baselines.stylegan2.e4e import E4e, E4eSettings
-from derender.data.nearest import nearest
+from derender.data import suggestion
 
 
 class RisSettings(E4eSettings):
@@ -57,7 +57,7 @@ class Ris(BaselineModel):
         """How much of each style channel belongs to a part, 0..1."""
         if part not in self.features:
             known = ", ".join(self.features)
-            raise ValueError(f"no part {part!r}{nearest(part, self.features)}; there is {known}")
+            raise ValueError(f"no part {part!r}{suggestion(part, self.features)}; there is {known}")
         return self.matrix[self.features.index(part)]
 
     def describe(self, images: Float[Tensor, "n 3 h w"]) -> dict[str, Float[Tensor, "n _"]]:

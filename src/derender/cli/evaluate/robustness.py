@@ -92,11 +92,13 @@ class Shown:
     @property
     def way(self) -> str:
         """Where pictures come from, checked against the other options."""
-        from derender.data.nearest import nearest
+        from derender.data import suggestion
 
         way = self.pictures or ("faces" if self.data is None else "render")
         if way not in WAYS:
-            raise ValueError(f"--pictures {way!r} is unknown{nearest(way, WAYS)}: choose {', '.join(WAYS)}")
+            raise ValueError(
+                f"--pictures {way!r} is unknown{suggestion(way, WAYS)}: choose {', '.join(WAYS)}"
+            )
         generated = way in ("faces", "cars")
         if generated == (self.data is not None):
             what = "are generated and take no --data" if generated else "need --data: the pictures"

@@ -110,8 +110,7 @@ class MaskSource:
 
     def read(self, image_size: int) -> "tuple[PictureSet, np.ndarray, tuple[str, ...]]":
         """Pictures, masks and the names of the classes."""
-        from derender.data import read_masks
-        from derender.data.mask_folder import read_mask_folder
+        from derender.data import read_mask_folder, read_masks
 
         own = {"dataset": self.dataset, "limit": self.limit}
         with bar("reading") as report:

@@ -13,7 +13,7 @@ import yaml
 from pydantic import Field, field_validator
 
 from derender.cli.baselines import CONTROLS, NAMES, TRAINED, baseline_config
-from derender.data.nearest import nearest
+from derender.data import suggestion
 from derender.evaluation.tables import table_named
 from derender.settings import Settings
 from derender.training.config import config_from_tree, resolve
@@ -195,7 +195,7 @@ def _check_method(plan: Plan, name: str) -> None:
             raise ValueError(f"method {name!r} is like {method.like!r}: it takes features and whitened alone")
     kind = plan.kind(name)
     if kind not in KINDS:
-        raise ValueError(f"method {name!r} is of no known kind{nearest(kind, KINDS)}: choose {_or(KINDS)}")
+        raise ValueError(f"method {name!r} is of no known kind{suggestion(kind, KINDS)}: choose {_or(KINDS)}")
     for where in (*method.runs, *method.settings_on):
         _known("training set", where, plan.train)
     for settings in (plan.settings, method.settings, *method.settings_on.values()):
@@ -243,7 +243,7 @@ def _check_scored(plan: Plan, name: str, scored: ScoredSet) -> None:
 def _known(what: str, name: str, names: Any) -> None:
     if name not in names:
         raise ValueError(
-            f"unknown {what} {name!r}{nearest(name, names)}; there is {', '.join(names) or 'none'}"
+            f"unknown {what} {name!r}{suggestion(name, names)}; there is {', '.join(names) or 'none'}"
         )
 
 

@@ -12,7 +12,7 @@ from itertools import islice, product
 from pathlib import Path
 from urllib.parse import parse_qsl
 
-from derender.data.nearest import nearest
+from derender.data.names import suggestion
 from derender.data.source import is_hidden, is_picture, nearest_sibling
 from derender.data.stream.huggingface import HuggingFaceStream, is_saved
 from derender.data.stream.sample import Stream
@@ -99,7 +99,7 @@ def _parsed(text: str) -> tuple[str, dict[str, str], str | None]:
     for name in options:
         if name not in _OPTIONS:
             raise ValueError(
-                f"{text}: unknown option {name!r}{nearest(name, _OPTIONS)} (known: {', '.join(_OPTIONS)})"
+                f"{text}: unknown option {name!r}{suggestion(name, _OPTIONS)} (known: {', '.join(_OPTIONS)})"
             )
     return place, options, part if separator else None
 

@@ -16,7 +16,7 @@ from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
 from derender.data.layout import PARTITION_NAMES
-from derender.data.nearest import nearest
+from derender.data.names import suggestion
 from derender.data.source import printable, read_bounded
 from derender.data.stream.sample import Sample, Stream, Value, given, label_name, unreadable
 
@@ -183,7 +183,7 @@ def _chosen(splits: list[str], split: str | None, source: str) -> list[str]:
         split = "train" if "train" in splits else splits[0] if len(splits) == 1 else None
     if split not in splits:
         asked = "name one of its splits" if split is None else f"it has no split {split!r}"
-        found = "" if split is None else nearest(split, splits)
+        found = "" if split is None else suggestion(split, splits)
         raise ValueError(f"{source}: {asked}{found}; there are {', '.join(splits)}, and all of them as ::all")
     return [split]
 
@@ -206,7 +206,7 @@ def _columns(rows: Any, column: str | None, source: str) -> tuple[str, dict[str,
         )
     if column is not None and column not in pictures:
         raise ValueError(
-            f"{source} has no column of pictures {column!r}{nearest(column, pictures)}; "
+            f"{source} has no column of pictures {column!r}{suggestion(column, pictures)}; "
             f"there is {', '.join(pictures)}"
         )
     labels = {

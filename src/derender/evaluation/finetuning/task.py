@@ -19,8 +19,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Generator, Tensor, nn
 
-from derender.data import PictureSet, Split, split_indices
-from derender.data.nearest import nearest
+from derender.data import PictureSet, Split, split_indices, suggestion
 from derender.evaluation.finetuning.model import FinetunedModel, TargetHead
 from derender.evaluation.finetuning.pixel_labels import PixelLabels
 from derender.evaluation.linear_head import head_loss
@@ -130,7 +129,7 @@ class FinetuneTask:
         known = [factor.name for factor in (self.start or Derenderer(self.config.model)).factors]
         for name in self.config.target.factors:
             if name not in known:
-                raise ValueError(f"no factor {name!r}{nearest(name, known)}: there is {', '.join(known)}")
+                raise ValueError(f"no factor {name!r}{suggestion(name, known)}: there is {', '.join(known)}")
 
     def build(self) -> FinetunedModel:
         """The model to start from with a fresh head, the same for the same seed."""

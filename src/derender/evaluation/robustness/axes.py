@@ -11,7 +11,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from derender.data.nearest import nearest
+from derender.data import suggestion
 from derender.scene import Scene
 
 LEVELS = (0.0, 15.0, 30.0, 45.0, 60.0, 75.0)
@@ -106,7 +106,7 @@ def chosen_axes(names: Sequence[str], kind: str | None = None) -> tuple[Axis, ..
     """Axes by name; an unknown one, or one that generated pictures cannot be turned about, is an error."""
     for name in names:
         if name not in AXES:
-            raise ValueError(f"no axis {name!r}{nearest(name, AXES)}: there is {', '.join(AXES)}")
+            raise ValueError(f"no axis {name!r}{suggestion(name, AXES)}: there is {', '.join(AXES)}")
         if kind is not None and kind not in AXES[name].fixed:
             raise ValueError(f"generated {kind} cannot be turned about the axis {name!r}: leave it out")
     if not names:

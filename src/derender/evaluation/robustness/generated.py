@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from derender.data.nearest import nearest
+from derender.data import suggestion
 from derender.data.synthetic import CarSettings, FaceSettings, SyntheticSet, cars, faces
 from derender.evaluation.linear_task import task_of
 from derender.evaluation.memory import Memory
@@ -65,7 +65,9 @@ class Recipe:
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
-            raise ValueError(f"no kind {self.kind!r}{nearest(self.kind, KINDS)}: there is {', '.join(KINDS)}")
+            raise ValueError(
+                f"no kind {self.kind!r}{suggestion(self.kind, KINDS)}: there is {', '.join(KINDS)}"
+            )
         if self.people < 2 or self.learned < 1 or self.tested < 1:
             raise ValueError(
                 f"generated pictures need two people or more, each with a picture to learn from and one to "
@@ -92,8 +94,8 @@ def generated_trial(
     columns = {"identity": sample.identity, **sample.labels}
     if recipe.label not in columns:
         raise ValueError(
-            f"generated {recipe.kind} have no label {recipe.label!r}{nearest(recipe.label, columns)}; there "
-            f"is {', '.join(columns)}"
+            f"generated {recipe.kind} have no label {recipe.label!r}{suggestion(recipe.label, columns)}; "
+            f"there is {', '.join(columns)}"
         )
     inputs = {
         "recipe": {name: getattr(recipe, name) for name in ("kind", "people", "learned", "tested", "seed")},

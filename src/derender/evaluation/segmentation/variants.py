@@ -17,8 +17,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from derender.data import as_float
-from derender.data.nearest import nearest
+from derender.data import as_float, suggestion
 from derender.evaluation.segmentation.pixels import SegmentationData
 from derender.networks.encoders import UNetEncoder
 from derender.networks.unet import SegmentationNet
@@ -66,7 +65,9 @@ def chosen_variants(names: Sequence[str]) -> dict[str, Variant]:
     """Variants by name; an unknown one is an error that names the nearest."""
     for name in names:
         if name not in VARIANTS:
-            raise ValueError(f"no variant {name!r}{nearest(name, VARIANTS)}: there is {', '.join(VARIANTS)}")
+            raise ValueError(
+                f"no variant {name!r}{suggestion(name, VARIANTS)}: there is {', '.join(VARIANTS)}"
+            )
     if not names:
         raise ValueError(f"name a variant: there is {', '.join(VARIANTS)}")
     return {name: VARIANTS[name] for name in dict.fromkeys(names)}

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL.Image import DecompressionBombError
 
-from derender.data.decode import Unreadable, decode, quiet_pillow
+from derender.data import Unreadable, decode, quiet_pillow
 from derender.report.viewer.refused import Refused
 
 BODY_LIMIT_BYTES = 20_000_000

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
-from derender.data.inventory import Inventory, parse_source, take_inventory
-from derender.data.stream import open_stream
+from derender.data import Inventory, open_stream, parse_source, take_inventory
 from derender.features import FeatureTable
 from derender.report.viewer.intake import pixels_of
 from derender.report.viewer.refused import Refused
