@@ -122,7 +122,7 @@ def test_table_marks_the_best_and_gives_numbers_to_sort_by():
         Row("pixels", [0.5, 2.0, 7], True),
         Row("none", [None, float("nan"), "-"], True),
     ]
-    html = blocks.table(ScoreTable("scores", "features", columns, rows)).text
+    html = blocks.table(ScoreTable("scores", "features", columns, rows))
     best = re.findall(r'<td data-value="([^"]+)" class="best"', html)
     assert best == ["0.5", "2"]
     assert html.count('class="none"') == 2
@@ -132,7 +132,7 @@ def test_table_marks_the_best_and_gives_numbers_to_sort_by():
 def test_a_sentence_in_a_cell_may_break_and_a_short_word_may_not():
     long = "failed: the weights are not here, fetch them once"
     table = ScoreTable("scores", "features", [Column("why")], [Row("a", [long]), Row("b", ["0.1-0.2"])])
-    html = blocks.table(table).text
+    html = blocks.table(table)
     assert f'<td class="words">{long}</td>' in html and "<td>0.1-0.2</td>" in html
     assert ".numbers td.words { white-space: normal;" in full_page()
 

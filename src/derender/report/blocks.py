@@ -1,78 +1,74 @@
-"""What a report page is made of: prose, key figures, figures, grids of images, tables with controls.
+"""Blocks of a report page: prose, key figures, figures, grids of images, tables with controls.
 
-Every function takes plain values and returns ``Html``, whose text is already escaped; a plain ``str``
-never becomes markup. Images become data URIs. Leaves out the page around the blocks (see ``page``).
+Every function takes plain values and returns ``Html``: text is escaped by the templates
+(``templates/blocks.html``), and a plain ``str`` never becomes markup. Images become data URIs. Leaves out the
+page around the blocks (see ``page``).
 """
 
 from base64 import b64encode
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from html import escape
+from collections.abc import Mapping, Sequence
 from io import BytesIO
 from math import isfinite
+from typing import Any
 
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup as Html
 from PIL import Image
 
 from derender.report.colours import Images, same_length
 from derender.report.score_table import Cell, Column, ScoreTable
 
 LONGEST_WORD = 24  # characters of a cell that is kept on one line
-
-
-@dataclass(frozen=True)
-class Html:
-    """Markup that is safe to put into a page as it is."""
-
-    text: str
-
-
-def joined(blocks: Iterable[Html]) -> Html:
-    return Html("\n".join(block.text for block in blocks))
+TEMPLATES = Environment(
+    loader=PackageLoader("derender.report"),
+    autoescape=True,
+    trim_blocks=True,
+    keep_trailing_newline=True,
+    undefined=StrictUndefined,
+)
+_macros: Any = TEMPLATES.get_template("blocks.html").module
 
 
 def strong(text: str) -> Html:
-    return Html(f"<strong>{escape(text)}</strong>")
+    return Html(_macros.strong(text))
 
 
 def code(text: str) -> Html:
-    return Html(f"<code>{escape(text)}</code>")
+    return Html(_macros.code(text))
 
 
 def prose(*parts: str | Html) -> Html:
     """One paragraph of plain text (escaped) and ``strong``/``code`` pieces."""
-    return Html(
-        "<p>" + "".join(part.text if isinstance(part, Html) else escape(part) for part in parts) + "</p>"
-    )
+    return Html(_macros.prose(parts))
 
 
 def listing(command: str) -> Html:
     """Commands or other text in a fixed-width box."""
-    return Html(f"<pre><code>{escape(command)}</code></pre>")
+    return Html(_macros.listing(command))
 
 
 def key_figures(figures: Mapping[str, tuple[str, str]]) -> Html:
     """Large numbers: name to (value, what to compare it with)."""
-    tiles = "".join(
-        f"<div><dt>{escape(name)}</dt><dd><b>{escape(value)}</b><span>{escape(note)}</span></dd></div>"
-        for name, (value, note) in figures.items()
-    )
-    return Html(f'<dl class="tiles">{tiles}</dl>')
+    return Html(_macros.key_figures(figures))
 
 
 def facts(values: Mapping[str, object]) -> Html:
     """Settings and versions: name and value, one line each."""
-    lines = "".join(
-        f"<dt>{escape(str(name))}</dt><dd>{escape(str(value))}</dd>" for name, value in values.items()
-    )
-    return Html(f'<dl class="facts">{lines}</dl>')
+    return Html(_macros.facts(values))
+
+
+def definitions(meaning: Mapping[str, str]) -> Html:
+    """Words and what they mean."""
+    return Html(_macros.definitions(meaning))
 
 
 def folded(title: str, *blocks: Html) -> Html:
     """Blocks that open on request."""
-    return Html(f"<details><summary>{escape(title)}</summary>{joined(blocks).text}</details>")
+    return Html(_macros.folded(title, blocks))
 
 
 def png_bytes(image: Image.Image) -> bytes:
+    """A compact PNG file."""
     stream = BytesIO()
     image.save(stream, format="PNG", optimize=True)
     return stream.getvalue()
@@ -80,39 +76,32 @@ def png_bytes(image: Image.Image) -> bytes:
 
 def image(source: Image.Image | bytes, alt: str, width: int | None = None) -> Html:
     """One image (PIL, or PNG/GIF/JPEG bytes) as a data URI; ``width`` in CSS pixels."""
-    content = source if isinstance(source, bytes) else png_bytes(source)
-    size = f' width="{width}"' if width else ""
-    return Html(f'<img alt="{escape(alt)}"{size} src="{_data_uri(content)}">')
+    return Html(_macros.image(_data_uri(source), alt, width))
 
 
 def wide(content: Html, alt: str) -> Html:
     """An image with small parts: on a narrow screen it keeps a readable width and scrolls by itself."""
-    return Html(
-        f'<div class="scroll wide" tabindex="0" role="group" aria-label="{escape(alt)}">{content.text}</div>'
-    )
+    return Html(_macros.scroll(alt, content, "scroll wide"))
 
 
 def film(moving: bytes, still: Image.Image, alt: str, width: int | None = None) -> Html:
     """An animated image; readers who ask for reduced motion get ``still`` in its place."""
-    uri = _data_uri(png_bytes(still))
-    source = f'<source media="(prefers-reduced-motion: reduce)" srcset="{uri}">'
-    return Html(f"<picture>{source}{image(moving, alt, width).text}</picture>")
+    return Html(_macros.film(_data_uri(moving), _data_uri(still), alt, width))
 
 
 def figure(content: Html, caption: str) -> Html:
     """An image, chart or row of films with its caption."""
-    return Html(f"<figure>{content.text}<figcaption>{escape(caption)}</figcaption></figure>")
+    return Html(_macros.figure(content, caption))
 
 
 def chart(svg: str, alt: str, caption: str) -> Html:
     """SVG text made by ``charts`` as a figure."""
-    return figure(Html(f'<div class="chart" role="img" aria-label="{escape(alt)}">{svg}</div>'), caption)
+    return figure(_macros.chart(Html(svg), alt), caption)
 
 
 def row_of(items: Sequence[tuple[Html, str]]) -> Html:
     """Images or films next to each other, each with a short label; they wrap on small screens."""
-    cells = "".join(f"<div>{content.text}<span>{escape(label)}</span></div>" for content, label in items)
-    return Html(f'<div class="row">{cells}</div>')
+    return Html(_macros.row_of(items))
 
 
 def image_grid(
@@ -122,84 +111,58 @@ def image_grid(
     meaning: Mapping[str, str] | None = None,
     show_names: bool = True,
 ) -> Html:
-    """Images in rows (pictures) and named columns; each image's alt text is its column and row name."""
-    rows = same_length(list(columns.values()))
-    if len(row_names) != rows:
-        raise ValueError(f"expected {rows} row names, one per picture; got {len(row_names)}")
-    meaning = meaning or {}
-    head = "".join(
-        f'<th scope="col"{_tooltip(meaning.get(name, ""))}>{escape(name)}</th>' for name in columns
-    )
-    body = ""
-    for index, row_name in enumerate(row_names):
-        label = f'<th scope="row">{escape(row_name)}</th>' if show_names else ""
-        cells = "".join(
-            f"<td>{image(images[index], f'{name}: {row_name}').text}</td>" for name, images in columns.items()
-        )
-        body += f"<tr>{label}{cells}</tr>"
-    corner = '<th aria-hidden="true"></th>' if show_names else ""
-    table = f'<table class="images"><thead><tr>{corner}{head}</tr></thead><tbody>{body}</tbody></table>'
+    """Images in rows (one per input) and named columns; each image's alt text is its column and row name."""
+    count = same_length(list(columns.values()))
+    if len(row_names) != count:
+        raise ValueError(f"expected {count} row names, one per picture; got {len(row_names)}")
+    rows = [
+        (row, [image(images[index], f"{name}: {row}") for name, images in columns.items()])
+        for index, row in enumerate(row_names)
+    ]
     return figure(
-        Html(f'<div class="scroll" tabindex="0" role="group" aria-label="{escape(caption)}">{table}</div>'),
-        caption,
-    )
-
-
-def definitions(meaning: Mapping[str, str]) -> Html:
-    """Words and what they mean."""
-    return Html(
-        '<dl class="words">'
-        + "".join(
-            f"<div><dt>{escape(word)}</dt><dd>{escape(text)}</dd></div>" for word, text in meaning.items()
-        )
-        + "</dl>"
+        _macros.scroll(caption, _macros.image_grid(list(columns), rows, meaning or {}, show_names)), caption
     )
 
 
 def table(scores: ScoreTable) -> Html:
     """Numbers with controls: the best of each column is bold, a click on a head sorts."""
-    columns, rows = scores.columns, scores.rows
-    head = f'<th scope="col">{escape(scores.first)}</th>' + "".join(_head(column) for column in columns)
-    body = ""
-    for row in rows:
-        cells = "".join(
-            _cell(cell, column, scores.best(index), scores.largest(index))
-            for index, (cell, column) in enumerate(zip(row.cells, columns, strict=True))
+    rows = [
+        (
+            row,
+            [
+                _cell(cell, column, scores.best(index), scores.largest(index))
+                for index, (cell, column) in enumerate(zip(row.cells, scores.columns, strict=True))
+            ],
         )
-        note = f"<small>{escape(row.note)}</small>" if row.note else ""
-        kind = ' class="control"' if row.control else ""
-        body += f'<tr{kind}><th scope="row">{escape(row.name)}{note}</th>{cells}</tr>'
-    caption = escape(scores.caption)
-    text = (
-        f'<table class="numbers sortable"><caption>{caption}</caption>'
-        f"<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
-    )
-    return Html(f'<div class="scroll" tabindex="0" role="group" aria-label="{caption}">{text}</div>')
+        for row in scores.rows
+    ]
+    heads = [_head(column) for column in scores.columns]
+    return Html(_macros.scroll(scores.caption, _macros.table(scores, heads, rows)))
 
 
-def _head(column: Column) -> str:
+def _head(column: Column) -> tuple[str, str]:
+    """Text and tooltip of a column's head."""
     arrow = {"high": " ↑", "low": " ↓", None: ""}[column.best]
-    spoken = {"high": "higher is better", "low": "lower is better", None: ""}[column.best]
-    note = "; ".join(part for part in (column.note, spoken) if part)
-    return f'<th scope="col"{_tooltip(note)}>{escape(column.name)}{arrow}</th>'
+    direction = {"high": "higher is better", "low": "lower is better", None: ""}[column.best]
+    return column.name + arrow, "; ".join(part for part in (column.note, direction) if part)
 
 
-def _cell(cell: Cell, column: Column, best: float | None, largest: float) -> str:
+def _cell(cell: Cell, column: Column, best: float | None, largest: float) -> tuple[str, dict[str, str]]:
+    """Text and attributes of a cell."""
     if isinstance(cell, str):
-        words = ' class="words"' if len(cell) > LONGEST_WORD else ""  # a sentence may break
-        return f"<td{words}>{escape(cell)}</td>"
+        return cell, {"class": "words"} if len(cell) > LONGEST_WORD else {}  # a sentence may break
     if cell is None or not isfinite(cell):
-        return '<td class="none">-</td>'
-    kind = ' class="best"' if best is not None and cell == best else ""
-    share = f' style="--share:{abs(cell) / largest:.3f}"' if column.best and largest > 0 else ""
-    return f'<td data-value="{float(cell):.9g}"{kind}{share}>{column.text(cell)}</td>'
+        return "-", {"class": "none"}
+    attributes = {"data-value": f"{float(cell):.9g}"}
+    if best is not None and cell == best:
+        attributes["class"] = "best"
+    if column.best and largest > 0:
+        attributes["style"] = f"--share:{abs(cell) / largest:.3f}"
+    return column.text(cell), attributes
 
 
-def _tooltip(text: str) -> str:
-    return f' title="{escape(text)}"' if text else ""
-
-
-def _data_uri(content: bytes) -> str:
+def _data_uri(source: Image.Image | bytes) -> str:
+    content = source if isinstance(source, bytes) else png_bytes(source)
     kinds = {b"\x89PNG": "png", b"GIF8": "gif", b"\xff\xd8\xff": "jpeg"}
     kind = next((name for start, name in kinds.items() if content.startswith(start)), None)
     if kind is None:
