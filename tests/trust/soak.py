@@ -28,7 +28,7 @@ from soaking.clients import Answers, Nuisance, Visitor, encoded
 from soaking.flat import BOUNDS, Series, Verdict, draw, markdown, verdict
 from soaking.measure import files_below, measured, of_group
 
-from derender.cli.console import bar
+from derender.cli.console import progress_bar
 
 MODEL = "rendered-faces-64"
 PICTURES, UPLOADS, BATCH = 600, 40, 16
@@ -213,7 +213,7 @@ class Soak:
         for thread in threads:
             thread.start()
         try:
-            with bar("soaking", "s") as report:
+            with progress_bar("soaking", "s") as report:
                 while (now := time.monotonic() - self.began) < self.seconds:
                     if not self.stop.wait(every_seconds):
                         self.sample(every_seconds)

@@ -35,7 +35,7 @@ from derender.cli import (
     view,
     whiten,
 )
-from derender.cli.console import damage_said, visible
+from derender.cli.console import damage_as_notices, visible
 
 app = typer.Typer(
     name="derender",
@@ -79,7 +79,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         command = typer.main.get_command(app)
         with (
             command.make_context("derender", arguments) as context,  # typer's own main hides what Ctrl-C said
-            damage_said(),
+            damage_as_notices(),
         ):
             command.invoke(context)
         sys.stdout.flush()

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from derender.cli.console import bar, result, say_pictures, write_json
+from derender.cli.console import progress_bar, report_images, result, write_json
 
 if TYPE_CHECKING:
     from derender.data import PictureSet
@@ -175,12 +175,12 @@ def write_control(
     from derender.cli.models import part_of
     from derender.data import read_pictures
 
-    with bar("reading") as report:
+    with progress_bar("reading") as report:
         pictures = read_pictures(data, image_size, dataset=dataset, limit=limit, progress=report)
     chosen = part_of(pictures, part, model)
     fit_on = pictures if part == "all" else part_of(pictures, "train", model)
-    say_pictures(chosen)
-    with bar("describing") as report:
+    report_images(chosen)
+    with progress_bar("describing") as report:
         table = control_features(name, chosen, fit_on, components=components, seed=seed, progress=report)
     table.write(out)
     sizes = {factor: values.shape[1] for factor, values in table.factors.items()}

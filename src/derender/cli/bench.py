@@ -17,7 +17,7 @@ from typing import Annotated, Any
 import typer
 
 from derender.cli import options
-from derender.cli.console import bar, result, write_json
+from derender.cli.console import progress_bar, result, write_json
 
 AGREEMENT = 1e-4
 
@@ -54,7 +54,7 @@ def bench(
     rounds = 1 if quick else 5
     pairs = (rasteriser, embedding, clustering)
     rows = []
-    with bar("measuring", unit="pairs") as report:
+    with progress_bar("measuring", unit="pairs") as report:
         for done, make in enumerate(pairs):
             rows.append(measured(make(quick), rounds))
             report(done + 1, len(pairs), rows[-1]["what"])

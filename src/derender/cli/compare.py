@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from derender.cli import feature_rows, scoring
-from derender.cli.console import say
+from derender.cli.console import notice
 from derender.cli.gathered import gathered
 from derender.cli.paper_tables import Choices, Given, finetuning, run_parts, run_segment
 
@@ -183,7 +183,7 @@ def gather_rows(
         rows += feature_rows.rows_from_models(models, pictures, chosen, computed.device, memory)
     check_rows(rows)
     if pictures is None:
-        say("without --data there are no pixels, PCA and untrained encoder to compare with")
+        notice("without --data there are no pixels, PCA and untrained encoder to compare with")
         return rows
     settings = feature_rows.architecture(rows)
     size = 64 if settings is None else settings.network.image_size

@@ -41,14 +41,14 @@ NAMED = 5
 PLAIN_LINE_EVERY_SECONDS = 30.0
 
 
-def speaks() -> bool:
+def is_main_process() -> bool:
     """Whether this process talks to the user: of those that torchrun starts together only the first does."""
     return "LOCAL_WORLD_SIZE" not in os.environ or os.environ.get("RANK", "0") == "0"
 
 
-def say(text: str) -> None:
+def notice(text: str) -> None:
     """One note for the person at the terminal."""
-    if speaks():
+    if is_main_process():
         Console(stderr=True, highlight=False, soft_wrap=True, markup=False).print(visible(text))
 
 
@@ -57,17 +57,17 @@ def visible(text: str, kept: str = "\n") -> str:
     return "".join(char if char in kept or char.isprintable() else repr(char)[1:-1] for char in text)
 
 
-def say_pictures(pictures: "PictureSet") -> None:
+def report_images(pictures: "PictureSet") -> None:
     """What was read, and the first of what was left out by name."""
-    say(pictures.describe())
+    notice(pictures.describe())
     for row in pictures.skipped[:NAMED]:
-        say(f"skipped {visible(row.file, '')}: {row.reason}")
+        notice(f"skipped {visible(row.file, '')}: {row.reason}")
     if len(pictures.skipped) > NAMED:
-        say(f"and {len(pictures.skipped) - NAMED:,} more (derender doctor --json FILE names all)")
+        notice(f"and {len(pictures.skipped) - NAMED:,} more (derender doctor --json FILE names all)")
 
 
 @contextmanager
-def damage_said() -> Iterator[None]:
+def damage_as_notices() -> Iterator[None]:
     """Within the block the library's warnings of passed-over damage are notes at the terminal."""
     with warnings.catch_warnings():
         warnings.simplefilter("always", DamageNoticed)
@@ -75,7 +75,7 @@ def damage_said() -> Iterator[None]:
 
         def say_or_show(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
             if issubclass(category, DamageNoticed):
-                say(str(message))
+                notice(str(message))
             else:
                 show(message, category, *where, **more)
 
@@ -85,18 +85,18 @@ def damage_said() -> Iterator[None]:
 
 def result(text: str, json_file: str | None) -> None:
     """One line of result; it makes way on standard output where the JSON goes there."""
-    if speaks():
+    if is_main_process():
         Console(stderr=json_file == "-", highlight=False, soft_wrap=True, markup=False).print(visible(text))
 
 
 @contextmanager
-def bar(description: str, unit: str = "pictures") -> Iterator[Callable[..., None]]:
+def progress_bar(description: str, unit: str = "pictures") -> Iterator[Callable[..., None]]:
     """A progress bar on standard error: call the given function with (done, total) and, if any, a note.
 
     Where standard error is no terminal, a plain line appears every half minute instead.
     """
     console = Console(stderr=True)
-    if not console.is_terminal or not speaks():
+    if not console.is_terminal or not is_main_process():
         yield _plain_lines(description, unit)
         return
     columns = (
@@ -127,7 +127,7 @@ def _plain_lines(description: str, unit: str) -> Callable[..., None]:
         nonlocal last
         if time.monotonic() - last >= PLAIN_LINE_EVERY_SECONDS:
             last = time.monotonic()
-            say(f"{description}: {done:,} of {total:,} {unit} {note}".rstrip())
+            notice(f"{description}: {done:,} of {total:,} {unit} {note}".rstrip())
 
     return report
 
@@ -161,7 +161,7 @@ def show_scores(scores: "ScoreTable", json_file: str | None) -> None:
 
 def write_json(target: str | None, values: Mapping[str, Any]) -> None:
     """What ``--json`` asks for: a file written whole, or standard output for ``-``; nothing for None."""
-    if target is None or not speaks():
+    if target is None or not is_main_process():
         return
     text = json.dumps(plain(values), indent=1, ensure_ascii=False) + "\n"
     if target == "-":
@@ -189,14 +189,14 @@ def plain(value: Any) -> Any:
     return value
 
 
-def out_of_the_way(path: Path, force: bool) -> None:
+def refuse_existing_file(path: Path, force: bool) -> None:
     """Refuse to write over an existing file unless told to."""
     if path.is_dir():
         raise IsADirectoryError(f"{path} is a folder: give --out the name of a file")
-    nothing_there(path, force)
+    refuse_existing(path, force)
 
 
-def nothing_there(path: Path, force: bool) -> None:
+def refuse_existing(path: Path, force: bool) -> None:
     """Refuse to write over an existing file or folder unless told to."""
     if path.exists() and not force:
         raise FileExistsError(f"{path} exists already: choose another --out, or add --force to replace it")

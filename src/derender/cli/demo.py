@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from derender.cli import options
-from derender.cli.console import bar, duration, result, say, show_scores, write_json
+from derender.cli.console import duration, notice, progress_bar, result, show_scores, write_json
 
 
 def register(app: typer.Typer) -> None:
@@ -26,14 +26,14 @@ def demo(
 ) -> None:
     """Generate faces, train on them without labels, score unseen ones, write one page. Offline."""
     began = time.monotonic()
-    say("taking faces apart, learned from scratch on this machine" + (" (quick)" if quick else ""))
+    notice("taking faces apart, learned from scratch on this machine" + (" (quick)" if quick else ""))
     from derender.demo import FULL, QUICK, demo_page, run_demo
     from derender.demo.page import score_tables
     from derender.training.interrupt import TrainingInterrupted
 
     folder = out or _free_folder(Path("derender-demo"))
     try:
-        with bar("starting", "") as report:
+        with progress_bar("starting", "") as report:
 
             def show(stage: str, done: int, total: int, note: str) -> None:
                 report(done, total, note, description=stage)
@@ -51,8 +51,8 @@ def demo(
         show_scores(table, json_file)
         result("", json_file)
     for finding in told.trained.findings:
-        say(f"{finding.sign}: {finding.text}; {finding.advice}")
-    say(f"done in {duration(time.monotonic() - began)}; the model is in {told.trained.folder}")
+        notice(f"{finding.sign}: {finding.text}; {finding.advice}")
+    notice(f"done in {duration(time.monotonic() - began)}; the model is in {told.trained.folder}")
     result(f"report {page}", json_file)
     write_json(
         json_file,

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from derender.cli import options
-from derender.cli.console import bar, out_of_the_way, result, say, write_json
+from derender.cli.console import notice, progress_bar, refuse_existing_file, result, write_json
 
 if TYPE_CHECKING:
     from derender.data import PictureSet
@@ -35,21 +35,21 @@ def doctor(
 ) -> None:
     """Say whether pictures suit the method: copies, crop, symmetry, view and light. Trains nothing."""
     if out is not None:
-        out_of_the_way(out, force)
+        refuse_existing_file(out, force)
     if json_file is not None and json_file != "-":
-        out_of_the_way(Path(json_file), force)
+        refuse_existing_file(Path(json_file), force)
     from derender.data import read_pictures
     from derender.data.doctor import EXAMINED_PX, examine
 
     _refuse_one_file(data)
-    with bar("reading") as report:
+    with progress_bar("reading") as report:
         pictures = read_pictures(
             data, EXAMINED_PX, dataset=dataset, limit=limit, keep_duplicates=True, progress=report
         )
     originals = _originals(data, pictures, dataset)
-    with bar("examining") as report:
+    with progress_bar("examining") as report:
         found = examine(pictures, originals, seed=seed, progress=report)
-    say(pictures.describe())
+    notice(pictures.describe())
     _tell(pictures, found, json_file)
     values = _values(pictures, found)
     if out is not None:
@@ -58,7 +58,7 @@ def doctor(
         values["report"] = doctor_page(pictures, found).write(out)
         result(f"report {out}", json_file)
     else:
-        say("add --out doctor.html for a page with example pictures")
+        notice("add --out doctor.html for a page with example pictures")
     write_json(json_file, values)
 
 
@@ -91,9 +91,9 @@ def _originals(data: str, pictures: "PictureSet", dataset: str) -> "Originals | 
 def _tell(pictures: "PictureSet", found: "Examination", json_file: str | None) -> None:
     """The findings as the page has them, worst first, and the verdict."""
     for row in pictures.skipped[:UNREADABLE_SAID]:
-        say(f"unreadable: {row.file}: {row.reason}")
+        notice(f"unreadable: {row.file}: {row.reason}")
     if len(pictures.skipped) > UNREADABLE_SAID:
-        say(f"and {len(pictures.skipped) - UNREADABLE_SAID:,} more unreadable files (--json names all)")
+        notice(f"and {len(pictures.skipped) - UNREADABLE_SAID:,} more unreadable files (--json names all)")
     words = {"objection": "NO", "trouble": "!", "note": "note", "open": "?", "good": "ok"}
     for level, word in words.items():
         for finding in found.findings:

@@ -17,7 +17,16 @@ from derender.cli.baselines import (
     BaselineName,
     BaselineSeed,
 )
-from derender.cli.console import NAMED, bar, out_of_the_way, result, say, say_pictures, visible, write_json
+from derender.cli.console import (
+    NAMED,
+    notice,
+    progress_bar,
+    refuse_existing_file,
+    report_images,
+    result,
+    visible,
+    write_json,
+)
 
 if TYPE_CHECKING:
     from derender.data import PictureSet, Stream
@@ -67,7 +76,7 @@ def embed(
     Pictures are read, embedded and written as they come, so memory does not grow with their number. A run
     that was stopped goes on where it was when the command is given again.
     """
-    out_of_the_way(out, force)
+    refuse_existing_file(out, force)
     _check_engine(engine, workers, part)
     from derender.cli.models import open_model
     from derender.data import stream_of
@@ -94,7 +103,10 @@ def embed(
         raise ValueError("give --model RUN, or --baseline NAME (see derender embed --help)")
     else:
         net, origin = open_model(model, device, fit_steps), {"source": model}
-    with _opened(data, dataset, part, limit, model, net.image_size) as source, bar("embedding") as report:
+    with (
+        _opened(data, dataset, part, limit, model, net.image_size) as source,
+        progress_bar("embedding") as report,
+    ):
         done = embed_to_file(
             net,
             source,
@@ -110,7 +122,7 @@ def embed(
                 batch_size=batch_size,
             ),
         )  # fmt: skip
-        say(_account(done, source))
+        notice(_account(done, source))
     sizes = ", ".join(f"{name} {size}" for name, size in done.factors.items())
     result(f"{done.rows:,} rows in {out}: {sizes}", json_file)
     write_json(
@@ -152,11 +164,11 @@ def _opened(
         return
     from derender.cli.models import part_of
 
-    with bar("reading") as report:
+    with progress_bar("reading") as report:
         pictures = read_pictures(data, image_size, dataset=dataset, limit=limit, progress=report)
-    say_pictures(pictures)
+    report_images(pictures)
     if pictures.terms:
-        say(f"on its owners' terms: {pictures.terms}")
+        notice(f"on its owners' terms: {pictures.terms}")
     yield part_of(pictures, part, model)
 
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from derender.cli import options, scoring
-from derender.cli.console import bar, nothing_there, result, say_pictures
+from derender.cli.console import progress_bar, refuse_existing, report_images, result
 from derender.cli.gathered import gathered
 
 if TYPE_CHECKING:
@@ -90,7 +90,7 @@ def explain(
 ) -> None:
     """Which factor made the answer, and where was it seen? Shares, maps, and controls for both."""
     if out is not None:
-        nothing_there(out, published.force)
+        refuse_existing(out, published.force)
     if bool(label) == attributes:
         raise ValueError("give either --label NAME (may be repeated) or --attributes")
     published.check()
@@ -104,12 +104,12 @@ def explain(
 
     captum_attr()
     net = open_model(model, device)
-    with bar("reading") as report:
+    with progress_bar("reading") as report:
         pictures = read_pictures(data, net.image_size, dataset=dataset, limit=limit, progress=report)
     pictures = part_of(pictures, part, model)
-    say_pictures(pictures)
+    report_images(pictures)
     both = None if pair is None else tuple(_row_of(pictures, name) for name in pair)
-    with bar("embedding") as report:
+    with progress_bar("embedding") as report:
         table = embed_pictures(net, pictures, batch_size=batch_size, progress=report)
     names = attribute_columns(table) if attributes else tuple(dict.fromkeys(label or ()))
     if not names:
@@ -118,7 +118,7 @@ def explain(
     draws = range(seed, seed + seeds)
     split = _split(task, table, count, draws, groups)
     untrained = _untrained(net, pictures, draws, batch_size)
-    with bar("probing", "probes") as report:
+    with progress_bar("probing", "probes") as report:
         found = explain_labels(
             table.factors, task, split,
             untrained=untrained, seeds=draws, head=head, output=output, baseline=baseline, progress=report,
@@ -181,7 +181,7 @@ def _untrained(net: "Derenderer", pictures: "PictureSet", draws: range, batch_si
 
     found = []
     for seed in draws:
-        with bar(f"untrained encoder {seed}") as report:
+        with progress_bar(f"untrained encoder {seed}") as report:
             twin = untrained_features(net, pictures, seed=seed, batch_size=batch_size, progress=report)
         found.append(twin.factors)
     return found
@@ -215,7 +215,7 @@ def _write(
     from derender.report.share_chart import share_chart
     from derender.whole import whole_folder
 
-    with bar("drawing maps", "labels") as report:
+    with progress_bar("drawing maps", "labels") as report:
         drawn, checks = draw_maps(
             net, found, pictures.images, task.targets, split.test, labels=sheets, rows=rows, seeds=seeds,
             progress=report,

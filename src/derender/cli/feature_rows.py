@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from derender.cli.console import bar, say, say_pictures
+from derender.cli.console import notice, progress_bar, report_images
 
 if TYPE_CHECKING:
     from derender.data import PictureSet
@@ -184,7 +184,7 @@ class Source:
             assert self.model is not None and self.pictures is not None
             rows = rows_from_models({name: [self.model]}, self.pictures, chosen, self.device, self.memory)
         if self.pictures is None:
-            say("without --data there are no pixels, PCA and untrained encoder to compare with")
+            notice("without --data there are no pixels, PCA and untrained encoder to compare with")
             return rows
         settings = architecture(rows)
         size = 64 if settings is None else settings.network.image_size
@@ -244,7 +244,7 @@ def asked_attributes(table: "FeatureTable", least: int = 1) -> tuple[str, ...]:
     if not names:
         raise ValueError(f"every yes/no label has {rows} of one of its answers: give more pictures")
     if left := [name for name in there if name not in names]:
-        say(f"left out, with {rows} of one of their answers: {', '.join(left)}")
+        notice(f"left out, with {rows} of one of their answers: {', '.join(left)}")
     return names
 
 
@@ -267,11 +267,11 @@ class Pictures:
         from derender.data import read_pictures
 
         if image_size not in self._read:
-            with bar("reading") as report:
+            with progress_bar("reading") as report:
                 pictures = read_pictures(
                     self.data, image_size, dataset=self.dataset, limit=self.limit, progress=report
                 )
-            say_pictures(pictures)
+            report_images(pictures)
             self._read[image_size] = pictures
         return self._read[image_size]
 
@@ -322,7 +322,7 @@ def embedded(model: Any, pictures: "PictureSet", memory: "Memory", what: str) ->
     from derender.features import embed_pictures, model_fingerprint
 
     def make() -> "FeatureTable":
-        with bar(what) as report:
+        with progress_bar(what) as report:
             return embed_pictures(model, pictures, progress=report)
 
     inputs = {"weights": model_fingerprint(model), "images": pictures.images}

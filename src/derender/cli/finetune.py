@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from derender.cli import feature_rows, options, scoring
-from derender.cli.console import bar, duration, result, say, say_pictures, write_json
+from derender.cli.console import duration, notice, progress_bar, report_images, result, write_json
 from derender.cli.gathered import gathered
 
 if TYPE_CHECKING:
@@ -122,14 +122,14 @@ def finetune(
 
     if not resume:
         refuse_taken(out)
-    with bar("reading") as report:
+    with progress_bar("reading") as report:
         size = config.model.network.image_size
         pictures = read_pictures(data, size, dataset=dataset, limit=limit, progress=report)
-    say_pictures(pictures)
+    report_images(pictures)
     if attributes:
         config = _changed(config, target__labels=_attributes(pictures))
     task = FinetuneTask(config, pictures.images, target_of(pictures, config), start)
-    with bar("training") as report:
+    with progress_bar("training") as report:
 
         def show(progress: Progress) -> None:
             if progress.phase == "train":
@@ -149,12 +149,12 @@ def finetune(
         )
     page = run_page(out).write(out / "report.html")
     for finding in trained.findings:
-        say(f"{finding.sign}: {finding.text}; {finding.advice}")
-    say(f"{trained.images:,} pictures in {duration(trained.seconds)}; stopped by: {trained.stopped}")
+        notice(f"{finding.sign}: {finding.text}; {finding.advice}")
+    notice(f"{trained.images:,} pictures in {duration(trained.seconds)}; stopped by: {trained.stopped}")
     if not (out / "model").is_dir():
         raise ValueError(f"{out} kept no model: training collapsed before the first held-out score")
     memory = feature_rows.memory_in(cache)
-    with bar("scoring", "heads") as report:
+    with progress_bar("scoring", "heads") as report:
         found = score_finetuned(load_finetuned(out, device=accelerator), task, memory=memory, progress=report)
     table = finetuning_table(found, config.start or "fresh weights")
     notes = [

@@ -8,7 +8,7 @@ import functools
 from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from derender.cli.console import bar
+from derender.cli.console import progress_bar
 
 if TYPE_CHECKING:
     import numpy as np
@@ -59,7 +59,7 @@ def finetuned_answers(
         }  # fmt: skip
 
         def make() -> "dict[str, np.ndarray]":
-            with bar(f"fine-tuning {what}, {count:,} labels, seed {seeds[at]}", "epochs") as report:
+            with progress_bar(f"fine-tuning {what}, {count:,} labels, seed {seeds[at]}", "epochs") as report:
                 found = finetune(
                     model, images, task, rows, split.test,
                     factors=chosen, seed=seeds[at], settings=settings, progress=report,

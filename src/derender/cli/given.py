@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from derender.cli.console import result, say, write_json
+from derender.cli.console import notice, result, write_json
 
 if TYPE_CHECKING:
     import numpy as np
@@ -217,7 +217,7 @@ def percentiles(source: str, net: "Derenderer", pictures: "Mapping[Path, np.ndar
     try:
         held_out = read_errors(model_folder(source))
     except (ValueError, OSError) as problem:
-        say(f"cannot tell odd pictures: {problem}")
+        notice(f"cannot tell odd pictures: {problem}")
         return {}
     if held_out is None:
         return {}
@@ -232,7 +232,7 @@ def tell_odd(found: Mapping[Path, float], framed: bool = False) -> None:
     hint = "" if framed else ", or not as it knows it (--frame auto looks for the part that it knows)"
     for path, percentile in found.items():
         if percentile > ODD_PERCENTILE:
-            say(
+            notice(
                 f"{path}: reconstructed worse than {ODD_PERCENTILE:g} % of the pictures this model was "
                 f"validated on; it may not be what the model knows{hint}"
             )
@@ -243,7 +243,7 @@ def tell_percentiles(found: Mapping[Path, float]) -> None:
     if found:
         low, high = round(min(found.values())), round(max(found.values()))
         span = f"{low}" if low == high else f"{low} to {high}"
-        say(f"rendered again worse than {span} % of the pictures this model was validated on")
+        notice(f"rendered again worse than {span} % of the pictures this model was validated on")
 
 
 def finish(
@@ -260,7 +260,7 @@ def finish(
     ``odd`` has the reconstruction percentile of each picture.
     """
     for path, reason in given.refused.items():
-        say(f"left out {path}: {reason}")
+        notice(f"left out {path}: {reason}")
     tell_percentiles(odd or {})
     tell_odd(odd or {}, read.auto)
     count = "1 picture" if len(written) == 1 else f"{len(written):,} pictures"
@@ -270,7 +270,7 @@ def finish(
     }
     if read.auto:
         told["framing"] = {str(path): asdict(framing) for path, framing in read.framings.items()}
-        say(_framed_account(read))
+        notice(_framed_account(read))
     write_json(json_file, {"out": out, "pictures": written, "refused": given.refused, **told, **more})
     if given.refused:
         raise typer.Exit(2)

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from derender.cli import options
-from derender.cli.console import nothing_there, result, say, write_json
+from derender.cli.console import notice, refuse_existing, result, write_json
 
 PRESETS = ("faces", "cats", "cars")
 
@@ -37,7 +37,7 @@ def import_checkpoint(
     json_file: options.Json = None,
 ) -> None:
     """Write a model of ours with the weights of an unsup3d checkpoint. Nothing in the file is run."""
-    nothing_there(out, force)
+    refuse_existing(out, force)
     from derender.model import Derenderer
     from derender.networks.unsup3d import NETS
     from derender.presets import MODEL_PRESETS, named_preset
@@ -53,7 +53,7 @@ def import_checkpoint(
         overwrite=force,
     )
     counts = {name: sum(value.numel() for value in model.nets[name].parameters()) for name in NETS.values()}
-    say(
+    notice(
         f"{model.image_size} x {model.image_size} pictures, {sum(counts.values()):,} numbers; see how well "
         f"it renders yours: derender evaluate reconstruction --model {folder} --data YOURS"
     )

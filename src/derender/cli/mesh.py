@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from derender.cli import options
-from derender.cli.console import bar
+from derender.cli.console import progress_bar
 from derender.cli.given import (
     Frame,
     PictureFiles,
@@ -65,7 +65,7 @@ def mesh(
     given = given_pictures(images, read, out, force, sheet=False)
     border = _border(net.settings.ranges.border_columns(net.image_size), net.image_size, size)
     written = []
-    with bar("meshing") as report:
+    with progress_bar("meshing") as report:
         for scene, folder, path in zip(scenes_of(net, given, 64), given.folders, given.pictures, strict=True):
             finer = scene if refine is None else refine(scene, [path])
             made = mesh_of(finer, net.fov_deg, border, grazing)

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from derender.cli.console import bar, say, say_pictures
+from derender.cli.console import notice, progress_bar, report_images
 
 if TYPE_CHECKING:
     from derender.data import PictureSet
@@ -53,7 +53,7 @@ def check_maker(model: "Derenderer", source: str, table: "FeatureTable", path: s
         model.fitting.set_steps(max(0, steps))
     made_by, weights = table.origin.get("weights"), model_fingerprint(model)
     if made_by is None:
-        say(f"{path} does not say which model made it: cannot check that it was {source}")
+        notice(f"{path} does not say which model made it: cannot check that it was {source}")
     elif made_by != weights:
         raise ValueError(
             f"{path} was made by another model (weights {made_by}, {source} has {weights}): "
@@ -88,10 +88,10 @@ def pictures_for(
     """A data set's pictures at a model's size, of one part of its split; says what they are."""
     from derender.data import read_pictures
 
-    with bar("reading") as report:
+    with progress_bar("reading") as report:
         pictures = read_pictures(data, net.image_size, dataset=dataset, limit=limit, progress=report)
     chosen = part_of(pictures, part, model).require(fewest)
-    say_pictures(chosen)
+    report_images(chosen)
     return chosen
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from derender.cli import options
-from derender.cli.console import bar
+from derender.cli.console import progress_bar
 from derender.cli.given import (
     Frame,
     Given,
@@ -250,7 +250,7 @@ class _Work:
         from derender.report.sweeps import drawn
 
         sheets, written = Sheets(), []
-        with bar("drawing") as report:
+        with progress_bar("drawing") as report:
             report(0, len(self.scenes))
             for scene, folder, (path, picture) in zip(
                 self.scenes, self.given.folders, self.given.pictures.items(), strict=True

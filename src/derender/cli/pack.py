@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from derender.cli import options
-from derender.cli.console import bar, nothing_there, result, say, write_json
+from derender.cli.console import notice, progress_bar, refuse_existing, result, write_json
 
 Maps = Annotated[
     str,
@@ -45,7 +45,7 @@ def pack(
     from derender.evaluation.copies import copy_cost
     from derender.pretrained.packing import pack_model
 
-    nothing_there(out, force)
+    refuse_existing(out, force)
     net = open_model(model, device)
     chosen = None
     if data is not None:
@@ -53,14 +53,14 @@ def pack(
     made = pack_model(model, out, maps=maps, overwrite=force)
     keep_split(made.folder, model)
     sizes = {"before": sum(made.before.values()), "after": sum(made.after.values())}
-    say(f"{sizes['after'] / 1e6:,.2f} MB, before {sizes['before'] / 1e6:,.2f} MB")
+    notice(f"{sizes['after'] / 1e6:,.2f} MB, before {sizes['before'] / 1e6:,.2f} MB")
     facts = {"model": made.folder, "bytes": sizes}
     if chosen is not None:
-        with bar("comparing") as report:
+        with progress_bar("comparing") as report:
             cost = copy_cost(net, open_model(str(made.folder), device), chosen.images, progress=report)
         moved = ", ".join(f"{name} {share:.2%}" for name, share in cost.moved.items())
-        say(f"features moved, in shares of how far two pictures are apart: {moved}")
-        say(f"rendered again with L1 {cost.l1:.5f}, before {cost.l1_before:.5f}")
+        notice(f"features moved, in shares of how far two pictures are apart: {moved}")
+        notice(f"rendered again with L1 {cost.l1:.5f}, before {cost.l1_before:.5f}")
         facts |= {"pictures": len(chosen), "cost": cost}
     result(f"model {made.folder}", json_file)
     write_json(json_file, facts)

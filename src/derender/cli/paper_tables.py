@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from derender.cli import feature_rows, options
-from derender.cli.console import bar
+from derender.cli.console import progress_bar
 from derender.cli.evaluate.segment import Masks, MaskSource, segmented
 
 if TYPE_CHECKING:
@@ -194,7 +194,7 @@ def run_linear(
     draws = tuple(range(choices.seed, choices.seed + choices.seeds))
     task = task_of(ready.labels)
     split = choose_rows(task, ready.files, choices.counts, draws, partition=ready.partition)
-    with bar("probing", "probes") as report:
+    with progress_bar("probing", "probes") as report:
         found = compare_linear(
             ready.features,
             task,

@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from derender.cli import options
-from derender.cli.console import bar
+from derender.cli.console import progress_bar
 from derender.cli.given import (
     Frame,
     OwnSize,
@@ -59,7 +59,7 @@ def decompose(
             row = {name: column[index] for name, column in drawn.columns.items()}
             sheets.add(next(names).name, row)
 
-    with bar("decomposing") as report:
+    with progress_bar("decomposing") as report:
         written = write_decompositions(
             net,
             dict(zip(given.folders, given.pictures.items(), strict=True)),

@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from derender.cli import options
-from derender.cli.console import bar, nothing_there, result, say, write_json
+from derender.cli.console import notice, progress_bar, refuse_existing, result, write_json
 
 
 def register(app: typer.Typer) -> None:
@@ -52,7 +52,7 @@ def refine(
     from derender.training.held_out_errors import store_errors
     from derender.training.refining import RefineConfig, refine
 
-    nothing_there(out, force)
+    refuse_existing(out, force)
     config = with_changes(RefineConfig(), overrides or [])
     net = open_model(model, device)
     fitting_of(net, model)
@@ -60,19 +60,19 @@ def refine(
     split = split_indices(chosen.files, (0.9, 0.1, 0.0), seed=seed)
     images = torch.from_numpy(chosen.images)
     own, held_out = images[split.train], images[split.validation]
-    with bar("refining") as report:
+    with progress_bar("refining") as report:
         refined = refine(net, own, held_out, config, seed=seed, progress=report)
     folder = refined.model.save(out, overwrite=force)
     store_errors(folder, held_out)
     if part == "train":  # other pictures taught, too, so nobody could say which did not
         keep_split(folder, model)
     errors = refined.errors
-    say(
+    notice(
         f"{len(held_out)} pictures that taught nothing: rendered again with an error of {errors['now']:.4f}, "
         f"before {errors['before']:.4f}, fitted {errors['fitted']:.4f}"
     )
     for name, gap in refined.gaps.items():
-        say(
+        notice(
             f"{name}: {gap['now']:.2f} of the spread away from what fitting finds, before {gap['before']:.2f}"
         )
     result(f"model {folder}", json_file)

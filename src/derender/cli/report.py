@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from derender.cli import options
-from derender.cli.console import bar, out_of_the_way, result, say, say_pictures, write_json
+from derender.cli.console import notice, progress_bar, refuse_existing_file, report_images, result, write_json
 
 if TYPE_CHECKING:
     from derender.data import GroundTruth, PictureSet
@@ -63,18 +63,18 @@ def report(
     if not (run / "config.yaml").is_file():
         raise FileNotFoundError(f"no run in {run} (no config.yaml): give a folder made by derender train")
     if out is not None:
-        out_of_the_way(out, force)
+        refuse_existing_file(out, force)
     if data is None and (truth is not None or label):
         raise ValueError("--truth and --label need --data: pictures to tell about")
     evidence = None
     if data is None:
-        say("add --data for decompositions, films, scores, the disentanglement card and explanations")
+        notice("add --data for decompositions, films, scores, the disentanglement card and explanations")
     else:
         evidence = _evidence(run, data, truth, label or [], dataset, limit, device)
     page = run_page(run, evidence).write(out or run / "report.html")
     failed = [] if evidence is None else list(evidence.failed)
     for reason in failed:
-        say(f"not on the page: {reason}")
+        notice(f"not on the page: {reason}")
     result(f"report {page}", json_file)
     write_json(json_file, {"report": page, "failed": failed})
 
@@ -93,17 +93,17 @@ def _evidence(
         net, missing = open_model(str(run), device), ""
     except (ValueError, FileNotFoundError) as reason:  # a baseline, a collapse, a run that just began
         net, missing = None, f"Everything about the model: {reason}"
-    with bar("reading") as progress:
+    with progress_bar("reading") as progress:
         size = EXAMINED_PX if net is None else net.image_size
         pictures = read_pictures(data, size, dataset=dataset, limit=limit, progress=progress)
-    say_pictures(pictures)
+    report_images(pictures)
     for name in labels:
         pictures.label(name)
     if net is None:
         return Evidence([Section("The data", look_at_data(pictures), "Data")], [missing])
     held_out, which = _held_out(run, pictures)
     known = _truth(truth, net.image_size)
-    with bar("gathering", "parts") as progress:
+    with progress_bar("gathering", "parts") as progress:
         return gather(AtHand(net, pictures, held_out, which, known, labels), progress)
 
 

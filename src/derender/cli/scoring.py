@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from derender.cli import feature_rows, options
-from derender.cli.console import say, show_scores, write_json
+from derender.cli.console import notice, show_scores, write_json
 
 if TYPE_CHECKING:
     from derender.evaluation.memory import Memory
@@ -91,7 +91,7 @@ class Published:
         for table in tables:
             show_scores(table, self.json_file)
         for note in notes:
-            say(note)
+            notice(note)
         write_json(self.json_file, values)
         feature_rows.write_tables(tables, self.markdown, self.latex)
         if self.html is not None:
@@ -99,7 +99,7 @@ class Published:
 
             facts = {name: value for name, value in values.items() if isinstance(value, str | int | float)}
             page = comparison_page("Scores beside their controls", tables, lead=". ".join(notes), facts=facts)
-            say(f"page {page.write(self.html)}")
+            notice(f"page {page.write(self.html)}")
 
 
 def remembered(memory: "Memory", what: str = "results") -> str:

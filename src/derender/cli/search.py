@@ -8,7 +8,7 @@ import typer
 from rich.markup import escape
 
 from derender.cli import options
-from derender.cli.console import bar, out_of_the_way, say, visible, write_json
+from derender.cli.console import notice, progress_bar, refuse_existing_file, visible, write_json
 
 if TYPE_CHECKING:
     import numpy as np
@@ -64,7 +64,7 @@ def search(
 ) -> None:
     """Find the same geometry in any light, the same light on anything: nearest by one factor, exactly."""
     if out is not None:
-        out_of_the_way(out, force)
+        refuse_existing_file(out, force)
         if out.suffix.lower() != ".png":
             raise ValueError(f"{out} is no PNG: give --out a name that ends in .png")
     from derender.features import FeatureTable
@@ -95,14 +95,14 @@ def search(
         json_file,
     )
     if len(rows) < k:
-        say(f"the table has no more than {len(rows):,} {'rows' if copies else 'other rows'}")
+        notice(f"the table has no more than {len(rows):,} {'rows' if copies else 'other rows'}")
     others = [table.files[row] for row in hidden if row != own_row]
     if others:
         more = f" and {len(others) - 1:,} more" if len(others) > 1 else ""
-        say(f"left out as the very same picture: {others[0]}{more} (--copies finds it)")
+        notice(f"left out as the very same picture: {others[0]}{more} (--copies finds it)")
     if out is not None:
         _draw(out, table, rows, distances, like, own_row, data, dataset, f"nearest by {factor}")
-        say(f"drawn in {out}")
+        notice(f"drawn in {out}")
     write_json(
         json_file,
         {
@@ -201,7 +201,7 @@ def _draw(
         if table.files[row] in read:
             shown.append((captions.get(row, "query"), read[table.files[row]]))
         else:
-            say(f"left out of the sheet: {table.files[row]} cannot be read from {source}")
+            notice(f"left out of the sheet: {table.files[row]} cannot be read from {source}")
     sheet = contact_sheet(
         [pictures(picture[None])[0] for _, picture in shown],
         [caption for caption, _ in shown],
@@ -220,7 +220,11 @@ def _pictures_of(files: Sequence[str], source: str, dataset: str) -> "dict[str, 
     from derender.data import Unreadable, decode, quiet_pillow, stream_of
 
     missing, read = set(files), {}
-    with stream_of(source, dataset=dataset) as stream, bar("finding pictures") as report, quiet_pillow():
+    with (
+        stream_of(source, dataset=dataset) as stream,
+        progress_bar("finding pictures") as report,
+        quiet_pillow(),
+    ):
         for number, sample in enumerate(stream.samples(), 1):
             if sample.file in missing:
                 missing.remove(sample.file)

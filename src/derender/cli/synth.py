@@ -7,7 +7,7 @@ from typing import Annotated, TypeVar
 import typer
 
 from derender.cli import options
-from derender.cli.console import bar, result, write_json
+from derender.cli.console import progress_bar, result, write_json
 
 Kind = TypeVar("Kind")
 ImageSize = Annotated[
@@ -107,9 +107,9 @@ def faces(
             each = -(-count // identities)
             settings = changed(settings, [f"pictures_per_identity={each}"])
     source = None if model is None else MorphableFaces.read(model)
-    with bar("generating") as report:
+    with progress_bar("generating") as report:
         made = generator.generate(count, image_size, seed, settings, report, model=source)
-    with bar("writing") as report, whole_folder(out) as folder:
+    with progress_bar("writing") as report, whole_folder(out) as folder:
         if tracks:
             write_tracks(made, folder, report)
         else:
@@ -150,9 +150,9 @@ def cars(
     settings = CarSettings(light=_named("--light", light, CAR_LIGHTS), view=_named("--view", view, CAR_VIEWS))
     asked = [] if classes is None else [f"classes=[{classes}]"]
     settings = changed(settings, [*asked, *(overrides or [])])
-    with bar("generating") as report:
+    with progress_bar("generating") as report:
         made = generator.generate(count, image_size, seed, settings, report)
-    with bar("writing") as report, whole_folder(out) as folder:
+    with progress_bar("writing") as report, whole_folder(out) as folder:
         write(made, folder, truth, report)
     models = len(set(made.identity.tolist()))
     result(f"{count:,} pictures of {models:,} cars in {out}", json_file)

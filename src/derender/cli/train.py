@@ -6,7 +6,15 @@ from typing import Annotated
 import typer
 
 from derender.cli import options
-from derender.cli.console import bar, duration, result, say, say_pictures, speaks, write_json
+from derender.cli.console import (
+    duration,
+    is_main_process,
+    notice,
+    progress_bar,
+    report_images,
+    result,
+    write_json,
+)
 
 
 def register(app: typer.Typer) -> None:
@@ -114,14 +122,14 @@ def train(
         raise FileNotFoundError(f"no run to resume in {out} (no config.yaml): train without --resume first")
     accelerator = chosen_device(device)
     fabric = open_fabric(accelerator)
-    if speaks() and not resume:
+    if is_main_process() and not resume:
         refuse_taken(out)
-    with first_then_others(fabric, local=True), bar("reading") as report:
+    with first_then_others(fabric, local=True), progress_bar("reading") as report:
         pictures = read_pictures(data, picture_size(config), dataset=dataset, limit=limit, progress=report)
-    say_pictures(pictures)
+    report_images(pictures)
     if pictures.terms:
-        say(f"on its owners' terms: {pictures.terms}")
-    with bar("training") as report:
+        notice(f"on its owners' terms: {pictures.terms}")
+    with progress_bar("training") as report:
 
         def show(progress: Progress) -> None:
             if progress.phase == "train":
@@ -139,20 +147,20 @@ def train(
         else:
             trained = train_baseline(config, pictures, out, **how)
     leave()
-    if not speaks():
+    if not is_main_process():
         return
     examined = Evidence([Section("The data", look_at_data(pictures), "Data")])
     page = run_page(out, examined).write(out / "report.html")
     for finding in trained.findings:
-        say(f"{finding.sign}: {finding.text}; {finding.advice}")
+        notice(f"{finding.sign}: {finding.text}; {finding.advice}")
     if trained.stopped == "collapse":
-        say("training on is pointless: what is left is the last good checkpoint and model, if any")
+        notice("training on is pointless: what is left is the last good checkpoint and model, if any")
     waited = f"{trained.waiting:.1%} of it waiting for data"
-    say(
+    notice(
         f"{trained.images:,} pictures in {duration(trained.seconds)}, {waited}; stopped by: {trained.stopped}"
     )
     if trained.stopped != "collapse" and trained.model_images not in (None, trained.images):
-        say(
+        notice(
             f"the model has the weights of {trained.model_images:,} pictures, the best on held-out ones; "
             "for those of the end: the same command with --resume --set keep=last"
         )

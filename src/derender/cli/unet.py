@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from derender.cli import options
-from derender.cli.console import bar, nothing_there, result, say, write_json
+from derender.cli.console import notice, progress_bar, refuse_existing, result, write_json
 
 
 def register(app: typer.Typer) -> None:
@@ -47,17 +47,17 @@ def unet(
     from derender.training.config import with_changes
     from derender.training.unets import TeachingSettings, teach_unets
 
-    nothing_there(out, force)
+    refuse_existing(out, force)
     settings = with_changes(TeachingSettings(), overrides or [])
     net = open_model(model, device)
     chosen = pictures_for(net, model, data, dataset=dataset, part=part, limit=limit, fewest=2)
-    with bar("teaching") as report:
+    with progress_bar("teaching") as report:
         taught = teach_unets(net, torch.from_numpy(chosen.images), settings, seed=seed, progress=report)
     folder = taught.model.save(out, overwrite=force)
     if part == "train":  # other pictures taught, too, so nobody could say which did not
         keep_split(folder, model)
     errors = taught.errors
-    say(
+    notice(
         f"mean errors against what {model} says: place {errors['place']:.2f} pixels, depth "
         f"{errors['depth']:.1%} of its range, albedo {errors['albedo']:.3f}; reconstruction "
         f"{errors['reconstruction']:.4f}, before {errors['reconstruction before']:.4f}"

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from derender.cli import options
-from derender.cli.console import result, say, write_json
+from derender.cli.console import notice, result, write_json
 from derender.cli.given import Frame, check_frame
 
 if TYPE_CHECKING:
@@ -87,7 +87,7 @@ def view(
         studio = Studio(net, Path(model).name, Shelf(keep), _held_out(model), table, fit_steps or 0, framed)
         url = address_of(listener, host)
         if not is_loopback(host):
-            say(f"warning: anyone who can reach {host} can use this page, and there is no password")
+            notice(f"warning: anyone who can reach {host} can use this page, and there is no password")
         result(f"open {url} (Ctrl-C ends)", json_file)
         write_json(json_file, {"url": url, "host": host, "port": listener.getsockname()[1], "model": model})
         serve(Application(Viewer(studio, examples, gallery), host), listener)
@@ -95,7 +95,7 @@ def view(
         pass
     finally:
         listener.close()
-    say("stopped")
+    notice("stopped")
 
 
 def _check_installed() -> None:
@@ -117,7 +117,7 @@ def _readable(images: list[Path], size: int) -> "dict[Path, np.ndarray]":
     if problems and not read:
         raise ValueError(next(iter(problems.values())))
     for path, reason in problems.items():
-        say(f"left out {path}: {reason}")
+        notice(f"left out {path}: {reason}")
     return read
 
 
@@ -133,7 +133,7 @@ def _gallery(features: Path, data: str | None, dataset: str, model: str, net: "D
         raise ValueError(f"{features} has none of the factors of {model}: make it again with derender embed")
     gallery = Gallery(table, data, dataset)
     if gallery.without_pictures:
-        say(f"neighbours are shown without pictures: {gallery.without_pictures}")
+        notice(f"neighbours are shown without pictures: {gallery.without_pictures}")
     return gallery
 
 
@@ -145,5 +145,5 @@ def _held_out(model: str) -> "HeldOutErrors | None":
     try:
         return read_errors(model_folder(model))
     except (ValueError, OSError) as problem:
-        say(f"cannot tell odd pictures: {problem}")
+        notice(f"cannot tell odd pictures: {problem}")
         return None

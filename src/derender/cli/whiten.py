@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from derender.cli import options
-from derender.cli.console import bar, nothing_there, result, say, write_json
+from derender.cli.console import notice, progress_bar, refuse_existing, result, write_json
 
 
 def register(app: typer.Typer) -> None:
@@ -55,7 +55,7 @@ def whiten(
     from derender.training.features import make_features
     from derender.training.whitening import recentre
 
-    nothing_there(out, force)
+    refuse_existing(out, force)
     settings = with_changes(FeatureSettings(), overrides or [])
     if settings.whitening.pictures < 2:
         raise ValueError("whitening needs 2 pictures or more: set pictures=2000, say")
@@ -65,10 +65,10 @@ def whiten(
     chosen = pictures_for(net, model, data, dataset=dataset, part=part, limit=limit, fewest=2)
     images = torch.from_numpy(chosen.images)
     if mean_only:
-        with bar("reading pictures") as report:
+        with progress_bar("reading pictures") as report:
             net.whitening = recentre(net, images, progress=report)
     else:
-        with bar("rendering again") as report:
+        with progress_bar("rendering again") as report:
             make_features(net, images, settings, seed=seed, progress=report)
     assert net.whitening is not None
     folder = net.save(out, overwrite=force)
@@ -76,7 +76,7 @@ def whiten(
     ratios = {name: net.whitening.get_buffer(f"{name}_ratios").tolist() for name in net.whitening.names}
     for name, values in ratios.items():
         clear = sum(value > 1 for value in values)
-        say(
+        notice(
             f"{name}: {len(values)} directions kept; in {clear} pictures differ more than one does where "
             "other factors change"
         )

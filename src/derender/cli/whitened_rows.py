@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from derender.cli.console import bar, say
+from derender.cli.console import notice, progress_bar
 
 if TYPE_CHECKING:
     from derender.cli.feature_rows import Source
@@ -32,10 +32,10 @@ def whitened_rows(
     wanted = settings.whitening.pictures
     if wanted < 2:
         raise ValueError(f"{source.model} was trained with whitening.pictures={wanted}: nothing to compare")
-    with bar("reading") as report:
+    with progress_bar("reading") as report:
         lent = read_pictures(whiten_on, net.image_size, limit=wanted, progress=report)
     lent = lent.require(20, "--whiten-on")
-    say(f"whitening is fitted to {len(lent):,} pictures of {lent.source}")
+    notice(f"whitening is fitted to {len(lent):,} pictures of {lent.source}")
     lender = Lender(net, lent.images, settings, memory=source.memory)
     chosen, name, memory = factors_of(factors), source.row_name(factors), source.memory
     rows = []
@@ -43,19 +43,19 @@ def whitened_rows(
         bare = copy.deepcopy(net)
         bare.whitening = bare.fitting = None
         rows.append(FeatureRow(f"{name}, not whitened", (embedded(bare, pictures, memory, "codes"),), chosen))
-    with bar("rendering again") as report:
+    with progress_bar("rendering again") as report:
         again = whitened(lender, net, report)
     table = embedded(again, pictures, memory, "embedding whitened")
     rows.append(FeatureRow(f"{name}, whitened here", (table,), chosen))
     tables = []
     for seed in seeds:
-        with bar(f"rendering again for untrained encoder {seed}") as report:
+        with progress_bar(f"rendering again for untrained encoder {seed}") as report:
             twin = whitened(lender, untrained_twin(net, seed), report)
         table = embedded(twin, pictures, memory, f"whitened untrained encoder {seed}")
         tables.append(replace(table, origin={**table.origin, "control": "untrained", "seed": seed}))
     rows.append(FeatureRow("untrained encoder, whitened", tuple(tables), chosen, control=True))
     inputs = {"lent": lent.images, "images": pictures.images, "renders": rows[0].tables[0].origin["weights"]}
-    with bar("rendering again for PCA") as report:
+    with progress_bar("rendering again for PCA") as report:
         table = remembered(
             memory, "pca-whitened", {**inputs, "settings": settings.model_dump(mode="json")}, pictures,
             lambda: whitened_components(lender, pictures, progress=report),

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from derender.cli import feature_rows, options, scoring
-from derender.cli.console import bar, out_of_the_way, result, say_pictures
+from derender.cli.console import progress_bar, refuse_existing_file, report_images, result
 from derender.cli.gathered import gathered
 
 
@@ -50,7 +50,7 @@ def disentangle(
     if out is not None:
         if out.suffix.lower() != ".png":
             raise ValueError(f"--out {out} must end in .png: the matrices are drawn as a PNG picture")
-        out_of_the_way(out, published.force)
+        refuse_existing_file(out, published.force)
     published.check()
     from derender.cli.models import open_model, part_of
     from derender.data import read_pictures
@@ -58,11 +58,11 @@ def disentangle(
     from derender.report import tables_disentanglement as tables
 
     net, memory = open_model(model, device), feature_rows.memory_in(cache)
-    with bar("reading") as report:
+    with progress_bar("reading") as report:
         pictures = read_pictures(data, net.image_size, dataset=dataset, limit=limit, progress=report)
     pictures = part_of(pictures, part, model)
-    say_pictures(pictures)
-    with bar("scoring", "steps") as report:
+    report_images(pictures)
+    with progress_bar("scoring", "steps") as report:
         card = evaluate_disentanglement(
             net,
             pictures,

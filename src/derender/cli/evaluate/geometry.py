@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from derender.cli import feature_rows, options, scoring
-from derender.cli.console import bar
+from derender.cli.console import progress_bar
 from derender.cli.gathered import gathered
 
 if TYPE_CHECKING:
@@ -68,7 +68,7 @@ def geometry(
     twin, memory = untrained_twin(net, seed), feature_rows.memory_in(cache)
     inputs = {**feature_rows.model_facts(net), **truth_facts(truth), "seed": seed, "fitted": fit_steps or 0}
     scored_net = with_fitted_scenes(net, model, fit_steps)
-    with bar("decomposing") as report:
+    with progress_bar("decomposing") as report:
         found = recall_value(
             memory, "geometry", inputs, GeometryResult,
             lambda: evaluate_geometry(

@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from derender.cli import feature_rows, scoring
-from derender.cli.console import bar
+from derender.cli.console import progress_bar
 from derender.cli.gathered import gathered
 
 Counts = Annotated[
@@ -102,7 +102,7 @@ def linear(
             lambda size: source.pictures_of(size, ready.files).images,
             ready, task, split, draws, feature_rows.factors_of(asked.factors), settings, source.memory,
         )  # fmt: skip
-    with bar("probing", "probes") as report:
+    with progress_bar("probing", "probes") as report:
         found = compare_linear(
             ready.features,
             task,

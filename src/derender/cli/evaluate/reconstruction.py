@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from derender.cli import feature_rows, options, scoring
-from derender.cli.console import bar, say, say_pictures
+from derender.cli.console import notice, progress_bar, report_images
 from derender.cli.gathered import gathered
 
 FITTED = 2_000  # pictures that give the principal components
@@ -60,9 +60,9 @@ def reconstruction(
     from derender.training.held_out_errors import errors_of, write_errors
 
     net = open_model(model, device)
-    with bar("reading") as report:
+    with progress_bar("reading") as report:
         pictures = read_pictures(data, net.image_size, dataset=dataset, limit=limit, progress=report)
-    say_pictures(pictures)
+    report_images(pictures)
     chosen = part_of(pictures, part, model)
     fitted = (pictures if part == "all" else part_of(pictures, "train", model)).images
     memory = feature_rows.memory_in(cache)
@@ -72,7 +72,7 @@ def reconstruction(
         "fit_steps": fit_steps or 0,
     }  # fmt: skip
     scored = with_fitted_scenes(net, model, fit_steps)
-    with bar("rendering") as report:
+    with progress_bar("rendering") as report:
         found = recall_value(
             memory, "reconstruction", inputs, ReconstructionResult,
             lambda: evaluate_reconstruction(
@@ -93,4 +93,4 @@ def reconstruction(
     )
     if store:
         kept = write_errors(model_folder(model), errors_of(net, chosen.images, batch_size))
-        say(f"errors of {len(chosen):,} pictures kept in {kept}")
+        notice(f"errors of {len(chosen):,} pictures kept in {kept}")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from derender.cli import feature_rows, options, scoring
-from derender.cli.console import bar, out_of_the_way, result, say
+from derender.cli.console import notice, progress_bar, refuse_existing_file, result
 from derender.cli.gathered import gathered
 
 if TYPE_CHECKING:
@@ -137,7 +137,7 @@ def robustness(
     if out is not None:
         if out.suffix.lower() not in FORMS:
             raise ValueError(f"--out {out} must end in {', '.join(FORMS)}: a chart, or a page with tables")
-        out_of_the_way(out, published.force)
+        refuse_existing_file(out, published.force)
     if score not in ("accuracy", "balanced"):
         raise ValueError(f"unknown --score {score!r}: choose accuracy or balanced")
     score = {"balanced": "balanced_accuracy"}.get(score, score)
@@ -160,9 +160,9 @@ def robustness(
     }
     memory = feature_rows.memory_in(computed.cache)
     trial = make_trial(shown, way, axes, next(iter(nets.values())), computed, memory)
-    say(f"{len(trial.images):,} pictures: {trial.how}")
+    notice(f"{len(trial.images):,} pictures: {trial.how}")
     rows = all_rows(trial, nets, factors, computed.from_seed(untrained_seeds), computed.device, memory)
-    with bar("probing", "probes") as report:
+    with progress_bar("probing", "probes") as report:
         found = compare_robustness(
             {row.name: [table.concatenate(row.factors) for table in row.tables] for row in rows},
             trial,
@@ -211,7 +211,7 @@ def make_trial(
     if way in KINDS:
         label = shown.label[0] if shown.label else KINDS[way].label
         recipe = Recipe(way, label, shown.people, shown.learned, shown.tested, net.image_size, computed.seed)
-        with bar("generating") as report:
+        with progress_bar("generating") as report:
             return generated_trial(recipe, axes, levels, memory=memory, progress=report)
     import numpy as np
 
@@ -234,7 +234,7 @@ def make_trial(
     learn, test = divide_rows(
         task, ready.files, test_fraction=shown.test_fraction, partition=ready.partition, groups=sides
     )
-    with bar("rendering again") as report:
+    with progress_bar("rendering again") as report:
         return rendered_trial(
             net, pictures, task, learn, test, axes, levels, groups=sides, memory=memory, progress=report
         )

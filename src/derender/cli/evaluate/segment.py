@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from derender.cli import feature_rows, options, scoring
-from derender.cli.console import bar, result, say
+from derender.cli.console import notice, progress_bar, result
 from derender.cli.gathered import gathered
 
 if TYPE_CHECKING:
@@ -113,7 +113,7 @@ class MaskSource:
         from derender.data import read_mask_folder, read_masks
 
         own = {"dataset": self.dataset, "limit": self.limit}
-        with bar("reading") as report:
+        with progress_bar("reading") as report:
             if self.masks is None:
                 return read_masks(self.data, image_size, progress=report, **own)
             return read_mask_folder(self.data, self.masks, image_size, progress=report, **own)
@@ -162,9 +162,9 @@ def segmented(
     wanted = wanted or usual_variants(net)
     check_encoders(net, wanted, model)
     read = pictures.read(net.image_size)
-    say(read[0].describe())
+    notice(read[0].describe())
     divided = divide(*read, test_fraction=test_fraction, split_seed=seeds[0], labelled=labelled)
-    with bar("training") as report:
+    with progress_bar("training") as report:
         found = compare_segmentations(
             net,
             divided,

@@ -4,7 +4,7 @@ from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from derender.cli.console import result, say, show_scores, write_json
+from derender.cli.console import notice, result, show_scores, write_json
 
 if TYPE_CHECKING:
     from derender.cli.plan.jobs import Place
@@ -43,18 +43,18 @@ def by_plan(
         temporary.write_text(to_yaml(plan))
     place = Place(out)
     try:
-        notes = run_plan(plan, place, workers=workers, minutes=minutes, device=device, say=say)
+        notes = run_plan(plan, place, workers=workers, minutes=minutes, device=device, say=notice)
     except KeyboardInterrupt as stop:
         raise KeyboardInterrupt("stopped and saved; the same command goes on where it stopped") from stop
     outcome = write_outcome(plan, place, notes)
     for table in outcome.tables:
         show_scores(table, json_file)
     for sentence in outcome.failed:
-        say(f"failed: {sentence}")
+        notice(f"failed: {sentence}")
     for sentence in outcome.missing:
-        say(f"missing: {sentence}")
+        notice(f"missing: {sentence}")
     if outcome.missing:
-        say("the budget is used; the same command goes on where it stopped")
+        notice("the budget is used; the same command goes on where it stopped")
     for written in outcome.files:
         result(str(written), json_file)
     values = {"out": out, "files": outcome.files, "failed": outcome.failed, "missing": outcome.missing}
@@ -71,5 +71,5 @@ def tell(plan: "Plan", place: "Place | None", json_file: str | None) -> None:
         told[job.name] = "to do" if note is None else note.state
     for name, state in told.items():
         result(f"{name}: {state}", json_file)
-    say(", ".join(f"{count} {state}" for state, count in Counter(told.values()).items()))
+    notice(", ".join(f"{count} {state}" for state, count in Counter(told.values()).items()))
     write_json(json_file, {"jobs": told, "plan": plan.model_dump(mode="json")})

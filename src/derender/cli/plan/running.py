@@ -17,7 +17,7 @@ from multiprocessing import connection
 from pathlib import Path
 from typing import Any
 
-from derender.cli.console import bar, duration
+from derender.cli.console import duration, progress_bar
 from derender.cli.plan.asking import score_job, scoring_key
 from derender.cli.plan.embedding import embed_job, embedding_key
 from derender.cli.plan.jobs import Job, Note, Place, jobs_of
@@ -54,7 +54,7 @@ def perform(plan: Plan, place: Place, job: Job, device: str, deadline: float | N
     """Do one job and leave its note; whatever goes wrong in it is a note, too."""
     how: dict[str, Any] = {"device": device}
     try:
-        with bar(job.name, unit="steps" if job.kind == "score" else "pictures") as progress:
+        with progress_bar(job.name, unit="steps" if job.kind == "score" else "pictures") as progress:
             if job.kind == "score":
                 note = score_job(plan, place, job, **how)
             else:
