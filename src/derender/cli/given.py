@@ -210,7 +210,7 @@ def percentiles(source: str, net: "Derenderer", pictures: "Mapping[Path, np.ndar
     """
     import numpy as np
 
-    from derender.evaluation.oddness import reconstruction_percentile
+    from derender.evaluation.out_of_distribution import reconstruction_percentile
     from derender.model import model_folder
     from derender.training.held_out_errors import read_errors
 
@@ -227,13 +227,13 @@ def percentiles(source: str, net: "Derenderer", pictures: "Mapping[Path, np.ndar
 
 def tell_odd(found: Mapping[Path, float], framed: bool = False) -> None:
     """Name every picture that the model renders again worse than nearly all it was validated on."""
-    from derender.evaluation.oddness import ODD_PERCENTILE
+    from derender.evaluation.out_of_distribution import OUTLIER_PERCENTILE
 
     hint = "" if framed else ", or not as it knows it (--frame auto looks for the part that it knows)"
     for path, percentile in found.items():
-        if percentile > ODD_PERCENTILE:
+        if percentile > OUTLIER_PERCENTILE:
             notice(
-                f"{path}: reconstructed worse than {ODD_PERCENTILE:g} % of the pictures this model was "
+                f"{path}: reconstructed worse than {OUTLIER_PERCENTILE:g} % of the pictures this model was "
                 f"validated on; it may not be what the model knows{hint}"
             )
 

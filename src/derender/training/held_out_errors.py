@@ -1,7 +1,8 @@
 """How far a model's reconstructions lie from pictures it was not trained on, kept with the model.
 
 One number per picture, the mean absolute difference inside the mask; of all of them 101 quantiles, in a small
-JSON file of the saved model's folder. Leaves out judging a picture by them (``evaluation/oddness.py``).
+JSON file of the saved model's folder. Leaves out judging an image by them
+(``evaluation/out_of_distribution.py``).
 """
 
 import json

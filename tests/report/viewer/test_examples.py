@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from derender import load
-from derender.evaluation.oddness import ODD_PERCENTILE, reconstruction_percentile
+from derender.evaluation.out_of_distribution import OUTLIER_PERCENTILE, reconstruction_percentile
 from derender.model import bundled_models, model_folder
 from derender.report.viewer.examples import named_examples, rendered_examples
 from derender.training.held_out_errors import read_errors
@@ -21,7 +21,7 @@ def test_rendered_examples_are_known_to_the_model_and_differ(model, thing):
     net, errors = load(model), read_errors(model_folder(model))
     assert errors is not None
     found = reconstruction_percentile(net, stacked, errors)
-    assert (found <= ODD_PERCENTILE).all() and np.median(found) < 80
+    assert (found <= OUTLIER_PERCENTILE).all() and np.median(found) < 80
 
 
 def test_every_bundled_model_has_examples():

@@ -20,7 +20,7 @@ from PIL import Image
 
 from derender import __version__
 from derender.data import as_float
-from derender.evaluation.oddness import ODD_PERCENTILE, percentile_of
+from derender.evaluation.out_of_distribution import OUTLIER_PERCENTILE, percentile_of
 from derender.features import FeatureTable, named
 from derender.features.search import nearest, same_picture
 from derender.model import Derenderer
@@ -102,7 +102,7 @@ class Studio:
             "l1_as_read": float(errors[0]) if self.fit_steps and isfinite(errors[0]) else None,
             "percentile": percentile,
             "side": side,
-            "odd": percentile is not None and percentile > ODD_PERCENTILE,
+            "odd": percentile is not None and percentile > OUTLIER_PERCENTILE,
         }
 
     def scene(self, question: Question) -> Scene:

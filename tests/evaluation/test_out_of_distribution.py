@@ -5,7 +5,11 @@ import pytest
 
 import derender
 from derender.data import read_pictures
-from derender.evaluation.oddness import ODD_PERCENTILE, percentile_of, reconstruction_percentile
+from derender.evaluation.out_of_distribution import (
+    OUTLIER_PERCENTILE,
+    percentile_of,
+    reconstruction_percentile,
+)
 from derender.model import model_folder
 from derender.training.held_out_errors import HeldOutErrors, errors_of, read_errors
 
@@ -21,7 +25,7 @@ def test_pictures_like_the_held_out_ones_have_every_percentile_equally_often():
     held_out = HeldOutErrors(np.quantile(errors[:2000], np.linspace(0, 1, 101)), 2000)
     found = percentile_of(errors[2000:], held_out)
     assert np.quantile(found, [0.1, 0.5, 0.9]) == pytest.approx([10, 50, 90], abs=3)
-    assert np.mean(found > ODD_PERCENTILE) == pytest.approx(0.01, abs=0.008)
+    assert np.mean(found > OUTLIER_PERCENTILE) == pytest.approx(0.01, abs=0.008)
 
 
 def test_noise_is_odd_to_the_bundled_model_and_says_so_for_every_picture():
@@ -29,7 +33,7 @@ def test_noise_is_odd_to_the_bundled_model_and_says_so_for_every_picture():
     assert held_out is not None and held_out.pictures == 800
     noise = np.random.default_rng(0).integers(0, 256, (8, 3, 64, 64), dtype=np.uint8)
     found = reconstruction_percentile(derender.load("rendered-faces-64"), noise, held_out)
-    assert (found > ODD_PERCENTILE).all()
+    assert (found > OUTLIER_PERCENTILE).all()
 
 
 def test_rendered_faces_are_known_to_the_bundled_model_and_cars_are_not(shared_data):
@@ -39,5 +43,5 @@ def test_rendered_faces_are_known_to_the_bundled_model_and_cars_are_not(shared_d
     faces = read_pictures(f"{shared_data('data/synface64.zip')}::test_gt", 64, limit=48).images
     cars = read_pictures(str(shared_data("data/syncar64.zip")), 64, limit=24).images
     assert np.median(reconstruction_percentile(net, faces, held_out)) == pytest.approx(50, abs=20)
-    assert (reconstruction_percentile(net, cars, held_out) > ODD_PERCENTILE).all()
+    assert (reconstruction_percentile(net, cars, held_out) > OUTLIER_PERCENTILE).all()
     assert errors_of(net, faces).quantiles[50] == pytest.approx(held_out.quantiles[50], rel=0.15)
