@@ -7,6 +7,7 @@ import derender
 from derender.data.synthetic import faces
 from derender.objectives.reconstruction import masked_l1
 from derender.render import Rendering
+from derender.scene.crop import CropSettings, crop_images
 from derender.training.refining import (
     FACTORS,
     RefineConfig,
@@ -17,9 +18,8 @@ from derender.training.refining import (
     _Unit,
     refine,
 )
-from derender.training.reframe import ReframeSettings, shown_in
 
-FRAMES = ReframeSettings(nearer=1.15, farther=1.9, shift=0.25)
+FRAMES = CropSettings(nearer=1.15, farther=1.9, shift=0.25)
 LESSONS = RefiningSettings(
     images=480, batch_size=16, learning_rate=5e-4, fit_steps=8, rendered=0.25, worst=0, picture_weight=0
 )
@@ -148,7 +148,7 @@ def test_a_copy_taught_so_steps_back_from_smaller_faces(model, images):
     assert taught.settings.ranges.translation_z == pytest.approx(0.9 / 0.75)
     assert model.settings.ranges.translation_z == 0
     pictures = images.float() / 255
-    smaller = shown_in(pictures, torch.tensor([[[1.7, 0, 0], [0, 1.7, 0]]]).expand(len(pictures), 2, 3))
+    smaller = crop_images(pictures, torch.tensor([[[1.7, 0, 0], [0, 1.7, 0]]]).expand(len(pictures), 2, 3))
     near, far = (taught.decompose(one).camera[:, 5] for one in (pictures, smaller))
     assert (far > near).float().mean() > 0.9
     assert float(far.mean() - near.mean()) > 0.08, "what few lessons teach of 0.7"

@@ -2,7 +2,7 @@
 
 A picture that cannot be read is left out and named at the end (exit code 2); the others are done. One that is
 unlike what the model was validated on is done too, and named. With ``--frame auto`` a picture is the part of
-the file that the model renders again best (training/framing.py), wherever it is read.
+the file that the model renders again best (scene/crop_search.py), wherever it is read.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from derender.model import Derenderer
     from derender.scene import Scene
-    from derender.training.framing import Framing
+    from derender.scene.crop_search import Crop
 
 PictureFiles = Annotated[list[Path], typer.Argument(help="Pictures to take apart.", metavar="IMAGE...")]
 Size = Annotated[
@@ -87,7 +87,7 @@ class PictureReader:
 
     def __init__(self, net: "Derenderer", frame: str = "whole"):
         self.net, self.auto = net, check_frame(frame)
-        self.framings: dict[Path, Framing] = {}
+        self.framings: dict[Path, Crop] = {}
 
     def __call__(self, path: Path, size: int) -> "np.ndarray":
         """(3, size, size) uint8; a file that is no picture is a ValueError or OSError that says so."""
@@ -96,11 +96,11 @@ class PictureReader:
     def _framed(self, path: Path, size: int) -> "np.ndarray":
         import torch
 
-        from derender.training.framing import READ_LARGER, as_bytes, each_framing
+        from derender.scene.crop_search import SEARCH_SCALE, as_bytes, best_crops
 
         if path not in self.framings:
-            looked_at = torch.from_numpy(one_picture(path, READ_LARGER * self.net.image_size)[None])
-            (self.framings[path],) = each_framing(self.net, looked_at)
+            looked_at = torch.from_numpy(one_picture(path, SEARCH_SCALE * self.net.image_size)[None])
+            (self.framings[path],) = best_crops(self.net, looked_at)
         framing = self.framings[path]
         larger = torch.from_numpy(one_picture(path, round(size / framing.side))[None])
         return as_bytes(framing.cut(larger, size))[0].numpy()
@@ -278,7 +278,7 @@ def finish(
 
 def _framed_account(read: PictureReader) -> str:
     """How many pictures are shown in part, and how small the parts are."""
-    from derender.training.framing import WHOLE
+    from derender.scene.crop_search import WHOLE
 
     sides = [framing.side for framing in read.framings.values() if framing != WHOLE]
     if not sides:

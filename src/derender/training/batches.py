@@ -10,9 +10,9 @@ import torch
 from jaxtyping import Float, Int64, UInt8
 from torch import Generator, Tensor
 
+from derender.scene.crop import DEFAULT_CROPS, CropSettings, crop_images, random_crops
 from derender.training.config import LoopSettings
 from derender.training.distributed import ALONE, Ranks
-from derender.training.reframe import DEFAULT_FRAMES, ReframeSettings, draw_frames, shown_in
 
 SAMPLED = 65_536
 """So many pictures of a memory-mapped set are drawn from where a few of all are wanted."""
@@ -48,7 +48,7 @@ class Batches:
     horizontal_flips: bool
     rows: Int64[np.ndarray, " k"] | None = None
     reframed: float = 0.0
-    reframe: ReframeSettings = DEFAULT_FRAMES
+    reframe: CropSettings = DEFAULT_CROPS
 
     def __post_init__(self) -> None:
         if self.batch_size > len(self):
@@ -93,8 +93,8 @@ class Batches:
             batch = torch.where(flip.to(batch.device)[:, None, None, None], batch.flip(-1), batch)
         if self.reframed:
             generator = random_stream(self.seed, "frame", position)
-            frames = draw_frames(self.batch_size, generator, self.reframe, self.reframed)
-            batch = shown_in(batch, ranks.own(frames))
+            frames = random_crops(self.batch_size, generator, self.reframe, self.reframed)
+            batch = crop_images(batch, ranks.own(frames))
         return batch
 
 

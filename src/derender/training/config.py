@@ -16,9 +16,9 @@ from derender.data import suggestion
 from derender.model import load
 from derender.networks.fitting import FittingSettings
 from derender.presets import MODEL_PRESETS, ModelSettings, named_preset
+from derender.scene.crop import DEFAULT_CROPS, CropSettings
 from derender.scene.perturb import PerturbSettings
 from derender.settings import Settings
-from derender.training.reframe import DEFAULT_FRAMES, ReframeSettings
 
 LooccKind = Literal["none", "light", "light+camera", "all"]
 
@@ -64,7 +64,7 @@ class WhiteningSettings(Settings):
     vectors: bool = True  # light and camera have features of their own; else those are their codes
     vector_power: float = Field(default=3.0, ge=0)  # of repeatability, by which their directions are weighted
     frames: int = Field(default=0, ge=0)  # times each picture is also shown in another frame
-    reframe: ReframeSettings = DEFAULT_FRAMES
+    reframe: CropSettings = DEFAULT_CROPS
 
 
 class FeatureSettings(Settings):
@@ -99,7 +99,7 @@ class LoopSettings(Settings):
     keep: Literal["best", "last"] = "best"  # the model: of the best validation, or of the last checkpoint
     horizontal_flips: bool = True
     reframed: float = Field(default=0.0, ge=0, le=1)  # share of the pictures shown in another frame
-    reframe: ReframeSettings = DEFAULT_FRAMES
+    reframe: CropSettings = DEFAULT_CROPS
     split: tuple[float, float, float] = (0.8, 0.1, 0.1)  # train, validation, test
     precision: Literal["32-true", "bf16-mixed"] = "32-true"  # networks only; geometry is always float32
     channels_last: bool = True

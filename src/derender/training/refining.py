@@ -27,19 +27,20 @@ from derender.networks.morphable import MorphableMaps
 from derender.objectives.reconstruction import masked_l1
 from derender.objectives.self_training import endless_order
 from derender.scene import Scene
-from derender.scene.frame import ranges_for_frames, seen_in_frame
+from derender.scene.crop import (
+    DEFAULT_CROPS,
+    CropSettings,
+    crop_images,
+    crop_scene,
+    other_surroundings,
+    random_crops,
+    ranges_for_crops,
+)
 from derender.scene.mirror import seen_in_mirror
 from derender.scene.perturb import PerturbSettings, perturb_camera, perturb_light
 from derender.settings import Settings
 from derender.training.config import FeatureSettings
 from derender.training.features import make_features
-from derender.training.reframe import (
-    DEFAULT_FRAMES,
-    ReframeSettings,
-    draw_frames,
-    shown_in,
-    strange_surroundings,
-)
 from derender.training.step import concatenate, fill_uncovered
 
 FACTORS = {**PARAMETERS, "light": "light", "camera": "camera"}
@@ -76,7 +77,7 @@ class RefineConfig(FeatureSettings):
     perturb: PerturbSettings = PerturbSettings(
         ambient=1, diffuse=1, light_deg=90, camera_pitch_deg=30, camera_yaw_deg=60
     )
-    reframe: ReframeSettings = DEFAULT_FRAMES
+    reframe: CropSettings = DEFAULT_CROPS
 
 
 @dataclass(frozen=True)
@@ -204,15 +205,9 @@ def _fit(model: Derenderer, images: UInt8[Tensor, "n 3 h w"], steps: int, progre
     return _Fits(*(torch.cat(part) for part in zip(*parts, strict=True)))
 
 
-def _give_room(student: Derenderer, reframe: ReframeSettings) -> None:
-    """Widen the ranges of its camera's position so that scenes in such frames can be said."""
-    ranges = ranges_for_frames(
-        student.settings.ranges,
-        student.image_size,
-        nearer=reframe.nearer,
-        farther=reframe.farther,
-        shift=reframe.shift,
-    )
+def _give_room(student: Derenderer, reframe: CropSettings) -> None:
+    """Widen the ranges of its camera's position so that scenes in such crops can be said."""
+    ranges = ranges_for_crops(student.settings.ranges, student.image_size, reframe)
     student.settings = student.settings.model_copy(update={"ranges": ranges})
 
 
@@ -304,11 +299,11 @@ def _reframed(
     settings = config.refining
     if not settings.reframed:
         return pictures, scene
-    frames = draw_frames(len(pictures), generator, config.reframe, settings.reframed)
+    frames = random_crops(len(pictures), generator, config.reframe, settings.reframed)
     strange = torch.rand(len(pictures), generator=generator) < settings.strange
-    around = strange_surroundings(pictures, generator)
-    shown = _either(strange, shown_in(pictures, frames, around), shown_in(pictures, frames))
-    return shown, seen_in_frame(scene, frames, model.settings.ranges.fov_deg)
+    around = other_surroundings(pictures, generator)
+    shown = _either(strange, crop_images(pictures, frames, around), crop_images(pictures, frames))
+    return shown, crop_scene(scene, frames, model.settings.ranges.fov_deg)
 
 
 def _either(rows: Tensor, one: Tensor, other: Tensor) -> Tensor:

@@ -19,9 +19,9 @@ from derender.model import Derenderer
 from derender.networks import Factor
 from derender.networks.whitening import Spread, Whitening, contrast
 from derender.scene import Scene
+from derender.scene.crop import crop_images, random_crops
 from derender.scene.perturb import PerturbSettings
 from derender.training.config import WhiteningSettings
-from derender.training.reframe import draw_frames, shown_in
 from derender.training.step import fill_uncovered
 
 BATCH_SIZE = 128
@@ -84,7 +84,7 @@ def fit_whitening(
                     for _ in range(settings.views)
                 ]
                 for _ in range(settings.frames):
-                    shown.append(shown_in(batch, draw_frames(len(batch), generator, settings.reframe)))
+                    shown.append(crop_images(batch, random_crops(len(batch), generator, settings.reframe)))
                 views = [say(one) for one in shown]
                 if settings.mirrored:
                     views += [say(one.flip(-1)) for one in shown]

@@ -19,7 +19,7 @@ from derender.report.viewer.examples import rendered_examples
 from derender.report.viewer.server import BoundedProtocol, serving
 from derender.report.viewer.shelf import Shelf
 from derender.report.viewer.studio import Studio
-from derender.training.framing import Framing
+from derender.scene.crop_search import Crop
 from derender.training.held_out_errors import read_errors
 
 LIGHT = {"ambient": 0.3, "diffuse": 0.7, "pitch_deg": 0.0, "yaw_deg": 0.0}
@@ -207,7 +207,7 @@ def test_too_much_work_is_refused_not_queued_for_ever(model, picture, client):
 def test_a_wider_picture_is_shown_in_the_part_that_the_model_knows():
     model, face = load("rendered-faces-64"), rendered_examples("rendered-faces-64", 64)[3].picture
     wide = np.random.default_rng(0).integers(0, 256, (3, 8, 8), dtype=np.uint8).repeat(16, 1).repeat(16, 2)
-    left, top, side = Framing(0.5, 0.0, 0.2).corner(128)
+    left, top, side = Crop(0.5, 0.0, 0.2).corner(128)
     wide[:, top : top + side, left : left + side] = face
     framed, whole = Studio(model, "faces", framed=True), Studio(model, "faces")
     assert (framed.reading_size, whole.reading_size) == (128, 64)

@@ -32,10 +32,10 @@ from derender.report.viewer.questions import Camera, Light, NeighbourQuestion, Q
 from derender.report.viewer.refused import Refused
 from derender.report.viewer.shelf import Shelf, TakenApart
 from derender.scene import Scene
+from derender.scene.crop_search import SEARCH_SCALE, as_bytes, best_crops
 from derender.scene.enlarge import at_size
 from derender.scene.light import lambert_shading
 from derender.scene.normals import normals_from_depth
-from derender.training.framing import READ_LARGER, as_bytes, each_framing
 from derender.training.held_out_errors import HeldOutErrors, masked_l1, reconstruction_errors
 
 ENLARGED_BORDER = 1  # enlarging smooths the step at the model's border over one more column
@@ -43,7 +43,7 @@ ENLARGED_BORDER = 1  # enlarging smooths the step at the model's border over one
 
 def reading_size(model: Derenderer, framed: bool) -> int:
     """Side at which pictures are read, in pixels: larger where the best part of each is looked for."""
-    return model.image_size * (READ_LARGER if framed else 1)
+    return model.image_size * (SEARCH_SCALE if framed else 1)
 
 
 @dataclass
@@ -78,7 +78,7 @@ class Studio:
         side = 1.0
         if self.framed and picture.shape[-1] != self.model.image_size:
             larger = torch.from_numpy(picture[None])
-            (framing,) = each_framing(self.model, larger)
+            (framing,) = best_crops(self.model, larger)
             side = framing.side
             picture = as_bytes(framing.cut(larger, self.model.image_size))[0].numpy()
         with torch.inference_mode():

@@ -7,17 +7,16 @@ from torch.nn.functional import interpolate
 
 import derender
 from derender.report.viewer.examples import rendered_examples
-from derender.training.framing import (
+from derender.scene.crop_search import (
     WHOLE,
-    Framing,
+    Crop,
     as_bytes,
-    common_framing,
-    each_framing,
-    framing_errors,
-    framings,
+    best_crops,
+    candidate_crops,
+    crop_errors,
 )
 
-TRUE = Framing(0.7, 0.1, 0.2)
+TRUE = Crop(0.7, 0.1, 0.2)
 
 
 @pytest.fixture(scope="module")
@@ -46,23 +45,19 @@ def laid_in(faces_known) -> torch.Tensor:
 
 
 def test_the_part_that_holds_what_the_model_knows_is_found(model, laid_in):
-    found = each_framing(model, laid_in)
+    found = best_crops(model, laid_in)
     near = [
         abs(one.side - 0.7) < 0.11 and abs(one.across - 0.1) + abs(one.down - 0.2) < 0.21 for one in found
     ]
     assert sum(near) == 5
-    common = common_framing(model, laid_in)
-    assert abs(common.side - TRUE.side) < 0.11
-    assert abs(common.across - TRUE.across) + abs(common.down - TRUE.down) < 0.11
 
 
 def test_what_the_model_knows_as_it_is_stays_whole(model, faces_known):
-    assert common_framing(model, as_bytes(faces_known)) == WHOLE
-    assert each_framing(model, as_bytes(faces_known)).count(WHOLE) >= 4
+    assert best_crops(model, as_bytes(faces_known)).count(WHOLE) >= 4
 
 
 def test_the_part_is_rendered_again_better(model, laid_in):
-    whole, part = framing_errors(model, laid_in, [WHOLE, TRUE])
+    whole, part = crop_errors(model, laid_in, [WHOLE, TRUE])
     assert (part < 0.7 * whole).all()
 
 
@@ -71,7 +66,7 @@ def test_errors_are_shares_of_the_pictures_variance(model, faces_known):
     pictures = bytes_.float() / 255
     with torch.inference_mode():
         seen = model.reconstruct(pictures)
-    (found,) = framing_errors(model, bytes_, [WHOLE], batch_size=3)
+    (found,) = crop_errors(model, bytes_, [WHOLE], batch_size=3)
     for row in range(5):
         inside = seen.mask[row] > 0
         target, drawn = pictures[row][:, inside].numpy(), seen.image[row][:, inside].numpy()
@@ -81,7 +76,7 @@ def test_errors_are_shares_of_the_pictures_variance(model, faces_known):
 
 def test_a_plain_picture_and_one_with_nothing_in_it_have_an_answer(model, monkeypatch):
     plain = torch.full((2, 3, 128, 128), 90, dtype=torch.uint8)
-    assert np.isfinite(framing_errors(model, plain, [WHOLE, TRUE])).all()
+    assert np.isfinite(crop_errors(model, plain, [WHOLE, TRUE])).all()
     reconstruct = model.reconstruct
 
     def nothing(pictures):
@@ -89,16 +84,16 @@ def test_a_plain_picture_and_one_with_nothing_in_it_have_an_answer(model, monkey
         return type(seen)(seen.image * 0, seen.depth, seen.mask * 0)
 
     monkeypatch.setattr(model, "reconstruct", nothing)
-    assert np.isinf(framing_errors(model, plain, [WHOLE, TRUE])).all()
-    assert each_framing(model, plain) == [WHOLE, WHOLE]
+    assert np.isinf(crop_errors(model, plain, [WHOLE, TRUE])).all()
+    assert best_crops(model, plain) == [WHOLE, WHOLE]
 
 
 def test_every_part_that_is_tried_lies_inside_the_picture():
-    tried = framings()
+    tried = candidate_crops()
     assert tried[0] == WHOLE and len(set(tried)) == len(tried) > 100
-    for framing in tried:
+    for crop in tried:
         for size in (64, 128, 101):
-            left, top, side = framing.corner(size)
+            left, top, side = crop.corner(size)
             assert left >= 0 and top >= 0 and side >= 1 and max(left, top) + side <= size
 
 
@@ -106,13 +101,13 @@ def test_every_part_that_is_tried_lies_inside_the_picture():
     "numbers", [(0.0,), (1.1,), (0.7, 0.4), (0.7, 0, -0.4), (float("nan"),), (0.5, float("nan"))]
 )
 def test_a_part_beyond_the_picture_is_refused(numbers):
-    with pytest.raises(ValueError, match="inside the picture"):
-        Framing(*numbers)
+    with pytest.raises(ValueError, match="inside the image"):
+        Crop(*numbers)
 
 
 def test_a_cut_of_the_right_size_is_the_pixels_themselves():
     picture = torch.randint(0, 256, (1, 3, 80, 80), dtype=torch.uint8)
-    part = Framing(0.8, -0.2, 0.2).cut(picture, 64)
+    part = Crop(0.8, -0.2, 0.2).cut(picture, 64)
     assert torch.equal(as_bytes(part), picture[:, :, 16:, :64])
     assert torch.equal(as_bytes(WHOLE.cut(picture, 80)), picture)
-    assert Framing(0.5).cut(picture, 64).shape == (1, 3, 64, 64)
+    assert Crop(0.5).cut(picture, 64).shape == (1, 3, 64, 64)

@@ -6,11 +6,11 @@ from torch import Tensor
 
 import derender
 from derender.data.synthetic import faces
+from derender.scene.crop import CropSettings, crop_images, other_surroundings, random_crops
 from derender.scene.perturb import PerturbSettings
 from derender.training.batches import Batches
 from derender.training.config import WhiteningSettings
 from derender.training.distributed import Ranks
-from derender.training.reframe import ReframeSettings, draw_frames, shown_in, strange_surroundings
 from derender.training.whitening import fit_whitening
 
 STILL = {"nearer": 1, "farther": 1, "shift": 0, "roll_deg": 0}
@@ -28,8 +28,8 @@ def brightest(image: Tensor) -> tuple[int, int]:
 
 
 def moves(**changes: float) -> Tensor:
-    settings = ReframeSettings(**{**STILL, **changes})
-    return draw_frames(400, torch.Generator().manual_seed(0), settings)
+    settings = CropSettings(**{**STILL, **changes})
+    return random_crops(400, torch.Generator().manual_seed(0), settings)
 
 
 def test_frames_stay_within_their_bounds_and_reach_them():
@@ -44,16 +44,16 @@ def test_frames_stay_within_their_bounds_and_reach_them():
 
 def test_a_frame_says_where_its_pixels_lie_in_the_picture():
     larger = torch.tensor([[[2.0, 0, 0], [0, 2.0, 0]]])  # shows twice as much: the spot moves inwards
-    assert brightest(shown_in(spot(16, 24), larger)) == (16, 20)
+    assert brightest(crop_images(spot(16, 24), larger)) == (16, 20)
     beside = torch.tensor([[[1.0, 0, 8 / 16.5], [0, 1.0, 0]]])  # looks 8 pixels to the right
-    assert brightest(shown_in(spot(16, 24), beside)) == (16, 16)
+    assert brightest(crop_images(spot(16, 24), beside)) == (16, 16)
     quarter = torch.tensor([[[0.0, -1.0, 0], [1.0, 0, 0]]])
-    assert brightest(shown_in(spot(16, 24), quarter)) == (8, 16)
+    assert brightest(crop_images(spot(16, 24), quarter)) == (8, 16)
 
 
 def test_beyond_the_edge_lies_the_reflection():
     images = torch.rand(1, 3, 8, 8, generator=torch.Generator().manual_seed(1))
-    aside = shown_in(images, torch.tensor([[[1.0, 0, 0.5], [0, 1.0, 0]]]))  # two pixels to the right
+    aside = crop_images(images, torch.tensor([[[1.0, 0, 0.5], [0, 1.0, 0]]]))  # two pixels to the right
     assert torch.allclose(aside[..., :6], images[..., 2:], atol=1e-5)
     assert torch.allclose(aside[..., 6:], images[..., 6:].flip(-1), atol=1e-5)
 
@@ -61,17 +61,17 @@ def test_beyond_the_edge_lies_the_reflection():
 def test_beyond_the_edge_can_lie_what_is_given():
     images, around = torch.rand(2, 1, 3, 8, 8, generator=torch.Generator().manual_seed(1))
     aside = torch.tensor([[[1.0, 0, 0.5], [0, 1.0, 0]]])  # two pixels to the right
-    shown = shown_in(images, aside, around)
+    shown = crop_images(images, aside, around)
     assert torch.equal(shown[..., 6:], around[..., 6:])
-    assert torch.equal(shown[..., :6], shown_in(images, aside)[..., :6])
+    assert torch.equal(shown[..., :6], crop_images(images, aside)[..., :6])
     whole = torch.tensor([[[1.0, 0, 0], [0, 1.0, 0]]])
-    assert torch.equal(shown_in(images, whole, around), images)
+    assert torch.equal(crop_images(images, whole, around), images)
 
 
 def test_strange_surroundings_are_the_neighbours_in_large_patches():
     generator = torch.Generator().manual_seed(4)
     images = torch.rand(3, 3, 32, 32, generator=generator)
-    drawn = [strange_surroundings(images, generator) for _ in range(60)]
+    drawn = [other_surroundings(images, generator) for _ in range(60)]
     for around in drawn:
         assert around.shape == images.shape
         assert torch.allclose(around.mean(dim=(2, 3)), images.roll(1, 0).mean(dim=(2, 3)), atol=0.05)
@@ -82,8 +82,8 @@ def test_strange_surroundings_are_the_neighbours_in_large_patches():
 
 def test_the_share_that_is_not_framed_anew_stays_bit_for_bit():
     images = torch.rand(300, 3, 8, 8, generator=torch.Generator().manual_seed(2))
-    frames = draw_frames(300, torch.Generator().manual_seed(0), ReframeSettings(), share=0.25)
-    same = (shown_in(images, frames) == images).flatten(1).all(dim=1)
+    frames = random_crops(300, torch.Generator().manual_seed(0), CropSettings(), share=0.25)
+    same = (crop_images(images, frames) == images).flatten(1).all(dim=1)
     assert 0.68 < same.float().mean() < 0.82
 
 
@@ -100,7 +100,7 @@ def test_batches_are_framed_anew_the_same_way_every_time_and_on_several_devices(
 @pytest.mark.parametrize("wrong", [{"farther": 0.5}, {"shift": -0.1}, {"roll_deg": 400}])
 def test_impossible_frames_are_refused(wrong):
     with pytest.raises(ValueError, match=next(iter(wrong))):
-        ReframeSettings(**wrong)
+        CropSettings(**wrong)
 
 
 def test_frames_as_views_make_features_move_less_with_the_frame():
@@ -108,7 +108,7 @@ def test_frames_as_views_make_features_move_less_with_the_frame():
     model = derender.load("faces-64")
     model.fitting = None
     unseen = images[200:].float() / 255
-    moved = shown_in(unseen, draw_frames(64, torch.Generator().manual_seed(9), ReframeSettings()))
+    moved = crop_images(unseen, random_crops(64, torch.Generator().manual_seed(9), CropSettings()))
     found = {}
     for frames in (0, 2):
         settings = WhiteningSettings(

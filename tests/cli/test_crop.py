@@ -9,10 +9,10 @@ from PIL import Image
 
 from derender.cli import main
 from derender.report.viewer.examples import rendered_examples
-from derender.training.framing import Framing
+from derender.scene.crop_search import Crop
 
 KNOWN = "rendered-faces-64"
-TRUE = Framing(0.7, 0.1, 0.2)
+TRUE = Crop(0.7, 0.1, 0.2)
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +48,7 @@ def test_the_part_is_found_told_and_drawn(photos, tmp_path, capsys):
     assert odd == 100 and percentile < 99
     shown = np.asarray(Image.open(tmp_path / "framed" / "wide" / "input.png").convert("RGB"), float)
     face = rendered_examples(KNOWN, 64)[3].picture.transpose(1, 2, 0)
-    assert Framing(**wide) == TRUE
+    assert Crop(**wide) == TRUE
     assert np.abs(shown - face).mean() < 6
     beside = np.asarray(Image.open(tmp_path / "whole" / "near" / "input.png"))
     np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "framed" / "near" / "input.png")), beside)
