@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from derender.data import MASK_CLASSES
-from derender.whole import whole_file
+from derender.storage.atomic import atomic_file
 
 EXPRESSIONS = {
     "happiness": {
@@ -71,7 +71,7 @@ def main(arguments: list[str] | None = None) -> int:
     except (ValueError, FileNotFoundError) as problem:
         print(f"convert_ict_facekit: {problem}", file=sys.stderr)
         return 2
-    with whole_file(given.out) as path, path.open("wb") as file:
+    with atomic_file(given.out) as path, path.open("wb") as file:
         np.savez_compressed(file, allow_pickle=False, **arrays)
     shape = arrays["components"].shape
     print(

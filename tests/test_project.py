@@ -23,14 +23,14 @@ DOCS = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md"), *(ROOT / "benc
 # A module imports only from its own stage or from stages to its left.
 STAGES = [
     "settings",
-    "whole",
+    "storage",
     "scene",
     "render",
     "data",
     "networks",
     "objectives",
     "presets",
-    "pretrained",
+    "postprocess",
     "model",
     "training",
     "features",

@@ -17,30 +17,33 @@ from torch import Tensor, nn
 from derender.data import check_pictures, refuse_not_finite
 from derender.networks import FACTORS, Factor, NetworkSettings
 from derender.networks.confidence import Confidence, ConfidenceNet
-from derender.networks.fitting import STEPS, Fitted, Fitting, coordinates_of
-from derender.networks.tensor_file import read_tensors, write_tensors
 from derender.networks.unet import pixel_decoder
 from derender.networks.unsup3d import read_checkpoint
-from derender.networks.whitening import Whitening
+from derender.postprocess.fitting import STEPS, Fitted, Fitting, coordinates_of
+from derender.postprocess.whitening import Whitening
 from derender.presets import MODEL_PRESETS, ModelSettings, named_preset
-from derender.pretrained import hub
-from derender.pretrained.card import CARD_FILE, model_card, with_metadata
-from derender.pretrained.folders import PRETRAINED, bundled_models, model_folder, texts_beside
-from derender.pretrained.saved import (
+from derender.render import Rendering, render_scene
+from derender.scene import Scene
+from derender.scene.ranges import SceneRanges
+from derender.storage import hub
+from derender.storage.atomic import atomic_folder
+from derender.storage.card import CARD_FILE, model_card, with_metadata
+from derender.storage.folder import (
     CONFIG_FILE,
     ERRORS_FILE,
     FITTING_FILE,
     FORMAT,
+    PRETRAINED,
     SPLIT_FILE,
     WEIGHTS_FILE,
     WHITENING_FILE,
+    bundled_models,
     check_shapes,
+    model_folder,
     read_config,
+    texts_beside,
 )
-from derender.render import Rendering, render_scene
-from derender.scene import Scene
-from derender.scene.ranges import SceneRanges
-from derender.whole import whole_folder
+from derender.storage.tensors import read_tensors, write_tensors
 
 Renderer = Callable[[Scene, float], Rendering]
 
@@ -259,7 +262,7 @@ class Derenderer(nn.Module):
         folder = Path(folder)
         if folder.exists() and not overwrite:
             raise FileExistsError(f"{folder} exists already: choose another folder or pass overwrite=True")
-        with whole_folder(folder) as temporary:
+        with atomic_folder(folder) as temporary:
             self._write(temporary)
         return folder
 
@@ -284,7 +287,7 @@ class Derenderer(nn.Module):
             raise FileExistsError(f"{folder} exists already: choose another folder or pass overwrite=True")
         beside = self._beside()
         card = card or self._card(beside, folder.name, data=data, licence=licence, scores=scores)
-        with whole_folder(folder) as temporary:
+        with atomic_folder(folder) as temporary:
             self._write(temporary)
             (temporary / CARD_FILE).write_text(with_metadata(card, licence), encoding="utf-8")
             for name in (ERRORS_FILE, SPLIT_FILE):
@@ -342,7 +345,7 @@ class Derenderer(nn.Module):
         """The card that lies beside the weights, unless something else is told of them."""
         if CARD_FILE in beside and not any(told.values()):
             return beside[CARD_FILE]
-        return model_card(title, self.settings, **told, held_out=beside.get(ERRORS_FILE))
+        return model_card(title, self.settings.description(), **told, held_out=beside.get(ERRORS_FILE))
 
     def _beside(self) -> dict[str, str]:
         """Card and held-out errors of the folder it was loaded from, if its weights still are those."""

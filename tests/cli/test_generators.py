@@ -9,7 +9,7 @@ from PIL import Image
 
 from derender import FeatureTable
 from derender.cli import main
-from derender.networks.torch_file import reads_safely
+from derender.storage.tensors import reads_safely
 
 COMMON = ["batch_size=8", "images=16"]
 GENERATOR = ["image_size=32", "style_size=6", "mapping_layers=2", "channel_base=64", "channel_max=6"]

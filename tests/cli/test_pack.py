@@ -13,8 +13,8 @@ from derender.cli import main
 from derender.data.synthetic import faces
 from derender.evaluation.copies import copy_cost
 from derender.model import load
-from derender.networks.tensor_file import CHECKSUM
-from derender.pretrained.packing import pack_model
+from derender.storage.packing import pack_model
+from derender.storage.tensors import CHECKSUM
 
 FILES = ("model.safetensors", "whitening.safetensors", "fitting.safetensors")
 

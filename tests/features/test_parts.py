@@ -5,7 +5,7 @@ import pytest
 
 from derender.data import PictureSet
 from derender.features import FeatureTable, embed_to_file, embedding
-from derender.whole import DamageNoticed
+from derender.storage.atomic import DamageNoticed
 
 
 @pytest.fixture

@@ -20,7 +20,7 @@ from derender.interpretation.probe import Probe
 from derender.interpretation.sanity import sanity_check, similarity, spearman
 from derender.model import Derenderer
 from derender.networks.encoders import reading
-from derender.networks.whitening import Contrast, Whitening
+from derender.postprocess.whitening import Contrast, Whitening
 from derender.presets import MODEL_PRESETS
 
 SIZE, CODE = 32, 6

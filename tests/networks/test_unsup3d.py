@@ -15,8 +15,8 @@ from torch import Tensor, nn
 
 from derender.cli import main
 from derender.model import Derenderer, load
-from derender.networks.torch_file import reads_safely
 from derender.networks.unsup3d import read_checkpoint
+from derender.storage.tensors import reads_safely
 
 pytestmark = pytest.mark.skipif(not reads_safely(), reason="this PyTorch is not trusted with pickles")
 

@@ -6,8 +6,8 @@ import torch
 from safetensors.torch import save_file
 from torch.nn import functional
 
-from derender.networks.torch_file import reads_safely
 from derender.objectives.vgg import Vgg16Features, load_vgg16
+from derender.storage.tensors import reads_safely
 
 PICKLED = pytest.mark.skipif(not reads_safely(), reason="this PyTorch is not trusted with pickles")
 

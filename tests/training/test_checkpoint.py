@@ -6,8 +6,8 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
+from derender.storage.atomic import CHECKSUMS, seal
 from derender.training.checkpoint import TrainState, load_checkpoint, save_checkpoint
-from derender.whole import CHECKSUMS, seal
 
 
 def fresh(width=5):

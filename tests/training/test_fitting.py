@@ -9,8 +9,8 @@ import derender
 from derender.data.synthetic import faces
 from derender.features.extract import model_fingerprint
 from derender.model import FITTING_FILE
-from derender.networks.fitting import Fitting, FittingSettings, coordinates_of
-from derender.networks.morphable import MorphableMaps
+from derender.postprocess.fitting import Fitting, FittingSettings, coordinates_of
+from derender.postprocess.morphable import MorphableMaps
 from derender.training.config import FeatureSettings, with_changes
 from derender.training.features import make_features
 from derender.training.fitting import make_fitting
@@ -47,7 +47,7 @@ def test_the_rendering_comes_nearer_to_the_picture(model, images):
 
 def test_light_and_camera_stay_where_something_is_seen(model, monkeypatch):
     for rate in ("_LIGHT_RATE", "_ROTATION_RATE", "_TRANSLATION_RATE"):
-        monkeypatch.setattr(f"derender.networks.fitting.{rate}", 1.0)
+        monkeypatch.setattr(f"derender.postprocess.fitting.{rate}", 1.0)
     scene = model.fit_scenes(torch.rand(4, 3, 64, 64, generator=torch.Generator().manual_seed(0)), 8).scene
     assert scene.light[:, :2].min() >= 0.02 and scene.light[:, :2].max() <= 1.2
     assert scene.light[:, 2:].abs().rad2deg().max() <= 80.001

@@ -19,13 +19,13 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 import derender
 from derender.cli import main
 from derender.data import PictureSet
+from derender.storage.atomic import DamageNoticed
 from derender.training import TrainingInterrupted, resolve, train
 from derender.training.batches import Batches
 from derender.training.checkpoint import WEIGHTS_FILE, load_checkpoint
 from derender.training.loop import Progress
 from derender.training.run_folder import read_config, read_metrics
 from derender.training.schedule import kept
-from derender.whole import DamageNoticed
 
 TINY = ["image_size=32", "width=8", "light_width=4", "perceptual=none", "batch_size=8", "checkpoint_every=32"]
 TINY += [

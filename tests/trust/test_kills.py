@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from derender import whole
+from derender.storage.atomic import CHECKSUMS, Damaged, DamageNoticed, atomic_folder, check_seal, seal
 from derender.training.checkpoint import (
     DamagedCheckpoint,
     TrainState,
@@ -19,7 +20,6 @@ from derender.training.checkpoint import (
     resume_from,
     save_checkpoint,
 )
-from derender.whole import CHECKSUMS, Damaged, DamageNoticed, check_seal, seal, whole_folder
 
 ROOT = Path(__file__).resolve().parents[2]
 STEPS = ("open", "os.", "shutil.", "tempfile.")
@@ -196,7 +196,7 @@ def test_a_checkpoint_that_reads_back_otherwise_is_not_taken(net, run, monkeypat
 
 
 def test_a_seal_names_what_has_changed(tmp_path):
-    with whole_folder(tmp_path / "sealed") as folder:
+    with atomic_folder(tmp_path / "sealed") as folder:
         (folder / "a").write_bytes(b"aaa")
         (folder / "b").write_bytes(b"bbb")
         seal(folder)

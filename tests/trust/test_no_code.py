@@ -17,8 +17,8 @@ from derender.baselines.training import load_baseline
 from derender.data.listing import recall
 from derender.evaluation.memory import Memory
 from derender.features import FeatureTable
-from derender.networks.torch_file import reads_safely
 from derender.objectives.vgg import _read_weights
+from derender.storage.tensors import reads_safely
 from derender.training import resolve
 from derender.training.run_folder import read_config_tree
 

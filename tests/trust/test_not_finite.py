@@ -13,10 +13,10 @@ from derender.data import PictureSet
 from derender.features.extract import embed_pictures
 from derender.model import Derenderer
 from derender.networks.confidence import Confidence
-from derender.networks.whitening import Contrast, Whitening
 from derender.objectives import self_training
 from derender.objectives.self_features import SelfFeatures
 from derender.objectives.self_training import SelfTraining
+from derender.postprocess.whitening import Contrast, Whitening
 from derender.render import Rendering
 from derender.scene import Scene
 from derender.scene.perturb import PerturbSettings

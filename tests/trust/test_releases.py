@@ -17,11 +17,11 @@ from derender.data.cache import _MARK, read_cache
 from derender.features import FeatureTable, missing
 from derender.interpretation.probe import Probe, load_probe
 from derender.model import CONFIG_FILE, ERRORS_FILE
+from derender.storage.atomic import CHECKSUMS, seal
 from derender.training.checkpoint import STATE_FILE, TrainState, load_checkpoint
 from derender.training.config import config_from_tree
 from derender.training.held_out_errors import read_errors
 from derender.training.run_folder import read_config, read_config_tree, read_metrics
-from derender.whole import CHECKSUMS, seal
 
 RELEASES = Path(__file__).with_name("releases")
 VERSIONS = sorted(folder.name for folder in RELEASES.iterdir() if (folder / "expected.json").is_file())

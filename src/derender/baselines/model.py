@@ -15,10 +15,10 @@ from pydantic import ValidationError
 from torch import Tensor, nn
 
 from derender.data import suggestion
-from derender.networks.tensor_file import read_tensors, write_tensors
 from derender.settings import Settings
+from derender.storage.atomic import atomic_folder
+from derender.storage.tensors import read_tensors, write_tensors
 from derender.training.weights import fit_weights
-from derender.whole import whole_folder
 
 FORMAT = 1
 WEIGHTS_FILE, CONFIG_FILE = "model.safetensors", "config.json"
@@ -93,7 +93,7 @@ class BaselineModel(nn.Module):
         if folder.exists() and not overwrite:
             raise FileExistsError(f"{folder} exists already: choose another folder or pass overwrite=True")
         config = {"format": FORMAT, "baseline": self.name, "settings": self.settings.model_dump(mode="json")}
-        with whole_folder(folder) as temporary:
+        with atomic_folder(folder) as temporary:
             write_tensors(self.state_dict(), temporary / WEIGHTS_FILE)
             (temporary / CONFIG_FILE).write_text(json.dumps(config, indent=1))
         return folder

@@ -29,7 +29,7 @@ from rich.progress import (
 from rich.table import Table
 from rich.text import Text
 
-from derender.whole import DamageNoticed
+from derender.storage.atomic import DamageNoticed
 
 if TYPE_CHECKING:
     from derender.data import PictureSet

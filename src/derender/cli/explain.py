@@ -213,7 +213,7 @@ def _write(
     from derender.report.explanation import Shown, explanation_page
     from derender.report.saliency import draw_maps, safe_name
     from derender.report.share_chart import share_chart
-    from derender.whole import whole_folder
+    from derender.storage.atomic import atomic_folder
 
     with progress_bar("drawing maps", "labels") as report:
         drawn, checks = draw_maps(
@@ -222,7 +222,7 @@ def _write(
         )  # fmt: skip
     svg, png = share_chart(found)
     shown = Shown(found, svg, pictures.source, model, drawn, checks, apart, alike)
-    with whole_folder(out) as folder:
+    with atomic_folder(out) as folder:
         (folder / "shares.svg").write_text(svg, encoding="utf-8")
         (folder / "shares.png").write_bytes(png)
         for place, (name, made) in enumerate(drawn.items(), 1):

@@ -368,11 +368,11 @@ def architecture(rows: "Sequence[FeatureRow]") -> Any:
 def write_tables(tables: "Sequence[ScoreTable]", markdown_file: str | None, latex_file: str | None) -> None:
     """What ``--markdown`` and ``--latex`` ask for."""
     from derender.report import table_text
-    from derender.whole import whole_file
+    from derender.storage.atomic import atomic_file
 
     for target, form in ((markdown_file, table_text.markdown), (latex_file, table_text.latex)):
         if target is not None:
-            with whole_file(Path(target)) as temporary:
+            with atomic_file(Path(target)) as temporary:
                 temporary.write_text(form(tables), encoding="utf-8")
 
 

@@ -54,7 +54,7 @@ def mesh(
     from derender.cli.models import open_model
     from derender.report.mesh import mesh_of
     from derender.report.mesh_files import checked_format, mesh_files
-    from derender.whole import whole_folder
+    from derender.storage.atomic import atomic_folder
 
     checked_format(form)
     if not 0 < grazing <= 90:
@@ -69,7 +69,7 @@ def mesh(
         for scene, folder, path in zip(scenes_of(net, given, 64), given.folders, given.pictures, strict=True):
             finer = scene if refine is None else refine(scene, [path])
             made = mesh_of(finer, net.fov_deg, border, grazing)
-            with whole_folder(folder) as temporary:
+            with atomic_folder(folder) as temporary:
                 files = mesh_files(made, folder.name, form)
                 for name, content in files.items():
                     (temporary / name).write_bytes(content)

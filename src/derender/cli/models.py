@@ -10,8 +10,8 @@ if TYPE_CHECKING:
     from derender.evaluation.fitted import FittedModel
     from derender.features import FeatureTable
     from derender.model import Derenderer
-    from derender.networks.fitting import Fitting
-    from derender.pretrained.split_record import SplitRecord
+    from derender.postprocess.fitting import Fitting
+    from derender.storage.split import SplitRecord
 
 PARTS = ("all", "train", "validation", "test")
 
@@ -115,8 +115,8 @@ def part_of(pictures: "PictureSet", part: str, model: str | None) -> "PictureSet
 def split_of(model: str) -> "SplitRecord | None":
     """The split of a run, or of the run that a saved model comes from; None where nothing says it."""
     from derender.baselines.training import read_any_config
-    from derender.pretrained.folders import model_folder
-    from derender.pretrained.split_record import SplitRecord, read_split
+    from derender.storage.folder import model_folder
+    from derender.storage.split import SplitRecord, read_split
 
     if (Path(model) / "config.yaml").is_file():
         config = read_any_config(Path(model))
@@ -129,7 +129,7 @@ def split_of(model: str) -> "SplitRecord | None":
 
 def keep_split(folder: Path, model: str) -> None:
     """Keep with a copy of ``model`` the split of its training, if that is known."""
-    from derender.pretrained.split_record import write_split
+    from derender.storage.split import write_split
 
     record = split_of(model)
     if record is not None:

@@ -43,7 +43,7 @@ def pack(
     """
     from derender.cli.models import keep_split, open_model, pictures_for
     from derender.evaluation.copies import copy_cost
-    from derender.pretrained.packing import pack_model
+    from derender.storage.packing import pack_model
 
     refuse_existing(out, force)
     net = open_model(model, device)

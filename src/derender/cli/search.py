@@ -188,7 +188,7 @@ def _draw(
     from derender.cli.given import one_picture
     from derender.report.colours import pictures
     from derender.report.panel import GridLayout, contact_sheet
-    from derender.whole import whole_file
+    from derender.storage.atomic import atomic_file
 
     source = data if data is not None else str(table.origin.get("data", ""))
     wanted = [*(() if own_row is None else (own_row,)), *rows]
@@ -209,7 +209,7 @@ def _draw(
         title=title,
         layout=GridLayout(cell=CELL),
     )
-    with whole_file(out) as temporary:
+    with atomic_file(out) as temporary:
         sheet.save(temporary, format="PNG")
 
 

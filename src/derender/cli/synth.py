@@ -86,7 +86,7 @@ def faces(
     from derender.data.synthetic import LIGHTS, VIEWS, FaceSettings, MorphableFaces, write, write_tracks
     from derender.data.synthetic import faces as generator
     from derender.data.synthetic.overrides import changed
-    from derender.whole import whole_folder
+    from derender.storage.atomic import atomic_folder
 
     settings = FaceSettings(
         light=_named("--light", light, LIGHTS),
@@ -109,7 +109,7 @@ def faces(
     source = None if model is None else MorphableFaces.read(model)
     with progress_bar("generating") as report:
         made = generator.generate(count, image_size, seed, settings, report, model=source)
-    with progress_bar("writing") as report, whole_folder(out) as folder:
+    with progress_bar("writing") as report, atomic_folder(out) as folder:
         if tracks:
             write_tracks(made, folder, report)
         else:
@@ -145,14 +145,14 @@ def cars(
     from derender.data.synthetic import CAR_LIGHTS, CAR_VIEWS, CarSettings, write
     from derender.data.synthetic import cars as generator
     from derender.data.synthetic.overrides import changed
-    from derender.whole import whole_folder
+    from derender.storage.atomic import atomic_folder
 
     settings = CarSettings(light=_named("--light", light, CAR_LIGHTS), view=_named("--view", view, CAR_VIEWS))
     asked = [] if classes is None else [f"classes=[{classes}]"]
     settings = changed(settings, [*asked, *(overrides or [])])
     with progress_bar("generating") as report:
         made = generator.generate(count, image_size, seed, settings, report)
-    with progress_bar("writing") as report, whole_folder(out) as folder:
+    with progress_bar("writing") as report, atomic_folder(out) as folder:
         write(made, folder, truth, report)
     models = len(set(made.identity.tolist()))
     result(f"{count:,} pictures of {models:,} cars in {out}", json_file)

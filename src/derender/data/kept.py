@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 import derender
-from derender.whole import whole_file
+from derender.storage.atomic import atomic_file
 
 _DAMAGED = (OSError, ValueError, LookupError, TypeError, AttributeError)
 
@@ -51,7 +51,7 @@ def keep(file: Path, kept: Kept) -> None:
     )
     content = buffer.getbuffer()
     try:
-        with whole_file(file) as temporary, temporary.open("wb") as stream:
+        with atomic_file(file) as temporary, temporary.open("wb") as stream:
             stream.write(_checksum(content))
             stream.write(content)
     except OSError:

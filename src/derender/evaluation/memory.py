@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from derender.whole import whole_file
+from derender.storage.atomic import atomic_file
 
 Arrays = dict[str, np.ndarray]
 NAMES = "names of all arrays"
@@ -56,7 +56,7 @@ class Memory:
             self.recalled += 1
             return found
         arrays = make()
-        with whole_file(file) as temporary, temporary.open("wb") as stream:
+        with atomic_file(file) as temporary, temporary.open("wb") as stream:
             np.savez(stream, **arrays, **{NAMES: np.array(list(arrays))})  # pyright: ignore[reportArgumentType]
         self.made += 1
         return arrays

@@ -1,12 +1,12 @@
 """Controls with the whitening of a trained model: how much of a score is the whitening, how much the codes?
 
-The whitening (networks/whitening.py) learns from renderings of the same scene in other light and from other
-sides. An untrained model's renderings show nothing, so it cannot whiten its own codes. What can be lent is
-the trained model's renderings: the same pictures, the same light, the same sides, described by an untrained
-encoder or by principal components of their pixels, and whitened by the same rule. Such a control knows what
-light and camera do to its codes as well as the model does; what is left between them is what the codes hold.
-Leaves out pixels as they are: 12,288 directions cannot be told from 2,000 pictures, so 256 components stand
-for them, as many as a factor's code has numbers.
+The whitening (postprocess/whitening.py) learns from renderings of the same scene in other light and from
+other sides. An untrained model's renderings show nothing, so it cannot whiten its own codes. What can be lent
+is the trained model's renderings: the same pictures, the same light, the same sides, described by an
+untrained encoder or by principal components of their pixels, and whitened by the same rule. Such a control
+knows what light and camera do to its codes as well as the model does; what is left between them is what the
+codes hold. Leaves out pixels as they are: 12,288 directions cannot be told from 2,000 pictures, so 256
+components stand for them, as many as a factor's code has numbers.
 """
 
 import copy
@@ -24,7 +24,7 @@ from derender.data import PictureSet
 from derender.evaluation.memory import Memory
 from derender.features import FeatureTable, model_fingerprint
 from derender.model import Derenderer
-from derender.networks.whitening import Contrast, Whitening
+from derender.postprocess.whitening import Contrast, Whitening
 from derender.training.config import FeatureSettings
 from derender.training.whitening import Describe, fit_whitening
 

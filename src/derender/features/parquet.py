@@ -16,7 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from derender.data import check_lists, checked_footer, suggestion
-from derender.whole import whole_file
+from derender.storage.atomic import atomic_file
 
 FORMAT = 1
 METADATA_KEY = b"derender"
@@ -36,7 +36,7 @@ def write_columns(path: Path, content: Columns) -> None:
     """Write a parquet file; at ``path`` stands the old file or the whole new one, never half of it."""
     if path.is_dir():
         raise ValueError(f"{path} is a folder: name a file to write, such as {path / 'features.parquet'}")
-    with whole_file(path, durable=True) as temporary:
+    with atomic_file(path, durable=True) as temporary:
         pq.write_table(as_arrow(content), temporary, write_page_checksum=True)
 
 
@@ -47,7 +47,7 @@ def write_row_groups(path: Path, groups: Iterable[Columns]) -> int:
     ``write_columns``: the file reads the same.
     """
     rows, writer = 0, None
-    with whole_file(path, durable=True) as temporary:
+    with atomic_file(path, durable=True) as temporary:
         try:
             for group in groups:
                 table = as_arrow(group)

@@ -22,7 +22,7 @@ import pyarrow.parquet as pq
 from derender.data import Kind, Kinds, SeenPixels, Skipped, column_of
 from derender.features.batches import Rows
 from derender.features.parquet import Columns, factor_column
-from derender.whole import Damaged, DamageNoticed, measured, whole_file
+from derender.storage.atomic import Damaged, DamageNoticed, atomic_file, measured
 
 PLAN = "plan.json"
 LISTED_SKIPPED = 20
@@ -81,7 +81,7 @@ class Parts:
                 )
             shutil.rmtree(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        with whole_file(folder / PLAN) as temporary:
+        with atomic_file(folder / PLAN) as temporary:
             temporary.write_text(json.dumps(plan))
         self.files: list[Path] = []
         self._join_all(sorted(folder.glob("part-*.parquet")))
@@ -120,7 +120,7 @@ class Parts:
         for name in factors[0] if factors else ():
             columns[f"factor {name}"] = factor_column(np.concatenate([codes[name] for codes in factors]))
         table = pa.table(columns).replace_schema_metadata({_KEY: json.dumps(note).encode()})
-        with whole_file(self.folder / "writing.parquet", durable=True) as temporary:
+        with atomic_file(self.folder / "writing.parquet", durable=True) as temporary:
             pq.write_table(table, temporary, use_dictionary=False)
             name = f"part-{len(self.files):06d}-{measured(temporary)[1]:08x}.parquet"
         file = (self.folder / "writing.parquet").rename(self.folder / name)

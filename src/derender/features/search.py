@@ -13,7 +13,7 @@ from jaxtyping import Float64, Int64
 
 from derender.data import suggestion
 from derender.features.table import FeatureTable, named
-from derender.networks.fitting import PARAMETERS
+from derender.postprocess.fitting import PARAMETERS
 
 METRICS = ("cosine", "euclidean")
 BLOCK_ROWS = 4096

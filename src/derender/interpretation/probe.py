@@ -22,8 +22,8 @@ from derender.data import suggestion
 from derender.evaluation.linear_head import PAPER_HEAD, HeadSettings, head_loss
 from derender.evaluation.linear_logistic import axes_of, fit_logistic, solve_logistic
 from derender.evaluation.linear_task import Task
-from derender.networks.tensor_file import disk_errors
-from derender.whole import whole_folder
+from derender.storage.atomic import atomic_folder
+from derender.storage.tensors import disk_errors
 
 HEADS = ("logistic", "linear")
 PENALTIES = (1e-1, 1.0, 1e1)
@@ -108,7 +108,7 @@ class Probe:
             raise FileExistsError(f"{folder} exists already: choose another folder or pass overwrite=True")
         facts: dict[str, Any] = {"format": FORMAT, "kind": self.kind, "names": list(self.names)}
         facts |= {"sizes": [[name, size] for name, size in self.sizes.items()], "head": self.head}
-        with whole_folder(folder) as temporary:
+        with atomic_folder(folder) as temporary:
             with disk_errors(temporary / WEIGHTS_FILE):
                 save_file({"weight": self.weight, "bias": self.bias}, temporary / WEIGHTS_FILE)
             (temporary / CONFIG_FILE).write_text(json.dumps(facts, indent=1))

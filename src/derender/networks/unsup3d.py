@@ -23,7 +23,7 @@ from torch.serialization import safe_globals
 from derender.networks.confidence import ConfidenceNet
 from derender.networks.factors import FACTORS
 from derender.networks.settings import IMAGE_SIZES, NetworkSettings
-from derender.networks.torch_file import refuse_old_torch
+from derender.storage.tensors import refuse_old_torch
 
 NETS = {"netD": "geometry", "netA": "albedo", "netL": "light", "netV": "camera", "netC": "confidence"}
 OPTIONAL = "netC"

@@ -12,8 +12,8 @@ from pathlib import Path
 import torch
 from torch import nn
 
-from derender.networks.tensor_file import read_described, write_tensors
 from derender.objectives.frozen import PerceptualFeatures
+from derender.storage.tensors import read_described, write_tensors
 
 DEFAULT_WIDTHS = (16, 32, 64)
 

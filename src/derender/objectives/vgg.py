@@ -16,8 +16,8 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import nn
 
-from derender.networks.torch_file import refuse_old_torch
 from derender.objectives.frozen import PerceptualFeatures
+from derender.storage.tensors import refuse_old_torch
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)

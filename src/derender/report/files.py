@@ -19,7 +19,7 @@ from derender.report.figures import Decomposition, decomposition
 from derender.report.panel import strip
 from derender.scene import Scene
 from derender.scene.normals import normals_from_depth
-from derender.whole import whole_folder
+from derender.storage.atomic import atomic_folder
 
 
 def folder_names(pictures: Sequence[Path], out: Path) -> list[Path]:
@@ -98,7 +98,7 @@ def scene_numbers(drawn: Decomposition, index: int) -> dict[str, Any]:
 def _write_folder(
     folder: Path, drawn: Decomposition, index: int, scene: Scene, fov_deg: float, record: Mapping[str, Any]
 ) -> None:
-    with whole_folder(folder) as temporary:
+    with atomic_folder(folder) as temporary:
         drawn.panel(index).save(temporary / "panel.png")
         for name, images in drawn.columns.items():
             strip([images[index]]).save(temporary / f"{name.replace(' ', '_')}.png")

@@ -16,7 +16,7 @@ from derender.data import suggestion
 from derender.report.colours import Images
 from derender.report.films import gif, mp4
 from derender.report.panel import GridLayout, labelled_grid
-from derender.whole import whole_folder
+from derender.storage.atomic import atomic_folder
 
 FILMS = {"gif": gif, "mp4": mp4}
 SMALLEST_CELL = 128
@@ -72,7 +72,7 @@ def write_moved(
     seconds: float = 2.4,
 ) -> dict[str, Any]:
     """Write one picture's folder; gives what its moved.json says: the record, and each still's numbers."""
-    with whole_folder(folder) as temporary:
+    with atomic_folder(folder) as temporary:
         moved.strip().save(temporary / "strip.png")
         told = []
         for number, (label, still) in enumerate(moved.stills.items(), 1):

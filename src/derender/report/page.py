@@ -11,7 +11,7 @@ from hashlib import sha256
 from pathlib import Path
 
 from derender.report.blocks import TEMPLATES, Html
-from derender.whole import whole_file
+from derender.storage.atomic import atomic_file
 
 
 @dataclass(frozen=True)
@@ -53,6 +53,6 @@ class Page:
 def write_whole(path: str | Path, content: bytes) -> Path:
     """Write a file whole or not at all; a failure leaves the old one. Makes the folder."""
     path = Path(path)
-    with whole_file(path) as temporary:
+    with atomic_file(path) as temporary:
         temporary.write_bytes(content)
     return path

@@ -11,7 +11,7 @@ from PIL import Image
 
 from derender.report.colours import enlarged
 from derender.report.panel import GridLayout, labelled_grid
-from derender.whole import whole_file
+from derender.storage.atomic import atomic_file
 
 ROWS_PER_SHEET = 16
 CELL = 128
@@ -64,6 +64,6 @@ def write_sheets(sheets: Sheets, out: Path) -> list[Path]:
     """Write all sheets, each whole or not at all."""
     paths = sheet_paths(out, len(sheets), sheets.rows)
     for path, sheet in zip(paths, sheets.drawn(), strict=True):
-        with whole_file(path) as temporary:
+        with atomic_file(path) as temporary:
             sheet.save(temporary, format="PNG")
     return paths

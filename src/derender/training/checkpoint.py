@@ -17,9 +17,9 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from derender.networks.tensor_file import disk_errors
+from derender.storage.atomic import CHECKSUMS, Damaged, DamageNoticed, atomic_folder, check_seal, seal
+from derender.storage.tensors import disk_errors
 from derender.training.weights import fit_weights
-from derender.whole import CHECKSUMS, Damaged, DamageNoticed, check_seal, seal, whole_folder
 
 FORMAT = 1
 WEIGHTS_FILE, OPTIMISER_FILE, STATE_FILE = "model.safetensors", "optimiser.safetensors", "state.json"
@@ -69,7 +69,7 @@ def save_checkpoint(
     """
     weights = {name: value.detach().cpu().contiguous() for name, value in model.state_dict().items()}
     tensors, groups = _flatten(optimiser.state_dict())
-    with whole_folder(folder, previous=previous) as temporary:
+    with atomic_folder(folder, previous=previous) as temporary:
         for file, values in ((WEIGHTS_FILE, weights), (OPTIMISER_FILE, tensors)):
             with disk_errors(temporary / file):
                 save_file(values, temporary / file)

@@ -14,7 +14,7 @@ from pydantic import Field, ValidationError, field_validator
 
 from derender.data import suggestion
 from derender.model import load
-from derender.networks.fitting import FittingSettings
+from derender.postprocess.fitting import FittingSettings
 from derender.presets import MODEL_PRESETS, ModelSettings, named_preset
 from derender.scene.crop import DEFAULT_CROPS, CropSettings
 from derender.scene.perturb import PerturbSettings
@@ -52,7 +52,7 @@ class ObjectiveSettings(Settings):
 
 
 class WhiteningSettings(Settings):
-    """How codes become features after training (networks/whitening.py); no pictures: features are codes."""
+    """How codes become features after training (postprocess/whitening.py); 0 pictures: features are codes."""
 
     pictures: int = Field(default=3_000, ge=0)  # training pictures that are rendered again
     views: int = Field(default=4, ge=1)  # renderings of each

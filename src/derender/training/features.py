@@ -6,8 +6,8 @@ from jaxtyping import Shaped
 from torch import Tensor
 
 from derender.model import Derenderer
-from derender.networks.fitting import PARAMETERS
-from derender.networks.morphable import MorphableMaps
+from derender.postprocess.fitting import PARAMETERS
+from derender.postprocess.morphable import MorphableMaps
 from derender.training.config import FeatureSettings
 from derender.training.fitting import make_fitting
 from derender.training.whitening import fit_whitening

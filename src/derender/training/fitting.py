@@ -1,6 +1,6 @@
 """What a trained model needs to fit scenes to pictures: a morphable model of its own answers.
 
-Leaves out the fitting itself (networks/fitting.py), which happens when a model is used.
+Leaves out the fitting itself (postprocess/fitting.py), which happens when a model is used.
 """
 
 from collections.abc import Callable
@@ -11,8 +11,8 @@ from torch import Tensor
 
 from derender.data import as_float
 from derender.model import Derenderer
-from derender.networks.fitting import PARAMETERS, Fitting, FittingSettings
-from derender.networks.morphable import MorphableMaps
+from derender.postprocess.fitting import PARAMETERS, Fitting, FittingSettings
+from derender.postprocess.morphable import MorphableMaps
 
 BATCH_SIZE = 128
 MEASURED = 256  # pictures that are fitted to learn how long fitted coordinates are, where features hold them

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from derender.data import as_float
 from derender.model import ERRORS_FILE, load
-from derender.whole import whole_file
+from derender.storage.atomic import atomic_file
 
 FORMAT = 1
 QUANTILES = 101
@@ -116,7 +116,7 @@ def write_errors(folder: Path, errors: HeldOutErrors) -> Path:
         "pictures": errors.pictures,
         "quantiles": [float(f"{value:.6g}") for value in errors.quantiles.tolist()],
     }
-    with whole_file(folder / ERRORS_FILE) as temporary:
+    with atomic_file(folder / ERRORS_FILE) as temporary:
         temporary.write_text(json.dumps(values) + "\n")
     return folder / ERRORS_FILE
 

@@ -6,10 +6,10 @@ from typing import Literal, cast
 
 from torch import nn
 
+from derender.storage.atomic import DamageNoticed
 from derender.training.checkpoint import DamagedCheckpoint, TrainState, load_checkpoint
 from derender.training.run_folder import RunFolder
 from derender.training.task import SavedModel
-from derender.whole import DamageNoticed
 
 
 @dataclass

@@ -20,6 +20,7 @@ from torch import Tensor, nn
 from torch.utils.tensorboard.writer import SummaryWriter
 
 from derender.data import PictureSet, split_indices
+from derender.storage.atomic import atomic_file
 from derender.training.allocator import freed_memory_kept
 from derender.training.batches import Batches, Reader, batches_of, random_stream, some_of
 from derender.training.checkpoint import TrainState, resume_from, save_checkpoint
@@ -47,7 +48,6 @@ from derender.training.step_module import compute_step
 from derender.training.task import StepLosses, Task, Watch
 from derender.training.validate import validate
 from derender.training.watch import Finding
-from derender.whole import whole_file
 
 SAMPLE_COUNT = 8
 LOG_EVERY_STEPS = 50
@@ -294,7 +294,7 @@ class _Run:
         with torch.no_grad():
             sheet = self.sample_sheet(self.model, self.held_out[:SAMPLE_COUNT].float() / 255)
         self.model.train()
-        with whole_file(self.folder.samples / f"{self.state.images:09d}.png") as temporary:
+        with atomic_file(self.folder.samples / f"{self.state.images:09d}.png") as temporary:
             sheet.save(temporary, format="PNG")
 
     def checkpoint(self) -> None:

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from derender.objectives.perceptual import PerceptualFeatures, build_perceptual
 from derender.objectives.self_features import SelfFeatures, load_self_features
+from derender.storage.atomic import DamageNoticed, atomic_file
 from derender.training.config import TrainConfig
-from derender.whole import DamageNoticed, whole_file
 
 
 def prepare_perceptual(
@@ -43,6 +43,6 @@ def prepare_perceptual(
         device=images.device,
     )
     if isinstance(features, SelfFeatures):
-        with whole_file(file) as temporary:
+        with atomic_file(file) as temporary:
             features.save(temporary)
     return features

@@ -1,13 +1,13 @@
 """Encoders that learn to say at once what fitting finds; ours.
 
-Fitting (networks/fitting.py) brings a scene nearer to its picture than encoders do, but takes many times as
-long. Here scenes are fitted to the training pictures once, and a copy of the model learns to read them: from
-the pictures, and from renderings of the fitted scenes in other light, from other sides and with another's
-geometry, whose scenes are known exactly. So what optimisation finds is amortised; that the scenes read from
-pictures render them again is asked for, too. Shown in other frames (``reframed``), pictures teach where their
-camera stands, which rendering alone does not: a decoder draws a small thing sooner than a camera learns to
-step back. Needs no labels. Leaves out models with further factors, and the
-confidence net, which stays.
+Fitting (postprocess/fitting.py) brings a scene nearer to its picture than encoders do, but takes many times
+as long. Here scenes are fitted to the training pictures once, and a copy of the model learns to read them:
+from the pictures, and from renderings of the fitted scenes in other light, from other sides and with
+another's geometry, whose scenes are known exactly. So what optimisation finds is amortised; that the scenes
+read from pictures render them again is asked for, too. Shown in other frames (``reframed``), pictures teach
+where their camera stands, which rendering alone does not: a decoder draws a small thing sooner than a camera
+learns to step back. Needs no labels. Leaves out models with further factors, and the confidence net, which
+stays.
 """
 
 import math
@@ -22,10 +22,10 @@ from torch import Generator, Tensor, nn
 
 from derender.data import as_float
 from derender.model import Derenderer
-from derender.networks.fitting import PARAMETERS, STEPS
-from derender.networks.morphable import MorphableMaps
 from derender.objectives.reconstruction import masked_l1
 from derender.objectives.self_training import endless_order
+from derender.postprocess.fitting import PARAMETERS, STEPS
+from derender.postprocess.morphable import MorphableMaps
 from derender.scene import Scene
 from derender.scene.crop import (
     DEFAULT_CROPS,

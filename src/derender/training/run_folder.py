@@ -18,8 +18,8 @@ import yaml
 
 from derender.data import PictureSet, Split
 from derender.settings import Settings
+from derender.storage.atomic import atomic_file, remove_abandoned
 from derender.training.config import Config, TrainConfig, config_from_tree, to_yaml
-from derender.whole import remove_abandoned, whole_file
 
 FORMAT = 1
 """Of config.yaml, which says so in its first line; one that does not is of this format, too."""
@@ -244,7 +244,7 @@ def describe_data(pictures: PictureSet, split: Split) -> dict[str, Any]:
 
 def write_text(path: Path, text: str) -> None:
     """Write a file whole or not at all."""
-    with whole_file(path) as temporary:
+    with atomic_file(path) as temporary:
         temporary.write_text(text)
 
 

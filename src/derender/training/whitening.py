@@ -17,7 +17,7 @@ from torch import Generator, Tensor
 from derender.data import as_float
 from derender.model import Derenderer
 from derender.networks import Factor
-from derender.networks.whitening import Spread, Whitening, contrast
+from derender.postprocess.whitening import Spread, Whitening, contrast
 from derender.scene import Scene
 from derender.scene.crop import crop_images, random_crops
 from derender.scene.perturb import PerturbSettings

@@ -20,7 +20,7 @@ from derender.baselines.stylegan2.published import (
     load_published_e4e,
     load_published_generator,
 )
-from derender.networks.torch_file import reads_safely
+from derender.storage.tensors import reads_safely
 
 pytestmark = pytest.mark.skipif(not reads_safely(), reason="this PyTorch is not trusted with pickles")
 

@@ -28,12 +28,12 @@ from derender.data import checked_footer, decode, open_source, quiet_pillow, rea
 from derender.data.cache import cache_file, read_cache
 from derender.evaluation.memory import Memory
 from derender.features import FeatureTable
+from derender.storage.atomic import CHECKSUMS
 from derender.training import resolve
 from derender.training.checkpoint import TrainState, load_checkpoint, save_checkpoint
 from derender.training.config import config_from_tree, to_yaml
 from derender.training.run_folder import read_config_tree, read_metrics
 from derender.training.watch import Watcher
-from derender.whole import CHECKSUMS
 
 REFUSALS = (ValueError, OSError)
 TEXT = partial(str, encoding="utf-8", errors="surrogateescape")

@@ -12,7 +12,7 @@ from safetensors.torch import load_file
 
 from derender.features import FeatureTable
 from derender.model import load
-from derender.whole import check_seal
+from derender.storage.atomic import check_seal
 
 TRAINING = (
     "image_size=32",

@@ -13,7 +13,7 @@ from pathlib import Path
 from derender.data import read_pictures, stream_of
 from derender.features import DisentangledFeatures, FeatureTable, embed_to_file
 from derender.model import load
-from derender.whole import whole_file
+from derender.storage.atomic import atomic_file
 
 PAUSE_SECONDS = 1.0
 
@@ -35,7 +35,7 @@ def embed_until_told(folder: Path, model: str) -> None:
             if rows != 2 * len(table) or width != due:
                 raise RuntimeError(f"{rows} rows, {len(table)} in the table; {width} numbers, not {due}")
             passes += 1
-            with whole_file(folder / "passes.txt") as temporary:
+            with atomic_file(folder / "passes.txt") as temporary:
                 temporary.write_text(str(passes))
             time.sleep(PAUSE_SECONDS)
     except KeyboardInterrupt:

@@ -26,10 +26,10 @@ from derender.objectives.frozen import PerceptualFeatures
 from derender.objectives.perceptual import build_perceptual
 from derender.objectives.self_features import SelfFeatures, load_self_features
 from derender.settings import Settings
+from derender.storage.atomic import atomic_file
 from derender.training.batches import random_stream
 from derender.training.config import LoopSettings, OptimiserSettings
 from derender.training.step import Precision
-from derender.whole import whole_file
 
 REGULARISERS = ("delta", "prior")
 """Terms that say nothing of how well a picture is rebuilt."""
@@ -109,7 +109,7 @@ def perceptual_features(
         device=images.device,
     )
     assert isinstance(features, SelfFeatures)
-    with whole_file(file) as temporary:
+    with atomic_file(file) as temporary:
         features.save(temporary)
     return features
 

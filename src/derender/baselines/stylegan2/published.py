@@ -24,7 +24,7 @@ from torch import Tensor
 from derender.baselines.stylegan2.e4e import E4e, E4eSettings
 from derender.baselines.stylegan2.generator import Generator, GeneratorSettings, style_layers
 from derender.baselines.stylegan2.layers import FILTER
-from derender.networks.torch_file import refuse_old_torch
+from derender.storage.tensors import refuse_old_torch
 
 GENERATOR_FILE = (
     "stylegan2-ffhq-config-f.pt (linked from the READMEs of https://github.com/rosinality/stylegan2-pytorch "

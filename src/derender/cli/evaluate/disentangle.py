@@ -83,10 +83,10 @@ def disentangle(
     notes += [f"left out of the true factors: {name} ({why})" for name, why in unasked.items()]
     if out is not None:
         from derender.report.matrices import card_matrices, matrix_sheet
-        from derender.whole import whole_file
+        from derender.storage.atomic import atomic_file
 
         sheet = matrix_sheet(card_matrices(card), f"{model}: {card.n_pictures:,} pictures")
-        with whole_file(out) as temporary:
+        with atomic_file(out) as temporary:
             sheet.save(temporary, "PNG")
         result(f"matrices in {out}", published.json_file)
     values = {

@@ -26,8 +26,8 @@ def by_plan(
     from derender.cli.plan.outcome import write_outcome
     from derender.cli.plan.running import run_plan
     from derender.cli.plan.settings import read_plan
+    from derender.storage.atomic import atomic_file
     from derender.training.config import to_yaml
-    from derender.whole import whole_file
 
     plan = read_plan(file)
     if dry_run:
@@ -39,7 +39,7 @@ def by_plan(
         raise ValueError(f"{out} is a file: give --out the name of a folder")
     if out.is_dir() and any(out.iterdir()) and not (out / "plan.yaml").is_file():
         raise ValueError(f"{out} is not empty and holds no comparison: choose another --out")
-    with whole_file(out / "plan.yaml") as temporary:
+    with atomic_file(out / "plan.yaml") as temporary:
         temporary.write_text(to_yaml(plan))
     place = Place(out)
     try:

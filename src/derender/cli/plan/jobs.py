@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 from derender.cli.plan.settings import Plan
 from derender.evaluation.memory import content_hash
-from derender.whole import whole_file
+from derender.storage.atomic import atomic_file
 
 Kind = Literal["train", "embed", "score"]
 State = Literal["done", "failed", "stopped"]
@@ -104,7 +104,7 @@ class Place:
 
     def leave(self, job: Job, note: Note) -> Note:
         """Write a job's note."""
-        with whole_file(self._note(job)) as temporary:
+        with atomic_file(self._note(job)) as temporary:
             temporary.write_text(json.dumps({"job": job.name, **asdict(note)}, indent=1))
         return note
 

@@ -10,8 +10,8 @@ from torch import Tensor, nn
 
 from derender.evaluation.linear_head import probabilities
 from derender.model import Derenderer, load
-from derender.networks.tensor_file import read_tensors, write_tensors
-from derender.whole import whole_folder
+from derender.storage.atomic import atomic_folder
+from derender.storage.tensors import read_tensors, write_tensors
 
 HEAD_FILE, HEAD_CONFIG_FILE = "head.safetensors", "head.json"
 
@@ -61,7 +61,7 @@ class FinetunedModel(nn.Module):
         if folder.exists() and not overwrite:
             raise FileExistsError(f"{folder} exists already: choose another folder or pass overwrite=True")
         about = {"factors": self.head.factors, "kind": self.head.kind, "names": self.head.names}
-        with whole_folder(folder) as temporary:
+        with atomic_folder(folder) as temporary:
             self.model.save(temporary, overwrite=True)
             write_tensors(self.head.state_dict(), temporary / HEAD_FILE)
             (temporary / HEAD_CONFIG_FILE).write_text(json.dumps(about, indent=1))

@@ -27,6 +27,7 @@ from derender.evaluation.linear_task import Task, task_of
 from derender.model import Derenderer
 from derender.objectives.perceptual import PerceptualFeatures
 from derender.scene import Scene
+from derender.storage.atomic import atomic_file
 from derender.training.derender_task import DerenderTask
 from derender.training.finetune_config import FinetuneConfig
 from derender.training.finite import first_not_finite
@@ -38,7 +39,6 @@ from derender.training.step_module import Held
 from derender.training.task import PhaseProgress
 from derender.training.validate import NOT_RECONSTRUCTION
 from derender.training.watch import Finding, Watcher
-from derender.whole import whole_file
 
 RENDERING_TERMS = (
     *("photometric", "photometric_flip", "perceptual", "perceptual_flip", "smoothness", "curvature"),
@@ -264,5 +264,5 @@ def _bring_perceptual(config: FinetuneConfig, file: Path) -> None:
         return
     there = RunFolder(Path(config.start)).perceptual
     if there.is_file():
-        with whole_file(file) as temporary:
+        with atomic_file(file) as temporary:
             shutil.copyfile(there, temporary)

@@ -5,7 +5,7 @@ import stat
 import pytest
 import torch
 
-from derender.networks.tensor_file import UNIT, packed, read_tensors, write_tensors
+from derender.storage.tensors import UNIT, packed, read_tensors, write_tensors
 
 
 @pytest.mark.parametrize("along", [0, 1])

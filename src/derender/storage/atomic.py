@@ -32,7 +32,7 @@ class DamageNoticed(UserWarning):
 
 
 @contextmanager
-def whole_file(path: Path, *, durable: bool = False) -> Iterator[Path]:
+def atomic_file(path: Path, *, durable: bool = False) -> Iterator[Path]:
     """Give a temporary path to write to; it takes the place of ``path`` if nothing is raised.
 
     With ``durable`` the disk has the content before the name: losing power cannot leave an empty file.
@@ -54,7 +54,7 @@ def whole_file(path: Path, *, durable: bool = False) -> Iterator[Path]:
 
 
 @contextmanager
-def whole_folder(folder: Path, *, previous: Path | None = None) -> Iterator[Path]:
+def atomic_folder(folder: Path, *, previous: Path | None = None) -> Iterator[Path]:
     """Give a temporary folder to fill; it takes the place of ``folder`` if nothing is raised.
 
     The two are exchanged in one step where the system can (Linux); elsewhere the old one is moved aside

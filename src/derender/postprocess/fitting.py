@@ -1,7 +1,7 @@
 """Scenes fitted to their pictures: from where the encoders left them, downhill through the renderer.
 
 Analysis by synthesis at the time of use. Geometry and albedo move within a morphable model of what the
-trained model says of its training pictures (networks/morphable.py), light and camera freely, so that the
+trained model says of its training pictures (postprocess/morphable.py), light and camera freely, so that the
 rendering comes near the picture; the further a coordinate is from usual, the more it costs. Encoders know the
 light and views they were trained in; the renderer holds in any. Leaves out the parameters of further factors,
 which stay as they were read.
@@ -18,12 +18,12 @@ from jaxtyping import Float
 from pydantic import Field, ValidationError, model_validator
 from torch import Tensor, nn
 
-from derender.networks.morphable import MorphableMaps
-from derender.networks.tensor_file import read_described, write_tensors
+from derender.postprocess.morphable import MorphableMaps
 from derender.render import Rendering
 from derender.scene import Scene
 from derender.settings import Settings
-from derender.whole import whole_file
+from derender.storage.atomic import atomic_file
+from derender.storage.tensors import read_described, write_tensors
 
 PARAMETERS = {"geometry": "depth", "albedo": "albedo"}
 """Factors that are fitted within the morphable model, and what they fill."""
@@ -48,7 +48,7 @@ def coordinates_of(factor: str) -> str:
 
 
 class FittingSettings(Settings):
-    """How scenes are fitted to pictures (networks/fitting.py); no examples: they cannot be."""
+    """How scenes are fitted to pictures (postprocess/fitting.py); no examples: they cannot be."""
 
     examples: int = Field(default=2_000, ge=0)  # training pictures whose maps the morphable model is made of
     coordinates: int = Field(default=64, ge=1)  # of geometry, and of albedo
@@ -204,7 +204,7 @@ class Fitting(nn.Module):
 
     def save(self, file: Path) -> None:
         """Write it; complete or not at all."""
-        with whole_file(file) as temporary:
+        with atomic_file(file) as temporary:
             write_tensors(self.tensors(), temporary, {"settings": self.settings.model_dump_json()})
 
     @classmethod

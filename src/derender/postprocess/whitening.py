@@ -15,8 +15,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from derender.networks.tensor_file import read_tensors, write_tensors
-from derender.whole import whole_file
+from derender.storage.atomic import atomic_file
+from derender.storage.tensors import read_tensors, write_tensors
 
 _MIRRORED = "reads_mirror_image"  # a file without it is of a model that reads pictures as they are alone
 _ALONE = "_alone"  # after a name: this one is read of pictures as they are, though others are not
@@ -183,7 +183,7 @@ class Whitening(nn.Module):
 
     def save(self, file: Path) -> None:
         """Write the maps; complete or not at all."""
-        with whole_file(file) as temporary:
+        with atomic_file(file) as temporary:
             write_tensors(self.tensors(), temporary)
 
     @classmethod

@@ -8,8 +8,8 @@ import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from derender.pretrained.saved import SPLIT_FILE
-from derender.whole import whole_file
+from derender.storage.atomic import atomic_file
+from derender.storage.folder import SPLIT_FILE
 
 FORMAT = 1
 
@@ -29,7 +29,7 @@ class SplitRecord:
 
 def write_split(folder: Path, split: SplitRecord) -> None:
     """Write the file into a saved model's folder; whole or not at all."""
-    with whole_file(folder / SPLIT_FILE) as temporary:
+    with atomic_file(folder / SPLIT_FILE) as temporary:
         temporary.write_text(json.dumps({"format": FORMAT, **asdict(split)}) + "\n")
 
 

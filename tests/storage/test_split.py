@@ -11,7 +11,7 @@ from derender.cli.models import keep_split, part_of, split_of
 from derender.data import read_pictures
 from derender.data.synthetic import faces
 from derender.model import SPLIT_FILE
-from derender.pretrained.split_record import SplitRecord, read_split, write_split
+from derender.storage.split import SplitRecord, read_split, write_split
 from derender.training.config import TrainConfig
 from derender.training.run_folder import start_run
 

@@ -12,19 +12,19 @@ from pathlib import Path
 
 from torch import Tensor
 
-from derender.networks.tensor_file import UNIT, packed, read_described, write_tensors
-from derender.pretrained.card import CARD_FILE
-from derender.pretrained.folders import model_folder
-from derender.pretrained.saved import (
+from derender.storage.atomic import atomic_folder
+from derender.storage.card import CARD_FILE
+from derender.storage.folder import (
     CONFIG_FILE,
     ERRORS_FILE,
     FITTING_FILE,
     SPLIT_FILE,
     WEIGHTS_FILE,
     WHITENING_FILE,
+    model_folder,
     read_config,
 )
-from derender.whole import whole_folder
+from derender.storage.tensors import UNIT, packed, read_described, write_tensors
 
 KINDS = ("bytes", "float16")
 """How the large maps of whitening and fitting are kept; weights are kept in float16 by both."""
@@ -70,7 +70,7 @@ def pack_model(
         raise FileExistsError(f"{folder} exists already: choose another folder or pass overwrite=True")
     read_config(own)
     before, after = {}, {}
-    with whole_folder(folder) as temporary:
+    with atomic_folder(folder) as temporary:
         for name in (WEIGHTS_FILE, WHITENING_FILE, FITTING_FILE):
             if not (own / name).is_file():
                 continue

@@ -2,16 +2,16 @@
 
 import pytest
 
-from derender.whole import whole_file, whole_folder
+from derender.storage.atomic import atomic_file, atomic_folder
 
 
 def test_a_file_is_replaced_only_at_the_end(tmp_path):
     path = tmp_path / "deep" / "a.txt"
-    with whole_file(path) as temporary:
+    with atomic_file(path) as temporary:
         temporary.write_text("one")
         assert not path.exists()
     assert path.read_text() == "one"
-    with pytest.raises(RuntimeError, match="disk full"), whole_file(path) as temporary:
+    with pytest.raises(RuntimeError, match="disk full"), atomic_file(path) as temporary:
         temporary.write_text("half")
         raise RuntimeError("disk full")
     assert path.read_text() == "one"
@@ -22,10 +22,10 @@ def test_a_file_is_replaced_only_at_the_end(tmp_path):
 def test_a_folder_is_replaced_only_at_the_end(tmp_path):
     folder = tmp_path / "model"
     for content in ("one", "two"):
-        with whole_folder(folder) as temporary:
+        with atomic_folder(folder) as temporary:
             (temporary / content).write_text(content)
         assert [entry.name for entry in folder.iterdir()] == [content]
-    with pytest.raises(KeyboardInterrupt), whole_folder(folder) as temporary:
+    with pytest.raises(KeyboardInterrupt), atomic_folder(folder) as temporary:
         (temporary / "half").write_text("half")
         raise KeyboardInterrupt
     assert [entry.name for entry in folder.iterdir()] == ["two"]
@@ -34,6 +34,6 @@ def test_a_folder_is_replaced_only_at_the_end(tmp_path):
 
 def test_the_longest_names_are_fine(tmp_path):
     path = tmp_path / ("n" * 250 + ".txt")
-    with whole_file(path) as temporary:
+    with atomic_file(path) as temporary:
         temporary.write_text("x")
     assert path.read_text() == "x"

@@ -5,15 +5,13 @@ Made from what is known; what nobody said stands there as not stated. Leaves out
 
 import json
 
-from derender.presets import ModelSettings
-
 CARD_FILE = "README.md"
 NOT_STATED = "not stated"
 
 
 def model_card(
     title: str,
-    settings: ModelSettings,
+    description: str,
     *,
     data: str | None = None,
     licence: str | None = None,
@@ -24,14 +22,12 @@ def model_card(
 
     Args:
         title: what the model is called.
-        settings: sizes and ranges.
+        description: one sentence: what the model does, its sizes and ranges.
         data: what it was trained on.
         licence: what it may be used for.
         scores: what was measured.
         held_out: its reconstruction errors (JSON), whose middle and 99th percentile are told.
     """
-    network, ranges = settings.network, settings.ranges
-    size = network.image_size
     measured = [text for text in (scores, _held_out(held_out)) if text]
     parts = {
         "Trained on": data,
@@ -41,10 +37,7 @@ def model_card(
     return "\n\n".join(
         [
             f"# {title}",
-            f"Takes {size} x {size} pictures of one kind of thing apart into geometry, albedo, light and "
-            f"camera (field of view {ranges.fov_deg:g} degrees; depth {ranges.depth_min:g} to "
-            f"{ranges.depth_max:g}; networks of width {network.width} and {network.light_width}, codes of "
-            f"{network.code_size}).",
+            description,
             f'```python\nimport derender\n\nmodel = derender.load("{title}")\n```',
             *(f"**{name}**: {text or NOT_STATED}" for name, text in parts.items()),
         ]

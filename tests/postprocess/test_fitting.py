@@ -6,8 +6,8 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from derender.networks.fitting import Fitting, FittingSettings, coordinates_of
-from derender.networks.morphable import MorphableMaps
+from derender.postprocess.fitting import Fitting, FittingSettings, coordinates_of
+from derender.postprocess.morphable import MorphableMaps
 from derender.render import render_scene
 from derender.scene import Scene
 

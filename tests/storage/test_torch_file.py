@@ -5,9 +5,9 @@ import torch
 from torch.torch_version import TorchVersion
 
 from derender.baselines.stylegan2.published import read_weights
-from derender.networks.torch_file import reads_safely
 from derender.networks.unsup3d import read_checkpoint
 from derender.objectives.vgg import load_vgg16
+from derender.storage.tensors import reads_safely
 
 
 @pytest.mark.parametrize(

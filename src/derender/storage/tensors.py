@@ -1,7 +1,9 @@
-"""Named tensors in a safetensors file that carries its own checksum.
+"""Named tensors in a safetensors file that carries its own checksum; and which pickles of weights are safe.
 
-The CRC-32 of names, kinds, shapes and values stands in the file's metadata, so that a bit that has changed is
-an error and not another model. Files made elsewhere carry none and are read as they are.
+The CRC-32 of names, kinds, shapes and values is in the file's metadata, so that a changed bit is an error and
+not another model. Files made elsewhere carry none and are read as they are. Published networks exist only as
+pickles (.pth): torch's restricted reader makes tensors and plain values and runs no code, but before PyTorch
+2.10 a crafted file could corrupt memory through it (CVE-2026-24747). derender never writes a pickle.
 """
 
 import os
@@ -17,6 +19,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 CHECKSUM = "crc32"
+SAFE_SINCE = "2.10.0"  # version of PyTorch that reads pickles of weights safely
 UNIT = ".unit"
 """A tensor of bytes is in the unit that lies beside it under its name and this: read as their product."""
 
@@ -95,3 +98,17 @@ def checksum(tensors: Mapping[str, Tensor]) -> str:
         if value.numel():
             found = zlib.crc32(value.contiguous().reshape(-1).view(torch.uint8).numpy().data, found)
     return f"{found:08x}"
+
+
+def reads_safely() -> bool:
+    """Whether the installed PyTorch is new enough."""
+    return torch.__version__ >= SAFE_SINCE
+
+
+def refuse_old_torch(file: str | Path) -> None:
+    """Raise ValueError where a crafted ``file`` could make the installed PyTorch run code."""
+    if not reads_safely():
+        raise ValueError(
+            f"{file} is a pickle, and PyTorch {torch.__version__} can be made to run code by a crafted one "
+            f"(CVE-2026-24747): install PyTorch {SAFE_SINCE} or newer"
+        )

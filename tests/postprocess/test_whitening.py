@@ -5,7 +5,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from derender.networks.whitening import Spread, Whitening, contrast
+from derender.postprocess.whitening import Spread, Whitening, contrast
 
 VIEWS, PICTURES, SIZE = 5, 400, 12
 

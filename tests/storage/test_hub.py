@@ -12,7 +12,7 @@ import torch
 
 import derender
 from derender.model import ERRORS_FILE, Derenderer
-from derender.pretrained import hub
+from derender.storage import hub
 from derender.training.held_out_errors import HeldOutErrors, read_errors, write_errors
 
 

@@ -1,0 +1,1 @@
+"""Encoder activations to features: whitening, and coordinates of scenes fitted per image at test time."""

@@ -1,0 +1,105 @@
+"""The folder of a saved model: its files, where it lies, what ``config.json`` must say, whether weights fit.
+
+A model is looked for in a folder, among the bundled models, then on the Hugging Face Hub.
+"""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from derender.storage import hub
+from derender.storage.card import CARD_FILE
+from derender.storage.tensors import read_tensors
+
+FORMAT = 1
+WEIGHTS_FILE, CONFIG_FILE = "model.safetensors", "config.json"
+WHITENING_FILE, FITTING_FILE = "whitening.safetensors", "fitting.safetensors"  # a model may lack them
+ERRORS_FILE = "held_out_errors.json"  # written and read by training/held_out_errors.py; a model may lack it
+SPLIT_FILE = "split.json"  # written and read by storage/split.py; a model may lack it
+PRETRAINED = Path(__file__).parents[1] / "pretrained"
+
+
+def bundled_models() -> tuple[str, ...]:
+    """Names of the trained models that come with derender; each has a card, ``pretrained/NAME/README.md``."""
+    return tuple(sorted(folder.parent.name for folder in PRETRAINED.glob(f"*/{CONFIG_FILE}")))
+
+
+def model_folder(source: str | Path) -> Path:
+    """The folder that ``load`` reads for this source.
+
+    Raises:
+        FileNotFoundError: nothing is there.
+    """
+    folder = Path(source)
+    for candidate in (folder, folder / "model"):
+        if (candidate / CONFIG_FILE).is_file() and (candidate / WEIGHTS_FILE).is_file():
+            return candidate
+    if folder.exists():
+        raise FileNotFoundError(
+            f"{folder} holds no model (expected {CONFIG_FILE} and {WEIGHTS_FILE} here or in 'model'): "
+            "give a run folder made by 'derender train' or a folder made by model.save"
+        )
+    if source in bundled_models():
+        return PRETRAINED / source
+    if isinstance(source, str) and source.count("/") == 1 and not source.startswith((".", "/", "~")):
+        weights = (CONFIG_FILE, WEIGHTS_FILE, WHITENING_FILE, FITTING_FILE)
+        return hub.download(source, (*weights, ERRORS_FILE, SPLIT_FILE, CARD_FILE))
+    raise FileNotFoundError(
+        f"no model at {source}: give a run folder, a saved folder, a Hub id 'owner/name', or one of those "
+        f"that come with derender ({', '.join(bundled_models())})"
+    )
+
+
+def texts_beside(folder: Path | None, tensors: Mapping[str, Tensor]) -> dict[str, str]:
+    """Card, held-out errors and split of a saved folder, by file, if its files hold these tensors."""
+    if folder is None or not (folder / WEIGHTS_FILE).is_file():
+        return {}
+    stored: dict[str, Tensor] = {}
+    for name in (WEIGHTS_FILE, WHITENING_FILE, FITTING_FILE):
+        stored |= read_tensors(folder / name) if (folder / name).is_file() else {}
+    if stored.keys() != tensors.keys() or any(
+        not torch.equal(stored[name].to(value), value) for name, value in tensors.items()
+    ):
+        return {}
+    files = (folder / name for name in (CARD_FILE, ERRORS_FILE, SPLIT_FILE))
+    return {file.name: file.read_text(encoding="utf-8") for file in files if file.is_file()}
+
+
+def read_config(folder: Path) -> dict[str, Any]:
+    """What a saved folder says of its model: ``factors`` and ``settings``.
+
+    Raises:
+        ValueError: it is damaged, of a newer version, or of a baseline.
+    """
+    try:
+        config = json.loads((folder / CONFIG_FILE).read_text())
+        version, complete = config["format"], isinstance(config.get("settings"), dict)
+        names = config.get("factors")
+        complete = complete and isinstance(names, list) and all(isinstance(name, str) for name in names)
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
+        raise ValueError(f"{folder / CONFIG_FILE} is damaged: copy or train the model again") from error
+    if "baseline" in config:
+        name = config["baseline"]
+        raise ValueError(
+            f"{folder} holds the baseline {name!r}, not our model: add --baseline {name}, or load it with "
+            "derender.baselines.training.load_baseline"
+        )
+    if not isinstance(version, int) or version > FORMAT:
+        raise ValueError(
+            f"{folder} was saved in format {version}, this version reads up to {FORMAT}: update derender"
+        )
+    if not complete:
+        raise ValueError(f"{folder / CONFIG_FILE} is damaged: copy or train the model again")
+    return config
+
+
+def check_shapes(found: Mapping[str, Tensor], wanted: Mapping[str, Tensor]) -> None:
+    """The same names and shapes, or an error that names the first that differs."""
+    for name in sorted({*found, *wanted}):
+        shapes = [tuple(side[name].shape) if name in side else "nothing" for side in (found, wanted)]
+        if shapes[0] != shapes[1]:
+            raise ValueError(f"{name}: {shapes[0]} in {WEIGHTS_FILE}, {shapes[1]} by {CONFIG_FILE}")
