@@ -4,7 +4,6 @@ Source: Klinghoffer et al., ECCV 2022, Sec. 3; networks and scene of unsup3d (Wu
 Training lives in training/, scores in evaluation/; the model knows neither.
 """
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -32,7 +31,6 @@ from derender.storage.folder import (
     CONFIG_FILE,
     ERRORS_FILE,
     FITTING_FILE,
-    FORMAT,
     PRETRAINED,
     SPLIT_FILE,
     WEIGHTS_FILE,
@@ -42,6 +40,7 @@ from derender.storage.folder import (
     model_folder,
     read_config,
     texts_beside,
+    write_config,
 )
 from derender.storage.tensors import read_tensors, write_tensors
 
@@ -329,13 +328,8 @@ class Derenderer(nn.Module):
         return load(source, **rows)
 
     def _write(self, folder: Path) -> None:
-        config = {
-            "format": FORMAT,
-            "factors": [factor.name for factor in self.factors],
-            "settings": self.settings.model_dump(mode="json"),
-        }
         write_tensors(self.state_dict(), folder / WEIGHTS_FILE)
-        (folder / CONFIG_FILE).write_text(json.dumps(config, indent=1))
+        write_config(folder, [factor.name for factor in self.factors], self.settings.model_dump(mode="json"))
         if self.whitening is not None:
             self.whitening.save(folder / WHITENING_FILE)
         if self.fitting is not None:

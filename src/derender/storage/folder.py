@@ -4,7 +4,7 @@ A model is looked for in a folder, among the bundled models, then on the Hugging
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -95,6 +95,12 @@ def read_config(folder: Path) -> dict[str, Any]:
     if not complete:
         raise ValueError(f"{folder / CONFIG_FILE} is damaged: copy or train the model again")
     return config
+
+
+def write_config(folder: Path, factors: Sequence[str], settings: Mapping[str, Any]) -> None:
+    """Write ``config.json``: what ``read_config`` reads."""
+    config = {"format": FORMAT, "factors": list(factors), "settings": settings}
+    (folder / CONFIG_FILE).write_text(json.dumps(config, indent=1))
 
 
 def check_shapes(found: Mapping[str, Tensor], wanted: Mapping[str, Tensor]) -> None:
