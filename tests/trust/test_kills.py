@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from derender import whole
+from derender.storage import atomic
 from derender.storage.atomic import CHECKSUMS, Damaged, DamageNoticed, atomic_folder, check_seal, seal
 from derender.training.checkpoint import (
     DamagedCheckpoint,
@@ -91,7 +91,7 @@ def test_a_kill_at_any_step_of_writing_a_checkpoint_leaves_a_whole_one(
     net, run, tmp_path, monkeypatch, exchange
 ):
     if not exchange:
-        monkeypatch.setattr(whole, "_system_exchange", lambda: None)
+        monkeypatch.setattr(atomic, "_system_exchange", lambda: None)
     seen, step = set(), 0
     while True:
         step += 1
