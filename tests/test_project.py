@@ -33,6 +33,7 @@ STAGES = [
     "postprocess",
     "model",
     "training",
+    "inputs",
     "features",
     "baselines",
     "evaluation",

@@ -128,7 +128,7 @@ def test_bad_words_are_one_line(run, faces, tmp_path, refused):
     assert "holds the baseline 'vqvae'" in refused(*embed, "--model", run)
     assert "holds the baseline 'vqvae', asked for ae" in refused(*embed, "--baseline", "ae", "--model", run)
     assert "hf download" in refused(*embed, "--baseline", "dinov2", "--model", "nobody/nothing")
-    assert "--part needs --model" in refused(*embed, "--baseline", "pixels", "--part", "test")
+    assert "needs a model" in refused(*embed, "--baseline", "pixels", "--part", "test")
     assert "(N, 3" not in refused(*embed, "--baseline", "pca", "--image-size", "16")
     train = ("train", "--data", faces, "--out", tmp_path / "run")
     assert "did you mean 'simclr'" in refused(*train, "--model", "simcrl")

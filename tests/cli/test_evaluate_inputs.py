@@ -50,7 +50,7 @@ def refused(folder, capsys):
 def test_a_model_that_went_wrong_is_not_scored(protocol, folder, refused):
     data = ["-d", folder / "faces"] if protocol != "robustness" else []
     said = refused(protocol, "-m", folder / "broken", *data, "--cache", "none")
-    assert "has weights that are no numbers (first nets.geometry." in said
+    assert "has weights that are NaN or infinite (first nets.geometry." in said
 
 
 def test_labels_and_factors_that_ask_nothing(folder, refused):

@@ -52,4 +52,4 @@ def test_a_model_that_cannot_is_told(made, tmp_path, capsys):
     model.save(tmp_path / "plain")
     given = ["evaluate", "geometry", "-m", str(tmp_path / "plain"), "-d", str(made), "--fit-steps", "5"]
     assert main(given) == 2
-    assert "cannot fit scenes yet" in capsys.readouterr().err
+    assert "cannot optimise scenes per image yet" in capsys.readouterr().err

@@ -87,7 +87,7 @@ def test_scenes_that_cannot_be_fitted_are_told_before_anything_is_written(folder
     ):
         assert main([*command, "--fit-steps", "5"]) == 2
         said = capsys.readouterr().err
-        assert "cannot fit scenes yet" in said and "derender whiten" in said
+        assert "cannot optimise scenes per image yet" in said and "derender whiten" in said
     assert not (tmp_path / "t.parquet").exists() and not (tmp_path / "apart").exists()
 
 

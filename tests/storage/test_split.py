@@ -79,7 +79,7 @@ def test_what_learnt_from_all_pictures_has_no_parts(run, pictures, tmp_path, cap
     capsys.readouterr()
     asked = ["evaluate", "reconstruction", "-m", str(tmp_path / "all"), "-d", pictures, "--part", "test"]
     assert main(asked) == 2
-    assert "records no split: use --part all" in capsys.readouterr().err
+    assert "records no split: use part all" in capsys.readouterr().err
 
 
 def test_it_goes_with_weights_that_are_given_away(tmp_path):

@@ -1,14 +1,34 @@
-"""Options that several commands share, each declared once."""
+"""Options that several commands share, each declared once; groups of them are dataclasses (gathered.py).
 
+A group knows how to do what its options ask for: a new option of every command that reads images is one field
+here, used in one method here.
+"""
+
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-Model = Annotated[
-    str,
-    typer.Option("--model", "-m", help="Run folder, saved model or Hugging Face Hub id.", metavar="MODEL"),
-]
+from derender.cli.console import progress_bar, refuse_existing, report_images, result, write_json
+
+if TYPE_CHECKING:
+    from derender.data import PictureSet
+    from derender.model import Derenderer
+
+MODELS = (
+    "Run folder, saved model, Hugging Face Hub id, or a bundled model: faces-64, rendered-faces-64, cars-64."
+)
+
+Model = Annotated[str, typer.Option("--model", "-m", help=MODELS, metavar="MODEL")]
+Images = Annotated[
+    str | None,
+    typer.Argument(
+        help="Folder, zip, .tar shards or Hugging Face id; ADDRESS::PART for a part of it.", metavar="IMAGES",
+        show_default=False,
+    ),
+]  # fmt: skip
+DataAlias = Annotated[str | None, typer.Option("--data", "-d", hidden=True, metavar="IMAGES")]
 Data = Annotated[
     str,
     typer.Option(
@@ -16,37 +36,127 @@ Data = Annotated[
     ),
 ]
 Dataset = Annotated[
-    str,
-    typer.Option("--dataset", help="Layout of the data, if it is not recognised by itself.", metavar="NAME"),
+    str, typer.Option("--dataset", help="Layout of the images, if it is not recognised.", metavar="NAME")
 ]
 Json = Annotated[
     str | None,
     typer.Option("--json", help="Also write the numbers as JSON; - is standard output.", metavar="FILE"),
 ]
 Limit = Annotated[
-    int | None, typer.Option("--limit", min=1, metavar="N", help="At most so many pictures, evenly spaced.")
+    int | None,
+    typer.Option(
+        "--limit", min=1, metavar="N", help="Read at most N images: evenly spaced, or the first of a stream."
+    ),
 ]
 BatchSize = Annotated[
     int,
-    typer.Option(
-        "--batch-size", min=1, metavar="N", help="Pictures at a time; changes speed and memory only."
-    ),
+    typer.Option("--batch-size", min=1, metavar="N", help="Images per batch; changes speed and memory only."),
 ]
 Part = Annotated[
     str,
+    typer.Option("--part", help="all, or the train, validation or test part of the model's training split."),
+]
+Seed = Annotated[
+    int,
     typer.Option(
-        "--part", help="all, or the train, validation or test part of the split the model was trained with."
+        "--seed", min=0, metavar="N", help="Seed of every random choice: sampling, splits, initial weights."
     ),
 ]
-Seed = Annotated[int, typer.Option("--seed", min=0, metavar="N", help="Same seed, same result.")]
 Force = Annotated[bool, typer.Option("--force", help="Replace what is there.")]
 OutFolder = Annotated[Path, typer.Option("--out", "-o", help="Folder to write to.", metavar="DIR")]
-OutModel = Annotated[Path, typer.Option("--out", "-o", help="Folder for the model to make.", metavar="DIR")]
+OutModel = Annotated[Path, typer.Option("--out", "-o", help="Folder of the new model.", metavar="DIR")]
 Device = Annotated[str, typer.Option("--device", help="cpu, cuda, or auto.", metavar="NAME")]
 FitSteps = Annotated[
     int | None,
     typer.Option(
         "--fit-steps", min=0, max=10_000, metavar="N",
-        help="Fit each scene to its picture by rendering, in so many steps (60, say; slow).",
+        help="Optimise each scene against its image by rendering, in N steps (60, say; slow).",
     ),
 ]  # fmt: skip
+Settings = Annotated[
+    list[str] | None,
+    typer.Option("--set", help="Change one setting; may be repeated.", metavar="KEY=VALUE"),
+]
+
+
+@dataclass(frozen=True)
+class Output:
+    """Where numbers go, and whether existing files are replaced."""
+
+    force: Force = False
+    json_file: Json = None
+
+    def refuse_existing(self, path: Path) -> None:
+        """Stop before any work where ``path`` exists, unless --force was given."""
+        refuse_existing(path, self.force)
+
+    def result(self, text: str) -> None:
+        """Print one line of result."""
+        result(text, self.json_file)
+
+    def write(self, values: dict[str, Any]) -> None:
+        """Write what --json requests."""
+        write_json(self.json_file, values)
+
+
+@dataclass(frozen=True)
+class ImageSet:
+    """The images of a command: one data set, by address."""
+
+    images: Images = None
+    data: DataAlias = None
+    dataset: Dataset = "auto"
+    limit: Limit = None
+
+    @property
+    def optional_address(self) -> str | None:
+        """The address that was given, or None."""
+        if self.images is not None and self.data is not None:
+            raise ValueError(f"two sets of images were given, {self.images} and {self.data}: give one")
+        return self.images if self.data is None else self.data
+
+    @property
+    def address(self) -> str:
+        """The address that was given; none is an error."""
+        if (address := self.optional_address) is None:
+            raise ValueError("give the images: a folder, a zip or another data set")
+        return address
+
+    @property
+    def how(self) -> dict[str, Any]:
+        """How the address is read: keywords of library calls (`derender.inputs.as_images`)."""
+        return {"dataset": self.dataset, "limit": self.limit}
+
+    def read(self, image_size: int, **how: Any) -> "PictureSet":
+        """The decoded images, with a progress bar and a line on what was read and left out."""
+        from derender.inputs import as_images
+
+        with progress_bar("reading") as report:
+            images = as_images(self.address, image_size, **self.how, **how, progress=report)
+        report_images(images)
+        return images
+
+
+@dataclass(frozen=True)
+class PartOfImages(ImageSet):
+    """The images of a command, or one part of a training split."""
+
+    part: Part = "all"
+
+    @property
+    def how(self) -> dict[str, Any]:
+        return {**super().how, "part": self.part}
+
+
+@dataclass(frozen=True)
+class TrainedModel:
+    """The trained model of a command."""
+
+    model: Model
+    device: Device = "auto"
+
+    def open(self, fit_steps: int | None = None) -> "Derenderer":
+        """Load it."""
+        from derender.inputs import as_model
+
+        return as_model(self.model, device=self.device, fit_steps=fit_steps)

@@ -1,66 +1,53 @@
-"""`derender pack`: a model in fewer bytes, to give away."""
+"""`derender pack`: a model in fewer bytes, for release."""
 
 from typing import Annotated
 
 import typer
 
-from derender.cli import options
-from derender.cli.console import notice, progress_bar, refuse_existing, result, write_json
+from derender.cli.console import notice, progress_bar
+from derender.cli.gathered import gathered
+from derender.cli.options import OutModel, Output, PartOfImages, TrainedModel
 
 Maps = Annotated[
     str,
-    typer.Option(
-        "--maps",
-        help="How the large maps of features and fitting are kept: bytes or float16.",
-        metavar="KIND",
-    ),
-]
-Pictures = Annotated[
-    str | None,
-    typer.Option("--data", "-d", help="Pictures by which to say what packing costs.", metavar="PATH"),
+    typer.Option("--maps", help="Storage of the large maps of features: bytes or float16.", metavar="KIND"),
 ]
 
 
 def register(app: typer.Typer) -> None:
-    app.command("pack", epilog="Example: derender pack --model runs/mine --out mine --data photos/")(pack)
+    app.command("pack", epilog="Example: derender pack photos/ --model runs/mine --out mine")(pack)
 
 
+@gathered
 def pack(
-    model: options.Model,
-    out: options.OutModel,
-    maps: Maps = "bytes",
-    data: Pictures = None,
-    dataset: options.Dataset = "auto",
-    part: options.Part = "all",
-    limit: options.Limit = None,
-    device: options.Device = "auto",
-    force: options.Force = False,
-    json_file: options.Json = None,
+    images: PartOfImages, model: TrainedModel, out: OutModel, output: Output, maps: Maps = "bytes"
 ) -> None:
     """Write a copy of a model in fewer bytes: weights in float16, large maps in bytes or float16.
 
-    Card, held-out errors and split go along. With --data it is said how far features and renderings move.
+    Card, held-out errors and split are copied. With images, the loss of quality is measured on them.
     """
-    from derender.cli.models import keep_split, open_model, pictures_for
     from derender.evaluation.copies import copy_cost
+    from derender.inputs import as_model, copy_split
     from derender.storage.packing import pack_model
 
-    refuse_existing(out, force)
-    net = open_model(model, device)
+    output.refuse_existing(out)
+    original = model.open()
     chosen = None
-    if data is not None:
-        chosen = pictures_for(net, model, data, dataset=dataset, part=part, limit=limit, fewest=2)
-    made = pack_model(model, out, maps=maps, overwrite=force)
-    keep_split(made.folder, model)
-    sizes = {"before": sum(made.before.values()), "after": sum(made.after.values())}
+    if images.optional_address is not None:
+        chosen = images.read(original.image_size, model=model.model, at_least=2)
+    packed = pack_model(model.model, out, maps=maps, overwrite=output.force)
+    copy_split(packed.folder, model.model)
+    sizes = {"before": sum(packed.before.values()), "after": sum(packed.after.values())}
     notice(f"{sizes['after'] / 1e6:,.2f} MB, before {sizes['before'] / 1e6:,.2f} MB")
-    facts = {"model": made.folder, "bytes": sizes}
+    values = {"model": packed.folder, "bytes": sizes}
     if chosen is not None:
         with progress_bar("comparing") as report:
-            cost = copy_cost(net, open_model(str(made.folder), device), chosen.images, progress=report)
+            cost = copy_cost(
+                original, as_model(packed.folder, device=model.device), chosen.images, progress=report
+            )
         moved = ", ".join(f"{name} {share:.2%}" for name, share in cost.moved.items())
-        notice(f"features moved, in shares of how far two pictures are apart: {moved}")
-        notice(f"rendered again with L1 {cost.l1:.5f}, before {cost.l1_before:.5f}")
-        facts |= {"pictures": len(chosen), "cost": cost}
-    result(f"model {made.folder}", json_file)
-    write_json(json_file, facts)
+        notice(f"features moved, as a share of the distance between two images: {moved}")
+        notice(f"reconstruction L1 {cost.l1:.5f}, before {cost.l1_before:.5f}")
+        values |= {"pictures": len(chosen), "cost": cost}
+    output.result(f"model {packed.folder}")
+    output.write(values)

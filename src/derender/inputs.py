@@ -1,0 +1,143 @@
+"""Arguments of library calls: a model or its name, images or the address of a data set, a device by name.
+
+Every documented call takes either form and resolves it here, so that a command and a Python user get the same
+checks and the same errors.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+
+from derender.data import PictureSet, read_pictures, split_indices, suggestion
+from derender.model import Derenderer, load
+from derender.storage.folder import model_folder
+from derender.storage.split import SplitRecord, read_split, write_split
+from derender.training.config import TrainConfig
+from derender.training.run_folder import read_config_tree
+
+PARTS = ("all", "train", "validation", "test")
+DEVICES = ("auto", "cpu", "cuda")
+
+Progress = Callable[[int, int], object]
+"""Called with (done, total)."""
+
+
+def as_model(
+    model: Derenderer | str | Path, *, device: str = "auto", fit_steps: int | None = None
+) -> Derenderer:
+    """A model ready for use: one that is loaded already is returned as it is, a name is loaded.
+
+    Args:
+        model: a model, a run folder, a saved folder, a bundled name or a Hugging Face Hub id.
+        device: "auto", "cpu" or "cuda", for a model that is loaded here.
+        fit_steps: Adam steps of test-time optimisation that its features are made with; 0 makes none, None
+            keeps the model's own.
+
+    Raises:
+        FileNotFoundError: no model is there.
+        ValueError: the model is damaged, has weights that are NaN or infinite, or cannot be optimised per
+            image.
+    """
+    if isinstance(model, Derenderer):
+        source, loaded = str(model.source or "this model"), model
+    else:
+        source, loaded = str(model), load(model, device=device_named(device))
+        for name, value in loaded.state_dict().items():
+            if value.is_floating_point() and not bool(value.isfinite().all()):
+                raise ValueError(
+                    f"{source} has weights that are NaN or infinite (first {name}): its training went wrong "
+                    "or the file is damaged; take another checkpoint or train again"
+                )
+    if fit_steps is not None and (fit_steps or loaded.fitting is not None):
+        require_fitting(loaded, source)
+        assert loaded.fitting is not None
+        loaded.fitting.set_steps(fit_steps)
+    return loaded
+
+
+def require_fitting(model: Derenderer, source: str = "this model") -> None:
+    """Raise ValueError where a model lacks the morphable maps that test-time optimisation needs."""
+    if model.fitting is None:
+        raise ValueError(
+            f"{source} cannot optimise scenes per image yet: derender whiten --model {source} IMAGES --out "
+            "NEW makes a copy that can"
+        )
+
+
+def as_images(
+    images: PictureSet | str | Path,
+    image_size: int,
+    *,
+    dataset: str = "auto",
+    limit: int | None = None,
+    part: str = "all",
+    model: str | Path | None = None,
+    at_least: int = 1,
+    keep_duplicates: bool = False,
+    progress: Progress | None = None,
+) -> PictureSet:
+    """Decoded images: a set that is read already is returned as it is, an address is read.
+
+    Args:
+        images: a set, or a folder, zip, ``PATH::SUBSET``, shards or Hugging Face id.
+        image_size: side in pixels to read at.
+        dataset: the layout's name, or "auto" to recognise it.
+        limit: at most so many images, evenly spaced in the sorted list; of a stream the first.
+        part: "all", or the "train", "validation" or "test" part of the split that ``model`` was trained with.
+        model: a run folder or a saved model that records its split.
+        at_least: fewer images raise an error.
+        keep_duplicates: keep every one of identical images.
+        progress: called with (done, total) while reading.
+    """
+    if not isinstance(images, PictureSet):
+        images = read_pictures(
+            images, image_size, dataset=dataset, limit=limit, keep_duplicates=keep_duplicates,
+            progress=progress,
+        )  # fmt: skip
+    return part_of(images, part, model).require(at_least)
+
+
+def part_of(images: PictureSet, part: str, model: str | Path | None) -> PictureSet:
+    """The images of one part of the split of ``model``: a run, or a model that was saved from one."""
+    if part not in PARTS:
+        raise ValueError(f"unknown part {part!r}{suggestion(part, PARTS)}: choose {', '.join(PARTS)}")
+    if part == "all":
+        return images
+    if model is None:
+        raise ValueError(f"part {part!r} needs a model: the run whose split it is")
+    record = split_of(model)
+    if record is None:
+        raise ValueError(f"{model} is no run folder and records no split: use part all")
+    split = split_indices(images.files, record.shares, seed=record.seed)
+    return images.select(getattr(split, part)).require(1, f"the {part} part")
+
+
+def split_of(model: str | Path) -> SplitRecord | None:
+    """The split of a run, or of the run that a saved model comes from; None where it is not recorded."""
+    if (Path(model) / "config.yaml").is_file():
+        recorded = read_config_tree(Path(model))
+        default = TrainConfig.model_fields
+        shares, seed = (recorded.get(key, default[key].get_default()) for key in ("split", "seed"))
+        train, validation, test = (float(share) for share in shares)
+        return SplitRecord((train, validation, test), int(seed))
+    try:
+        return read_split(model_folder(model))
+    except FileNotFoundError:
+        return None
+
+
+def copy_split(folder: Path, model: str | Path) -> None:
+    """Record with a copy of ``model`` the split of its training, if that is known."""
+    record = split_of(model)
+    if record is not None:
+        write_split(folder, record)
+
+
+def device_named(device: str) -> str:
+    """``cpu`` or ``cuda``; for ``auto`` the graphics card if there is one."""
+    if device not in DEVICES:
+        raise ValueError(f"unknown device {device!r}{suggestion(device, DEVICES)}: choose auto, cpu or cuda")
+    if device == "cuda" and not torch.cuda.is_available():
+        raise ValueError("no CUDA device here: choose device cpu")
+    return "cuda" if device != "cpu" and torch.cuda.is_available() else "cpu"
