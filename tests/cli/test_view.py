@@ -63,7 +63,8 @@ def served(monkeypatch):
 
 
 def test_a_model_that_cannot_fit_scenes_is_told_how_it_could(model, refused):
-    assert "cannot optimise scenes per image yet: derender whiten" in refused("view", "--model", model, "--fit-steps", 5)
+    said = refused("view", "--model", model, "--fit-steps", 5)
+    assert "cannot optimise scenes per image yet: derender whiten" in said
 
 
 def test_help_has_an_example(capsys):
