@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import pytest
 
+from derender.evaluation.score_table import Column, Row, ScoreTable
 from derender.report.comparison import chart_of, comparison_page
-from derender.report.score_table import Column, Row, ScoreTable
 
 EVIL = "<script>alert(1)</script>"
 

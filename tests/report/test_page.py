@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from derender.evaluation.score_table import Column, Row, ScoreTable
 from derender.report import blocks, charts, films
 from derender.report.page import Page, Section, write_whole
-from derender.report.score_table import Column, Row, ScoreTable
 
 HOSTILE = "<script>alert('x')</script>\"&"
 

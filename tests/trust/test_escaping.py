@@ -12,6 +12,7 @@ from derender.data.doctor import examine
 from derender.evaluation.bootstrap import ScoredRow, estimate, with_verdicts
 from derender.evaluation.linear_task import Rows, task_of
 from derender.evaluation.robustness import CurveResult, RobustnessComparison
+from derender.evaluation.score_table import Column, Row, ScoreTable
 from derender.interpretation import cluster_shares, explain_labels, pair_parts
 from derender.report import charts
 from derender.report.comparison import comparison_page
@@ -20,7 +21,6 @@ from derender.report.explanation import Pair, Shown, explanation_page
 from derender.report.page import Page
 from derender.report.robustness import robustness_page
 from derender.report.run import run_page
-from derender.report.score_table import Column, Row, ScoreTable
 from derender.report.share_chart import share_chart
 from derender.training.config import resolve
 from derender.training.run_folder import append_metrics, start_run

@@ -33,7 +33,7 @@ from derender.storage.atomic import DamageNoticed
 
 if TYPE_CHECKING:
     from derender.data import PictureSet
-    from derender.report.score_table import ScoreTable
+    from derender.evaluation.score_table import ScoreTable
 
 NAMED = 5
 """So many unreadable pictures are named."""
@@ -144,13 +144,9 @@ def show_scores(scores: "ScoreTable", json_file: str | None) -> None:
     )
     table.add_column(scores.first, header_style="dim")
     for column in scores.columns:
-        arrow = {"high": " ↑", "low": " ↓", None: ""}[column.best]
-        table.add_column(column.name + arrow, justify="right", no_wrap=True, header_style="dim")
+        table.add_column(column.head, justify="right", no_wrap=True, header_style="dim")
     for row in scores.rows:
-        cells = [
-            Text(column.text(cell), style="bold" if cell is not None and cell == scores.best(index) else "")
-            for index, (column, cell) in enumerate(zip(scores.columns, row.cells, strict=True))
-        ]
+        cells = [Text(text, style="bold" if best else "") for text, best in scores.texts(row)]
         table.add_row(Text(row.name), *cells, style="dim" if row.control else "")
     console = Console(stderr=json_file == "-", highlight=False)
     if not console.is_terminal:  # a file or a pipe is as wide as the table

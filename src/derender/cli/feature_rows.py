@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from derender.data import PictureSet
     from derender.evaluation.feature_rows import FeatureRow
     from derender.evaluation.memory import Memory
+    from derender.evaluation.score_table import ScoreTable
     from derender.features import FeatureTable
-    from derender.report.score_table import ScoreTable
 
 Features = Annotated[
     str | None,
@@ -367,13 +367,14 @@ def architecture(rows: "Sequence[FeatureRow]") -> Any:
 
 def write_tables(tables: "Sequence[ScoreTable]", markdown_file: str | None, latex_file: str | None) -> None:
     """What ``--markdown`` and ``--latex`` ask for."""
-    from derender.report import table_text
+    from derender.evaluation.score_table import Scores
     from derender.storage.atomic import atomic_file
 
-    for target, form in ((markdown_file, table_text.markdown), (latex_file, table_text.latex)):
+    scores = Scores(tables, {})
+    for target, form in ((markdown_file, scores.to_markdown), (latex_file, scores.to_latex)):
         if target is not None:
             with atomic_file(Path(target)) as temporary:
-                temporary.write_text(form(tables), encoding="utf-8")
+                temporary.write_text(form(), encoding="utf-8")
 
 
 def refuse_to_replace(force: bool, *targets: str | None) -> None:

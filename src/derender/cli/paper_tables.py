@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 
     from derender.evaluation.feature_rows import FeatureRow
     from derender.evaluation.memory import Memory
+    from derender.evaluation.score_table import ScoreTable
     from derender.evaluation.tables import Part, TableSpec
-    from derender.report.score_table import ScoreTable
 
 PAPER_VARIANTS = "joint,geometry,albedo,joint-frozen,random"
 
@@ -152,11 +152,11 @@ def run_cluster(
     """One question of a clustering table."""
     from derender.evaluation.clustering_compare import compare_clusterings
     from derender.evaluation.feature_rows import prepare
+    from derender.evaluation.score_table import verdict_table
     from derender.report.tables_comparison import (
         CLUSTER_COLUMNS,
         cluster_comparison_table,
         paper_cluster_table,
-        verdict_table,
     )
 
     first = rows[0].tables[0]

@@ -15,7 +15,7 @@ from derender.cli.console import notice, show_scores, write_json
 
 if TYPE_CHECKING:
     from derender.evaluation.memory import Memory
-    from derender.report.score_table import ScoreTable
+    from derender.evaluation.score_table import ScoreTable
 
 Method = Annotated[Literal["ward", "finch", "k-means"], typer.Option("--method", help="How to cluster.")]
 Model = Annotated[str | None, typer.Option("--model", "-m", help="Or a model, with --data.")]

@@ -13,18 +13,13 @@ from derender.data import as_float
 from derender.demo.shipped import beside_table, shipped_blocks
 from derender.demo.story import STAGES, DemoResult
 from derender.evaluation.geometry import predicted_depth
+from derender.evaluation.score_table import ScoreTable
 from derender.presets import MODEL_PRESETS
 from derender.report import blocks, colours, films
 from derender.report.figures import COLUMN_MEANING, Decomposition, decomposition
 from derender.report.page import Page, Section
 from derender.report.run import loss_charts
-from derender.report.score_table import (
-    ScoreTable,
-    clustering_table,
-    factor_table,
-    geometry_table,
-    reconstruction_table,
-)
+from derender.report.score_table import clustering_table, factor_table, geometry_table, reconstruction_table
 from derender.scene.normals import normals_from_depth
 from derender.training.config import PRESETS
 from derender.training.run_folder import read_metrics

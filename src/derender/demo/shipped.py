@@ -12,10 +12,11 @@ from jaxtyping import UInt8
 
 from derender.data import as_float
 from derender.demo.story import SHIPPED, DemoResult
+from derender.evaluation.score_table import ScoreTable
 from derender.model import Derenderer
 from derender.report import blocks, colours, films
 from derender.report.figures import Decomposition, decomposition
-from derender.report.score_table import ScoreTable, geometry_table
+from derender.report.score_table import geometry_table
 from derender.report.viewer.examples import rendered_examples
 
 FRAMES, MOVES = 16, "the light goes round, the head turns"

@@ -15,8 +15,8 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup as Html
 from PIL import Image
 
+from derender.evaluation.score_table import Cell, Column, Interval, ScoreTable
 from derender.report.colours import Images, same_length
-from derender.report.score_table import Cell, Column, ScoreTable
 
 LONGEST_WORD = 24  # characters of a cell that is kept on one line
 TEMPLATES = Environment(
@@ -142,13 +142,14 @@ def table(scores: ScoreTable) -> Html:
 
 def _head(column: Column) -> tuple[str, str]:
     """Text and tooltip of a column's head."""
-    arrow = {"high": " ↑", "low": " ↓", None: ""}[column.best]
     direction = {"high": "higher is better", "low": "lower is better", None: ""}[column.best]
-    return column.name + arrow, "; ".join(part for part in (column.note, direction) if part)
+    return column.head, "; ".join(part for part in (column.note, direction) if part)
 
 
 def _cell(cell: Cell, column: Column, best: float | None, largest: float) -> tuple[str, dict[str, str]]:
     """Text and attributes of a cell."""
+    if isinstance(cell, Interval):
+        cell = column.text(cell)
     if isinstance(cell, str):
         return cell, {"class": "words"} if len(cell) > LONGEST_WORD else {}  # a sentence may break
     if cell is None or not isfinite(cell):

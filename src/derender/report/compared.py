@@ -15,17 +15,21 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from derender.evaluation.bootstrap import Difference, Estimate, ScoredRow
+from derender.evaluation.score_table import (
+    Cell,
+    Column,
+    Row,
+    ScoreTable,
+    deviation_column,
+    interval_column,
+    interval_of,
+    verdict_table,
+)
 from derender.report.charts import SERIES, side_by_side
-from derender.report.score_table import Cell, Column, Row, ScoreTable
 from derender.report.tables_comparison import (
     CLUSTER_COLUMNS,
-    INTERVAL,
     LINEAR_COLUMNS,
     PROBES,
-    SPREAD,
-    interval_text,
-    spread_value,
-    verdict_table,
 )
 
 LONGEST_REASON = 60  # characters of it in a cell; the page and the Markdown say it whole
@@ -54,7 +58,7 @@ class Cost:
 
 
 @dataclass(frozen=True)
-class Scores:
+class Question:
     """One question under one protocol (and one head at one number of labels, for the linear one).
 
     Attributes:
@@ -93,7 +97,7 @@ COST_COLUMNS = (
 
 def scores_from(
     question: Mapping[str, Any], costs: Mapping[str, Cost], absent: Mapping[str, str]
-) -> list[Scores]:
+) -> list[Question]:
     """The scores of a question as JSON keeps them: one of clusters, or one for each head and count."""
     name = str(question["name"])
     if question["protocol"] == "cluster":
@@ -104,7 +108,7 @@ def scores_from(
             else f"mean of {len(labels)} labels"
         )
         about = f"{METHODS[question['method']]}, {question['n_rows']:,} rows, {what}"
-        return [Scores(name, "cluster", about, rows_from(question["rows"]), costs, absent)]
+        return [Question(name, "cluster", about, rows_from(question["rows"]), costs, absent)]
     kind = "classes" if question["kind"] == "classes" else "yes/no labels"
     found = []
     for part in question["parts"]:
@@ -113,7 +117,7 @@ def scores_from(
             f"{question['n_test']:,} tested, {len(question['names'])} {kind}, {len(question['seeds'])} seeds"
         )
         rows = rows_from(part["rows"])
-        found.append(Scores(name, "linear", about, rows, costs, absent, part["head"], part["labels"]))
+        found.append(Question(name, "linear", about, rows, costs, absent, part["head"], part["labels"]))
     return found
 
 
@@ -136,7 +140,7 @@ def rows_from(values: Mapping[str, Any]) -> list[ScoredRow]:
     ]
 
 
-def protocol_table(scores: Sequence[Scores], methods: Sequence[str]) -> ScoreTable:
+def protocol_table(scores: Sequence[Question], methods: Sequence[str]) -> ScoreTable:
     """The one table: a row for each method and control, two scores for each data set, and the cost.
 
     Args:
@@ -171,7 +175,7 @@ def protocol_table(scores: Sequence[Scores], methods: Sequence[str]) -> ScoreTab
     return ScoreTable(caption, "features", (*columns, *COST_COLUMNS), rows)
 
 
-def set_tables(one: Scores, methods: Sequence[str]) -> list[ScoreTable]:
+def set_tables(one: Question, methods: Sequence[str]) -> list[ScoreTable]:
     """One data set's own table, with every score, interval and cost, and who is above the controls."""
     columns, (first, *others) = one.columns, one.columns
     found = {row.name: row for row in one.rows}
@@ -181,17 +185,18 @@ def set_tables(one: Scores, methods: Sequence[str]) -> list[ScoreTable]:
         if name in found:
             row = found[name]
             values = (row.scores[score].value for score in others)
-            scored = (row.scores[first].value, interval_text(row, first), spread_value(row, first), *values)
+            scored = (row.scores[first].value, interval_of(row, first), row.scores[first].spread, *values)
             rows.append(Row(name, (*scored, *cost), row.control))
         elif name in one.absent:
             why = shorten(one.absent[name], LONGEST_REASON, placeholder=" ...")
             rows.append(Row(name, (why, None, None, *(None for _ in others), *cost)))
-    shown = (columns[first], INTERVAL, SPREAD, *(columns[name] for name in others), *COST_COLUMNS)
+    ends = interval_column(columns[first]), deviation_column(columns[first])
+    shown = (columns[first], *ends, *(columns[name] for name in others), *COST_COLUMNS)
     verdict = verdict_table(one.rows, columns, f"{one.name}, above the strongest control? {one.about}")
     return [ScoreTable(f"{one.name}: {one.about}", "features", shown, rows), verdict]
 
 
-def protocol_picture(scores: Sequence[Scores], methods: Sequence[str]) -> tuple[str, bytes]:
+def protocol_picture(scores: Sequence[Question], methods: Sequence[str]) -> tuple[str, bytes]:
     """A panel of bars for each data set, methods in colour, controls grey, as SVG text and as PNG.
 
     Whiskers are 95 % intervals. Of the linear protocol the largest number of labels is shown.
@@ -215,7 +220,7 @@ def one_word(score: str) -> str:
     return {"balanced": "balanced accuracy"}.get(score, score)
 
 
-def _panel(one: Scores, names: Sequence[str], score: str) -> Any:
+def _panel(one: Question, names: Sequence[str], score: str) -> Any:
     found = {row.name: row for row in one.rows}
 
     def draw(axes: Axes) -> None:
@@ -240,7 +245,7 @@ def _panel(one: Scores, names: Sequence[str], score: str) -> Any:
     return draw
 
 
-def _shown(scores: Sequence[Scores]) -> list[Scores]:
+def _shown(scores: Sequence[Question]) -> list[Question]:
     """What the one table and the picture show."""
     if not scores:
         raise ValueError("there is nothing to show: no data set was scored")
@@ -249,7 +254,7 @@ def _shown(scores: Sequence[Scores]) -> list[Scores]:
     return [one for one in scores if one.head == head]
 
 
-def _together(scores: Sequence[Scores], name: str) -> Cost:
+def _together(scores: Sequence[Question], name: str) -> Cost:
     """A method's cost over several data sets: trainings that several share count once."""
     costs = [one.costs[name] for one in scores if name in one.costs]
     if not costs:

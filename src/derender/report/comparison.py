@@ -8,10 +8,10 @@ from math import isfinite
 from textwrap import shorten
 
 from derender import __version__
+from derender.evaluation.score_table import ScoreTable
 from derender.report import blocks, charts
 from derender.report.blocks import Html
 from derender.report.page import Page, Section
-from derender.report.score_table import ScoreTable
 
 LONGEST_HEAD = 40
 

@@ -16,10 +16,10 @@ from derender.data.doctor import Examination, Finding
 from derender.data.doctor.counting import count_of
 from derender.data.doctor.estimate import Estimate
 from derender.data.doctor.limits import LIMITS
+from derender.evaluation.score_table import Cell, Column, Row, ScoreTable
 from derender.report import blocks, colours
 from derender.report.blocks import Html
 from derender.report.page import Page, Section
-from derender.report.score_table import Cell, Column, Row, ScoreTable
 
 GAP_PX = 4
 UNREADABLE_SHOWN = 200

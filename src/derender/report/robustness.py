@@ -4,15 +4,17 @@ The chart has a panel for each axis; controls are grey and dashed, and shaded is
 interval of the first features covers. Leaves out computing anything (``derender.evaluation.robustness``).
 """
 
+from collections.abc import Callable
+
 from matplotlib.axes import Axes
 
+from derender.evaluation.bootstrap import ScoredRow
 from derender.evaluation.robustness import CurveResult, RobustnessComparison
 from derender.evaluation.robustness.compare import AREA, ORDINARY, level_name
+from derender.evaluation.score_table import Cell, Column, Row, ScoreTable, scored_table, verdict_table
 from derender.report import blocks
 from derender.report.charts import SERIES, side_by_side
 from derender.report.page import Page, Section
-from derender.report.score_table import Column, Row, ScoreTable
-from derender.report.tables_comparison import INTERVAL, SPREAD, interval_text, spread_value, verdict_table
 
 SCORE_NAMES = {"accuracy": "accuracy", "balanced_accuracy": "balanced accuracy"}
 CONTROL_LINES = ((0, (5, 2)), (0, (1, 1)), (0, (3, 1, 1, 1)), (0, (6, 1, 1, 1, 1, 1)))
@@ -39,31 +41,20 @@ def robustness_tables(found: RobustnessComparison, score: str = "accuracy") -> l
 def area_table(found: RobustnessComparison, curve: CurveResult, score: str) -> ScoreTable:
     """One row for each feature and control: the area, in ordinary light and view, and at the last angle."""
     last = curve.levels[-1]
-    columns = (
-        Column("area", "high", note=AREA_NOTE),
-        INTERVAL,
-        SPREAD,
-        Column("ordinary", "high", note="other pictures in the light and view of those learned from"),
-        Column(f"at {last:.0f} deg", "high", note="the curve's last point"),
-        Column(
-            "lost", None, note="ordinary less area; read it beside ordinary, who knows nothing loses none"
+    at_last = level_name(last)
+    columns = {
+        AREA: Column("area", "high", note=AREA_NOTE),
+        ORDINARY: Column(
+            "ordinary", "high", note="other pictures in the light and view of those learned from"
         ),
+        at_last: Column(f"at {last:.0f} deg", "high", note="the curve's last point"),
+    }
+    lost = Column(
+        "lost", None, note="ordinary less area; read it beside ordinary, who knows nothing loses none"
     )
-    rows = [
-        Row(
-            row.name,
-            (
-                row.scores[AREA].value,
-                interval_text(row, AREA),
-                spread_value(row, AREA),
-                row.scores[ORDINARY].value,
-                row.scores[level_name(last)].value,
-                row.scores[ORDINARY].value - row.scores[AREA].value,
-            ),
-            row.control,
-        )
-        for row in curve.rows[score]
-    ]
+    more: dict[Column, Callable[[ScoredRow], Cell]] = {
+        lost: lambda row: row.scores[ORDINARY].value - row.scores[AREA].value
+    }
     caption = (
         f"{curve.title}, {curve.levels[0]:.0f} to {last:.0f} degrees: {SCORE_NAMES[score]} of "
         f"{_asked(found)}, {found.how}; {found.head} probes on {found.n_learned[curve.name]:,} pictures, "
@@ -71,7 +62,7 @@ def area_table(found: RobustnessComparison, curve: CurveResult, score: str) -> S
     )
     if found.n_dropped:
         caption += f"; {found.n_dropped:,} pictures without label left out"
-    return ScoreTable(caption, "features", columns, rows)
+    return scored_table(caption, "features", curve.rows[score], columns, more=more)
 
 
 def curve_table(curve: CurveResult, score: str) -> ScoreTable:

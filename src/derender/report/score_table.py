@@ -1,13 +1,6 @@
-"""A table of scores beside controls, as a value: made once, shown on a page, at a terminal or as JSON.
-
-The second half makes one from each protocol's result. Leaves out computing scores (see
-``derender.evaluation``).
-"""
+"""Tables of the demo's protocols: clusters, depth, factors and reconstructions, each beside its controls."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from math import isfinite
-from typing import Literal
 
 from derender.evaluation import (
     ClusteringResult,
@@ -16,105 +9,7 @@ from derender.evaluation import (
     GeometryScores,
     ReconstructionResult,
 )
-
-Cell = float | int | str | None
-
-
-@dataclass(frozen=True)
-class Column:
-    """One column of numbers.
-
-    Attributes:
-        name: shown in the head.
-        best: which end is better; None where the numbers are no score.
-        digits: after the point.
-        note: range and meaning.
-    """
-
-    name: str
-    best: Literal["high", "low"] | None = None
-    digits: int = 3
-    note: str = ""
-
-    def text(self, cell: Cell) -> str:
-        """A cell as people read it; a dash where there is no number."""
-        if cell is None or (isinstance(cell, float) and not isfinite(cell)):
-            return "-"
-        if isinstance(cell, str):
-            return cell
-        return f"{cell:,}" if isinstance(cell, int) else f"{cell:.{self.digits}f}"
-
-
-@dataclass(frozen=True)
-class Row:
-    """One row: its name, one cell per column, and whether it is a control (it learned nothing)."""
-
-    name: str
-    cells: Sequence[Cell]
-    control: bool = False
-    note: str = ""
-
-
-@dataclass(frozen=True)
-class ScoreTable:
-    """Rows of numbers under named columns; the first row is what the table is about.
-
-    Attributes:
-        caption: what was scored, on what.
-        first: head of the column of row names.
-    """
-
-    caption: str
-    first: str
-    columns: Sequence[Column]
-    rows: Sequence[Row]
-
-    def __post_init__(self) -> None:
-        for row in self.rows:
-            if len(row.cells) != len(self.columns):
-                raise ValueError(
-                    f"row {row.name!r} has {len(row.cells)} cells for {len(self.columns)} columns"
-                )
-
-    def numbers(self, column: int) -> list[float]:
-        """Every finite number of one column."""
-        cells = (row.cells[column] for row in self.rows)
-        return [cell for cell in cells if isinstance(cell, float | int) and isfinite(cell)]
-
-    def best(self, column: int) -> float | None:
-        """The best number of a column; None where the column is no score or there is nothing to compare."""
-        numbers, end = self.numbers(column), self.columns[column].best
-        if end is None or len(numbers) < 2:
-            return None
-        return max(numbers) if end == "high" else min(numbers)
-
-    def largest(self, column: int) -> float:
-        return max((abs(value) for value in self.numbers(column)), default=0.0)
-
-    def values(self) -> dict[str, dict[str, Cell]]:
-        """Row name to column name to cell."""
-        names = [column.name for column in self.columns]
-        return {row.name: dict(zip(names, row.cells, strict=True)) for row in self.rows}
-
-    def verdict(self, column: int) -> str:
-        """In words: whether the first row is better than every control in one column."""
-        column_, (first, *others) = self.columns[column], self.rows
-        value = first.cells[column]
-        sign = -1 if column_.best == "low" else 1
-        rivals = [
-            (row.name, row.cells[column]) for row in others if isinstance(row.cells[column], float | int)
-        ]
-        if not isinstance(value, float | int) or not rivals:
-            return f"{first.name}: {column_.text(value)} ({column_.name})"
-        name, strongest = max(rivals, key=lambda rival: sign * float(rival[1] or 0))
-        shown, other = column_.text(value), column_.text(strongest)
-        if sign * value > sign * float(strongest or 0):
-            return f"better than every control: {shown} against {other} ({name})"
-        if value == strongest:
-            return f"level with the strongest control: {shown} ({name})"
-        beaten = [rival for rival, score in rivals if sign * value > sign * float(score or 0)]
-        rest = f", but ahead of {', '.join(beaten)}" if beaten else ""
-        return f"behind the strongest control: {shown} against {other} ({name}){rest}"
+from derender.evaluation.score_table import Column, Row, ScoreTable
 
 
 def clustering_table(results: Mapping[str, ClusteringResult], controls: Sequence[str] = ()) -> ScoreTable:

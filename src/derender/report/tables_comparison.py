@@ -1,17 +1,26 @@
 """Tables from comparisons of features: scores with intervals, who beats the controls, and beside the paper.
 
-Leaves out computing (``derender.evaluation``) and showing (cli/console.py, table_text.py, blocks.py).
+Leaves out computing (``derender.evaluation``) and showing (cli/console.py, blocks.py).
 """
 
-from collections.abc import Mapping, Sequence
-from math import isfinite
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 from derender.evaluation.bootstrap import ScoredRow
 from derender.evaluation.clustering_compare import ClusterComparison
 from derender.evaluation.clustering_levels import Level
 from derender.evaluation.linear_compare import LinearComparison, LinearPart
+from derender.evaluation.score_table import (
+    Cell,
+    Column,
+    Row,
+    ScoreTable,
+    interval_column,
+    interval_of,
+    scored_table,
+    verdict_table,
+)
 from derender.evaluation.tables import PaperRow
-from derender.report.score_table import Cell, Column, Row, ScoreTable
 
 CLUSTER_COLUMNS = {
     "accuracy": Column("accuracy", "high", note="weighted purity, 0 to 1"),
@@ -25,8 +34,6 @@ LINEAR_COLUMNS = {
     "balanced_accuracy": Column("balanced", "high", note="mean recall over values or classes, 0 to 1"),
     "average_precision": Column("AP", "high", note="average precision, 0 to 1"),
 }
-INTERVAL = Column("95 %", note="interval of the first score over resamples of the scored rows")
-SPREAD = Column("±", note="standard deviation of the first score over seeds")
 PROBES = {
     "linear": "the paper's head, frozen features",
     "centred": "the paper's head, frozen features, centred",
@@ -49,7 +56,7 @@ def cluster_comparison_table(comparison: ClusterComparison) -> ScoreTable:
         caption += f"; {comparison.n_dropped:,} rows without label left out"
     if comparison.n_missing:
         caption += f"; {comparison.n_missing:,} single labels unknown"
-    return _scores_table(caption, comparison.rows, CLUSTER_COLUMNS)
+    return scored_table(caption, "features", comparison.rows, CLUSTER_COLUMNS)
 
 
 def linear_part_table(comparison: LinearComparison, part: LinearPart) -> ScoreTable:
@@ -65,7 +72,7 @@ def linear_part_table(comparison: LinearComparison, part: LinearPart) -> ScoreTa
     )
     if comparison.n_dropped:
         caption += f"; {comparison.n_dropped:,} rows without label left out"
-    return _scores_table(caption, part.rows, LINEAR_COLUMNS)
+    return scored_table(caption, "features", part.rows, LINEAR_COLUMNS)
 
 
 def linear_tables(comparison: LinearComparison) -> list[ScoreTable]:
@@ -77,62 +84,22 @@ def linear_tables(comparison: LinearComparison) -> list[ScoreTable]:
     return tables
 
 
-def verdict_table(rows: Sequence[ScoredRow], columns: Mapping[str, Column], caption: str) -> ScoreTable:
-    """Which row is above the strongest control, in each score named by a column, and by how much."""
-    found = [
-        Row(
-            f"{row.name}: {columns[name].name}",
-            (one.value, one.low, one.high, one.rival, "yes" if one.above else "no"),
-        )
-        for row in rows
-        for name, one in row.versus.items()
-        if name in columns and isfinite(row.scores[name].low)
-    ]
-    shown = (
-        Column("difference", None, note="to the strongest control, on the same resamples"),
-        Column("low"),
-        Column("high"),
-        Column("strongest control"),
-        Column("above", note="whether the whole 95 % interval lies above 0"),
-    )
-    return ScoreTable(caption, "features: score", shown, found)
-
-
-def verdict(row: ScoredRow, score: str) -> str:
-    """In words: whether a row is above the strongest control in one score."""
-    own, one = row.scores[score], row.versus.get(score)
-    if one is None:
-        return f"{row.name}: {own.value:.3f} ({score})"
-    found = "above" if one.above else "below" if one.high < 0 else "not told apart from"
-    return (
-        f"{row.name}: {score} {own.value:.3f}, {found} the strongest control ({one.rival}): "
-        f"{one.value:+.3f}, 95 % {one.low:+.3f} to {one.high:+.3f}"
-    )
-
-
 def paper_cluster_table(
     name: str, number: int, paper: Sequence[PaperRow], comparison: ClusterComparison, differs: str
 ) -> ScoreTable:
     """Our rows over the paper's own lines, with a column that says what differs."""
-    columns = (*(CLUSTER_COLUMNS[one] for one in ("accuracy", "f1")), INTERVAL, Column("data"))
-    ours = [
-        Row(
-            row.name,
-            (*_values(row, ("accuracy", "f1")), interval_text(row, "accuracy"), differs),
-            row.control,
-        )
-        for row in comparison.rows
-    ]
+    columns = {one: CLUSTER_COLUMNS[one] for one in ("accuracy", "f1")}
+    more: dict[Column, Callable[[ScoredRow], Cell]] = {
+        interval_column(CLUSTER_COLUMNS["accuracy"]): lambda row: interval_of(row, "accuracy"),
+        Column("data"): lambda _: differs,
+    }
+    caption = f"{name}, beside the paper's Table {number} ({_method(comparison.method)})"
+    ours = scored_table(caption, "features", comparison.rows, columns, intervals=(), deviations=(), more=more)
     theirs = [
-        Row(
-            f"paper: {row.method}",
-            (row.scores["accuracy"], row.scores["f1"], None, row.dataset),
-            note="paper",
-        )
+        Row(f"paper: {row.method}", (*(row.scores[one] for one in columns), None, row.dataset), note="paper")
         for row in paper
     ]
-    caption = f"{name}, beside the paper's Table {number} ({_method(comparison.method)})"
-    return ScoreTable(caption, "features", columns, (*ours, *theirs))
+    return replace(ours, rows=[*ours.rows, *theirs])
 
 
 def paper_linear_table(
@@ -164,41 +131,6 @@ def paper_linear_table(
     ]
     caption = f"{name}: accuracy of the paper's head, beside the paper's Table {number}"
     return ScoreTable(caption, "features", (*columns, Column("data")), (*ours, *theirs))
-
-
-def _scores_table(caption: str, rows: Sequence[ScoredRow], columns: Mapping[str, Column]) -> ScoreTable:
-    first, *others = columns
-    shown = (columns[first], INTERVAL, SPREAD, *(columns[name] for name in others))
-    cells = [
-        Row(
-            row.name,
-            (
-                row.scores[first].value,
-                interval_text(row, first),
-                spread_value(row, first),
-                *_values(row, others),
-            ),
-            row.control,
-        )
-        for row in rows
-    ]
-    return ScoreTable(caption, "features", shown, cells)
-
-
-def _values(row: ScoredRow, names: Sequence[str]) -> list[Cell]:
-    return [row.scores[name].value for name in names]
-
-
-def spread_value(row: ScoredRow, name: str) -> Cell:
-    """The standard deviation over seeds of one score, None for a single run."""
-    spread = row.scores[name].spread
-    return spread if isfinite(spread) else None
-
-
-def interval_text(row: ScoredRow, name: str) -> Cell:
-    """The interval of one score, None where there is none."""
-    one = row.scores[name]
-    return f"{one.low:.3f}-{one.high:.3f}" if isfinite(one.low) else None
 
 
 def _method(method: str) -> str:

@@ -10,13 +10,10 @@ from dataclasses import replace
 import numpy as np
 
 from derender.evaluation.disentanglement import DisentanglementCard, FeatureScores, swap_interval
-from derender.report.score_table import Column, Row, ScoreTable
+from derender.evaluation.score_table import Column, Interval, Row, ScoreTable, interval_column
 
 Reading = Callable[[FeatureScores], float | None]
 
-SWAP_INTERVAL = Column(
-    "95 %", note="interval of the swap test's number before it, over resamples of the pictures"
-)
 _BETWEEN: tuple[tuple[Column, Reading], ...] = (
     (
         Column("PCC image", note="Pearson between two vectors of a picture, -1 to 1, best 0"),
@@ -52,17 +49,15 @@ def summary_table(card: DisentanglementCard) -> ScoreTable:
         f"{_seeds(card)} of all pairs; low correlation alone proves nothing, read it with the swap test"
     )
     table = _table(card, caption, _BETWEEN)
-    columns = [*table.columns[:5], SWAP_INTERVAL, table.columns[5], SWAP_INTERVAL]
+    swap, decoded = table.columns[4:]
+    ends = [interval_column(column, "pictures") for column in (swap, decoded)]
+    columns = [*table.columns[:5], ends[0], decoded, ends[1]]
     rows = []
     for row in table.rows:
         tests = [scores.swap for scores in card.rows.get(row.name, ()) if scores.swap is not None]
-        both = [_ends(ends) for ends in swap_interval(tests)] if tests else [None, None]
+        both = [Interval(*ends) for ends in swap_interval(tests)] if tests else [None, None]
         rows.append(replace(row, cells=[*row.cells[:5], both[0], row.cells[5], both[1]]))
     return replace(table, columns=columns, rows=rows)
-
-
-def _ends(ends: tuple[float, float]) -> str | None:
-    return f"{ends[0]:.2f}-{ends[1]:.2f}" if np.isfinite(ends).all() else None
 
 
 def truth_table(card: DisentanglementCard) -> ScoreTable | None:

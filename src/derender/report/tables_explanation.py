@@ -4,10 +4,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from derender.evaluation.score_table import Cell, Column, Interval, Row, ScoreTable, interval_column
 from derender.interpretation import ClusterShares, Explanation, PairParts, ShareRow
 from derender.interpretation.sanity import UNCHANGED, Similarity
-from derender.report.score_table import Cell, Column, Row, ScoreTable
-from derender.report.tables_comparison import INTERVAL
 
 AUC = Column("AUC", note="area under the ROC curve on held-out pictures, chance 0.5, best 1")
 
@@ -16,14 +15,15 @@ def share_table(found: Explanation) -> ScoreTable:
     """One row for each label or class, their mean first; the means of the controls last."""
     columns: list[Column] = []
     for factor in found.factors:
-        columns += [Column(factor, note="share of the sum of |integrated gradients|, 0 to 1"), INTERVAL]
+        column = Column(factor, note="share of the sum of |integrated gradients|, 0 to 1")
+        columns += [column, interval_column(column, "pictures")]
     model, *controls = found.rows
     rows = [_mean_row(f"mean of {len(found.names)}", model)] if len(found.names) > 1 else []
     for answer, name in enumerate(found.names):
         cells: list[Cell] = []
         for place in range(len(found.factors)):
             ends = model.low[answer, place], model.high[answer, place]
-            cells += [_number(model.shares[:, answer, place]), _ends(*ends)]
+            cells += [_number(model.shares[:, answer, place]), Interval(*map(float, ends))]
         rows.append(Row(name, (*cells, _number(model.auc[:, answer]))))
     rows += [_mean_row(row.name, row) for row in controls]
     what = "yes/no labels" if found.kind == "labels" else "classes, each on its own pictures"
@@ -150,7 +150,3 @@ def _over_all(values: np.ndarray) -> tuple[Cell, ...]:
 def _number(values: np.ndarray) -> float | None:
     known = values[np.isfinite(values)]
     return float(known.mean()) if len(known) else None
-
-
-def _ends(low: float, high: float) -> str | None:
-    return f"{low:.3f}-{high:.3f}" if np.isfinite(low) and np.isfinite(high) else None

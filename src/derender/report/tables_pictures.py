@@ -4,9 +4,7 @@ from collections.abc import Mapping, Sequence
 from math import isfinite
 
 from derender.evaluation.bootstrap import ScoredRow
-from derender.report.score_table import Cell, Column, Row, ScoreTable
-
-INTERVAL = Column("95 %", note="interval of the score before it, over resamples of the pictures")
+from derender.evaluation.score_table import Cell, Column, Row, ScoreTable, interval_column, interval_of
 
 
 def with_intervals(
@@ -22,7 +20,7 @@ def with_intervals(
     found = {row.name: row for row in scored}
     columns: list[Column] = []
     for column in table.columns:
-        columns += [column, INTERVAL] if column.name in scores else [column]
+        columns += [column, interval_column(column, "pictures")] if column.name in scores else [column]
     rows = []
     for row in table.rows:
         cells: list[Cell] = []
@@ -30,7 +28,8 @@ def with_intervals(
             cells.append(cell)
             if column.name in scores:
                 score, scale = scores[column.name]
-                cells.append(_ends(found.get(row.name), score, scale, column.digits))
+                own = found.get(row.name)
+                cells.append(interval_of(own, score, scale) if own and score in own.scores else None)
         rows.append(Row(row.name, cells, row.control, row.note))
     return ScoreTable(table.caption, table.first, columns, rows)
 
@@ -47,17 +46,10 @@ def picture_verdicts(
         one = row.versus.get(score)
         if one is None or not isfinite(one.low):
             continue
-        found = "better than" if one.above else "worse than" if one.high < 0 else "not told apart from"
+        found = "better than" if one.above else "worse than" if one.high < 0 else "not distinguished from"
         ends = [f"{scale * value:+.{column.digits}f}" for value in (one.value, one.low, one.high)]
         told.append(
             f"{column.name}: {scale * row.scores[score].value:.{column.digits}f}, {found} the strongest "
             f"control ({one.rival}), by {ends[0]}, 95 % {ends[1]} to {ends[2]}"
         )
     return told
-
-
-def _ends(row: ScoredRow | None, score: str, scale: float, digits: int) -> str | None:
-    one = None if row is None else row.scores.get(score)
-    if one is None or not isfinite(one.low):
-        return None
-    return f"{scale * one.low:.{digits}f}-{scale * one.high:.{digits}f}"

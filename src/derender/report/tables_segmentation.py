@@ -1,26 +1,17 @@
 """Tables of segmentation: scores beside controls and the paper's lines, and the IoU of every class."""
 
-from math import isfinite
+from collections.abc import Callable, Mapping
 
 from derender.evaluation.bootstrap import ScoredRow
+from derender.evaluation.score_table import Cell, Column, Row, ScoreTable, scored_table, verdict_table
 from derender.evaluation.segmentation import SegmentationComparison
 from derender.evaluation.tables import SEGMENTATION
-from derender.report.score_table import Cell, Column, Row, ScoreTable
-from derender.report.tables_comparison import verdict_table
 
 SEGMENT_COLUMNS = {
     "mean_iou": Column("mIoU", "high", note="intersection over union, mean over classes, 0 to 1"),
     "top10_iou": Column("top 10", "high", note="the same over the row's own ten best classes, 0 to 1"),
     "pixel_accuracy": Column("pixels", "high", note="share of right pixels, 0 to 1"),
 }
-_SHOWN = (
-    SEGMENT_COLUMNS["mean_iou"],
-    Column("95 %", note="interval of mIoU over resamples of the tested pictures"),
-    Column("±", note="standard deviation of mIoU over seeds"),
-    SEGMENT_COLUMNS["top10_iou"],
-    SEGMENT_COLUMNS["pixel_accuracy"],
-    Column("learn", note="weights that were trained"),
-)
 
 
 def segmentation_tables(found: SegmentationComparison, differs: str) -> list[ScoreTable]:
@@ -37,8 +28,11 @@ def segmentation_tables(found: SegmentationComparison, differs: str) -> list[Sco
 
 def segmentation_table(found: SegmentationComparison) -> ScoreTable:
     """A row for each net and control."""
-    rows = [Row(row.scored.name, _cells(row.scored, row.trainable), row.scored.control) for row in found.rows]
-    return ScoreTable(_caption(found), "net", _SHOWN, rows)
+    trainable = {row.scored.name: row.trainable or None for row in found.rows}
+    learn = Column("learn", note="weights that were trained")
+    scored = [row.scored for row in found.rows]
+    more: Mapping[Column, Callable[[ScoredRow], Cell]] = {learn: lambda row: trainable[row.name]}
+    return scored_table(_caption(found), "net", scored, SEGMENT_COLUMNS, more=more)
 
 
 def beside_the_paper(found: SegmentationComparison, differs: str) -> ScoreTable:
@@ -79,18 +73,6 @@ def class_table(found: SegmentationComparison) -> ScoreTable:
         for number in order
     ]
     return ScoreTable("intersection over union of every class", "class", columns, rows)
-
-
-def _cells(row: ScoredRow, trainable: int) -> tuple[Cell, ...]:
-    mean = row.scores["mean_iou"]
-    return (
-        mean.value,
-        f"{mean.low:.3f}-{mean.high:.3f}" if isfinite(mean.low) else None,
-        mean.spread if isfinite(mean.spread) else None,
-        row.scores["top10_iou"].value,
-        row.scores["pixel_accuracy"].value,
-        trainable or None,
-    )
 
 
 def _caption(found: SegmentationComparison) -> str:

@@ -37,12 +37,11 @@ def cluster(
     from derender.evaluation.clustering_levels import finch_levels
     from derender.evaluation.clustering_methods import approximation
     from derender.evaluation.feature_rows import prepare
+    from derender.evaluation.score_table import verdict, verdict_table
     from derender.report.tables_comparison import (
         CLUSTER_COLUMNS,
         cluster_comparison_table,
         finch_table,
-        verdict,
-        verdict_table,
     )
 
     ready = prepare(rows, names, mean_by=mean_by or (), min_count=asked.min_count, max_count=asked.max_count)

@@ -146,8 +146,8 @@ def robustness(
     from derender.cli.models import open_model
     from derender.evaluation.linear_probes import check_head
     from derender.evaluation.robustness import chosen_axes, compare_robustness
+    from derender.evaluation.score_table import verdict
     from derender.report.robustness import robustness_tables
-    from derender.report.tables_comparison import verdict
 
     check_head(head)
     axes = chosen_axes(

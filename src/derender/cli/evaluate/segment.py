@@ -15,8 +15,8 @@ if TYPE_CHECKING:
 
     from derender.data import PictureSet
     from derender.evaluation.memory import Memory
+    from derender.evaluation.score_table import ScoreTable
     from derender.evaluation.segmentation import SegmentationComparison, SegmentationData
-    from derender.report.score_table import ScoreTable
 
 Masks = Annotated[
     str | None,

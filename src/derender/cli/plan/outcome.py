@@ -15,8 +15,8 @@ from derender.cli.plan.jobs import Job, Note, Place
 from derender.cli.plan.settings import OURS, Plan
 
 if TYPE_CHECKING:
-    from derender.report.compared import Cost, Scores
-    from derender.report.score_table import ScoreTable
+    from derender.evaluation.score_table import ScoreTable
+    from derender.report.compared import Cost, Question
 
 NAMES = {"cluster": "clustering", "linear": "linear"}
 MISSING = {"failed": "failed", "stopped": "missing"}
@@ -45,12 +45,12 @@ def write_outcome(plan: Plan, place: Place, notes: Mapping[Job, Note]) -> Outcom
     Raises:
         ValueError: nothing at all could be scored.
     """
-    from derender.report import table_text
+    from derender.evaluation.score_table import Scores
     from derender.report.compared import protocol_picture, protocol_table, scores_from, set_tables
     from derender.report.comparison import comparison_page
     from derender.report.page import write_whole
 
-    found: dict[str, list[Scores]] = {}
+    found: dict[str, list[Question]] = {}
     kept: dict[str, list[Any]] = {}
     for job, note in notes.items():
         if job.kind == "score" and note.state == "done":
@@ -68,6 +68,7 @@ def write_outcome(plan: Plan, place: Place, notes: Mapping[Job, Note]) -> Outcom
         methods = plan.rows()
         summary = protocol_table(scores, methods)
         every = [summary, *(table for one in scores for table in set_tables(one, methods))]
+        shown = Scores(every, {})
         svg, png = protocol_picture(scores, methods)
         page = comparison_page(
             f"{NAMES[protocol].capitalize()}: {', '.join(one['name'] for one in kept[protocol])}",
@@ -81,8 +82,8 @@ def write_outcome(plan: Plan, place: Place, notes: Mapping[Job, Note]) -> Outcom
         told = "".join(f"\n- {sentence}" for sentence in (*failed, *missing))
         notes_text = f"\nFailed or missing:\n{told}\n" if told else ""
         for suffix, text in (
-            (".md", table_text.markdown(every) + notes_text),
-            (".tex", table_text.latex(every)),
+            (".md", shown.to_markdown() + notes_text),
+            (".tex", shown.to_latex()),
             (".html", page.html()),
             (".svg", standing_alone(svg)),
         ):

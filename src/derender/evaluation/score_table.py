@@ -1,0 +1,333 @@
+"""Tables of scores beside controls: one value for the terminal, a page, Markdown, LaTeX, pandas and JSON.
+
+A protocol gives ``Scores``: its tables (the main one first) and its numbers. ``scored_table`` and
+``verdict_table`` make tables of rows that were scored with resamples. Leaves out computing scores.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from math import isfinite
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+from derender.evaluation.bootstrap import ScoredRow
+
+if TYPE_CHECKING:
+    import pandas
+
+
+class Interval(NamedTuple):
+    """Both ends of a 95 % interval, in the unit of its score; NaN where there is none."""
+
+    low: float
+    high: float
+
+
+Cell = float | int | str | Interval | None
+ARROWS = {"high": " ↑", "low": " ↓", None: ""}
+
+
+@dataclass(frozen=True)
+class Column:
+    """One column of numbers.
+
+    Attributes:
+        name: shown in the head.
+        best: which end is better; None where the numbers are no score.
+        digits: after the point.
+        note: range, unit and meaning.
+        of: the score whose interval or standard deviation the column holds.
+    """
+
+    name: str
+    best: Literal["high", "low"] | None = None
+    digits: int = 3
+    note: str = ""
+    of: str = ""
+
+    @property
+    def head(self) -> str:
+        """The name and an arrow to the better end."""
+        return self.name + ARROWS[self.best]
+
+    def text(self, cell: Cell) -> str:
+        """A cell as text; a dash where there is no number."""
+        if isinstance(cell, Interval):
+            return f"{self.text(cell.low)}-{self.text(cell.high)}" if isfinite(cell.low) else "-"
+        if cell is None or (isinstance(cell, float) and not isfinite(cell)):
+            return "-"
+        if isinstance(cell, str):
+            return cell
+        return f"{cell:,}" if isinstance(cell, int) else f"{cell:.{self.digits}f}"
+
+
+@dataclass(frozen=True)
+class Row:
+    """One row: its name, one cell per column, and whether it is a control (it learned nothing)."""
+
+    name: str
+    cells: Sequence[Cell]
+    control: bool = False
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class ScoreTable:
+    """Rows of numbers under named columns; the first row is the subject of the table.
+
+    Attributes:
+        caption: the score and the data.
+        first: head of the column of row names.
+        columns: one for each cell of a row.
+        rows: in the order of display.
+    """
+
+    caption: str
+    first: str
+    columns: Sequence[Column]
+    rows: Sequence[Row]
+
+    def __post_init__(self) -> None:
+        for row in self.rows:
+            if len(row.cells) != len(self.columns):
+                raise ValueError(
+                    f"row {row.name!r} has {len(row.cells)} cells for {len(self.columns)} columns"
+                )
+
+    def __str__(self) -> str:
+        return self.to_markdown()
+
+    def numbers(self, column: int) -> list[float]:
+        """Every finite number of one column."""
+        return [number for row in self.rows if (number := _number(row.cells[column])) is not None]
+
+    def best(self, column: int) -> float | None:
+        """The best number of a column; None where the column is no score or there is nothing to compare."""
+        numbers, end = self.numbers(column), self.columns[column].best
+        if end is None or len(numbers) < 2:
+            return None
+        return max(numbers) if end == "high" else min(numbers)
+
+    def largest(self, column: int) -> float:
+        """The largest absolute number of a column, 0 without any."""
+        return max((abs(value) for value in self.numbers(column)), default=0.0)
+
+    def texts(self, row: Row) -> list[tuple[str, bool]]:
+        """Each cell of a row as text, and whether it is the best of its column."""
+        return [
+            (column.text(cell), cell is not None and cell == self.best(place))
+            for place, (column, cell) in enumerate(zip(self.columns, row.cells, strict=True))
+        ]
+
+    def values(self) -> dict[str, dict[str, Cell]]:
+        """Row name to column name to cell."""
+        names = [column.name for column in self.columns]
+        return {row.name: dict(zip(names, row.cells, strict=True)) for row in self.rows}
+
+    def verdict(self, column: int) -> str:
+        """In words: whether the first row is better than every control in one column."""
+        column_, (first, *others) = self.columns[column], self.rows
+        value, sign = _number(first.cells[column]), -1 if column_.best == "low" else 1
+        rivals = {row.name: score for row in others if (score := _number(row.cells[column])) is not None}
+        if value is None or not rivals:
+            return f"{first.name}: {column_.text(first.cells[column])} ({column_.name})"
+        name, strongest = max(rivals.items(), key=lambda rival: sign * rival[1])
+        shown, other = column_.text(first.cells[column]), column_.text(strongest)
+        if sign * value > sign * strongest:
+            return f"better than every control: {shown} against {other} ({name})"
+        if value == strongest:
+            return f"level with the strongest control: {shown} ({name})"
+        beaten = [rival for rival, score in rivals.items() if sign * value > sign * score]
+        rest = f", but ahead of {', '.join(beaten)}" if beaten else ""
+        return f"behind the strongest control: {shown} against {other} ({name}){rest}"
+
+    def to_pandas(self) -> "pandas.DataFrame":
+        """A data frame with one row for each row, named by it, and a last column ``control`` (bool).
+
+        An interval becomes two columns, such as ``accuracy low`` and ``accuracy high``.
+
+        Raises:
+            ImportError: pandas is not installed.
+        """
+        try:
+            import pandas
+        except ImportError as error:
+            raise ImportError("to_pandas() needs pandas: pip install pandas") from error
+        data: dict[str, list[Any]] = {}
+        for place, column in enumerate(self.columns):
+            cells = [row.cells[place] for row in self.rows]
+            if any(isinstance(cell, Interval) for cell in cells):
+                nothing = Interval(float("nan"), float("nan"))
+                ends = [cell if isinstance(cell, Interval) else nothing for cell in cells]
+                data[f"{column.of} low".lstrip()] = [one.low for one in ends]
+                data[f"{column.of} high".lstrip()] = [one.high for one in ends]
+            else:
+                data[f"{column.of} {column.name}".lstrip()] = cells
+        names = pandas.Index([row.name for row in self.rows], name=self.first)
+        return pandas.DataFrame({**data, "control": [row.control for row in self.rows]}, index=names)
+
+    def to_markdown(self) -> str:
+        """The caption, a table with the best of each column bold and controls in italics, and the notes."""
+        heads = [self.first, *(column.head for column in self.columns)]
+        lines = [_bars(map(_markdown, heads)), _bars([":---", *("---:" for _ in self.columns)])]
+        for row in self.rows:
+            name = f"*{_markdown(row.name)}*" if row.control else _markdown(row.name)
+            cells = [f"**{_markdown(text)}**" if best else _markdown(text) for text, best in self.texts(row)]
+            lines.append(_bars([name, *cells]))
+        notes = "; ".join(f"{column.name}: {column.note}" for column in self.columns if column.note)
+        return "\n".join([self.caption, "", *lines, *(["", notes] if notes else []), ""])
+
+    def to_latex(self) -> str:
+        """A table environment; it needs ``\\usepackage{booktabs}``."""
+        arrows = {"high": r" $\uparrow$", "low": r" $\downarrow$", None: ""}
+        heads = [_latex(self.first), *(_latex(column.name) + arrows[column.best] for column in self.columns)]
+        lines = []
+        for row in self.rows:
+            name = rf"\textit{{{_latex(row.name)}}}" if row.control else _latex(row.name)
+            texts = [(_latex(text), best) for text, best in self.texts(row)]
+            cells = [rf"\textbf{{{text}}}" if best else text for text, best in texts]
+            lines.append(" & ".join([name, *cells]) + r" \\")
+        begin = [r"\begin{table}", r"\centering", rf"\caption{{{_latex(self.caption)}}}"]
+        rules = [rf"\begin{{tabular}}{{l{'r' * len(self.columns)}}}", r"\toprule", " & ".join(heads) + r" \\"]
+        end = [r"\bottomrule", r"\end{tabular}", r"\end{table}", ""]
+        return "\n".join([*begin, *rules, r"\midrule", *lines, *end])
+
+
+@dataclass(frozen=True)
+class Scores:
+    """The result of a protocol.
+
+    Attributes:
+        tables: the main table first.
+        values: every number by name, as ``--json`` writes it.
+        notes: sentences on the result.
+    """
+
+    tables: Sequence[ScoreTable]
+    values: Mapping[str, Any]
+    notes: Sequence[str] = ()
+
+    def __str__(self) -> str:
+        return self.to_markdown()
+
+    def to_pandas(self) -> "pandas.DataFrame":
+        """The main table as a data frame, see ``ScoreTable.to_pandas``."""
+        return self.tables[0].to_pandas()
+
+    def to_markdown(self) -> str:
+        """Every table, one after another."""
+        return "\n".join(table.to_markdown() for table in self.tables)
+
+    def to_latex(self) -> str:
+        """Every table environment, one after another."""
+        return "\n".join(table.to_latex() for table in self.tables)
+
+
+def scored_table(
+    caption: str,
+    first: str,
+    rows: Sequence[ScoredRow],
+    columns: Mapping[str, Column],
+    *,
+    intervals: Sequence[str] | None = None,
+    deviations: Sequence[str] | None = None,
+    more: Mapping[Column, Callable[[ScoredRow], Cell]] | None = None,
+) -> ScoreTable:
+    """One row for each scored row.
+
+    Args:
+        caption, first: of the table.
+        rows: in the order of display.
+        columns: by score, in the order of display.
+        intervals: scores followed by their 95 % interval; by default the first.
+        deviations: scores followed by their standard deviation over seeds; by default the first.
+        more: further columns, each with the function that gives its cell.
+    """
+    main = list(columns)[:1]
+    shown: dict[Column, Callable[[ScoredRow], Cell]] = {}
+    for name, column in columns.items():
+        shown[column] = lambda row, name=name: row.scores[name].value
+        if name in (main if intervals is None else intervals):
+            shown[interval_column(column)] = lambda row, name=name: interval_of(row, name)
+        if name in (main if deviations is None else deviations):
+            shown[deviation_column(column)] = lambda row, name=name: row.scores[name].spread
+    shown |= more or {}
+    cells = [Row(row.name, [cell(row) for cell in shown.values()], row.control) for row in rows]
+    return ScoreTable(caption, first, tuple(shown), cells)
+
+
+def interval_column(column: Column, over: str = "scored rows") -> Column:
+    """The column that holds the interval of another one's score."""
+    note = f"interval of {column.name} over resamples of the {over}"
+    return Column("95 %", None, column.digits, note, column.name)
+
+
+def deviation_column(column: Column) -> Column:
+    """The column that holds the standard deviation of another one's score."""
+    return Column("±", None, column.digits, f"standard deviation of {column.name} over seeds", column.name)
+
+
+def interval_of(row: ScoredRow, score: str, scale: float = 1.0) -> Interval:
+    """The interval of one score, times ``scale``."""
+    return Interval(scale * row.scores[score].low, scale * row.scores[score].high)
+
+
+def verdict_table(rows: Sequence[ScoredRow], columns: Mapping[str, Column], caption: str) -> ScoreTable:
+    """Which row is above the strongest control, in each score named by a column, and by how much."""
+    found = [
+        Row(
+            f"{row.name}: {columns[name].name}",
+            (one.value, one.low, one.high, one.rival, "yes" if one.above else "no"),
+        )
+        for row in rows
+        for name, one in row.versus.items()
+        if name in columns and isfinite(row.scores[name].low)
+    ]
+    shown = (
+        Column("difference", None, note="to the strongest control, on the same resamples"),
+        Column("low"),
+        Column("high"),
+        Column("strongest control"),
+        Column("above", note="whether the whole 95 % interval lies above 0"),
+    )
+    return ScoreTable(caption, "features: score", shown, found)
+
+
+def verdict(row: ScoredRow, score: str) -> str:
+    """In words: whether a row is above the strongest control in one score."""
+    own, one = row.scores[score], row.versus.get(score)
+    if one is None:
+        return f"{row.name}: {own.value:.3f} ({score})"
+    found = "above" if one.above else "below" if one.high < 0 else "not distinguished from"
+    return (
+        f"{row.name}: {score} {own.value:.3f}, {found} the strongest control ({one.rival}): "
+        f"{one.value:+.3f}, 95 % {one.low:+.3f} to {one.high:+.3f}"
+    )
+
+
+def _number(cell: Cell) -> float | None:
+    return cell if isinstance(cell, float | int) and isfinite(cell) else None
+
+
+def _bars(cells: Sequence[str] | map) -> str:
+    return "| " + " | ".join(cells) + " |"
+
+
+def _markdown(text: str) -> str:
+    """Text that stays in its cell and is not read as emphasis."""
+    return " ".join(text.split()).replace("|", r"\|").replace("*", r"\*").replace("_", r"\_")
+
+
+def _latex(text: str) -> str:
+    return " ".join(text.split()).translate(_LATEX)
+
+
+_LATEX = str.maketrans(
+    {
+        "\\": r"\textbackslash{}",
+        **{letter: rf"\{letter}" for letter in "{}$&#%_"},
+        "^": r"\textasciicircum{}",
+        "~": r"\textasciitilde{}",
+        "±": r"$\pm$",
+        "≥": r"$\geq$",
+    }
+)
