@@ -189,5 +189,5 @@ def test_weights_that_are_no_numbers_are_an_error(model, images):
     broken = derender.Derenderer(model.settings)
     broken.load_state_dict(model.state_dict())
     next(broken.nets["albedo"].decoder.parameters()).data.fill_(float("nan"))
-    with pytest.raises(ValueError, match="no numbers after 16 pictures"):
+    with pytest.raises(ValueError, match="NaN or infinite after 16 pictures"):
         teach_unets(broken.eval(), images, SHORT.model_copy(update={"images": 16}))

@@ -103,8 +103,8 @@ def _trained(
             progress(step + 1, steps, loss.item())
     if not all(bool(value.isfinite().all()) for value in layers.state_dict().values()):
         raise ValueError(
-            f"learning perceptual features ended in weights that are no numbers after {steps} steps: give "
-            "another seed, or perceptual=none"
+            f"learning perceptual features ended in weights that are NaN or infinite after {steps} steps: "
+            "give another seed, or perceptual=none"
         )
     net = SelfFeatures(settings.widths)
     net.features.load_state_dict(without_normalisation(layers.cpu().eval(), settings.widths).state_dict())

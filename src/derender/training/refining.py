@@ -124,7 +124,7 @@ def refine(
 
     Raises:
         ValueError: a model that cannot fit scenes or has further factors; too few pictures, or pictures of
-            another size; weights that are no numbers in the end.
+            another size; weights that are NaN or infinite in the end.
     """
     config = config or RefineConfig()
     settings = config.refining
@@ -147,8 +147,8 @@ def refine(
     _learn(student, images[rows[clear]], maps, fitted[clear], config, generator, progress)
     if not all(bool(value.isfinite().all()) for value in student.state_dict().values()):
         raise ValueError(
-            f"refining ended in weights that are no numbers after {settings.images:,} pictures: give another "
-            "seed or a lower learning_rate"
+            f"refining ended in weights that are NaN or infinite after {settings.images:,} pictures: "
+            "give another seed or a lower learning_rate"
         )
     as_many = config.fitting.model_copy(update={"coordinates": maps.size("depth")})
     features = config.model_copy(update={"fitting": as_many})

@@ -122,8 +122,8 @@ def teach_unets(
     _learn(model, student, heads, images, settings, Generator().manual_seed(seed), progress)
     if not all(bool(value.isfinite().all()) for value in student.state_dict().values()):
         raise ValueError(
-            f"teaching ended in weights that are no numbers after {settings.images:,} pictures: give another "
-            "seed or a lower learning_rate"
+            f"teaching ended in weights that are NaN or infinite after {settings.images:,} pictures: "
+            "give another seed or a lower learning_rate"
         )
     return Taught(student, _errors(model, student, heads, images[:_MEASURED]))
 
