@@ -1,8 +1,8 @@
-"""Augmentations with torch alone: crop, flip, colour jitter, grey, blur; each drawn for every picture.
+"""Augmentations in torch: crop, flip, colour jitter, grey, blur; each random for every image.
 
 Source: SimCLR (Chen et al. 2020, appendix A) with half its strengths for colours; crops keep more of the
-picture by default, because ours are aligned and small. Pictures are 0..1 before and after. Leaves out hue in
-HSV: it turns about the grey axis of RGB.
+image by default, because ours are aligned and small. Images are 0..1 before and after. Leaves out hue in HSV:
+colours rotate about the grey axis of RGB.
 """
 
 import math
@@ -13,6 +13,7 @@ from pydantic import Field
 from torch import Generator, Tensor
 from torch.nn.functional import affine_grid, conv2d, grid_sample, pad
 
+from derender.baselines.model import Images
 from derender.settings import Settings
 
 LUMINANCE = (0.299, 0.587, 0.114)
@@ -34,10 +35,8 @@ class AugmentSettings(Settings):
     blur_px: tuple[float, float] = (0.1, 1.0)  # standard deviation, smallest and largest
 
 
-def augment(
-    images: Float[Tensor, "n 3 h w"], settings: AugmentSettings, generator: Generator
-) -> Float[Tensor, "n 3 h w"]:
-    """A random view of every picture, in 0..1; the same generator gives the same views."""
+def augment(images: Images, settings: AugmentSettings, generator: Generator) -> Images:
+    """A random view of every image, in 0..1; the same generator gives the same views."""
     images = crop(images, settings, generator)
     images = where(settings.flip, images.flip(-1), images, generator)
     images = where(settings.jitter, jitter(images, settings, generator), images, generator)
@@ -50,37 +49,26 @@ def where(
     changed: Float[Tensor, "n 3 h w"],
     kept: Float[Tensor, "n 3 h w"],
     generator: Generator,
-) -> Float[Tensor, "n 3 h w"]:
-    """Each picture changed with this probability."""
+) -> Images:
+    """Each image changed with this probability."""
     chosen = torch.rand(len(kept), generator=generator) < probability
     return torch.where(chosen.to(kept.device)[:, None, None, None], changed, kept)
 
 
-def crop(
-    images: Float[Tensor, "n 3 h w"], settings: AugmentSettings, generator: Generator
-) -> Float[Tensor, "n 3 h w"]:
-    """A part of every picture, inside it, stretched to the full size (bilinear)."""
+def crop(images: Images, settings: AugmentSettings, generator: Generator) -> Images:
+    """A part of every image, inside it, stretched to the full size (bilinear)."""
     count = len(images)
     area = _uniform((count,), settings.crop_from, 1.0, generator)
     stretch = _uniform((count,), -math.log(settings.aspect), math.log(settings.aspect), generator).exp()
     sides = torch.stack([(area * stretch).sqrt(), (area / stretch).sqrt()], dim=1).clamp(max=1.0)
-    centre = _uniform((count, 2), -1.0, 1.0, generator) * (1 - sides)  # -1..1 spans the picture
-    return cut(images, sides, centre)
-
-
-def cut(
-    images: Float[Tensor, "n 3 h w"], sides: Float[Tensor, "n 2"], centre: Float[Tensor, "n 2"]
-) -> Float[Tensor, "n 3 h w"]:
-    """The part with these sides (share of width, height) about this centre (x, y; -1..1 is the picture)."""
+    centre = _uniform((count, 2), -1.0, 1.0, generator) * (1 - sides)  # -1..1 spans the image
     change = torch.cat([torch.diag_embed(sides), centre[:, :, None]], dim=2).to(images)
     grid = affine_grid(change, list(images.shape), align_corners=False)
     return grid_sample(images, grid, padding_mode="border", align_corners=False)
 
 
-def jitter(
-    images: Float[Tensor, "n 3 h w"], settings: AugmentSettings, generator: Generator
-) -> Float[Tensor, "n 3 h w"]:
-    """Brightness, contrast about the picture's mean grey, saturation about each pixel's grey, hue."""
+def jitter(images: Images, settings: AugmentSettings, generator: Generator) -> Images:
+    """Brightness, contrast about the image's mean grey, saturation about each pixel's grey, hue."""
     count = len(images)
 
     def gain(strength: float) -> Tensor:
@@ -92,30 +80,28 @@ def jitter(
     colourless = grey(images)
     images = (colourless + (images - colourless) * gain(settings.saturation)).clamp(0, 1)
     angle = math.radians(settings.hue_deg)
-    return turn_hue(images, _uniform((count,), -angle, angle, generator).to(images)).clamp(0, 1)
+    return rotate_hue(images, _uniform((count,), -angle, angle, generator).to(images)).clamp(0, 1)
 
 
-def turn_hue(images: Float[Tensor, "n 3 h w"], angle_rad: Float[Tensor, " n"]) -> Float[Tensor, "n 3 h w"]:
-    """Colours turned about the grey axis of RGB; greys stay, three turns of 120 degrees are none."""
+def rotate_hue(images: Images, angle_rad: Float[Tensor, " n"]) -> Images:
+    """Colours rotated about the grey axis of RGB; greys stay."""
     cosine, sine = angle_rad.cos(), angle_rad.sin()
     same = cosine + (1 - cosine) / 3
     ahead = (1 - cosine) / 3 - sine / math.sqrt(3)
     behind = (1 - cosine) / 3 + sine / math.sqrt(3)
     rows = [(same, ahead, behind), (behind, same, ahead), (ahead, behind, same)]
-    turn = torch.stack([torch.stack(row, dim=1) for row in rows], dim=1)
-    return torch.einsum("nij,njhw->nihw", turn, images)
+    rotation = torch.stack([torch.stack(row, dim=1) for row in rows], dim=1)
+    return torch.einsum("nij,njhw->nihw", rotation, images)
 
 
-def grey(images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n 3 h w"]:
+def grey(images: Images) -> Images:
     """Luminance in all three channels (ITU-R BT.601)."""
     weights = torch.tensor(LUMINANCE, device=images.device, dtype=images.dtype).view(1, 3, 1, 1)
     return (images * weights).sum(dim=1, keepdim=True).expand_as(images)
 
 
-def blur(
-    images: Float[Tensor, "n 3 h w"], sigma_px: tuple[float, float], generator: Generator
-) -> Float[Tensor, "n 3 h w"]:
-    """Gaussian blur with a standard deviation drawn for every picture; borders are mirrored."""
+def blur(images: Images, sigma_px: tuple[float, float], generator: Generator) -> Images:
+    """Gaussian blur with a standard deviation drawn for every image; borders are mirrored."""
     count, channels, height, width = images.shape
     sigma = _uniform((count, 1), *sigma_px, generator).to(images)
     reach = min(math.ceil(3 * sigma_px[1]), height - 1, width - 1)

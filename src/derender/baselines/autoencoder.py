@@ -1,26 +1,25 @@
-"""Autoencoders of our geometry net's size: what the bottleneck alone gives, without any physics.
+"""Autoencoders of our geometry net's size: the effect of the bottleneck alone, without any physics.
 
 Plain: the encoder and the map decoder of networks/ with three output channels, 12,982,848 parameters (our
 albedo net), least squares. beta-VAE: the same with a normal posterior over the code; source Higgins et al.,
-*beta-VAE* (ICLR 2017), Bernoulli likelihood as there, divided by the number of colour values in a picture so
-that both terms have one scale. Leaves out sampling of new pictures.
+*beta-VAE* (ICLR 2017), Bernoulli likelihood as there, divided by the number of colour values in an image so
+that both terms have one scale. Leaves out sampling of new images.
 """
 
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float
 from pydantic import Field, field_validator
-from torch import Generator, Tensor, nn
+from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits, mse_loss
 
-from derender.baselines.model import BaselineModel, BaselineSettings
+from derender.baselines.model import BaselineModel, BaselineSettings, Images, LossInputs
 from derender.networks.decoders import MapDecoder
 from derender.networks.encoders import Encoder
 from derender.networks.settings import NetworkSettings
 from derender.settings import Settings
 from derender.training.config import LoopSettings, OptimiserSettings
-from derender.training.step import Precision
 
 
 class AutoencoderSettings(BaselineSettings):
@@ -33,6 +32,10 @@ class AutoencoderSettings(BaselineSettings):
     @classmethod
     def _as_ours(cls, value: int) -> int:
         return NetworkSettings(image_size=value).image_size
+
+    def encoder(self, code_size: int | None = None) -> Encoder:
+        """A geometry encoder of this size."""
+        return Encoder(self.network, self.width, code_size or self.code_size, normalised=True)
 
     @property
     def network(self) -> NetworkSettings:
@@ -49,7 +52,7 @@ class AutoencoderConfig(LoopSettings):
 
 
 class BetaObjective(Settings):
-    """How much the divergence from the prior counts; 1 is an ordinary VAE."""
+    """The weight of the divergence from the prior; 1 is an ordinary VAE."""
 
     beta: float = Field(default=4.0, ge=0)
 
@@ -64,98 +67,83 @@ class BetaVaeConfig(LoopSettings):
 
 
 class Autoencoder(BaselineModel):
-    """Picture to code to picture. Feature: ``code``, as our own codes the output of a ReLU."""
+    """Image to code to image. Feature: ``code``, as our own codes the output of a ReLU."""
 
-    name = "ae"
+    name, settings_type, config_type = "ae", AutoencoderSettings, AutoencoderConfig
     features = ("code",)
     settings: AutoencoderSettings
 
     def __init__(self, settings: AutoencoderSettings):
         super().__init__(settings)
-        network = settings.network
-        self.encoder = Encoder(network, network.width, network.code_size, normalised=True)
-        self.decoder = MapDecoder(network, 3)
+        self.encoder = settings.encoder()
+        self.decoder = MapDecoder(settings.network, 3)
 
-    def reconstruct(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n 3 h w"]:
-        """Pictures through the code, in 0..1."""
+    def reconstruct(self, images: Images) -> Images:
+        """Images through the code, in 0..1."""
         return self.decoder(self.encoder(images)).float().tanh() / 2 + 0.5
 
-    def describe(self, images: Float[Tensor, "n 3 h w"]) -> dict[str, Float[Tensor, "n _"]]:
+    def describe(self, images: Images) -> dict[str, Float[Tensor, "n _"]]:
         return {"code": self.encoder(images)}
 
-    def shown(self, images: Float[Tensor, "n 3 h w"]) -> dict[str, Float[Tensor, "n 3 h w"]]:
+    def shown(self, images: Images, config: Any) -> dict[str, Images]:
         return {"input": images, "reconstruction": self.reconstruct(images)}
+
+    def losses(self, images: Images, run: LossInputs) -> dict[str, Tensor]:
+        """Mean squared error in 0..1, and beside it L1."""
+        with run.precision():
+            again = self.reconstruct(images)
+        return {"reconstruction": mse_loss(again, images), "l1": (again.detach() - images).abs().mean()}
 
 
 class BetaVae(BaselineModel):
-    """Picture to a normal posterior over codes to a picture. Feature: ``mean``, the posterior's mean."""
+    """Image to a normal posterior over codes to an image. Feature: ``mean``, the posterior's mean."""
 
-    name = "beta-vae"
+    name, settings_type, config_type = "beta-vae", AutoencoderSettings, BetaVaeConfig
     features = ("mean",)
     settings: AutoencoderSettings
 
     def __init__(self, settings: AutoencoderSettings):
         super().__init__(settings)
-        network = settings.network
-        self.encoder = Encoder(network, network.width, 2 * network.code_size, normalised=True)
+        self.encoder = settings.encoder(2 * settings.code_size)
         self.encoder.to_code = nn.Sequential(self.encoder.to_code[0])  # no ReLU: a mean has both signs
-        self.decoder = MapDecoder(network, 3)
+        self.decoder = MapDecoder(settings.network, 3)
 
-    def posterior(
-        self, images: Float[Tensor, "n 3 h w"]
-    ) -> tuple[Float[Tensor, "n code"], Float[Tensor, "n code"]]:
+    def posterior(self, images: Images) -> tuple[Float[Tensor, "n code"], Float[Tensor, "n code"]]:
         """Mean and log variance of every number of the code."""
         mean, log_variance = self.encoder(images).float().chunk(2, dim=1)
         return mean, log_variance.clamp(-20, 10)
 
-    def logits(self, code: Float[Tensor, "n code"]) -> Float[Tensor, "n 3 h w"]:
+    def logits(self, code: Float[Tensor, "n code"]) -> Images:
         """Log odds of every colour value."""
         return self.decoder(code).float()
 
-    def describe(self, images: Float[Tensor, "n 3 h w"]) -> dict[str, Float[Tensor, "n _"]]:
+    def describe(self, images: Images) -> dict[str, Float[Tensor, "n _"]]:
         return {"mean": self.posterior(images)[0]}
 
-    def shown(self, images: Float[Tensor, "n 3 h w"]) -> dict[str, Float[Tensor, "n 3 h w"]]:
+    def shown(self, images: Images, config: Any) -> dict[str, Images]:
         return {"input": images, "reconstruction": self.logits(self.posterior(images)[0]).sigmoid()}
 
+    def losses(self, images: Images, run: LossInputs) -> dict[str, Tensor]:
+        """Bernoulli likelihood and weighted divergence, both per colour value; beside them L1, ``active``.
 
-def autoencoder_losses(
-    model: Autoencoder, images: Float[Tensor, "n 3 h w"], precision: Precision
-) -> dict[str, Tensor]:
-    """Mean squared error in 0..1, and beside it L1."""
-    with precision():
-        again = model.reconstruct(images)
-    return {"reconstruction": mse_loss(again, images), "l1": (again.detach() - images).abs().mean()}
-
-
-def beta_vae_losses(
-    model: BetaVae,
-    images: Float[Tensor, "n 3 h w"],
-    objective: BetaObjective,
-    generator: Generator,
-    precision: Precision,
-) -> dict[str, Tensor]:
-    """Bernoulli likelihood and weighted divergence, both per colour value; beside them L1 and ``active``.
-
-    ``active`` counts the numbers of the code whose divergence, averaged over the batch, is above 0.01 nats.
-    The code is sampled in training and is the mean otherwise.
-    """
-    with precision():
-        mean, log_variance = model.posterior(images)
-    code = mean
-    if model.training:
-        noise = torch.randn(mean.shape, generator=generator).to(mean)
-        code = mean + noise * (0.5 * log_variance).exp()
-    with precision():
-        logits = model.logits(code)
-    divergence = kl_to_standard_normal(mean, log_variance)
-    values = images[0].numel()
-    return {
-        "reconstruction": binary_cross_entropy_with_logits(logits, images),
-        "kl": objective.beta * divergence.sum(dim=1).mean() / values,
-        "l1": (logits.detach().sigmoid() - images).abs().mean(),
-        "active": (divergence.detach().mean(dim=0) > 0.01).float().sum(),
-    }
+        ``active`` counts the numbers of the code whose divergence, averaged over the batch, is above 0.01
+        nats. The code is sampled in training and is the mean otherwise.
+        """
+        with run.precision():
+            mean, log_variance = self.posterior(images)
+        code = mean
+        if self.training:
+            noise = torch.randn(mean.shape, generator=run.generator).to(mean)
+            code = mean + noise * (0.5 * log_variance).exp()
+        with run.precision():
+            logits = self.logits(code)
+        divergence = kl_to_standard_normal(mean, log_variance)
+        return {
+            "reconstruction": binary_cross_entropy_with_logits(logits, images),
+            "kl": run.config.objective.beta * divergence.sum(dim=1).mean() / images[0].numel(),
+            "l1": (logits.detach().sigmoid() - images).abs().mean(),
+            "active": (divergence.detach().mean(dim=0) > 0.01).float().sum(),
+        }
 
 
 def kl_to_standard_normal(

@@ -1,8 +1,8 @@
-"""DINOv2-small: features learnt by others on 142 million pictures, for scale.
+"""DINOv2-small: features learnt by others on 142 million images, for scale.
 
 Source: Oquab et al., *DINOv2* (2023); weights facebook/dinov2-small (Apache-2.0), 22 million parameters, read
 through transformers from the user's Hugging Face cache or a folder, as safetensors only. Nothing is ever
-downloaded here. Pictures are enlarged to 224 pixels. Leaves out fine-tuning.
+downloaded here. Images are enlarged to 224 pixels. Leaves out fine-tuning.
 """
 
 from pathlib import Path
@@ -13,15 +13,14 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from derender.baselines.extras import optional
-from derender.baselines.model import PICKLES, WEIGHTS_FILE, BaselineModel, BaselineSettings
+from derender.baselines.model import PICKLES, WEIGHTS_FILE, BaselineModel, BaselineSettings, Images, optional
 
 DEFAULT_ID = "facebook/dinov2-small"
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 
 class Dinov2Settings(BaselineSettings):
-    """Which weights, and the side to which pictures are enlarged: a multiple of the patches' 14 pixels."""
+    """Which weights, and the side to which images are enlarged: a multiple of the patches' 14 pixels."""
 
     weights: str = DEFAULT_ID
     enlarged: int = 224
@@ -30,7 +29,7 @@ class Dinov2Settings(BaselineSettings):
 class Dinov2(BaselineModel):
     """A vision transformer. Features: ``class`` (the class token) and ``patches`` (the mean patch)."""
 
-    name = "dinov2"
+    name, settings_type = "dinov2", Dinov2Settings
     features = ("class", "patches")
     settings: Dinov2Settings
     mean: Tensor
@@ -42,12 +41,16 @@ class Dinov2(BaselineModel):
         self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(1, 3, 1, 1), persistent=False)
         self.register_buffer("std", torch.tensor(IMAGENET_STD).view(1, 3, 1, 1), persistent=False)
 
-    def describe(self, images: Float[Tensor, "n 3 h w"]) -> dict[str, Float[Tensor, "n _"]]:
+    def describe(self, images: Images) -> dict[str, Float[Tensor, "n _"]]:
         side = self.settings.enlarged
         large = interpolate(images, (side, side), mode="bicubic", align_corners=False, antialias=True)
         tokens = self.net((large.clamp(0, 1) - self.mean) / self.std).last_hidden_state
-        made = {"class": tokens[:, 0], "patches": tokens[:, 1:].mean(dim=1)}
-        return {name: made[name] for name in self.chosen}
+        return {"class": tokens[:, 0], "patches": tokens[:, 1:].mean(dim=1)}
+
+
+def open_dinov2(name: str, source: str | None, image_size: int, seed: int) -> Dinov2:
+    """See `registry.open_baseline`."""
+    return load_dinov2(source or DEFAULT_ID, image_size=image_size)
 
 
 def load_dinov2(source: str = DEFAULT_ID, *, image_size: int = 64, enlarged: int = 224) -> Dinov2:
@@ -55,11 +58,11 @@ def load_dinov2(source: str = DEFAULT_ID, *, image_size: int = 64, enlarged: int
 
     Args:
         source: an id in the Hugging Face cache, or a folder with config.json and model.safetensors.
-        image_size: side of the pictures that it will be given.
+        image_size: side of its input images.
         enlarged: side to which it enlarges them.
 
     Raises:
-        ValueError: the weights are not here, are a pickle, or are of another kind of network.
+        ValueError: there are no weights, or they are a pickle, or of another kind of network.
     """
     if Path(source).suffix.lower() in PICKLES:
         raise ValueError(
@@ -75,7 +78,7 @@ def load_dinov2(source: str = DEFAULT_ID, *, image_size: int = 64, enlarged: int
         tree, _ = library.PretrainedConfig.get_config_dict(source, local_files_only=True)
         if tree.get("model_type") != "dinov2":
             raise ValueError(f"{source} is a {tree.get('model_type')}, expected a dinov2")
-        net, told = library.Dinov2Model.from_pretrained(
+        net, info = library.Dinov2Model.from_pretrained(
             source, local_files_only=True, use_safetensors=True, output_loading_info=True
         )
     except OSError as error:
@@ -86,9 +89,9 @@ def load_dinov2(source: str = DEFAULT_ID, *, image_size: int = 64, enlarged: int
             ) from error
         raise ValueError(
             f"the weights {source} are not in the Hugging Face cache and nothing is downloaded here: run "
-            f"'hf download {source}' once where there is a network, or give their folder with --model"
+            f"'hf download {source}' once where there is a network, or name their folder"
         ) from error
-    missing = sorted(told["missing_keys"])
+    missing = sorted(info["missing_keys"])
     if missing:
         raise ValueError(f"{source} is of another architecture: it has no {missing[0]!r}")
     model = Dinov2(Dinov2Settings(image_size=image_size, weights=source, enlarged=enlarged), net)

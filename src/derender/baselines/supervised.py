@@ -1,15 +1,14 @@
-"""ResNet-18 trained with labels: what a few hundred of them buy.
+"""ResNet-18 trained with a few hundred labels.
 
 Source: He et al., *Deep Residual Learning* (CVPR 2016); the network is transformers' (Apache-2.0), configured
 as ResNet-18, with fresh weights: nothing is downloaded. It learns every label column at once, one softmax for
-each, on 100, 500 or 1,000 pictures of the training part. Feature: ``pooled``, the 512 numbers before the
+each, on 100, 500 or 1,000 images of the training part. Feature: ``pooled``, the 512 numbers before the
 classifier. Leaves out pre-training.
 """
 
-import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -19,60 +18,23 @@ from torch import Generator, Tensor
 from torch.nn.functional import cross_entropy
 
 from derender.baselines.augment import AugmentSettings, augment
-from derender.baselines.extras import optional
-from derender.baselines.model import BaselineModel, BaselineSettings
+from derender.baselines.model import BaselineModel, BaselineSettings, Images, optional
+from derender.baselines.training import ShortRun
 from derender.data import PictureSet, as_float, split_indices
 from derender.features import map_batches, missing
 from derender.settings import Settings
-from derender.training.loop import Progress, TrainResult, describe_data
-from derender.training.run_folder import append_metrics, start_run
+from derender.training.loop import TrainResult
 
 MILD = AugmentSettings(crop_from=0.7, jitter=0.5, hue_deg=0.0, grey=0.0, blur=0.0)
-"""Views of labelled pictures: a little crop, flip and jitter."""
+"""Views of labelled images: a little crop, flip and jitter."""
 
 
 class Resnet18Settings(BaselineSettings):
-    """What the network tells apart: the class names of every label column."""
+    """The classes that the network distinguishes: the class names of every label column."""
 
     image_size: int = Field(default=64, ge=32)
     width: int = Field(default=64, ge=1)  # of the first stage; each of the three others doubles it
     classes: dict[str, tuple[str, ...]]
-
-
-class Resnet18(BaselineModel):
-    """ResNet-18. Features: ``pooled`` (512 numbers) and ``logits`` (one for every class)."""
-
-    name = "resnet18"
-    features = ("pooled", "logits")
-    settings: Resnet18Settings
-
-    def __init__(self, settings: Resnet18Settings):
-        super().__init__(settings)
-        library = optional("transformers", "the baseline resnet18")
-        shape = library.ResNetConfig(
-            num_channels=3,
-            embedding_size=settings.width,
-            hidden_sizes=[settings.width * 2**stage for stage in range(4)],
-            depths=[2, 2, 2, 2],
-            layer_type="basic",
-            num_labels=sum(len(names) for names in settings.classes.values()),
-        )
-        self.net = library.ResNetForImageClassification(shape)
-
-    def pooled(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n d"]:
-        """The mean over places of the last feature map, for pictures in 0..1."""
-        return self.net.resnet(images * 2 - 1).pooler_output.flatten(1)
-
-    def logits(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n classes"]:
-        """One number for every class of every label, label after label."""
-        return self.net.classifier(self.pooled(images))
-
-    def describe(self, images: Float[Tensor, "n 3 h w"]) -> dict[str, Float[Tensor, "n _"]]:
-        pooled = self.pooled(images)
-        made = {"pooled": pooled}
-        if "logits" in self.chosen:
-            made["logits"] = self.net.classifier(pooled)
-        return {name: made[name] for name in self.chosen}
 
 
 class SupervisedConfig(Settings):
@@ -80,7 +42,7 @@ class SupervisedConfig(Settings):
 
     baseline: Literal["resnet18"] = "resnet18"
     labels: tuple[str, ...] = ()  # label columns to learn; at least one
-    labelled: int = Field(default=1_000, ge=2)  # pictures whose labels are used
+    labelled: int = Field(default=1_000, ge=2)  # images whose labels are used
     image_size: int = Field(default=64, ge=32)
     width: int = Field(default=64, ge=1)
     epochs: int = Field(default=30, ge=1)
@@ -97,50 +59,83 @@ class SupervisedConfig(Settings):
         return (value,) if isinstance(value, str) else value
 
 
-def labelled_rows(pictures: PictureSet, config: SupervisedConfig) -> np.ndarray:
-    """Rows of the pictures to learn from: of the training part, drawn by the seed, every label known.
+class Resnet18(BaselineModel):
+    """ResNet-18. Features: ``pooled`` (512 numbers) and ``logits`` (one for every class)."""
+
+    name, settings_type, config_type = "resnet18", Resnet18Settings, SupervisedConfig
+    features = ("pooled", "logits")
+    settings: Resnet18Settings
+
+    def __init__(self, settings: Resnet18Settings):
+        super().__init__(settings)
+        library = optional("transformers", "the baseline resnet18")
+        shape = library.ResNetConfig(
+            num_channels=3,
+            embedding_size=settings.width,
+            hidden_sizes=[settings.width * 2**stage for stage in range(4)],
+            depths=[2, 2, 2, 2],
+            layer_type="basic",
+            num_labels=sum(len(names) for names in settings.classes.values()),
+        )
+        self.net = library.ResNetForImageClassification(shape)
+
+    def pooled(self, images: Images) -> Float[Tensor, "n d"]:
+        """The mean over places of the last feature map, for images in 0..1."""
+        return self.net.resnet(images * 2 - 1).pooler_output.flatten(1)
+
+    def logits(self, images: Images) -> Float[Tensor, "n classes"]:
+        """One number for every class of every label, label after label."""
+        return self.net.classifier(self.pooled(images))
+
+    def describe(self, images: Images) -> dict[str, Float[Tensor, "n _"]]:
+        pooled = self.pooled(images)
+        return {"pooled": pooled, "logits": self.net.classifier(pooled)}
+
+
+def labelled_rows(images: PictureSet, config: SupervisedConfig) -> np.ndarray:
+    """Rows of the images to learn from: of the training part, drawn by the seed, every label known.
 
     Raises:
         ValueError: there are fewer than asked for, or no label was named.
     """
     if not config.labels:
-        known = ", ".join(pictures.labels) or "no labels"
-        raise ValueError(f"name a label to learn, as in --set labels=NAME; the pictures have {known}")
-    train = split_indices(pictures.files, config.split, seed=config.seed).train
-    known = ~np.any([missing(pictures.label(name)[train]) for name in config.labels], axis=0)
+        known = ", ".join(images.labels) or "no labels"
+        raise ValueError(f"name a label to learn, as in --set labels=NAME; the images have {known}")
+    train = split_indices(images.files, config.split, seed=config.seed).train
+    known = ~np.any([missing(images.label(name)[train]) for name in config.labels], axis=0)
     rows = np.random.default_rng(config.seed).permutation(train[known])
     if len(rows) < config.labelled:
         raise ValueError(
-            f"{config.labelled:,} labelled pictures were asked for, the training part has {len(rows):,} "
+            f"{config.labelled:,} labelled images were requested, the training part has {len(rows):,} "
             f"with {', '.join(config.labels)}: set labelled={len(rows)} or fewer"
         )
     return rows[: config.labelled]
 
 
 def train_resnet18(
-    pictures: PictureSet,
+    images: PictureSet,
     config: SupervisedConfig,
     *,
     device: str | torch.device = "cpu",
     progress: Callable[[int, int, float], None] | None = None,
 ) -> Resnet18:
-    """A ResNet-18 trained on ``config.labelled`` pictures, ready to embed.
+    """A ResNet-18 trained on ``config.labelled`` images, ready to embed.
 
     The same seed gives the same weights; torch's global generator is left as it was.
 
     Args:
-        pictures: with these labels; those outside the labelled rows are not looked at.
+        images: with these labels; only the labelled rows are used.
         config: how.
         device: where.
-        progress: called with (pictures seen, in all, loss) after every step.
+        progress: called with (images seen, in all, loss) after every step.
     """
-    rows = labelled_rows(pictures, config)
-    names, targets = encode_labels(pictures, config.labels, rows)
+    rows = labelled_rows(images, config)
+    names, targets = encode_labels(images, config.labels, rows)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
-        size = pictures.images.shape[-1]
+        size = images.images.shape[-1]
         model = Resnet18(Resnet18Settings(image_size=size, width=config.width, classes=names))
-    images, wanted = as_float(pictures.images[rows]).to(device), targets.to(device)
+    inputs, wanted = as_float(images.images[rows]).to(device), targets.to(device)
     model = model.to(device).train()
     optimiser = torch.optim.AdamW(model.parameters(), config.learning_rate, weight_decay=config.weight_decay)
     batch = min(config.batch_size, len(rows))
@@ -152,7 +147,7 @@ def train_resnet18(
         order = torch.randperm(len(rows), generator=generator).to(device)
         for within in range(per_epoch):
             chosen = order[within * batch : (within + 1) * batch]
-            seen = augment(images[chosen], config.augment, generator)
+            seen = augment(inputs[chosen], config.augment, generator)
             loss = label_loss(model.logits(seen), wanted[chosen], sizes)
             optimiser.zero_grad(set_to_none=True)
             loss.backward()
@@ -164,15 +159,15 @@ def train_resnet18(
 
 
 def encode_labels(
-    pictures: PictureSet, labels: tuple[str, ...], rows: np.ndarray
+    images: PictureSet, labels: tuple[str, ...], rows: np.ndarray
 ) -> tuple[dict[str, tuple[str, ...]], Int64[Tensor, "n labels"]]:
     """Class names of every label among these rows, in order, and each row's class numbers."""
     names, columns = {}, []
     for label in labels:
-        values = pictures.label(label)[rows]
+        values = images.label(label)[rows]
         classes, numbers = np.unique(values, return_inverse=True)
         if len(classes) < 2:
-            raise ValueError(f"label {label!r} has one value only ({classes[0]}) in {len(rows)} pictures")
+            raise ValueError(f"label {label!r} has one value only ({classes[0]}) in {len(rows)} images")
         names[label] = tuple(str(value) for value in classes)
         columns.append(torch.from_numpy(numbers.reshape(-1).astype(np.int64)))
     return names, torch.stack(columns, dim=1)
@@ -186,14 +181,12 @@ def label_loss(
     return torch.stack([cross_entropy(part, targets[:, i]) for i, part in enumerate(parts)]).mean()
 
 
-def accuracy(model: Resnet18, pictures: PictureSet) -> dict[str, float]:
-    """Share of right answers for every label among pictures where it is known, 0 to 1; NaN if nowhere."""
-    parts = map_batches(
-        lambda batch: model.logits(batch).cpu().numpy(), model, pictures.images, batch_size=256
-    )
+def accuracy(model: Resnet18, images: PictureSet) -> dict[str, float]:
+    """Share of right answers for every label among images where it is known, 0 to 1; NaN if nowhere."""
+    parts = map_batches(lambda batch: model.logits(batch).cpu().numpy(), model, images.images, batch_size=256)
     answers, found, start = np.concatenate(parts), {}, 0
     for label, names in model.settings.classes.items():
-        values = pictures.label(label)
+        values = images.label(label)
         known = ~missing(values)
         best = np.array(names)[answers[:, start : start + len(names)].argmax(axis=1)]
         right = best[known] == values[known].astype(str)
@@ -202,43 +195,29 @@ def accuracy(model: Resnet18, pictures: PictureSet) -> dict[str, float]:
     return found
 
 
-def supervised_run(
-    config: SupervisedConfig,
-    pictures: PictureSet,
-    out: str | Path,
-    *,
-    progress: Callable[[Progress], None] | None = None,
-    accelerator: str = "cpu",
+def train_supervised(
+    config: SupervisedConfig, images: PictureSet, out: str | Path, *, sample_sheet: Any = None, **how: Any
 ) -> TrainResult:
-    """Train into a new run folder, which `derender embed --baseline resnet18` takes; minutes, no resume.
+    """Train into a new run folder; see `registry.train_baseline`. Minutes, no resume, no sample sheet.
 
     Raises:
         FileExistsError: the folder is not empty.
-        ValueError: too few pictures with these labels.
+        ValueError: too few images with these labels.
     """
-    split = split_indices(pictures.files, config.split, seed=config.seed)
-    labelled_rows(pictures, config)  # what is wrong with the labels is an error before a folder is made
+    labelled_rows(images, config)  # wrong labels are an error before a folder is made
     optional("transformers", "the baseline resnet18")
-    run = start_run(Path(out), config, describe_data(pictures, split), accelerator)
-    began, seen = time.perf_counter(), 0
+    run, seen = ShortRun(config, images, out, **how), 0
 
     def note(done: int, total: int, loss: float) -> None:
         nonlocal seen
         seen = done
-        elapsed = time.perf_counter() - began
-        speed = done / elapsed
-        if progress is not None:
-            progress(Progress("train", done, total, speed, {"loss": loss}))
-        row = {"kind": "train", "images": done, "seconds": round(elapsed, 2), "loss": loss}
-        append_metrics(run, {**row, "images_per_second": speed})
+        run.note(done, total, {"loss": loss})
+        run.record("train", done, {"loss": loss, "images_per_second": done / run.seconds})
 
-    model = train_resnet18(pictures, config, device=accelerator, progress=note)
-    seconds, validation = time.perf_counter() - began, {}
-    if len(split.validation):
-        found = accuracy(model, pictures.select(split.validation))
-        validation = {f"accuracy {label}": value for label, value in found.items()}
-        append_metrics(
-            run, {"kind": "validation", "images": seen, "seconds": round(seconds, 2), **validation}
-        )
-    model.save(run.model)
-    return TrainResult(run.path, seen, seconds, seen / seconds, validation, "images", ())
+    model = train_resnet18(images, config, device=run.accelerator, progress=note)
+    scores = {}
+    if len(run.split.validation):
+        right = accuracy(model, images.select(run.split.validation))
+        scores = {f"accuracy {label}": value for label, value in right.items()}
+        run.record("validation", seen, scores)
+    return run.finish(model, seen, scores)

@@ -1,209 +1,64 @@
-"""Baselines that the training loop trains: one row each, and the task that joins a row to the loop.
+"""Training runs of baselines: settings by name, the task that joins a baseline to the loop, short runs.
 
 Runs, checkpoints, exact resume, early stop and reports are those of our own model (training/loop.py).
 """
 
-from collections.abc import Callable, Mapping
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from math import isfinite
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 from torch import Generator, Tensor, nn
 
-from derender.baselines.autoencoder import (
-    Autoencoder,
-    AutoencoderConfig,
-    AutoencoderSettings,
-    BetaVae,
-    BetaVaeConfig,
-    autoencoder_losses,
-    beta_vae_losses,
-)
-from derender.baselines.model import BaselineModel, BaselineSettings, saved_baseline
-from derender.baselines.ris.building import RisConfig
-from derender.baselines.ris.model import Ris, RisSettings
-from derender.baselines.simclr import Simclr, SimclrConfig, SimclrSettings, make_views, simclr_losses
-from derender.baselines.stylegan2.adversarial import (
-    ADVERSARIAL_TERMS,
-    Stylegan,
-    StyleganConfig,
-    adversarial_losses,
-)
-from derender.baselines.stylegan2.e4e import E4e, E4eSettings
-from derender.baselines.stylegan2.generator import GeneratorSettings
-from derender.baselines.stylegan2.inversion import (
-    REGULARISERS,
-    E4eConfig,
-    build_e4e,
-    inversion_losses,
-    perceptual_features,
-)
-from derender.baselines.supervised import Resnet18, Resnet18Settings, SupervisedConfig
-from derender.baselines.vqvae import Vqvae, VqvaeConfig, VqvaeSettings, vqvae_losses
-from derender.data import suggestion
-from derender.training.batches import random_stream
-from derender.training.config import LoopSettings, TrainConfig
+from derender.baselines.model import BaselineModel, Images, LossInputs
+from derender.baselines.registry import config_type, network_type
+from derender.data import PictureSet, Split, split_indices
+from derender.settings import Settings
+from derender.training.config import TrainConfig, with_changes
 from derender.training.finetune_config import FinetuneConfig
 from derender.training.finite import first_not_finite
-from derender.training.run_folder import RunFolder, read_config, read_config_tree
+from derender.training.loop import Progress, TrainResult, describe_data, train_task
+from derender.training.run_folder import (
+    RunFolder,
+    append_metrics,
+    read_config,
+    read_config_tree,
+    start_run,
+)
 from derender.training.step import Precision
 from derender.training.step_module import Held
 from derender.training.task import PhaseProgress
 from derender.training.watch import Finding
 
-Losses = Callable[[Any, Tensor, Generator, Precision], dict[str, Tensor]]
-"""(model, pictures in 0..1, generator, precision) to losses and other numbers by name."""
-Shown = Callable[[Any, Tensor], dict[str, Tensor]]
-"""(model, pictures in 0..1) to pictures by column."""
-
-Row = TypeVar("Row")
-
-OUTSIDE_LOSS = ("l1", "codes_used", "active", "found")  # numbers beside the losses
+OUTSIDE_LOSS = ("l1", "codes_used", "active", "found")
+"""Numbers that ``losses`` returns beside the losses."""
+SheetOf = Callable[[Callable[[Any, Tensor], dict[str, Tensor]]], Any]
+"""Makes the loop's drawing function from one that gives images by column."""
 
 
-@dataclass(frozen=True)
-class TrainedBaseline:
-    """One row.
-
-    Attributes:
-        config: settings of a run; its ``baseline`` is the name, its ``model`` the module's settings.
-        module: the network, made from ``settings``.
-        losses: makes the function of a batch, given the configuration and the device.
-        shown: makes the function of a sample sheet, given the same.
-        not_judged: losses that say nothing of held-out pictures.
-        build: makes the network of a configuration, where it takes more than the module's settings.
-        prepare: makes the function of a batch where that needs pictures to learn from first, given the
-            configuration, a file that keeps what was learnt, the pictures and the progress.
-    """
-
-    config: type[LoopSettings]
-    module: type[BaselineModel]
-    settings: type[BaselineSettings]
-    losses: Callable[[Any, torch.device], Losses]
-    shown: Callable[[Any, torch.device], Shown]
-    not_judged: tuple[str, ...] = ()
-    build: Callable[[Any], BaselineModel] | None = None
-    prepare: Callable[[Any, Path, Tensor, PhaseProgress], Losses] | None = None
+def baseline_config(name: str, overrides: Sequence[str] = ()) -> Settings:
+    """The settings of a baseline's run, with ``key=value`` changes."""
+    return with_changes(config_type(name)(), overrides)
 
 
-def _vqvae(config: VqvaeConfig, device: torch.device) -> Losses:
-    return lambda model, images, generator, precision: vqvae_losses(
-        model, images, config.objective, generator, precision
-    )
-
-
-def _autoencoder(config: AutoencoderConfig, device: torch.device) -> Losses:
-    return lambda model, images, generator, precision: autoencoder_losses(model, images, precision)
-
-
-def _beta_vae(config: BetaVaeConfig, device: torch.device) -> Losses:
-    return lambda model, images, generator, precision: beta_vae_losses(
-        model, images, config.objective, generator, precision
-    )
-
-
-def _simclr(config: SimclrConfig, device: torch.device) -> Losses:
-    views = make_views(config.objective, config.model.image_size, device)
-    return lambda model, images, generator, precision: simclr_losses(
-        model, images, config.objective, views, generator, precision
-    )
-
-
-def _simclr_shown(config: SimclrConfig, device: torch.device) -> Shown:
-    views = make_views(config.objective, config.model.image_size, device)
-
-    def shown(model: Simclr, images: Tensor) -> dict[str, Tensor]:
-        generator = random_stream(config.seed, "perturb", 0)
-        return {"input": images, **{f"view {n}": views(images, generator) for n in (1, 2, 3, 4)}}
-
-    return shown
-
-
-def _stylegan2(config: StyleganConfig, device: torch.device) -> Losses:
-    return lambda model, images, generator, precision: adversarial_losses(
-        model, images, config.objective, generator, precision
-    )
-
-
-def _e4e(config: E4eConfig, device: torch.device) -> Losses:
-    return lambda model, images, generator, precision: inversion_losses(
-        model, images, config.objective, None, generator, precision
-    )
-
-
-def _e4e_prepared(config: E4eConfig, file: Path, images: Tensor, progress: PhaseProgress) -> Losses:
-    features = perceptual_features(config, file, images, progress)
-    return lambda model, images, generator, precision: inversion_losses(
-        model, images, config.objective, features, generator, precision
-    )
-
-
-def _own_pictures(config: LoopSettings, device: torch.device) -> Shown:
-    return lambda model, images: model.shown(images)
-
-
-TRAINED: dict[str, TrainedBaseline] = {
-    "vqvae": TrainedBaseline(
-        VqvaeConfig, Vqvae, VqvaeSettings, _vqvae, _own_pictures, not_judged=("codebook", "commitment")
-    ),
-    "simclr": TrainedBaseline(SimclrConfig, Simclr, SimclrSettings, _simclr, _simclr_shown),
-    "ae": TrainedBaseline(AutoencoderConfig, Autoencoder, AutoencoderSettings, _autoencoder, _own_pictures),
-    "beta-vae": TrainedBaseline(BetaVaeConfig, BetaVae, AutoencoderSettings, _beta_vae, _own_pictures),
-    "stylegan2": TrainedBaseline(
-        StyleganConfig, Stylegan, GeneratorSettings, _stylegan2, _own_pictures, not_judged=ADVERSARIAL_TERMS
-    ),
-    "e4e": TrainedBaseline(
-        E4eConfig,
-        E4e,
-        E4eSettings,
-        _e4e,
-        _own_pictures,
-        not_judged=REGULARISERS,
-        build=build_e4e,
-        prepare=_e4e_prepared,
-    ),
-}
-
-
-CONFIGS: dict[str, type[LoopSettings] | type[SupervisedConfig] | type[RisConfig]] = {
-    **{name: row.config for name, row in TRAINED.items()},
-    "resnet18": SupervisedConfig,
-    "ris": RisConfig,
-}
-"""Settings of a run of every baseline that is trained here."""
-MODULES: dict[str, tuple[type[BaselineModel], type[BaselineSettings]]] = {
-    **{name: (row.module, row.settings) for name, row in TRAINED.items()},
-    "resnet18": (Resnet18, Resnet18Settings),
-    "ris": (Ris, RisSettings),
-}
-"""Module and settings of every baseline that lies in a folder of ours."""
-
-
-def named_baseline(name: str, rows: Mapping[str, Row]) -> Row:
-    """The entry of that name, or an error that names the nearest one."""
-    if name not in rows:
-        raise ValueError(f"no baseline {name!r}{suggestion(name, rows)}: choose one of {', '.join(rows)}")
-    return rows[name]
-
-
-def load_baseline(source: str | Path, name: str | None = None) -> BaselineModel:
-    """The baseline in a run folder or a saved folder, ready to embed; of that name, if one is given.
-
-    Raises:
-        FileNotFoundError: nothing is there.
-        ValueError: it is a pickle, damaged, of another architecture or another baseline.
-    """
-    return saved_baseline(source, MODULES if name is None else {name: named_baseline(name, MODULES)})
-
-
-def read_any_config(path: Path) -> LoopSettings | SupervisedConfig | RisConfig:
-    """The configuration of a run, whether it trained our model or a baseline."""
+def read_any_config(path: Path) -> Any:
+    """The configuration of a run: of our model, a fine-tuning, or a baseline."""
     tree = read_config_tree(path)
     name, ours = tree.get("baseline"), FinetuneConfig if "target" in tree else TrainConfig
-    return read_config(path, ours if name is None else named_baseline(str(name), CONFIGS))
+    return read_config(path, ours if name is None else config_type(str(name)))
+
+
+def train_in_loop(
+    config: Any, images: PictureSet, out: str | Path, *, sample_sheet: SheetOf | None = None, **how: Any
+) -> TrainResult:
+    """Train a baseline in the common loop; see `registry.train_baseline`."""
+    task = BaselineTask(config)
+    sheet = None if sample_sheet is None else sample_sheet(task.shown)
+    return train_task(task, images, out, sample_sheet=sheet, **how)
 
 
 @dataclass(frozen=True)
@@ -213,50 +68,42 @@ class BaselineTask:
     config: Any
 
     @property
-    def row(self) -> TrainedBaseline:
-        return named_baseline(self.config.baseline, TRAINED)
+    def network(self) -> type[BaselineModel]:
+        return network_type(self.config.baseline)
 
     @property
     def outside_loss(self) -> tuple[str, ...]:
-        """What held-out pictures are not judged by."""
-        return (*OUTSIDE_LOSS, *self.row.not_judged)
+        """Names of numbers by which held-out images are not judged."""
+        return (*OUTSIDE_LOSS, *self.network.not_judged)
 
     def check(self) -> None:
         """A missing package or model is an error before a folder is made."""
         self.build()
-        self.row.losses(self.config, torch.device("cpu"))
 
     def build(self) -> BaselineModel:
         """The untrained network; torch's global generator is left as it was."""
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.config.seed)
-            build = self.row.build
-            return self.row.module(self.config.model) if build is None else build(self.config)
+            return self.network.build(self.config)
 
     def step_module(
-        self,
-        model: nn.Module,
-        run: RunFolder,
-        images: UInt8[Tensor, "n 3 h w"],
-        progress: PhaseProgress,
+        self, model: nn.Module, run: RunFolder, images: UInt8[Tensor, "n 3 h w"], progress: PhaseProgress
     ) -> "BaselineStep":
-        prepare = self.row.prepare
-        if prepare is None:
-            return BaselineStep(model, self.row.losses(self.config, images.device))
-        return BaselineStep(model, prepare(self.config, run.perceptual, images, progress))
+        aid = self.network.prepare(self.config, images, run.perceptual, progress)
+        return BaselineStep(model, self.config, aid)
 
     def watch(self, memory: dict[str, Any]) -> "FiniteWatch":
-        """Stops a run whose loss is no longer a number."""
+        """Stops a run whose loss is NaN or infinite."""
         return FiniteWatch()
 
-    def shown(self, model: BaselineModel, images: Float[Tensor, "n 3 h w"]) -> dict[str, Tensor]:
-        """Pictures for a sample sheet, by column."""
-        return self.row.shown(self.config, images.device)(model, images)
+    def shown(self, model: BaselineModel, images: Images) -> dict[str, Tensor]:
+        """Images for a sample sheet, by column."""
+        return model.shown(images, self.config)
 
 
 @dataclass(frozen=True)
 class BaselineLosses:
-    """Losses of one batch: what is minimised, and every number by name, detached."""
+    """Losses of one batch: the minimised total, and every number by name, detached."""
 
     total: Tensor
     terms: dict[str, Tensor]
@@ -265,21 +112,23 @@ class BaselineLosses:
 class BaselineStep(nn.Module):
     """A baseline and its losses; a batch goes in, the total and the result come out."""
 
-    def __init__(self, model: nn.Module, losses: Losses):
+    def __init__(self, model: nn.Module, config: Any, aid: Any):
         super().__init__()
-        self.model, self.losses = model, losses
+        self.model, self.config = model, config
+        self.aid = [aid]  # in a list: its weights are not this module's
 
     def forward(
         self, images: Tensor, generator: Generator, precision: Precision, done: float | None = None
     ) -> tuple[Tensor, Held]:
-        terms = self.losses(self.model, images, generator, precision)
+        assert isinstance(self.model, BaselineModel)
+        terms = self.model.losses(images, LossInputs(self.config, generator, precision, self.aid[0]))
         total = torch.stack([term for name, term in terms.items() if name not in OUTSIDE_LOSS]).sum()
         return total, Held(BaselineLosses(total, {name: term.detach() for name, term in terms.items()}))
 
 
 @dataclass
 class FiniteWatch:
-    """Watches for a loss that is not finite."""
+    """Watches for a loss that is NaN or infinite."""
 
     uneasy: bool = field(default=False, init=False)
 
@@ -297,3 +146,56 @@ class FiniteWatch:
     def memory(self) -> dict[str, Any]:
         """Nothing: a finite loss leaves nothing to remember."""
         return {}
+
+
+class ShortRun:
+    """A run folder filled in one go of minutes, without checkpoints: resnet18 and ris.
+
+    Args:
+        config: settings with ``split``, ``seed`` and ``baseline``.
+        images: all images, of which ``split`` learns from a part.
+        out: a new folder.
+        resume: refused.
+        progress: called with the share done.
+        accelerator: "cpu" or "cuda".
+    """
+
+    def __init__(
+        self,
+        config: Any,
+        images: PictureSet,
+        out: str | Path,
+        *,
+        resume: bool = False,
+        progress: Callable[[Progress], None] | None = None,
+        accelerator: str = "cpu",
+    ):
+        if resume:
+            raise ValueError(
+                f"{config.baseline} trains in minutes and is not resumed: train it again into another folder"
+            )
+        self.split: Split = split_indices(images.files, config.split, seed=config.seed)
+        self.folder = start_run(Path(out), config, describe_data(images, self.split), accelerator)
+        self.report, self.accelerator = progress or (lambda _: None), accelerator
+        self.began = time.perf_counter()
+
+    @property
+    def seconds(self) -> float:
+        """Time since the start."""
+        return time.perf_counter() - self.began
+
+    def note(self, done: int, total: int, terms: dict[str, float] | None = None) -> None:
+        """Report progress, in images."""
+        self.report(Progress("train", done, total, done / self.seconds, terms))
+
+    def record(self, kind: str, images: int, numbers: dict[str, float]) -> None:
+        """A line of metrics.jsonl."""
+        append_metrics(
+            self.folder, {"kind": kind, "images": images, "seconds": round(self.seconds, 2), **numbers}
+        )
+
+    def finish(self, model: BaselineModel, images: int, numbers: dict[str, float]) -> TrainResult:
+        """Save the model; ``numbers`` are the last scores by name."""
+        seconds = self.seconds
+        model.save(self.folder.model)
+        return TrainResult(self.folder.path, images, seconds, images / seconds, numbers, "images", ())

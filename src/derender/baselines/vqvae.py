@@ -1,7 +1,7 @@
-"""VQ-VAE: a picture becomes a grid of entries of a learnt codebook, and a picture again.
+"""VQ-VAE: an image becomes a grid of entries of a learnt codebook, and an image again.
 
 Source: van den Oord et al., *Neural Discrete Representation Learning* (2017), in the size that the paper
-compares with (SPEC: two convolutions k4 s2 p1, two residual blocks of ReLU, conv3, BatchNorm, ReLU, conv1,
+compares with (two convolutions k4 s2 p1, two residual blocks of ReLU, conv3, BatchNorm, ReLU, conv1,
 BatchNorm between). The paper says 416 channels and 19,199,491 parameters; that count is the one of 512
 channels, 416 have 12,724,195: both are offered (``width``). Both counts hold for eight BatchNorms, 512 codes
 as trainable parameters, and biases throughout; they say nothing of where the eight stand. Here: one after
@@ -10,13 +10,13 @@ decoder's blocks and one between its transposed convolutions.
 
 The codebook is the `VectorQuantize` of vector-quantize-pytorch (MIT), learnt by gradient as in the source
 (codebook term + 0.25 commitment), started by k-means on the first batch; entries that hardly any place chose
-of late are given to places of the batch. Leaves out the prior over codes that samples new pictures.
+of late are replaced by places of the batch. Leaves out the prior over codes that samples new images.
 """
 
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float, Int64
@@ -24,20 +24,18 @@ from pydantic import Field
 from torch import Generator, Tensor, nn
 from torch.nn.functional import mse_loss, one_hot
 
-from derender.baselines.extras import optional
-from derender.baselines.model import BaselineModel, BaselineSettings
+from derender.baselines.model import BaselineModel, BaselineSettings, Images, LossInputs, optional
 from derender.settings import Settings
 from derender.training.config import LoopSettings, OptimiserSettings
-from derender.training.step import Precision
 
 
 class VqvaeSettings(BaselineSettings):
-    """Sizes: channels (D) and entries of the codebook (K). Pictures are any multiple of 4 pixels wide."""
+    """Sizes: channels (D) and entries of the codebook (K). Images are any multiple of 4 pixels wide."""
 
     image_size: int = Field(default=64, ge=8, multiple_of=4)
     width: int = Field(default=512, ge=1)
     codes: int = Field(default=512, ge=2)
-    dead_below: float = Field(default=1.0, ge=0)  # places a batch, averaged; 0: entries are never given away
+    dead_below: float = Field(default=1.0, ge=0)  # places a batch, averaged; 0: entries are never replaced
 
 
 class VqvaeObjective(Settings):
@@ -47,7 +45,7 @@ class VqvaeObjective(Settings):
 
 
 class VqvaeConfig(LoopSettings):
-    """One training run of a VQ-VAE; the rate is that of the paper's text."""
+    """One training run of a VQ-VAE; the learning rate is that of the paper's text."""
 
     baseline: Literal["vqvae"] = "vqvae"
     model: VqvaeSettings = VqvaeSettings()
@@ -60,7 +58,7 @@ class Quantised:
     """A grid of places, each at its nearest entry.
 
     Attributes:
-        through: the entries; gradients pass straight through to what was quantised.
+        through: the entries; gradients pass straight through to the input.
         entries: the entries; gradients reach the codebook.
         indices: which.
     """
@@ -75,11 +73,12 @@ class Vqvae(BaselineModel):
 
     Features: ``pooled`` (D numbers: the mean entry over all places), ``map`` (the entries of all places,
     flattened: what the paper compares with, 106,496 numbers at 64x64 and 416 channels; its 416x25x25 are
-    those of 100x100 pictures), ``histogram`` (K numbers: the share of places at each entry).
+    those of 100x100 images), ``histogram`` (K numbers: the share of places at each entry).
     """
 
-    name = "vqvae"
+    name, settings_type, config_type = "vqvae", VqvaeSettings, VqvaeConfig
     features = ("pooled", "map", "histogram")
+    not_judged = ("codebook", "commitment")
     settings: VqvaeSettings
 
     def __init__(self, settings: VqvaeSettings):
@@ -119,8 +118,8 @@ class Vqvae(BaselineModel):
             nn.ConvTranspose2d(width, 3, 4, stride=2, padding=1),
         )
 
-    def encode(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n d gh gw"]:
-        """Pictures in 0..1 to a grid of a quarter of their side, not yet quantised."""
+    def encode(self, images: Images) -> Float[Tensor, "n d gh gw"]:
+        """Images in 0..1 to a grid of a quarter of their side, not yet quantised."""
         return self.encoder(images * 2 - 1)
 
     def quantise(self, grid: Float[Tensor, "n d h w"]) -> Quantised:
@@ -128,28 +127,44 @@ class Vqvae(BaselineModel):
         through, indices, _ = self.codebook(grid.float(), freeze_codebook=True)
         return Quantised(through, self.codebook.get_codes_from_indices(indices), indices)
 
-    def decode(self, grid: Float[Tensor, "n d gh gw"]) -> Float[Tensor, "n 3 h w"]:
-        """Pictures, about 0..1 but not clipped."""
+    def decode(self, grid: Float[Tensor, "n d gh gw"]) -> Images:
+        """Images, about 0..1 but not clipped."""
         return self.decoder(grid).float() / 2 + 0.5
 
-    def note_use(self, grid: Float[Tensor, "n d h w"], found: Quantised) -> None:
-        """Count which entries were chosen, give away those that hardly are; draws from torch's generator."""
-        self.codebook.update_indices(grid.detach().float(), found.indices)
+    def describe(self, images: Images) -> dict[str, Float[Tensor, "n _"]]:
+        quantised = self.quantise(self.encode(images))
+        return {
+            "pooled": quantised.entries.mean(dim=(2, 3)),
+            "map": quantised.entries.flatten(1),
+            "histogram": one_hot(quantised.indices.flatten(1), self.settings.codes).float().mean(dim=1),
+        }
 
-    def describe(self, images: Float[Tensor, "n 3 h w"]) -> dict[str, Float[Tensor, "n _"]]:
-        found = self.quantise(self.encode(images))
-        made = {}
-        if "pooled" in self.chosen:
-            made["pooled"] = found.entries.mean(dim=(2, 3))
-        if "map" in self.chosen:
-            made["map"] = found.entries.flatten(1)
-        if "histogram" in self.chosen:
-            made["histogram"] = one_hot(found.indices.flatten(1), self.settings.codes).float().mean(dim=1)
-        return {name: made[name] for name in self.chosen}
-
-    def shown(self, images: Float[Tensor, "n 3 h w"]) -> dict[str, Float[Tensor, "n 3 h w"]]:
+    def shown(self, images: Images, config: Any) -> dict[str, Images]:
         again = self.decode(self.quantise(self.encode(images)).through).clamp(0, 1)
         return {"input": images, "reconstruction": again}
+
+    def losses(self, images: Images, run: LossInputs) -> dict[str, Tensor]:
+        """Squared error in -1..1, codebook and commitment terms; beside them L1 in 0..1 and ``codes_used``.
+
+        ``codes_used`` is exp(entropy) of the entries chosen in this batch: from 1 (one entry for all) to K.
+        """
+        with run.precision():
+            grid = self.encode(images).float()
+        with _seeded(run.generator, grid.device):  # k-means, at the very first batch
+            quantised = self.quantise(grid)
+        with run.precision():
+            again = self.decode(quantised.through)
+        terms = {
+            "reconstruction": mse_loss(2 * again, 2 * images),
+            "codebook": mse_loss(quantised.entries, grid.detach()),
+            "commitment": run.config.objective.commitment * mse_loss(grid, quantised.entries.detach()),
+            "l1": (again.detach().clamp(0, 1) - images).abs().mean(),
+            "codes_used": codes_used(quantised.indices, self.settings.codes),
+        }
+        if self.training:  # count which entries were chosen, replace those that hardly ever are
+            with _seeded(run.generator, grid.device):
+                self.codebook.update_indices(grid.detach().float(), quantised.indices)
+        return terms
 
 
 class Residual(nn.Module):
@@ -164,36 +179,6 @@ class Residual(nn.Module):
 
     def forward(self, grid: Float[Tensor, "n d h w"]) -> Float[Tensor, "n d h w"]:
         return grid + self.layers(grid)
-
-
-def vqvae_losses(
-    model: Vqvae,
-    images: Float[Tensor, "n 3 h w"],
-    objective: VqvaeObjective,
-    generator: Generator,
-    precision: Precision,
-) -> dict[str, Tensor]:
-    """Mean squared error in -1..1, codebook and commitment terms; beside them L1 in 0..1 and ``codes_used``.
-
-    ``codes_used`` is exp(entropy) of the entries chosen in this batch: from 1 (one entry does all) to K.
-    """
-    with precision():
-        grid = model.encode(images).float()
-    with _seeded(generator, grid.device):  # k-means, at the very first batch
-        found = model.quantise(grid)
-    with precision():
-        again = model.decode(found.through)
-    terms = {
-        "reconstruction": mse_loss(2 * again, 2 * images),
-        "codebook": mse_loss(found.entries, grid.detach()),
-        "commitment": objective.commitment * mse_loss(grid, found.entries.detach()),
-        "l1": (again.detach().clamp(0, 1) - images).abs().mean(),
-        "codes_used": codes_used(found.indices, model.settings.codes),
-    }
-    if model.training:
-        with _seeded(generator, grid.device):
-            model.note_use(grid, found)
-    return terms
 
 
 def codes_used(indices: Int64[Tensor, "n h w"], codes: int) -> Float[Tensor, ""]:
