@@ -11,10 +11,9 @@ from derender.baselines.augment import (
     augment,
     blur,
     crop,
-    cut,
     grey,
     jitter,
-    turn_hue,
+    rotate_hue,
     where,
 )
 
@@ -51,12 +50,6 @@ def test_a_flip_is_certain_or_never_and_its_own_inverse(images):
     assert 0.46 < half[:, 0].mean() < 0.54
 
 
-def test_cutting_a_quarter_out_of_a_ramp_gives_that_part_of_it():
-    ramp = ((torch.arange(24) + 0.5) / 24).expand(1, 3, 20, 24)  # the share of the width left of each centre
-    half = cut(ramp, torch.tensor([[0.5, 1.0]]), torch.tensor([[-0.5, 0.0]]))
-    torch.testing.assert_close(half[0, 0, 0], (torch.arange(24) + 0.5).clamp(min=1.0) / 48, atol=1e-6, rtol=0)
-
-
 def test_a_crop_lies_inside_the_picture(images):
     """A frame of another colour, wider than the border, is seen by whatever reaches beyond."""
     small = AugmentSettings(crop_from=0.1)
@@ -79,11 +72,11 @@ def test_grey_has_three_equal_channels_and_the_luminance(images):
 def test_hue_turns_red_to_green_to_blue_and_leaves_grey(images):
     red = torch.tensor([1.0, 0, 0]).view(1, 3, 1, 1)
     third = torch.tensor([2 * math.pi / 3])
-    torch.testing.assert_close(turn_hue(red, third).flatten(), torch.tensor([0.0, 1, 0]), atol=1e-6, rtol=0)
+    torch.testing.assert_close(rotate_hue(red, third).flatten(), torch.tensor([0.0, 1, 0]), atol=1e-6, rtol=0)
     angle = torch.full((6,), 0.7)
-    torch.testing.assert_close(turn_hue(turn_hue(images, angle), -angle), images, atol=1e-5, rtol=0)
+    torch.testing.assert_close(rotate_hue(rotate_hue(images, angle), -angle), images, atol=1e-5, rtol=0)
     colourless = grey(images)
-    torch.testing.assert_close(turn_hue(colourless, angle), colourless, atol=1e-5, rtol=0)
+    torch.testing.assert_close(rotate_hue(colourless, angle), colourless, atol=1e-5, rtol=0)
 
 
 def test_jitter_without_strength_changes_nothing(images):

@@ -8,13 +8,14 @@ from torch.distributions import Normal, kl_divergence
 
 from derender.baselines.autoencoder import (
     Autoencoder,
+    AutoencoderConfig,
     AutoencoderSettings,
     BetaObjective,
     BetaVae,
-    autoencoder_losses,
-    beta_vae_losses,
+    BetaVaeConfig,
     kl_to_standard_normal,
 )
+from derender.baselines.model import LossInputs
 from derender.model import Derenderer
 from derender.presets import ModelSettings
 
@@ -41,13 +42,13 @@ def test_the_vae_samples_in_training_and_takes_the_mean_otherwise():
 
     def l1(seed: int) -> float:
         generator = torch.Generator().manual_seed(seed)
-        return beta_vae_losses(model, images, BetaObjective(), generator, nullcontext)["l1"].item()
+        return model.losses(images, LossInputs(BetaVaeConfig(), generator, nullcontext))["l1"].item()
 
     model.train()
     assert l1(0) == l1(0) != l1(1)
     model.eval()
     assert l1(0) == l1(1)
-    shown = model.shown(images)["reconstruction"]
+    shown = model.shown(images, None)["reconstruction"]
     assert l1(0) == pytest.approx((shown - images).abs().mean().item(), rel=1e-5)
     mean = model.embed(images)["mean"]
     assert mean.shape == (4, 16) and (mean < 0).any()
@@ -57,7 +58,10 @@ def test_beta_scales_the_divergence_and_nothing_else():
     torch.manual_seed(0)
     model, images = BetaVae(TINY).eval(), torch.rand(4, 3, 32, 32)
     one, four = (
-        beta_vae_losses(model, images, BetaObjective(beta=beta), torch.Generator(), nullcontext)
+        model.losses(
+            images,
+            LossInputs(BetaVaeConfig(objective=BetaObjective(beta=beta)), torch.Generator(), nullcontext),
+        )
         for beta in (1.0, 4.0)
     )
     torch.testing.assert_close(four["kl"], 4 * one["kl"])
@@ -72,7 +76,7 @@ def test_a_reconstruction_lies_in_range_and_its_error_is_the_mean_square():
     model, images = Autoencoder(TINY).eval(), torch.rand(4, 3, 32, 32)
     again = model.reconstruct(images)
     assert 0 <= again.min() <= again.max() <= 1
-    terms = autoencoder_losses(model, images, nullcontext)
+    terms = model.losses(images, LossInputs(AutoencoderConfig(), torch.Generator(), nullcontext))
     torch.testing.assert_close(terms["reconstruction"], (again - images).square().mean())
     assert model.embed(images)["code"].min() >= 0
 

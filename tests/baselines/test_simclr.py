@@ -7,19 +7,24 @@ import torch
 from pytorch_metric_learning.losses import NTXentLoss
 
 from derender.baselines.augment import AugmentSettings
+from derender.baselines.model import LossInputs
 from derender.baselines.simclr import (
     Simclr,
+    SimclrConfig,
     SimclrObjective,
     SimclrSettings,
-    make_views,
     physical_view,
-    simclr_losses,
     twin_found,
+    views_of,
 )
 from derender.model import Derenderer
 from derender.scene.perturb import PerturbSettings
 
 TINY = SimclrSettings(image_size=32, width=8, code_size=16, projection=6)
+
+
+def config(objective: SimclrObjective) -> SimclrConfig:
+    return SimclrConfig(model=TINY, objective=objective)
 
 
 def model() -> Simclr:
@@ -37,7 +42,9 @@ def test_the_loss_is_nt_xent_of_the_projections():
     net, images = model(), torch.rand(5, 3, 32, 32)
     objective = SimclrObjective(temperature=0.2)
     noisy = lambda images, generator: images + torch.rand(images.shape, generator=generator) / 4  # noqa: E731
-    terms = simclr_losses(net, images, objective, noisy, torch.Generator().manual_seed(3), nullcontext)
+    terms = net.losses(
+        images, LossInputs(config(objective), torch.Generator().manual_seed(3), nullcontext, noisy)
+    )
     generator = torch.Generator().manual_seed(3)
     views = [noisy(images, generator), noisy(images, generator)]
     codes = torch.cat([net.head(net.encoder(view)) for view in views])
@@ -56,11 +63,11 @@ def test_twin_found_is_one_for_twins_and_low_for_strangers():
 def test_learning_tells_pictures_apart(blobs):
     images = torch.from_numpy(blobs.images[:12]).float() / 255
     objective, net = SimclrObjective(augment=AugmentSettings(crop_from=0.8, blur=0, grey=0)), model().train()
-    views = make_views(objective, 32, torch.device("cpu"))
+    views = views_of(config(objective), torch.device("cpu"))
     optimiser, generator = torch.optim.Adam(net.parameters(), 3e-3), torch.Generator().manual_seed(0)
     losses = []
     for _ in range(40):
-        loss = simclr_losses(net, images, objective, views, generator, nullcontext)["nt_xent"]
+        loss = net.losses(images, LossInputs(config(objective), generator, nullcontext, views))["nt_xent"]
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
@@ -117,11 +124,11 @@ def test_physical_views_need_a_model_of_that_size(physics, tmp_path):
         SimclrObjective(physics="runs/x")
     missing = SimclrObjective(views="physical", physics=str(tmp_path / "none"))
     with pytest.raises(FileNotFoundError, match="no model at"):
-        make_views(missing, 32, torch.device("cpu"))
+        views_of(config(missing), torch.device("cpu"))
     saved = SimclrObjective(views="physical", physics=str(physics.save(tmp_path / "physics")))
-    with pytest.raises(ValueError, match="takes pictures of 32 pixels, this run of 64: set image_size=32"):
-        make_views(saved, 64, torch.device("cpu"))
-    views = make_views(saved, 32, torch.device("cpu"))
+    with pytest.raises(ValueError, match="takes images of 32 pixels, this run of 64: set image_size=32"):
+        views_of(SimclrConfig(objective=saved), torch.device("cpu"))
+    views = views_of(config(saved), torch.device("cpu"))
     images = torch.rand(2, 3, 32, 32)
     expected = physical_view(physics, images, saved.perturb, torch.Generator().manual_seed(5))
     torch.testing.assert_close(views(images, torch.Generator().manual_seed(5)), expected)

@@ -5,6 +5,7 @@ import pytest
 import torch
 from torch.nn.functional import cross_entropy
 
+from derender.baselines import load_baseline, read_any_config
 from derender.baselines.supervised import (
     MILD,
     Resnet18,
@@ -14,10 +15,9 @@ from derender.baselines.supervised import (
     encode_labels,
     label_loss,
     labelled_rows,
-    supervised_run,
     train_resnet18,
+    train_supervised,
 )
-from derender.baselines.training import load_baseline, read_any_config
 from derender.data import split_indices
 from derender.features import embed_pictures, model_fingerprint
 from derender.training.config import with_changes
@@ -42,7 +42,7 @@ def test_it_has_the_parameters_of_resnet18():
 
 def test_it_learns_from_few_labels_and_repeats(blobs, tmp_path):
     state = torch.random.get_rng_state()
-    result = supervised_run(FEW, blobs, tmp_path / "run")
+    result = train_supervised(FEW, blobs, tmp_path / "run")
     assert torch.equal(torch.random.get_rng_state(), state)
     losses = [row["loss"] for row in read_metrics(tmp_path / "run") if row["kind"] == "train"]
     assert len(losses) == 18 and np.mean(losses[-3:]) < 0.6 * np.mean(losses[:3])
@@ -98,13 +98,13 @@ def test_bad_labels_are_refused_before_a_folder_is_made(blobs, tmp_path):
     for changes, message in [
         (
             ["labels=[]"],
-            "name a label to learn, as in --set labels=NAME; the pictures have side, shade, same",
+            "name a label to learn, as in --set labels=NAME; the images have side, shade, same",
         ),
         (["labels=sid"], "no label 'sid'; did you mean 'side'"),
-        (["labelled=39"], r"39 labelled pictures were asked for, the training part has 38 with side"),
+        (["labelled=39"], r"39 labelled images were requested, the training part has 38 with side"),
     ]:
         with pytest.raises(ValueError, match=message):
-            supervised_run(with_changes(FEW, changes), blobs, tmp_path / "run")
+            train_supervised(with_changes(FEW, changes), blobs, tmp_path / "run")
     assert not (tmp_path / "run").exists()
     with pytest.raises(ValueError, match="label 'same' has one value only"):
         train_resnet18(blobs, with_changes(FEW, ["labels=same"]))

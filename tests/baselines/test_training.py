@@ -11,21 +11,15 @@ from PIL import Image
 from safetensors.torch import load_file, save_file
 
 import derender
-from derender.baselines.simclr import SimclrConfig
-from derender.baselines.training import (
-    CONFIGS,
-    BaselineLosses,
-    BaselineTask,
-    FiniteWatch,
-    load_baseline,
-    read_any_config,
-)
+from derender.baselines import baseline_config, load_baseline, read_any_config
+from derender.baselines.registry import config_type
+from derender.baselines.training import BaselineLosses, BaselineTask, FiniteWatch
 from derender.features import embed_pictures
 from derender.report.baseline_sheet import baseline_sheet
 from derender.report.run import run_page
 from derender.training import resolve, train
 from derender.training.checkpoint import WEIGHTS_FILE
-from derender.training.config import config_from_tree, with_changes
+from derender.training.config import config_from_tree
 from derender.training.loop import train_task
 from derender.training.run_folder import read_config, read_metrics
 
@@ -41,7 +35,7 @@ def _restore_determinism():
 
 
 def task(name: str, images: int, *more: str) -> BaselineTask:
-    return BaselineTask(with_changes(CONFIGS[name](), [*COMMON, *OWN[name], f"images={images}", *more]))
+    return BaselineTask(baseline_config(name, [*COMMON, *OWN[name], f"images={images}", *more]))
 
 
 @pytest.fixture(scope="module")
@@ -99,7 +93,7 @@ def test_physical_views_train_and_the_renderer_stays_out_of_the_checkpoint(blobs
     plain = {"encoder", "head"}
     assert {key.split(".")[0] for key in weights(tmp_path / "run")} == plain
     with pytest.raises(ValueError, match="views=physical and physics=RUN"):
-        with_changes(SimclrConfig(), ["views=physical"])
+        baseline_config("simclr", ["views=physical"])
     with pytest.raises(FileNotFoundError, match="no model at"):
         train_task(task("simclr", 16, "views=physical", "physics=nowhere"), blobs, tmp_path / "no")
     assert not (tmp_path / "no").exists()
@@ -201,9 +195,9 @@ def test_a_run_of_one_kind_is_not_taken_for_another(runs, blobs, tmp_path):
     with pytest.raises(ValueError, match="is a run of the baseline ae, not of a derender model"):
         read_config(runs / "ae")
     with pytest.raises(ValueError, match="is a run of the baseline ae, not of the baseline vqvae"):
-        read_config(runs / "ae", CONFIGS["vqvae"])
+        read_config(runs / "ae", config_type("vqvae"))
     with pytest.raises(ValueError, match="is a run of the baseline ae, not of a derender model"):
         train(resolve("small", ["image_size=32", "perceptual=none"]), blobs, runs / "ae", resume=True)
     with pytest.raises(ValueError, match=r"unknown setting 'model\.widht'; did you mean 'model\.width'"):
-        tree = CONFIGS["vqvae"]().model_dump(mode="json")
-        config_from_tree({**tree, "model": {**tree["model"], "widht": 3}}, CONFIGS["vqvae"])
+        tree = config_type("vqvae")().model_dump(mode="json")
+        config_from_tree({**tree, "model": {**tree["model"], "widht": 3}}, config_type("vqvae"))

@@ -5,7 +5,8 @@ from contextlib import nullcontext
 import pytest
 import torch
 
-from derender.baselines.vqvae import Vqvae, VqvaeObjective, VqvaeSettings, codes_used, vqvae_losses
+from derender.baselines.model import LossInputs
+from derender.baselines.vqvae import Vqvae, VqvaeConfig, VqvaeSettings, codes_used
 
 TINY = VqvaeSettings(image_size=32, width=8, codes=16)
 
@@ -22,7 +23,7 @@ def pictures(count: int = 6, seed: int = 0) -> torch.Tensor:
 
 def losses(model: Vqvae, images: torch.Tensor, seed: int = 0) -> dict[str, torch.Tensor]:
     generator = torch.Generator().manual_seed(seed)
-    return vqvae_losses(model, images, VqvaeObjective(), generator, nullcontext)
+    return model.losses(images, LossInputs(VqvaeConfig(), generator, nullcontext))
 
 
 @pytest.mark.parametrize(("width", "count"), [(512, 19_199_491), (416, 12_724_195)])
@@ -84,7 +85,7 @@ def test_training_lowers_the_error_and_keeps_the_codebook_in_use(blobs):
     optimiser = torch.optim.Adam(model.parameters(), 3e-3)
     generator, history = torch.Generator().manual_seed(0), []
     for _ in range(40):
-        terms = vqvae_losses(model, images, VqvaeObjective(), generator, nullcontext)
+        terms = model.losses(images, LossInputs(VqvaeConfig(), generator, nullcontext))
         optimiser.zero_grad()
         (terms["reconstruction"] + terms["codebook"] + terms["commitment"]).backward()
         optimiser.step()
@@ -142,5 +143,5 @@ def test_features_are_the_map_its_mean_and_its_histogram():
     torch.testing.assert_close(features["pooled"], features["histogram"] @ codebook)
     with pytest.raises(ValueError, match="vqvae has no feature 'poold'; did you mean 'pooled'"):
         model.choose(("poold",))
-    with pytest.raises(ValueError, match=r"takes pictures of shape \(N, 3, 32, 32\), got \(1, 3, 16, 16\)"):
+    with pytest.raises(ValueError, match=r"takes images of shape \(N, 3, 32, 32\), got \(1, 3, 16, 16\)"):
         model.embed(torch.rand(1, 3, 16, 16))

@@ -8,8 +8,8 @@ import pytest
 from PIL import Image
 
 from derender import FeatureTable
+from derender.baselines import BASELINES
 from derender.cli import main
-from derender.cli.baselines import NAMES
 
 TINY = ["image_size=32", "width=8", "codes=8", "batch_size=4", "images=8"]
 SETTINGS = [word for setting in TINY for word in ("--set", setting)]
@@ -121,7 +121,7 @@ def test_bad_words_are_one_line(run, faces, tmp_path, refused):
     assert "did you mean 'vqvae'" in refused(*embed, "--baseline", "vqvea")
     assert "give --model RUN, or --baseline NAME" in refused(*embed)
     for name in ("vqvae", "untrained"):
-        assert f"--baseline {name} needs --model" in refused(*embed, "--baseline", name)
+        assert f"the baseline {name} needs a model" in refused(*embed, "--baseline", name)
     assert "has no feature 'maps'; did you mean 'map'" in refused(
         *embed, "--baseline", "vqvae", "--model", run, "--features", "maps"
     )
@@ -143,4 +143,4 @@ def test_bad_words_are_one_line(run, faces, tmp_path, refused):
 def test_help_names_every_baseline(capsys):
     assert main(["embed", "--help"]) == 0
     text = capsys.readouterr().out
-    assert all(name in text for name in NAMES)
+    assert all(name in text for name in BASELINES)

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.torch_version import TorchVersion
 
-from derender.baselines.stylegan2.published import read_weights
+from derender.baselines.published import read_weights
 from derender.networks.unsup3d import read_checkpoint
 from derender.objectives.vgg import load_vgg16
 from derender.storage.tensors import reads_safely

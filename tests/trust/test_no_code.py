@@ -12,8 +12,8 @@ import torch
 from safetensors.torch import save_file
 
 import derender
-from derender.baselines.stylegan2.published import read_weights
-from derender.baselines.training import load_baseline
+from derender.baselines import load_baseline
+from derender.baselines.published import read_weights
 from derender.data.listing import recall
 from derender.evaluation.memory import Memory
 from derender.features import FeatureTable

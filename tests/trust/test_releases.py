@@ -11,7 +11,7 @@ import pytest
 import torch
 
 import derender
-from derender.baselines.training import load_baseline
+from derender.baselines import load_baseline
 from derender.data import read_pictures
 from derender.data.cache import _MARK, read_cache
 from derender.features import FeatureTable, missing

@@ -1,6 +1,6 @@
 """Other ways to make a feature table, for comparison: networks that are trained here or by others, controls.
 
-registry: one row each; model: the base of those with a network; training: their runs; controls: those without.
+registry: one row each; model: the base of those with a network; training: their runs; controls: the others.
 Names below are imported on first use, so that the registry costs nothing.
 """
 
@@ -11,11 +11,11 @@ if TYPE_CHECKING:
     from derender.baselines.controls import control_features
     from derender.baselines.model import load_baseline
     from derender.baselines.registry import BASELINES, open_baseline, train_baseline
-    from derender.baselines.training import baseline_config, read_any_config
+    from derender.baselines.training import baseline_config, image_size_of, read_any_config, stored_config
 
 _HOME = {
     **dict.fromkeys(("BASELINES", "open_baseline", "train_baseline"), "registry"),
-    **dict.fromkeys(("baseline_config", "read_any_config"), "training"),
+    **dict.fromkeys(("baseline_config", "image_size_of", "read_any_config", "stored_config"), "training"),
     "control_features": "controls",
     "load_baseline": "model",
 }
@@ -23,9 +23,11 @@ __all__ = [
     "BASELINES",
     "baseline_config",
     "control_features",
+    "image_size_of",
     "load_baseline",
     "open_baseline",
     "read_any_config",
+    "stored_config",
     "train_baseline",
 ]
 

@@ -16,7 +16,7 @@ from collections.abc import Callable
 from itertools import pairwise
 from math import log2
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float, UInt8
@@ -215,7 +215,7 @@ class E4e(BaselineModel):
         self.register_buffer("released", torch.tensor(codes))
 
     @classmethod
-    def build(cls, config: E4eConfig) -> Self:
+    def build(cls, config: E4eConfig) -> "E4e":
         """The untrained encoder with the generator that the configuration names and its mean code."""
         generator = open_generator(config.objective.generator)
         model = cls(E4eSettings(**config.model.model_dump(), generator=generator.settings))

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Float, UInt8
@@ -90,7 +90,7 @@ class BaselineModel(nn.Module):
         self.chosen = self.features[:1]
 
     @classmethod
-    def build(cls, config: Any) -> Self:
+    def build(cls, config: Any) -> "BaselineModel":
         """The untrained network of a run; an error if the configuration names something that is missing."""
         return cls(config.model)
 

@@ -35,7 +35,7 @@ BASELINES: Mapping[str, Baseline] = {
     "beta-vae": Baseline("autoencoder.BetaVae"),
     "resnet18": Baseline("supervised.Resnet18", trainer="supervised.train_supervised"),
     "stylegan2": Baseline("stylegan2.Stylegan"),
-    "e4e": Baseline("e4e.E4e"),
+    "e4e": Baseline("e4e.E4e", opener="e4e.open_e4e"),
     "ris": Baseline("ris.Ris", trainer="ris_catalogue.train_ris"),
     "dinov2": Baseline(trainer="", opener="dinov2.open_dinov2"),
     "untrained": Baseline(trainer="", opener="controls.open_untrained"),

@@ -14,7 +14,7 @@ Leaves out LARS and batches of thousands.
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float, UInt8
@@ -81,7 +81,7 @@ class Simclr(BaselineModel):
         self.head = nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, settings.projection))
 
     @classmethod
-    def build(cls, config: SimclrConfig) -> Self:
+    def build(cls, config: SimclrConfig) -> "Simclr":
         model = cls(config.model)
         views_of(config, torch.device("cpu"))
         return model

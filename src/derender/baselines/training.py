@@ -52,6 +52,23 @@ def read_any_config(path: Path) -> Any:
     return read_config(path, ours if name is None else config_type(str(name)))
 
 
+def stored_config(run: Path, name: str) -> Any:
+    """The settings of a run to go on with, which has to be of ``name`` ("derender": of any)."""
+    config = read_any_config(run)
+    if isinstance(config, FinetuneConfig):
+        raise ValueError(f"{run} was made by derender finetune: go on with derender finetune --resume")
+    trained = getattr(config, "baseline", "derender")
+    if name not in ("derender", trained):
+        raise ValueError(f"{run} trained {trained}, not {name}: give model {trained} or another folder")
+    return config
+
+
+def image_size_of(config: Any) -> int:
+    """Side of the images that a run takes, in pixels."""
+    model = getattr(config, "model", config)
+    return getattr(model, "network", model).image_size
+
+
 def train_in_loop(
     config: Any, images: PictureSet, out: str | Path, *, sample_sheet: SheetOf | None = None, **how: Any
 ) -> TrainResult:

@@ -84,17 +84,25 @@ def embed(
     from derender.features.ray_engine import ray_engine
 
     if baseline is not None:
-        from derender.cli.baselines import CONTROLS, checked, open_baseline, write_control
+        from derender.baselines import open_baseline
+        from derender.baselines.registry import row_of
+        from derender.cli.baselines import write_control
+        from derender.cli.models import chosen_device
 
-        if checked(baseline) in CONTROLS:
+        if not row_of(baseline).opener:
             write_control(
                 baseline, data, out, dataset=dataset, part=part, limit=limit, model=model,
                 image_size=image_size, components=components, seed=seed, json_file=json_file,
             )  # fmt: skip
             return
+        if checkpoint is not None and (baseline != "e4e" or model is not None):
+            raise ValueError(
+                "--checkpoint is a published e4e file: give it with --baseline e4e and no --model"
+            )
         net = open_baseline(
-            baseline, model, device=device, features=features, image_size=image_size, seed=seed,
-            checkpoint=checkpoint,
+            baseline, model or checkpoint, device=chosen_device(device),
+            features=None if features is None else [part.strip() for part in features.split(",")],
+            image_size=image_size, seed=seed,
         )  # fmt: skip
         origin = {"source": model or checkpoint, "baseline": baseline}
     elif checkpoint is not None:

@@ -172,7 +172,7 @@ def _config(
     model: str | None, start: "Derenderer | None", preset: str | None, overrides: list[str]
 ) -> "FinetuneConfig":
     """Settings of a new run: those of the model it starts from, where it has any, else those of a preset."""
-    from derender.baselines.training import read_any_config
+    from derender.baselines import read_any_config
     from derender.training.config import PRESETS, TrainConfig, resolve
     from derender.training.finetune_config import FinetuneConfig
 
@@ -197,7 +197,7 @@ def _changed(
 
 def _stored(out: Path) -> "FinetuneConfig":
     """The settings of the run to go on with."""
-    from derender.baselines.training import read_any_config
+    from derender.baselines import read_any_config
     from derender.training.finetune_config import FinetuneConfig
 
     if not (out / "config.yaml").is_file():

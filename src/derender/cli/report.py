@@ -109,7 +109,7 @@ def _evidence(
 
 def _held_out(run: Path, pictures: "PictureSet") -> "tuple[PictureSet, str]":
     """What the run did not learn from, if these are its own pictures; otherwise all."""
-    from derender.baselines.training import read_any_config
+    from derender.baselines import read_any_config
     from derender.data import split_indices
     from derender.report.run import trained_pictures
 

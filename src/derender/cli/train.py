@@ -92,13 +92,18 @@ def train(
 
     def configuration() -> Settings:
         if resume and not settings_given and (out / "config.yaml").is_file():
-            from derender.cli.baselines import stored_config
+            from derender.baselines import stored_config
 
             return stored_config(out, model)
         if model != "derender":
-            from derender.cli.baselines import baseline_config
+            from derender.baselines import baseline_config
 
-            return baseline_config(model, overrides or [], preset=preset, loocc=loocc)
+            for option, value in (("--preset", preset), ("--loocc", loocc)):
+                if value is not None:
+                    raise ValueError(
+                        f"{option} is for our own model: leave it out with --model {model}, or use --set"
+                    )
+            return baseline_config(model, overrides)
         return resolve(preset or "faces", overrides or [], objective__loocc=loocc, start_from=start_from)
 
     config = configuration()
@@ -107,9 +112,10 @@ def train(
         write_json(json_file, config.model_dump(mode="json"))
         return
 
-    from derender.cli.baselines import picture_size, train_baseline
+    from derender.baselines import image_size_of, train_baseline
     from derender.cli.models import chosen_device
     from derender.data import read_pictures
+    from derender.report.baseline_sheet import baseline_sheet
     from derender.report.evidence import Evidence, look_at_data
     from derender.report.page import Section
     from derender.report.run import decomposition_sheet, run_page
@@ -125,7 +131,7 @@ def train(
     if is_main_process() and not resume:
         refuse_taken(out)
     with first_then_others(fabric, local=True), progress_bar("reading") as report:
-        pictures = read_pictures(data, picture_size(config), dataset=dataset, limit=limit, progress=report)
+        pictures = read_pictures(data, image_size_of(config), dataset=dataset, limit=limit, progress=report)
     report_images(pictures)
     if pictures.terms:
         notice(f"on its owners' terms: {pictures.terms}")
@@ -145,7 +151,7 @@ def train(
         if isinstance(config, TrainConfig):
             trained = train_model(config, pictures, out, sample_sheet=decomposition_sheet, **how)
         else:
-            trained = train_baseline(config, pictures, out, **how)
+            trained = train_baseline(config, pictures, out, sample_sheet=baseline_sheet, **how)
     leave()
     if not is_main_process():
         return

@@ -66,7 +66,7 @@ def whitened_rows(
 
 def whitening_settings(model: str) -> "FeatureSettings":
     """How a run whitens, from its own configuration where it has one."""
-    from derender.baselines.training import read_any_config
+    from derender.baselines import read_any_config
     from derender.training.config import FeatureSettings, TrainConfig
 
     if (Path(model) / "config.yaml").is_file():

@@ -86,7 +86,7 @@ def read_config(folder: Path) -> dict[str, Any]:
         name = config["baseline"]
         raise ValueError(
             f"{folder} holds the baseline {name!r}, not our model: add --baseline {name}, or load it with "
-            "derender.baselines.training.load_baseline"
+            "derender.baselines.load_baseline"
         )
     if not isinstance(version, int) or version > FORMAT:
         raise ValueError(

@@ -5,7 +5,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from derender.cli.baselines import CONTROLS, control_features, open_baseline
+from derender.baselines import control_features, open_baseline, read_any_config
+from derender.baselines.registry import CONTROLS
 from derender.cli.plan.jobs import Job, Note, Place, facts_of_file
 from derender.cli.plan.settings import OURS, Plan, ScoredSet
 from derender.cli.plan.training import BudgetUsed, run_folder
@@ -51,7 +52,7 @@ def embed_job(
         if kind in CONTROLS:
             pictures = scored_pictures(scored, plan, plan.image_size)
             began = time.perf_counter()
-            table = control_features(kind, pictures, pictures, components=64, seed=job.seed, progress=watch)
+            table = control_features(kind, pictures, seed=job.seed, progress=watch)
             parameters = 0
         else:
             source = str(run_folder(plan, place, job.after[0])) if job.after else None
@@ -78,7 +79,7 @@ def embed_job(
 
 def opened(plan: Plan, name: str, source: str | None, device: str) -> Any:
     """The network of a method, ready to embed."""
-    from derender.cli.models import open_model
+    from derender.cli.models import chosen_device, open_model
 
     method, kind = plan.methods[name], plan.kind(name)
     if kind == OURS:
@@ -91,10 +92,9 @@ def opened(plan: Plan, name: str, source: str | None, device: str) -> Any:
     return open_baseline(
         kind,
         source,
-        device=device,
-        features=",".join(method.features) or None,
+        device=chosen_device(device),
+        features=method.features or None,
         image_size=plan.image_size,
-        seed=0,
     )
 
 
@@ -107,8 +107,6 @@ def scored_pictures(scored: ScoredSet, plan: Plan, image_size: int, run: str | N
         return pictures
     learnt = plan.train[str(scored.trained_on)]
     if run is not None and (Path(run) / "config.yaml").is_file():
-        from derender.baselines.training import read_any_config
-
         config = read_any_config(Path(run))
         if (tuple(config.split), config.seed) != (tuple(learnt.split), 0):
             raise ValueError(

@@ -12,14 +12,15 @@ from typing import Any, Literal
 import yaml
 from pydantic import Field, field_validator
 
-from derender.cli.baselines import CONTROLS, NAMES, TRAINED, baseline_config
+from derender.baselines import baseline_config
+from derender.baselines.registry import BASELINES, CONTROLS, TRAINED
 from derender.data import suggestion
 from derender.evaluation.tables import table_named
 from derender.settings import Settings
 from derender.training.config import config_from_tree, resolve
 
 OURS = "derender"
-KINDS = (OURS, *NAMES)
+KINDS = (OURS, *BASELINES)
 ALWAYS_THERE = ("pixels", "pca", "untrained")  # every table has these controls
 WITHOUT_LOOP = ("resnet18", "ris")  # trained, but not by the training loop: no number of pictures seen
 RESERVED = ("images", "split", "seed")  # the plan's own

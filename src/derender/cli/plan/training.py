@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from derender.cli.baselines import picture_size, train_baseline
+from derender.baselines import image_size_of, load_baseline, train_baseline
 from derender.cli.plan.jobs import Job, Note, Place, facts_of_file
 from derender.cli.plan.settings import OURS, WITHOUT_LOOP, Plan
 from derender.evaluation.memory import content_hash
@@ -71,6 +71,7 @@ def _train(
 ) -> Any:
     from derender.cli.models import chosen_device
     from derender.data import read_pictures
+    from derender.report.baseline_sheet import baseline_sheet
     from derender.report.run import decomposition_sheet
     from derender.training.loop import train
 
@@ -79,7 +80,7 @@ def _train(
     if run.exists() and not resume:  # killed at its very beginning, or nothing to go on with
         shutil.rmtree(run)
     pictures = read_pictures(
-        learnt.data, picture_size(config), dataset=learnt.dataset, limit=learnt.limit, progress=None
+        learnt.data, image_size_of(config), dataset=learnt.dataset, limit=learnt.limit, progress=None
     )
 
     def watch(state: Any) -> None:
@@ -94,12 +95,11 @@ def _train(
     how = {"progress": watch, "accelerator": chosen_device(device)}
     if plan.kind(job.method) == OURS:
         return train(config, pictures, run, resume=resume, sample_sheet=decomposition_sheet, **how)
-    return train_baseline(config, pictures, run, resume=resume, **how)
+    return train_baseline(config, pictures, run, resume=resume, sample_sheet=baseline_sheet, **how)
 
 
 def run_facts(kind: str, run: Path) -> dict[str, Any]:
     """Parameters, and for a finished run pictures seen and seconds as its last checkpoint has them."""
-    from derender.baselines.training import load_baseline
     from derender.model import load
 
     model: Any = load(str(run)) if kind == OURS else load_baseline(run, kind)

@@ -6,10 +6,11 @@ import pytest
 import torch
 from torch import nn
 
-from derender.baselines.stylegan2.adversarial import (
+from derender.baselines.model import LossInputs
+from derender.baselines.stylegan2 import (
     AdversarialObjective,
     Stylegan,
-    adversarial_losses,
+    StyleganConfig,
     energy_distance,
     mixed_w,
     path_lengths,
@@ -17,9 +18,13 @@ from derender.baselines.stylegan2.adversarial import (
     r1_penalty,
     r1_weight_of,
 )
-from derender.baselines.stylegan2.generator import GeneratorSettings
+from derender.baselines.stylegan2_generator import GeneratorSettings
 
 TINY = GeneratorSettings(image_size=8, style_size=6, mapping_layers=2, channel_base=32, channel_max=6)
+
+
+def losses(model, images, objective, generator):
+    return model.losses(images, LossInputs(StyleganConfig(objective=objective), generator, nullcontext))
 
 
 @pytest.fixture
@@ -30,7 +35,7 @@ def model():
 
 def test_each_loss_moves_its_own_network(model, generator):
     images = torch.rand(4, 3, 8, 8, generator=generator)
-    terms = adversarial_losses(model, images, AdversarialObjective(), generator, nullcontext)
+    terms = losses(model, images, AdversarialObjective(), generator)
     assert set(terms) == {"generator", "discriminator", "r1", "path"}  # the first step has both regularisers
     moved = {
         "generator": model.learner, "path": model.learner,
@@ -43,7 +48,7 @@ def test_each_loss_moves_its_own_network(model, generator):
             touched = any(value.grad is not None and value.grad.any() for value in net.parameters())
             assert touched == (net is moved[name]), name
     assert not any(value.requires_grad for value in model.generator.parameters())
-    again = adversarial_losses(model, images, AdversarialObjective(), generator, nullcontext)
+    again = losses(model, images, AdversarialObjective(), generator)
     assert set(again) == {"generator", "discriminator"}
 
 
@@ -62,7 +67,7 @@ def test_r1_weighs_by_size_and_batch_unless_told(model, generator):
     found = []
     for objective in (by_size, AdversarialObjective(r1_weight=3.0)):
         model.steps.zero_()
-        found.append(adversarial_losses(model, images, objective, generator, nullcontext)["r1"])
+        found.append(losses(model, images, objective, generator)["r1"])
     torch.testing.assert_close(found[1], 3 / (2e-4 * 64 / 4) * found[0])
 
 
@@ -124,12 +129,8 @@ def test_energy_distance_is_zero_for_one_distribution_only(generator):
 
 
 def test_held_out_pictures_are_judged_by_samples_of_the_average(model, generator):
-    terms = adversarial_losses(
-        model.eval(),
-        torch.rand(6, 3, 8, 8, generator=generator),
-        AdversarialObjective(),
-        generator,
-        nullcontext,
+    terms = losses(
+        model.eval(), torch.rand(6, 3, 8, 8, generator=generator), AdversarialObjective(), generator
     )
     assert set(terms) == {"energy"} and model.steps == 0
     samples = model.sample(3, torch.Generator().manual_seed(5))
@@ -137,4 +138,4 @@ def test_held_out_pictures_are_judged_by_samples_of_the_average(model, generator
     assert torch.equal(samples, model.sample(3, torch.Generator().manual_seed(5)))
     centre = model.sample(2, generator, truncation=0.0)
     torch.testing.assert_close(centre[0], centre[1])
-    assert [column.shape for column in model.shown(samples).values()] == 7 * [samples.shape]
+    assert [column.shape for column in model.shown(samples, None).values()] == 7 * [samples.shape]

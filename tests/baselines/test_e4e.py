@@ -6,20 +6,22 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from derender.baselines.stylegan2.e4e import E4e, E4eSettings, EncoderSettings
-from derender.baselines.stylegan2.generator import GeneratorSettings
-from derender.baselines.stylegan2.inversion import (
+from derender.baselines import baseline_config, load_baseline
+from derender.baselines.e4e import (
+    E4e,
     E4eConfig,
+    E4eSettings,
+    EncoderSettings,
     InversionObjective,
     code_deltas,
-    inversion_losses,
     open_generator,
     released_codes,
 )
-from derender.baselines.training import CONFIGS, BaselineTask, load_baseline
+from derender.baselines.model import LossInputs
+from derender.baselines.stylegan2_generator import GeneratorSettings
+from derender.baselines.training import BaselineTask
 from derender.report.baseline_sheet import baseline_sheet
 from derender.training.checkpoint import WEIGHTS_FILE
-from derender.training.config import with_changes
 from derender.training.loop import train_task
 from derender.training.run_folder import read_metrics
 
@@ -43,7 +45,7 @@ def model():
 
 
 def task(name: str, images: int, *more: str) -> BaselineTask:
-    return BaselineTask(with_changes(CONFIGS[name](), [*COMMON, *more, f"images={images}"]))
+    return BaselineTask(baseline_config(name, [*COMMON, *more, f"images={images}"]))
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +90,7 @@ def test_the_mean_code_is_added(model, generator):
     model.centre.add_(2)
     torch.testing.assert_close(model.embed(images)["w+"], before + 2)
     assert before.shape == (1, 8 * 6)
-    with pytest.raises(ValueError, match=r"this e4e takes pictures of shape \(N, 3, 32, 32\)"):
+    with pytest.raises(ValueError, match=r"this e4e takes images of shape \(N, 3, 32, 32\)"):
         model.embed(torch.rand(1, 3, 64, 64))
 
 
@@ -103,7 +105,7 @@ def test_losses_are_zero_for_what_the_generator_made_from_its_mean_code(model, g
     for head in model.encoder.heads:
         head.linear.weight.data.zero_()
     images = model.rebuild(model.centre[None]).detach().expand(2, -1, -1, -1)
-    terms = inversion_losses(model, images, InversionObjective(), None, generator, nullcontext)
+    terms = model.losses(images, LossInputs(E4eConfig(), generator, nullcontext))
     for name in ("reconstruction", "delta", "prior"):
         assert terms[name] < 1e-6, name
     codes = torch.zeros(1, 3, 2)
@@ -151,6 +153,6 @@ def test_a_run_without_a_generator_is_refused_before_a_folder_is_made(runs, blob
             train_task(task("e4e", 32, *ENCODER, *more), blobs, tmp_path / "run")
         assert not (tmp_path / "run").exists()
     with pytest.raises(ValueError, match="32, 64, 128, 256"):
-        with_changes(E4eConfig(), ["image_size=48"])
+        baseline_config("e4e", ["image_size=48"])
     with pytest.raises(ValueError, match="at least one unit"):
         EncoderSettings(units=(1, 0, 1, 1))
