@@ -191,17 +191,17 @@ def test_bad_questions_about_pictures(model, photos, tmp_path, refused):
         "swap", *given, "--from", photos / "1.png", "--factor", "albdo"
     )
     assert "none.png does not exist" in refused("relight", *given, "--like", tmp_path / "none.png")
-    assert "is a folder: name pictures" in refused("rotate", "-m", model, photos, "-o", out)
+    assert "is a folder: name images" in refused("rotate", "-m", model, photos, "-o", out)
     assert "reach must lie between" in refused("rotate", *given, "--reach", "120")
-    assert "--reach must be above 0" in refused("relight", *given, "--reach", "0")
-    assert "--size 16 is below the model's 32" in refused("relight", *given, "--size", "16")
+    assert "reach must be above 0" in refused("relight", *given, "--reach", "0")
+    assert "size 16 is below the model's 32" in refused("relight", *given, "--size", "16")
     assert "unknown texture 'orginal'; did you mean 'original'" in refused(
         "mesh", *given, "--texture", "orginal"
     )
     assert "unknown format 'gbl'; did you mean 'glb'" in refused("mesh", *given, "--format", "gbl")
     assert "unknown kind of film 'avi'" in refused("rotate", *given, "--film", "avi")
     assert not out.exists()
-    assert "is a file: give --out the name of a folder" in refused("mesh", "-m", model, one, "-o", one)
+    assert "is a file: name a folder to write to" in refused("mesh", "-m", model, one, "-o", one)
     (out / "0").mkdir(parents=True)
     assert "exists already: choose another --out, or add --force" in refused("mesh", *given)
     assert list((out / "0").iterdir()) == []
@@ -245,20 +245,20 @@ def test_pictures_unlike_what_the_model_was_validated_on_are_named(model, photos
         name, *rest = command
         assert main([name, "-m", model, str(one), "-o", str(tmp_path / f"no-{name}"), *rest]) == 0
         said = capsys.readouterr().err
-        assert "reconstructed worse" not in said and "rendered again worse" not in said
+        assert "reconstructed worse" not in said and "not in the crop" not in said
     write_errors(known, HeldOutErrors(np.linspace(0, 0.001, 101), 50))
     told = tmp_path / "told.json"
     words = ["--size", "32", "--from", str(two), "--factor", "light", "--json", str(told)]
     assert main(["swap", "-m", str(known), str(one), "-o", str(tmp_path / "swapped"), *words]) == 0
     said = capsys.readouterr().err
     for path in (one, two):
-        assert f"{path}: reconstructed worse than 99 % of the pictures this model was validated on" in said
+        assert f"{path}: reconstructed worse than 99 % of the images this model was validated on" in said
     assert json.loads(told.read_text())["reconstruction_percentile"] == {str(one): 100, str(two): 100}
     write_errors(known, HeldOutErrors(np.linspace(0, 2, 101), 50))
     assert main(["mesh", "-m", str(known), str(one), "-o", str(tmp_path / "usual"), "--size", "32"]) == 0
     said = capsys.readouterr().err
-    assert "reconstructed worse" not in said
-    assert re.search(r"rendered again worse than \d\d? % of the pictures this model was validated on", said)
+    assert "out-of-distribution" not in said
+    assert re.search(r"reconstructed worse than \d\d? % of the images this model was validated on", said)
     (known / ERRORS_FILE).write_text("{")
     assert main(["mesh", "-m", str(known), str(one), "-o", str(tmp_path / "damaged"), "--size", "32"]) == 0
-    assert "cannot tell odd pictures" in capsys.readouterr().err
+    assert "cannot find out-of-distribution images" in capsys.readouterr().err

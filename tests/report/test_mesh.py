@@ -9,7 +9,6 @@ import trimesh
 from PIL import Image
 
 from derender.report.mesh import mesh_of
-from derender.report.mesh_files import mesh_files
 from derender.scene import Scene
 
 FOV_DEG = 10.0
@@ -31,7 +30,7 @@ def opened(content: bytes, form: str, **more) -> trimesh.Trimesh:
 
 @pytest.fixture
 def from_glb() -> trimesh.Trimesh:
-    return opened(mesh_files(mesh_of(nosed(), FOV_DEG), "one")["one.glb"], "glb")
+    return opened(mesh_of(nosed(), FOV_DEG).files("one")["one.glb"], "glb")
 
 
 def colour_at(mesh: trimesh.Trimesh, vertex: int, texture: Image.Image) -> np.ndarray:
@@ -78,7 +77,7 @@ def test_glb_holds_every_vertex_and_face(from_glb):
 
 def test_obj_says_the_same(tmp_path):
     mesh = mesh_of(nosed(), FOV_DEG)
-    files = mesh_files(mesh, "a face", "obj")
+    files = mesh.files("a face", "obj")
     assert list(files) == ["a_face.obj", "a_face.mtl", "a_face.png"]
     for name, content in files.items():
         (tmp_path / name).write_bytes(content)
@@ -126,4 +125,4 @@ def test_bad_meshes():
     with pytest.raises(ValueError, match="nothing of this surface is seen at less than 85 degrees"):
         mesh_of(jagged, FOV_DEG)
     with pytest.raises(ValueError, match="unknown format 'glbb'; did you mean 'glb'"):
-        mesh_files(mesh_of(scene, FOV_DEG), "a", "glbb")
+        mesh_of(scene, FOV_DEG).files("a", "glbb")

@@ -2,11 +2,13 @@
 
 from math import radians
 
+import numpy as np
 import pytest
 import torch
 
 from derender.render import render_scene
 from derender.report import sweeps
+from derender.report.colours import on_background
 from derender.scene import Scene
 
 FOV_DEG = 10.0
@@ -92,6 +94,16 @@ def test_drawing_in_parts_changes_nothing(monkeypatch):
     assert [image.tobytes() for image in sweeps.drawn(scene, render)] == whole
 
 
+def test_loops_move_and_close():
+    for loop in (sweeps.circling_light, sweeps.nodding_view):
+        scene = loop(ball(), 8)
+        frames = sweeps.drawn(scene, render)
+        assert len(frames) == 8 and len({frame.tobytes() for frame in frames}) > 4
+        first, last = (np.asarray(on_background(frame)).astype(int) for frame in (frames[0], frames[-1]))
+        assert np.abs(first - last).mean() < 40
+    assert [frame.size for frame in sweeps.relit_and_rotated(ball(), render, 2)] == [(48, 24)] * 2
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
@@ -102,6 +114,7 @@ def test_drawing_in_parts_changes_nothing(monkeypatch):
         (lambda: sweeps.cameras_around(sweeps.stills(2), 10, 95), "pitch must lie between"),
         (lambda: sweeps.varied(ball(), light=torch.zeros(2, 4), camera=torch.zeros(3, 6)), r"\[2, 3\]"),
         (lambda: sweeps.swapped(ball(), ball()[[0, 0]], "light"), "takes from one scene, got 2"),
+        (lambda: sweeps.nodding_view(ball()[[0, 0]]), "one scene"),
     ],
 )
 def test_bad_sweeps(call, message):

@@ -15,6 +15,7 @@ from derender import __version__
 from derender.cli import (
     bench,
     compare,
+    decompose,
     demo,
     doctor,
     embed,
@@ -23,12 +24,13 @@ from derender.cli import (
     finetune,
     importing,
     mesh,
-    move,
     pack,
-    pictures,
     refine,
+    relight,
     report,
+    rotate,
     search,
+    swap,
     synth,
     train,
     unet,
@@ -67,7 +69,7 @@ def _options(
 for group in (
     demo, doctor, train, whiten, refine, unet, pack, embed, evaluate, explain, finetune, importing, compare,
     report,
-    pictures, move, mesh, search, view, synth, bench,
+    decompose, relight, rotate, swap, mesh, search, view, synth, bench,
 ):  # fmt: skip
     group.register(app)
 

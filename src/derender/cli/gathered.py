@@ -1,14 +1,17 @@
 """Options that several commands share, as one parameter: a dataclass whose fields are options.
 
 A command that asks for such a dataclass is shown to typer with the fields in its place, and called with the
-value. Leaves out which options there are.
+value. A field of a library's own dataclass says in its metadata what typer shows (``report/opening.py``).
+Leaves out which options there are.
 """
 
 import functools
 import inspect
 from collections.abc import Callable
 from dataclasses import MISSING, fields, is_dataclass
-from typing import Any
+from typing import Annotated, Any
+
+import typer
 
 
 def gathered(command: Callable[..., None]) -> Callable[..., None]:
@@ -21,7 +24,7 @@ def gathered(command: Callable[..., None]) -> Callable[..., None]:
             shown += [
                 _option(
                     field.name,
-                    field.type,
+                    Annotated[field.type, typer.Option(**field.metadata)] if field.metadata else field.type,
                     inspect.Parameter.empty if field.default is MISSING else field.default,
                 )
                 for field in fields(parameter.annotation)

@@ -161,13 +161,13 @@ def _query(
         known = table.files if len(table) <= 2_000 else ()
         hint = "; to search with a picture, add --model" if Path(like).is_file() else suggestion(like, known)
         raise ValueError(f"{features} has no row {like!r}{hint}; its first is {table.files[0]!r}")
-    from derender.cli.given import one_picture
     from derender.cli.models import check_maker, open_model
     from derender.features import embed_images
+    from derender.report.opening import read_file
 
     net = open_model(model, device)
     check_maker(net, model, table, features)
-    codes = embed_images(net, one_picture(Path(like), net.image_size)[None])
+    codes = embed_images(net, read_file(Path(like), net.image_size)[None])
     if factor not in codes:
         raise ValueError(f"{model} makes no {factor!r}; it makes {', '.join(codes)}")
     return {name: rows[0] for name, rows in codes.items()}, None
@@ -185,8 +185,8 @@ def _draw(
     title: str,
 ) -> None:
     """A contact sheet: the query, then what was found; what cannot be read is left out and named."""
-    from derender.cli.given import one_picture
     from derender.report.colours import pictures
+    from derender.report.opening import read_file
     from derender.report.panel import GridLayout, contact_sheet
     from derender.storage.atomic import atomic_file
 
@@ -196,7 +196,7 @@ def _draw(
     captions = {row: f"{distance:.3f}" for row, distance in zip(rows, distances, strict=True)}
     shown: list[tuple[str, Any]] = []
     if own_row is None:
-        shown.append(("query", one_picture(Path(like), CELL)))
+        shown.append(("query", read_file(Path(like), CELL)))
     for row in wanted:
         if table.files[row] in read:
             shown.append((captions.get(row, "query"), read[table.files[row]]))

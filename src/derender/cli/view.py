@@ -8,7 +8,7 @@ import typer
 
 from derender.cli import options
 from derender.cli.console import notice, result, write_json
-from derender.cli.given import Frame, check_frame
+from derender.report.opening import ImageOptions
 
 if TYPE_CHECKING:
     import numpy as np
@@ -55,7 +55,15 @@ def view(
         int, typer.Option("--keep", min=2, max=10_000, help="Opened pictures held in memory.", metavar="N")
     ] = 64,
     fit_steps: options.FitSteps = None,
-    frame: Frame = "whole",
+    crop: Annotated[
+        str,
+        typer.Option(
+            "--crop",
+            help="auto: the part of each image that the model reconstructs best.",
+            metavar="whole|auto",
+        ),
+    ] = "whole",
+    frame: Annotated[str | None, typer.Option("--frame", hidden=True)] = None,
     device: options.Device = "auto",
     json_file: options.Json = None,
 ) -> None:
@@ -64,7 +72,7 @@ def view(
     It listens on this machine only, keeps no picture on disk, and needs no network. Ctrl-C ends it.
     """
     _check_installed()
-    framed = check_frame(frame)
+    cropped = ImageOptions(crop=crop, frame=frame).cropped
     from derender.report.viewer.listener import address_of, listen
 
     listener = listen(host, port)
@@ -80,11 +88,11 @@ def view(
         net = open_model(model, device)
         if fit_steps:
             fitting_of(net, model)
-        pictures = _readable(images or [], reading_size(net, framed))
+        pictures = _readable(images or [], reading_size(net, cropped))
         gallery = None if features is None else _gallery(features, data, dataset, model, net)
         examples = named_examples(pictures) if images else rendered_examples(model, net.image_size)
         table = None if gallery is None else gallery.table
-        studio = Studio(net, Path(model).name, Shelf(keep), _held_out(model), table, fit_steps or 0, framed)
+        studio = Studio(net, Path(model).name, Shelf(keep), _held_out(model), table, fit_steps or 0, cropped)
         url = address_of(listener, host)
         if not is_loopback(host):
             notice(f"warning: anyone who can reach {host} can use this page, and there is no password")
@@ -106,12 +114,12 @@ def _check_installed() -> None:
 
 def _readable(images: list[Path], size: int) -> "dict[Path, np.ndarray]":
     """The pictures that can be read; those that cannot are named."""
-    from derender.cli.given import one_picture
+    from derender.report.opening import read_file
 
     read, problems = {}, {}
     for path in dict.fromkeys(images):
         try:
-            read[path] = one_picture(path, size)
+            read[path] = read_file(path, size)
         except (ValueError, OSError) as problem:
             problems[path] = " ".join(str(problem).split())
     if problems and not read:

@@ -1,183 +1,221 @@
-"""The demo's report: what came out, in pictures and in numbers beside controls.
+"""The demo's report: images, and numbers beside controls, of the trained and of the bundled model.
 
-Every sentence about a number is made by comparing it; none is true by hope.
+Every sentence about a number is made by comparing it. Leaves out computing (``story``).
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 import torch
+from jaxtyping import UInt8
 
 from derender import __version__
 from derender.data import as_float
-from derender.demo.shipped import beside_table, shipped_blocks
-from derender.demo.story import STAGES, DemoResult
+from derender.demo.story import BUNDLED, STAGES, DemoResult
 from derender.evaluation.geometry import predicted_depth
 from derender.evaluation.score_table import ScoreTable
+from derender.model import Derenderer
 from derender.presets import MODEL_PRESETS
-from derender.report import blocks, colours, films
-from derender.report.figures import COLUMN_MEANING, Decomposition, decomposition
+from derender.report import blocks, colours
+from derender.report.decomposition import COLUMN_MEANING, decompose_images
+from derender.report.evidence import looping_films
 from derender.report.page import Page, Section
 from derender.report.run import loss_charts
 from derender.report.score_table import clustering_table, factor_table, geometry_table, reconstruction_table
+from derender.report.viewer.examples import rendered_examples
 from derender.scene.normals import normals_from_depth
 from derender.training.config import PRESETS
 from derender.training.run_folder import read_metrics
 
-CLUSTERS_SHOWN, MEMBERS_SHOWN, INPUTS_SHOWN = 5, 12, 10
+CLUSTERS_SHOWN, MEMBERS_SHOWN, INPUTS_SHOWN, BUNDLED_SHOWN = 5, 12, 10, 4
+COLUMNS_BESIDE = ("reconstruction", "normals", "albedo", "another view")
 ENDED = {
-    "images": "the planned number of pictures",
+    "images": "the planned number of images",
     "minutes": "the time limit",
-    "patience": "no more improvement on held-out pictures",
+    "patience": "no more improvement on held-out images",
     "collapse": "the watcher",
 }
-FRAMES, MOVES = 16, "the light goes round, the head turns"
+EMPTY_PARTS = "Empty parts are those that the frontal view does not show."
 
 
 def demo_page(result: DemoResult) -> Page:
     """The whole report of one demo."""
     rows = shown_rows(result)
-    pictures = as_float(result.truth.images[rows])
-    with torch.no_grad():
-        scene = result.model.decompose(pictures)
-    drawn = decomposition(pictures, scene, result.model.render, result.model.fov_deg)
-    tables = score_tables(result)
+    images, tables = result.truth.images[rows], score_tables(result)
+    films = looping_films(
+        result.model,
+        images[: result.settings.films],
+        [f"unseen face {row + 1}" for row in range(min(len(rows), result.settings.films))],
+        f"From one image each: only light or camera moves, everything else stays. {EMPTY_PARTS}",
+    )
     return Page(
-        "Pictures taken apart",
-        "derender was given faces without a single label and learned to take each one apart into geometry, "
-        "albedo, light and camera, by rendering it again. One run on this machine made this page; every "
+        "Images decomposed",
+        "derender was given faces without a single label and learned to decompose each one into geometry, "
+        "albedo, light and camera, by reconstructing it. One run on this machine made this page; every "
         "number was measured in it.",
         [
-            Section("What came out", _summary(result, tables), "Summary"),
-            Section("Faces it never saw, taken apart", _decomposed(drawn), "Taken apart"),
-            Section("Move the light, turn the head", _films(result, scene), "Moved"),
-            Section("The model that comes with derender", shipped_blocks(result, rows), "Beside it"),
+            Section("Results", _summary(result, tables), "Summary"),
+            Section("Unseen faces, decomposed", _decomposed(result.model, images), "Decomposed"),
+            Section("Move the light, turn the head", [films], "Moved"),
+            Section("The bundled model", _bundled(result, images, tables), "Beside it"),
             Section("Is the geometry real?", _geometry(result, rows, tables), "Geometry"),
-            Section("Who is who, without labels", _clusters(result, tables["clustering"]), "Clusters"),
-            Section("How it was trained", _training(result), "Training"),
-            Section("With your own pictures", _next_steps(), "Next"),
+            Section(
+                "Clusters of people, without labels", _clusters(result, tables["clustering"]), "Clusters"
+            ),
+            Section("Training", _training(result), "Training"),
+            Section("With your own images", _next_steps(), "Next"),
         ],
-        f"derender {__version__}. The faces are generated and show nobody.",
+        f"derender {__version__}. The faces are generated; they show no real person.",
     )
 
 
 def score_tables(result: DemoResult) -> dict[str, ScoreTable]:
     """Every table of the page by name."""
-    pictures = len(result.truth)
-    controls = list(result.clustering)[1:]
-    beside = {} if result.shipped_geometry is None else {"beside": beside_table(result)}
-    return {
-        "geometry": geometry_table(result.geometry, pictures),
-        **beside,
-        "factors": factor_table(result.factors, pictures),
-        "reconstruction": reconstruction_table(result.reconstruction, pictures),
-        "clustering": clustering_table(result.clustering, controls),
+    count = len(result.truth)
+    own = geometry_table(result.geometry, count)
+    tables = {"geometry": own}
+    if result.bundled_geometry is not None:
+        other = geometry_table(result.bundled_geometry, count).rows[0]
+        note = "bundled with derender; has not seen faces of this family"
+        models = [replace(own.rows[0], name="this run"), replace(other, name=BUNDLED, note=note)]
+        tables["beside"] = replace(own, caption=f"{own.caption}: both models", rows=[*models, *own.rows[1:]])
+    return tables | {
+        "factors": factor_table(result.factors, count),
+        "reconstruction": reconstruction_table(result.reconstruction, count),
+        "clustering": clustering_table(result.clustering, list(result.clustering)[1:]),
     }
 
 
 def shown_rows(result: DemoResult) -> np.ndarray:
-    """Unseen pictures for the page, evenly through the set: chosen before anything was scored."""
+    """Unseen images for the page, evenly through the set: chosen before anything was scored."""
     count = min(result.settings.shown, len(result.truth))
     return np.linspace(0, len(result.truth) - 1, count).round().astype(int)
 
 
-def _summary(result: DemoResult, tables: dict[str, ScoreTable]) -> list[blocks.Html]:
-    geometry, reconstruction, clustering = result.geometry, result.reconstruction, tables["clustering"]
-    chance = clustering.rows[-1].cells[0]
+def _summary(result: DemoResult, tables: Mapping[str, ScoreTable]) -> list[blocks.Html]:
     tiles = {
-        "Depth error, SIDE x 100": (
-            f"{100 * geometry.model.side:.2f}",
-            f"average depth {100 * geometry.average_depth.side:.2f}, plane {100 * geometry.plane.side:.2f}; "
-            "lower is better",
-        ),
-        "Normals, mean angle": (
-            f"{geometry.model.mad_deg:.1f}°",
-            f"average depth {geometry.average_depth.mad_deg:.1f}°, plane {geometry.plane.mad_deg:.1f}°; "
-            "lower is better",
-        ),
-        "Identity, cluster accuracy": (
-            clustering.columns[0].text(clustering.rows[0].cells[0]),
-            f"chance {clustering.columns[0].text(chance)}; higher is better",
-        ),
-        "Rendered again, L1": (
-            f"{reconstruction.model.l1:.3f}",
-            f"mean picture {reconstruction.mean_picture.l1:.3f}; lower is better",
-        ),
+        "Depth error, SIDE x 100": _tile(tables["geometry"], 0, ("average depth", "plane")),
+        "Normals, mean angle in degrees": _tile(tables["geometry"], 1, ("average depth", "plane")),
+        "Identity, cluster accuracy": _tile(tables["clustering"], 0, ("chance",)),
+        "Reconstruction, L1": _tile(tables["reconstruction"], 0, ("mean picture",)),
     }
     usual, seen = PRESETS[result.config.preset].images, result.trained.images
-    length = f"It saw {seen:,} pictures (repeats counted)"
+    length = f"Training saw {seen:,} images (repeats counted)"
     if seen < usual:
-        length += f"; an ordinary run of the same preset sees {usual:,}: read this as a beginning"
+        length += f"; an ordinary run of the same preset sees {usual:,}"
     verdicts = {
         "Depth": tables["geometry"].verdict(0),
         "Normals": tables["geometry"].verdict(1),
-        "Clusters by identity": clustering.verdict(0),
-        "Rendered again": tables["reconstruction"].verdict(0),
+        "Clusters by identity": tables["clustering"].verdict(0),
+        "Reconstruction": tables["reconstruction"].verdict(0),
     }
     warnings = [
-        blocks.prose(blocks.strong("The watcher says: "), finding.text) for finding in result.trained.findings
+        blocks.prose(blocks.strong("Warning of the watcher: "), finding.text)
+        for finding in result.trained.findings
     ]
     inputs = colours.pictures(result.seen.images[:: max(1, len(result.seen) // INPUTS_SHOWN)][:INPUTS_SHOWN])
     return [
         blocks.key_figures(tiles),
-        blocks.prose(
-            f"All on {len(result.truth):,} generated faces of people that training never met. {length}."
-        ),
+        blocks.prose(f"All on {len(result.truth):,} generated faces of people not in training. {length}."),
         *warnings,
         blocks.definitions(verdicts),
         blocks.figure(
             blocks.row_of([(blocks.image(image, "a training face", 86), "") for image in inputs]),
-            f"What it learned from: {len(result.seen):,} generated faces, in varied light and view.",
+            f"Training images: {len(result.seen):,} generated faces, in varied lighting and viewpoint.",
         ),
     ]
 
 
-def _decomposed(drawn: Decomposition) -> list[blocks.Html]:
-    names = [f"unseen face {number}" for number in range(1, len(drawn) + 1)]
-    caption = "Each row is one unseen picture, evenly chosen through the set before anything was scored."
-    return [
-        blocks.image_grid(drawn.columns, names, caption, COLUMN_MEANING, show_names=False),
-        blocks.definitions(COLUMN_MEANING),
+def _tile(table: ScoreTable, column: int, controls: tuple[str, ...]) -> tuple[str, str]:
+    """The first row's number, and those of some controls."""
+    head = table.columns[column]
+    cells = {row.name: head.text(row.cells[column]) for row in table.rows}
+    better = "lower is better" if head.best == "low" else "higher is better"
+    return cells[table.rows[0].name], ", ".join(
+        [f"{name} {cells[name]}" for name in controls]
+    ) + f"; {better}"
+
+
+def _decomposed(model: Derenderer, images: UInt8[np.ndarray, "n 3 h w"]) -> list[blocks.Html]:
+    caption = "Each row is one unseen image, evenly chosen through the set before anything was scored."
+    columns = decompose_images(model, as_float(images)).columns
+    return [_grid(columns, "unseen face", caption, COLUMN_MEANING), blocks.definitions(COLUMN_MEANING)]
+
+
+def _grid(
+    columns: Mapping[str, colours.Images],
+    name: str,
+    caption: str,
+    meaning: Mapping[str, str] | None = None,
+) -> blocks.Html:
+    """A grid whose rows are numbered faces."""
+    names = [f"{name} {number + 1}" for number in range(len(next(iter(columns.values()))))]
+    return blocks.image_grid(columns, names, caption, meaning, show_names=False)
+
+
+def _bundled(
+    result: DemoResult, images: UInt8[np.ndarray, "n 3 h w"], tables: Mapping[str, ScoreTable]
+) -> list[blocks.Html]:
+    """Faces of the family that the bundled model knows, then the demo's own faces by both models."""
+    own, bundled = result.model, result.bundled
+    known = np.stack([example.picture for example in rendered_examples(BUNDLED, bundled.image_size)])
+    models = {BUNDLED: bundled}
+    both = "; this run's model takes images of another size."
+    if own.image_size == bundled.image_size:
+        models, both = {"this run": own, BUNDLED: bundled}, ", by both models."
+
+    def beside(shown: UInt8[np.ndarray, "n 3 h w"]) -> dict[str, colours.Images]:
+        """Inputs, then what each model makes of them."""
+        columns: dict[str, colours.Images] = {"input": colours.pictures(shown)}
+        for name, model in models.items():
+            drawn = decompose_images(model, as_float(shown)).columns
+            columns |= {f"{column}, {name}": drawn[column] for column in COLUMNS_BESIDE}
+        return columns
+
+    shown = known[:BUNDLED_SHOWN]
+    names = [f"rendered face {number + 1}, by {BUNDLED}" for number in range(len(shown))]
+    made = [
+        blocks.prose(
+            blocks.code(BUNDLED),
+            " was trained beforehand, on rendered faces of another family, and is installed with derender: ",
+            blocks.code(f'derender.load("{BUNDLED}")'),
+            ". Neither model saw any of these images in training.",
+        ),
+        looping_films(bundled, shown, names, f"Made by {BUNDLED} from one image each."),
+        _grid(
+            beside(known[::2]), "rendered face", f"Faces of the family that {BUNDLED} was trained on{both}"
+        ),
     ]
-
-
-def _films(result: DemoResult, scene) -> list[blocks.Html]:
-    items = []
-    for index in range(min(result.settings.films, len(scene))):
-        relit = films.relighting(scene[index], result.model.render, frames=FRAMES)
-        turned = films.rotation(scene[index], result.model.render, frames=FRAMES)
-        both = films.side_by_side([relit, turned])
-        film = blocks.film(
-            films.animated_png(both), both[FRAMES // 4], f"unseen face {index + 1}: {MOVES}", 236
+    if "beside" in tables:
+        caption = (
+            "Faces of the family that this run was trained on, by both models. Most have hair or beards: "
+            f"{BUNDLED} has seen bald heads only."
         )
-        items.append((film, MOVES))
-    return [
-        blocks.figure(
-            blocks.row_of(items),
-            "From one picture each: only light or camera moves, everything else stays. "
-            "Empty parts are those that the frontal view does not show.",
-        )
-    ]
+        made += [
+            _grid(beside(images[:BUNDLED_SHOWN]), "unseen face", caption),
+            blocks.table(tables["beside"]),
+        ]
+    return made
 
 
-def _geometry(result: DemoResult, rows: np.ndarray, tables: dict[str, ScoreTable]) -> list[blocks.Html]:
+def _geometry(result: DemoResult, rows: np.ndarray, tables: Mapping[str, ScoreTable]) -> list[blocks.Html]:
     return [
         blocks.prose(
             "The faces were generated, so their true depth is known. ",
             blocks.strong("SIDE"),
             " is the error of depth up to scale, ",
             blocks.strong("MAD"),
-            " the mean angle between found and true surface directions; both are measured inside "
-            "the face and shrink to 0 for perfect geometry. The average depth of all these faces is a hard "
-            "control: it knows what a face is like.",
+            " the mean angle between predicted and true surface directions; both are measured inside "
+            "the face and are 0 for perfect geometry. The average depth of all these faces is a hard "
+            "control: it knows the shape of a face.",
         ),
         blocks.table(tables["geometry"]),
-        blocks.image_grid(
+        _grid(
             _beside_truth(result, rows),
-            [f"unseen face {number}" for number in range(1, len(rows) + 1)],
-            "Found and true surface in the view of the picture, inside the true outline. "
+            "unseen face",
+            "Predicted and true surface in the view of the image, inside the true outline. "
             "Depth is brighter where nearer, each column on its own scale.",
-            show_names=False,
         ),
         blocks.table(tables["factors"]),
         blocks.table(tables["reconstruction"]),
@@ -186,46 +224,36 @@ def _geometry(result: DemoResult, rows: np.ndarray, tables: dict[str, ScoreTable
 
 def _beside_truth(result: DemoResult, rows: np.ndarray) -> dict[str, colours.Images]:
     truth, model = result.truth, result.model
-    depth, covered = predicted_depth(model, truth.images[rows])
-    true_mask = torch.as_tensor(truth.mask[rows])
-    both = (covered & true_mask).float()
+    images = truth.images[rows]
+    depth, covered = predicted_depth(model, images)
+    mask = truth.mask[rows]
+    both = (covered & torch.as_tensor(mask)).float()
     filled = torch.where(covered, depth, torch.ones_like(depth))
     columns = {
-        "input": colours.pictures(truth.images[rows]),
-        "depth found": colours.depth_maps(depth, both),
-        "true depth": colours.depth_maps(truth.depth[rows], truth.mask[rows]),
-        "normals found": colours.normal_maps(normals_from_depth(filled, model.fov_deg), both),
+        "input": colours.pictures(images),
+        "predicted depth": colours.depth_maps(depth, both),
+        "true depth": colours.depth_maps(truth.depth[rows], mask),
+        "predicted normals": colours.normal_maps(normals_from_depth(filled, model.fov_deg), both),
     }
     if truth.normal is not None:
-        columns["true normals"] = colours.normal_maps(truth.normal[rows], truth.mask[rows])
+        columns["true normals"] = colours.normal_maps(truth.normal[rows], mask)
     with torch.no_grad():
-        scene = model.decompose(as_float(truth.images[rows]))
-        white = torch.tensor([1.0, 0.0, 0.0, 0.0]).expand_as(scene.light)
-        flat = model.render(scene.with_parameters(light=white))
-    columns["albedo found"] = colours.pictures(flat.image, both)
+        scene = model.decompose(as_float(images))
+        ambient = torch.tensor([1.0, 0.0, 0.0, 0.0]).expand_as(scene.light)
+        flat = model.render(scene.with_parameters(light=ambient))
+    columns["predicted albedo"] = colours.pictures(flat.image, both)
     if truth.albedo is not None:
-        columns["true albedo"] = colours.pictures(truth.albedo[rows], truth.mask[rows])
+        columns["true albedo"] = colours.pictures(truth.albedo[rows], mask)
     return columns
 
 
 def _clusters(result: DemoResult, table: ScoreTable) -> list[blocks.Html]:
     people = len(np.unique(result.identities))
-    shown = [
-        blocks.figure(
-            blocks.row_of(
-                [
-                    (blocks.image(image, f"a face of {name}", 64), name)
-                    for image, name in zip(
-                        colours.pictures(result.truth.images[members]),
-                        result.identities[members],
-                        strict=True,
-                    )
-                ]
-            ),
-            caption,
-        )
-        for members, caption in _purest_and_worst(result)
-    ]
+    figures = []
+    for members, caption in _purest_to_most_mixed(result):
+        faces = zip(colours.pictures(result.truth.images[members]), result.identities[members], strict=True)
+        row = [(blocks.image(image, f"a face of {name}", 64), name) for image, name in faces]
+        figures.append(blocks.figure(blocks.row_of(row), caption))
     return [
         blocks.prose(
             f"The unseen faces show {people} people in changing light, view and expression. "
@@ -233,35 +261,31 @@ def _clusters(result: DemoResult, table: ScoreTable) -> list[blocks.Html]:
         ),
         blocks.definitions({f"{table.columns[column].name}": table.verdict(column) for column in (0, 1, 2)}),
         blocks.table(table),
-        blocks.folded("Some of the clusters", *shown),
+        blocks.folded("Some of the clusters", *figures),
     ]
 
 
-def _purest_and_worst(result: DemoResult) -> list[tuple[np.ndarray, str]]:
-    """Clusters from the purest to the most mixed, with a caption each."""
+def _purest_to_most_mixed(result: DemoResult) -> list[tuple[np.ndarray, str]]:
+    """Members of some clusters from the purest to the most mixed, with a caption each."""
     groups = []
     for cluster in np.unique(result.clusters):
         members = np.flatnonzero(result.clusters == cluster)
         counts = np.unique(result.identities[members], return_counts=True)[1]
-        groups.append((counts.max() / len(members), len(members), members))
-    groups.sort(key=lambda group: (-group[0], -group[1]))
+        groups.append((counts.max() / len(members), members))
+    groups.sort(key=lambda group: (-group[0], -len(group[1])))
     picks = np.unique(np.linspace(0, len(groups) - 1, CLUSTERS_SHOWN).round().astype(int))
     return [
-        (
-            groups[pick][2][:MEMBERS_SHOWN],
-            f"{groups[pick][1]} pictures, {100 * groups[pick][0]:.0f} % of one person",
-        )
-        for pick in picks
+        (members[:MEMBERS_SHOWN], f"{len(members)} images, {100 * purity:.0f} % of one person")
+        for purity, members in (groups[pick] for pick in picks)
     ]
 
 
 def _training(result: DemoResult) -> list[blocks.Html]:
     trained = result.trained
-    minutes = {stage: f"{result.seconds[stage]:.0f} s" for stage in STAGES if stage in result.seconds}
     facts = {
-        **minutes,
-        "pictures seen": f"{trained.images:,}",
-        "pictures per second": f"{trained.images_per_second:.0f}",
+        **{stage: f"{result.seconds[stage]:.0f} s" for stage in STAGES if stage in result.seconds},
+        "images seen": f"{trained.images:,}",
+        "images per second": f"{trained.images_per_second:.0f}",
         "training ended by": ENDED.get(trained.stopped, trained.stopped),
         "preset": result.config.preset,
         "perceptual features": result.config.objective.perceptual,
@@ -272,16 +296,14 @@ def _training(result: DemoResult) -> list[blocks.Html]:
 
 
 def _next_steps() -> list[blocks.Html]:
-    presets: Sequence[str] = tuple(MODEL_PRESETS)
     return [
         blocks.prose(
-            "Any folder or zip of pictures of one kind of thing, roughly centred and aligned, will do; "
-            "no labels are read. "
-            f"Presets: {', '.join(presets)}."
+            "Any folder or zip of images of one kind of thing, roughly centred and aligned, will do; "
+            f"no labels are read. Presets: {', '.join(MODEL_PRESETS)}."
         ),
         blocks.listing(
-            "derender train --data photos/ --preset small --out runs/mine\n"
-            "derender decompose --model runs/mine photo.jpg --out apart/\n"
-            "derender embed --model runs/mine --data photos/ --out features.parquet"
+            "derender train photos/ --preset small --out runs/mine\n"
+            "derender decompose --model runs/mine photo.jpg --out decomposed/\n"
+            "derender embed photos/ --model runs/mine --out features.parquet"
         ),
     ]

@@ -45,8 +45,8 @@ STAGES = (
     "writing the report",
 )
 FACTORS = ("geometry", "albedo")
-SHIPPED = "rendered-faces-64"
-"""The model that comes with derender and has seen rendered faces only, as this demo's has."""
+BUNDLED = "rendered-faces-64"
+"""The bundled model that has seen rendered faces only, as this demo's has."""
 
 
 class DemoSettings(Settings):
@@ -88,8 +88,8 @@ class DemoResult:
         settings, seed, config: what was asked for, and the training's resolved configuration.
         trained: how training ended.
         model: the trained model.
-        shipped: the model that comes with derender.
-        shipped_geometry: its scores on the same pictures; None where they are not of its size.
+        bundled: the bundled model.
+        bundled_geometry: its scores on the same pictures; None where they are not of its size.
         seen: pictures that training saw.
         truth: the unseen pictures with everything that made them.
         geometry, factors, reconstruction: scores on the unseen pictures.
@@ -104,8 +104,8 @@ class DemoResult:
     config: TrainConfig
     trained: TrainResult
     model: Derenderer
-    shipped: Derenderer
-    shipped_geometry: GeometryResult | None
+    bundled: Derenderer
+    bundled_geometry: GeometryResult | None
     seen: PictureSet
     truth: GroundTruth
     geometry: GeometryResult
@@ -164,8 +164,8 @@ def run_demo(
     tell(STAGES[3], 0, 4, "geometry")
     geometry = evaluate_geometry(model, truth, untrained=untrained_twin(model, seed))
     factors = evaluate_factors(model, truth)
-    shipped = load(SHIPPED, device="cpu")
-    shipped_geometry = evaluate_geometry(shipped, truth) if size == shipped.image_size else None
+    bundled = load(BUNDLED, device="cpu")
+    bundled_geometry = evaluate_geometry(bundled, truth) if size == bundled.image_size else None
     tell(STAGES[3], 1, 4, "reconstruction")
     reconstruction = evaluate_reconstruction(model, unseen.images, mean=mean_picture(seen.images))
     tell(STAGES[3], 2, 4, "features")
@@ -185,7 +185,7 @@ def run_demo(
     tell(STAGES[3], 4, 4, "")
     clock.lap(STAGES[3])
     return DemoResult(
-        out, settings, seed, config, trained, model, shipped, shipped_geometry, seen, truth,
+        out, settings, seed, config, trained, model, bundled, bundled_geometry, seen, truth,
         geometry, factors, reconstruction, clustering, clusters, clock.seconds,
     )  # fmt: skip
 

@@ -1,4 +1,4 @@
-"""From values to colours: pictures, depth maps, normals and shading as 8-bit images.
+"""From values to colours: images, depth maps, normals and shading as 8-bit images.
 
 Every function takes one array for a whole set and uses one range for all of it, so that images side by
 side can be compared. Leaves out layout (see ``panel``) and anything that needs a model.
@@ -42,16 +42,12 @@ def depth_maps(
     depth: Tensor | np.ndarray,
     mask: Tensor | np.ndarray | None = None,
     limits: tuple[float, float] | None = None,
-    colour_map: str = "magma",
 ) -> Images:
-    """(N, H, W) depth as images, near is bright; one range for the whole set.
-
-    ``magma`` shows relief in lightness as well as in colour; any colour map of matplotlib will do.
-    """
+    """(N, H, W) depth as images, near is bright; one range for the whole set."""
     near, far = limits or depth_range(depth, mask)
     values = np.nan_to_num(as_numpy(depth), nan=far)
     nearness = np.clip((far - values) / max(far - near, 1e-9), 0, 1)
-    return _images(colormaps[colour_map](nearness)[..., :3], mask)
+    return _images(colormaps["magma"](nearness)[..., :3], mask)
 
 
 def normal_maps(normal: Tensor | np.ndarray, mask: Tensor | np.ndarray | None = None) -> Images:
@@ -71,10 +67,12 @@ def shading_maps(shading: Tensor | np.ndarray, mask: Tensor | np.ndarray | None 
     return _images(np.repeat(grey[..., None] / white, 3, axis=-1), mask)
 
 
-def error_maps(first: Tensor | np.ndarray, second: Tensor | np.ndarray, full_scale: float = 0.25) -> Images:
-    """Absolute difference of two (N, 3, H, W) sets, mean over colours; brightest is ``full_scale``."""
-    difference = np.abs(as_numpy(first) - as_numpy(second)).mean(axis=1)
-    return _images(colormaps["magma"](np.clip(difference / full_scale, 0, 1))[..., :3], None)
+def any_maps(values: Tensor | np.ndarray) -> Images:
+    """The parameter of any further factor as images: (N, 3, H, W) colours or (N, H, W) levels; else none."""
+    maps = as_numpy(values)
+    if maps.ndim == 3:
+        return depth_maps(-maps)
+    return pictures(maps) if maps.ndim == 4 and maps.shape[1] == 3 else []
 
 
 def _images(colours: np.ndarray, mask: Tensor | np.ndarray | None) -> Images:

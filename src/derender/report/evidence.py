@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import UInt8
 
 from derender.baselines.controls import untrained_features
 from derender.data import GroundTruth, PictureSet, as_float
@@ -22,21 +23,22 @@ from derender.evaluation.linear_task import choose_rows
 from derender.features import embed_pictures
 from derender.interpretation import explain_labels, question
 from derender.model import Derenderer
-from derender.report import blocks, films
+from derender.report import blocks
 from derender.report.blocks import Html
+from derender.report.decomposition import COLUMN_MEANING, decompose_images
 from derender.report.doctor import doctor_blocks
 from derender.report.explanation import share_blocks
-from derender.report.figures import COLUMN_MEANING, decomposition
+from derender.report.films import animated_png
 from derender.report.matrices import card_matrices, matrix_sheet
 from derender.report.page import Section
 from derender.report.score_table import factor_table, geometry_table, reconstruction_table
 from derender.report.share_chart import share_chart
+from derender.report.sweeps import relit_and_rotated
 from derender.report.tables_disentanglement import summary_table, swap_tables
 
 EXAMINED, SCORED, CARD, EXPLAINED = 1_500, 200, 200, 400  # pictures each part looks at, at most
-SHOWN, FILMED, FRAMES = 5, 2, 16
+SHOWN, FILMED = 5, 2
 FILM_WIDTH = 256
-MOVES = "the light goes round, the object turns"
 FEWEST_OF_A_CLASS, MOST_CLASSES = 10, 12
 
 Progress = Callable[[int, int], object]
@@ -112,10 +114,7 @@ def gather(hand: AtHand, progress: Progress | None = None) -> Evidence:
 def decompositions(hand: AtHand) -> list[Html]:
     """A few pictures in their factors, rendered again, in other light and from another side."""
     sample = _sample(hand.held_out.require(1, "a decomposition"), SHOWN)
-    images = as_float(sample.images).to(hand.model.device)
-    with torch.no_grad():
-        scene = hand.model.decompose(images)
-    drawn = decomposition(images, scene, hand.model.render, hand.model.fov_deg)
+    drawn = decompose_images(hand.model, as_float(sample.images).to(hand.model.device))
     caption = f"{hand.which}, evenly chosen by their order. Every column is made from the picture alone."
     return [
         blocks.image_grid(drawn.columns, [Path(name).name for name in sample.files], caption, COLUMN_MEANING),
@@ -124,21 +123,26 @@ def decompositions(hand: AtHand) -> list[Html]:
 
 
 def moved(hand: AtHand) -> list[Html]:
-    """Short films of some of the same pictures."""
+    """Short films of some of the same images."""
     sample = _sample(hand.held_out.require(1, "a film"), SHOWN).select(slice(FILMED))
-    images = as_float(sample.images).to(hand.model.device)
-    with torch.no_grad():
-        scene = hand.model.decompose(images)
-    items = []
-    for index, name in enumerate(sample.files):
-        relit = films.relighting(scene[index], hand.model.render, FRAMES)
-        turned = films.rotation(scene[index], hand.model.render, FRAMES)
-        both = films.side_by_side([relit, turned])
-        alt = f"{Path(name).name}: {MOVES}"
-        film = blocks.film(films.animated_png(both), both[FRAMES // 4], alt, FILM_WIDTH)
-        items.append((film, Path(name).name))
+    names = [Path(name).name for name in sample.files]
     caption = "Only light or camera moves. Empty parts are those that the frontal view does not show."
-    return [blocks.figure(blocks.row_of(items), caption)]
+    return [looping_films(hand.model, sample.images, names, caption)]
+
+
+def looping_films(
+    model: Derenderer, images: UInt8[np.ndarray, "n 3 h w"], names: Sequence[str], caption: str
+) -> Html:
+    """A film of each image: the light goes round, the object rotates."""
+    with torch.no_grad():
+        scenes = model.decompose(as_float(images).to(model.device))
+    items = []
+    for index, name in enumerate(names):
+        frames = relit_and_rotated(scenes[index], model.render)
+        alt = f"{name}: the light goes round, the object rotates"
+        film = blocks.film(animated_png(frames), frames[len(frames) // 4], alt, FILM_WIDTH)
+        items.append((film, name))
+    return blocks.figure(blocks.row_of(items), caption)
 
 
 def scores(hand: AtHand) -> list[Html]:

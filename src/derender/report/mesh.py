@@ -1,17 +1,22 @@
-"""A scene's surface as a triangle mesh that other programs open right way up.
+"""A scene's surface as a textured triangle mesh in glTF's axes, and the bytes of its files.
 
-Axes change on the way: here x is right, y DOWN, z forward and normals point inward (conventions.md); in the
-mesh x is right, y UP, z towards the viewer and normals point outward, as in glTF, so that the object looks
+Axes change: a scene's x is right, y DOWN, z forward and its normals point inward (conventions.md); the mesh's
+x is right, y UP, z towards the viewer and its normals point outward, as in glTF, so that the object looks
 along +z. That is half a turn about x, (x, y, z) -> (x, -y, 1 - z): handedness stays, and the object's centre
 (0, 0, 1) becomes the origin. Lengths stay scene units. Texture coordinates have their origin at the texture's
 lower left corner. Cells of the pixel grid that are no surface are left out: the border columns that the model
 holds at one depth, cells seen at a grazing angle (on a grid a jump in depth is one) where they reach the
-rim, and scraps that hang together with the rest nowhere. A steep flank inside the surface stays: without it
-the surface would have holes. Leaves out closing the back, and files (``mesh_files``).
+rim, and pieces apart from the largest. A steep flank inside the surface stays: without it the surface would
+have holes. Values are stored as they are: images are sRGB-coded, as is a base colour in glTF. Leaves out
+closing the back, several objects, and compressed geometry.
 """
 
+import io
+import re
 from dataclasses import dataclass
-from math import cos, radians
+from math import ceil, cos, radians
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,11 +25,14 @@ from PIL import Image
 from scipy import ndimage
 from torch import Tensor
 
+from derender.data import suggestion
+from derender.model import Derenderer
 from derender.report.colours import pictures
 from derender.scene import Scene
 from derender.scene.camera import unproject
 from derender.scene.normals import normals_from_depth
 
+FORMATS = ("glb", "obj")
 GRAZING_DEG = 85.0
 
 
@@ -48,6 +56,61 @@ class Mesh:
     texture: Image.Image
     trimmed: float
 
+    def files(self, name: str, form: str = "glb") -> dict[str, bytes]:
+        """File name to content: ``NAME.glb``, or ``NAME.obj``, ``NAME.mtl`` and ``NAME.png``.
+
+        OBJ knows no names with spaces; such characters become underscores.
+        """
+        if checked_format(form) == "glb":
+            return {f"{name}.glb": _glb(self)}
+        return _obj(self, re.sub(r"[^\w.-]", "_", name))
+
+
+@dataclass(frozen=True)
+class MeshFiles:
+    """A mesh to be written in one format; what an edit of an image is to ``editing``."""
+
+    mesh: Mesh
+    form: str = "glb"
+
+    @property
+    def row(self) -> dict[str, Image.Image]:
+        """Empty: meshes have no sheet."""
+        return {}
+
+    def write(self, folder: Path, record: dict[str, Any]) -> dict[str, Any]:
+        """Write the files; returns their names and the mesh's size."""
+        home = Path(record["folder"])
+        files = self.mesh.files(home.name, self.form)
+        for name, content in files.items():
+            (folder / name).write_bytes(content)
+        return {
+            **record,
+            "files": [home / name for name in files],
+            "vertices": len(self.mesh.vertices),
+            "faces": len(self.mesh.faces),
+            "trimmed": self.mesh.trimmed,
+        }
+
+
+def checked_format(form: str) -> str:
+    """The format itself; an unknown one is an error that suggests another."""
+    if form not in FORMATS:
+        raise ValueError(f"unknown format {form!r}{suggestion(form, FORMATS)}: choose {' or '.join(FORMATS)}")
+    return form
+
+
+def model_mesh(model: Derenderer, scene: Scene, grazing_deg: float = GRAZING_DEG) -> Mesh:
+    """The mesh of one scene of a model, enlarged or not, without the border held at one depth.
+
+    Enlarging smooths the step at that border over one more of the model's columns.
+    """
+    own, size = model.image_size, scene.depth.shape[-1]
+    border = model.settings.ranges.border_columns(own)
+    if border and size != own:
+        border = ceil((border + 1) * (size - 1) / (own - 1))
+    return mesh_of(scene, model.fov_deg, border, grazing_deg)
+
 
 def mesh_of(scene: Scene, fov_deg: float, border_columns: int = 0, grazing_deg: float = GRAZING_DEG) -> Mesh:
     """The mesh of one scene in its canonical view.
@@ -56,12 +119,14 @@ def mesh_of(scene: Scene, fov_deg: float, border_columns: int = 0, grazing_deg: 
         scene: one scene.
         fov_deg: horizontal field of view.
         border_columns: pixel columns at each side that the model holds at one depth; they are left out.
-        grazing_deg: cells whose surface is turned further from the viewer are left out, but for those that
-            the rest of the surface encloses.
+        grazing_deg: cells whose surface is turned further from the viewer are left out, except those that the
+            rest of the surface encloses.
 
     Raises:
         ValueError: there are several scenes, or nothing of the surface is left.
     """
+    if not 0 < grazing_deg <= 90:
+        raise ValueError(f"grazing must lie above 0 and up to 90 degrees, got {grazing_deg:g}")
     if len(scene) != 1:
         raise ValueError(f"a mesh shows one scene, got {len(scene)}: pass scene[index]")
     depth = scene.depth.detach().double().cpu()
@@ -69,17 +134,17 @@ def mesh_of(scene: Scene, fov_deg: float, border_columns: int = 0, grazing_deg: 
     points = unproject(depth, fov_deg)[0]
     inside = torch.ones(height - 1, width - 1, dtype=torch.bool)
     inside[:, :border_columns] = inside[:, width - 1 - border_columns :] = False
-    kept = _whole_piece((inside & _facing(points, grazing_deg)).numpy())
-    if not kept.any():
+    surface = _largest_piece((inside & _facing(points, grazing_deg)).numpy())
+    if not surface.any():
         raise ValueError(
             f"nothing of this surface is seen at less than {grazing_deg:g} degrees: allow more, or see "
             "whether the model was trained"
         )
-    corners = _faces(kept, width)
+    corners = _faces(surface, width)
     used, faces = np.unique(corners, return_inverse=True)
-    turned = np.array([1.0, -1.0, -1.0])
-    vertices = (points.numpy().reshape(-1, 3) - (0, 0, 1)) * turned
-    outward = -normals_from_depth(depth, fov_deg)[0].numpy().reshape(-1, 3) * turned
+    to_gltf = np.array([1.0, -1.0, -1.0])
+    vertices = (points.numpy().reshape(-1, 3) - (0, 0, 1)) * to_gltf
+    outward = -normals_from_depth(depth, fov_deg)[0].numpy().reshape(-1, 3) * to_gltf
     row, column = np.divmod(used, width)
     uv = np.stack(((column + 0.5) / width, 1 - (row + 0.5) / height), axis=1)
     return Mesh(
@@ -88,7 +153,7 @@ def mesh_of(scene: Scene, fov_deg: float, border_columns: int = 0, grazing_deg: 
         uv.astype(np.float32),
         faces.reshape(-1, 3).astype(np.int64),
         pictures(scene.albedo.detach())[0],
-        float(1 - kept.mean()),
+        float(1 - surface.mean()),
     )
 
 
@@ -104,8 +169,8 @@ def _facing(points: Float[Tensor, "h w 3"], grazing_deg: float) -> Tensor:
     return facing
 
 
-def _whole_piece(cells: np.ndarray) -> np.ndarray:
-    """The largest set of cells that hang together by their sides, with the holes in it filled."""
+def _largest_piece(cells: np.ndarray) -> np.ndarray:
+    """The largest set of cells connected by their sides, with the holes in it filled."""
     pieces = np.zeros(cells.shape, np.int32)
     ndimage.label(cells, output=pieces)
     if pieces.max() > 1:
@@ -119,3 +184,41 @@ def _faces(cells: np.ndarray, width: int) -> np.ndarray:
     a = row * width + column
     b, c, d = a + width, a + 1, a + width + 1
     return np.concatenate((np.stack((a, b, c), axis=1), np.stack((c, b, d), axis=1)))
+
+
+def _glb(mesh: Mesh) -> bytes:
+    import trimesh
+    from trimesh.exchange.gltf import export_glb
+    from trimesh.visual import TextureVisuals
+    from trimesh.visual.material import PBRMaterial
+
+    material = PBRMaterial(
+        name="albedo",
+        baseColorTexture=mesh.texture,
+        metallicFactor=0.0,
+        roughnessFactor=1.0,
+        doubleSided=True,
+    )
+    visual = TextureVisuals(uv=mesh.uv, material=material)
+    made: Any = trimesh.Trimesh(
+        mesh.vertices, mesh.faces, vertex_normals=mesh.normals, visual=visual, process=False
+    )
+    return bytes(export_glb(trimesh.Scene(made), include_normals=True))
+
+
+def _obj(mesh: Mesh, name: str) -> dict[str, bytes]:
+    """Written here, since trimesh chooses the names of material and texture itself."""
+    lines = io.StringIO()
+    lines.write(f"# x right, y up, z towards the viewer\nmtllib {name}.mtl\no {name}\nusemtl albedo\n")
+    for word, rows in (("v", mesh.vertices), ("vt", mesh.uv), ("vn", mesh.normals)):
+        np.savetxt(lines, rows, fmt=f"{word} " + " ".join(["%.7g"] * rows.shape[1]))
+    numbers = mesh.faces + 1
+    np.savetxt(lines, np.repeat(numbers, 3, axis=1), fmt="f %d/%d/%d %d/%d/%d %d/%d/%d")
+    texture = io.BytesIO()
+    mesh.texture.save(texture, format="PNG")
+    material = f"newmtl albedo\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd {name}.png\n"
+    return {
+        f"{name}.obj": lines.getvalue().encode(),
+        f"{name}.mtl": material.encode(),
+        f"{name}.png": texture.getvalue(),
+    }

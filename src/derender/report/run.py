@@ -17,8 +17,8 @@ from torch import Tensor
 from derender.baselines import read_any_config
 from derender.model import Derenderer
 from derender.report import blocks, charts
+from derender.report.decomposition import decompose_images
 from derender.report.evidence import Evidence
-from derender.report.figures import decomposition
 from derender.report.page import Page, Section
 from derender.settings import Settings
 from derender.training.config import TrainConfig, setting_names
@@ -42,7 +42,7 @@ BASELINE_CHARTS = (
 
 def decomposition_sheet(model: Derenderer, pictures: Float[Tensor, "n 3 h w"]) -> Image.Image:
     """What the model makes of some pictures: a labelled panel with a row for each."""
-    return decomposition(pictures, model.decompose(pictures), model.render, model.fov_deg).sheet()
+    return decompose_images(model, pictures).sheet()
 
 
 def run_page(folder: str | Path, evidence: Evidence | None = None) -> Page:

@@ -1,12 +1,12 @@
-"""One scene in many lights or from many sides: values for a strip of stills and for a film that loops.
+"""One scene under many lightings or from many viewpoints: for strips of stills and for films that loop.
 
-A sweep is a function of places t between 0 and 1; ``stills`` and ``there_and_back`` say at which. Lights are
-relative to the object (conventions.md), so the same light falls on the same side of every object, however it
-is turned. Leaves out drawing (``sheets``) and files (``moved``).
+A sweep is a function of places t between 0 and 1; ``stills`` and ``there_and_back`` give the places. Lights
+are relative to the object (conventions.md), so the same light falls on the same side of every object,
+however it is rotated. Leaves out files (``films``, ``edits``).
 """
 
 from collections.abc import Callable
-from math import cos, inf, pi, radians
+from math import inf, pi, radians
 
 import torch
 from jaxtyping import Float
@@ -14,11 +14,15 @@ from torch import Tensor
 
 from derender.render import Rendering
 from derender.report.colours import Images, pictures
+from derender.report.panel import strip
 from derender.scene import Scene
 
 AMBIENT_SHARE = 0.35
 """Of the strength of a light that goes round; the rest is diffuse."""
 FRAMES_AT_ONCE = 8
+LOOP_FRAMES, LOOP_LIGHT_DEG, LOOP_VIEW_DEG = 16, 45.0, 35.0
+
+Render = Callable[[Scene], Rendering]
 
 
 def stills(count: int) -> Float[Tensor, " k"]:
@@ -29,21 +33,21 @@ def stills(count: int) -> Float[Tensor, " k"]:
 
 
 def there_and_back(frames: int) -> Float[Tensor, " k"]:
-    """Places of a film that goes from 0 to 1 and back without a jerk; the last frame leads to the first."""
+    """Places of a film that goes smoothly from 0 to 1 and back; the last frame leads to the first."""
     if frames < 2:
         raise ValueError(f"a film needs 2 frames or more, got {frames}")
-    return torch.tensor([(1 - cos(2 * pi * frame / frames)) / 2 for frame in range(frames)])
+    return (1 - _angles(frames).cos()) / 2
 
 
 def lights_around(
     t: Float[Tensor, " k"], reach_deg: float, pitch_deg: float = 0.0, strength: float = 1.0
 ) -> Float[Tensor, "k 4"]:
-    """Lights from the right of the picture (t = 0) to its left (t = 1), ``reach_deg`` off the axis.
+    """Lights from the right of the image (t = 0) to its left (t = 1), ``reach_deg`` off the axis.
 
-    ``strength`` is ambient plus diffuse light; with its own light's, a picture stays as bright as it is.
+    ``strength`` is ambient plus diffuse light; with its own light's, an image stays as bright as it is.
     """
-    _within("reach", reach_deg, 90)
-    _within("pitch", pitch_deg, 90)
+    _within("reach", reach_deg)
+    _within("pitch", pitch_deg)
     if not 0 <= strength < inf:
         raise ValueError(f"the strength of a light must be 0 or more, got {strength}: give such a number")
     ambient = AMBIENT_SHARE * strength
@@ -60,12 +64,12 @@ def lights_between(
 
 
 def cameras_around(t: Float[Tensor, " k"], reach_deg: float, pitch_deg: float = 0.0) -> Float[Tensor, "k 6"]:
-    """Cameras for an object that looks to the right of the picture (t = 0), then to its left (t = 1).
+    """Cameras for an object that looks to the right of the image (t = 0), then to its left (t = 1).
 
     ``pitch_deg`` > 0 brings its top forward. No shift, no roll: yaw 0 and pitch 0 show the canonical view.
     """
-    _within("reach", reach_deg, 90)
-    _within("pitch", pitch_deg, 90)
+    _within("reach", reach_deg)
+    _within("pitch", pitch_deg)
     camera = torch.zeros(len(t), 6)
     camera[:, 0] = radians(pitch_deg)
     camera[:, 1] = radians(reach_deg) * (2 * t - 1)
@@ -96,7 +100,7 @@ def swapped(scene: Scene, donor: Scene, parameter: str) -> Scene:
     return scene.with_parameters(**{parameter: value.expand(len(scene), *value.shape[1:])})
 
 
-def drawn(scene: Scene, render: Callable[[Scene], Rendering]) -> Images:
+def drawn(scene: Scene, render: Render) -> Images:
     """Renderings as images, transparent where nothing is seen; few at a time, so that large ones fit."""
     images: Images = []
     with torch.no_grad():
@@ -106,7 +110,36 @@ def drawn(scene: Scene, render: Callable[[Scene], Rendering]) -> Images:
     return images
 
 
-def _within(name: str, angle_deg: float, limit_deg: float) -> None:
+def circling_light(scene: Scene, frames: int = LOOP_FRAMES, reach_deg: float = LOOP_LIGHT_DEG) -> Scene:
+    """One scene while a light as strong as its own goes round once, ``reach_deg`` off the axis; a loop."""
+    angle, strength = _angles(frames), float(scene.light[0, :2].sum())
+    light = torch.tensor([AMBIENT_SHARE * strength, (1 - AMBIENT_SHARE) * strength, 0.0, 0.0])
+    light = light.repeat(frames, 1)
+    light[:, 2] = radians(reach_deg) * 0.6 * angle.cos()
+    light[:, 3] = radians(reach_deg) * angle.sin()
+    return varied(scene, light=light)
+
+
+def nodding_view(scene: Scene, frames: int = LOOP_FRAMES, reach_deg: float = LOOP_VIEW_DEG) -> Scene:
+    """One scene while it rotates to either side and nods a little; a loop around the frontal view."""
+    angle, camera = _angles(frames), torch.zeros(frames, 6)
+    camera[:, 0] = radians(reach_deg) * 0.25 * (2 * angle).sin()
+    camera[:, 1] = radians(reach_deg) * angle.sin()
+    return varied(scene, camera=camera)
+
+
+def relit_and_rotated(scene: Scene, render: Render, frames: int = LOOP_FRAMES) -> Images:
+    """The frames of both loops beside each other: the light goes round, the object rotates."""
+    both = (drawn(loop(scene, frames), render) for loop in (circling_light, nodding_view))
+    return [strip(list(pair)) for pair in zip(*both, strict=True)]
+
+
+def _angles(frames: int) -> Float[Tensor, " k"]:
+    """Once round in so many steps, in radians."""
+    return 2 * pi * torch.arange(frames) / frames
+
+
+def _within(name: str, angle_deg: float, limit_deg: float = 90) -> None:
     if not -limit_deg < angle_deg < limit_deg:
         raise ValueError(
             f"{name} must lie between -{limit_deg} and {limit_deg} degrees, got {angle_deg}: "

@@ -10,7 +10,7 @@ import io
 import json
 import zipfile
 from dataclasses import dataclass, field
-from math import ceil, isfinite
+from math import isfinite
 from typing import Any
 
 import numpy as np
@@ -25,9 +25,8 @@ from derender.features import FeatureTable, named
 from derender.features.search import nearest, same_picture
 from derender.model import Derenderer
 from derender.report import colours
-from derender.report.mesh import mesh_of
-from derender.report.mesh_files import mesh_files
-from derender.report.panel import labelled_grid
+from derender.report.mesh import model_mesh
+from derender.report.panel import labelled_grid, strip
 from derender.report.viewer.questions import Camera, Light, NeighbourQuestion, Question
 from derender.report.viewer.refused import Refused
 from derender.report.viewer.shelf import Shelf, TakenApart
@@ -37,8 +36,6 @@ from derender.scene.enlarge import at_size
 from derender.scene.light import lambert_shading
 from derender.scene.normals import normals_from_depth
 from derender.training.held_out_errors import HeldOutErrors, masked_l1, reconstruction_errors
-
-ENLARGED_BORDER = 1  # enlarging smooths the step at the model's border over one more column
 
 
 def reading_size(model: Derenderer, framed: bool) -> int:
@@ -123,7 +120,7 @@ class Studio:
         with torch.inference_mode():
             scene = self.scene(question)
             images = (self._rendered(scene), self._shading(scene))
-        return _png(_side_by_side(*images), quick=True)
+        return _png(strip(list(images)), quick=True)
 
     def picture(self, question: Question) -> bytes:
         """The rendering alone, as a PNG with transparency."""
@@ -167,15 +164,11 @@ class Studio:
     def mesh(self, question: Question) -> bytes:
         """The surface in its canonical view as GLB; ``Refused`` (422) where there is none."""
         scene = self.scene(question)
-        own, size = self.model.image_size, scene.depth.shape[-1]
-        border = self.model.settings.ranges.border_columns(own)
-        if border and size != own:
-            border = ceil((border + ENLARGED_BORDER) * (size - 1) / (own - 1))
         try:
-            made = mesh_of(scene, self.model.fov_deg, border)
+            made = model_mesh(self.model, scene)
         except ValueError as problem:
             raise Refused(422, str(problem)) from problem
-        return mesh_files(made, "surface")["surface.glb"]
+        return made.files("surface")["surface.glb"]
 
     def settings(self, question: Question) -> dict[str, Any]:
         """Light and camera in numbers, and what made the picture."""
@@ -227,10 +220,3 @@ def _png(image: Image.Image, quick: bool = False) -> bytes:
     stream = io.BytesIO()
     image.save(stream, format="PNG", compress_level=1 if quick else 6)
     return stream.getvalue()
-
-
-def _side_by_side(left: Image.Image, right: Image.Image) -> Image.Image:
-    both = Image.new("RGBA", (left.width + right.width, left.height), (0, 0, 0, 0))
-    both.paste(left, (0, 0))
-    both.paste(right, (left.width, 0))
-    return both

@@ -1,6 +1,5 @@
 """Images show what the values say: sizes, labels, one scale for a set, normals, transparency."""
 
-from io import BytesIO
 from math import radians
 
 import numpy as np
@@ -9,9 +8,14 @@ import torch
 from PIL import Image, ImageDraw
 
 from derender.render import render_scene
-from derender.report import colours, films, panel
-from derender.report.figures import COLUMN_MEANING, decomposition, from_another_view, under_another_light
-from derender.report.panel import GridLayout, before_after, contact_sheet, labelled_grid
+from derender.report import colours, panel
+from derender.report.decomposition import (
+    COLUMN_MEANING,
+    decomposition,
+    from_another_view,
+    under_another_light,
+)
+from derender.report.panel import GridLayout, contact_sheet, labelled_grid
 from derender.scene import Scene
 
 FOV_DEG = 10.0
@@ -51,8 +55,14 @@ def test_decomposition_has_every_column_for_every_picture():
     drawn = decomposition(render(scene).image.clamp(0, 1), scene, render, FOV_DEG)
     assert list(drawn.columns) == list(COLUMN_MEANING)
     assert all([image.size for image in images] == [(16, 16)] * 3 for images in drawn.columns.values())
-    near, far = drawn.depth_range
-    assert near == pytest.approx(0.95, abs=0.01) and far == pytest.approx(1.05, abs=0.01)
+
+
+def test_a_further_factor_is_drawn_where_its_parameter_is_a_map():
+    scene = bump().with_extra(
+        gloss=torch.rand(3, 16, 16), tint=torch.rand(3, 3, 16, 16), age=torch.rand(3, 2)
+    )
+    drawn = decomposition(render(scene).image.clamp(0, 1), scene, render, FOV_DEG)
+    assert list(drawn.columns) == [*COLUMN_MEANING, "gloss", "tint"]
 
 
 def test_panel_has_the_expected_size_and_labels(drawn_text):
@@ -82,7 +92,6 @@ def test_contact_sheet_and_pairs():
     layout = GridLayout(cell=20, gap=5, margin=10, label=10)
     assert contact_sheet(images, across=3, layout=layout).size == (10 + 3 * 25 - 5 + 10, 10 + 2 * 25 - 5 + 10)
     assert contact_sheet(images, ["x"] * 5, across=3, layout=layout).height == 10 + 2 * (25 + 15) - 5 + 10
-    assert before_after(images[:2], images[2:4]).size[1] > 2 * 160
     with pytest.raises(ValueError, match="at least one image"):
         contact_sheet([])
     with pytest.raises(ValueError, match="expected 5 captions"):
@@ -152,21 +161,3 @@ def test_another_light_comes_from_the_other_side_and_another_view_turns_back():
     assert (camera[:, 1] - scene.camera[:, 1]).abs() == pytest.approx([radians(35)] * 3)
     assert camera[0, 1] > scene.camera[0, 1] and camera[2, 1] < scene.camera[2, 1]
     assert torch.equal(scene.light, bump().light)
-
-
-def test_films_are_loops_that_move():
-    scene = bump()
-    for film in (films.relighting, films.rotation):
-        frames = film(scene[1], render, frames=8)
-        content = films.animated_png(frames)
-        with Image.open(BytesIO(content)) as image:
-            assert image.n_frames == 8 and image.info["loop"] == 0 and image.size == (16, 16)
-        assert len({frame.tobytes() for frame in frames}) > 4
-        first, last = (
-            np.asarray(colours.on_background(frame)).astype(int) for frame in (frames[0], frames[-1])
-        )
-        assert np.abs(first - last).mean() < 40
-    with pytest.raises(ValueError, match="one scene"):
-        films.relighting(scene, render)
-    with pytest.raises(ValueError, match="two frames"):
-        films.animated_png(frames[:1])

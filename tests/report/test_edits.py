@@ -1,4 +1,4 @@
-"""Strips, films and sheets on disk: what a player and a person find in them."""
+"""Strips, films and sheets as a player and a person find them."""
 
 import io
 import json
@@ -9,9 +9,10 @@ import pytest
 from imageio_ffmpeg import get_ffmpeg_exe
 from PIL import Image
 
-from derender.report.films import gif, mp4
-from derender.report.moved import Moved, film_kinds, write_moved
-from derender.report.sheets import Sheets, sheet_paths, write_sheets
+from derender.report.edits import Edit
+from derender.report.films import animated_png, gif, mp4
+from derender.report.opening import FilmOptions
+from derender.report.panel import Sheets
 
 
 def frames(count: int = 6, size: tuple[int, int] = (33, 24)) -> list[Image.Image]:
@@ -35,6 +36,12 @@ def test_gif_has_every_frame_on_white():
     assert abs(int(shown[5, 20, 0]) - 130) <= 2
 
 
+def test_animated_png_keeps_transparency():
+    with Image.open(io.BytesIO(animated_png(frames()))) as film:
+        assert film.n_frames == 6 and film.size == (33, 24) and film.info["loop"] == 0
+        assert film.convert("RGBA").getpixel((3, 3))[3] == 0
+
+
 def test_mp4_has_every_frame_and_even_sides(tmp_path):
     (tmp_path / "film.mp4").write_bytes(mp4(frames(), seconds=1.2))
     decode = [
@@ -56,7 +63,7 @@ def test_mp4_has_every_frame_and_even_sides(tmp_path):
 
 
 def test_a_film_needs_frames():
-    for film in (gif, mp4):
+    for film in (animated_png, gif, mp4):
         with pytest.raises(ValueError, match="at least two frames; got 1"):
             film(frames(1))
 
@@ -68,40 +75,33 @@ def test_no_ffmpeg_is_an_error_that_helps(monkeypatch):
 
 
 def test_kinds_of_film():
-    assert film_kinds("mp4, gif,mp4") == ("mp4", "gif")
-    assert film_kinds("none") == ()
+    assert FilmOptions(film="mp4, gif,mp4").kinds == ("mp4", "gif")
+    assert FilmOptions(film="none").kinds == ()
     with pytest.raises(ValueError, match="unknown kind of film 'mp5'; did you mean 'mp4'"):
-        film_kinds("mp5")
+        FilmOptions(film="mp5")
 
 
 def test_a_folder_has_strip_stills_film_and_numbers(tmp_path):
     images = frames(3, (20, 20))
-    moved = Moved(
-        {"input": images[0]}, dict(zip("ab", images[1:], strict=True)), {"a": {"x": 1}, "b": {"x": 2}}, images
-    )
-    told = write_moved(tmp_path / "one", moved, {"picture": "one.png"}, ("gif",), 0.3)
+    stills = dict(zip("ab", images[1:], strict=True))
+    edit = Edit({"input": images[0]}, stills, {"a": {"x": 1}, "b": {"x": 2}}, images, ("gif",), 0.3)
+    written = edit.write(tmp_path, {"picture": "one.png"})
     names = {"strip.png", "still-01.png", "still-02.png", "film.gif", "moved.json"}
-    assert {file.name for file in (tmp_path / "one").iterdir()} == names
-    assert json.loads((tmp_path / "one" / "moved.json").read_text()) == told
-    assert [still["x"] for still in told["stills"]] == [1, 2] and told["picture"] == "one.png"
-    with Image.open(tmp_path / "one" / "still-02.png") as still:
+    assert {file.name for file in tmp_path.iterdir()} == names
+    assert json.loads((tmp_path / "moved.json").read_text()) == written
+    assert [still["x"] for still in written["stills"]] == [1, 2] and written["picture"] == "one.png"
+    with Image.open(tmp_path / "still-02.png") as still:
         assert still.mode == "RGBA" and still.tobytes() == images[2].tobytes()
-    with Image.open(tmp_path / "one" / "strip.png") as strip:
+    with Image.open(tmp_path / "strip.png") as strip:
         assert strip.width > 3 * 128
 
 
-def test_sheets_break_after_so_many_rows(tmp_path):
-    sheets = Sheets("many", rows=2)
+def test_sheets_break_after_so_many_rows():
+    sheets = Sheets(rows=2)
     for number in range(5):
         sheets.add(f"{number}.png", {"input": frames(1)[0], "after": frames(1)[0]})
-    paths = write_sheets(sheets, tmp_path)
-    assert paths == [tmp_path / f"sheet-{number}.png" for number in (1, 2, 3)] == sheet_paths(tmp_path, 5, 2)
-    heights = []
-    for path in paths:
-        with Image.open(path) as sheet:
-            heights.append(sheet.height)
-    assert heights[0] == heights[1] > heights[2]
-    assert sheet_paths(tmp_path, 2, 2) == [tmp_path / "sheet.png"]
+    first, second, third = sheets.drawn()
+    assert first.height == second.height > third.height
     with pytest.raises(ValueError, match="columns input, after; got input"):
         sheets.add("6.png", {"input": frames(1)[0]})
-    assert write_sheets(Sheets(), tmp_path) == []
+    assert Sheets().drawn() == []

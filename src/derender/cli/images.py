@@ -1,0 +1,57 @@
+"""Files, output and notes of the image commands: decompose, relight, rotate, swap, mesh.
+
+How an image is read and drawn is in report/opening.py; a new option of all these commands is one field there.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from derender.cli.console import notice, progress_bar
+from derender.cli.options import OutFolder, Output, TrainedModel
+from derender.report.opening import ImageOpener, ImageOptions, OpenedImage, held_out_errors
+
+if TYPE_CHECKING:
+    from derender.report.editing import Edited
+
+
+@dataclass(frozen=True)
+class ImageFiles:
+    """Image files, and the folder for what is made of them."""
+
+    images: Annotated[list[Path], typer.Argument(help="Image files.", metavar="IMAGE...")]
+    out: OutFolder
+
+    def edit(
+        self,
+        opener: ImageOpener,
+        edit: "Callable[[OpenedImage], Edited]",
+        output: Output,
+        *,
+        sheet: bool | None = None,
+        beside: Sequence[OpenedImage] = (),
+    ) -> None:
+        """Edit and write every image and report it; exit code 2 where one could not be read."""
+        from derender.report.editing import write_images
+
+        with progress_bar("drawing", "images") as report:
+            written = write_images(
+                opener, self.images, self.out, edit,
+                force=output.force, sheet=sheet, beside=beside, progress=report,
+            )  # fmt: skip
+        for note in written.notes():
+            notice(note)
+        count = len(written.images)
+        output.result(f"{count:,} image{'s' if count != 1 else ''} in {self.out}")
+        output.write(written.values())
+        if written.refused:
+            raise typer.Exit(2)
+
+
+def opener_of(model: TrainedModel, how: ImageOptions, default_size: int = 0) -> ImageOpener:
+    """What opens images: the loaded model with the options."""
+    loaded = model.open()
+    return ImageOpener(loaded, how, default_size=default_size, held_out=held_out_errors(model.model))

@@ -1,0 +1,169 @@
+"""A decomposition as images and files: input, reconstruction, every factor, another light and another view.
+
+Takes images and the ``Scene`` a model found in them; gives a ``Decomposition``, from which panels, pages and
+files are made. On disk each image has a folder: panel.png, one PNG per column, ``scene.npz`` with all scene
+parameters and normals as the renderer takes them, ``scene.json`` with light and camera in words and degrees.
+"""
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from math import degrees, radians
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from PIL import Image
+from torch import Tensor
+
+from derender.data import as_float
+from derender.model import Derenderer
+from derender.render import Rendering
+from derender.report import colours
+from derender.report.opening import OpenedImage
+from derender.report.panel import GridLayout, labelled_grid, strip
+from derender.scene import Scene
+from derender.scene.light import lambert_shading
+from derender.scene.normals import normals_from_depth
+
+OTHER_LIGHT = {"ambient_share": 0.3, "yaw_rad": radians(40), "pitch_rad": radians(10)}
+OTHER_VIEW_YAW_RAD = radians(35)
+COLUMN_MEANING = {
+    "input": "the image as the model takes it",
+    "reconstruction": "the image rendered from the four factors",
+    "depth": "geometry in the frontal view: bright is near, dark is far; one scale for all images",
+    "normals": "direction of the surface: red to the right, green upwards, blue towards the viewer",
+    "albedo": "colour of the surface without lighting",
+    "shading": "lighting on this surface: white is fully lit",
+    "another light": "the same object lit from the other side",
+    "another view": "the same object rotated to the other side",
+}
+
+
+@dataclass(frozen=True)
+class Decomposition:
+    """Images of N decomposed images, one list of N per column.
+
+    Attributes:
+        columns: column name to N images, in the order of a panel: those of ``COLUMN_MEANING``, then further
+            factors whose parameter is a map.
+        scene: the N scenes.
+        fov_deg: horizontal field of view.
+    """
+
+    columns: Mapping[str, colours.Images]
+    scene: Scene
+    fov_deg: float
+
+    def __len__(self) -> int:
+        return len(self.scene)
+
+    def panel(self, index: int = 0, layout: GridLayout | None = None) -> Image.Image:
+        """The labelled panel of one image."""
+        return labelled_grid({name: [images[index]] for name, images in self.columns.items()}, layout=layout)
+
+    def sheet(self, row_labels: list[str] | None = None, layout: GridLayout | None = None) -> Image.Image:
+        """One labelled panel with a row for every image."""
+        return labelled_grid(self.columns, row_labels, layout=layout)
+
+    @property
+    def row(self) -> dict[str, Image.Image]:
+        """The first image's columns."""
+        return {name: images[0] for name, images in self.columns.items()}
+
+    def write(self, folder: Path, record: Mapping[str, Any]) -> dict[str, Any]:
+        """Write the first image's files; returns the content of its scene.json."""
+        scene = self.scene[0].detach()
+        written = {**record, **scene_numbers(scene)}
+        self.panel().save(folder / "panel.png")
+        for name, image in self.row.items():
+            strip([image]).save(folder / f"{name.replace(' ', '_')}.png")
+        text = json.dumps(written, indent=1, ensure_ascii=False)
+        (folder / "scene.json").write_text(text, encoding="utf-8")
+        values: dict[str, Any] = {name: value[0].cpu().numpy() for name, value in scene.parameters.items()}
+        values["normal"] = normals_from_depth(scene.depth, self.fov_deg)[0].cpu().numpy()
+        np.savez_compressed(folder / "scene.npz", **values)
+        return written
+
+
+def decomposition(
+    images: Float[Tensor, "n 3 h w"],
+    scene: Scene,
+    render: Callable[[Scene], Rendering],
+    fov_deg: float,
+    depth_range: tuple[float, float] | None = None,
+) -> Decomposition:
+    """Draw the scenes of ``images`` (0..1); ``render`` is ``model.render`` or the plain renderer.
+
+    ``depth_range`` is the nearest and farthest depth of the colour scale; by default that of these scenes.
+    """
+    scene = scene.detach()
+    with torch.no_grad():
+        own, relit, rotated = (
+            render(scene),
+            render(under_another_light(scene)),
+            render(from_another_view(scene)),
+        )
+        normal = normals_from_depth(scene.depth, fov_deg)
+        shading = lambert_shading(normal, scene.light)
+    columns = {
+        "input": colours.pictures(images),
+        "reconstruction": colours.pictures(own.image, own.mask),
+        "depth": colours.depth_maps(scene.depth, limits=depth_range),
+        "normals": colours.normal_maps(normal),
+        "albedo": colours.pictures(scene.albedo),
+        "shading": colours.shading_maps(shading),
+        "another light": colours.pictures(relit.image, relit.mask),
+        "another view": colours.pictures(rotated.image, rotated.mask),
+    }
+    further = {name: drawn for name, value in scene.extra.items() if (drawn := colours.any_maps(value))}
+    return Decomposition({**columns, **further}, scene.to("cpu"), fov_deg)
+
+
+def decompose_images(model: Derenderer, images: Float[Tensor, "n 3 h w"]) -> Decomposition:
+    """Decompose images (0..1) and draw the result."""
+    with torch.no_grad():
+        scene = model.decompose(images)
+    return decomposition(images, scene, model.render, model.fov_deg)
+
+
+def decomposed(model: Derenderer, image: OpenedImage) -> Decomposition:
+    """An opened image (``opening``) with its factors drawn; images opened together share the depth scale."""
+    pixels = as_float(image.pixels[None])
+    return decomposition(pixels, image.scene, model.render, model.fov_deg, image.depth_range)
+
+
+def scene_numbers(scene: Scene, index: int = 0) -> dict[str, Any]:
+    """Light and camera of one scene, angles in degrees."""
+    ambient, diffuse, light_pitch, light_yaw = scene.light[index].tolist()
+    *rotation, x, y, z = scene.camera[index].tolist()
+    return {
+        "light": {
+            "ambient": ambient,
+            "diffuse": diffuse,
+            "pitch_deg": degrees(light_pitch),
+            "yaw_deg": degrees(light_yaw),
+        },
+        "camera": {"rotation_deg": [degrees(angle) for angle in rotation], "translation": [x, y, z]},
+    }
+
+
+def under_another_light(scene: Scene) -> Scene:
+    """The scenes under a light as strong as their own, most of it from the opposite side."""
+    light = scene.light
+    strength = light[:, 0] + light[:, 1]
+    other = torch.empty_like(light)
+    other[:, 0] = OTHER_LIGHT["ambient_share"] * strength
+    other[:, 1] = strength - other[:, 0]
+    other[:, 2] = OTHER_LIGHT["pitch_rad"]
+    other[:, 3] = OTHER_LIGHT["yaw_rad"] * torch.where(light[:, 3] > 0, -1.0, 1.0)
+    return scene.with_parameters(light=other)
+
+
+def from_another_view(scene: Scene) -> Scene:
+    """The scenes rotated about the vertical axis, away from the side to which they look."""
+    camera = scene.camera.clone()
+    camera[:, 1] += OTHER_VIEW_YAW_RAD * torch.where(camera[:, 1] > 0, -1.0, 1.0)
+    return scene.with_parameters(camera=camera)

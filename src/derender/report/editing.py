@@ -1,0 +1,188 @@
+"""Edit images and write the results: what the image commands do, as one library call.
+
+An edit makes of an opened image what is written for it: a ``Decomposition``, an ``Edit`` (relit, rotated,
+swapped) or ``MeshFiles``. Each image has a folder, which appears whole or not at all. An image that cannot be
+read is left out and listed; the others are written. Leaves out opening (``opening``) and the edits
+(``decomposition``, ``edits``, ``mesh``).
+"""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from PIL import Image
+
+from derender.evaluation.out_of_distribution import OUTLIER_PERCENTILE
+from derender.report.opening import ImageOpener, OpenedImage
+from derender.report.panel import Sheets
+from derender.scene.crop_search import WHOLE, Crop
+from derender.storage.atomic import atomic_file, atomic_folder
+
+
+class Edited(Protocol):
+    """What can be written for one image."""
+
+    @property
+    def row(self) -> Mapping[str, Image.Image]:
+        """Its row of a sheet over all images; empty for none."""
+        ...
+
+    def write(self, folder: Path, record: dict[str, Any], /) -> dict[str, Any]:
+        """Write its files to ``folder``; returns the record with what was written."""
+        ...
+
+
+@dataclass(frozen=True)
+class WrittenImages:
+    """What ``write_images`` made.
+
+    Attributes:
+        out: the folder.
+        images: a record for each image, as its JSON file holds it.
+        sheets: files with a row for every image.
+        refused: reasons why other images cannot be read, by path.
+        percentiles: of the reconstruction errors, by path; empty where the model keeps none.
+        crops: the part of each image that is shown, by path; empty unless parts were searched.
+    """
+
+    out: Path
+    images: Sequence[dict[str, Any]]
+    sheets: Sequence[Path]
+    refused: Mapping[str, str]
+    percentiles: Mapping[str, float]
+    crops: Mapping[str, Crop] = field(default_factory=dict)
+
+    @property
+    def out_of_distribution(self) -> dict[str, float]:
+        """Percentiles of images that are reconstructed worse than nearly all the model was validated on."""
+        return {path: at for path, at in self.percentiles.items() if at > OUTLIER_PERCENTILE}
+
+    def notes(self) -> list[str]:
+        """Lines for a person: what was left out, what is out-of-distribution, what was cropped."""
+        lines = [f"left out {path}: {reason}" for path, reason in self.refused.items()]
+        if self.percentiles:
+            span = _span(self.percentiles.values())
+            lines.append(f"reconstructed worse than {span} % of the images this model was validated on")
+        hint = "" if self.crops else ", or not in the crop it knows (--crop auto searches for that)"
+        lines += [
+            f"{path}: reconstructed worse than {OUTLIER_PERCENTILE:g} % of the images this model was "
+            f"validated on; it may be out-of-distribution{hint}"
+            for path in self.out_of_distribution
+        ]
+        if self.crops:
+            sides = [100 * crop.side for crop in self.crops.values() if crop != WHOLE]
+            part = f"shown in part, {_span(sides)} % of their side: " if sides else "shown in part: "
+            lines.append(f"{part}{len(sides):,} of {len(self.crops):,} images")
+        return lines
+
+    def values(self) -> dict[str, Any]:
+        """All of it as JSON can hold it."""
+        crops = {"framing": {path: vars(crop) for path, crop in self.crops.items()}} if self.crops else {}
+        return {
+            "out": self.out,
+            "pictures": self.images,
+            "refused": self.refused,
+            "reconstruction_percentile": self.percentiles,
+            **crops,
+            "sheets": self.sheets,
+        }
+
+
+def write_images(
+    opener: ImageOpener,
+    paths: Sequence[Path],
+    out: Path,
+    edit: Callable[[OpenedImage], Edited],
+    *,
+    force: bool = False,
+    sheet: bool | None = None,
+    beside: Sequence[OpenedImage] = (),
+    progress: Callable[[int, int], object] | None = None,
+) -> WrittenImages:
+    """Edit images, and write a folder for each.
+
+    Args:
+        opener: a model and how images are read and drawn.
+        paths: image files.
+        out: folder of the folders.
+        edit: makes of an opened image what is written.
+        force: replace what is there.
+        sheet: also draw a row for every image as sheet.png; by default for two images or more.
+        beside: images that the edit takes something from; percentiles and crops list them, too.
+        progress: called with (images done, images in all).
+
+    Raises:
+        FileExistsError: something would be replaced, and ``force`` is off.
+        ValueError: no image can be read, or what was requested is impossible.
+    """
+    read, refused = _readable(opener, paths)
+    with_sheet = len(read) > 1 if sheet is None else sheet
+    sheets, records = Sheets(), []
+    folders = _free_places(list(read), out, sheets.rows if with_sheet else None, force)
+    images = opener.decomposed(read)
+    for image, folder in zip(images, folders, strict=True):
+        made = edit(opener.finer(image))
+        with atomic_folder(folder) as temporary:
+            records.append(made.write(temporary, {"picture": str(image.path), "folder": str(folder)}))
+        if with_sheet and made.row:
+            sheets.add(image.path.name, made.row)
+        if progress is not None:
+            progress(len(records), len(images))
+    files = _sheet_files(out, len(sheets), sheets.rows)
+    for file, drawn in zip(files, sheets.drawn(), strict=True):
+        with atomic_file(file) as temporary:
+            drawn.save(temporary, format="PNG")
+    every = [*images, *beside]
+    percentiles = {str(one.path): one.percentile for one in every if one.percentile is not None}
+    crops = {str(one.path): one.crop for one in every} if opener.options.cropped else {}
+    return WrittenImages(out, records, files, refused, percentiles, crops)
+
+
+def _readable(
+    opener: ImageOpener, paths: Sequence[Path]
+) -> tuple[dict[Path, tuple[np.ndarray, Crop]], dict[str, str]]:
+    """The images that can be read, and reasons why the others cannot."""
+    read: dict[Path, tuple[np.ndarray, Crop]] = {}
+    refused: dict[str, str] = {}
+    for path in dict.fromkeys(paths):
+        try:
+            read[path] = opener.read(path)
+        except (ValueError, OSError) as problem:
+            refused[str(path)] = " ".join(str(problem).split())
+    if not read:
+        raise ValueError(next(iter(refused.values()), "give at least one image"))
+    return read, refused
+
+
+def _free_places(images: Sequence[Path], out: Path, sheet_rows: int | None, force: bool) -> list[Path]:
+    """A folder in ``out`` for each image, named after it; what is there already is an error."""
+    if out.exists() and not out.is_dir():
+        raise NotADirectoryError(f"{out} is a file: name a folder to write to")
+    names: dict[str, Path] = {}
+    for image in images:
+        name, number = image.stem or "picture", 2
+        while name.casefold() in names:
+            name, number = f"{image.stem}-{number}", number + 1
+        names[name.casefold()] = out / name
+    folders = list(names.values())
+    sheets = [] if sheet_rows is None else _sheet_files(out, len(images), sheet_rows)
+    existing = [place for place in (*folders, *sheets) if place.exists()]
+    if existing and not force:
+        raise FileExistsError(
+            f"{existing[0]} exists already: choose another --out, or add --force to replace it"
+        )
+    return folders
+
+
+def _sheet_files(out: Path, count: int, rows: int) -> list[Path]:
+    """``sheet.png``, or ``sheet-1.png`` and so on where the rows fill several."""
+    number = -(-count // rows)
+    return [out / ("sheet.png" if number == 1 else f"sheet-{index}.png") for index in range(1, number + 1)]
+
+
+def _span(values: Iterable[float]) -> str:
+    """The lowest and highest of some numbers, rounded."""
+    rounded = sorted(round(value) for value in values)
+    return f"{rounded[0]}" if rounded[0] == rounded[-1] else f"{rounded[0]} to {rounded[-1]}"

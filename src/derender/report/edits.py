@@ -1,0 +1,200 @@
+"""One image under other lighting, from other viewpoints, or with a factor of another image.
+
+``relit``, ``rotated`` and ``swapped_factors`` take an opened image (``opening``) and return an ``Edit``:
+stills, their numbers and the frames of a film. On disk an edit is strip.png (labelled), each still as a PNG
+with transparency, film.gif, film.mp4, and moved.json with the numbers of every still.
+"""
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from math import ceil, degrees, log10
+from pathlib import Path
+from typing import Any
+
+from PIL import Image
+from torch import Tensor
+
+from derender.features import named
+from derender.model import Derenderer
+from derender.report import sweeps
+from derender.report.colours import Images, pictures
+from derender.report.films import FILMS
+from derender.report.opening import FilmOptions, OpenedImage
+from derender.report.panel import GridLayout, labelled_grid
+
+SMALLEST_CELL = 128
+
+
+@dataclass(frozen=True)
+class Edit:
+    """One edited image.
+
+    Attributes:
+        inputs: what it was made from, by label; these come first in the strip.
+        stills: what came out, by label.
+        numbers: what holds in each still, by the same labels: anything JSON can hold.
+        frames: of a film; empty for none.
+        films: kinds of film that are written.
+        seconds: length of the film.
+    """
+
+    inputs: Mapping[str, Image.Image]
+    stills: Mapping[str, Image.Image]
+    numbers: Mapping[str, Any]
+    frames: Images = field(default_factory=list)
+    films: Sequence[str] = ()
+    seconds: float = 2.4
+
+    @property
+    def row(self) -> dict[str, Image.Image]:
+        """All images by label, in the order of the strip."""
+        return {**self.inputs, **self.stills}
+
+    def strip(self) -> Image.Image:
+        """All images in one labelled row, as large as the stills are, and large enough to see."""
+        cell = max(SMALLEST_CELL, *(still.width for still in self.stills.values()))
+        return labelled_grid(
+            {name: [image] for name, image in self.row.items()}, layout=GridLayout(cell=cell)
+        )
+
+    def write(self, folder: Path, record: Mapping[str, Any]) -> dict[str, Any]:
+        """Write all files; returns the content of moved.json: the record, and each still's numbers."""
+        self.strip().save(folder / "strip.png")
+        stills = []
+        for number, (label, still) in enumerate(self.stills.items(), 1):
+            name = f"still-{number:02d}.png"
+            still.save(folder / name)
+            stills.append({"file": name, "label": label, **self.numbers[label]})
+        for kind in self.films if self.frames else ():
+            (folder / f"film.{kind}").write_bytes(FILMS[kind](self.frames, self.seconds))
+        written = {**record, "stills": stills}
+        text = json.dumps(written, indent=1, ensure_ascii=False)
+        (folder / "moved.json").write_text(text, encoding="utf-8")
+        return written
+
+
+def relit(
+    model: Derenderer,
+    image: OpenedImage,
+    *,
+    reach_deg: float = 60.0,
+    pitch_deg: float = 10.0,
+    strength: float = 1.0,
+    like: OpenedImage | None = None,
+    film: FilmOptions | None = None,
+) -> Edit:
+    """The image under other lighting: from right to left, or from its own to that of another image.
+
+    Args:
+        model: renders the scenes.
+        image: is relit.
+        reach_deg, pitch_deg: how far to the sides, and how high, the light goes, in degrees.
+        strength: of the light, in multiples of the image's own.
+        like: an image whose lighting is approached instead.
+        film: stills and frames.
+    """
+    film = film or FilmOptions()
+    angle = _angle_text(reach_deg, film.stills)
+
+    def lights(t: Tensor) -> Tensor:
+        if like is not None:
+            return sweeps.lights_between(t, image.scene.light[0], like.scene.light[0])
+        own = float(image.scene.light[0, :2].sum())
+        return sweeps.lights_around(t, reach_deg, pitch_deg, strength * own)
+
+    def label(place: float, row: Tensor) -> str:
+        return f"light {angle(degrees(row[3]))}" if like is None else f"{place:.0%} of its light"
+
+    return _swept(model, image, like, "light", lights, label, film)
+
+
+def rotated(
+    model: Derenderer,
+    image: OpenedImage,
+    *,
+    reach_deg: float = 40.0,
+    pitch_deg: float = 0.0,
+    film: FilmOptions | None = None,
+) -> Edit:
+    """The image rotated from one side to the other, ``reach_deg`` to each, in its own lighting."""
+    film = film or FilmOptions()
+    angle = _angle_text(reach_deg, film.stills)
+    return _swept(
+        model,
+        image,
+        None,
+        "camera",
+        lambda t: sweeps.cameras_around(t, reach_deg, pitch_deg),
+        lambda _, row: f"yaw {angle(degrees(row[1]))}",
+        film,
+    )
+
+
+def swapped_factors(
+    model: Derenderer, image: OpenedImage, donor: OpenedImage, factors: Sequence[str] = ()
+) -> Edit:
+    """The image with one factor of another, for each of ``factors`` by itself (default: every factor)."""
+    parameters = swappable(model, factors)
+    stills = {
+        f"its {name}": sweeps.drawn(sweeps.swapped(image.scene, donor.scene, parameter), model.render)[0]
+        for name, parameter in parameters.items()
+    }
+    numbers = {f"its {name}": {"factor": name, "from": str(donor.path)} for name in parameters}
+    return Edit(_inputs(model, image, donor), stills, numbers)
+
+
+def swappable(model: Derenderer, factors: Sequence[str] = ()) -> dict[str, str]:
+    """Factor to scene parameter; an unknown factor is an error that suggests another."""
+    parameters = {row.name: row.parameter for row in model.factors}
+    return {name: named(parameters, name, "factor") for name in factors or parameters}
+
+
+def _swept(
+    model: Derenderer,
+    image: OpenedImage,
+    other: OpenedImage | None,
+    parameter: str,
+    values: Callable[[Tensor], Tensor],
+    label: Callable[[float, Tensor], str],
+    film: FilmOptions,
+) -> Edit:
+    """Stills and film of one scene along a sweep of one parameter."""
+
+    def drawn(rows: Tensor) -> Images:
+        return sweeps.drawn(sweeps.varied(image.scene, **{parameter: rows}), model.render)
+
+    places = sweeps.stills(film.stills)
+    rows = values(places)
+    labels = [label(place, row) for place, row in zip(places.tolist(), rows, strict=True)]
+    return Edit(
+        _inputs(model, image, other),
+        dict(zip(labels, drawn(rows), strict=True)),
+        {text: {parameter: row} for text, row in zip(labels, rows.tolist(), strict=True)},
+        drawn(values(sweeps.there_and_back(film.frames))) if film.kinds else [],
+        film.kinds,
+        film.seconds,
+    )
+
+
+def _inputs(
+    model: Derenderer, image: OpenedImage, other: OpenedImage | None = None
+) -> dict[str, Image.Image]:
+    shown = {
+        "input": pictures(image.pixels[None])[0],
+        "reconstruction": sweeps.drawn(image.scene, model.render)[0],
+    }
+    return shown if other is None else {**shown, "the other": pictures(other.pixels[None])[0]}
+
+
+def _angle_text(reach_deg: float, stills: int) -> Callable[[float], str]:
+    """How angles of a sweep are written: with as many decimals as distinguish its stills."""
+    if reach_deg <= 0:
+        raise ValueError(f"reach must be above 0 degrees, got {reach_deg:g}")
+    decimals = max(0, ceil(-log10(2 * reach_deg / (stills - 1))))
+
+    def written(angle_deg: float) -> str:
+        number = f"{angle_deg:+.{decimals}f}"
+        return f"{number if float(number) else number[1:]}°"
+
+    return written
