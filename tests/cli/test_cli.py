@@ -14,7 +14,7 @@ from PIL import Image
 from derender import FeatureTable, __version__
 from derender.cli import main
 from derender.cli.console import duration, plain
-from derender.report.figures import COLUMN_MEANING
+from derender.report.decomposition import COLUMN_MEANING
 
 COMMANDS = [
     ["demo"],

@@ -1,4 +1,4 @@
-"""`--frame auto`: commands that take pictures by name show a model the part that it knows."""
+"""`--crop auto` (formerly `--frame`): a model is shown the part of an image that it knows."""
 
 import json
 from pathlib import Path
@@ -38,10 +38,10 @@ def _run(command: str, photos: Path, out: Path, *words: str) -> dict:
 
 def test_the_part_is_found_told_and_drawn(photos, tmp_path, capsys):
     whole = _run("decompose", photos, tmp_path / "whole")
-    assert "--frame auto looks for the part" in capsys.readouterr().err and "framing" not in whole
-    found = _run("decompose", photos, tmp_path / "framed", "--frame", "auto")
+    assert "--crop auto searches for that" in capsys.readouterr().err and "framing" not in whole
+    found = _run("decompose", photos, tmp_path / "framed", "--crop", "auto")
     said = capsys.readouterr().err
-    assert "shown in part, 70 % of their side: 1 of 2 pictures" in said and "--frame auto" not in said
+    assert "shown in part, 70 % of their side: 1 of 2 images" in said and "--crop auto" not in said
     near, wide = (found["framing"][str(photos / name)] for name in ("near.png", "wide.png"))
     assert near == {"side": 1.0, "across": 0.0, "down": 0.0}
     odd, percentile = (one["reconstruction_percentile"][str(photos / "wide.png")] for one in (whole, found))
@@ -66,6 +66,6 @@ def test_detail_films_and_meshes_are_of_the_same_part(photos, tmp_path):
 def test_another_word_is_refused(photos, tmp_path, capsys):
     for command in ("decompose", "rotate", "mesh"):
         words = [command, "-m", KNOWN, str(photos / "near.png"), "-o", str(tmp_path / "out")]
-        assert main([*words, "--frame", "atuo"]) == 2
-        assert "unknown --frame 'atuo'; did you mean 'auto'?" in capsys.readouterr().err
+        assert main([*words, "--crop", "atuo"]) == 2
+        assert "unknown crop 'atuo'; did you mean 'auto'?" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()

@@ -114,20 +114,20 @@ def test_command_writes_page_and_numbers(tmp_path, monkeypatch, capsys):
     assert numbers["geometry"]["plane"]["MAD"] > 0 and numbers["clustering"]["pixels"]["accuracy"] > 0
 
 
-def test_the_model_that_comes_along_stands_beside_and_is_named(told, html):
+def test_the_bundled_model_is_beside_and_named(told, html):
     result, _ = told
-    assert "The model that comes with derender" in html
+    assert "The bundled model" in html
     assert html.count("by rendered-faces-64: the light goes round") == 4
     for column in ("reconstruction", "normals", "albedo", "another view"):
-        assert f"{column}, rendered-faces-64: rendered face 7" in html
-    assert result.shipped_geometry is None and "beside" not in score_tables(result)  # 32 pixels, not 64
+        assert f"{column}, rendered-faces-64: rendered face 4" in html
+    assert result.bundled_geometry is None and "beside" not in score_tables(result)  # 32 pixels, not 64
 
 
 def test_both_models_are_scored_on_the_same_faces(told):
     result, _ = told
     geometry = result.geometry
     better = replace(geometry, model=replace(geometry.model, side=0.001))
-    table = score_tables(replace(result, shipped_geometry=better))["beside"]
+    table = score_tables(replace(result, bundled_geometry=better))["beside"]
     assert [row.name for row in table.rows][:2] == ["this run", "rendered-faces-64"]
     assert table.rows[0].cells[0] == 100 * geometry.model.side and table.rows[1].cells[0] == 0.1
     assert not table.rows[1].control
