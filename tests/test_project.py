@@ -250,19 +250,25 @@ def test_tests_mirror_the_package():
             assert list((ROOT / "tests" / stage).rglob("test_*.py")), f"{stage} has code and no test"
 
 
-def readme_tree() -> dict[str, str]:
-    """The paths drawn in the README's tree, with the phrase beside each."""
-    drawn = re.search(r"```text\nsrc/derender/\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
-    assert drawn is not None, "the README shows the tree of src/derender in a ```text block"
+def drawn_tree() -> dict[str, str]:
+    """The paths drawn in docs/architecture.md, with the phrase beside each."""
+    text = (ROOT / "docs" / "architecture.md").read_text()
+    drawn = re.search(r"```text\nsrc/derender/\n(.*?)```", text, re.DOTALL)
+    assert drawn is not None, "docs/architecture.md shows the tree of src/derender in a ```text block"
     rows = [re.match(r"[├└]── (\S+)\s+(.*)", line) for line in drawn[1].splitlines()]
     return {row[1].rstrip("/"): row[2] for row in rows if row is not None}
 
 
-def test_the_readme_tree_is_the_tree():
-    drawn = readme_tree()
+def test_the_drawn_tree_is_the_tree():
+    drawn = drawn_tree()
     real = {path.name for path in PACKAGE.iterdir() if path.name not in {"__pycache__", "__init__.py"}}
     assert set(drawn) == real
     assert all(drawn.values()), "a phrase per file"
+
+
+def test_the_readme_is_short():
+    lines = (ROOT / "README.md").read_text().splitlines()
+    assert len(lines) <= 150 and max(map(len, lines)) <= 120
 
 
 @pytest.mark.parametrize("path", DOCS, ids=lambda path: str(path.relative_to(ROOT)))
