@@ -48,7 +48,7 @@ from derender.model import Derenderer  # noqa: E402
 from derender.render import render  # noqa: E402
 from derender.render.rasterize import rasterize  # noqa: E402
 from derender.scene.camera import focal_px, to_camera, unproject  # noqa: E402
-from derender.training.determinism import deterministic_algorithms  # noqa: E402
+from derender.training.process import deterministic_algorithms  # noqa: E402
 
 FOV_DEG = 10.0
 AGREEMENT = 1e-5  # of the largest value, float32

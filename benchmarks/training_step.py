@@ -29,10 +29,10 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from derender.model import Derenderer
 from derender.objectives import Vgg16Features
-from derender.training.allocator import freed_memory_kept
 from derender.training.config import resolve
-from derender.training.loop import network_precision
+from derender.training.process import freed_memory_kept
 from derender.training.step import training_step
+from derender.training.task import network_precision
 
 CONFIG = resolve("paper")
 LOSS_TOLERANCE = 1e-5

@@ -13,7 +13,7 @@ from safetensors.torch import load_file, save_file
 import derender
 from derender.baselines import baseline_config, load_baseline, read_any_config
 from derender.baselines.registry import config_type
-from derender.baselines.training import BaselineLosses, BaselineTask, FiniteWatch
+from derender.baselines.training import BaselineTask
 from derender.features import embed_pictures
 from derender.report.baseline_sheet import baseline_sheet
 from derender.report.run import run_page
@@ -22,6 +22,8 @@ from derender.training.checkpoint import WEIGHTS_FILE
 from derender.training.config import config_from_tree
 from derender.training.loop import train_task
 from derender.training.run_folder import read_config, read_metrics
+from derender.training.task import StepLosses
+from derender.training.watch import FiniteWatch
 
 COMMON = ["image_size=32", "width=8", "batch_size=8", "checkpoint_every=24", "validate_every=24"]
 COMMON += ["sample_every=48", "deterministic=true"]
@@ -101,8 +103,8 @@ def test_physical_views_train_and_the_renderer_stays_out_of_the_checkpoint(blobs
 
 def test_a_loss_that_is_no_number_stops_the_run(blobs, tmp_path):
     watch = FiniteWatch()
-    assert watch.look(8, BaselineLosses(torch.tensor(1.0), {})) == ()
-    (finding,) = watch.look(8, BaselineLosses(torch.tensor(float("nan")), {}))
+    assert watch.look(8, StepLosses(torch.tensor(1.0), {})) == ()
+    (finding,) = watch.look(8, StepLosses(torch.tensor(float("nan")), {}))
     assert finding.fatal and "nan" in finding.text
     result = train_task(task("ae", 480, "learning_rate=1e30"), blobs, tmp_path / "run")
     assert result.stopped == "collapse" and result.images < 480

@@ -279,13 +279,13 @@ def test_resume_takes_the_stored_settings(run, faces, tmp_path, capsys):
 
 
 def test_ctrl_c_says_how_to_go_on(faces, tmp_path, monkeypatch, capsys):
-    from derender.training import loop
-    from derender.training.interrupt import TrainingInterrupted
+    from derender.training import derender_task
+    from derender.training.process import TrainingInterrupted
 
     def interrupted(*_, **__):
         raise TrainingInterrupted("stopped after 32 pictures; run the same command with --resume to go on")
 
-    monkeypatch.setattr(loop, "train", interrupted)
+    monkeypatch.setattr(derender_task, "train", interrupted)
     assert main(["train", "--data", str(faces), "--out", str(tmp_path / "run"), *SETTINGS]) == 130
     assert capsys.readouterr().err.splitlines()[-1].endswith("with --resume to go on")
 

@@ -6,7 +6,7 @@ import sys
 import pytest
 import torch
 
-from derender.training.allocator import freed_memory_kept
+from derender.training.process import freed_memory_kept
 
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="mallopt is glibc's")
 

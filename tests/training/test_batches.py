@@ -8,7 +8,6 @@ import torch
 from derender.training import batches as batches_module
 from derender.training.batches import Batches, Reader, random_stream
 from derender.training.config import OptimiserSettings
-from derender.training.schedule import learning_rate
 
 
 def numbered(count: int) -> torch.Tensor:
@@ -57,7 +56,7 @@ def test_about_half_of_the_pictures_are_mirrored():
 
 def test_a_batch_larger_than_the_set_is_refused():
     with pytest.raises(
-        ValueError, match="batch_size 64 is more than the 12 training pictures: set batch_size=6"
+        ValueError, match="batch_size 64 is more than the 12 training images: set batch_size=6"
     ):
         Batches(numbered(12), 64, 0, True)
 
@@ -115,9 +114,9 @@ def test_streams_differ_by_purpose_and_position_and_repeat():
 
 def test_learning_rate_warms_up_then_falls_along_a_cosine():
     settings = OptimiserSettings(learning_rate=1e-3, warmup_images=100, final_rate=0.1)
-    rates = [learning_rate(settings, images, 1100) for images in (0, 49, 99, 100, 600, 1100, 5000)]
+    rates = [settings.rate(images, 1100) for images in (0, 49, 99, 100, 600, 1100, 5000)]
     assert rates == pytest.approx([1e-5, 5e-4, 1e-3, 1e-3, 5.5e-4, 1e-4, 1e-4])
 
 
 def test_learning_rate_is_constant_by_default():
-    assert learning_rate(OptimiserSettings(), 0, 100) == learning_rate(OptimiserSettings(), 99, 100) == 1e-4
+    assert OptimiserSettings().rate(0, 100) == OptimiserSettings().rate(99, 100) == 1e-4

@@ -9,9 +9,8 @@ from torch import nn
 from derender.model import Derenderer
 from derender.objectives import SelfFeatures
 from derender.render import render_scene
-from derender.training.chunks import in_chunks
 from derender.training.config import ObjectiveSettings, resolve
-from derender.training.step import training_step
+from derender.training.step import in_chunks, training_step
 
 OBJECTIVE = ObjectiveSettings(loocc="all", cycle_weight=1.0, smoothness_weight=0.1)
 FEATURES = SelfFeatures((4, 8, 8))

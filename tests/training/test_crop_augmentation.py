@@ -4,14 +4,9 @@ import pytest
 import torch
 from torch import Tensor
 
-import derender
-from derender.data.synthetic import faces
 from derender.scene.crop import CropSettings, crop_images, other_surroundings, random_crops
-from derender.scene.perturb import PerturbSettings
 from derender.training.batches import Batches
-from derender.training.config import WhiteningSettings
 from derender.training.distributed import Ranks
-from derender.training.whitening import fit_whitening
 
 STILL = {"nearer": 1, "farther": 1, "shift": 0, "roll_deg": 0}
 
@@ -101,24 +96,3 @@ def test_batches_are_framed_anew_the_same_way_every_time_and_on_several_devices(
 def test_impossible_frames_are_refused(wrong):
     with pytest.raises(ValueError, match=next(iter(wrong))):
         CropSettings(**wrong)
-
-
-def test_frames_as_views_make_features_move_less_with_the_frame():
-    images = torch.from_numpy(faces.generate(264, image_size=64, seed=5).images)
-    model = derender.load("faces-64")
-    model.fitting = None
-    unseen = images[200:].float() / 255
-    moved = crop_images(unseen, random_crops(64, torch.Generator().manual_seed(9), CropSettings()))
-    found = {}
-    for frames in (0, 2):
-        settings = WhiteningSettings(
-            pictures=200, views=2, directions=16, frames=frames, spatial=False, vectors=False
-        )
-        model.whitening = fit_whitening(model, images[:200], settings, PerturbSettings())
-        with torch.no_grad():
-            one, two = model.embed(unseen), model.embed(moved)
-        found[frames] = {
-            name: float((one[name] - two[name]).norm(dim=1).mean() / one[name].std(dim=0).norm())
-            for name in ("geometry", "albedo")
-        }
-    assert all(found[2][name] < 0.9 * found[0][name] for name in found[2])

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from derender.training.determinism import deterministic_algorithms
+from derender.training.process import deterministic_algorithms
 
 
 @pytest.mark.parametrize("before", [False, True])

@@ -12,7 +12,7 @@ SCORE = "from torchmetrics.functional.classification import multiclass_stat_scor
 def test_torchmetrics_is_whole_for_whoever_asks_for_it(order):
     fabric = """
 import sys
-from derender.training.fabric import DDPStrategy, Fabric
+from derender.training.distributed import DDPStrategy, Fabric
 loaded = sorted(name for name in sys.modules if name.split(".")[0] == "torchmetrics")
 """
     code = f"{fabric}assert not loaded, loaded\n{SCORE}" if order == "fabric first" else f"{SCORE}{fabric}"

@@ -23,9 +23,9 @@ from derender.storage.atomic import DamageNoticed
 from derender.training import TrainingInterrupted, resolve, train
 from derender.training.batches import Batches
 from derender.training.checkpoint import WEIGHTS_FILE, load_checkpoint
-from derender.training.loop import Progress
+from derender.training.loop import kept
 from derender.training.run_folder import read_config, read_metrics
-from derender.training.schedule import kept
+from derender.training.task import Progress
 
 TINY = ["image_size=32", "width=8", "light_width=4", "perceptual=none", "batch_size=8", "checkpoint_every=32"]
 TINY += [
@@ -142,7 +142,7 @@ def test_an_interrupted_run_is_saved_and_resumes_exactly(pictures, tmp_path):
             os.kill(os.getpid(), signal.SIGINT)
 
     config = resolve("small", [*TINY, "images=160", "warmup_images=40", "final_rate=0.1"])
-    with pytest.raises(TrainingInterrupted, match=r"stopped after 72 pictures and saved.*--resume"):
+    with pytest.raises(TrainingInterrupted, match=r"stopped after 72 images and saved.*--resume"):
         train(config, pictures, tmp_path / "parts", progress=press_ctrl_c)
     train(config, pictures, tmp_path / "parts", resume=True)
     train(config, pictures, tmp_path / "whole")
@@ -278,7 +278,7 @@ def test_a_damaged_checkpoint_is_named(pictures, tmp_path):
 def test_one_picture_or_too_few_for_a_batch_is_refused_before_a_folder_is_made(pictures, tmp_path):
     with pytest.raises(ValueError, match="only one picture was found"):
         train(resolve("small", TINY), pictures.select([0]), tmp_path / "run")
-    with pytest.raises(ValueError, match="batch_size 64 is more than the 48 training pictures"):
+    with pytest.raises(ValueError, match="batch_size 64 is more than the 48 training images"):
         train(resolve("small", [*TINY, "batch_size=64"]), pictures, tmp_path / "run")
     assert not (tmp_path / "run").exists()
 

@@ -6,10 +6,10 @@ import pytest
 import torch
 
 from derender.model import Derenderer
-from derender.training.config import ObjectiveSettings
-from derender.training.sharing import own_share, share_codes
-from derender.training.step import training_step
-from derender.training.step_module import StepModule, compute_step
+from derender.training.config import ObjectiveSettings, TrainConfig
+from derender.training.derender_task import DerenderStep
+from derender.training.step import own_share, share_codes, training_step
+from derender.training.task import compute_step
 
 OBJECTIVE = ObjectiveSettings(perceptual="none", curvature_weight=0.0, template_share=0.1, release_share=0.2)
 
@@ -51,7 +51,7 @@ def test_a_shared_template_leaves_cameras_and_lights_their_own(model, generator)
 
 def test_the_step_follows_the_run_and_validation_does_not(model, generator):
     images = torch.rand(4, 3, 32, 32, generator=generator)
-    module = StepModule(model, OBJECTIVE, None)
+    module = DerenderStep(model, TrainConfig(objective=OBJECTIVE), None)
 
     def depth(done):
         return compute_step(module, images, generator, nullcontext, done).scene.depth
@@ -60,16 +60,3 @@ def test_the_step_follows_the_run_and_validation_does_not(model, generator):
     torch.testing.assert_close(depth(None), model.decompose(images).depth)
     torch.testing.assert_close(depth(0.3), depth(None))
     assert (depth(None)[0] != depth(None)[1]).any()
-
-
-def test_loocc_and_its_cycle_begin_after_their_share_of_the_run(model, generator):
-    images = torch.rand(4, 3, 32, 32, generator=generator)
-    late = OBJECTIVE.model_copy(update={"loocc": "light+camera", "cycle_weight": 1.0, "loocc_after": 0.5})
-    module = StepModule(model, late, None)
-
-    def terms(done):
-        return compute_step(module, images, generator, nullcontext, done).terms.keys()
-
-    without = compute_step(StepModule(model, OBJECTIVE, None), images, generator, nullcontext, 0.49).terms
-    assert terms(0.49) == without.keys()
-    assert terms(0.5) == terms(None) == terms(0.49) | {"loocc", "cycle"}

@@ -65,7 +65,7 @@ def test_a_taught_decoder_is_left_behind(tmp_path):
     assert begun.unet_decoder is None and config.model.network.encoder == "unet"
     weights = taught.state_dict()
     assert all(torch.equal(value, weights[name]) for name, value in begun.state_dict().items())
-    with pytest.raises(ValueError, match="rendering trains none, derender unet teaches one"):
+    with pytest.raises(ValueError, match="rendering trains none, derender unet distils one"):
         resolve("small", ["unet_decoder=true"])
 
 

@@ -13,8 +13,8 @@ from derender.data.synthetic import faces
 from derender.scene import Scene
 from derender.scene.ranges import SceneRanges
 from derender.training import resolve, train
+from derender.training.loop import FIRST_KEPT_IMAGES
 from derender.training.run_folder import read_metrics
-from derender.training.schedule import FIRST_KEPT_IMAGES
 from derender.training.watch import SIGNS, Watcher, measure
 
 RANGES = SceneRanges()
@@ -71,7 +71,7 @@ def watch(scene: Scene, images: int, watcher: Watcher | None = None) -> list[str
     watcher = watcher or Watcher(RANGES, BATCH)
     findings = ()
     for seen in range(STEP, images + 1, STEP):
-        findings = watcher.look(seen, 0.1, scene)
+        findings = watcher.judge(seen, 0.1, scene)
     return [finding.sign for finding in findings]
 
 
@@ -93,7 +93,7 @@ def test_each_failure_is_found_within_20000_images_but_not_at_once(sign):
 def test_findings_say_what_is_seen_and_what_to_change(sign):
     watcher = Watcher(RANGES, BATCH)
     for seen in range(STEP, 20_001, STEP):
-        findings = watcher.look(seen, 0.1, FAILED_SCENES[sign])
+        findings = watcher.judge(seen, 0.1, FAILED_SCENES[sign])
     found = next(finding for finding in findings if finding.sign == sign)
     assert "{" not in found.text
     assert any(character.isdigit() for character in found.text)
@@ -112,17 +112,17 @@ def test_a_failure_that_passes_is_forgiven():
     watcher = Watcher(RANGES, BATCH)
     failed = FAILED_SCENES["view at its bound"]
     for seen in range(STEP, 6_001, STEP):
-        watcher.look(seen, 0.1, failed)
+        watcher.judge(seen, 0.1, failed)
     assert watcher.uneasy
     for seen in range(6_500, 20_001, STEP):
-        findings = watcher.look(seen, 0.1, healthy_scene())
+        findings = watcher.judge(seen, 0.1, healthy_scene())
     assert findings == ()
     assert not watcher.uneasy
 
 
 @pytest.mark.parametrize("loss", [math.nan, math.inf])
 def test_a_loss_that_is_no_number_is_fatal_at_once(loss):
-    (finding,) = Watcher(RANGES, BATCH).look(16, loss, healthy_scene())
+    (finding,) = Watcher(RANGES, BATCH).judge(16, loss, healthy_scene())
     assert finding.fatal
     assert finding.sign == "non-finite loss"
 
@@ -132,7 +132,7 @@ def test_a_watcher_goes_on_from_its_memory():
     first = Watcher(RANGES, BATCH)
     assert watch(failed, 7_000, first) == []
     second = Watcher.remembering(RANGES, BATCH, first.memory())
-    (finding,) = second.look(9_000, 0.1, failed)
+    (finding,) = second.judge(9_000, 0.1, failed)
     assert finding.sign == "view at its bound"
 
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import nn
 
-from derender.training.weights import fit_weights
+from derender.training.checkpoint import fit_weights
 
 
 def net(width: int = 3) -> nn.Module:

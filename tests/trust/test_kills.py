@@ -136,7 +136,7 @@ DAMAGES = {
 @pytest.mark.parametrize("damage", DAMAGES)
 def test_a_damaged_last_checkpoint_falls_back_to_the_one_before_and_says_so(net, run, file, damage):
     DAMAGES[damage](run / "last" / file)
-    with pytest.warns(DamageNoticed, match=r"last is damaged \(.*going on from .* before it, of 8 pictures"):
+    with pytest.warns(DamageNoticed, match=r"last is damaged \(.*going on from .* before it, of 8 images"):
         images, note = net.resumed(run)
     assert images == 8 and note is not None
     DAMAGES[damage](run / "previous" / file)

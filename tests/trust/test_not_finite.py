@@ -8,7 +8,6 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from derender.baselines.training import BaselineLosses, FiniteWatch
 from derender.data import PictureSet
 from derender.features.extract import embed_pictures
 from derender.model import Derenderer
@@ -22,11 +21,11 @@ from derender.scene import Scene
 from derender.scene.perturb import PerturbSettings
 from derender.training import resolve, train
 from derender.training.config import ObjectiveSettings, WhiteningSettings
-from derender.training.derender_task import DerenderTask, SceneWatch
-from derender.training.finite import broken_gradient, first_not_finite
+from derender.training.derender_task import DerenderTask
 from derender.training.held_out_errors import NotFinite, errors_of
 from derender.training.step import training_step
-from derender.training.watch import Finding, Watcher
+from derender.training.task import StepLosses
+from derender.training.watch import Finding, FiniteWatch, Watcher, broken_gradient, first_not_finite
 from derender.training.whitening import fit_whitening
 
 SIZE = 32
@@ -68,7 +67,7 @@ def what_is_said(model: Derenderer, images: Tensor, perceptual: nn.Module | None
     """What the watcher of a training says of one step; it has to end the run."""
     objective = ObjectiveSettings(loocc="light+camera", perceptual="self" if perceptual else "none")
     result = training_step(model, images, objective, perceptual, torch.Generator().manual_seed(0))  # type: ignore[arg-type]
-    watch = SceneWatch(Watcher(model.settings.ranges, 4))
+    watch = Watcher(model.settings.ranges, 4)
     findings = watch.look(len(images), result)
     assert watch.uneasy and findings and findings[0].fatal
     return findings[0].text
@@ -77,7 +76,7 @@ def what_is_said(model: Derenderer, images: Tensor, perceptual: nn.Module | None
 def test_a_sound_step_raises_nothing(model, images):
     result = training_step(model, images, ObjectiveSettings(perceptual="none"), None, torch.Generator())
     result.total.backward()
-    assert SceneWatch(Watcher(model.settings.ranges, 4)).look(4, result) == ()
+    assert Watcher(model.settings.ranges, 4).look(4, result) == ()
     assert broken_gradient(model) is None
 
 
@@ -146,7 +145,7 @@ def test_a_depth_that_is_no_number_leaves_the_loss_finite_and_is_seen_all_the_sa
     spoil(model.nets["geometry"].decoder, nan)
     objective = ObjectiveSettings(perceptual="none", curvature_weight=0, confidence=False)
     result = training_step(model, images, objective, None, torch.Generator().manual_seed(0))
-    (finding,) = SceneWatch(Watcher(model.settings.ranges, 4)).look(4, result)
+    (finding,) = Watcher(model.settings.ranges, 4).look(4, result)
     assert "the predicted depth" in finding.text
     assert result.total.isfinite()
 
@@ -223,7 +222,7 @@ def test_held_out_pictures_that_are_rendered_as_no_numbers_end_a_run(tmp_path, m
         model.nets["albedo"].decoder.register_forward_hook(hook)
 
     (finding,) = run_of(spoiler, tmp_path / "run", monkeypatch)
-    assert "the loss of held-out pictures is not finite" in finding.text
+    assert "the loss of held-out images is not finite" in finding.text
 
 
 @pytest.mark.parametrize("bad", [nan, inf])
@@ -270,5 +269,5 @@ def test_held_out_errors(model):
 
 def test_baselines():
     terms = {"l1": torch.tensor(0.1), "commitment": torch.tensor(nan)}
-    (finding,) = FiniteWatch().look(4, BaselineLosses(torch.tensor(nan), terms))
+    (finding,) = FiniteWatch().look(4, StepLosses(torch.tensor(nan), terms))
     assert finding.fatal and "the first term that is not finite is 'commitment'" in finding.text

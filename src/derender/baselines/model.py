@@ -22,8 +22,8 @@ from derender.data import suggestion
 from derender.settings import Settings
 from derender.storage.atomic import atomic_folder
 from derender.storage.tensors import read_tensors, write_tensors
-from derender.training.step import Precision
-from derender.training.weights import fit_weights
+from derender.training.checkpoint import fit_weights
+from derender.training.task import Precision
 
 FORMAT = 1
 WEIGHTS_FILE, CONFIG_FILE = "model.safetensors", "config.json"

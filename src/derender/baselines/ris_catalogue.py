@@ -24,7 +24,8 @@ from derender.baselines.stylegan2_generator import TINY, Generator
 from derender.baselines.training import SheetOf, ShortRun
 from derender.data import PictureSet, read_mask_folder, read_masks, split_indices
 from derender.training.batches import random_stream
-from derender.training.loop import SAMPLE_COUNT, TrainResult
+from derender.training.loop import SAMPLE_COUNT
+from derender.training.task import TrainResult
 
 FACE_PARTS = {
     **dict.fromkeys(("l_ear", "r_ear", "ear_r"), "ears"),

@@ -23,7 +23,7 @@ from derender.baselines.training import ShortRun
 from derender.data import PictureSet, as_float, split_indices
 from derender.features import map_batches, missing
 from derender.settings import Settings
-from derender.training.loop import TrainResult
+from derender.training.task import TrainResult
 
 MILD = AugmentSettings(crop_from=0.7, jitter=0.5, hue_deg=0.0, grey=0.0, blur=0.0)
 """Views of labelled images: a little crop, flip and jitter."""

@@ -5,8 +5,7 @@ Runs, checkpoints, exact resume, early stop and reports are those of our own mod
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from math import isfinite
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,21 +17,26 @@ from derender.baselines.model import BaselineModel, Images, LossInputs
 from derender.baselines.registry import config_type, network_type
 from derender.data import PictureSet, Split, split_indices
 from derender.settings import Settings
-from derender.training.config import TrainConfig, with_changes
-from derender.training.finetune_config import FinetuneConfig
-from derender.training.finite import first_not_finite
-from derender.training.loop import Progress, TrainResult, describe_data, train_task
+from derender.training.config import FinetuneConfig, TrainConfig, with_changes
+from derender.training.loop import train_task
 from derender.training.run_folder import (
     RunFolder,
     append_metrics,
+    describe_data,
     read_config,
     read_config_tree,
     start_run,
 )
-from derender.training.step import Precision
-from derender.training.step_module import Held
-from derender.training.task import PhaseProgress
-from derender.training.watch import Finding
+from derender.training.task import (
+    Held,
+    PhaseProgress,
+    Precision,
+    Progress,
+    StepLosses,
+    TrainingTask,
+    TrainResult,
+)
+from derender.training.watch import FiniteWatch
 
 OUTSIDE_LOSS = ("l1", "codes_used", "active", "found")
 """Numbers that ``losses`` returns beside the losses."""
@@ -79,7 +83,7 @@ def train_in_loop(
 
 
 @dataclass(frozen=True)
-class BaselineTask:
+class BaselineTask(TrainingTask):
     """Train a baseline as its configuration says."""
 
     config: Any
@@ -109,21 +113,13 @@ class BaselineTask:
         aid = self.network.prepare(self.config, images, run.perceptual, progress)
         return BaselineStep(model, self.config, aid)
 
-    def watch(self, memory: dict[str, Any]) -> "FiniteWatch":
+    def watch(self, memory: dict[str, Any]) -> FiniteWatch:
         """Stops a run whose loss is NaN or infinite."""
         return FiniteWatch()
 
     def shown(self, model: BaselineModel, images: Images) -> dict[str, Tensor]:
         """Images for a sample sheet, by column."""
         return model.shown(images, self.config)
-
-
-@dataclass(frozen=True)
-class BaselineLosses:
-    """Losses of one batch: the minimised total, and every number by name, detached."""
-
-    total: Tensor
-    terms: dict[str, Tensor]
 
 
 class BaselineStep(nn.Module):
@@ -135,34 +131,17 @@ class BaselineStep(nn.Module):
         self.aid = [aid]  # in a list: its weights are not this module's
 
     def forward(
-        self, images: Tensor, generator: Generator, precision: Precision, done: float | None = None
+        self,
+        images: Tensor,
+        generator: Generator,
+        precision: Precision,
+        done: float | None = None,
+        rows: Tensor | None = None,
     ) -> tuple[Tensor, Held]:
         assert isinstance(self.model, BaselineModel)
         terms = self.model.losses(images, LossInputs(self.config, generator, precision, self.aid[0]))
         total = torch.stack([term for name, term in terms.items() if name not in OUTSIDE_LOSS]).sum()
-        return total, Held(BaselineLosses(total, {name: term.detach() for name, term in terms.items()}))
-
-
-@dataclass
-class FiniteWatch:
-    """Watches for a loss that is NaN or infinite."""
-
-    uneasy: bool = field(default=False, init=False)
-
-    def look(self, images: int, result: BaselineLosses) -> tuple[Finding, ...]:
-        """A fatal finding once the loss is not finite."""
-        loss = result.total.item()
-        if isfinite(loss):
-            return ()
-        broken = first_not_finite(result.terms.items())
-        first = "" if broken is None else f"; the first term that is not finite is {broken!r}"
-        return (
-            Finding("non-finite loss", f"the loss is {loss}{first}", "use a smaller learning_rate", True),
-        )
-
-    def memory(self) -> dict[str, Any]:
-        """Nothing: a finite loss leaves nothing to remember."""
-        return {}
+        return total, Held(StepLosses(total, {name: term.detach() for name, term in terms.items()}))
 
 
 class ShortRun:

@@ -29,7 +29,7 @@ def demo(
     notice("taking faces apart, learned from scratch on this machine" + (" (quick)" if quick else ""))
     from derender.demo import FULL, QUICK, demo_page, run_demo
     from derender.demo.page import score_tables
-    from derender.training.interrupt import TrainingInterrupted
+    from derender.training.process import TrainingInterrupted
 
     folder = out or _free_folder(Path("derender-demo"))
     try:

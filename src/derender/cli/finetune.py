@@ -12,7 +12,7 @@ from derender.cli.gathered import gathered
 if TYPE_CHECKING:
     from derender.data import PictureSet
     from derender.model import Derenderer
-    from derender.training.finetune_config import FinetuneConfig
+    from derender.training.config import FinetuneConfig
 
 
 def register(app: typer.Typer) -> None:
@@ -117,8 +117,9 @@ def finetune(
     from derender.evaluation.finetuning import FinetuneTask, load_finetuned, score_finetuned, target_of
     from derender.report.run import decomposition_sheet, run_page
     from derender.report.tables_finetuning import finetuning_table
-    from derender.training.loop import Progress, train_task
+    from derender.training.loop import train_task
     from derender.training.run_folder import refuse_taken
+    from derender.training.task import Progress
 
     if not resume:
         refuse_taken(out)
@@ -173,8 +174,7 @@ def _config(
 ) -> "FinetuneConfig":
     """Settings of a new run: those of the model it starts from, where it has any, else those of a preset."""
     from derender.baselines import read_any_config
-    from derender.training.config import PRESETS, TrainConfig, resolve
-    from derender.training.finetune_config import FinetuneConfig
+    from derender.training.config import PRESETS, FinetuneConfig, TrainConfig, resolve
 
     if start is None:
         fresh = resolve(preset or "faces").model_dump(mode="json")
@@ -198,7 +198,7 @@ def _changed(
 def _stored(out: Path) -> "FinetuneConfig":
     """The settings of the run to go on with."""
     from derender.baselines import read_any_config
-    from derender.training.finetune_config import FinetuneConfig
+    from derender.training.config import FinetuneConfig
 
     if not (out / "config.yaml").is_file():
         raise FileNotFoundError(f"no run to resume in {out} (no config.yaml): run it without --resume first")

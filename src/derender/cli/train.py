@@ -119,10 +119,10 @@ def train(
     from derender.report.evidence import Evidence, look_at_data
     from derender.report.page import Section
     from derender.report.run import decomposition_sheet, run_page
+    from derender.training.derender_task import train as train_model
     from derender.training.distributed import first_then_others, leave, open_fabric
-    from derender.training.loop import Progress
-    from derender.training.loop import train as train_model
     from derender.training.run_folder import refuse_taken
+    from derender.training.task import Progress
 
     if resume and not (out / "config.yaml").is_file():
         raise FileNotFoundError(f"no run to resume in {out} (no config.yaml): train without --resume first")

@@ -32,7 +32,8 @@ from derender.model import Derenderer, load
 from derender.report.run import decomposition_sheet
 from derender.settings import Settings
 from derender.training.config import TrainConfig, resolve
-from derender.training.loop import Progress, TrainResult, train
+from derender.training.derender_task import train
+from derender.training.task import Progress, TrainResult
 
 Report = Callable[[str, int, int, str], None]
 """Called with (stage, done, total, note)."""

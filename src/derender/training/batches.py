@@ -1,4 +1,4 @@
-"""Which pictures make up each batch: a pure function of seed and position, so that a run resumes exactly."""
+"""The images of each batch: a pure function of seed and position, so that a run resumes exactly."""
 
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -15,7 +15,7 @@ from derender.training.config import LoopSettings
 from derender.training.distributed import ALONE, Ranks
 
 SAMPLED = 65_536
-"""So many pictures of a memory-mapped set are drawn from where a few of all are wanted."""
+"""Images of a memory-mapped set that represent all of them where a few suffice."""
 
 _STREAMS = {"order": 1, "flip": 2, "perturb": 3, "frame": 4}
 
@@ -35,11 +35,11 @@ class Batches:
 
     Attributes:
         images: (N, 3, H, W) uint8.
-        batch_size: pictures in every batch; at most as many as there are.
+        batch_size: images in every batch; at most as many as there are.
         seed: of the order and the flips.
-        horizontal_flips: whether each picture is mirrored with probability one half.
-        rows: which of the images are the training set; None: all. Saves a copy of those that are.
-        reframed, reframe: the share of pictures that are shown in another frame, and how far it is moved.
+        horizontal_flips: whether each image is mirrored with probability one half.
+        rows: the rows of images that are the training set; None: all. Saves a copy of them.
+        reframed, reframe: the share of images that are shown in another crop, and how far it is moved.
     """
 
     images: UInt8[Tensor, "n 3 h w"]
@@ -53,15 +53,15 @@ class Batches:
     def __post_init__(self) -> None:
         if self.batch_size > len(self):
             raise ValueError(
-                f"batch_size {self.batch_size} is more than the {len(self)} training pictures: "
-                f"set batch_size={max(2, len(self) // 2)} or bring more pictures"
+                f"batch_size {self.batch_size} is more than the {len(self)} training images: "
+                f"set batch_size={max(2, len(self) // 2)} or bring more images"
             )
 
     def __len__(self) -> int:
         return len(self.images) if self.rows is None else len(self.rows)
 
     def sample(self) -> UInt8[Tensor, "n 3 h w"]:
-        """All training pictures; of a mapped set at most ``SAMPLED``, evenly spread, in memory."""
+        """All training images; of a mapped set at most ``SAMPLED``, evenly spread, in memory."""
         return self.images if self.rows is None else torch.from_numpy(_spread(self.images.numpy(), self.rows))
 
     def at(self, position: int, ranks: Ranks = ALONE) -> Float[Tensor, "b 3 h w"]:
@@ -71,12 +71,15 @@ class Batches:
         """
         return self.ready(self.read(position, ranks), position, ranks)
 
-    def read(self, position: int, ranks: Ranks = ALONE) -> UInt8[Tensor, "b 3 h w"]:
-        """The pictures of that batch as they lie in memory: what may have to wait for a disk; one thread."""
-        per_epoch = len(self) // self.batch_size
-        epoch, within = divmod(position, per_epoch)
+    def order(self, position: int, ranks: Ranks = ALONE) -> Int64[Tensor, " b"]:
+        """Which images of the training set that batch holds."""
+        epoch, within = divmod(position, len(self) // self.batch_size)
         order = _order(len(self), self.seed, epoch)
-        rows = ranks.own(order[within * self.batch_size : (within + 1) * self.batch_size])
+        return ranks.own(order[within * self.batch_size : (within + 1) * self.batch_size])
+
+    def read(self, position: int, ranks: Ranks = ALONE) -> UInt8[Tensor, "b 3 h w"]:
+        """The images of that batch as bytes: the part that may wait for a disk; one thread."""
+        rows = self.order(position, ranks)
         if self.images.device.type != "cpu":
             return self.images[rows.to(self.images.device)]
         chosen = rows.numpy() if self.rows is None else self.rows[rows.numpy()]
@@ -85,7 +88,7 @@ class Batches:
     def ready(
         self, pictures: UInt8[Tensor, "b 3 h w"], position: int, ranks: Ranks = ALONE
     ) -> Float[Tensor, "b 3 h w"]:
-        """What ``read`` gave for this position as float32 in 0..1, some pictures mirrored or framed anew."""
+        """What ``read`` gave for this position as float32 in 0..1, some images mirrored or cropped anew."""
         batch = pictures.float() / 255
         if self.horizontal_flips:
             flip = torch.rand(self.batch_size, generator=random_stream(self.seed, "flip", position)) < 0.5
@@ -93,8 +96,8 @@ class Batches:
             batch = torch.where(flip.to(batch.device)[:, None, None, None], batch.flip(-1), batch)
         if self.reframed:
             generator = random_stream(self.seed, "frame", position)
-            frames = random_crops(self.batch_size, generator, self.reframe, self.reframed)
-            batch = crop_images(batch, ranks.own(frames))
+            crops = random_crops(self.batch_size, generator, self.reframe, self.reframed)
+            batch = crop_images(batch, ranks.own(crops))
         return batch
 
 
@@ -114,7 +117,7 @@ def batches_of(
 
 
 def some_of(images: UInt8[np.ndarray, "n 3 h w"], rows: Int64[np.ndarray, " k"]) -> np.ndarray:
-    """These pictures; of a mapped set at most ``SAMPLED``, evenly spread: (m, 3, H, W) in memory."""
+    """These images; of a mapped set at most ``SAMPLED``, evenly spread: (m, 3, H, W) in memory."""
     if isinstance(images, np.memmap):
         return _spread(images, rows)
     return np.ascontiguousarray(images[rows])
@@ -129,10 +132,10 @@ def _spread(images: np.ndarray, rows: np.ndarray) -> np.ndarray:
 class Reader:
     """Takes batches in order; the next one is read in another thread while the present one is computed.
 
-    On another device than the CPU the pictures lie there already, and nothing is read ahead.
+    On another device than the CPU the images lie there already, and nothing is read ahead.
 
     Attributes:
-        waited_s: seconds spent waiting for pictures, of all batches so far.
+        waited_s: seconds spent waiting for images, of all batches so far.
     """
 
     def __init__(self, batches: Batches, ranks: Ranks = ALONE):

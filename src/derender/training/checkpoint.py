@@ -6,20 +6,21 @@ it is kept. Every file has a checksum.
 """
 
 import json
-import math
 import warnings
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import torch
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from derender.storage.atomic import CHECKSUMS, Damaged, DamageNoticed, atomic_folder, check_seal, seal
 from derender.storage.tensors import disk_errors
-from derender.training.weights import fit_weights
+from derender.training.run_folder import RunFolder
 
 FORMAT = 1
 WEIGHTS_FILE, OPTIMISER_FILE, STATE_FILE = "model.safetensors", "optimiser.safetensors", "state.json"
@@ -30,18 +31,23 @@ class TrainState:
     """Counters of a run; with the weights and the optimiser they determine everything that follows.
 
     Attributes:
-        images: pictures seen so far, repeats counted.
+        images: images seen so far, repeats counted.
         seconds: time spent training.
         best_loss: lowest validation loss so far, None before the first validation.
-        validations_since_best: how many validations ago that was.
-        watcher: what the collapse detector remembers.
+        validations_since_best: number of validations after that one.
+        watcher: state of the collapse detector.
     """
 
-    images: int = 0
-    seconds: float = 0.0
-    best_loss: float | None = None
-    validations_since_best: int = 0
+    __pydantic_config__ = ConfigDict(strict=True, extra="forbid")
+
+    images: Annotated[int, Field(ge=0, lt=1 << 62)] = 0
+    seconds: Annotated[float, Field(allow_inf_nan=False)] = 0.0
+    best_loss: Annotated[float, Field(allow_inf_nan=False)] | None = None
+    validations_since_best: Annotated[int, Field(ge=0, lt=1 << 62)] = 0
     watcher: dict[str, Any] = field(default_factory=dict)
+
+
+_COUNTERS = TypeAdapter(TrainState)
 
 
 class DamagedCheckpoint(Damaged):
@@ -100,7 +106,7 @@ def resume_from(
             raise
         what = f"is damaged ({problem.reason})" if isinstance(problem, DamagedCheckpoint) else "is missing"
     state = load_checkpoint(previous, model, optimiser)
-    note = f"{last} {what}: going on from the checkpoint before it, of {state.images:,} pictures"
+    note = f"{last} {what}: going on from the checkpoint before it, of {state.images:,} images"
     warnings.warn(note, DamageNoticed, stacklevel=2)
     return state, note
 
@@ -119,8 +125,7 @@ def load_checkpoint(folder: Path, model: nn.Module, optimiser: torch.optim.Optim
         )
     stored, weights, moments = _read(folder, with_optimiser=optimiser is not None)
     try:
-        _check_counters(stored["state"])
-        state = TrainState(**stored["state"])
+        state = _COUNTERS.validate_json(json.dumps(stored["state"]))
         fit_weights(model, weights)
         if optimiser is not None:
             _check_moments(optimiser, moments)
@@ -152,19 +157,6 @@ def _read(folder: Path, *, with_optimiser: bool) -> tuple[dict[str, Any], dict[s
     )
 
 
-def _check_counters(noted: dict[str, Any]) -> None:
-    """Counters that no run could have noted are a ValueError."""
-    noted = {**asdict(TrainState()), **noted}
-    counts = [noted["images"], noted["validations_since_best"]]
-    if not all(type(count) is int and 0 <= count < 1 << 62 for count in counts):
-        raise ValueError(f"pictures and validations must be counts, got {counts}")
-    numbers = [noted["seconds"], 0.0 if noted["best_loss"] is None else noted["best_loss"]]
-    if not all(type(number) in (int, float) and abs(number) < math.inf for number in numbers):
-        raise ValueError(f"seconds and the best loss must be finite numbers, got {numbers}")
-    if type(noted["watcher"]) is not dict:
-        raise ValueError("what the collapse detector remembers must be a table")
-
-
 def _check_moments(optimiser: torch.optim.Optimizer, moments: dict[str, Any]) -> None:
     """A state that is not of these parameters is a ValueError: a fused step goes by their size alone.
 
@@ -188,32 +180,26 @@ def _check_moments(optimiser: torch.optim.Optimizer, moments: dict[str, Any]) ->
 
 
 _MOMENTS = ("exp_avg", "exp_avg_sq")  # Adam's
-
-_DAMAGE = (
-    ValueError,
-    RecursionError,
-    LookupError,
-    TypeError,
-    AttributeError,
-    SafetensorError,
-    OSError,
-)
-"""What readers raise on files that are not as they were written."""
+_DAMAGE = (ValueError, RecursionError, LookupError, TypeError, AttributeError, SafetensorError, OSError)
+"""The errors that readers raise on files that are not as they were written."""
 
 
 def _first_line(error: Exception) -> str:
+    """Of its message, and of a ValidationError its first finding."""
+    if isinstance(error, ValidationError):
+        first = error.errors()[0]
+        return f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
     return str(error).splitlines()[0] if str(error) else type(error).__name__
 
 
 def _check_written(file: Path, tensors: dict[str, Tensor]) -> None:
-    """What stands in the file is what was to be written, or an error."""
-    found = load_file(file)
-    if found.keys() != tensors.keys() or not all(_same(found[name], tensors[name]) for name in found):
+    """The file reads back bit for bit as it was to be written, or an error."""
+    stored = load_file(file)
+    if stored.keys() != tensors.keys() or not all(_same(stored[name], tensors[name]) for name in stored):
         raise OSError(f"{file} reads back other than it was written: check the disk; the old one is kept")
 
 
 def _same(one: Tensor, other: Tensor) -> bool:
-    """Whether two tensors are the same, bit for bit."""
     pair = [value.contiguous().reshape(-1).view(torch.uint8) for value in (one, other)]
     return one.dtype == other.dtype and one.shape == other.shape and torch.equal(*pair)
 
@@ -246,3 +232,70 @@ def _unflatten(tensors: dict[str, Tensor], groups: list[dict[str, Any]]) -> dict
         index, name = key.split(".", 1)
         state.setdefault(int(index), {})[name] = value
     return {"state": state, "param_groups": groups}
+
+
+def fit_weights(module: nn.Module, weights: Mapping[str, Tensor]) -> None:
+    """Load weights by name; all of them, and no others.
+
+    Raises:
+        ValueError: one is missing, has another shape, or is not the module's; names the first.
+    """
+    expected = module.state_dict()
+    for name, value in expected.items():
+        if name not in weights:
+            raise ValueError(f"it has no {name!r}, which this architecture needs")
+        if weights[name].shape != value.shape:
+            there, here = tuple(weights[name].shape), tuple(value.shape)
+            raise ValueError(f"{name!r} has shape {there} there and {here} in this architecture")
+    unknown = [name for name in weights if name not in expected]
+    if unknown:
+        raise ValueError(f"it has {unknown[0]!r}, which this architecture lacks")
+    module.load_state_dict(dict(weights))
+
+
+@dataclass
+class ModelOfRun:
+    """The saved model in a run's folder: with the weights of its best validation, or those of its end.
+
+    Attributes:
+        folder: of the run.
+        model: the model in training.
+        keep: which weights are saved.
+        images: images that the saved weights had seen; None where this process saved none.
+    """
+
+    folder: RunFolder
+    model: Any
+    keep: Literal["best", "last"]
+    images: int | None = None
+
+    def at_best(self, images: int) -> None:
+        """After the best validation so far, of weights that have seen so many images."""
+        if self.keep == "best":
+            self._save(images)
+
+    def at_checkpoint(self, images: int) -> None:
+        """After a checkpoint; the first one of all leaves a model in any case."""
+        if self.keep == "last" or not self.folder.model.exists():
+            self._save(images)
+
+    def at_end(self, state: TrainState) -> None:
+        """Make sure that a run that ends leaves the weights its settings name: on resuming they may differ.
+
+        Where nothing was ever judged, because nothing was held out, those are of its end.
+        """
+        if self.keep == "last" or state.best_loss is None:
+            if self.images != state.images:
+                self._save(state.images)
+        elif self.images is None:
+            try:
+                best = load_checkpoint(self.folder.best, self.model, None)
+            except (DamagedCheckpoint, FileNotFoundError):
+                note = f"{self.folder.best} is damaged or missing: {self.folder.model} stays as it is"
+                warnings.warn(note, DamageNoticed, stacklevel=2)
+            else:
+                self._save(best.images)
+
+    def _save(self, images: int) -> None:
+        self.model.save(self.folder.model, overwrite=True)
+        self.images = images

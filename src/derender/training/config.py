@@ -5,6 +5,7 @@ Source: the paper, Sec. 4 and its published settings; where the two differ (lear
 """
 
 import json
+import math
 from collections.abc import Iterable, Mapping
 from reprlib import Repr
 from typing import Any, Literal, TypeVar, overload
@@ -22,53 +23,48 @@ from derender.settings import Settings
 
 LooccKind = Literal["none", "light", "light+camera", "all"]
 
-LOOCC_FACTORS: dict[str, tuple[str, ...]] = {
-    "none": (),
-    "light": ("light",),
-    "light+camera": ("light", "camera"),
-    "all": ("geometry", "albedo", "light", "camera"),
-}
+LOOCC_FACTORS: dict[str, tuple[str, ...] | None] = {
+    "none": (), "light": ("light",), "light+camera": ("light", "camera"), "all": None,
+}  # fmt: skip
+"""The factors that each kind of LOOCC perturbs; None: every one that can be."""
 
 
 class ObjectiveSettings(Settings):
-    """What is minimised: reconstruction of the picture by a scene and by its flipped twin, plus LOOCC."""
+    """The loss: reconstruction of the image by a scene and by its flipped twin, plus LOOCC."""
 
     flip_weight: float = Field(default=0.5, ge=0)
     confidence: bool = True
     perceptual: Literal["vgg16", "self", "none"] = "self"
     perceptual_weight: float = Field(default=1.0, ge=0)
     smoothness_weight: float = Field(default=0.0, ge=0)  # on steps of depth, as unsup3d for cars
-    curvature_weight: float = Field(default=3.0, ge=0)  # on second differences of depth; ours, 0 in the paper
+    curvature_weight: float = Field(default=3.0, ge=0)  # on second differences of depth; 0 in the paper
     vgg16_path: str | None = None  # None: the file torch hub keeps
     self_features_steps: int = Field(default=600, ge=1)
     loocc: LooccKind = "none"
     loocc_weight: float = Field(default=0.01, ge=0)
     loocc_temperature: float = Field(default=0.5, gt=0)
-    loocc_after: float = Field(default=0.0, ge=0, le=1)  # share of the run before LOOCC and its cycle; ours
-    cycle_weight: float = Field(default=0.0, ge=0)  # light and camera read back from LOOCC's renderings; ours
-    template_share: float = Field(default=0.0, ge=0, le=1)  # of the run: all share one shape and albedo; ours
-    release_share: float = Field(default=0.0, ge=0, le=1)  # of the run: each gets its own bit by bit
+    cycle_weight: float = Field(default=0.0, ge=0)  # light and camera predicted from LOOCC's renderings
+    template_share: float = Field(default=0.0, ge=0, le=1)  # of the run: all share one shape and albedo
+    release_share: float = Field(default=0.0, ge=0, le=1)  # of the run: each gets its own gradually
     perturb: PerturbSettings = PerturbSettings()
 
 
 class WhiteningSettings(Settings):
-    """How codes become features after training (postprocess/whitening.py); 0 pictures: features are codes."""
+    """How activations become features after training (postprocess/whitening.py); 0 pictures: codes are."""
 
-    pictures: int = Field(default=3_000, ge=0)  # training pictures that are rendered again
+    pictures: int = Field(default=3_000, ge=0)  # training images that are re-rendered
     views: int = Field(default=4, ge=1)  # renderings of each
-    spatial: bool = True  # read the encoder's last spatial features beside the code
-    mirrored: bool = True  # read the picture's mirror image beside it
+    spatial: bool = True  # with the encoder's last spatial map beside the code
+    mirrored: bool = True  # with the activations of the mirror image
     directions: int = Field(default=128, ge=1)  # kept of geometry and albedo each, at most the code's size
     shrinkage: float = Field(default=0.1, ge=0)  # share of the mean variance added to every direction's
-    evenness: float = Field(default=0.5, ge=0, le=1)  # 0: what tells pictures apart best counts most
+    evenness: float = Field(default=0.5, ge=0, le=1)  # 0: the most discriminative directions count most
     vectors: bool = True  # light and camera have features of their own; else those are their codes
     vector_power: float = Field(default=3.0, ge=0)  # of repeatability, by which their directions are weighted
-    frames: int = Field(default=0, ge=0)  # times each picture is also shown in another frame
-    reframe: CropSettings = DEFAULT_CROPS
 
 
 class FeatureSettings(Settings):
-    """What `derender whiten` can be told: how features are fitted, and what is changed for it."""
+    """All settings of `derender whiten`: how features are estimated, and how far scenes are perturbed."""
 
     whitening: WhiteningSettings = WhiteningSettings()
     fitting: FittingSettings = FittingSettings()
@@ -84,21 +80,30 @@ class OptimiserSettings(Settings):
     warmup_images: int = Field(default=0, ge=0)
     betas: tuple[float, float] = (0.9, 0.999)
 
+    def rate(self, images: int, total_images: int) -> float:
+        """The learning rate after so many images: linear warm-up from zero, then constant or the cosine."""
+        if images < self.warmup_images:
+            return self.learning_rate * (images + 1) / self.warmup_images
+        span = max(total_images - self.warmup_images, 1)
+        done = min((images - self.warmup_images) / span, 1.0)
+        share = self.final_rate + (1 - self.final_rate) * (1 + math.cos(math.pi * done)) / 2
+        return self.learning_rate * share
+
 
 class LoopSettings(Settings):
-    """What every run of the training loop has, whatever it trains."""
+    """Settings of every run of the training loop, whatever it trains."""
 
     optimiser: OptimiserSettings = OptimiserSettings()
     batch_size: int = Field(default=64, ge=2)
-    images: int = Field(default=600_000, ge=1)  # pictures seen in the whole run, repeats counted
+    images: int = Field(default=600_000, ge=1)  # images of the whole run, repeats counted
     minutes: float | None = Field(default=None, gt=0)  # stop earlier once training has taken this long
-    validate_every: int = Field(default=20_000, ge=1)  # pictures between validations
-    sample_every: int = Field(default=20_000, ge=1)  # pictures between sample sheets
-    checkpoint_every: int = Field(default=20_000, ge=1)  # pictures between checkpoints
+    validate_every: int = Field(default=20_000, ge=1)  # images between validations
+    sample_every: int = Field(default=20_000, ge=1)  # images between sample sheets
+    checkpoint_every: int = Field(default=20_000, ge=1)  # images between checkpoints
     patience: int = Field(default=10, ge=1)  # validations without improvement before stopping
     keep: Literal["best", "last"] = "best"  # the model: of the best validation, or of the last checkpoint
     horizontal_flips: bool = True
-    reframed: float = Field(default=0.0, ge=0, le=1)  # share of the pictures shown in another frame
+    reframed: float = Field(default=0.0, ge=0, le=1)  # share of the images shown in another crop
     reframe: CropSettings = DEFAULT_CROPS
     split: tuple[float, float, float] = (0.8, 0.1, 0.1)  # train, validation, test
     precision: Literal["32-true", "bf16-mixed"] = "32-true"  # networks only; geometry is always float32
@@ -109,7 +114,7 @@ class LoopSettings(Settings):
 
 
 class TrainConfig(LoopSettings):
-    """One training run of our model, whole."""
+    """One training run of a `Derenderer`, whole."""
 
     preset: str = "faces"
     start_from: str | None = None  # a trained model whose weights the run begins with
@@ -123,14 +128,37 @@ class TrainConfig(LoopSettings):
     @classmethod
     def _without_decoder(cls, value: ModelSettings) -> ModelSettings:
         if value.network.unet_decoder:
-            raise ValueError("network.unet_decoder: rendering trains none, derender unet teaches one")
+            raise ValueError("network.unet_decoder: rendering trains none, derender unet distils one")
         return value
 
     @property
     def features(self) -> FeatureSettings:
-        """How features are made once training has ended."""
+        """How features are estimated once training has ended."""
         return FeatureSettings(whitening=self.whitening, fitting=self.fitting, perturb=self.objective.perturb)
 
+
+class TargetSettings(Settings):
+    """Labels beside the rendering objective: total = rendering_weight * rendering + weight * labels."""
+
+    labels: tuple[str, ...] = ()  # label columns: one of classes, or any number of two values each
+    factors: tuple[str, ...] = ("geometry", "albedo")  # whose codes the head takes
+    weight: float = Field(default=1.0, gt=0)
+    rendering_weight: float = Field(default=1.0, ge=0)  # 0: nothing is rendered, plain fine-tuning
+    labelled: int | None = Field(default=None, ge=2)  # training images whose labels are used; None: all
+
+
+class FinetuneConfig(TrainConfig):
+    """One joint training with labels, whole."""
+
+    start: str | None = None  # the pre-trained run or model; None: from fresh weights
+    target: TargetSettings = TargetSettings()
+    images: int = Field(default=100_000, ge=1)  # images of the whole run, repeats counted
+    validate_every: int = Field(default=5_000, ge=1)
+    checkpoint_every: int = Field(default=5_000, ge=1)
+
+
+REMOVED: dict[str, Any] = {"objective.loocc_after": 0.0, "whitening.frames": 0, "whitening.reframe": ...}
+"""Settings of earlier versions: runs that have them at this value (...: at any) still load."""
 
 Config = TypeVar("Config", bound=Settings)
 
@@ -171,8 +199,8 @@ def resolve(preset: str, overrides: Iterable[str] = (), **explicit: Any) -> Trai
 
     Keys are dotted (``optimiser.learning_rate``); a unique last part may stand alone (``learning_rate``).
     Values are read as YAML. In ``explicit`` dots are written as double underscores and None means not given.
-    With ``start_from`` the model is that model's (a taught decoder aside), not the preset's, before overrides
-    change it.
+    With ``start_from`` the model has that model's settings (without a U-Net decoder) instead of the preset's,
+    before overrides change them.
 
     Raises:
         ValueError: unknown preset or key (names the nearest), or a value that does not fit.
@@ -234,12 +262,33 @@ def setting_names(kind: type[Settings] = TrainConfig) -> list[str]:
     return list(_leaves(kind().model_dump(mode="json")))
 
 
+def without_removed(tree: dict[str, Any]) -> dict[str, Any]:
+    """Stored settings without those of ``REMOVED``.
+
+    Raises:
+        ValueError: one has a value that this version cannot honour.
+    """
+    for key, neutral in REMOVED.items():
+        *parents, last = key.split(".")
+        part: Any = tree
+        for parent in parents:
+            part = part.get(parent) if isinstance(part, dict) else None
+        if not isinstance(part, dict) or last not in part:
+            continue
+        if (value := part.pop(last)) != neutral and neutral is not ...:
+            raise ValueError(
+                f"setting {key!r} no longer exists: it can be {neutral}, not {_SHORT.repr(value)}; use an "
+                "earlier version of derender"
+            )
+    return tree
+
+
 def _leaves(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    found: dict[str, Any] = {}
+    leaves: dict[str, Any] = {}
     for key, value in tree.items():
         name = f"{prefix}{key}"
-        found |= _leaves(value, f"{name}.") if isinstance(value, dict) else {name: value}
-    return found
+        leaves |= _leaves(value, f"{name}.") if isinstance(value, dict) else {name: value}
+    return leaves
 
 
 def _full_key(key: str, tree: Mapping[str, Any]) -> str:

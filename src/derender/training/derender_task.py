@@ -1,29 +1,82 @@
-"""Our own model as a task of the training loop: pictures taken apart, rendered again, and watched."""
+"""Pre-training: a `Derenderer` as a task of the training loop, run until its features are there."""
 
+import warnings
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import UInt8
-from torch import Tensor, nn
+from torch import Generator, Tensor, nn
 
+from derender.data import PictureSet, split_indices
 from derender.model import Derenderer, load
 from derender.objectives import load_vgg16
+from derender.objectives.perceptual import PerceptualFeatures, build_perceptual
+from derender.objectives.self_features import SelfFeatures, load_self_features
+from derender.storage.atomic import DamageNoticed, atomic_file
+from derender.training.batches import some_of
+from derender.training.checkpoint import fit_weights
+from derender.training.complete import complete_model
 from derender.training.config import TrainConfig
-from derender.training.distributed import ALONE, Ranks
-from derender.training.finite import first_not_finite, stages_of
-from derender.training.perceptual import prepare_perceptual
+from derender.training.distributed import ALONE, Ranks, this_rank_writes
+from derender.training.loop import MAX_VALIDATION_IMAGES, NOT_RECONSTRUCTION, SampleSheet, train_task
+from derender.training.process import deterministic_algorithms
 from derender.training.run_folder import RunFolder
-from derender.training.step import StepResult
-from derender.training.step_module import StepModule
-from derender.training.task import PhaseProgress, Task
-from derender.training.validate import NOT_RECONSTRUCTION
-from derender.training.watch import Finding, Watcher
-from derender.training.weights import fit_weights
+from derender.training.step import own_share, training_step
+from derender.training.task import Held, PhaseProgress, Precision, Progress, TrainingTask, TrainResult
+from derender.training.watch import Watcher
+
+
+def train(
+    config: TrainConfig,
+    pictures: PictureSet,
+    out: str | Path,
+    *,
+    resume: bool = False,
+    sample_sheet: SampleSheet | None = None,
+    progress: Callable[[Progress], None] | None = None,
+    accelerator: str = "auto",
+) -> TrainResult:
+    """Train a model on images and estimate its features; all files lie in the folder ``out``.
+
+    Args:
+        config: see `derender.training.config.resolve`.
+        pictures: at the model's image size.
+        out: a new folder, or with ``resume`` the folder of an unfinished run.
+        sample_sheet: draws a sheet for a few held-out images from time to time.
+        progress: called after every step.
+        accelerator: "auto", "cpu" or "cuda".
+
+    Raises:
+        FileExistsError: ``out`` is not empty and ``resume`` was not requested.
+        ValueError: images and configuration do not fit, or the run to resume has other settings.
+        TrainingInterrupted: Ctrl-C or SIGTERM; the run can be resumed.
+    """
+    report = progress or (lambda _: None)
+    task = DerenderTask(config, begins=not (resume and RunFolder(Path(out)).resumable))
+    how = {"resume": resume, "sample_sheet": sample_sheet, "accelerator": accelerator}
+    result = train_task(task, pictures, out, progress=report, **how)
+    if this_rank_writes() and result.stopped != "collapse":
+        split = split_indices(pictures.files, config.split, seed=config.seed)
+        held_out = pictures.images[split.validation[:MAX_VALIDATION_IMAGES]]
+        on_gpu = accelerator != "cpu" and torch.cuda.is_available()
+        with deterministic_algorithms(config.deterministic):
+            complete_model(
+                RunFolder(result.folder).model,
+                config,
+                some_of(pictures.images, split.train),
+                np.ascontiguousarray(held_out),
+                device="cuda" if on_gpu else "cpu",
+                progress=lambda done, total: report(Progress("features", done, total)),
+            )
+    return result
 
 
 @dataclass(frozen=True)
-class DerenderTask:
+class DerenderTask(TrainingTask):
     """Train a `Derenderer` as the configuration says.
 
     ``begins`` is false where a checkpoint gives the weights: then the model to start from is not needed.
@@ -35,10 +88,14 @@ class DerenderTask:
     outside_loss: tuple[str, ...] = NOT_RECONSTRUCTION
 
     @property
-    def all_learn(self) -> bool:
-        """Whether every parameter gets a gradient in every step: both heads of the confidence net do."""
+    def every_parameter_learns(self) -> bool:
+        """Both heads of the confidence net get gradients."""
         objective = self.config.objective
         return objective.confidence and objective.perceptual != "none" and objective.perceptual_weight > 0
+
+    def shared(self, ranks: Ranks) -> "DerenderTask":
+        ranks.check(self.config.batch_size)
+        return replace(self, ranks=ranks)
 
     def check(self) -> None:
         """Missing perceptual weights are an error before a folder is made."""
@@ -65,61 +122,87 @@ class DerenderTask:
         return model
 
     def step_module(
-        self,
-        model: nn.Module,
-        run: RunFolder,
-        images: UInt8[Tensor, "n 3 h w"],
-        progress: PhaseProgress,
-    ) -> StepModule:
+        self, model: nn.Module, run: RunFolder, images: UInt8[Tensor, "n 3 h w"], progress: PhaseProgress
+    ) -> "DerenderStep":
         """The step with the run's perceptual features, learnt first where there are none yet."""
         assert isinstance(model, Derenderer)
-        perceptual = prepare_perceptual(
-            self.config, run.perceptual, images, lambda done, total, _: progress(done, total)
-        )
-        if self.config.channels_last and perceptual is not None:
-            perceptual = perceptual.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
-        return StepModule(model, self.config.objective, perceptual, self.ranks, self.config.accumulate)
+        return DerenderStep(model, self.config, perceptual_of(self.config, run, images, progress), self.ranks)
 
-    def watch(self, memory: dict[str, Any]) -> "SceneWatch":
+    def watch(self, memory: dict[str, Any]) -> Watcher:
         """The collapse detector."""
-        watcher = Watcher.remembering(self.config.model.ranges, self.config.batch_size, memory)
-        watcher.ranks = self.ranks
-        return SceneWatch(watcher)
+        return Watcher.remembering(self.config.model.ranges, self.config.batch_size, memory, self.ranks)
 
 
-def sharing_batches(task: Task, ranks: Ranks) -> Task:
-    """The task as one of several ranks does it.
+class DerenderStep(nn.Module):
+    """Model, objective and perceptual features; a batch goes in, the total and the result come out.
 
-    Raises:
-        ValueError: the batch cannot be shared evenly, or what is trained needs it whole.
+    ``ranks`` share the batches of training; held-out images are each judged by one of them.
     """
-    if ranks.count == 1:
-        return task
-    ranks.check(task.config.batch_size)
-    if not isinstance(task, DerenderTask):
-        raise ValueError("a baseline trains on one device: start it without torchrun")
-    return replace(task, ranks=ranks)
+
+    def __init__(
+        self,
+        model: Derenderer,
+        config: TrainConfig,
+        perceptual: PerceptualFeatures | None,
+        ranks: Ranks = ALONE,
+    ):
+        super().__init__()
+        self.model, self.config, self.perceptual, self.ranks = model, config, perceptual, ranks
+
+    def forward(
+        self,
+        images: Tensor,
+        generator: Generator,
+        precision: Precision,
+        done: float | None = None,
+        rows: Tensor | None = None,
+    ) -> tuple[Tensor, Held]:
+        objective = self.config.objective
+        result = training_step(
+            self.model,
+            images,
+            objective,
+            self.perceptual,
+            generator,
+            precision,
+            1.0 if done is None else own_share(objective, done),
+            ALONE if done is None else self.ranks,
+            self.config.accumulate,
+        )
+        return result.total, Held(result)
 
 
-@dataclass(frozen=True)
-class SceneWatch:
-    """The collapse detector, looking at a step's result."""
+def perceptual_of(
+    config: TrainConfig, run: RunFolder, images: UInt8[Tensor, "n 3 h w"], progress: PhaseProgress
+) -> PerceptualFeatures | None:
+    """The perceptual features of a run, the same after a resume; None where they have no weight.
 
-    watcher: Watcher
-
-    @property
-    def uneasy(self) -> bool:
-        """Whether a fatal sign is on."""
-        return self.watcher.uneasy
-
-    def look(self, images: int, result: StepResult) -> tuple[Finding, ...]:
-        """What is wrong with the scenes of this batch; usually nothing."""
-        broken = first_not_finite(stages_of(result))
-        shared = self.watcher.ranks.mean({"loss": result.total.item(), "broken": float(broken is not None)})
-        if shared["broken"] and broken is None:
-            broken = "that of another rank"
-        return self.watcher.look(images, shared["loss"], result.scene, broken)
-
-    def memory(self) -> dict[str, Any]:
-        """What a resumed run needs."""
-        return self.watcher.memory()
+    Self-trained features are read from the run's folder, or learnt once and written there.
+    """
+    objective, file = config.objective, run.perceptual
+    if objective.perceptual == "none" or objective.perceptual_weight == 0:
+        return None
+    features = None
+    if objective.perceptual == "self" and file.exists():
+        try:
+            features = load_self_features(file).to(images.device)
+        except ValueError as problem:
+            warnings.warn(
+                f"{problem}: they are learnt again, from the same seed", DamageNoticed, stacklevel=2
+            )
+    if features is None:
+        features = build_perceptual(
+            objective.perceptual,
+            images,
+            weights=objective.vgg16_path,
+            seed=config.seed,
+            steps=objective.self_features_steps,
+            progress=lambda done, total, _: progress(done, total),
+            device=images.device,
+        )
+        if isinstance(features, SelfFeatures):
+            with atomic_file(file) as temporary:
+                features.save(temporary)
+    if config.channels_last and features is not None:
+        features = features.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
+    return features

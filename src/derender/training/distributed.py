@@ -1,6 +1,6 @@
-"""Training on several devices: who has which pictures of a batch, and what must be known of all of them.
+"""Training on several devices: each has its rows of a batch, and values of all rows are exchanged.
 
-Each rank (one process, one device) takes its rows of every batch. What couples the pictures of a batch goes
+Each rank (one process, one device) takes its rows of every batch. What couples the images of a batch goes
 through `Ranks`, with gradient where one is due, so that losses and gradients are those of one process with
 the whole batch: a rank's loss is its share of the whole, such that the mean over ranks is the loss of the
 batch, and DDP averages gradients accordingly. Processes are started by torchrun; their traffic is
@@ -9,10 +9,13 @@ torch.distributed's, through Lightning Fabric's DDP strategy. Leaves out splitti
 
 import logging
 import os
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib.metadata import version
 from inspect import signature
+from types import ModuleType
 from typing import Any
 
 import torch
@@ -21,7 +24,25 @@ from torch import Tensor, distributed
 from torch.autograd.function import once_differentiable
 from torch.nn.parallel import DistributedDataParallel
 
-from derender.training.fabric import DDPStrategy, Fabric
+
+@contextmanager
+def _version_alone(package: str) -> Iterator[None]:
+    """Within the block a package that is not imported yet is there with its version and nothing else."""
+    if package in sys.modules:
+        yield
+        return
+    placeholder = ModuleType(package)
+    placeholder.__dict__["__version__"] = version(package)
+    sys.modules[package] = placeholder
+    try:
+        yield
+    finally:
+        sys.modules.pop(package)
+
+
+with _version_alone("torchmetrics"):  # Fabric reads its version: two of the six seconds of its import
+    from lightning_fabric import Fabric
+    from lightning_fabric.strategies.ddp import DDPStrategy
 
 
 @dataclass(frozen=True)
@@ -38,11 +59,11 @@ class Ranks:
 
     @property
     def first(self) -> bool:
-        """Whether this process writes and speaks."""
+        """Whether this process writes files and prints."""
         return self.rank == 0
 
     def check(self, batch_size: int) -> None:
-        """Every rank gets the same number of pictures, or ValueError."""
+        """Every rank gets the same number of images, or ValueError."""
         if batch_size % self.count:
             raise ValueError(
                 f"batch_size {batch_size} cannot be shared evenly by {self.count} processes: set "
@@ -62,9 +83,9 @@ class Ranks:
         return gathered
 
     def part_of_mean(self, weight: Tensor) -> Tensor:
-        """What a mean weighted by ``weight``, taken over this rank's pictures, counts in that over all.
+        """The share of a mean weighted by ``weight``, taken over this rank's images, in that over all.
 
-        ``mean of (local mean x this)`` over ranks is the weighted mean over all pictures.
+        ``mean of (local mean x this)`` over ranks is the weighted mean over all images.
         """
         if self.count == 1:
             return torch.ones((), device=weight.device)
@@ -109,7 +130,7 @@ _HALF = (torch.bfloat16, torch.float16)
 
 
 class _Gather(torch.autograd.Function):
-    """All ranks' rows; backward sums what all ranks ask of this rank's rows."""
+    """All ranks' rows; backward sums the gradients of all ranks for this rank's rows."""
 
     @staticmethod
     def forward(ctx: Any, piece: Tensor, ranks: Ranks) -> Tensor:
@@ -131,12 +152,12 @@ def started_together() -> int:
     return int(os.environ.get("WORLD_SIZE", "1")) if "LOCAL_WORLD_SIZE" in os.environ else 1
 
 
-def open_fabric(accelerator: str, *, all_learn: bool = False) -> Fabric:
+def open_fabric(accelerator: str, *, every_parameter_learns: bool = False) -> Fabric:
     """One device; under torchrun one for each of its processes, joined when this returns.
 
     Args:
         accelerator: "auto", "cpu" or "cuda".
-        all_learn: whether every parameter gets a gradient in every step, which saves DDP a search.
+        every_parameter_learns: in every step, which saves DDP a search.
 
     Raises:
         ValueError: nodes with different numbers of processes.
@@ -152,24 +173,17 @@ def open_fabric(accelerator: str, *, all_learn: bool = False) -> Fabric:
         )
     known = signature(DistributedDataParallel.__init__).parameters
     buffers = "forward_sync_buffers" if "forward_sync_buffers" in known else "broadcast_buffers"
-    options: dict[str, Any] = {"find_unused_parameters": not all_learn, buffers: False}
+    options: dict[str, Any] = {"find_unused_parameters": not every_parameter_learns, buffers: False}
     strategy = DDPStrategy(**options)
     fabric = Fabric(accelerator=accelerator, devices=local, num_nodes=world // local, strategy=strategy)
-    with _lightning_quiet():
-        fabric.launch()
-    return fabric
-
-
-@contextmanager
-def _lightning_quiet() -> Iterator[None]:
-    """Keep back what Lightning says of processes that find each other."""
-    logger = logging.getLogger("lightning_fabric")
+    logger = logging.getLogger("lightning_fabric")  # quiet while processes find each other
     before = logger.level
     logger.setLevel(logging.WARNING)
     try:
-        yield
+        fabric.launch()
     finally:
         logger.setLevel(before)
+    return fabric
 
 
 def ranks_of(fabric: Fabric) -> Ranks:
@@ -190,7 +204,7 @@ def first_then_others(fabric: Fabric, *, local: bool = False) -> Iterator[None]:
 def first_to_fail() -> bool:
     """Whether no other process of this run has failed before; asked once, by one that is about to end.
 
-    The others then end silently: what they have to say is that the first one has gone.
+    The others then end silently: they would only report that the first one has gone.
     """
     if started_together() == 1 or not distributed.is_available():
         return True

@@ -1,4 +1,4 @@
-"""What a run leaves on disk, and the rules under which a folder may be written.
+"""The files of a run, and the rules under which its folder may be written.
 
 config.yaml, environment.json, metrics.jsonl, samples/, checkpoints/ (last, the previous one, best), model/,
 tensorboard/.
@@ -19,7 +19,7 @@ import yaml
 from derender.data import PictureSet, Split
 from derender.settings import Settings
 from derender.storage.atomic import atomic_file, remove_abandoned
-from derender.training.config import Config, TrainConfig, config_from_tree, to_yaml
+from derender.training.config import Config, TrainConfig, config_from_tree, to_yaml, without_removed
 
 FORMAT = 1
 """Of config.yaml, which says so in its first line; one that does not is of this format, too."""
@@ -62,13 +62,13 @@ class RunFolder:
         return self.path / "checkpoints" / "previous"
 
     @property
+    def best(self) -> Path:
+        return self.path / "checkpoints" / "best"
+
+    @property
     def resumable(self) -> bool:
         """Whether there is a checkpoint to go on from."""
         return self.last.exists() or self.previous.exists()
-
-    @property
-    def best(self) -> Path:
-        return self.path / "checkpoints" / "best"
 
     @property
     def model(self) -> Path:
@@ -94,7 +94,7 @@ def start_run(path: Path, config: Settings, data: dict[str, Any], device: str) -
 
 
 def refuse_taken(path: Path) -> None:
-    """A place for a new run that holds anything is an error, but for what a run leaves that hardly began.
+    """Refuse a place for a new run that holds anything but the traces of a run that hardly began.
 
     Raises:
         FileExistsError: the folder is not empty.
@@ -115,7 +115,7 @@ def reopen_run(path: Path, config: Settings) -> RunFolder:
 
     Raises:
         FileNotFoundError: there is no run.
-        ValueError: its settings differ in something that a resumed run must keep.
+        ValueError: its settings differ in one that a resumed run must keep.
     """
     run = RunFolder(path)
     if not run.config.is_file():
@@ -165,11 +165,11 @@ def read_config_tree(path: Path) -> dict[str, Any]:
 
 
 def read_settings(file: Path) -> dict[str, Any]:
-    """Settings that somebody wrote down, or those of a run folder, as plain values.
+    """The settings in a YAML file or a run folder, as plain values.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: it holds something else, or is of a newer version.
+        ValueError: it holds no settings, or is of a newer version.
     """
     file = file / "config.yaml" if file.is_dir() else file
     if not file.is_file():
@@ -190,7 +190,7 @@ def _settings_tree(file: Path, otherwise: str) -> dict[str, Any]:
             f"{file} was written in format {_SHORT.repr(version)}, this version reads up to {FORMAT}: "
             "update derender"
         )
-    return tree
+    return without_removed(tree)
 
 
 def append_metrics(run: RunFolder, row: dict[str, Any]) -> None:
@@ -212,13 +212,13 @@ def read_metrics(path: Path) -> list[dict[str, Any]]:
 
 
 def drop_metrics_after(run: RunFolder, images: int) -> None:
-    """Forget rows written after a checkpoint, so that a resumed run does not tell its story twice."""
+    """Drop rows written after a checkpoint, so that a resumed run writes them once."""
     kept = [row for row in read_metrics(run.path) if row.get("images", 0) <= images]
     write_text(run.metrics, "".join(json.dumps(row) + "\n" for row in kept))
 
 
 def environment(device: str) -> dict[str, Any]:
-    """Versions, machine and commit, for whoever wants to repeat the run."""
+    """Versions, machine and commit, to repeat the run."""
     return {
         "python": platform.python_version(),
         "platform": platform.platform(terse=True),
@@ -230,7 +230,7 @@ def environment(device: str) -> dict[str, Any]:
 
 
 def describe_data(pictures: PictureSet, split: Split) -> dict[str, Any]:
-    """What a run was trained on, for its environment.json."""
+    """The data of a run, for its environment.json."""
     return {
         "layout": pictures.layout,
         "pictures": len(pictures),

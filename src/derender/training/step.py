@@ -1,19 +1,21 @@
-"""One training step's losses: take apart, render the scene and its flipped twin, compare; then LOOCC.
+"""The losses of one training step: decompose, render the scene and its flipped twin, compare; then LOOCC.
 
-Source: unsup3d Sec. 3 (reconstruction), Klinghoffer et al. Sec. 3.2 (LOOCC). Every picture is encoded and
-decoded once; the twin reuses the decoded maps, and perturbed scenes are rendered in the same call. A batch
-may be shared by several devices (distributed.py) and computed in chunks (chunks.py): the losses stay its own.
+Source: unsup3d Sec. 3 (reconstruction), Klinghoffer et al. Sec. 3.2 (LOOCC). Every image is encoded and
+decoded once; the twin reuses the decoded maps, and perturbed scenes are rendered in the same call. Several
+devices may share a batch (distributed.py), and it may be computed in chunks: the losses stay its own.
 """
 
-from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable, Collection, Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Shaped
 from torch import Generator, Tensor
+from torch.utils.checkpoint import checkpoint
 
 from derender.model import Derenderer
+from derender.networks import Factor
 from derender.networks.confidence import Confidence
 from derender.objectives.loocc import loocc_loss
 from derender.objectives.perceptual import PerceptualFeatures, perceptual_loss
@@ -21,33 +23,38 @@ from derender.objectives.reconstruction import depth_curvature, depth_smoothness
 from derender.render import Rendering
 from derender.scene import Scene
 from derender.scene.perturb import choose_factors
-from derender.training.chunks import in_chunks
 from derender.training.config import LOOCC_FACTORS, ObjectiveSettings
 from derender.training.distributed import ALONE, Ranks
-from derender.training.sharing import share_codes
+from derender.training.task import Precision, StepLosses
 
-Precision = Callable[[], AbstractContextManager]
+Columns = Mapping[str, Shaped[Tensor, "n ..."]]
 
 
 @dataclass(frozen=True)
-class StepResult:
-    """Losses of one batch and what the watcher and the sample sheets look at.
+class StepResult(StepLosses):
+    """Losses of one batch, and the values that the watcher and the sample sheets look at.
 
     Attributes:
-        total: what is minimised.
-        terms: every weighted term of it by name, and the plain masked L1 ("l1"), detached.
+        terms: every weighted term of the total by name, and the plain masked L1 ("l1"), detached.
         scene: the scenes predicted for the batch.
         rendering: their renderings, without the twins.
-        codes: the pictures' features by factor, with gradient, for an objective beside this one.
-        confidence: what the confidence net says, where it is used.
+        codes: the images' codes by factor, with gradient, for an objective beside this one.
+        confidence: the output of the confidence net, where it is used.
     """
 
-    total: Tensor
-    terms: dict[str, Tensor]
     scene: Scene
     rendering: Rendering
     codes: dict[str, Tensor]
     confidence: Confidence | None
+
+    def stages(self) -> list[tuple[str, Tensor]]:
+        """The output of every stage of the step by name, in the order in which they work."""
+        stages = [(f"the code of {name}", code) for name, code in self.codes.items()]
+        stages += [(f"the predicted {name}", value) for name, value in self.scene.parameters.items()]
+        if self.confidence is not None:
+            stages += [(f"the {name} confidence", value) for name, value in vars(self.confidence).items()]
+        stages += [(f"the rendered {name}", value) for name, value in vars(self.rendering).items()]
+        return stages + [(f"the loss term {name!r}", value) for name, value in self.terms.items()]
 
 
 def training_step(
@@ -61,26 +68,31 @@ def training_step(
     ranks: Ranks = ALONE,
     chunks: int = 1,
 ) -> StepResult:
-    """Losses for one batch of pictures in 0..1; networks run under ``precision``, geometry in float32.
+    """Losses for one batch of images in 0..1; networks run under ``precision``, geometry in float32.
 
     Args:
-        model: takes the pictures apart.
+        model: the model.
         images: this rank's rows of the batch.
         objective: which terms, and their weights.
         perceptual: features to compare, or None.
         generator: of the perturbations; in the same state on every rank.
         precision: a context for the networks.
-        own: each picture's share in its maps (see sharing.py).
+        own: each image's share in its maps (`own_share`).
         ranks: those that share the batch. Every term is then the rank's part: the mean over ranks is the
             batch's.
-        chunks: in how many runs of pictures networks and renderer work, to save memory.
+        chunks: number of chunks in which networks and renderer work, to save memory.
     """
     count = images.shape[0]
     with precision():
         codes = in_chunks(lambda rows: model.encode(rows["images"]), {"images": images}, chunks)
         shared = share_codes(codes, [f.name for f in model.factors if f.mirrored], own, ranks)
-        scene = Scene.from_parameters(in_chunks(lambda rows: _parameters(model, rows), shared, chunks))
-        confidence = _confidence(model, images, chunks) if objective.confidence else None
+        scene = Scene.from_parameters(
+            in_chunks(lambda rows: dict(model.decode(dict(rows)).parameters), shared, chunks)
+        )
+        confidence = None
+        if objective.confidence:
+            maps = in_chunks(lambda rows: vars(model.confidence(rows["images"])), {"images": images}, chunks)
+            confidence = Confidence(**maps)
     scenes = [scene, model.mirror(scene)]
     left_out = None
     if objective.loocc != "none":
@@ -98,15 +110,16 @@ def training_step(
         * photometric_loss(twin, images, covered, _sigma(confidence, "photometric_flip")),
     }
     if perceptual is not None and objective.perceptual_weight > 0:
-        straight_term, twin_term = _perceptual_terms(
-            perceptual, straight, twin, images, covered, confidence, precision, chunks
-        )
+        columns = {"straight": straight, "twin": twin, "images": images, "covered": covered}
+        straight_term, twin_term = _perceptual_terms(perceptual, columns, confidence, precision, chunks)
         terms["perceptual"] = part * objective.perceptual_weight * straight_term
         terms["perceptual_flip"] = part * objective.perceptual_weight * objective.flip_weight * twin_term
+    ranges = model.settings.ranges
+    inside = ranges.depth_max - ranges.depth_min, ranges.border_columns(model.image_size)
     if objective.smoothness_weight > 0:
-        terms["smoothness"] = objective.smoothness_weight * depth_smoothness(scene.depth, *_inside(model))
+        terms["smoothness"] = objective.smoothness_weight * depth_smoothness(scene.depth, *inside)
     if objective.curvature_weight > 0:
-        terms["curvature"] = objective.curvature_weight * depth_curvature(scene.depth, *_inside(model))
+        terms["curvature"] = objective.curvature_weight * depth_curvature(scene.depth, *inside)
     if left_out is not None:
         seen = fill_uncovered(rendering.image[2 * count :], rendering.mask[2 * count :], images)
         with precision():
@@ -138,20 +151,15 @@ def perturb_one_factor(
     Raises:
         ValueError: the model has none of the factors that ``objective.loocc`` names, or cannot perturb one.
     """
-    wanted = LOOCC_FACTORS[objective.loocc]
-    candidates = [
-        i for i, factor in enumerate(model.factors) if factor.name in wanted and factor.perturb is not None
-    ]
-    if objective.loocc == "all":
-        candidates = [i for i, factor in enumerate(model.factors) if factor.perturb is not None]
-    if not candidates:
+    factors = _contrasted(model, objective)
+    if not factors:
         raise ValueError(
             f"loocc {objective.loocc!r} needs a factor that can be perturbed, this model has none of them"
         )
-    chosen = ranks.own(choose_factors(len(scene) * ranks.count, candidates, generator)).to(scene.depth.device)
+    indices = [model.factors.index(factor) for factor in factors]
+    chosen = ranks.own(choose_factors(len(scene) * ranks.count, indices, generator)).to(scene.depth.device)
     changed = {}
-    for index in candidates:
-        factor = model.factors[index]
+    for index, factor in zip(indices, factors, strict=True):
         assert factor.perturb is not None
         value = scene.parameters[factor.parameter]
         drawn = ranks.own(
@@ -162,14 +170,21 @@ def perturb_one_factor(
     return scene.with_parameters(**changed), chosen
 
 
-def fill_uncovered(
-    rendered: Float[Tensor, "n 3 h w"], mask: Float[Tensor, "n h w"], pictures: Float[Tensor, "n 3 h w"]
-) -> Float[Tensor, "n 3 h w"]:
-    """Give pixels that nothing covers the mean colour of the picture's edge.
+def _contrasted(model: Derenderer, objective: ObjectiveSettings) -> list[Factor]:
+    """The model's factors that LOOCC perturbs."""
+    names = LOOCC_FACTORS[objective.loocc]
+    able = [factor for factor in model.factors if factor.perturb is not None]
+    return able if names is None else [factor for factor in able if factor.name in names]
 
-    Left black, they would tell an encoder how far the camera was turned, which no real picture does.
+
+def fill_uncovered(
+    rendered: Float[Tensor, "n 3 h w"], mask: Float[Tensor, "n h w"], images: Float[Tensor, "n 3 h w"]
+) -> Float[Tensor, "n 3 h w"]:
+    """Give pixels that nothing covers the mean colour of the image's edge.
+
+    Left black, they would show an encoder how far the camera was turned, which no real image does.
     """
-    edge = torch.cat([pictures[..., 0], pictures[..., -1], pictures[:, :, 0]], dim=-1)
+    edge = torch.cat([images[..., 0], images[..., -1], images[:, :, 0]], dim=-1)
     colour = edge.mean(dim=-1)[:, :, None, None]
     return torch.where(mask[:, None] > 0, rendered, colour)
 
@@ -177,25 +192,23 @@ def fill_uncovered(
 def cycle_loss(
     model: Derenderer,
     codes_again: dict[str, Float[Tensor, "n _"]],
-    shown: Scene,
+    rendered: Scene,
     objective: ObjectiveSettings,
 ) -> Float[Tensor, ""]:
-    """How far light and camera, read from a rendering, are from those it was rendered with; ours, 0 is best.
+    """How far light and camera, predicted from a rendering, are from those it was rendered with; best 0.
 
     Mean absolute difference (radians, intensities, scene units) over the vector factors that were perturbed,
-    with the rendered scene as a fixed target: renderings come with exact labels, so they can teach what a
-    picture alone leaves open (pitch above all, which shifted albedo explains nearly as well).
+    with the rendered scene as a fixed target: renderings come with exact labels, so they can teach what an
+    image alone leaves open (pitch above all, which shifted albedo explains nearly as well).
     """
-    wanted = LOOCC_FACTORS[objective.loocc]
     differences = []
-    for factor in model.factors:
-        asked = factor.name in wanted or objective.loocc == "all"
-        if factor.mirrored or factor.perturb is None or not asked:
+    for factor in _contrasted(model, objective):
+        if factor.mirrored:
             continue
         raw = model.nets[factor.name].decode(codes_again[factor.name].float())  # type: ignore[operator]
-        found = factor.to_parameter(raw, model.settings.ranges)
-        differences.append((found - shown.parameters[factor.parameter].detach()).abs().mean())
-    return torch.stack(differences).sum() if differences else shown.depth.new_zeros(())
+        predicted = factor.to_parameter(raw, model.settings.ranges)
+        differences.append((predicted - rendered.parameters[factor.parameter].detach()).abs().mean())
+    return torch.stack(differences).sum() if differences else rendered.depth.new_zeros(())
 
 
 def concatenate(scenes: list[Scene]) -> Scene:
@@ -205,23 +218,58 @@ def concatenate(scenes: list[Scene]) -> Scene:
     )
 
 
-def _inside(model: Derenderer) -> tuple[float, int]:
-    """Depth range and border columns, for terms that look at the free part of the depth maps."""
-    ranges = model.settings.ranges
-    return ranges.depth_max - ranges.depth_min, ranges.border_columns(model.image_size)
+def in_chunks(function: Callable[[Columns], Columns], inputs: Columns, chunks: int) -> dict[str, Tensor]:
+    """Apply a function of rows to ``inputs`` in chunks of rows, each computed again in backward.
+
+    The function's output for a row must not depend on other rows, so networks with batch norm are left out.
+    Loss and gradient are those of the whole batch, up to the rounding of sums, for one more forward pass,
+    because whatever couples the rows (LOOCC's negatives, masked means, shared shapes) sees all outputs.
+    Source: gradient caching (Gao et al. 2021), here through torch's activation checkpointing.
+    """
+    if chunks == 1:
+        return dict(function(inputs))
+    pieces = zip(*(column.chunk(chunks) for column in inputs.values()), strict=True)
+    rows = [dict(zip(inputs, piece, strict=True)) for piece in pieces]
+    if torch.is_grad_enabled():
+        done = [checkpoint(function, row, use_reentrant=False, preserve_rng_state=False) for row in rows]
+    else:
+        done = [function(row) for row in rows]
+    return {name: torch.cat([columns[name] for columns in done]) for name in done[0]}
+
+
+def own_share(objective: ObjectiveSettings, done: float) -> float:
+    """The template start: an image's share in its own maps after this share of the run, 0 (all shared) to 1.
+
+    An image's pose can be explained by its camera, or by a geometry and an albedo that have moved: nothing in
+    the reconstruction prefers the camera (for left and right the flipped twin does, for up and down nothing).
+    While all images share the same maps only camera and light can explain how they differ, so both are
+    learnt. Then each image's own code is let in gradually.
+    """
+    if done < objective.template_share:
+        return 0.0
+    if objective.release_share == 0:
+        return 1.0
+    return min((done - objective.template_share) / objective.release_share, 1.0)
+
+
+def share_codes(
+    codes: Mapping[str, Float[Tensor, "n _"]], names: Collection[str], own: float, ranks: Ranks = ALONE
+) -> dict[str, Float[Tensor, "n _"]]:
+    """The codes of the named factors moved to their mean over the batch, which ``ranks`` may share.
+
+    ``own`` = 1 leaves all as they are.
+    """
+    if own >= 1:
+        return dict(codes)
+    means = {name: ranks.gather(codes[name]).mean(dim=0, keepdim=True) for name in codes if name in names}
+    return {
+        name: torch.lerp(means[name].to(code.dtype).expand_as(code), code, own) if name in names else code
+        for name, code in codes.items()
+    }
 
 
 def _sigma(confidence: Confidence | None, name: str) -> Tensor | None:
     return None if confidence is None else getattr(confidence, name)
-
-
-def _parameters(model: Derenderer, codes: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    return dict(model.decode(dict(codes)).parameters)
-
-
-def _confidence(model: Derenderer, images: Float[Tensor, "n 3 h w"], chunks: int) -> Confidence:
-    maps = in_chunks(lambda rows: vars(model.confidence(rows["images"])), {"images": images}, chunks)
-    return Confidence(**maps)
 
 
 def _rendered(model: Derenderer, scene: Scene, chunks: int) -> Rendering:
@@ -234,52 +282,34 @@ def _rendered(model: Derenderer, scene: Scene, chunks: int) -> Rendering:
 
 def _perceptual_terms(
     perceptual: PerceptualFeatures,
-    straight: Float[Tensor, "n 3 h w"],
-    twin: Float[Tensor, "n 3 h w"],
-    images: Float[Tensor, "n 3 h w"],
-    covered: Float[Tensor, "n h w"],
+    columns: Columns,
     confidence: Confidence | None,
     precision: Precision,
     chunks: int,
-) -> tuple[Tensor, Tensor]:
-    """Both perceptual terms; in chunks each counts as much as its pixels that are covered."""
-    if chunks == 1:
-        return _perceptual_of(perceptual, straight, twin, images, covered, confidence, precision)
+) -> Float[Tensor, "2"]:
+    """The terms of the reconstruction and of its twin; in chunks each counts as its covered pixels.
 
-    def sums(rows: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        seen = rows["covered"]
-        sigma = None if confidence is None else Confidence(**{name: rows[name] for name in vars(confidence)})
-        terms = _perceptual_of(
-            perceptual, rows["straight"], rows["twin"], rows["images"], seen, sigma, precision
-        )
-        return {"sums": (torch.stack(terms) * seen.sum())[None]}
+    ``columns`` are straight, twin and images (n, 3, h, w), and covered (n, h, w); pixels that nothing covers
+    show the image itself.
+    """
+    if chunks > 1:
+        columns = {**columns, **({} if confidence is None else vars(confidence))}
 
-    columns = {"straight": straight, "twin": twin, "images": images, "covered": covered}
-    if confidence is not None:
-        columns |= vars(confidence)
-    total = in_chunks(sums, columns, chunks)["sums"].sum(dim=0)
-    straight_term, twin_term = (total / covered.sum().clamp(min=1)).unbind()
-    return straight_term, twin_term
+        def weighted(rows: Columns) -> dict[str, Tensor]:
+            sigma = confidence and Confidence(**{name: rows[name] for name in vars(confidence)})
+            terms = _perceptual_terms(perceptual, rows, sigma, precision, 1)
+            return {"sums": (terms * rows["covered"].sum())[None]}
 
-
-def _perceptual_of(
-    perceptual: PerceptualFeatures,
-    straight: Float[Tensor, "n 3 h w"],
-    twin: Float[Tensor, "n 3 h w"],
-    images: Float[Tensor, "n 3 h w"],
-    covered: Float[Tensor, "n h w"],
-    confidence: Confidence | None,
-    precision: Precision,
-) -> tuple[Tensor, Tensor]:
-    """The perceptual term of the reconstruction and of its twin; uncovered pixels show the picture itself."""
+        sums = in_chunks(weighted, columns, chunks)["sums"].sum(dim=0)
+        return sums / columns["covered"].sum().clamp(min=1)
+    images, covered = columns["images"], columns["covered"]
     hole = covered[:, None] == 0
-    filled = torch.cat([torch.where(hole, images, straight), torch.where(hole, images, twin)])
+    filled = torch.cat([torch.where(hole, images, columns[name]) for name in ("straight", "twin")])
     with precision():
         with torch.no_grad():
             target = perceptual(images)
         predicted = perceptual(filled)
-    count = images.shape[0]
-    return (
-        perceptual_loss(predicted[:count], target, covered, _sigma(confidence, "perceptual")),
-        perceptual_loss(predicted[count:], target, covered, _sigma(confidence, "perceptual_flip")),
-    )
+    halves = predicted[: len(images)], predicted[len(images) :]
+    sigmas = _sigma(confidence, "perceptual"), _sigma(confidence, "perceptual_flip")
+    terms = zip(halves, sigmas, strict=True)
+    return torch.stack([perceptual_loss(half, target, covered, sigma) for half, sigma in terms])

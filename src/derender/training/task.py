@@ -1,44 +1,48 @@
-"""What a run trains, as the loop sees it: a model, the losses of a batch, and what to look out for.
+"""What a run trains, as the loop sees it: a model, the losses of a batch, and a watcher.
 
-The loop decides on batches, learning rate, checkpoints and when to stop; everything else is the task's. Our
-own model is one task (derender_task.py), the trained baselines are others.
+The loop decides on batches, learning rate, checkpoints and when to stop; everything else is the task's. A
+`Derenderer` is one task (derender_task.py), the trained baselines are others.
 """
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
-from jaxtyping import UInt8
-from torch import Tensor, nn
+import torch
+from jaxtyping import Float, Int64, UInt8
+from torch import Generator, Tensor, nn
 
-from derender.training.config import LoopSettings
+from derender.training.distributed import Ranks
 from derender.training.run_folder import RunFolder
 from derender.training.watch import Finding
 
 PhaseProgress = Callable[[int, int], None]
 """Called with (done, total) while a task prepares itself."""
+Precision = Callable[[], AbstractContextManager]
+"""A context in which networks run."""
 
 
-@runtime_checkable
-class StepLosses(Protocol):
+@dataclass(frozen=True)
+class StepLosses:
     """Losses of one batch: ``total`` is minimised, ``terms`` are its parts and other numbers, detached."""
 
-    @property
-    def total(self) -> Tensor: ...
-    @property
-    def terms(self) -> dict[str, Tensor]: ...
+    total: Tensor
+    terms: dict[str, Tensor]
 
 
-@runtime_checkable
-class SavedModel(Protocol):
-    """A model that knows how to lie in a folder."""
+class Held:
+    """Hides a result from wrappers that walk through a module's output in search of tensors."""
 
-    def save(self, folder: str | Path, *, overwrite: bool = False) -> Path: ...
+    def __init__(self, result: StepLosses):
+        self.result = result
 
 
 @runtime_checkable
 class Watch(Protocol):
-    """Looks at every step and says what is wrong; remembers, so that a resumed run goes on watching."""
+    """Looks at every step and names problems; remembers, so that a resumed run goes on watching."""
 
     @property
     def uneasy(self) -> bool:
@@ -49,41 +53,112 @@ class Watch(Protocol):
     def memory(self) -> dict[str, Any]: ...
 
 
-@runtime_checkable
-class Task(Protocol):
-    """What the loop needs to know of what it trains."""
+class TrainingTask:
+    """What the loop needs to know of what it trains; the base class of all tasks."""
 
-    @property
-    def config(self) -> LoopSettings:
-        """How the run goes."""
-        ...
+    config: Any
+    """A `LoopSettings`."""
+    outside_loss: Any = ()
+    """Names of terms that held-out images are not judged by."""
+    every_parameter_learns = False
+    """Whether every parameter gets a gradient in every step, which saves DDP a search."""
 
-    @property
-    def outside_loss(self) -> tuple[str, ...]:
-        """Names of terms that held-out pictures are not judged by."""
-        ...
+    def shared(self, ranks: Ranks) -> "TrainingTask":
+        """The same task as one of several ranks that share every batch.
+
+        Raises:
+            ValueError: the batch cannot be shared evenly, or the task needs it whole.
+        """
+        raise ValueError("this is trained on one device: start it without torchrun")
 
     def check(self) -> None:
         """Raise what is missing, before a run folder is made."""
-        ...
 
     def build(self) -> nn.Module:
-        """The untrained model, the same for the same seed; it is also a `SavedModel`."""
-        ...
+        """The untrained model, the same for the same seed; its ``save(folder, overwrite=)`` writes it."""
+        raise NotImplementedError
 
     def step_module(
-        self,
-        model: nn.Module,
-        run: RunFolder,
-        images: UInt8[Tensor, "n 3 h w"],
-        progress: PhaseProgress,
+        self, model: nn.Module, run: RunFolder, images: UInt8[Tensor, "n 3 h w"], progress: PhaseProgress
     ) -> nn.Module:
-        """A module ``(pictures, generator, precision, done) -> (total, Held)``; its ``model`` is the model.
+        """A module that `compute_step` can call and that returns (total, Held); its ``model`` is the model.
 
-        ``images`` are all training pictures, on the device.
+        ``images`` are all training images, on the device.
         """
-        ...
+        raise NotImplementedError
 
     def watch(self, memory: dict[str, Any]) -> Watch | None:
         """A watcher that goes on from ``memory``, or None."""
-        ...
+        return None
+
+
+def compute_step(
+    module: nn.Module,
+    images: Float[Tensor, "n 3 h w"],
+    generator: Generator,
+    precision: Precision,
+    done: float | None = None,
+    rows: Int64[Tensor, " n"] | None = None,
+) -> Any:
+    """The losses of one batch through a task's step module, wrapped by a strategy or not.
+
+    ``done`` is the share of the run so far, for what changes in its course; None in evaluation. ``rows`` are
+    the images' places in the run's data set, where labels are found.
+    """
+    _, held = module(images, generator, precision, done, rows)
+    return held.result
+
+
+def network_precision(precision: str, device: torch.device) -> Precision:
+    """A context in which networks run in that precision; geometry and losses are computed outside it."""
+    if precision == "32-true":
+        return nullcontext
+    return partial(torch.autocast, device.type, torch.bfloat16)
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where a run stands, for a progress bar.
+
+    Attributes:
+        phase: "perceptual" while perceptual features are learnt, then "train", then "features" while
+            whitening and fitting are estimated.
+        done, total: steps of the first phase, images of the others.
+        images_per_second: since the run was started or resumed.
+        terms: the latest losses by name.
+        waiting: share of the time, since the run was started or resumed, spent waiting for images, 0..1.
+    """
+
+    phase: str
+    done: int
+    total: int
+    images_per_second: float = 0.0
+    terms: dict[str, float] | None = None
+    waiting: float = 0.0
+
+
+@dataclass(frozen=True)
+class TrainResult:
+    """How a run ended.
+
+    Attributes:
+        folder: the run folder; `derender.load` takes it.
+        images: images seen.
+        seconds: time spent training, resumed parts included.
+        images_per_second: of this call.
+        validation: last validation losses by name.
+        stopped: "images", "minutes", "patience" or "collapse".
+        findings: what the watcher found last; empty without problems.
+        waiting: share of this call's time spent waiting for images, 0..1.
+        model_images: images that the weights of the saved model had seen; None where that is unknown.
+    """
+
+    folder: Path
+    images: int
+    seconds: float
+    images_per_second: float
+    validation: dict[str, float]
+    stopped: str
+    findings: tuple[Finding, ...]
+    waiting: float = 0.0
+    model_images: int | None = None

@@ -1,21 +1,23 @@
-"""Notices a training that fails while its loss still falls, and says so in plain words.
+"""Detects a training that fails while its loss still falls, and explains it in plain words.
 
 Unsupervised geometry can fail in ways that reconstruction does not show: depth that is flat, hollow, torn
-into stripes or stuck at its bounds, every camera at its limit, albedo that simply is the picture. Each sign
-below is a number measured on training batches, smoothed, and compared with a limit; a sign that stays on for
-a while is a finding.
-The limits were set on healthy and collapsed runs (docs/log.md), the times below on runs with batches of 16:
-a network recovers by updates, so with larger batches it is given as many updates, not as many pictures.
+into stripes or stuck at its bounds, every camera at its limit, albedo that equals the image. Each sign below
+is a number measured on training batches, smoothed, and compared with a limit; a sign that stays on for a
+while is a finding. The limits were set on healthy and collapsed runs (docs/log.md), the times on runs with
+batches of 16: networks recover by updates, so larger batches get as many updates, not as many images.
+
+NaN and infinity are looked for at every stage: a NaN need not reach the loss, because a depth of NaN covers
+no pixel, and a pixel that nothing covers does not count. Leaves out images, which are bytes.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 
 from derender.scene import Scene
 from derender.scene.light import lambert_shading
@@ -27,16 +29,17 @@ USUAL_BATCH = 16
 GRACE_IMAGES = 4_000  # a network that has just started has no geometry yet
 SLOW_GRACE_IMAGES = 14_000  # slow starts show pixel noise for longer, and recover
 PERSISTENCE_IMAGES = 4_000  # how long a sign must stay on
-MEMORY_IMAGES = 2_000  # over how many pictures measurements are averaged
+MEMORY_IMAGES = 2_000  # over how many images measurements are averaged
+SLOWER = "use a smaller learning_rate (1e-4 or less), a weight_decay of 5e-4 and warmup_images"
 
 
 @dataclass(frozen=True)
 class Finding:
-    """Something wrong with a run.
+    """A problem of a run.
 
     Attributes:
         sign: short name.
-        text: what is seen, in plain words with the number.
+        text: the problem in plain words, with the number.
         advice: what to change.
         fatal: whether training on is pointless.
     """
@@ -49,7 +52,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Sign:
-    """One row of the table of signs: a measurement, its limit and what it means."""
+    """One row of the table of signs: a measurement, its limit and its meaning."""
 
     name: str
     measure: str
@@ -65,97 +68,109 @@ class Sign:
         return measured > self.limit if self.above else measured < self.limit
 
 
-SLOWER = "use a smaller learning_rate (1e-4 or less), a weight_decay of 5e-4 and warmup_images"
-
 SIGNS = (
     Sign(
-        "saturated depth",
-        "depth_at_bound",
-        0.5,
-        True,
-        True,
-        "{value:.0%} of the depth values lie at the bounds of their range",
-        SLOWER,
+        "saturated depth", "depth_at_bound", 0.5, above=True, fatal=True, advice=SLOWER,
+        text="{value:.0%} of the depth values lie at the bounds of their range",
     ),
     Sign(
-        "torn depth",
-        "depth_roughness",
-        0.6,
-        True,
-        True,
-        "depth jumps from pixel to pixel ({value:.2f} of its spread; a smooth surface has less than 0.3)",
-        f"set curvature_weight=3, which removes stripes; {SLOWER}",
-        SLOW_GRACE_IMAGES,
-        SLOW_GRACE_IMAGES,
+        "torn depth", "depth_roughness", 0.6, above=True, fatal=True,
+        text="depth jumps from pixel to pixel ({value:.2f} of its spread; a smooth surface has below 0.3)",
+        advice=f"set curvature_weight=3, which removes stripes; {SLOWER}",
+        grace_images=SLOW_GRACE_IMAGES, usual_images=SLOW_GRACE_IMAGES,
     ),
     Sign(
-        "flat depth",
-        "depth_spread",
-        0.03,
-        False,
-        False,
-        "depth is flat (spread {value:.1%} of its range)",
-        "train longer; if it stays, the pictures may show too little variety of light and view",
+        "flat depth", "depth_spread", 0.03, above=False, fatal=False,
+        text="depth is flat (spread {value:.1%} of its range)",
+        advice="train longer; if it stays, the images may show too little variety of light and view",
     ),
     Sign(
-        "hollow depth",
-        "bulge",
-        -0.15,
-        False,
-        True,
-        "surfaces are hollow: the middle lies {value:.0%} of the depth range behind the rim",
-        "start again with another seed; light from above in most pictures helps, upside-down pictures hurt",
+        "hollow depth", "bulge", -0.15, above=False, fatal=True,
+        text="surfaces are hollow: the middle lies {value:.0%} of the depth range behind the rim",
+        advice="start again with another seed; light from above in most images helps, upside-down ones hurt",
     ),
     Sign(
-        "view at its bound",
-        "view_at_bound",
-        0.5,
-        True,
-        True,
-        "{value:.0%} of the pictures have the camera turned to its limit",
-        SLOWER,
+        "view at its bound", "view_at_bound", 0.5, above=True, fatal=True, advice=SLOWER,
+        text="{value:.0%} of the images have the camera turned to its limit",
     ),
     Sign(
-        "light at its bound",
-        "light_at_bound",
-        0.8,
-        True,
-        False,
-        "{value:.0%} of the pictures have the light at the limit of its angles",
-        "look at the samples; a smaller learning_rate or a wider light_deg may help",
+        "light at its bound", "light_at_bound", 0.8, above=True, fatal=False,
+        text="{value:.0%} of the images have the light at the limit of its angles",
+        advice="look at the samples; a smaller learning_rate or a wider light_deg may help",
     ),
     Sign(
-        "albedo copies the picture",
-        "shading_contrast",
-        0.004,
-        False,
-        False,
-        "shading is the same everywhere (contrast {value:.2%}), so albedo is the picture itself",
-        "raise flip_weight, or check that the pictures show the thing from the front and roughly symmetric",
+        "albedo copies the picture", "shading_contrast", 0.004, above=False, fatal=False,
+        text="shading is the same everywhere (contrast {value:.2%}), so albedo is the image itself",
+        advice="raise flip_weight, or check that images show the object from the front, roughly symmetric",
     ),
-)
+)  # fmt: skip
+
+
+def first_not_finite(stages: Iterable[tuple[str, Tensor]]) -> str | None:
+    """The name of the first tensor that holds NaN or infinity; None where none does."""
+    named = [(name, value.detach()) for name, value in stages]
+    if not named:
+        return None
+    finite = torch.stack([value.isfinite().all() for _, value in named]).tolist()
+    return next((name for (name, _), one in zip(named, finite, strict=True) if not one), None)
+
+
+def broken_gradient(model: nn.Module) -> str | None:
+    """Names the first parameter whose gradient is not finite; None where all gradients are."""
+    gradients = [(name, value.grad) for name, value in model.named_parameters() if value.grad is not None]
+    if not gradients or bool(torch.stack([gradient.sum() for _, gradient in gradients]).isfinite().all()):
+        return None  # a sum is finite only if its terms are
+    return first_not_finite((f"the gradient of {name}", gradient) for name, gradient in gradients)
+
+
+def not_finite(what: str) -> Finding:
+    """The finding that ends a run with a value that is NaN or infinite."""
+    return Finding("non-finite value", f"{what} is not finite", f"{SLOWER}; with bf16, try 32-true", True)
+
+
+@dataclass
+class FiniteWatch:
+    """Looks for a loss that is not finite: the watcher of what has no scene."""
+
+    uneasy: bool = field(default=False, init=False)
+
+    def look(self, images: int, result: Any) -> tuple[Finding, ...]:
+        """A fatal finding once the loss is not finite."""
+        loss = result.total.item()
+        if math.isfinite(loss):
+            return ()
+        broken = first_not_finite(result.terms.items())
+        first = "" if broken is None else f"; the first term that is not finite is {broken!r}"
+        return (
+            Finding("non-finite loss", f"the loss is {loss}{first}", "use a smaller learning_rate", True),
+        )
+
+    def memory(self) -> dict[str, Any]:
+        """Nothing: a finite loss leaves nothing to remember."""
+        return {}
 
 
 @dataclass
 class Watcher:
-    """Looks at training batches and remembers what it saw.
+    """Looks at training batches and remembers its measurements.
 
     Args:
         ranges: bounds of the scene.
-        batch_size: pictures in every update.
-        memory: what `memory()` gave in the run that is resumed.
+        batch_size: images in every update.
     """
 
     ranges: SceneRanges
     batch_size: int
     averages: dict[str, float] = field(default_factory=dict)
-    on_since: dict[str, int] = field(default_factory=dict)  # pictures seen when a sign came on
+    on_since: dict[str, int] = field(default_factory=dict)  # images seen when a sign came on
     last_images: int = 0
     ranks: Ranks = ALONE  # those that share a batch; all see the same
     uneasy: bool = False  # whether the latest batch or the averages show a fatal sign: no state to keep
 
     @classmethod
-    def remembering(cls, ranges: SceneRanges, batch_size: int, memory: Mapping[str, Any]) -> "Watcher":
+    def remembering(
+        cls, ranges: SceneRanges, batch_size: int, memory: Mapping[str, Any], ranks: Ranks = ALONE
+    ) -> "Watcher":
         """A watcher that goes on where ``memory`` was taken; an empty one starts fresh.
 
         Raises:
@@ -165,6 +180,7 @@ class Watcher:
             watcher = cls(ranges, batch_size, **memory)
             numbers = [watcher.last_images, *watcher.averages.values(), *watcher.on_since.values()]
             if all(type(number) in (int, float) for number in numbers):
+                watcher.ranks = ranks
                 return watcher
         except (TypeError, AttributeError):
             pass
@@ -174,17 +190,25 @@ class Watcher:
         )
 
     def memory(self) -> dict[str, Any]:
-        """What a resumed run needs."""
+        """The state that a resumed run needs."""
         return {
             "averages": dict(self.averages),
             "on_since": dict(self.on_since),
             "last_images": self.last_images,
         }
 
-    def look(self, images: int, loss: float, scene: Scene, broken: str | None = None) -> tuple[Finding, ...]:
-        """What is wrong after ``images`` pictures, given the latest batch; usually nothing.
+    def look(self, images: int, result: Any) -> tuple[Finding, ...]:
+        """The problems of a step's result (a `training.step.StepResult`); usually none."""
+        broken = first_not_finite(result.stages())
+        shared = self.ranks.mean({"loss": result.total.item(), "broken": float(broken is not None)})
+        if shared["broken"] and broken is None:
+            broken = "that of another rank"
+        return self.judge(images, shared["loss"], result.scene, broken)
 
-        ``broken`` names the first stage that gave a value that is no number, if one did.
+    def judge(self, images: int, loss: float, scene: Scene, broken: str | None = None) -> tuple[Finding, ...]:
+        """The problems after ``images`` images, given the latest batch's loss and scenes; usually none.
+
+        ``broken`` names the first stage whose value is not finite, if there is one.
         """
         if broken is not None or not math.isfinite(loss):
             self.uneasy = True
@@ -216,7 +240,7 @@ class Watcher:
 
 @torch.no_grad()
 def measure(scene: Scene, ranges: SceneRanges) -> dict[str, float]:
-    """The numbers that signs are read from, each a mean over the batch.
+    """The measurements of all signs, each a mean over the batch.
 
     depth_at_bound, view_at_bound, light_at_bound: shares, 0..1. depth_spread: standard deviation of a depth
     map over its range. depth_roughness: mean step between neighbours over that deviation. bulge: how far

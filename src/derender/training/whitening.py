@@ -19,7 +19,6 @@ from derender.model import Derenderer
 from derender.networks import Factor
 from derender.postprocess.whitening import Spread, Whitening, contrast
 from derender.scene import Scene
-from derender.scene.crop import crop_images, random_crops
 from derender.scene.perturb import PerturbSettings
 from derender.training.config import WhiteningSettings
 from derender.training.step import fill_uncovered
@@ -83,8 +82,6 @@ def fit_whitening(
                     _seen_otherwise(model, scene, batch, moving, perturb, generator)
                     for _ in range(settings.views)
                 ]
-                for _ in range(settings.frames):
-                    shown.append(crop_images(batch, random_crops(len(batch), generator, settings.reframe)))
                 views = [say(one) for one in shown]
                 if settings.mirrored:
                     views += [say(one.flip(-1)) for one in shown]

@@ -17,17 +17,16 @@ from derender.evaluation.finetuning import (
     target_loss,
     target_of,
 )
-from derender.evaluation.finetuning.task import RENDERING_TERMS
+from derender.evaluation.finetuning.joint import RENDERING_TERMS, FinetuneStep
 from derender.evaluation.memory import Memory
 from derender.report.run import run_page
 from derender.report.tables_finetuning import finetuning_table
 from derender.training.batches import random_stream
 from derender.training.checkpoint import WEIGHTS_FILE
-from derender.training.config import PRESETS, with_changes
-from derender.training.finetune_config import FinetuneConfig
-from derender.training.loop import network_precision, train_task
+from derender.training.config import PRESETS, FinetuneConfig, with_changes
+from derender.training.loop import train_task
 from derender.training.run_folder import RunFolder, read_metrics
-from derender.training.step_module import compute_step
+from derender.training.task import compute_step, network_precision
 
 TINY = ["image_size=32", "width=4", "light_width=4", "perceptual=none", "batch_size=8", "patience=99"]
 TINY += ["validate_every=32", "checkpoint_every=32", "deterministic=true", "watch=false", "warmup_images=0"]
@@ -81,9 +80,12 @@ def test_both_objectives_reach_the_encoders(pictures, tmp_path):
         module = one.step_module(
             model, RunFolder(tmp_path), torch.zeros(0, 3, 32, 32, dtype=torch.uint8), lambda *at: None
         )
-        images = torch.from_numpy(pictures.images[one.target.split.train[:8]]).float() / 255
+        rows = one.target.split.train[:8]
+        images = torch.from_numpy(pictures.images[rows]).float() / 255
         precision = network_precision("32-true", torch.device("cpu"))
-        losses = compute_step(module, images, random_stream(0, "perturb", 0), precision, 0.5)
+        losses = compute_step(
+            module, images, random_stream(0, "perturb", 0), precision, 0.5, torch.from_numpy(rows)
+        )
         assert set(losses.terms) - {"target"} <= set(RENDERING_TERMS)
         losses.total.backward()
         found = [
@@ -116,13 +118,29 @@ def test_a_resumed_run_ends_with_the_very_weights_and_the_model_loads(pictures, 
     images = torch.from_numpy(pictures.images[:4]).float() / 255
     tuned = load_finetuned(tmp_path / "whole")
     assert torch.equal(tuned.model.embed(images)["geometry"], model.embed(images)["geometry"])
-    assert tuned.answer(images).sum(dim=1) == pytest.approx(np.ones(4), abs=1e-5)
+    assert tuned.predict(images).sum(dim=1) == pytest.approx(np.ones(4), abs=1e-5)
     best = load_file(tmp_path / "whole" / "checkpoints" / "best" / WEIGHTS_FILE)
     assert torch.equal(best["head.linear.weight"], tuned.head.linear.weight)
     assert "Preset small" in run_page(tmp_path / "whole").html()
     with pytest.raises(ValueError, match="was trained with another target"):
         other = task(pictures, "images=96", labels=("dark",))
         train_task(other, pictures, tmp_path / "whole", resume=True)
+
+
+def test_every_batch_of_the_loop_gets_its_labels(pictures, tmp_path, monkeypatch):
+    forward, seen = FinetuneStep.forward, set()
+
+    def noted(step, images, generator, precision, done=None, rows=None):
+        for image, row in zip((images * 255).round().byte().numpy(), rows.tolist(), strict=True):
+            views = pictures.images[row], pictures.images[row][..., ::-1]
+            assert any((image == view).all() for view in views)
+            seen.add(row)
+        return forward(step, images, generator, precision, done, rows)
+
+    monkeypatch.setattr(FinetuneStep, "forward", noted)
+    one = task(pictures, "images=48", "rendering_weight=0")
+    train_task(one, pictures, tmp_path / "run")
+    assert seen == {*one.target.split.train.tolist(), *one.target.split.validation.tolist()}
 
 
 def test_it_learns_beside_the_controls_and_leaves_its_start_alone(pictures, tmp_path):
@@ -190,7 +208,7 @@ def test_target_loss_is_torchs_cross_entropy_over_what_is_known():
 
 
 def test_bad_input_is_named_before_a_folder_is_made(pictures, tmp_path):
-    with pytest.raises(ValueError, match="name a label to learn; the pictures have bright, dark"):
+    with pytest.raises(ValueError, match="name a label to learn; the images have bright, dark"):
         target_of(pictures, config(labels=()))
     with pytest.raises(ValueError, match="has no label 'shades'; did you mean 'shade'"):
         target_of(pictures, config(labels=("shades",)))
@@ -200,7 +218,7 @@ def test_bad_input_is_named_before_a_folder_is_made(pictures, tmp_path):
         target_of(pictures, config(labels=("shade", "dark")))
     shade = np.full(60, "high")
     shade[target_of(pictures, config()).split.train] = "low"
-    with pytest.raises(ValueError, match="48 labelled pictures to learn from have one class of shade only"):
+    with pytest.raises(ValueError, match="48 labelled images to learn from have one class of shade only"):
         target_of(replace(pictures, labels={"shade": shade}), config())
     with pytest.raises(ValueError, match="48 with shade: set labelled=48 or fewer"):
         target_of(pictures, config(target__labelled=49))

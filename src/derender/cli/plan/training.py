@@ -15,7 +15,7 @@ from derender.baselines import image_size_of, load_baseline, train_baseline
 from derender.cli.plan.jobs import Job, Note, Place, facts_of_file
 from derender.cli.plan.settings import OURS, WITHOUT_LOOP, Plan
 from derender.evaluation.memory import content_hash
-from derender.training.interrupt import TrainingInterrupted
+from derender.training.process import TrainingInterrupted
 
 
 class BudgetUsed(Exception):
@@ -73,7 +73,7 @@ def _train(
     from derender.data import read_pictures
     from derender.report.baseline_sheet import baseline_sheet
     from derender.report.run import decomposition_sheet
-    from derender.training.loop import train
+    from derender.training.derender_task import train
 
     learnt, in_the_loop = plan.train[job.where], plan.kind(job.method) not in WITHOUT_LOOP
     resume = in_the_loop and (run / "config.yaml").is_file()

@@ -1,12 +1,15 @@
-"""Joint training with a target task: the paper's future work.
+"""Joint training with labels, the paper's future work: the task of the training loop, and held-out scores."""
 
-task: both objectives as a task of the training loop; pixel_labels: a batch's labels; model: what is trained
-and saved; score: held-out scores beside heads on frozen features.
-"""
-
-from derender.evaluation.finetuning.model import FinetunedModel, TargetHead, load_finetuned
+from derender.evaluation.finetuning.joint import (
+    FinetunedModel,
+    FinetuneTask,
+    Target,
+    TargetHead,
+    load_finetuned,
+    target_loss,
+    target_of,
+)
 from derender.evaluation.finetuning.score import FinetuneScores, score_finetuned
-from derender.evaluation.finetuning.task import FinetuneTask, Target, target_loss, target_of
 
 __all__ = [
     "FinetuneScores",

@@ -13,8 +13,7 @@ import numpy as np
 from derender.baselines.controls import pca_features, pixel_features, untrained_twin
 from derender.data import PictureSet
 from derender.evaluation.bootstrap import RESAMPLES, Difference, ScoredRow, difference
-from derender.evaluation.finetuning.model import FinetunedModel
-from derender.evaluation.finetuning.task import FinetuneTask
+from derender.evaluation.finetuning.joint import FinetunedModel, FinetuneTask
 from derender.evaluation.linear_compare import Progress, compare_linear
 from derender.evaluation.linear_task import Rows, Task
 from derender.evaluation.memory import Memory
@@ -80,7 +79,7 @@ def score_finetuned(
 
     def answered() -> dict[str, np.ndarray]:
         parts = map_batches(
-            lambda batch: tuned.answer(batch).cpu().numpy(), tuned, task.images[test], batch_size=256
+            lambda batch: tuned.predict(batch).cpu().numpy(), tuned, task.images[test], batch_size=256
         )
         return {"answers": np.concatenate(parts)}
 

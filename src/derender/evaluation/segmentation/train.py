@@ -18,7 +18,7 @@ from derender.data import as_float
 from derender.evaluation.segmentation.pixels import SegmentationData
 from derender.networks.unet import SegmentationNet
 from derender.settings import Settings
-from derender.training.allocator import freed_memory_kept
+from derender.training.process import freed_memory_kept
 
 LARGEST_BATCH, SMALLEST_BATCH, STEPS_AN_EPOCH = 64, 2, 320
 

@@ -1,0 +1,298 @@
+"""Joint training as a task of the training loop: the rendering objective and labels, one total.
+
+Source: Klinghoffer et al., ECCV 2022, Sec. 3.1, where it is future work ("jointly train a learned
+representation with the target task in mind"). Images without a label take part in the rendering objective
+alone. Held-out images are judged by the labels, which so choose the saved weights. Leaves out weights of
+classes, and a rate of its own for the head.
+"""
+
+import copy
+import json
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Generator, Tensor, nn
+
+from derender.data import PictureSet, Split, split_indices, suggestion
+from derender.evaluation.linear_head import head_loss, probabilities
+from derender.evaluation.linear_task import Task, task_of
+from derender.model import Derenderer, load
+from derender.objectives.perceptual import PerceptualFeatures
+from derender.storage.atomic import atomic_file, atomic_folder
+from derender.storage.tensors import read_tensors, write_tensors
+from derender.training.config import FinetuneConfig
+from derender.training.derender_task import DerenderTask, perceptual_of
+from derender.training.loop import NOT_RECONSTRUCTION
+from derender.training.run_folder import RunFolder
+from derender.training.step import own_share, training_step
+from derender.training.task import Held, PhaseProgress, Precision, StepLosses, TrainingTask, Watch
+from derender.training.watch import FiniteWatch, Watcher
+
+HEAD_FILE, HEAD_CONFIG_FILE = "head.safetensors", "head.json"
+RENDERING_TERMS = (
+    *("photometric", "photometric_flip", "perceptual", "perceptual_flip", "smoothness", "curvature"),
+    *NOT_RECONSTRUCTION,
+)
+
+
+class TargetHead(nn.Module):
+    """One linear layer on standardised codes: every dimension with mean 0 and variance 1.
+
+    Attributes:
+        factors: whose codes it takes, side by side.
+        kind: "labels" (yes or no, each apart) or "classes" (one of several).
+        names: of the labels, or of the classes.
+    """
+
+    def __init__(self, factors: Sequence[str], width: int, kind: str, names: Sequence[str]):
+        super().__init__()
+        self.factors, self.kind, self.names = tuple(factors), kind, tuple(names)
+        self.standardise = nn.BatchNorm1d(width, affine=False)
+        self.linear = nn.Linear(width, len(self.names))
+
+    def forward(self, codes: Mapping[str, Tensor]) -> Float[Tensor, "n outputs"]:
+        """Logits from codes by factor."""
+        return self.linear(self.standardise(torch.cat([codes[name].float() for name in self.factors], dim=1)))
+
+
+class FinetunedModel(nn.Module):
+    """A `Derenderer` and a head on its codes."""
+
+    def __init__(self, model: Derenderer, head: TargetHead):
+        super().__init__()
+        self.model, self.head = model, head
+
+    @property
+    def device(self) -> torch.device:
+        return self.model.device
+
+    @property
+    def image_size(self) -> int:
+        return self.model.image_size
+
+    def predict(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n outputs"]:
+        """Probabilities for images in 0..1: of each label, or of every class."""
+        return probabilities(self.head(self.model.encode(images)), self.head.kind)
+
+    def save(self, folder: str | Path, *, overwrite: bool = False) -> Path:
+        """Write a folder that `derender.load` takes, the head beside the model; complete or not at all."""
+        folder = Path(folder)
+        if folder.exists() and not overwrite:
+            raise FileExistsError(f"{folder} exists already: choose another folder or pass overwrite=True")
+        about = {"factors": self.head.factors, "kind": self.head.kind, "names": self.head.names}
+        with atomic_folder(folder) as temporary:
+            self.model.save(temporary, overwrite=True)
+            write_tensors(self.head.state_dict(), temporary / HEAD_FILE)
+            (temporary / HEAD_CONFIG_FILE).write_text(json.dumps(about, indent=1))
+        return folder
+
+
+def load_finetuned(source: str | Path, *, device: str | torch.device = "cpu") -> FinetunedModel:
+    """A run folder of `derender finetune`, or its ``model``, ready to predict.
+
+    Raises:
+        FileNotFoundError: there is no model, or none with a head.
+        ValueError: it is damaged.
+    """
+    model, folder = load(source, device=device), Path(source)
+    folder = folder if (folder / HEAD_FILE).is_file() else folder / "model"
+    if not (folder / HEAD_FILE).is_file():
+        raise FileNotFoundError(f"{source} has no head ({HEAD_FILE}): give a run made by 'derender finetune'")
+    try:
+        about = json.loads((folder / HEAD_CONFIG_FILE).read_text())
+        width = model.settings.network.code_size * len(about["factors"])
+        head = TargetHead(about["factors"], width, about["kind"], about["names"])
+        head.load_state_dict(read_tensors(folder / HEAD_FILE))
+    except (OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
+        raise ValueError(f"the head in {folder} is damaged: copy or train the model again") from error
+    return FinetunedModel(model, head.to(device)).eval().requires_grad_(False)
+
+
+@dataclass(frozen=True)
+class Target:
+    """The labels of a joint training, and the part of them that it may see.
+
+    Attributes:
+        asked: the labels of all images.
+        visible: (N, A) the same; -1 for training images beyond those labelled, and for all tested ones.
+        split: the run's own parts; the test part is never seen by training.
+    """
+
+    asked: Task
+    visible: np.ndarray
+    split: Split
+
+
+def target_of(pictures: PictureSet, config: FinetuneConfig) -> Target:
+    """The labels that the configuration names, -1 where training must not see them.
+
+    Raises:
+        ValueError: no or unknown labels, a single class, fewer labelled images than requested, or unknown
+            factors.
+    """
+    target = config.target
+    if not target.labels:
+        known = ", ".join(pictures.labels) or "no labels"
+        raise ValueError(f"name a label to learn; the images have {known}")
+    asked = task_of({name: pictures.label(name) for name in target.labels})
+    split = split_indices(pictures.files, config.split, seed=config.seed)
+    labelled = split.train[asked.known[split.train]]
+    if target.labelled is not None:
+        if target.labelled > len(labelled):
+            raise ValueError(
+                f"{target.labelled:,} labelled images were requested, the training part has "
+                f"{len(labelled):,} with {', '.join(target.labels)}: set labelled={len(labelled)} or fewer"
+            )
+        labelled = np.random.default_rng(config.seed).permutation(labelled)[: target.labelled]
+    if len(labelled) < 2 or not (asked.targets[labelled] == 1).any():
+        raise ValueError(
+            f"the training part has {len(labelled)} images with {', '.join(target.labels)} to learn from: "
+            "bring more labelled images"
+        )
+    known = asked.targets[labelled]
+    varied = (known == 1).any(axis=0) & ((known == 0).any(axis=0))
+    if not varied.any():
+        raise ValueError(
+            f"the {len(labelled)} labelled images to learn from have one class of "
+            f"{', '.join(target.labels)} only: use more of them, or another seed"
+        )
+    visible = np.full_like(asked.targets, -1)
+    for rows in (labelled, split.validation):
+        visible[rows] = asked.targets[rows]
+    return Target(asked, visible, split)
+
+
+@dataclass(frozen=True)
+class FinetuneTask(TrainingTask):
+    """Train a `Derenderer` and a head on its codes.
+
+    Attributes:
+        config: how.
+        images: (N, 3, H, W) all images of the run.
+        target: their labels.
+        start: the pre-trained model, which stays as it is; None for fresh weights.
+    """
+
+    config: FinetuneConfig
+    images: UInt8[np.ndarray, "n 3 h w"]
+    target: Target
+    start: Derenderer | None = None
+    outside_loss: tuple[str, ...] = RENDERING_TERMS
+
+    def check(self) -> None:
+        """Raise what is missing or does not fit, before a folder is made."""
+        if self.config.target.rendering_weight > 0:
+            DerenderTask(self.config).check()
+        if self.start is not None and self.start.settings != self.config.model:
+            raise ValueError(
+                "the networks of a pre-trained model are given: leave out settings of model.network and "
+                "model.ranges"
+            )
+        known = [factor.name for factor in (self.start or Derenderer(self.config.model)).factors]
+        for name in self.config.target.factors:
+            if name not in known:
+                raise ValueError(f"no factor {name!r}{suggestion(name, known)}: there is {', '.join(known)}")
+
+    def build(self) -> FinetunedModel:
+        """The model to start from with a fresh head, the same for the same seed."""
+        target, config = self.config.target, self.config
+        model = (
+            Derenderer.seeded(config.model, config.seed) if self.start is None else copy.deepcopy(self.start)
+        )
+        width = config.model.network.code_size * len(target.factors)
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(config.seed)
+            head = TargetHead(target.factors, width, self.target.asked.kind, self.target.asked.names)
+        return FinetunedModel(model.cpu(), head).requires_grad_(True).train()
+
+    def step_module(
+        self, model: nn.Module, run: RunFolder, images: UInt8[Tensor, "n 3 h w"], progress: PhaseProgress
+    ) -> "FinetuneStep":
+        """The step, with all labels, and with the perceptual features of the run that it starts from."""
+        assert isinstance(model, FinetunedModel)
+        perceptual = None
+        if self.config.target.rendering_weight > 0:
+            _bring_perceptual(self.config, run.perceptual)
+            perceptual = perceptual_of(self.config, run, images, progress)
+        labels = torch.from_numpy(self.target.visible).float().to(images.device)
+        return FinetuneStep(model, self.config, labels, perceptual)
+
+    def watch(self, memory: dict[str, Any]) -> Watch:
+        """The collapse detector; where nothing is rendered, a watcher of the loss."""
+        if self.config.target.rendering_weight == 0:
+            return FiniteWatch()
+        return Watcher.remembering(self.config.model.ranges, self.config.batch_size, memory)
+
+
+class FinetuneStep(nn.Module):
+    """Model, head and both objectives; a batch goes in, the total and the result come out.
+
+    ``labels`` (N, A) are those of the whole data set: -1 (unknown), 0 or 1.
+    """
+
+    def __init__(
+        self,
+        model: FinetunedModel,
+        config: FinetuneConfig,
+        labels: Float[Tensor, "n a"],
+        perceptual: PerceptualFeatures | None,
+    ):
+        super().__init__()
+        self.model, self.config, self.labels, self.perceptual = model, config, labels, perceptual
+
+    def forward(
+        self,
+        images: Tensor,
+        generator: Generator,
+        precision: Precision,
+        done: float | None = None,
+        rows: Tensor | None = None,
+    ) -> tuple[Tensor, Held]:
+        assert rows is not None
+        config, target, head = self.config, self.config.target, self.model.head
+        if target.rendering_weight == 0:
+            with precision():
+                codes = self.model.model.encode(images)
+            result = StepLosses(images.new_zeros(()), {})
+        else:
+            own = 1.0 if done is None or config.start is not None else own_share(config.objective, done)
+            result = training_step(
+                self.model.model, images, config.objective, self.perceptual, generator, precision, own
+            )
+            codes = result.codes
+        terms = {
+            name: value if name == "l1" else target.rendering_weight * value
+            for name, value in result.terms.items()
+        }
+        labels = self.labels[rows.to(self.labels.device)]
+        loss = target.weight * target_loss(head(codes), labels, head.kind)
+        total = target.rendering_weight * result.total + loss
+        return total, Held(replace(result, total=total, terms={**terms, "target": loss.detach()}))
+
+
+def target_loss(logits: Float[Tensor, "n a"], targets: Float[Tensor, "n a"], kind: str) -> Float[Tensor, ""]:
+    """Mean cross-entropy over images with a known class, or over known labels; 0 where none is known.
+
+    ``targets`` are -1 (unknown), 0, 1; for classes one-hot, or all -1.
+    """
+    if kind == "labels":
+        return head_loss(logits[None], targets[None], kind)[0]
+    known = (targets >= 0).any(dim=1)
+    each = -(logits.log_softmax(dim=1) * targets.clamp(min=0)).sum(dim=1)
+    return (each * known).sum() / known.sum().clamp(min=1)
+
+
+def _bring_perceptual(config: FinetuneConfig, file: Path) -> None:
+    """Copy self-trained perceptual features from the run it starts from: its sigmas belong to them."""
+    if config.start is None or config.objective.perceptual != "self" or file.exists():
+        return
+    there = RunFolder(Path(config.start)).perceptual
+    if there.is_file():
+        with atomic_file(file) as temporary:
+            shutil.copyfile(there, temporary)

@@ -1,0 +1,87 @@
+"""The process of a run: Ctrl-C and SIGTERM, torch's deterministic operators, and memory that is freed."""
+
+import ctypes
+import os
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import torch
+
+_TRIM_THRESHOLD, _MMAP_MAX = -1, -4  # numbers of mallopt's parameters in glibc's malloc.h
+_KEEP = {_TRIM_THRESHOLD: -1, _MMAP_MAX: 0}  # never trim; no blocks of their own mapping
+_DEFAULT = {_TRIM_THRESHOLD: 128 * 1024, _MMAP_MAX: 65_536}
+
+
+class TrainingInterrupted(KeyboardInterrupt):
+    """Ctrl-C or SIGTERM during training; the run was saved first and can be resumed."""
+
+
+@dataclass
+class StopRequest:
+    """Whether a signal has requested a stop."""
+
+    requested: bool = False
+
+
+@contextmanager
+def stop_on_signal() -> Iterator[StopRequest]:
+    """Turn the first Ctrl-C or SIGTERM into a request; a second one ends the program at once.
+
+    Outside the main thread signals cannot be caught, and the request never comes.
+    """
+    request = StopRequest()
+    if threading.current_thread() is not threading.main_thread():
+        yield request
+        return
+    previous = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+
+    def note(number: int, frame: object) -> None:
+        if request.requested:
+            raise KeyboardInterrupt
+        request.requested = True
+
+    for number in previous:
+        signal.signal(number, note)
+    try:
+        yield request
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def deterministic_algorithms(deterministic: bool) -> Iterator[None]:
+    """Within the block torch uses deterministic operators (an error names one that has none), or need not."""
+    before = torch.are_deterministic_algorithms_enabled()
+    warn_only = torch.is_deterministic_algorithms_warn_only_enabled()
+    if deterministic:
+        os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # on CUDA torch refuses without
+    torch.use_deterministic_algorithms(deterministic)
+    try:
+        yield
+    finally:
+        torch.use_deterministic_algorithms(before, warn_only=warn_only)
+
+
+@contextmanager
+def freed_memory_kept() -> Iterator[bool]:
+    """Have glibc reuse freed memory instead of returning it; gives whether it could be configured so.
+
+    glibc returns every freed large block, and the system fills it with zeros, page by page, when it is needed
+    again: up to a third of a training step on a CPU. Until the end of the block the process keeps its highest
+    need. Leaves other allocators, and memory of other devices, as they are.
+    """
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform.startswith("linux") else None
+    if mallopt is None:
+        yield False
+        return
+    accepted = [mallopt(parameter, value) for parameter, value in _KEEP.items()]
+    try:
+        yield all(accepted)
+    finally:
+        for parameter, value in _DEFAULT.items():
+            mallopt(parameter, value)
