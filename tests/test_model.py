@@ -10,13 +10,14 @@ import torch
 import derender
 from derender.data import check_pictures, read_ground_truth
 from derender.evaluation import evaluate_geometry
-from derender.model import CONFIG_FILE, PRETRAINED, WEIGHTS_FILE, Derenderer, bundled_models, load
+from derender.model import Derenderer, load
 from derender.networks import FACTORS, Factor
-from derender.networks.encoders import reading
+from derender.networks.encoders import activations
 from derender.networks.factors import vector_net
 from derender.presets import ModelSettings
 from derender.render import Rendering, render_scene
 from derender.scene import Scene
+from derender.storage.folder import CONFIG_FILE, PRETRAINED, WEIGHTS_FILE, bundled_models
 from derender.training.config import ObjectiveSettings
 from derender.training.step import training_step
 
@@ -56,22 +57,22 @@ def test_embed_gives_one_feature_per_factor(model, images):
     assert all(feature.shape == (3, 256) for feature in features.values())
 
 
-def test_a_reading_begins_with_the_code_and_ends_with_the_places_before_it(model, images):
-    readings = model.read(images)
+def test_activations_begin_with_the_code_and_end_with_the_spatial_map(model, images):
+    found = model.activations(images)
     codes = model.encode(images)
-    for name, code in model.codes(readings).items():
+    for name, code in model.codes(found).items():
         torch.testing.assert_close(code, codes[name])
-        torch.testing.assert_close(model.features(readings)[name], codes[name])  # nothing was fitted yet
+        torch.testing.assert_close(model.features_from(found)[name], codes[name])  # nothing was fitted yet
         places = model.nets[name].encoder.spatial(images)
-        torch.testing.assert_close(readings[name][:, code.shape[1] :], places.flatten(1))
+        torch.testing.assert_close(found[name][:, code.shape[1] :], places.flatten(1))
 
 
 def test_many_channels_are_averaged_over_places():
     places = torch.arange(2 * 300 * 16.0).reshape(2, 300, 4, 4)
-    found = reading(torch.zeros(2, 5), places)
+    found = activations(torch.zeros(2, 5), places)
     assert found.shape == (2, 5 + 300 * 4)
     assert found[0, 5] == places[0, 0, :2, :2].mean()
-    assert reading(torch.zeros(2, 5), places[:, :128]).shape == (2, 5 + 128 * 16)
+    assert activations(torch.zeros(2, 5), places[:, :128]).shape == (2, 5 + 128 * 16)
 
 
 def test_each_feature_decides_its_own_parameter_only(model, images):

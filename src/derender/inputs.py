@@ -50,19 +50,14 @@ def as_model(
                     "or the file is damaged; take another checkpoint or train again"
                 )
     if fit_steps is not None and (fit_steps or loaded.fitting is not None):
-        require_fitting(loaded, source)
-        assert loaded.fitting is not None
-        loaded.fitting.set_steps(fit_steps)
+        loaded.features.required_fitting(source)
+        loaded = loaded.with_features(loaded.features.with_steps(fit_steps))
     return loaded
 
 
 def require_fitting(model: Derenderer, source: str = "this model") -> None:
     """Raise ValueError where a model lacks the morphable maps that test-time optimisation needs."""
-    if model.fitting is None:
-        raise ValueError(
-            f"{source} cannot optimise scenes per image yet: derender whiten --model {source} IMAGES --out "
-            "NEW makes a copy that can"
-        )
+    model.features.required_fitting(source)
 
 
 def as_images(

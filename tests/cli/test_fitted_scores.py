@@ -48,7 +48,7 @@ def test_geometry_of_fitted_scenes_is_another(made, capsys):
 
 def test_a_model_that_cannot_is_told(made, tmp_path, capsys):
     model = derender.load("rendered-faces-64")
-    model.fitting = None
+    model = model.without_features()
     model.save(tmp_path / "plain")
     given = ["evaluate", "geometry", "-m", str(tmp_path / "plain"), "-d", str(made), "--fit-steps", "5"]
     assert main(given) == 2

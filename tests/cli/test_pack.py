@@ -23,7 +23,7 @@ FILES = ("model.safetensors", "whitening.safetensors", "fitting.safetensors")
 def unpacked(tmp_path_factory):
     """Weights and maps of no round numbers, saved in float32 as training does; features are not fitted."""
     model = load("rendered-faces-64")
-    model.fitting.set_steps(0)
+    model = model.with_features(model.features.with_steps(0))
     generator = torch.Generator().manual_seed(0)
     for value in (*model.parameters(), *model.whitening.buffers(), *model.fitting.buffers()):
         if value.is_floating_point() and value.ndim > 1:

@@ -14,7 +14,7 @@ from PIL import Image
 
 from derender import Derenderer, FeatureTable
 from derender.cli import main
-from derender.model import ERRORS_FILE
+from derender.storage.folder import ERRORS_FILE
 from derender.training.held_out_errors import HeldOutErrors, write_errors
 
 SIZE = 32

@@ -66,7 +66,7 @@ def test_features_of_fitted_scenes_when_steps_are_asked_for(folder, tmp_path, ca
     made = tmp_path / "fitted"
     assert run(folder, made, *SMALL, "--set", "coordinates=10", "--set", "steps=3", "--set", "weight=2") == 0
     model = derender.load(made)
-    assert model.fits_scenes and model.fitting.settings.weight == 2
+    assert model.features.fits_scenes and model.fitting.settings.weight == 2
     assert {name: size.shape[1] for name, size in model.embed(torch.rand(1, 3, 64, 64)).items()} == {
         "geometry": 256, "albedo": 256, "light": 256, "camera": 256
     }  # fmt: skip
@@ -79,7 +79,7 @@ def test_features_of_fitted_scenes_when_steps_are_asked_for(folder, tmp_path, ca
 
 def test_scenes_that_cannot_be_fitted_are_told_before_anything_is_written(folder, tmp_path, capsys):
     model = derender.load("rendered-faces-64")
-    model.fitting = None
+    model = model.without_features()
     model.save(tmp_path / "plain")
     for command in (
         ["embed", "-m", str(tmp_path / "plain"), "-d", str(folder), "-o", str(tmp_path / "t.parquet")],
@@ -106,7 +106,7 @@ def test_pictures_are_made_of_fitted_scenes(folder, tmp_path, command):
 def test_a_table_of_fitted_scenes_is_searched_as_it_was_made(folder, tmp_path, capsys):
     model, table = tmp_path / "model", tmp_path / "table.parquet"
     assert run(folder, model, *SMALL, "--set", "coordinates=10") == 0
-    assert not derender.load(model).fits_scenes
+    assert not derender.load(model).features.fits_scenes
     given = ["-m", str(model)]
     assert main(["embed", *given, "-d", str(folder), "-o", str(table), "--fit-steps", "3"]) == 0
     assert derender.FeatureTable.read(table).factors["geometry"].shape == (24, 266)
@@ -130,13 +130,15 @@ def test_mean_only_moves_features_to_a_mean_of_zero_and_no_distance(folder, tmp_
     assert run(folder, tmp_path / "mine", "--mean-only") == 0
     one, two = derender.load("rendered-faces-64"), derender.load(tmp_path / "mine")
     images = torch.from_numpy(read_pictures(folder, 64).images).float() / 255
-    before, after = (model.features(model.read(images))["albedo"][:, :192] for model in (one, two))
+    before, after = (
+        model.features_from(model.activations(images))["albedo"][:, :192] for model in (one, two)
+    )
     assert before.mean(dim=0).norm() > 0.05 * before.std(dim=0).norm()
     assert after.mean(dim=0).norm() < 1e-4 * before.norm(dim=1).mean()
     torch.testing.assert_close(torch.cdist(after, after), torch.cdist(before, before), atol=1e-2, rtol=1e-3)
     assert run(folder, tmp_path / "other", "--mean-only", "--set", "views=2") == 2
     assert "leave out --set views=2" in capsys.readouterr().err
-    two.whitening = None
+    two = two.without_features()
     two.save(tmp_path / "codes")
     refused = [
         "whiten",

@@ -10,7 +10,7 @@ from derender.evaluation.out_of_distribution import (
     percentile_of,
     reconstruction_percentile,
 )
-from derender.model import model_folder
+from derender.storage.folder import model_folder
 from derender.training.held_out_errors import HeldOutErrors, errors_of, read_errors
 
 

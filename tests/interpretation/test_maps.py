@@ -1,7 +1,5 @@
 """Maps over the picture: where a network looks, what changes them, exact sums."""
 
-import copy
-
 import numpy as np
 import pytest
 import torch
@@ -19,7 +17,8 @@ from derender.interpretation.cam import (
 from derender.interpretation.probe import Probe
 from derender.interpretation.sanity import sanity_check, similarity, spearman
 from derender.model import Derenderer
-from derender.networks.encoders import reading
+from derender.networks.encoders import activations
+from derender.postprocess import Features
 from derender.postprocess.whitening import Contrast, Whitening
 from derender.presets import MODEL_PRESETS
 
@@ -57,20 +56,14 @@ class Looking:
         net = nn.Module()
         net.encoder = QuadrantEncoder(where)
         net.encode = net.encoder.forward  # type: ignore[assignment]
-        net.read = lambda images: reading(net.encode(images), net.encoder.spatial(images))  # type: ignore[assignment]
-        self.nets = {"geometry": net}
+        self.nets, self.features = {"geometry": net}, Features()
 
-    def mirrors(self, name: str) -> bool:
-        return False
+    def factor_activations(self, name: str, images: torch.Tensor) -> torch.Tensor:
+        encoder = self.nets[name].encoder
+        return activations(encoder(images), encoder.spatial(images))
 
-    def read_factor(self, name: str, images: torch.Tensor) -> torch.Tensor:
-        return self.nets[name].read(images)
-
-    def features(self, readings: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-        return {
-            name: said[:, : self.nets[name].encoder.to_code[0].out_channels]
-            for name, said in readings.items()
-        }
+    def features_from(self, found: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+        return {name: value[:, :CODE] for name, value in found.items()}
 
 
 @pytest.fixture
@@ -149,14 +142,13 @@ def test_maps_do_not_change_shape_with_the_scale_of_the_probe(model, probe, imag
 
 
 def test_features_of_both_sides_give_a_mirrored_picture_the_mirrored_map(model, probe, images):
-    width, names = model.read(images[:1])["geometry"].shape[1], ("geometry", "albedo")
+    width, names = model.activations(images[:1])["geometry"].shape[1], ("geometry", "albedo")
     draw = torch.Generator().manual_seed(0)
     maps = {
         name: Contrast(torch.zeros(width), torch.randn(width, CODE, generator=draw), torch.ones(CODE))
         for name in names
     }
-    mirroring = copy.deepcopy(model)
-    mirroring.whitening = Whitening(maps, mirrored=maps)
+    mirroring = model.with_features(Features(Whitening(maps, mirrored=maps)))
     for method in METHODS:
         own, mirror = (
             saliency(method, mirroring, one, "albedo", probe, [0, 1, 0]) for one in (images, images.flip(-1))

@@ -11,8 +11,9 @@ import pytest
 import torch
 
 import derender
-from derender.model import ERRORS_FILE, Derenderer
+from derender.model import Derenderer
 from derender.storage import hub
+from derender.storage.folder import ERRORS_FILE
 from derender.training.held_out_errors import HeldOutErrors, read_errors, write_errors
 
 

@@ -1,16 +1,15 @@
 """What lets a trained model fit scenes: made of its own maps, saved with it, part of features when asked."""
 
-import copy
-
 import pytest
 import torch
 
 import derender
 from derender.data.synthetic import faces
 from derender.features.extract import model_fingerprint
-from derender.model import FITTING_FILE
+from derender.postprocess import Features
 from derender.postprocess.fitting import Fitting, FittingSettings, coordinates_of
 from derender.postprocess.morphable import MorphableMaps
+from derender.storage.folder import FITTING_FILE
 from derender.training.config import FeatureSettings, with_changes
 from derender.training.features import make_features
 from derender.training.fitting import make_fitting
@@ -30,8 +29,7 @@ def fitting(images):
 @pytest.fixture
 def model(fitting) -> derender.Derenderer:
     model = derender.load("rendered-faces-64")
-    model.fitting = copy.deepcopy(fitting)
-    return model
+    return model.with_features(Features(model.whitening, fitting))
 
 
 def test_the_rendering_comes_nearer_to_the_picture(model, images):
@@ -57,17 +55,16 @@ def test_light_and_camera_stay_where_something_is_seen(model, monkeypatch):
 
 def test_fitted_coordinates_follow_what_is_read(model, images):
     pictures = images[:4].float() / 255
-    fitted, readings = model.embed(pictures), model.read(pictures)
-    model.fitting.settings = model.fitting.settings.model_copy(update={"steps": 0})
-    read = model.embed(pictures)
+    fitted, activations = model.embed(pictures), model.activations(pictures)
+    read = model.with_features(model.features.with_steps(0)).embed(pictures)
     for name in ("geometry", "albedo"):
         size = read[name].shape[1]
         assert torch.equal(fitted[name][:, :size], read[name])
-        expected = model.fitting.features(readings[coordinates_of(name)])
+        expected = model.fitting.features(activations[coordinates_of(name)])
         assert torch.equal(fitted[name][:, size:], expected) and expected.shape == (4, 12)
     for name in ("light", "camera"):
         assert torch.equal(fitted[name], read[name])
-    assert set(model.codes(readings)) == {"geometry", "albedo", "light", "camera"}
+    assert set(model.codes(activations)) == {"geometry", "albedo", "light", "camera"}
 
 
 def test_weight_is_the_length_of_fitted_coordinates_beside_what_is_read(model, images):
@@ -81,11 +78,9 @@ def test_weight_is_the_length_of_fitted_coordinates_beside_what_is_read(model, i
 
 def test_steps_are_part_of_the_fingerprint(model):
     before = model_fingerprint(model)
-    settings = model.fitting.settings
-    model.fitting.settings = settings.model_copy(update={"steps": 7})
-    assert model_fingerprint(model) != before
-    model.fitting.settings = settings
-    assert model_fingerprint(model) == before
+    other = model.with_features(model.features.with_steps(7))
+    assert model_fingerprint(other) != before
+    assert model_fingerprint(other.with_features(other.features.with_steps(6))) == before
 
 
 def test_saved_with_the_model(model, images, tmp_path):
@@ -102,8 +97,8 @@ def test_saved_with_the_model(model, images, tmp_path):
 def test_maps_of_another_size_are_refused_when_a_model_is_loaded(tmp_path):
     small = derender.Derenderer.from_preset("small", image_size=32, width=8, light_width=4, code_size=16)
     maps = {"depth": torch.rand(4, 64, 64), "albedo": torch.rand(4, 3, 64, 64)}
-    small.fitting = Fitting(MorphableMaps.of(maps, 2), FittingSettings())
-    small.save(tmp_path / "small")
+    fitting = Fitting(MorphableMaps.of(maps, 2), FittingSettings())
+    small.with_features(Features(fitting=fitting)).save(tmp_path / "small")
     with pytest.raises(ValueError, match=r"is damaged \(it fits depth of \(64, 64\)"):
         derender.load(tmp_path / "small")
 
@@ -125,7 +120,7 @@ def test_a_feature_keeps_its_size(images):
         "coordinates=12",
         "steps=2",
     )
-    make_features(model, images, with_changes(FeatureSettings(), changes))
+    model = make_features(model, images, with_changes(FeatureSettings(), changes))
     features = model.embed(images[:3].float() / 255)
     assert {name: value.shape for name, value in features.items()} == dict.fromkeys(features, (3, 256))
     assert float(features["geometry"][:, -12:].abs().sum()) > 0
@@ -159,9 +154,7 @@ def test_one_picture_is_too_few(images):
 
 def test_maps_that_are_no_numbers_are_named(images):
     model = derender.load("rendered-faces-64")
-    model.fitting = None
     with torch.no_grad():
         next(model.nets["albedo"].decoder.parameters()).fill_(float("nan"))
     with pytest.raises(ValueError, match="fitting: albedo is not finite in pictures 0"):
         make_fitting(model, images, FittingSettings())
-    assert model.fitting is None

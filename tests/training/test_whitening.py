@@ -9,8 +9,10 @@ from derender.data import PictureSet
 from derender.data.synthetic import faces
 from derender.evaluation.disentanglement.swap import swap_test
 from derender.features.extract import model_fingerprint
-from derender.model import WHITENING_FILE
+from derender.postprocess import Features
+from derender.postprocess.whitening import Whitening
 from derender.scene.perturb import PerturbSettings
+from derender.storage.folder import WHITENING_FILE
 from derender.training import resolve, train
 from derender.training.config import WhiteningSettings
 from derender.training.whitening import BATCH_SIZE, fit_whitening
@@ -25,8 +27,11 @@ TINY += ["images=16", "warmup_images=0"]
 def read_only(name: str = "rendered-faces-64") -> derender.Derenderer:
     """A bundled model, its features made of what its encoders say alone."""
     model = derender.load(name)
-    model.fitting = None
-    return model
+    return model.with_features(Features(model.whitening))
+
+
+def whitened(model: derender.Derenderer, whitening: Whitening) -> derender.Derenderer:
+    return model.with_features(Features(whitening))
 
 
 @pytest.fixture(scope="module")
@@ -55,9 +60,9 @@ def moved_by_light(model, images) -> dict[str, float]:
 
 def test_light_moves_features_less_than_codes_on_pictures_that_were_not_seen(images):
     model = read_only("faces-64")  # codes of albedo of the other follow light little as they are
-    model.whitening = None
+    model = model.without_features()
     before = moved_by_light(model, images[200:])
-    model.whitening = fit_whitening(model, images[:200], WITH_PLACES, PerturbSettings(), seed=1)
+    model = whitened(model, fit_whitening(model, images[:200], WITH_PLACES, PerturbSettings(), seed=1))
     after = moved_by_light(model, images[200:])
     assert after["geometry"] < 0.9 * before["geometry"]
     assert after["albedo"] < 0.9 * before["albedo"]
@@ -65,7 +70,7 @@ def test_light_moves_features_less_than_codes_on_pictures_that_were_not_seen(ima
 
 def test_scenes_are_those_of_the_codes(images):
     model = read_only()
-    model.whitening = fit_whitening(model, images[:50], WITH_VECTORS, PerturbSettings())
+    model = whitened(model, fit_whitening(model, images[:50], WITH_VECTORS, PerturbSettings()))
     pictures = images[:4].float() / 255
     with torch.no_grad():
         codes, features = model.encode(pictures), model.embed(pictures)
@@ -79,7 +84,7 @@ def test_light_and_camera_keep_their_codes_where_that_is_asked_for(images):
     model = read_only()
     settings = WITH_VECTORS.model_copy(update={"vectors": False})
     others = fit_whitening(model, images[:50], WITH_VECTORS, PerturbSettings())
-    model.whitening = fit_whitening(model, images[:50], settings, PerturbSettings())
+    model = whitened(model, fit_whitening(model, images[:50], settings, PerturbSettings()))
     for name in ("geometry_map", "albedo_map"):
         assert torch.equal(model.whitening.get_buffer(name), others.get_buffer(name))
     with torch.no_grad():
@@ -90,9 +95,9 @@ def test_light_and_camera_keep_their_codes_where_that_is_asked_for(images):
 
 def test_light_and_camera_follow_other_factors_less_than_codes_on_pictures_that_were_not_seen(images):
     model = read_only()
-    model.whitening = None
+    model = model.without_features()
     before = swap_test(model, images[-32:].numpy()).moved
-    model.whitening = fit_whitening(model, images[:128], WITH_VECTORS, PerturbSettings(), seed=1)
+    model = whitened(model, fit_whitening(model, images[:128], WITH_VECTORS, PerturbSettings(), seed=1))
     after = swap_test(model, images[-32:].numpy()).moved
     for place in (2, 3):
         others = np.arange(4) != place
@@ -112,7 +117,7 @@ def test_a_mirror_image_has_the_features_of_the_picture_unless_told_otherwise(im
     pictures = images[:6].float() / 255
     for mirrored in (True, False):
         settings = WITH_PLACES.model_copy(update={"mirrored": mirrored, "pictures": 40, "spatial": mirrored})
-        model.whitening = fit_whitening(model, images, settings, PerturbSettings())
+        model = whitened(model, fit_whitening(model, images, settings, PerturbSettings()))
         again = derender.load(model.save(tmp_path / str(mirrored)))
         with torch.no_grad():
             one, two, kept = model.embed(pictures), model.embed(pictures.flip(-1)), again.embed(pictures)
@@ -126,7 +131,7 @@ def test_fitting_anew_does_not_depend_on_the_features_there_were(images):
     model = read_only()
     found = []
     for _ in range(2):
-        model.whitening = fit_whitening(model, images[:30], SETTINGS, PerturbSettings())
+        model = whitened(model, fit_whitening(model, images[:30], SETTINGS, PerturbSettings()))
         found.append(model.whitening.get_buffer("albedo_map"))
     assert torch.equal(*found)
 
@@ -160,9 +165,9 @@ def test_a_run_ends_with_features_whitened_unless_told_not_to(pictures, tmp_path
 
 def test_a_table_knows_whether_its_features_were_whitened(images):
     model = read_only()
-    model.whitening = None
+    model = model.without_features()
     before = model_fingerprint(model)
-    model.whitening = fit_whitening(model, images[:20], SETTINGS, PerturbSettings())
+    model = whitened(model, fit_whitening(model, images[:20], SETTINGS, PerturbSettings()))
     assert model_fingerprint(model) != before
 
 

@@ -15,6 +15,7 @@ from derender.networks.confidence import Confidence
 from derender.objectives import self_training
 from derender.objectives.self_features import SelfFeatures
 from derender.objectives.self_training import SelfTraining
+from derender.postprocess import Features
 from derender.postprocess.whitening import Contrast, Whitening
 from derender.render import Rendering
 from derender.scene import Scene
@@ -254,9 +255,9 @@ def test_embedding(model, stage, bad):
     if stage == "encoder":
         spoil(model.nets["albedo"].encoder, bad)
     else:
-        width = model.read(torch.zeros(1, 3, SIZE, SIZE))["albedo"].shape[1]
+        width = model.activations(torch.zeros(1, 3, SIZE, SIZE))["albedo"].shape[1]
         maps = {"albedo": Contrast(torch.zeros(width), torch.full((width, 16), bad), torch.ones(16))}
-        model.whitening = Whitening(maps)
+        model = model.with_features(Features(Whitening(maps)))
     with pytest.raises(ValueError, match=r"factor 'albedo' is not finite in \d+ of 20 rows, first in 000"):
         embed_pictures(model, picture_set(), batch_size=20)
 

@@ -16,8 +16,8 @@ from derender.data import read_pictures
 from derender.data.cache import _MARK, read_cache
 from derender.features import FeatureTable, missing
 from derender.interpretation.probe import Probe, load_probe
-from derender.model import CONFIG_FILE, ERRORS_FILE
 from derender.storage.atomic import CHECKSUMS, seal
+from derender.storage.folder import CONFIG_FILE, ERRORS_FILE
 from derender.training.checkpoint import STATE_FILE, TrainState, load_checkpoint
 from derender.training.config import config_from_tree
 from derender.training.held_out_errors import read_errors

@@ -32,12 +32,14 @@ def with_fitted_scenes(model: "Derenderer", source: str, steps: int | None) -> "
     return FittedModel(model, steps)
 
 
-def check_maker(model: "Derenderer", source: str, table: "FeatureTable", path: str | Path) -> None:
-    """Give a model the optimisation steps a table was made with; a table of another model is an error."""
+def check_maker(
+    model: "Derenderer", source: str, table: "FeatureTable", path: str | Path
+) -> "Derenderer":
+    """The model with the fitting steps a table was made with; a table of another model is an error."""
     from derender.features import model_fingerprint
 
     if model.fitting is not None and isinstance(steps := table.origin.get("fit_steps"), int):
-        model.fitting.set_steps(max(0, steps))
+        model = model.with_features(model.features.with_steps(max(0, steps)))
     made_by, weights = table.origin.get("weights"), model_fingerprint(model)
     if made_by is None:
         notice(f"{path} does not record which model made it: cannot check that it was {source}")
@@ -46,13 +48,12 @@ def check_maker(model: "Derenderer", source: str, table: "FeatureTable", path: s
             f"{path} was made by another model (weights {made_by}, {source} has {weights}): "
             "give that one, or make the table again with derender embed"
         )
+    return model
 
 
 def fitting_of(model: "Derenderer", source: str) -> "Fitting":
     """The maps and settings of a model's test-time optimisation, or an error that names how to get them."""
-    require_fitting(model, source)
-    assert model.fitting is not None
-    return model.fitting
+    return model.features.required_fitting(source)
 
 
 def pictures_for(

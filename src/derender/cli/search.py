@@ -166,7 +166,7 @@ def _query(
     from derender.report.opening import read_file
 
     net = open_model(model, device)
-    check_maker(net, model, table, features)
+    net = check_maker(net, model, table, features)
     codes = embed_images(net, read_file(Path(like), net.image_size)[None])
     if factor not in codes:
         raise ValueError(f"{model} makes no {factor!r}; it makes {', '.join(codes)}")

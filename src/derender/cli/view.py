@@ -89,7 +89,9 @@ def view(
         if fit_steps:
             fitting_of(net, model)
         pictures = _readable(images or [], reading_size(net, cropped))
-        gallery = None if features is None else _gallery(features, data, dataset, model, net)
+        gallery = None
+        if features is not None:
+            gallery, net = _gallery(features, data, dataset, model, net)
         examples = named_examples(pictures) if images else rendered_examples(model, net.image_size)
         table = None if gallery is None else gallery.table
         studio = Studio(net, Path(model).name, Shelf(keep), _held_out(model), table, fit_steps or 0, cropped)
@@ -129,25 +131,27 @@ def _readable(images: list[Path], size: int) -> "dict[Path, np.ndarray]":
     return read
 
 
-def _gallery(features: Path, data: str | None, dataset: str, model: str, net: "Derenderer") -> "Gallery":
-    """The table, if this model made it."""
+def _gallery(
+    features: Path, data: str | None, dataset: str, model: str, net: "Derenderer"
+) -> "tuple[Gallery, Derenderer]":
+    """The table, if this model made it, and the model with its steps of fitting."""
     from derender.cli.models import check_maker
     from derender.features import FeatureTable
     from derender.report.viewer.neighbours import Gallery
 
     table = FeatureTable.read(features)
-    check_maker(net, model, table, features)
+    net = check_maker(net, model, table, features)
     if not set(table.factors) & set(net.nets):
         raise ValueError(f"{features} has none of the factors of {model}: make it again with derender embed")
     gallery = Gallery(table, data, dataset)
     if gallery.without_pictures:
         notice(f"neighbours are shown without pictures: {gallery.without_pictures}")
-    return gallery
+    return gallery, net
 
 
 def _held_out(model: str) -> "HeldOutErrors | None":
     """The errors stored with the model; None where there are none or they are damaged."""
-    from derender.model import model_folder
+    from derender.storage.folder import model_folder
     from derender.training.held_out_errors import read_errors
 
     try:

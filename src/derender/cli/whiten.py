@@ -48,6 +48,8 @@ def whiten(
     It is fitted to these pictures, without labels. Weights and scenes stay as they are. Training ends with
     this by itself. With --set steps=60 features are also made of scenes fitted to each picture by rendering.
     """
+    from dataclasses import replace
+
     import torch
 
     from derender.cli.models import keep_split, open_model, pictures_for
@@ -66,10 +68,10 @@ def whiten(
     images = torch.from_numpy(chosen.images)
     if mean_only:
         with progress_bar("reading pictures") as report:
-            net.whitening = recentre(net, images, progress=report)
+            net = net.with_features(replace(net.features, whitening=recentre(net, images, progress=report)))
     else:
         with progress_bar("rendering again") as report:
-            make_features(net, images, settings, seed=seed, progress=report)
+            net = make_features(net, images, settings, seed=seed, progress=report)
     assert net.whitening is not None
     folder = net.save(out, overwrite=force)
     keep_split(folder, model)

@@ -1,6 +1,5 @@
 """Rows that tell whitening from codes: codes not whitened, and controls whitened by a model's renderings."""
 
-import copy
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -40,8 +39,7 @@ def whitened_rows(
     chosen, name, memory = factors_of(factors), source.row_name(factors), source.memory
     rows = []
     if net.whitening is not None:
-        bare = copy.deepcopy(net)
-        bare.whitening = bare.fitting = None
+        bare = net.without_features()
         rows.append(FeatureRow(f"{name}, not whitened", (embedded(bare, pictures, memory, "codes"),), chosen))
     with progress_bar("rendering again") as report:
         again = whitened(lender, net, report)

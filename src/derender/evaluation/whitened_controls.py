@@ -24,6 +24,7 @@ from derender.data import PictureSet
 from derender.evaluation.memory import Memory
 from derender.features import FeatureTable, model_fingerprint
 from derender.model import Derenderer
+from derender.postprocess import Features
 from derender.postprocess.whitening import Contrast, Whitening
 from derender.training.config import FeatureSettings
 from derender.training.whitening import Describe, fit_whitening
@@ -59,17 +60,14 @@ def whitened(lender: Lender, encoder: Derenderer, progress: Progress | None = No
     """
     names = [factor.name for factor in encoder.factors if factor.mirrored]
     spatial, size = lender.settings.whitening.spatial, encoder.settings.network.code_size
-    found = copy.deepcopy(encoder).eval()
-    fitting, found.fitting = found.fitting, None
-    found.whitening = None  # it would have pictures read with their mirror images, which are views here
+    found = copy.deepcopy(encoder.without_features()).eval()  # mirror images are views here
 
     def describe(pictures: Float[Tensor, "n 3 h w"]) -> dict[str, Tensor]:
-        said = (found.read if spatial else found.encode)(pictures.to(found.device))
+        said = (found.activations if spatial else found.encode)(pictures.to(found.device))
         return {name: said[name] for name in names}
 
-    found.whitening = _fitted(lender, describe, model_fingerprint(found), progress, size).to(found.device)
-    found.fitting = fitting
-    return found.train(encoder.training)
+    whitening = _fitted(lender, describe, model_fingerprint(found), progress, size).to(found.device)
+    return found.with_features(Features(whitening, encoder.fitting)).train(encoder.training)
 
 
 def component_count(images: np.ndarray) -> int:
@@ -113,8 +111,7 @@ def _fitted(
 ) -> Whitening:
     """The whitening of what ``describe`` says of the lender's renderings, remembered."""
     settings = lender.settings
-    bare = copy.deepcopy(lender.model)
-    bare.whitening = bare.fitting = None
+    bare = lender.model.without_features()
     inputs = {
         "renders": model_fingerprint(bare), "images": lender.images, "describes": f"{mark} {size}",
         "seed": lender.seed, "settings": settings.model_dump(mode="json"),

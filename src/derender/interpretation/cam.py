@@ -20,7 +20,7 @@ from torch.nn.functional import interpolate
 from derender.data import suggestion
 from derender.interpretation.probe import Probe
 from derender.interpretation.shares import captum_attr
-from derender.networks.encoders import reading
+from derender.networks.encoders import activations
 
 METHODS = ("grad-cam", "hires-cam", "pixels")
 GREY = 0.5
@@ -85,14 +85,14 @@ def _at_features(
 
     Where the feature is made of pictures and their mirror images, those of the mirror images follow.
     """
-    encoder, mirrors = model.nets[factor].encoder, model.mirrors(factor)
+    encoder, mirrors = model.nets[factor].encoder, model.features.mirrors(factor)
     seen = torch.cat([images, images.flip(-1)]) if mirrors else images
     with torch.enable_grad():
         features = encoder.spatial(seen).detach().requires_grad_()
-        said = reading(encoder.to_code(features).flatten(1), features)
+        active = activations(encoder.to_code(features).flatten(1), features)
         if mirrors:
-            said = torch.cat(said.chunk(2), dim=1)
-        answer = score(model.features({factor: said})[factor], weight).sum()
+            active = torch.cat(active.chunk(2), dim=1)
+        answer = score(model.features_from({factor: active})[factor], weight).sum()
         (gradient,) = torch.autograd.grad(answer, features)
     return features.detach(), gradient
 
@@ -107,8 +107,8 @@ def pixel_attribution(
     """|IG| of the pixels from a grey picture, summed over colours, and the relative completeness error."""
 
     def answer(pictures: Tensor, own: Tensor | None = None) -> Tensor:
-        said = model.read_factor(factor, pictures)
-        return score(model.features({factor: said})[factor], own)
+        active = model.factor_activations(factor, pictures)
+        return score(model.features_from({factor: active})[factor], own)
 
     grey = torch.full_like(images[:1], GREY)
     with torch.enable_grad():

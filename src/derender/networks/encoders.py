@@ -13,7 +13,7 @@ from derender.networks.norm_relu import NormReLU
 from derender.networks.settings import NetworkSettings
 
 CHANNELS_PER_GROUP = 4
-MAX_PLACES = 2048  # numbers of spatial features in a reading
+MAX_PLACES = 2048  # numbers of the last spatial map among the activations
 
 
 def stage_widths(first: int, stages: int) -> list[int]:
@@ -31,10 +31,12 @@ def norm_relu(channels: int, slope: float = 0.0) -> NormReLU:
     return NormReLU(channels, channels // CHANNELS_PER_GROUP, slope)
 
 
-def reading(code: Float[Tensor, "n code"], spatial: Float[Tensor, "n channels y x"]) -> Float[Tensor, "n _"]:
-    """All that an encoder says of pictures: the code, then the last spatial features, row by row.
+def activations(
+    code: Float[Tensor, "n code"], spatial: Float[Tensor, "n channels y x"]
+) -> Float[Tensor, "n _"]:
+    """Encoder activations, one row per image: the code, then the last spatial map.
 
-    Spatial features are averaged over 2x2 places, then over all, where they are more than 2,048 numbers.
+    The map is averaged over 2x2 locations, then over all, where it holds more than 2,048 numbers.
     """
     side = spatial.shape[-1]
     while side > 1 and spatial.shape[1] * side**2 > MAX_PLACES:

@@ -15,7 +15,7 @@ from torch import Generator, Tensor, nn
 from torch.nn.functional import pad
 
 from derender.networks.decoders import MapDecoder, VectorDecoder
-from derender.networks.encoders import Encoder, UNetEncoder, reading
+from derender.networks.encoders import Encoder, UNetEncoder, activations
 from derender.networks.settings import NetworkSettings
 from derender.scene.constants import kept
 from derender.scene.perturb import PerturbSettings, exchange, perturb_camera, perturb_light
@@ -29,15 +29,16 @@ class FactorNet(nn.Module):
         super().__init__()
         self.encoder = encoder
         self.decoder = decoder
+        self.code_size: int = encoder.code_size  # type: ignore[assignment]
 
     def encode(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n code"]:
         """The factor's feature, one row per picture (pictures in 0..1)."""
         return self.encoder(images)
 
-    def read(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n _"]:
-        """The feature, followed by the encoder's last spatial features (pictures in 0..1)."""
+    def activations(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n _"]:
+        """The code, followed by the encoder's last spatial map (images in 0..1)."""
         spatial = self.encoder.spatial(images)  # type: ignore[operator]
-        return reading(self.encoder.to_code(spatial).flatten(1), spatial)  # type: ignore[operator]
+        return activations(self.encoder.to_code(spatial).flatten(1), spatial)  # type: ignore[operator]
 
     def decode(self, code: Float[Tensor, "n code"]) -> Tensor:
         """The factor's raw value, before its range is applied."""

@@ -96,28 +96,15 @@ class Fitting(nn.Module):
         self.maps = maps
         self.register_buffer("length", torch.tensor(float(length)), persistent=False)
         self.settings = settings
-
-    @property
-    def settings(self) -> FittingSettings:
-        """How; exchange it to change how many steps are made."""
-        return self._settings
-
-    @settings.setter
-    def settings(self, settings: FittingSettings) -> None:
-        self._settings = settings
         told = torch.tensor([settings.steps, settings.prior, settings.tolerance], dtype=torch.float64)
-        self.register_buffer("told", told, persistent=False)  # part of what a model's fingerprint is made of
+        self.register_buffer("told", told, persistent=False)  # the name is part of a model's fingerprint
 
-    def check_size(self, size: int) -> None:
-        """Maps of another size than a model's pictures are an error."""
-        for name, expected in (("depth", (size, size)), ("albedo", (3, size, size))):
-            found = tuple(self.maps.get_buffer(f"{name}_mean").shape)
-            if found != expected:
-                raise ValueError(f"it fits {name} of {found}, the model's is {expected}")
-
-    def set_steps(self, steps: int) -> None:
-        """So many steps from now on; 0: features are read only."""
-        self.settings = FittingSettings.model_validate(self.settings.model_dump() | {"steps": steps})
+    def with_steps(self, steps: int) -> "Fitting":
+        """The same, with the same maps, that makes so many steps; 0: features are feed-forward only."""
+        settings = FittingSettings.model_validate(self.settings.model_dump() | {"steps": steps})
+        return Fitting(self.maps, settings, float(self.get_buffer("length"))).to(
+            self.get_buffer("length").device
+        )
 
     def features(self, coordinates: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
         """Coordinates in the unit of what is read beside them."""
@@ -208,11 +195,12 @@ class Fitting(nn.Module):
             write_tensors(self.tensors(), temporary, {"settings": self.settings.model_dump_json()})
 
     @classmethod
-    def load(cls, file: Path) -> "Fitting":
+    def load(cls, file: Path, image_size: int | None = None) -> "Fitting":
         """Read what ``save`` wrote.
 
         Raises:
-            ValueError: it is damaged, or tensors are missing or do not fit each other.
+            ValueError: it is damaged, tensors are missing or do not fit each other, or maps have another side
+                than ``image_size``.
         """
         tensors, told = read_described(file)
         try:
@@ -221,6 +209,11 @@ class Fitting(nn.Module):
                 {name: tensors[f"maps.{name}_{part}"] for name in PARAMETERS.values()}
                 for part in ("mean", "axes")
             )
-            return cls(MorphableMaps(means, axes), settings, float(tensors["length"]))
+            fitting = cls(MorphableMaps(means, axes), settings, float(tensors["length"]))
         except (KeyError, json.JSONDecodeError, ValidationError, RuntimeError) as error:
             raise ValueError(f"{Path(file).name} holds no fitting ({str(error).splitlines()[0]})") from error
+        for name, mean in means.items():
+            expected = (*mean.shape[:-2], image_size, image_size)
+            if image_size is not None and tuple(mean.shape) != expected:
+                raise ValueError(f"it fits {name} of {tuple(mean.shape)}, the model's is {expected}")
+        return fitting

@@ -82,6 +82,16 @@ def atomic_folder(folder: Path, *, previous: Path | None = None) -> Iterator[Pat
         shutil.rmtree(temporary, ignore_errors=True)
 
 
+@contextmanager
+def new_folder(folder: str | Path, *, overwrite: bool = False) -> Iterator[Path]:
+    """`atomic_folder` for a folder that must not exist yet, unless ``overwrite`` says that it may."""
+    folder = Path(folder)
+    if folder.exists() and not overwrite:
+        raise FileExistsError(f"{folder} exists already: choose another folder or pass overwrite=True")
+    with atomic_folder(folder) as temporary:
+        yield temporary
+
+
 def remove_abandoned(path: Path) -> None:
     """Delete what processes killed while writing this file or folder left; nobody may be writing."""
     for entry in path.parent.iterdir() if path.parent.is_dir() else ():

@@ -4,16 +4,19 @@ A model is looked for in a folder, among the bundled models, then on the Hugging
 """
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from derender.storage import hub
 from derender.storage.card import CARD_FILE
-from derender.storage.tensors import read_tensors
+from derender.storage.tensors import read_tensors, write_tensors
+
+Net = TypeVar("Net", bound=nn.Module)
 
 FORMAT = 1
 WEIGHTS_FILE, CONFIG_FILE = "model.safetensors", "config.json"
@@ -69,11 +72,11 @@ def texts_beside(folder: Path | None, tensors: Mapping[str, Tensor]) -> dict[str
     return {file.name: file.read_text(encoding="utf-8") for file in files if file.is_file()}
 
 
-def read_config(folder: Path) -> dict[str, Any]:
-    """What a saved folder says of its model: ``factors`` and ``settings``.
+def read_config(folder: Path, factors: Sequence[str] | None = None) -> dict[str, Any]:
+    """``config.json`` of a saved model: its ``factors`` and ``settings``.
 
     Raises:
-        ValueError: it is damaged, of a newer version, or of a baseline.
+        ValueError: it is damaged, of a newer version, of a baseline, or of other ``factors``.
     """
     try:
         config = json.loads((folder / CONFIG_FILE).read_text())
@@ -94,18 +97,47 @@ def read_config(folder: Path) -> dict[str, Any]:
         )
     if not complete:
         raise ValueError(f"{folder / CONFIG_FILE} is damaged: copy or train the model again")
+    if factors is not None and config["factors"] != list(factors):
+        raise ValueError(
+            f"{folder} holds factors {', '.join(config['factors'])}, asked for {', '.join(factors)}: "
+            "pass its rows as factors="
+        )
     return config
 
 
-def write_config(folder: Path, factors: Sequence[str], settings: Mapping[str, Any]) -> None:
-    """Write ``config.json``: what ``read_config`` reads."""
+def write_model(
+    folder: Path, factors: Sequence[str], settings: Mapping[str, Any], weights: Mapping[str, Tensor]
+) -> None:
+    """Write configuration and weights into a folder that exists."""
+    write_tensors(weights, folder / WEIGHTS_FILE)
     config = {"format": FORMAT, "factors": list(factors), "settings": settings}
     (folder / CONFIG_FILE).write_text(json.dumps(config, indent=1))
 
 
-def check_shapes(found: Mapping[str, Tensor], wanted: Mapping[str, Tensor]) -> None:
-    """The same names and shapes, or an error that names the first that differs."""
-    for name in sorted({*found, *wanted}):
-        shapes = [tuple(side[name].shape) if name in side else "nothing" for side in (found, wanted)]
+def read_weights(folder: Path, build: Callable[[], Net]) -> Net:
+    """The network that ``build`` makes, with the weights of a saved folder.
+
+    Raises:
+        ValueError: the file is damaged, or a name or shape differs; names the first.
+    """
+    weights = read_tensors(folder / WEIGHTS_FILE)
+    with torch.device("meta"):  # sizes are compared before memory is taken for what the file only claims
+        expected = build().state_dict()
+    for name in sorted({*weights, *expected}):
+        shapes = [tuple(side[name].shape) if name in side else "nothing" for side in (weights, expected)]
         if shapes[0] != shapes[1]:
             raise ValueError(f"{name}: {shapes[0]} in {WEIGHTS_FILE}, {shapes[1]} by {CONFIG_FILE}")
+    network = build()
+    network.load_state_dict(weights)
+    return network
+
+
+@contextmanager
+def naming_damage(folder: Path) -> Iterator[None]:
+    """Turn what a damaged file raises into one sentence that names the folder."""
+    try:
+        yield
+    except (RuntimeError, ValueError) as error:
+        raise ValueError(
+            f"{folder} is damaged ({str(error).splitlines()[0]}): copy or train the model again"
+        ) from error

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from torch import Tensor
 
-from derender.storage.atomic import atomic_folder
+from derender.storage.atomic import new_folder
 from derender.storage.card import CARD_FILE
 from derender.storage.folder import (
     CONFIG_FILE,
@@ -66,11 +66,9 @@ def pack_model(
     if maps not in KINDS:
         raise ValueError(f"unknown kind of maps {maps!r}: choose {' or '.join(KINDS)}")
     folder, own = Path(folder), model_folder(source)
-    if folder.exists() and not overwrite:
-        raise FileExistsError(f"{folder} exists already: choose another folder or pass overwrite=True")
     read_config(own)
     before, after = {}, {}
-    with atomic_folder(folder) as temporary:
+    with new_folder(folder, overwrite=overwrite) as temporary:
         for name in (WEIGHTS_FILE, WHITENING_FILE, FITTING_FILE):
             if not (own / name).is_file():
                 continue

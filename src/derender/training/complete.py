@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from jaxtyping import UInt8
 
-from derender.model import FITTING_FILE, WHITENING_FILE, load
+from derender.model import load
 from derender.training.config import TrainConfig
 from derender.training.features import make_features
 from derender.training.held_out_errors import store_errors
@@ -32,9 +32,8 @@ def complete_model(
         progress: called with (pictures done, pictures in all).
     """
     model = load(folder, device=device)
-    make_features(model, torch.from_numpy(training), config.features, seed=config.seed, progress=progress)
-    if model.whitening is not None:
-        model.whitening.save(folder / WHITENING_FILE)
-    if model.fitting is not None:
-        model.fitting.save(folder / FITTING_FILE)
+    model = make_features(
+        model, torch.from_numpy(training), config.features, seed=config.seed, progress=progress
+    )
+    model.features.save(folder)
     store_errors(folder, torch.from_numpy(held_out))

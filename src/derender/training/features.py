@@ -6,6 +6,7 @@ from jaxtyping import Shaped
 from torch import Tensor
 
 from derender.model import Derenderer
+from derender.postprocess import Features
 from derender.postprocess.fitting import PARAMETERS
 from derender.postprocess.morphable import MorphableMaps
 from derender.training.config import FeatureSettings
@@ -21,8 +22,8 @@ def make_features(
     seed: int = 0,
     progress: Callable[[int, int], object] | None = None,
     maps: MorphableMaps | None = None,
-) -> None:
-    """Give a model its whitening and its fitting, as far as the settings ask for them; in place.
+) -> Derenderer:
+    """A model that shares these weights, with whitening and fitting as far as the settings ask for them.
 
     A feature keeps the size of the code: where fitted coordinates are part of it, what is read has the rest.
 
@@ -38,7 +39,7 @@ def make_features(
         ValueError: too few pictures, or more fitted coordinates than a feature has numbers.
     """
     size = model.settings.network.code_size
-    model.fitting = None
+    model = model.with_features(Features(model.whitening))
     if settings.fitting.steps:
         size -= settings.fitting.coordinates
         if size < 1:
@@ -47,8 +48,11 @@ def make_features(
                 f"{model.settings.network.code_size} numbers to what is read: set coordinates lower"
             )
     if settings.whitening.pictures >= 2:
-        model.whitening = fit_whitening(
+        whitening = fit_whitening(
             model, images, settings.whitening, settings.perturb, size=size, seed=seed, progress=progress
         )
+        model = model.with_features(Features(whitening))
     if settings.fitting.examples >= 2 and PARAMETERS.keys() <= {factor.name for factor in model.factors}:
-        model.fitting = make_fitting(model, images, settings.fitting, seed=seed, progress=progress, maps=maps)
+        fitting = make_fitting(model, images, settings.fitting, seed=seed, progress=progress, maps=maps)
+        model = model.with_features(Features(model.whitening, fitting))
+    return model

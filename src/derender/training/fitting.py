@@ -11,6 +11,7 @@ from torch import Tensor
 
 from derender.data import as_float
 from derender.model import Derenderer
+from derender.postprocess import Features
 from derender.postprocess.fitting import PARAMETERS, Fitting, FittingSettings
 from derender.postprocess.morphable import MorphableMaps
 
@@ -50,9 +51,8 @@ def make_fitting(
         raise ValueError(f"fitting needs at least 2 pictures, got {len(chosen)}")
     found: dict[str, list[Tensor]] = {parameter: [] for parameter in PARAMETERS.values()}
     squares = torch.zeros((), dtype=torch.float64)
-    was_training, was_fitting = model.training, model.fitting
+    model, was_training = model.with_features(Features(model.whitening)), model.training
     model.eval()
-    model.fitting = None  # features as they are read
     try:
         with torch.no_grad():
             for start in range(0, len(chosen), BATCH_SIZE):
@@ -72,7 +72,6 @@ def make_fitting(
                     progress(min(start + BATCH_SIZE, len(chosen)), len(chosen))
     finally:
         model.train(was_training)
-        model.fitting = was_fitting
     if maps is None:
         examples = {name: torch.cat(parts) for name, parts in found.items()}
         maps = MorphableMaps.of(examples, settings.coordinates)

@@ -17,8 +17,9 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from derender.data import as_float
-from derender.model import ERRORS_FILE, load
+from derender.model import load
 from derender.storage.atomic import atomic_file
+from derender.storage.folder import ERRORS_FILE
 
 FORMAT = 1
 QUANTILES = 101

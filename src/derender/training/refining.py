@@ -140,8 +140,8 @@ def refine(
     clear = fitted.clear(settings.worst).cpu()
     if not clear.any():
         raise ValueError("fitting finds no scene of any picture: the model's training went wrong")
-    student = deepcopy(model)
-    student.whitening = student.fitting = student.source = None
+    student = deepcopy(model.without_features())
+    student.source = None
     if settings.reframed:
         _give_room(student, config.reframe)
     _learn(student, images[rows[clear]], maps, fitted[clear], config, generator, progress)
@@ -152,7 +152,7 @@ def refine(
         )
     as_many = config.fitting.model_copy(update={"coordinates": maps.size("depth")})
     features = config.model_copy(update={"fitting": as_many})
-    make_features(student, images, features, seed=seed, progress=progress, maps=maps)
+    student = make_features(student, images, features, seed=seed, progress=progress, maps=maps)
     return Refined(student, *_compared(model, student, maps, held_out[:_MEASURED], settings.fit_steps))
 
 
@@ -186,12 +186,7 @@ def _maps_of(model: Derenderer) -> MorphableMaps:
     further = [factor.name for factor in model.factors if factor.name not in FACTORS]
     if further:
         raise ValueError(f"the model has {further[0]} beside the paper's factors: it cannot be refined")
-    if model.fitting is None:
-        raise ValueError(
-            "this model cannot fit scenes yet: derender whiten --model MODEL --data PICTURES --out NEW "
-            "makes a copy that can"
-        )
-    return model.fitting.maps
+    return model.features.required_fitting().maps
 
 
 def _fit(model: Derenderer, images: UInt8[Tensor, "n 3 h w"], steps: int, progress: Progress | None) -> _Fits:

@@ -64,12 +64,11 @@ def fit_whitening(
     moving = tuple(factor for factor in model.factors if not factor.mirrored)
     vectors = moving if describe is None and settings.vectors else ()
     others = torch.Generator().manual_seed(seed)  # of their own: what they draw changes no other feature
-    say = describe or (model.read if settings.spatial else model.encode)
     found: dict[str, Spread] = {}
     alone: dict[str, Spread] = {}
-    was_training, was_whitened, was_fitting = model.training, model.whitening, model.fitting
+    model, was_training = model.without_features(), model.training
     model.eval()
-    model.whitening = model.fitting = None  # readings as they are
+    say = describe or (model.activations if settings.spatial else model.encode)
     try:
         with torch.no_grad():
             for start in range(0, len(chosen), BATCH_SIZE):
@@ -109,7 +108,6 @@ def fit_whitening(
                     progress(min(start + BATCH_SIZE, len(chosen)), len(chosen))
     finally:
         model.train(was_training)
-        model.whitening, model.fitting = was_whitened, was_fitting
     if describe is None:
         size = size or model.settings.network.code_size
     contrasts = {
@@ -146,7 +144,7 @@ def recentre(
         drawn = images[start : start + BATCH_SIZE]
         batch = (as_float(drawn) if drawn.dtype == torch.uint8 else drawn.float()).to(model.device)
         for name in whitening.names:
-            total = whitening.taken(name, model.read_factor(name, batch)).double().sum(dim=0)
+            total = whitening.taken(name, model.factor_activations(name, batch)).double().sum(dim=0)
             totals[name] = totals[name] + total if name in totals else total
         if progress is not None:
             progress(min(start + BATCH_SIZE, len(images)), len(images))

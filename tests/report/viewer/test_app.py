@@ -13,13 +13,13 @@ import trimesh
 
 from derender import load
 from derender.data.synthetic import faces
-from derender.model import model_folder
 from derender.report.viewer.app import Application, Viewer
 from derender.report.viewer.examples import rendered_examples
 from derender.report.viewer.server import BoundedProtocol, serving
 from derender.report.viewer.shelf import Shelf
 from derender.report.viewer.studio import Studio
 from derender.scene.crop_search import Crop
+from derender.storage.folder import model_folder
 from derender.training.held_out_errors import read_errors
 
 LIGHT = {"ambient": 0.3, "diffuse": 0.7, "pitch_deg": 0.0, "yaw_deg": 0.0}

@@ -5,8 +5,8 @@ import pytest
 
 from derender import load
 from derender.evaluation.out_of_distribution import OUTLIER_PERCENTILE, reconstruction_percentile
-from derender.model import bundled_models, model_folder
 from derender.report.viewer.examples import named_examples, rendered_examples
+from derender.storage.folder import bundled_models, model_folder
 from derender.training.held_out_errors import read_errors
 
 

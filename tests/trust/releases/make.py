@@ -15,10 +15,11 @@ from torch import nn
 
 import derender
 from derender.features import FeatureTable
-from derender.model import WHITENING_FILE, Derenderer
+from derender.model import Derenderer
 from derender.networks import NetworkSettings
 from derender.presets import ModelSettings
 from derender.scene.perturb import PerturbSettings
+from derender.storage.folder import WHITENING_FILE
 from derender.training import resolve
 from derender.training.checkpoint import TrainState, save_checkpoint
 from derender.training.config import WhiteningSettings

@@ -54,9 +54,9 @@ def reconstruction(
     from derender.evaluation import ReconstructionResult, evaluate_reconstruction, mean_picture
     from derender.evaluation.memory_values import recall_value
     from derender.evaluation.reconstruction import component_count, reconstruction_rows
-    from derender.model import model_folder
     from derender.report.score_table import reconstruction_table
     from derender.report.tables_pictures import picture_verdicts, with_intervals
+    from derender.storage.folder import model_folder
     from derender.training.held_out_errors import errors_of, write_errors
 
     net = open_model(model, device)

@@ -86,9 +86,7 @@ def opened(plan: Plan, name: str, source: str | None, device: str) -> Any:
         if source is None:
             raise ValueError(f"method {name!r} has neither runs nor a model")
         net = open_model(source, device)
-        if not method.whitened:
-            net.whitening = net.fitting = None
-        return net
+        return net if method.whitened else net.without_features()
     return open_baseline(
         kind,
         source,

@@ -173,9 +173,9 @@ def _decompose(model: Any, images: np.ndarray, batch_size: int) -> tuple[Scene, 
     """Scenes of pictures and the features they were decoded from, on the CPU."""
     scenes, codes = [], []
     for start in range(0, len(images), batch_size):
-        readings = model.read(as_float(images[start : start + batch_size]).to(model.device))
-        scenes.append(model.decode(model.codes(readings)).to("cpu"))
-        codes.append({name: value.float().cpu() for name, value in model.features(readings).items()})
+        activations = model.activations(as_float(images[start : start + batch_size]).to(model.device))
+        scenes.append(model.decode(model.codes(activations)).to("cpu"))
+        codes.append({name: value.float().cpu() for name, value in model.features_from(activations).items()})
     joined = {name: torch.cat([scene.parameters[name] for scene in scenes]) for name in scenes[0].parameters}
     return Scene.from_parameters(joined), {name: torch.cat([c[name] for c in codes]) for name in codes[0]}
 
@@ -195,8 +195,11 @@ def _seen_again(
         rendering = model.render(scenes[rows].to(model.device))
         pictures = as_float(images[rows]).to(model.device)
         shown = fill_uncovered(rendering.image.float(), rendering.mask.float(), pictures)
-        readings = model.read(shown)
-        decoded, features = model.decode(model.codes(readings)).parameters, model.features(readings)
+        activations = model.activations(shown)
+        decoded, features = (
+            model.decode(model.codes(activations)).parameters,
+            model.features_from(activations),
+        )
         part = {f"feature {name}": features[name] for name in parameters}
         part |= {f"parameter {name}": decoded[parameter] for name, parameter in parameters.items()}
         parts.append({key: value.float().cpu() for key, value in (part | {"pixels": shown}).items()})

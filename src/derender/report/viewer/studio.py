@@ -80,15 +80,18 @@ class Studio:
             picture = as_bytes(framing.cut(larger, self.model.image_size))[0].numpy()
         with torch.inference_mode():
             images = as_float(picture[None]).to(self.model.device)
-            readings = self.model.read(images)
+            activations = self.model.activations(images)
             errors = reconstruction_errors(self.model, picture[None])
             if self.fit_steps:
                 scene = self.model.fit_scenes(images, self.fit_steps).scene
                 shown = masked_l1(self.model.render(scene), images)
             else:
-                scene, shown = self.model.decode(self.model.codes(readings)), errors
+                scene, shown = self.model.decode(self.model.codes(activations)), errors
         scene, l1 = scene.to("cpu"), float(shown[0])
-        rows = {name: code[0].float().cpu().numpy() for name, code in self.model.features(readings).items()}
+        rows = {
+            name: code[0].float().cpu().numpy()
+            for name, code in self.model.features_from(activations).items()
+        }
         name = self.shelf.put(TakenApart(picture, scene, rows, l1))
         percentile = None if self.held_out is None else float(percentile_of(errors, self.held_out)[0])
         return {

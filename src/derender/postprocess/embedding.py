@@ -1,0 +1,128 @@
+"""A model's features: encoder activations, and what `Features` makes of them; scenes fitted per image.
+
+Leaves out the encoders, the decoders and the renderer, which the class that inherits `EmbeddingModel` has.
+"""
+
+import copy
+from abc import abstractmethod
+from collections.abc import Mapping
+from typing import TypeVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from derender.data.checks import check_pictures, refuse_not_finite
+from derender.networks import Factor
+from derender.postprocess.features import Features
+from derender.postprocess.fitting import STEPS, Fitted, Fitting, coordinates_of
+from derender.postprocess.whitening import Whitening
+from derender.render import Rendering
+from derender.scene import Scene
+
+Model = TypeVar("Model", bound="EmbeddingModel")
+
+
+class EmbeddingModel(nn.Module):
+    """Images to features.
+
+    Attributes:
+        factors: the declared rows.
+        nets: by factor name, a `FactorNet`.
+        whitening, fitting: the parts of ``features``; exchange them by ``with_features``.
+    """
+
+    factors: tuple[Factor, ...]
+    nets: nn.ModuleDict
+
+    def __init__(self, features: Features | None):
+        super().__init__()
+        features = features or Features()
+        self.whitening: Whitening | None = features.whitening
+        self.fitting: Fitting | None = features.fitting
+
+    @property
+    @abstractmethod
+    def image_size(self) -> int: ...
+
+    @abstractmethod
+    def encode(self, images: Float[Tensor, "n 3 h w"]) -> dict[str, Float[Tensor, "n code"]]: ...
+
+    @abstractmethod
+    def decode(self, codes: Mapping[str, Float[Tensor, "n code"]]) -> Scene: ...
+
+    @abstractmethod
+    def render(self, scene: Scene) -> Rendering: ...
+
+    @property
+    def features(self) -> Features:
+        """How features are made of encoder activations."""
+        return Features(self.whitening, self.fitting)
+
+    def with_features(self: Model, features: Features) -> Model:
+        """A model that shares these weights and makes features in another way."""
+        model = copy.copy(self)
+        model._modules = dict(self._modules)
+        model.whitening, model.fitting = features.whitening, features.fitting
+        return model
+
+    def without_features(self: Model) -> Model:
+        """A model that shares these weights and whose features are the codes."""
+        return self.with_features(Features())
+
+    def embed(self, images: Float[Tensor, "n 3 h w"]) -> dict[str, Float[Tensor, "n _"]]:
+        """One feature per factor for images in 0..1, by name: made as ``features`` says, else the code."""
+        refuse_not_finite(images)
+        if self.whitening is None and not self.features.fits_scenes:
+            return self.encode(images)
+        return self.features_from(self.activations(images))
+
+    def activations(self, images: Float[Tensor, "n 3 h w"]) -> dict[str, Float[Tensor, "n _"]]:
+        """Encoder activations of images in 0..1, by factor: the code, then the last spatial map.
+
+        Where ``features`` needs them, those of the mirror image follow, and coordinates of the fitted scene
+        come under keys of their own (`coordinates_of`).
+        """
+        check_pictures(images, self.image_size)
+        found = {factor.name: self.factor_activations(factor.name, images) for factor in self.factors}
+        if self.features.fits_scenes:
+            scene = self.decode(self.codes(found))
+            fitted = self.features.required_fitting().fit(images, scene, self.render).coordinates
+            found |= {coordinates_of(name): value for name, value in fitted.items()}
+        return found
+
+    def factor_activations(self, name: str, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n _"]:
+        """``activations`` for one factor, without coordinates."""
+        seen = (images, images.flip(-1)) if self.features.mirrors(name) else (images,)
+        return torch.cat([self.nets[name].activations(one) for one in seen], dim=1)  # type: ignore[operator]
+
+    def codes(self, activations: Mapping[str, Float[Tensor, "n _"]]) -> dict[str, Float[Tensor, "n code"]]:
+        """The codes that activations begin with: ``encode`` of the same images."""
+        return {
+            factor.name: activations[factor.name][:, : self.nets[factor.name].code_size]  # type: ignore[misc]
+            for factor in self.factors
+            if factor.name in activations
+        }
+
+    def features_from(
+        self, activations: Mapping[str, Float[Tensor, "n _"]]
+    ) -> dict[str, Float[Tensor, "n _"]]:
+        """``embed`` of the images that these activations belong to.
+
+        Raises:
+            ValueError: there are codes where a feature needs all activations.
+        """
+        return self.features(self.codes(activations), activations)
+
+    def fit_scenes(self, images: Float[Tensor, "n 3 h w"], steps: int = STEPS) -> Fitted:
+        """Scenes optimised per image, images in 0..1: from ``decompose`` on, downhill through the renderer.
+
+        Slower than ``decompose`` by a hundred times, with a smaller error, also under lighting and viewpoints
+        that the encoders were not trained on.
+
+        Raises:
+            ValueError: the model has no fitting (``derender whiten`` makes one).
+        """
+        refuse_not_finite(images)
+        fitting = self.features.required_fitting()
+        return fitting.fit(images, self.decode(self.encode(images)), self.render, steps)
