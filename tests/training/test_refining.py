@@ -171,7 +171,7 @@ def test_what_cannot_be_refined_is_named(model, images):
         refine(model, images[:1], images[1:])
     with pytest.raises(ValueError, match="and one held out, got 16 of 64 and 0"):
         refine(model, images, images[:0])
-    with pytest.raises(ValueError, match="cannot fit scenes yet"):
+    with pytest.raises(ValueError, match="cannot optimise scenes per image yet"):
         refine(derender.load("cars-64"), images[:4], images[4:])
 
 

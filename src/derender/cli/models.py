@@ -32,9 +32,7 @@ def with_fitted_scenes(model: "Derenderer", source: str, steps: int | None) -> "
     return FittedModel(model, steps)
 
 
-def check_maker(
-    model: "Derenderer", source: str, table: "FeatureTable", path: str | Path
-) -> "Derenderer":
+def check_maker(model: "Derenderer", source: str, table: "FeatureTable", path: str | Path) -> "Derenderer":
     """The model with the fitting steps a table was made with; a table of another model is an error."""
     from derender.features import model_fingerprint
 

@@ -62,8 +62,8 @@ class Features:
         if self.fitting is None:
             name = model if model != "this model" else "MODEL"
             raise ValueError(
-                f"{model} cannot optimise scenes per image yet: derender whiten --model {name} IMAGES --out NEW "
-                "makes a copy that can"
+                f"{model} cannot optimise scenes per image yet: derender whiten --model {name} IMAGES --out "
+                "NEW makes a copy that can"
             )
         return self.fitting
 
