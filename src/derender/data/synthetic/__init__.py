@@ -1,13 +1,22 @@
-"""Built-in pictures with exact ground truth: procedural generators that need no download.
+"""Built-in images with exact ground truth: procedural generators that need no download.
 
 ``faces.generate`` and ``cars.generate`` make them, ``write`` saves them in the layout of the rendered data
 sets.
 """
 
 from derender.data.synthetic import cars, faces
-from derender.data.synthetic.car_settings import CAR_LIGHTS, CAR_VIEWS, CarSettings, CarViewSettings
 from derender.data.synthetic.morphable import MorphableFaces
-from derender.data.synthetic.settings import LIGHTS, VIEWS, FaceSettings, LightSettings, ViewSettings
+from derender.data.synthetic.settings import (
+    CAR_LIGHTS,
+    CAR_VIEWS,
+    LIGHTS,
+    VIEWS,
+    CarSettings,
+    CarViewSettings,
+    FaceSettings,
+    LightSettings,
+    ViewSettings,
+)
 from derender.data.synthetic.synthetic_set import SyntheticSet
 from derender.data.synthetic.write import write, write_tracks
 

@@ -7,7 +7,7 @@ car, its upper edge, its waist (the windows' lower edge, or the shoulder of bonn
 are; between stations the rows are interpolated linearly with rounded corners. Across, the surface goes from
 the middle over the crowned top to the edge, down the glass to the waist, and down the side to the sill. The
 half with x > 0 is mirrored, so the body is exactly symmetric. Points are x to the right, y UP from the
-ground, z to the rear. Wheel arches are holes of the paint (car_decals). Leaves out the underside."""
+ground, z to the rear. Wheel arches are holes of the paint. Leaves out the underside."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -16,7 +16,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from derender.data.synthetic.car_shape import CarShape
+from derender.data.synthetic.car_mesh import Grid, part_of, smooth_grid
+from derender.data.synthetic.car_traits import CarShape
 
 STATIONS = 10
 ARCH = 1.13  # radius of the wheel arches in wheel radii
@@ -39,19 +40,6 @@ class BodyLines:
     sill: Float[ndarray, "t 3"]
 
 
-@dataclass(frozen=True)
-class Body:
-    """``points`` (rows, columns, 3), rear to front and left to right; which columns are top and which side.
-
-    ``chart`` (rows, columns, 2) is where paint lies: (share of the half width, station) on top, (z, y)
-    beside."""
-
-    points: Float[ndarray, "r c 3"]
-    top: slice
-    chart_top: Float[ndarray, "r c 2"]
-    chart_side: Float[ndarray, "r c 2"]
-
-
 def body_lines(shape: CarShape, stations: Float[ndarray, "t"]) -> BodyLines:
     """The body's lines at these stations (0..9)."""
     rows = _rounded(_table(shape), _corners(shape), stations)
@@ -59,17 +47,27 @@ def body_lines(shape: CarShape, stations: Float[ndarray, "t"]) -> BodyLines:
     return BodyLines(stations, *(rows[:, i : i + 3] for i in (0, 3, 6, 9)))
 
 
-def body_grid(shape: CarShape) -> Body:
+def body_pieces(shape: CarShape, top: int, side: int) -> tuple[list[Grid], Float[ndarray, "points 3"]]:
+    """The body with the numbers of its surfaces, and the points of its right side.
+
+    The top's chart is (share of the half width, station), the sides' (z, y)."""
     stations = _stations()
-    lines = body_lines(shape, stations)
-    half = _half(shape, lines)
+    half = _half(shape, body_lines(shape, stations))
     left = half[:, :0:-1] * np.array([-1.0, 1.0, 1.0])
     points = np.concatenate([left, half], axis=1)[::-1]
     across = np.concatenate([_ACROSS, np.ones(len(_GLASS) + len(_SIDE))])
     share = np.concatenate([-across[:0:-1], across])
     chart_top = np.stack(np.broadcast_arrays(share[None], stations[::-1, None]), axis=-1)
+    chart_side = points[..., [2, 1]]
+    whole = smooth_grid(points, chart_top, top)
     middle = half.shape[1] - 1
-    return Body(points, slice(middle - _TOP + 1, middle + _TOP), chart_top, points[..., [2, 1]])
+    first, last = middle - _TOP + 1, middle + _TOP
+    pieces = [
+        part_of(whole, slice(0, first + 1), chart_side, side),
+        part_of(whole, slice(first, last), chart_top, top),
+        part_of(whole, slice(last - 1, None), chart_side, side),
+    ]
+    return pieces, points[:, last:].reshape(-1, 3)
 
 
 @lru_cache(maxsize=1)
@@ -82,21 +80,16 @@ def _stations() -> ndarray:
 def _table(s: CarShape) -> Float[ndarray, "stations 12"]:
     """Middle (x = 0), upper edge, waist and sill at each station."""
     w, end = s.width / 2, s.length
-    crown = 0.045
-    roof = s.height
-    glass = w - 0.035
-    top = glass - s.tumblehome
-    belt = s.cowl + 0.02
-    back_belt = max(belt, s.deck - 0.04)
+    belt, back_belt = s.cowl + 0.02, max(s.cowl + 0.02, s.deck - 0.04)
+    glass, top = w - 0.035, w - 0.035 - s.tumblehome
     cabin = s.deck_at - s.cowl_at
     bonnet = w - 0.07
     middle = np.array([
         (0, s.sill, 0.12), (0, s.bumper, 0.0), (0, s.nose, s.nose_at), (0, s.cowl, s.cowl_at),
-        (0, roof, s.screen_at), (0, roof - s.roof_drop, s.roof_end_at), (0, s.deck, s.deck_at),
+        (0, s.height, s.screen_at), (0, s.height - s.roof_drop, s.roof_end_at), (0, s.deck, s.deck_at),
         (0, s.tail, s.tail_at), (0, s.bumper + 0.05, end), (0, s.sill + 0.04, end - 0.1),
     ])  # fmt: skip
-    open_top = s.bed > 0 and s.screen_at - s.cowl_at < 0.2
-    if open_top:
+    if s.bed > 0 and s.screen_at - s.cowl_at < 0.2:  # an open top
         glass, top, belt, back_belt = w - 0.01, w - 0.06, s.cowl - 0.06, s.deck - 0.06
     half = np.array([
         0.86 * w, 0.90 * w - 0.6 * s.hood_inset, 0.90 * w - s.hood_inset, bonnet - 0.02, top, top - 0.02,
@@ -105,7 +98,7 @@ def _table(s: CarShape) -> Float[ndarray, "stations 12"]:
     bow = np.array([0.7, 1.0, 0.9, 0.35, 0.25, -0.12, -0.25, -0.5, -0.55, -0.5]) * s.bow
     edge = middle.copy()
     edge[:, 0], edge[:, 2] = half, middle[:, 2] + bow
-    edge[2:8, 1] -= np.array([0.03, crown, 0.05, 0.05, 0.03, 0.02])
+    edge[2:8, 1] -= np.array([0.03, 0.045, 0.05, 0.05, 0.03, 0.02])
     waist = edge + np.array([
         (0.04 * w, 0.01, 0.05), (0.06 * w, -0.01, 0.05), (0.06 * w, -0.07, 0.06), (0.05, -0.06, 0.03),
         (0, 0, 0), (0, 0, 0), (0.05, -0.05, 0.0), (0.04 * w, -0.06, -0.04), (0.04 * w, -0.01, -0.05),
@@ -138,17 +131,15 @@ def _rounded(table: ndarray, corners: ndarray, t: ndarray) -> ndarray:
 
 def _half(s: CarShape, lines: BodyLines) -> Float[ndarray, "t c 3"]:
     """The half with x >= 0, from the middle to the sill."""
-    a = _ACROSS[:, None]
-    drop = 0.4 * a**2 + 0.6 * a**8
-    back = 0.25 * a**2 + 0.75 * a**4
-    span = lines.edge - lines.middle
-    top = lines.middle[:, None] + np.concatenate([a, drop, back], axis=1) * span[:, None]
+    a, cabin = _ACROSS[:, None], _cabin(lines.stations)
+    across = np.concatenate([a, 0.4 * a**2 + 0.6 * a**8, 0.25 * a**2 + 0.75 * a**4], axis=1)
+    top = lines.middle[:, None] + across * (lines.edge - lines.middle)[:, None]
     if s.bed > 0:
         inside = (lines.stations > BED_FROM) & (lines.stations < BED_TO + 0.005)
         top[inside, : np.searchsorted(_ACROSS, BED_SIDE) + 1, 1] -= s.bed
-    glass = _between(lines.edge, lines.waist, _GLASS, _bulge(lines.stations))
+    glass = _bulged(lines.edge, lines.waist, _GLASS, 0.9 - 0.75 * cabin)
     down = lines.waist[:, None] + _SIDE[:, None] * (lines.sill - lines.waist)[:, None]
-    down[..., 0] += 0.035 * (1.0 - np.exp(-_SIDE / 0.06)) * _cabin(lines.stations)[:, None]
+    down[..., 0] += 0.035 * (1.0 - np.exp(-_SIDE / 0.06)) * cabin[:, None]
     from_ends = np.clip(_from_ends(lines.stations) - 0.4, 0.0, 1.0)[:, None]
     down[..., 0] += 0.05 * np.sin(np.pi * _SIDE) * (1.0 - _SIDE) * from_ends
     half = np.concatenate([top, glass, down], axis=1)
@@ -170,7 +161,7 @@ def _raise_wings(shape: CarShape, rows: Float[ndarray, "t 12"], stations: Float[
         rows[:, [4, 7]] += (np.maximum(0.0, lack) * near * shoulder)[:, None]
 
 
-def _between(edge: ndarray, waist: ndarray, share: ndarray, bulge: ndarray) -> ndarray:
+def _bulged(edge: ndarray, waist: ndarray, share: ndarray, bulge: ndarray) -> ndarray:
     """A parabola from edge to waist; ``bulge`` 0 is straight, 1 leaves the edge level and drops at the
     end."""
     corner = np.stack([waist[:, 0], edge[:, 1], 0.5 * (edge[:, 2] + waist[:, 2])], axis=-1)
@@ -187,7 +178,3 @@ def _from_ends(stations: ndarray) -> ndarray:
 def _cabin(stations: ndarray) -> ndarray:
     """1 where the waist carries windows, 0 along bonnet and boot."""
     return np.clip(np.minimum(stations - 3.0, 6.0 - stations) / 0.5, 0.0, 1.0)
-
-
-def _bulge(stations: ndarray) -> ndarray:
-    return 0.9 - 0.75 * _cabin(stations)

@@ -11,9 +11,10 @@ from functools import lru_cache
 from typing import no_type_check
 
 import numpy as np
-from jaxtyping import Float, Float32, Int32
+from jaxtyping import Float, Int32
 from numpy import ndarray
 
+from derender.data.synthetic.mesh_image import Mesh
 from derender.render.numba_threads import kernel
 
 _DOWN = np.array([1.0, -1.0, 1.0])
@@ -35,26 +36,11 @@ class Grid:
     surface: int
 
 
-@dataclass(frozen=True)
-class CarMesh:
-    """Vertices in metres (y down, ground at 0), inward normals, charts; triangles with their surface."""
-
-    vertices: Float32[ndarray, "v 3"]
-    normals: Float32[ndarray, "v 3"]
-    chart: Float32[ndarray, "v 2"]
-    triangles: Int32[ndarray, "f 3"]
-    surface: Int32[ndarray, "f"]
-
-
 def smooth_grid(points: Float[ndarray, "r c 3"], chart: Float[ndarray, "r c 2"], surface: int) -> Grid:
-    return Grid(points, smooth_normals(points), chart, surface)
-
-
-def smooth_normals(points: Float[ndarray, "r c 3"]) -> Float[ndarray, "r c 3"]:
-    """Area-weighted means of the cells around each vertex, inward, in the y-down frame."""
+    """A grid whose normals are area-weighted means of the cells around each vertex."""
     normals = np.zeros(points.shape)
     _add_cells(points * _DOWN, normals)
-    return normals
+    return Grid(points, normals, chart, surface)
 
 
 @kernel
@@ -63,16 +49,9 @@ def _add_cells(p, normals):
     rows, columns = p.shape[0], p.shape[1]
     for r in range(rows - 1):
         for c in range(columns - 1):
-            ax, ay, az = (
-                p[r + 1, c + 1, 0] - p[r, c, 0],
-                p[r + 1, c + 1, 1] - p[r, c, 1],
-                p[r + 1, c + 1, 2] - p[r, c, 2],
-            )
-            bx, by, bz = (
-                p[r + 1, c, 0] - p[r, c + 1, 0],
-                p[r + 1, c, 1] - p[r, c + 1, 1],
-                p[r + 1, c, 2] - p[r, c + 1, 2],
-            )
+            first, across, right, below = p[r, c], p[r + 1, c + 1], p[r, c + 1], p[r + 1, c]
+            ax, ay, az = across[0] - first[0], across[1] - first[1], across[2] - first[2]
+            bx, by, bz = below[0] - right[0], below[1] - right[1], below[2] - right[2]
             x, y, z = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
             for k in range(4):
                 normals[r + k // 2, c + k % 2, 0] += x
@@ -113,40 +92,34 @@ def rounded_box(
     """
     sizes = np.asarray(half, float)
     core = sizes - min(radius, *half)
-    unit, faces = _box_faces()
-    outer = np.abs(unit) > 0.9
-    spread = np.where(outer, np.sign(unit), 0.0)
-    local = np.where(np.abs(unit) > 0.4, np.sign(unit) * core, 0.0)
-    length = np.sqrt((spread * spread).sum(axis=-1, keepdims=True))
-    outward = spread / length
-    local = local + (sizes - core).min() * outward
+    rim = _box_faces()
+    flat = np.where(np.abs(rim) > 0.4, np.sign(rim) * core, 0.0)
+    spread = np.where(np.abs(rim) > 0.9, np.sign(rim), 0.0)
+    outward = spread / np.sqrt((spread * spread).sum(axis=-1, keepdims=True))
     cos, sin = np.cos(lean_rad), np.sin(lean_rad)
     turn = np.array([[1, 0, 0], [0, cos, -sin], [0, sin, cos]])
-    points = local @ turn.T + np.asarray(centre, float)
+    points = (flat + (sizes - core).min() * outward) @ turn.T + np.asarray(centre, float)
     normals = -(outward @ turn.T) * _DOWN
-    numbers = (surfaces,) * 4 if isinstance(surfaces, int) else surfaces
-    charts = {"top": [0, 2], "front": [0, 1], "rear": [0, 1], "left": [2, 1], "right": [2, 1]}
-    order = {"top": 0, "front": 1, "rear": 2, "left": 3, "right": 3}
-    return [
-        Grid(points[i], normals[i], points[i][..., charts[name]], numbers[order[name]])
-        for i, name in enumerate(faces)
-    ]
+    top, front, rear, side = (surfaces,) * 4 if isinstance(surfaces, int) else surfaces
+    faces = ((top, [0, 2]), (front, [0, 1]), (rear, [0, 1]), (side, [2, 1]), (side, [2, 1]))
+    return [Grid(points[i], normals[i], points[i][..., axes], k) for i, (k, axes) in enumerate(faces)]
 
 
 @lru_cache(maxsize=1)
-def _box_faces() -> tuple[ndarray, tuple[str, ...]]:
-    """(faces, 4, 4, 3): 1 marks the rounded rim of a face, 0.5 its flat inside, with the sign of the side."""
+def _box_faces() -> ndarray:
+    """(5, 4, 4, 3), top, front, rear, right, left: 1 marks the rounded rim of a face, 0.5 its flat inside,
+    with the sign of the side."""
     a = np.array([-1.0, -0.5, 0.5, 1.0])
     row, column = np.meshgrid(-a, a, indexing="ij")  # rows run down or forwards, columns to the right
     one = np.ones_like(row)
-    faces = {
-        "top": (column, one, row),
-        "front": (column, row, -one),
-        "rear": (-column, row, one),
-        "right": (one, row, column),
-        "left": (-one, row, -column),
-    }
-    return np.stack([np.stack(face, axis=-1) for face in faces.values()]), tuple(faces)
+    faces = (
+        (column, one, row),
+        (column, row, -one),
+        (-column, row, one),
+        (one, row, column),
+        (-one, row, -column),
+    )
+    return np.stack([np.stack(face, axis=-1) for face in faces])
 
 
 def wheel(
@@ -164,9 +137,8 @@ def wheel(
     points = np.stack(local, axis=-1) + np.asarray(centre, float)
     grid = smooth_grid(points, chart, surface)
     seam = grid.normals[:, 0] + grid.normals[:, -1]
-    grid.normals[:, 0] = grid.normals[:, -1] = seam / np.maximum(
-        np.linalg.norm(seam, axis=-1, keepdims=True), 1e-12
-    )
+    length = np.maximum(np.linalg.norm(seam, axis=-1, keepdims=True), 1e-12)
+    grid.normals[:, 0] = grid.normals[:, -1] = seam / length
     return grid
 
 
@@ -184,20 +156,18 @@ def wheel_house(
     """
     angle = np.linspace(0.0, 2.0 * np.pi, _WHEEL_SECTORS + 1)
     z, y = axle[0] - radius * np.sin(angle), axle[1] + radius * np.cos(angle)
-    sides = [
-        outside(a, b) - 0.01 if b > lowest else inside for a, b in zip(z.tolist(), y.tolist(), strict=True)
-    ]
-    out, y = np.array(sides), np.maximum(y, lowest)
+    out = np.array([outside(a, b) - 0.01 if b > lowest else inside for a, b in zip(z, y, strict=True)])
+    y = np.maximum(y, lowest)
     rows = [(inside, axle[1], axle[0]), (inside, y, z), (inside, y, z), (out, y, z)]
     points = np.stack([np.stack(np.broadcast_arrays(*row, angle)[:3], axis=-1) for row in rows])
     return smooth_grid(points, points[..., [2, 1]], surface)
 
 
-def join(pieces: Sequence[Grid]) -> CarMesh:
-    """One mesh of all pieces."""
+def join(pieces: Sequence[Grid]) -> Mesh:
+    """One mesh of all pieces, y down from the ground at 0."""
     starts = np.cumsum([0, *(g.points.shape[0] * g.points.shape[1] for g in pieces)])
     cells = [_cells(*g.points.shape[:2]) for g in pieces]
-    return CarMesh(
+    return Mesh(
         vertices=(np.concatenate([g.points.reshape(-1, 3) for g in pieces]) * _DOWN).astype(np.float32),
         normals=np.concatenate([g.normals.reshape(-1, 3) for g in pieces]).astype(np.float32),
         chart=np.concatenate([g.chart.reshape(-1, 2) for g in pieces]).astype(np.float32),

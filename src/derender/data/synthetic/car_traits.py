@@ -1,82 +1,83 @@
-"""What one car is: its class, body style, measures, colours and fittings, drawn from a generator.
+"""One car: its class, body style, measures, colours and fittings, drawn from a generator.
 
-Twelve classes: seven body styles (sedan, hatchback, estate, suv, van, pickup, coupe) and five that are told
-by more than their body: police, ambulance, limousine, jeep, sports. Paint is drawn from short lists of
-usual colours with some spread; the lists and chances are ours. Leaves out rust, dirt and damage."""
+Twelve classes: seven body styles and five that differ by more than their body (police, ambulance, limousine,
+jeep, sports). Measures are metres and, along the car, distance from the front bumper: a row of ``cars.yaml``
+for each body style (typical outside measures of road cars, rounded) times small independent factors. Paint
+is drawn from short lists of usual colours. Leaves out rust, dirt and damage; no existing car is drawn.
+"""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+import yaml
 
-from derender.data.synthetic.car_decals import Colour
-from derender.data.synthetic.car_shape import CarShape, draw_shape
-
-CLASSES: dict[str, tuple[str, ...]] = {
-    "sedan": ("sedan",),
-    "hatchback": ("hatchback",),
-    "estate": ("estate",),
-    "suv": ("suv",),
-    "van": ("van",),
-    "pickup": ("pickup",),
-    "coupe": ("coupe",),
-    "police": ("sedan", "sedan", "estate", "suv"),
-    "ambulance": ("cab",),
-    "limousine": ("sedan",),
-    "jeep": ("jeep_hard", "jeep_open"),
-    "sports": ("sports",),
-}
+from derender.data.synthetic.decals import Colour
+from derender.data.synthetic.settings import CLASSES
 
 _WHITE, _BLACK = (0.92, 0.92, 0.91), (0.075, 0.075, 0.08)
-_USUAL: tuple[tuple[Colour, float], ...] = (
-    (_WHITE, 4), (_BLACK, 2.5), ((0.33, 0.34, 0.36), 2.5), ((0.66, 0.67, 0.68), 2.5), ((0.10, 0.22, 0.52), 2),
-    ((0.18, 0.42, 0.72), 1.5), ((0.66, 0.07, 0.08), 2.5), ((0.40, 0.05, 0.09), 1), ((0.07, 0.26, 0.16), 1),
-    ((0.36, 0.50, 0.30), 1), ((0.86, 0.42, 0.08), 1), ((0.88, 0.74, 0.14), 1), ((0.60, 0.50, 0.36), 1),
-    ((0.24, 0.16, 0.11), 0.7), ((0.08, 0.42, 0.44), 1), ((0.38, 0.16, 0.42), 0.5),
-)  # fmt: skip
-_BRIGHT: tuple[tuple[Colour, float], ...] = (
-    ((0.80, 0.05, 0.05), 4), ((0.95, 0.80, 0.06), 3), ((0.96, 0.45, 0.03), 2.5), ((0.45, 0.78, 0.10), 1.5),
-    ((0.05, 0.30, 0.82), 2), ((0.08, 0.62, 0.86), 1), (_WHITE, 1), ((0.70, 0.72, 0.74), 0.7), (_BLACK, 0.5),
-)  # fmt: skip
-_RUGGED: tuple[tuple[Colour, float], ...] = (
-    ((0.30, 0.34, 0.18), 3), ((0.68, 0.58, 0.40), 2.5), ((0.72, 0.08, 0.06), 1.5), ((0.93, 0.74, 0.10), 1.5),
-    ((0.90, 0.44, 0.08), 1.5), ((0.12, 0.28, 0.50), 1.5), (_WHITE, 1), ((0.10, 0.30, 0.18), 1.5),
-    ((0.5, 0.52, 0.54), 1),
-)  # fmt: skip
-_STATELY: tuple[tuple[Colour, float], ...] = (
-    ((0.085, 0.085, 0.095), 4),
-    (_WHITE, 4),
-    ((0.62, 0.63, 0.66), 1.5),
+_ALONG = (
+    *("length", "front_wheel", "rear_wheel", "nose_at", "cowl_at", "screen_at"),
+    *("roof_end_at", "deck_at", "tail_at"),
 )
-_PALETTES = {"sports": _BRIGHT, "jeep": _RUGGED, "limousine": _STATELY, "ambulance": ((_WHITE, 1.0),)}
+_UP = ("height", "nose", "cowl", "deck", "tail", "bumper")
+_PLASTIC = {"suv": 0.6, "van": 0.6, "pickup": 0.6, "jeep": 1.0, "hatchback": 0.15}  # chance of such bumpers
+
+
+@dataclass(frozen=True)
+class CarShape:
+    """One body, in metres. ``*_at`` lies along the car from its front; heights are from the ground."""
+
+    length: float  # of the body without mirrors and what is mounted on it, as width and height
+    width: float
+    height: float
+    sill: float  # height of the body's lower edge
+    front_wheel: float  # where the axles are
+    rear_wheel: float
+    wheel: float  # radius of the wheels
+    nose_at: float  # upper edge of the front face
+    nose: float
+    cowl_at: float  # where bonnet and windscreen meet
+    cowl: float
+    screen_at: float  # upper edge of the windscreen
+    roof_end_at: float  # rear end of the roof, and how much lower it is than the height
+    roof_drop: float
+    deck_at: float  # lower edge of the rear window
+    deck: float
+    tail_at: float  # upper edge of the rear face
+    tail: float
+    bumper: float  # height of the foremost point
+    tumblehome: float  # how much narrower the roof is on each side than the body at the windows' lower edge
+    hood_inset: float  # how much narrower the bonnet's front is on each side than the body
+    bow: float  # how far the front's corners stand back
+    flare: float  # how far the wings stand out around the wheels
+    soft: float  # 0..1, how far the profile's corners are rounded
+    bed: float  # depth of an open bed or cabin behind the deck line; 0 is none
 
 
 @dataclass(frozen=True)
 class CarTraits:
-    """One model.
+    """One model."""
 
-    Attributes:
-        name: its class.
-        style: its body style.
-        shape: its measures.
-        paint, roof, glass, rim, trim: colours of body, roof, windows, wheels and plastic.
-        bumpers: colour of the bumpers, the body's or the trim's.
-        spokes: how many a wheel has.
-        chances: ten uniform numbers that decide on fittings, each by its own position.
-        livery: which of its class's liveries (police, ambulance, sports).
-    """
-
-    name: str
-    style: str
+    name: str  # its class
+    style: str  # its body style
     shape: CarShape
-    paint: Colour
+    paint: Colour  # of the body
     roof: Colour
-    glass: Colour
-    rim: Colour
-    trim: Colour
-    bumpers: Colour
-    spokes: int
-    chances: tuple[float, ...]
-    livery: int
+    glass: Colour  # of the windows
+    rim: Colour  # of the wheels
+    trim: Colour  # of plastic
+    bumpers: Colour  # the body's or the trim's
+    spokes: int  # of a wheel
+    chances: tuple[float, ...]  # ten uniform numbers that decide on fittings, each by its own position
+    livery: int  # which of its class's liveries (police, ambulance, sports)
+
+    @property
+    def plastic(self) -> bool:
+        """Whether the bumpers are of plastic rather than painted as the body."""
+        return self.bumpers != self.paint
 
 
 def draw_traits(name: str, generator: np.random.Generator) -> CarTraits:
@@ -84,45 +85,46 @@ def draw_traits(name: str, generator: np.random.Generator) -> CarTraits:
     uniform = generator.random(24)
     spread = generator.standard_normal(8)
     style = CLASSES[name][int(uniform[0] * len(CLASSES[name]))]
-    stretch = 1.5 + 1.0 * uniform[1] if name == "limousine" else 0.0
-    shape = draw_shape(style, generator, stretch)
+    shape = _draw_shape(style, generator, 1.5 + 1.0 * uniform[1] if name == "limousine" else 0.0)
     livery = int(uniform[2] * 3)
-    paint = _spread(_pick(_PALETTES.get(name, _USUAL), uniform[3]), spread[:3])
+    palettes = _numbers()["palettes"]
+    paint = _spread(_pick(palettes.get(name, palettes["usual"]), uniform[3]), spread[:3])
     if name == "police":
         paint = (_BLACK, _WHITE, _WHITE)[livery]
     roof = paint
-    if (name == "suv" and uniform[4] < 0.3) or (name == "hatchback" and uniform[4] < 0.2):
+    if uniform[4] < {"suv": 0.3, "hatchback": 0.2}.get(name, 0.0):
         roof = _WHITE if sum(paint) < 1.4 else _BLACK
-    if name in ("sports", "coupe") and uniform[4] < 0.25:
-        roof = _BLACK
-    if name == "jeep" and uniform[4] < 0.6:
-        roof = _BLACK if uniform[5] < 0.6 else _WHITE
+    if uniform[4] < {"sports": 0.25, "coupe": 0.25, "jeep": 0.6}.get(name, 0.0):
+        roof = _BLACK if name != "jeep" or uniform[5] < 0.6 else _WHITE
     grey = 0.06 + 0.10 * uniform[6] + (0.08 if sum(paint) < 0.5 else 0.0)
-    glass = (grey, grey * (1.05 + 0.2 * uniform[7]), grey * (1.15 + 0.5 * uniform[7]))
     bright = 0.25 if uniform[8] < 0.2 else 0.55 + 0.25 * uniform[9]
     trim = 0.07 + 0.06 * uniform[10]
-    plastic = uniform[11] < {"suv": 0.6, "van": 0.6, "pickup": 0.6, "jeep": 1.0, "hatchback": 0.15}.get(
-        name, 0.0
-    )
+    plastic = (trim, trim, trim * 1.05)
     return CarTraits(
         name=name,
         style=style,
         shape=shape,
         paint=paint,
         roof=roof,
-        glass=glass,
+        glass=(grey, grey * (1.05 + 0.2 * uniform[7]), grey * (1.15 + 0.5 * uniform[7])),
         rim=(bright, bright, bright * 1.02),
-        trim=(trim, trim, trim * 1.05),
-        bumpers=(trim, trim, trim * 1.05) if plastic else paint,
+        trim=plastic,
+        bumpers=plastic if uniform[11] < _PLASTIC.get(name, 0.0) else paint,
         spokes=5 + int(uniform[12] * 4),
         chances=tuple(uniform[13:23].tolist()),
         livery=livery,
     )
 
 
-def _pick(palette: tuple[tuple[Colour, float], ...], share: float) -> Colour:
-    weights = np.cumsum([weight for _, weight in palette])
-    return palette[int(np.searchsorted(weights, share * weights[-1]))][0]
+@lru_cache(maxsize=1)
+def _numbers() -> dict[str, Any]:
+    return yaml.safe_load(Path(__file__).with_name("cars.yaml").read_text(encoding="utf-8"))
+
+
+def _pick(palette: list[list[float]], share: float) -> Colour:
+    ends = np.cumsum([weight for *_, weight in palette])
+    red, green, blue, _ = palette[int(np.searchsorted(ends, share * ends[-1]))]
+    return red, green, blue
 
 
 def _spread(colour: Colour, by: np.ndarray) -> Colour:
@@ -131,3 +133,28 @@ def _spread(colour: Colour, by: np.ndarray) -> Colour:
     moved = np.array(colour) * lighter * (1.0 + 0.05 * np.clip(by, -2, 2))
     red, green, blue = np.clip(moved, 0.03, 0.95).tolist()
     return red, green, blue
+
+
+def _draw_shape(style: str, generator: np.random.Generator, stretch: float) -> CarShape:
+    """A model of that style; ``stretch`` metres are put in behind the front doors (limousines)."""
+    names = [f.name for f in fields(CarShape)]
+    row = CarShape(*_numbers()["measures"][style])
+    normal = np.clip(generator.standard_normal(len(names)), -2.0, 2.0)
+    factor = {name: 1.0 + 0.03 * float(v) for name, v in zip(names, normal, strict=True)}
+    drawn = {name: getattr(row, name) * factor[name] for name in names}
+    for name in _ALONG:  # along the car one common factor, so that nothing changes places
+        drawn[name] = getattr(row, name) * factor["length"]
+    for name in _UP:
+        drawn[name] = getattr(row, name) * factor["height"]
+    between = factor["cowl"] - 1.0  # a longer or shorter bonnet moves the windscreen as a whole
+    drawn["cowl_at"] += 1.2 * between
+    drawn["screen_at"] += 1.2 * between + 2.0 * row.soft * (factor["screen_at"] - 1.0)
+    if row.roof_end_at < row.deck_at - 0.25 and row.bed == 0.0:
+        drawn["roof_end_at"] += 4.0 * row.soft * (factor["roof_end_at"] - 1.0)
+    drawn["soft"] = min(1.0, row.soft * (1.0 + 5.0 * (factor["soft"] - 1.0)))
+    drawn["bow"] = row.bow * (1.0 + 5.0 * (factor["bow"] - 1.0))
+    drawn["nose"] *= 1.0 + (factor["nose"] - 1.0)
+    if stretch:
+        for name in ("length", "rear_wheel", "roof_end_at", "deck_at", "tail_at"):
+            drawn[name] += stretch
+    return CarShape(**drawn)

@@ -1,8 +1,8 @@
-"""What is drawn for each picture: who, expression, light, view, background.
+"""The random draw of one image of a face: person, expression, lighting, viewpoint, background.
 
-A picture's draw is a function of seed and index alone. In a track (settings.tracks) light, background and
-expression belong to the track, while view, gaze and the expression's strength move from one draw to another
-along its frames.
+A draw is a function of seed and index alone. In a track (settings.tracks) light, background and expression
+belong to the track, while view, gaze and the expression's strength move from one draw to another along its
+frames.
 """
 
 from dataclasses import dataclass
@@ -11,19 +11,28 @@ import numpy as np
 from jaxtyping import Float32
 from numpy import ndarray
 
-from derender.data.synthetic.backgrounds import draw_background
-from derender.data.synthetic.draws import clipped, either_side, light_angles, name_at, scaled
-from derender.data.synthetic.face_expression import ACTIONS, EXPRESSIONS, LID_ACTIONS
-from derender.data.synthetic.settings import FaceSettings, LightSettings, Range, ViewSettings
+from derender.data.synthetic.face_shape import ACTIONS, LID_ACTIONS
+from derender.data.synthetic.settings import (
+    EXPRESSIONS,
+    FaceSettings,
+    Range,
+    ViewSettings,
+    clipped,
+    either_side,
+    name_at,
+    scaled,
+)
+from derender.data.synthetic.synthetic_set import draw_background
 
+NOSE_TIP_Z = 0.947  # of neutral faces
 _DRIFT = np.array([*np.deg2rad([8.0, 18.0, 5.0]), 0.005, 0.005, 0.0])  # how far a head moves within a track
 _JAW = ACTIONS.index("jaw_open")
 
 
 @dataclass(frozen=True)
 class FaceDraw:
-    """One picture's draw: ``actions`` and ``lids`` are weights of each half of the face's actions, ``gaze``
-    is in face pixels, ``light`` and ``camera`` as in SyntheticSet."""
+    """One image's draw: ``actions`` and ``lids`` are weights of each half of the face's actions, ``gaze`` is
+    in face pixels, ``light`` and ``camera`` as in SyntheticSet."""
 
     identity: int
     track: int
@@ -39,11 +48,10 @@ class FaceDraw:
 
 
 def draw_face(seed: int, index: int, image_size: int, settings: FaceSettings) -> FaceDraw:
-    """The draw of picture number ``index``."""
+    """The draw of image number ``index``."""
     person, within = divmod(index, settings.per_identity)
     track, frame = divmod(within, settings.frames) if settings.tracks else (0, 0)
-    scene = index - frame  # tracks draw everything once, with their first frame
-    generator = np.random.default_rng([seed, 1, scene])
+    generator = np.random.default_rng([seed, 1, index - frame])  # a track's is that of its first frame
     normal = generator.standard_normal((2, 7))
     uniform = generator.random(8)
     ends = generator.random((2, 4))
@@ -70,34 +78,24 @@ def draw_face(seed: int, index: int, image_size: int, settings: FaceSettings) ->
         actions=sides[: len(ACTIONS)].astype(np.float32),
         lids=sides[len(ACTIONS) :].astype(np.float32),
         gaze=_moved(gaze, along).astype(np.float32),
-        light=_light(settings.light, uniform[1:6]),
+        light=settings.light.draw(uniform[1:6]),
         camera=_moved(cameras, along).astype(np.float32),
         background=draw_background(kind, generator, image_size),
     )
 
 
 def _camera(view: ViewSettings, normal: ndarray, uniform: ndarray) -> ndarray:
+    pitch = _angle(view.pitch_deg, view.pitch_sd_deg, normal[0], uniform[0])
     yaw = _angle(view.yaw_deg, view.yaw_sd_deg, normal[1], uniform[1])
     if view.yaw_beyond_deg > 0:
         yaw = either_side(view.yaw_deg, view.yaw_beyond_deg, uniform[1])
-    rotation = np.deg2rad(
-        [
-            _angle(view.pitch_deg, view.pitch_sd_deg, normal[0], uniform[0]),
-            yaw,
-            _angle(view.roll_deg, view.roll_sd_deg, normal[2], uniform[2]),
-        ]
-    )
-    shift = [_angle(view.shift, view.shift_sd, normal[k], float(uniform[k - 3])) for k in (3, 4)]
-    return np.array([*rotation, *shift, 0.0])
-
-
-def _light(light: LightSettings, uniform: ndarray) -> Float32[ndarray, "4"]:
-    ambient, diffuse = scaled(light.ambient, uniform[0]), scaled(light.diffuse, uniform[1])
-    return np.array([ambient, diffuse, *light_angles(light, uniform[2:])], np.float32)
+    roll = _angle(view.roll_deg, view.roll_sd_deg, normal[2], uniform[2])
+    shift = [_angle(view.shift, view.shift_sd, normal[k], uniform[k - 3]) for k in (3, 4)]
+    return np.array([*np.deg2rad([pitch, yaw, roll]), *shift, 0.0])
 
 
 def _angle(ends: Range, sd: float | None, normal: float, uniform: float) -> float:
-    """A normal about the middle, clipped at the ends; uniform without a spread."""
+    """A normal about the middle, clipped at the ends; uniform without a standard deviation."""
     if sd is None:
         return scaled(ends, uniform)
     return clipped(0.5 * (ends[0] + ends[1]) + sd * normal, ends)

@@ -1,76 +1,146 @@
-"""Which views, lights and expressions generated pictures show; defaults follow the rendered development set.
+"""Which views, lighting and objects generated images show, and how settings' ranges turn into drawn values.
 
-Angles are degrees because people write settings; radians everywhere else. A setting changes only what it
-names: the random numbers behind each picture do not depend on it, so the same seed shows the same people in
-another light. ``LIGHTS`` and ``VIEWS`` name whole sets of them: "wide" is outside what "usual" ever shows.
+Defaults follow the rendered development sets. Angles are degrees because people write settings; radians
+everywhere else. A setting changes only what it names: the random numbers behind each image do not depend on
+it, so the same seed shows the same people in another light. ``LIGHTS``, ``VIEWS``, ``CAR_LIGHTS`` and
+``CAR_VIEWS`` name whole sets of them: "wide" is outside what "usual" ever shows.
 """
 
-from collections.abc import Iterable, Mapping
-from typing import Annotated
+from collections.abc import Callable, Iterable, Mapping
+from typing import Annotated, Any, TypeVar
 
-from pydantic import BeforeValidator, Field, model_validator
+import numpy as np
+import yaml
+from numpy import ndarray
+from pydantic import AfterValidator, BeforeValidator, Field, ValidationError, ValidationInfo
 
-from derender.data.synthetic.face_expression import EXPRESSIONS
 from derender.settings import Settings
 
+Kind = TypeVar("Kind", bound=Settings)
 Range = tuple[float, float]
 BACKGROUNDS = ("plain", "gradient", "noise")
+EXPRESSIONS: dict[str, dict[str, float]] = {  # weights of the actions in face_shape, and of the two lids'
+    "neutral": {},
+    "happiness": {"smile": 1.0, "cheek_raise": 0.9, "lips_part": 0.75, "squint": 0.45, "stretch": 0.2},
+    "sadness": {"brow_inner_up": 1.0, "frown": 0.85, "brow_lower": 0.25, "squint": 0.4},
+    "surprise": {"jaw_open": 1.0, "stretch": -0.6, "brow_inner_up": 0.9, "brow_outer_up": 1.0, "wide": 0.9},
+    "anger": {"brow_lower": 1.15, "press": 0.8, "squint": 0.3, "sneer": 0.3, "frown": 0.45},
+    "disgust": {"sneer": 1.1, "brow_lower": 0.6, "squint": 0.6, "frown": 0.5, "cheek_raise": 0.6,
+                "lips_part": 0.25},
+    "fear": {"brow_inner_up": 1.0, "brow_outer_up": 0.5, "wide": 0.9, "stretch": 1.0, "lips_part": 0.6,
+             "jaw_open": 0.25},
+}  # fmt: skip
+CLASSES: dict[str, tuple[str, ...]] = {  # body styles of each class of cars
+    **{name: (name,) for name in ("sedan", "hatchback", "estate", "suv", "van", "pickup", "coupe")},
+    "police": ("sedan", "sedan", "estate", "suv"),
+    "ambulance": ("cab",),
+    "limousine": ("sedan",),
+    "jeep": ("jeep_hard", "jeep_open"),
+    "sports": ("sports",),
+}
+_OTHER_DEG = 20.0  # with beyond_deg, the angle that is not beyond stays within this
+_YAW_SHARE = 0.6
 
 
-def check_range(name: str, value: Range, low: float, high: float) -> None:
-    """Raise ValueError unless the range lies within low..high."""
-    if not low <= value[0] <= value[1] <= high:
-        raise ValueError(f"{name} must be two numbers, low <= high, within {low}..{high}; got {value}")
+def scaled(ends: Range, share: float) -> float:
+    """The value at that share of a range."""
+    return float(ends[0] + (ends[1] - ends[0]) * share)
 
 
-def check_names(name: str, values: Iterable[str], known: Iterable[str]) -> None:
-    """Raise ValueError unless there are names and all are known."""
-    if not set(values) or not set(values) <= set(known):
-        raise ValueError(f"{name} must be one or more of {', '.join(known)}; got {tuple(values)}")
+def clipped(value: float, ends: Range) -> float:
+    """The value of a range that is nearest."""
+    return float(min(max(value, ends[0]), ends[1]))
 
 
-def check_shares(name: str, shares: Mapping[str, float], known: Iterable[str]) -> None:
-    """Raise ValueError unless known names have shares of 0 or more, at least one of them above."""
-    check_names(name, shares, known)
-    if min(shares.values()) < 0 or sum(shares.values()) <= 0:
-        raise ValueError(f"{name}: shares must be 0 or more and not all 0, got {dict(shares)}")
+def either_side(ends: Range, beyond: float, share: float) -> float:
+    """Uniform over the two pieces of a range that lie at least ``beyond`` from 0."""
+    left, right = max(0.0, -beyond - ends[0]), max(0.0, ends[1] - beyond)
+    at = share * (left + right)
+    return float(ends[0] + at if at < left else beyond + (at - left))
 
 
-def check_beyond(name: str, beyond: float, ends: Range) -> None:
-    """Raise ValueError unless an angle above 0 lies within a range on both sides of 0."""
-    if beyond > 0 and not ends[0] <= -beyond <= beyond <= ends[1]:
-        kind = name.replace("_beyond", "")
-        raise ValueError(f"{name} must lie within {kind} {ends} on both sides, got {beyond}")
+def name_at(shares: Mapping[str, float], at: float) -> str:
+    """The name in whose share of the whole a number of 0..1 falls."""
+    names = list(shares)
+    ends = np.cumsum([shares[name] for name in names])
+    return names[int(np.searchsorted(ends, at * ends[-1], side="right"))]
 
 
-def equal_shares(value: object) -> object:
+def _known(names: Iterable[str]) -> Callable[[Any, ValidationInfo], Any]:
+    known = tuple(names)
+
+    def check(values: Iterable[str] | Mapping[str, float], info: ValidationInfo) -> Any:
+        if not set(values) or not set(values) <= set(known):
+            raise ValueError(
+                f"{info.field_name} must be one or more of {', '.join(known)}; got {tuple(values)}"
+            )
+        if isinstance(values, Mapping) and (min(values.values()) < 0 or sum(values.values()) <= 0):
+            raise ValueError(f"{info.field_name}: shares must be 0 or more and not all 0, got {dict(values)}")
+        return values
+
+    return check
+
+
+def _equal_shares(value: object) -> object:
     """A list of names means equal shares."""
     return dict.fromkeys(value, 1.0) if isinstance(value, (list, tuple)) else value
 
 
-Shares = Annotated[Mapping[str, float], BeforeValidator(equal_shares)]
+_Backgrounds = Annotated[tuple[str, ...], AfterValidator(_known(BACKGROUNDS))]
+_Shares = Annotated[Mapping[str, float], BeforeValidator(_equal_shares)]
+
+
+def _within(low: float, high: float, where: str = "") -> AfterValidator:
+    """A range within those limits; ``where`` is the dotted place of its settings."""
+
+    def check(value: Range, info: ValidationInfo) -> Range:
+        if not low <= value[0] <= value[1] <= high:
+            raise ValueError(
+                f"{where}{info.field_name} must be two numbers, low <= high, within {low}..{high}; got {value}"
+            )
+        return value
+
+    return AfterValidator(check)
+
+
+def _on_both_sides(angle: str) -> AfterValidator:
+    """An angle that, above 0, lies within the range of that name, which stands before it, on both sides."""
+
+    def check(value: float, info: ValidationInfo) -> float:
+        ends = info.data.get(angle)
+        if ends is not None and value > 0 and not ends[0] <= -value <= value <= ends[1]:
+            name = f"view.{info.field_name}"
+            raise ValueError(f"{name} must lie within view.{angle} {ends} on both sides, got {value}")
+        return value
+
+    return AfterValidator(check)
 
 
 class LightSettings(Settings):
     """Uniform ranges. With ``beyond_deg`` either yaw or pitch (60 : 40) is at least so far off the front, on
     either side, and the other at most 20 degrees."""
 
-    yaw_deg: Range = (-45.0, 45.0)
-    pitch_deg: Range = (-45.0, 45.0)
+    yaw_deg: Annotated[Range, _within(-85, 85, "light.")] = (-45.0, 45.0)
+    pitch_deg: Annotated[Range, _within(-85, 85, "light.")] = (-45.0, 45.0)
     beyond_deg: float = Field(default=0.0, ge=0, lt=85)
-    ambient: Range = (0.25, 0.7)
-    diffuse: Range = (0.2, 0.8)
+    ambient: Annotated[Range, _within(0, 1, "light.")] = (0.25, 0.7)
+    diffuse: Annotated[Range, _within(0, 1, "light.")] = (0.2, 0.8)
 
-    @model_validator(mode="after")
-    def _possible(self) -> "LightSettings":
-        for name, low, high in (
-            ("yaw_deg", -85, 85),
-            ("pitch_deg", -85, 85),
-            ("ambient", 0, 1),
-            ("diffuse", 0, 1),
-        ):
-            check_range(f"light.{name}", getattr(self, name), low, high)
-        return self
+    def draw(self, uniform: ndarray, brightest: float = np.inf) -> ndarray:
+        """Ambient, diffuse, pitch and yaw (radians) from five uniform numbers: one each, and which of the
+        angles is beyond. Ambient is limited so that ambient and diffuse together stay below ``brightest``."""
+        diffuse = scaled(self.diffuse, uniform[1])
+        low, high = self.ambient
+        ambient = scaled((low, max(low, min(high, brightest - diffuse))), uniform[0])
+        pitch, yaw = scaled(self.pitch_deg, uniform[2]), scaled(self.yaw_deg, uniform[3])
+        if self.beyond_deg > 0:
+            if uniform[4] < _YAW_SHARE:
+                yaw = either_side(self.yaw_deg, self.beyond_deg, uniform[3])
+                pitch = _OTHER_DEG * (2.0 * uniform[2] - 1.0)
+            else:
+                pitch = either_side(self.pitch_deg, self.beyond_deg, uniform[2])
+                yaw = _OTHER_DEG * (2.0 * uniform[3] - 1.0)
+        return np.array([ambient, diffuse, float(np.deg2rad(pitch)), float(np.deg2rad(yaw))], np.float32)
 
 
 class ViewSettings(Settings):
@@ -78,43 +148,70 @@ class ViewSettings(Settings):
     clipped at its ends; without one (null) the range is uniform. With ``yaw_beyond_deg`` yaw is uniform on
     either side, from there to the range's ends."""
 
-    yaw_deg: Range = (-45.0, 45.0)
+    yaw_deg: Annotated[Range, _within(-90.0, 90.0, "view.")] = (-45.0, 45.0)
     yaw_sd_deg: float | None = Field(default=18.0, ge=0, le=90)
-    yaw_beyond_deg: float = Field(default=0.0, ge=0, lt=90)
-    pitch_deg: Range = (-20.0, 20.0)
+    yaw_beyond_deg: Annotated[float, _on_both_sides("yaw_deg")] = Field(default=0.0, ge=0, lt=90)
+    pitch_deg: Annotated[Range, _within(-60.0, 60.0, "view.")] = (-20.0, 20.0)
     pitch_sd_deg: float | None = Field(default=8.0, ge=0, le=90)
-    roll_deg: Range = (-12.0, 12.0)
+    roll_deg: Annotated[Range, _within(-180.0, 180.0, "view.")] = (-12.0, 12.0)
     roll_sd_deg: float | None = Field(default=4.0, ge=0, le=90)
-    shift: Range = (-0.008, 0.008)  # scene units, right and down; one pixel of 64 is 0.0028
+    shift: Annotated[Range, _within(-0.1, 0.1, "view.")] = (
+        -0.008,
+        0.008,
+    )  # scene units, right and down; one pixel of 64 is 0.0028
     shift_sd: float | None = Field(default=0.0035, ge=0, le=0.1)
 
-    @model_validator(mode="after")
-    def _possible(self) -> "ViewSettings":
-        for name, limit in (("yaw_deg", 90.0), ("pitch_deg", 60.0), ("roll_deg", 180.0), ("shift", 0.1)):
-            check_range(f"view.{name}", getattr(self, name), -limit, limit)
-        check_beyond("view.yaw_beyond_deg", self.yaw_beyond_deg, self.yaw_deg)
-        return self
+
+class CarViewSettings(Settings):
+    """A turntable seen from above: uniform elevation above the ground and azimuth about the car's vertical
+    axis.
+
+    Azimuth 0 sees the front; above 0 the front moves to the left of the image. With ``azimuth_beyond_deg``
+    azimuth is uniform on either side, from there to the range's ends. The rotation in the image plane is
+    normal, clipped at its range's ends, as are the shifts; a car that a shift would move out of the image is
+    shifted less."""
+
+    elevation_deg: Annotated[Range, _within(0.0, 90.0, "view.")] = (25.0, 60.0)
+    azimuth_deg: Annotated[Range, _within(-180.0, 180.0, "view.")] = (-30.0, 30.0)
+    azimuth_beyond_deg: Annotated[float, _on_both_sides("azimuth_deg")] = Field(default=0.0, ge=0, lt=180)
+    inplane_deg: Annotated[Range, _within(-180.0, 180.0, "view.")] = (-8.0, 8.0)
+    inplane_sd_deg: float = Field(default=3.0, ge=0, le=90)
+    shift: Annotated[Range, _within(-0.1, 0.1, "view.")] = (
+        -0.008,
+        0.008,
+    )  # scene units, right and down; one pixel of 64 is 0.0028
+    shift_sd: float = Field(default=0.003, ge=0, le=0.1)
 
 
+_WIDE = {"yaw_deg": (-70, 70), "pitch_deg": (-60, 60), "beyond_deg": 35}
+_AHEAD = {"yaw_deg": (0, 0), "pitch_deg": (0, 0)}
 LIGHTS: Mapping[str, LightSettings] = {
     "usual": LightSettings(),
-    "wide": LightSettings(
-        yaw_deg=(-70, 70), pitch_deg=(-60, 60), beyond_deg=35, ambient=(0.05, 0.3), diffuse=(0.6, 1.0)
-    ),
-    "frontal": LightSettings(yaw_deg=(0, 0), pitch_deg=(0, 0), ambient=(0.45, 0.45), diffuse=(0.5, 0.5)),
+    "wide": LightSettings(**_WIDE, ambient=(0.05, 0.3), diffuse=(0.6, 1.0)),
+    "frontal": LightSettings(**_AHEAD, ambient=(0.45, 0.45), diffuse=(0.5, 0.5)),
 }
 VIEWS: Mapping[str, ViewSettings] = {
     "usual": ViewSettings(),
     "wide": ViewSettings(yaw_deg=(-60, 60), yaw_beyond_deg=20),
     "frontal": ViewSettings(yaw_sd_deg=0, pitch_sd_deg=0, roll_sd_deg=0, shift_sd=0),
 }
+CAR_LIGHTS: Mapping[str, LightSettings] = {
+    "usual": LightSettings(diffuse=(0.5, 1.0)),
+    "wide": LIGHTS["wide"],
+    "frontal": LightSettings(**_AHEAD, ambient=(0.4, 0.4), diffuse=(0.6, 0.6)),
+}
+CAR_VIEWS: Mapping[str, CarViewSettings] = {
+    "usual": CarViewSettings(),
+    "wide": CarViewSettings(azimuth_deg=(-75, 75), azimuth_beyond_deg=35),
+    "frontal": CarViewSettings(elevation_deg=(42.5, 42.5), azimuth_deg=(0, 0), inplane_sd_deg=0, shift_sd=0),
+}
 
 
 class FaceSettings(Settings):
-    """Everything that may be asked of generated faces.
+    """Every option of generated faces.
 
-    With ``tracks`` (per identity) pictures come as sequences of ``frames``: light and background stay, head
-    and expression move smoothly; otherwise an identity has ``pictures_per_identity`` pictures.
+    With ``tracks`` (per identity) images come as sequences of ``frames``: light and background stay, head
+    and expression move smoothly; otherwise an identity has ``pictures_per_identity`` images.
     """
 
     light: LightSettings = LightSettings()
@@ -123,23 +220,65 @@ class FaceSettings(Settings):
     first_identity: int = Field(default=0, ge=0)  # other people from the same seed
     tracks: int = Field(default=0, ge=0)
     frames: int = Field(default=6, ge=1)
-    expressions: Shares = Field(default=dict.fromkeys(EXPRESSIONS, 1.0))  # name: share
-    strength: Range = (0.4, 1.05)
+    expressions: Annotated[_Shares, AfterValidator(_known(EXPRESSIONS))] = dict.fromkeys(EXPRESSIONS, 1.0)
+    strength: Annotated[Range, _within(0.0, 1.5)] = (0.4, 1.05)
     asymmetry: float = Field(default=0.12, ge=0, le=1)  # sd by which the two halves of an expression differ
     gaze_px: float = Field(default=0.6, ge=0, le=3)  # sd of the irises' shift
-    age_years: Range = (18.0, 80.0)
-    skin_tone: Range = (0.0, 1.0)  # 0 fair .. 1 dark
-    backgrounds: tuple[str, ...] = BACKGROUNDS
-
-    @model_validator(mode="after")
-    def _possible(self) -> "FaceSettings":
-        for name, low, high in (("strength", 0.0, 1.5), ("age_years", 16.0, 100.0), ("skin_tone", 0.0, 1.0)):
-            check_range(name, getattr(self, name), low, high)
-        check_shares("expressions", self.expressions, EXPRESSIONS)
-        check_names("backgrounds", self.backgrounds, BACKGROUNDS)
-        return self
+    age_years: Annotated[Range, _within(16.0, 100.0)] = (18.0, 80.0)
+    skin_tone: Annotated[Range, _within(0.0, 1.0)] = (0.0, 1.0)  # 0 fair .. 1 dark
+    backgrounds: _Backgrounds = BACKGROUNDS
 
     @property
     def per_identity(self) -> int:
-        """How many consecutive pictures show one person."""
+        """Number of consecutive images that show one person."""
         return self.tracks * self.frames or self.pictures_per_identity
+
+
+class CarSettings(Settings):
+    """Every option of generated cars."""
+
+    light: LightSettings = CAR_LIGHTS["usual"]  # in the canonical frame
+    brightest: float = Field(default=1.3, ge=0.1, le=2)  # limit of ambient and diffuse together
+    view: CarViewSettings = CarViewSettings()
+    classes: Annotated[_Shares, AfterValidator(_known(CLASSES))] = dict.fromkeys(CLASSES, 1.0)
+    pictures_per_model: int = Field(default=4, ge=1)  # consecutive images that show one car
+    first_model: int = Field(default=0, ge=0)  # other cars from the same seed
+    size: float = Field(default=0.198, gt=0.01, le=0.3)  # diagonal of the bounding box; the image: 0.175
+    backgrounds: _Backgrounds = BACKGROUNDS
+
+
+def changed(settings: Kind, overrides: Iterable[str]) -> Kind:
+    """The settings with changes such as ``light.yaw_deg=[-60,60]``; keys are dotted, values are YAML.
+
+    Raises:
+        ValueError: text that is not key=value, an unknown key (the known ones are listed), or a bad value.
+    """
+    tree = settings.model_dump(mode="python")
+    for override in overrides:
+        key, equals, text = override.partition("=")
+        if not equals:
+            raise ValueError(f"cannot read {override!r}: write key=value, for example light.yaw_deg=[-60,60]")
+        *parents, last = key.strip().split(".")
+        branch: Any = tree
+        for parent in parents:
+            branch = branch.get(parent) if isinstance(branch, dict) else None
+        if not isinstance(branch, dict) or last not in branch:
+            raise ValueError(f"unknown setting {key.strip()!r}; there are {', '.join(_names(tree))}")
+        try:
+            branch[last] = yaml.safe_load(text)
+        except (yaml.YAMLError, ValueError, RecursionError) as error:
+            raise ValueError(f"cannot read the value {text!r} of {key.strip()}") from error
+    try:
+        return type(settings).model_validate(tree)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        what = first["msg"].removeprefix("Value error, ")
+        raise ValueError(what if what.startswith(where) else f"setting {where}: {what}") from error
+
+
+def _names(tree: dict[str, Any], prefix: str = "") -> list[str]:
+    names: list[str] = []
+    for key, value in tree.items():
+        names += _names(value, f"{prefix}{key}.") if isinstance(value, dict) else [prefix + key]
+    return names
