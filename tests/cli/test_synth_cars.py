@@ -47,7 +47,7 @@ def test_geometry_is_evaluated_on_it(folder, tmp_path):
     ("arguments", "message"),
     [
         (["--classes", "tank"], "classes must be one or more of sedan"),
-        (["--view", "side"], "--view must be one of usual, wide, frontal"),
+        (["--view", "side"], "view must be one of usual, wide, frontal"),
         (["--set", "view.azimuth_deg=[50,10]"], "view.azimuth_deg"),
         (["--set", "doors=3"], "unknown setting 'doors'"),
     ],

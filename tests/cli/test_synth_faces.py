@@ -74,8 +74,8 @@ def test_a_model_of_ones_own(folder):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--light", "noon"], "--light must be one of usual, wide, frontal, got 'noon'"),
-        (["--view", "above"], "--view must be one of usual, wide, frontal"),
+        (["--light", "noon"], "light must be one of usual, wide, frontal, got 'noon'"),
+        (["--view", "above"], "view must be one of usual, wide, frontal"),
         (["--set", "light.colour=red"], "unknown setting 'light.colour'; there are light.yaw_deg"),
         (["--set", "light.yaw_deg"], "write key=value"),
         (["--set", "light.yaw_deg=[-60,99]"], "light.yaw_deg must be two numbers"),

@@ -1,166 +1,80 @@
-"""`derender synth`: rendered pictures with exact depth, normals, albedo, parts, light and camera."""
+"""`derender synth`: rendered images with exact depth, normals, albedo, parts, light and camera."""
 
-from collections.abc import Mapping
-from pathlib import Path
-from typing import Annotated, TypeVar
+from dataclasses import dataclass
+from functools import partial
+from typing import Annotated, Any
 
-import typer
+from typer import Option, Typer
 
 from derender.cli import options
 from derender.cli.console import progress_bar, result, write_json
-
-Kind = TypeVar("Kind")
-ImageSize = Annotated[
-    int, typer.Option("--image-size", min=16, max=1024, metavar="N", help="Width and height in pixels.")
-]
-Light = Annotated[
-    str,
-    typer.Option(
-        "--light", help="Range of lights: usual, wide (outside of usual) or frontal.", metavar="NAME"
-    ),
-]
-View = Annotated[
-    str,
-    typer.Option("--view", help="Range of views: usual, wide (outside of usual) or frontal.", metavar="NAME"),
-]
-Overrides = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--set", help="Change one setting, e.g. light.yaw_deg=[-60,60]; may be repeated.", metavar="KEY=VALUE"
-    ),
-]
+from derender.cli.gathered import gathered
 
 
-def register(app: typer.Typer) -> None:
-    group = typer.Typer(
-        help="Make pictures whose geometry, albedo, light and camera are known.", no_args_is_help=True
-    )
-    group.command(
-        "faces",
-        epilog="Example: derender synth faces --out made/ --count 500 --seed 1 --light wide --view wide",
-    )(faces)
-    group.command(
-        "cars", epilog="Example: derender synth cars --out made/ --count 500 --classes police,jeep,sports"
-    )(cars)
+@dataclass(frozen=True)
+class Request:
+    """The options of both kinds of generated images."""
+
+    out: options.OutFolder
+    count: Annotated[int | None, Option("--count", "-n", min=1, help="Number of images (1000).")] = None
+    image_size: Annotated[int, Option(min=16, max=1024, help="Width and height in pixels.")] = 64
+    seed: options.Seed = 0
+    light: Annotated[str, Option(help="Range of lighting: usual, wide, frontal.")] = "usual"
+    view: Annotated[str, Option(help="Range of viewpoints: usual, wide, frontal.")] = "usual"
+    truth: Annotated[bool, Option(help="Write the maps of ground truth too.")] = True
+    overrides: options.Settings = None
+    json_file: options.Json = None
+
+    def generate(self, call: Any, count: int, objects: str, kind: Any, names: list[str], **own: Any) -> None:
+        from derender.data.synthetic import named_settings, require_empty, write_folder
+
+        require_empty(self.out)
+        settings = named_settings(kind, self.light, self.view, [*names, *(self.overrides or [])], **own)
+        with progress_bar("generating") as report:
+            made = call(count, self.image_size, self.seed, settings, report)
+        with progress_bar("writing") as report:
+            write_folder(made, self.out, self.truth, report)
+        different = len(set(made.identity.tolist()))
+        result(f"{count:,} images of {different:,} {objects} in {self.out}", self.json_file)
+        facts = {"count": count, objects: different, "image_size": self.image_size, "seed": self.seed}
+        write_json(self.json_file, {"out": self.out, **facts, "settings": settings.model_dump(mode="json")})
+
+
+def register(app: Typer) -> None:
+    group = Typer(help="Generate images of known geometry, albedo, light and camera.", no_args_is_help=True)
+    group.command("faces", epilog="Example: derender synth faces --out made/ --count 500 --light wide")(faces)
+    group.command("cars", epilog="Example: derender synth cars --out made/ --classes police,jeep")(cars)
     app.add_typer(group, name="synth")
 
 
+@gathered
 def faces(
-    out: options.OutFolder,
-    count: Annotated[
-        int | None,
-        typer.Option("--count", "-n", min=1, metavar="N", help="How many pictures; default: 1000."),
-    ] = None,
-    image_size: ImageSize = 64,
-    seed: options.Seed = 0,
-    light: Light = "usual",
-    view: View = "usual",
-    identities: Annotated[
-        int | None,
-        typer.Option("--identities", min=1, metavar="N", help="How many people; default: 8 pictures each."),
-    ] = None,
-    tracks: Annotated[
-        int,
-        typer.Option("--tracks", min=0, metavar="N", help="Make sequences instead, so many of each person."),
-    ] = 0,
-    frames: Annotated[int, typer.Option("--frames", min=1, metavar="N", help="Pictures in a track.")] = 6,
-    expressions: Annotated[
-        str | None,
-        typer.Option("--expressions", metavar="A,B", help="Only these expressions; default: all seven."),
-    ] = None,
-    model: Annotated[
-        Path | None,
-        typer.Option(
-            "--model", metavar="FILE", help="A morphable model (.npz) instead of the built-in faces."
-        ),
-    ] = None,
-    truth: Annotated[
-        bool, typer.Option("--truth/--no-truth", help="Write the maps of ground truth too.")
-    ] = True,
-    overrides: Overrides = None,
-    json_file: options.Json = None,
+    request: Request,
+    identities: Annotated[int | None, Option(min=1, help="Number of people; default: 8 images each.")] = None,
+    tracks: Annotated[int, Option(min=0, help="Number of sequences of each person, instead of images.")] = 0,
+    frames: Annotated[int, Option(min=1, help="Number of images in a sequence.")] = 6,
+    expressions: Annotated[str, Option(metavar="A,B", help="Only these expressions; default: all.")] = "",
+    model: Annotated[str | None, Option(metavar="FILE", help="Morphable model (.npz) to use.")] = None,
 ) -> None:
     """Generate faces with ground truth; the folder reads back as data for training and for evaluation."""
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise FileExistsError(f"{out} exists and is not empty: choose another --out")
-    from derender.data.synthetic import LIGHTS, VIEWS, FaceSettings, MorphableFaces, write, write_tracks
-    from derender.data.synthetic import faces as generator
-    from derender.data.synthetic.overrides import changed
-    from derender.storage.atomic import atomic_folder
+    from derender.data.synthetic import FaceSettings, faces
 
-    settings = FaceSettings(
-        light=_named("--light", light, LIGHTS),
-        view=_named("--view", view, VIEWS),
-        tracks=tracks,
-        frames=frames,
-    )
-    asked = [] if expressions is None else [f"expressions=[{expressions}]"]
-    settings = changed(settings, [*asked, *(overrides or [])])
-    if tracks:
-        if count is not None:
-            raise ValueError("--count does not go with --tracks: say --identities, --tracks and --frames")
-        people = identities or 12
-        count = people * settings.per_identity
-    else:
-        count = count or 1000
-        if identities is not None:
-            each = -(-count // identities)
-            settings = changed(settings, [f"pictures_per_identity={each}"])
-    source = None if model is None else MorphableFaces.read(model)
-    with progress_bar("generating") as report:
-        made = generator.generate(count, image_size, seed, settings, report, model=source)
-    with progress_bar("writing") as report, atomic_folder(out) as folder:
-        if tracks:
-            write_tracks(made, folder, report)
-        else:
-            write(made, folder, truth, report)
-    people = len(set(made.identity.tolist()))
-    result(f"{count:,} faces of {people:,} people in {out}", json_file)
-    facts = {"out": out, "count": count, "identities": people, "image_size": image_size, "seed": seed}
-    write_json(json_file, facts | {"settings": settings.model_dump(mode="json")})
+    if tracks and request.count is not None:
+        raise ValueError("--count does not go with --tracks: say --identities, --tracks and --frames")
+    count = (identities or 12) * tracks * frames or request.count or 1000
+    names = [f"expressions=[{expressions}]"] if expressions else []
+    each = -(-count // identities) if identities and not tracks else FaceSettings().pictures_per_identity
+    own = {"tracks": tracks, "frames": frames, "pictures_per_identity": each}
+    request.generate(partial(faces.generate, model=model), count, "identities", FaceSettings, names, **own)
 
 
+@gathered
 def cars(
-    out: options.OutFolder,
-    count: Annotated[
-        int, typer.Option("--count", "-n", min=1, metavar="N", help="How many pictures.")
-    ] = 1000,
-    image_size: ImageSize = 64,
-    seed: options.Seed = 0,
-    light: Light = "usual",
-    view: View = "usual",
-    classes: Annotated[
-        str | None,
-        typer.Option("--classes", metavar="A,B", help="Only these classes of cars; default: all twelve."),
-    ] = None,
-    truth: Annotated[
-        bool, typer.Option("--truth/--no-truth", help="Write the maps of ground truth too.")
-    ] = True,
-    overrides: Overrides = None,
-    json_file: options.Json = None,
+    request: Request,
+    classes: Annotated[str, Option(metavar="A,B", help="Only these classes; default: all twelve.")] = "",
 ) -> None:
     """Generate cars of twelve classes with ground truth; the folder reads back as the layout syncar."""
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise FileExistsError(f"{out} exists and is not empty: choose another --out")
-    from derender.data.synthetic import CAR_LIGHTS, CAR_VIEWS, CarSettings, write
-    from derender.data.synthetic import cars as generator
-    from derender.data.synthetic.overrides import changed
-    from derender.storage.atomic import atomic_folder
+    from derender.data.synthetic import CarSettings, cars
 
-    settings = CarSettings(light=_named("--light", light, CAR_LIGHTS), view=_named("--view", view, CAR_VIEWS))
-    asked = [] if classes is None else [f"classes=[{classes}]"]
-    settings = changed(settings, [*asked, *(overrides or [])])
-    with progress_bar("generating") as report:
-        made = generator.generate(count, image_size, seed, settings, report)
-    with progress_bar("writing") as report, atomic_folder(out) as folder:
-        write(made, folder, truth, report)
-    models = len(set(made.identity.tolist()))
-    result(f"{count:,} pictures of {models:,} cars in {out}", json_file)
-    facts = {"out": out, "count": count, "models": models, "image_size": image_size, "seed": seed}
-    write_json(json_file, facts | {"settings": settings.model_dump(mode="json")})
-
-
-def _named(option: str, name: str, known: Mapping[str, Kind]) -> Kind:
-    if name not in known:
-        raise ValueError(f"{option} must be one of {', '.join(known)}, got {name!r}")
-    return known[name]
+    names = [f"classes=[{classes}]"] if classes else []
+    request.generate(cars.generate, request.count or 1000, "models", CarSettings, names)

@@ -11,8 +11,8 @@ from scipy.spatial import cKDTree
 from derender.data.ground_truth import read_ground_truth
 from derender.data.pictures import read_pictures
 from derender.data.synthetic import CAR_LIGHTS, CAR_VIEWS, CarSettings, CarViewSettings, cars, write
-from derender.data.synthetic.car_draw import about_x, class_of, euler_angles, view_rotation
-from derender.data.synthetic.car_traits import CLASSES
+from derender.data.synthetic.cars import about_x, class_of, euler_angles, view_rotation
+from derender.data.synthetic.settings import CLASSES
 from derender.data.synthetic.synthetic_set import SyntheticSet, camera_rotation_and_light
 from derender.evaluation.geometry import geometry_scores
 from derender.render import render
@@ -83,21 +83,21 @@ def test_pictures_of_a_model_show_the_same_car(sample):
 @pytest.mark.parametrize("number", range(12))
 def test_meshes_are_mirror_symmetric_and_at_their_size(number):
     car = cars.model_car(1, number, CarSettings(classes=list(CLASSES)))
-    points = np.hstack([car.vertices, car.normals]).astype(np.float64)
+    points = np.hstack([car.mesh.vertices, car.mesh.normals]).astype(np.float64)
     flip = np.array([-1.0, 1.0, 1.0])
-    apart, _ = cKDTree(car.vertices.astype(np.float64)).query(car.vertices * flip)
+    apart, _ = cKDTree(points[:, :3]).query(points[:, :3] * flip)
     assert apart.max() < 1e-7
-    upright = car.vertices.astype(np.float64) @ about_x(42.5)
+    upright = points[:, :3] @ about_x(42.5)
     low, high = upright.min(axis=0), upright.max(axis=0)
     assert np.allclose(low + high, 0.0, atol=1e-6) and abs(np.linalg.norm(high - low) - 0.198) < 1e-6
     assert np.allclose(np.linalg.norm(points[:, 3:], axis=1)[used(car)], 1.0, atol=1e-5)
 
 
-def used(car: cars.ModelCar) -> np.ndarray:
+def used(car: cars.Car) -> np.ndarray:
     """Vertices of triangles that have an area."""
-    corners = car.vertices[car.model.mesh.triangles].astype(np.float64)
+    corners = car.mesh.vertices[car.mesh.triangles].astype(np.float64)
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    return np.unique(car.model.mesh.triangles[area > 1e-9])
+    return np.unique(car.mesh.triangles[area > 1e-9])
 
 
 def test_frontal_pictures_are_their_own_mirror_images():
@@ -240,7 +240,7 @@ def test_shifts_keep_cars_inside_the_picture():
     view = CarViewSettings(shift_sd=0.1, shift=(-0.1, 0.1))
     settings = CarSettings(view=view, classes=("sedan",), pictures_per_model=8)
     made = cars.generate(8, settings=settings)
-    vertices = torch.from_numpy(cars.model_car(0, 0, settings).vertices.astype(np.float64))
+    vertices = torch.from_numpy(cars.model_car(0, 0, settings).mesh.vertices.astype(np.float64))
     vertices[:, 2] += 1.0
     seen = to_camera(vertices.expand(8, -1, 3), torch.from_numpy(made.camera.astype(np.float64)))
     place = project(seen, 64, 64, made.fov_deg)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from derender.data.synthetic.png import encode_png
+from derender.data.synthetic.write import encode_png
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (5, 3), (64, 64), (7, 9, 3)])

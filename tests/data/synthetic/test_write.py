@@ -125,5 +125,5 @@ def test_tracks_read_back_as_tracks(tmp_path):
 
 
 def test_only_tracks_are_written_as_tracks(made, tmp_path):
-    with pytest.raises(ValueError, match="these pictures are no tracks"):
+    with pytest.raises(ValueError, match="these images are no tracks"):
         write_tracks(made, tmp_path / "set")

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from derender.data.synthetic.z_buffer import fill_triangle
+from derender.data.synthetic.mesh_image import fill_triangle
 
 SIZE = 48
 

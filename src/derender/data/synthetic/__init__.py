@@ -16,9 +16,10 @@ from derender.data.synthetic.settings import (
     FaceSettings,
     LightSettings,
     ViewSettings,
+    named_settings,
 )
 from derender.data.synthetic.synthetic_set import SyntheticSet
-from derender.data.synthetic.write import write, write_tracks
+from derender.data.synthetic.write import require_empty, write, write_folder, write_tracks
 
 __all__ = [
     "CAR_LIGHTS",
@@ -34,6 +35,9 @@ __all__ = [
     "ViewSettings",
     "cars",
     "faces",
+    "named_settings",
+    "require_empty",
     "write",
+    "write_folder",
     "write_tracks",
 ]

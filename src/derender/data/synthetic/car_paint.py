@@ -208,7 +208,8 @@ def _windows(car: CarTraits, lines: BodyLines) -> list[Decal]:
     ]
     edges = _door_edges(car)
     if car.style == "van" and car.chances[6] < 0.6:  # a panel instead of windows
-        return [*decals, box(edges[-1], outline[0, 1], *outline.max(axis=0), car.paint, "body")]
+        right, top = outline.max(axis=0)
+        return [*decals, box(edges[-1], outline[0, 1], right, top, car.paint, "body")]
     post = BLACK if car.chances[7] < 0.5 else car.paint
     for at in edges[1:]:
         if corners[0, 0] + 0.2 < at < corners[3, 0] - 0.1:

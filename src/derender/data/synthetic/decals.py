@@ -118,7 +118,7 @@ def _decal(
 
 @kernel
 @no_type_check
-def paint_samples(paint, surface, spot, of, inside, colour, part):
+def paint_samples(decals, first, end, base, base_part, surface, spot, of, inside, colour, part):
     """Fill in colour and part of a pixel's samples on one surface: the last shape that holds a point wins."""
     low_p, high_p = np.float32(np.inf), -np.float32(np.inf)
     low_q, high_q = low_p, high_p
@@ -126,20 +126,22 @@ def paint_samples(paint, surface, spot, of, inside, colour, part):
         if of[s] == surface:
             low_p, high_p = min(low_p, spot[0, s]), max(high_p, spot[0, s])
             low_q, high_q = min(low_q, spot[1, s]), max(high_q, spot[1, s])
-            colour[s] = paint.colour[surface]
-            part[s] = paint.part[surface]
-    for d in range(np.uint32(paint.first[surface]), np.uint32(paint.first[surface + 1])):
-        decal = paint.decals[d]
+            for n in range(3):
+                colour[s, n] = base[n]
+            part[s] = base_part
+    for d in range(np.uint32(first), np.uint32(end)):
+        decal = decals[d]
         outside = high_p < decal[_BOUNDS] or high_q < decal[_BOUNDS + 1]
         if outside or low_p > decal[_BOUNDS + 2] or low_q > decal[_BOUNDS + 3]:
             continue
         _cover(decal, spot, inside)
+        multiplies, named = decal[_MULTIPLIES] > np.float32(0.0), decal[_PART] >= np.float32(0.0)
         for s in range(np.uint32(_ALL)):
             if inside[s] and of[s] == surface:
                 for n in range(3):
-                    factor = colour[s, n] if decal[_MULTIPLIES] > np.float32(0.0) else np.float32(1.0)
-                    colour[s, n] = factor * decal[_COLOUR + n]
-                if decal[_PART] >= np.float32(0.0):
+                    value = decal[_COLOUR + n]
+                    colour[s, n] = colour[s, n] * value if multiplies else value
+                if named:
                     part[s] = int(decal[_PART])
 
 

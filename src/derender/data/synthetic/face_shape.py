@@ -142,7 +142,7 @@ def _numbers() -> dict[str, Any]:
 def face_basis(detail: float = 1.0) -> FaceBasis:
     """Mean head, traits of shape and expressions, sampled on ``face_grid(detail)``."""
     grid, numbers = face_grid(detail), _numbers()
-    fields = _named_fields(grid) | wrinkles(grid)
+    fields = _named_fields(grid)
     modes = [_displacement(grid, fields, terms) for terms in numbers["modes"].values()]
     actions = np.stack([_displacement(grid, fields, numbers["actions"][name]) for name in ACTIONS])
     left = 1.0 - smoothstep(-4.0, 4.0, grid.p)[..., None]

@@ -57,30 +57,48 @@ def draw_meshes(
     light = np.hstack([maps["light"][:, :2], direction]).astype(np.float32)
     rotation, pivot = rotation.astype(np.float32), np.float32(pivot_z)
     focal = np.float32(focal_px(maps["images"].shape[-1], FOV_DEG))
+    fine = maps["images"].shape[-1] * SAMPLES
+    nearest, owner = np.empty((fine, fine), np.float32), np.empty((fine, fine), np.int32)
     for n, ((mesh, paint), background) in enumerate(zip(meshes, backgrounds, strict=True)):
         out = Target(*(maps[name][n] for name in ("images", "depth", "normal", "albedo", "mask", "parts")))
-        _draw(mesh, paint, pivot, rotation[n], maps["camera"][n, 3:], light[n], background, focal, out)
+        _draw(
+            mesh,
+            paint,
+            pivot,
+            rotation[n],
+            maps["camera"][n, 3:],
+            light[n],
+            background,
+            focal,
+            nearest,
+            owner,
+            out,
+        )
 
 
 @kernel
 @no_type_check
-def _draw(mesh, paint, pivot_z, rotation, translation, light, background, focal_px, out):
+def _draw(mesh, paint, pivot_z, rotation, translation, light, background, focal_px, nearest, owner, out):
     """Fill ``out``. The mesh turns by rotation (3,3) about (0, 0, pivot_z), which comes to (0, 0, 1) +
     translation (3,); light (5,) is ambient, diffuse and the direction in the camera frame; background (S,S,3)
     0..1."""
-    fine = len(background) * SAMPLES
-    points = np.empty((len(mesh.vertices), 4), np.float32)  # sample column, row, 1 / z, cosine to the light
-    camera = np.empty((len(mesh.vertices), 3), np.float32)
-    nearest = np.zeros((fine, fine), np.float32)
-    owner = np.full((fine, fine), -1, np.int32)
-    _place(mesh.vertices, pivot_z, rotation, translation, focal_px, len(background), camera, points)
     painted = len(mesh.chart) > 0
+    # sample column, row, 1 / z, and if coloured by vertex cosine to the light and albedo: rows of 32 bytes
+    points = np.empty((len(mesh.vertices), 4 if painted else 8), np.float32)
+    camera = np.empty((len(mesh.vertices), 3), np.float32)
+    nearest[:], owner[:] = 0.0, -1
+    _place(mesh.vertices, pivot_z, rotation, translation, focal_px, len(background), camera, points)
     normals = mesh.normals if painted else np.zeros((len(mesh.vertices), 3), np.float32)
     if not painted:
-        _shade_vertices(camera, mesh.triangles, light, points, normals)
+        _shade_vertices(camera, mesh.triangles, mesh.albedo, light, points, normals)
     for f in range(len(mesh.triangles)):
         a, b, c = _corners(mesh.triangles, f)
-        hole = _hole(mesh, paint, f, a, b, c) if painted else -1
+        hole = -1
+        if painted:
+            k = mesh.surface[f]
+            for h in range(paint.first_hole[k], paint.first_hole[k + 1]):
+                if _meets(mesh.chart, a, b, c, paint.holes[h]):
+                    hole = h
         if hole < 0:
             fill_triangle(points, a, b, c, f, nearest, owner)
         else:
@@ -126,7 +144,7 @@ def _place(vertices, pivot_z, rotation, translation, focal_px, size, camera, poi
 
 @kernel
 @no_type_check
-def _shade_vertices(camera, triangles, light, points, normals):
+def _shade_vertices(camera, triangles, albedo, light, points, normals):
     """Inward unit normals of a smooth mesh in the camera frame, and the cosine of each with the light."""
     for t in range(triangles.shape[0]):
         a, b, c = _corners(triangles, t)
@@ -143,6 +161,8 @@ def _shade_vertices(camera, triangles, light, points, normals):
         x, y, z = x * scale, y * scale, z * scale
         normals[v, 0], normals[v, 1], normals[v, 2] = x, y, z
         points[v, 3] = x * light[2] + y * light[3] + z * light[4]
+        for k in range(3):
+            points[v, 4 + k] = albedo[v, k]
 
 
 @kernel
@@ -200,18 +220,13 @@ def _crossing(edge, row):
 
 @kernel
 @no_type_check
-def _hole(mesh, paint, f, a, b, c):
-    """The last hole of a triangle's surface whose bounds on the chart meet the triangle's; -1 is none."""
-    found, k, chart = -1, mesh.surface[f], mesh.chart
-    for h in range(paint.first_hole[k], paint.first_hole[k + 1]):
-        meets = True
-        for i in range(2):
-            middle, radius = paint.holes[h, i], paint.holes[h, 2]
-            low, high = min(chart[a, i], chart[b, i], chart[c, i]), max(chart[a, i], chart[b, i], chart[c, i])
-            meets = meets and low < middle + radius and high > middle - radius
-        if meets:
-            found = h
-    return found
+def _meets(chart, a, b, c, hole):
+    """Whether the triangle's bounds on its chart meet those of a circle."""
+    meets = True
+    for i in range(2):
+        low, high = min(chart[a, i], chart[b, i], chart[c, i]), max(chart[a, i], chart[b, i], chart[c, i])
+        meets = meets and low < hole[i] + hole[2] and high > hole[i] - hole[2]
+    return meets
 
 
 @kernel
@@ -259,7 +274,7 @@ def _blend(values, k, a, b, c, wa, wb, wc):
 @kernel
 @no_type_check
 def _shade(mesh, paint, points, normals, owner, rotation, light, background, out):
-    painted = len(mesh.chart) > 0
+    triangles, painted = mesh.triangles, len(mesh.chart) > 0
     # a painted mesh's light in the frame of its normals, so that these need not be turned
     lx = rotation[0, 0] * light[2] + rotation[1, 0] * light[3] + rotation[2, 0] * light[4]
     ly = rotation[0, 1] * light[2] + rotation[1, 1] * light[3] + rotation[2, 1] * light[4]
@@ -268,26 +283,42 @@ def _shade(mesh, paint, points, normals, owner, rotation, light, background, out
     weight = np.empty((_ALL, 3), np.float32)  # of the corners of each sample's triangle
     spot = np.zeros((2, _ALL), np.float32)  # place on the chart
     of = np.empty(_ALL, np.int32)  # surface, -1 on the background
-    inside, total = np.empty(_ALL, np.bool_), np.empty(3, np.float32)
+    inside = np.empty(_ALL, np.bool_)
     colour = np.empty((_ALL, 3), np.float32)
     part = np.empty(_ALL, np.int32)
     for i in range(np.uint32(len(background))):
         for j in range(np.uint32(len(background))):
-            seen = _locate(mesh, paint, points, owner, i, j, weight, spot, of)
+            seen = 0
+            for s in range(np.uint32(_ALL)):  # weights, place on the chart and surface of every sample
+                f = owner[SAMPLES * i + s // SAMPLES, SAMPLES * j + s % SAMPLES]
+                of[s] = -1
+                if f < 0:
+                    continue
+                a, b, c = _corners(triangles, np.uint32(f))
+                column, row = np.float32(SAMPLES * j + s % SAMPLES), np.float32(SAMPLES * i + s // SAMPLES)
+                wa, wb, wc = _weights(points, a, b, c, column, row)
+                scale = one / (wa + wb + wc)
+                wa, wb, wc = wa * scale, wb * scale, wc * scale
+                weight[s, 0], weight[s, 1], weight[s, 2] = wa, wb, wc
+                of[s] = 0
+                if painted:
+                    of[s] = mesh.surface[f]
+                    p = _blend(mesh.chart, 0, a, b, c, wa, wb, wc)
+                    spot[0, s] = abs(p) if paint.folded[of[s]] else p
+                    spot[1, s] = _blend(mesh.chart, 1, a, b, c, wa, wb, wc)
+                seen += 1
             empty = np.float32(_ALL - seen)
             behind = background[i, j]
             # painted meshes are added to their background, others have it added: sums round differently
             before = empty if painted else zero
-            for n in range(3):
-                total[n] = before * behind[n]
+            red, green, blue = before * behind[0], before * behind[1], before * behind[2]
             current = -1
             for s in range(np.uint32(_ALL if seen else 0)):
                 k = of[s]
                 if k < 0:
                     continue
-                a, b, c = _corners(
-                    mesh.triangles, owner[SAMPLES * i + s // SAMPLES, SAMPLES * j + s % SAMPLES]
-                )
+                f = np.uint32(owner[SAMPLES * i + s // SAMPLES, SAMPLES * j + s % SAMPLES])
+                a, b, c = _corners(triangles, f)
                 wa, wb, wc = weight[s, 0], weight[s, 1], weight[s, 2]
                 x, y, z, scale = zero, zero, zero, one
                 if painted or s == _ALL // 2:
@@ -298,15 +329,20 @@ def _shade(mesh, paint, points, normals, owner, rotation, light, background, out
                 if painted:
                     if k != current:
                         current = k
-                        paint_samples(paint, k, spot, of, inside, colour, part)
+                        first, end = paint.first[k], paint.first[k + 1]
+                        base, base_part = paint.colour[k], paint.part[k]
+                        paint_samples(
+                            paint.decals, first, end, base, base_part, k, spot, of, inside, colour, part
+                        )
                     cosine = (x * lx + y * ly + z * lz) * scale
                 else:
                     for n in range(3):
-                        colour[s, n] = _blend(mesh.albedo, n, a, b, c, wa, wb, wc)
+                        colour[s, n] = _blend(points, 4 + n, a, b, c, wa, wb, wc)
                     cosine = _blend(points, 3, a, b, c, wa, wb, wc)
                 lit = light[0] + light[1] * max(zero, cosine)
-                for n in range(3):
-                    total[n] += min(colour[s, n] * lit, one)
+                red += min(colour[s, 0] * lit, one)
+                green += min(colour[s, 1] * lit, one)
+                blue += min(colour[s, 2] * lit, one)
                 if s == _ALL // 2:
                     out.mask[i, j] = True
                     out.depth[i, j] = one / _blend(points, 2, a, b, c, wa, wb, wc)
@@ -319,9 +355,8 @@ def _shade(mesh, paint, points, normals, owner, rotation, light, background, out
                     out.normal[i, j, 0], out.normal[i, j, 1], out.normal[i, j, 2] = x, y, z
                     _store(out.albedo, i, j, colour[s])
             after = zero if painted else empty
-            for n in range(3):
-                total[n] = (total[n] + after * behind[n]) * share
-            _store(out.image, i, j, total)
+            red, green, blue = red + after * behind[0], green + after * behind[1], blue + after * behind[2]
+            _store(out.image, i, j, (red * share, green * share, blue * share))
 
 
 @kernel
@@ -341,30 +376,3 @@ def _store(target, i, j, colour):
     zero, one, top, half = np.float32(0.0), np.float32(1.0), np.float32(255.0), np.float32(0.5)
     for n in range(3):
         target[n, i, j] = np.uint8(min(max(colour[n], zero), one) * top + half)
-
-
-@kernel
-@no_type_check
-def _locate(mesh, paint, points, owner, i, j, weight, spot, of):
-    """Fill in the weights, chart place and surface (0 without paint) of a pixel's samples; how many are on
-    the object."""
-    seen = 0
-    for s in range(np.uint32(_ALL)):
-        v, u = SAMPLES * i + s // SAMPLES, SAMPLES * j + s % SAMPLES
-        of[s] = -1
-        if owner[v, u] < 0:
-            continue
-        f = np.uint32(owner[v, u])
-        a, b, c = _corners(mesh.triangles, f)
-        wa, wb, wc = _weights(points, a, b, c, np.float32(u), np.float32(v))
-        scale = np.float32(1.0) / (wa + wb + wc)
-        wa, wb, wc = wa * scale, wb * scale, wc * scale
-        weight[s, 0], weight[s, 1], weight[s, 2] = wa, wb, wc
-        of[s] = 0
-        if len(mesh.chart) > 0:
-            of[s] = mesh.surface[f]
-            p = _blend(mesh.chart, 0, a, b, c, wa, wb, wc)
-            spot[0, s] = abs(p) if paint.folded[of[s]] else p
-            spot[1, s] = _blend(mesh.chart, 1, a, b, c, wa, wb, wc)
-        seen += 1
-    return seen

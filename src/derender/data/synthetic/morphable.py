@@ -138,7 +138,7 @@ def _checked(arrays: Arrays) -> MorphableFaces:
         raise ValueError(f"triangles must number vertices 0..{v - 1}, got {low}..{high}")
     components = _floats(arrays, "components", (-1, v, 3))
     low, high = mean.min(axis=0), mean.max(axis=0)
-    unit = float(arrays.get("unit", (high[0] - low[0]) / 0.9))
+    unit = float(arrays["unit"] if "unit" in arrays else (high[0] - low[0]) / 0.9)
     if not unit > 0:
         raise ValueError(f"unit must be above 0, got {unit}")
     scale = np.array([1.0, -1.0, -1.0]) * (_PICTURE_WIDTH / unit)

@@ -12,7 +12,7 @@ from typing import Annotated, Any, TypeVar
 import numpy as np
 import yaml
 from numpy import ndarray
-from pydantic import AfterValidator, BeforeValidator, Field, ValidationError, ValidationInfo
+from pydantic import AfterValidator, BeforeValidator, Field, ValidationError
 
 from derender.settings import Settings
 
@@ -66,10 +66,10 @@ def name_at(shares: Mapping[str, float], at: float) -> str:
     return names[int(np.searchsorted(ends, at * ends[-1], side="right"))]
 
 
-def _known(names: Iterable[str]) -> Callable[[Any, ValidationInfo], Any]:
+def _known(names: Iterable[str]) -> Callable[[Any, Any], Any]:
     known = tuple(names)
 
-    def check(values: Iterable[str] | Mapping[str, float], info: ValidationInfo) -> Any:
+    def check(values: Iterable[str] | Mapping[str, float], info: Any) -> Any:
         if not set(values) or not set(values) <= set(known):
             raise ValueError(
                 f"{info.field_name} must be one or more of {', '.join(known)}; got {tuple(values)}"
@@ -93,11 +93,10 @@ _Shares = Annotated[Mapping[str, float], BeforeValidator(_equal_shares)]
 def _within(low: float, high: float, where: str = "") -> AfterValidator:
     """A range within those limits; ``where`` is the dotted place of its settings."""
 
-    def check(value: Range, info: ValidationInfo) -> Range:
+    def check(value: Range, info: Any) -> Range:
         if not low <= value[0] <= value[1] <= high:
-            raise ValueError(
-                f"{where}{info.field_name} must be two numbers, low <= high, within {low}..{high}; got {value}"
-            )
+            limits = f"two numbers, low <= high, within {low}..{high}"
+            raise ValueError(f"{where}{info.field_name} must be {limits}; got {value}")
         return value
 
     return AfterValidator(check)
@@ -106,7 +105,7 @@ def _within(low: float, high: float, where: str = "") -> AfterValidator:
 def _on_both_sides(angle: str) -> AfterValidator:
     """An angle that, above 0, lies within the range of that name, which stands before it, on both sides."""
 
-    def check(value: float, info: ValidationInfo) -> float:
+    def check(value: float, info: Any) -> float:
         ends = info.data.get(angle)
         if ends is not None and value > 0 and not ends[0] <= -value <= value <= ends[1]:
             name = f"view.{info.field_name}"
@@ -183,12 +182,13 @@ class CarViewSettings(Settings):
     shift_sd: float = Field(default=0.003, ge=0, le=0.1)
 
 
-_WIDE = {"yaw_deg": (-70, 70), "pitch_deg": (-60, 60), "beyond_deg": 35}
-_AHEAD = {"yaw_deg": (0, 0), "pitch_deg": (0, 0)}
+_WIDE_LIGHT = LightSettings(
+    yaw_deg=(-70, 70), pitch_deg=(-60, 60), beyond_deg=35, ambient=(0.05, 0.3), diffuse=(0.6, 1.0)
+)
 LIGHTS: Mapping[str, LightSettings] = {
     "usual": LightSettings(),
-    "wide": LightSettings(**_WIDE, ambient=(0.05, 0.3), diffuse=(0.6, 1.0)),
-    "frontal": LightSettings(**_AHEAD, ambient=(0.45, 0.45), diffuse=(0.5, 0.5)),
+    "wide": _WIDE_LIGHT,
+    "frontal": LightSettings(yaw_deg=(0, 0), pitch_deg=(0, 0), ambient=(0.45, 0.45), diffuse=(0.5, 0.5)),
 }
 VIEWS: Mapping[str, ViewSettings] = {
     "usual": ViewSettings(),
@@ -197,8 +197,8 @@ VIEWS: Mapping[str, ViewSettings] = {
 }
 CAR_LIGHTS: Mapping[str, LightSettings] = {
     "usual": LightSettings(diffuse=(0.5, 1.0)),
-    "wide": LIGHTS["wide"],
-    "frontal": LightSettings(**_AHEAD, ambient=(0.4, 0.4), diffuse=(0.6, 0.6)),
+    "wide": _WIDE_LIGHT,
+    "frontal": LightSettings(yaw_deg=(0, 0), pitch_deg=(0, 0), ambient=(0.4, 0.4), diffuse=(0.6, 0.6)),
 }
 CAR_VIEWS: Mapping[str, CarViewSettings] = {
     "usual": CarViewSettings(),
@@ -245,6 +245,22 @@ class CarSettings(Settings):
     first_model: int = Field(default=0, ge=0)  # other cars from the same seed
     size: float = Field(default=0.198, gt=0.01, le=0.3)  # diagonal of the bounding box; the image: 0.175
     backgrounds: _Backgrounds = BACKGROUNDS
+
+
+def named_settings(
+    kind: type[Kind], light: str = "usual", view: str = "usual", overrides: Iterable[str] = (), **own: Any
+) -> Kind:
+    """Settings by the names of their lighting and viewpoints, own values by keyword, then overrides.
+
+    Raises:
+        ValueError: an unknown name, or as ``changed``.
+    """
+    lights, views = (LIGHTS, VIEWS) if kind is FaceSettings else (CAR_LIGHTS, CAR_VIEWS)
+    for option, name, known in (("light", light, lights), ("view", view, views)):
+        if name not in known:
+            raise ValueError(f"{option} must be one of {', '.join(known)}, got {name!r}")
+    own |= {"light": lights[light], "view": views[view]}
+    return changed(kind.model_validate(own), overrides)
 
 
 def changed(settings: Kind, overrides: Iterable[str]) -> Kind:

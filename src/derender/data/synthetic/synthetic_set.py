@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import torch
@@ -124,7 +125,8 @@ def make_set(
     labels, traits = (
         {name: np.array([row[name] for row in each]) for name in each[0]} for each in zip(*rows, strict=True)
     )
-    return SyntheticSet(**out, labels=labels, identity_traits=traits, part_names=part_names)
+    more: dict[str, Any] = {"labels": labels, "identity_traits": traits, "part_names": part_names}
+    return SyntheticSet(**out, **more)
 
 
 def _batches(first: int, count: int, per_object: int, most: int) -> list[slice]:

@@ -24,6 +24,7 @@ from numpy import ndarray
 from PIL import Image
 
 from derender.data.synthetic.synthetic_set import SyntheticSet, camera_rotation_and_light
+from derender.storage.atomic import atomic_folder
 
 DEPTH_LOW, DEPTH_SPAN = 0.8, 0.4
 _MAPS = ("depth", "normal", "albedo", "mask", "masks")
@@ -74,6 +75,26 @@ def write_tracks(
         parent.mkdir(parents=True, exist_ok=True)
     _on_threads(lambda i: _save_image(synthetic, i, f"{folder}/{files[i]}"), len(files), progress)
     return _write_tables(synthetic, folder, files)
+
+
+def require_empty(folder: Path) -> None:
+    """Raise FileExistsError unless the folder is empty or missing."""
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise FileExistsError(f"{folder} exists and is not empty: choose another folder")
+
+
+def write_folder(
+    synthetic: SyntheticSet,
+    folder: Path,
+    truth: bool = True,
+    progress: Callable[[int, int], None] | None = None,
+) -> None:
+    """Write images or tracks into a new folder, which appears when it is complete."""
+    with atomic_folder(folder) as temporary:
+        if "track" in synthetic.labels:
+            write_tracks(synthetic, temporary, progress)
+        else:
+            write(synthetic, temporary, truth, progress)
 
 
 def _on_threads(save: Callable[[int], None], count: int, progress: Callable[[int, int], None] | None) -> None:
