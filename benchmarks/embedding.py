@@ -32,7 +32,7 @@ from PIL import Image
 from torch import nn
 from training_step import CONFIG, OurStep
 
-from derender.data import Sample, Stream, as_float, stream_of
+from derender.data import Sample, Stream, as_float, open_images
 from derender.features import FeatureTable, embed_images, embed_to_file
 from derender.model import Derenderer
 from derender.objectives import Vgg16Features
@@ -112,11 +112,11 @@ def measure_speed(
         shard, table = shard_of(folder, count), folder / "features.parquet"
 
         def whole_way() -> None:
-            with stream_of(shard) as stream:
+            with open_images(shard) as stream:
                 embed_to_file(model, stream, table)
 
         whole_way()
-        with stream_of(shard) as stream:
+        with open_images(shard) as stream:
             sample = next(iter(stream.samples())).read()
         first = np.asarray(Image.open(io.BytesIO(sample))).transpose(2, 0, 1)[None]
         expected = embed_images(model, np.ascontiguousarray(first))

@@ -23,7 +23,7 @@ import torch
 from machine import describe_machine
 from PIL import Image
 
-from derender.data import stream_of
+from derender.data import open_images
 from derender.features import FeatureTable, embed_to_file
 from derender.features.ray_engine import ray_engine
 from derender.model import Derenderer
@@ -79,7 +79,7 @@ def main() -> None:
         pictures, tables = Path(name) / "pictures", Path(name)
         pictures.mkdir()
         made_up(pictures, options.count)
-        reopen = partial(stream_of, pictures)
+        reopen = partial(open_images, pictures)
 
         def embed(path: Path, workers: int | None) -> float:
             engine = None

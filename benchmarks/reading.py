@@ -2,7 +2,7 @@
 
 Made-up sets of tiny files lie in a temporary folder: a folder of class folders, a zip, tars. A start is what
 a command does before the first picture is decoded: list, recognise the layout, read labels, ask every file's
-size and time of change (``fingerprint``). The first start has no index to go by, later ones have the
+size and time of change (``identity``). The first start has no index to go by, later ones have the
 remembered one where there is one. Every start runs in a process of its own; imports are not counted. First it
 is shown that an added, a removed and a changed file are seen, in a folder and in a zip that are just large
 enough to be remembered; and that as many members of the zip as ``--read`` says, drawn at random, are those
@@ -33,12 +33,11 @@ from typing import Any
 from machine import describe_machine
 from PIL import Image
 
-from derender.data import open_source, read_pictures, take_inventory
-from derender.data.cache import fingerprint
+from derender.data import list_images, open_source, read_pictures
 from derender.data.listing import REMEMBERED_FROM
 
 CLASSES = 20
-SETTLED_SECONDS = 2.5  # what changed a moment ago is never trusted (data/listing.py)
+SETTLED_SECONDS = 2.5  # what changed a moment ago is never trusted (data/folder_source.py)
 
 
 def tiny(number: int) -> bytes:
@@ -83,9 +82,9 @@ def most_memory_mb() -> float:
 def start(source: Path) -> dict[str, Any]:
     """Seconds until a folder or zip is known, and what is known of it."""
     began, cpu = time.perf_counter(), time.process_time()
-    with (found := take_inventory(source)).source as opened:
+    with list_images(source) as found:
         listed = time.perf_counter() - began
-        mark = fingerprint(opened, found.table.files, ())
+        mark = found.identity()
     return {
         "files": len(found.table.files), "mark": mark, "listed_s": listed,
         "known_s": time.perf_counter() - began, "cpu_s": time.process_time() - cpu,

@@ -64,9 +64,9 @@ def test_what_is_no_set_of_pictures_is_refused(folder: Path, tmp_path: Path, cap
     broken.mkdir()
     (broken / "a.png").write_bytes(b"no picture")
     text.write_text("no picture")
-    assert "no pictures found" in refused(capsys, "doctor", empty)
-    assert "none of the 1 pictures" in refused(capsys, "doctor", broken)
-    assert "is no folder, zip or picture" in refused(capsys, "doctor", text)
+    assert "no images found" in refused(capsys, "doctor", empty)
+    assert "none of the 1 images" in refused(capsys, "doctor", broken)
+    assert "is no folder, zip or image" in refused(capsys, "doctor", text)
     assert "is one picture: a set of pictures" in refused(capsys, "doctor", folder / "00.png")
     assert "does not exist" in refused(capsys, "doctor", tmp_path / "nowhere")
 

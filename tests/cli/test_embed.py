@@ -11,7 +11,7 @@ from PIL import Image
 
 from derender import Derenderer, FeatureTable
 from derender.cli import main
-from derender.data.stream import decoding
+from derender.data import decoding
 
 
 @pytest.fixture(scope="module")

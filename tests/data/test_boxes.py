@@ -7,8 +7,8 @@ import pytest
 from PIL import Image
 from tests.data.conftest import noise
 
-from derender.data import Unreadable, read_pictures, take_inventory
-from derender.data.decode import decode
+from derender.data import Unreadable, list_images, read_pictures
+from derender.data.image import decode
 
 
 def box(*sides: float) -> np.ndarray:
@@ -89,9 +89,9 @@ def wild(tree, encoded):
 
 
 def boxes_of(source) -> list[list[float]]:
-    inventory = take_inventory(source)
-    inventory.source.close()
-    assert inventory.layout.name == "celeba" and inventory.table.boxes is not None
+    inventory = list_images(source)
+    inventory.files.close()
+    assert inventory.layout == "celeba" and inventory.table.boxes is not None
     return inventory.table.boxes.tolist()
 
 
@@ -119,14 +119,14 @@ def test_pictures_are_cut_by_the_list(wild, encoded):
 @pytest.mark.parametrize(
     ("lines", "message"),
     [
-        ([HEADER, *SIZED[:2]], r"boxes\.csv in .* has no row for 000003\.jpg \(1 of 3 pictures have none"),
+        ([HEADER, *SIZED[:2]], r"boxes\.csv in .* has no row for 000003\.jpg \(1 of 3 images have none"),
         ([HEADER, *SIZED, SIZED[0]], r"line 5: a second row for 000001\.jpg"),
         (
             [HEADER, "000001.jpg,1,2,3"],
-            r"line 2: expected a picture's name and left, top, width, height, got '000001",
+            r"line 2: expected an image's name and left, top, width, height, got '000001",
         ),
-        ([*SIZED[:2], "000003.jpg,1,2,3,x"], r"line 3: expected a picture's name and left, top, width"),
-        ([*SIZED[:2], "000003.jpg,1,2,nan,4"], "line 3: expected a picture's name"),
+        ([*SIZED[:2], "000003.jpg,1,2,3,x"], r"line 3: expected an image's name and left, top, width"),
+        ([*SIZED[:2], "000003.jpg,1,2,nan,4"], "line 3: expected an image's name"),
         ([HEADER, *SIZED[:2], "000003.jpg,1,2,0,4"], "line 4: the box has no area"),
         (["file,left,top,right,bottom", *SIDES[:2], "000003.jpg,9,2,5,4"], "line 4: the box has no area"),
         (

@@ -1,4 +1,4 @@
-"""One picture in, RGB of the wanted size out: every mode has its meaning, every damage its reason."""
+"""One image in, RGB of the wanted size out: every mode has its meaning, every damage its reason."""
 
 import io
 import struct
@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from derender.data import decode as module
+from derender.data import image as module
 from derender.data import read_picture
-from derender.data.decode import FITS, Unreadable
+from derender.data.image import FITS, Unreadable
 
 MODE_NAMES = ["grey", "bilevel", "palette", "opaque", "clear", "translucent", "grey-alpha"]
 MODE_NAMES += ["cmyk", "cmyk-jpeg", "float", "ycbcr"]
@@ -220,7 +220,7 @@ def test_large_pictures_within_the_limit_raise_no_warning(encoded, monkeypatch):
 
 def test_truncated_jpeg_has_a_reason(encoded):
     content = encoded(np.random.default_rng(0).integers(0, 256, (200, 200, 3), dtype=np.uint8), "JPEG")
-    with pytest.raises(Unreadable, match=r"the given bytes cannot be used as a picture: damaged .*truncated"):
+    with pytest.raises(Unreadable, match=r"the given bytes cannot be used as an image: damaged .*truncated"):
         read_picture(content[: len(content) // 2], 16)
 
 
@@ -228,7 +228,7 @@ def test_truncated_jpeg_has_a_reason(encoded):
     "content", [b"", b"text", b"\xff\xd8\xff", b"<svg></svg>", b"%!PS-Adobe-3.0 EPSF-3.0\n"]
 )
 def test_what_is_no_picture_has_a_reason(content):
-    with pytest.raises(Unreadable, match=r"not a picture in a known format|damaged"):
+    with pytest.raises(Unreadable, match=r"not an image in a known format|damaged"):
         read_picture(content, 16)
 
 
@@ -268,4 +268,4 @@ def test_no_damage_raises_anything_but_unreadable(content, data):
     try:
         assert read_picture(bytes(damaged[:cut]), 8).shape == (3, 8, 8)
     except Unreadable as problem:
-        assert "cannot be used as a picture" in str(problem)
+        assert "cannot be used as an image" in str(problem)

@@ -113,7 +113,7 @@ def test_pictures_of_another_size_than_their_maps(rendered, encoded):
         f"test_gt/images/00000{row}.jpg": encoded(np.zeros((8, 8, 3), np.uint8), "JPEG") for row in (0, 1)
     }
     path, _ = rendered(images)
-    with pytest.raises(ValueError, match=r"pictures in test_gt/images are \(8, 8\), their maps \(4, 6\)"):
+    with pytest.raises(ValueError, match=r"images in test_gt/images are \(8, 8\), their maps \(4, 6\)"):
         read_ground_truth(path)
 
 
@@ -129,7 +129,7 @@ def test_missing_column_and_missing_maps(rendered):
     with pytest.raises(ValueError, match="lacks the column for 'light_yaw_rad'"):
         read_ground_truth(path)
     path, _ = rendered({"test_gt/depth/000000.png": None, "test_gt/depth/000001.png": None}, zipped=True)
-    with pytest.raises(ValueError, match=r"has no depth maps for the pictures of test_gt/params\.csv"):
+    with pytest.raises(ValueError, match=r"has no depth maps for the images of test_gt/params\.csv"):
         read_ground_truth(path)
 
 

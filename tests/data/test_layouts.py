@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from derender.data import LAYOUTS, take_inventory
+from derender.data import LAYOUTS, list_images
 
 ATTRIBUTES = ["Bald", "Smiling", "Young"]
 
@@ -80,8 +80,8 @@ TREES = {
 
 
 def table(source, **options):
-    inventory = take_inventory(source, **options)
-    inventory.source.close()
+    inventory = list_images(source, **options)
+    inventory.files.close()
     return inventory.table
 
 
@@ -97,9 +97,9 @@ def test_recognised_wherever_the_tree_lies(tree, name, zipped, wrapped):
     files = TREES[name] if isinstance(TREES[name], dict) else dict.fromkeys(TREES[name])
     if wrapped:
         files = {f"download/{file}": content for file, content in files.items()}
-    inventory = take_inventory(tree(files, zipped))
-    inventory.source.close()
-    assert inventory.layout.name == name
+    inventory = list_images(tree(files, zipped))
+    inventory.files.close()
+    assert inventory.layout == name
     for column in inventory.table.labels.values():
         assert len(column) == len(inventory.table.files) > 0
 
@@ -186,7 +186,7 @@ def test_celeba_csv_identity_and_partition(tree):
 )
 def test_celeba_faults_are_named(tree, text, message):
     with pytest.raises(ValueError, match=r"list_attr_celeba\.txt in .*" + message):
-        take_inventory(tree({**CELEBA, "list_attr_celeba.txt": text}))
+        list_images(tree({**CELEBA, "list_attr_celeba.txt": text}))
 
 
 def test_celeba_without_its_list_says_where_it_is_published(tree):
@@ -194,7 +194,7 @@ def test_celeba_without_its_list_says_where_it_is_published(tree):
     with pytest.raises(
         ValueError, match=r"has no list_attr_celeba\.txt; CelebA's owners publish it at https"
     ):
-        take_inventory(tree(files), dataset="celeba")
+        list_images(tree(files), dataset="celeba")
 
 
 def test_rendered_labels_are_in_radians(tree):
@@ -226,9 +226,9 @@ def test_rendered_subset_by_name_and_by_suffix(tree, zipped):
     assert named.files == table(f"{source}::test_gt").files == ("test_gt/images/000000.jpg",)
     assert named.labels["identity"].tolist() == ["9"]
     with pytest.raises(ValueError, match=r"it has no subset 'tests'; there are 'test_gt', 'train'"):
-        take_inventory(source, subset="tests")
-    with pytest.raises(ValueError, match=r"names the subset 'train', but subset='test_gt' was given too"):
-        take_inventory(f"{source}::train", subset="test_gt")
+        list_images(source, subset="tests")
+    with pytest.raises(ValueError, match=r"names the part 'train', but subset='test_gt' was given too"):
+        list_images(f"{source}::train", subset="test_gt")
 
 
 def test_one_part_of_a_rendered_set_on_its_own(tree):
@@ -255,12 +255,12 @@ def test_rendered_pictures_without_a_row_have_no_labels(tree):
         ),
         (PARAMS + "images/000000.jpg" + ",0" * 13 + "\n", "line 2: expected 13 values as in the header"),
         (PARAMS + "x" * 200_000, "is no CSV table"),
-        (PARAMS + "images/elsewhere.jpg" + ",0" * 12 + "\n", "names none of the pictures in train/images"),
+        (PARAMS + "images/elsewhere.jpg" + ",0" * 12 + "\n", "names none of the images in train/images"),
     ],
 )
 def test_rendered_faults_are_named(tree, text, message):
     with pytest.raises(ValueError, match=message):
-        take_inventory(tree({**SYNFACE, "train/params.csv": text}), dataset="synface")
+        list_images(tree({**SYNFACE, "train/params.csv": text}), dataset="synface")
 
 
 def test_a_csv_with_an_index_column_and_quoted_newlines(tree):
@@ -282,7 +282,7 @@ def test_tracks(tree):
     assert found.labels["identity"].tolist() == ["id1", "id1", "id2"]
     assert found.labels["track"].tolist() == ["id1/track_000", "id1/track_001", "id2/track_000"]
     with pytest.raises(ValueError, match=r"stray\.jpg does not lie in tracks/IDENTITY/TRACK/"):
-        take_inventory(tree([*TRACKS, "stray.jpg"]), dataset="synface_tracks")
+        list_images(tree([*TRACKS, "stray.jpg"]), dataset="synface_tracks")
 
 
 def test_tracks_with_parameters(tree):
@@ -304,8 +304,8 @@ def test_classes_inside_partitions(tree):
     [["train/1.png", "test/2.png"], ["cat/1.png", "dog/2.png", "3.png"], ["only/1.png", "only/2.png"]],
 )
 def test_what_is_not_one_folder_per_class(tree, files):
-    inventory = take_inventory(tree(files))
-    assert inventory.layout.name == "folder"
+    inventory = list_images(tree(files))
+    assert inventory.layout == "folder"
     assert inventory.table.labels == {}
 
 
@@ -317,8 +317,8 @@ def test_sub_folder_as_subset(tree):
     source = tree(["a/1.png", "a/b/2.png", "c/3.png"])
     assert table(f"{source}::a").files == ("a/1.png", "a/b/2.png")
     assert table(source, subset="b").files == ("a/b/2.png",)
-    with pytest.raises(ValueError, match=r"no pictures in a folder 'd'; its folders are a, c"):
-        take_inventory(source, subset="d")
+    with pytest.raises(ValueError, match=r"no images in a folder 'd'; its folders are a, c"):
+        list_images(source, subset="d")
 
 
 def test_a_path_that_really_holds_the_separator(tree):
@@ -327,45 +327,45 @@ def test_a_path_that_really_holds_the_separator(tree):
 
 def test_named_layout_overrules_recognition(tree):
     source = tree(TREES["classes"])
-    inventory = take_inventory(source, dataset="folder")
-    assert (inventory.layout.name, inventory.table.labels) == ("folder", {})
+    inventory = list_images(source, dataset="folder")
+    assert (inventory.layout, inventory.table.labels) == ("folder", {})
 
 
 @pytest.mark.parametrize("name", ["utkface", "synface", "celebamask", "celeba"])
 def test_a_named_layout_that_does_not_fit_says_why(tree, name):
     with pytest.raises(ValueError, match="set"):
-        take_inventory(tree(["1.png", "2.png"]), dataset=name)
+        list_images(tree(["1.png", "2.png"]), dataset=name)
 
 
 def test_lfw_needs_folders(tree):
     with pytest.raises(ValueError, match=r"one folder per person, but 1\.png in .* lies in none"):
-        take_inventory(tree(["1.png"]), dataset="lfw")
+        list_images(tree(["1.png"]), dataset="lfw")
 
 
 def test_unknown_layout_names_the_nearest(tree):
     with pytest.raises(
         ValueError, match=r"unknown data set 'utkfaces'; did you mean 'utkface'\? \(known: auto, "
     ):
-        take_inventory(tree(["1.png"]), dataset="utkfaces")
+        list_images(tree(["1.png"]), dataset="utkfaces")
 
 
 def test_nothing_found_says_what_is_there(tree):
     source = tree({"a.txt": "x", "b.txt": "x", "c.heic": "x", "faces.zip": "x"})
     with pytest.raises(ValueError) as problem:
-        take_inventory(source)
+        list_images(source)
     message = str(problem.value)
-    assert f"no pictures found in {source}: looked for .jpg" in message
+    assert f"no images found in {source}: looked for .jpg" in message
     assert "2 of .txt, 1 of .heic, 1 of .zip" in message
     assert "name that file itself" in message
 
 
 def test_nothing_but_unsafe_names_says_so(tree):
     with pytest.raises(ValueError, match=r"passed over 1, the first is '\.\./1\.png': unsafe name"):
-        take_inventory(tree(["../1.png"], zipped=True))
+        list_images(tree(["../1.png"], zipped=True))
 
 
 def test_empty_folder_and_empty_zip(tree, tmp_path):
     (tmp_path / "empty").mkdir()
     for source in (tmp_path / "empty", tree([], zipped=True)):
-        with pytest.raises(ValueError, match=r"no pictures found in .*found no files at all"):
-            take_inventory(source)
+        with pytest.raises(ValueError, match=r"no images found in .*found no files at all"):
+            list_images(source)

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from tests.data.conftest import noise
 
-from derender.data import read_pictures, take_inventory
-from derender.data.cars import CAR_CLASSES, car_class
-from derender.data.decode import decode
+from derender.data import list_images, read_pictures
+from derender.data.image import decode
+from derender.data.layouts.cars import CAR_CLASSES, car_class
 
 IDS = [f"{row:031x}a" for row in range(6)] + ["1c9725db9005eda1aaa354fd606bff0"]
 TABLE = (
@@ -29,8 +29,8 @@ def tree_of(files):
 
 
 def inventory_of(source, **options):
-    inventory = take_inventory(source, **options)
-    inventory.source.close()
+    inventory = list_images(source, **options)
+    inventory.files.close()
     return inventory
 
 
@@ -39,7 +39,7 @@ def inventory_of(source, **options):
 def test_classes_by_the_table(tree, zipped, name):
     source = tree({**tree_of(lambda row: None), name: TABLE}, zipped)
     inventory = inventory_of(source)
-    assert inventory.layout.name == "shapenet_cars"
+    assert inventory.layout == "shapenet_cars"
     found = inventory.table
     by_model = dict(zip(found.labels["model"], found.labels["class"], strict=True))
     assert [by_model[model] for model in IDS] == [*CAR_CLASSES, "", ""]
@@ -81,7 +81,7 @@ def test_the_published_crop(tree, encoded):
 def test_hexadecimal_names_alone_are_not_cars(tree):
     """Scraped pictures are often named by a checksum."""
     files = [f"{name}.png" for name in IDS]
-    assert inventory_of(tree(files)).layout.name == "folder"
+    assert inventory_of(tree(files)).layout == "folder"
     asked = inventory_of(tree(files), dataset="shapenet_cars").table
     assert asked.labels["model"].tolist() == IDS
     assert asked.partition is None
@@ -98,12 +98,12 @@ def test_faults_are_named(tree):
     with pytest.raises(
         ValueError, match=r"holds no rendered ShapeNet cars: expected folders train, val and test"
     ):
-        take_inventory(tree(["1.png"]), dataset="shapenet_cars")
+        list_images(tree(["1.png"]), dataset="shapenet_cars")
     strangers = TABLE.splitlines()[0] + "\n3dw.ffff,n,,,,x,y\n"
     with pytest.raises(
         ValueError, match=r"metadata\.csv in .* names none of the models there; ShapeNet's owners"
     ):
-        take_inventory(tree({**tree_of(lambda row: None), "metadata.csv": strangers}, name="strangers"))
+        list_images(tree({**tree_of(lambda row: None), "metadata.csv": strangers}, name="strangers"))
     short = "fullId,name\n3dw.ffff,x\n"
     with pytest.raises(ValueError, match="has no column 'wnlemmas'; its columns are fullId, name"):
-        take_inventory(tree({**tree_of(lambda row: None), "metadata.csv": short}, name="short"))
+        list_images(tree({**tree_of(lambda row: None), "metadata.csv": short}, name="short"))

@@ -3,8 +3,8 @@
 import pytest
 from PIL import Image
 
-from derender.data import read_pictures, take_inventory
-from derender.data.emotions import EMOTIONS, RAFDB
+from derender.data import list_images, read_pictures
+from derender.data.layouts.faces import EMOTIONS, RAFDB
 
 RAF = {
     "basic/EmoLabel/list_patition_label.txt": "".join(f"train_{row:05d}.jpg {row}\n" for row in range(1, 8))
@@ -25,8 +25,8 @@ LFW = {
 
 
 def table(source, **options):
-    inventory = take_inventory(source, **options)
-    inventory.source.close()
+    inventory = list_images(source, **options)
+    inventory.files.close()
     return inventory.table
 
 
@@ -45,7 +45,7 @@ def test_rafdb(tree, zipped):
         ["happiness"],
     )
     with pytest.raises(ValueError, match="no subset 'val'; there are test, train"):
-        take_inventory(source, subset="val")
+        list_images(source, subset="val")
 
 
 def test_rafdb_with_the_list_spelt_right(tree):
@@ -58,31 +58,29 @@ def test_rafdb_with_the_list_spelt_right(tree):
     [
         (
             "train_00001.jpg 5\ntrain_00002.jpg 8\n",
-            r"line 2: expected a picture and an emotion from 1 \(surprise\)",
+            r"line 2: expected an image and an emotion from 1 \(surprise\)",
         ),
         ("train_00001.jpg 0\n", r"to 7 \(neutral\), got 'train_00001\.jpg 0'"),
-        ("5\n", r"line 1: expected a picture and an emotion"),
+        ("5\n", r"line 1: expected an image and an emotion"),
         (
             "other.jpg 5\n",
-            "names none of its pictures; the first is 'basic/Image/aligned/test_0001_aligned.jpg'",
+            "names none of its images; the first is 'basic/Image/aligned/test_0001_aligned.jpg'",
         ),
     ],
 )
 def test_faults_in_rafdbs_list_are_named(tree, text, message):
     with pytest.raises(ValueError, match=message):
-        take_inventory(tree({**RAF, "basic/EmoLabel/list_patition_label.txt": text}))
+        list_images(tree({**RAF, "basic/EmoLabel/list_patition_label.txt": text}))
 
 
 def test_rafdb_half_unpacked(tree):
     packed = {"basic/EmoLabel/list_patition_label.txt": "train_00001.jpg 5\n", "basic/Image/aligned.zip": "x"}
-    with pytest.raises(
-        ValueError, match=r"no aligned pictures: expected Image/aligned/.* unpack aligned\.zip"
-    ):
-        take_inventory(tree(packed))
+    with pytest.raises(ValueError, match=r"no aligned images: expected Image/aligned/.* unpack aligned\.zip"):
+        list_images(tree(packed))
     with pytest.raises(
         ValueError, match=rf"no EmoLabel/list_patition_label\.txt .* on request: {RAFDB.home}"
     ):
-        take_inventory(tree(["aligned/test_1_aligned.jpg"], name="bare"), dataset="rafdb")
+        list_images(tree(["aligned/test_1_aligned.jpg"], name="bare"), dataset="rafdb")
 
 
 @pytest.mark.parametrize("zipped", [False, True])
@@ -97,21 +95,21 @@ def test_lfw_by_the_people_of_view_1(tree, zipped):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("3\nBo\t1\n", r"peopleDevTest\.txt in .* is cut short: expected the number of people"),
-        ("", "is cut short"),
-        ("1\nBo x\n", "line 2: expected a name and a number of pictures"),
+        ("3\nBo\t1\n", r"peopleDevTest\.txt in .* is cut short: 1 people of 3"),
+        ("", "line 1: expected the number of people"),
+        ("1\nBo x\n", "line 2: .* a name and a number of images"),
     ],
 )
 def test_faults_in_lfws_lists_are_named(tree, text, message):
     with pytest.raises(ValueError, match=message):
-        take_inventory(tree({**LFW, "peopleDevTest.txt": text}))
+        list_images(tree({**LFW, "peopleDevTest.txt": text}))
 
 
 def test_lfw_without_lists_has_no_parts(tree):
     files = [name for name in LFW if name.endswith("jpg")]
     assert table(tree(files)).partition is None
-    with pytest.raises(ValueError, match=r"no pictures in a folder 'test'"):
-        take_inventory(tree(files), subset="test")
+    with pytest.raises(ValueError, match=r"no images in a folder 'test'"):
+        list_images(tree(files), subset="test")
 
 
 def test_a_published_set_says_on_whose_terms_it_is_read(tmp_path):

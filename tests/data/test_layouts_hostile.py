@@ -4,8 +4,7 @@ import zipfile
 
 import pytest
 
-from derender.data import read_masks, read_pictures, take_inventory
-from derender.data import source as source_module
+from derender.data import list_images, read_masks, read_pictures, zip_source
 
 NAMES = ["ann lee", "ÄÖ ß 日本", "two\nlines", "quote\"'", "tab\there"]
 
@@ -40,7 +39,7 @@ def test_loops_of_links_end_in_published_layouts(tree):
 
 def bomb(path, names, monkeypatch):
     """A zip whose members unpack to more than is allowed."""
-    monkeypatch.setattr(source_module, "FILE_LIMIT_BYTES", 1 << 20)
+    monkeypatch.setattr(zip_source, "FILE_LIMIT_BYTES", 1 << 20)
     with zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED) as archive:
         for name in names:
             archive.writestr(name, bytes(3 << 20))
@@ -59,7 +58,7 @@ def test_a_list_that_is_a_bomb_is_an_error(tree, monkeypatch, name):
     path = tree(["1/000001.jpg"], zipped=True)
     bomb(path, [name], monkeypatch)
     with pytest.raises(ValueError, match="unpacks to 3 MiB, more than 1 MiB"):
-        take_inventory(path)
+        list_images(path)
 
 
 def test_a_mask_that_is_a_bomb_is_an_error(tree, monkeypatch):

@@ -8,8 +8,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from derender.data import read_pictures, take_inventory
-from derender.data.tables import label_column
+from derender.data import list_images, read_pictures
+from derender.data.layouts.tables import label_column
 
 ROWS = [
     {"path": "a b/1.png", "age": "31", "kind": "cat", "smiles": "yes", "split": "train", "id": "007"},
@@ -33,8 +33,8 @@ def as_parquet(rows=ROWS) -> bytes:
 
 
 def inventory_of(source, **options):
-    inventory = take_inventory(source, **options)
-    inventory.source.close()
+    inventory = list_images(source, **options)
+    inventory.files.close()
     return inventory
 
 
@@ -42,7 +42,7 @@ def inventory_of(source, **options):
 @pytest.mark.parametrize(("name", "content"), [("data.csv", as_csv()), ("data.parquet", as_parquet())])
 def test_beside_the_pictures(tree, zipped, name, content):
     inventory = inventory_of(tree({**PICTURES, name: content, "other.png": None}, zipped))
-    assert inventory.layout.name == "table"
+    assert inventory.layout == "table"
     found = inventory.table
     assert found.files == tuple(PICTURES)
     assert found.labels["age"].tolist()[::2] == [31, 4.5] and np.isnan(found.labels["age"][1])
@@ -77,7 +77,7 @@ def test_rows_without_a_picture_are_listed(tree):
         pictures = read_pictures(source, 8)
         assert pictures.files == ("1.png",)
         assert [(row.file, row.reason) for row in pictures.skipped] == [
-            (file, "named in data.csv, but no picture of that name is there")
+            (file, "named in data.csv, but no image of that name is there")
             for file in ("gone.png", "notes.txt")
         ]
 
@@ -136,14 +136,14 @@ def test_a_split_of_ones_own_is_a_label(tree):
         ("file,x\n1.png\n", "line 2: expected 2 values as in the header"),
         (
             "file,x\n7.png,2\n",
-            r"the column 'file' of data\.csv in .* names no picture .*: the first is '7\.png'",
+            r"the column 'file' of data\.csv in .* names no image .*: the first is '7\.png'",
         ),
-        ("file,x\n", "names no picture that is there; paths are relative"),
+        ("file,x\n", "names no image that is there; paths are relative"),
     ],
 )
 def test_faults_are_named(tree, zipped, text, message):
     with pytest.raises(ValueError, match=message):
-        take_inventory(tree({"data.csv": text, "1.png": None}, zipped), dataset="table")
+        list_images(tree({"data.csv": text, "1.png": None}, zipped), dataset="table")
 
 
 def test_faults_of_parquet_are_named(tree, encoded):
@@ -152,17 +152,17 @@ def test_faults_of_parquet_are_named(tree, encoded):
     with pytest.raises(
         ValueError, match=r"column 'image' of data\.parquet in .* holds struct<.*kept inside a table"
     ):
-        take_inventory(tree({"data.parquet": stored.getvalue(), "1.png": None}))
+        list_images(tree({"data.parquet": stored.getvalue(), "1.png": None}))
     with pytest.raises(ValueError, match=r"data\.parquet in .* is no Parquet table"):
-        take_inventory(tree({"data.parquet": b"PAR1", "1.png": None}, name="cut"))
-    with pytest.raises(ValueError, match=r"has no table of its pictures: expected data\.csv"):
-        take_inventory(tree(["1.png"], name="none"), dataset="table")
+        list_images(tree({"data.parquet": b"PAR1", "1.png": None}, name="cut"))
+    with pytest.raises(ValueError, match=r"has no table of its images: expected data\.csv"):
+        list_images(tree(["1.png"], name="none"), dataset="table")
 
 
 def test_a_metadata_table_about_something_else_is_passed_over(tree):
-    assert inventory_of(tree({"metadata.csv": "camera,lens\nx,y\n", "1.png": None})).layout.name == "folder"
+    assert inventory_of(tree({"metadata.csv": "camera,lens\nx,y\n", "1.png": None})).layout == "folder"
 
 
 def test_a_table_comes_before_what_names_look_like(tree):
     name = "24_0_1_20170116220224657.jpg"
-    assert inventory_of(tree({"data.csv": f"file,mood\n{name},good\n", name: None})).layout.name == "table"
+    assert inventory_of(tree({"data.csv": f"file,mood\n{name},good\n", name: None})).layout == "table"

@@ -5,24 +5,18 @@ from pathlib import Path
 
 import pytest
 
-from derender.data import cache_folder, listing, take_inventory
-from derender.data import inventory as inventory_module
-from derender.data.source import FolderSource
+from derender.data import cache_folder, folder_source, list_images, opening
+from derender.data.folder_source import FolderSource
 
 
 @pytest.fixture
 def walks(monkeypatch, tmp_path) -> list[str]:
     """Folders of 30 files count as very large, in a cache of our own; which folders were walked."""
-    monkeypatch.setattr(listing, "REMEMBERED_FROM", 30)
-    monkeypatch.setattr(listing, "_SETTLED_NS", -(10**12))
+    monkeypatch.setattr("derender.data.listing.REMEMBERED_FROM", 30)
+    monkeypatch.setattr(folder_source, "_SETTLED_NS", -(10**12))
     monkeypatch.setenv("DERENDER_CACHE", str(tmp_path / "cache"))
-    walked, real = [], listing.list_files
-
-    def counting(root, hidden):
-        walked.append(root)
-        return real(root, hidden)
-
-    monkeypatch.setattr("derender.data.source.list_files", counting)
+    walked, real = [], folder_source.list_files
+    monkeypatch.setattr(folder_source, "list_files", lambda root: walked.append(root) or real(root))
     return walked
 
 
@@ -39,7 +33,9 @@ def folder(tree, walks) -> Path:
 
 
 def known(source: FolderSource) -> tuple[object, ...]:
-    return source.files, source.skipped, [source.stamp(file) for file in source.files]
+    stamps = source.stamps(source.files).tolist()
+    source.remember()
+    return source.files, source.skipped, stamps
 
 
 def test_what_is_remembered_is_what_a_walk_finds(folder, walks):
@@ -49,18 +45,17 @@ def test_what_is_remembered_is_what_a_walk_finds(folder, walks):
     assert known(again) == first and len(walks) == 1
     assert again.read("raw\\xff.png") == b"x"
     status = (folder / "cat" / "ä03.png").stat()
-    assert again.stamp("cat/ä03.png") == (status.st_size, status.st_mtime_ns)
+    assert again.stamps(["cat/ä03.png"]).tolist() == [[status.st_size, status.st_mtime_ns]]
     assert [row.file for row in again.skipped] == ["gone.png"]
 
 
 def test_the_layout_is_recognised_once(folder, walks, monkeypatch):
     (folder / os.fsdecode(b"raw\xff.png")).unlink()
-    asked, real = [], inventory_module.recognise
-    monkeypatch.setattr(inventory_module, "recognise", lambda source: asked.append(1) or real(source))
+    asked, real = [], opening.recognise
+    monkeypatch.setattr(opening, "recognise", lambda source: asked.append(1) or real(source))
     for _ in range(2):
-        with (found := take_inventory(folder)).source:
-            assert found.layout.name == "classes"
-            assert found.source.stamp("cat/ä00.png")
+        with list_images(folder) as found:
+            assert found.layout == "classes"
     assert len(asked) == 1 and len(walks) == 1
 
 
@@ -110,17 +105,17 @@ def test_a_damaged_listing_is_made_again(folder, walks, damage):
 
 
 def test_what_changed_a_moment_ago_is_not_trusted(folder, walks, monkeypatch):
-    monkeypatch.setattr(listing, "_SETTLED_NS", 10**10)
+    monkeypatch.setattr(folder_source, "_SETTLED_NS", 10**10)
     known(FolderSource(folder))
     FolderSource(folder)
     assert len(walks) == 2
 
 
 def test_small_folders_and_a_cache_that_cannot_be_written(folder, walks, monkeypatch, tmp_path):
-    monkeypatch.setattr(listing, "REMEMBERED_FROM", 100)
+    monkeypatch.setattr("derender.data.listing.REMEMBERED_FROM", 100)
     known(FolderSource(folder))
     assert not cache_folder().exists()
-    monkeypatch.setattr(listing, "REMEMBERED_FROM", 30)
+    monkeypatch.setattr("derender.data.listing.REMEMBERED_FROM", 30)
     (tmp_path / "file").write_text("in the way")
     monkeypatch.setenv("DERENDER_CACHE", str(tmp_path / "file"))
     assert known(FolderSource(folder)) and known(FolderSource(folder))

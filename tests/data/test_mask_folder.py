@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from derender.data.mask_folder import read_mask_folder
+from derender.data.masks import read_mask_folder
 
 
 @pytest.fixture
@@ -68,5 +68,5 @@ def test_what_does_not_fit_is_named(folders, write, tmp_path):
     with pytest.raises(ValueError, match=r"a/1\.png in .* cannot be read"):
         read_mask_folder(photos, masks, 4)
     (masks / "a" / "1.png").unlink()
-    with pytest.raises(ValueError, match=r"1 of 3 pictures have no mask in .* 'a/1\.png'"):
+    with pytest.raises(ValueError, match=r"1 of 3 images have no mask in .* 'a/1\.png'"):
         read_mask_folder(photos, masks, 4)

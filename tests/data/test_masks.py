@@ -7,8 +7,8 @@ import pytest
 from PIL import Image
 from tests.data.conftest import noise
 
-from derender.data import MASK_CLASSES, read_masks, take_inventory
-from derender.data.celebamask import CELEBAMASK
+from derender.data import MASK_CLASSES, list_images, read_masks
+from derender.data.layouts.celebamask import CELEBAMASK
 
 MAPPING = (
     "idx orig_idx         orig_file\n"
@@ -129,7 +129,7 @@ def test_rows_belong_together_when_some_are_left_out(tree, merged):
         tree(files), 8, limit=2, keep_duplicates=True, progress=lambda *step: seen.append(step)
     )
     assert (len(limited.pictures), limited.masks.shape) == (2, (2, 8, 8))
-    assert seen == [(2, 2), (2, 2)]
+    assert seen == [(2, 2), (1, 2), (2, 2)]
 
 
 def test_official_parts_and_attributes(tree, published):
@@ -165,10 +165,10 @@ def test_attributes_by_way_of_celebas_own_list(tree, published):
 
 def test_a_picture_without_a_mask_is_a_picture_but_has_no_mask(tree, merged):
     source = tree({**merged, "images/9.jpg": picture(9)})
-    inventory = take_inventory(source, dataset="celebamask")
-    inventory.source.close()
+    inventory = list_images(source, dataset="celebamask")
+    inventory.files.close()
     assert inventory.table.labels["mask"].tolist() == ["masks/0.png", "masks/1.png", "masks/2.png", ""]
-    with pytest.raises(ValueError, match=r"1 of 4 pictures in .* have no mask, the first is 'images/9\.jpg'"):
+    with pytest.raises(ValueError, match=r"1 of 4 images in .* have no mask, the first is 'images/9\.jpg'"):
         read_masks(source, 8, dataset="celebamask")
 
 
@@ -187,7 +187,7 @@ ZERO = np.zeros((32, 32), np.uint8)
             r"masks/1\.png in .* holds the number 19; classes are 0 \(background\) to 18 \(cloth\)",
         ),
         (png(ZERO.astype(np.uint16) + 300), "holds the number 300; classes are 0"),
-        (png(wide(ZERO)), r"is 64 x 32 and its picture images/1\.jpg 32 x 32: a mask has the aspect ratio"),
+        (png(wide(ZERO)), r"is 64 x 32 and its image images/1\.jpg 32 x 32: a mask has the aspect ratio"),
         (png(ZERO, "RGB"), "has 3 channels; a mask has one, of class numbers"),
         (b"no picture", r"masks/1\.png in .* cannot be read"),
         (png(noise(1, channels=1))[:90], r"masks/1\.png in .* cannot be read"),
@@ -214,9 +214,9 @@ def test_half_unpacked_sets_say_what_is_missing(tree, published):
     with pytest.raises(
         ValueError, match=rf"none of their masks: expected CelebAMask-HQ-mask-anno/.*{CELEBAMASK.home}"
     ):
-        take_inventory(tree(pictures), dataset="celebamask")
-    with pytest.raises(ValueError, match=r"no pictures of CelebAMask-HQ: expected CelebA-HQ-img/0\.jpg"):
-        take_inventory(tree(parts, name="parts"), dataset="celebamask")
+        list_images(tree(pictures), dataset="celebamask")
+    with pytest.raises(ValueError, match=r"no images of CelebAMask-HQ: expected CelebA-HQ-img/0\.jpg"):
+        list_images(tree(parts, name="parts"), dataset="celebamask")
 
 
 def test_a_damaged_mapping_is_named(tree, published):
@@ -225,7 +225,7 @@ def test_a_damaged_mapping_is_named(tree, published):
         with pytest.raises(
             ValueError, match=rf"mapping\.txt in .*, line {line}: expected idx orig_idx orig_file"
         ):
-            take_inventory(tree(files))
+            list_images(tree(files))
 
 
 def test_a_set_without_masks_says_as_what_it_was_read(tree):

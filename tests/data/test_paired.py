@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from derender.data import read_ground_truth, read_pictures
-from derender.data.paired import DEPTH_RANGE
+from derender.data.layouts.depth_pairs import DEPTH_RANGE
 
 SIZE = 12
 

@@ -7,9 +7,6 @@ import pytest
 import torch
 
 from derender.data import as_float, read_picture, read_pictures
-from derender.data.decode import decode
-from derender.data.loading import load_into
-from derender.data.source import open_source
 
 
 @pytest.mark.parametrize("zipped", [False, True])
@@ -61,7 +58,7 @@ def test_unreadable_files_are_skipped_with_reasons_and_labels_stay_aligned(tree,
     assert pictures.label("class").tolist() == ["cat", "cat", "dog"]
     reasons = {row.file: row.reason for row in pictures.skipped}
     assert set(reasons) == {"cat/2.png", "dog/1.jpg", "dog/3.png"}
-    assert reasons["cat/2.png"] == "not a picture in a known format"
+    assert reasons["cat/2.png"] == "not an image in a known format"
     assert "truncated" in reasons["dog/1.jpg"]
     assert reasons["dog/3.png"] == "empty file"
     for row, seed in enumerate((0, 2, 4)):
@@ -93,9 +90,7 @@ def test_copies_are_dropped_by_content(tree, encoded):
 
 def test_only_unreadable_files(tree):
     source = tree({"a.png": "text", "b.jpg": "text"})
-    with pytest.raises(
-        ValueError, match=r"none of the 2 pictures in .* the first is 'a\.png': not a picture"
-    ):
+    with pytest.raises(ValueError, match=r"none of the 2 images in .* the first is 'a\.png': not an image"):
         read_pictures(source, 8)
 
 
@@ -156,7 +151,7 @@ def test_unknown_label_names_those_there_are(tree):
 
 def test_misaligned_columns_are_refused(tree):
     pictures = read_pictures(tree(["1.png", "2.png"]), 8)
-    with pytest.raises(ValueError, match="2 pictures, but 3 values in 'age'"):
+    with pytest.raises(ValueError, match="2 images, but 3 values in 'age'"):
         replace(pictures, labels={"age": np.zeros(3)})
 
 
@@ -178,13 +173,3 @@ def test_as_float():
     tensor = as_float(images)
     tensor += 1
     assert images.max() == 255
-
-
-def test_unused_rows_of_a_dirty_buffer_are_not_needed(tree, encoded):
-    """Rows close up over those of unreadable files whatever the buffer held before."""
-    with open_source(tree({"a.png": "text", "b.png": None, "c.png": "text", "d.png": None})) as source:
-        images = np.full((4, 3, 8, 8), 77, np.uint8)
-        loaded = load_into(images, source, source.files, fit="crop", keep_duplicates=False)
-    assert loaded.files == ("b.png", "d.png")
-    for row, seed in enumerate((1, 3)):
-        np.testing.assert_array_equal(images[row], decode(encoded(seed), 8))

@@ -7,13 +7,16 @@ import pytest
 
 from derender.data import (
     MASK_CLASSES,
+    ListedStream,
+    decoded,
+    list_images,
+    quiet_pillow,
     read_ground_truth,
     read_masks,
     read_pictures,
     split_indices,
-    take_inventory,
 )
-from derender.data.loading import load_into
+from derender.data.layouts import layout_named
 
 
 @pytest.mark.parametrize(
@@ -37,12 +40,12 @@ from derender.data.loading import load_into
 )
 def test_every_archive_is_recognised_and_whole(shared_data, source, layout, count, labels):
     name, _, subset = source.partition("::")
-    inventory = take_inventory(shared_data(f"data/{name}"), subset=subset or None)
-    inventory.source.close()
-    assert inventory.layout.name == layout
+    inventory = list_images(shared_data(f"data/{name}"), subset=subset or None)
+    inventory.files.close()
+    assert inventory.layout == layout
     assert len(inventory.table.files) == count
     assert labels <= set(inventory.table.labels)
-    assert inventory.source.skipped == ()
+    assert inventory.files.skipped == ()
 
 
 def test_utkface_labels(shared_data):
@@ -54,22 +57,23 @@ def test_utkface_labels(shared_data):
 
 def test_utkface_copies(shared_data):
     """The archive's copies are byte for byte the same, so its checksums tell how many pixels must find."""
-    inventory = take_inventory(shared_data("data/utkface64.zip"))
-    with inventory.source as source:
-        files = inventory.table.files
+    inventory = list_images(shared_data("data/utkface64.zip"))
+    with inventory, quiet_pillow():
         assert (inventory.table.labels["race"] == "").sum() == 3
-        stamps = Counter(source.stamp(file) for file in files)
-        copied = [file for file in files if stamps[source.stamp(file)] > 1]
-        single = [file for file in files if stamps[source.stamp(file)] == 1][::200]
-        images = np.empty((len(copied) + len(single), 3, 64, 64), np.uint8)
-        loaded = load_into(images, source, [*copied, *single], fit="crop", keep_duplicates=False)
-    assert len(loaded.duplicates) == sum(count - 1 for count in stamps.values()) == 390
-    assert loaded.skipped == ()
+        stamps = list(map(tuple, inventory.files.stamps(inventory.table.files).tolist()))
+        counts = Counter(stamps)
+        copied = [row for row, stamp in enumerate(stamps) if counts[stamp] > 1]
+        single = [row for row, stamp in enumerate(stamps) if counts[stamp] == 1][::200]
+        table = inventory.table.select(np.array([*copied, *single]))
+        some = ListedStream(inventory.files, layout_named("utkface"), table)
+        digests = [digest for chunk in decoded(some, 64) for digest in chunk.outcomes]
+    assert all(isinstance(digest, bytes) for digest in digests)
+    assert len(digests) - len(set(digests)) == sum(count - 1 for count in counts.values()) == 390
 
 
 def test_lfw_people(shared_data):
-    inventory = take_inventory(shared_data("data/lfw64.zip"))
-    inventory.source.close()
+    inventory = list_images(shared_data("data/lfw64.zip"))
+    inventory.files.close()
     labels = inventory.table.labels
     _, counts = np.unique(labels["identity"], return_counts=True)
     assert (counts >= 20).sum() == 31

@@ -11,8 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from derender.data import source as module
-from derender.data.source import open_source
+from derender.data import open_source, zip_source
 
 
 @pytest.mark.parametrize("zipped", [False, True])
@@ -98,7 +97,7 @@ def test_zip_bomb_is_bounded(tmp_path, monkeypatch):
     path = tmp_path / "bomb.zip"
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("bomb.png", bytes(2_000_000))
-    monkeypatch.setattr(module, "FILE_LIMIT_BYTES", 1 << 20)
+    monkeypatch.setattr(zip_source, "FILE_LIMIT_BYTES", 1 << 20)
     with open_source(path) as source, pytest.raises(ValueError, match="unpacks to 1 MiB, more than 1 MiB"):
         source.read("bomb.png")
 
@@ -178,7 +177,7 @@ def test_missing_source_names_the_nearest(tree):
 
 def test_other_files_are_refused(tmp_path):
     (tmp_path / "faces.tar").write_bytes(b"x" * 2000)
-    with pytest.raises(ValueError, match=r"faces\.tar is no folder, zip or picture .* unpack"):
+    with pytest.raises(ValueError, match=r"faces\.tar is no folder, zip or image .* unpack"):
         open_source(tmp_path / "faces.tar")
 
 
@@ -189,7 +188,7 @@ def test_a_zip_by_another_name_and_a_pipe(tree, tmp_path):
     path.write_bytes(path.read_bytes()[:-1])
     os.mkfifo(tmp_path / "pipe.zip")
     for other in (path, tmp_path / "pipe.zip"):
-        with pytest.raises(ValueError, match="is no folder, zip or picture"):
+        with pytest.raises(ValueError, match="is no folder, zip or image"):
             open_source(other)
 
 

@@ -75,5 +75,5 @@ def test_bad_fractions_and_groups():
         split_indices(10, (0.8, 0.1, 0.2))
     with pytest.raises(ValueError, match="add up to 1"):
         split_indices(10, (1.5, -0.5, 0.0))
-    with pytest.raises(ValueError, match="one group for each of 10 pictures, got 3"):
+    with pytest.raises(ValueError, match="one group for each of 10 images, got 3"):
         split_indices(10, groups=["a", "b", "c"])

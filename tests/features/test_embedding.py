@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 from PIL import Image
 
-from derender.data import read_pictures, stream_of
+from derender.data import open_images, read_pictures
 from derender.features import FeatureTable, embed_pictures, embed_to_file, embedding
 from derender.features.blocks import BlockEmbedder, in_order
 
@@ -94,14 +94,14 @@ def in_memory(model, source: str, path: Path, **options) -> FeatureTable:
 @pytest.mark.parametrize("keep", [False, True])
 def test_the_table_is_that_of_the_set_in_memory(model, source, tmp_path, keep):
     expected = in_memory(model, source, tmp_path / "memory.parquet", keep_duplicates=keep)
-    with stream_of(source) as stream:
+    with open_images(source) as stream:
         done = embed_to_file(
             model, stream, tmp_path / "out.parquet", batch_size=16, keep_duplicates=keep, workers=2
         )
     assert_same(tmp_path / "out.parquet", expected)
     assert (done.rows, done.skipped, done.copies, done.resumed) == (len(expected), 6, 4, 0)
     assert done.factors == {"geometry": 3, "albedo": 2} and list(done.labels) == list(expected.labels)
-    assert done.examples[0].reason == "not a picture in a known format"
+    assert done.examples[0].reason == "not an image in a known format"
     assert pq.ParquetFile(tmp_path / "out.parquet").num_row_groups == -(-len(expected) // 32)
     assert not (tmp_path / "out.parquet.partial").exists()
 
@@ -109,7 +109,7 @@ def test_the_table_is_that_of_the_set_in_memory(model, source, tmp_path, keep):
 @pytest.mark.parametrize("keep", [False, True])
 def test_blocks_of_several_workers_make_the_same_table(model, source, tmp_path, keep):
     expected = in_memory(model, source, tmp_path / "memory.parquet", keep_duplicates=keep)
-    workers = [BlockEmbedder(model, partial(stream_of, source), 16) for _ in range(2)]
+    workers = [BlockEmbedder(model, partial(open_images, source), 16) for _ in range(2)]
 
     def engine(stream, start, seen):
         turns = enumerate(range(start, COUNT, 16))
@@ -119,7 +119,7 @@ def test_blocks_of_several_workers_make_the_same_table(model, source, tmp_path, 
         return nullcontext(in_order(blocks, seen, keep_duplicates=keep))
 
     path = tmp_path / "out.parquet"
-    with stream_of(source) as stream:
+    with open_images(source) as stream:
         done = embed_to_file(model, stream, path, batch_size=16, keep_duplicates=keep, engine=engine)
     for worker in workers:
         worker.close()
@@ -144,7 +144,7 @@ def test_a_stopped_run_goes_on_to_the_same_table(model, source, tmp_path, stop_a
             if done > stop:
                 raise how
 
-        with stream_of(source) as stream, pytest.raises(how) as stopped:
+        with open_images(source) as stream, pytest.raises(how) as stopped:
             embed_to_file(model, stream, out, batch_size=16, progress=stop_there)
         assert not out.exists()
         if how is KeyboardInterrupt:
@@ -152,7 +152,7 @@ def test_a_stopped_run_goes_on_to_the_same_table(model, source, tmp_path, stop_a
             kept = sum(pq.ParquetFile(part).metadata.num_rows for part in parts)
             assert kept == sum(embedded) > 0, "what was computed is kept"
             assert f"stopped by Ctrl-C; {kept} rows are kept in" in str(stopped.value)
-    with stream_of(source) as stream:
+    with open_images(source) as stream:
         done = embed_to_file(model, stream, out, batch_size=16)
     assert_same(out, expected)
     assert done.skipped == 6 and done.copies == 4
@@ -186,15 +186,15 @@ def test_parts_of_another_run_are_an_error_until_told(model, source, tmp_path):
     def stop(done: int, total: int) -> None:
         raise KeyboardInterrupt
 
-    with stream_of(source) as stream, pytest.raises(KeyboardInterrupt):
+    with open_images(source) as stream, pytest.raises(KeyboardInterrupt):
         embed_to_file(model, stream, out, batch_size=16, progress=stop)
     with (
-        stream_of(source) as stream,
+        open_images(source) as stream,
         pytest.raises(ValueError, match=r"unfinished table .*\(differs in batch_size\): delete"),
     ):
         embed_to_file(model, stream, out, batch_size=8)
     model.b[0, 0] += 1
-    with stream_of(source) as stream:
+    with open_images(source) as stream:
         with pytest.raises(ValueError, match=r"differs in origin.*add --force"):
             embed_to_file(model, stream, out, batch_size=16)
         assert embed_to_file(model, stream, out, batch_size=16, fresh=True).resumed == 0
@@ -204,7 +204,7 @@ def test_parts_of_another_run_are_an_error_until_told(model, source, tmp_path):
 @pytest.mark.parametrize("source", ["folder", "shards"], indirect=True)
 def test_limits(model, source, tmp_path):
     for limit in (5, 40, 1000):
-        with stream_of(source, limit=limit) as stream:
+        with open_images(source, limit=limit) as stream:
             embed_to_file(model, stream, tmp_path / "out.parquet", batch_size=16)
         assert_same(
             tmp_path / "out.parquet", in_memory(model, source, tmp_path / "memory.parquet", limit=limit)
@@ -216,7 +216,7 @@ def test_bad_input_leaves_nothing(model, tmp_path):
     for name in ("a.png", "b.png"):
         (tmp_path / "bad" / name).write_bytes(b"text")
     out = tmp_path / "out.parquet"
-    with stream_of(str(tmp_path / "bad")) as stream:
+    with open_images(str(tmp_path / "bad")) as stream:
         with pytest.raises(
             ValueError, match=r"no picture in .*bad \(folder\) can be read; the first is 'a\.png'"
         ):
@@ -226,13 +226,16 @@ def test_bad_input_leaves_nothing(model, tmp_path):
     (tmp_path / "bad" / "c.png").write_bytes(png(1))
     model.b[:] = np.nan
     with (
-        stream_of(str(tmp_path / "bad")) as stream,
+        open_images(str(tmp_path / "bad")) as stream,
         pytest.raises(ValueError, match=r"factor 'albedo' is not finite in 1 of 1 rows, first in c\.png"),
     ):
         embed_to_file(model, stream, out)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["bad"]
     (tmp_path / "out.parquet.partial").write_text("in the way")
-    with stream_of(str(tmp_path / "bad")) as stream, pytest.raises(ValueError, match="in the way: delete it"):
+    with (
+        open_images(str(tmp_path / "bad")) as stream,
+        pytest.raises(ValueError, match="in the way: delete it"),
+    ):
         embed_to_file(model, stream, out)
 
 
@@ -240,7 +243,7 @@ def test_bad_input_leaves_nothing(model, tmp_path):
 def test_the_model_keeps_its_mode_and_progress_ends_at_the_total(model, source, tmp_path):
     model.train()
     seen = []
-    with stream_of(source) as stream:
+    with open_images(source) as stream:
         embed_to_file(
             model, stream, tmp_path / "o.parquet", batch_size=16, progress=lambda *state: seen.append(state)
         )

@@ -16,7 +16,7 @@ import pytest
 import derender
 from derender.cli import main
 from derender.data import Unreadable, read_picture, read_pictures
-from derender.data.source import FolderSource
+from derender.data.folder_source import FolderSource
 
 
 @pytest.fixture(scope="module")
@@ -110,7 +110,7 @@ def test_a_zip_gives_its_pictures_and_writes_nothing(corpus, tmp_path):
     reasons = {row.file: row.reason for row in pictures.skipped}
     assert sum("unsafe name" in reason for reason in reasons.values()) == 5
     assert reasons["encrypted.png"] == "encrypted in the zip"
-    assert "not a picture" in reasons["link.png"]
+    assert "not an image" in reasons["link.png"]
     assert reasons["huge.png"] == "unpacks to 4,095 MiB, more than 512 MiB"
     assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == ["hostile.zip"]
 

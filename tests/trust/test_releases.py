@@ -186,8 +186,8 @@ def test_a_cache_from_the_future_is_made_again(tmp_path):
     rows = read_pictures(pictures, 8, cache=tmp_path / "kept", workers=1).images
     (file,) = (tmp_path / "kept").iterdir()
     whole = file.read_bytes()
-    assert whole.endswith(_MARK) and _MARK.endswith(b"1\n")
-    file.write_bytes(whole[: -len(_MARK)] + _MARK.replace(b"1\n", b"2\n"))
+    assert whole.endswith(_MARK) and _MARK.endswith(b"2\n")
+    file.write_bytes(whole[: -len(_MARK)] + _MARK.replace(b"2\n", b"3\n"))
     assert read_cache(file, "any", 8) is None
     assert (read_pictures(pictures, 8, cache=tmp_path / "kept", workers=1).images == rows).all()
     assert file.read_bytes().endswith(_MARK)

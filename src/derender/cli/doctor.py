@@ -73,19 +73,19 @@ def _refuse_one_file(data: str) -> None:
 
 def _originals(data: str, pictures: "PictureSet", dataset: str) -> "Originals | None":
     """Sizes of the files where they can be asked for by name; a stream's cannot."""
-    from derender.data import parse_source, take_inventory
+    from derender.data import list_images, parse_source
     from derender.data.doctor import EXAMINED_PX, measure_originals
 
     if not parse_source(data)[0].exists():
         return None
     try:
-        inventory = take_inventory(data, dataset=dataset)
+        listed = list_images(data, dataset=dataset)
     except ValueError:  # shards: read as a stream
         return None
-    with inventory.source:
-        if not set(pictures.files) <= set(inventory.source.files):
+    with listed:
+        if not set(pictures.files) <= set(listed.files.files):
             return None
-        return measure_originals(inventory.source, pictures.files, EXAMINED_PX)
+        return measure_originals(listed.files, pictures.files, EXAMINED_PX)
 
 
 def _tell(pictures: "PictureSet", found: "Examination", json_file: str | None) -> None:

@@ -79,7 +79,7 @@ def embed(
     refuse_existing_file(out, force)
     _check_engine(engine, workers, part)
     from derender.cli.models import open_model
-    from derender.data import stream_of
+    from derender.data import open_images
     from derender.features import embed_to_file
     from derender.features.ray_engine import ray_engine
 
@@ -126,7 +126,7 @@ def embed(
             engine=None
             if engine == "local"
             else ray_engine(
-                net, partial(stream_of, data, dataset=dataset, limit=limit), workers=workers or 2,
+                net, partial(open_images, data, dataset=dataset, limit=limit), workers=workers or 2,
                 batch_size=batch_size,
             ),
         )  # fmt: skip
@@ -164,10 +164,10 @@ def _opened(
     data: str, dataset: str, part: str, limit: int | None, model: str | None, image_size: int
 ) -> "Iterator[Stream | PictureSet]":
     """The pictures as a stream; those of one part of a split, which has to know them all first, as a set."""
-    from derender.data import read_pictures, stream_of
+    from derender.data import open_images, read_pictures
 
     if part == "all":
-        with stream_of(data, dataset=dataset, limit=limit) as stream:
+        with open_images(data, dataset=dataset, limit=limit) as stream:
             yield stream
         return
     from derender.cli.models import part_of

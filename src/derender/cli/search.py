@@ -217,11 +217,11 @@ def _pictures_of(files: Sequence[str], source: str, dataset: str) -> "dict[str, 
     """The pictures of these names, by name, as far as they can be read; nothing else is decoded."""
     if not source:
         raise ValueError("the table does not say where its pictures lie: give --data, or leave out --out")
-    from derender.data import Unreadable, decode, quiet_pillow, stream_of
+    from derender.data import Unreadable, decode, open_images, quiet_pillow
 
     missing, read = set(files), {}
     with (
-        stream_of(source, dataset=dataset) as stream,
+        open_images(source, dataset=dataset) as stream,
         progress_bar("finding pictures") as report,
         quiet_pillow(),
     ):

@@ -1,43 +1,48 @@
-"""Pictures in: folders, zips and published data sets, decoded once into one array.
+"""Images in: folders, zips, shards and published data sets, decoded once into one array or streamed.
 
-source      files of a folder (listing: of a very large one, remembered), a zip, or one picture
-zip_directory, zip_member, zip_listing  a zip's members without an object for each, read at their places
-names       which names count; kept: what is remembered between starts
-stream/     what comes one after another: WebDataset shards, Hugging Face data sets
-layout      what a data set's layout is; registry lists them, one or a few in a file: celeba, celebamask,
-            emotions, faces, tracks, cars, rendered, tables, folders
-masks       pictures with a mask each: read_masks
-inventory   files and labels, nothing decoded
-decode      one picture; loading: all, on every core; duplicates; cache: large sets in a memory map
-pictures    all of it joined: read_pictures
-splits      which rows are for training, validation, test
-ground_truth  the exact maps of rendered sets
+opening       from what the user wrote to a stream of images: open_images
+source, folder_source, zip_source   named files; listing: what is remembered of very large ones
+layouts/      how data sets lie: recognised, and read into a table of files and labels
+stream        images one after another; shards (WebDataset), huggingface
+decode        one image; decoding: a stream, on every core
+pictures      a stream collected into an array: read_pictures; cache: large sets in a memory map
+masks, ground_truth   images with masks, with exact maps
+splits        which rows are for training, validation, test
+parquet       a parquet footer, checked before it is believed
+names         which names count, and suggestions for unknown ones
 """
 
 from derender.data.cache import sample_checksum
-from derender.data.celebamask import MASK_CLASSES
-from derender.data.checks import check_pictures, refuse_not_finite
-from derender.data.decode import READER_VERSION, Unreadable, decode, quiet_pillow, read_picture
-from derender.data.duplicates import Duplicate
+from derender.data.decoding import (
+    Decoded,
+    Progress,
+    SeenPixels,
+    ahead,
+    decode_samples,
+    decoded,
+    estimated_total,
+    usable_cores,
+)
 from derender.data.ground_truth import GroundTruth, read_ground_truth
-from derender.data.inventory import Inventory, parse_source, take_inventory
-from derender.data.loading import Progress, usable_cores
-from derender.data.mask_folder import read_mask_folder
-from derender.data.masks import MaskedPictures, read_masks
+from derender.data.image import READER_VERSION, Unreadable, decode, quiet_pillow, read_picture
+from derender.data.layouts import LAYOUTS
+from derender.data.layouts.celebamask import MASK_CLASSES
+from derender.data.listing import cache_folder
+from derender.data.masks import MaskedPictures, read_mask_folder, read_masks
 from derender.data.names import is_picture, suggestion
-from derender.data.parquet_claims import check_lists, checked_footer
-from derender.data.pictures import PictureSet, as_float, read_pictures
-from derender.data.places import cache_folder
-from derender.data.registry import LAYOUTS
-from derender.data.source import Skipped, nearest_sibling, open_source
+from derender.data.opening import ListedStream, list_images, open_images, open_source, parse_source
+from derender.data.parquet import check_lists, checked_footer
+from derender.data.pictures import (
+    Duplicate,
+    PictureSet,
+    as_float,
+    check_pictures,
+    read_pictures,
+    refuse_not_finite,
+)
+from derender.data.source import Skipped, nearest_sibling
 from derender.data.splits import Split, split_indices
-from derender.data.stream.address import open_stream
-from derender.data.stream.collect import estimated_total
-from derender.data.stream.decoding import Decoded, ahead, decode_samples, decoded
-from derender.data.stream.labels import Kind, Kinds, column_of
-from derender.data.stream.listed import ListedStream, stream_of
-from derender.data.stream.sample import Sample, Stream, Value
-from derender.data.stream.seen import SeenPixels
+from derender.data.stream import Kind, Kinds, Sample, Stream, Value, column_of
 
 __all__ = [
     "LAYOUTS",
@@ -46,7 +51,6 @@ __all__ = [
     "Decoded",
     "Duplicate",
     "GroundTruth",
-    "Inventory",
     "Kind",
     "Kinds",
     "ListedStream",
@@ -72,9 +76,10 @@ __all__ = [
     "decoded",
     "estimated_total",
     "is_picture",
+    "list_images",
     "nearest_sibling",
+    "open_images",
     "open_source",
-    "open_stream",
     "parse_source",
     "quiet_pillow",
     "read_ground_truth",
@@ -85,8 +90,6 @@ __all__ = [
     "refuse_not_finite",
     "sample_checksum",
     "split_indices",
-    "stream_of",
     "suggestion",
-    "take_inventory",
     "usable_cores",
 ]

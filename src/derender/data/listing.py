@@ -1,154 +1,153 @@
-"""The files below a folder: found by one walk, and remembered where there are very many.
+"""What a very large folder or zip holds, remembered in the cache folder between starts.
 
-What is remembered (names, sizes, times of change, the layout that was recognised) counts only while every
-folder has the time of change it had, which any file added, removed or renamed alters, every file that is no
-picture is as it was, and so is a sample of a thousand files. A few of very many pictures that are written
-over in place, under their old names, therefore go unnoticed; below ``REMEMBERED_FROM`` files nothing is
-remembered and every file is looked at. Listings lie in the cache folder; deleting one there does no harm.
+The file is a checksum and, behind it, an archive of numpy arrays: names, numbers and a note. It can be made
+again, so one that is missing, damaged or of another version is as good as none, and a full disk is no error.
 """
 
+import hashlib
+import io
+import json
 import os
-import stat
-import time
-from collections.abc import Callable
-from dataclasses import dataclass
+import sys
+from abc import abstractmethod
+from bisect import bisect_left
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Int64
 
-from derender.data.kept import Kept, keep, read_kept
+import derender
+from derender.data.names import printable
+from derender.data.source import Skipped, Source
+from derender.storage.atomic import atomic_file
 
 REMEMBERED_FROM = 50_000
-"""Folders with this many files or more are remembered."""
+"""Folders and zips with this many files or more are remembered."""
 
-SAMPLED = 1_000
-_SETTLED_NS = 2_000_000_000  # what changed a moment ago may change again within one tick of the disk's clock
+_DAMAGED = (OSError, ValueError, LookupError, TypeError, AttributeError)
+_DIGEST_BYTES = 32
+
+
+def cache_folder() -> Path:
+    """``$DERENDER_CACHE``, or derender's folder in the place this system has for caches."""
+    if "DERENDER_CACHE" in os.environ:
+        return Path(os.environ["DERENDER_CACHE"])
+    if sys.platform == "darwin":
+        base = Path.home() / "Library" / "Caches"
+    elif sys.platform == "win32":
+        base = Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData" / "Local"))
+    else:
+        base = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
+    return base / "derender"
 
 
 @dataclass(frozen=True)
 class Listing:
-    """What lies below a folder.
+    """Files, and what is known of them.
 
     Attributes:
-        files: every regular file that is not hidden, as a path relative to the folder, in the order met.
-        faults: what is no regular file or cannot be looked at: its path, and why.
-        folders: every folder ("" is the root itself) with its time of change in nanoseconds.
+        files: their names as the system or archive has them, sorted by their printable form.
+        numbers: (N, k) whole numbers, a row for each file; (N, 0) before they are looked up.
+        faults: what is no usable file: its name, and why.
+        proof: what must still be so for the listing to hold.
+        layout: the layout that was recognised, "" for none.
     """
 
     files: tuple[str, ...]
+    numbers: Int64[np.ndarray, "n k"]
     faults: tuple[tuple[str, str], ...]
-    folders: tuple[tuple[str, int], ...]
+    proof: dict[str, Any] = field(default_factory=dict)
+    layout: str = ""
 
-    def in_order(self, key: Callable[[str], str]) -> "Listing":
-        """The same with the files sorted by what ``key`` makes of them."""
-        return Listing(tuple(sorted(self.files, key=key)), self.faults, self.folders)
-
-
-@dataclass(frozen=True)
-class Remembered:
-    """A listing that was found to hold still.
-
-    Attributes:
-        listing: the files.
-        stamps: (N, 2) size and time of change in nanoseconds of each file.
-        layout: the layout that was recognised, or "".
-    """
-
-    listing: Listing
-    stamps: Int64[np.ndarray, "n 2"]
-    layout: str
-
-
-def list_files(root: str, hidden: Callable[[str], bool]) -> Listing:
-    """Walk a folder. Links are followed, each real folder once, so that loops end.
-
-    Args:
-        root: where to begin.
-        hidden: whether a file or folder of this name is passed over.
-    """
-    files: list[str] = []
-    faults: list[tuple[str, str]] = []
-    folders: list[tuple[str, int]] = []
-    seen: set[tuple[int, int]] = set()
-    waiting = [""]
-    while waiting:
-        here = waiting.pop()
+    def write(self, file: Path) -> None:
+        """Write the listing to a file; one that cannot be written is only slower next time."""
+        note = {"version": derender.__version__, "proof": self.proof}
+        note |= {"faults": self.faults, "layout": self.layout}
+        names = "\0".join(self.files).encode("utf-8", "surrogateescape")
+        texts = {"note": json.dumps(note).encode(), "names": names}
+        buffer = io.BytesIO()
+        arrays = {name: np.frombuffer(text, np.uint8) for name, text in texts.items()}
+        np.savez(buffer, numbers=self.numbers, **arrays)  # pyright: ignore[reportArgumentType]
+        content = buffer.getbuffer()
         try:
-            status = os.stat(f"{root}/{here}")  # noqa: PTH116  (a million times; so below)
-            if (status.st_dev, status.st_ino) in seen:
-                continue
-            seen.add((status.st_dev, status.st_ino))
-            with os.scandir(f"{root}/{here}") as found:
-                entries = list(found)
-        except OSError as problem:
-            faults.append((here.rstrip("/") or ".", f"folder cannot be listed: {problem.strerror}"))
-            continue
-        folders.append((here, status.st_mtime_ns))
-        below: list[str] = []
-        for entry in entries:
-            if hidden(entry.name):
-                continue
-            path = f"{here}{entry.name}"
-            try:
-                if entry.is_file():
-                    files.append(path)
-                elif entry.is_dir():
-                    below.append(f"{path}/")
-                elif stat.S_ISREG(entry.stat().st_mode):  # a broken link raises here
-                    files.append(path)
-                else:
-                    faults.append((path, "not a regular file"))
-            except OSError as problem:
-                faults.append((path, f"broken link or unreachable file: {problem.strerror}"))
-        waiting += sorted(below, reverse=True)
-    return Listing(tuple(files), tuple(faults), tuple(folders))
+            with atomic_file(file) as temporary, temporary.open("wb") as stream:
+                stream.write(_checksum(content))
+                stream.write(content)
+        except OSError:
+            return
 
 
-def stamps_of(root: str, files: tuple[str, ...]) -> Int64[np.ndarray, "n 2"]:
-    """Size and time of change in nanoseconds of each file; a file that has gone has -1."""
-    stamps = np.empty((len(files), 2), np.int64)
-    for row, file in enumerate(files):
-        stamps[row] = _stamp(f"{root}/{file}")
-    return stamps
-
-
-def remember(file: Path, listing: Listing, stamps: Int64[np.ndarray, "n 2"], layout: str) -> None:
-    """Keep a listing; that nothing can be kept is no error."""
-    note = {
-        "made_ns": time.time_ns(),
-        "folders": listing.folders,
-        "faults": listing.faults,
-        "layout": layout,
-    }
-    keep(file, Kept(listing.files, stamps, note))
-
-
-def recall(file: Path, root: str, is_picture: Callable[[str], bool]) -> Remembered | None:
-    """The listing that is kept, if the folder still is as it says, else None."""
-    kept = read_kept(file)
-    if kept is None or "folders" not in kept.note:
-        return None
-    files, stamps, note = kept.names, kept.array, kept.note
-    listing = Listing(
-        files,
-        tuple((path, why) for path, why in note["faults"]),
-        tuple((path, changed) for path, changed in note["folders"]),
-    )
-    settled = note["made_ns"] - _SETTLED_NS
-    for path, changed in listing.folders:
-        if changed > settled or _stamp(f"{root}/{path}")[1] != changed:
-            return None
-    checked = {row for row, path in enumerate(files) if not is_picture(path)}
-    checked |= set(np.linspace(0, len(files) - 1, SAMPLED).astype(int).tolist())
-    if any(_stamp(f"{root}/{files[row]}") != tuple(stamps[row].tolist()) for row in checked):
-        return None
-    return Remembered(listing, stamps, note["layout"])
-
-
-def _stamp(path: str) -> tuple[int, int]:
+def read_listing(file: Path) -> Listing | None:
+    """What was written, or None where there is none, it is damaged, or another version wrote it."""
     try:
-        status = os.stat(path)  # noqa: PTH116
-    except OSError:
-        return -1, -1
-    return status.st_size, status.st_mtime_ns
+        with file.open("rb") as stream:
+            checksum, content = stream.read(_DIGEST_BYTES), stream.read()
+        if _checksum(content) != checksum:
+            return None
+        with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
+            note = json.loads(arrays["note"].tobytes())
+            joined = arrays["names"].tobytes().decode("utf-8", "surrogateescape")
+            numbers = arrays["numbers"]
+        names, faults = tuple(joined.split("\0")), tuple((name, why) for name, why in note["faults"])
+        if note["version"] != derender.__version__ or len(numbers) != len(names):
+            return None
+        return Listing(names, numbers, faults, note["proof"], note["layout"])
+    except _DAMAGED:
+        return None
+
+
+def _checksum(content: bytes | memoryview) -> bytes:
+    return hashlib.blake2b(content, digest_size=_DIGEST_BYTES).digest()
+
+
+class ListedSource(Source):
+    """A source whose files are listed, by itself or by what was remembered of it."""
+
+    def __init__(self, path: Path):
+        self.path = path
+        whole = path.resolve()
+        key = hashlib.sha256(str(whole).encode("utf-8", "surrogateescape")).hexdigest()
+        self._file = cache_folder() / f"{whole.name[:40]}-{key[:16]}.listing"
+        known = read_listing(self._file)
+        self._remembered = known is not None and self._holds(known)
+        self.listing = known if known is not None and self._remembered else self._listed()
+        self.recognised = self.listing.layout
+        self.files = tuple(map(printable, self.listing.files))
+        faults = [Skipped(printable(file), reason) for file, reason in self.listing.faults]
+        self.skipped = tuple(sorted(faults, key=lambda row: row.file))
+
+    @abstractmethod
+    def _listed(self) -> Listing:
+        """List the files anew."""
+
+    @abstractmethod
+    def _holds(self, known: Listing) -> bool:
+        """Whether a remembered listing still tells what is there."""
+
+    @cached_property
+    def numbers(self) -> Int64[np.ndarray, "n k"]:
+        """A row for every file."""
+        return self.listing.numbers
+
+    def remember(self) -> None:
+        if len(self.files) < REMEMBERED_FROM:
+            return
+        if not self._remembered or self.listing.layout != self.recognised:
+            self.listing = replace(self.listing, numbers=self.numbers, layout=self.recognised)
+            self.listing.write(self._file)
+            self._remembered = True
+
+    def row_of(self, file: str) -> int:
+        """The place of a file in ``files``."""
+        row = bisect_left(self.files, file)
+        if row == len(self.files) or self.files[row] != file:
+            raise ValueError(f"{file} is not in {self.path}")
+        return row
+
+    def rows_of(self, files: Sequence[str]) -> list[int] | slice:
+        """The places of files in ``files``."""
+        return slice(None) if files == self.files else [self.row_of(file) for file in files]

@@ -1,35 +1,40 @@
-"""Pictures with a mask each: which of CelebAMask-HQ's 19 classes every pixel shows.
+"""Images with a mask each: which class every pixel shows.
 
-A mask in parts is merged as its owners do it (their g_mask.py): the parts are laid over one another in
-the order of the classes, so that a later class hides an earlier one. Masks are only ever resized to the
-nearest value, after the same crop as their picture's. Which file belongs to which picture is decided in
-data/celebamask.py.
+Masks lie in the data set itself (``read_masks``: CelebAMask-HQ, rendered sets), or in another folder or zip
+beside images of any layout (``read_mask_folder``): one of class numbers for each, named alike. Masks are
+only ever resized to the nearest value, after the same crop as their image's. A mask in parts is merged as
+CelebAMask-HQ's owners do it (their g_mask.py): the parts are laid over one another in the order of the
+classes, so that a later class hides an earlier one. Leaves out colours as classes, and a number for pixels
+without a class.
 """
 
 import io
-from pathlib import Path
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-from derender.data.celebamask import MASK_CLASSES, parts_of
-from derender.data.decode import DECODER_ERRORS, fit_square, quiet_pillow, upright
-from derender.data.inventory import Inventory, take_inventory
-from derender.data.loading import Progress, decoding_threads, usable_cores
+from derender.data.decoding import Progress, usable_cores
+from derender.data.image import fit_square, opened_image, quiet_pillow, upright_size
+from derender.data.layouts.celebamask import MASK_CLASSES, parts_of
+from derender.data.opening import ListedStream, list_images, open_source
 from derender.data.pictures import PictureSet, read_pictures
 from derender.data.source import Source
 
-_CHUNK = 32
+CLASSES_FILE = "classes.txt"
+MOST_CLASSES = 255  # 255 itself marks pixels without a class in many sets
 
 
 class MaskedPictures(NamedTuple):
     """What ``read_masks`` returns.
 
     Attributes:
-        pictures: the pictures with their labels and partition.
-        masks: (N, S, S) the class number of every pixel, a row for each picture.
+        pictures: the images with their labels and partition.
+        masks: (N, S, S) the class number of every pixel, a row for each image.
         classes: the name of every class number.
     """
 
@@ -51,15 +56,14 @@ def read_masks(
     workers: int | None = None,
     progress: Progress | None = None,
 ) -> MaskedPictures:
-    """Read every picture of a folder or zip with its mask, both at ``image_size`` x ``image_size``.
+    """Read every image of a folder or zip with its mask, both at ``image_size`` x ``image_size``.
 
-    The options are those of ``read_pictures``; ``progress`` counts the pictures and then, from the start, the
-    masks. A data set without masks is an error, and so is a mask that does not fit its picture: one that is
-    missing, has another aspect ratio, is no picture of one channel, or holds a number that is no class.
+    The options are those of ``read_pictures``; ``progress`` counts the images and then, from the start, the
+    masks. A data set without masks is an error, and so is a mask that does not fit its image: one that is
+    missing, has another aspect ratio, is no image of one channel, or holds a number that is no class.
     """
-    inventory = take_inventory(source, dataset=dataset, subset=subset)
-    with inventory.source as opened:
-        _require_all(inventory)
+    with list_images(source, dataset=dataset, subset=subset) as listed:
+        _require_all(listed)
         pictures = read_pictures(
             source,
             image_size,
@@ -72,77 +76,119 @@ def read_masks(
             workers=workers,
             progress=progress,
         )
-        masks = np.empty((len(pictures), image_size, image_size), np.uint8)
-        names, parts = pictures.label("mask"), parts_of(opened)
+        files, names, parts = listed.files, pictures.label("mask"), parts_of(listed.files)
+        limit_text = f"0 ({MASK_CLASSES[0]}) to {len(MASK_CLASSES) - 1} ({MASK_CLASSES[-1]})"
 
-        def load(start: int) -> int:
-            rows = range(start, min(start + _CHUNK, len(pictures)))
-            for row in rows:
-                masks[row] = _read_mask(opened, pictures.files[row], str(names[row]), parts, image_size, fit)
-            return rows.stop
+        def read(row: int) -> UInt8[np.ndarray, "h w"]:
+            name, image = str(names[row]), pictures.files[row]
+            if name in parts:
+                mask = _merged(files, parts[name])
+            else:
+                mask = _class_numbers(files, name, len(MASK_CLASSES), limit_text)
+            with Image.open(io.BytesIO(files.read(image))) as opened:
+                width, height = upright_size(opened)
+            rows, columns = mask.shape
+            if abs(columns * height - rows * width) > width + height:
+                raise ValueError(
+                    f"{name} in {files.path} is {columns} x {rows} and its image {image} {width} x {height}: "
+                    f"a mask has the aspect ratio of its image"
+                )
+            return mask
 
-        with quiet_pillow(), decoding_threads(workers or usable_cores()) as pool:
-            for done in pool.map(load, range(0, len(pictures), _CHUNK)):
-                if progress is not None:
-                    progress(done, len(pictures))
+        masks = _all_masks(read, len(pictures), image_size, fit, workers, progress)
     return MaskedPictures(pictures, masks, MASK_CLASSES)
 
 
-def _require_all(inventory: Inventory) -> None:
-    """Every picture has a mask, or an error says how many have none."""
-    path, files = inventory.source.path, inventory.table.files
-    if "mask" not in inventory.table.labels:
+def read_mask_folder(
+    source: str | Path,
+    masks: str | Path,
+    image_size: int,
+    *,
+    dataset: str = "auto",
+    fit: str = "crop",
+    limit: int | None = None,
+    progress: Progress | None = None,
+) -> MaskedPictures:
+    """Read images as ``read_pictures`` does, and the mask of each, at ``image_size`` x ``image_size``.
+
+    The mask of ``a/b.jpg`` is ``a/b.png``, or the only ``b.png`` there is. A file ``classes.txt`` among the
+    masks, or beside their folder as `derender synth` writes it, names the classes, one a line, the first
+    being number 0; without it they are called after their numbers. An image without a mask is an error, and
+    so is a mask of more than one channel or with a number that is no class.
+    """
+    pictures = read_pictures(source, image_size, dataset=dataset, fit=fit, limit=limit, progress=progress)
+    limit_text = f"0 to {MOST_CLASSES - 1}: give pixels without a class a class of their own"
+    with open_source(Path(masks).expanduser()) as opened:
+        names = _mask_names(opened, pictures.files)
+
+        def read(row: int) -> UInt8[np.ndarray, "h w"]:
+            return _class_numbers(opened, names[row], MOST_CLASSES, limit_text)
+
+        found = _all_masks(read, len(pictures), image_size, fit, None, progress)
+        return MaskedPictures(pictures, found, _class_names(opened, found, names))
+
+
+def _all_masks(
+    read: Callable[[int], UInt8[np.ndarray, "h w"]],
+    count: int,
+    image_size: int,
+    fit: str,
+    workers: int | None,
+    progress: Progress | None,
+) -> UInt8[np.ndarray, "n s s"]:
+    """The mask of every row at one size."""
+    masks = np.empty((count, image_size, image_size), np.uint8)
+
+    def load(row: int) -> None:
+        square = fit_square(Image.fromarray(read(row)), image_size, fit, Image.Resampling.NEAREST, 0)
+        masks[row] = np.asarray(square)
+
+    pool = ThreadPoolExecutor(workers or usable_cores())
+    try:
+        with quiet_pillow():
+            for done, _ in enumerate(pool.map(load, range(count)), 1):
+                if progress is not None:
+                    progress(done, count)
+    finally:
+        pool.shutdown(cancel_futures=True)
+    return masks
+
+
+def _require_all(listed: ListedStream) -> None:
+    """Every image has a mask, or an error says how many have none."""
+    path, table = listed.files.path, listed.table
+    if "mask" not in table.labels:
         raise ValueError(
-            f"{path} holds no masks (it was read as {inventory.layout.name}): expected images/NAME.jpg with "
+            f"{path} holds no masks (it was read as {listed.layout}): expected images/NAME.jpg with "
             f"masks/NAME.png, or CelebA-HQ-img with CelebAMask-HQ-mask-anno"
         )
-    bare = [file for file, mask in zip(files, inventory.table.labels["mask"], strict=True) if not mask]
+    bare = [file for file, mask in zip(table.files, table.labels["mask"], strict=True) if not mask]
     if bare:
         raise ValueError(
-            f"{len(bare):,} of {len(files):,} pictures in {path} have no mask, the first is {bare[0]!r}; "
-            f"add the masks or take these pictures out"
+            f"{len(bare):,} of {len(table.files):,} images in {path} have no mask, the first is {bare[0]!r}; "
+            f"add the masks or take these images out"
         )
 
 
-def _read_mask(
-    source: Source, picture: str, name: str, parts: dict[str, dict[int, str]], image_size: int, fit: str
-) -> UInt8[np.ndarray, "s s"]:
-    mask = _merged(source, parts[name]) if name in parts else _class_numbers(source, name)
-    width, height = _size_of(source, picture)
-    rows, columns = mask.shape
-    if abs(columns * height - rows * width) > width + height:
-        raise ValueError(
-            f"{name} in {source.path} is {columns} x {rows} and its picture {picture} {width} x {height}: "
-            f"a mask has the aspect ratio of its picture"
-        )
-    square = fit_square(Image.fromarray(mask), image_size, fit, Image.Resampling.NEAREST, 0)
-    return np.asarray(square)
-
-
-def _class_numbers(source: Source, file: str) -> UInt8[np.ndarray, "h w"]:
+def _class_numbers(source: Source, file: str, classes: int, limits: str) -> UInt8[np.ndarray, "h w"]:
     """A mask that holds class numbers; a palette's colours do not matter."""
-    with _opened(source, file) as opened:
-        if len(opened.getbands()) > 1:
-            raise ValueError(
-                f"{file} in {source.path} has {len(opened.getbands())} channels; "
-                f"a mask has one, of class numbers"
-            )
-        values = np.asarray(opened)
-    if values.min() < 0 or values.max() >= len(MASK_CLASSES):
-        wrong = int(values.min() if values.min() < 0 else values.max())
+    opened = opened_image(source, file)
+    if len(opened.getbands()) > 1:
         raise ValueError(
-            f"{file} in {source.path} holds the number {wrong}; classes are 0 ({MASK_CLASSES[0]}) "
-            f"to {len(MASK_CLASSES) - 1} ({MASK_CLASSES[-1]})"
+            f"{file} in {source.path} has {len(opened.getbands())} channels; a mask has one, of class numbers"
         )
+    values = np.asarray(opened)
+    if values.min() < 0 or values.max() >= classes:
+        wrong = int(values.min() if values.min() < 0 else values.max())
+        raise ValueError(f"{file} in {source.path} holds the number {wrong}; classes are {limits}")
     return values.astype(np.uint8)
 
 
 def _merged(source: Source, files: dict[int, str]) -> UInt8[np.ndarray, "h w"]:
-    """The parts of one face over one another, in the order of their class numbers."""
+    """The parts of one face, at least one, over one another, in the order of their class numbers."""
     merged = None
     for number in sorted(files):
-        with _opened(source, files[number]) as opened:
-            inside = np.asarray(opened.convert("L")) > 0
+        inside = np.asarray(opened_image(source, files[number]).convert("L")) > 0
         rows, columns = inside.shape
         if merged is None:
             merged = np.zeros((rows, columns), np.uint8)
@@ -151,20 +197,45 @@ def _merged(source: Source, files: dict[int, str]) -> UInt8[np.ndarray, "h w"]:
                 f"{files[number]} in {source.path} is {columns} x {rows}, other parts of the face are not"
             )
         merged[inside] = number
-    assert merged is not None, "a mask in parts has at least one"
+    assert merged is not None
     return merged
 
 
-def _size_of(source: Source, picture: str) -> tuple[int, int]:
-    """Width and height of a picture that was read before, turned as its EXIF orientation says."""
-    with Image.open(io.BytesIO(source.read(picture))) as opened:
-        return upright(Image.new("1", opened.size), opened).size
+def _mask_names(source: Source, images: tuple[str, ...]) -> list[str]:
+    by_path = {file.removesuffix(".png"): file for file in source.files if file.endswith(".png")}
+    by_stem: dict[str, list[str]] = {}
+    for path, file in by_path.items():
+        by_stem.setdefault(path.rpartition("/")[2], []).append(file)
+    names, bare = [], []
+    for image in images:
+        path = PurePosixPath(image)
+        alike = by_stem.get(path.stem, [])
+        name = by_path.get(str(path.with_suffix(""))) or (alike[0] if len(alike) == 1 else None)
+        names.append(name or "")
+        if name is None:
+            bare.append(image)
+    if bare:
+        raise ValueError(
+            f"{len(bare):,} of {len(images):,} images have no mask in {source.path}, the first is "
+            f"{bare[0]!r}: expected {PurePosixPath(bare[0]).with_suffix('.png')} there"
+        )
+    return names
 
 
-def _opened(source: Source, file: str) -> Image.Image:
-    try:
-        opened = Image.open(io.BytesIO(source.read(file)))
-        opened.load()
-        return opened
-    except DECODER_ERRORS as problem:
-        raise ValueError(f"{file} in {source.path} cannot be read: {problem}") from problem
+def _class_names(source: Source, masks: UInt8[np.ndarray, "n s s"], files: list[str]) -> tuple[str, ...]:
+    largest = masks.max(axis=(1, 2))
+    listed, beside = source.named(CLASSES_FILE), source.path.parent / CLASSES_FILE
+    if listed is not None:
+        text = source.read_text(listed)
+    elif source.path.is_dir() and beside.is_file():
+        listed, text = str(beside), beside.read_text(encoding="utf-8", errors="replace")
+    else:
+        return tuple(f"class {number}" for number in range(int(largest.max()) + 1))
+    names = tuple(line.strip() for line in text.splitlines() if line.strip())
+    if int(largest.max()) >= len(names):
+        file = files[int(largest.argmax())]
+        raise ValueError(
+            f"{file} in {source.path} holds the number {int(largest.max())}; {listed} names "
+            f"{len(names)} classes"
+        )
+    return names

@@ -1,42 +1,57 @@
-"""From a folder, a zip, a picture or a stream to one array of decoded pictures with their labels."""
+"""From any source to one array of decoded images with their labels: ``read_pictures``.
 
-from dataclasses import dataclass, field, replace
-from hashlib import sha256
+There is one way to read: a stream of samples, decoded in order on every core. What is known to fit lies in
+memory; everything else is appended to a cache file, decoded once, and mapped into memory, so that training
+has random access. Besides its pixels, an image takes its name, its labels and 24 bytes that find copies.
+"""
+
+import hashlib
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import PIL
 import torch
 from jaxtyping import Float, Shaped, UInt8
 from torch import Tensor
 
-from derender.data.cache import cache_file, fingerprint, new_cache, read_cache
-from derender.data.decode import READER_VERSION, check_fit
-from derender.data.duplicates import Duplicate
-from derender.data.inventory import Inventory, take_inventory
-from derender.data.layout import Labels, count_unknown
-from derender.data.loading import Loaded, Progress, load_into
+from derender.data.cache import cache_file, new_cache, read_cache
+from derender.data.decoding import Decoded, Progress, SeenPixels, ahead, decoded, estimated_total
+from derender.data.image import READER_VERSION, Unreadable, check_fit, quiet_pillow
+from derender.data.layouts.layout import Labels, count_unknown, text_column
+from derender.data.listing import cache_folder
 from derender.data.names import suggestion
-from derender.data.places import cache_folder
+from derender.data.opening import open_images
 from derender.data.source import Skipped
-from derender.data.stream.address import open_stream
-from derender.data.stream.collect import collect
+from derender.data.stream import Kinds, Stream, Value, column_of
 
 MEMORY_LIMIT_BYTES = 2 << 30
-"""Sets larger than this (175,000 pictures of 64 x 64) are kept in a memory-mapped file instead of memory."""
+"""Sets larger than this (175,000 images of 64 x 64) lie in a memory-mapped file instead of memory."""
+
+
+@dataclass(frozen=True)
+class Duplicate:
+    """An image with exactly the pixels of an earlier one, at the size both were read in."""
+
+    file: str
+    first: str
 
 
 @dataclass(frozen=True)
 class PictureSet:
-    """Decoded pictures, their labels, and what was left out.
+    """Decoded images, their labels, and what was left out.
 
     Attributes:
         images: (N, 3, S, S) RGB; a memory map for large sets.
-        files: the name of each picture, relative to the source.
-        labels: columns by name, one value per picture ("" / NaN / -1 where unknown: see data/layout.py).
+        files: the name of each image, relative to the source.
+        labels: columns by name, one value per image ("" / NaN / -1 where unknown: see ``layouts/layout.py``).
         layout: the name of the layout they were read by ("utkface", "classes", "folder", ...).
         skipped: files that could not be read, with reasons.
         duplicates: files with the very pixels of an earlier one; not in ``images`` unless copies were kept.
-        partition: the owners' own split of each picture ("train", "validation", "test", ...), or None.
+        partition: the owners' own split of each image ("train", "validation", "test", ...), or None.
         source: what was read.
         terms: on what terms the owners of a published set give it, in a few words.
     """
@@ -57,7 +72,7 @@ class PictureSet:
             columns["partition"] = self.partition
         for name, column in columns.items():
             if len(column) != len(self.images):
-                raise ValueError(f"{len(self.images)} pictures, but {len(column)} values in {name!r}")
+                raise ValueError(f"{len(self.images)} images, but {len(column)} values in {name!r}")
 
     def __len__(self) -> int:
         return len(self.files)
@@ -65,7 +80,7 @@ class PictureSet:
     def select(self, indices: Shaped[np.ndarray, " k"] | list[int] | slice) -> "PictureSet":
         """The same set with only these rows: numbers, a true/false mask, or a slice.
 
-        A slice shares the pictures' memory; other choices copy them.
+        A slice shares the images' memory; other choices copy them.
         """
         rows = np.arange(len(self))[indices]
         return replace(
@@ -86,7 +101,7 @@ class PictureSet:
         return self.labels[name]
 
     def require(self, minimum: int, purpose: str = "training") -> "PictureSet":
-        """The set itself if it holds enough pictures; otherwise an error that says so."""
+        """The set itself if it holds enough images; otherwise an error that says so."""
         if len(self) < minimum:
             found = "only one picture was" if len(self) == 1 else f"only {len(self)} pictures were"
             left_out = len(self.skipped) + len(self.duplicates)
@@ -98,7 +113,7 @@ class PictureSet:
         return self
 
     def describe(self) -> str:
-        """One line: how many pictures, of which layout, what was left out."""
+        """One line: how many images, of which layout, what was left out."""
         noun = "picture" if len(self) == 1 else "pictures"
         parts = [f"{len(self):,} {noun} from {self.source} ({self.layout})"]
         if self.skipped:
@@ -129,152 +144,207 @@ def read_pictures(
     workers: int | None = None,
     progress: Progress | None = None,
 ) -> PictureSet:
-    """Read every picture of a folder, zip or stream at ``image_size`` x ``image_size``.
+    """Read every image of a source at ``image_size`` x ``image_size``.
 
     Args:
-        source: a folder, a zip, one picture, or ``PATH::SUBSET``; also shards and Hugging Face data sets
-            (data/stream/address.py), which are always kept in a cache file.
-        image_size: side of the square pictures, in pixels.
+        source: a folder, zip, image, table of paths, shards or Hugging Face data set, also ``PATH::SUBSET``
+            (data/opening.py).
+        image_size: side of the square images, in pixels.
         dataset: the layout's name, or "auto" to recognise it.
         subset: a part of the data set ("train", "test_gt", a sub-folder); rendered sets: "train" by default.
-        fit: what becomes of pictures that are not square: "crop" to the centre, "pad" with white, "stretch".
-        keep_duplicates: keep all of identical pictures and not only the first; they are listed in any case.
-        limit: read at most so many pictures, evenly spaced in the sorted list; of a stream the first.
-        cache: a folder to keep decoded pictures in, whatever their size. None keeps sets above
-            ``memory_limit_bytes`` in the user's cache folder (``DERENDER_CACHE`` names another), and
+        fit: what becomes of images that are not square: "crop" to the centre, "pad" with white, "stretch".
+        keep_duplicates: keep all of identical images and not only the first; they are listed in any case.
+        limit: read at most so many images, evenly spaced in the sorted list; of a stream the first.
+        cache: a folder to cache decoded images in, whatever their size. None caches streams and sets above
+            ``memory_limit_bytes`` in the user's cache folder (``DERENDER_CACHE`` names another), and has
             others in memory.
         workers: threads; by default one for each core.
-        progress: called with (done, total).
+        progress: called with (done, total); of a stream the total is an estimate.
     """
     if not 1 <= image_size <= 4096:
         raise ValueError(f"image_size must be in 1..4096 pixels, got {image_size}")
     if limit is not None and limit < 1:
         raise ValueError(f"limit must be 1 or more, got {limit}")
     check_fit(fit)
-    stream = open_stream(source, dataset=dataset, subset=subset)
-    if stream is not None:
-        folder = Path(cache) if cache is not None else cache_folder()
-        stream.limit = limit
-        with stream:
-            collected = collect(
-                stream,
-                image_size,
-                folder,
-                fit=fit,
-                keep_duplicates=keep_duplicates,
-                workers=workers,
-                progress=progress,
-            )
-        return PictureSet(
-            images=collected.images,
-            files=collected.loaded.files,
-            labels=collected.labels,
-            layout=stream.layout,
-            skipped=collected.loaded.skipped,
-            duplicates=collected.loaded.duplicates,
-            partition=collected.partition,
-            source=stream.source,
-        )
-    inventory = take_inventory(source, dataset=dataset, subset=subset)
-    with inventory.source:
-        files, boxes = inventory.table.files, inventory.table.boxes
-        if limit is not None and limit < len(files):
-            rows = np.linspace(0, len(files) - 1, limit).astype(int)
-            files = tuple(files[row] for row in rows)
-            boxes = None if boxes is None else boxes[rows]
-        needed = len(files) * 3 * image_size * image_size
-        how = _How(image_size, fit, keep_duplicates, limit, boxes, workers, progress)
-        if cache is None and needed <= memory_limit_bytes:
-            images = np.empty((len(files), 3, image_size, image_size), np.uint8)
-            loaded = how.load(images, inventory, files)
-            images = images[: len(loaded.files)]
+    with open_images(source, dataset=dataset, subset=subset, limit=limit) as stream:
+        reading = _Reading(stream, image_size, fit, keep_duplicates, workers, progress)
+        count = None if stream.table is None else len(stream.table.files)
+        if cache is None and count is not None and count * 3 * image_size**2 <= memory_limit_bytes:
+            rows = _RowsInMemory(np.empty((count, 3, image_size, image_size), np.uint8))
+            content = reading.into(rows.append)
+            images = rows.images[: rows.count]
         else:
-            images, loaded = _through_cache(
-                Path(cache) if cache is not None else cache_folder(), inventory, files, how
-            )
-    return _with_labels(inventory, images, loaded)
+            images, content = reading.through(cache_folder() if cache is None else Path(cache), limit)
+        return _joined(stream, images, content)
 
 
 def as_float(images: UInt8[np.ndarray, "*n 3 h w"] | UInt8[Tensor, "*n 3 h w"]) -> Float[Tensor, "*n 3 h w"]:
-    """Pictures of 0..255 as a float32 tensor of 0..1."""
+    """Images of 0..255 as a float32 tensor of 0..1."""
     tensor = torch.from_numpy(np.array(images)) if isinstance(images, np.ndarray) else images
     return tensor.to(torch.float32) / 255
 
 
-@dataclass(frozen=True)
-class _How:
-    """How to decode: the settings that pass through unchanged."""
+def check_pictures(images: Tensor, size: int) -> None:
+    """Images of another shape than (N, 3, size, size), or of whole numbers, are an error."""
+    if images.ndim != 4 or images.shape[1:] != (3, size, size):
+        raise ValueError(
+            f"this model takes pictures of shape (N, 3, {size}, {size}), got {tuple(images.shape)}: "
+            f"read them with derender.data.read_pictures(..., image_size={size}) or resize them"
+        )
+    if not images.is_floating_point():
+        raise ValueError(f"pictures must be floating point in 0..1, got {images.dtype}: divide uint8 by 255")
 
+
+def refuse_not_finite(images: Tensor) -> None:
+    """NaN or infinity in images is an error; not looked for on other devices, which would have to wait."""
+    if images.device.type != "cpu" or torch.compiler.is_compiling() or bool(images.isfinite().all()):
+        return
+    first = int(images.isfinite().flatten(1).all(dim=1).int().argmin())
+    raise ValueError(
+        f"picture {first} of {len(images)} holds values that are not finite: give numbers in 0..1"
+    )
+
+
+@dataclass
+class _RowsInMemory:
+    """An array of known length that is filled from its beginning."""
+
+    images: UInt8[np.ndarray, "n 3 s s"]
+    count: int = 0
+
+    def append(self, rows: np.ndarray) -> None:
+        self.images[self.count : self.count + len(rows)] = rows
+        self.count += len(rows)
+
+
+@dataclass(frozen=True)
+class _Reading:
+    """A stream, and how to decode it."""
+
+    stream: Stream
     image_size: int
     fit: str
     keep_duplicates: bool
-    limit: int | None
-    boxes: np.ndarray | None
     workers: int | None
     progress: Progress | None
 
-    @property
-    def settings(self) -> tuple[object, ...]:
-        """What the decoded rows depend on."""
-        settings = (self.image_size, self.fit, self.keep_duplicates, self.limit)
-        return settings if self.boxes is None else (*settings, sha256(self.boxes.tobytes()).hexdigest())
+    def into(self, append: Callable[[np.ndarray], object]) -> dict[str, Any]:
+        """Decode everything and ``append`` the rows; what is known of them, as JSON has it."""
+        found = _Found(self.keep_duplicates)
+        chunks = decoded(self.stream, self.image_size, fit=self.fit, workers=self.workers)
+        with quiet_pillow(), ahead(chunks) as ready:
+            for chunk in ready:
+                append(chunk.images[found.add(chunk)])
+                if self.progress is not None:
+                    done = chunk.start + len(chunk)
+                    self.progress(done, estimated_total(done, chunk.share, self.stream.limit))
+        if not found.files:
+            raise nothing_readable(self.stream, found.skipped)
+        return found.content()
 
-    def load(self, images: np.ndarray, inventory: Inventory, files: tuple[str, ...]) -> Loaded:
-        loaded = load_into(
-            images,
-            inventory.source,
-            files,
-            fit=self.fit,
-            keep_duplicates=self.keep_duplicates,
-            boxes=self.boxes,
-            progress=self.progress,
-            workers=self.workers,
-        )
-        if not loaded.files:
-            first = loaded.skipped[0]
-            raise ValueError(
-                f"none of the {len(files):,} pictures in {inventory.source.path} can be read; "
-                f"the first is {first.file!r}: {first.reason}"
-            )
-        return loaded
-
-
-def _through_cache(
-    folder: Path, inventory: Inventory, files: tuple[str, ...], how: _How
-) -> tuple[np.ndarray, Loaded]:
-    """Rows from the cache file if it is good, else decoded into a new one."""
-    settings = (READER_VERSION, inventory.layout.name, inventory.subset, *how.settings)
-    path = inventory.source.path
-    file = cache_file(folder, path.stem, (str(path.resolve()), settings))
-    mark = fingerprint(inventory.source, files, settings)
-    cached = read_cache(file, mark, how.image_size)
-    if cached is None:
-        with new_cache(file, len(files), how.image_size) as writer:
-            writer.finish(how.load(writer.rows, inventory, files), mark)
-        cached = read_cache(file, mark, how.image_size)
+    def through(self, folder: Path, limit: int | None) -> tuple[np.ndarray, dict[str, Any]]:
+        """Rows and content from the cache file if it is good, else decoded into a new one."""
+        stream = self.stream
+        settings = (READER_VERSION, stream.layout, self.image_size, self.fit, self.keep_duplicates, limit)
+        made_of = repr((settings, PIL.__version__, stream.identity()))
+        fingerprint = hashlib.sha256(made_of.encode()).hexdigest()
+        name = re.sub(r"[^\w.-]+", "-", stream.source.rpartition("/")[2])
+        file = cache_file(folder, name, (stream.place, settings))
+        cached = read_cache(file, fingerprint, self.image_size)
         if cached is None:
-            raise OSError(f"decoded pictures could not be read back from {file}; check the disk")
-    elif how.progress is not None:
-        how.progress(len(files), len(files))
-    return cached.images, cached.loaded
+            with new_cache(file, self.image_size) as writer:
+                content = self.into(writer.append)
+                writer.finish(fingerprint, content)
+            cached = read_cache(file, fingerprint, self.image_size)
+            if cached is None:
+                raise OSError(f"decoded images could not be read back from {file}; check the disk")
+        if self.progress is not None:
+            self.progress(len(cached[0]), len(cached[0]))
+        return cached
 
 
-def _with_labels(inventory: Inventory, images: np.ndarray, loaded: Loaded) -> PictureSet:
-    row_of = {file: row for row, file in enumerate(inventory.table.files)}
-    table = inventory.table.select(np.array([row_of[file] for file in loaded.files], np.int64))
-    where = (
-        str(inventory.source.path)
-        if inventory.subset is None
-        else f"{inventory.source.path}::{inventory.subset}"
-    )
+@dataclass
+class _Found:
+    """What is known after each chunk: names, labels and partitions of the rows, and what is left out."""
+
+    keep_duplicates: bool
+    files: list[str] = field(default_factory=list)
+    skipped: list[Skipped] = field(default_factory=list)
+    copies: list[tuple[str, int]] = field(default_factory=list)
+    columns: dict[str, list[Value]] = field(default_factory=dict)
+    partitions: list[str] = field(default_factory=list)
+    kinds: Kinds = field(default_factory=Kinds)
+    seen: SeenPixels = field(default_factory=SeenPixels)
+    readable: list[str] = field(default_factory=list)
+
+    def add(self, chunk: Decoded) -> list[int]:
+        """Note a chunk; which of its rows are to be kept."""
+        good = {row: one for row, one in enumerate(chunk.outcomes) if not isinstance(one, Unreadable)}
+        numbers = range(len(self.readable), len(self.readable) + len(good))
+        first = self.seen.first(list(good.values()), numbers).tolist()
+        kept = []
+        for row, number, earlier in zip(good, numbers, first, strict=True):
+            self.readable.append(chunk.files[row])
+            if earlier != number:
+                self.copies.append((chunk.files[row], earlier))
+            if earlier == number or self.keep_duplicates:
+                kept.append(row)
+                self._label(chunk.labels[row])
+                self.files.append(chunk.files[row])
+                self.partitions.append(chunk.partitions[row])
+        outcomes = zip(chunk.files, chunk.outcomes, strict=True)
+        self.skipped += [Skipped(file, str(one)) for file, one in outcomes if isinstance(one, Unreadable)]
+        return kept
+
+    def _label(self, labels: Mapping[str, Value]) -> None:
+        self.kinds.see(labels)
+        for name in labels:
+            self.columns.setdefault(name, [None] * len(self.files))
+        for name, column in self.columns.items():
+            column.append(labels.get(name))
+
+    def content(self) -> dict[str, Any]:
+        """Everything, as JSON has it."""
+        return {
+            "files": self.files,
+            "skipped": [asdict(row) for row in self.skipped],
+            "duplicates": [{"file": file, "first": self.readable[first]} for file, first in self.copies],
+            "labels": {name: [self.kinds[name], column] for name, column in self.columns.items()},
+            "partition": self.partitions if any(self.partitions) else None,
+        }
+
+
+def nothing_readable(stream: Stream, skipped: list[Skipped]) -> ValueError:
+    """The error for a stream without a usable image."""
+    where = f"{stream.source} ({stream.layout})"
+    if not skipped:
+        return ValueError(f"no image in {where}: it is empty")
+    first = f"the first is {skipped[0].file!r}: {skipped[0].reason}"
+    return ValueError(f"none of the {len(skipped):,} images in {where} can be read; {first}")
+
+
+def _joined(stream: Stream, images: np.ndarray, content: Mapping[str, Any]) -> PictureSet:
+    """The rows with their labels: those of the stream's table, or those that came with each."""
+    files, partition = tuple(content["files"]), content["partition"]
+    if stream.table is None:
+        columns = content["labels"].items()
+        labels = {
+            name: column_of(name, ({name: value} for value in values), kind)
+            for name, (kind, values) in columns
+        }
+        partition = None if partition is None else text_column(partition)
+    else:
+        row_of = {file: row for row, file in enumerate(stream.table.files)}
+        table = stream.table.select(np.array([row_of[file] for file in files], np.int64))
+        labels, partition = table.labels, table.partition
     return PictureSet(
         images=images,
-        files=loaded.files,
-        labels=table.labels,
-        layout=inventory.layout.name,
-        skipped=(*inventory.source.skipped, *inventory.table.skipped, *loaded.skipped),
-        duplicates=loaded.duplicates,
-        partition=table.partition,
-        source=where,
-        terms=inventory.layout.terms,
+        files=files,
+        labels=labels,
+        layout=stream.layout,
+        skipped=(*stream.passed_over, *(Skipped(**row) for row in content["skipped"])),
+        duplicates=tuple(Duplicate(**row) for row in content["duplicates"]),
+        partition=partition,
+        source=stream.source,
+        terms=stream.terms,
     )

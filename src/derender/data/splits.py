@@ -1,7 +1,7 @@
-"""Divides pictures into train, validation and test, the same way on every machine.
+"""Divides images into train, validation and test, the same way on every machine.
 
 Files are put in the order of a hash of their name and the seed, and that order is cut. So the split depends
-on neither the file system nor a random generator's version, counts are exact, and a picture added later
+on neither the file system nor a random generator's version, counts are exact, and an image added later
 moves only those few that lie at a cut. With groups (identities), whole groups are ordered and cut: no
 person is on two sides.
 """
@@ -43,15 +43,15 @@ def split_indices(
         members.setdefault(key, []).append(row)
     ordered = sorted(members, key=lambda key: _hash(key, seed))
     ends = np.cumsum([0, *(len(members[key]) for key in ordered)])
-    wanted = np.cumsum(_counts(len(names), fractions))
-    cuts = [int(np.abs(ends - end).argmin()) for end in wanted[:2]]
+    targets = np.cumsum(_counts(len(names), fractions))
+    cuts = [int(np.abs(ends - end).argmin()) for end in targets[:2]]
     parts = (ordered[: cuts[0]], ordered[cuts[0] : cuts[1]], ordered[cuts[1] :])
     return Split(*(np.array(sorted(row for key in part for row in members[key]), np.int64) for part in parts))
 
 
 def _group_keys(names: list[str], groups: Sequence[object] | np.ndarray) -> list[str]:
     if len(groups) != len(names):
-        raise ValueError(f"expected one group for each of {len(names)} pictures, got {len(groups)}")
+        raise ValueError(f"expected one group for each of {len(names)} images, got {len(groups)}")
     return [
         f"file {name}" if str(group) in ("", "nan") else f"group {group}"
         for name, group in zip(names, groups, strict=True)

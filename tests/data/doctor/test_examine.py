@@ -13,7 +13,7 @@ from derender.data.doctor import examine, measure_originals
 from derender.data.doctor.estimate import Estimate
 from derender.data.doctor.findings import Finding, judged, verdict_of
 from derender.data.doctor.limits import LIMITS
-from derender.data.duplicates import Duplicate
+from derender.data.pictures import Duplicate
 from derender.data.source import Skipped, open_source
 
 

@@ -98,10 +98,10 @@ def test_saved_to_disk(rows, places):
 
 
 def test_a_stream_goes_on_in_the_middle_of_its_splits(rows, places):
-    from derender.data.stream import open_stream
+    from derender.data import open_images
 
     datasets.DatasetDict({"train": rows(5), "test": rows(3, 10)}).save_to_disk("two")
-    with open_stream("two::all") as stream:
+    with open_images("two::all") as stream:
         names = [sample.file for sample in stream.samples()]
         assert len(names) == 8
         for start in (0, 3, 5, 6, 8):
@@ -123,17 +123,17 @@ def test_a_folder_of_pictures_asked_for_as_a_data_set(places, encoded):
 def test_no_picture_column_and_several(rows, places):
     rows(3).remove_columns("photo").to_parquet("none.parquet")
     with pytest.raises(
-        ValueError, match=r"none\.parquet has no column of pictures; its columns are label \(int64\)"
+        ValueError, match=r"none\.parquet has no column of images; its columns are label \(int64\)"
     ):
         read_pictures("none.parquet", 9)
     rows(5, other=1).to_parquet("both.parquet")
     with pytest.raises(
         ValueError,
-        match=r"several columns of pictures \(photo, other\); name one: 'both\.parquet\?column=photo'",
+        match=r"several columns of images \(photo, other\); name one: 'both\.parquet\?column=photo'",
     ):
         read_pictures("both.parquet", 9)
     check(read_pictures("both.parquet?column=other", 9), 5)
-    with pytest.raises(ValueError, match=r"no column of pictures 'photos'; did you mean 'photo'"):
+    with pytest.raises(ValueError, match=r"no column of images 'photos'; did you mean 'photo'"):
         read_pictures("both.parquet?column=photos", 9)
 
 
@@ -147,7 +147,7 @@ def test_rows_that_only_point_at_a_file_outside_are_not_followed(places, encoded
     pictures = read_pictures("set/rows.parquet", 12)
     assert len(pictures) == 1
     assert "which is not in the data set" in pictures.skipped[0].reason
-    assert pictures.skipped[1].reason == "no picture in this row"
+    assert pictures.skipped[1].reason == "no image in this row"
 
 
 def test_a_path_wins_and_an_id_that_cannot_be_reached_names_both_readings(places, encoded, monkeypatch):

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from derender.data import read_picture, read_pictures
-from derender.data.stream.address import expand_braces
-from derender.data.stream.shards import find_shards
+from derender.data.shards import expand_braces, find_shards
 
 
 @pytest.fixture(autouse=True)
@@ -76,7 +75,7 @@ def test_names_with_braces_a_folder_and_its_parts(shard, tmp_path):
     assert whole.partition.tolist() == ["train"] * 12 + ["validation"] * 2
     assert len(read_pictures(f"{tmp_path / 'set'}::val", 8)) == 2
     assert len(read_pictures(tmp_path / "set", 8, subset="train", limit=5)) == 5
-    assert len(find_shards(tmp_path / "set")) == 4
+    assert len(find_shards(tmp_path / "set", "set")) == 4
     with pytest.raises(ValueError, match=r"no shards of a part 'tes'; there are set, train, val"):
         read_pictures(f"{tmp_path / 'set'}::tes", 8)
     with pytest.raises(ValueError, match=r"2 of the 5 shards of .* do not exist; the first is .*train-003"):
@@ -133,7 +132,7 @@ def test_several_pictures_in_a_sample_are_a_question(shard):
     )
     with pytest.raises(
         ValueError,
-        match=r"'1' in p\.tar has several pictures \(jpg, seg\.png\); name one: '.*p\.tar\?column=jpg'",
+        match=r"'1' in p\.tar has several images \(jpg, seg\.png\); name one: '.*p\.tar\?column=jpg'",
     ):
         read_pictures(path, 8)
     jpgs = read_pictures(f"{path}?column=jpg", 8)
@@ -211,11 +210,9 @@ def test_it_is_decoded_once_and_again_after_a_change(shard, cache, encoded):
 
 
 def test_nothing_usable_and_an_interruption_leave_nothing(shard, cache, tmp_path):
-    with pytest.raises(ValueError, match=r"no picture in .*e\.tar \(webdataset\) can be read; it is empty"):
+    with pytest.raises(ValueError, match=r"no image in .*e\.tar \(webdataset\): it is empty"):
         read_pictures(shard("e.tar", {}), 8)
-    with pytest.raises(
-        ValueError, match=r"the first is 't\.tar/1': no picture in this sample \(it has txt\)"
-    ):
+    with pytest.raises(ValueError, match=r"the first is 't\.tar/1': no image in this sample \(it has txt\)"):
         read_pictures(shard("t.tar", {"1.txt": "x"}), 8)
     (tmp_path / "folder").mkdir()
     with pytest.raises(ValueError, match="holds no shards"):

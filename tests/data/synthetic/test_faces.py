@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.ndimage import binary_erosion
 
-from derender.data.celebamask import MASK_CLASSES
+from derender.data.layouts.celebamask import MASK_CLASSES
 from derender.data.synthetic import LIGHTS, VIEWS, FaceSettings, LightSettings, ViewSettings, faces
 from derender.data.synthetic.synthetic_set import SyntheticSet, camera_rotation_and_light
 from derender.render import render

@@ -169,7 +169,7 @@ def test_what_is_wrong_is_said_and_the_page_goes_on(page, rendered):
         "#file", {"name": "a.jpg", "mimeType": "image/jpeg", "buffer": b"<svg onload=alert(1)>"}
     )
     page.wait_for_selector("#status.wrong")
-    assert "not a picture" in page.inner_text("#status")
+    assert "not an image" in page.inner_text("#status")
     for number in (1, 2, 0):  # the shelf holds three: the first goes
         page.set_input_files(
             "#file-second",

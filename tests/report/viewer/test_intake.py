@@ -43,10 +43,10 @@ def test_pictures_are_read_whatever_they_are_called(client, form):
     ("content", "status", "words"),
     [
         (b"", 415, "empty"),
-        (b"<html><script>alert(1)</script></html>", 415, "not a picture"),
-        (b'<svg xmlns="http://www.w3.org/2000/svg"><script>alert(1)</script></svg>', 415, "not a picture"),
-        (b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n", 415, "not a picture"),
-        (b"PK\x03\x04" + bytes(99), 415, "not a picture"),
+        (b"<html><script>alert(1)</script></html>", 415, "not an image"),
+        (b'<svg xmlns="http://www.w3.org/2000/svg"><script>alert(1)</script></svg>', 415, "not an image"),
+        (b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n", 415, "not an image"),
+        (b"PK\x03\x04" + bytes(99), 415, "not an image"),
         (saved("PNG")[:60], 415, "damaged"),
         (png_that_claims(60_000, 60_000), 413, "million pixels"),
         (png_that_claims(8160, 6144), 413, "make it smaller"),  # 50 million pixels

@@ -10,7 +10,7 @@ import sys
 import time
 from pathlib import Path
 
-from derender.data import read_pictures, stream_of
+from derender.data import open_images, read_pictures
 from derender.features import DisentangledFeatures, FeatureTable, embed_to_file
 from derender.model import load
 from derender.storage.atomic import atomic_file
@@ -25,7 +25,7 @@ def embed_until_told(folder: Path, model: str) -> None:
     try:
         while True:
             source = folder / ("data.zip" if passes % 2 else "data")
-            with stream_of(source) as stream:
+            with open_images(source) as stream:
                 rows = embed_to_file(net, stream, out, fresh=True).rows
             pictures = read_pictures(source, net.image_size, cache=folder / "cache")
             rows += embed_to_file(net, pictures, out, fresh=True).rows
@@ -39,7 +39,7 @@ def embed_until_told(folder: Path, model: str) -> None:
                 temporary.write_text(str(passes))
             time.sleep(PAUSE_SECONDS)
     except KeyboardInterrupt:
-        with stream_of(folder / "data") as stream:
+        with open_images(folder / "data") as stream:
             embed_to_file(net, stream, out, fresh=True)
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from PIL import Image
 
-from derender.data.decode import DECODER_ERRORS, quiet_pillow
+from derender.data.image import DECODER_ERRORS, quiet_pillow
 from derender.data.source import Source
 
 SAMPLE = 1_000

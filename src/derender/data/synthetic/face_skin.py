@@ -16,7 +16,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from scipy.interpolate import PchipInterpolator
 
-from derender.data.celebamask import MASK_CLASSES
+from derender.data import MASK_CLASSES
 from derender.data.synthetic.face_identity import (
     BEARDS,
     CURTAIN,

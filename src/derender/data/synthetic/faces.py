@@ -12,7 +12,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from numpy import ndarray
 
-from derender.data.celebamask import MASK_CLASSES
+from derender.data import MASK_CLASSES
 from derender.data.synthetic.decals import paint_table
 from derender.data.synthetic.face_draw import NOSE_TIP_Z as NOSE_TIP_Z
 from derender.data.synthetic.face_draw import FaceDraw, draw_face

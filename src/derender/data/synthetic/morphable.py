@@ -28,7 +28,7 @@ import numpy as np
 from jaxtyping import Float32, Int32, UInt8
 from numpy import ndarray
 
-from derender.data.celebamask import MASK_CLASSES
+from derender.data import MASK_CLASSES
 from derender.data.synthetic.face_draw import NOSE_TIP_Z, FaceDraw
 from derender.data.synthetic.face_identity import draw_identity
 from derender.data.synthetic.settings import EXPRESSIONS, FaceSettings

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
-from derender.data import Inventory, open_stream, parse_source, take_inventory
+from derender.data import ListedStream, open_images, parse_source
 from derender.features import FeatureTable
 from derender.report.viewer.intake import pixels_of
 from derender.report.viewer.refused import Refused
@@ -33,16 +33,16 @@ class Gallery:
     def __init__(self, table: FeatureTable, source: str | None = None, dataset: str = "auto"):
         self.table = table
         self.without_pictures = ""
-        self._inventory: Inventory | None = None
+        self._listed: ListedStream | None = None
         place = source if source is not None else str(table.origin.get("data", ""))
         try:
-            self._inventory = _inventory(place, dataset)
+            self._listed = _listed(place, dataset)
         except (ValueError, OSError) as problem:
             if source is not None:
                 raise
             self.without_pictures = " ".join(str(problem).split())
-        listed = () if self._inventory is None else self._inventory.table.files
-        self._position = {file: row for row, file in enumerate(listed)}
+        files = () if self._listed is None else self._listed.table.files
+        self._position = {file: row for row, file in enumerate(files)}
         if source is not None and not any(file in self._position for file in table.files):
             raise ValueError(f"{source} holds none of the table's pictures, such as {table.files[0]!r}")
 
@@ -60,28 +60,28 @@ class Gallery:
         if not 0 <= row < len(self.table):
             raise Refused(404, f"the table has {len(self.table):,} rows, there is no row {row}")
         file = self.table.files[row]
-        if self._inventory is None or file not in self._position:
+        if self._listed is None or file not in self._position:
             raise Refused(404, "the picture of this row is not here: name its place with --data")
-        boxes = self._inventory.table.boxes
+        boxes = self._listed.table.boxes
         box = None if boxes is None else boxes[self._position[file]]
         try:
-            encoded = self._inventory.source.read(file)
+            encoded = self._listed.files.read(file)
         except (ValueError, OSError) as problem:
             raise Refused(404, "the picture of this row can no longer be read") from problem
         return pixels_of(encoded, size, box)
 
     def close(self) -> None:
-        if self._inventory is not None:
-            self._inventory.source.close()
+        if self._listed is not None:
+            self._listed.close()
 
 
-def _inventory(place: str, dataset: str) -> Inventory:
+def _listed(place: str, dataset: str) -> ListedStream:
     if not place:
         raise ValueError("the table does not say where its pictures lie: name the place with --data")
     if not parse_source(place)[0].exists():
         raise ValueError(f"{place} is not here: name the place of the pictures with --data")
-    stream = open_stream(place, dataset=dataset)
-    if stream is not None:
-        stream.close()
-        raise ValueError(f"{place} can only be read from its beginning: pictures of rows are not shown")
-    return take_inventory(place, dataset=dataset)
+    stream = open_images(place, dataset=dataset)
+    if isinstance(stream, ListedStream):
+        return stream
+    stream.close()
+    raise ValueError(f"{place} can only be read from its beginning: pictures of rows are not shown")

@@ -1,0 +1,191 @@
+"""Samples to pixels, in order, on every core, a bounded number on the way; and which pixels came before.
+
+A pool decodes (Pillow does so without Python's lock), and ``ahead`` lets a thread of its own read while
+whoever takes the results computes. The bound counts images, so that memory does not grow with the stream.
+"""
+
+import hashlib
+import os
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import islice
+from typing import TypeVar
+
+import numpy as np
+from jaxtyping import Int64, UInt8
+
+from derender.data.image import Unreadable, decode
+from derender.data.stream import Sample, Stream, Value
+
+T = TypeVar("T")
+
+Progress = Callable[[int, int], object]
+"""Called with (images done, images in all), from the calling thread."""
+
+CHUNK = 32
+"""Images that one thread decodes before it hands them on."""
+
+DIGEST_BYTES = 16
+
+
+@dataclass(frozen=True)
+class Decoded:
+    """A few consecutive samples.
+
+    Attributes:
+        start: the number of the first one in the stream.
+        files: their names.
+        images: (n, 3, S, S) RGB; rows of unreadable images are waste.
+        outcomes: the digest of the pixels, or why there are none.
+        labels: of each sample.
+        partitions: of each sample.
+        share: how much of the stream has been read, 0..1; None where that is unknown.
+    """
+
+    start: int
+    files: tuple[str, ...]
+    images: UInt8[np.ndarray, "n 3 s s"]
+    outcomes: tuple[bytes | Unreadable, ...]
+    labels: tuple[Mapping[str, Value], ...]
+    partitions: tuple[str, ...]
+    share: float | None
+
+    def __len__(self) -> int:
+        return len(self.files)
+
+
+def usable_cores() -> int:
+    """The cores this process may run on."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def decoded(
+    stream: Stream,
+    image_size: int,
+    *,
+    fit: str = "crop",
+    start: int = 0,
+    workers: int | None = None,
+) -> Iterator[Decoded]:
+    """Decode a stream from sample ``start`` on, up to its limit. Wrap in ``quiet_pillow``."""
+    cores = workers or usable_cores()
+    samples = islice(stream.samples(start), None if stream.limit is None else max(0, stream.limit - start))
+    waiting: deque[Future[Decoded]] = deque()
+    pool = ThreadPoolExecutor(cores, thread_name_prefix="decode")
+    try:
+        while chunk := list(islice(samples, CHUNK)):
+            waiting.append(pool.submit(decode_samples, start, chunk, image_size, fit))
+            start += len(chunk)
+            if len(waiting) > 2 * cores:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def decode_samples(start: int, samples: Sequence[Sample], image_size: int, fit: str = "crop") -> Decoded:
+    """Decode consecutive samples, at least one, the first of them number ``start``, in this thread."""
+    images = np.empty((len(samples), 3, image_size, image_size), np.uint8)
+    return Decoded(
+        start,
+        tuple(sample.file for sample in samples),
+        images,
+        tuple(_decode_one(target, sample, fit) for target, sample in zip(images, samples, strict=True)),
+        tuple(sample.labels for sample in samples),
+        tuple(sample.partition for sample in samples),
+        samples[-1].share,
+    )
+
+
+def _decode_one(target: np.ndarray, sample: Sample, fit: str) -> bytes | Unreadable:
+    """Decode one sample into its row and digest its pixels, or say why that cannot be done."""
+    try:
+        encoded = sample.read()
+        if not encoded:
+            return Unreadable("empty file")
+        target[:] = decode(encoded, target.shape[-1], fit, sample.box)
+    except Unreadable as problem:
+        return problem
+    except ValueError as problem:
+        return Unreadable(str(problem))
+    except OSError as problem:
+        return Unreadable(f"cannot be read: {problem.strerror or problem}")
+    return hashlib.blake2b(target.data, digest_size=DIGEST_BYTES).digest()
+
+
+@contextmanager
+def ahead(items: Iterable[T], depth: int = 4) -> Iterator[Iterator[T]]:
+    """Run an iterable in a thread of its own, at most ``depth`` items ahead of whoever takes them.
+
+    What it raises is raised where it is taken. Leaving the block ends the thread.
+    """
+    iterator, end = iter(items), object()
+    pool = ThreadPoolExecutor(1, thread_name_prefix="read")
+    waiting = deque(pool.submit(next, iterator, end) for _ in range(depth))
+
+    def take() -> Iterator[T]:
+        while (item := waiting.popleft().result()) is not end:
+            waiting.append(pool.submit(next, iterator, end))
+            yield item  # pyright: ignore[reportReturnType]
+
+    try:
+        yield take()
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+        if isinstance(iterator, Generator):
+            iterator.close()
+
+
+def estimated_total(done: int, share: float | None, limit: int | None) -> int:
+    """How many samples there will be, judged by the share of the stream that ``done`` of them took."""
+    total = done if not share else max(done, round(done / share))
+    return total if limit is None else min(total, limit)
+
+
+class SeenPixels:
+    """A growing map from the digest of an image to the number of the first row that had it, in 24 bytes each.
+
+    Digests lie in sorted runs, each at least twice as long as the next (a log-structured merge), so that a
+    batch is looked up in all of them by bisection and a run is copied a logarithmic number of times.
+    """
+
+    def __init__(self) -> None:
+        self._runs: list[tuple[np.ndarray, np.ndarray]] = []
+
+    def __len__(self) -> int:
+        return sum(len(digests) for digests, _ in self._runs)
+
+    def first(self, digests: Sequence[bytes], rows: Sequence[int]) -> Int64[np.ndarray, " n"]:
+        """For each digest the row that had it first, itself if new; new ones are remembered.
+
+        Args:
+            digests: sixteen bytes each.
+            rows: the numbers of these images, in order.
+        """
+        keys = np.array(digests, dtype=f"S{DIGEST_BYTES}")
+        numbers = np.array(rows, dtype=np.int64)
+        if not len(keys):
+            return numbers
+        unique, position, inverse = np.unique(keys, return_index=True, return_inverse=True)
+        found = numbers[position]
+        known = np.zeros(len(unique), bool)
+        for run_keys, run_rows in self._runs:
+            place = np.minimum(np.searchsorted(run_keys, unique), len(run_keys) - 1)
+            hit = run_keys[place] == unique
+            found[hit] = run_rows[place[hit]]
+            known |= hit
+        if not known.all():
+            self._add(unique[~known], found[~known])
+        return found[inverse.reshape(-1)]
+
+    def _add(self, keys: np.ndarray, rows: np.ndarray) -> None:
+        while self._runs and len(self._runs[-1][0]) < 2 * len(keys):
+            more_keys, more_rows = self._runs.pop()
+            keys, rows = np.concatenate([more_keys, keys]), np.concatenate([more_rows, rows])
+            order = np.argsort(keys, kind="stable")
+            keys, rows = keys[order], rows[order]
+        self._runs.append((keys, rows))

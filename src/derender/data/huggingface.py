@@ -1,0 +1,243 @@
+"""A Hugging Face data set, streamed: by its id, or as files that the `datasets` library wrote.
+
+The image column is found by its type; class labels become text, texts, numbers and yes/no stay what they
+are, other columns are not read. Nothing but the rows in hand is kept. The library is optional: ``pip
+install 'derender[huggingface]'``.
+
+Not tried against the Hub itself: what is tested are folders in the forms in which the Hub keeps data sets.
+"""
+
+import importlib
+import os
+from collections.abc import Iterator
+from contextlib import suppress
+from functools import partial
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING, Any
+
+from derender.data.layouts.layout import PARTITION_NAMES
+from derender.data.names import printable, suggestion
+from derender.data.source import read_bounded, stamps_of
+from derender.data.stream import Sample, Stream, label_name, unreadable
+
+if TYPE_CHECKING:
+    from datasets import IterableDataset
+
+_ANSWER_SECONDS = 10.0
+_LABEL_KINDS = ("string", "large_string", "int", "uint", "float", "bool")
+
+
+class HuggingFaceStream(Stream):
+    """The rows of one split, or of all of them.
+
+    Args:
+        source: what the user named, for messages.
+        place: a folder or .parquet file; or the id of a data set, "owner/name".
+        split: its name, "all", or None for "train" or the only one there is.
+        column: the image column, or None for the only one there is.
+        config: which configuration of the data set, or None for the only one there is.
+        revision: branch, tag or commit; of an id only.
+    """
+
+    layout = "huggingface"
+
+    def __init__(
+        self,
+        source: str,
+        place: str | Path,
+        *,
+        split: str | None = None,
+        column: str | None = None,
+        config: str | None = None,
+        revision: str | None = None,
+    ):
+        self.source = source
+        self._where = place
+        self.options = (split, column, config)
+        self.revision = revision if isinstance(place, Path) else _commit(place, revision, source)
+        splits = _load(source, place, config, self.revision)
+        names = _chosen(list(splits), split, source)
+        self.column, self._labels = _columns(splits[names[0]], column, source)
+        self.splits = {name: _raw(splits[name], [self.column, *self._labels], self.column) for name in names}
+        self._counts = {name: _count(splits[name]) for name in names}
+
+    def identity(self) -> object:
+        place = self._where
+        if not isinstance(place, Path):
+            return place, self.revision, self.options
+        files = [place] if place.is_file() else sorted(path for path in place.rglob("*") if path.is_file())
+        return self.options, [str(file.resolve()) for file in files], stamps_of(files).tolist()
+
+    @property
+    def place(self) -> str:
+        return super().place if isinstance(self._where, Path) else f"{self._where} {self.options}"
+
+    def samples(self, start: int = 0) -> Iterator[Sample]:
+        known = list(self._counts.values())
+        total = None if None in known else sum(count for count in known if count is not None)
+        before = 0
+        for name, rows in self.splits.items():
+            count = self._counts[name]
+            first = 0 if count is None else min(count, max(0, start - before))
+            row = first - 1
+            for row, values in enumerate(rows.skip(first) if first else rows, first):
+                if before + row >= start:
+                    yield self._sample(name, row, values, (before + row + 1) / total if total else None)
+            before += row + 1
+
+    def _sample(self, split: str, row: int, values: dict[str, Any], share: float | None) -> Sample:
+        image = values[self.column] or {}
+        content, path = image.get("bytes"), image.get("path")
+        name = f"{split}/{row:08d}"
+        if path:
+            name += f"-{printable(PurePosixPath(path.replace(os.sep, '/')).name)}"
+        if content is not None:
+            read = partial(bytes, content)
+        elif path:
+            read = partial(_read_path, path, self._where)
+        else:
+            read = unreadable("no image in this row")
+        labels = {label_name(column): values[column] for column in self._labels}
+        for column, feature in self._labels.items():
+            names, value = getattr(feature, "names", None), values[column]
+            if names is not None and value is not None:
+                labels[label_name(column)] = names[value] if 0 <= value < len(names) else None
+        return Sample(name, read, share, labels, PARTITION_NAMES.get(split.lower(), ""))
+
+
+def _library(source: str) -> Any:
+    try:
+        import datasets
+    except ImportError as problem:
+        raise ValueError(
+            f"reading {source} as a Hugging Face data set needs the package datasets: "
+            "pip install 'derender[huggingface]'"
+        ) from problem
+    return datasets
+
+
+def _commit(identifier: str, revision: str | None, source: str) -> str:
+    """The commit that an id stands for now; asked for first because the library itself retries for long."""
+    _library(source)
+    from huggingface_hub import HfApi, errors
+
+    try:
+        info = HfApi().dataset_info(identifier, revision=revision, timeout=_ANSWER_SECONDS)
+    except errors.GatedRepoError as problem:
+        raise ValueError(
+            f"the data set {identifier} is gated: accept its terms at https://huggingface.co/datasets/"
+            f"{identifier} and log in with 'hf auth login'"
+        ) from problem
+    except errors.RepositoryNotFoundError as problem:
+        raise ValueError(
+            f"the Hugging Face Hub has no data set {identifier} (or it is private): check the id, or log in"
+        ) from problem
+    except errors.HFValidationError as problem:
+        raise ValueError(f"{identifier!r} is no id of a Hugging Face data set ({problem})") from problem
+    except (errors.HfHubHTTPError, OSError, RuntimeError, _transport_error()) as problem:
+        raise ValueError(
+            f"the Hugging Face Hub cannot be asked for {identifier} "
+            f"({type(problem).__name__}): check the network"
+        ) from problem
+    return info.sha or "main"
+
+
+def _transport_error() -> type[Exception]:
+    """What the Hub's client raises where there is no network; it changed its transport more than once."""
+    for name in ("httpx2", "httpx"):
+        with suppress(ImportError):
+            return importlib.import_module(name).HTTPError
+    return OSError  # that of requests is one
+
+
+def _load(source: str, place: str | Path, config: str | None, revision: str | None) -> dict[str, Any]:
+    """Every split as an iterable data set that has read nothing yet."""
+    datasets = _library(source)
+    try:
+        if isinstance(place, Path) and is_saved(place):
+            saved = datasets.load_from_disk(str(place))
+            return dict(saved if isinstance(saved, dict) else {str(saved.split or "train"): saved})
+        if isinstance(place, Path) and place.is_file():
+            return dict(datasets.load_dataset("parquet", data_files=str(place), streaming=True))
+        return dict(datasets.load_dataset(str(place), config, revision=revision, streaming=True))
+    except (datasets.exceptions.DatasetsError, OSError, ValueError, LookupError, TypeError) as problem:
+        reason = (str(problem).strip().splitlines() or [type(problem).__name__])[0]
+        hint = "; name one of its configurations: 'OWNER/NAME?config=NAME'" if "Config name" in reason else ""
+        raise ValueError(f"{source} cannot be read as a Hugging Face data set: {reason}{hint}") from problem
+
+
+def _chosen(splits: list[str], split: str | None, source: str) -> list[str]:
+    if split == "all":
+        return splits
+    if split is None:
+        split = "train" if "train" in splits else splits[0] if len(splits) == 1 else None
+    if split not in splits:
+        hint = f"it has no split {split!r}{suggestion(split, splits)}" if split else "name one of its splits"
+        raise ValueError(f"{source}: {hint}; there are {', '.join(splits)}, and all of them as ::all")
+    return [split]
+
+
+def _columns(rows: Any, column: str | None, source: str) -> tuple[str, dict[str, Any]]:
+    """The image column, and the columns that are labels with their types."""
+    datasets = _library(source)
+    features = rows.features
+    if features is None:  # some forms tell only when rows are read
+        features = rows._resolve_features().features or {}
+    images = [name for name, feature in features.items() if isinstance(feature, datasets.Image)]
+    if not images:
+        kinds = {name: getattr(one, "dtype", None) or type(one).__name__ for name, one in features.items()}
+        there = ", ".join(f"{name} ({kind})" for name, kind in kinds.items()) or "none"
+        raise ValueError(f"{source} has no column of images; its columns are {there}")
+    if column is None and len(images) > 1:
+        left, separator, right = source.partition("::")
+        raise ValueError(
+            f"{source} has several columns of images ({', '.join(images)}); "
+            f"name one: '{left}?column={images[0]}{separator}{right}'"
+        )
+    if column is not None and column not in images:
+        hint = suggestion(column, images)
+        raise ValueError(f"{source} has no column of images {column!r}{hint}; there is {', '.join(images)}")
+    labels = {
+        name: feature
+        for name, feature in features.items()
+        if isinstance(feature, datasets.ClassLabel)
+        or (isinstance(feature, datasets.Value) and feature.dtype.startswith(_LABEL_KINDS))
+    }
+    return column or images[0], labels
+
+
+def _raw(rows: Any, columns: list[str], image: str) -> "IterableDataset":
+    """The rows with these columns only, images as encoded bytes."""
+    datasets = _library("")
+    chosen = rows.select_columns(columns).cast_column(image, datasets.Image(decode=False))
+    return chosen if isinstance(chosen, datasets.IterableDataset) else chosen.to_iterable_dataset()
+
+
+def _count(rows: Any) -> int | None:
+    """The number of rows, where it is known without reading them."""
+    if hasattr(rows, "num_rows"):
+        return rows.num_rows
+    split = (rows.info.splits or {}).get(str(rows.split)) if rows.split is not None else None
+    return split.num_examples if split is not None and split.num_examples else None
+
+
+def _read_path(path: str, place: str | Path) -> bytes:
+    """An image that the row only points at: on the Hub, or inside the local data set; never elsewhere."""
+    if "://" in path:
+        import fsspec
+
+        with fsspec.open(path, "rb") as stream:
+            return stream.read()  # pyright: ignore[reportAttributeAccessIssue]
+    if isinstance(place, Path):
+        inside = place if place.is_dir() else place.parent
+        file = inside / path
+        if file.resolve().is_relative_to(inside.resolve()) and file.is_file():
+            return read_bounded(file)
+    raise ValueError(f"the row holds no image, only the path {path!r}, which is not in the data set")
+
+
+def is_saved(folder: Path) -> bool:
+    """Whether a folder was written by ``save_to_disk``."""
+    return (folder / "dataset_dict.json").is_file() or (
+        (folder / "state.json").is_file() and (folder / "dataset_info.json").is_file()
+    )

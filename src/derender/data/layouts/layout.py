@@ -1,0 +1,214 @@
+"""What a data set's layout is, and what all of them read alike: folders, lists, tables, official parts.
+
+Labels are columns aligned with the files. Text columns are string arrays with "" where unknown; numbers are
+float32 with NaN where unknown; yes/no attributes are int8 with 1 yes, 0 no, -1 unknown.
+"""
+
+import csv
+import io
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import PurePosixPath
+
+import numpy as np
+from jaxtyping import Float32
+
+from derender.data.source import Skipped, Source
+
+Labels = dict[str, np.ndarray]
+
+PARTITION_NAMES = {
+    **dict.fromkeys(("train", "training"), "train"),
+    **dict.fromkeys(("val", "valid", "validation", "dev"), "validation"),
+    **dict.fromkeys(("test", "testing", "eval"), "test"),
+}
+"""What people call the parts of a split, and what they are called here."""
+
+MOSTLY = 0.9
+"""Share of the images that must look right for a layout to be recognised: real sets hold a few odd names."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """The images of a data set before any is decoded.
+
+    Attributes:
+        files: images, as named by the source.
+        labels: columns by name, one value per file.
+        partition: the owners' own split of each file ("train", "validation", "test"; "" unknown), or None.
+        boxes: (N, 4) left, top, right, bottom of the part of each image that is read, in pixels of the
+            upright image, or None for whole images. NaN: no box is known, and the image is passed over.
+        skipped: images that a user's own list names and that are not there, with reasons.
+    """
+
+    files: tuple[str, ...]
+    labels: Labels = field(default_factory=dict)
+    partition: np.ndarray | None = None
+    boxes: Float32[np.ndarray, "n 4"] | None = None
+    skipped: tuple[Skipped, ...] = ()
+
+    def select(self, rows: np.ndarray) -> "Table":
+        """The same table with only these rows."""
+        return Table(
+            tuple(self.files[row] for row in rows),
+            {name: column[rows] for name, column in self.labels.items()},
+            None if self.partition is None else self.partition[rows],
+            None if self.boxes is None else self.boxes[rows],
+            self.skipped,
+        )
+
+
+@dataclass(frozen=True)
+class Layout:
+    """One row of ``LAYOUTS``.
+
+    Attributes:
+        name: what the user writes to ask for this layout.
+        title: what it is, in a few words.
+        home: where the owners publish it; "" for layouts without owners.
+        recognise: whether a source looks like it, from the names of its files (and a header line).
+        read: the table of one subset; None asks for the default. An error names the file that is missing.
+        terms: on what terms the owners give it, in a few words; "" for layouts without owners.
+    """
+
+    name: str
+    title: str
+    home: str
+    recognise: Callable[[Source], bool]
+    read: Callable[[Source, str | None], Table]
+    terms: str = ""
+
+
+def base_name(file: str) -> str:
+    """A file's name without its folders."""
+    return file.rpartition("/")[2]
+
+
+def parent_name(file: str) -> str:
+    """The name of the folder that a file lies in, "" at the top."""
+    return file.rpartition("/")[0].rpartition("/")[2]
+
+
+def images_of(source: Source, subset: str | None = None) -> tuple[str, ...]:
+    """Every image of the source, or those in a folder ``subset`` at any depth."""
+    if subset is None:
+        return source.images
+    inside = tuple(file for file in source.images if f"/{subset.strip('/')}/" in f"/{file}")
+    if not inside:
+        folders = sorted({PurePosixPath(file).parts[0] for file in source.images if "/" in file})
+        known = f"its folders are {', '.join(folders[:8])}" if folders else "it has no folders with images"
+        raise ValueError(f"{source.path} has no images in a folder {subset!r}; {known}")
+    return inside
+
+
+def all_match(
+    source: Source, files: Sequence[str], pattern: re.Pattern[str], error: str
+) -> list[re.Match[str]]:
+    """The match of every file's whole name; one that has none is named before ``error``."""
+    matches = [pattern.fullmatch(file) for file in files]
+    if None in matches:
+        raise ValueError(f"{source.path}: {files[matches.index(None)]} {error}")
+    return [match for match in matches if match is not None]
+
+
+def partition_by_folder(file: str) -> str:
+    """The partition that the outermost folder of such a name stands for, or ""."""
+    folders = (folder.lower() for folder in file.split("/")[:-1])
+    return next((PARTITION_NAMES[folder] for folder in folders if folder in PARTITION_NAMES), "")
+
+
+def partition_column(values: Iterable[str]) -> np.ndarray | None:
+    """A column of partitions, or None where all are unknown."""
+    column = text_column(values)
+    return column if (column != "").any() else None
+
+
+def part_of(table: Table, source: Source, subset: str | None, needed: str) -> Table:
+    """The rows of one part of the official split, or all; ``needed`` is the file that gives the split."""
+    if subset is None:
+        return table
+    if table.partition is None:
+        raise ValueError(f"{source.path} has no official split, so no subset {subset!r}: {needed} is missing")
+    rows = np.flatnonzero(table.partition == PARTITION_NAMES.get(subset.lower(), ""))
+    if not len(rows) or subset.lower() not in PARTITION_NAMES:
+        known = sorted(set(table.partition.tolist()) - {""})
+        raise ValueError(f"{source.path} has no subset {subset!r}; there are {', '.join(known) or 'none'}")
+    return table.select(rows)
+
+
+def one_of(source: Source, subset: str | None, default: str, names: Iterable[str]) -> str:
+    """The subset that was asked for, else the default or the only one; none of that is an error."""
+    known = list(names)
+    if subset is None:
+        subset = default if default in known else known[0] if len(known) == 1 else None
+    if subset not in known:
+        problem = "name one of its subsets" if subset is None else f"it has no subset {subset!r}"
+        raise ValueError(f"{source.path}: {problem}; there are {', '.join(map(repr, known))}")
+    return subset
+
+
+def count_unknown(column: np.ndarray) -> int:
+    """How many values of a column of labels are unknown: "", NaN, or -1 of a yes/no attribute."""
+    if column.dtype.kind == "U":
+        return int((column == "").sum())
+    return int(np.isnan(column).sum()) if column.dtype.kind == "f" else int((column == -1).sum())
+
+
+def text_column(values: Iterable[str]) -> np.ndarray:
+    return np.array(list(values), dtype=np.str_)
+
+
+def number_column(values: Iterable[float]) -> np.ndarray:
+    return np.array(list(values), dtype=np.float32)
+
+
+def read_csv(source: Source, file: str, required: Sequence[str] = ()) -> list[Mapping[str, str]]:
+    """The rows of a CSV file with a header; a missing column or a ragged row is an error that names it."""
+    reader = csv.DictReader(io.StringIO(source.read_text(file), newline=""))
+    try:
+        header = [name.strip() for name in reader.fieldnames or ()]
+        reader.fieldnames = header
+        rows = [(reader.line_num, row) for row in reader]
+    except csv.Error as problem:
+        raise ValueError(f"{file} in {source.path} is no CSV table ({problem})") from problem
+    missing = [name for name in required if name not in header]
+    if missing:
+        raise ValueError(
+            f"{file} in {source.path} has no column {missing[0]!r}; its columns are {', '.join(header)}"
+        )
+    for number, row in rows:
+        if None in row or None in row.values():
+            raise ValueError(
+                f"{file} in {source.path}, line {number}: expected {len(header)} values as in the header"
+            )
+    return [row for _, row in rows]
+
+
+def header_of(source: Source, file: str) -> list[str]:
+    """The column names in the first line of a CSV file, or none if it is not text."""
+    try:
+        return [name.strip() for name in source.read_text(file).split("\n", 1)[0].split(",")]
+    except (ValueError, OSError):
+        return []
+
+
+def read_list(
+    source: Source, file: str, row: str, expected: str, header: str | None = None
+) -> list[tuple[int, tuple[str, ...]]]:
+    """The lines of a list, each as its number and the groups of the pattern ``row``; empty ones are left out.
+
+    A line that does not fit, or a first line that does not fit the pattern ``header``, is an error that says
+    what was ``expected``.
+    """
+    rows, pattern = [], re.compile(row)
+    for number, line in enumerate(source.read_text(file).splitlines() or [""], 1):
+        is_header = number == 1 and header is not None
+        match = re.fullmatch(header or "", line.strip()) if is_header else pattern.fullmatch(line.strip())
+        if match is None and (line.strip() or is_header):
+            raise ValueError(
+                f"{file} in {source.path}, line {number}: expected {expected}, got {line.strip()!r}"
+            )
+        if match is not None and not is_header:
+            rows.append((number, match.groups()))
+    return rows

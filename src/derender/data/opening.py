@@ -1,0 +1,261 @@
+"""From what the user wrote to a stream of images.
+
+A path (of a folder, a zip, an image, a table of paths) may be followed by ``::PART``: a part of the
+official split or any folder. ``shards-{000..009}.tar``, a ``.tar``, a folder of them, ``owner/name`` of a
+Hugging Face data set, a folder or ``.parquet`` in a form of its library are read from front to back; they
+take ``?column=NAME`` (also ``config``, ``revision``) before ``::PART``. A path that exists is always a
+path.
+"""
+
+import hashlib
+import os
+import re
+from collections import Counter
+from collections.abc import Iterator
+from functools import partial
+from itertools import islice
+from pathlib import Path, PurePosixPath
+from urllib.parse import parse_qsl
+
+import numpy as np
+
+from derender.data.folder_source import FolderSource
+from derender.data.huggingface import HuggingFaceStream, is_saved
+from derender.data.layouts import layout_named, recognise
+from derender.data.layouts.layout import Layout, Table
+from derender.data.layouts.tables import TableSource, holds_paths, is_table
+from derender.data.names import SUFFIXES, is_hidden, is_picture, suggestion
+from derender.data.shards import SHARD_SUFFIXES, ShardStream, find_shards, part_of_shards
+from derender.data.source import FileSource, Source, nearest_sibling
+from derender.data.stream import Sample, Stream
+from derender.data.zip_source import ZipSource, is_zip
+
+STREAMED = ("webdataset", "huggingface")
+"""The layouts that are read from front to back, by the names one can ask for them."""
+
+_IDENTIFIER = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
+_OPTIONS = ("column", "config", "revision")
+_ENTRIES_LOOKED_AT = 10_000
+_HASHED_AT_ONCE = 10_000
+
+
+class ListedStream(Stream):
+    """The images of a folder, zip or table, in the order of its layout; all are known beforehand.
+
+    Attributes:
+        files: where they are read; closed with the stream.
+    """
+
+    def __init__(self, files: Source, layout: Layout, table: Table, subset: str | None = None):
+        self.files = files
+        self.layout, self.terms = layout.name, layout.terms
+        self._table = table
+        self.source = str(files.path) if subset is None else f"{files.path}::{subset}"
+        self.passed_over = (*files.skipped, *table.skipped)
+
+    @property
+    def table(self) -> Table:
+        return self._table
+
+    def samples(self, start: int = 0) -> Iterator[Sample]:
+        table, count = self.table, len(self.table.files)
+        for row in range(start, count):
+            file, box = table.files[row], None if table.boxes is None else table.boxes[row]
+            yield Sample(file, partial(self.files.read, file), (row + 1) / count, box=box)
+
+    def identity(self) -> object:
+        """A digest of the layout, and of the name, size and checksum or time of change of every image."""
+        files, boxes = self.table.files, self.table.boxes
+        digest = hashlib.sha256(repr((self.layout, None if boxes is None else boxes.tobytes())).encode())
+        stamps = self.files.stamps(files)
+        for first in range(0, len(files), _HASHED_AT_ONCE):
+            some = slice(first, first + _HASHED_AT_ONCE)
+            rows = zip(files[some], stamps[some].tolist(), strict=True)
+            digest.update("".join(f"({file!r}, {stamp})" for file, stamp in rows).encode("utf-8"))
+        return digest.hexdigest()
+
+    def close(self) -> None:
+        self.files.close()
+
+
+def open_images(
+    source: str | Path, *, dataset: str = "auto", subset: str | None = None, limit: int | None = None
+) -> Stream:
+    """Any source of images as a stream; close it after use.
+
+    Args:
+        source: what the user wrote.
+        dataset: the layout's name, or "auto" to recognise it.
+        subset: the part, if it is not in ``source``.
+        limit: at most so many images: evenly spaced where it is known what there is, else the first.
+    """
+    if dataset in ("auto", *STREAMED):
+        place, options, part = _parsed(str(source))
+        path = Path(place).expanduser()
+        kind = dataset if dataset != "auto" else _kind_of(path, place)
+        if kind is not None:
+            part = _only_part(source, part, subset)
+            open_kind = _open_shards if kind == "webdataset" else _open_hugging_face
+            stream = open_kind(str(source), place, path, options, part)
+            stream.limit = limit
+            return stream
+    return list_images(source, dataset=dataset, subset=subset, limit=limit)
+
+
+def list_images(
+    source: str | Path, *, dataset: str = "auto", subset: str | None = None, limit: int | None = None
+) -> ListedStream:
+    """Open a folder, zip, image or table, recognise its layout (or take the one named), and read its labels.
+
+    No image at all is an error that says what is there instead. The arguments are those of ``open_images``.
+    """
+    layout = None if dataset == "auto" else layout_named(dataset)
+    path, part = parse_source(source)
+    subset = _only_part(source, part, subset)
+    files = open_source(path)
+    try:
+        layout = layout or (layout_named(files.recognised) if files.recognised else recognise(files))
+        if dataset == "auto":
+            files.recognised = layout.name
+        table = layout.read(files, subset)
+        if not table.files:
+            raise ValueError(_nothing_found(files))
+        files.remember()
+    except BaseException:
+        files.close()
+        raise
+    if limit is not None and limit < len(table.files):
+        table = table.select(np.linspace(0, len(table.files) - 1, limit).astype(int))
+    return ListedStream(files, layout, table, subset)
+
+
+def open_source(path: Path) -> Source:
+    """Open a folder, zip, image or table; anything else is an error that says what to give instead."""
+    if not path.exists():
+        raise ValueError(f"{path} does not exist{nearest_sibling(path)}")
+    if path.is_dir():
+        return FolderSource(path)
+    if is_table(path):
+        return TableSource(path)
+    if path.suffix.lower() in SUFFIXES:
+        return FileSource(path)
+    if path.is_file() and (path.suffix.lower() == ".zip" or is_zip(path)):
+        return ZipSource(path)
+    raise ValueError(
+        f"{path} is no folder, zip or image ({' '.join(SUFFIXES)}); unpack other archives into a folder"
+    )
+
+
+def parse_source(source: str | Path) -> tuple[Path, str | None]:
+    """Split ``PATH::SUBSET`` into its two parts; a path that exists as written is taken as it is."""
+    path = Path(source).expanduser()
+    left, separator, right = str(path).rpartition("::")
+    if not separator or path.exists():
+        return path, None
+    if not left or not right:
+        raise ValueError(f"{source!s} should read PATH::SUBSET, with both parts")
+    return Path(left), right
+
+
+def _only_part(source: str | Path, part: str | None, subset: str | None) -> str | None:
+    if part is not None and subset is not None and part != subset:
+        raise ValueError(f"{source} names the part {part!r}, but subset={subset!r} was given too; give one")
+    return subset if part is None else part
+
+
+def _nothing_found(files: Source) -> str:
+    """What was looked for, where, and what lies there instead."""
+    kinds = Counter(PurePosixPath(file).suffix.lower() or "no suffix" for file in files.files)
+    found = ", ".join(f"{count:,} of {kind}" for kind, count in kinds.most_common(5)) or "no files at all"
+    hint = "; to read an archive in it, name that file itself" if ".zip" in kinds else ""
+    if files.skipped:
+        first = files.skipped[0]
+        hint += f"; passed over {len(files.skipped):,}, the first is {first.file!r}: {first.reason}"
+    return f"no images found in {files.path}: looked for {' '.join(SUFFIXES)}; found {found}{hint}"
+
+
+def _open_shards(
+    source: str, place: str, path: Path, options: dict[str, str], part: str | None
+) -> ShardStream:
+    if set(options) - {"column"}:
+        raise ValueError(f"{source}: shards take ?column=NAME only")
+    shards = find_shards(path, source)
+    if part is not None:
+        shards = part_of_shards(shards, part, place)
+    return ShardStream(source, shards, options.get("column"))
+
+
+def _open_hugging_face(
+    source: str, place: str, path: Path, options: dict[str, str], part: str | None
+) -> HuggingFaceStream:
+    if path.exists():
+        return HuggingFaceStream(source, path, split=part, **options)
+    if not _IDENTIFIER.fullmatch(place):
+        raise ValueError(f"{place!r} is no folder here and no id of a Hugging Face data set (OWNER/NAME)")
+    try:
+        return HuggingFaceStream(source, place, split=part, **options)
+    except ValueError as problem:
+        raise ValueError(f"{place} does not exist here{nearest_sibling(path)}; and {problem}") from problem
+
+
+def _parsed(text: str) -> tuple[str, dict[str, str], str | None]:
+    """Place, options and part of ``PLACE?column=NAME::PART``; a path that exists is all place."""
+    if Path(text).expanduser().exists():
+        return text, {}, None
+    left, separator, part = text.rpartition("::")
+    if not separator:
+        left, part = text, ""
+    place, question, query = left.partition("?")
+    if not question or (Path(left).expanduser().exists()):
+        return left, {}, part if separator else None
+    options = dict(parse_qsl(query, keep_blank_values=True))
+    for name in options:
+        if name not in _OPTIONS:
+            raise ValueError(
+                f"{text}: unknown option {name!r}{suggestion(name, _OPTIONS)} (known: {', '.join(_OPTIONS)})"
+            )
+    return place, options, part if separator else None
+
+
+def _kind_of(path: Path, written: str) -> str | None:
+    """One of ``STREAMED`` by a place's name as written, or a folder's by the first files in it; or None."""
+    if path.is_dir():
+        return "huggingface" if is_saved(path) else _kind_of_folder(path)
+    if path.exists():
+        name = path.name.lower()
+        if name.endswith(SHARD_SUFFIXES):
+            return "webdataset"
+        return "huggingface" if name.endswith(".parquet") and not holds_paths(path) else None
+    if "{" in str(path) and str(path).endswith(SHARD_SUFFIXES):
+        return "webdataset"
+    known = (".zip", ".parquet", ".csv", *SHARD_SUFFIXES)
+    could_be_one = _IDENTIFIER.fullmatch(written) and not is_picture(written)
+    return "huggingface" if could_be_one and not written.lower().endswith(known) else None
+
+
+def _kind_of_folder(folder: Path) -> str | None:
+    """Shards or a library's files, if no image lies among the first files in it."""
+    kind = None
+    for name in islice(_names(folder), _ENTRIES_LOOKED_AT):
+        if is_picture(name):
+            return None
+        if name.lower().endswith(SHARD_SUFFIXES):
+            kind = kind or "webdataset"
+        elif name.lower().endswith(".parquet"):
+            kind = kind or "huggingface"
+    return kind
+
+
+def _names(folder: Path) -> Iterator[str]:
+    """Names of the files below a folder, its own first, no more of them looked up than are taken."""
+    waiting = [str(folder)]
+    while waiting:
+        try:
+            with os.scandir(waiting.pop(0)) as entries:
+                for entry in entries:
+                    if entry.is_dir(follow_symlinks=False):
+                        waiting += [] if is_hidden(entry.name) else [entry.path]
+                    else:
+                        yield entry.name
+        except OSError:  # whoever reads the folder says what is wrong with it
+            continue

@@ -1,0 +1,146 @@
+"""Images one after another, in a fixed order, named and not yet decoded, with the labels they bring."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from derender.data.layouts.layout import Table, number_column, text_column
+from derender.data.source import Skipped
+
+S = TypeVar("S", bound="Stream")
+Value = str | int | float | bool | None
+"""One label of one image; None is unknown."""
+
+_EXACT_IN_FLOAT32 = 1 << 24
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One image on its way.
+
+    Attributes:
+        file: its name, unique in the stream.
+        read: gives its encoded bytes, or raises ValueError or OSError with the reason. Any thread may call
+            it, once.
+        share: how much of the stream lies before the next sample, 0..1; None where that is unknown.
+        labels: value by column; a column that is not here is unknown for this image.
+        partition: the owners' own split ("train", "validation", "test"), or "".
+        box: the part of the image that is read (``Table.boxes``), or None for all of it.
+    """
+
+    file: str
+    read: Callable[[], bytes]
+    share: float | None = None
+    labels: Mapping[str, Value] = field(default_factory=dict)
+    partition: str = ""
+    box: np.ndarray | None = None
+
+
+class Stream(ABC):
+    """Samples in a fixed order.
+
+    Attributes:
+        source: what the user named.
+        layout: "webdataset", "huggingface", or the layout of a folder or zip.
+        terms: on what terms the owners of a published set give it, in a few words.
+        passed_over: files that are known beforehand to be no use.
+        limit: read only the first so many samples; None for all.
+    """
+
+    source: str
+    layout: str
+    terms: str = ""
+    passed_over: tuple[Skipped, ...] = ()
+    limit: int | None = None
+
+    @abstractmethod
+    def samples(self, start: int = 0) -> Iterator[Sample]:
+        """The samples from number ``start`` on; of one that cannot be read, ``read`` raises."""
+
+    @abstractmethod
+    def identity(self) -> object:
+        """Something whose ``repr`` changes when the content does (sizes, times, a revision)."""
+
+    @property
+    def table(self) -> Table | None:
+        """Names and labels of every sample where they are known beforehand; None: each brings its own."""
+        return None
+
+    @property
+    def place(self) -> str:
+        """Where it is, the same from every folder one may work in."""
+        return str(Path(self.source).absolute())
+
+    def close(self) -> None:  # noqa: B027  (most hold nothing open)
+        """Release what the stream holds open."""
+
+    def __enter__(self: S) -> S:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+
+def unreadable(reason: str) -> Callable[[], bytes]:
+    """A ``Sample.read`` of an image that is known to be no use."""
+
+    def refuse() -> bytes:
+        raise ValueError(reason)
+
+    return refuse
+
+
+def label_name(name: str) -> str:
+    """A column's name as a label: ``file`` is taken by our own names, so it becomes ``original_file``."""
+    return "original_file" if name == "file" else name
+
+
+class Kind(StrEnum):
+    """What a column of labels holds."""
+
+    TEXT = "text"
+    NUMBER = "number"
+    FLAG = "flag"
+
+
+class Kinds(dict[str, Kind | None]):
+    """The kind of each column so far; None while only unknown values were seen.
+
+    A column of several kinds is text, and so are whole numbers that float32 cannot hold (above 2^24:
+    identifiers, as a rule).
+    """
+
+    def see(self, labels: Mapping[str, Value]) -> None:
+        """Take one image's labels into account."""
+        for name, value in labels.items():
+            self.join(name, _kind(value))
+
+    def join(self, name: str, kind: Kind | None) -> None:
+        """Take a kind into account that a column has elsewhere."""
+        known = self.get(name)
+        self[name] = kind if known is None else known if kind in (None, known) else Kind.TEXT
+
+
+def column_of(name: str, rows: Iterable[Mapping[str, Value]], kind: Kind | str | None) -> np.ndarray:
+    """One column of labels of a given kind; unknown values are "", NaN or -1."""
+    values: Sequence[Value] = [row.get(name) for row in rows]
+    if kind == Kind.NUMBER:
+        return number_column(np.nan if value is None else float(value) for value in values)
+    if kind == Kind.FLAG:
+        return np.array([-1 if value is None else int(value) for value in values], np.int8)
+    return text_column("" if value is None else str(value) for value in values)
+
+
+def _kind(value: Value) -> Kind | None:
+    if value is None:
+        return None
+    if isinstance(value, bool):
+        return Kind.FLAG
+    if isinstance(value, int):
+        return Kind.NUMBER if abs(value) <= _EXACT_IN_FLOAT32 else Kind.TEXT
+    return Kind.NUMBER if isinstance(value, float) else Kind.TEXT

@@ -1,0 +1,257 @@
+"""Parquet footers: what pyarrow finds in good ones; false counts are refused before memory is taken."""
+
+import io
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from derender.data import check_lists, checked_footer, list_images
+from derender.data.parquet import ALWAYS_ALLOWED_BYTES, Footer, read_footer
+from derender.features import FeatureTable
+
+ROWS, WIDTH = 3, 4
+CLAIMED = 2**26
+"""Enough to be seen: where nothing is bounded, this many rows take 650 MB for a file of 2 kB."""
+
+
+@pytest.fixture
+def table(tmp_path) -> Path:
+    numbers = np.random.default_rng(0)
+    return FeatureTable(
+        ("a", "b", "c"),
+        {"geometry": numbers.normal(size=(ROWS, WIDTH))},
+        {"age": np.array([1.0, 2, 3]), "name": np.array(["x", "y", "z"])},
+    ).write(tmp_path / "F.parquet")
+
+
+def number(value: int) -> bytes:
+    """A 64-bit field right behind the one before it, as Thrift's compact protocol writes it."""
+    value, out = (2 * value if value >= 0 else -2 * value - 1), b"\x16"
+    while value > 127:
+        out += bytes([value & 127 | 128])
+        value >>= 7
+    return out + bytes([value])
+
+
+def with_claims(content: bytes, old: int, new: int, which: list[int] | None = None) -> bytes:
+    """A file in whose footer some of the places where ``old`` stands as a 64-bit number say ``new``."""
+    length = int.from_bytes(content[-8:-4], "little")
+    body, footer = content[: -8 - length], content[-8 - length : -8]
+    pieces = footer.split(number(old))
+    changed = pieces[0]
+    for place, piece in enumerate(pieces[1:]):
+        changed += number(new if which is None or place in which else old) + piece
+    return body + changed + len(changed).to_bytes(4, "little") + b"PAR1"
+
+
+def claim(content: bytes) -> str | None:
+    stream = io.BytesIO(content)
+    try:
+        footer = checked_footer(stream, len(content))
+        check_lists(footer, pq.ParquetFile(stream).schema_arrow, len(content))
+    except ValueError as problem:
+        return str(problem)
+    return None
+
+
+def damaged(content: bytes, old: int, new: int) -> dict[int, bytes]:
+    """One file for each place where a number stands."""
+    places = content[-8 - int.from_bytes(content[-8:-4], "little") :].count(number(old))
+    return {place: with_claims(content, old, new, [place]) for place in range(places)}
+
+
+def test_files_as_they_are_written_claim_nothing_false(table, tmp_path):
+    assert claim(table.read_bytes()) is None
+    stream = io.BytesIO()
+    lists = pa.array([[1.0], None, [], [2.0, 3.0]], pa.list_(pa.float64()))
+    elsewhere = pa.table({"f": lists, "n": [None, 1, 2, 3], "s": ["a", None, "b", "c"]})
+    pq.write_table(elsewhere, stream, row_group_size=2, compression="zstd")
+    assert claim(stream.getvalue()) is None
+    empty = FeatureTable((), {"f": np.zeros((0, 3))}).write(tmp_path / "empty.parquet")
+    assert claim(empty.read_bytes()) is None
+
+
+def test_features_that_are_all_the_same_are_read(tmp_path):
+    constant = FeatureTable(tuple(map(str, range(20_000))), {"f": np.zeros((20_000, 64))})
+    path = constant.write(tmp_path / "constant.parquet")
+    assert 20 * path.stat().st_size < 20_000 * 64 * 4
+    assert FeatureTable.read(path).factors["f"].shape == (20_000, 64)
+
+
+def test_the_row_count_that_made_the_reader_ask_for_eighteen_gigabytes_is_refused(table):
+    whole = table.read_bytes()
+    asked = {
+        place: content
+        for place, content in damaged(whole, ROWS, CLAIMED).items()
+        if pq.ParquetFile(io.BytesIO(content)).metadata.row_group(0).num_rows == CLAIMED
+    }
+    assert len(asked) == 1
+    (content,) = asked.values()
+    before = pa.default_memory_pool().max_memory()
+    table.write_bytes(content)
+    with pytest.raises(ValueError, match=r"F.parquet is damaged \(3 values of file in 67,108,864 rows\)"):
+        FeatureTable.read(table)
+    assert pa.default_memory_pool().max_memory() - before < 2**24
+
+
+def test_every_single_count_that_is_changed_is_refused_or_harmless(table):
+    whole = table.read_bytes()
+    expected = FeatureTable.read(table)
+    refused = 0
+    for old in (ROWS, ROWS * WIDTH):
+        for content in damaged(whole, old, 2**40).values():
+            table.write_bytes(content)
+            try:
+                found = FeatureTable.read(table)
+            except ValueError as error:
+                assert "is damaged" in str(error)
+                refused += 1
+            else:  # a statistic, which nobody reads
+                np.testing.assert_array_equal(found.factors["geometry"], expected.factors["geometry"])
+    assert refused >= 6  # rows of the file and of its group, values of four columns
+
+
+def test_counts_that_agree_with_each_other_are_held_against_the_size_of_the_file(table):
+    rows = ALWAYS_ALLOWED_BYTES // 8
+    content = with_claims(table.read_bytes(), ROWS, rows)
+    content = with_claims(content, ROWS * WIDTH, rows * WIDTH)
+    found = pq.ParquetFile(io.BytesIO(content)).metadata
+    assert found.num_rows == found.row_group(0).num_rows == found.row_group(0).column(0).num_values == rows
+    assert "bytes of values in a file of" in (claim(content) or "")
+
+
+def test_columns_larger_than_the_file_are_refused(table):
+    whole = table.read_bytes()
+    sizes = pq.ParquetFile(io.BytesIO(whole)).metadata.row_group(0).column(1).total_compressed_size
+    told = {claim(content) for content in damaged(whole, sizes, 10**6).values()}
+    assert any(one is not None and "bytes of columns in a file of" in one for one in told)
+    told = {claim(content) for content in damaged(whole, sizes, -1).values()}
+    assert "a size of geometry.list.element below zero" in told
+
+
+def test_a_list_of_pictures_is_held_to_the_same(tmp_path):
+    stream = io.BytesIO()
+    pq.write_table(pa.table({"path": ["a.png", "b.png", "c.png"], "age": [1, 2, 3]}), stream)
+    path = tmp_path / "labels.parquet"
+    path.write_bytes(with_claims(stream.getvalue(), 3, CLAIMED, None))
+    with pytest.raises(ValueError, match=r"labels.parquet .* is damaged \("):
+        list_images(path)
+
+
+def written(table: pa.Table, **how) -> bytes:
+    stream = io.BytesIO()
+    pq.write_table(table, stream, **how)
+    return stream.getvalue()
+
+
+def footer_of(content: bytes) -> Footer:
+    return read_footer(io.BytesIO(content), len(content))
+
+
+@pytest.fixture(scope="module")
+def columns() -> pa.Table:
+    rows = 40
+    return pa.table(
+        {
+            "file": [f"{row}.png" for row in range(rows)],
+            "yes": [row % 2 == 0 for row in range(rows)],
+            "age": pa.array([None if row % 3 else row for row in range(rows)], pa.int32()),
+            "when": pa.array([row / 3 for row in range(rows)]),
+            "fixed": pa.array([b"abcde"] * rows, pa.binary(5)),
+            "code": pa.array([[1.0, 2.0, 3.0]] * rows, pa.list_(pa.float32(), 3)),
+            "deep": pa.array([{"a": [row] * (row % 4), "b": "x"} for row in range(rows)]),
+            "by_name": pa.array([[("k", row)] for row in range(rows)], pa.map_(pa.string(), pa.int64())),
+        }
+    )
+
+
+@pytest.mark.parametrize(
+    "how",
+    [
+        {},
+        {"row_group_size": 7},
+        {"compression": "zstd", "write_statistics": False},
+        {"write_page_index": True, "write_page_checksum": True, "version": "1.0"},
+        {"sorting_columns": [pq.SortingColumn(0)], "use_dictionary": False},
+        {"bloom_filter_options": {"file": {"ndv": 40}}},
+    ],
+)
+def test_good_footers_say_what_pyarrow_finds_in_them(columns, how):
+    try:
+        content = written(columns, **how)
+    except TypeError:
+        pytest.skip(f"this pyarrow cannot write {how}")
+    found, expected = footer_of(content), pq.ParquetFile(io.BytesIO(content)).metadata
+    assert found.rows == expected.num_rows == 40
+    assert len(found.groups) == expected.num_row_groups
+    names = [expected.schema.column(number).path for number in range(expected.num_columns)]
+    assert [leaf.name for leaf in found.leaves] == names
+    for number, leaf in enumerate(found.leaves):
+        kind = expected.schema.column(number)
+        assert leaf.repeated == (kind.max_repetition_level > 0)
+        assert leaf.length == (5 if leaf.name == "fixed" else 0)
+    for place, group in enumerate(found.groups):
+        theirs = expected.row_group(place)
+        assert group.rows == theirs.num_rows
+        for number, chunk in enumerate(group.chunks):
+            column = theirs.column(number)
+            assert chunk.values == column.num_values
+            assert chunk.compressed == column.total_compressed_size
+            assert chunk.uncompressed == column.total_uncompressed_size
+
+
+def test_no_footer_is_told_from_a_damaged_one(columns):
+    content = written(columns)
+    for none in (b"", b"PAR1", b"text" * 10, content[:-1], content[:-4] + b"PARE"):
+        with pytest.raises(OSError, match="no parquet footer"):
+            footer_of(none)
+    length = int.from_bytes(content[-8:-4], "little")
+    for shorter in (0, 1, length // 3, length - 1):
+        with pytest.raises(ValueError):
+            footer_of(
+                content[: -8 - length]
+                + content[-8 - length :][:shorter]
+                + shorter.to_bytes(4, "little")
+                + b"PAR1"
+            )
+
+
+def test_every_changed_byte_is_refused_or_read_and_never_more_than_that(columns):
+    content = written(columns)
+    length = int.from_bytes(content[-8:-4], "little")
+    draw, refused = np.random.default_rng(0), 0
+    for place in draw.integers(len(content) - 8 - length, len(content) - 8, 600):
+        changed = bytearray(content)
+        changed[place] = draw.integers(256)
+        try:
+            footer_of(bytes(changed))
+        except ValueError:
+            refused += 1
+    assert refused > 60
+
+
+def test_nested_without_end_is_refused():
+    lists = b"\x19" * 5_000
+    for nested in (
+        b"\x1c" * 5_000,
+        b"\x19\x1c" * 5_000,
+        b"\x1b\x01\xcc" * 5_000,
+        lists,
+        b"\x1b" + b"\1\xbb" * 5_000,
+    ):
+        with pytest.raises(ValueError, match="nested too deeply"):
+            footer_of(b"PAR1" + nested + len(nested).to_bytes(4, "little") + b"PAR1")
+
+
+def test_a_histogram_that_fits_no_column_ends_no_process(tmp_path):
+    """pyarrow 26 ends the process when it is asked for such a column's numbers."""
+    rows = FeatureTable(("a", "b", "c"), {"geometry": np.ones((3, 4))}).write(tmp_path / "F.parquet")
+    content = rows.read_bytes()
+    optional, required = b"\x15\x0c\x25\x02\x18\x04file", b"\x15\x0c\x25\x00\x18\x04file"
+    assert content.count(optional) == 1
+    rows.write_bytes(content.replace(optional, required))
+    with pytest.raises(ValueError, match=r"F.parquet is "):
+        FeatureTable.read(rows)
