@@ -8,13 +8,12 @@ import pytest
 from PIL import Image
 from tests.data.doctor import made
 
-from derender.data import read_pictures
+from derender.data import Skipped, open_source, read_pictures
 from derender.data.doctor import examine, measure_originals
 from derender.data.doctor.estimate import Estimate
 from derender.data.doctor.findings import Finding, judged, verdict_of
 from derender.data.doctor.limits import LIMITS
 from derender.data.pictures import Duplicate
-from derender.data.source import Skipped, open_source
 
 
 def levels(examination) -> dict[str, str]:
@@ -165,7 +164,7 @@ def test_sizes_come_from_the_headers(tmp_path: Path):
         Image.new("RGB", size, (number, 0, 0)).save(tmp_path / f"{number}.png")
     (tmp_path / "broken.png").write_bytes(b"no picture")
     with open_source(tmp_path) as source:
-        found = measure_originals(source, source.pictures, 64)
+        found = measure_originals(source, source.images, 64)
         assert measure_originals(source, ("broken.png",), 64) is None
     assert found is not None
     assert (found.sampled, found.median_short, found.smallest_short, found.largest_long) == (4, 72, 40, 200)
