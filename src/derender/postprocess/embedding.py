@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from derender.data.checks import check_pictures, refuse_not_finite
+from derender.data import check_pictures, refuse_not_finite
 from derender.networks import Factor
 from derender.postprocess.features import Features
 from derender.postprocess.fitting import STEPS, Fitted, Fitting, coordinates_of

@@ -214,8 +214,7 @@ class ImageOpener:
 
 def read_file(path: Path, size: int) -> "np.ndarray":
     """One image file, (3, size, size) uint8; a path that leads nowhere or to a folder is an error."""
-    from derender.data import read_picture
-    from derender.data.source import nearest_sibling
+    from derender.data import nearest_sibling, read_picture
 
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist{nearest_sibling(path)}")
