@@ -1,4 +1,4 @@
-"""`derender synth faces` from the command line: what it writes, and what it refuses."""
+"""`derender synth` from the command line: the folders it writes, and the input it refuses."""
 
 import csv
 import json
@@ -6,8 +6,10 @@ import json
 import numpy as np
 import pytest
 
+from derender import Derenderer
 from derender.cli import main
 from derender.data import read_pictures
+from derender.presets import MODEL_PRESETS
 
 
 @pytest.fixture(scope="module")
@@ -71,21 +73,51 @@ def test_a_model_of_ones_own(folder):
         assert list(next(csv.reader(file))) == ["identity", "shape_000"]
 
 
+@pytest.fixture(scope="module")
+def car_folder(tmp_path_factory):
+    out = tmp_path_factory.mktemp("synth") / "cars"
+    arguments = ["--classes", "jeep,police", "--image-size", "32", "--light", "wide", "--json", f"{out}.json"]
+    assert main(["synth", "cars", "--out", str(out), "--count", "12", *arguments]) == 0
+    return out
+
+
+def test_a_folder_of_cars_holds_what_was_requested(car_folder):
+    with (car_folder / "params.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 12 and {row["class"] for row in rows} == {"jeep", "police"}
+    assert all(max(abs(float(row["light_yaw"])), abs(float(row["light_pitch"]))) >= 34.99 for row in rows)
+    facts = json.loads((car_folder.parent / "cars.json").read_text())
+    assert facts["models"] == 3 and facts["settings"]["classes"] == {"jeep": 1.0, "police": 1.0}
+
+
+def test_geometry_is_evaluated_on_cars(car_folder, tmp_path):
+    settings = MODEL_PRESETS["small"]
+    small = settings.network.model_copy(update={"image_size": 32, "width": 4, "light_width": 4})
+    Derenderer(settings.model_copy(update={"network": small})).save(tmp_path / "model")
+    arguments = ["--model", str(tmp_path / "model"), "--json", str(tmp_path / "scores.json")]
+    assert main(["evaluate", "geometry", *arguments, "--data", str(car_folder)]) == 0
+    assert json.loads((tmp_path / "scores.json").read_text())["pictures"] == 12
+
+
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("kind", "arguments", "message"),
     [
-        (["--light", "noon"], "light must be one of usual, wide, frontal, got 'noon'"),
-        (["--view", "above"], "view must be one of usual, wide, frontal"),
-        (["--set", "light.colour=red"], "unknown setting 'light.colour'; there are light.yaw_deg"),
-        (["--set", "light.yaw_deg"], "write key=value"),
-        (["--set", "light.yaw_deg=[-60,99]"], "light.yaw_deg must be two numbers"),
-        (["--expressions", "smug"], "expressions must be one or more of neutral, happiness"),
-        (["--tracks", "2", "--count", "5"], "--count does not go with --tracks"),
-        (["--model", "nowhere.npz"], "nowhere.npz does not exist: expected a morphable model"),
+        ("faces", ["--light", "noon"], "light must be one of usual, wide, frontal, got 'noon'"),
+        ("faces", ["--view", "above"], "view must be one of usual, wide, frontal"),
+        ("faces", ["--set", "light.colour=red"], "unknown setting 'light.colour'; there are light.yaw_deg"),
+        ("faces", ["--set", "light.yaw_deg"], "write key=value"),
+        ("faces", ["--set", "light.yaw_deg=[-60,99]"], "light.yaw_deg must be two numbers"),
+        ("faces", ["--expressions", "smug"], "expressions must be one or more of neutral, happiness"),
+        ("faces", ["--tracks", "2", "--count", "5"], "--count does not go with --tracks"),
+        ("faces", ["--model", "nowhere.npz"], "nowhere.npz does not exist: expected a morphable model"),
+        ("cars", ["--classes", "tank"], "classes must be one or more of sedan"),
+        ("cars", ["--view", "side"], "view must be one of usual, wide, frontal"),
+        ("cars", ["--set", "view.azimuth_deg=[50,10]"], "view.azimuth_deg"),
+        ("cars", ["--set", "doors=3"], "unknown setting 'doors'"),
     ],
 )
-def test_bad_input_is_one_line_and_leaves_nothing(folder, capsys, arguments, message):
-    assert main(["synth", "faces", "--out", str(folder / "bad"), *arguments]) == 2
+def test_bad_input_is_one_line_and_leaves_nothing(folder, capsys, kind, arguments, message):
+    assert main(["synth", kind, "--out", str(folder / "bad"), *arguments]) == 2
     said = capsys.readouterr().err.strip()
     assert message in said and len(said.splitlines()) == 1
     assert not (folder / "bad").exists()
