@@ -39,6 +39,7 @@ STAGES = [
     "evaluation",
     "interpretation",
     "report",
+    "learn",
     "demo",
     "cli",
     "__main__",

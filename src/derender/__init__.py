@@ -20,6 +20,11 @@ _HOME = {
     "Scene": "derender.scene",
     "FeatureTable": "derender.features",
     "DisentangledFeatures": "derender.features",
+    "train": "derender.learn",
+    "whiten": "derender.learn",
+    "refine": "derender.learn",
+    "unet": "derender.learn",
+    "finetune": "derender.learn",
 }
 _SUBMODULES = [
     "scene",

@@ -80,9 +80,9 @@ def test_from_a_run_to_features_and_scores(run, faces, tmp_path, capsys, refused
     capsys.readouterr()
     assert main([str(word) for word in [*again, "--json", "-"]]) == 0
     shown = capsys.readouterr()
-    assert "16 pictures in" in shown.err and "0 results computed, 9 found" in shown.err
+    assert "16 images in" in shown.err and "0 results computed, 9 found" in shown.err
     assert json.loads(shown.out)["scores"] == told
-    assert "leave out --weight" in refused("finetune", "-d", faces, "--out", out, "--resume", "--weight", 3)
+    assert "leave out weight" in refused("finetune", "-d", faces, "--out", out, "--resume", "--weight", 3)
     assert "go on with derender finetune --resume" in refused("train", "-d", faces, "--out", out, "--resume")
     assert "go on with derender train --resume" in refused("finetune", "-d", faces, "--out", run, "--resume")
 
@@ -99,8 +99,8 @@ def test_from_fresh_weights_by_labels_alone(faces, tmp_path, capsys):
 
 def test_bad_words_are_one_line(run, faces, tmp_path, refused):
     tune = ("finetune", "-d", faces, "--out", tmp_path / "out")
-    assert "give either --label NAME" in refused(*tune)
-    assert "give either --label NAME" in refused(*tune, "-l", "expression", "--attributes")
+    assert "give either labels or attributes" in refused(*tune)
+    assert "give either labels or attributes" in refused(*tune, "-l", "expression", "--attributes")
     assert "no yes/no label" in refused(*tune, "--attributes", "--preset", "small", *settings(*TINY))
     assert "give one of them" in refused(*tune, "-m", run, "--preset", "small", "-l", "expression")
     assert "no label 'expresion'; did you mean 'expression'" in refused(*tune, "-m", run, "-l", "expresion")

@@ -42,7 +42,7 @@ def test_a_copy_is_written_and_said_what_it_brought(folder, tmp_path, capsys):
     said = json.loads(shown.out)
     assert said["pictures"] == 180 and said["held_out"] == 20
     assert said["errors"]["before"] > said["errors"]["fitted"] > 0
-    assert "20 pictures that taught nothing: rendered again with an error of" in shown.err
+    assert "20 held-out images: reconstructed with an error of" in shown.err
     assert set(said["gaps"]) == {"depth", "albedo", "light", "camera"}
     copy = derender.load(tmp_path / "mine")
     assert copy.fitting is not None and copy.fitting.settings.steps == 2 and copy.whitening is not None

@@ -58,8 +58,8 @@ def test_a_baselines_settings_train_that_baseline(settings, tmp_path):
 @pytest.mark.parametrize(
     ("text", "more", "message"),
     [
-        ("preset: small", ["--preset", "paper"], "is for small, not for paper: leave out --preset"),
-        ("baseline: vqvae", ["--model", "ae"], "is for vqvae, not for ae: leave out --model"),
+        ("preset: small", ["--preset", "paper"], "is for small, not for paper: leave out preset"),
+        ("baseline: vqvae", ["--model", "ae"], "is for vqvae, not for ae: leave out model"),
         ("[1, 2]", [], "holds no settings"),
         ("{a: ", [], "holds no settings"),
         ("images: many", [], "setting 'images'"),

@@ -28,7 +28,7 @@ def test_a_copy_with_u_nets_is_written_and_said_how_good_it_is(folder, tmp_path,
     shown = capsys.readouterr()
     said = json.loads(shown.out)
     assert said["pictures"] == 12 and said["errors"]["place"] > 0
-    assert "mean errors against what rendered-faces-64 says: place" in shown.err
+    assert "mean errors against rendered-faces-64: place" in shown.err
     copy = derender.load(tmp_path / "mine")
     assert copy.settings.network.encoder == "unet" and copy.whitening is None and copy.fitting is None
 

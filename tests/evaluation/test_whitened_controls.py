@@ -13,7 +13,7 @@ from derender.evaluation.whitened_controls import Lender, component_count, white
 from derender.features import embed_images
 from derender.model import Derenderer
 from derender.training.config import FeatureSettings, WhiteningSettings
-from derender.training.whitening import fit_whitening
+from derender.training.features import fit_whitening
 
 SETTINGS = FeatureSettings(whitening=WhiteningSettings(pictures=40, views=2, directions=6))
 

@@ -11,8 +11,7 @@ from derender.postprocess.fitting import Fitting, FittingSettings, coordinates_o
 from derender.postprocess.morphable import MorphableMaps
 from derender.storage.folder import FITTING_FILE
 from derender.training.config import FeatureSettings, with_changes
-from derender.training.features import make_features
-from derender.training.fitting import make_fitting
+from derender.training.features import make_features, make_fitting
 
 
 @pytest.fixture(scope="module")
@@ -148,7 +147,7 @@ def test_settings_that_make_no_sense(images, changes, said):
 
 
 def test_one_picture_is_too_few(images):
-    with pytest.raises(ValueError, match="at least 2 pictures, got 1"):
+    with pytest.raises(ValueError, match="at least 2 images, got 1"):
         make_fitting(derender.load("rendered-faces-64"), images[:1], FittingSettings())
 
 
@@ -156,5 +155,5 @@ def test_maps_that_are_no_numbers_are_named(images):
     model = derender.load("rendered-faces-64")
     with torch.no_grad():
         next(model.nets["albedo"].decoder.parameters()).fill_(float("nan"))
-    with pytest.raises(ValueError, match="fitting: albedo is not finite in pictures 0"):
+    with pytest.raises(ValueError, match="fitting: NaN or infinity in albedo of images 0"):
         make_fitting(model, images, FittingSettings())

@@ -12,12 +12,12 @@ from derender.networks.unet import PIXEL_CHANNELS, UNetDecoder
 from derender.presets import ModelSettings
 from derender.scene.ranges import SceneRanges
 from derender.training.unets import (
-    Said,
-    TeachingSettings,
+    PixelTargets,
+    UNetSettings,
+    _augmented,
     _masked_error,
-    _seen_otherwise,
-    said_of,
-    teach_unets,
+    distil_unets,
+    pixel_targets,
 )
 
 SIZES = NetworkSettings(image_size=32, width=8, light_width=4, code_size=16)
@@ -43,12 +43,12 @@ def said_jointly(model, images) -> torch.Tensor:
     return model.unet_decoder([torch.cat(level, dim=1) for level in levels])
 
 
-SHORT = TeachingSettings(images=480, batch_size=8, unet_width=4, learning_rate=3e-3)
+SHORT = UNetSettings(images=480, batch_size=8, unet_width=4, learning_rate=3e-3)
 
 
 @pytest.fixture(scope="module")
 def taught(model, images):
-    return teach_unets(model, images, SHORT, seed=5)
+    return distil_unets(model, images, SHORT, seed=5)
 
 
 def test_seen_from_the_front_each_pixel_lies_where_it_is(model, images):
@@ -58,7 +58,7 @@ def test_seen_from_the_front_each_pixel_lies_where_it_is(model, images):
     model_facing = derender.Derenderer(model.settings)
     model_facing.load_state_dict(model.state_dict())
     model_facing.eval().decode = lambda codes: facing
-    said = said_of(model_facing, pictures)
+    said = pixel_targets(model_facing, pictures)
     line = torch.linspace(-1, 1, 32)
     inside = said.mask.bool()
     assert inside.float().mean() > 0.8
@@ -78,7 +78,7 @@ def test_depth_does_not_say_how_far_the_camera_stands(model, images):
     away.load_state_dict(model.state_dict())
     camera = torch.tensor([0, 0, 0, 0, 0, 0.5]).expand(3, 6)
     away.eval().decode = lambda codes: scene.with_parameters(camera=camera)
-    said = said_of(away, pictures)
+    said = pixel_targets(away, pictures)
     inside = said.mask.bool()
     assert 0.2 < inside.float().mean() < 0.7, "seen from 1.5 times as far"
     across, down, depth = said.maps["geometry"].unbind(dim=1)
@@ -91,8 +91,8 @@ def test_pictures_and_what_is_said_of_them_move_together(model, images):
     pictures = images[:8].float() / 255
     line = torch.linspace(-1, 1, 32).expand(8, 32, 32)
     maps = {"geometry": torch.stack([line, line.mT, line * 0], dim=1), "albedo": pictures.clone()}
-    said = Said(maps, torch.ones(8, 32, 32), {})
-    shown, moved, mask = _seen_otherwise(pictures, said, 2, torch.Generator().manual_seed(0))
+    said = PixelTargets(maps, torch.ones(8, 32, 32), {})
+    shown, moved, mask = _augmented(pictures, said, 2, torch.Generator().manual_seed(0))
     torch.testing.assert_close(shown[:2], pictures[:2], atol=1e-5, rtol=0)
     torch.testing.assert_close(moved["geometry"][:2], maps["geometry"][:2], atol=1e-5, rtol=0)
     assert not torch.allclose(shown[2:], pictures[2:], atol=0.1)
@@ -128,14 +128,14 @@ def test_the_decoder_is_saved_with_the_copy(taught, images, tmp_path):
 def test_it_learns_what_the_model_says():
     model = derender.load("rendered-faces-64")
     images = torch.from_numpy(faces.generate(48, image_size=64, seed=9).images)
-    settings = TeachingSettings(images=960, batch_size=16, unet_width=4, learning_rate=5e-3)
-    taught = teach_unets(model, images, settings)
-    hardly = teach_unets(model, images, settings.model_copy(update={"images": 16}))
+    settings = UNetSettings(images=960, batch_size=16, unet_width=4, learning_rate=5e-3)
+    taught = distil_unets(model, images, settings)
+    hardly = distil_unets(model, images, settings.model_copy(update={"images": 16}))
     assert taught.errors["place"] < 0.75 * hardly.errors["place"]
     assert taught.errors["albedo"] < 0.65 * hardly.errors["albedo"]
     assert taught.errors["depth"] < 0.8 * hardly.errors["depth"]
     pictures = images.float() / 255
-    said = said_of(model, pictures)
+    said = pixel_targets(model, pictures)
     maps = torch.cat([*said.maps.values()], dim=1)
     ours, none = (_masked_error(said_jointly(one.model, images), maps, said.mask) for one in (taught, hardly))
     assert ours < 0.8 * none, "the decoder over both learns it, too"
@@ -155,7 +155,7 @@ def test_the_decoder_does_not_change_what_the_encoders_learn(model, images, taug
         return 3 * found if found.shape[1] == six else found
 
     monkeypatch.setattr(UNetDecoder, "forward", otherwise)
-    other = teach_unets(model, images, SHORT, seed=5).model.state_dict()
+    other = distil_unets(model, images, SHORT, seed=5).model.state_dict()
     ours = taught.model.state_dict()
     own = [name for name in ours if name.startswith("unet_decoder.")]
     assert any(not torch.equal(ours[name], other[name]) for name in own)
@@ -164,7 +164,7 @@ def test_the_decoder_does_not_change_what_the_encoders_learn(model, images, taug
 
 def test_the_same_seed_teaches_the_same_and_nothing_else_is_touched(model, images, taught):
     before, state = torch.random.get_rng_state(), {k: v.clone() for k, v in model.state_dict().items()}
-    again = teach_unets(model, images, SHORT, seed=5)
+    again = distil_unets(model, images, SHORT, seed=5)
     assert torch.equal(torch.random.get_rng_state(), before)
     assert all(torch.equal(value, state[name]) for name, value in model.state_dict().items())
     assert all(torch.equal(v, taught.model.state_dict()[k]) for k, v in again.model.state_dict().items())
@@ -179,15 +179,15 @@ def test_only_covered_pixels_count():
 
 
 def test_what_cannot_be_taught_is_named(model, images):
-    with pytest.raises(ValueError, match="2 pictures or more of 32 pixels, got 1 of 32"):
-        teach_unets(model, images[:1])
+    with pytest.raises(ValueError, match="2 images or more of 32 pixels to learn from, got 1 of 32"):
+        distil_unets(model, images[:1])
     with pytest.raises(ValueError, match="got 24 of 16"):
-        teach_unets(model, images[..., :16, :16])
+        distil_unets(model, images[..., :16, :16])
 
 
 def test_weights_that_are_no_numbers_are_an_error(model, images):
     broken = derender.Derenderer(model.settings)
     broken.load_state_dict(model.state_dict())
     next(broken.nets["albedo"].decoder.parameters()).data.fill_(float("nan"))
-    with pytest.raises(ValueError, match="NaN or infinite after 16 pictures"):
-        teach_unets(broken.eval(), images, SHORT.model_copy(update={"images": 16}))
+    with pytest.raises(ValueError, match="NaN or infinite after 16 images"):
+        distil_unets(broken.eval(), images, SHORT.model_copy(update={"images": 16}))

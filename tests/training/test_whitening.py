@@ -15,7 +15,7 @@ from derender.scene.perturb import PerturbSettings
 from derender.storage.folder import WHITENING_FILE
 from derender.training import resolve, train
 from derender.training.config import WhiteningSettings
-from derender.training.whitening import BATCH_SIZE, fit_whitening
+from derender.training.features import BATCH_SIZE, fit_whitening
 
 WITH_PLACES = WhiteningSettings(pictures=200, views=3, directions=16, vectors=False)
 SETTINGS = WITH_PLACES.model_copy(update={"spatial": False})  # of codes alone, which is much quicker

@@ -23,11 +23,11 @@ from derender.scene.perturb import PerturbSettings
 from derender.training import resolve, train
 from derender.training.config import ObjectiveSettings, WhiteningSettings
 from derender.training.derender_task import DerenderTask
+from derender.training.features import fit_whitening
 from derender.training.held_out_errors import NotFinite, errors_of
 from derender.training.step import training_step
 from derender.training.task import StepLosses
 from derender.training.watch import Finding, FiniteWatch, Watcher, broken_gradient, first_not_finite
-from derender.training.whitening import fit_whitening
 
 SIZE = 32
 MIDDLE = SIZE // 2
@@ -245,7 +245,9 @@ def test_what_perceptual_features_learn(monkeypatch):
 @pytest.mark.parametrize("factor", ["geometry", "albedo"])
 def test_whitening(model, images, factor):
     spoil(model.nets[factor].encoder.convolutions, nan)
-    with pytest.raises(ValueError, match=f"whitening: what is read of {factor} is not finite in pictures 0"):
+    with pytest.raises(
+        ValueError, match=f"whitening: NaN or infinity in the activations of {factor} of images 0"
+    ):
         fit_whitening(model, images, WhiteningSettings(views=1), PerturbSettings())
 
 

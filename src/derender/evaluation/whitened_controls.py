@@ -27,7 +27,7 @@ from derender.model import Derenderer
 from derender.postprocess import Features
 from derender.postprocess.whitening import Contrast, Whitening
 from derender.training.config import FeatureSettings
-from derender.training.whitening import Describe, fit_whitening
+from derender.training.features import Describe, fit_whitening
 
 COMPONENTS = 256
 

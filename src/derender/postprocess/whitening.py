@@ -4,7 +4,7 @@ Linear discriminant analysis without labels: the classes are pictures, their mem
 with this factor left as it is and others changed. Directions in which the renderings of one picture differ
 are divided by how much they differ; of the result the directions in which pictures differ most are kept,
 counted in units of what those others alone would do, and made more even: a few directions must not drown the
-others. Leaves out how the renderings are made (training/whitening.py).
+others. Leaves out how the renderings are made (training/features.py).
 """
 
 from collections.abc import Collection, Mapping

@@ -19,9 +19,9 @@ from derender.objectives.self_features import SelfFeatures, load_self_features
 from derender.storage.atomic import DamageNoticed, atomic_file
 from derender.training.batches import some_of
 from derender.training.checkpoint import fit_weights
-from derender.training.complete import complete_model
 from derender.training.config import TrainConfig
 from derender.training.distributed import ALONE, Ranks, this_rank_writes
+from derender.training.features import complete_model
 from derender.training.loop import MAX_VALIDATION_IMAGES, NOT_RECONSTRUCTION, SampleSheet, train_task
 from derender.training.process import deterministic_algorithms
 from derender.training.run_folder import RunFolder
@@ -66,9 +66,10 @@ def train(
         with deterministic_algorithms(config.deterministic):
             complete_model(
                 RunFolder(result.folder).model,
-                config,
-                some_of(pictures.images, split.train),
-                np.ascontiguousarray(held_out),
+                torch.from_numpy(some_of(pictures.images, split.train)),
+                torch.from_numpy(np.ascontiguousarray(held_out)),
+                config.features,
+                seed=config.seed,
                 device="cuda" if on_gpu else "cpu",
                 progress=lambda done, total: report(Progress("features", done, total)),
             )

@@ -1,17 +1,60 @@
-"""What makes features of a trained model: whitening, then what fits scenes to pictures."""
+"""Features of a trained model, estimated on its training images: whitening, then test-time fitting.
 
-from collections.abc import Callable
+Whitening: how other factors move a model's activations, measured on its own renderings. For geometry and
+albedo every image is decomposed, rendered with other values of all its vector factors (light and camera), and
+encoded again, several times; mirror images count as views, too, for the object is symmetric. This is LOOCC's
+perturbation, of all vector factors at once, used after training instead of during it. For each vector factor
+everything but that factor is changed: maps are another image's. Leaves out changing one map beside the other,
+which brought nothing (docs/log.md).
 
-from jaxtyping import Shaped
-from torch import Tensor
+Fitting: a morphable model of the depths and albedos that the model predicts. The optimisation itself happens
+when a model is used (postprocess/fitting.py).
+"""
 
-from derender.model import Derenderer
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+import torch
+from jaxtyping import Float, Int64, Shaped
+from torch import Generator, Tensor
+
+from derender.data import as_float
+from derender.model import Derenderer, load
+from derender.networks import Factor
 from derender.postprocess import Features
-from derender.postprocess.fitting import PARAMETERS
+from derender.postprocess.fitting import PARAMETERS, Fitting, FittingSettings
 from derender.postprocess.morphable import MorphableMaps
-from derender.training.config import FeatureSettings
-from derender.training.fitting import make_fitting
-from derender.training.whitening import fit_whitening
+from derender.postprocess.whitening import Spread, Whitening, contrast
+from derender.scene import Scene
+from derender.scene.perturb import PerturbSettings
+from derender.training.config import FeatureSettings, WhiteningSettings
+from derender.training.held_out_errors import store_errors
+from derender.training.step import fill_uncovered
+
+BATCH_SIZE = 128
+LENGTH_IMAGES = 256  # that are fitted to measure the length of fitted coordinates, where features hold them
+
+Describe = Callable[[Float[Tensor, "n 3 h w"]], Mapping[str, Float[Tensor, "n _"]]]
+"""Activations by name of images in 0..1: the code, then the rest."""
+Progress = Callable[[int, int], object]
+"""Called with (images done, images in all)."""
+
+
+def complete_model(
+    folder: Path,
+    images: Shaped[Tensor, "n 3 h w"],
+    held_out: Shaped[Tensor, "m 3 h w"],
+    settings: FeatureSettings,
+    *,
+    seed: int = 0,
+    device: str | torch.device = "cpu",
+    progress: Progress | None = None,
+) -> None:
+    """Add features, estimated on training images, and errors of held-out images to a saved model."""
+    model = make_features(load(folder, device=device), images, settings, seed=seed, progress=progress)
+    model.features.save(folder)
+    store_errors(folder, held_out)
 
 
 def make_features(
@@ -20,39 +63,257 @@ def make_features(
     settings: FeatureSettings,
     *,
     seed: int = 0,
-    progress: Callable[[int, int], object] | None = None,
+    progress: Progress | None = None,
     maps: MorphableMaps | None = None,
 ) -> Derenderer:
-    """A model that shares these weights, with whitening and fitting as far as the settings ask for them.
+    """A model that shares these weights, with whitening and fitting as far as the settings have them.
 
-    A feature keeps the size of the code: where fitted coordinates are part of it, what is read has the rest.
+    A feature keeps the size of the code: fitted coordinates leave the rest of it to activations.
 
     Args:
         model: trained.
-        images: what it was trained on, uint8 or float in 0..1.
+        images: its training images, uint8 or float in 0..1.
         settings: how.
-        seed: of the pictures that are drawn.
-        progress: called with (pictures done, pictures in all), once for each of the two.
-        maps: to fit scenes within, by default made of what the model says.
+        seed: of the random subset of images.
+        progress: called once for each of the two.
+        maps: to fit scenes within, by default estimated here.
 
     Raises:
-        ValueError: too few pictures, or more fitted coordinates than a feature has numbers.
+        ValueError: too few images, or more fitted coordinates than a feature has numbers.
     """
-    size = model.settings.network.code_size
+    size, fitting = model.settings.network.code_size, settings.fitting
     model = model.with_features(Features(model.whitening))
-    if settings.fitting.steps:
-        size -= settings.fitting.coordinates
-        if size < 1:
-            raise ValueError(
-                f"{settings.fitting.coordinates} fitted coordinates leave none of a feature's "
-                f"{model.settings.network.code_size} numbers to what is read: set coordinates lower"
-            )
+    if fitting.steps and (size := size - fitting.coordinates) < 1:
+        raise ValueError(
+            f"{fitting.coordinates} fitted coordinates leave none of a feature's "
+            f"{size + fitting.coordinates} numbers to activations: set coordinates lower"
+        )
     if settings.whitening.pictures >= 2:
         whitening = fit_whitening(
             model, images, settings.whitening, settings.perturb, size=size, seed=seed, progress=progress
         )
         model = model.with_features(Features(whitening))
-    if settings.fitting.examples >= 2 and PARAMETERS.keys() <= {factor.name for factor in model.factors}:
-        fitting = make_fitting(model, images, settings.fitting, seed=seed, progress=progress, maps=maps)
-        model = model.with_features(Features(model.whitening, fitting))
+    if fitting.examples >= 2 and PARAMETERS.keys() <= {factor.name for factor in model.factors}:
+        made = make_fitting(model, images, fitting, seed=seed, progress=progress, maps=maps)
+        model = model.with_features(Features(model.whitening, made))
     return model
+
+
+def fit_whitening(
+    model: Derenderer,
+    images: Shaped[Tensor, "n 3 h w"],
+    settings: WhiteningSettings,
+    perturb: PerturbSettings,
+    *,
+    describe: Describe | None = None,
+    size: int | None = None,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Whitening:
+    """The map from a trained model's activations to its features.
+
+    Args:
+        model: trained; left as it is.
+        images: its training images, uint8 or float in 0..1; a random subset of the settings' size is used.
+        settings: how many images and views, how many directions are kept.
+        perturb: how far light and camera are changed.
+        describe: another encoder, all of whose activations of the model's renderings are measured; by default
+            the model's own of geometry and albedo.
+        size: of the features; by default that of the model's code, or of all activations of ``describe``.
+        seed: of the random subset and of the renderings, which are the same for every encoder.
+        progress: called after each batch.
+
+    Raises:
+        ValueError: fewer than two images, or activations that are NaN or infinite.
+    """
+    generator = Generator().manual_seed(seed)
+    others = Generator().manual_seed(seed)  # of the vector factors: it changes no other feature
+    rows = torch.randperm(len(images), generator=generator)[: settings.pictures]
+    if not len(rows):
+        raise ValueError("whitening needs at least 2 images, got 0")
+    model = model.without_features()
+    encode = describe or (model.activations if settings.spatial else model.encode)
+    moving = [factor for factor in model.factors if not factor.mirrored]
+    vectors = moving if describe is None and settings.vectors else []
+    mirrored: dict[str, Spread] = {}
+    alone: dict[str, Spread] = {}
+    with _evaluating(model), torch.no_grad():
+        for start, batch in _batches(model, images, rows, progress):
+            scene = model.decompose(batch)
+            shown = _renderings(model, scene, batch, moving, perturb, generator, settings.views)
+            views = [encode(one) for one in shown]
+            if settings.mirrored:
+                views += [encode(one.flip(-1)) for one in shown]
+            names = tuple(views[0])
+            if describe is None:
+                names = tuple(factor.name for factor in model.factors if factor.mirrored)
+            for view in views:  # the images first: of a broken rendering every activation is broken
+                _check_finite(
+                    "whitening", {f"the activations of {name}": view[name] for name in names}, start
+                )
+            for name in names:
+                joined = torch.stack([view[name].float() for view in views])
+                mirrored.setdefault(name, Spread()).add(joined)
+            for factor in vectors if len(batch) > 1 else ():  # maps are exchanged within the batch
+                rest = [other for other in model.factors if other.name != factor.name]
+                shown = _renderings(model, scene, batch, rest, perturb, others, settings.views)
+                codes = [model.nets[factor.name].encode(one).float() for one in shown]  # type: ignore[operator]
+                alone.setdefault(factor.name, Spread()).add(torch.stack(codes))
+    if describe is None:
+        size = size or model.settings.network.code_size
+    contrasts = {
+        name: contrast(spread, settings.directions, settings.shrinkage, size, settings.evenness)
+        for name, spread in mirrored.items()
+    }
+    contrasts |= {
+        name: contrast(spread, len(spread.mean), settings.shrinkage, power=settings.vector_power)
+        for name, spread in alone.items()
+    }
+    return Whitening(contrasts, mirrored=mirrored if settings.mirrored else ()).to(model.device)
+
+
+@torch.no_grad()
+def recentre(
+    model: Derenderer, images: Shaped[Tensor, "n 3 h w"], *, progress: Progress | None = None
+) -> Whitening:
+    """The model's own whitening about the mean of these images, uint8 or float in 0..1; the model stays.
+
+    Features of images of another kind than the training images have another mean, on which a penalised or
+    hardly trained head leans; nothing else about them changes.
+
+    Raises:
+        ValueError: the model's features are not whitened.
+    """
+    whitening = model.whitening
+    if whitening is None:
+        raise ValueError("its features are codes, which are not whitened: leave out mean_only")
+    totals = dict.fromkeys(whitening.names, torch.zeros((), dtype=torch.float64))
+    for _, batch in _batches(model, images, torch.arange(len(images)), progress):
+        for name, total in totals.items():
+            taken = whitening.taken(name, model.factor_activations(name, batch))
+            totals[name] = total + taken.double().sum(dim=0).cpu()
+    means = {name: (total / len(images)).to(model.device) for name, total in totals.items()}
+    return whitening.recentred(means).to(model.device)
+
+
+def make_fitting(
+    model: Derenderer,
+    images: Shaped[Tensor, "n 3 h w"],
+    settings: FittingSettings,
+    *,
+    seed: int = 0,
+    progress: Progress | None = None,
+    maps: MorphableMaps | None = None,
+) -> Fitting:
+    """The morphable model of a model's predicted maps, and the length of features made of fitted scenes.
+
+    Args:
+        model: trained and, if it is to be, whitened; left as it is.
+        images: its training images, uint8 or float in 0..1; a random subset of the settings' size is used.
+        settings: how many examples and coordinates, and how scenes are fitted later.
+        seed: of the random subset.
+        progress: called after each batch.
+        maps: an existing morphable model; by default one is made.
+
+    Raises:
+        ValueError: fewer than two images, maps that are NaN or infinite, or a model without geometry and
+            albedo.
+    """
+    missing = sorted(set(PARAMETERS) - {factor.name for factor in model.factors})
+    if missing:
+        raise ValueError(f"fitting needs the factors {', '.join(PARAMETERS)}; this model has no {missing[0]}")
+    rows = torch.randperm(len(images), generator=Generator().manual_seed(seed))[: settings.examples]
+    if len(rows) < 2:
+        raise ValueError(f"fitting needs at least 2 images, got {len(rows)}")
+    model = model.with_features(Features(model.whitening))
+    examples: dict[str, list[Tensor]] = {parameter: [] for parameter in PARAMETERS.values()}
+    squares = torch.zeros((), dtype=torch.float64)
+    with _evaluating(model), torch.no_grad():
+        for start, batch in _batches(model, images, rows, progress):
+            scene, features = model.decompose(batch), model.embed(batch)
+            _check_finite("fitting", {name: scene.parameters[name] for name in examples}, start)
+            if maps is None:
+                for name, parts in examples.items():
+                    parts.append(scene.parameters[name].float().cpu())
+            squares += sum(features[name].double().square().sum().cpu() for name in PARAMETERS)
+    if maps is None:
+        joined = {name: torch.cat(parts) for name, parts in examples.items()}
+        maps = MorphableMaps.of(joined, settings.coordinates)
+    fitting = Fitting(maps, settings).to(model.device)
+    # feed-forward every coordinate varies by 1
+    own = float(sum(maps.size(parameter) for parameter in PARAMETERS.values()))
+    if settings.steps:
+        own = _fitted_length(model, fitting, images, rows[:LENGTH_IMAGES])
+    features_length = float(squares / len(rows))
+    fitting.get_buffer("length").fill_(settings.weight * (features_length / own) ** 0.5 if own else 0.0)
+    return fitting
+
+
+def _fitted_length(
+    model: Derenderer, fitting: Fitting, images: Shaped[Tensor, "n 3 h w"], rows: Int64[Tensor, " k"]
+) -> float:
+    """Squared length of the images' fitted coordinates, all factors together, the mean over images."""
+    total = 0.0
+    for _, batch in _batches(model, images, rows, None):
+        with torch.no_grad():
+            scene = model.decompose(batch)
+        fitted = fitting.fit(batch, scene, model.render, fitting.settings.steps)
+        total += sum(float(value.double().square().sum()) for value in fitted.coordinates.values())
+    return total / len(rows)
+
+
+def _renderings(
+    model: Derenderer,
+    scene: Scene,
+    images: Float[Tensor, "n 3 h w"],
+    changing: Iterable[Factor],
+    perturb: PerturbSettings,
+    generator: Generator,
+    count: int,
+) -> list[Float[Tensor, "n 3 h w"]]:
+    """The images, then renderings of their scenes with other values of these factors, all pixels filled."""
+    shown, ranges = [images], model.settings.ranges
+    for _ in range(count):
+        changed = {
+            factor.parameter: factor.perturb(scene.parameters[factor.parameter], generator, perturb, ranges)
+            for factor in changing
+            if factor.perturb is not None
+        }
+        rendering = model.render(scene.with_parameters(**changed))
+        shown.append(fill_uncovered(rendering.image, rendering.mask, images))
+    return shown
+
+
+def _batches(
+    model: Derenderer,
+    images: Shaped[Tensor, "n 3 h w"],
+    rows: Int64[Tensor, " k"],
+    progress: Progress | None,
+) -> Iterator[tuple[int, Float[Tensor, "b 3 h w"]]]:
+    """These rows of the images in batches, in 0..1 on the model's device, each with its place."""
+    for start in range(0, len(rows), BATCH_SIZE):
+        batch = images[rows[start : start + BATCH_SIZE].to(images.device)]
+        yield start, (as_float(batch) if batch.dtype == torch.uint8 else batch.float()).to(model.device)
+        if progress is not None:
+            progress(min(start + BATCH_SIZE, len(rows)), len(rows))
+
+
+@contextmanager
+def _evaluating(model: Derenderer) -> Iterator[None]:
+    """Evaluation mode within the block."""
+    was_training = model.training
+    model.eval()
+    try:
+        yield
+    finally:
+        model.train(was_training)
+
+
+def _check_finite(what: str, values: Mapping[str, Tensor], start: int) -> None:
+    """NaN or infinity in a batch is an error that names it and its images."""
+    for name, value in values.items():
+        if not bool(value.isfinite().all()):
+            raise ValueError(
+                f"{what}: NaN or infinity in {name} of images {start} to {start + len(value) - 1} of the "
+                "random subset: the model's training went wrong"
+            )

@@ -23,8 +23,8 @@ from derender.storage.folder import WHITENING_FILE
 from derender.training import resolve
 from derender.training.checkpoint import TrainState, save_checkpoint
 from derender.training.config import WhiteningSettings
+from derender.training.features import fit_whitening
 from derender.training.run_folder import append_metrics, start_run
-from derender.training.whitening import fit_whitening
 
 HERE = Path(__file__).parent
 SIZE = 32

@@ -8,14 +8,14 @@ from derender.data.synthetic import faces
 from derender.objectives.reconstruction import masked_l1
 from derender.render import Rendering
 from derender.scene.crop import CropSettings, crop_images
-from derender.training.refining import (
+from derender.training.distillation import (
     FACTORS,
+    FittedScenes,
     RefineConfig,
     RefiningSettings,
+    SceneUnit,
+    _examples,
     _fit,
-    _Fits,
-    _lesson,
-    _Unit,
     refine,
 )
 
@@ -104,7 +104,7 @@ def test_renderings_come_with_the_scene_they_show(model, images):
     fitted = _fit(model, images[:16], 2, None)
     meant = fitted.scene(model.fitting.maps)
     half = changed(rendered=0.5, exchanged=0.5)
-    shown, scene = _lesson(model, pictures, meant, half, torch.Generator().manual_seed(0))
+    shown, scene = _examples(model, pictures, meant, half, torch.Generator().manual_seed(0))
     assert shown.shape == pictures.shape and len(scene) == 16
     made: Rendering = model.render(scene[:8])
     seen = made.mask.bool()[:, None].expand_as(made.image)
@@ -128,7 +128,7 @@ def framed(**refining) -> RefineConfig:
 def test_pictures_in_other_frames_come_with_the_camera_that_sees_them_so(model, images):
     pictures = images[:16].float() / 255
     meant = _fit(model, images[:16], 2, None).scene(model.fitting.maps)
-    shown, scene = _lesson(model, pictures, meant, framed(rendered=0), torch.Generator().manual_seed(0))
+    shown, scene = _examples(model, pictures, meant, framed(rendered=0), torch.Generator().manual_seed(0))
     away = scene.camera[:, 5] - meant.camera[:, 5]
     moved = away.abs() > 1e-6
     assert 3 < moved.sum() < 13
@@ -156,18 +156,18 @@ def test_a_copy_taught_so_steps_back_from_smaller_faces(model, images):
 
 def test_the_unit_is_the_spread_of_fitted_scenes(model, images):
     meant = _fit(model, images[:16], 2, None).scene(model.fitting.maps)
-    unit = _Unit(model, meant)
+    unit = SceneUnit(model, meant)
     mean = meant.map(lambda value: value.mean(dim=0, keepdim=True).expand_as(value))
     gaps = unit.gaps(mean, meant)
     assert all(float(gap) == pytest.approx(1, abs=1e-3) for gap in gaps.values())
-    assert float(unit.apart(mean, meant)) == pytest.approx(5, abs=1e-2)
-    assert float(unit.apart(meant, meant)) == 0
+    assert float(unit.distance(mean, meant)) == pytest.approx(5, abs=1e-2)
+    assert float(unit.distance(meant, meant)) == 0
     moved = meant.with_parameters(camera=meant.camera + torch.tensor([0, 0, 0, 0, 0, 1.0]))
     assert float(unit.gaps(moved, meant)["camera"]) == 0, "the model cannot say how near the camera is"
 
 
 def test_what_cannot_be_refined_is_named(model, images):
-    with pytest.raises(ValueError, match="2 pictures or more of 64 pixels and one held out, got 1 of 64"):
+    with pytest.raises(ValueError, match="2 images or more of 64 pixels and one held out, got 1 of 64"):
         refine(model, images[:1], images[1:])
     with pytest.raises(ValueError, match="and one held out, got 16 of 64 and 0"):
         refine(model, images, images[:0])
@@ -179,7 +179,7 @@ def test_weights_that_are_no_numbers_are_an_error(model, images):
     broken = derender.load("rendered-faces-64")
     broken.nets["confidence"].requires_grad_(False)
     next(broken.nets["confidence"].parameters()).fill_(float("nan"))
-    with pytest.raises(ValueError, match="NaN or infinite after 32 pictures"):
+    with pytest.raises(ValueError, match="NaN or infinite after 32 images"):
         refine(broken, images, images, changed(images=32, fit_steps=1))
 
 
@@ -187,7 +187,7 @@ def test_a_model_that_finds_no_scene_is_an_error(images):
     broken = derender.load("rendered-faces-64")
     for weights in broken.nets["light"].parameters():
         weights.fill_(float("nan"))
-    with pytest.raises(ValueError, match="fitting finds no scene of any picture"):
+    with pytest.raises(ValueError, match="fitting finds no scene of any image"):
         refine(broken, images, images, changed(images=32, fit_steps=1))
 
 
@@ -196,6 +196,6 @@ def test_only_clear_fits_teach():
     error = torch.tensor([0.02, 0.03, 0.0, 0.01, 0.5])
     light = torch.rand(5, 4)
     light[3, 1] = float("nan")
-    fits = _Fits(torch.rand(5, 3), torch.rand(5, 3), light, torch.rand(5, 6), error)
+    fits = FittedScenes(torch.rand(5, 3), torch.rand(5, 3), light, torch.rand(5, 6), error)
     assert fits.clear(0.2).tolist() == [True, True, False, False, False]
     assert fits.clear(0).tolist() == [True, True, False, False, True]

@@ -1,0 +1,62 @@
+"""Options and notices of the commands that train into a run folder: train and finetune."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from derender.cli.console import duration, notice, report_images
+
+if TYPE_CHECKING:
+    from derender.data import PictureSet
+    from derender.training import Progress, TrainResult
+
+OutRun = Annotated[
+    Path, typer.Option("--out", "-o", help="Run folder to make, or to go on with.", metavar="RUN")
+]
+Resume = Annotated[bool, typer.Option("--resume", help="Go on with the run in --out.")]
+DryRun = Annotated[bool, typer.Option("--dry-run", help="Show all settings and stop.")]
+PHASES = {
+    "reading": ("reading", "pictures"),
+    "train": ("training", "pictures"),
+    "perceptual": ("perceptual features", "steps"),
+    "features": ("whitening features", "pictures"),
+    "scoring": ("scoring", "heads"),
+}
+
+
+def show_progress(report: Callable[..., None]) -> "Callable[[Progress], None]":
+    """A run's progress on a progress bar."""
+
+    def show(progress: "Progress") -> None:
+        speed = ""
+        if progress.phase == "train":
+            waiting = f"{progress.waiting:.1%} waiting for data"
+            speed = f"{progress.images_per_second:.0f} pictures/s, {waiting}"
+        description, unit = PHASES[progress.phase]
+        report(progress.done, progress.total, speed, description=description, unit=unit)
+
+    return show
+
+
+def report_read(images: "PictureSet") -> None:
+    """Note what was read, and on which terms."""
+    report_images(images)
+    if images.terms:
+        notice(f"on its owners' terms: {images.terms}")
+
+
+def report_run(run: "TrainResult") -> None:
+    """Note how a run ended."""
+    for finding in run.findings:
+        notice(f"{finding.sign}: {finding.text}; {finding.advice}")
+    if run.stopped == "collapse":
+        notice("training on is pointless: what is left is the last good checkpoint and model, if any")
+    waited = f"{run.waiting:.1%} of it waiting for data"
+    notice(f"{run.images:,} images in {duration(run.seconds)}, {waited}; stopped by: {run.stopped}")
+    if run.stopped != "collapse" and run.model_images not in (None, run.images):
+        notice(
+            f"the model has the weights of {run.model_images:,} images, the best on held-out ones; "
+            "for those of the end: the same command with --resume --set keep=last"
+        )

@@ -1,0 +1,196 @@
+"""Copies of a trained model: whitened, refined by knowledge distillation, or with U-Net encoders."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from derender.data import PictureSet, split_indices
+from derender.inputs import as_images, as_model, copy_split
+from derender.learn.runs import Changes, OnImages, texts_of
+from derender.model import Derenderer
+from derender.training.config import (
+    FeatureSettings,
+    with_changes,
+)
+from derender.training.distillation import RefineConfig
+from derender.training.distillation import refine as distil
+from derender.training.features import make_features, recentre
+from derender.training.held_out_errors import store_errors
+from derender.training.unets import UNetSettings, distil_unets
+
+CopyProgress = Callable[[int, int], object]
+"""Called with (done, total), once for each part of the work."""
+
+
+@dataclass(frozen=True)
+class ModelCopy:
+    """A model made of another one.
+
+    Attributes:
+        folder: where it was saved; `derender.load` takes it.
+        model: ready for use.
+        images: how many it was made with.
+        scores: measurements by name.
+    """
+
+    folder: Path
+    model: Derenderer
+    images: int
+    scores: dict[str, Any] = field(default_factory=dict)
+
+    def values(self) -> dict[str, Any]:
+        """Everything as JSON takes it."""
+        return {"model": self.folder, "pictures": self.images, **self.scores}
+
+
+def whiten(
+    model: Derenderer | str | Path,
+    images: PictureSet | str | Path,
+    *,
+    out: str | Path,
+    settings: Changes = (),
+    mean_only: bool = False,
+    seed: int = 0,
+    **how: Any,
+) -> ModelCopy:
+    """A copy of a model whose features move as little as possible with other factors.
+
+    Whitening and fitting are estimated on these images, without labels. Weights and scenes stay as they are.
+    Training ends with this by itself.
+
+    Args:
+        model: trained, or where it is.
+        images: an image set at the model's size, or its address.
+        out: folder of the copy.
+        settings: changes of `FeatureSettings`, as ``{"whitening.pictures": 8000}``.
+        mean_only: keep the model's own directions; estimate only the mean of its features.
+        seed: of the random subset of images and of the renderings.
+        how: ``part``, ``dataset``, ``limit``, ``device``, ``overwrite``, ``on_images`` and ``progress``.
+
+    Returns:
+        The copy; "between_over_within" has the ratio of each direction by factor.
+    """
+    features = with_changes(FeatureSettings(), texts_of(settings))
+    if features.whitening.pictures < 2:
+        raise ValueError("whitening needs 2 images or more: set pictures=2000, say")
+    if mean_only and settings:
+        raise ValueError("with mean_only nothing else is estimated: leave out settings")
+    work = _Copying(model, images, Path(out), 2, **how)
+    pixels = torch.from_numpy(work.images.images)
+    if mean_only:
+        whitening = recentre(work.model, pixels, progress=work.progress)
+        made = work.model.with_features(replace(work.model.features, whitening=whitening))
+    else:
+        made = make_features(work.model, pixels, features, seed=seed, progress=work.progress)
+    assert made.whitening is not None
+    ratios = {name: made.whitening.get_buffer(f"{name}_ratios").tolist() for name in made.whitening.names}
+    return work.saved(made, {"between_over_within": ratios})
+
+
+def refine(
+    model: Derenderer | str | Path,
+    images: PictureSet | str | Path,
+    *,
+    out: str | Path,
+    settings: Changes = (),
+    seed: int = 0,
+    **how: Any,
+) -> ModelCopy:
+    """A copy of a model that predicts at once the scenes that test-time optimisation finds slowly.
+
+    Scenes are fitted to these images once, without labels; then the encoders learn to predict them. Every
+    tenth image is held out: errors are measured on those.
+
+    Args:
+        model: trained, with a fitting (`whiten` makes one), or where it is.
+        images: an image set at the model's size, or its address.
+        out: folder of the copy.
+        settings: changes of `RefineConfig`, as ``{"refining.images": 100_000}``.
+        seed: of every random choice.
+        how: ``part``, ``dataset``, ``limit``, ``device``, ``overwrite``, ``on_images`` and ``progress``.
+
+    Returns:
+        The copy; "held_out" is the number of held-out images, "errors" and "gaps" are those of `Refined`.
+    """
+    config = with_changes(RefineConfig(), texts_of(settings))
+    work = _Copying(model, images, Path(out), 10, **how)
+    work.model.features.required_fitting(str(work.model.source or "this model"))
+    split = split_indices(work.images.files, (0.9, 0.1, 0.0), seed=seed)
+    pixels = torch.from_numpy(work.images.images)
+    held_out = pixels[split.validation]
+    refined = distil(work.model, pixels[split.train], held_out, config, seed=seed, progress=work.progress)
+    scores = {"held_out": len(held_out), "errors": refined.errors, "gaps": refined.gaps}
+    made = work.saved(refined.model, scores, split=work.part == "train")
+    store_errors(made.folder, held_out)
+    return replace(made, images=len(split.train))
+
+
+def unet(
+    model: Derenderer | str | Path,
+    images: PictureSet | str | Path,
+    *,
+    out: str | Path,
+    settings: Changes = (),
+    seed: int = 0,
+    **how: Any,
+) -> ModelCopy:
+    """A copy of a model with U-Net encoders, which learn its scenes pixel by pixel; for segmentation.
+
+    Args:
+        model: trained, or where it is.
+        images: an image set at the model's size, or its address.
+        out: folder of the copy.
+        settings: changes of `UNetSettings`, as ``{"images": 50_000}``.
+        seed: of every random choice.
+        how: ``part``, ``dataset``, ``limit``, ``device``, ``overwrite``, ``on_images`` and ``progress``.
+
+    Returns:
+        The copy; "errors" are those of `DistilledUNets`.
+    """
+    config = with_changes(UNetSettings(), texts_of(settings))
+    work = _Copying(model, images, Path(out), 2, **how)
+    made = distil_unets(
+        work.model, torch.from_numpy(work.images.images), config, seed=seed, progress=work.progress
+    )
+    return work.saved(made.model, {"errors": made.errors}, split=work.part == "train")
+
+
+class _Copying:
+    """What every copy of a model needs: the model, the images, and a free place."""
+
+    def __init__(
+        self,
+        model: Derenderer | str | Path,
+        images: PictureSet | str | Path,
+        out: Path,
+        at_least: int,
+        *,
+        part: str = "all",
+        dataset: str = "auto",
+        limit: int | None = None,
+        device: str = "auto",
+        overwrite: bool = False,
+        on_images: OnImages | None = None,
+        progress: CopyProgress | None = None,
+    ):
+        if out.exists() and not overwrite:
+            raise FileExistsError(f"{out} exists already: choose another folder or pass overwrite=True")
+        self.out, self.part, self.overwrite, self.progress = out, part, overwrite, progress
+        self.model = as_model(model, device=device)
+        self.source = self.model.source if isinstance(model, Derenderer) else model
+        self.images = as_images(
+            images, self.model.image_size, dataset=dataset, limit=limit, part=part, model=self.source,
+            at_least=at_least,
+        )  # fmt: skip
+        if on_images is not None:
+            on_images(self.images)
+
+    def saved(self, made: Derenderer, scores: dict[str, Any], *, split: bool = True) -> ModelCopy:
+        """Save the copy, and with ``split`` that of the original: other images were not seen."""
+        folder = made.save(self.out, overwrite=self.overwrite)
+        if split and self.source is not None:
+            copy_split(folder, self.source)
+        return ModelCopy(folder, made, len(self.images), scores)

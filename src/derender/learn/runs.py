@@ -1,0 +1,140 @@
+"""Training runs: settings from every source, and the call that trains a model or a baseline."""
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from derender.baselines import baseline_config, image_size_of, stored_config, train_baseline
+from derender.data import PictureSet
+from derender.inputs import as_images, device_named
+from derender.report.baseline_sheet import baseline_sheet
+from derender.report.evidence import Evidence, look_at_data
+from derender.report.page import Section
+from derender.report.run import decomposition_sheet, run_page
+from derender.training import derender_task
+from derender.training.config import (
+    TrainConfig,
+    as_overrides,
+    resolve,
+)
+from derender.training.distributed import first_then_others, leave, open_fabric, this_rank_writes
+from derender.training.run_folder import read_settings, refuse_taken
+from derender.training.task import Progress, TrainResult
+
+OnImages = Callable[[PictureSet], object]
+"""Called with the images once they are read."""
+Changes = Mapping[str, Any] | Sequence[str]
+"""Settings by dotted name, or ``key=value`` texts."""
+
+
+def run_settings(
+    out: str | Path | None = None,
+    *,
+    model: str | None = None,
+    preset: str | None = None,
+    start_from: str | None = None,
+    loocc: str | None = None,
+    config: str | Path | None = None,
+    settings: Changes = (),
+    resume: bool = False,
+) -> Any:
+    """The settings of a training run; arguments as for `train`.
+
+    A run that is resumed without any of them keeps its own.
+    """
+    changes = texts_of(settings)
+    if config is not None:
+        stored = read_settings(Path(config))
+        trains, base = str(stored.pop("baseline", "derender")), stored.pop("preset", None)
+        for name, value, other in (("model", model, trains), ("preset", preset, base)):
+            if None not in (value, other) and value != other:
+                raise ValueError(f"{config} is for {other}, not for {value}: leave out {name}")
+        model, preset = trains, preset if base is None else str(base)
+        changes = [*as_overrides(stored), *changes]
+    model = model or "derender"
+    chosen = preset is not None or loocc is not None or start_from is not None or bool(changes)
+    if resume and not chosen and out is not None and (Path(out) / "config.yaml").is_file():
+        return stored_config(Path(out), model)
+    if model == "derender":
+        return resolve(preset or "faces", changes, objective__loocc=loocc, start_from=start_from)
+    for name, value in (("preset", preset), ("loocc", loocc)):
+        if value is not None:
+            raise ValueError(f"{name} is for derender models: leave it out with {model}, or change settings")
+    return baseline_config(model, changes)
+
+
+def train(
+    images: PictureSet | str | Path,
+    *,
+    out: str | Path,
+    model: str | None = None,
+    preset: str | None = None,
+    start_from: str | None = None,
+    loocc: str | None = None,
+    config: Any = None,
+    settings: Changes = (),
+    resume: bool = False,
+    dataset: str = "auto",
+    limit: int | None = None,
+    device: str = "auto",
+    on_images: OnImages | None = None,
+    progress: Callable[[Progress], None] | None = None,
+) -> TrainResult:
+    """Train a model on unlabelled images of one kind of object, into a run folder with a report page.
+
+    Args:
+        images: an image set at the model's size, or a folder, zip, shards or Hugging Face id.
+        out: a new run folder, or with ``resume`` that of an unfinished run.
+        model: "derender", or a baseline: vqvae, simclr, ae, beta-vae, resnet18, stylegan2, e4e or ris.
+        preset: faces (the default), cars, cats, paper, or small for a CPU.
+        start_from: a trained model whose weights the run begins with.
+        loocc: contrast over "none", "light", "light+camera" or "all" factors.
+        config: all settings as `run_settings` gives them, or a YAML file, which the other arguments change.
+        settings: changes of single settings, as ``{"batch_size": 32}`` or ``["batch_size=32"]``.
+        resume: go on with the run in ``out``; without other arguments with its own settings.
+        dataset: the layout's name, or "auto" to recognise it.
+        limit: read at most so many images.
+        device: "auto", "cpu" or "cuda".
+        on_images: called with the images once they are read.
+        progress: called after every step.
+
+    Raises:
+        FileExistsError: ``out`` is not empty and ``resume`` was not requested.
+        ValueError: images and settings do not fit, or the run to resume has other settings.
+        TrainingInterrupted: Ctrl-C or SIGTERM; the run can be resumed.
+    """
+    out, report = Path(out), progress or (lambda _: None)
+    if config is None or isinstance(config, str | Path):
+        config = run_settings(
+            out, model=model, preset=preset, start_from=start_from, loocc=loocc, config=config,
+            settings=settings, resume=resume,
+        )  # fmt: skip
+    if resume and not (out / "config.yaml").is_file():
+        raise FileNotFoundError(f"no run to resume in {out} (no config.yaml): train without resume first")
+    accelerator = device_named(device)
+    fabric = open_fabric(accelerator)
+    if this_rank_writes() and not resume:
+        refuse_taken(out)
+    with first_then_others(fabric, local=True):
+        images = as_images(
+            images, image_size_of(config), dataset=dataset, limit=limit,
+            progress=lambda *counts: report(Progress("reading", *counts)),
+        )  # fmt: skip
+    if on_images is not None:
+        on_images(images)
+    how = {"resume": resume, "progress": report, "accelerator": accelerator}
+    if isinstance(config, TrainConfig):
+        result = derender_task.train(config, images, out, sample_sheet=decomposition_sheet, **how)
+    else:
+        result = train_baseline(config, images, out, sample_sheet=baseline_sheet, **how)
+    writes = this_rank_writes()
+    leave()
+    if writes:
+        examined = Evidence([Section("The data", look_at_data(images), "Data")])
+        run_page(out, examined).write(out / "report.html")
+    return result
+
+
+def texts_of(settings: Changes) -> list[str]:
+    """As ``key=value`` texts."""
+    return as_overrides(settings) if isinstance(settings, Mapping) else list(settings)

@@ -1,0 +1,400 @@
+"""Knowledge distillation of test-time optimisation: encoders that predict the scenes which it finds.
+
+Fitting (postprocess/fitting.py) brings a scene nearer to its image than the encoders do, but takes many times
+as long. Here scenes are fitted to the training images once, and a copy of the model, the student, learns to
+predict them: from the images, and from renderings of the fitted scenes under other light, from other
+viewpoints and with another's geometry, whose scenes are known exactly. The student's scenes are also asked to
+reconstruct the images. Images in other crops (``reframed``) teach the position of the camera, which rendering
+alone does not: a decoder draws a small object sooner than a camera learns to step back. Needs no labels.
+Leaves out models with further factors, and the confidence net, which stays.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from copy import deepcopy
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int64, UInt8
+from pydantic import Field
+from torch import Generator, Tensor, nn
+
+from derender.data import as_float
+from derender.model import Derenderer
+from derender.objectives.reconstruction import masked_l1
+from derender.objectives.self_training import endless_order
+from derender.postprocess.fitting import PARAMETERS, STEPS
+from derender.postprocess.morphable import MorphableMaps
+from derender.scene import Scene
+from derender.scene.crop import (
+    DEFAULT_CROPS,
+    CropSettings,
+    crop_images,
+    crop_scene,
+    other_surroundings,
+    random_crops,
+    ranges_for_crops,
+)
+from derender.scene.mirror import seen_in_mirror
+from derender.scene.perturb import PerturbSettings, perturb_camera, perturb_light
+from derender.settings import Settings
+from derender.training.config import FeatureSettings
+from derender.training.features import Progress, make_features
+from derender.training.step import concatenate, fill_uncovered
+
+FACTORS = {**PARAMETERS, "light": "light", "camera": "camera"}
+"""Factors that are distilled, and their parameters of a scene."""
+MEASURED_IMAGES = 256
+"""Images on which standard deviations and errors are measured."""
+
+_FIT_BATCH = 128
+_NOISE = 0.03  # mean absolute error of a rendering that counts as much as a gap of 1
+
+
+class StudentSettings(Settings):
+    """How a student learns; ``images`` counts an image as often as it is seen."""
+
+    images: int = Field(default=160_000, ge=1)
+    batch_size: int = Field(default=64, ge=2)
+    learning_rate: float = Field(default=4e-4, gt=0)
+
+
+class RefiningSettings(StudentSettings):
+    """How encoders and decoders learn the fitted scenes."""
+
+    fitted: int = Field(default=12_000, ge=2)  # at most so many images are fitted
+    fit_steps: int = Field(default=STEPS, ge=1, le=10_000)
+    worst: float = Field(default=0.03, ge=0, lt=1)  # share of them, fitted worst, that is left out
+    rendered: float = Field(default=0.5, ge=0, le=1)  # share of a batch that are renderings
+    exchanged: float = Field(default=0.5, ge=0, le=1)  # share of those with another's geometry
+    picture_weight: float = Field(default=1.0, ge=0)  # of the reconstruction error
+    reframed: float = Field(default=0.0, ge=0, le=1)  # share of a batch that is shown in other crops
+    strange: float = Field(default=0.5, ge=0, le=1)  # share of those with another image beyond their edge
+
+
+class RefineConfig(FeatureSettings):
+    """All settings of `derender refine`; ``perturb`` is also how far its renderings differ.
+
+    ``reframe`` are the crops of ``refining.reframed``; the student's camera gets the room that they need.
+    """
+
+    refining: RefiningSettings = RefiningSettings()
+    perturb: PerturbSettings = PerturbSettings(
+        ambient=1, diffuse=1, light_deg=90, camera_pitch_deg=30, camera_yaw_deg=60
+    )
+    reframe: CropSettings = DEFAULT_CROPS
+
+
+@dataclass(frozen=True)
+class Refined:
+    """A student of its own fitted scenes, and what that brought.
+
+    Attributes:
+        model: the student, in evaluation mode, with features.
+        errors: of images that it did not learn from: "before", "now" and "fitted" are the mean masked L1
+            (0..1) of their reconstructions.
+        gaps: by parameter of a scene (depth, albedo, light, camera), how far predictions lie from fitted
+            scenes, "before" and "now", in mean deviations of the fitted scenes.
+    """
+
+    model: Derenderer
+    errors: dict[str, float]
+    gaps: dict[str, dict[str, float]]
+
+
+def refine(
+    model: Derenderer,
+    images: UInt8[Tensor, "n 3 h w"],
+    held_out: UInt8[Tensor, "m 3 h w"],
+    config: RefineConfig | None = None,
+    *,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Refined:
+    """A copy of a trained model that predicts what fitting finds; the model stays as it is.
+
+    The same seed gives the same weights on the same machine and thread count; torch's global random state is
+    neither read nor changed. The student fits scenes within the linear model that the model has.
+
+    Args:
+        model: trained, with a fitting.
+        images: its training images, or more of the kind.
+        held_out: other images, on which errors are measured.
+        config: how, and how features are made afterwards.
+        seed: of every random choice.
+        progress: called once for each part of the work.
+
+    Raises:
+        ValueError: a model that cannot fit scenes or has further factors; too few images, or images of
+            another size; weights that are NaN or infinite in the end.
+    """
+    config = config or RefineConfig()
+    settings, maps = config.refining, _maps_of(model)
+    if len(images) < 2 or not len(held_out) or images.shape[-1] != model.image_size:
+        raise ValueError(
+            f"refining needs 2 images or more of {model.image_size} pixels and one held out, got "
+            f"{len(images)} of {images.shape[-1]} and {len(held_out)}"
+        )
+    generator = Generator().manual_seed(seed)
+    rows = torch.randperm(len(images), generator=generator)[: settings.fitted]
+    fitted = _fit(model, images[rows], settings.fit_steps, progress)
+    clear = fitted.clear(settings.worst).cpu()
+    if not clear.any():
+        raise ValueError("fitting finds no scene of any image: the model's training went wrong")
+    student = deepcopy(model.without_features())
+    student.source = None
+    if settings.reframed:
+        ranges = ranges_for_crops(student.settings.ranges, student.image_size, config.reframe)
+        student.settings = student.settings.model_copy(update={"ranges": ranges})
+    _learn(student, images[rows[clear]], maps, fitted.rows(clear), config, generator, progress)
+    check_weights(student, "refining", settings)
+    fitting = config.fitting.model_copy(update={"coordinates": maps.size("depth")})
+    features = config.model_copy(update={"fitting": fitting})
+    student = make_features(student, images, features, seed=seed, progress=progress, maps=maps)
+    return Refined(student, *_compared(model, student, maps, held_out[:MEASURED_IMAGES], settings.fit_steps))
+
+
+def train_student(
+    parts: Sequence[nn.Module],
+    optimiser: torch.optim.Optimizer,
+    settings: StudentSettings,
+    count: int,
+    loss: Callable[[Int64[Tensor, " b"]], Float[Tensor, ""]],
+    generator: Generator,
+    progress: Progress | None,
+    *,
+    warm_up: float,
+    clip: float = math.inf,
+) -> None:
+    """Minimise a loss of random rows of ``count`` images, with one cycle of the learning rate.
+
+    ``warm_up`` is the share of the steps until the rate peaks; gradients of each of the ``parts`` are clipped
+    to the norm ``clip``. Afterwards the parts are in evaluation mode, without gradients.
+    """
+    batch = min(settings.batch_size, count)
+    steps = math.ceil(settings.images / batch)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(
+        optimiser, settings.learning_rate, total_steps=steps + 1, pct_start=warm_up, cycle_momentum=False
+    )
+    order = endless_order(count, generator)
+    for step in range(steps):
+        value = loss(torch.tensor([next(order) for _ in range(batch)]))
+        optimiser.zero_grad(set_to_none=True)
+        value.backward()
+        if clip < math.inf:
+            for part in parts:
+                nn.utils.clip_grad_norm_(part.parameters(), clip)
+        optimiser.step()
+        schedule.step()
+        if progress is not None:
+            progress(min((step + 1) * batch, settings.images), settings.images)
+    for part in parts:
+        part.eval().requires_grad_(False)
+
+
+def check_weights(student: nn.Module, what: str, settings: StudentSettings) -> None:
+    """Weights that are NaN or infinite are an error."""
+    if not all(bool(value.isfinite().all()) for value in student.state_dict().values()):
+        raise ValueError(
+            f"{what} ended in weights that are NaN or infinite after {settings.images:,} images: "
+            "give another seed or a lower learning_rate"
+        )
+
+
+class FittedScenes(NamedTuple):
+    """Fitted scenes, compact: coordinates instead of maps; ``error`` is each image's remaining one."""
+
+    geometry: Float[Tensor, "n k"]
+    albedo: Float[Tensor, "n k"]
+    light: Float[Tensor, "n 4"]
+    camera: Float[Tensor, "n 6"]
+    error: Float[Tensor, " n"]
+
+    def rows(self, rows: Tensor | slice) -> "FittedScenes":
+        """Some of the scenes."""
+        return FittedScenes(*(value[rows] for value in self))
+
+    def clear(self, worst: float) -> Bool[Tensor, " n"]:
+        """All but the share with the largest errors, and those that are not finite or out of the image."""
+        finite = torch.stack([value.isfinite().reshape(len(value), -1).all(dim=1) for value in self])
+        found = finite.all(dim=0) & (self.error > 0)  # where nothing is rendered there is no error
+        return found & (self.error <= self.error.quantile(1 - worst))
+
+    def scene(self, maps: MorphableMaps) -> Scene:
+        depth, albedo = maps.maps("depth", self.geometry), maps.maps("albedo", self.albedo)
+        return Scene(depth, albedo.clamp(0, 1), self.light, self.camera)
+
+
+def _maps_of(model: Derenderer) -> MorphableMaps:
+    further = [factor.name for factor in model.factors if factor.name not in FACTORS]
+    if further:
+        raise ValueError(f"the model has {further[0]} beside the paper's factors: it cannot be refined")
+    return model.features.required_fitting().maps
+
+
+def _fit(
+    model: Derenderer, images: UInt8[Tensor, "n 3 h w"], steps: int, progress: Progress | None
+) -> FittedScenes:
+    parts = []
+    for start in range(0, len(images), _FIT_BATCH):
+        found = model.fit_scenes(as_float(images[start : start + _FIT_BATCH]).to(model.device), steps)
+        own = found.coordinates
+        parts.append((own["geometry"], own["albedo"], found.scene.light, found.scene.camera, found.after))
+        if progress is not None:
+            progress(min(start + _FIT_BATCH, len(images)), len(images))
+    return FittedScenes(*(torch.cat(part) for part in zip(*parts, strict=True)))
+
+
+def _learn(
+    student: Derenderer,
+    images: UInt8[Tensor, "n 3 h w"],
+    maps: MorphableMaps,
+    fitted: FittedScenes,
+    config: RefineConfig,
+    generator: Generator,
+    progress: Progress | None,
+) -> None:
+    """Train the student's networks of the four factors in place."""
+    settings = config.refining
+    learning = nn.ModuleList([student.nets[name] for name in FACTORS])
+    learning.requires_grad_(True).train()
+    optimiser = torch.optim.Adam(learning.parameters(), settings.learning_rate)
+    few = slice(0, MEASURED_IMAGES)
+    seen, scenes = as_float(images[few]).to(student.device), fitted.rows(few).scene(maps)
+    unit = SceneUnit(student, _cropped(seen, scenes, student, config, Generator().manual_seed(0))[1])
+
+    def loss(rows: Tensor) -> Tensor:
+        shown = as_float(images[rows]).to(student.device)
+        shown, target = _examples(student, shown, fitted.rows(rows).scene(maps), config, generator)
+        predicted = student.decompose(shown)
+        total = unit.distance(predicted, target)
+        photographs = slice(round(len(rows) * settings.rendered), None)  # renderings have exact scenes
+        if settings.picture_weight and len(shown[photographs]):
+            again = student.render(predicted[photographs])
+            error = masked_l1(again.image, shown[photographs], again.mask.detach())
+            total = total + settings.picture_weight * error / _NOISE
+        return total
+
+    train_student([learning], optimiser, settings, len(images), loss, generator, progress, warm_up=0.05)
+    student.requires_grad_(False).eval()
+
+
+@torch.no_grad()
+def _examples(
+    model: Derenderer,
+    images: Float[Tensor, "n 3 h w"],
+    fitted: Scene,
+    config: RefineConfig,
+    generator: Generator,
+) -> tuple[Float[Tensor, "n 3 h w"], Scene]:
+    """A batch to learn from, and its scenes: renderings first, then images, half of them mirrored."""
+    settings, ranges = config.refining, model.settings.ranges
+    rendered = round(len(images) * settings.rendered)
+    exchanged = round(rendered * settings.exchanged)
+    depth = fitted.depth.clone()
+    depth[:exchanged] = depth[:exchanged].roll(1, 0)
+    otherwise = fitted.with_parameters(
+        depth=depth,
+        light=perturb_light(fitted.light, generator, config.perturb, ranges),
+        camera=perturb_camera(fitted.camera, generator, config.perturb, ranges),
+    )[:rendered]
+    shown, scene = images[rendered:], fitted[rendered:]
+    if rendered:
+        made = model.render(otherwise)
+        filled = fill_uncovered(made.image, made.mask, images[:rendered])
+        shown, scene = torch.cat([filled.clamp(0, 1), shown]), concatenate([otherwise, scene])
+    mirrored = torch.rand(len(shown), generator=generator) < 0.5
+    mirrored[:rendered] = False  # their light and view are any already
+    twin = seen_in_mirror(scene)
+    shown = _where(mirrored, shown.flip(-1), shown)
+    scene = scene.with_parameters(
+        **{name: _where(mirrored, twin.parameters[name], value) for name, value in scene.parameters.items()}
+    )
+    return _cropped(shown, scene, model, config, generator)
+
+
+def _cropped(
+    images: Float[Tensor, "n 3 h w"],
+    scene: Scene,
+    model: Derenderer,
+    config: RefineConfig,
+    generator: Generator,
+) -> tuple[Float[Tensor, "n 3 h w"], Scene]:
+    """Images and their scenes, a share of both in other crops."""
+    settings = config.refining
+    if not settings.reframed:
+        return images, scene
+    crops = random_crops(len(images), generator, config.reframe, settings.reframed)
+    strange = torch.rand(len(images), generator=generator) < settings.strange
+    surroundings = other_surroundings(images, generator)
+    shown = _where(strange, crop_images(images, crops, surroundings), crop_images(images, crops))
+    return shown, crop_scene(scene, crops, model.settings.ranges.fov_deg)
+
+
+def _where(rows: Tensor, one: Tensor, other: Tensor) -> Tensor:
+    return torch.where(rows.to(one.device).view(-1, *[1] * (one.ndim - 1)), one, other)
+
+
+class SceneUnit:
+    """The unit of errors: the mean deviation of fitted scenes from their mean.
+
+    Numbers that the model cannot change (a translation whose range is 0) do not count.
+    """
+
+    def __init__(self, model: Derenderer, fitted: Scene):
+        with torch.no_grad():
+            self.able = {
+                name: _changeable(model, name, fitted.parameters[name]) for name in ("light", "camera")
+            }
+            self.deviation = {name: _mean_deviation(value) for name, value in fitted.parameters.items()}
+            self.slope = _mean_deviation(_slopes(fitted.depth)).mean()
+
+    def gaps(self, predicted: Scene, target: Scene) -> dict[str, Tensor]:
+        """By parameter of a scene, mean absolute difference in this unit."""
+        apart = {
+            name: (value - target.parameters[name]).abs() for name, value in predicted.parameters.items()
+        }
+        gaps = {name: apart[name].mean() / self.deviation[name].mean() for name in PARAMETERS.values()}
+        for name, able in self.able.items():
+            gaps[name] = (apart[name] / self.deviation[name])[:, able].mean()
+        return gaps
+
+    def distance(self, predicted: Scene, target: Scene) -> Float[Tensor, ""]:
+        """The sum of the gaps, and that of the slopes of depth, which make the shading."""
+        slopes = (_slopes(predicted.depth) - _slopes(target.depth)).abs().mean() / self.slope
+        return torch.stack([*self.gaps(predicted, target).values(), slopes]).sum()
+
+
+def _changeable(model: Derenderer, name: str, values: Float[Tensor, "n k"]) -> Bool[Tensor, " k"]:
+    """Which numbers of a factor the model's ranges let it change."""
+    (factor,) = (factor for factor in model.factors if factor.name == name)
+    ends = (torch.full_like(values[:1], end) for end in (-1.0, 1.0))
+    least, most = (factor.to_parameter(end, model.settings.ranges) for end in ends)
+    return (least != most)[0]
+
+
+def _slopes(depth: Float[Tensor, "n h w"]) -> Float[Tensor, "n d"]:
+    """Differences of neighbours, across and down."""
+    return torch.cat([depth.diff(dim=-1).flatten(1), depth.diff(dim=-2).flatten(1)], dim=1)
+
+
+def _mean_deviation(value: Float[Tensor, "n ..."]) -> Tensor:
+    return (value - value.mean(dim=0)).abs().mean(dim=0).clamp(min=1e-5)
+
+
+@torch.no_grad()
+def _compared(
+    model: Derenderer, student: Derenderer, maps: MorphableMaps, images: UInt8[Tensor, "n 3 h w"], steps: int
+) -> tuple[dict[str, float], dict[str, dict[str, float]]]:
+    """Errors and gaps of ``Refined``."""
+    shown = as_float(images).to(model.device)
+    fitted = model.fit_scenes(shown, steps).scene
+    unit = SceneUnit(model, fitted)
+    predicted = {"before": model.decompose(shown), "now": student.decompose(shown)}
+    errors = {}
+    for name, scene in {**predicted, "fitted": fitted}.items():
+        again = model.render(scene)
+        errors[name] = float(masked_l1(again.image, shown, again.mask))
+    gaps = {name: unit.gaps(scene, fitted) for name, scene in predicted.items()}
+    return errors, {key: {name: float(gap[key]) for name, gap in gaps.items()} for key in gaps["now"]}

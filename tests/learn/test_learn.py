@@ -1,0 +1,80 @@
+"""The library calls that make models, on values and on addresses, without a command."""
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import derender
+from derender.data import PictureSet
+from derender.learn import finetune_settings, run_settings
+
+TINY = {
+    "image_size": 32, "width": 4, "light_width": 4, "batch_size": 8, "perceptual": "none", "images": 16,
+    "whitening.pictures": 8, "whitening.views": 1, "fitting.examples": 8,
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def images() -> PictureSet:
+    pixels = np.random.default_rng(0).integers(0, 256, (40, 3, 32, 32), dtype=np.uint8)
+    labels = {"bright": np.arange(40) % 2}
+    return PictureSet(pixels, tuple(f"{row:02d}.png" for row in range(40)), labels, source="made by the test")
+
+
+@pytest.fixture(scope="module")
+def run(images, tmp_path_factory):
+    out = tmp_path_factory.mktemp("learn") / "run"
+    phases = set()
+    result = derender.train(
+        images, out=out, preset="small", settings=TINY, device="cpu", progress=lambda at: phases.add(at.phase)
+    )
+    assert (result.images, result.stopped) == (16, "images") and phases == {"train", "features"}
+    return out
+
+
+def test_a_run_is_a_model_with_a_page_and_goes_on(run, images):
+    assert "made by the test" not in run.name and (run / "report.html").is_file()
+    assert derender.load(run).whitening is not None
+    more = derender.train(images, out=run, resume=True, device="cpu")
+    assert more.images == 16, "its own settings: there is nothing to do"
+    with pytest.raises(FileExistsError, match="is not empty"):
+        derender.train(images, out=run, settings=TINY)
+    with pytest.raises(FileNotFoundError, match="train without resume first"):
+        derender.train(images, out=run / "none", resume=True)
+
+
+def test_an_address_is_read(tmp_path):
+    (tmp_path / "photos").mkdir()
+    for row, pixels in enumerate(np.random.default_rng(1).integers(0, 256, (20, 40, 40, 3), dtype=np.uint8)):
+        Image.fromarray(pixels).save(tmp_path / "photos" / f"{row}.png")
+    read = []
+    result = derender.train(
+        str(tmp_path / "photos"), out=tmp_path / "run", preset="small", settings=TINY, on_images=read.append
+    )
+    assert result.images == 16 and len(read[0]) == 20
+
+
+def test_a_copy_is_made_of_a_model_or_of_its_place(run, images, tmp_path):
+    changes = {"whitening.pictures": 12, "whitening.views": 1, "fitting.examples": 8}
+    one = derender.whiten(derender.load(run), images, out=tmp_path / "one", settings=changes)
+    two = derender.whiten(run, images, out=tmp_path / "two", settings=changes)
+    assert one.values()["between_over_within"] == two.scores["between_over_within"]
+    assert one.images == 40 and derender.load(one.folder).whitening is not None
+    with pytest.raises(FileExistsError, match="overwrite=True"):
+        derender.whiten(run, images, out=tmp_path / "one")
+    with pytest.raises(ValueError, match="leave out settings"):
+        derender.whiten(run, images, out=tmp_path / "three", settings=changes, mean_only=True)
+
+
+def test_settings_are_resolved_in_one_order(tmp_path):
+    (tmp_path / "some.yaml").write_text("preset: small\nimages: 48\nseed: 3\n")
+    chosen = run_settings(config=tmp_path / "some.yaml", settings={"seed": 4}, loocc="light")
+    assert (chosen.preset, chosen.images, chosen.seed, chosen.objective.loocc) == ("small", 48, 4, "light")
+    with pytest.raises(ValueError, match="loocc is for derender models"):
+        run_settings(model="vqvae", loocc="light")
+    with pytest.raises(ValueError, match="give either labels or attributes"):
+        finetune_settings(tmp_path)
+    joint = finetune_settings(tmp_path, labels=["bright"], factors="light, camera", preset="small")
+    assert joint.target.factors == ("light", "camera")
+    with pytest.raises(ValueError, match="a resumed run keeps its settings: leave out labels"):
+        finetune_settings(tmp_path, labels=["bright"], resume=True)
