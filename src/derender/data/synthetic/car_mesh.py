@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int32
 from numpy import ndarray
 
-from derender.data.synthetic.mesh_image import Mesh
+from derender.data.synthetic.mesh_image import TriangleMesh
 from derender.render.numba_threads import kernel
 
 _DOWN = np.array([1.0, -1.0, 1.0])
@@ -163,11 +163,11 @@ def wheel_house(
     return smooth_grid(points, points[..., [2, 1]], surface)
 
 
-def join(pieces: Sequence[Grid]) -> Mesh:
+def join(pieces: Sequence[Grid]) -> TriangleMesh:
     """One mesh of all pieces, y down from the ground at 0."""
     starts = np.cumsum([0, *(g.points.shape[0] * g.points.shape[1] for g in pieces)])
     cells = [_cells(*g.points.shape[:2]) for g in pieces]
-    return Mesh(
+    return TriangleMesh(
         vertices=(np.concatenate([g.points.reshape(-1, 3) for g in pieces]) * _DOWN).astype(np.float32),
         normals=np.concatenate([g.normals.reshape(-1, 3) for g in pieces]).astype(np.float32),
         chart=np.concatenate([g.chart.reshape(-1, 2) for g in pieces]).astype(np.float32),

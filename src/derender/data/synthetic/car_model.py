@@ -22,7 +22,7 @@ from derender.data.synthetic.car_paint import (
 )
 from derender.data.synthetic.car_traits import CarTraits
 from derender.data.synthetic.decals import Colour, Decal, Paint, Surface, box, paint_table, ring
-from derender.data.synthetic.mesh_image import Mesh
+from derender.data.synthetic.mesh_image import TriangleMesh
 
 Place = Callable[..., int]  # registers a surface (colour, part, decals) and returns its number
 _BAR_BLUE: Colour = (0.05, 0.22, 0.95)
@@ -30,8 +30,8 @@ _BAR_RED: Colour = (0.95, 0.05, 0.06)
 _TYRE: Colour = (0.055, 0.055, 0.06)
 
 
-def build_car(car: CarTraits) -> tuple[Mesh, Paint]:
-    """Mesh in metres (x right, y down, z to the rear; ground at y = 0) and its paint."""
+def build_car(car: CarTraits) -> tuple[TriangleMesh, Paint]:
+    """TriangleMesh in metres (x right, y down, z to the rear; ground at y = 0) and its paint."""
     surfaces: list[Surface] = []
 
     def place(colour: Colour, part: str = "trim", decals: list[Decal] | None = None, **more: Any) -> int:

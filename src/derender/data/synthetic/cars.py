@@ -17,7 +17,7 @@ from numpy import ndarray
 from derender.data.synthetic.car_model import build_car
 from derender.data.synthetic.car_traits import CarTraits, draw_traits
 from derender.data.synthetic.decals import PARTS, Paint
-from derender.data.synthetic.mesh_image import Mesh, draw_meshes, shift_room
+from derender.data.synthetic.mesh_image import TriangleMesh, draw_meshes, shift_room
 from derender.data.synthetic.settings import CarSettings, clipped, either_side, name_at, scaled
 from derender.data.synthetic.synthetic_set import FOV_DEG, Maps, Row, SyntheticSet, draw_background, make_set
 
@@ -30,7 +30,7 @@ class Car:
     """A model: its mesh in the canonical frame, relative to the object's centre, at its size; its paint."""
 
     traits: CarTraits
-    mesh: Mesh
+    mesh: TriangleMesh
     paint: Paint
 
 

@@ -17,7 +17,7 @@ from derender.data.synthetic.decals import paint_table
 from derender.data.synthetic.face_draw import NOSE_TIP_Z as NOSE_TIP_Z
 from derender.data.synthetic.face_draw import FaceDraw, draw_face
 from derender.data.synthetic.face_mesh import ProceduralFaces
-from derender.data.synthetic.mesh_image import Mesh, draw_meshes
+from derender.data.synthetic.mesh_image import TriangleMesh, draw_meshes
 from derender.data.synthetic.morphable import MorphableFaces
 from derender.data.synthetic.settings import FaceSettings
 from derender.data.synthetic.synthetic_set import Maps, Row, SyntheticSet, make_set
@@ -61,7 +61,8 @@ def generate(
         for name in ("light", "camera", "identity"):
             maps[name][:] = [getattr(d, name) for d in draws]
         meshes = [
-            Mesh(v, source.triangles, a, p) for v, a, p in zip(*source.meshes(draws, people), strict=True)
+            TriangleMesh(v, source.triangles, a, p)
+            for v, a, p in zip(*source.meshes(draws, people), strict=True)
         ]
         draw_meshes([(mesh, no_paint) for mesh in meshes], 1.0, [d.background for d in draws], maps)
         rows = {number: (source.labels(who), source.traits(who)) for number, who in people.items()}

@@ -5,6 +5,7 @@ sample alone, at the pixel's centre. Colours, normals and charts are interpolate
 a colour, a part and a cosine to the light at each vertex; a car has normals, and its triangles lie on painted
 surfaces (``car_paint``), so that every sample looks its colour up. Unlike ``derender.render`` this needs no
 gradient. Leaves out cast shadows, speculars, and triangles seen from behind.
+Numba's cache on disk refers to the named tuples by name: who renames one renames the kernels that take it.
 """
 
 from collections.abc import Sequence
@@ -22,7 +23,7 @@ _ALL = SAMPLES * SAMPLES
 _SLIVER = np.float32(2e-6)  # area over squared sides; below, single precision cannot tell the sides apart
 
 
-class Mesh(NamedTuple):
+class TriangleMesh(NamedTuple):
     """One mesh. Corners of a triangle run clockwise in the image when seen from outside (x right, y down).
 
     Coloured by vertex: ``albedo`` (V,3) 0..1 and ``part`` (V,) uint8, the rest empty. Painted: ``normals``
@@ -38,7 +39,7 @@ class Mesh(NamedTuple):
     surface: ndarray = np.zeros(0, np.int32)
 
 
-class Target(NamedTuple):
+class ImageMaps(NamedTuple):
     """What one image is drawn into; zeros before."""
 
     image: ndarray  # (3,S,S) uint8
@@ -50,7 +51,7 @@ class Target(NamedTuple):
 
 
 def draw_meshes(
-    meshes: Sequence[tuple[Mesh, Paint]], pivot_z: float, backgrounds: Sequence[ndarray], maps: Maps
+    meshes: Sequence[tuple[TriangleMesh, Paint]], pivot_z: float, backgrounds: Sequence[ndarray], maps: Maps
 ) -> None:
     """Draw one mesh an image into a batch of maps, with their camera and light, over backgrounds (S,S,3)."""
     rotation, direction = camera_rotation_and_light(maps["camera"], maps["light"])
@@ -60,8 +61,8 @@ def draw_meshes(
     fine = maps["images"].shape[-1] * SAMPLES
     nearest, owner = np.empty((fine, fine), np.float32), np.empty((fine, fine), np.int32)
     for n, ((mesh, paint), background) in enumerate(zip(meshes, backgrounds, strict=True)):
-        out = Target(*(maps[name][n] for name in ("images", "depth", "normal", "albedo", "mask", "parts")))
-        _draw(
+        out = ImageMaps(*(maps[name][n] for name in ("images", "depth", "normal", "albedo", "mask", "parts")))
+        _draw_mesh(
             mesh,
             paint,
             pivot,
@@ -78,7 +79,7 @@ def draw_meshes(
 
 @kernel
 @no_type_check
-def _draw(mesh, paint, pivot_z, rotation, translation, light, background, focal_px, nearest, owner, out):
+def _draw_mesh(mesh, paint, pivot_z, rotation, translation, light, background, focal_px, nearest, owner, out):
     """Fill ``out``. The mesh turns by rotation (3,3) about (0, 0, pivot_z), which comes to (0, 0, 1) +
     translation (3,); light (5,) is ambient, diffuse and the direction in the camera frame; background (S,S,3)
     0..1."""
@@ -103,7 +104,7 @@ def _draw(mesh, paint, pivot_z, rotation, translation, light, background, focal_
             fill_triangle(points, a, b, c, f, nearest, owner)
         else:
             _fill_around_hole(points, mesh.chart, a, b, c, f, paint.holes[hole], nearest, owner)
-    _shade(mesh, paint, points, normals, owner, rotation, light, background, out)
+    _shade_samples(mesh, paint, points, normals, owner, rotation, light, background, out)
 
 
 @kernel
@@ -273,7 +274,7 @@ def _blend(values, k, a, b, c, wa, wb, wc):
 
 @kernel
 @no_type_check
-def _shade(mesh, paint, points, normals, owner, rotation, light, background, out):
+def _shade_samples(mesh, paint, points, normals, owner, rotation, light, background, out):
     triangles, painted = mesh.triangles, len(mesh.chart) > 0
     # a painted mesh's light in the frame of its normals, so that these need not be turned
     lx = rotation[0, 0] * light[2] + rotation[1, 0] * light[3] + rotation[2, 0] * light[4]
