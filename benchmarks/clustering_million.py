@@ -27,11 +27,10 @@ from machine import describe_machine
 from sklearn.metrics import adjusted_rand_score
 
 from derender.evaluation import neighbours
-from derender.evaluation.clustering_finch import finch
 from derender.evaluation.clustering_methods import clusterings
-from derender.evaluation.clustering_ward import cut, ward_tree
-from derender.evaluation.clustering_ward_cells import cut_leaves, ward_in_cells
+from derender.evaluation.finch import finch
 from derender.evaluation.neighbours import nearest_rows
+from derender.evaluation.ward import cut, cut_leaves, ward_in_cells, ward_tree
 
 CLASSES, DIMENSIONS = 40, 512
 COUNTS = (2, 10, 40, 100)

@@ -209,7 +209,7 @@ def test_bad_words_on_the_command_line(refused, tmp_path):
         "train", "--data", "x", "--out", tmp_path / "r", "--sett", "a=1"
     )
     assert "--features" in refused("evaluate", "cluster", "--label", "identity")
-    assert "--data" in refused("evaluate", "cluster", "--label", "identity", "--model", "m")
+    assert "IMAGES" in refused("evaluate", "cluster", "--label", "identity", "--model", "m")
     assert "choose auto, cpu or cuda" in refused(
         "train", "--data", "x", "--out", tmp_path / "r", "--device", "gpu0", *SETTINGS
     )

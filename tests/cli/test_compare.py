@@ -1,4 +1,5 @@
-"""Tables from the command line: files and models in, scores beside controls and the paper's numbers out."""
+"""Tables from the command line: files and models in, scores beside controls and the paper's numbers out;
+`--whiten-on` adds controls with the model's whitening."""
 
 import json
 from pathlib import Path
@@ -9,6 +10,7 @@ from PIL import Image
 
 from derender import Derenderer, FeatureTable
 from derender.cli import main
+from derender.data.synthetic import FaceSettings, faces, write
 
 ROWS = 64
 QUICK = ["--resamples", "20", "--untrained-seeds", "2", "--cache"]
@@ -178,7 +180,7 @@ def test_the_papers_linear_table_frozen_and_fine_tuned(smiling, model, tmp_path,
         shown.err.split()
     )
     wrong = ("compare", "--table", "identity", "-m", model, "-d", smiling, "--finetune")
-    assert "give --table linear with --model" in refused(*wrong)
+    assert "give the linear table, models and images" in refused(*wrong)
 
 
 def test_controls_for_a_table_made_before(model, people, tmp_path, capsys):
@@ -194,14 +196,14 @@ def test_bad_input_is_one_line(tables, model, people, refused, tmp_path):
     assert "unknown label 'identty'; did you mean 'identity'" in refused(*cluster, "-l", "identty")
     assert "two classes, the 192 labelled rows of 'same' have 1" in refused(*cluster, "-l", "same")
     assert "cannot make 500 clusters of 192 rows" in refused(*cluster, "-l", "identity", "--clusters", 500)
-    assert "either --label NAME" in refused(*cluster)
-    assert "either --label NAME" in refused(*cluster, "-l", "identity", "--attributes")
+    assert "give either label" in refused(*cluster)
+    assert "give either label" in refused(*cluster, "-l", "identity", "--attributes")
     linear = ("evaluate", "linear", "-f", good, "--cache", "none")
     assert "class 'lonely' of label 'single' has one row" in refused(*linear, "-l", "single")
     assert "96 can be learned from" in refused(*linear, "--attributes")
     assert "should read like 100,500,1000" in refused(*linear, "--attributes", "--counts", "ten")
     assert "unknown head 'svm'" in refused(*linear, "--attributes", "--counts", "20", "--heads", "svm")
-    assert "--finetune trains the encoders" in refused(*linear, "--attributes", "--finetune")
+    assert "finetune trains the encoders" in refused(*linear, "--attributes", "--finetune")
     compare = ("compare", "--table", "identity", "--cache", "none", "-f", f"good={good}")
     assert "different pictures, in 192 of 192 rows" in refused(*compare, "-f", f"b={tables['elsewhere']}")
     mixed = ("-f", f"n={tables['noise']}", "-f", f"n={tables['wide']}")
@@ -211,7 +213,7 @@ def test_bad_input_is_one_line(tables, model, people, refused, tmp_path):
         "compare", "--table", "identities"
     )
     assert "give --features NAME=FILE" in refused("compare", "--table", "identity")
-    assert "--model needs --data" in refused("compare", "--table", "identity", "-m", model)
+    assert "needs images to embed" in refused("compare", "--table", "identity", "-m", model)
     assert "needs labels (class)" in refused("compare", "--table", "cars", "-f", f"good={good}")
     assert "should read NAME=PATH" in refused("compare", "--table", "cars", "-f", f"={good}")
     assert "is a folder: name a file" in refused(*cluster, "-l", "identity", "--json", tmp_path)
@@ -221,3 +223,19 @@ def test_bad_input_is_one_line(tables, model, people, refused, tmp_path):
     assert "exists already" in refused(*compare, "--markdown", there)
     assert there.read_text() == "mine"
     assert "no feature table at" in refused(*compare, "-f", f"b={tmp_path / 'none.parquet'}")
+
+
+def test_controls_get_the_models_whitening(tmp_path, capsys):
+    net = Derenderer.from_preset("small", seed=0, image_size=32, width=4, light_width=4, code_size=8)
+    model, images = net.save(tmp_path / "model"), tmp_path / "faces"
+    write(faces.generate(32, 32, 0, FaceSettings(pictures_per_identity=8)), images)
+    words = ["evaluate", "cluster", images, "-m", model, "-l", "identity", "--whiten-on", images]
+    words += ["--resamples", "20", "--untrained-seeds", "1", "--cache", tmp_path / "cache"]
+    first, again = (run(capsys, *words)["rows"] for _ in range(2))
+    assert first == again and {name: row["control"] for name, row in first.items()} == {
+        "geometry + albedo": False, "geometry + albedo, whitened here": False, "untrained encoder": True,
+        "PCA (8)": True, "pixels": True, "untrained encoder, whitened": True, "PCA (8), whitened": True,
+        "majority": True, "chance": True,
+    }  # fmt: skip
+    assert main([*map(str, words)]) == 0
+    assert "0 results computed" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""Clustering scores against oracles and closed forms; the protocol on data against known numbers."""
+"""Clustering scores against oracles and closed forms; comparisons of features; the protocol on known data."""
 
 from itertools import permutations
 
@@ -6,29 +6,30 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from sklearn.cluster import AgglomerativeClustering
 from sklearn.metrics import adjusted_rand_score, f1_score, normalized_mutual_info_score
 
 from derender.baselines.controls import pca_features, pixel_features
 from derender.data import read_pictures
-from derender.evaluation import (
-    at_least,
-    chance_scores,
-    cluster_scores,
-    cluster_table,
-    evaluate_clustering,
-    ward,
-)
-from derender.evaluation.clustering_ward import cut, ward_tree
+from derender.evaluation import at_least, chance_scores, cluster, cluster_scores, compare_clusterings
+from derender.evaluation.clustering import clustering_table, finch_levels, finch_table
+from derender.evaluation.clustering_scores import CLUSTER_COLUMNS, METRICS, scores_of_counts
+from derender.evaluation.score_table import verdict, verdict_table
 from derender.features import FeatureTable
 
-SCORES = ("accuracy", "f1", "nmi", "hungarian", "ari")
+NAMES = np.array(["ann", "bob", "cid"])
 
 
-def blobs(classes: int = 4, each: int = 12, spread: float = 0.05) -> tuple[np.ndarray, np.ndarray]:
+def problem(rows: int = 90, spread: float = 0.1):
     rng = np.random.default_rng(0)
-    labels = np.repeat(np.arange(classes), each)
-    return 3 * np.eye(classes)[labels] + spread * rng.normal(size=(len(labels), classes)), labels
+    labels = np.arange(rows) % 3
+    return {
+        "ours": [np.eye(3)[labels] + spread * rng.normal(size=(rows, 3))],
+        "noise": [rng.normal(size=(rows, 3)) for _ in range(3)],
+    }, NAMES[labels]
+
+
+def compare(features, labels, **options):
+    return compare_clusterings(features, labels, controls=("noise",), resample_count=200, **options)
 
 
 @st.composite
@@ -45,18 +46,18 @@ def test_scores_agree_with_their_definitions_written_out(case):
     labels, clusters = case
     scores = cluster_scores(labels, clusters)
     majority = np.empty_like(labels)
-    for cluster in np.unique(clusters):
-        majority[clusters == cluster] = np.bincount(labels[clusters == cluster]).argmax()
-    assert scores.accuracy == pytest.approx((majority == labels).mean())
-    assert scores.f1 == pytest.approx(f1_score(labels, majority, average="weighted", zero_division=0))
-    assert scores.nmi == pytest.approx(normalized_mutual_info_score(labels, clusters))
-    assert scores.ari == pytest.approx(adjusted_rand_score(labels, clusters))
+    for one in np.unique(clusters):
+        majority[clusters == one] = np.bincount(labels[clusters == one]).argmax()
+    assert scores["accuracy"] == pytest.approx((majority == labels).mean())
+    assert scores["f1"] == pytest.approx(f1_score(labels, majority, average="weighted", zero_division=0))
+    assert scores["nmi"] == pytest.approx(normalized_mutual_info_score(labels, clusters))
+    assert scores["ari"] == pytest.approx(adjusted_rand_score(labels, clusters))
     best = max(
         sum((labels == names[c]) & (clusters == c) for c in range(4)).sum()
         for names in permutations(range(5), 4)
     )
-    assert scores.hungarian == pytest.approx(best / len(labels))
-    assert scores.hungarian <= scores.accuracy + 1e-12
+    assert scores["hungarian"] == pytest.approx(best / len(labels))
+    assert scores["hungarian"] <= scores["accuracy"] + 1e-12
 
 
 @settings(max_examples=40, deadline=None)
@@ -68,94 +69,50 @@ def test_names_of_clusters_and_classes_do_not_matter(case, cluster_names, class_
         np.array(list("abcde"))[list(class_names)][labels], np.array(cluster_names)[clusters] * 7 - 3
     )
     for name in ("accuracy", "nmi", "hungarian", "ari"):
-        assert getattr(renamed, name) == pytest.approx(getattr(scores, name))
+        assert renamed[name] == pytest.approx(scores[name])
 
 
 def test_true_classes_score_the_best_value_and_one_cluster_the_majority():
     labels = np.array(["a"] * 6 + ["b"] * 3 + ["c"])
-    best = cluster_scores(labels, np.array([2] * 6 + [0] * 3 + [1]))
-    assert [getattr(best, name) for name in SCORES] == pytest.approx([1] * 5)
+    assert list(cluster_scores(labels, np.array([2] * 6 + [0] * 3 + [1])).values()) == pytest.approx([1] * 5)
     one = cluster_scores(labels, np.zeros(10, int))
-    assert one.accuracy == one.hungarian == 0.6 and one.nmi == 0 and one.ari == 0
-    assert one.f1 == pytest.approx(0.6 * (2 * 0.6 / 1.6))
+    assert one["accuracy"] == one["hungarian"] == 0.6 and one["nmi"] == one["ari"] == 0
+    assert one["f1"] == pytest.approx(0.6 * (2 * 0.6 / 1.6))
 
 
-def test_ward_agrees_with_scikit_learn_at_every_cut():
-    features = np.random.default_rng(1).normal(size=(40, 5))
-    tree = ward_tree(features)
-    for n_clusters in range(1, 41):
-        ours = cut(tree, n_clusters)
-        theirs = AgglomerativeClustering(n_clusters, linkage="ward").fit_predict(features)
-        assert len(np.unique(ours)) == n_clusters and ours[0] == 0
-        assert adjusted_rand_score(ours, theirs) == 1
-
-
-def test_identical_rows_still_give_the_number_of_clusters_asked_for():
-    assert len(np.unique(ward(np.zeros((9, 2)), 4))) == 4
-
-
-def test_separated_blobs_are_found_and_shuffled_labels_score_chance():
-    features, labels = blobs()
-    result = evaluate_clustering(features, labels)
-    assert result.scores.accuracy == result.scores.nmi == result.scores.f1 == 1
-    assert (result.n_rows, result.n_classes, result.n_clusters, result.n_dropped) == (48, 4, 4, 0)
-    assert result.majority == 0.25
-    shuffled = evaluate_clustering(features, np.random.default_rng(5).permutation(labels), seeds=range(50))
-    for name in SCORES:
-        chance, spread = getattr(shuffled.chance, name), getattr(shuffled.chance_spread, name)
-        assert abs(getattr(shuffled.scores, name) - chance) < 4 * spread
-    assert abs(shuffled.chance.ari) < 0.02 and shuffled.chance.accuracy > 0.3
+def test_scores_of_many_tables_at_once_are_those_of_each():
+    tables = np.random.default_rng(0).integers(0, 6, size=(40, 3, 4))
+    tables[0] = np.diag([5, 5, 5, 0])[:3]
+    tables[1] = 0
+    tables[1, 0, 0] = 4
+    for table, scores in zip(tables, scores_of_counts(tables), strict=True):
+        np.testing.assert_allclose(scores, scores_of_counts(table[None])[0])
+        classes, clusters = (np.repeat(index, table.ravel()) for index in np.divmod(np.arange(12), 4))
+        assert scores[2] == pytest.approx(normalized_mutual_info_score(classes, clusters))
+        assert scores[4] == pytest.approx(adjusted_rand_score(classes, clusters))
 
 
 def test_chance_keeps_cluster_sizes_and_needs_a_seed():
     labels = np.array([0] * 90 + [1] * 10)
-    one_big = chance_scores(labels, np.array([0] * 99 + [1]), seeds=range(5))[0]
-    assert one_big.accuracy == pytest.approx(0.9)
-    equal, spread = chance_scores(np.arange(100) % 2, 50, seeds=range(20))
-    assert equal.accuracy == pytest.approx(0.75, abs=0.04) and spread.accuracy > 0
+    one_big = chance_scores(labels, np.array([0] * 99 + [1]), seeds=range(5))
+    assert one_big["accuracy"] == pytest.approx(0.9)
+    assert chance_scores(np.arange(100) % 2, 50, seeds=range(20))["accuracy"] == pytest.approx(0.75, abs=0.04)
     with pytest.raises(ValueError, match="at least one seed"):
         chance_scores(labels, labels, seeds=())
 
 
-def test_missing_labels_are_dropped_and_counted():
-    features, labels = blobs()
-    names = np.array(list("abcd"), dtype=object)[labels]
-    names[[0, 13]] = None
-    names[30] = ""
-    result = evaluate_clustering(np.vstack([features, np.full((1, 4), 99.0)]), np.append(names, None))
-    assert result.n_dropped == 4 and result.n_rows == 45 and result.scores.accuracy == 1
-
-
 @pytest.mark.parametrize(
-    ("features", "labels", "n_clusters", "message"),
+    ("labels", "clusters", "message"),
     [
-        (np.ones((3, 2)), ["a"] * 3, None, "at least two classes, the 3 labelled rows have 1"),
-        (np.ones((3, 2)), ["", "", ""], None, "at least two classes, the 0 labelled rows have 0"),
-        (np.ones((3, 2)), ["a", "b", "b"], 4, "cannot make 4 clusters of 3 rows: ask for 1 to 3"),
-        (np.ones((3, 2)), ["a", "b", "b"], 0, "cannot make 0 clusters"),
-        (np.array([[1.0], [np.nan], [2.0]]), ["a", "b", "b"], None, "not finite in 1 of 3 rows"),
-        (np.ones((3, 2)), ["a", "b"], None, "3 rows of features but 2 labels"),
-        (np.ones(3), ["a", "b", "b"], None, r"must be \(rows, dimensions\), got shape \(3,\)"),
-        (np.ones((3, 2)), [["a"], ["b"], ["b"]], None, "one value per row"),
+        ([], [], "no rows"),
+        (["a", ""], [0, 1], "1 labels are missing"),
+        (["a", "b"], [0, 1, 2], "must be of one length"),
+        ([["a"], ["b"]], [0, 1], "one value per row"),
     ],
 )
-def test_bad_input_is_refused_in_words(features, labels, n_clusters, message):
+def test_scores_need_rows_labels_and_one_length(labels, clusters, message):
     with pytest.raises(ValueError, match=message):
-        evaluate_clustering(features, np.array(labels), n_clusters)
-
-
-def test_scores_need_rows_labels_and_one_length():
-    with pytest.raises(ValueError, match="no rows"):
-        cluster_scores(np.array([]), np.array([]))
-    with pytest.raises(ValueError, match="1 labels are missing"):
-        cluster_scores(np.array(["a", ""]), np.array([0, 1]))
-    with pytest.raises(ValueError, match="must be of one length"):
-        cluster_scores(np.array(["a", "b"]), np.array([0, 1, 2]))
-
-
-def test_a_class_with_one_member_is_a_class():
-    result = evaluate_clustering(np.array([[0.0], [0.1], [9.0]]), np.array(["a", "a", "b"]))
-    assert result.n_classes == 2 and result.scores.accuracy == 1
+        cluster_scores(np.array(labels), np.array(clusters))
 
 
 def test_at_least_keeps_big_classes_and_their_first_members():
@@ -167,59 +124,181 @@ def test_at_least_keeps_big_classes_and_their_first_members():
         at_least(labels, 4)
 
 
-def test_a_table_is_averaged_capped_and_clustered():
-    features, labels = blobs(3, 20)
-    tracks = np.arange(60) // 5
-    noise = np.random.default_rng(0).normal(size=(60, 3)) * 30
+def test_true_groups_win_and_say_so():
+    features, who = problem()
+    found = compare(features, {"who": who})
+    rows = {row.name: row for row in found.rows}
+    assert list(rows) == ["ours", "noise", "majority", "chance"]
+    assert [row.control for row in found.rows] == [False, True, True, True]
+    ours = rows["ours"]
+    assert all(ours.scores[score].value == pytest.approx(1) for score in METRICS)
+    assert all(one.above for one in ours.versus.values())
+    assert rows["noise"].runs == 3 and rows["noise"].scores["accuracy"].spread > 0
+    assert rows["majority"].scores["accuracy"].value == pytest.approx(1 / 3)
+    assert rows["majority"].scores["nmi"].value == rows["majority"].scores["ari"].value == 0
+    assert abs(rows["chance"].scores["ari"].value) < 0.03
+    assert (found.n_rows, found.n_dropped, found.labels) == (90, 0, {"who": 3})
+
+
+def test_intervals_hold_the_value_and_shuffled_labels_are_at_chance():
+    features, who = problem(spread=0.6)
+    ours = compare(features, {"who": who}).rows[0]
+    assert all(one.low <= one.value <= one.high for one in ours.scores.values())
+    shuffled = compare(features, {"who": np.random.default_rng(1).permutation(who)})
+    assert not any(shuffled.rows[0].versus[score].above for score in ("accuracy", "nmi", "ari", "hungarian"))
+    chance = shuffled.rows[-1].scores
+    for name in METRICS:
+        assert abs(shuffled.rows[0].scores[name].value - chance[name].value) < 4 * chance[name].spread
+
+
+def test_several_labels_are_the_mean_of_each_alone():
+    features, who = problem(spread=0.6)
+    attributes = {"a": (who == "ann").astype(np.int8), "b": np.arange(90) % 2 == 0}
+    both = compare(features, attributes)
+    for score in METRICS:
+        alone = [compare(features, {name: v}).rows[0].scores[score].value for name, v in attributes.items()]
+        assert both.rows[0].scores[score].value == pytest.approx(np.mean(alone))
+    assert both.labels == {"a": 2, "b": 2} and set(both.per_label["ours"]) == {"a", "b"}
+
+
+def test_missing_labels_are_dropped_and_counted():
+    features, who = problem()
+    column = who.astype(object)
+    column[[0, 1]] = None
+    found = compare(features, {"who": column})
+    assert (found.n_rows, found.n_dropped, found.n_missing) == (88, 2, 0)
+    other = np.arange(90) % 2
+    both = compare(features, {"who": column, "other": other})
+    assert (both.n_rows, both.n_dropped, both.n_missing) == (90, 0, 2)
+    alone = compare(features, {"other": other}).rows[0].scores["accuracy"].value
+    assert both.rows[0].scores["accuracy"].value == pytest.approx((1 + alone) / 2)
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.permutations(range(30)), st.permutations(range(3)))
+def test_order_of_rows_and_names_of_classes_do_not_matter(order, names):
+    features, who = problem(30, spread=0.7)
+    order = np.array(order)
+    straight = compare(features, {"who": who}).rows[0].scores
+    moved = {name: [array[order] for array in arrays] for name, arrays in features.items()}
+    renamed = NAMES[list(names)][np.searchsorted(NAMES, who)][order]
+    other = compare(moved, {"who": renamed}).rows[0].scores
+    for score in ("accuracy", "nmi", "hungarian", "ari"):
+        assert other[score].value == pytest.approx(straight[score].value)
+
+
+def test_k_means_is_run_with_five_seeds():
+    features, who = problem()
+    found = compare({"ours": features["ours"]}, {"who": who}, method="k-means")
+    assert found.rows[0].runs == 5 and found.rows[0].scores["accuracy"].value == pytest.approx(1)
+
+
+@pytest.mark.parametrize(
+    ("labels", "options", "message"),
+    [
+        ({"who": np.zeros(90)}, {}, "two classes, the 90 labelled rows of 'who' have 1"),
+        ({"who": np.full(90, "")}, {}, "two classes, the 0 labelled rows of 'who' have 0"),
+        ({"who": np.arange(90) % 2}, {"n_clusters": 91}, "cannot make 91 clusters of 90 rows"),
+        ({"who": np.arange(89) % 2}, {}, "features 'ours' has 90 rows, the others 89"),
+        ({"who": np.arange(90)}, {}, "is a class of its own"),
+        ({}, {}, "at least one label"),
+    ],
+)
+def test_bad_input_is_refused_in_words(labels, options, message):
+    with pytest.raises(ValueError, match=message):
+        compare(problem()[0], labels, **options)
+
+
+def test_tables_show_scores_intervals_and_the_strongest_control():
+    features, who = problem()
+    column = who.astype(object)
+    column[:19] = None
+    found = compare(features, {"who": column})
+    table = clustering_table(found)
+    assert [one.name for one in table.columns] == ["accuracy", "95 %", "±", "F1", "NMI", "matched", "ARI"]
+    assert table.caption == "Ward clustering: 71 rows, 3 classes of who; 19 rows without label left out"
+    values = table.values()
+    assert np.isnan(values["ours"]["±"]) and values["noise"]["±"] > 0
+    assert np.isnan(values["chance"]["95 %"].low)
+    assert values["noise"]["95 %"].low < values["noise"]["accuracy"] < values["noise"]["95 %"].high
+    judged = verdict_table(found.rows, CLUSTER_COLUMNS, "above?")
+    assert [row.name for row in judged.rows] == [f"ours: {c.name}" for c in CLUSTER_COLUMNS.values()]
+    rival = found.rows[0].versus["accuracy"].rival
+    assert judged.values()["ours: accuracy"]["strongest control"] == rival
+    assert judged.values()["ours: accuracy"]["above"] == "yes"
+    assert f"above the strongest control ({rival})" in verdict(found.rows[0], "accuracy")
+    assert verdict(found.rows[1], "nmi").startswith("noise: 0.")
+    same = compare({"ours": features["noise"], "noise": features["noise"]}, {"who": who}).rows[0]
+    assert any(word in verdict(same, "ari") for word in ("not distinguished from", "below"))
+
+
+def test_finch_levels_are_shown_beside_chance():
+    features, who = problem()
+    levels = finch_levels(features["ours"][0], who)
+    table = finch_table("ours", levels, 3)
+    assert [row.name for row in table.rows] == [f"{level.clusters} clusters" for level in levels]
+    assert table.rows[0].cells[0] > table.rows[0].cells[1]
+
+
+@pytest.fixture(scope="module")
+def tracks() -> FeatureTable:
+    """12 tracks of three people; noise that is 0 in the mean of a track; one label missing."""
+    labels, noise = np.repeat(np.arange(3), 20), np.random.default_rng(0).normal(size=(60, 3)) * 30
     noise -= np.repeat(noise.reshape(12, 5, 3).mean(1), 5, axis=0)
-    who = np.array(["ann", "bob", "cid"])[labels]
+    who = NAMES[labels]
     who[7] = ""
-    table = FeatureTable(
-        tuple(map(str, range(60))),
-        {"geometry": features + noise, "junk": noise},
-        {"who": who, "track": tracks},
-    )
-    assert cluster_table(table, "who", factors=("geometry",)).scores.accuracy < 0.9
-    table = table.select(np.flatnonzero(tracks != 1))
-    means = cluster_table(table, "who", factors=("geometry",), mean_by=("track",))
-    assert means.scores.accuracy == 1 and means.n_rows == 11
-    capped = cluster_table(table, "who", factors="geometry", min_count=16, max_count=4)
-    assert (capped.n_rows, capped.n_classes) == (8, 2)
-    with pytest.raises(ValueError, match="label 'track' differs inside groups of who: average by it too"):
-        cluster_table(table, "track", mean_by=("who",))
-    with pytest.raises(ValueError, match="unknown label 'wo'; did you mean 'who'"):
-        cluster_table(table, "wo", factors=None)
+    features = {"geometry": 3 * np.eye(3)[labels] + noise, "junk": noise}
+    return FeatureTable(tuple(map(str, range(60))), features, {"who": who, "track": np.arange(60) // 5})
 
 
-def test_missing_labels_are_counted_before_averaging():
-    features, labels = blobs(2, 10)
-    who = np.array(["a", "b"])[labels]
-    who[3] = ""
-    table = FeatureTable(
-        tuple(map(str, range(20))), {"f": features}, {"who": who, "track": np.arange(20) // 2}
-    )
-    result = cluster_table(table, "who", factors=None, mean_by=("track",))
-    assert result.n_dropped == 1 and result.n_rows == 10
+def test_one_call_averages_caps_clusters_and_scores(tracks, tmp_path):
+    how = {"factors": ("geometry",), "resamples": 20, "cache": "none"}
+    path = tracks.write(tmp_path / "t.parquet")
+    plain = cluster(path, "who", **how)
+    assert plain.values["rows"]["geometry"]["scores"]["accuracy"]["value"] < 0.9
+    assert plain.values["n_dropped"] == 1 and "without images there are no pixels" in plain.notes[0]
+    means = cluster(tracks, "who", mean_by=("who", "track"), **how)
+    assert means.values["rows"]["geometry"]["scores"]["accuracy"]["value"] == 1
+    assert (means.values["n_rows"], means.values["n_dropped_before"]) == (12, 1)
+    assert means.to_pandas().loc["geometry", "accuracy"] == 1 and "| geometry |" in means.to_markdown()
+    capped = cluster(tracks, "who", min_count=20, max_count=4, **how)
+    assert (capped.values["n_rows"], capped.values["labels"]) == (8, {"who": 2})
+    levels = cluster(tracks, "who", method="finch", mean_by=("who", "track"), **how)
+    assert levels.tables[2].caption.startswith("FINCH on geometry") and levels.values["finch"]["geometry"]
+    for bad, message in (
+        (("track", {"mean_by": ("who",)}), "label 'track' differs inside groups of who: average by it too"),
+        (("wo", {}), "unknown label 'wo'; did you mean 'who'"),
+        ((None, {}), "give either label"),
+        (("who", {"factors": ("geometri",)}), "unknown factor 'geometri'"),
+        (("who", {"whiten_on": "x"}), "whiten_on needs a model"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            cluster(tracks, bad[0], **{**how, **bad[1]})
+    with pytest.raises(ValueError, match="needs images to embed"):
+        cluster("faces-64", "who")
+
+
+def accuracy(table, **how) -> tuple[float, float, dict]:
+    """Of the first row and of chance, and all values."""
+    values = cluster(table, "identity", factors=None, resamples=10, cache="none", **how).values
+    rows = list(values["rows"].values())
+    return rows[0]["scores"]["accuracy"]["value"], rows[-1]["scores"]["accuracy"]["value"], values
 
 
 def test_pixels_on_lfw_reach_what_is_known(shared_data):
-    """31 people, 20 pictures each: 0.24 by pixels, 0.13 by chance."""
-    pictures = read_pictures(shared_data("data/lfw64.zip"), 64)
-    pictures = pictures.select(at_least(pictures.labels["identity"], 20, most=20))
-    assert len(pictures) == 620
-    pixels = cluster_table(pixel_features(pictures), "identity", factors=None)
-    assert pixels.n_classes == 31
-    assert pixels.scores.accuracy == pytest.approx(0.237, abs=0.01)
-    assert pixels.chance.accuracy == pytest.approx(0.13, abs=0.01)
+    """31 people, 20 images each: 0.24 by pixels, 0.13 by chance."""
+    pixels = pixel_features(read_pictures(shared_data("data/lfw64.zip"), 64))
+    own, chance, values = accuracy(pixels, min_count=20, max_count=20)
+    assert (values["n_rows"], values["labels"]) == (620, {"identity": 31})
+    assert (own, chance) == (pytest.approx(0.237, abs=0.01), pytest.approx(0.13, abs=0.01))
 
 
 def test_pixels_on_tracks_reach_what_is_known(shared_data):
     """240 tracks of 12 rendered people: 0.23 by pixels; PCA is no better."""
-    pictures = read_pictures(shared_data("data/synface_tracks64.zip"), 64)
-    options = {"factors": None, "mean_by": ("identity", "track")}
-    pixels = cluster_table(pixel_features(pictures), "identity", **options)
-    assert (pixels.n_rows, pixels.n_classes) == (240, 12)
-    assert pixels.scores.accuracy == pytest.approx(0.225, abs=0.01)
-    assert pixels.majority == pytest.approx(1 / 12)
-    assert pixels.chance.accuracy == pytest.approx(0.195, abs=0.01)
-    assert cluster_table(pca_features(pictures), "identity", **options).scores.accuracy < 0.24
+    images = read_pictures(shared_data("data/synface_tracks64.zip"), 64)
+    how = {"mean_by": ("identity", "track")}
+    own, chance, values = accuracy(pixel_features(images), **how)
+    assert (values["n_rows"], values["labels"]) == (240, {"identity": 12})
+    assert values["rows"]["majority"]["scores"]["accuracy"]["value"] == pytest.approx(1 / 12)
+    assert (own, chance) == (pytest.approx(0.225, abs=0.01), pytest.approx(0.195, abs=0.01))
+    assert accuracy(pca_features(images), **how)[0] < 0.24

@@ -10,16 +10,19 @@ import pytest
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "evaluation.md").read_text()
 TABLES = (
-    *("tables_comparison", "tables_disentanglement", "tables_segmentation"),
-    *("tables_pictures", "score_table", "robustness"),
+    *("evaluation/clustering", "evaluation/clustering_scores", "evaluation/linear_probing"),
+    *("evaluation/paper_comparison", "evaluation/score_table", "report/score_table"),
+    *("report/tables_disentanglement", "report/tables_segmentation", "report/robustness"),
 )
 
 
 def columns(module: str) -> set[str]:
     """Names of the columns that a module of tables makes."""
-    tree = ast.parse((ROOT / "src" / "derender" / "report" / f"{module}.py").read_text())
+    tree = ast.parse((ROOT / "src" / "derender" / f"{module}.py").read_text())
     calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call) and node.args]
-    named = [call.args[0] for call in calls if isinstance(call.func, ast.Name) and call.func.id == "Column"]
+    place = {"Column": 0, "metric": 1}
+    functions = [(call, getattr(call.func, "id", "")) for call in calls]
+    named = [call.args[place[name]] for call, name in functions if name in place]
     return {one.value for one in named if isinstance(one, ast.Constant) and isinstance(one.value, str)}
 
 

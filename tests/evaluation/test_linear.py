@@ -11,11 +11,12 @@ from sklearn.linear_model import LogisticRegression
 from sklearn.metrics import accuracy_score, average_precision_score, balanced_accuracy_score
 from sklearn.neighbors import KNeighborsClassifier
 
-from derender.evaluation.linear_compare import compare_linear
+from derender import Derenderer
+from derender.evaluation.linear_finetune import finetune
 from derender.evaluation.linear_head import HeadSettings, train_heads
 from derender.evaluation.linear_logistic import axes_of, fit_logistic, solve_logistic
 from derender.evaluation.linear_probes import HEADS, PROBES, majority_answers, nearest_answers, probe
-from derender.evaluation.linear_scores import count_scores, linear_scores
+from derender.evaluation.linear_probing import compare_linear, count_scores, linear_scores
 from derender.evaluation.linear_task import Task, choose_rows, task_of
 from derender.evaluation.memory import Memory
 
@@ -360,3 +361,24 @@ def test_features_that_never_change_answer_with_the_shares():
     task = task_of({"a": np.arange(40) % 2, "b": np.arange(40) // 4 % 2})
     answers, _ = fit_logistic(np.ones((40, 3)), task.targets, np.ones((5, 3)), kind="labels")
     assert answers == pytest.approx(np.full((5, 2), 0.5), abs=1e-3)
+
+
+def test_bright_and_dark_pictures_are_learned_through_the_encoders():
+    rng = np.random.default_rng(0)
+    bright = rng.integers(0, 2, 32)
+    images = (rng.integers(0, 60, (32, 3, 32, 32)) + 150 * bright[:, None, None, None]).astype(np.uint8)
+    model = Derenderer.from_preset("small", seed=0, image_size=32, width=4, light_width=4).eval()
+    model.requires_grad_(False)
+    before = {name: value.clone() for name, value in model.state_dict().items()}
+    task = task_of({"bright": bright.astype(np.int8)})
+    rows, tested, done = np.arange(16), np.arange(16, 32), []
+    options = {"settings": HeadSettings(learning_rate=3e-3, epochs=8, batch_size=8), "seed": 3}
+    answers = finetune(
+        model, images, task, rows, tested, progress=lambda at, total: done.append((at, total)), **options
+    )
+    assert linear_scores(task.targets[tested], answers, "labels").accuracy == 1
+    assert done[-1] == (8, 8)
+    assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())
+    assert not any(parameter.requires_grad for parameter in model.parameters())
+    again = finetune(model, images, task, rows, tested, **options)
+    assert again == pytest.approx(answers, abs=1e-4)

@@ -1,9 +1,14 @@
-"""What is remembered is found again by content, and only by the same content."""
+"""Cached results are found by content, and only by the same content; dataclasses come back as they were."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
 
 import numpy as np
 import pytest
 
-from derender.evaluation.memory import Memory, content_hash
+from derender.evaluation import GeometryResult, GeometryScores
+from derender.evaluation.memory import Memory, content_hash, memory_in, packed, unpacked
+from derender.storage.atomic import DamageNoticed
 
 
 def test_the_same_inputs_are_computed_once(tmp_path):
@@ -29,7 +34,8 @@ def test_a_damaged_file_is_made_again(tmp_path):
     (file,) = tmp_path.iterdir()
     for damaged in (b"", b"nothing", file.read_bytes()[:-30]):
         file.write_bytes(damaged)
-        assert Memory(tmp_path).recall("x", {}, lambda: {"a": np.zeros(2)})["a"].tolist() == [0, 0]
+        with pytest.warns(DamageNoticed, match="is damaged: computed again"):
+            assert Memory(tmp_path).recall("x", {}, lambda: {"a": np.zeros(2)})["a"].tolist() == [0, 0]
         assert Memory(tmp_path).recall("x", {}, dict)["a"].tolist() == [0, 0]
 
 
@@ -46,6 +52,8 @@ def test_without_a_folder_nothing_is_kept():
     memory = Memory()
     assert [memory.recall("x", {}, lambda: {"a": np.ones(1)})["a"][0] for _ in range(2)] == [1, 1]
     assert (memory.made, memory.recalled) == (2, 0)
+    assert memory_in("none").folder is None and memory_in(memory) is memory
+    assert memory.summary("runs") == "2 runs computed, 0 found"
 
 
 @pytest.mark.parametrize(
@@ -63,3 +71,70 @@ def test_without_a_folder_nothing_is_kept():
 def test_every_difference_counts(other):
     assert content_hash({"x": np.array([1.0, 2.0, 3.0])}) != content_hash(other)
     assert content_hash(other) == content_hash(dict(reversed(other.items())))
+
+
+@dataclass(frozen=True)
+class Inner:
+    each: np.ndarray
+    names: tuple[str, ...]
+    counts: dict[str, int]
+
+
+@dataclass(frozen=True)
+class Outer:
+    inner: Inner
+    absent: Inner | None
+    pair: tuple[float, float] | None
+    by_name: Mapping[str, float]
+    value: float
+
+
+def outer(value: float = 0.1) -> Outer:
+    inner = Inner(np.array([[1.5, np.nan]], np.float32), ("a", "b"), {"a": 3})
+    return Outer(inner, None, (0.25, 1e-17), {"x": float("inf")}, value)
+
+
+def same(one: object, other: object) -> None:
+    assert type(one) is type(other)
+    for field in fields(one):  # pyright: ignore[reportArgumentType]
+        mine, theirs = getattr(one, field.name), getattr(other, field.name)
+        if isinstance(mine, Inner):
+            same(mine, theirs)
+        elif isinstance(mine, np.ndarray):
+            assert mine.dtype == theirs.dtype
+            np.testing.assert_array_equal(mine, theirs)
+        else:
+            assert mine == theirs, field.name
+
+
+def test_what_was_packed_is_unpacked(tmp_path):
+    same(unpacked(Outer, packed(outer())), outer())
+    memory = Memory(tmp_path)
+    same(memory.recall_value("outer", {"k": 1}, Outer, outer), outer())
+    same(memory.recall_value("outer", {"k": 1}, Outer, lambda: outer(0.9)), outer())
+    assert memory.recall_value("outer", {"k": 2}, Outer, lambda: outer(0.9)).value == 0.9
+    assert (memory.made, memory.recalled) == (2, 1)
+
+
+def test_numbers_of_numpy_become_numbers():
+    made = Outer(outer().inner, None, None, {"x": np.float32(0.5)}, np.float64(0.1))  # type: ignore[arg-type]
+    found = unpacked(Outer, packed(made))
+    assert found.by_name == {"x": 0.5} and found.value == 0.1 and found.pair is None
+
+
+def test_a_class_with_other_fields_is_another_result(tmp_path):
+    @dataclass(frozen=True)
+    class Grown(Inner):
+        more: float = 1.0
+
+    memory = Memory(tmp_path)
+    memory.recall_value("x", {}, Inner, lambda: outer().inner)
+    found = memory.recall_value("x", {}, Grown, lambda: Grown(np.ones(1), (), {}, 2.0))
+    assert found.more == 2.0 and memory.made == 2
+
+
+def test_a_protocols_own_result():
+    scores = GeometryScores(0.1, 20.0, 0.9, 1, np.array([0.1, np.nan]), np.array([20.0, np.nan]))
+    found = unpacked(GeometryResult, packed(GeometryResult(scores, scores, scores)))
+    assert found.untrained is None and found.model.n_empty == 1
+    assert found.plane.side_each == pytest.approx([0.1, np.nan], nan_ok=True)

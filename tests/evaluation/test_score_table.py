@@ -13,11 +13,10 @@ from derender.evaluation import (
     GeometryScores,
     ReconstructionResult,
     ReconstructionScores,
-    evaluate_clustering,
 )
 from derender.evaluation.bootstrap import Estimate, ScoredRow, constant
 from derender.evaluation.score_table import Column, Interval, Row, Scores, ScoreTable, scored_table
-from derender.report.score_table import clustering_table, geometry_table, reconstruction_table
+from derender.report.score_table import geometry_table, reconstruction_table
 
 
 def table(ours: float, controls: dict[str, float | None], best="high") -> ScoreTable:
@@ -61,19 +60,6 @@ def test_best_ignores_what_is_no_number():
 def test_rows_must_fit_the_columns():
     with pytest.raises(ValueError, match="'ours' has 2 cells for 1 columns"):
         ScoreTable("", "", [Column("a")], [Row("ours", [1, 2])])
-
-
-def test_clustering_table_carries_chance_and_sizes():
-    labels = np.repeat(np.arange(4), 6)
-    perfect = evaluate_clustering(np.eye(4)[labels] * 9, labels)
-    noise = evaluate_clustering(np.random.default_rng(0).standard_normal((24, 3)), labels)
-    scores = clustering_table({"ours": perfect, "pixels": noise}, ["pixels"])
-    values = scores.values()
-    assert values["ours"] == {"accuracy": 1.0, "F1": 1.0, "NMI": 1.0, "matched": 1.0, "ARI": 1.0}
-    assert list(values) == ["ours", "pixels", "chance"]
-    assert values["chance"]["accuracy"] == perfect.chance.accuracy < 0.7
-    assert [row.control for row in scores.rows] == [False, True, True]
-    assert "24 rows, 4 classes, 4 clusters" in scores.caption and "0.250" in scores.caption
 
 
 def test_geometry_and_reconstruction_tables_print_in_the_papers_units():

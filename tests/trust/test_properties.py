@@ -72,9 +72,9 @@ def test_two_sided_scores_do_not_care_which_side_is_which(pairs, names):
     straight, crossed = cluster_scores(one, other), cluster_scores(other, one)
     renamed = cluster_scores(np.array(names)[one], other)
     for name in ("nmi", "ari", "hungarian"):
-        assert getattr(crossed, name) == pytest.approx(getattr(straight, name), abs=1e-12)
-        assert getattr(renamed, name) == pytest.approx(getattr(straight, name), abs=1e-12)
-    assert renamed.accuracy == pytest.approx(straight.accuracy)
+        assert crossed[name] == pytest.approx(straight[name], abs=1e-12)
+        assert renamed[name] == pytest.approx(straight[name], abs=1e-12)
+    assert renamed["accuracy"] == pytest.approx(straight["accuracy"])
 
 
 @pytest.mark.parametrize("head", ["logistic", "k-NN"])

@@ -148,7 +148,7 @@ def clustering(quick: bool) -> Pair:
     from sklearn.cluster import AgglomerativeClustering
     from sklearn.metrics import adjusted_rand_score
 
-    from derender.evaluation.clustering_ward import cut, ward_tree
+    from derender.evaluation.ward import cut, ward_tree
 
     count = 500 if quick else 3_000
     features = np.random.default_rng(0).normal(size=(count, 128)).astype(np.float32)

@@ -96,7 +96,7 @@ def explain(
     published.check()
     from derender.cli.models import open_model, part_of
     from derender.data import read_pictures
-    from derender.evaluation.tables import attribute_columns
+    from derender.evaluation.feature_rows import attribute_columns
     from derender.features import embed_pictures
     from derender.interpretation import explain_labels, question
     from derender.interpretation.shares import captum_attr

@@ -13,6 +13,7 @@ from jaxtyping import UInt8
 from derender import __version__
 from derender.data import as_float
 from derender.demo.story import BUNDLED, STAGES, DemoResult
+from derender.evaluation.clustering import clustering_table
 from derender.evaluation.geometry import predicted_depth
 from derender.evaluation.score_table import ScoreTable
 from derender.model import Derenderer
@@ -22,7 +23,7 @@ from derender.report.decomposition import COLUMN_MEANING, decompose_images
 from derender.report.evidence import looping_films
 from derender.report.page import Page, Section
 from derender.report.run import loss_charts
-from derender.report.score_table import clustering_table, factor_table, geometry_table, reconstruction_table
+from derender.report.score_table import factor_table, geometry_table, reconstruction_table
 from derender.report.viewer.examples import rendered_examples
 from derender.scene.normals import normals_from_depth
 from derender.training.config import PRESETS
@@ -83,7 +84,7 @@ def score_tables(result: DemoResult) -> dict[str, ScoreTable]:
     return tables | {
         "factors": factor_table(result.factors, count),
         "reconstruction": reconstruction_table(result.reconstruction, count),
-        "clustering": clustering_table(result.clustering, list(result.clustering)[1:]),
+        "clustering": clustering_table(result.clustering),
     }
 
 

@@ -16,16 +16,16 @@ from derender.baselines.controls import pca_features, pixel_features, untrained_
 from derender.data import GroundTruth, PictureSet
 from derender.data.synthetic import SyntheticSet, faces
 from derender.evaluation import (
-    ClusteringResult,
+    ClusterComparison,
     FactorResult,
     GeometryResult,
     ReconstructionResult,
-    cluster_table,
+    clusterings,
+    compare_clusterings,
     evaluate_factors,
     evaluate_geometry,
     evaluate_reconstruction,
     mean_picture,
-    ward,
 )
 from derender.features import embed_pictures
 from derender.model import Derenderer, load
@@ -112,7 +112,7 @@ class DemoResult:
     geometry: GeometryResult
     factors: FactorResult
     reconstruction: ReconstructionResult
-    clustering: dict[str, ClusteringResult]
+    clustering: ClusterComparison
     clusters: np.ndarray
     seconds: dict[str, float]
 
@@ -179,10 +179,13 @@ def run_demo(
     }
     tell(STAGES[3], 3, 4, "clusters")
     tables = {" + ".join(FACTORS): (table, FACTORS), **controls}
-    clustering = {
-        name: cluster_table(rows, "identity", factors=chosen) for name, (rows, chosen) in tables.items()
-    }
-    clusters = ward(table.concatenate(FACTORS), len(np.unique(truth.labels["identity"])))
+    identities = truth.labels["identity"]
+    clustering = compare_clusterings(
+        {name: [rows.concatenate(chosen)] for name, (rows, chosen) in tables.items()},
+        {"identity": identities}, controls=tuple(controls),
+    )  # fmt: skip
+    people = len(np.unique(identities))
+    clusters = clusterings(table.concatenate(FACTORS), [people])[people]
     tell(STAGES[3], 4, 4, "")
     clock.lap(STAGES[3])
     return DemoResult(

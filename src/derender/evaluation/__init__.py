@@ -1,24 +1,21 @@
-"""Stage 7: scores. Every function says its range and its best value; every protocol carries controls.
+"""Stage 7: protocols that score features and models, each beside its controls.
 
-Here: clustering, linear probes, geometry, factors, reconstruction, intervals. Further scores on arrays:
-``evaluation.disentanglement``, ``evaluation.segmentation``, ``evaluation.robustness``; joint training:
-``evaluation.finetuning``. docs/evaluation.md has a table of them.
+A protocol is one call that gives ``Scores``: ``cluster``, ``linear``, ``compare`` (the paper's tables). Every
+function says its range and its best value. Scores on arrays: ``evaluation.disentanglement``,
+``evaluation.segmentation``, ``evaluation.robustness``; joint training: ``evaluation.finetuning``.
+docs/evaluation.md has a table of them.
 """
 
 from derender.evaluation.bootstrap import Difference, Estimate, ScoredRow, difference, estimate, resamples
 from derender.evaluation.clustering import (
-    ClusteringResult,
-    at_least,
-    cluster_table,
-    evaluate_clustering,
-    ward,
+    ClusterComparison,
+    Level,
+    cluster,
+    compare_clusterings,
+    finch_levels,
 )
-from derender.evaluation.clustering_compare import ClusterComparison, compare_clusterings
-from derender.evaluation.clustering_finch import FinchHierarchy, finch, finch_clusters
-from derender.evaluation.clustering_levels import Level, finch_levels
 from derender.evaluation.clustering_methods import clusterings
-from derender.evaluation.clustering_scores import ClusterScores, chance_scores, cluster_scores
-from derender.evaluation.clustering_ward import cut, ward_tree
+from derender.evaluation.clustering_scores import chance_scores, cluster_scores
 from derender.evaluation.factors import (
     AngleScores,
     FactorResult,
@@ -27,11 +24,19 @@ from derender.evaluation.factors import (
     evaluate_factors,
     light_error,
 )
+from derender.evaluation.feature_rows import at_least
+from derender.evaluation.finch import FinchHierarchy, finch, finch_clusters
 from derender.evaluation.geometry import GeometryResult, GeometryScores, evaluate_geometry, geometry_scores
-from derender.evaluation.linear_compare import LinearComparison, compare_linear
 from derender.evaluation.linear_probes import majority_answers, probe
-from derender.evaluation.linear_scores import LinearScores, linear_scores
+from derender.evaluation.linear_probing import (
+    LinearComparison,
+    LinearScores,
+    compare_linear,
+    linear,
+    linear_scores,
+)
 from derender.evaluation.linear_task import Rows, Task, choose_rows, task_of
+from derender.evaluation.paper_comparison import compare
 from derender.evaluation.reconstruction import (
     ReconstructionResult,
     ReconstructionScores,
@@ -39,12 +44,13 @@ from derender.evaluation.reconstruction import (
     mean_picture,
     reconstruction_scores,
 )
+from derender.evaluation.score_table import Column, Row, Scores, ScoreTable
+from derender.evaluation.ward import cut, ward_tree
 
 __all__ = [
     "AngleScores",
     "ClusterComparison",
-    "ClusterScores",
-    "ClusteringResult",
+    "Column",
     "Difference",
     "Estimate",
     "FactorResult",
@@ -56,23 +62,26 @@ __all__ = [
     "LinearScores",
     "ReconstructionResult",
     "ReconstructionScores",
+    "Row",
     "Rows",
+    "ScoreTable",
     "ScoredRow",
+    "Scores",
     "Task",
     "albedo_error",
     "at_least",
     "camera_error",
     "chance_scores",
     "choose_rows",
+    "cluster",
     "cluster_scores",
-    "cluster_table",
     "clusterings",
+    "compare",
     "compare_clusterings",
     "compare_linear",
     "cut",
     "difference",
     "estimate",
-    "evaluate_clustering",
     "evaluate_factors",
     "evaluate_geometry",
     "evaluate_reconstruction",
@@ -81,6 +90,7 @@ __all__ = [
     "finch_levels",
     "geometry_scores",
     "light_error",
+    "linear",
     "linear_scores",
     "majority_answers",
     "mean_picture",
@@ -88,6 +98,5 @@ __all__ = [
     "reconstruction_scores",
     "resamples",
     "task_of",
-    "ward",
     "ward_tree",
 ]

@@ -1,7 +1,7 @@
 """Ways to cluster by name: one fit gives every number of clusters asked for.
 
 ``ward`` and ``finch`` build one hierarchy and cut it, so forty attributes cost one tree; ``k-means``
-(scikit-learn, Euclidean, ten starts) fits anew for each number. Ward is Euclidean as in the paper, FINCH
+(scikit-learn, Euclidean, ten starts) is fitted anew for each number. Ward is Euclidean as in the paper, FINCH
 cosine as in its paper. Above ``EXACT_ROWS`` rows all are approximate, and ``approximation`` says how.
 """
 
@@ -12,18 +12,18 @@ from sklearn.cluster import KMeans, MiniBatchKMeans
 
 from derender.data import suggestion
 from derender.evaluation import neighbours
-from derender.evaluation.clustering_finch import FinchHierarchy, finch, finch_clusters
-from derender.evaluation.clustering_ward import cut, ward_tree
-from derender.evaluation.clustering_ward_cells import LEAVES, LeafTree, cut_leaves, ward_in_cells
+from derender.evaluation.finch import FinchHierarchy, finch, finch_clusters
 from derender.evaluation.memory import Memory
 from derender.evaluation.neighbours import finite_rows
+from derender.evaluation.ward import LEAVES, LeafTree, cut, cut_leaves, ward_in_cells, ward_tree
 
-METHODS = ("ward", "finch", "k-means")
+METHODS = {"ward": "Ward clustering", "finch": "FINCH clustering", "k-means": "k-means"}
+"""By name, as tables call it."""
 _MINI_BATCH = 16_384
 
 
 def approximation(method: str, n_rows: int) -> str:
-    """What is not exact about a method with so many rows, in a few words; "" where all is."""
+    """How a method is approximate with so many rows, in a few words; "" where it is exact."""
     if n_rows <= neighbours.EXACT_ROWS:
         return ""
     how = {
@@ -47,41 +47,50 @@ def clusterings(
     Args:
         features: finite.
         counts: numbers of clusters.
-        method: "ward", "finch" or "k-means".
+        method: one of ``METHODS``.
         seed: for the starts of k-means.
-        memory: where trees are kept.
+        memory: where trees are cached.
     """
     memory, wanted = memory or Memory(), sorted(set(counts))
     features = finite_rows(features, "clustering")
-    _check(method, wanted, len(features))
-    many = len(features) > neighbours.EXACT_ROWS
-    if method == "ward" and many:
-        found = memory.recall("ward-cells", {"features": features}, lambda: vars(ward_in_cells(features)))
-        return {count: cut_leaves(LeafTree(**found), count) for count in wanted}
-    if method == "ward":
-        tree = memory.recall("ward", {"features": features}, lambda: {"tree": ward_tree(features)})["tree"]
-        return {count: cut(tree, count) for count in wanted}
+    if method not in METHODS:
+        raise ValueError(
+            f"unknown method {method!r}{suggestion(method, METHODS)}; there is {', '.join(METHODS)}"
+        )
+    for count in wanted:
+        if not 1 <= count <= len(features):
+            raise ValueError(
+                f"cannot make {count} clusters of {len(features)} rows: ask for 1 to {len(features)}"
+            )
+    inputs = {"features": features}
     if method == "finch":
         hierarchy = finch_hierarchy(features, memory)
-        return {count: finch_clusters(features, count, hierarchy=hierarchy) for count in wanted}
-    inputs = {"features": features, "seed": seed}
-    return {
-        count: memory.recall(
-            "k-means", {**inputs, "clusters": count}, lambda count=count: _k_means(features, count, seed)
-        )["clusters"]
-        for count in wanted
-    }
+        return {count: finch_clusters(features, count, hierarchy) for count in wanted}
+    if method == "k-means":
+        return {
+            count: memory.recall(
+                "k-means",
+                {**inputs, "seed": seed, "clusters": count},
+                lambda count=count: _k_means(features, count, seed),
+            )["clusters"]
+            for count in wanted
+        }
+    if len(features) > neighbours.EXACT_ROWS:
+        leaves = LeafTree(**memory.recall("ward-cells", inputs, lambda: vars(ward_in_cells(features))))
+        return {count: cut_leaves(leaves, count) for count in wanted}
+    tree = memory.recall("ward", inputs, lambda: {"tree": ward_tree(features)})["tree"]
+    return {count: cut(tree, count) for count in wanted}
 
 
 def finch_hierarchy(features: np.ndarray, memory: Memory | None = None) -> FinchHierarchy:
-    """FINCH's partitions, remembered."""
+    """FINCH's partitions, cached."""
     features = finite_rows(features, "FINCH")
 
     def make() -> dict[str, np.ndarray]:
         return {"partitions": np.array(finch(features).partitions)}
 
     partitions = (memory or Memory()).recall("finch", {"features": features}, make)["partitions"]
-    return FinchHierarchy(tuple(partitions), tuple(int(partition.max()) + 1 for partition in partitions))
+    return FinchHierarchy(tuple(partitions))
 
 
 def _k_means(features: np.ndarray, count: int, seed: int) -> dict[str, np.ndarray]:
@@ -91,13 +100,3 @@ def _k_means(features: np.ndarray, count: int, seed: int) -> dict[str, np.ndarra
         means = KMeans(count, n_init=10, random_state=seed)  # pyright: ignore[reportArgumentType]
     fitted = means.fit(features.astype(np.float32, copy=False))
     return {"clusters": np.asarray(fitted.labels_, np.int64)}
-
-
-def _check(method: str, counts: list[int], n_rows: int) -> None:
-    if method not in METHODS:
-        raise ValueError(
-            f"unknown method {method!r}{suggestion(method, METHODS)}; there is {', '.join(METHODS)}"
-        )
-    for count in counts:
-        if not 1 <= count <= n_rows:
-            raise ValueError(f"cannot make {count} clusters of {n_rows} rows: ask for 1 to {n_rows}")

@@ -1,44 +1,129 @@
-"""Scores of a clustering against classes, and what chance would give.
+"""Scores of a clustering against classes, and their chance level.
 
-All come from the table of counts (class by cluster), many tables at a time, so that a thousand resamples
-cost little more than one. Accuracy and F1 are the paper's (Sec. 4.2); NMI, ARI and Hungarian accuracy as in
-scikit-learn and SciPy, which the tests compare with. Purity and NMI of random clusters are far from 0, and
-purity of one cluster is the majority's share: read no score without its chance.
+A score is one function below ``@metric``; its name goes to JSON and its column to tables. All come from the
+table of counts (class by cluster), many tables at a time, so that a thousand resamples cost little more
+than one. Accuracy and F1 are the paper's (Sec. 4.2); NMI, ARI and Hungarian accuracy are those of
+scikit-learn and SciPy. Purity and NMI of random clusters are far from 0, and the purity of one single
+cluster is the majority's share: read no score without its chance level.
 """
 
-from collections.abc import Iterable
-from dataclasses import astuple, dataclass
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.special import xlogy
 
+from derender.evaluation.score_table import Column
 from derender.features import missing
 
 SEEDS = tuple(range(10))
 
 
 @dataclass(frozen=True)
-class ClusterScores:
-    """How well clusters agree with classes. Every score is best at 1.
+class Counts:
+    """Tables of counts of B clusterings: (B, classes, clusters) numbers of rows, each with at least one."""
 
-    Attributes:
-        accuracy: weighted purity, the paper's accuracy: share of rows that carry their cluster's majority
-            label; 0..1.
-        f1: weighted F1 of the majority labels; 0..1.
-        nmi: mutual information over the arithmetic mean of the entropies; 0..1.
-        hungarian: share of rows under the best one-to-one matching of clusters to classes; 0..1.
-        ari: adjusted Rand index; -0.5..1, 0 for random clusters.
-    """
+    table: np.ndarray
 
-    accuracy: float
-    f1: float
-    nmi: float
-    hungarian: float
-    ari: float
+    @cached_property
+    def total(self) -> np.ndarray:
+        """(B,) rows."""
+        return self.table.sum(axis=(1, 2))
+
+    @cached_property
+    def by_class(self) -> np.ndarray:
+        """(B, classes) rows."""
+        return self.table.sum(axis=2)
+
+    @cached_property
+    def by_cluster(self) -> np.ndarray:
+        """(B, clusters) rows."""
+        return self.table.sum(axis=1)
 
 
-def cluster_scores(labels: np.ndarray, assignment: np.ndarray) -> ClusterScores:
+Metric = Callable[[Counts], np.ndarray]
+METRICS: dict[str, Metric] = {}
+"""By name: (B,) scores of B tables of counts. Every score is best at 1."""
+CLUSTER_COLUMNS: dict[str, Column] = {}
+
+
+def metric(name: str, shown: str, note: str) -> Callable[[Metric], Metric]:
+    """Declare a score: its name in JSON, the head of its column, and its range and meaning."""
+
+    def declare(function: Metric) -> Metric:
+        METRICS[name], CLUSTER_COLUMNS[name] = function, Column(shown, "high", note=note)
+        return function
+
+    return declare
+
+
+@metric("accuracy", "accuracy", "weighted purity, 0 to 1")
+def purity(counts: Counts) -> np.ndarray:
+    """The paper's accuracy: the share of rows that carry their cluster's majority label."""
+    return counts.table.max(axis=1).sum(axis=1) / counts.total
+
+
+@metric("f1", "F1", "weighted F1 of majority labels, 0 to 1")
+def majority_f1(counts: Counts) -> np.ndarray:
+    """Weighted F1 of clusters that answer their majority label."""
+    table, by_class = counts.table, counts.by_class
+    answers = table.argmax(axis=1)[:, None] == np.arange(table.shape[1])[:, None]  # (B, classes, clusters)
+    answered = (answers * counts.by_cluster[:, None]).sum(axis=2)
+    right = (answers * table).sum(axis=2)
+    f1 = np.divide(2 * right, answered + by_class, out=np.zeros_like(right), where=answered + by_class > 0)
+    return (by_class * f1).sum(axis=1) / by_class.sum(axis=1)
+
+
+@metric("nmi", "NMI", "normalised mutual information, 0 to 1")
+def mutual_information(counts: Counts) -> np.ndarray:
+    """Mutual information over the mean entropy; 1 where both sides are one group, as in scikit-learn."""
+    table, by_class, by_cluster, total = counts.table, counts.by_class, counts.by_cluster, counts.total
+    class_entropy = np.log(total) - xlogy(by_class, by_class).sum(axis=1) / total
+    cluster_entropy = np.log(total) - xlogy(by_cluster, by_cluster).sum(axis=1) / total
+    joint_entropy = np.log(total) - xlogy(table, table).sum(axis=(1, 2)) / total
+    information = np.maximum(class_entropy + cluster_entropy - joint_entropy, 0)
+    mean = (class_entropy + cluster_entropy) / 2
+    single = ((by_class > 0).sum(axis=1) == 1) & ((by_cluster > 0).sum(axis=1) == 1)
+    values = np.divide(information, mean, out=np.zeros_like(mean), where=~single & (mean > 0))
+    return np.where(single, 1.0, values)
+
+
+@metric("hungarian", "matched", "share of rows under the best one-to-one matching, 0 to 1")
+def matched(counts: Counts) -> np.ndarray:
+    """The share of rows under the best one-to-one matching of clusters to classes."""
+    table = counts.table
+    if table.shape[1:] == (2, 2):
+        straight, crossed = table[:, 0, 0] + table[:, 1, 1], table[:, 0, 1] + table[:, 1, 0]
+        return np.maximum(straight, crossed) / counts.total
+    return np.array([one[linear_sum_assignment(one, maximize=True)].sum() for one in table]) / counts.total
+
+
+@metric("ari", "ARI", "adjusted Rand index, 0 for random clusters, at most 1")
+def adjusted_rand(counts: Counts) -> np.ndarray:
+    """Pairs that lie together on both sides, beyond chance, -0.5 to 1; 1 where there is no doubt."""
+
+    def pairs(values: np.ndarray) -> np.ndarray:
+        return values * (values - 1) / 2
+
+    together = pairs(counts.table).sum(axis=(1, 2))
+    in_class, in_cluster = pairs(counts.by_class).sum(axis=1), pairs(counts.by_cluster).sum(axis=1)
+    all_pairs = np.maximum(pairs(counts.total), 1)
+    expected = in_class * in_cluster / all_pairs
+    most = (in_class + in_cluster) / 2
+    same = (together == in_class) & (together == in_cluster)
+    values = np.divide(together - expected, most - expected, out=np.ones_like(most), where=~same)
+    return np.where(same, 1.0, values)
+
+
+def scores_of_counts(counts: np.ndarray) -> np.ndarray:
+    """Every score of ``METRICS`` of (B, classes, clusters) counts: (B, scores)."""
+    tables = Counts(np.asarray(counts, np.float64))
+    return np.column_stack([score(tables) for score in METRICS.values()])
+
+
+def cluster_scores(labels: np.ndarray, assignment: np.ndarray) -> dict[str, float]:
     """Score any clustering of labelled rows; names of clusters and classes do not matter.
 
     Args:
@@ -51,48 +136,27 @@ def cluster_scores(labels: np.ndarray, assignment: np.ndarray) -> ClusterScores:
     if len(classes) == 0:
         raise ValueError("nothing to score: no rows")
     clusters = np.unique(assignment, return_inverse=True)[1]
-    counts = np.zeros((classes.max() + 1, clusters.max() + 1))
-    np.add.at(counts, (classes, clusters), 1)
-    return ClusterScores(*scores_of_counts(counts[None])[0].tolist())
-
-
-def scores_of_counts(counts: np.ndarray) -> np.ndarray:
-    """The five scores of many clusterings at once, in the order of ``ClusterScores``: (B, 5).
-
-    Args:
-        counts: (B, classes, clusters) numbers of rows, each table with at least one row.
-    """
-    counts = np.asarray(counts, np.float64)
-    total = counts.sum(axis=(1, 2))
-    by_class, by_cluster = counts.sum(axis=2), counts.sum(axis=1)
-    return np.column_stack(
-        (
-            counts.max(axis=1).sum(axis=1) / total,
-            _majority_f1(counts, by_class, by_cluster),
-            _nmi(counts, by_class, by_cluster, total),
-            _matched(counts) / total,
-            _ari(counts, by_class, by_cluster, total),
-        )
-    )
+    counts = np.zeros((1, classes.max() + 1, clusters.max() + 1))
+    np.add.at(counts[0], (classes, clusters), 1)
+    return dict(zip(METRICS, scores_of_counts(counts)[0].tolist(), strict=True))
 
 
 def chance_scores(
     labels: np.ndarray, clusters: np.ndarray | int, seeds: Iterable[int] = SEEDS
-) -> tuple[ClusterScores, ClusterScores]:
-    """Mean and standard deviation of the scores when rows are dealt at random.
+) -> dict[str, float]:
+    """Mean scores when rows are dealt to clusters at random.
 
     Args:
         labels: (N,) classes.
         clusters: an assignment whose cluster sizes are kept, or a number of clusters of equal size.
         seeds: one random deal each.
     """
-    n_rows = len(labels)
-    sizes = np.arange(n_rows) % clusters if isinstance(clusters, (int, np.integer)) else np.asarray(clusters)
+    sizes = np.arange(len(labels)) % clusters if isinstance(clusters, int) else np.asarray(clusters)
     deals = [cluster_scores(labels, np.random.default_rng(seed).permutation(sizes)) for seed in seeds]
     if not deals:
         raise ValueError("the chance level needs at least one seed")
-    values = np.array([astuple(deal) for deal in deals])
-    return ClusterScores(*values.mean(axis=0).tolist()), ClusterScores(*values.std(axis=0).tolist())
+    mean = np.array([list(deal.values()) for deal in deals]).mean(axis=0)
+    return dict(zip(METRICS, mean.tolist(), strict=True))
 
 
 def encoded(labels: np.ndarray) -> np.ndarray:
@@ -106,48 +170,3 @@ def encoded(labels: np.ndarray) -> np.ndarray:
         numbers = {value: number for number, value in enumerate(dict.fromkeys(labels.tolist()))}
         return np.array([numbers[value] for value in labels.tolist()], dtype=np.int64)
     return np.unique(labels, return_inverse=True)[1]
-
-
-def _majority_f1(counts: np.ndarray, by_class: np.ndarray, by_cluster: np.ndarray) -> np.ndarray:
-    """Weighted F1 of clusters that answer their majority label."""
-    answers = counts.argmax(axis=1)[:, None] == np.arange(counts.shape[1])[:, None]  # (B, classes, clusters)
-    answered = (answers * by_cluster[:, None]).sum(axis=2)
-    right = (answers * counts).sum(axis=2)
-    f1 = np.divide(2 * right, answered + by_class, out=np.zeros_like(right), where=answered + by_class > 0)
-    return (by_class * f1).sum(axis=1) / by_class.sum(axis=1)
-
-
-def _nmi(counts: np.ndarray, by_class: np.ndarray, by_cluster: np.ndarray, total: np.ndarray) -> np.ndarray:
-    """Mutual information over the mean entropy; 1 where both sides are one group, as in scikit-learn."""
-    class_entropy = np.log(total) - xlogy(by_class, by_class).sum(axis=1) / total
-    cluster_entropy = np.log(total) - xlogy(by_cluster, by_cluster).sum(axis=1) / total
-    joint_entropy = np.log(total) - xlogy(counts, counts).sum(axis=(1, 2)) / total
-    information = np.maximum(class_entropy + cluster_entropy - joint_entropy, 0)
-    mean = (class_entropy + cluster_entropy) / 2
-    single = ((by_class > 0).sum(axis=1) == 1) & ((by_cluster > 0).sum(axis=1) == 1)
-    values = np.divide(information, mean, out=np.zeros_like(mean), where=~single & (mean > 0))
-    return np.where(single, 1.0, values)
-
-
-def _matched(counts: np.ndarray) -> np.ndarray:
-    """Rows under the best one-to-one matching of clusters to classes."""
-    if counts.shape[1:] == (2, 2):
-        straight, crossed = counts[:, 0, 0] + counts[:, 1, 1], counts[:, 0, 1] + counts[:, 1, 0]
-        return np.maximum(straight, crossed)
-    return np.array([table[linear_sum_assignment(table, maximize=True)].sum() for table in counts])
-
-
-def _ari(counts: np.ndarray, by_class: np.ndarray, by_cluster: np.ndarray, total: np.ndarray) -> np.ndarray:
-    """Pairs that lie together on both sides, beyond what chance would give; 1 where there is no doubt."""
-
-    def pairs(values: np.ndarray) -> np.ndarray:
-        return values * (values - 1) / 2
-
-    together = pairs(counts).sum(axis=(1, 2))
-    in_class, in_cluster = pairs(by_class).sum(axis=1), pairs(by_cluster).sum(axis=1)
-    all_pairs = np.maximum(pairs(total), 1)
-    expected = in_class * in_cluster / all_pairs
-    most = (in_class + in_cluster) / 2
-    same = (together == in_class) & (together == in_cluster)
-    values = np.divide(together - expected, most - expected, out=np.ones_like(most), where=~same)
-    return np.where(same, 1.0, values)

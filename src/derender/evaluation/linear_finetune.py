@@ -1,13 +1,15 @@
-"""The paper's head trained together with the encoders under it.
+"""The paper's head trained together with the encoders under it: models, and untrained ones as their control.
 
 Source: Klinghoffer et al., ECCV 2022, Sec. 4.4 and Table 2 ("Finetune"). Encoders and head share Adam 2e-4,
-100 epochs and batches of 64, as the frozen head; the paper does not say whether the encoders had a rate of
-their own. An untrained model under the same protocol is the control: a supervised training from nothing.
-Leaves out the rendering objective beside the task.
+    100 epochs and batches of 64, as the frozen head; the paper does not say whether the encoders had a rate
+    of their own. An untrained model under the same protocol is the control: a supervised training from
+    nothing. Controls without an encoder (pixels, principal components) have nothing below the head to
+    train: theirs are the answers of the head alone. Leaves out the rendering objective beside the task.
 """
 
 import copy
-from collections.abc import Callable, Sequence
+import functools
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,10 +17,15 @@ import torch
 from torch import nn
 
 from derender.data import as_float
+from derender.evaluation.controls import UNTRAINED
+from derender.evaluation.feature_rows import Prepared, StageProgress, stage
 from derender.evaluation.linear_head import PAPER_HEAD, HeadSettings, head_loss, probabilities
-from derender.evaluation.linear_task import Task
-
-Progress = Callable[[int, int], object]
+from derender.evaluation.linear_probes import probe_runs
+from derender.evaluation.linear_task import Rows, Task
+from derender.evaluation.memory import Memory
+from derender.features import model_fingerprint
+from derender.inputs import Progress
+from derender.model import Derenderer
 
 
 def finetune(
@@ -78,3 +85,72 @@ def finetune(
     with torch.inference_mode():
         parts = np.array_split(tested, max(1, len(tested) // 256))
         return np.concatenate([probabilities(head(embed(part)), task.kind).cpu().numpy() for part in parts])
+
+
+def finetuned_answers(
+    models: Mapping[str, Sequence[Derenderer]],
+    images_of: Callable[[int], np.ndarray],
+    ready: Prepared,
+    task: Task,
+    split: Rows,
+    seeds: Sequence[int],
+    factors: Sequence[str] | None,
+    settings: HeadSettings,
+    memory: Memory,
+    progress: StageProgress | None = None,
+) -> dict[str, dict[int, np.ndarray]]:
+    """By row name and number of labels, (S, T, A) answers: models, untrained ones, and other controls' heads.
+
+    Args:
+        models: by row name, one for each run; seed s trains run s modulo their number.
+        images_of: the images of the task's rows at a size in pixels, (N, 3, H, W) uint8.
+        ready: the rows of features; its controls without an encoder answer by the head alone.
+        task, split, seeds: the targets, the rows of each seed, and the seeds.
+        factors: the encoders that are trained; None means all.
+        settings: of the paper's head.
+        memory: where answers are cached.
+        progress: called while training.
+    """
+    images_of = functools.cache(images_of)
+
+    def answers(model: Derenderer, count: int, at: int, what: str) -> np.ndarray:
+        rows, images = split.train[count][at], images_of(model.image_size)
+        chosen = list(factors or (factor.name for factor in model.factors))
+        inputs = {
+            "weights": model_fingerprint(model), "images": images, "targets": task.targets, "kind": task.kind,
+            "rows": rows, "tested": split.test, "seed": seeds[at], "factors": chosen,
+            "settings": settings.model_dump(),
+        }  # fmt: skip
+        shown = stage(progress, f"fine-tuning {what}, {count:,} labels, seed {seeds[at]}", "epochs")
+
+        def make() -> dict[str, np.ndarray]:
+            found = finetune(
+                model, images, task, rows, split.test,
+                factors=chosen, seed=seeds[at], settings=settings, progress=shown,
+            )  # fmt: skip
+            return {"probabilities": found}
+
+        return memory.recall("finetuned", inputs, make)["probabilities"]
+
+    first = next(iter(models.values()))[0]
+
+    def untrained(at: int) -> Derenderer:
+        fresh = Derenderer.seeded(first.settings, seeds[at], factors=first.factors)
+        return fresh.to(first.device).eval()
+
+    found: dict[str, dict[int, np.ndarray]] = {name: {} for name in (*models, UNTRAINED)}
+    seeded = range(len(seeds))
+    for count in split.train:
+        for name, runs in models.items():
+            found[name][count] = np.stack([answers(runs[at % len(runs)], count, at, name) for at in seeded])
+        found[UNTRAINED][count] = np.stack(
+            [answers(untrained(at), count, at, f"an {UNTRAINED}") for at in seeded]
+        )
+    for name in ready.controls:
+        if not name.startswith(UNTRAINED):
+            own = ready.features[name]
+            found[name] = {
+                count: probe_runs("linear", own, task, rows, split.test, seeds, settings, memory)
+                for count, rows in split.train.items()
+            }
+    return found

@@ -85,6 +85,28 @@ def probe(
     return (memory or Memory()).recall(f"probe-{head}", inputs, make)["probabilities"]
 
 
+def probe_runs(
+    head: str,
+    arrays: Sequence[np.ndarray],
+    task: Task,
+    rows: np.ndarray,
+    tested: np.ndarray,
+    seeds: Sequence[int],
+    settings: HeadSettings,
+    memory: Memory | None,
+) -> np.ndarray:
+    """(S, T, A) answers; seeds that share a run are trained together."""
+    answers: list[np.ndarray | None] = [None] * len(seeds)
+    for run, array in enumerate(arrays):
+        mine = [at for at in range(len(seeds)) if at % len(arrays) == run]
+        if mine:
+            own = [seeds[at] for at in mine]
+            found = probe(head, array, task, rows[mine], tested, own, settings=settings, memory=memory)
+            for at, answer in zip(mine, found, strict=True):
+                answers[at] = answer
+    return np.stack([answer for answer in answers if answer is not None])
+
+
 def check_head(head: str) -> None:
     """A kind of probe that is none is an error that names the nearest."""
     if head not in PROBES:

@@ -1,23 +1,39 @@
-"""Each row's nearest other row, without ever holding all distances: exactly, or by cells for very many rows.
+"""Each row's nearest other row by cosine, in bounded memory: exactly, or by cells for very many rows.
 
 Distances are made in square tiles with one matrix product each: memory is a copy of the rows and 8 MB.
 Equally near rows: the first counts. Above ``EXACT_ROWS`` rows a row is compared with those of its own cell
-and of the ``NEAR_CELLS`` nearest ones (evaluation/cells.py), and everything is float32.
+    and of the ``NEAR_CELLS`` nearest ones, in float32, so that work grows with the rows and not with their
+    square.
+
+``cells`` puts near rows together: centres come from a few rounds of k-means (Lloyd 1982) over a sample;
+every row goes to its nearest centre; cells that came out too large are divided again. Approximate by
+nature: rows on two sides of a border do not see each other. Nothing is random but for the seed.
 """
 
-from typing import Literal
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
 
 import numpy as np
+from jaxtyping import Float32, Int64
+from threadpoolctl import threadpool_limits
 
-from derender.evaluation.cells import CELL_ROWS, cells, members, of_each
+from derender.data import usable_cores
 
-Metric = Literal["cosine", "euclidean"]
-TILE = 1024
+T = TypeVar("T")
+TILE = 1_024
 
 EXACT_ROWS = 100_000
 """Up to so many rows all pairs are looked at."""
 
 NEAR_CELLS = 4
+
+CELL_ROWS = 2_000
+"""Rows that a cell is to have; none has more than four times as many."""
+
+_SAMPLED_PER_CELL = 32
+_ROUNDS = 6
+_CENTRE_TILE = 2_048
 
 
 def finite_rows(features: np.ndarray, purpose: str) -> np.ndarray:
@@ -36,29 +52,26 @@ def finite_rows(features: np.ndarray, purpose: str) -> np.ndarray:
     return features
 
 
-def prepared(points: np.ndarray, metric: Metric) -> np.ndarray:
-    """Rows whose squared Euclidean distances are the metric's (cosine: twice 1 - cosine; a zero row is
-    at distance 1 from all)."""
-    if metric == "euclidean":
-        return points - points.mean(axis=0)
+def unit_rows(points: np.ndarray) -> np.ndarray:
+    """Rows of length 1; a zero row stays, at cosine distance 1 from all."""
     length = np.linalg.norm(points, axis=1, keepdims=True)
     return np.divide(points, length, out=np.zeros_like(points), where=length > 0)
 
 
-def nearest_rows(points: np.ndarray, metric: Metric = "cosine") -> tuple[np.ndarray, np.ndarray]:
-    """For each of (N, D) rows the nearest other row, (N,) integers, and the distance to it, (N,).
+def nearest_rows(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """For each of (N, D) rows the nearest other row, (N,) integers, and its cosine distance, (N,), 0..2.
 
-    Cosine distance is 1 - cosine, 0..2. Euclidean distance is not squared. Above ``EXACT_ROWS`` rows some
+    Above ``EXACT_ROWS`` rows some
     are not the nearest: docs/scale.md says how many.
     """
-    points = prepared(points, metric)
+    points = unit_rows(points)
     if len(points) > EXACT_ROWS:
-        return _nearest_in_cells(points.astype(np.float32, copy=False), metric)
+        return _nearest_in_cells(points.astype(np.float32, copy=False))
     nearest, distance = np.zeros(len(points), np.int64), np.full(len(points), np.inf)
     for start in range(0, len(points), TILE):
         rows = slice(start, start + TILE)
         for left in range(0, len(points), TILE):
-            block = _distances(points[rows], points[left : left + TILE], metric)
+            block = 1 - points[rows] @ points[left : left + TILE].T
             if left == start:
                 np.fill_diagonal(block, np.inf)
             at = block.argmin(axis=1)
@@ -69,8 +82,8 @@ def nearest_rows(points: np.ndarray, metric: Metric = "cosine") -> tuple[np.ndar
     return nearest, distance
 
 
-def _nearest_in_cells(points: np.ndarray, metric: Metric) -> tuple[np.ndarray, np.ndarray]:
-    """``nearest_rows`` of prepared rows, compared with those of near cells only."""
+def _nearest_in_cells(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """``nearest_rows`` of unit rows, compared with those of near cells only."""
     groups = members(cells(points, CELL_ROWS))
     centres = np.stack([points[rows].mean(axis=0) for rows in groups])
     square = (centres**2).sum(axis=1)
@@ -84,7 +97,7 @@ def _nearest_in_cells(points: np.ndarray, metric: Metric) -> tuple[np.ndarray, n
         candidates = points[others]
         for start in range(0, len(rows), TILE):
             part = rows[start : start + TILE]
-            block = _distances(points[part], candidates, metric)
+            block = 1 - points[part] @ candidates.T
             block[np.arange(len(part)), np.searchsorted(others, part)] = np.inf
             at = block.argmin(axis=1)
             nearest[part], distance[part] = others[at], block[np.arange(len(part)), at]
@@ -94,10 +107,59 @@ def _nearest_in_cells(points: np.ndarray, metric: Metric) -> tuple[np.ndarray, n
     return nearest, distance
 
 
-def _distances(a: np.ndarray, b: np.ndarray, metric: Metric) -> np.ndarray:
-    """(A, B) distances of prepared rows."""
-    product = a @ b.T
-    if metric == "cosine":
-        return 1 - product
-    square = (a**2).sum(axis=1)[:, None] + (b**2).sum(axis=1) - 2 * product
-    return np.sqrt(np.maximum(square, 0))
+def cells(
+    points: Float32[np.ndarray, "n d"], rows_per_cell: int = CELL_ROWS, seed: int = 0
+) -> Int64[np.ndarray, " n"]:
+    """The cell of each row, (N,) integers from 0 without gaps; near rows mostly share one."""
+    number = np.zeros(len(points), np.int64)
+    waiting, made = [np.arange(len(points))], 0
+    generator = np.random.default_rng(seed)
+    while waiting:
+        rows = waiting.pop()
+        if len(rows) <= rows_per_cell:
+            number[rows], made = made, made + 1
+            continue
+        wanted = -(-len(rows) // rows_per_cell)
+        sampled = generator.choice(rows, min(len(rows), _SAMPLED_PER_CELL * wanted), replace=False)
+        found = _nearest_centre(points, rows, _centres(points[np.sort(sampled)], wanted, generator))
+        parts = [rows[found == one] for one in np.unique(found)]
+        if len(parts) == 1:  # copies of one row: no centre tells them apart
+            parts = np.array_split(rows, wanted)
+        for part in parts:
+            if len(part) > 4 * rows_per_cell:
+                waiting.append(part)
+            else:
+                number[part], made = made, made + 1
+    return number
+
+
+def members(number: Int64[np.ndarray, " n"]) -> list[Int64[np.ndarray, " rows"]]:
+    """The rows of each cell, in ascending order."""
+    order = np.argsort(number, kind="stable")
+    return np.split(order, np.cumsum(np.bincount(number))[:-1])
+
+
+def of_each(work: Callable[[int], T], groups: Sequence[np.ndarray]) -> Iterator[T]:
+    """What ``work`` gives for the number of each cell, in order, computed on all cores, one cell on each."""
+    with threadpool_limits(1), ThreadPoolExecutor(usable_cores(), thread_name_prefix="cell") as pool:
+        yield from pool.map(work, range(len(groups)))
+
+
+def _centres(sample: np.ndarray, wanted: int, generator: np.random.Generator) -> np.ndarray:
+    centres = sample[generator.choice(len(sample), wanted, replace=False)].copy()
+    for _ in range(_ROUNDS):
+        found = _nearest_centre(sample, np.arange(len(sample)), centres)
+        order = np.argsort(found, kind="stable")
+        held, first = np.unique(found[order], return_index=True)
+        sums = np.add.reduceat(sample[order], first, axis=0)
+        centres[held] = sums / np.diff([*first, len(sample)])[:, None]
+    return centres
+
+
+def _nearest_centre(points: np.ndarray, rows: np.ndarray, centres: np.ndarray) -> np.ndarray:
+    """For each of these rows the nearest centre."""
+    found, half_square = np.empty(len(rows), np.int64), (centres**2).sum(axis=1) / 2
+    for start in range(0, len(rows), _CENTRE_TILE):
+        part = slice(start, start + _CENTRE_TILE)
+        found[part] = (half_square - points[rows[part]] @ centres.T).argmin(axis=1)
+    return found

@@ -15,6 +15,9 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from derender.evaluation.bootstrap import Difference, Estimate, ScoredRow
+from derender.evaluation.clustering import about_clustering
+from derender.evaluation.clustering_scores import CLUSTER_COLUMNS
+from derender.evaluation.linear_probing import LINEAR_COLUMNS, PROBE_NAMES
 from derender.evaluation.score_table import (
     Cell,
     Column,
@@ -26,16 +29,10 @@ from derender.evaluation.score_table import (
     verdict_table,
 )
 from derender.report.charts import SERIES, side_by_side
-from derender.report.tables_comparison import (
-    CLUSTER_COLUMNS,
-    LINEAR_COLUMNS,
-    PROBES,
-)
 
 LONGEST_REASON = 60  # characters of it in a cell; the page and the Markdown say it whole
 CONTROL_COLOUR = "#94a3b8"
 SUMMARY_HEAD = "logistic"  # the head of the linear protocol that the one table shows
-METHODS = {"ward": "Ward clustering", "finch": "FINCH clustering", "k-means": "k-means"}
 
 
 @dataclass(frozen=True)
@@ -58,7 +55,7 @@ class Cost:
 
 
 @dataclass(frozen=True)
-class Question:
+class ScoredQuestion:
     """One question under one protocol (and one head at one number of labels, for the linear one).
 
     Attributes:
@@ -97,27 +94,21 @@ COST_COLUMNS = (
 
 def scores_from(
     question: Mapping[str, Any], costs: Mapping[str, Cost], absent: Mapping[str, str]
-) -> list[Question]:
+) -> list[ScoredQuestion]:
     """The scores of a question as JSON keeps them: one of clusters, or one for each head and count."""
     name = str(question["name"])
     if question["protocol"] == "cluster":
-        labels = question["labels"]
-        what = (
-            f"{next(iter(labels.values()))} classes of {next(iter(labels))}"
-            if len(labels) == 1
-            else f"mean of {len(labels)} labels"
-        )
-        about = f"{METHODS[question['method']]}, {question['n_rows']:,} rows, {what}"
-        return [Question(name, "cluster", about, rows_from(question["rows"]), costs, absent)]
+        about = about_clustering(question["method"], question["n_rows"], question["labels"])
+        return [ScoredQuestion(name, "cluster", about, rows_from(question["rows"]), costs, absent)]
     kind = "classes" if question["kind"] == "classes" else "yes/no labels"
     found = []
     for part in question["parts"]:
         about = (
-            f"{PROBES.get(part['head'], part['head'])}, {part['labels']:,} labelled rows, "
+            f"{PROBE_NAMES.get(part['head'], part['head'])}, {part['labels']:,} labelled rows, "
             f"{question['n_test']:,} tested, {len(question['names'])} {kind}, {len(question['seeds'])} seeds"
         )
         rows = rows_from(part["rows"])
-        found.append(Question(name, "linear", about, rows, costs, absent, part["head"], part["labels"]))
+        found.append(ScoredQuestion(name, "linear", about, rows, costs, absent, part["head"], part["labels"]))
     return found
 
 
@@ -140,7 +131,7 @@ def rows_from(values: Mapping[str, Any]) -> list[ScoredRow]:
     ]
 
 
-def protocol_table(scores: Sequence[Question], methods: Sequence[str]) -> ScoreTable:
+def protocol_table(scores: Sequence[ScoredQuestion], methods: Sequence[str]) -> ScoreTable:
     """The one table: a row for each method and control, two scores for each data set, and the cost.
 
     Args:
@@ -170,12 +161,12 @@ def protocol_table(scores: Sequence[Question], methods: Sequence[str]) -> ScoreT
                 cells.append(None if row is None else row.scores[second].value)
         control = any(found[name].control for found in by_name if name in found)
         rows.append(Row(name, (*cells, *_cells(_together(shown, name))), control))
-    caption = "Clustering" if shown[0].protocol == "cluster" else f"Few labels, {PROBES[shown[0].head]}"
+    caption = "Clustering" if shown[0].protocol == "cluster" else f"Few labels, {PROBE_NAMES[shown[0].head]}"
     caption += ": all data sets; training time is the sum over training sets"
     return ScoreTable(caption, "features", (*columns, *COST_COLUMNS), rows)
 
 
-def set_tables(one: Question, methods: Sequence[str]) -> list[ScoreTable]:
+def set_tables(one: ScoredQuestion, methods: Sequence[str]) -> list[ScoreTable]:
     """One data set's own table, with every score, interval and cost, and who is above the controls."""
     columns, (first, *others) = one.columns, one.columns
     found = {row.name: row for row in one.rows}
@@ -196,7 +187,7 @@ def set_tables(one: Question, methods: Sequence[str]) -> list[ScoreTable]:
     return [ScoreTable(f"{one.name}: {one.about}", "features", shown, rows), verdict]
 
 
-def protocol_picture(scores: Sequence[Question], methods: Sequence[str]) -> tuple[str, bytes]:
+def protocol_picture(scores: Sequence[ScoredQuestion], methods: Sequence[str]) -> tuple[str, bytes]:
     """A panel of bars for each data set, methods in colour, controls grey, as SVG text and as PNG.
 
     Whiskers are 95 % intervals. Of the linear protocol the largest number of labels is shown.
@@ -220,7 +211,7 @@ def one_word(score: str) -> str:
     return {"balanced": "balanced accuracy"}.get(score, score)
 
 
-def _panel(one: Question, names: Sequence[str], score: str) -> Any:
+def _panel(one: ScoredQuestion, names: Sequence[str], score: str) -> Any:
     found = {row.name: row for row in one.rows}
 
     def draw(axes: Axes) -> None:
@@ -245,7 +236,7 @@ def _panel(one: Question, names: Sequence[str], score: str) -> Any:
     return draw
 
 
-def _shown(scores: Sequence[Question]) -> list[Question]:
+def _shown(scores: Sequence[ScoredQuestion]) -> list[ScoredQuestion]:
     """What the one table and the picture show."""
     if not scores:
         raise ValueError("there is nothing to show: no data set was scored")
@@ -254,7 +245,7 @@ def _shown(scores: Sequence[Question]) -> list[Question]:
     return [one for one in scores if one.head == head]
 
 
-def _together(scores: Sequence[Question], name: str) -> Cost:
+def _together(scores: Sequence[ScoredQuestion], name: str) -> Cost:
     """A method's cost over several data sets: trainings that several share count once."""
     costs = [one.costs[name] for one in scores if name in one.costs]
     if not costs:

@@ -1,43 +1,12 @@
 """Tables of the demo's protocols: clusters, depth, factors and reconstructions, each beside its controls."""
 
-from collections.abc import Mapping, Sequence
-
 from derender.evaluation import (
-    ClusteringResult,
     FactorResult,
     GeometryResult,
     GeometryScores,
     ReconstructionResult,
 )
 from derender.evaluation.score_table import Column, Row, ScoreTable
-
-
-def clustering_table(results: Mapping[str, ClusteringResult], controls: Sequence[str] = ()) -> ScoreTable:
-    """One row for each set of features, names in ``controls`` set back, and a row for random clusters."""
-    if not results:
-        raise ValueError("a clustering table needs at least one result")
-    first = next(iter(results.values()))
-    columns = (
-        Column("accuracy", "high", note="weighted purity, 0 to 1"),
-        Column("F1", "high", note="weighted F1 of majority labels, 0 to 1"),
-        Column("NMI", "high", note="normalised mutual information, 0 to 1"),
-        Column("matched", "high", note="share of rows under the best one-to-one matching, 0 to 1"),
-        Column("ARI", "high", note="adjusted Rand index, 0 for random clusters, at most 1"),
-    )
-
-    def row(name: str, scores: object, control: bool, note: str = "") -> Row:
-        cells = [getattr(scores, field) for field in ("accuracy", "f1", "nmi", "hungarian", "ari")]
-        return Row(name, cells, control, note)
-
-    rows = [row(name, result.scores, name in controls) for name, result in results.items()]
-    rows.append(row("chance", first.chance, True, "clusters of the same sizes, rows dealt at random"))
-    caption = (
-        f"Ward clustering: {first.n_rows:,} rows, {first.n_classes} classes, {first.n_clusters} clusters; "
-        f"always answering the most frequent class gives {first.majority:.3f} accuracy"
-    )
-    if first.n_dropped:
-        caption += f"; {first.n_dropped:,} rows without label left out"
-    return ScoreTable(caption, "features", columns, rows)
 
 
 def geometry_table(result: GeometryResult, pictures: int) -> ScoreTable:

@@ -1,8 +1,8 @@
 """The table of joint training: a fine-tuned model beside heads on frozen features and the majority."""
 
 from derender.evaluation.finetuning import FinetuneScores
+from derender.evaluation.linear_probing import LINEAR_COLUMNS
 from derender.evaluation.score_table import ScoreTable, scored_table
-from derender.report.tables_comparison import LINEAR_COLUMNS
 
 
 def finetuning_table(found: FinetuneScores, began: str) -> ScoreTable:

@@ -3,9 +3,9 @@
 from collections.abc import Callable, Mapping
 
 from derender.evaluation.bootstrap import ScoredRow
+from derender.evaluation.paper_tables import SEGMENTATION
 from derender.evaluation.score_table import Cell, Column, Row, ScoreTable, scored_table, verdict_table
 from derender.evaluation.segmentation import SegmentationComparison
-from derender.evaluation.tables import SEGMENTATION
 
 SEGMENT_COLUMNS = {
     "mean_iou": Column("mIoU", "high", note="intersection over union, mean over classes, 0 to 1"),

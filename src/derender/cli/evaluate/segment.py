@@ -146,6 +146,7 @@ def segmented(
 ) -> Segmented:
     """Train every variant of a model's encoders on the masks, beside the controls; None: all it has."""
     from derender.cli.models import open_model
+    from derender.evaluation.paper_tables import SEGMENTATION
     from derender.evaluation.segmentation import (
         SegmentSettings,
         chosen_variants,
@@ -153,7 +154,6 @@ def segmented(
         divide,
     )
     from derender.evaluation.segmentation.variants import check_encoders, usual_variants
-    from derender.evaluation.tables import SEGMENTATION
     from derender.report.tables_segmentation import segmentation_tables
 
     named = None if variants is None else [name.strip() for name in variants.split(",") if name.strip()]

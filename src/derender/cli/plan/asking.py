@@ -8,8 +8,9 @@ from derender.cli.console import plain
 from derender.cli.plan.embedding import scored_pictures
 from derender.cli.plan.jobs import Job, Note, Place
 from derender.cli.plan.settings import OURS, Plan
+from derender.evaluation.feature_rows import attribute_columns
 from derender.evaluation.memory import Memory, content_hash
-from derender.evaluation.tables import ATTRIBUTES, RowRules, attribute_columns, table_named
+from derender.evaluation.paper_tables import ATTRIBUTES, RowRules, table_named
 
 if TYPE_CHECKING:
     from derender.evaluation.feature_rows import FeatureRow
@@ -127,9 +128,9 @@ def _controls(
 def _ask(
     plan: Plan, question: Question, protocol: str, rows: "list[FeatureRow]", memory: Memory
 ) -> dict[str, Any]:
-    from derender.evaluation.clustering_compare import compare_clusterings
+    from derender.evaluation.clustering import compare_clusterings
     from derender.evaluation.feature_rows import prepare
-    from derender.evaluation.linear_compare import compare_prepared
+    from derender.evaluation.linear_probing import compare_prepared
 
     ready = prepare(rows, question.columns, **asdict(question.rules))
     if protocol == "cluster":

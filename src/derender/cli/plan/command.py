@@ -1,14 +1,56 @@
 """What `derender compare --plan` does, from the file to the last word."""
 
 from collections import Counter
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
+
+import typer
 
 from derender.cli.console import notice, result, show_scores, write_json
 
 if TYPE_CHECKING:
     from derender.cli.plan.jobs import Place
     from derender.cli.plan.settings import Plan
+
+
+PANEL = "Many methods on many data sets"
+
+
+@dataclass(frozen=True)
+class Planned:
+    """The options of a comparison by plan."""
+
+    plan: Annotated[
+        Path | None,
+        typer.Option(
+            "--plan", metavar="FILE", rich_help_panel=PANEL,
+            help="YAML or TOML file of methods and data sets to train, embed and score.",
+        ),
+    ] = None  # fmt: skip
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out", "-o", metavar="DIR", rich_help_panel=PANEL,
+            help="Folder of --plan for runs, tables and charts; an existing one is resumed.",
+        ),
+    ] = None  # fmt: skip
+    workers: Annotated[
+        int,
+        typer.Option(
+            "--workers", min=1, metavar="N", help="Number of jobs of --plan at a time.", rich_help_panel=PANEL
+        ),
+    ] = 1
+    minutes: Annotated[
+        float | None,
+        typer.Option(
+            "--minutes", min=0, metavar="M", rich_help_panel=PANEL,
+            help="Minutes after which --plan stops, and scores the finished jobs.",
+        ),
+    ] = None  # fmt: skip
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="List the jobs of --plan, and stop.", rich_help_panel=PANEL)
+    ] = False
 
 
 def by_plan(

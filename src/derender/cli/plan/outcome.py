@@ -16,7 +16,7 @@ from derender.cli.plan.settings import OURS, Plan
 
 if TYPE_CHECKING:
     from derender.evaluation.score_table import ScoreTable
-    from derender.report.compared import Cost, Question
+    from derender.report.compared import Cost, ScoredQuestion
 
 NAMES = {"cluster": "clustering", "linear": "linear"}
 MISSING = {"failed": "failed", "stopped": "missing"}
@@ -50,7 +50,7 @@ def write_outcome(plan: Plan, place: Place, notes: Mapping[Job, Note]) -> Outcom
     from derender.report.comparison import comparison_page
     from derender.report.page import write_whole
 
-    found: dict[str, list[Question]] = {}
+    found: dict[str, list[ScoredQuestion]] = {}
     kept: dict[str, list[Any]] = {}
     for job, note in notes.items():
         if job.kind == "score" and note.state == "done":

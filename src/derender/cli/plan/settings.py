@@ -15,7 +15,7 @@ from pydantic import Field, field_validator
 from derender.baselines import baseline_config
 from derender.baselines.registry import BASELINES, CONTROLS, TRAINED
 from derender.data import suggestion
-from derender.evaluation.tables import table_named
+from derender.evaluation.paper_tables import table_named
 from derender.settings import Settings
 from derender.training.config import config_from_tree, resolve
 

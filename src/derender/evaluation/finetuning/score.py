@@ -14,10 +14,11 @@ from derender.baselines.controls import pca_features, pixel_features, untrained_
 from derender.data import PictureSet
 from derender.evaluation.bootstrap import RESAMPLES, Difference, ScoredRow, difference
 from derender.evaluation.finetuning.joint import FinetunedModel, FinetuneTask
-from derender.evaluation.linear_compare import Progress, compare_linear
+from derender.evaluation.linear_probing import compare_linear
 from derender.evaluation.linear_task import Rows, Task
 from derender.evaluation.memory import Memory
 from derender.features import embed_images, map_batches, model_fingerprint
+from derender.inputs import Progress
 
 JOINT, LOGISTIC, PAPER_HEAD, MAJORITY = "fine-tuned", "frozen, logistic", "frozen, paper's head", "majority"
 

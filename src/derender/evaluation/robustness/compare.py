@@ -13,10 +13,9 @@ from typing import Any
 import numpy as np
 
 from derender.evaluation.bootstrap import RESAMPLES, ScoredRow, estimate, resamples, with_verdicts
-from derender.evaluation.linear_compare import probe_runs
 from derender.evaluation.linear_head import PAPER_HEAD, HeadSettings
 from derender.evaluation.linear_probes import majority_answers
-from derender.evaluation.linear_scores import count_scores
+from derender.evaluation.linear_probing import count_scores, probe_runs
 from derender.evaluation.linear_task import Task
 from derender.evaluation.memory import Memory
 from derender.evaluation.robustness.trial import Curve, Trial

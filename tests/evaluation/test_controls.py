@@ -1,4 +1,4 @@
-"""Controls whitened by the lender: its own model as in training, others by the same rule."""
+"""Controls whitened by a model's renderings: the model itself as in training, others by the same rule."""
 
 from dataclasses import replace
 
@@ -8,8 +8,8 @@ import torch
 
 from derender.data import PictureSet
 from derender.data.synthetic import faces
+from derender.evaluation.controls import Renderings, component_count, whitened, whitened_components
 from derender.evaluation.memory import Memory
-from derender.evaluation.whitened_controls import Lender, component_count, whitened, whitened_components
 from derender.features import embed_images
 from derender.model import Derenderer
 from derender.training.config import FeatureSettings, WhiteningSettings
@@ -24,51 +24,55 @@ def images() -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def lender(images) -> Lender:
-    return Lender(net(0), images[:40], SETTINGS)
+def renderings(images) -> Renderings:
+    return Renderings(net(0), images[:40], SETTINGS)
 
 
 def net(seed: int) -> Derenderer:
     return Derenderer.from_preset("small", seed=seed, image_size=32, width=4, light_width=4, code_size=12)
 
 
-def test_the_lender_whitens_itself_as_training_does(lender):
-    found = whitened(lender, lender.model).whitening
+def test_a_model_whitens_itself_as_training_does(renderings):
+    found = whitened(renderings, renderings.model).whitening
     expected = fit_whitening(
-        lender.model, torch.from_numpy(lender.images), SETTINGS.whitening, SETTINGS.perturb, seed=lender.seed
+        renderings.model,
+        torch.from_numpy(renderings.images),
+        SETTINGS.whitening,
+        SETTINGS.perturb,
+        seed=renderings.seed,
     )
     assert found is not None and sorted(found.names) == ["albedo", "geometry"]
     for name, value in found.named_buffers():
         torch.testing.assert_close(expected.get_buffer(name), value)
-    assert lender.model.whitening is None
+    assert renderings.model.whitening is None
 
 
-def test_features_there_are_already_change_nothing(lender, images):
-    fitted = whitened(lender, lender.model)
+def test_features_there_are_already_change_nothing(renderings, images):
+    fitted = whitened(renderings, renderings.model)
     assert fitted.whitening is not None and fitted.whitening.mirrored
-    again = whitened(replace(lender, model=fitted), fitted)
+    again = whitened(replace(renderings, model=fitted), fitted)
     expected = embed_images(fitted, images)
     for name, feature in embed_images(again, images).items():
         np.testing.assert_array_equal(feature, expected[name])
 
 
-def test_another_encoder_is_whitened_by_its_own_codes_of_the_lenders_renderings(lender, images):
+def test_another_encoder_is_whitened_by_its_own_codes_of_the_renderings(renderings, images):
     other = net(1)
-    found = whitened(lender, other)
+    found = whitened(renderings, other)
     features, codes = (embed_images(one, images) for one in (found, other))
     assert np.linalg.matrix_rank(features["geometry"]) <= 6 < np.linalg.matrix_rank(codes["geometry"])
     np.testing.assert_allclose(features["light"], codes["light"], rtol=1e-5)
-    own = whitened(lender, lender.model).whitening
+    own = whitened(renderings, renderings.model).whitening
     assert own is not None and found.whitening is not None
     assert not torch.allclose(found.whitening.get_buffer("geometry_map"), own.get_buffer("geometry_map"))
 
 
-def test_components_are_whitened_and_remembered(lender, images, tmp_path):
+def test_components_are_whitened_and_cached(renderings, images, tmp_path):
     pictures = PictureSet(images[40:], tuple("abcdefgh"))
-    assert component_count(lender.images) == 10
-    keeping = Lender(lender.model, lender.images, SETTINGS, memory=Memory(tmp_path))
+    assert component_count(renderings.images) == 10
+    keeping = Renderings(renderings.model, renderings.images, SETTINGS, memory=Memory(tmp_path))
     one, two = (whitened_components(keeping, pictures).factors["pca"] for _ in range(2))
     assert keeping.memory is not None and (keeping.memory.made, keeping.memory.recalled) == (1, 1)
     np.testing.assert_array_equal(one, two)
     assert one.shape == (8, 10) and np.linalg.matrix_rank(one) <= 6
-    np.testing.assert_allclose(one, whitened_components(lender, pictures).factors["pca"], rtol=1e-5)
+    np.testing.assert_allclose(one, whitened_components(renderings, pictures).factors["pca"], rtol=1e-5)

@@ -1,18 +1,26 @@
-"""Ward's tree, exact, in memory that grows with the rows and not with their square.
+"""Ward's tree, exact, in memory that grows with the rows and not with their square; by cells for very many.
 
 Source: Ward (1963), the paper's clustering. Ward's criterion is reducible (Bruynooghe 1977): a merged pair is
 never nearer to a third cluster than the nearer of its parts was. So all pairs that are each other's nearest
 neighbour may be merged at once, and only those rows look again whose neighbour was merged. Clusters are kept
 as mean and size, distances are made block by block with one matrix product and forgotten. SciPy's
 ``linkage`` finds the same tree from the N(N-1)/2 distances held in memory: 10 GB for 50,000 rows.
+
+``ward_in_cells`` builds Ward's exact tree inside every cell of near rows (neighbours.py); of all merges the
+cheapest are made until ``LEAVES`` clusters are left, and Ward's exact tree is built over their means and
+sizes. No merge before the leaves goes over a cell's border.
 """
+
+from dataclasses import dataclass
 
 import numpy as np
 
-from derender.evaluation.neighbours import TILE, finite_rows
+from derender.evaluation.neighbours import CELL_ROWS, TILE, cells, finite_rows, members, of_each
 
 FLOAT64_ROWS = 20_000  # above, nearest neighbours are looked up in float32; heights are always float64
 COMPACT_AT = 0.1  # share of merged-away rows at which they are removed
+LEAVES = 16_384
+"""Clusters that the cells leave; more cannot be asked for."""
 
 
 def ward_tree(features: np.ndarray, sizes: np.ndarray | None = None) -> np.ndarray:
@@ -76,6 +84,71 @@ def by_appearance(names: np.ndarray) -> np.ndarray:
     """Any names as integers from 0 in the order in which they first appear."""
     _, first, cluster = np.unique(names, return_index=True, return_inverse=True)
     return np.argsort(np.argsort(first))[cluster]
+
+
+@dataclass(frozen=True)
+class LeafTree:
+    """Ward's tree over leaves.
+
+    Attributes:
+        leaf: (N,) the leaf of each row, integers from 0.
+        tree: (leaves - 1, 4) merges of leaves, as ``ward_tree`` gives them.
+    """
+
+    leaf: np.ndarray
+    tree: np.ndarray
+
+
+def ward_in_cells(
+    features: np.ndarray, leaves: int = LEAVES, rows_per_cell: int = CELL_ROWS, seed: int = 0
+) -> LeafTree:
+    """Approximate Ward over the rows of (N, D) features; at most as many leaves as rows."""
+    features = finite_rows(features, "Ward clustering")
+    points = features.astype(np.float32, copy=False)
+    groups = members(cells(points, rows_per_cell, seed))
+    trees = list(of_each(lambda cell: _tree(points[groups[cell]]), groups))
+    kept = _counts([tree[:, 2] for tree in trees], min(leaves, len(points)))
+    leaf, made = np.zeros(len(points), np.int64), 0
+    for rows, tree, count in zip(groups, trees, kept, strict=True):
+        leaf[rows] = made + (cut(tree, count) if len(rows) > 1 else 0)
+        made += count
+    means, sizes = _means(points, leaf, made)
+    return LeafTree(leaf, _tree(means, sizes))
+
+
+def cut_leaves(found: LeafTree, n_clusters: int) -> np.ndarray:
+    """Cut into exactly ``n_clusters``: (N,) integers from 0, numbered by first appearance."""
+    leaves = len(found.tree) + 1
+    if not 1 <= n_clusters <= leaves:
+        raise ValueError(
+            f"Ward by cells keeps {leaves} leaves of {len(found.leaf)} rows, cannot make {n_clusters} "
+            f"clusters: ask for 1 to {leaves}"
+        )
+    top = cut(found.tree, n_clusters) if leaves > 1 else np.zeros(1, np.int64)
+    return by_appearance(top[found.leaf])
+
+
+def _tree(points: np.ndarray, sizes: np.ndarray | None = None) -> np.ndarray:
+    return ward_tree(points, sizes) if len(points) > 1 else np.zeros((0, 4))
+
+
+def _counts(heights: list[np.ndarray], leaves: int) -> list[int]:
+    """Into how many clusters each cell is cut when the cheapest merges of all cells are made first."""
+    merges = max(0, sum(len(one) + 1 for one in heights) - max(leaves, len(heights)))
+    cell = np.repeat(np.arange(len(heights)), [len(one) for one in heights])
+    cheapest = np.argsort(np.concatenate(heights), kind="stable")[:merges]
+    made = np.bincount(cell[cheapest], minlength=len(heights))
+    return [len(one) + 1 - int(done) for one, done in zip(heights, made, strict=True)]
+
+
+def _means(points: np.ndarray, leaf: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Mean (float64) and number of rows of each leaf."""
+    sizes = np.bincount(leaf, minlength=count)
+    sums = np.zeros((count, points.shape[1]))
+    for rows in np.array_split(np.argsort(leaf, kind="stable"), max(1, len(points) // 65_536)):
+        held, first = np.unique(leaf[rows], return_index=True)
+        sums[held] += np.add.reduceat(points[rows].astype(np.float64), first, axis=0)
+    return sums / sizes[:, None], sizes
 
 
 def _look(

@@ -10,9 +10,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
-import numpy as np
-
 from derender.data import suggestion
+from derender.evaluation.feature_rows import attribute_columns
 from derender.features import FeatureTable
 
 ATTRIBUTES = "attributes"
@@ -98,15 +97,6 @@ class TableSpec:
     number: int
     kind: Literal["cluster", "linear", "segment"]
     parts: tuple[Part, ...] = field(default=())
-
-
-def attribute_columns(table: FeatureTable, least: int = 0) -> tuple[str, ...]:
-    """Yes/no label columns (int8 with 1, 0 and -1 for unknown) that have ``least`` rows of either answer."""
-    return tuple(
-        name
-        for name, values in table.labels.items()
-        if values.dtype == np.int8 and min((values == 0).sum(), (values == 1).sum()) >= least
-    )
 
 
 def table_named(name: str) -> TableSpec:

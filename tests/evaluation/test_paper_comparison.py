@@ -1,0 +1,141 @@
+"""The paper's numbers are those in the paper; a part finds its labels; the paper's lines stand below ours."""
+
+import re
+
+import numpy as np
+import pytest
+
+from derender.evaluation import compare, compare_clusterings
+from derender.evaluation.clustering_scores import CLUSTER_COLUMNS
+from derender.evaluation.linear_probing import LINEAR_COLUMNS, compare_linear, linear_part_table
+from derender.evaluation.linear_task import choose_rows, task_of
+from derender.evaluation.paper_comparison import beside_the_paper, beside_the_papers_heads
+from derender.evaluation.paper_tables import (
+    CARS,
+    EMOTION,
+    FACE_ATTRIBUTES,
+    IDENTITY,
+    LINEAR,
+    SEGMENTATION,
+    TABLES,
+    table_named,
+)
+from derender.evaluation.score_table import verdict_table
+from derender.features import FeatureTable
+
+
+def table(**labels) -> FeatureTable:
+    return FeatureTable(("a", "b"), {"f": np.eye(2)}, labels)
+
+
+def lines_of_the_paper(text: str) -> list[tuple[str, list[float]]]:
+    """Every line of the paper's tables that has numbers: the method's name, and the numbers after it."""
+    found = []
+    for line in re.findall(r"^(.*?&.*?)\\\\", text, re.MULTILINE):
+        cells = re.sub(r"\\cite\{[^}]*\}|\\textbf|\\texttt|\$.*?\$|[{}\s]", "", line).split("&")
+        method = re.sub(r"\(.*?\)", "", cells[0])
+        numbers = [float(cell) for cell in cells[1:] if re.fullmatch(r"0\.\d+", cell)]
+        if numbers:
+            found.append((method, numbers))
+    return found
+
+
+def test_every_number_is_the_papers(shared_data):
+    printed = lines_of_the_paper(shared_data("paper.tex").read_text())
+    ours = [
+        (re.sub(r"\(.*?\)|\s", "", row.method), list(row.scores.values()))
+        for part in (IDENTITY, EMOTION, FACE_ATTRIBUTES, LINEAR, SEGMENTATION, CARS)
+        for row in part.paper
+    ]
+    assert len(ours) == 12 + 6 + 6 + 21 + 5 + 4
+    assert not [line for line in ours if line not in printed]
+    assert not [line for line in printed if line not in ours]
+
+
+def test_parts_find_their_labels():
+    yes_no = np.array([0, 1], np.int8)
+    celeba = table(Smiling=yes_no, Young=yes_no, name=np.array(["a", "b"]))
+    assert FACE_ATTRIBUTES.columns(celeba) == ("Smiling", "Young") and IDENTITY.columns(celeba) == ()
+    faces = table(identity=np.array(["a", "b"]), expression=np.array(["x", "y"]))
+    assert IDENTITY.columns(faces) == ("identity",) and EMOTION.columns(faces) == ("expression",)
+
+
+def test_a_part_says_what_differs():
+    assert EMOTION.differs("rafdb", 3_068).startswith("subset: 3,068 rows of rafdb; the paper: 3,068")
+    told = SEGMENTATION.differs("celebamask", 640, "+ 160 pictures at 64 x 64, 19 classes,")
+    assert told.startswith(
+        "subset: 640 + 160 pictures at 64 x 64, 19 classes, of celebamask; the paper: 24,127"
+    )
+    assert EMOTION.differs("lfw", 500).startswith("stand-in: 500 rows of lfw for 3,068 pictures of RAF-DB")
+
+
+def test_tables_are_known_by_name():
+    assert {"clustering", "linear", "segmentation", "cars", "identity", "emotion"} == set(TABLES)
+    named = [table_named(name) for name in ("clustering", "linear", "segmentation", "cars")]
+    assert [one.number for one in named] == [1, 2, 3, 4]
+    with pytest.raises(ValueError, match="unknown table 'clusterin'; did you mean 'clustering'"):
+        table_named("clusterin")
+
+
+WHO = np.arange(60) % 3
+FEATURES = {
+    "ours": [np.eye(3)[WHO] + 0.01 * np.random.default_rng(0).normal(size=(60, 3))],
+    "noise": [np.random.default_rng(seed).normal(size=(60, 3)) for seed in range(2)],
+}
+
+
+def test_the_papers_lines_stand_below_ours():
+    found = compare_clusterings(FEATURES, {"who": WHO}, controls=("noise",), resample_count=50)
+    columns = {name: CLUSTER_COLUMNS[name] for name in ("accuracy", "f1")}
+    rows = ("features", found.rows, columns, EMOTION.paper, "stand-in: made up")
+    values = beside_the_paper("Table 1", *rows, interval="accuracy").values()
+    assert values["paper: Ours - LOOCC-L"] == {
+        "accuracy": 0.4058, "F1": 0.3014, "95 %": None, "data": "RAF-DB"
+    }  # fmt: skip
+    assert values["ours"]["data"] == "stand-in: made up"
+
+
+def test_linear_tables_and_the_papers():
+    task = task_of({"a": (WHO == 0).astype(np.int8)})
+    rows = choose_rows(task, [str(row) for row in range(60)], (10, 20), (0, 1))
+    found = compare_linear(
+        FEATURES, task, rows, (0, 1), controls=("noise",), heads=("linear", "k-NN"), resample_count=50
+    )
+    part = linear_part_table(found, found.parts[0])
+    assert "10 labelled rows, the paper's head, frozen features: 30 rows tested" in part.caption
+    assert [column.name for column in part.columns] == ["accuracy", "95 %", "±", "balanced", "AP"]
+    judged = verdict_table(found.parts[0].rows, LINEAR_COLUMNS, "above?")
+    assert [row.name for row in judged.rows] == ["ours: accuracy", "ours: balanced"]
+    table = beside_the_papers_heads("attributes", 2, LINEAR.paper, found, "subset")
+    assert [column.name for column in table.columns] == ["10 frozen", "20 frozen", "data"]
+    assert not any(row.note for row in table.rows)  # the paper has no numbers for 10 and 20 labels
+    wide = compare_linear(
+        {"ours": [np.repeat(FEATURES["ours"][0], 4, axis=0)]},
+        wide_task := task_of({"a": np.repeat(WHO == 0, 4).astype(np.int8)}),
+        choose_rows(wide_task, [str(row) for row in range(240)], (100,), (0, 1)),
+        (0, 1), heads=("linear",), resample_count=20,
+    )  # fmt: skip
+    values = beside_the_papers_heads("attributes", 2, LINEAR.paper, wide, "subset").values()
+    assert values["paper: Ours - LOOCC-LV"] == {"100 frozen": 0.8226, "data": "CelebA"}
+    assert "paper: Supervised ResNet-18" not in values  # it has no frozen head
+
+
+def test_one_call_compares_tables_beside_the_papers_lines():
+    labels = {"expression": np.array(list("abc"))[WHO]}
+    files = tuple(map(str, range(60)))
+    rows = {
+        name: [FeatureTable(files, {"geometry": one}, labels, {"layout": "lfw"}) for one in runs]
+        for name, runs in FEATURES.items()
+    }
+    found = compare("emotion", rows, resamples=20, cache="none")
+    assert found.values["parts"]["emotion"]["differs"].startswith("stand-in: 60 rows of lfw")
+    assert found.to_pandas().loc["paper: RIS", "accuracy"] == 0.3862
+    assert found.values["parts"]["emotion"]["rows"]["noise"]["runs"] == 2
+    for wrong, message in (
+        (("emotion", {}), "at least one feature table"),
+        (("cars", rows), r"needs labels \(class\), the features have expression"),
+        (("emotions", rows), "did you mean 'emotion'"),
+        (("emotion", {"m": "faces-64"}), "model 'm' needs images"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            compare(*wrong, cache="none")
