@@ -8,6 +8,8 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from derender import evaluation as evaluate
+    from derender.evaluation import compare
     from derender.features import DisentangledFeatures, FeatureTable
     from derender.model import Derenderer, load
     from derender.scene import Scene
@@ -25,7 +27,9 @@ _HOME = {
     "refine": "derender.learn",
     "unet": "derender.learn",
     "finetune": "derender.learn",
+    "compare": "derender.evaluation",
 }
+_ALIASES = {"evaluate": "derender.evaluation"}
 _SUBMODULES = [
     "scene",
     "render",
@@ -41,7 +45,16 @@ _SUBMODULES = [
     "report",
 ]
 
-__all__ = ["Derenderer", "DisentangledFeatures", "FeatureTable", "Scene", "__version__", "load"]
+__all__ = [
+    "Derenderer",
+    "DisentangledFeatures",
+    "FeatureTable",
+    "Scene",
+    "__version__",
+    "compare",
+    "evaluate",
+    "load",
+]
 
 
 def __getattr__(name: str) -> Any:
@@ -49,8 +62,10 @@ def __getattr__(name: str) -> Any:
         return getattr(importlib.import_module(_HOME[name]), name)
     if name in _SUBMODULES:
         return importlib.import_module(f"derender.{name}")
+    if name in _ALIASES:
+        return importlib.import_module(_ALIASES[name])
     raise AttributeError(f"module 'derender' has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:
-    return sorted([*globals(), *_HOME, *_SUBMODULES])
+    return sorted([*globals(), *_HOME, *_ALIASES, *_SUBMODULES])

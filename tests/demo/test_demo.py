@@ -52,6 +52,7 @@ def test_scores_stand_beside_their_controls(told):
         "untrained encoder",
         "PCA (6)",
         "pixels",
+        "majority",
         "chance",
     ]
     assert list(tables["geometry"].values()) == ["model", "average depth", "plane", "untrained model"]

@@ -124,7 +124,9 @@ def test_one_call_compares_tables_beside_the_papers_lines():
     labels = {"expression": np.array(list("abc"))[WHO]}
     files = tuple(map(str, range(60)))
     rows = {
-        name: [FeatureTable(files, {"geometry": one}, labels, {"layout": "lfw"}) for one in runs]
+        name: [
+            FeatureTable(files, {"geometry": one, "albedo": one}, labels, {"layout": "lfw"}) for one in runs
+        ]
         for name, runs in FEATURES.items()
     }
     found = compare("emotion", rows, resamples=20, cache="none")

@@ -47,7 +47,7 @@ from derender.postprocess import Features
 from derender.postprocess.whitening import Contrast, Whitening
 from derender.presets import ModelSettings
 from derender.training.config import FeatureSettings, TrainConfig
-from derender.training.whitening import Describe, fit_whitening
+from derender.training.features import Describe, fit_whitening
 
 UNTRAINED = "untrained encoder"
 MISSING_CONTROLS = "without images there are no pixels, PCA and untrained encoder to compare with"

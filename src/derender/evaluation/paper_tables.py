@@ -1,13 +1,15 @@
-"""The paper's tables as data: its numbers, and the protocol that makes numbers to stand beside them.
+"""The paper's tables as data: its numbers (paper_tables.csv), and the questions that they answer.
 
-Source: Klinghoffer et al., ECCV 2022, Tables 1 to 4. A table has parts, one for each question (who is
-it, which emotion, ...); a part says which label answers it, how rows are chosen, and which of the paper's
-rows it stands beside. Where a user's data are not the paper's, ``differs`` says so in words. A further
-table is a further ``TableSpec`` in ``TABLES`` and a runner of its kind in the command.
+Source: Klinghoffer et al., ECCV 2022, Tables 1 to 4. A table has parts, one for each question (who is it,
+    which emotion, ...); a part names the label that answers it, the rows that are used, and the paper's
+    lines. Where the data are not the paper's, ``differs`` says so in words. A further table is a further
+    ``TableSpec`` in ``TABLES``; paper_comparison.py makes them.
 """
 
+import csv
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from importlib.resources import files
 from typing import Literal
 
 from derender.data import suggestion
@@ -96,7 +98,7 @@ class TableSpec:
     name: str
     number: int
     kind: Literal["cluster", "linear", "segment"]
-    parts: tuple[Part, ...] = field(default=())
+    parts: tuple[Part, ...]
 
 
 def table_named(name: str) -> TableSpec:
@@ -106,156 +108,40 @@ def table_named(name: str) -> TableSpec:
     return TABLES[name]
 
 
-def _clustering(dataset: str, rows: str) -> tuple[PaperRow, ...]:
-    """Lines "method | accuracy | F1"."""
-    cells = [[cell.strip() for cell in line.split("|")] for line in rows.strip().splitlines()]
-    return tuple(
-        PaperRow(method, dataset, {"accuracy": float(accuracy), "f1": float(f1)})
-        for method, accuracy, f1 in cells
-    )
+def _paper() -> dict[str, tuple[PaperRow, ...]]:
+    """The paper's lines by part, in its order."""
+    text = (files(__package__) / "paper_tables.csv").read_text(encoding="utf-8")
+    found: dict[str, tuple[PaperRow, ...]] = {}
+    for line in csv.DictReader(text.splitlines()):
+        part, method, dataset = (line.pop(name) for name in ("part", "method", "dataset"))
+        scores = {name: float(value) for name, value in line.items() if value}
+        found[part] = (*found.get(part, ()), PaperRow(method, dataset, scores))
+    return found
 
 
-def _linear(count: int, rows: str) -> tuple[PaperRow, ...]:
-    """Lines "method | fine-tuned | frozen" of accuracies; a dash where the paper has none."""
-    found = []
-    for line in rows.strip().splitlines():
-        method, *values = (cell.strip() for cell in line.split("|"))
-        named = zip((f"fine-tuned {count}", f"linear {count}"), values, strict=True)
-        scores = {name: float(value) for name, value in named if value != "-"}
-        found.append(PaperRow(method, "CelebA", scores))
-    return tuple(found)
-
-
-_BBT = _clustering(
-    "BBT",
-    """
-    VQ-VAE             | 0.4168 | 0.2796
-    StyleGAN2          | 0.4261 | 0.3528
-    RIS                | 0.4790 | 0.4346
-    Ours - No LOOCC    | 0.5754 | 0.4572
-    Ours - LOOCC-L     | 0.6252 | 0.6133
-    Ours - LOOCC-LV    | 0.6096 | 0.5669
-    """,
-)
-_BUFFY = _clustering(
-    "Buffy",
-    """
-    VQ-VAE             | 0.4489 | 0.3427
-    StyleGAN2          | 0.3909 | 0.2767
-    RIS                | 0.3715 | 0.2837
-    Ours - No LOOCC    | 0.4507 | 0.3697
-    Ours - LOOCC-L     | 0.4718 | 0.4095
-    Ours - LOOCC-LV    | 0.4806 | 0.4234
-    """,
-)
-_RAF_DB = _clustering(
-    "RAF-DB",
-    """
-    VQ-VAE             | 0.3993 | 0.2660
-    StyleGAN2          | 0.3863 | 0.2153
-    RIS                | 0.3862 | 0.2152
-    Ours - No LOOCC    | 0.3918 | 0.2651
-    Ours - LOOCC-L     | 0.4058 | 0.3014
-    Ours - LOOCC-LV    | 0.396  | 0.2452
-    """,
-)
-_CELEBA = _clustering(
-    "CelebA",
-    """
-    VQ-VAE             | 0.8010 | 0.7420
-    StyleGAN2          | 0.8042 | 0.7466
-    RIS                | 0.8023 | 0.7375
-    Ours - No LOOCC    | 0.8135 | 0.7607
-    Ours - LOOCC-L     | 0.8143 | 0.7616
-    Ours - LOOCC-LV    | 0.8139 | 0.7649
-    """,
-)
-_CARS = _clustering(
-    "ShapeNet cars",
-    """
-    VQ-VAE             | 0.4915 | 0.3696
-    Ours - No LOOCC    | 0.5100 | 0.3877
-    Ours - LOOCC-L     | 0.5270 | 0.4016
-    Ours - LOOCC-LV    | 0.5485 | 0.4995
-    """,
-)
-_LINEAR = (
-    *_linear(
-        100,
-        """
-        Supervised ResNet-18 | 0.8186 | -
-        VQ-VAE               | 0.8148 | 0.8182
-        StyleGAN2            | 0.7781 | 0.7688
-        RIS                  | 0.8250 | 0.8208
-        Ours - No LOOCC      | 0.8212 | 0.8033
-        Ours - LOOCC-L       | 0.8245 | 0.8205
-        Ours - LOOCC-LV      | 0.8556 | 0.8226
-        """,
-    ),
-    *_linear(
-        500,
-        """
-        Supervised ResNet-18 | 0.8336 | -
-        VQ-VAE               | 0.8349 | 0.8354
-        StyleGAN2            | 0.8125 | 0.7875
-        RIS                  | 0.8550 | 0.8500
-        Ours - No LOOCC      | 0.8403 | 0.8166
-        Ours - LOOCC-L       | 0.8509 | 0.8219
-        Ours - LOOCC-LV      | 0.8556 | 0.8226
-        """,
-    ),
-    *_linear(
-        1_000,
-        """
-        Supervised ResNet-18 | 0.8407 | -
-        VQ-VAE               | 0.8368 | 0.8406
-        StyleGAN2            | 0.8063 | 0.7937
-        RIS                  | 0.8250 | 0.8400
-        Ours - No LOOCC      | 0.8539 | 0.8240
-        Ours - LOOCC-L       | 0.8543 | 0.8226
-        Ours - LOOCC-LV      | 0.8556 | 0.8149
-        """,
-    ),
-)
-_SEGMENTATION = tuple(
-    PaperRow(
-        method,
-        "CelebAMask-HQ, 64 x 64",
-        {"mean_iou": mean, "top10_iou": top, "pixel_accuracy": accuracy},
-    )
-    for method, mean, top, accuracy in (
-        ("Supervised (random init)", 0.3862, 0.5858, 0.8669),
-        ("Geometry Encoder", 0.4066, 0.5977, 0.8715),
-        ("Albedo Encoder", 0.3987, 0.5984, 0.8724),
-        ("Joint Encoders", 0.4390, 0.6221, 0.8781),
-        ("Joint Encoders Frozen", 0.3962, 0.5712, 0.8540),
-    )
-)
-
+_PAPER = _paper()
 IDENTITY = Part(
-    "identity",
-    ("identity",),
-    (*_BBT, *_BUFFY),
-    ("face_tracks",),
-    "644 tracks of 5 people (BBT) and 568 of 6 (Buffy)",
-    min_count=20,
-    max_count=20,
-)
+    "identity", ("identity",), _PAPER["identity"], ("face_tracks",),
+    "644 tracks of 5 people (BBT) and 568 of 6 (Buffy)", min_count=20, max_count=20,
+)  # fmt: skip
 EMOTION = Part(
-    "emotion", ("emotion", "expression"), _RAF_DB, ("rafdb",), "3,068 pictures of RAF-DB, 7 emotions"
-)
+    "emotion", ("emotion", "expression"), _PAPER["emotion"], ("rafdb",),
+    "3,068 pictures of RAF-DB, 7 emotions",
+)  # fmt: skip
 FACE_ATTRIBUTES = Part(
-    ATTRIBUTES, (ATTRIBUTES,), _CELEBA, ("celeba",), "6,000 pictures of CelebA, mean of 40 attributes"
+    ATTRIBUTES, (ATTRIBUTES,), _PAPER["attributes"], ("celeba",),
+    "6,000 pictures of CelebA, mean of 40 attributes",
+)  # fmt: skip
+CARS = Part(
+    "cars", ("class",), _PAPER["cars"], ("shapenet_cars",), "1,000 pictures of ShapeNet cars, 5 classes"
 )
-CARS = Part("cars", ("class",), _CARS, ("shapenet_cars",), "1,000 pictures of ShapeNet cars, 5 classes")
-LINEAR = Part(ATTRIBUTES, (ATTRIBUTES,), _LINEAR, ("celeba",), "6,000 pictures of CelebA, 40 attributes")
+LINEAR = Part(
+    ATTRIBUTES, (ATTRIBUTES,), _PAPER["linear"], ("celeba",), "6,000 pictures of CelebA, 40 attributes"
+)
 SEGMENTATION = Part(
-    "segmentation",
-    ("mask",),
-    _SEGMENTATION,
-    ("celebamask",),
+    "segmentation", ("mask",), _PAPER["segmentation"], ("celebamask",),
     "24,127 + 2,885 pictures of CelebAMask-HQ at 64 x 64, 19 classes",
-)
+)  # fmt: skip
 
 TABLES: dict[str, TableSpec] = {
     spec.name: spec
