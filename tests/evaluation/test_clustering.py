@@ -242,7 +242,7 @@ def test_finch_levels_are_shown_beside_chance():
 
 @pytest.fixture(scope="module")
 def tracks() -> FeatureTable:
-    """12 tracks of three people; noise that is 0 in the mean of a track, and in the track with a label missing."""
+    """12 tracks of three people; the mean noise of a track is 0, the track with a label missing has none."""
     labels, noise = np.repeat(np.arange(3), 20), np.random.default_rng(0).normal(size=(60, 3)) * 30
     noise -= np.repeat(noise.reshape(12, 5, 3).mean(1), 5, axis=0)
     noise[5:10] = 0
