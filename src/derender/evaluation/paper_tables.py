@@ -110,7 +110,7 @@ def table_named(name: str) -> TableSpec:
 
 def _paper() -> dict[str, tuple[PaperRow, ...]]:
     """The paper's lines by part, in its order."""
-    text = (files(__package__) / "paper_tables.csv").read_text(encoding="utf-8")
+    text = (files("derender.evaluation") / "paper_tables.csv").read_text(encoding="utf-8")
     found: dict[str, tuple[PaperRow, ...]] = {}
     for line in csv.DictReader(text.splitlines()):
         part, method, dataset = (line.pop(name) for name in ("part", "method", "dataset"))
