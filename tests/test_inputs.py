@@ -8,7 +8,7 @@ from PIL import Image
 import derender
 from derender.data import PictureSet
 from derender.inputs import as_images, as_model, device_named, part_of
-from derender.storage.split import SplitRecord, write_split
+from derender.storage.folder import SplitRecord, write_split
 
 
 @pytest.fixture

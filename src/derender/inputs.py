@@ -11,8 +11,7 @@ import torch
 
 from derender.data import PictureSet, read_pictures, split_indices, suggestion
 from derender.model import Derenderer, load
-from derender.storage.folder import model_folder
-from derender.storage.split import SplitRecord, read_split, write_split
+from derender.storage.folder import SplitRecord, model_folder, read_split, write_split
 from derender.training.config import TrainConfig
 from derender.training.run_folder import read_config_tree
 

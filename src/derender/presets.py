@@ -2,14 +2,14 @@
 
 `paper` is the paper's model; `faces`, `cats` and `cars` are the same networks with the ranges that suit
 the kind of thing; `small` has a quarter of the widths (a sixteenth of the work) and trains on a CPU.
-How each is trained stands in training/config.py under the same names.
+How each is trained is in training/config.py under the same names.
 """
 
 from collections.abc import Mapping
 from typing import TypeVar
 
 from derender.data import suggestion
-from derender.networks.settings import NetworkSettings
+from derender.networks.encoders import NetworkSettings
 from derender.scene.ranges import SceneRanges
 from derender.settings import Settings
 

@@ -19,7 +19,7 @@ from derender.interpretation.sanity import sanity_check, similarity, spearman
 from derender.model import Derenderer
 from derender.networks.encoders import activations
 from derender.postprocess import Features
-from derender.postprocess.whitening import Contrast, Whitening
+from derender.postprocess.whitening import Projection, Whitening
 from derender.presets import MODEL_PRESETS
 
 SIZE, CODE = 32, 6
@@ -145,7 +145,7 @@ def test_features_of_both_sides_give_a_mirrored_picture_the_mirrored_map(model, 
     width, names = model.activations(images[:1])["geometry"].shape[1], ("geometry", "albedo")
     draw = torch.Generator().manual_seed(0)
     maps = {
-        name: Contrast(torch.zeros(width), torch.randn(width, CODE, generator=draw), torch.ones(CODE))
+        name: Projection(torch.zeros(width), torch.randn(width, CODE, generator=draw), torch.ones(CODE))
         for name in names
     }
     mirroring = model.with_features(Features(Whitening(maps, mirrored=maps)))

@@ -6,8 +6,9 @@ from tests.tolerances import assert_agrees
 from torch import nn
 from torch.nn import functional
 
-from derender.networks.convolutions import NarrowConv2d, UpsampledConv2d
-from derender.networks.norm_relu import EPSILON, NormReLU, numba_cpu, reference
+from derender.networks import norm_relu
+from derender.networks.decoders import NarrowConv2d, UpsampledConv2d
+from derender.networks.norm_relu import EPSILON, NormReLU, fast, reference
 
 DTYPES = (torch.float32, torch.float64)
 
@@ -24,19 +25,23 @@ def leaf(shape, generator, dtype, *, channels_last=True):
     return value.requires_grad_()
 
 
+def assert_same(actual, expected, inputs, generator):
+    """Outputs, and the gradient of every input."""
+    assert_agrees(actual, expected)
+    seed = generator.get_state()
+    found = gradients(actual, inputs, generator)
+    wanted = gradients(expected, inputs, generator.set_state(seed))
+    for index, (a, b) in enumerate(zip(found, wanted, strict=True)):
+        assert_agrees(a, b, f"gradient of input {index}")
+
+
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize(("height", "width"), [(4, 4), (5, 3), (1, 7)])
 def test_one_transposed_convolution_is_doubling_then_convolution(height, width, dtype, generator):
     layer = UpsampledConv2d(3, 5).to(dtype)
     values = leaf((2, 3, height, width), generator, dtype)
     expected = functional.conv2d(functional.interpolate(values, scale_factor=2), layer.weight, padding=1)
-    actual = layer(values)
-    assert_agrees(actual, expected)
-    seed = generator.get_state()
-    found = gradients(actual, (values, layer.weight), generator)
-    wanted = gradients(expected, (values, layer.weight), generator.set_state(seed))
-    for a, b in zip(found, wanted, strict=True):
-        assert_agrees(a, b, "gradient")
+    assert_same(layer(values), expected, (values, layer.weight), generator)
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -46,13 +51,7 @@ def test_convolution_by_blocks_is_the_plain_convolution(height, width, channels,
     layer = NarrowConv2d(6, channels).to(dtype)
     values = leaf((2, 6, height, width), generator, dtype)
     expected = functional.conv2d(values, layer.weight, padding=2)
-    actual = layer(values)
-    assert_agrees(actual, expected)
-    seed = generator.get_state()
-    found = gradients(actual, (values, layer.weight), generator)
-    wanted = gradients(expected, (values, layer.weight), generator.set_state(seed))
-    for a, b in zip(found, wanted, strict=True):
-        assert_agrees(a, b, "gradient")
+    assert_same(layer(values), expected, (values, layer.weight), generator)
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -62,24 +61,17 @@ def test_numba_normalisation_agrees_with_torchs(shape, slope, dtype, generator):
     values = leaf(shape, generator, dtype)
     weight, bias = leaf((shape[1],), generator, dtype), leaf((shape[1],), generator, dtype)
     groups = shape[1] // 4
-    actual = numba_cpu.norm_relu(values, weight, bias, groups, slope, EPSILON)
-    expected = reference.norm_relu(values, weight, bias, groups, slope, EPSILON)
-    assert_agrees(actual, expected)
-    seed = generator.get_state()
-    found = gradients(actual, (values, weight, bias), generator)
-    wanted = gradients(expected, (values, weight, bias), generator.set_state(seed))
-    for a, b, name in zip(found, wanted, ("values", "weight", "bias"), strict=True):
-        assert_agrees(a, b, name)
+    actual = fast(values, weight, bias, groups, slope, EPSILON)
+    expected = reference(values, weight, bias, groups, slope, EPSILON)
+    assert_same(actual, expected, (values, weight, bias), generator)
 
 
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")  # torch 2.15's own
 def test_numba_normalisation_passes_gradcheck_and_opcheck(generator):
     values = leaf((2, 8, 3, 2), generator, torch.float64)
     weight, bias = leaf((8,), generator, torch.float64), leaf((8,), generator, torch.float64)
-    assert torch.autograd.gradcheck(
-        lambda *inputs: numba_cpu.norm_relu(*inputs, 2, 0.2, EPSILON), (values, weight, bias)
-    )
-    torch.library.opcheck(numba_cpu._forward, (values, weight, bias, 2, 0.2, EPSILON))
+    assert torch.autograd.gradcheck(lambda *inputs: fast(*inputs, 2, 0.2, EPSILON), (values, weight, bias))
+    torch.library.opcheck(norm_relu._forward, (values, weight, bias, 2, 0.2, EPSILON))
 
 
 def test_pictures_far_from_zero_are_normalised_as_exactly(generator):
@@ -88,7 +80,7 @@ def test_pictures_far_from_zero_are_normalised_as_exactly(generator):
         memory_format=torch.channels_last
     )
     weight, bias = torch.ones(8), torch.zeros(8)
-    result = numba_cpu.norm_relu(values, weight, bias, 2, 0.0, EPSILON)
+    result = fast(values, weight, bias, 2, 0.0, EPSILON)
     exact = functional.relu(functional.group_norm(values.double(), 2))
     # float32 pictures near 1000 are themselves rounded to 6e-5, and scale and shift are float32
     assert (result.double() - exact).abs().max() < 5e-4
@@ -110,7 +102,7 @@ def test_the_input_decides_who_normalises(change, taken, generator):
     layer = NormReLU(8, 2)
     if values.dtype == torch.float64:
         layer.double()
-    assert numba_cpu.suits(values, layer.weight) is taken
+    assert norm_relu.suits_fast(values, layer.weight) is taken
     plain = nn.Sequential(nn.GroupNorm(2, 8), nn.ReLU())
     tolerance = 3e-2 if values.dtype == torch.bfloat16 else 1e-5
     torch.testing.assert_close(layer(values).float(), plain(values.float()), atol=tolerance, rtol=tolerance)

@@ -6,8 +6,7 @@ import torch
 from derender.model import Derenderer
 from derender.networks import FACTORS, NetworkSettings
 from derender.networks.confidence import ConfidenceNet
-from derender.networks.encoders import UNetEncoder
-from derender.networks.settings import IMAGE_SIZES
+from derender.networks.encoders import IMAGE_SIZES, UNetEncoder
 
 PAPER_PARAMETERS = {
     "geometry": 12_979_648,

@@ -184,7 +184,7 @@ def test_another_architecture_is_named_by_its_first_tensor(checkpoint, tmp_path)
     with pytest.raises(ValueError, match="netV has 5 tensors, expected 6"):
         read_checkpoint(saved({**checkpoint, "netV": shorter}, tmp_path))
     broken = {**checkpoint["netD"], "network.0.weight": checkpoint["netD"]["network.0.weight"] * torch.nan}
-    with pytest.raises(ValueError, match=r"netD has network.0.weight with values that are no numbers"):
+    with pytest.raises(ValueError, match=r"netD has network.0.weight with NaN or infinite values"):
         read_checkpoint(saved({**checkpoint, "netD": broken}, tmp_path))
 
 

@@ -6,8 +6,8 @@ import pytest
 import torch
 from torch import nn
 
-from derender.objectives.frozen import PerceptualFeatures
 from derender.objectives.perceptual import build_perceptual, perceptual_loss
+from derender.objectives.perceptual_features import PerceptualFeatures
 from derender.objectives.self_features import SelfFeatures
 
 
@@ -151,7 +151,7 @@ def test_calibration_makes_the_spread_one_and_keeps_relations(generator):
 def test_calibration_on_pictures_that_do_not_differ_is_refused(generator):
     net = Tiny(generator)
     net.features[0].bias.fill_(-1e3)
-    with pytest.raises(ValueError, match="do not vary over 2 calibration pictures"):
+    with pytest.raises(ValueError, match="do not vary over 2 calibration images"):
         net.calibrate_(torch.rand(2, 3, 6, 8, generator=generator))
 
 

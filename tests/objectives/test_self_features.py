@@ -8,13 +8,16 @@ from safetensors.torch import save_file
 from torch import Generator, nn
 from torch.nn import functional
 
-from derender.objectives.self_features import SelfFeatures, load_self_features, trunk, without_normalisation
-from derender.objectives.self_training import (
+from derender.objectives.self_features import (
     DEFAULT_STEPS,
+    SelfFeatures,
     SelfTraining,
+    load_self_features,
     photometric_augmentation,
     train_self_features,
+    trunk,
     two_views,
+    without_normalisation,
 )
 
 QUICK = SelfTraining(widths=(8, 8, 16), batch=8, places=8, crop=24, projection=16)
@@ -42,7 +45,7 @@ def as_bytes(images: torch.Tensor) -> torch.Tensor:
 @pytest.mark.parametrize(("height", "width"), [(32, 32), (64, 48), (20, 33)])
 def test_places_of_two_views_show_the_same_point(monkeypatch, generator, height, width):
     monkeypatch.setattr(
-        "derender.objectives.self_training.photometric_augmentation", lambda images, generator: images
+        "derender.objectives.self_features.photometric_augmentation", lambda images, generator: images
     )
     n, stride = 40, 4
     rows, columns = torch.meshgrid(torch.arange(float(height)), torch.arange(float(width)), indexing="ij")

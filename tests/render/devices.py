@@ -15,7 +15,6 @@ from torch import Tensor
 from derender import render as renderer
 from derender.render import available_backends
 from derender.render.rasterize import rasterize as rasterize_there
-from derender.render.sample import sample as sample_there
 
 FAST = tuple(name for name in available_backends() if name != "reference")
 
@@ -50,4 +49,4 @@ def there_and_back(function: Callable[..., Any]) -> Callable[..., Any]:
 
 render, render_scene = there_and_back(renderer.render), there_and_back(renderer.render_scene)
 shade, warp = there_and_back(renderer.shade), there_and_back(renderer.warp)
-rasterize, sample = there_and_back(rasterize_there), there_and_back(sample_there)
+rasterize = there_and_back(rasterize_there)

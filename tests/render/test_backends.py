@@ -9,14 +9,17 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
-from tests.render.devices import FAST, device_of, rasterize, render, sample, shade, warp
+from tests.render.devices import FAST, device_of, rasterize, render, shade, warp
 from tests.render.scenes import FOV_DEG, scene, smooth_depth
 from tests.tolerances import assert_agrees
 from torch import Tensor
 
 from derender.render import available_backends, chosen_backend
-from derender.render.rasterize import IMPLEMENTATIONS, reference
+from derender.render.rasterize import reference
+from derender.render.rasterize.choose import CHOOSE
 from derender.render.triton_launch import triton_installed
+from derender.render.warping.operators import FORWARD
+from derender.render.warping.reference import sample
 from derender.scene.camera import focal_px, motion, to_camera, unproject
 
 fast = pytest.mark.parametrize("backend", FAST)
@@ -96,10 +99,10 @@ def test_backends_choose_the_same_triangle(backend, dtype, generator):
     depth[1] = 1
     pose[1, 3] = 0.5 / focal_px(17, FOV_DEG)
     vertices, focal = to_camera(unproject(depth, FOV_DEG), pose), focal_px(17, FOV_DEG)
-    expected = reference.rasterize(vertices, focal)[2]
+    screen = reference.project(vertices.double(), focal)
+    expected = reference.visible_triangles(screen)
     assert (expected >= 0).float().mean() > 0.2
-    chosen = IMPLEMENTATIONS[backend].rasterize(vertices.to(device_of(backend)), focal)[2]
-    assert torch.equal(chosen.cpu().long(), expected)
+    assert torch.equal(CHOOSE[backend](screen.to(device_of(backend))).cpu().long(), expected)
 
 
 @fast
@@ -122,8 +125,8 @@ def test_rasterizing_agrees(backend, dtype, generator, nan_filled_memory):
 @fast
 def test_identity_camera_takes_the_first_triangle_of_each_vertex(backend, generator):
     vertices = unproject(smooth_depth(1, 6, 6, generator), FOV_DEG)
-    vertices = vertices.to(device_of(backend))
-    triangle = IMPLEMENTATIONS[backend].rasterize(vertices, focal_px(6, FOV_DEG))[2][0].cpu()
+    screen = reference.project(vertices.double(), focal_px(6, FOV_DEG)).to(device_of(backend))
+    triangle = CHOOSE[backend](screen)[0].cpu()
     # the vertex below and right of a cell is first met as that cell's lower triangle's corner
     v, u = torch.meshgrid(torch.arange(1, 6), torch.arange(1, 6), indexing="ij")
     assert torch.equal(triangle[1:, 1:].long(), 2 * ((v - 1) * 5 + u - 1) + 1)
@@ -142,39 +145,34 @@ def test_reference_gives_the_same_in_small_portions(generator, monkeypatch):
 @fast
 @pytest.mark.parametrize("channels", [1, 3, 5])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_sampling_agrees(backend, channels, dtype, generator, nan_filled_memory):
-    """Also where both pictures differ in size, at whole pixels, and just beyond the border."""
+def test_warping_agrees_for_any_number_of_channels(backend, channels, dtype, generator, nan_filled_memory):
+    depth, _, _, pose = scene(2, 5, 8, generator, dtype)
     image = torch.randn(2, channels, 5, 8, generator=generator, dtype=dtype)
-    uv = torch.rand(2, 9, 6, 2, generator=generator, dtype=dtype) * torch.tensor([7.0, 4.0], dtype=dtype)
-    uv[0, 0, 0], uv[0, 0, 1] = torch.tensor([-1e-4, 4 + 1e-4]), torch.tensor([7 + 1e-4, -1e-4])
-    uv[1, 0] = torch.tensor([[0.0, 0.0], [1.0, 1.0], [2.0, 3.0], [6.0, 3.0], [7.0, 4.0], [1.0, 4.0]])
-    mask = (torch.rand(2, 9, 6, generator=generator) > 0.3).to(dtype)
-    mask[0, 0, :2] = mask[1, 0] = 1
     kept = []
     for name in ("reference", backend):
-        inputs = [image.clone().requires_grad_(), uv.clone().requires_grad_()]
-        colour = sample(*inputs, mask, name)
-        kept.append((colour, *gradients_with(torch.Generator().manual_seed(1), (colour,), inputs)))
-    for name, expected, actual in zip(("colour", "d/d image", "d/d uv"), *kept, strict=True):
+        inputs = [value.clone().requires_grad_() for value in (image, depth, pose)]
+        seen = warp(*inputs, FOV_DEG, name)
+        outputs = (seen.image, seen.depth)
+        kept.append((*outputs, *gradients_with(torch.Generator().manual_seed(1), outputs, inputs)))
+    names = ("image", "depth", "d/d image", "d/d depth", "d/d camera")
+    for name, expected, actual in zip(names, *kept, strict=True):
         assert_agrees(actual, expected, name)
 
 
-@pytest.mark.parametrize("backend", available_backends())
-def test_sampling_is_exact_on_bilinear_images_and_at_pixels(backend, generator):
+def test_sampling_is_exact_on_bilinear_images_and_at_pixels(generator):
     v, u = torch.meshgrid(torch.arange(5.0), torch.arange(8.0), indexing="ij")
     image = (2 * u - 3 * v + 0.5 * u * v + 1)[None, None].double()
     uv = torch.rand(1, 9, 6, 2, generator=generator, dtype=torch.float64) * torch.tensor([7.0, 4.0])
     expected = 2 * uv[..., 0] - 3 * uv[..., 1] + 0.5 * uv[..., 0] * uv[..., 1] + 1
-    assert_agrees(sample(image, uv, torch.ones(1, 9, 6).double(), backend)[:, 0], expected)
+    assert_agrees(sample(image, uv, torch.ones(1, 9, 6).double())[:, 0], expected)
     at_pixels = torch.stack((u, v), -1)[None].double()
-    assert torch.equal(sample(image, at_pixels, torch.ones(1, 5, 8).double(), backend), image)
+    assert torch.equal(sample(image, at_pixels, torch.ones(1, 5, 8).double()), image)
 
 
-@pytest.mark.parametrize("backend", available_backends())
-def test_sampling_ignores_what_stands_outside_the_mask(backend, generator):
+def test_sampling_ignores_what_stands_outside_the_mask(generator):
     image = torch.randn(1, 2, 4, 4, generator=generator).requires_grad_()
     uv = torch.full((1, 3, 3, 2), math.nan, requires_grad=True)
-    colour = sample(image, uv, torch.zeros(1, 3, 3), backend)
+    colour = sample(image, uv, torch.zeros(1, 3, 3))
     assert (colour == 0).all()
     for gradient in torch.autograd.grad(colour.sum(), (image, uv)):
         assert (gradient == 0).all()
@@ -185,17 +183,11 @@ def test_sampling_ignores_what_stands_outside_the_mask(backend, generator):
 def test_operators_keep_torch_s_rules(backend, generator):
     operators, device = torch.ops.derender, device_of(backend)
     depth, albedo, _, pose = (value.to(device) for value in scene(2, 5, 6, generator))
-    vertices = to_camera(unproject(depth, FOV_DEG), pose).requires_grad_()
-    uv, distance, triangle = IMPLEMENTATIONS[backend].rasterize(vertices, 20.0)
-    assert uv.requires_grad and not triangle.requires_grad
-    mask, uv, points = (triangle >= 0).float(), uv.detach(), vertices.detach()
+    rotation, offset = motion(pose.double())
+    _, distance, _, triangle = FORWARD[backend](albedo, depth, rotation, offset, 20.0)
     picture = torch.randn(2, 3, 5, 6, generator=generator).to(device)
-    lamp, (rotation, offset) = torch.rand(2, 5, generator=generator).to(device), motion(pose.double())
+    lamp = torch.rand(2, 5, generator=generator).to(device)
     checks = {
-        "rasterize": (vertices, 20.0),
-        "rasterize_backward": (uv, distance.detach(), points, triangle, 20.0),
-        "sample": (albedo, uv, mask),
-        "sample_backward": (picture, albedo, uv, mask),
         "shade": (depth, albedo, lamp, 20.0),
         "shade_backward": (picture, depth, albedo, lamp, 20.0),
         "warp": (albedo, depth, rotation, offset, 20.0),
@@ -302,7 +294,7 @@ def test_what_can_be_imported_counts_as_installed():
 
 
 def test_auto_takes_the_fastest_that_is_installed(monkeypatch):
-    package = sys.modules["derender.render.rasterize"]
+    package = sys.modules["derender.render.backends"]
     for installed, on_cpu, on_cuda in ((True, "numba", "triton"), (False, "reference", "reference")):
         monkeypatch.setattr(package, "_numba_installed", lambda installed=installed: installed)
         monkeypatch.setattr(package, "triton_installed", lambda installed=installed: installed)
@@ -325,7 +317,7 @@ def test_auto_takes_the_fastest_that_is_installed(monkeypatch):
     ],
 )
 def test_impossible_backends_are_errors(device, backend, message, monkeypatch):
-    package = sys.modules["derender.render.rasterize"]
+    package = sys.modules["derender.render.backends"]
     for name, value in (("_numba_installed", True), ("triton_installed", True), ("interpreted", False)):
         monkeypatch.setattr(package, name, lambda value=value: value)
     with pytest.raises(ValueError, match=message):

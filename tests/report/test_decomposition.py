@@ -1,5 +1,6 @@
 """Images show what the values say: sizes, labels, one scale for a set, normals, transparency."""
 
+from dataclasses import replace
 from math import radians
 
 import numpy as np
@@ -58,9 +59,8 @@ def test_decomposition_has_every_column_for_every_picture():
 
 
 def test_a_further_factor_is_drawn_where_its_parameter_is_a_map():
-    scene = bump().with_extra(
-        gloss=torch.rand(3, 16, 16), tint=torch.rand(3, 3, 16, 16), age=torch.rand(3, 2)
-    )
+    extra = {"gloss": torch.rand(3, 16, 16), "tint": torch.rand(3, 3, 16, 16), "age": torch.rand(3, 2)}
+    scene = replace(bump(), extra=extra)
     drawn = decomposition(render(scene).image.clamp(0, 1), scene, render, FOV_DEG)
     assert list(drawn.columns) == [*COLUMN_MEANING, "gloss", "tint"]
 

@@ -1,11 +1,13 @@
 """Scene: one value that carries every parameter, extras included, and refuses unknown names."""
 
-from dataclasses import FrozenInstanceError
+from dataclasses import FrozenInstanceError, replace
 
 import pytest
 import torch
 
+from derender.render import render
 from derender.scene import Scene
+from derender.scene.scene import seen_in_mirror
 
 
 @pytest.fixture
@@ -61,7 +63,39 @@ def test_a_scene_is_a_value(scene):
         scene.depth = torch.zeros(3, 4, 5)
 
 
-def test_extras_are_added_and_detach_reaches_them(scene):
-    grown = scene.with_extra(haze=torch.ones(3, requires_grad=True))
-    assert list(grown.extra) == ["shine", "haze"]
+def test_detach_reaches_extras(scene):
+    grown = replace(scene, extra={"haze": torch.ones(3, requires_grad=True)})
     assert not grown.detach().extra["haze"].requires_grad
+
+
+def test_the_image_of_the_mirrored_scene_is_the_mirror_image():
+    generator = torch.Generator().manual_seed(0)
+    line = torch.linspace(-1, 1, 33)
+    bump = 1 - 0.08 * torch.exp(-4 * (line[:, None].square() + (line - 0.2).square()))
+    depth = bump.expand(4, 33, 33).contiguous()
+    albedo = torch.rand(4, 3, 33, 33, generator=generator)
+    light = torch.tensor([[0.2, 0.7, 0.3, 0.5], [0.4, 0.4, -0.2, -0.6], [0.1, 0.9, 0.6, 0.1], [0, 1, 0, 0.7]])
+    camera = (torch.rand(4, 6, generator=generator) - 0.5) * torch.tensor([0.6, 0.8, 0.4, 0.05, 0.05, 0.0])
+    scene = Scene(depth, albedo, light, camera)
+    straight, twin = (
+        render(one.depth, one.albedo, one.light, one.camera, fov_deg=10.0)
+        for one in (scene, seen_in_mirror(scene))
+    )
+    assert (straight.image - straight.image.flip(-1)).abs().mean() > 0.1, "the scenes are not symmetric"
+    both = (straight.mask.flip(-1) * twin.mask).bool()
+    assert both.float().mean() > 0.5
+    assert (straight.mask.flip(-1) != twin.mask).float().mean() < 0.02
+    apart = (straight.image.flip(-1) - twin.image).abs().mean(dim=1)[both]
+    assert apart.median() < 1e-3  # where triangles' diagonals lie the other way a little more
+    assert apart.mean() < 5e-3
+
+
+def test_a_mirror_of_a_mirror_shows_the_scene():
+    scene = Scene(torch.rand(2, 8, 8), torch.rand(2, 3, 8, 8), torch.rand(2, 4), torch.rand(2, 6))
+    twice = seen_in_mirror(seen_in_mirror(scene))
+    assert all(torch.equal(value, scene.parameters[name]) for name, value in twice.parameters.items())
+
+
+def test_no_mirror_image_of_further_factors(scene):
+    with pytest.raises(ValueError, match="shine is not known"):
+        seen_in_mirror(scene)

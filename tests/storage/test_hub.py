@@ -99,7 +99,7 @@ def test_the_card_says_what_was_told_and_how_to_load_it(model, fake):
 
 
 def test_a_model_that_nobody_describes_is_not_given_away(model, fake):
-    with pytest.raises(ValueError, match="has no card: say what it was trained on"):
+    with pytest.raises(ValueError, match="has no card: state what it was trained on"):
         model.push_to_hub("me/faces", data="mugs")
     assert not fake.asked
 
@@ -122,7 +122,7 @@ def test_scores_on_a_card_come_from_the_errors_beside_the_model(model, tmp_path)
     folder = model.save(tmp_path / "plain")
     with_errors(folder)
     card = (derender.load(folder).save_pretrained(tmp_path / "told", data="mugs") / "README.md").read_text()
-    assert "1,234 pictures it was not trained on give a masked L1 of 0.0600 in the middle and 0.1090" in card
+    assert "1,234 images it was not trained on have a masked L1 of 0.0600 in the median and 0.1090" in card
 
 
 def test_saving_over_the_folder_it_came_from_keeps_the_card(model, tmp_path):

@@ -10,8 +10,7 @@ from derender.cli import main
 from derender.cli.models import keep_split, part_of, split_of
 from derender.data import read_pictures
 from derender.data.synthetic import faces
-from derender.storage.folder import SPLIT_FILE
-from derender.storage.split import SplitRecord, read_split, write_split
+from derender.storage.folder import SPLIT_FILE, SplitRecord, read_split, write_split
 from derender.training.config import TrainConfig
 from derender.training.run_folder import start_run
 

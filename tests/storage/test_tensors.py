@@ -29,9 +29,9 @@ def test_nothing_but_zeros_stays_zero(tmp_path):
 @pytest.mark.parametrize(
     ("tensors", "said"),
     [
-        ({"a.unit": torch.ones(1, 1)}, "the unit of nothing"),
-        ({"a": torch.ones(2, 2), "a.unit": torch.ones(1, 2)}, "the unit of nothing"),
-        ({"a": torch.ones(2, 2, dtype=torch.int8), "a.unit": torch.ones(2)}, "the unit of nothing"),
+        ({"a.unit": torch.ones(1, 1)}, "the unit of no tensor"),
+        ({"a": torch.ones(2, 2), "a.unit": torch.ones(1, 2)}, "the unit of no tensor"),
+        ({"a": torch.ones(2, 2, dtype=torch.int8), "a.unit": torch.ones(2)}, "the unit of no tensor"),
         ({"a": torch.ones(2, 2, dtype=torch.int8), "a.unit": torch.ones(1, 3)}, "does not fit"),
     ],
 )

@@ -6,7 +6,7 @@ from torch.torch_version import TorchVersion
 
 from derender.baselines.published import read_weights
 from derender.networks.unsup3d import read_checkpoint
-from derender.objectives.vgg import load_vgg16
+from derender.objectives.perceptual_features import load_vgg16
 from derender.storage.tensors import reads_safely
 
 

@@ -6,8 +6,7 @@ from torch.nn.functional import grid_sample
 
 import derender
 from derender.data.synthetic import faces
-from derender.networks.encoders import UNetEncoder
-from derender.networks.settings import NetworkSettings
+from derender.networks.encoders import NetworkSettings, UNetEncoder
 from derender.networks.unet import PIXEL_CHANNELS, UNetDecoder
 from derender.presets import ModelSettings
 from derender.scene.ranges import SceneRanges

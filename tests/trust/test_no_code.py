@@ -17,7 +17,7 @@ from derender.baselines.published import read_weights
 from derender.data.listing import read_listing
 from derender.evaluation.memory import Memory
 from derender.features import FeatureTable
-from derender.objectives.vgg import _read_weights
+from derender.objectives.perceptual_features import _read_weights
 from derender.storage.atomic import DamageNoticed
 from derender.storage.tensors import reads_safely
 from derender.training import resolve

@@ -12,11 +12,10 @@ from derender.data import PictureSet
 from derender.features.extract import embed_pictures
 from derender.model import Derenderer
 from derender.networks.confidence import Confidence
-from derender.objectives import self_training
-from derender.objectives.self_features import SelfFeatures
-from derender.objectives.self_training import SelfTraining
+from derender.objectives import self_features
+from derender.objectives.self_features import SelfFeatures, SelfTraining
 from derender.postprocess import Features
-from derender.postprocess.whitening import Contrast, Whitening
+from derender.postprocess.whitening import Projection, Whitening
 from derender.render import Rendering
 from derender.scene import Scene
 from derender.scene.perturb import PerturbSettings
@@ -234,12 +233,12 @@ def test_pictures(model, images, bad):
 
 
 def test_what_perceptual_features_learn(monkeypatch):
-    plain = self_training.nt_xent
-    monkeypatch.setattr(self_training, "nt_xent", lambda *given: plain(*given) * nan)
+    plain = self_features.nt_xent
+    monkeypatch.setattr(self_features, "nt_xent", lambda *given: plain(*given) * nan)
     pixels = torch.randint(0, 256, (8, 3, SIZE, SIZE), dtype=torch.uint8)
     settings = SelfTraining(widths=(4, 4, 4), batch=4)
     with pytest.raises(ValueError, match="ended in weights that are NaN or infinite"):
-        self_training.train_self_features(pixels, seed=0, steps=3, settings=settings)
+        self_features.train_self_features(pixels, seed=0, steps=3, settings=settings)
 
 
 @pytest.mark.parametrize("factor", ["geometry", "albedo"])
@@ -258,7 +257,7 @@ def test_embedding(model, stage, bad):
         spoil(model.nets["albedo"].encoder, bad)
     else:
         width = model.activations(torch.zeros(1, 3, SIZE, SIZE))["albedo"].shape[1]
-        maps = {"albedo": Contrast(torch.zeros(width), torch.full((width, 16), bad), torch.ones(16))}
+        maps = {"albedo": Projection(torch.zeros(width), torch.full((width, 16), bad), torch.ones(16))}
         model = model.with_features(Features(Whitening(maps)))
     with pytest.raises(ValueError, match=r"factor 'albedo' is not finite in \d+ of 20 rows, first in 000"):
         embed_pictures(model, picture_set(), batch_size=20)

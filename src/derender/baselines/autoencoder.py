@@ -16,8 +16,7 @@ from torch.nn.functional import binary_cross_entropy_with_logits, mse_loss
 
 from derender.baselines.model import BaselineModel, BaselineSettings, Images, LossInputs
 from derender.networks.decoders import MapDecoder
-from derender.networks.encoders import Encoder
-from derender.networks.settings import NetworkSettings
+from derender.networks.encoders import Encoder, NetworkSettings
 from derender.settings import Settings
 from derender.training.config import LoopSettings, OptimiserSettings
 

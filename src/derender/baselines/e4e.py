@@ -34,8 +34,8 @@ from derender.baselines.model import (
 )
 from derender.baselines.stylegan2 import CENTRE_LATENTS, Stylegan
 from derender.baselines.stylegan2_generator import EqualLinear, Generator, GeneratorSettings
-from derender.objectives.frozen import PerceptualFeatures
 from derender.objectives.perceptual import build_perceptual
+from derender.objectives.perceptual_features import PerceptualFeatures
 from derender.objectives.self_features import SelfFeatures, load_self_features
 from derender.settings import Settings
 from derender.storage.atomic import atomic_file

@@ -1,6 +1,6 @@
 """Per-pixel uncertainty of the reconstruction; used in training only.
 
-Source: unsup3d, Sec. 3.2. The network sees the picture alone and says where its rendering cannot be trusted.
+Source: unsup3d, Sec. 3.2. The network predicts, from the image alone, where its rendering cannot be trusted.
 """
 
 from dataclasses import dataclass
@@ -9,9 +9,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
-from derender.networks.convolutions import NarrowConv2d
-from derender.networks.encoders import Encoder, norm_relu
-from derender.networks.settings import NetworkSettings
+from derender.networks.decoders import NarrowConv2d
+from derender.networks.encoders import Encoder, NetworkSettings, norm_relu
 
 
 @dataclass(frozen=True)
@@ -32,7 +31,7 @@ class Confidence:
 
 
 class ConfidenceNet(nn.Module):
-    """Picture to four maps of uncertainty."""
+    """Image to four maps of uncertainty."""
 
     def __init__(self, settings: NetworkSettings):
         super().__init__()

@@ -1,21 +1,23 @@
 """Code to map or to numbers.
 
 Source: unsup3d's networks as pinned in the paper's appendix. No convolution has a bias; outputs are raw
-(the factor's row in factors.py gives them range and meaning).
+(the factor's row in factors.py gives them range and meaning). `UpsampledConv2d` and `NarrowConv2d` do less
+work than the plain layers for the same result, to rounding, and the same weights: a convolution is linear in
+its kernel, so kernels can be combined or shifted before they meet the image.
 """
 
 from itertools import pairwise
 
+import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.nn import functional
 
-from derender.networks.convolutions import NarrowConv2d, UpsampledConv2d
-from derender.networks.encoders import norm_relu, stage_widths
-from derender.networks.settings import NetworkSettings
+from derender.networks.encoders import NetworkSettings, norm_relu, stage_widths
 
 
 class MapDecoder(nn.Module):
-    """A code becomes a picture-sized map with ``channels`` channels (depth: 1, albedo: 3), unbounded."""
+    """A code becomes an image-sized map with ``channels`` channels (depth: 1, albedo: 3), unbounded."""
 
     def __init__(self, settings: NetworkSettings, channels: int):
         super().__init__()
@@ -56,3 +58,43 @@ class VectorDecoder(nn.Module):
 
     def forward(self, code: Float[Tensor, "n code"]) -> Float[Tensor, "n numbers"]:
         return self.linear(code).tanh()
+
+
+class UpsampledConv2d(nn.Conv2d):
+    """Nearest-neighbour doubling, then a 3x3 convolution, done as one transposed convolution.
+
+    Of the 3x3 values under the kernel only 2x2 differ: 4 multiplications instead of 9.
+    """
+
+    def __init__(self, channels_in: int, channels_out: int):
+        super().__init__(channels_in, channels_out, 3, padding=1, bias=False)
+
+    def forward(self, input: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c2 h2 w2"]:
+        doubling = self.weight.new_ones(1, 1, 2, 2)
+        flipped = self.weight.flip(2, 3).flatten(0, 1)[:, None]
+        kernel = functional.conv2d(flipped, doubling, padding=1)[:, 0].unflatten(0, self.weight.shape[:2])
+        return functional.conv_transpose2d(input, kernel.transpose(0, 1), stride=2, padding=1)
+
+
+class NarrowConv2d(nn.Conv2d):
+    """A 5x5 convolution to very few channels, done for a block of neighbouring pixels at a time.
+
+    Processors work on 16 channels or more at once, so one to three of them leave most lanes empty. The pixels
+    of a block become channels: one convolution with the kernel shifted to each of them, then put in their
+    places. Height and width must be multiples of the block (4 for one channel, else 2).
+    """
+
+    def __init__(self, channels_in: int, channels_out: int):
+        super().__init__(channels_in, channels_out, 5, padding=2, bias=False)
+        self.block = 4 if channels_out == 1 else 2
+
+    def forward(self, input: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c2 h w"]:
+        last = self.block - 1
+        shifted = [
+            functional.pad(self.weight, (across, last - across, down, last - down))
+            for down in range(self.block)
+            for across in range(self.block)
+        ]
+        kernel = torch.stack(shifted, dim=1).flatten(0, 1).contiguous(memory_format=torch.channels_last)
+        blocks = functional.conv2d(input, kernel, stride=self.block, padding=2)
+        return functional.pixel_shuffle(blocks, self.block)

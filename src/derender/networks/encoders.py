@@ -1,19 +1,53 @@
-"""Picture to code: strided convolutions down to 4x4 pixels, then one convolution to 1x1.
+"""Sizes of the networks; image to code: strided convolutions down to 4x4 pixels, then one convolution to 1x1.
 
 Source: unsup3d's networks as pinned in the paper's appendix; the U-Net encoder is the one the paper
-swaps in for segmentation. No convolution has a bias. Input pictures are 0..1 and are moved to -1..1 here.
+swaps in for segmentation. No convolution has a bias. Input images are 0..1 and are moved to -1..1 here.
 """
+
+from typing import Literal
 
 import torch
 from jaxtyping import Float
+from pydantic import Field, field_validator
 from torch import Tensor, nn
 from torch.nn.functional import adaptive_avg_pool2d
 
 from derender.networks.norm_relu import NormReLU
-from derender.networks.settings import NetworkSettings
+from derender.settings import Settings
 
+IMAGE_SIZES = (32, 64, 128, 256)
 CHANNELS_PER_GROUP = 4
 MAX_PLACES = 2048  # numbers of the last spatial map among the activations
+
+
+class NetworkSettings(Settings):
+    """Sizes of the networks; the defaults are the paper's.
+
+    The geometry and albedo nets start at ``width`` channels and double to 8x that; light and camera
+    start at ``light_width``. ``unet_width`` counts only where ``encoder`` is "unet"; ``unet_decoder`` adds a
+    decoder over the U-Nets of geometry and albedo, which ``derender unet`` trains.
+    """
+
+    image_size: int = 64
+    width: int = Field(default=64, ge=4, multiple_of=4)
+    light_width: int = Field(default=32, ge=1)
+    code_size: int = Field(default=256, ge=1)
+    confidence_code_size: int = Field(default=128, ge=1)
+    encoder: Literal["conv", "unet"] = "conv"
+    unet_width: int = Field(default=16, ge=1)
+    unet_decoder: bool = False
+
+    @field_validator("image_size")
+    @classmethod
+    def _power_of_two(cls, value: int) -> int:
+        if value not in IMAGE_SIZES:
+            raise ValueError(f"image_size must be one of {', '.join(map(str, IMAGE_SIZES))}, got {value}")
+        return value
+
+    @property
+    def stages(self) -> int:
+        """How many halvings take an image to 4x4 pixels."""
+        return self.image_size.bit_length() - 3
 
 
 def stage_widths(first: int, stages: int) -> list[int]:
@@ -48,7 +82,7 @@ def activations(
 class Encoder(nn.Module):
     """Strided convolutions to a code of 1x1 pixels.
 
-    ``spatial`` gives the last features that still have a place in the picture, for attribution.
+    ``spatial`` gives the last features that still have a place in the image, for attribution.
     """
 
     def __init__(self, settings: NetworkSettings, width: int, code_size: int, *, normalised: bool):

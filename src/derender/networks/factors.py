@@ -1,4 +1,4 @@
-"""The factors a picture is taken apart into: one declared row each.
+"""The factors that an image is decomposed into: one declared row each.
 
 Training, features and evaluation go through these rows only, so that a fifth factor (the strength of a
 highlight, say) is a new row and a renderer that uses it, and nothing else changes.
@@ -15,8 +15,7 @@ from torch import Generator, Tensor, nn
 from torch.nn.functional import pad
 
 from derender.networks.decoders import MapDecoder, VectorDecoder
-from derender.networks.encoders import Encoder, UNetEncoder, activations
-from derender.networks.settings import NetworkSettings
+from derender.networks.encoders import Encoder, NetworkSettings, UNetEncoder, activations
 from derender.scene.constants import kept
 from derender.scene.perturb import PerturbSettings, exchange, perturb_camera, perturb_light
 from derender.scene.ranges import SceneRanges
@@ -32,7 +31,7 @@ class FactorNet(nn.Module):
         self.code_size: int = encoder.code_size  # type: ignore[assignment]
 
     def encode(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n code"]:
-        """The factor's feature, one row per picture (pictures in 0..1)."""
+        """The factor's feature, one row per image (images in 0..1)."""
         return self.encoder(images)
 
     def activations(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n _"]:
@@ -137,7 +136,7 @@ def _radians(angle_deg: float) -> float:
 
 
 def map_net(channels: int, initial_scale: float = 1.0) -> Callable[[NetworkSettings], FactorNet]:
-    """Builder of a network that predicts a picture-sized map.
+    """Builder of a network that predicts an image-sized map.
 
     ``initial_scale`` shrinks the last layer's first weights, for maps that must not start as noise.
     """

@@ -15,15 +15,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from derender.networks.encoders import UNetEncoder, double_convolution, unet_widths
-from derender.networks.settings import NetworkSettings
+from derender.networks.encoders import NetworkSettings, UNetEncoder, double_convolution, unet_widths
 
 PIXEL_CHANNELS: Mapping[str, int] = {"geometry": 3, "albedo": 3}
-"""What a taught decoder says of every pixel, by the factor whose encoder is joined: place on the thing across
-and down, and depth; red, green, blue (training/unets.py)."""
+"""Outputs of a trained decoder per pixel, by factor: position on the object across and down, and depth; red,
+green, blue (training/unets.py)."""
 
 LEVELS_KEPT = 2
-"""Of encoders and a decoder that learnt together, finest first, whose BatchNorm keeps its statistics."""
+"""Levels, finest first, whose BatchNorm keeps its statistics in encoders and a decoder trained together."""
 
 
 class UNetDecoder(nn.Module):
@@ -65,14 +64,14 @@ def pixel_decoder(settings: NetworkSettings) -> UNetDecoder:
 
 
 class SegmentationNet(nn.Module):
-    """Pictures in 0..1 to one logit a class and pixel, from U-Net encoders and a decoder over all of them.
+    """Images in 0..1 to one logit a class and pixel, from U-Net encoders and a decoder over all of them.
 
     Args:
         encoders: of one width; their features are joined in this order.
         outputs: classes.
         frozen: encoders never change: weights take no gradient, and statistics are kept.
         kept_statistics: the encoders' BatchNorm uses and keeps the statistics it came with, in training too:
-            those of a batch of two pictures say little.
+            a batch of two images gives poor estimates.
         decoder: one that has learnt over these encoders, of which all but the last layer is taken; where
             statistics are kept, its two finest levels and the encoders' keep theirs, while coarser ones,
             which have most to learn anew, take each batch's. Without it the decoder is fresh.

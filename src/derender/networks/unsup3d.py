@@ -1,11 +1,12 @@
 """The weights in a checkpoint of unsup3d (Wu et al., CVPR 2020), as those of our networks.
 
-The networks are the same (the paper's appendix), their tensors have other names. So they are told apart by
+The networks are the same (the paper's appendix), their tensors have other names. So they are matched by
 net (``netD`` depth, ``netA`` albedo, ``netL`` light, ``netV`` view, ``netC`` confidence) and, within one, by
-order: the n-th tensor of theirs becomes the n-th of ours, and every shape is compared. Two things are
-converted: 1x1 convolutions become linear layers, and light comes as (ambient, diffuse, x, y) where ours has
-pitch, y, first. The file is a pickle, read with torch's reader for weights: objects of kinds it does not know
-become empty ones, no code is imported or run. Leaves out optimisers, and the ranges, which no file holds.
+order: the n-th tensor of the file becomes the n-th of the network, and every shape is compared. Two things
+are converted: 1x1 convolutions become linear layers, and light comes as (ambient, diffuse, x, y) where
+derender has pitch, y, first. The file is a pickle, read with torch's reader for weights: objects of kinds it
+does not know become empty ones, no code is imported or run. Leaves out optimisers, and the ranges, which no
+file holds.
 """
 
 import pickle
@@ -21,8 +22,8 @@ from torch import Tensor, nn
 from torch.serialization import safe_globals
 
 from derender.networks.confidence import ConfidenceNet
+from derender.networks.encoders import IMAGE_SIZES, NetworkSettings
 from derender.networks.factors import FACTORS
-from derender.networks.settings import IMAGE_SIZES, NetworkSettings
 from derender.storage.tensors import refuse_old_torch
 
 NETS = {"netD": "geometry", "netA": "albedo", "netL": "light", "netV": "camera", "netC": "confidence"}
@@ -94,9 +95,9 @@ def _loaded(file: Path) -> Any:
                 name = unknown[1] if "." in unknown[1] else f"builtins.{unknown[1]}"
                 known.enter_context(safe_globals([(Empty, name)]))
             except (RuntimeError, EOFError, ValueError, LookupError, TypeError, AttributeError) as error:
-                said = str(error).splitlines()[0] if str(error) else type(error).__name__
+                message = str(error).splitlines()[0] if str(error) else type(error).__name__
                 raise ValueError(
-                    f"{file} is damaged or no file of torch ({said}): download it again"
+                    f"{file} is damaged or no file of torch ({message}): download it again"
                 ) from error
     raise ValueError(f"{file} holds more than {MOST_UNKNOWN} kinds of objects: no checkpoint of unsup3d")
 
@@ -119,19 +120,19 @@ def _sizes(theirs: Mapping[str, Mapping[str, Tensor]], file: Path) -> NetworkSet
     shapes = {net: [tuple(value.shape) for value in tensors.values()] for net, tensors in theirs.items()}
     depth, light = shapes["netD"], shapes["netL"]
     try:
-        told = {
+        sizes = {
             "width": depth[0][0],
             "light_width": light[0][0],
             "code_size": light[-1][1],
             "image_size": 4 * 2 ** (len(light) - 2),
         }
         if shapes[OPTIONAL]:  # the first layer there that narrows is the one to the code
-            told["confidence_code_size"] = next(
+            sizes["confidence_code_size"] = next(
                 shape[0] for shape in shapes[OPTIONAL] if len(shape) == 4 and shape[0] < shape[1]
             )
-        if told["image_size"] not in IMAGE_SIZES:
+        if sizes["image_size"] not in IMAGE_SIZES:
             raise ValueError(f"light has {len(light)} layers")
-        return NetworkSettings(**told)
+        return NetworkSettings(**sizes)
     except (IndexError, ValueError, StopIteration) as error:
         raise ValueError(
             f"{file} has networks of another kind than unsup3d's ({error}): not imported"
@@ -139,7 +140,7 @@ def _sizes(theirs: Mapping[str, Mapping[str, Tensor]], file: Path) -> NetworkSet
 
 
 def _modules(settings: NetworkSettings) -> dict[str, nn.Module]:
-    """Our networks without memory, by the names of theirs."""
+    """derender's networks without memory, by unsup3d's names."""
     with torch.device("meta"):
         ours: dict[str, nn.Module] = {factor.name: factor.build(settings) for factor in FACTORS}
         ours["confidence"] = ConfidenceNet(settings)
@@ -147,23 +148,21 @@ def _modules(settings: NetworkSettings) -> dict[str, nn.Module]:
 
 
 def _renamed(theirs: Mapping[str, Tensor], module: nn.Module, net: str, file: Path) -> dict[str, Tensor]:
-    """The n-th tensor of theirs under the name of the n-th of ours."""
+    """The n-th tensor of the file under the name of the network's n-th."""
     found: dict[str, Tensor] = {}
-    wanted = list(module.state_dict().items())
-    for (name, value), (ours, like) in zip(theirs.items(), wanted, strict=False):
+    expected = list(module.state_dict().items())
+    for (name, value), (ours, like) in zip(theirs.items(), expected, strict=False):
         fits = value.shape == like.shape or value.shape == (*like.shape, 1, 1)
         if not fits:
             raise ValueError(
                 f"{file}: {net} has {name} of shape {tuple(value.shape)} where {tuple(like.shape)} is "
-                f"expected (our {ours}): this is another architecture"
+                f"expected (derender's {ours}): this is another architecture"
             )
         if not bool(value.isfinite().all()):
-            raise ValueError(
-                f"{file}: {net} has {name} with values that are no numbers: its training went wrong"
-            )
+            raise ValueError(f"{file}: {net} has {name} with NaN or infinite values: its training went wrong")
         found[f"nets.{NETS[net]}.{ours}"] = value.detach().reshape(like.shape).float()
-    if len(theirs) != len(wanted):
+    if len(theirs) != len(expected):
         raise ValueError(
-            f"{file}: {net} has {len(theirs)} tensors, expected {len(wanted)}: this is another architecture"
+            f"{file}: {net} has {len(theirs)} tensors, expected {len(expected)}: this is another architecture"
         )
     return found

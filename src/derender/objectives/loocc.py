@@ -5,7 +5,7 @@ two views of each of N images, each view against the 2N - 1 others. Three choice
 
 - The perturbed factor is drawn per image. An image is absent from the contrast of its perturbed factor
   altogether: neither anchor, positive nor negative, as the paper's denominator also runs over unchanged
-  features only. Its two codes of that factor are free to be as far apart as the perturbation says.
+  features only. Its two codes of that factor are free to differ as far as the perturbation moves them.
 - Every contrasted (image, factor) counts the same: the loss is the mean over all of them. In expectation this
   is the mean over the unperturbed factors when one factor is drawn for the whole batch.
 - A factor that fewer than two images kept has nothing to contrast and is dropped from the mean.
@@ -93,7 +93,7 @@ def _directions(codes: Float[Tensor, "n d"]) -> Float[Tensor, "n d"]:
     """Unit vectors, safe for any magnitude: each code is first divided by its largest entry.
 
     The divisor is taken as a constant; a direction does not depend on the length, so the gradient is still
-    exact. What is no number stays none: it must not pass for a code without a direction.
+    exact. NaN stays NaN: it must not pass for a code without a direction.
     """
     largest = codes.detach().abs().amax(dim=1, keepdim=True)
     has_direction = ~(largest <= _NO_DIRECTION)

@@ -13,10 +13,9 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 from torch.nn import functional
 
-from derender.objectives.frozen import PerceptualFeatures
+from derender.objectives.perceptual_features import PerceptualFeatures, load_vgg16
 from derender.objectives.reconstruction import at_least_float32, bounded_sigma, masked_mean
-from derender.objectives.self_training import train_self_features
-from derender.objectives.vgg import load_vgg16
+from derender.objectives.self_features import train_self_features
 
 PerceptualKind = Literal["vgg16", "self", "none"]
 PERCEPTUAL_KINDS: tuple[PerceptualKind, ...] = ("vgg16", "self", "none")
@@ -32,8 +31,8 @@ def perceptual_loss(
     """``|df|^2 / (2 sigma^2) + log sigma`` with |df|^2 averaged over channels, weighted by the mask's share.
 
     The mask is average-pooled to the features' resolution. Without sigma it is the plain mean of |df|^2 (not
-    half of it), as in unsup3d's code; 0 is best there. Best sigma is |df|; ``bounded_sigma`` says how it is
-    kept from 0.
+    half of it), as in unsup3d's code; 0 is best there. Best sigma is |df|; ``bounded_sigma`` keeps it
+    from 0.
     """
     height, width = prediction.shape[-2:]
     weight = functional.adaptive_avg_pool2d(
@@ -50,8 +49,8 @@ def perceptual_loss(
             f"the perceptual sigma must have the features' resolution {height} x {width}, got shape "
             f"{tuple(sigma.shape)}; let the confidence net put out that size"
         )
-    spread = bounded_sigma(torch.where(kept.unsqueeze(1), sigma, 1.0))[:, 0]
-    return masked_mean(squared / (2 * spread.square()) + spread.log(), weight)
+    deviation = bounded_sigma(torch.where(kept.unsqueeze(1), sigma, 1.0))[:, 0]
+    return masked_mean(squared / (2 * deviation.square()) + deviation.log(), weight)
 
 
 def build_perceptual(
@@ -64,10 +63,10 @@ def build_perceptual(
     progress: Callable[[int, int, float], None] | None = None,
     device: torch.device | str = "cpu",
 ) -> PerceptualFeatures | None:
-    """Frozen, calibrated features of the wanted kind; None for ``none``.
+    """Frozen, calibrated features of one kind; None for ``none``.
 
-    ``images`` are training pictures: ``self`` learns from them, and both kinds are calibrated on the first
-    256. Without pictures ``vgg16`` keeps scale 1. ``weights`` is VGG16's file; None looks in torch hub's
+    ``images`` are training images: ``self`` learns from them, and both kinds are calibrated on the first
+    256. Without images ``vgg16`` keeps scale 1. ``weights`` is VGG16's file; None looks in torch hub's
     cache.
     """
     match kind:
@@ -81,7 +80,7 @@ def build_perceptual(
         case "self":
             if images is None:
                 raise ValueError(
-                    "perceptual features 'self' are learned from the training pictures: give images"
+                    "perceptual features 'self' are learned from the training images: give images"
                 )
             return train_self_features(images, seed=seed, steps=steps, progress=progress, device=device)
         case _:

@@ -1,4 +1,4 @@
-"""How well a rendering explains the picture: photometric, plain L1 and depth smoothness losses.
+"""How well a rendering explains the image: photometric, plain L1 and depth smoothness losses.
 
 Source: unsup3d (Wu et al., CVPR 2020), Eq. 3, and its public training code for what the paper leaves out:
 the average runs over every pixel of the batch that the mask keeps, and smoothness is the mean absolute
@@ -46,46 +46,40 @@ def masked_l1(
 
 
 def depth_smoothness(
-    depth: Float[Tensor, "n h w"],
-    depth_range: float = 0.2,
-    border: int = 0,
+    depth: Float[Tensor, "n h w"], depth_range: float = 0.2, border: int = 0
 ) -> Float[Tensor, ""]:
     """Mean |step| to the next row plus mean |step| to the next column, in depth ranges; 0 is flat.
 
-    ``border`` columns at each side are left out: the presets clamp two of them, a step that says nothing of
-    the surface. The paper of unsup3d names the term without a formula; the definition is that of its code.
+    ``border`` columns at each side are left out: the presets clamp two of them, a step that is no part of the
+    surface. The paper of unsup3d names the term without a formula; the definition is that of its code.
     """
-    if depth_range <= 0:
-        raise ValueError(f"depth_range must be above 0, got {depth_range}; give farthest minus nearest depth")
-    depth = at_least_float32(depth[:, :, border : depth.shape[2] - border])
-    if min(depth.shape[1:]) < 2:
-        raise ValueError(
-            f"depth smoothness needs 2 rows and 2 columns inside the border, got {tuple(depth.shape)}"
-        )
-    rows = depth.diff(dim=1).abs().mean()
-    columns = depth.diff(dim=2).abs().mean()
-    return (rows + columns) / depth_range
+    return _mean_differences(depth, 1, depth_range, border, "smoothness")
 
 
 def depth_curvature(
-    depth: Float[Tensor, "n h w"],
-    depth_range: float = 0.2,
-    border: int = 0,
+    depth: Float[Tensor, "n h w"], depth_range: float = 0.2, border: int = 0
 ) -> Float[Tensor, ""]:
     """Mean |second difference| down the columns plus along the rows, in depth ranges; 0 for every plane.
 
     Depth noise of a thousandth turns normals by tens of degrees, and stripes can pass for matt skin; this
-    term removes both and leaves slopes alone, which ``depth_smoothness`` flattens. ``border`` as there. Ours.
+    term removes both and leaves slopes alone, which ``depth_smoothness`` flattens. ``border`` as there.
+    No published source.
     """
+    return _mean_differences(depth, 2, depth_range, border, "curvature")
+
+
+def _mean_differences(
+    depth: Float[Tensor, "n h w"], order: int, depth_range: float, border: int, name: str
+) -> Float[Tensor, ""]:
     if depth_range <= 0:
         raise ValueError(f"depth_range must be above 0, got {depth_range}; give farthest minus nearest depth")
     depth = at_least_float32(depth[:, :, border : depth.shape[2] - border])
-    if min(depth.shape[1:]) < 3:
+    if min(depth.shape[1:]) <= order:
         raise ValueError(
-            f"depth curvature needs 3 rows and 3 columns inside the border, got {tuple(depth.shape)}"
+            f"depth {name} needs {order + 1} rows and {order + 1} columns inside the border, got "
+            f"{tuple(depth.shape)}"
         )
-    rows = depth.diff(n=2, dim=1).abs().mean()
-    columns = depth.diff(n=2, dim=2).abs().mean()
+    rows, columns = (depth.diff(n=order, dim=axis).abs().mean() for axis in (1, 2))
     return (rows + columns) / depth_range
 
 

@@ -71,7 +71,7 @@ class EmbeddingModel(nn.Module):
         return self.with_features(Features())
 
     def embed(self, images: Float[Tensor, "n 3 h w"]) -> dict[str, Float[Tensor, "n _"]]:
-        """One feature per factor for images in 0..1, by name: made as ``features`` says, else the code."""
+        """One feature per factor for images in 0..1, by name: as ``features`` makes it, else the code."""
         refuse_not_finite(images)
         if self.whitening is None and not self.features.fits_scenes:
             return self.encode(images)

@@ -58,7 +58,7 @@ class Features:
         return features
 
     def required_fitting(self, model: str = "this model") -> Fitting:
-        """The fitting, or an error that says how to get one."""
+        """The fitting, or an error that names how to get one."""
         if self.fitting is None:
             name = model if model != "this model" else "MODEL"
             raise ValueError(

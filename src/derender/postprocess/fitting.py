@@ -1,10 +1,9 @@
-"""Scenes fitted to their pictures: from where the encoders left them, downhill through the renderer.
+"""Test-time optimisation: scenes fitted per image, from the encoders' prediction down through the renderer.
 
-Analysis by synthesis at the time of use. Geometry and albedo move within a morphable model of what the
-trained model says of its training pictures (postprocess/morphable.py), light and camera freely, so that the
-rendering comes near the picture; the further a coordinate is from usual, the more it costs. Encoders know the
-light and views they were trained in; the renderer holds in any. Leaves out the parameters of further factors,
-which stay as they were read.
+Analysis by synthesis. Geometry and albedo move within a morphable model of the trained model's predictions on
+its training images (morphable.py), light and camera freely, so that the rendering comes near the image; the
+further a coordinate is from its mean, the more it costs. Encoders know the lighting and viewpoints of their
+training; the renderer holds in any. Leaves out the parameters of further factors, which stay as predicted.
 """
 
 import json
@@ -29,35 +28,35 @@ PARAMETERS = {"geometry": "depth", "albedo": "albedo"}
 """Factors that are fitted within the morphable model, and what they fill."""
 
 STEPS = 60
-"""As many as are worth it: twice as many bring the error down by 2 % more."""
+"""Twice as many bring the error down by 2 % more."""
 
 _COORDINATE_RATE, _LIGHT_RATE = 0.1, 0.03  # how far a step goes: standard deviations; shares and radians
 _ROTATION_RATE, _TRANSLATION_RATE = 0.01, 0.003  # radians, scene units
 _LATE, _LATE_RATE = 0.6, 0.3  # from this share of the steps on rates are multiplied by this
-_START_LIMIT = 2.5  # standard deviations; a reading beyond is where encoders do not know
+_START_LIMIT = 2.5  # standard deviations; predictions beyond are unreliable
 _LIGHT_LIMIT, _ROTATION_LIMIT = math.radians(80), math.radians(75)
-_TRANSLATION_LIMIT = 0.4  # scene units; beyond, little is left in the picture
-_BRIGHTNESS = (0.02, 1.2)  # of ambient and diffuse light; pictures may be lit more than the ranges say
+_TRANSLATION_LIMIT = 0.4  # scene units; beyond, little is left in the image
+_BRIGHTNESS = (0.02, 1.2)  # of ambient and diffuse light; images may be brighter than the ranges allow
 _NOISE = 0.03  # mean absolute error, 0..1, that counts as much as coordinates of 1
 _BEYOND = 0.1  # what an error beyond the tolerance still counts
 
 
 def coordinates_of(factor: str) -> str:
-    """The key under which readings hold a factor's fitted coordinates."""
+    """The key under which activations hold a factor's fitted coordinates."""
     return f"{factor} fitted"
 
 
 class FittingSettings(Settings):
-    """How scenes are fitted to pictures (postprocess/fitting.py); no examples: they cannot be."""
+    """How scenes are fitted to images; 0 examples: they cannot be."""
 
-    examples: int = Field(default=2_000, ge=0)  # training pictures whose maps the morphable model is made of
+    examples: int = Field(default=2_000, ge=0)  # training images whose maps the morphable model is made of
     coordinates: int = Field(default=64, ge=1)  # of geometry, and of albedo
     steps: int = Field(
         default=0, ge=0, le=10_000
-    )  # of every picture when features are made; 0: features are read only
+    )  # of every image when features are made; 0: feed-forward only
     prior: float = Field(default=0.1, ge=0)  # how much unusual coordinates cost
     tolerance: float = Field(default=0.15, gt=0)  # error of a pixel beyond which it hardly counts more
-    weight: float = Field(default=1.0, ge=0)  # length of the fitted coordinates beside that of what is read
+    weight: float = Field(default=1.0, ge=0)  # length of fitted coordinates beside feed-forward features
 
     @model_validator(mode="after")
     def _possible(self) -> "FittingSettings":
@@ -68,11 +67,11 @@ class FittingSettings(Settings):
 
 @dataclass(frozen=True)
 class Fitted:
-    """Scenes fitted to pictures.
+    """Scenes fitted to images.
 
     Attributes:
-        scene: what was found.
-        coordinates: by factor (geometry, albedo), in standard deviations of the training pictures' maps.
+        scene: the optimised scenes.
+        coordinates: by factor (geometry, albedo), in standard deviations of the training images' maps.
         before, after: (N,) mean absolute error where the surface is seen, each pixel's error limited softly.
     """
 
@@ -83,7 +82,7 @@ class Fitted:
 
 
 class Fitting(nn.Module):
-    """What a model needs to fit scenes: the morphable model, how, and the length of features made of it.
+    """Fits scenes to images: a morphable model, settings, and the length of features made of coordinates.
 
     Args:
         maps: of depth and albedo.
@@ -96,8 +95,8 @@ class Fitting(nn.Module):
         self.maps = maps
         self.register_buffer("length", torch.tensor(float(length)), persistent=False)
         self.settings = settings
-        told = torch.tensor([settings.steps, settings.prior, settings.tolerance], dtype=torch.float64)
-        self.register_buffer("told", told, persistent=False)  # the name is part of a model's fingerprint
+        numbers = torch.tensor([settings.steps, settings.prior, settings.tolerance], dtype=torch.float64)
+        self.register_buffer("told", numbers, persistent=False)  # the name is part of a model's fingerprint
 
     def with_steps(self, steps: int) -> "Fitting":
         """The same, with the same maps, that makes so many steps; 0: features are feed-forward only."""
@@ -107,22 +106,22 @@ class Fitting(nn.Module):
         )
 
     def features(self, coordinates: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
-        """Coordinates in the unit of what is read beside them."""
+        """Coordinates in the unit of the feed-forward features beside them."""
         return coordinates * self.get_buffer("length")
 
     def fit(
         self,
-        pictures: Float[Tensor, "n 3 h w"],
+        images: Float[Tensor, "n 3 h w"],
         scene: Scene,
         render: Callable[[Scene], Rendering],
         steps: int | None = None,
     ) -> Fitted:
-        """Fit scenes to pictures, each by itself.
+        """Fit scenes to images, each by itself.
 
         Args:
-            pictures: in 0..1.
-            scene: where to begin, at the pictures' size.
-            render: gives pictures of scenes, with gradients.
+            images: in 0..1.
+            scene: where to begin, at the images' size.
+            render: gives images of scenes, with gradients.
             steps: of Adam; by default the settings'.
         """
         steps = self.settings.steps if steps is None else steps
@@ -130,10 +129,10 @@ class Fitting(nn.Module):
             raise ValueError(f"fitting needs 1 step or more, got {steps}")
         with torch.inference_mode(False), torch.enable_grad():
             own = scene.map(lambda value: value.detach().clone())
-            return self._fitted(pictures.detach().clone(), own, render, steps)
+            return self._fitted(images.detach().clone(), own, render, steps)
 
     def _fitted(
-        self, pictures: Tensor, scene: Scene, render: Callable[[Scene], Rendering], steps: int
+        self, images: Tensor, scene: Scene, render: Callable[[Scene], Rendering], steps: int
     ) -> Fitted:
         coordinates = {
             factor: self.maps.coordinates(parameter, scene.parameters[parameter].float()).clamp(
@@ -151,17 +150,17 @@ class Fitting(nn.Module):
             betas=(0.9, 0.95),
         )
 
-        def shown() -> tuple[Scene, Tensor]:
+        def rendered() -> tuple[Scene, Tensor]:
             depth, albedo = (self.maps.maps(PARAMETERS[name], value) for name, value in coordinates.items())
             camera = torch.cat([rotation, translation], dim=1)
-            found = Scene(depth, albedo.clamp(0, 1), light, camera, scene.extra)
-            return found, self._error(pictures, render(found))
+            moved_scene = Scene(depth, albedo.clamp(0, 1), light, camera, scene.extra)
+            return moved_scene, self._error(images, render(moved_scene))
 
         before = None
         for step in range(steps):
             for group, rate in zip(optimiser.param_groups, rates, strict=True):
                 group["lr"] = rate * (_LATE_RATE if step >= _LATE * steps else 1.0)
-            error = shown()[1]
+            error = rendered()[1]
             before = error.detach() if before is None else before
             usual = torch.stack([value.square().mean(dim=1) for value in coordinates.values()]).sum(dim=0)
             optimiser.zero_grad(set_to_none=True)
@@ -173,20 +172,22 @@ class Fitting(nn.Module):
                 rotation.clamp_(-_ROTATION_LIMIT, _ROTATION_LIMIT)
                 translation.clamp_(-_TRANSLATION_LIMIT, _TRANSLATION_LIMIT)
         with torch.no_grad():
-            found, after = shown()
+            fitted, after = rendered()
         assert before is not None
         return Fitted(
-            found.detach(), {name: value.detach() for name, value in coordinates.items()}, before, after
+            fitted.detach(), {name: value.detach() for name, value in coordinates.items()}, before, after
         )
 
-    def _error(self, pictures: Tensor, rendering: Rendering) -> Float[Tensor, " n"]:
-        apart = (rendering.image - pictures).abs().mean(dim=1)
+    def _error(self, images: Tensor, rendering: Rendering) -> Float[Tensor, " n"]:
+        apart = (rendering.image - images).abs().mean(dim=1)
         beyond = (apart - self.settings.tolerance).clamp(min=0)
-        seen = rendering.mask.flatten(1)
-        return ((apart - (1 - _BEYOND) * beyond).flatten(1) * seen).sum(dim=1) / seen.sum(dim=1).clamp(min=1)
+        covered = rendering.mask.flatten(1)
+        return ((apart - (1 - _BEYOND) * beyond).flatten(1) * covered).sum(dim=1) / covered.sum(dim=1).clamp(
+            min=1
+        )
 
     def tensors(self) -> dict[str, Tensor]:
-        """What ``save`` writes, by name."""
+        """All tensors that ``save`` writes, by name."""
         return dict(self.named_buffers())
 
     def save(self, file: Path) -> None:
@@ -202,9 +203,9 @@ class Fitting(nn.Module):
             ValueError: it is damaged, tensors are missing or do not fit each other, or maps have another side
                 than ``image_size``.
         """
-        tensors, told = read_described(file)
+        tensors, metadata = read_described(file)
         try:
-            settings = FittingSettings.model_validate(json.loads(told["settings"]))
+            settings = FittingSettings.model_validate(json.loads(metadata["settings"]))
             means, axes = (
                 {name: tensors[f"maps.{name}_{part}"] for name in PARAMETERS.values()}
                 for part in ("mean", "axes")

@@ -1,10 +1,10 @@
 """Geometry and albedo as a linear model: a mean map, and the directions in which a model's own maps vary.
 
-A morphable model (Blanz and Vetter, SIGGRAPH 1999) whose examples are no scans: they are what a trained model
-says of unlabelled pictures, each the mean of itself and its mirror image, for the object is symmetric and the
-light need not be. A coordinate of 1 is one standard deviation of them. Making maps of coordinates is two
-products of matrices, where decoders take a hundred times as long. Leaves out what differs between the sides,
-and everything a decoder can say that is not near the mean.
+A morphable model (Blanz and Vetter, SIGGRAPH 1999) whose examples are no scans: they are a trained model's
+predictions on unlabelled images, each averaged with its mirror image, for the object is symmetric and the
+lighting need not be. A coordinate of 1 is one standard deviation of them. Making maps of coordinates is two
+products of matrices, where decoders take a hundred times as long. Leaves out differences
+between the sides, and everything a decoder can predict that is far from the mean.
 """
 
 from collections.abc import Mapping
@@ -38,7 +38,7 @@ class MorphableMaps(nn.Module):
 
     @classmethod
     def of(cls, examples: Mapping[str, Float[Tensor, "n ..."]], coordinates: int) -> "MorphableMaps":
-        """The directions in which examples vary most, at most as many as can be told; same maps, same model.
+        """The directions in which examples vary most, at most as many as differ; same maps, same model.
 
         Args:
             examples: by name, maps; what their mirror images (along the last axis) share with them counts.
@@ -76,7 +76,7 @@ class MorphableMaps(nn.Module):
 
 
 def _principal(centred: Float[Tensor, "n d"], count: int) -> tuple[Float[Tensor, " k"], Float[Tensor, "k d"]]:
-    """Standard deviations and directions of the most varied ones, by way of the smaller Gram matrix."""
+    """The largest principal components: standard deviations and directions, by the smaller Gram matrix."""
     from scipy.linalg import eigh  # only the largest: torch would find all
 
     rows, columns = centred.shape
@@ -91,6 +91,6 @@ def _principal(centred: Float[Tensor, "n d"], count: int) -> tuple[Float[Tensor,
     if wide:
         directions = directions @ centred
     length = directions.norm(dim=1, keepdim=True)
-    tellable = (variances > variances.max() * 1e-10).to(centred)[:, None]
-    directions = directions / length.clamp(min=torch.finfo(centred.dtype).tiny) * tellable
+    distinct = (variances > variances.max() * 1e-10).to(centred)[:, None]
+    directions = directions / length.clamp(min=torch.finfo(centred.dtype).tiny) * distinct
     return (variances.clamp(min=0) / rows).sqrt().to(centred), directions

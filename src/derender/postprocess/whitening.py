@@ -1,10 +1,9 @@
-"""Readings to features: what other factors move is shrunk, what tells pictures apart is kept; ours.
+"""Encoder activations to features: linear discriminant analysis (LDA) without labels.
 
-Linear discriminant analysis without labels: the classes are pictures, their members the same scene rendered
-with this factor left as it is and others changed. Directions in which the renderings of one picture differ
-are divided by how much they differ; of the result the directions in which pictures differ most are kept,
-counted in units of what those others alone would do, and made more even: a few directions must not drown the
-others. Leaves out how the renderings are made (training/features.py).
+The classes are images; the members of a class are renderings of its scene with this factor left as it is and
+the others changed. Within-class covariance normalisation divides each direction by how much renderings of one
+image differ in it. The most discriminative directions are kept and made more even, so that a few do not drown
+the others. Leaves out how the renderings are made (training/features.py).
 """
 
 from collections.abc import Collection, Mapping
@@ -18,31 +17,31 @@ from torch import Tensor, nn
 from derender.storage.atomic import atomic_file
 from derender.storage.tensors import read_tensors, write_tensors
 
-_MIRRORED = "reads_mirror_image"  # a file without it is of a model that reads pictures as they are alone
-_ALONE = "_alone"  # after a name: this one is read of pictures as they are, though others are not
+_MIRRORED = "reads_mirror_image"  # in a file: maps take images with their mirror images
+_ALONE = "_alone"  # after a factor's name, beside the former: this one takes images alone
 _NEVER_SINGULAR = 1e-9  # share of the mean variance that is added at least: Cholesky's root must exist
 
 
 @dataclass(frozen=True)
-class Contrast:
-    """An affine map of one factor's readings.
+class Projection:
+    """An affine map of one factor's activations.
 
     Attributes:
         mean: what is subtracted first.
-        map: multiplied from the right; of the rank that was asked for.
-        ratios: of every kept direction, largest first: variance between pictures over variance within them.
+        map: multiplied from the right; its rank is the number of directions kept.
+        ratios: of every kept direction, largest first: variance between images over variance within them.
     """
 
-    mean: Float[Tensor, " reading"]
-    map: Float[Tensor, "reading code"]
+    mean: Float[Tensor, " input"]
+    map: Float[Tensor, "input code"]
     ratios: Float[Tensor, " directions"]
 
 
-class Spread:
-    """How readings differ within pictures and between them, summed up batch by batch.
+class Scatter:
+    """Within-class and between-class covariance of activations, one class an image, summed batch by batch.
 
     Attributes:
-        views, count: readings of each picture, and pictures so far.
+        views, count: activations of each image, and images so far.
     """
 
     def __init__(self) -> None:
@@ -50,139 +49,138 @@ class Spread:
         self._within = self._centres = self._centre = torch.zeros((), dtype=torch.float64)
 
     @classmethod
-    def of(cls, readings: Float[Tensor, "views n reading"]) -> "Spread":
-        """Of readings that are all there."""
-        spread = cls()
-        spread.add(readings)
-        return spread
+    def of(cls, activations: Float[Tensor, "views n input"]) -> "Scatter":
+        """Of activations that are all there."""
+        scatter = cls()
+        scatter.add(activations)
+        return scatter
 
-    def add(self, readings: Float[Tensor, "views n reading"]) -> None:
-        """More pictures, each with as many views as those before."""
-        self.views = len(readings)
-        self.count += readings.shape[1]
-        centres = readings.double().mean(dim=0)
-        apart = (readings - centres.to(readings)).flatten(0, 1)
+    def add(self, activations: Float[Tensor, "views n input"]) -> None:
+        """More images, each with as many views as those before."""
+        self.views = len(activations)
+        self.count += activations.shape[1]
+        centres = activations.double().mean(dim=0)
+        apart = (activations - centres.to(activations)).flatten(0, 1)
         self._within = self._within + (apart.T @ apart).double()
         self._centres = self._centres + centres.T @ centres
         self._centre = self._centre + centres.sum(dim=0)
 
     @property
-    def mean(self) -> Float[Tensor, " reading"]:
-        """Of the pictures' centres."""
+    def mean(self) -> Float[Tensor, " input"]:
+        """Of the class means."""
         return self._centre / self.count
 
     @property
-    def within(self) -> Float[Tensor, "reading reading"]:
-        """Covariance of a picture's readings, the mean over pictures, unbiased."""
+    def within(self) -> Float[Tensor, "input input"]:
+        """Within-class covariance, the mean over images, unbiased."""
         return self._within / (self.count * (self.views - 1))
 
     @property
-    def between(self) -> Float[Tensor, "reading reading"]:
-        """Covariance of the pictures' centres."""
+    def between(self) -> Float[Tensor, "input input"]:
+        """Covariance of the class means."""
         return self._centres / self.count - torch.outer(self.mean, self.mean)
 
 
-def contrast(
-    spread: Spread,
+def fit_projection(
+    scatter: Scatter,
     directions: int,
     shrinkage: float,
     size: int | None = None,
     evenness: float = 0.0,
     power: float = 0.0,
-) -> Contrast:
-    """The map that makes the mean variance within pictures 1 in every kept direction, or evens out the whole.
+) -> Projection:
+    """The map that makes the mean within-class variance 1 in every kept direction, or evens out the total.
 
-    Features are turned so that each is as near as can be to the number of the code in its place, which
+    Features are rotated so that each is as near as can be to the number of the code in its place, which
     changes no distance.
 
     Args:
-        spread: of readings in which the code stands first.
+        scatter: of activations in which the code comes first.
         directions: how many are kept, those with the largest ratio between over within; at most ``size``.
-        shrinkage: how much of the mean variance within is added to every direction's, so that a direction
-            that hardly moved in these pictures is not taken for one that never moves.
-        size: of the code, and of the features; by default that of the readings.
-        evenness: 0..1. At 0 a direction in which pictures differ more counts for more; at 1 all count alike:
-            like one in which pictures differ as much as the renderings of one of them do.
-        power: of each direction's repeatability, between / (between + within), by which it is weighted: what
-            would be expected of the picture itself, at 1 the posterior mean. At 0 all that is kept is alike.
+        shrinkage: how much of the mean within-class variance is added to every direction's, so that a
+            direction that hardly moved in these images does not count as one that never moves.
+        size: of the code, and of the features; by default that of the activations.
+        evenness: 0..1. At 0 a direction in which images differ more counts for more; at 1 all count alike:
+            like one whose variances between and within classes are equal.
+        power: of each direction's repeatability, between / (between + within), by which it is weighted: the
+            expected class mean, at 1 the posterior mean. At 0 kept directions are weighted alike.
 
     Raises:
-        ValueError: fewer than two views or pictures.
+        ValueError: fewer than two views or images.
     """
-    if spread.views < 2 or spread.count < 2:
+    if scatter.views < 2 or scatter.count < 2:
         raise ValueError(
-            f"whitening needs at least 2 views of 2 pictures, got {spread.views} of {spread.count}"
+            f"whitening needs at least 2 views of 2 images, got {scatter.views} of {scatter.count}"
         )
-    mean, within, between = spread.mean, spread.within, spread.between
+    mean, within, between = scatter.mean, scatter.within, scatter.between
     width = len(mean)
     size = size or width
     floor = within.diagonal().mean().clamp(min=torch.finfo(torch.float32).tiny)
     within = within + max(shrinkage, _NEVER_SINGULAR) * floor * torch.eye(width).to(within)
-    ratios, kept = _most_told_apart(between, within, min(directions, size, width))
+    ratios, kept = _most_discriminative(between, within, min(directions, size, width))
     kept = kept * (2 / (1 + ratios)) ** (evenness / 2)  # 1 within and as much between are the 2
-    own = ratios.clamp(min=torch.finfo(torch.float32).tiny)
-    kept = kept * (own / (1 + own)) ** power
+    positive = ratios.clamp(min=torch.finfo(torch.float32).tiny)
+    kept = kept * (positive / (1 + positive)) ** power
     left, _, right = torch.linalg.svd(kept.T @ (within + between)[:, :size], full_matrices=False)
-    return Contrast(mean.float(), (kept @ left @ right).float(), ratios.float())
+    return Projection(mean.float(), (kept @ left @ right).float(), ratios.float())
 
 
 class Whitening(nn.Module):
-    """The maps of some factors, applied to readings by name; gives the features of those factors alone.
+    """The projections of some factors, applied to activations by name; gives those factors' features alone.
 
-    A map of fewer rows than the reading has takes the reading's beginning: the code. Maps of names in
-    ``mirrored`` take the mean of a picture's reading and its mirror image's, which follows the first.
+    A projection of fewer rows than there are activations takes the first of them: the code. Projections of
+    names in ``mirrored`` take the mean over an image and its mirror image, whose activations follow.
     """
 
-    def __init__(self, contrasts: Mapping[str, Contrast], *, mirrored: Collection[str] = ()):
+    def __init__(self, projections: Mapping[str, Projection], *, mirrored: Collection[str] = ()):
         super().__init__()
-        self.names = tuple(contrasts)
-        self.mirrored = frozenset(mirrored) & frozenset(contrasts)
-        if self.mirrored:
-            self.register_buffer(_MIRRORED, torch.ones(1), persistent=False)
-        for name, found in contrasts.items():
+        self.names = tuple(projections)
+        self.mirrored = frozenset(mirrored) & frozenset(projections)
+        tensors = {_MIRRORED: torch.ones(1)} if self.mirrored else {}
+        for name, own in projections.items():
             if self.mirrored and name not in self.mirrored:
-                self.register_buffer(f"{name}{_ALONE}", torch.ones(1), persistent=False)
-            self.register_buffer(f"{name}_mean", found.mean, persistent=False)
-            self.register_buffer(f"{name}_map", found.map, persistent=False)
-            self.register_buffer(f"{name}_ratios", found.ratios, persistent=False)
+                tensors[f"{name}{_ALONE}"] = torch.ones(1)
+            tensors |= {f"{name}_{part}": value for part, value in vars(own).items()}
+        for name, value in tensors.items():
+            self.register_buffer(name, value, persistent=False)
 
-    def forward(self, readings: Mapping[str, Float[Tensor, "n _"]]) -> dict[str, Float[Tensor, "n _"]]:
-        return {name: self._whitened(name, readings[name]) for name in self.names if name in readings}
+    def forward(self, activations: Mapping[str, Float[Tensor, "n _"]]) -> dict[str, Float[Tensor, "n _"]]:
+        return {
+            name: (self.inputs(name, activations[name]) - self.get_buffer(f"{name}_mean"))
+            @ self.get_buffer(f"{name}_map")
+            for name in self.names
+            if name in activations
+        }
 
-    def _whitened(self, name: str, reading: Float[Tensor, "n _"]) -> Float[Tensor, "n code"]:
-        mean, chart = self.get_buffer(f"{name}_mean"), self.get_buffer(f"{name}_map")
-        return (self.taken(name, reading) - mean) @ chart
-
-    def taken(self, name: str, reading: Float[Tensor, "n _"]) -> Float[Tensor, "n taken"]:
-        """What the map is applied to: the reading's beginning, or the mean of it and its mirror image's."""
-        mean = self.get_buffer(f"{name}_mean")
-        mirrored = name in self.mirrored
-        wanted = len(mean) * (2 if mirrored else 1)
-        if reading.shape[1] < wanted:
+    def inputs(self, name: str, activations: Float[Tensor, "n _"]) -> Float[Tensor, "n input"]:
+        """What a factor's projection is applied to, of its activations."""
+        size, mirrored = len(self.get_buffer(f"{name}_mean")), name in self.mirrored
+        needed = size * (2 if mirrored else 1)
+        if activations.shape[1] < needed:
             raise ValueError(
-                f"features of {name} are made of {wanted:,} numbers, got {reading.shape[1]:,}: "
-                "give what model.read gives, not codes"
+                f"features of {name} are made of {needed:,} numbers, got {activations.shape[1]:,}: "
+                "give what model.activations gives, not codes"
             )
         if mirrored:
-            reading = reading.unflatten(1, (2, -1)).mean(dim=1)
-        return reading[:, : len(mean)].float()
+            activations = activations.unflatten(1, (2, -1)).mean(dim=1)
+        return activations[:, :size].float()
 
-    def recentred(self, means: Mapping[str, Float[Tensor, " taken"]]) -> "Whitening":
-        """The same maps about other means of what is ``taken``, by name; distances stay as they are."""
-        contrasts = {
-            name: Contrast(
+    def with_means(self, means: Mapping[str, Float[Tensor, " input"]]) -> "Whitening":
+        """The same maps about other means of ``inputs``, by name; distances stay as they are."""
+        projections = {
+            name: Projection(
                 means[name].float(), self.get_buffer(f"{name}_map"), self.get_buffer(f"{name}_ratios")
             )
             for name in self.names
         }
-        return Whitening(contrasts, mirrored=self.mirrored)
+        return Whitening(projections, mirrored=self.mirrored)
 
     def tensors(self) -> dict[str, Tensor]:
-        """What ``save`` writes, by name."""
+        """All tensors that ``save`` writes, by name."""
         return dict(self.named_buffers())
 
     def save(self, file: Path) -> None:
-        """Write the maps; complete or not at all."""
+        """Write the projections; complete or not at all."""
         with atomic_file(file) as temporary:
             write_tensors(self.tensors(), temporary)
 
@@ -194,26 +192,22 @@ class Whitening(nn.Module):
             ValueError: it is damaged, or tensors are missing or do not fit each other.
         """
         tensors = read_tensors(file)
-        found = {}
+        projections = {}
         for name in [key.removesuffix("_map") for key in tensors if key.endswith("_map")]:
             try:
-                mean, chart, ratios = (
-                    tensors[f"{name}_{part}"].float() for part in ("mean", "map", "ratios")
-                )
+                own = Projection(*(tensors[f"{name}_{part}"].float() for part in ("mean", "map", "ratios")))
             except KeyError as error:
                 raise ValueError(f"it has no {error.args[0]!r}") from error
-            if chart.ndim != 2 or len(chart) != len(mean) or ratios.ndim != 1:
-                raise ValueError(f"{name}: a map of {tuple(chart.shape)} beside a mean of {len(mean)}")
-            found[name] = Contrast(mean, chart, ratios)
-        alone = {name for name in found if f"{name}{_ALONE}" in tensors or _MIRRORED not in tensors}
-        return cls(found, mirrored=found.keys() - alone)
+            if own.map.ndim != 2 or len(own.map) != len(own.mean) or own.ratios.ndim != 1:
+                raise ValueError(f"{name}: a map of {tuple(own.map.shape)} beside a mean of {len(own.mean)}")
+            projections[name] = own
+        alone = {name for name in projections if f"{name}{_ALONE}" in tensors or _MIRRORED not in tensors}
+        return cls(projections, mirrored=projections.keys() - alone)
 
 
-def _most_told_apart(between: Tensor, within: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """The largest ratios of two covariances and their directions (reading, count), of variance 1 within."""
-    from scipy.linalg import (
-        eigh,
-    )  # only the directions that are kept: torch would find all, three times as slow
+def _most_discriminative(between: Tensor, within: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """The largest ratios of two covariances and their directions (input, count), of variance 1 within."""
+    from scipy.linalg import eigh  # only the kept directions: torch would find all, three times as slow
 
     width = len(within)
     ratios, directions = eigh(

@@ -3,7 +3,7 @@
 ``rasterize`` (coordinates and depth without colours) is reached as ``derender.render.rasterize.rasterize``.
 """
 
-from derender.render.rasterize import available_backends, chosen_backend
+from derender.render.backends import available_backends, chosen_backend
 from derender.render.renderer import Rendering, render, render_scene, shade, warp
 
 __all__ = [

@@ -2,8 +2,8 @@
 
 image(p) = canonical image at the canonical coordinates that pixel p sees. The canonical image is albedo times
 Lambertian shading with the light in the canonical frame. Leaves out cast shadows, speculars, clipping at 1
-and gradients at occlusion edges. Shading is computed in float32 at least, whatever autocast says; where the
-surface lands in the picture in float64, so that the identity camera gives the canonical image bit for bit.
+and gradients at occlusion edges. Shading is computed in float32 at least, under any autocast; where the
+surface lands in the image in float64, so that the identity camera gives the canonical image bit for bit.
 """
 
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ from derender.scene.scene import Scene
 
 @dataclass(frozen=True)
 class Rendering:
-    """Pictures of a batch of scenes.
+    """Images of a batch of scenes.
 
     Attributes:
         image: (N, C, H, W) colours from 0 on, not clipped at 1; 0 where nothing is seen. ``render``: C = 3.
@@ -87,7 +87,7 @@ def _map_size(depth: Tensor) -> tuple[int, int, int]:
 
 
 def _checked(**inputs: tuple[Tensor, tuple[int, ...]]) -> list[Tensor]:
-    """The tensors in float32 or float64, or an error that says which one does not fit and why."""
+    """The tensors in float32 or float64, or an error that names the one that does not fit."""
     values = []
     for name, (value, shape) in inputs.items():
         if not value.is_floating_point():

@@ -1,4 +1,4 @@
-"""Scene parameters: what a picture is taken apart into."""
+"""Scene parameters: the values that an image is decomposed into."""
 
 from derender.scene.scene import Scene
 

@@ -1,15 +1,16 @@
 """Physical augmentation: change one factor of a scene by a random, physically possible amount.
 
 Source: the paper, section 4 (LOOCC): uniform additive perturbations of light (ambient and diffuse +-0.5,
-pitch and yaw +-45 degrees) and camera (pitch +-22.5, yaw +-45 degrees). The paper does not say what happens
+pitch and yaw +-45 degrees) and camera (pitch +-22.5, yaw +-45 degrees). The paper leaves open what happens
 at the bounds. Here the perturbation is uniform over those values in its range that keep the result physical
 (the law that rejecting and drawing again would give, from one draw): intensities stay in their bounds, light
 within 45 degrees, camera within 60, and nothing piles up at a bound. Geometry and albedo, which have no such
-range, are exchanged between images. Leaves out rendering and encoding the new scene.
+range, are exchanged between images. Which factor changes, and by which of these functions, is declared in a
+factor's row (networks/factors.py). Leaves out rendering and encoding the new scene.
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 
 import torch
 from jaxtyping import Float, Int64, Shaped
@@ -18,10 +19,7 @@ from torch import Generator, Tensor
 
 from derender.scene.constants import constant, kept
 from derender.scene.ranges import SceneRanges
-from derender.scene.scene import Scene
 from derender.settings import Settings
-
-Perturbation = Callable[[Tensor, Generator, "PerturbSettings", SceneRanges], Tensor]
 
 
 class PerturbSettings(Settings):
@@ -95,44 +93,6 @@ def choose_factors(n: int, candidates: Sequence[int], generator: Generator) -> I
         raise ValueError("no factor to choose from; name at least one that may be perturbed")
     drawn = torch.randint(len(candidates), (n,), generator=generator, device=generator.device)
     return kept(tuple(candidates), generator.device, torch.int64)[drawn]
-
-
-PHYSICAL: Mapping[str, Perturbation] = {
-    "depth": exchange,
-    "albedo": exchange,
-    "light": perturb_light,
-    "camera": perturb_camera,
-}
-
-
-def perturb_scene(
-    scene: Scene,
-    chosen: Int64[Tensor, " n"],
-    generator: Generator,
-    settings: PerturbSettings = DEFAULT_CHANGES,
-    ranges: SceneRanges = DEFAULT_RANGES,
-    perturbations: Mapping[str, Perturbation] = PHYSICAL,
-) -> Scene:
-    """Change, in image i, only the parameter at place ``chosen[i]`` of ``perturbations``; -1 changes nothing.
-
-    The keys name parameters of the scene. A perturbation that some image chose draws for the whole batch, in
-    the mapping's order, so the result depends on the generator and the choice alone.
-    """
-    if len(chosen) != len(scene):
-        raise ValueError(f"the choice names {len(chosen)} images, the scene holds {len(scene)}")
-    names = tuple(perturbations)
-    if len(chosen) and not -1 <= int(chosen.min()) <= int(chosen.max()) < len(names):
-        raise ValueError(
-            f"the choice must lie in -1..{len(names) - 1} ({', '.join(names)}), got {chosen.tolist()}"
-        )
-    changed = {}
-    for index, name in enumerate(names):
-        if bool((rows := chosen == index).any()):
-            value = scene.parameters[name]
-            drawn = perturbations[name](value, generator, settings, ranges)
-            rows = rows.to(value.device).view(-1, *[1] * (value.dim() - 1))
-            changed[name] = torch.where(rows, drawn, value)
-    return scene.with_parameters(**changed)
 
 
 def _uniform_about(

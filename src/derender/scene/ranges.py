@@ -12,21 +12,16 @@ from derender.settings import Settings
 
 
 class SceneRanges(Settings):
-    """Bounds of every scene parameter, and the field of view that all pictures share."""
+    """Bounds of every scene parameter, and the field of view that all images share."""
 
     fov_deg: float = Field(default=10.0, gt=0, lt=180)
     depth_min: float = Field(default=0.9, gt=0)
     depth_max: float = Field(default=1.1, gt=0)
-    border_depth: float = Field(
-        default=0.7 * 1.1 + 0.3 * 0.9, gt=0
-    )  # depth held at the picture's left and right edge
-    border_share: float = Field(
-        default=2 / 64, ge=0, lt=0.5
-    )  # share of the width, each side, held at border_depth
-    level_depth: bool = False  # take each map's slope from top to bottom away: only the camera tilts; ours
-    lean_deg: float = Field(
-        default=0.0, gt=-80, lt=80
-    )  # by how much the top of every depth map starts out further away than upright, seen from above; ours
+    border_depth: float = Field(default=0.7 * 1.1 + 0.3 * 0.9, gt=0)  # held at the left and right edge
+    border_share: float = Field(default=2 / 64, ge=0, lt=0.5)  # of the width, each side, held at border_depth
+    level_depth: bool = False  # remove each map's vertical slope: only the camera tilts; no published source
+    # depth maps start out leaning back by this angle, for views from above; no published source
+    lean_deg: float = Field(default=0.0, gt=-80, lt=80)
     ambient: tuple[float, float] = (0.0, 1.0)
     diffuse: tuple[float, float] = (0.0, 1.0)
     light_deg: float = Field(default=45.0, gt=0, lt=90)  # light pitch and yaw lie in +- this

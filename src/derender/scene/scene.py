@@ -4,8 +4,9 @@ Conventions (axes, signs, units) are written in docs/conventions.md.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -70,9 +71,23 @@ class Scene:
     def __len__(self) -> int:
         return self.depth.shape[0]
 
-    def with_extra(self, **values: Tensor) -> "Scene":
-        """The same scenes with parameters of further factors added or exchanged."""
-        return replace(self, extra={**self.extra, **values})
-
 
 _FIELDS = ("depth", "albedo", "light", "camera")
+_LIGHT_SIGNS = (1.0, 1.0, 1.0, -1.0)  # ambient, diffuse, pitch, yaw
+_CAMERA_SIGNS = (1.0, -1.0, -1.0, -1.0, 1.0, 1.0)  # rotation about x, y, z; translation along x, y, z
+
+
+def seen_in_mirror(scene: Scene) -> Scene:
+    """Scenes whose images are the mirror images (left to right) of these scenes' images.
+
+    Raises:
+        ValueError: there are further factors, for which no mirror image is defined.
+    """
+    if scene.extra:
+        raise ValueError(f"what a mirror does to {', '.join(scene.extra)} is not known")
+    return Scene(
+        scene.depth.flip(-1),
+        scene.albedo.flip(-1),
+        scene.light * torch.tensor(_LIGHT_SIGNS).to(scene.light),
+        scene.camera * torch.tensor(_CAMERA_SIGNS).to(scene.camera),
+    )

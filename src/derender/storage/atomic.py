@@ -1,8 +1,8 @@
-"""Files and folders that appear whole or not at all, and folders that know whether they still are.
+"""Files and folders that appear complete or not at all, and folders with checksums of their files.
 
 Both are written under another name beside their place and moved there at the end. A run that is killed, or a
 disk that is full, leaves what was there before. A sealed folder holds a checksum of each of its files, which
-tells a later reader of a bit that has changed; it is no protection against somebody who means harm.
+shows a later reader a changed bit; it is no protection against an attacker.
 """
 
 import ctypes
@@ -93,7 +93,7 @@ def new_folder(folder: str | Path, *, overwrite: bool = False) -> Iterator[Path]
 
 
 def remove_abandoned(path: Path) -> None:
-    """Delete what processes killed while writing this file or folder left; nobody may be writing."""
+    """Delete what processes killed while writing this file or folder left; no process may be writing it."""
     for entry in path.parent.iterdir() if path.parent.is_dir() else ():
         if not entry.name.startswith(_prefix(path)):
             continue

@@ -1,4 +1,4 @@
-"""The folder of a saved model: its files, where it lies, what ``config.json`` must say, whether weights fit.
+"""The folder of a saved model: its files, where it lies, its ``config.json``, whether weights fit.
 
 A model is looked for in a folder, among the bundled models, then on the Hugging Face Hub.
 """
@@ -6,6 +6,7 @@ A model is looked for in a folder, among the bundled models, then on the Hugging
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -13,16 +14,16 @@ import torch
 from torch import Tensor, nn
 
 from derender.storage import hub
-from derender.storage.card import CARD_FILE
+from derender.storage.atomic import atomic_file
 from derender.storage.tensors import read_tensors, write_tensors
 
 Net = TypeVar("Net", bound=nn.Module)
 
-FORMAT = 1
+FORMAT = SPLIT_FORMAT = 1
 WEIGHTS_FILE, CONFIG_FILE = "model.safetensors", "config.json"
 WHITENING_FILE, FITTING_FILE = "whitening.safetensors", "fitting.safetensors"  # a model may lack them
 ERRORS_FILE = "held_out_errors.json"  # written and read by training/held_out_errors.py; a model may lack it
-SPLIT_FILE = "split.json"  # written and read by storage/split.py; a model may lack it
+SPLIT_FILE, CARD_FILE = "split.json", "README.md"  # a model may lack them
 PRETRAINED = Path(__file__).parents[1] / "pretrained"
 
 
@@ -141,3 +142,45 @@ def naming_damage(folder: Path) -> Iterator[None]:
         raise ValueError(
             f"{folder} is damaged ({str(error).splitlines()[0]}): copy or train the model again"
         ) from error
+
+
+@dataclass(frozen=True)
+class SplitRecord:
+    """Which images a saved model was not trained on: the split of the run it comes from.
+
+    Parts are drawn from files' names (``data.splits``), so shares and a seed define it.
+
+    Attributes:
+        shares: of training, validation and test, which sum to 1.
+        seed: that they were drawn with.
+    """
+
+    shares: tuple[float, float, float]
+    seed: int
+
+
+def write_split(folder: Path, split: SplitRecord) -> None:
+    """Write the file into a saved model's folder; complete or not at all."""
+    with atomic_file(folder / SPLIT_FILE) as temporary:
+        temporary.write_text(json.dumps({"format": SPLIT_FORMAT, **asdict(split)}) + "\n")
+
+
+def read_split(folder: Path) -> SplitRecord | None:
+    """The split recorded with the model in ``folder``; None where there is none.
+
+    Raises:
+        ValueError: the file is damaged or of a newer version.
+    """
+    file = folder / SPLIT_FILE
+    if not file.is_file():
+        return None
+    try:
+        values = json.loads(file.read_text())
+        train, validation, test = (float(share) for share in values["shares"])
+        sound = values["format"] == SPLIT_FORMAT and abs(train + validation + test - 1) < 1e-6
+        found = SplitRecord((train, validation, test), int(values["seed"])) if sound else None
+    except (UnicodeDecodeError, KeyError, TypeError, ValueError):
+        found = None
+    if found is None:
+        raise ValueError(f"{file} is damaged or of a newer version: take the model again, or update derender")
+    return found

@@ -43,9 +43,9 @@ def upload(folder: Path, repository: str, *, private: bool, token: str | None) -
     except HFValidationError as error:
         raise ValueError(f"{repository!r} is no name on the Hub: give OWNER/NAME") from error
     except (HfHubHTTPError, LocalTokenNotFoundError) as error:
-        said = " ".join(str(error).split())
+        message = " ".join(str(error).split())
         raise PermissionError(
-            f"the Hub refuses {repository} ({said}): log in with 'hf auth login' or pass token=, with the "
+            f"the Hub refuses {repository} ({message}): log in with 'hf auth login' or pass token=, with the "
             "right to write there"
         ) from error
     except Exception as error:  # what a broken connection raises changes with the client's HTTP library

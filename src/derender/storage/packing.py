@@ -13,8 +13,8 @@ from pathlib import Path
 from torch import Tensor
 
 from derender.storage.atomic import new_folder
-from derender.storage.card import CARD_FILE
 from derender.storage.folder import (
+    CARD_FILE,
     CONFIG_FILE,
     ERRORS_FILE,
     FITTING_FILE,
@@ -72,9 +72,9 @@ def pack_model(
         for name in (WEIGHTS_FILE, WHITENING_FILE, FITTING_FILE):
             if not (own / name).is_file():
                 continue
-            tensors, told = read_described(own / name)
+            tensors, metadata = read_described(own / name)
             small = _halved(tensors) if name == WEIGHTS_FILE else _maps_packed(tensors, maps)
-            write_tensors(small, temporary / name, told)
+            write_tensors(small, temporary / name, metadata)
             before[name], after[name] = ((place / name).stat().st_size for place in (own, temporary))
         for name in (CONFIG_FILE, *_TEXTS):
             if (own / name).is_file():

@@ -1,8 +1,11 @@
 """Saving and sharing a model: beside its weights a card, held-out errors and its split; the way to the Hub.
 
-Leaves out what a model writes of itself, which the class that inherits `Shareable` says.
+The card is the README.md that states what a model is, what made it and what it may be used for; what is
+unknown is "not stated". Leaves out the files of the model itself, which the class that inherits `Shareable`
+writes.
 """
 
+import json
 from abc import abstractmethod
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,8 +15,9 @@ from torch import Tensor
 
 from derender.storage import hub
 from derender.storage.atomic import new_folder
-from derender.storage.card import CARD_FILE, model_card, with_metadata
-from derender.storage.folder import ERRORS_FILE, SPLIT_FILE, texts_beside
+from derender.storage.folder import CARD_FILE, ERRORS_FILE, SPLIT_FILE, texts_beside
+
+NOT_STATED = "not stated"
 
 
 class Shareable:
@@ -88,7 +92,7 @@ class Shareable:
         beside = texts_beside(self.source, self.tensors())
         if not (card or (data and licence) or CARD_FILE in beside):
             raise ValueError(
-                "this model has no card: say what it was trained on and what it may be used for, "
+                "this model has no card: state what it was trained on and what it may be used for, "
                 "push_to_hub(..., data=..., licence=...), or pass card="
             )
         card = card or self._card(beside, repository, {"data": data, "licence": licence, "scores": scores})
@@ -101,3 +105,67 @@ class Shareable:
         if CARD_FILE in beside and not any(stated.values()):
             return beside[CARD_FILE]
         return model_card(title, self.description(), **stated, held_out=beside.get(ERRORS_FILE))
+
+
+def model_card(
+    title: str,
+    description: str,
+    *,
+    data: str | None = None,
+    licence: str | None = None,
+    scores: str | None = None,
+    held_out: str | None = None,
+) -> str:
+    """The card of one model as Markdown.
+
+    Args:
+        title: the model's name.
+        description: one sentence: what the model does, its sizes and ranges.
+        data: what it was trained on.
+        licence: what it may be used for.
+        scores: measured results.
+        held_out: its reconstruction errors (JSON), whose median and 99th percentile are stated.
+    """
+    measured = [text for text in (scores, _held_out(held_out)) if text]
+    parts = {
+        "Trained on": data,
+        "Scores": " ".join(measured),
+        "Licence": licence,
+    }
+    return "\n\n".join(
+        [
+            f"# {title}",
+            description,
+            f'```python\nimport derender\n\nmodel = derender.load("{title}")\n```',
+            *(f"**{name}**: {text or NOT_STATED}" for name, text in parts.items()),
+        ]
+    ) + "\n"  # fmt: skip
+
+
+def with_metadata(card: str, licence: str | None = None) -> str:
+    """The card headed by what the Hub files it under, unless it has a head of its own."""
+    if card.startswith("---"):
+        return card
+    tags = "library_name: derender\ntags: [inverse-rendering, disentanglement]\n"
+    named = f"license: {json.dumps(licence.lower())}\n" if licence and _is_short_name(licence) else ""
+    return f"---\n{tags}{named}---\n\n{card}"
+
+
+def _is_short_name(licence: str) -> bool:
+    """Whether this is a licence's short name, such as MIT, and no sentence."""
+    return len(licence) <= 32 and " " not in licence
+
+
+def _held_out(errors: str | None) -> str:
+    if errors is None:
+        return ""
+    try:
+        stored = json.loads(errors)
+        quantiles, count = [float(value) for value in stored["quantiles"]], int(stored["pictures"])
+        median, high = quantiles[50], quantiles[99]
+    except (ValueError, LookupError, TypeError):
+        return ""
+    return (
+        f"Reconstructions of {count:,} images it was not trained on have a masked L1 of {median:.4f} in the "
+        f"median and {high:.4f} at the 99th percentile (0..1, best 0)."
+    )

@@ -31,7 +31,7 @@ def write_tensors(
     plain = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
     with disk_errors(file):
         save_file(plain, file, metadata={**(metadata or {}), CHECKSUM: checksum(plain)})
-    Path(file).chmod(0o644)  # safetensors lets nobody else read what it writes
+    Path(file).chmod(0o644)  # safetensors makes files that only their owner can read
 
 
 @contextmanager
@@ -83,7 +83,7 @@ def _unpacked(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
             continue
         value = plain.get(name.removesuffix(UNIT))
         if value is None or value.dtype != torch.int8 or value.ndim != unit.ndim:
-            raise ValueError(f"{name} is the unit of nothing that is there")
+            raise ValueError(f"{name} is the unit of no tensor in the file")
         if any(one not in (1, size) for one, size in zip(unit.shape, value.shape, strict=True)):
             raise ValueError(f"{name} does not fit: {tuple(unit.shape)} beside {tuple(value.shape)}")
         plain[name.removesuffix(UNIT)] = value.float() * unit.float()

@@ -14,7 +14,8 @@ from torch import Generator, Tensor, nn
 from derender.data import PictureSet, split_indices
 from derender.model import Derenderer, load
 from derender.objectives import load_vgg16
-from derender.objectives.perceptual import PerceptualFeatures, build_perceptual
+from derender.objectives.perceptual import build_perceptual
+from derender.objectives.perceptual_features import PerceptualFeatures
 from derender.objectives.self_features import SelfFeatures, load_self_features
 from derender.storage.atomic import DamageNoticed, atomic_file
 from derender.training.batches import some_of

@@ -23,7 +23,7 @@ from derender.data import PictureSet, Split, split_indices, suggestion
 from derender.evaluation.linear_head import head_loss, probabilities
 from derender.evaluation.linear_task import Task, task_of
 from derender.model import Derenderer, load
-from derender.objectives.perceptual import PerceptualFeatures
+from derender.objectives.perceptual_features import PerceptualFeatures
 from derender.storage.atomic import atomic_file, atomic_folder
 from derender.storage.tensors import read_tensors, write_tensors
 from derender.training.config import FinetuneConfig

@@ -57,7 +57,7 @@ def forward(values, weight, bias, slope, epsilon, result, statistics, start, sto
 @kernel
 @no_type_check
 def backward(grad, values, weight, bias, statistics, slope, grad_values, each, start, stop):
-    """Write the derivative by the input, and by weight and bias for each picture (overwrites both)."""
+    """Write the derivative by the input, and by weight and bias for each image (overwrites both)."""
     rows, span = values.shape[1], values.shape[2]
     channels, groups = len(weight), statistics.shape[1]
     width = channels // groups

@@ -1,9 +1,7 @@
 """The rasteriser's inner loops for Numba; importing this module imports Numba.
 
-``choose`` walks each image's triangles in order with a z-buffer (``choose_in`` for one image, which warping
-uses too), ``intersect`` meets each pixel's ray with its triangle, ``intersect_backward`` is the derivative of
-that meeting, by hand. Arithmetic is float64 in the order of operations of ``reference.py``, so that both
-decide alike.
+``project`` and ``choose_in`` work on one image, for warping; ``choose_in`` walks its triangles in order with
+a z-buffer. Arithmetic is float64 in the order of operations of ``reference.py``, so that both decide alike.
 """
 
 from math import ceil, floor
@@ -12,7 +10,7 @@ from typing import no_type_check
 import numpy as np
 
 from derender.render.numba_threads import kernel
-from derender.render.rasterize.rule import (
+from derender.render.rasterize.reference import (
     EDGE_TOLERANCE,
     MAX_COORDINATE_PX,
     MIN_TWICE_AREA_PX2,
@@ -27,7 +25,7 @@ TIED = 1 - TIE_TOLERANCE
 @kernel
 @no_type_check
 def project(points, focal, screen):
-    """Write where points (H, W, 3) land in the picture and their inverse depth, 0 for one left out."""
+    """Write where points (H, W, 3) land in the image and their inverse depth, 0 for one left out."""
     height, width = points.shape[0], points.shape[1]
     centre_u, centre_v = (width - 1) / 2, (height - 1) / 2
     for i in range(height):
@@ -104,87 +102,9 @@ def choose_in(screen, nearest, held, triangle):
 
 @kernel
 @no_type_check
-def choose(vertices, focal, triangle, start, stop):
+def choose(screen, triangle, start, stop):
     """Write the visible triangle of each pixel, or -1."""
-    size = vertices.shape[1], vertices.shape[2]
-    screen, nearest, held = np.empty((3, *size)), np.empty(size), np.empty(size)
+    size = triangle.shape[1], triangle.shape[2]
+    nearest, held = np.empty(size), np.empty(size)
     for n in range(start, stop):
-        project(vertices[n], focal, screen)
-        choose_in(screen, nearest, held, triangle[n])
-
-
-@kernel
-@no_type_check
-def intersect(vertices, focal, triangle, uv, depth, start, stop):
-    """Write canonical pixel coordinates and depth where each pixel's ray meets its triangle."""
-    height, width = vertices.shape[1], vertices.shape[2]
-    centre_u, centre_v = (width - 1) / 2, (height - 1) / 2
-    for n in range(start, stop):
-        for q in range(height):
-            ray_y = (q - centre_v) / focal
-            for p in range(width):
-                index = triangle[n, q, p]
-                if index < 0:
-                    uv[n, q, p, 0] = 0
-                    uv[n, q, p, 1] = 0
-                    depth[n, q, p] = 0
-                    continue
-                ray_x = (p - centre_u) / focal
-                half, i, j = index % 2, index // 2 // (width - 1), index // 2 % (width - 1)
-                i0, j0, i1, j1, i2, j2 = i, j + half, i + half, j + 1, i + 1, j
-                z0, z1, z2 = vertices[n, i0, j0, 2], vertices[n, i1, j1, 2], vertices[n, i2, j2, 2]
-                x0, y0 = vertices[n, i0, j0, 0] - ray_x * z0, vertices[n, i0, j0, 1] - ray_y * z0
-                x1, y1 = vertices[n, i1, j1, 0] - ray_x * z1, vertices[n, i1, j1, 1] - ray_y * z1
-                x2, y2 = vertices[n, i2, j2, 0] - ray_x * z2, vertices[n, i2, j2, 1] - ray_y * z2
-                w0, w1, w2 = x1 * y2 - x2 * y1, x2 * y0 - x0 * y2, x0 * y1 - x1 * y0
-                scale = 1 / (w0 + w1 + w2)
-                uv[n, q, p, 0] = (w0 * j0 + w1 * j1 + w2 * j2) * scale
-                uv[n, q, p, 1] = (w0 * i0 + w1 * i1 + w2 * i2) * scale
-                depth[n, q, p] = (w0 * z0 + w1 * z1 + w2 * z2) * scale
-
-
-@kernel
-@no_type_check
-def intersect_backward(grad_uv, grad_depth, vertices, focal, triangle, grad_vertices, start, stop):
-    """Write the derivative of ``intersect`` with respect to the vertices (overwrites ``grad_vertices``)."""
-    height, width = vertices.shape[1], vertices.shape[2]
-    centre_u, centre_v = (width - 1) / 2, (height - 1) / 2
-    total = np.empty((height, width, 3))
-    for n in range(start, stop):
-        total[:] = 0
-        for q in range(height):
-            ray_y = (q - centre_v) / focal
-            for p in range(width):
-                index = triangle[n, q, p]
-                if index < 0:
-                    continue
-                ray_x = (p - centre_u) / focal
-                half, i, j = index % 2, index // 2 // (width - 1), index // 2 % (width - 1)
-                i0, j0, i1, j1, i2, j2 = i, j + half, i + half, j + 1, i + 1, j
-                z0, z1, z2 = vertices[n, i0, j0, 2], vertices[n, i1, j1, 2], vertices[n, i2, j2, 2]
-                x0, y0 = vertices[n, i0, j0, 0] - ray_x * z0, vertices[n, i0, j0, 1] - ray_y * z0
-                x1, y1 = vertices[n, i1, j1, 0] - ray_x * z1, vertices[n, i1, j1, 1] - ray_y * z1
-                x2, y2 = vertices[n, i2, j2, 0] - ray_x * z2, vertices[n, i2, j2, 1] - ray_y * z2
-                w0, w1, w2 = x1 * y2 - x2 * y1, x2 * y0 - x0 * y2, x0 * y1 - x1 * y0
-                scale = 1 / (w0 + w1 + w2)
-                b0, b1, b2 = w0 * scale, w1 * scale, w2 * scale
-                gu, gv, gz = grad_uv[n, q, p, 0], grad_uv[n, q, p, 1], grad_depth[n, q, p]
-                # Derivatives by the barycentric weights b, then by the unnormalised w, then by q = (x, y).
-                gb0 = gu * j0 + gv * i0 + gz * z0
-                gb1 = gu * j1 + gv * i1 + gz * z1
-                gb2 = gu * j2 + gv * i2 + gz * z2
-                mean = b0 * gb0 + b1 * gb1 + b2 * gb2
-                gw0, gw1, gw2 = (gb0 - mean) * scale, (gb1 - mean) * scale, (gb2 - mean) * scale
-                gx0, gy0 = gw2 * y1 - gw1 * y2, gw1 * x2 - gw2 * x1
-                gx1, gy1 = gw0 * y2 - gw2 * y0, gw2 * x0 - gw0 * x2
-                gx2, gy2 = gw1 * y0 - gw0 * y1, gw0 * x1 - gw1 * x0
-                total[i0, j0, 0] += gx0
-                total[i0, j0, 1] += gy0
-                total[i0, j0, 2] += gz * b0 - ray_x * gx0 - ray_y * gy0
-                total[i1, j1, 0] += gx1
-                total[i1, j1, 1] += gy1
-                total[i1, j1, 2] += gz * b1 - ray_x * gx1 - ray_y * gy1
-                total[i2, j2, 0] += gx2
-                total[i2, j2, 1] += gy2
-                total[i2, j2, 2] += gz * b2 - ray_x * gx2 - ray_y * gy2
-        grad_vertices[n] = total
+        choose_in(screen[:, n], nearest, held, triangle[n])

@@ -1,9 +1,9 @@
 """The rasteriser's definition in plain torch: any device, any floating dtype, arithmetic in float64.
 
-Two steps. ``visible_triangle`` finds, without gradients, the triangle each pixel shows: every triangle is
-paired with the pixels of its bounding box, the pairs are tested, and the nearest kept by scatter reductions.
-``intersect`` then computes, differentiably, where the pixel's ray meets that triangle. Memory is bounded by
-working through pairs ``PAIRS_AT_ONCE`` at a time. Speed is not an aim.
+``project`` finds where vertices land. ``visible_triangles`` finds, without gradients, the triangle each pixel
+shows: every triangle is paired with the pixels of its bounding box, the pairs are tested, and the nearest
+kept by scatter reductions. ``intersect`` then computes, differentiably, where the pixel's ray meets that
+triangle. Memory is bounded by working through pairs ``PAIRS_AT_ONCE`` at a time. Speed is not an aim.
 """
 
 from collections.abc import Iterator
@@ -11,24 +11,33 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-from derender.render.rasterize.rule import (
-    EDGE_TOLERANCE,
-    MAX_COORDINATE_PX,
-    MIN_TWICE_AREA_PX2,
-    NEAR_Z,
-    TIE_TOLERANCE,
-)
+NEAR_Z = 1e-3
+"""Triangles with a vertex at or before this depth are skipped."""
+
+MIN_TWICE_AREA_PX2 = 1e-5
+"""Triangles whose doubled screen area is not above this are skipped: edge-on, or a point."""
+
+MAX_COORDINATE_PX = 1e9
+"""Triangles with a vertex projected farther out are skipped (this also drops infinite ones)."""
+
+EDGE_TOLERANCE = 1e-4
+"""A barycentric weight may be this far below zero; in pixels, that part of a cell."""
+
+TIE_TOLERANCE = 1e-6
+"""Inverse depths this close (relative) count as equal; the triangle with the lowest index wins."""
 
 PAIRS_AT_ONCE = 1 << 20
 
 
-def rasterize(vertices: Tensor, focal_px: float) -> tuple[Tensor, Tensor, Tensor]:
-    """uv (N, H, W, 2), depth (N, H, W) and the visible triangle (N, H, W), -1 where there is none."""
-    triangle = torch.full(vertices.shape[:3], -1, device=vertices.device)
-    for n, mesh in enumerate(vertices.detach().double()):
-        triangle[n] = visible_triangle(mesh, focal_px)
-    uv, depth = intersect(vertices, triangle, focal_px)
-    return uv, depth, triangle
+def project(vertices: Tensor, focal_px: float) -> Tensor:
+    """u, v and inverse depth (3, N, H, W) of vertices in float64; inverse depth 0 marks one left out."""
+    height, width = vertices.shape[1:3]
+    x, y, z = vertices.unbind(-1)
+    inverse_z = 1 / z
+    u = x * inverse_z * focal_px + (width - 1) / 2
+    v = y * inverse_z * focal_px + (height - 1) / 2
+    seen = (z > NEAR_Z) & (u.abs() <= MAX_COORDINATE_PX) & (v.abs() <= MAX_COORDINATE_PX)
+    return torch.where(seen, torch.stack((u, v, inverse_z)), 0)
 
 
 def triangle_corners(height: int, width: int, device: torch.device) -> Tensor:
@@ -40,25 +49,28 @@ def triangle_corners(height: int, width: int, device: torch.device) -> Tensor:
     return torch.stack((upper, lower), 1).view(-1, 3)
 
 
-def visible_triangle(vertices: Tensor, focal_px: float) -> Tensor:
-    """Index of the triangle each pixel of one mesh (H, W, 3) shows, or -1."""
-    height, width, _ = vertices.shape
-    inverse_z = 1 / vertices[..., 2]
-    u = vertices[..., 0] * inverse_z * focal_px + (width - 1) / 2
-    v = vertices[..., 1] * inverse_z * focal_px + (height - 1) / 2
-    corners = triangle_corners(height, width, vertices.device)
-    u, v, inverse_z, z = (value.ravel()[corners] for value in (u, v, inverse_z, vertices[..., 2]))
+def visible_triangles(screen: Tensor) -> Tensor:
+    """Index of the triangle each pixel shows, (N, H, W), or -1, from ``project``'s result."""
+    triangle = torch.full(screen.shape[1:], -1, device=screen.device)
+    for n in range(len(triangle)):
+        triangle[n] = _visible_triangle(*screen[:, n])
+    return triangle
+
+
+def _visible_triangle(u: Tensor, v: Tensor, inverse_z: Tensor) -> Tensor:
+    height, width = u.shape
+    corners = triangle_corners(height, width, u.device)
+    u, v, inverse_z = (value.ravel()[corners] for value in (u, v, inverse_z))
     area = (u[:, 1] - u[:, 0]) * (v[:, 2] - v[:, 0]) - (u[:, 2] - u[:, 0]) * (v[:, 1] - v[:, 0])
-    kept = (z > NEAR_Z).all(-1) & (area.abs() > MIN_TWICE_AREA_PX2)
-    kept &= ((u.abs() <= MAX_COORDINATE_PX) & (v.abs() <= MAX_COORDINATE_PX)).all(-1)
+    kept = (inverse_z != 0).all(-1) & (area.abs() > MIN_TWICE_AREA_PX2)
     kept = kept.nonzero()[:, 0]
     u, v, inverse_z, area = u[kept], v[kept], inverse_z[kept], area[kept]
 
-    nearest = vertices.new_zeros(height * width)
+    nearest = u.new_zeros(height * width)
     for _, pixel, inverse_depth in _covered(u, v, inverse_z, area, height, width):
         nearest.scatter_reduce_(0, pixel, inverse_depth, "amax")
     none = torch.iinfo(torch.long).max
-    first = torch.full((height * width,), none, device=vertices.device)
+    first = torch.full((height * width,), none, device=u.device)
     for chosen, pixel, inverse_depth in _covered(u, v, inverse_z, area, height, width):
         tied = inverse_depth >= nearest[pixel] * (1 - TIE_TOLERANCE)
         first.scatter_reduce_(0, pixel[tied], kept[chosen[tied]], "amin")

@@ -1,10 +1,10 @@
 """The rasteriser's Triton kernels; importing this module imports Triton.
 
-A lane per vertex projects; a lane per triangle walks its bounding box, twice: the first walk leaves each
-pixel's nearest inverse depth, the second the lowest triangle within the tie tolerance of it. Both are
-extremes of integers (a positive float's bits order like the float), so the order of lanes changes nothing.
-A lane per pixel then meets its ray with its triangle, or spreads gradients over the triangle's vertices.
-Arithmetic is float64 in the order of operations of ``reference.py``.
+In ``choose`` a lane per triangle walks its bounding box, twice: the first walk leaves each pixel's nearest
+inverse depth, the second the lowest triangle within the tie tolerance of it. Both are extremes of integers (a
+positive float's bits order like the float), so the order of lanes changes nothing. ``project`` (a vertex),
+``meet`` and ``meet_backward`` (a pixel's ray and its triangle) are parts of warping's kernels. Arithmetic is
+float64 in the order of operations of ``reference.py``.
 """
 
 from typing import no_type_check
@@ -12,8 +12,8 @@ from typing import no_type_check
 import triton
 import triton.language as tl
 
-from derender.render.rasterize import rule
-from derender.render.triton_parts import accumulate, float64, lanes, magnitude, note_largest
+from derender.render.rasterize import reference as rule
+from derender.render.triton_parts import lanes
 
 NEAR_Z = tl.constexpr(rule.NEAR_Z)
 MIN_TWICE_AREA_PX2 = tl.constexpr(rule.MIN_TWICE_AREA_PX2)
@@ -27,7 +27,7 @@ NO_TRIANGLE = tl.constexpr(2**31 - 1)
 @triton.jit
 @no_type_check
 def project(x, y, z, focal, place, live, us, vs, inverse_zs, height, width):
-    """Write where vertices land in the picture and their inverse depth; 0 for that marks one left out."""
+    """Write where vertices land in the image and their inverse depth; 0 for that marks one left out."""
     seen = z > NEAR_Z
     inverse_z = 1 / tl.where(seen, z, 1.0)
     u = x * inverse_z * focal + (width - 1) * 0.5
@@ -36,17 +36,6 @@ def project(x, y, z, focal, place, live, us, vs, inverse_zs, height, width):
     tl.store(us + place, tl.where(seen, u, 0.0), mask=live)
     tl.store(vs + place, tl.where(seen, v, 0.0), mask=live)
     tl.store(inverse_zs + place, tl.where(seen, inverse_z, 0.0), mask=live)
-
-
-@triton.jit
-@no_type_check
-def project_vertices(vertices, us, vs, inverse_zs, focal_bits, height, width, BLOCK: tl.constexpr):
-    image, pixel, live = lanes(height * width, BLOCK)
-    place = image * height * width + pixel
-    x = tl.load(vertices + place * 3, mask=live, other=0).to(tl.float64)
-    y = tl.load(vertices + place * 3 + 1, mask=live, other=0).to(tl.float64)
-    z = tl.load(vertices + place * 3 + 2, mask=live, other=0).to(tl.float64)
-    project(x, y, z, float64(focal_bits), place, live, us, vs, inverse_zs, height, width)
 
 
 @triton.jit
@@ -140,83 +129,3 @@ def meet_backward(gb0, gb1, gb2, b0, b1, b2, scale, x0, y0, x1, y1, x2, y2):
     gx1, gy1 = gw0 * y2 - gw2 * y0, gw2 * x0 - gw0 * x2
     gx2, gy2 = gw1 * y0 - gw0 * y1, gw0 * x1 - gw1 * x0
     return gx0, gy0, gx1, gy1, gx2, gy2
-
-
-@triton.jit
-@no_type_check
-def vertex(vertices, place, seen):
-    x = tl.load(vertices + place * 3, mask=seen, other=0).to(tl.float64)
-    y = tl.load(vertices + place * 3 + 1, mask=seen, other=0).to(tl.float64)
-    return x, y, tl.load(vertices + place * 3 + 2, mask=seen, other=0).to(tl.float64)
-
-
-@triton.jit
-@no_type_check
-def intersect(vertices, triangle, uv, depth, focal_bits, height, width, BLOCK: tl.constexpr):
-    """Write canonical coordinates and depth; turn the mark of a pixel without triangle into -1."""
-    image, pixel, live = lanes(height * width, BLOCK)
-    base, focal = image * height * width, float64(focal_bits)
-    index = tl.load(triangle + base + pixel, mask=live, other=NO_TRIANGLE)
-    seen = index != NO_TRIANGLE
-    i0, j0, i1, j1, i2, j2 = corners(tl.where(seen, index, 0), width)
-    x0, y0, z0 = vertex(vertices, base + i0 * width + j0, seen)
-    x1, y1, z1 = vertex(vertices, base + i1 * width + j1, seen)
-    x2, y2, z2 = vertex(vertices, base + i2 * width + j2, seen)
-    ray_x = (pixel % width - (width - 1) * 0.5).to(tl.float64) / focal
-    ray_y = (pixel // width - (height - 1) * 0.5).to(tl.float64) / focal
-    b0, b1, b2, _, _, _, _, _, _, _ = meet(ray_x, ray_y, x0, y0, z0, x1, y1, z1, x2, y2, z2, seen)
-    kind = uv.dtype.element_ty
-    u, v = b0 * j0 + b1 * j1 + b2 * j2, b0 * i0 + b1 * i1 + b2 * i2
-    tl.store(uv + (base + pixel) * 2, tl.where(seen, u, 0.0).to(kind), mask=live)
-    tl.store(uv + (base + pixel) * 2 + 1, tl.where(seen, v, 0.0).to(kind), mask=live)
-    z = b0 * z0 + b1 * z1 + b2 * z2
-    tl.store(depth + base + pixel, tl.where(seen, z, 0.0).to(kind), mask=live)
-    tl.store(triangle + base + pixel, tl.where(seen, index, -1), mask=live)
-
-
-@triton.jit
-@no_type_check
-def intersect_backward(
-    grad_uv, grad_depth, vertices, triangle, grad_vertices, units, largest, focal_bits, height, width,
-    MODE: tl.constexpr, BLOCK: tl.constexpr,
-):  # fmt: skip
-    """Add the derivative of ``intersect`` to ``grad_vertices``, or note the largest summand of each image."""
-    image, pixel, live = lanes(height * width, BLOCK)
-    base, focal = image * height * width, float64(focal_bits)
-    index = tl.load(triangle + base + pixel, mask=live, other=-1)
-    seen = index >= 0
-    i0, j0, i1, j1, i2, j2 = corners(tl.where(seen, index, 0), width)
-    place0, place1, place2 = base + i0 * width + j0, base + i1 * width + j1, base + i2 * width + j2
-    x0, y0, z0 = vertex(vertices, place0, seen)
-    x1, y1, z1 = vertex(vertices, place1, seen)
-    x2, y2, z2 = vertex(vertices, place2, seen)
-    ray_x = (pixel % width - (width - 1) * 0.5).to(tl.float64) / focal
-    ray_y = (pixel // width - (height - 1) * 0.5).to(tl.float64) / focal
-    b0, b1, b2, scale, x0, y0, x1, y1, x2, y2 = meet(ray_x, ray_y, x0, y0, z0, x1, y1, z1, x2, y2, z2, seen)
-    gu = tl.load(grad_uv + (base + pixel) * 2, mask=seen, other=0).to(tl.float64)
-    gv = tl.load(grad_uv + (base + pixel) * 2 + 1, mask=seen, other=0).to(tl.float64)
-    gz = tl.load(grad_depth + base + pixel, mask=seen, other=0).to(tl.float64)
-    gb0 = gu * j0 + gv * i0 + gz * z0
-    gb1 = gu * j1 + gv * i1 + gz * z1
-    gb2 = gu * j2 + gv * i2 + gz * z2
-    gx0, gy0, gx1, gy1, gx2, gy2 = meet_backward(gb0, gb1, gb2, b0, b1, b2, scale, x0, y0, x1, y1, x2, y2)
-    gz0 = gz * b0 - ray_x * gx0 - ray_y * gy0
-    gz1 = gz * b1 - ray_x * gx1 - ray_y * gy1
-    gz2 = gz * b2 - ray_x * gx2 - ray_y * gy2
-    if MODE == 1:
-        most = tl.maximum(tl.maximum(magnitude(gx0, seen), magnitude(gy0, seen)), magnitude(gz0, seen))
-        most = tl.maximum(tl.maximum(magnitude(gx1, seen), magnitude(gy1, seen)), most)
-        most = tl.maximum(tl.maximum(magnitude(gx2, seen), magnitude(gy2, seen)), most)
-        most = tl.maximum(tl.maximum(magnitude(gz1, seen), magnitude(gz2, seen)), most)
-        note_largest(largest + image, most)
-    else:
-        unit = tl.load(units + image)
-        accumulate(grad_vertices + place0 * 3, gx0, seen, unit, MODE)
-        accumulate(grad_vertices + place0 * 3 + 1, gy0, seen, unit, MODE)
-        accumulate(grad_vertices + place0 * 3 + 2, gz0, seen, unit, MODE)
-        accumulate(grad_vertices + place1 * 3, gx1, seen, unit, MODE)
-        accumulate(grad_vertices + place1 * 3 + 1, gy1, seen, unit, MODE)
-        accumulate(grad_vertices + place1 * 3 + 2, gz1, seen, unit, MODE)
-        accumulate(grad_vertices + place2 * 3, gx2, seen, unit, MODE)
-        accumulate(grad_vertices + place2 * 3 + 1, gy2, seen, unit, MODE)
-        accumulate(grad_vertices + place2 * 3 + 2, gz2, seen, unit, MODE)

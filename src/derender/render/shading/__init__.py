@@ -1,20 +1,18 @@
 """Shade the canonical view: albedo times Lambertian shading of the depth map's normals.
 
 ``reference`` composes the scene's own functions, which define what is computed; ``numba`` and ``triton`` go
-over the picture once forward and twice backward and store no normals.
+over the image once forward and twice backward and store no normals.
 """
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from derender.render.rasterize import chosen_backend
-from derender.render.shading import numba_cpu, triton_gpu
+from derender.render.backends import chosen_backend
+from derender.render.shading.operators import FORWARD
 from derender.scene.camera import focal_px
 from derender.scene.light import lambert_shading, light_direction
 from derender.scene.normals import normals_from_depth
-
-IMPLEMENTATIONS = {"numba": numba_cpu, "triton": triton_gpu}
 
 
 def shade(
@@ -29,4 +27,4 @@ def shade(
     if chosen == "reference":
         return albedo * lambert_shading(normals_from_depth(depth, fov_deg), light)
     lamp = torch.cat((light[:, :2], light_direction(light)), dim=1)
-    return IMPLEMENTATIONS[chosen].shade(depth, albedo, lamp, focal_px(depth.shape[2], fov_deg))
+    return FORWARD[chosen](depth, albedo, lamp, focal_px(depth.shape[2], fov_deg))

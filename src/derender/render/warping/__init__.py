@@ -1,19 +1,17 @@
 """Show a canonical image, painted on the surface of a depth map, to a camera.
 
-The surface's grid mesh is moved, rasterised (``rasterize``), and its colours looked up (``sample``).
-``reference`` composes the definitions of those two; ``numba`` and ``triton`` do it all in one pass over the
-picture, storing neither the moved points nor the canonical coordinates. They give the same picture, but for
-rounding, and the same gradients.
+The surface's grid mesh is moved, rasterised (``rasterize``), and its colours looked up. ``reference``
+composes the definitions of those; ``numba`` and ``triton`` do it all in one pass over the image, storing
+neither the moved points nor the canonical coordinates. They give the same image, but for rounding, and the
+same gradients.
 """
 
 from jaxtyping import Float
 from torch import Tensor
 
-from derender.render.rasterize import chosen_backend
-from derender.render.warping import numba_cpu, reference, triton_gpu
-from derender.scene.camera import motion
-
-IMPLEMENTATIONS = {"reference": reference, "numba": numba_cpu, "triton": triton_gpu}
+from derender.render.backends import chosen_backend
+from derender.render.warping import operators, reference
+from derender.scene.camera import focal_px, motion
 
 
 def warp(
@@ -23,6 +21,9 @@ def warp(
     fov_deg: float,
     backend: str = "auto",
 ) -> tuple[Float[Tensor, "n c h w"], Float[Tensor, "n h w"], Float[Tensor, "n h w"]]:
-    """Picture, depth and mask as the camera sees them; 0 where nothing is seen."""
-    implementation = IMPLEMENTATIONS[chosen_backend(depth.device, backend)]
-    return implementation.warp(image, depth, *motion(camera.double()), fov_deg)
+    """Image, depth and mask as the camera sees them; 0 where nothing is seen."""
+    rotation, offset = motion(camera.double())
+    chosen = chosen_backend(depth.device, backend)
+    if chosen == "reference":
+        return reference.warp(image, depth, rotation, offset, fov_deg)
+    return operators.FORWARD[chosen](image, depth, rotation, offset, focal_px(depth.shape[2], fov_deg))[:3]

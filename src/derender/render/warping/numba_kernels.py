@@ -1,7 +1,7 @@
-"""Warping's inner loops for Numba: from depth map and motion to the picture; importing this imports Numba.
+"""Warping's inner loops for Numba: from depth map and motion to the image; importing this imports Numba.
 
-Where the surface lands and what a pixel shows is float64 arithmetic; colours are computed in the picture's
-own dtype. The moved points of one image at a time stand in scratch memory and stay in the processor's cache.
+Where the surface lands and what a pixel shows is float64 arithmetic; colours are computed in the image's
+own dtype. The moved points of one image at a time are in scratch memory and stay in the processor's cache.
 """
 
 from typing import no_type_check
@@ -33,7 +33,7 @@ def move(depth, rotation, offset, focal, points):
 @kernel
 @no_type_check
 def forward(image, depth, rotation, offset, focal, colour, seen_depth, mask, triangle, start, stop):
-    """Write the picture, its depth and mask, and the triangle each pixel shows."""
+    """Write the image, its depth and mask, and the triangle each pixel shows."""
     channels, height, width = image.shape[1], image.shape[2], image.shape[3]
     centre_u, centre_v = (width - 1) / 2, (height - 1) / 2
     pixels, kind = height * width, image.dtype.type
@@ -72,7 +72,7 @@ def forward(image, depth, rotation, offset, focal, colour, seen_depth, mask, tri
                 scale = 1 / (w0 + w1 + w2)
                 distance[at] = (w0 * z0 + w1 * z1 + w2 * z2) * scale
                 covered[at] = 1
-                # in the picture's dtype, in which the identity camera's coordinates are whole
+                # in the image's dtype, in which the identity camera's coordinates are whole
                 u, v = kind(j + (w0 * half + w1) * scale), kind(i + (w1 * half + w2) * scale)
                 left, top = corner(u, width), corner(v, height)
                 across, down = u - kind(left), v - kind(top)

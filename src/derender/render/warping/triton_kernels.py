@@ -1,9 +1,9 @@
-"""From a depth map and a camera's motion to the picture, in Triton; importing this module imports Triton.
+"""From a depth map and a camera's motion to the image, in Triton; importing this module imports Triton.
 
 ``project_depth`` finds where the surface's vertices land; the rasteriser's ``choose`` then decides what each
 pixel shows; ``show`` meets the pixel's ray with its triangle and looks the colour up, all in one lane.
 ``show_backward`` is the derivative of ``show``. Points are never stored: a vertex is rotation times its ray
-times its depth, plus offset, in float64. Colours are computed in the picture's own dtype.
+times its depth, plus offset, in float64. Colours are computed in the image's own dtype.
 """
 
 from typing import no_type_check
@@ -12,8 +12,43 @@ import triton
 import triton.language as tl
 
 from derender.render.rasterize.triton_kernels import NO_TRIANGLE, corners, meet, meet_backward, project
-from derender.render.sample.triton_kernels import cell, look_up, spread
 from derender.render.triton_parts import accumulate, float64, lanes, magnitude, note_largest
+
+
+@triton.jit
+@no_type_check
+def cell(u, v, height, width):
+    """Row and column of the cell that holds (u, v), border cells continued, and where in it the point lies.
+
+    Coordinates are clipped before they become integers: a NaN must not become an address.
+    """
+    j = tl.where(u > 0, tl.minimum(u, width - 2), 0.0).to(tl.int32)
+    i = tl.where(v > 0, tl.minimum(v, height - 2), 0.0).to(tl.int32)
+    return i, j, u - j, v - i
+
+
+@triton.jit
+@no_type_check
+def look_up(image, place, across, down, width, seen):
+    """The value at a point, and its derivatives along u and v."""
+    a = tl.load(image + place, mask=seen, other=0)
+    b = tl.load(image + place + 1, mask=seen, other=0)
+    c = tl.load(image + place + width, mask=seen, other=0)
+    d = tl.load(image + place + width + 1, mask=seen, other=0)
+    upper, lower = a * (1 - across) + b * across, c * (1 - across) + d * across
+    along_u = (b - a) * (1 - down) + (d - c) * down
+    along_v = (c - a) * (1 - across) + (d - b) * across
+    return upper * (1 - down) + lower * down, along_u, along_v
+
+
+@triton.jit
+@no_type_check
+def spread(grad_image, place, gradient, across, down, width, seen, unit, MODE: tl.constexpr):
+    """Add a pixel's gradient to the four values it was made of."""
+    accumulate(grad_image + place, gradient * (1 - across) * (1 - down), seen, unit, MODE)
+    accumulate(grad_image + place + 1, gradient * across * (1 - down), seen, unit, MODE)
+    accumulate(grad_image + place + width, gradient * (1 - across) * down, seen, unit, MODE)
+    accumulate(grad_image + place + width + 1, gradient * across * down, seen, unit, MODE)
 
 
 @triton.jit

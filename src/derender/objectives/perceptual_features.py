@@ -1,0 +1,177 @@
+"""Frozen perceptual features: what every extractor shares, and VGG16 up to relu3_3 from weights on disk.
+
+An extractor normalises images in 0..1, runs ``features``, and divides by one number measured on a calibration
+batch, so that confidence terms mean the same whichever weights are used. Source of VGG16: Simonyan &
+Zisserman 2015 (configuration D); layer choice of unsup3d (Wu et al., CVPR 2020). Layer numbers and key names
+(``features.0.weight`` ...) are torchvision's. Leaves out the loss (perceptual.py), self-supervised features
+(self_features.py), everything after relu3_3, and downloading.
+"""
+
+import pickle
+import zipfile
+import zlib
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from safetensors import SafetensorError
+from safetensors.torch import load_file
+from torch import Tensor, nn
+
+from derender.storage.tensors import refuse_old_torch
+
+IMAGENET_MEAN = (0.485, 0.456, 0.406)
+IMAGENET_STD = (0.229, 0.224, 0.225)
+WHERE_TO_GET_IT = (
+    "save https://download.pytorch.org/models/vgg16-397923af.pth (torchvision's ImageNet weights, 528 MB) "
+    "in torch hub's cache, or anywhere and give its path"
+)
+# what the readers raise on bytes that are not theirs, the last three from torch.load's restricted unpickler
+_DAMAGED = (
+    zipfile.BadZipFile,
+    zlib.error,
+    SafetensorError,
+    pickle.UnpicklingError,
+    RuntimeError,
+    EOFError,
+    OSError,
+    ValueError,
+    LookupError,
+    AttributeError,
+    TypeError,
+)
+_WIDTHS = (64, 64, "pool", 128, 128, "pool", 256, 256, 256)
+
+
+class PerceptualFeatures(nn.Module):
+    """A frozen net from images in 0..1 to feature maps; always in evaluation mode, never trained further.
+
+    Attributes:
+        kind: the name under which ``build_perceptual`` makes it.
+        stride: pixels per feature location.
+        channels: channels of the feature map.
+    """
+
+    kind: str
+    stride: int
+    channels: int
+    scale: Tensor
+    image_mean: Tensor
+    image_std: Tensor
+
+    def __init__(self, features: nn.Sequential, image_mean: tuple[float, ...], image_std: tuple[float, ...]):
+        super().__init__()
+        self.features = features
+        self.register_buffer("scale", torch.ones(()))
+        self.register_buffer("image_mean", torch.tensor(image_mean).view(1, 3, 1, 1))
+        self.register_buffer("image_std", torch.tensor(image_std).view(1, 3, 1, 1))
+        self.requires_grad_(False)
+        self.eval()
+
+    def forward(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n c fh fw"]:
+        """Calibrated features, with gradient to the images (never to the weights)."""
+        return self.features((images - self.image_mean) / self.image_std) * self.scale
+
+    @torch.no_grad()
+    def target(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n c fh fw"]:
+        """The same without gradient, for the images that a rendering is compared with."""
+        return self(images)
+
+    @torch.no_grad()
+    def calibrate_(self, images: Float[Tensor, "n 3 h w"]) -> "PerceptualFeatures":
+        """Set the scale so that on these images the features' standard deviation about channel means is 1.
+
+        It is pooled over channels (one number for all), so relations between channels stay, and two unrelated
+        locations differ by a mean square of about 2. A few hundred images are enough.
+        """
+        self.scale.fill_(1.0)
+        count = 0
+        total = square = torch.zeros(self.channels, dtype=torch.float64, device=images.device)
+        for batch in images.split(16):
+            features = self(batch).double()
+            count += features.numel() // self.channels
+            total = total + features.sum(dim=(0, 2, 3))
+            square = square + features.square().sum(dim=(0, 2, 3))
+        deviation = (square / count - (total / count).square()).clamp(min=0).mean().sqrt().item()
+        if not 1e-8 < deviation < float("inf"):
+            raise ValueError(
+                f"the perceptual features do not vary over {len(images)} calibration images (standard "
+                f"deviation {deviation:g}); give images that differ, or check the weights"
+            )
+        self.scale.fill_(1.0 / deviation)
+        return self
+
+    def train(self, mode: bool = True) -> "PerceptualFeatures":
+        """Stay in evaluation mode, whatever the model around it does."""
+        return super().train(False)
+
+
+class Vgg16Features(PerceptualFeatures):
+    """relu3_3 of VGG16: 256 channels at a quarter of the resolution."""
+
+    kind = "vgg16"
+    stride = 4
+    channels = 256
+
+    def __init__(self):
+        layers: list[nn.Module] = []
+        channels = 3
+        for width in _WIDTHS:
+            if isinstance(width, str):
+                layers.append(nn.MaxPool2d(2))
+            else:
+                layers += [nn.Conv2d(channels, width, 3, padding=1), nn.ReLU(inplace=True)]
+                channels = width
+        super().__init__(nn.Sequential(*layers), IMAGENET_MEAN, IMAGENET_STD)
+
+
+def load_vgg16(path: Path | str | None = None) -> Vgg16Features:
+    """VGG16's first seven convolutions from .npz, .safetensors or .pth; None looks in torch hub's cache.
+
+    Keys beyond relu3_3 are ignored. A ``.pth`` is read with ``weights_only=True``, so it cannot run code.
+    """
+    path = _cached_weights() if path is None else Path(path).expanduser()
+    if not path.is_file():
+        raise ValueError(f"no VGG16 weights at {path}: {WHERE_TO_GET_IT}")
+    found = _read_weights(path)
+    if not isinstance(found, dict):
+        raise ValueError(
+            f"{path} holds no named weights, so it is not torchvision's VGG16: {WHERE_TO_GET_IT}"
+        )
+    net = Vgg16Features()
+    expected = {name: value for name, value in net.state_dict().items() if name.startswith("features.")}
+    for name, value in expected.items():
+        if name not in found:
+            raise ValueError(f"{path} has no {name!r}, so it is not torchvision's VGG16: {WHERE_TO_GET_IT}")
+        if found[name].shape != value.shape:
+            raise ValueError(
+                f"{name} in {path} has shape {tuple(found[name].shape)}, VGG16 needs {tuple(value.shape)}: "
+                f"{WHERE_TO_GET_IT}"
+            )
+    net.load_state_dict({**net.state_dict(), **{name: found[name].float() for name in expected}})
+    return net
+
+
+def _cached_weights() -> Path:
+    folder = Path(torch.hub.get_dir()) / "checkpoints"
+    candidates = sorted(folder.glob("vgg16-*.pth"))
+    if not candidates:
+        raise ValueError(f"no vgg16-*.pth in torch hub's cache {folder}: {WHERE_TO_GET_IT}")
+    return candidates[0]
+
+
+def _read_weights(path: Path) -> object:
+    try:
+        match path.suffix.lower():
+            case ".npz":
+                with np.load(path, allow_pickle=False) as archive:
+                    return {name: torch.from_numpy(archive[name]) for name in archive.files}
+            case ".safetensors":
+                return load_file(path)
+            case ".pth" | ".pt":
+                refuse_old_torch(path)
+                return torch.load(path, map_location="cpu", weights_only=True)
+    except _DAMAGED as problem:
+        raise ValueError(f"VGG16 weights in {path} cannot be read ({problem})") from problem
+    raise ValueError(f"VGG16 weights in {path}: expected a .npz, .safetensors or .pth file")
