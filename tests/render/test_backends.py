@@ -106,23 +106,6 @@ def test_backends_choose_the_same_triangle(backend, dtype, generator):
 
 
 @fast
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_rasterizing_agrees(backend, dtype, generator, nan_filled_memory):
-    """Coordinates, depth and the gradient of every vertex, where layers hide each other."""
-    depth, _, _, pose = scene(3, 9, 14, generator, dtype, turn_rad=1.2)
-    vertices = to_camera(unproject(depth, FOV_DEG), pose)
-    kept = []
-    for name in ("reference", backend):
-        points = vertices.clone().requires_grad_()
-        seen = rasterize(points, focal_px(14, FOV_DEG), name)
-        outputs = (seen.uv, seen.depth)
-        kept.append((*outputs, *gradients_with(torch.Generator().manual_seed(1), outputs, [points])))
-    assert 0.2 < (kept[0][1] > 0).float().mean() < 1
-    for name, expected, actual in zip(("uv", "depth", "d/d vertices"), *kept, strict=True):
-        assert_agrees(actual, expected, name)
-
-
-@fast
 def test_identity_camera_takes_the_first_triangle_of_each_vertex(backend, generator):
     vertices = unproject(smooth_depth(1, 6, 6, generator), FOV_DEG)
     screen = reference.project(vertices.double(), focal_px(6, FOV_DEG)).to(device_of(backend))

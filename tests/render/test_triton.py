@@ -31,7 +31,6 @@ INTERPRETED = (
     "test_backends.py::test_backends_agree[3-17-23-dtype0-triton]",
     "test_backends.py::test_backends_agree[5-3-9-dtype1-triton]",
     "test_backends.py::test_backends_choose_the_same_triangle[dtype1-triton]",
-    "test_backends.py::test_rasterizing_agrees[dtype0-triton]",
     "test_backends.py::test_warping_agrees_for_any_number_of_channels[dtype0-3-triton]",
     "test_triton.py::test_several_programs_for_an_image_change_nothing",
     "test_triton.py::test_where_nothing_is_added_repeatable_gradients_are_nothing",

@@ -1,11 +1,15 @@
-"""Tensors on disk: bytes with a unit come back as numbers, what does not fit is refused, others may read."""
+"""Tensors on disk: bytes with a unit come back as numbers, misfits are refused; pickles need a new PyTorch."""
 
 import stat
 
 import pytest
 import torch
+from torch.torch_version import TorchVersion
 
-from derender.storage.tensors import UNIT, packed, read_tensors, write_tensors
+from derender.baselines.published import read_weights
+from derender.networks.unsup3d import read_checkpoint
+from derender.objectives.perceptual_features import load_vgg16
+from derender.storage.tensors import UNIT, packed, read_tensors, reads_safely, write_tensors
 
 
 @pytest.mark.parametrize("along", [0, 1])
@@ -44,3 +48,23 @@ def test_units_that_do_not_fit_are_refused(tmp_path, tensors, said):
 def test_others_may_read_what_is_written(tmp_path):
     write_tensors({"a": torch.ones(2)}, tmp_path / "t.safetensors")
     assert stat.S_IMODE((tmp_path / "t.safetensors").stat().st_mode) == 0o644
+
+
+@pytest.mark.parametrize(
+    "version, safe", [("2.6.0+cpu", False), ("2.9.1", False), ("2.10.0", True), ("2.13.0+cpu", True)]
+)
+def test_torch_is_trusted_from_2_10_on(version, safe, monkeypatch):
+    monkeypatch.setattr(torch, "__version__", TorchVersion(version))
+    assert reads_safely() is safe
+
+
+@pytest.mark.parametrize(
+    "read", [load_vgg16, read_checkpoint, lambda file: read_weights(file, "the published file")]
+)
+def test_an_older_one_is_not_asked(read, tmp_path, monkeypatch):
+    file = tmp_path / "weights.pth"
+    torch.save({"weight": torch.zeros(1)}, file)
+    monkeypatch.setattr(torch, "__version__", TorchVersion("2.9.1+cu128"))
+    monkeypatch.setattr(torch, "load", lambda *_, **__: pytest.fail("the file was opened"))
+    with pytest.raises(ValueError, match=r"PyTorch 2\.9\.1\+cu128 can be made to run code.*PyTorch 2\.10\.0"):
+        read(file)
