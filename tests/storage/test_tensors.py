@@ -1,4 +1,4 @@
-"""Tensors on disk: bytes with a unit come back as numbers, misfits are refused; pickles need a new PyTorch."""
+"""Tensors on disk: bytes with a unit come back as numbers, or are refused; pickles need a new PyTorch."""
 
 import stat
 

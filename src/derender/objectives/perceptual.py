@@ -13,13 +13,12 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 from torch.nn import functional
 
-from derender.objectives.perceptual_features import PerceptualFeatures, load_vgg16
+from derender.objectives.perceptual_features import CALIBRATION_IMAGES, PerceptualFeatures, load_vgg16
 from derender.objectives.reconstruction import at_least_float32, bounded_sigma, masked_mean
 from derender.objectives.self_features import train_self_features
 
 PerceptualKind = Literal["vgg16", "self", "none"]
 PERCEPTUAL_KINDS: tuple[PerceptualKind, ...] = ("vgg16", "self", "none")
-CALIBRATION_PICTURES = 256
 
 
 def perceptual_loss(
@@ -75,7 +74,7 @@ def build_perceptual(
         case "vgg16":
             features = load_vgg16(weights).to(device)
             if images is not None:
-                features.calibrate_(images[:CALIBRATION_PICTURES].to(device).float() / 255)
+                features.calibrate_(images[:CALIBRATION_IMAGES].to(device).float() / 255)
             return features
         case "self":
             if images is None:

@@ -21,6 +21,7 @@ from torch import Tensor, nn
 
 from derender.storage.tensors import refuse_old_torch
 
+CALIBRATION_IMAGES = 256
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
 WHERE_TO_GET_IT = (

@@ -21,12 +21,11 @@ from jaxtyping import Float, Int64, UInt8
 from torch import Generator, Tensor, nn
 
 from derender.objectives.loocc import nt_xent
-from derender.objectives.perceptual_features import PerceptualFeatures
+from derender.objectives.perceptual_features import CALIBRATION_IMAGES, PerceptualFeatures
 from derender.storage.tensors import read_described, write_tensors
 
 DEFAULT_WIDTHS = (16, 32, 64)
 DEFAULT_STEPS = 600
-_CALIBRATION_PICTURES = 256
 
 
 class SelfFeatures(PerceptualFeatures):
@@ -125,6 +124,7 @@ class SelfTraining:
     weight_decay: float = 1e-4
 
 
+@torch.random.fork_rng(devices=[])  # building layers draws from the global state
 def train_self_features(
     images: UInt8[Tensor, "n 3 h w"],
     *,
@@ -144,21 +144,9 @@ def train_self_features(
     steps = DEFAULT_STEPS if steps is None else steps
     if steps < 1:
         raise ValueError(f"training perceptual features needs at least 1 step, got {steps}")
-    with torch.random.fork_rng(devices=[]):  # building layers draws from the global state before we do
-        return _trained(images, Generator().manual_seed(seed), steps, progress, device, settings)
-
-
-def _trained(
-    images: UInt8[Tensor, "n 3 h w"],
-    generator: Generator,
-    steps: int,
-    progress: Callable[[int, int, float], None] | None,
-    device: torch.device | str,
-    settings: SelfTraining,
-) -> SelfFeatures:
-    layers, head = _initialised(settings, generator)
-    layers, head = layers.to(device).train(), head.to(device).train()
-    frame = SelfFeatures(settings.widths).to(device)
+    generator = Generator().manual_seed(seed)
+    net = SelfFeatures(settings.widths).to(device)
+    layers, head = (module.to(device).train() for module in _initialised(settings, generator))
     parameters = [*layers.parameters(), *head.parameters()]
     optimiser = torch.optim.AdamW(parameters, settings.learning_rate, weight_decay=settings.weight_decay)
     schedule = torch.optim.lr_scheduler.OneCycleLR(
@@ -168,11 +156,10 @@ def _trained(
     order = endless_order(len(images), generator)
     for step in range(steps):
         rows = torch.tensor([next(order) for _ in range(batch)])
-        pictures = images[rows].to(device).float() / 255
-        pair = two_views(pictures, settings.crop, SelfFeatures.stride, settings.places, generator)
-        views = (torch.cat([pair.first, pair.second]) - frame.image_mean) / frame.image_std
-        codes = head(layers(views.contiguous(memory_format=torch.channels_last)))
-        first, second = codes.chunk(2)
+        crops = images[rows].to(device).float() / 255
+        pair = two_views(crops, settings.crop, SelfFeatures.stride, settings.places, generator)
+        views = (torch.cat([pair.first, pair.second]) - net.image_mean) / net.image_std
+        first, second = head(layers(views.contiguous(memory_format=torch.channels_last))).chunk(2)
         loss = nt_xent(_at(first, pair.first_places), _at(second, pair.second_places), settings.temperature)
         optimiser.zero_grad(set_to_none=True)
         loss.backward()
@@ -185,10 +172,8 @@ def _trained(
             f"learning perceptual features ended in weights that are NaN or infinite after {steps} steps: "
             "give another seed, or perceptual=none"
         )
-    net = SelfFeatures(settings.widths)
     net.features.load_state_dict(without_normalisation(layers.cpu().eval(), settings.widths).state_dict())
-    rows = torch.randperm(len(images), generator=generator)[:_CALIBRATION_PICTURES]
-    net.to(device)
+    rows = torch.randperm(len(images), generator=generator)[:CALIBRATION_IMAGES]
     net.calibrate_(images[rows].to(device).float() / 255)
     return net
 
