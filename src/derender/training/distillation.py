@@ -23,7 +23,7 @@ from torch import Generator, Tensor, nn
 from derender.data import as_float
 from derender.model import Derenderer
 from derender.objectives.reconstruction import masked_l1
-from derender.objectives.self_training import endless_order
+from derender.objectives.self_features import endless_order
 from derender.postprocess.fitting import PARAMETERS, STEPS
 from derender.postprocess.morphable import MorphableMaps
 from derender.scene import Scene
@@ -36,8 +36,8 @@ from derender.scene.crop import (
     random_crops,
     ranges_for_crops,
 )
-from derender.scene.mirror import seen_in_mirror
 from derender.scene.perturb import PerturbSettings, perturb_camera, perturb_light
+from derender.scene.scene import seen_in_mirror
 from derender.settings import Settings
 from derender.training.config import FeatureSettings
 from derender.training.features import Progress, make_features

@@ -25,7 +25,7 @@ from derender.networks import Factor
 from derender.postprocess import Features
 from derender.postprocess.fitting import PARAMETERS, Fitting, FittingSettings
 from derender.postprocess.morphable import MorphableMaps
-from derender.postprocess.whitening import Spread, Whitening, contrast
+from derender.postprocess.whitening import Scatter, Whitening, fit_projection
 from derender.scene import Scene
 from derender.scene.perturb import PerturbSettings
 from derender.training.config import FeatureSettings, WhiteningSettings
@@ -135,8 +135,8 @@ def fit_whitening(
     encode = describe or (model.activations if settings.spatial else model.encode)
     moving = [factor for factor in model.factors if not factor.mirrored]
     vectors = moving if describe is None and settings.vectors else []
-    mirrored: dict[str, Spread] = {}
-    alone: dict[str, Spread] = {}
+    mirrored: dict[str, Scatter] = {}
+    alone: dict[str, Scatter] = {}
     with _evaluating(model), torch.no_grad():
         for start, batch in _batches(model, images, rows, progress):
             scene = model.decompose(batch)
@@ -153,21 +153,21 @@ def fit_whitening(
                 )
             for name in names:
                 joined = torch.stack([view[name].float() for view in views])
-                mirrored.setdefault(name, Spread()).add(joined)
+                mirrored.setdefault(name, Scatter()).add(joined)
             for factor in vectors if len(batch) > 1 else ():  # maps are exchanged within the batch
                 rest = [other for other in model.factors if other.name != factor.name]
                 shown = _renderings(model, scene, batch, rest, perturb, others, settings.views)
                 codes = [model.nets[factor.name].encode(one).float() for one in shown]  # type: ignore[operator]
-                alone.setdefault(factor.name, Spread()).add(torch.stack(codes))
+                alone.setdefault(factor.name, Scatter()).add(torch.stack(codes))
     if describe is None:
         size = size or model.settings.network.code_size
     contrasts = {
-        name: contrast(spread, settings.directions, settings.shrinkage, size, settings.evenness)
-        for name, spread in mirrored.items()
+        name: fit_projection(scatter, settings.directions, settings.shrinkage, size, settings.evenness)
+        for name, scatter in mirrored.items()
     }
     contrasts |= {
-        name: contrast(spread, len(spread.mean), settings.shrinkage, power=settings.vector_power)
-        for name, spread in alone.items()
+        name: fit_projection(scatter, len(scatter.mean), settings.shrinkage, power=settings.vector_power)
+        for name, scatter in alone.items()
     }
     return Whitening(contrasts, mirrored=mirrored if settings.mirrored else ()).to(model.device)
 
@@ -190,10 +190,10 @@ def recentre(
     totals = dict.fromkeys(whitening.names, torch.zeros((), dtype=torch.float64))
     for _, batch in _batches(model, images, torch.arange(len(images)), progress):
         for name, total in totals.items():
-            taken = whitening.taken(name, model.factor_activations(name, batch))
+            taken = whitening.inputs(name, model.factor_activations(name, batch))
             totals[name] = total + taken.double().sum(dim=0).cpu()
     means = {name: (total / len(images)).to(model.device) for name, total in totals.items()}
-    return whitening.recentred(means).to(model.device)
+    return whitening.with_means(means).to(model.device)
 
 
 def make_fitting(
