@@ -44,7 +44,7 @@ from derender.features import FeatureTable, model_fingerprint
 from derender.inputs import Progress, as_images, as_model, device_named
 from derender.model import Derenderer
 from derender.postprocess import Features
-from derender.postprocess.whitening import Contrast, Whitening
+from derender.postprocess.whitening import Projection, Whitening
 from derender.presets import ModelSettings
 from derender.training.config import FeatureSettings, TrainConfig
 from derender.training.features import Describe, fit_whitening
@@ -315,7 +315,7 @@ def _fitted(
     names = [name.removesuffix("_map") for name in arrays if name.endswith("_map")]
     parts = ("mean", "map", "ratios")
     contrasts = {
-        name: Contrast(*(torch.from_numpy(arrays[f"{name}_{part}"]) for part in parts)) for name in names
+        name: Projection(*(torch.from_numpy(arrays[f"{name}_{part}"]) for part in parts)) for name in names
     }
     return Whitening(contrasts, mirrored=names if settings.whitening.mirrored else ())
 
