@@ -112,8 +112,7 @@ def measure_speed(
         shard, table = shard_of(folder, count), folder / "features.parquet"
 
         def whole_way() -> None:
-            with open_images(shard) as stream:
-                embed_to_file(model, stream, table)
+            embed_to_file(shard, model, table)
 
         whole_way()
         with open_images(shard) as stream:
@@ -146,10 +145,10 @@ def measure_speed(
 def measure_memory(count: int) -> dict[str, float]:
     """Embed so many pictures in this process; its highest resident memory before and after, in MB."""
     with tempfile.TemporaryDirectory() as name:
-        embed_to_file(Idle(), MadeUp(600), Path(name) / "warm.parquet", workers=2)
+        embed_to_file(MadeUp(600), Idle(), Path(name) / "warm.parquet", workers=2)
         before = peak_mb()
         table = Path(name) / "t.parquet"
-        took = seconds(lambda: embed_to_file(Idle(), MadeUp(count), table, workers=2))
+        took = seconds(lambda: embed_to_file(MadeUp(count), Idle(), table, workers=2))
     usage = resource.getrusage(resource.RUSAGE_SELF)
     return {
         "pictures": count,

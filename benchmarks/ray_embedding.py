@@ -14,7 +14,6 @@ import signal
 import tempfile
 import threading
 import time
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -23,9 +22,7 @@ import torch
 from machine import describe_machine
 from PIL import Image
 
-from derender.data import open_images
 from derender.features import FeatureTable, embed_to_file
-from derender.features.ray_engine import ray_engine
 from derender.model import Derenderer
 
 BATCH = 64
@@ -79,15 +76,11 @@ def main() -> None:
         pictures, tables = Path(name) / "pictures", Path(name)
         pictures.mkdir()
         made_up(pictures, options.count)
-        reopen = partial(open_images, pictures)
 
         def embed(path: Path, workers: int | None) -> float:
-            engine = None
-            if workers is not None:
-                engine = ray_engine(model, reopen, workers=workers, batch_size=BATCH)
             began = time.perf_counter()
-            with reopen() as stream:
-                embed_to_file(model, stream, path, batch_size=BATCH, workers=1, engine=engine)
+            engine = "local" if workers is None else "ray"
+            embed_to_file(pictures, model, path, batch_size=BATCH, workers=workers or 1, engine=engine)
             return time.perf_counter() - began
 
         def check(path: Path) -> None:

@@ -21,7 +21,7 @@ from machine import describe_machine
 from sklearn.neighbors import NearestNeighbors
 
 from derender.features import FeatureTable
-from derender.features.search import nearest, same_picture
+from derender.features.neighbours import nearest, same_picture
 
 FACTORS = ("geometry", "albedo", "light", "camera")
 FOUND = 12

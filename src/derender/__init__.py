@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from derender import evaluation as evaluate
     from derender.evaluation import compare
-    from derender.features import DisentangledFeatures, FeatureTable
+    from derender.features import DisentangledFeatures, FeatureTable, embed, embed_to_file, search
+    from derender.interpretation import explain
     from derender.model import Derenderer, load
     from derender.scene import Scene
 
@@ -28,6 +29,10 @@ _HOME = {
     "unet": "derender.learn",
     "finetune": "derender.learn",
     "compare": "derender.evaluation",
+    "embed": "derender.features",
+    "embed_to_file": "derender.features",
+    "search": "derender.features",
+    "explain": "derender.interpretation",
 }
 _ALIASES = {"evaluate": "derender.evaluation"}
 _SUBMODULES = [
@@ -52,8 +57,12 @@ __all__ = [
     "Scene",
     "__version__",
     "compare",
+    "embed",
+    "embed_to_file",
     "evaluate",
+    "explain",
     "load",
+    "search",
 ]
 
 

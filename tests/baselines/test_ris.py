@@ -16,7 +16,7 @@ from derender.baselines.ris_catalogue import (
     spherical_kmeans,
 )
 from derender.baselines.stylegan2_generator import Generator, GeneratorSettings, style_layers
-from derender.features.search import nearest
+from derender.features.neighbours import nearest
 
 PARTS = ("hair", "skin", "nose", "mouth")  # of the planted generator: quarters of the width, left to right
 EACH = 4  # channels that paint a part

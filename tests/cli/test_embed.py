@@ -55,7 +55,7 @@ def test_shards_with_a_cut_one_among_them(model, tmp_path, capsys):
     table = FeatureTable.read(tmp_path / "f.parquet")
     told = json.loads((tmp_path / "told.json").read_text())
     assert told["rows"] == len(table) < 20 and told["skipped"] == 1 and told["labels"] == ["class"]
-    assert f"{len(table)} pictures from {data} (webdataset), 1 skipped" in said.err
+    assert f"{len(table)} images from {data} (webdataset), 1 skipped" in said.err
     assert "skipped s-1.tar: damaged or cut short, what comes before counts" in said.err
     assert "rows in" in said.out
 

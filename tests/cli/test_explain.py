@@ -9,10 +9,9 @@ import pytest
 from PIL import Image
 
 from derender.cli import main
-from derender.cli.explain import _split
 from derender.features import FeatureTable
-from derender.interpretation import load_probe
-from derender.interpretation.question import question
+from derender.interpretation import load_probe, question
+from derender.interpretation.explanation import split_rows
 from derender.model import Derenderer
 from derender.presets import MODEL_PRESETS
 
@@ -87,8 +86,8 @@ def test_the_folder_holds_page_chart_maps_and_probe(why):
         "Whether the maps can be trusted",
         "most alike in",
         "shuffled labels",
-        'alt="the picture dark/00.png"',
-        'alt="the picture dark/02.png"',
+        'alt="the image dark/00.png"',
+        'alt="the image dark/02.png"',
     ):
         assert word in page
     assert "http://" not in page.replace("http://www.w3.org", "") and "<script src" not in page
@@ -121,9 +120,7 @@ def test_bad_words(model, data, why, tmp_path, capsys):
     assert "give either --label NAME" in refused()
     assert "add --force to replace it" in refused("-l", "class", "--out", why[0])
     assert "needs 20 or more" in refused("-l", "class", "--limit", "12")
-    assert "no picture 'dark/0.png'; did you mean 'dark/" in refused(
-        "-l", "class", "--pair", "dark/0.png", "x"
-    )
+    assert "no image 'dark/0.png'; did you mean 'dark/" in refused("-l", "class", "--pair", "dark/0.png", "x")
     assert "unknown head 'lin'" in refused("-l", "class", "--head", "lin")
     flat = tmp_path / "flat"
     flat.mkdir()
@@ -137,8 +134,8 @@ def test_bad_words(model, data, why, tmp_path, capsys):
 def test_pictures_that_are_all_their_owners_test_part_are_split_here():
     labels = {"class": np.array(["a", "b"] * 20), "partition": np.array(["test"] * 40)}
     table = FeatureTable(tuple(map(str, range(40))), {"geometry": np.eye(40)}, labels)
-    rows = _split(question(labels, ["class"]), table, 10, range(2), None)
+    rows = split_rows(question(labels, ["class"]), table, 10, range(2), None)
     assert len(rows.test) >= 10 and rows.train[10].shape == (2, 10)
     owners = {**labels, "partition": np.array(["train"] * 30 + ["test"] * 10)}
-    rows = _split(question(owners, ["class"]), replace(table, labels=owners), 10, range(1), None)
+    rows = split_rows(question(owners, ["class"]), replace(table, labels=owners), 10, range(1), None)
     assert rows.test.tolist() == list(range(30, 40))

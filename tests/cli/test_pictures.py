@@ -155,7 +155,7 @@ def test_search_with_a_picture_of_the_table(table, model, photos, tmp_path, caps
     assert "4.png" not in {row["file"] for row in answer["found"]}
     distances = [row["distance"] for row in answer["found"]]
     assert distances == sorted(distances) and distances[0] > 1e-5
-    assert "left out as the very same picture: 4.png (--copies" in capsys.readouterr().err
+    assert "left out as the very same image: 4.png (--copies" in capsys.readouterr().err
     assert main(["search", "-f", table, "--like", renamed, *words, "--copies", "--force"]) == 0
     found = json.loads(told.read_text())["found"]
     assert found[0]["file"] == "4.png" and len(found) == 3
@@ -220,8 +220,8 @@ def test_bad_searches(table, model, photos, tmp_path, refused):
     assert "did you mean 'geometry'" in refused(*like, "0.png", "--factor", "geometri")
     assert "unknown metric 'l2'" in refused(*like, "0.png", "--metric", "l2")
     assert "has no row '9.png'" in refused(*like, "9.png")
-    assert "to search with a picture, add --model" in refused(*like, photos / "0.png")
-    assert "no.png does not exist" in refused(*like, tmp_path / "no.png", "--model", model)
+    assert "to search with an image, add a model" in refused(*like, photos / "0.png")
+    assert "no.png is no image file" in refused(*like, tmp_path / "no.png", "--model", model)
     assert "ends in .png" in refused(*like, "0.png", "--out", tmp_path / "sheet.gif")
     taken = tmp_path / "taken.png"
     taken.write_bytes(b"mine")
@@ -233,7 +233,7 @@ def test_bad_searches(table, model, photos, tmp_path, refused):
     elsewhere.mkdir()
     Image.new("RGB", (8, 8)).save(elsewhere / "x.png")
     complaint = refused(*like, "0.png", "--out", tmp_path / "s.png", "--data", elsewhere)
-    assert "holds none of the pictures found" in complaint and not (tmp_path / "s.png").exists()
+    assert "holds none of the images found" in complaint and not (tmp_path / "s.png").exists()
 
 
 def test_pictures_unlike_what_the_model_was_validated_on_are_named(model, photos, tmp_path, capsys):

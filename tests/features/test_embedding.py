@@ -4,8 +4,7 @@ import io
 import json
 import tarfile
 import zipfile
-from contextlib import nullcontext
-from functools import partial
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +14,7 @@ from PIL import Image
 
 from derender.data import open_images, read_pictures
 from derender.features import FeatureTable, embed_pictures, embed_to_file, embedding
-from derender.features.blocks import BlockEmbedder, in_order
+from derender.features.blocks import BlockEmbedder
 
 COUNT = 110
 
@@ -96,7 +95,7 @@ def test_the_table_is_that_of_the_set_in_memory(model, source, tmp_path, keep):
     expected = in_memory(model, source, tmp_path / "memory.parquet", keep_duplicates=keep)
     with open_images(source) as stream:
         done = embed_to_file(
-            model, stream, tmp_path / "out.parquet", batch_size=16, keep_duplicates=keep, workers=2
+            stream, model, tmp_path / "out.parquet", batch_size=16, keep_duplicates=keep, workers=2
         )
     assert_same(tmp_path / "out.parquet", expected)
     assert (done.rows, done.skipped, done.copies, done.resumed) == (len(expected), 6, 4, 0)
@@ -107,24 +106,27 @@ def test_the_table_is_that_of_the_set_in_memory(model, source, tmp_path, keep):
 
 
 @pytest.mark.parametrize("keep", [False, True])
-def test_blocks_of_several_workers_make_the_same_table(model, source, tmp_path, keep):
+def test_blocks_of_several_workers_make_the_same_table(model, source, tmp_path, keep, monkeypatch):
     expected = in_memory(model, source, tmp_path / "memory.parquet", keep_duplicates=keep)
-    workers = [BlockEmbedder(model, partial(open_images, source), 16) for _ in range(2)]
 
-    def engine(stream, start, seen):
-        turns = enumerate(range(start, COUNT, 16))
-        blocks = [workers[turn % 3 == 1].embed(first) for turn, first in turns]
-        again = workers[0].embed(start)  # a worker may be given a block that another one lost
+    @contextmanager
+    def two_workers(net, stream, start, *, open_stream, batch_size, fit, workers):
+        made = [BlockEmbedder(net, open_stream, batch_size, fit) for _ in range(workers)]
+        turns = enumerate(range(start, COUNT, batch_size))
+        blocks = [made[turn % 3 == 1].embed(first) for turn, first in turns]
+        again = made[0].embed(start)  # a worker may get a block that another one lost
         assert again.decoded.files == blocks[0].decoded.files
-        return nullcontext(in_order(blocks, seen, keep_duplicates=keep))
+        yield iter(blocks)
+        for worker in made:
+            worker.close()
 
+    monkeypatch.setattr(embedding, "ray_blocks", two_workers)
     path = tmp_path / "out.parquet"
-    with open_images(source) as stream:
-        done = embed_to_file(model, stream, path, batch_size=16, keep_duplicates=keep, engine=engine)
-    for worker in workers:
-        worker.close()
+    done = embed_to_file(source, model, path, batch_size=16, keep_duplicates=keep, engine="ray")
     assert_same(path, expected)
     assert (done.rows, done.skipped, done.copies) == (len(expected), 6, 4)
+    with pytest.raises(ValueError, match="no engine 'rai'; did you mean 'ray'"):
+        embed_to_file(source, model, path, engine="rai")
 
 
 @pytest.mark.parametrize("source", ["folder", "shards"], indirect=True)
@@ -145,19 +147,19 @@ def test_a_stopped_run_goes_on_to_the_same_table(model, source, tmp_path, stop_a
                 raise how
 
         with open_images(source) as stream, pytest.raises(how) as stopped:
-            embed_to_file(model, stream, out, batch_size=16, progress=stop_there)
+            embed_to_file(stream, model, out, batch_size=16, progress=stop_there)
         assert not out.exists()
         if how is KeyboardInterrupt:
             parts = list((tmp_path / "out.parquet.partial").glob("part-*"))
             kept = sum(pq.ParquetFile(part).metadata.num_rows for part in parts)
-            assert kept == sum(embedded) > 0, "what was computed is kept"
+            assert 0 < kept <= sum(embedded) <= kept + 4, "what was computed is kept, but for copies"
             assert f"stopped by Ctrl-C; {kept} rows are kept in" in str(stopped.value)
     with open_images(source) as stream:
-        done = embed_to_file(model, stream, out, batch_size=16)
+        done = embed_to_file(stream, model, out, batch_size=16)
     assert_same(out, expected)
     assert done.skipped == 6 and done.copies == 4
     if how is KeyboardInterrupt:
-        assert done.resumed > 0 and sum(embedded) == len(expected), "nothing was computed twice"
+        assert done.resumed > 0 and sum(embedded) == len(expected) + 4, "nothing was computed twice"
     assert {path.name for path in tmp_path.iterdir()} >= {"out.parquet"}
     assert not (tmp_path / "out.parquet.partial").exists()
 
@@ -174,8 +176,8 @@ def test_a_set_is_written_as_a_stream_is(model, source, tmp_path):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt, match="the same command goes on"):
-        embed_to_file(model, part, tmp_path / "out.parquet", batch_size=16, progress=stop)
-    assert embed_to_file(model, part, tmp_path / "out.parquet", batch_size=16).resumed == 32
+        embed_to_file(part, model, tmp_path / "out.parquet", batch_size=16, progress=stop)
+    assert embed_to_file(part, model, tmp_path / "out.parquet", batch_size=16).resumed == 32
     assert_same(tmp_path / "out.parquet", expected)
 
 
@@ -187,17 +189,17 @@ def test_parts_of_another_run_are_an_error_until_told(model, source, tmp_path):
         raise KeyboardInterrupt
 
     with open_images(source) as stream, pytest.raises(KeyboardInterrupt):
-        embed_to_file(model, stream, out, batch_size=16, progress=stop)
+        embed_to_file(stream, model, out, batch_size=16, progress=stop)
     with (
         open_images(source) as stream,
         pytest.raises(ValueError, match=r"unfinished table .*\(differs in batch_size\): delete"),
     ):
-        embed_to_file(model, stream, out, batch_size=8)
+        embed_to_file(stream, model, out, batch_size=8)
     model.b[0, 0] += 1
     with open_images(source) as stream:
         with pytest.raises(ValueError, match=r"differs in origin.*add --force"):
-            embed_to_file(model, stream, out, batch_size=16)
-        assert embed_to_file(model, stream, out, batch_size=16, fresh=True).resumed == 0
+            embed_to_file(stream, model, out, batch_size=16)
+        assert embed_to_file(stream, model, out, batch_size=16, fresh=True).resumed == 0
     assert_same(out, in_memory(model, source, tmp_path / "memory.parquet"))
 
 
@@ -205,7 +207,7 @@ def test_parts_of_another_run_are_an_error_until_told(model, source, tmp_path):
 def test_limits(model, source, tmp_path):
     for limit in (5, 40, 1000):
         with open_images(source, limit=limit) as stream:
-            embed_to_file(model, stream, tmp_path / "out.parquet", batch_size=16)
+            embed_to_file(stream, model, tmp_path / "out.parquet", batch_size=16)
         assert_same(
             tmp_path / "out.parquet", in_memory(model, source, tmp_path / "memory.parquet", limit=limit)
         )
@@ -218,25 +220,25 @@ def test_bad_input_leaves_nothing(model, tmp_path):
     out = tmp_path / "out.parquet"
     with open_images(str(tmp_path / "bad")) as stream:
         with pytest.raises(
-            ValueError, match=r"no picture in .*bad \(folder\) can be read; the first is 'a\.png'"
+            ValueError, match=r"no image in .*bad \(folder\) can be read; the first is 'a\.png'"
         ):
-            embed_to_file(model, stream, out)
+            embed_to_file(stream, model, out)
         with pytest.raises(ValueError, match="batch_size must be 1 or more, got 0"):
-            embed_to_file(model, stream, out, batch_size=0)
+            embed_to_file(stream, model, out, batch_size=0)
     (tmp_path / "bad" / "c.png").write_bytes(png(1))
     model.b[:] = np.nan
     with (
         open_images(str(tmp_path / "bad")) as stream,
         pytest.raises(ValueError, match=r"factor 'albedo' is not finite in 1 of 1 rows, first in c\.png"),
     ):
-        embed_to_file(model, stream, out)
+        embed_to_file(stream, model, out)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["bad"]
     (tmp_path / "out.parquet.partial").write_text("in the way")
     with (
         open_images(str(tmp_path / "bad")) as stream,
         pytest.raises(ValueError, match="in the way: delete it"),
     ):
-        embed_to_file(model, stream, out)
+        embed_to_file(stream, model, out)
 
 
 @pytest.mark.parametrize("source", ["zip", "shards"], indirect=True)
@@ -245,7 +247,7 @@ def test_the_model_keeps_its_mode_and_progress_ends_at_the_total(model, source, 
     seen = []
     with open_images(source) as stream:
         embed_to_file(
-            model, stream, tmp_path / "o.parquet", batch_size=16, progress=lambda *state: seen.append(state)
+            stream, model, tmp_path / "o.parquet", batch_size=16, progress=lambda *state: seen.append(state)
         )
     assert model.training
     assert seen[-1] == (COUNT, COUNT) and all(done <= total for done, total in seen)

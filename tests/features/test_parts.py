@@ -24,7 +24,7 @@ def stopped(model, pictures, tmp_path, monkeypatch):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        embed_to_file(model, pictures, tmp_path / "F.parquet", batch_size=8, progress=press_ctrl_c)
+        embed_to_file(pictures, model, tmp_path / "F.parquet", batch_size=8, progress=press_ctrl_c)
     return sorted((tmp_path / "F.parquet.partial").glob("part-*"))
 
 
@@ -51,9 +51,9 @@ def test_a_damaged_part_is_made_again_with_those_after_it(model, pictures, stopp
     assert len(stopped) == 6
     damage(stopped[2])
     with pytest.warns(DamageNoticed, match=rf"damaged \({words}\): going on from the 16 rows before it"):
-        done = embed_to_file(model, pictures, tmp_path / "F.parquet", batch_size=8)
+        done = embed_to_file(pictures, model, tmp_path / "F.parquet", batch_size=8)
     assert (done.resumed, done.rows) == (16, 60)
-    whole = embed_to_file(model, pictures, tmp_path / "whole.parquet", batch_size=8)
+    whole = embed_to_file(pictures, model, tmp_path / "whole.parquet", batch_size=8)
     one, other = (FeatureTable.read(tmp_path / name) for name in ("F.parquet", "whole.parquet"))
     assert one.files == other.files and whole.resumed == 0
     assert all(np.array_equal(one.factors[name], other.factors[name]) for name in other.factors)
@@ -66,19 +66,19 @@ def test_what_a_run_leaves_that_was_killed_before_its_first_part_is_no_obstacle(
     (folder / ".plan.json-abc").write_text("{")
     (folder / "plan.json").write_text('{"other": 1}')
     (folder / ".writing.parquet-x").write_bytes(b"PAR1")
-    assert embed_to_file(model, pictures, tmp_path / "F.parquet").rows == 60
+    assert embed_to_file(pictures, model, tmp_path / "F.parquet").rows == 60
 
 
 def test_parts_without_a_sound_plan_are_told_of(model, pictures, stopped, tmp_path):
     (stopped[0].parent / "plan.json").write_text("{")
     with pytest.raises(ValueError, match=r"unfinished table without a sound plan\.json: delete that folder"):
-        embed_to_file(model, pictures, tmp_path / "F.parquet", batch_size=8)
+        embed_to_file(pictures, model, tmp_path / "F.parquet", batch_size=8)
 
 
 @pytest.mark.parametrize("at", [0.2, 0.4, 0.6])
 def test_a_changed_byte_in_a_finished_table_is_an_error_and_not_another_number(model, pictures, tmp_path, at):
     file = tmp_path / "F.parquet"
-    embed_to_file(model, pictures, file)
+    embed_to_file(pictures, model, file)
     wanted = FeatureTable.read(file)
     content = bytearray(file.read_bytes())
     content[int(at * len(content))] ^= 16

@@ -5,17 +5,19 @@ import pytest
 import torch
 from torch import nn
 
-from derender.interpretation.cam import (
+from derender.interpretation.attribution import (
     METHODS,
     factor_weights,
     pixel_attribution,
     saliency,
+    sanity_check,
     score,
+    similarity,
+    spearman,
     to_one,
     upsampled,
 )
 from derender.interpretation.probe import Probe
-from derender.interpretation.sanity import sanity_check, similarity, spearman
 from derender.model import Derenderer
 from derender.networks.encoders import activations
 from derender.postprocess import Features
@@ -206,7 +208,7 @@ def test_bad_words(model, probe, images):
         saliency("gradcam", model, images, "geometry")
     with pytest.raises(ValueError, match="no factor 'shape'"):
         saliency("grad-cam", model, images, "shape", probe, [0, 0, 0])
-    with pytest.raises(ValueError, match="3 pictures need as many targets, got 1"):
+    with pytest.raises(ValueError, match="3 images need as many targets, got 1"):
         saliency("grad-cam", model, images, "geometry", probe, [0])
-    with pytest.raises(ValueError, match="2 pictures or more, got 1"):
+    with pytest.raises(ValueError, match="2 images or more, got 1"):
         sanity_check(model, probe, None, images[:1], np.zeros(1, np.int64))

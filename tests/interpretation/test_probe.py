@@ -8,8 +8,7 @@ from derender.evaluation.linear_head import HeadSettings, train_heads
 from derender.evaluation.linear_logistic import fit_logistic
 from derender.evaluation.linear_task import task_of
 from derender.interpretation import Probe, fit_probe, load_probe, question
-from derender.interpretation.probe import FOLDS, PENALTIES
-from derender.interpretation.question import in_bins
+from derender.interpretation.probe import FOLDS, PENALTIES, in_bins
 
 N = 80
 
@@ -97,10 +96,10 @@ def test_bad_questions(labels):
     with pytest.raises(ValueError, match="no label 'smilin'; did you mean 'smiling'"):
         question(labels, ["smilin"])
     with pytest.raises(
-        ValueError, match=r"has same one, so there is nothing to tell apart.*smiling, size, age"
+        ValueError, match=r"has same one, so there is nothing to distinguish.*smiling, size, age"
     ):
         question(labels, ["same"])
-    with pytest.raises(ValueError, match="known for 5 pictures, and an explanation needs 20"):
+    with pytest.raises(ValueError, match="known for 5 images, and an explanation needs 20"):
         question(labels, ["few"])
     with pytest.raises(ValueError, match="has no labels"):
         question({}, ["smiling"])

@@ -5,7 +5,7 @@ import pytest
 
 from derender.evaluation.linear_task import Rows, task_of
 from derender.interpretation import Probe, explain_labels
-from derender.interpretation.shares import factor_shares, integrated_gradients
+from derender.interpretation.attribution import factor_shares, integrated_gradients
 
 SIZES = {"geometry": 4, "albedo": 4, "light": 4}
 
@@ -162,5 +162,5 @@ def test_an_explanation_refuses_what_does_not_fit(known):
     features, task, rows = known
     with pytest.raises(ValueError, match="unknown baseline 'black'"):
         explain_labels(features, task, rows, seeds=(0, 1), baseline="black")
-    with pytest.raises(ValueError, match="3 seeds need as many draws"):
+    with pytest.raises(ValueError, match="3 seeds need as many choices"):
         explain_labels(features, task, rows, seeds=(0, 1, 2))

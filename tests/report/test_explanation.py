@@ -8,16 +8,16 @@ import torch
 from PIL import Image
 
 from derender.interpretation import cluster_shares, pair_parts
-from derender.interpretation.sanity import Similarity
-from derender.report.charts import side_by_side
-from derender.report.saliency import overlays, safe_name
-from derender.report.tables_explanation import (
+from derender.interpretation.attribution import Similarity
+from derender.interpretation.tables import (
     cluster_share_table,
     pair_table,
     sanity_table,
     unasked,
     untrusted,
 )
+from derender.report.charts import side_by_side
+from derender.report.saliency import overlays, safe_name
 
 
 def test_an_empty_map_leaves_a_grey_picture_and_a_full_one_lights_its_place():
@@ -41,7 +41,7 @@ def test_the_sanity_table_names_what_not_to_trust():
     assert untrusted(rows) == ["pixels, light"] and unasked(rows) == ["grad-cam, camera"]
     values = sanity_table(rows).values()
     assert values["pixels, light"]["changes"] == "no" and values["grad-cam, camera"]["changes"] == "yes"
-    assert values["pixels, light"]["other picture"] is None
+    assert values["pixels, light"]["other image"] is None
 
 
 def test_tables_of_groups_hold_the_parts():
@@ -52,7 +52,7 @@ def test_tables_of_groups_hold_the_parts():
     assert table["all"]["of the distance"] == pytest.approx(1)
     assert table["geometry"]["of the cosine"] == pytest.approx(parts.cosine[0])
     clusters = cluster_share_table(cluster_shares(features, np.arange(20) % 2)).values()
-    assert clusters["cluster 0"]["pictures"] == 10
+    assert clusters["cluster 0"]["images"] == 10
     shares = [clusters["cluster 0"][name] for name in features]
     assert sum(float(share) for share in shares) == pytest.approx(1)
 

@@ -2,6 +2,7 @@
 
 import json
 from html.parser import HTMLParser
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,15 +14,14 @@ from derender.evaluation.bootstrap import ScoredRow, estimate, with_verdicts
 from derender.evaluation.linear_task import Rows, task_of
 from derender.evaluation.robustness import CurveResult, RobustnessComparison
 from derender.evaluation.score_table import Column, Row, ScoreTable
-from derender.interpretation import cluster_shares, explain_labels, pair_parts
+from derender.interpretation import Explained, cluster_shares, explain_labels, pair_parts
 from derender.report import charts
 from derender.report.comparison import comparison_page
 from derender.report.doctor import doctor_page
-from derender.report.explanation import Pair, Shown, explanation_page
+from derender.report.explanation import explanation_page, share_chart
 from derender.report.page import Page
 from derender.report.robustness import robustness_page
 from derender.report.run import run_page
-from derender.report.share_chart import share_chart
 from derender.training.config import resolve
 from derender.training.run_folder import append_metrics, start_run
 
@@ -113,12 +113,14 @@ def test_explanation(evil):
     features = {name: generator.standard_normal((90, 3)).astype(np.float32) for name in ("geometry", "light")}
     classes = np.where(features["light"][:, 0] > 0, evil, "b")
     rows = Rows(np.arange(60, 90), {40: np.arange(40)[None]})
-    found = explain_labels(features, task_of({evil: classes}), rows, seeds=(0,))
+    task = task_of({evil: classes})
+    shares = explain_labels(features, task, rows, seeds=(0,))
     sheets = {evil: {"grad-cam": Image.new("RGB", (8, 8))}}
-    pair = Pair(pair_parts(features, 0, 1), (evil, evil), np.zeros((2, 3, 8, 8), np.uint8))
-    clusters = cluster_shares(features, np.arange(90) % 2)
-    shown = Shown(found, share_chart(found)[0], evil, evil, sheets=sheets, clusters=clusters, pair=pair)
-    harmless(explanation_page(shown), evil)
+    images = PictureSet(np.zeros((1, 3, 8, 8), np.uint8), (evil,), source=evil)
+    pair = (evil, evil), pair_parts(features, 0, 1)
+    model, clusters = SimpleNamespace(source=evil), cluster_shares(features, np.arange(90) % 2)
+    found = Explained(shares, model, images, task, rows, clusters, pair)
+    harmless(explanation_page(found, share_chart(shares)[0], sheets), evil)
 
 
 def test_a_name_with_dollars_is_text_and_no_formula():

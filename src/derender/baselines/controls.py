@@ -7,6 +7,7 @@ an untrained encoder 0.662. Histograms of oriented gradients: Dalal and Triggs (
 """
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from sklearn.decomposition import PCA
 from derender.baselines.model import optional
 from derender.data import PictureSet
 from derender.features import FeatureTable, Progress, embed_pictures, table_labels
+from derender.inputs import as_images, part_of
 from derender.model import load
 
 ORIENTATIONS, BLOCK_CELLS = 9, 2
@@ -23,9 +25,13 @@ ORIENTATIONS, BLOCK_CELLS = 9, 2
 
 def control_features(
     name: str,
-    images: PictureSet,
+    images: PictureSet | str | Path,
     *,
-    fit_on: PictureSet | None = None,
+    image_size: int = 64,
+    dataset: str = "auto",
+    limit: int | None = None,
+    part: str = "all",
+    model: str | Path | None = None,
     components: int = 64,
     seed: int = 0,
     progress: Progress | None = None,
@@ -34,17 +40,21 @@ def control_features(
 
     Args:
         name: of the control; also the name of its only factor.
-        images: N images to describe.
-        fit_on: images whose principal components are used; by default ``images``.
+        images: an image set, or the address of one.
+        image_size, dataset, limit, part, model: how an address is read, see `derender.inputs.as_images`. The
+            principal components of a part are those of the training part.
         components: of pca, and dimensions of noise.
         seed: of the solver of pca, and of noise.
         progress: called with (images done, images in all), by hog.
     """
+    whole = as_images(images, image_size, dataset=dataset, limit=limit)
+    chosen = part_of(whole, part, model)
+    fit_on = chosen if part == "all" else part_of(whole, "train", model)
     makers = {
-        "pixels": lambda: pixel_features(images),
-        "pca": lambda: pca_features(images, components=components, fit_on=fit_on, seed=seed),
-        "hog": lambda: hog_features(images, progress=progress),
-        "noise": lambda: noise_features(images, dimensions=components, seed=seed),
+        "pixels": lambda: pixel_features(chosen),
+        "pca": lambda: pca_features(chosen, components=components, fit_on=fit_on, seed=seed),
+        "hog": lambda: hog_features(chosen, progress=progress),
+        "noise": lambda: noise_features(chosen, dimensions=components, seed=seed),
     }
     return makers[name]()
 

@@ -84,7 +84,7 @@ def open_baseline(
     name: str,
     source: str | None = None,
     *,
-    device: str = "cpu",
+    device: str = "auto",
     features: Sequence[str] | None = None,
     image_size: int = 64,
     seed: int = 0,
@@ -95,7 +95,7 @@ def open_baseline(
         name: of a baseline that has a network.
         source: its run folder; for e4e or its generator also a published .pt file; for dinov2 an id or a
             folder of weights (default: facebook/dinov2-small); for untrained the derender model to copy.
-        device: "cpu" or "cuda".
+        device: "auto", "cpu" or "cuda".
         features: names of the features to compute; by default the baseline's first.
         image_size: side of the input images, where the network does not fix it (dinov2).
         seed: of the fresh weights of untrained.
@@ -104,13 +104,15 @@ def open_baseline(
         ValueError: unknown name or feature, no source where one is needed, or damaged weights.
         FileNotFoundError: there is no such source.
     """
+    from derender.inputs import device_named
+
     opener = row_of(name).opener
     if not opener:
         raise ValueError(f"the baseline {name} has no network: its table comes from control_features")
     net = _resolve(opener)(name, source, image_size, seed)
     if features is not None:
         net.choose(tuple(features))
-    return net.to(device)
+    return net.to(device_named(device))
 
 
 def _resolve(place: str) -> Any:

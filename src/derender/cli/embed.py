@@ -1,194 +1,110 @@
-"""`derender embed`: one feature per factor for every picture, in one parquet file."""
+"""`derender embed`: one feature per factor for every image, in one parquet file."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-from functools import partial
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated, Any
 
 import typer
 
+from derender.baselines.registry import BASELINES, row_of
 from derender.cli import options
-from derender.cli.baselines import (
-    BaselineCheckpoint,
-    BaselineComponents,
-    BaselineFeatures,
-    BaselineImageSize,
-    BaselineName,
-    BaselineSeed,
-)
-from derender.cli.console import (
-    NAMED,
-    notice,
-    progress_bar,
-    refuse_existing_file,
-    report_images,
-    result,
-    visible,
-    write_json,
-)
+from derender.cli.console import NAMED, notice, progress_bar, visible
+from derender.cli.gathered import gathered
 
-if TYPE_CHECKING:
-    from derender.data import PictureSet, Stream
-    from derender.features import Embedded
+Out = Annotated[Path, typer.Option("--out", "-o", help="The table to write.", metavar="FILE.parquet")]
+Model = Annotated[str | None, typer.Option("--model", "-m", help=options.MODELS, metavar="MODEL")]
+Engine = Annotated[
+    str, typer.Option("--engine", help="local, or ray: on the machines of a Ray cluster.", metavar="NAME")
+]
+Workers = Annotated[
+    int | None, typer.Option("--workers", min=1, metavar="N", help="Number of Ray actors; default: 2.")
+]
 
-ENGINES = ("local", "ray")
+
+def _option(help: str, *names: str, metavar: str = "N", **more: Any) -> Any:
+    return typer.Option(*names, help=help, metavar=metavar, rich_help_panel="Baselines", **more)
+
+
+@dataclass(frozen=True)
+class BaselineOptions:
+    """Another network or control in place of our model."""
+
+    baseline: Annotated[
+        str | None, _option(f"Instead of our model: {', '.join(BASELINES)}.", "--baseline", metavar="NAME")
+    ] = None
+    checkpoint: Annotated[
+        str | None,
+        _option(
+            "Published e4e file such as e4e_ffhq_encode.pt, for --model.", "--checkpoint", metavar="FILE"
+        ),
+    ] = None
+    features: Annotated[
+        str | None, _option("Features of a baseline, separated by commas.", "--features", metavar="A,B")
+    ] = None
+    image_size: Annotated[
+        int, _option("Side in pixels, where no network fixes it.", "--image-size", min=8)
+    ] = 64
+    components: Annotated[int, _option("Numbers in pca and noise.", "--components", min=1)] = 64
+    seed: Annotated[int, _option("Seed of pca, noise and untrained.", "--seed", min=0)] = 0
 
 
 def register(app: typer.Typer) -> None:
-    app.command(
-        "embed", epilog="Example: derender embed --model runs/faces --data photos/ --out features.parquet"
-    )(embed)
+    example = "derender embed photos/ --model runs/faces --out features.parquet"
+    app.command("embed", epilog=f"Example: {example}")(embed)
 
 
+@gathered
 def embed(
-    data: options.Data,
-    out: Annotated[Path, typer.Option("--out", "-o", help="The table to write.", metavar="FILE.parquet")],
-    model: Annotated[
-        str | None,
-        typer.Option(
-            "--model", "-m", help="Run folder, saved model or Hugging Face Hub id.", metavar="MODEL"
-        ),
-    ] = None,
-    baseline: BaselineName = None,
-    checkpoint: BaselineCheckpoint = None,
-    features: BaselineFeatures = None,
-    image_size: BaselineImageSize = 64,
-    components: BaselineComponents = 64,
-    seed: BaselineSeed = 0,
-    dataset: options.Dataset = "auto",
-    part: options.Part = "all",
-    limit: options.Limit = None,
-    batch_size: options.BatchSize = 256,
-    fit_steps: options.FitSteps = None,
-    device: options.Device = "auto",
-    engine: Annotated[
-        str, typer.Option("--engine", help="local, or ray: on the machines of a Ray cluster.", metavar="NAME")
-    ] = "local",
-    workers: Annotated[
-        int | None, typer.Option("--workers", min=1, metavar="N", help="Of --engine ray; default: 2.")
-    ] = None,
-    force: options.Force = False,
-    json_file: options.Json = None,
-) -> None:
+    images: options.PartOfImages, out: Out, baselines: BaselineOptions, output: options.Output,
+    model: Model = None, batch_size: options.BatchSize = 256, fit_steps: options.FitSteps = None,
+    device: options.Device = "auto", engine: Engine = "local", workers: Workers = None,
+) -> None:  # fmt: skip
     """Write a feature table: file, one list column per factor, and the labels of the data set.
 
-    Pictures are read, embedded and written as they come, so memory does not grow with their number. A run
-    that was stopped goes on where it was when the command is given again.
+    Images are read, embedded and written as they come, so memory does not grow with their number. A run that
+    was stopped goes on where it was when the command is given again.
     """
-    refuse_existing_file(out, force)
-    _check_engine(engine, workers, part)
-    from derender.cli.models import open_model
-    from derender.data import open_images
-    from derender.features import embed_to_file
-    from derender.features.ray_engine import ray_engine
+    output.refuse_existing(out)
+    import derender
 
-    if baseline is not None:
-        from derender.baselines import open_baseline
-        from derender.baselines.registry import row_of
-        from derender.cli.baselines import write_control
-        from derender.cli.models import chosen_device
-
-        if not row_of(baseline).opener:
-            write_control(
-                baseline, data, out, dataset=dataset, part=part, limit=limit, model=model,
-                image_size=image_size, components=components, seed=seed, json_file=json_file,
-            )  # fmt: skip
-            return
-        if checkpoint is not None and (baseline != "e4e" or model is not None):
-            raise ValueError(
-                "--checkpoint is a published e4e file: give it with --baseline e4e and no --model"
-            )
-        net = open_baseline(
-            baseline, model or checkpoint, device=chosen_device(device),
-            features=None if features is None else [part.strip() for part in features.split(",")],
-            image_size=image_size, seed=seed,
-        )  # fmt: skip
-        origin = {"source": model or checkpoint, "baseline": baseline}
-    elif checkpoint is not None:
-        raise ValueError("--checkpoint is a published e4e file: give it with --baseline e4e")
-    elif model is None:
+    name, source = baselines.baseline, model or baselines.checkpoint
+    if baselines.checkpoint is not None and (name != "e4e" or model is not None):
+        raise ValueError("--checkpoint is a published e4e file: give it with --baseline e4e and no --model")
+    if name is None and model is None:
         raise ValueError("give --model RUN, or --baseline NAME (see derender embed --help)")
-    else:
-        net, origin = open_model(model, device, fit_steps), {"source": model}
-    with (
-        _opened(data, dataset, part, limit, model, net.image_size) as source,
-        progress_bar("embedding") as report,
-    ):
-        done = embed_to_file(
-            net,
-            source,
-            out,
-            batch_size=batch_size,
-            fresh=force,
-            progress=report,
-            origin=origin,
-            engine=None
-            if engine == "local"
-            else ray_engine(
-                net, partial(open_images, data, dataset=dataset, limit=limit), workers=workers or 2,
-                batch_size=batch_size,
-            ),
-        )  # fmt: skip
-        notice(_account(done, source))
-    sizes = ", ".join(f"{name} {size}" for name, size in done.factors.items())
-    result(f"{done.rows:,} rows in {out}: {sizes}", json_file)
-    write_json(
-        json_file,
-        {
-            "out": out,
-            "rows": done.rows,
-            "factors": done.factors,
-            "labels": done.labels,
-            "origin": done.origin,
-            "skipped": done.skipped,
-            "copies": done.copies,
-            "resumed": done.resumed,
-        },
-    )
-
-
-def _check_engine(engine: str, workers: int | None, part: str) -> None:
-    from derender.data import suggestion
-
-    if engine not in ENGINES:
-        raise ValueError(f"no engine {engine!r}{suggestion(engine, ENGINES)}: choose {' or '.join(ENGINES)}")
     if engine == "local" and workers is not None:
         raise ValueError("--workers belongs to --engine ray: leave it out, every core is used")
-    if engine == "ray" and part != "all":
-        raise ValueError("--engine ray embeds all of a data set: leave --part out")
-
-
-@contextmanager
-def _opened(
-    data: str, dataset: str, part: str, limit: int | None, model: str | None, image_size: int
-) -> "Iterator[Stream | PictureSet]":
-    """The pictures as a stream; those of one part of a split, which has to know them all first, as a set."""
-    from derender.data import open_images, read_pictures
-
-    if part == "all":
-        with open_images(data, dataset=dataset, limit=limit) as stream:
-            yield stream
-        return
-    from derender.cli.models import part_of
-
-    with progress_bar("reading") as report:
-        pictures = read_pictures(data, image_size, dataset=dataset, limit=limit, progress=report)
-    report_images(pictures)
-    if pictures.terms:
-        notice(f"on its owners' terms: {pictures.terms}")
-    yield part_of(pictures, part, model)
-
-
-def _account(done: "Embedded", source: "Stream | PictureSet") -> str:
-    """One line: how many pictures of what, and what was left out or had been there."""
-    noun = "picture" if done.rows == 1 else "pictures"
-    parts = [f"{done.rows:,} {noun} from {source.source} ({source.layout})"]
-    if done.resumed:
-        parts.append(f"{done.resumed:,} of them from the run before")
-    if done.skipped:
-        parts.append(f"{done.skipped:,} skipped")
-    if done.copies:
-        parts.append(f"{done.copies:,} identical copies dropped")
-    named = (f"skipped {visible(row.file, '')}: {row.reason}" for row in done.examples[:NAMED])
-    return "\n".join([", ".join(parts), *named])
+    if name is not None and not row_of(name).opener:
+        with progress_bar("describing") as report:
+            table = derender.baselines.control_features(
+                name, images.address, **images.how, model=model, image_size=baselines.image_size,
+                components=baselines.components, seed=baselines.seed, progress=report,
+            )  # fmt: skip
+        table.write(out)
+        factors = {factor: made.shape[1] for factor, made in table.factors.items()}
+        values = {
+            "rows": len(table),
+            "factors": factors,
+            "labels": list(table.labels),
+            "origin": table.origin,
+        }
+    else:
+        net, origin = model, {"source": source}
+        if name is not None:
+            chosen = baselines.features and [part.strip() for part in baselines.features.split(",")]
+            sizes = {"image_size": baselines.image_size, "seed": baselines.seed}
+            net = derender.baselines.open_baseline(name, source, device=device, features=chosen, **sizes)
+            origin["baseline"] = name
+        with progress_bar("embedding") as report:
+            done = derender.embed_to_file(
+                images.address, net, out, **images.how, batch_size=batch_size, fit_steps=fit_steps,
+                device=device, engine=engine, workers=workers, fresh=output.force, origin=origin,
+                progress=report,
+            )  # fmt: skip
+        named = (f"skipped {visible(row.file, '')}: {row.reason}" for row in done.examples[:NAMED])
+        notice("\n".join([done.describe(), *named]))
+        values = done.__dict__
+    shown = ", ".join(f"{factor} {size}" for factor, size in values["factors"].items())
+    output.result(f"{values['rows']:,} rows in {out}: {shown}")
+    names = ("rows", "factors", "labels", "origin", "skipped", "copies", "resumed")
+    output.write({"out": out, **{name: values[name] for name in names if name in values}})

@@ -1,11 +1,11 @@
-"""Stage 6: features extracted once, kept in one table, scored many times.
+"""Features extracted once, kept in one table, scored many times.
 
-table: the value; parquet: its file; extract: model and pictures in, table out; transformer: the same for
-    scikit-learn; embedding: any source to a file, never whole in memory (batches, parts: its halves);
-    blocks, ray_engine: the same on many machines; search: nearest rows by one factor.
+table: the value; parquet: its file; extract: model and images in, features out; transformer: the same for
+scikit-learn; embedding: any images to a table in memory or a file (blocks, parts: its halves); neighbours:
+nearest rows by one factor.
 """
 
-from derender.features.embedding import Embedded, embed_to_file
+from derender.features.embedding import Embedded, embed, embed_to_file
 from derender.features.extract import (
     Progress,
     embed_images,
@@ -14,6 +14,7 @@ from derender.features.extract import (
     model_fingerprint,
     table_labels,
 )
+from derender.features.neighbours import search
 from derender.features.table import FeatureTable, missing, named
 from derender.features.transformer import DisentangledFeatures
 
@@ -22,6 +23,7 @@ __all__ = [
     "Embedded",
     "FeatureTable",
     "Progress",
+    "embed",
     "embed_images",
     "embed_pictures",
     "embed_to_file",
@@ -29,5 +31,6 @@ __all__ = [
     "missing",
     "model_fingerprint",
     "named",
+    "search",
     "table_labels",
 ]

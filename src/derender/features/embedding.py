@@ -1,17 +1,18 @@
-"""From a model and any source to a feature table on disk, which is never whole in memory.
+"""From a model and any images to a feature table: in memory, or on disk and never whole in memory.
 
-Reading and decoding, computing, and writing overlap; what waits between them is bounded. Parts lie beside the
-table in a folder of its name with ``.partial`` until all are there: a run that was stopped goes on from them,
-and gives the same table, bit for bit, because batches hold the same pictures.
+On the way to a file, reading and decoding, computing, and writing overlap; the queues between them are
+bounded. Parts are written beside the table, in a folder of its name with ``.partial``, until all are there: a
+run that was stopped goes on from them, and gives the same table, bit for bit: its batches are the same.
 """
 
 import hashlib
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import PIL
@@ -22,45 +23,39 @@ from derender.data import (
     PictureSet,
     Skipped,
     Stream,
-    ahead,
-    decoded,
     estimated_total,
-    quiet_pillow,
+    open_images,
     sample_checksum,
+    suggestion,
 )
-from derender.features.batches import Batch, Rows, batches_of_chunks, batches_of_set
-from derender.features.blocks import Computed, Engine
-from derender.features.extract import (
-    Progress,
-    as_batch,
-    check_size,
-    evaluating,
-    factor_codes,
-    model_facts,
-    table_labels,
-)
+from derender.features.blocks import Rows, in_order, local_blocks, ray_blocks
+from derender.features.extract import check_size, embed_pictures, model_facts, table_labels
 from derender.features.parquet import Columns, write_row_groups
 from derender.features.parts import Parts
-from derender.features.table import check_finite, check_names
+from derender.features.table import FeatureTable, check_finite, check_names
+from derender.inputs import Progress, as_images, as_model
 
 PART_ROWS = 4096
 """A part is written when this many rows are there."""
+ENGINES = ("local", "ray")
 
 
 @dataclass(frozen=True)
 class Embedded:
-    """What was written.
+    """A feature table that was written.
 
     Attributes:
         path: the table.
-        rows: pictures in it.
+        rows: images in it.
         factors: numbers of each factor.
         labels: names of label columns.
         origin: as in the table.
-        skipped: how many pictures could not be read.
+        skipped: how many images could not be read.
         examples: the first of those, with reasons.
         copies: how many were identical copies of an earlier one.
         resumed: how many rows an earlier run had made.
+        source: the images, as the caller named them.
+        layout: of the data set.
     """
 
     path: Path
@@ -72,85 +67,153 @@ class Embedded:
     examples: tuple[Skipped, ...]
     copies: int
     resumed: int
+    source: str
+    layout: str
+
+    def describe(self) -> str:
+        """One line: how many images of which data set, how many were left out or had been there."""
+        parts = [
+            f"{self.rows:,} {'image' if self.rows == 1 else 'images'} from {self.source} ({self.layout})"
+        ]
+        parts += [f"{self.resumed:,} of them from the run before"] if self.resumed else []
+        parts += [f"{self.skipped:,} skipped"] if self.skipped else []
+        parts += [f"{self.copies:,} identical copies dropped"] if self.copies else []
+        return ", ".join(parts)
+
+
+def embed(
+    images: PictureSet | str | Path,
+    model: Any = "faces-64",
+    *,
+    dataset: str = "auto",
+    part: str = "all",
+    limit: int | None = None,
+    batch_size: int = 256,
+    fit_steps: int | None = None,
+    device: str = "auto",
+    progress: Progress | None = None,
+) -> FeatureTable:
+    """The features of images as a table in memory: one row an image, one feature per factor, and the labels.
+
+    Args:
+        images: an image set, or a folder, zip, shards or Hugging Face id.
+        model: a trained model or its name (a run folder, a saved folder, a bundled name, a Hub id), or a
+            network that `derender.baselines.open_baseline` opened.
+        dataset, part, limit: how the images are read, see `derender.inputs.as_images`.
+        batch_size: images at a time; changes speed and memory only.
+        fit_steps: steps of test-time optimisation for its features; None keeps the model's own.
+        device: "auto", "cpu" or "cuda".
+        progress: called with (images done, images in all).
+    """
+    net, origin = _network(model, device, fit_steps)
+    how = {"dataset": dataset, "limit": limit, "part": part, "model": origin.get("source")}
+    read = as_images(images, net.image_size, **how)
+    return embed_pictures(net, read, batch_size=batch_size, progress=progress, origin=origin)
 
 
 def embed_to_file(
+    images: Stream | PictureSet | str | Path,
     model: Any,
-    source: Stream | PictureSet,
-    path: str | Path,
+    out: str | Path,
     *,
+    dataset: str = "auto",
+    part: str = "all",
+    limit: int | None = None,
     fit: str = "crop",
     keep_duplicates: bool = False,
     batch_size: int = 256,
-    fresh: bool = False,
+    fit_steps: int | None = None,
+    device: str = "auto",
+    engine: Literal["local", "ray"] | str = "local",
     workers: int | None = None,
-    progress: Progress | None = None,
+    fresh: bool = False,
     origin: Mapping[str, Any] | None = None,
-    engine: Engine | None = None,
+    progress: Progress | None = None,
 ) -> Embedded:
-    """Run a model's encoders over a stream or set and write the table, going on where an earlier run stopped.
+    """Write the feature table of any number of images, going on where an earlier run stopped.
 
     Args:
-        model: a module with ``embed(pictures in 0..1) -> {factor: (N, D)}``, ``device`` and ``image_size``.
-        source: a stream, or a set that was read at the model's image size.
-        path: the parquet file; parts lie in ``PATH.partial`` meanwhile.
-        fit: what becomes of pictures that are not square (of a stream).
+        images: as for ``embed``, or an open stream.
+        model: as for ``embed``.
+        out: the parquet file; parts are in ``OUT.partial`` meanwhile.
+        dataset, part, limit: how an address is read; a part of a split is read whole first.
+        fit: how images that are not square are read (of a stream).
         keep_duplicates: keep identical copies (of a stream).
-        batch_size: pictures at a time.
+        batch_size: images at a time.
+        fit_steps, device: as for ``embed``.
+        engine: "local", or "ray": on the machines of a Ray cluster, which open ``images`` by their address.
+        workers: decoding threads (default: one for each core); actors of Ray (default: 2).
         fresh: begin anew where an earlier run made something else; otherwise that is an error.
-        workers: decoding threads; by default one for each core.
-        progress: called with (pictures done, estimated total) after every batch.
         origin: further facts for the table.
-        engine: who reads and computes a stream, if not this process (ray_engine.py).
+        progress: called with (images done, estimated total) after every batch.
 
     Raises:
-        ValueError: no picture can be read, a feature is not finite, or the parts are of another run.
+        ValueError: no image can be read, a feature is not finite, or the parts are of another run.
         KeyboardInterrupt: it was stopped; the message says what is kept.
     """
-    path = Path(path)
     if batch_size < 1:
         raise ValueError(f"batch_size must be 1 or more, got {batch_size}")
-    facts = {**model_facts(model, source.source, source.layout), **(origin or {})}
-    if isinstance(source, PictureSet):
-        check_size(model, source)
-        labels = {name: column.tolist() for name, column in source.labels.items()}
-        content: object = (source.files, labels, sample_checksum(source.images))
-        limit = None
-    else:
-        content = (source.place, source.identity(), fit, source.limit, keep_duplicates, READER_VERSION)
-        limit = source.limit
-    plan = {
-        "origin": facts,
-        "pictures": hashlib.sha256(repr((PIL.__version__, content)).encode("utf-8", "replace")).hexdigest(),
-        "image_size": model.image_size,
-        "batch_size": batch_size,
-        "device": str(model.device),
-        "torch": torch.__version__,
-    }
-    parts = Parts(path.with_name(f"{path.name}.partial"), plan, fresh=fresh)
-    resumed = parts.so_far.rows
-
-    @contextmanager
-    def here() -> Iterator[Iterator[Computed]]:
-        start = parts.so_far.following
-        if isinstance(source, PictureSet):
-            chunks = nullcontext(batches_of_set(source, batch_size, start))
+    if engine not in ENGINES:
+        raise ValueError(f"no engine {engine!r}{suggestion(engine, ENGINES)}: choose {' or '.join(ENGINES)}")
+    if engine == "ray" and (part != "all" or not isinstance(images, str | Path)):
+        raise ValueError("engine 'ray' embeds all images of an address: use part 'all', and name a data set")
+    net, made_by = _network(model, device, fit_steps)
+    with ExitStack() as stack:
+        address, reopen = images, None
+        if isinstance(address, str | Path):
+            reopen = partial(open_images, str(address), dataset=dataset, limit=limit)
+            if part == "all":
+                images = stack.enter_context(reopen())
+            else:
+                split = {**made_by, **(origin or {})}.get("source")
+                how = {"dataset": dataset, "limit": limit, "part": part, "model": split}
+                images = as_images(address, net.image_size, **how)
+        assert isinstance(images, Stream | PictureSet)
+        facts = {**model_facts(net, images.source, images.layout), **made_by, **(origin or {})}
+        plan = _plan(net, images, facts, (fit, keep_duplicates), batch_size)
+        path = Path(out)
+        parts = Parts(path.with_name(f"{path.name}.partial"), plan, fresh=fresh)
+        resumed, start = parts.so_far.rows, parts.so_far.following
+        options = {"batch_size": batch_size, "fit": fit}
+        if engine == "ray":
+            assert isinstance(images, Stream) and reopen is not None
+            blocks = ray_blocks(net, images, start, open_stream=reopen, workers=workers or 2, **options)
         else:
-            pixels = decoded(source, model.image_size, fit=fit, start=start, workers=workers)
-            copies = {"keep_duplicates": keep_duplicates}
-            chunks = ahead(batches_of_chunks(pixels, batch_size, parts.seen(), **copies), 2)
-        with quiet_pillow(), evaluating(model), chunks as batches:
-            yield (_computed(model, batch) for batch in batches)
+            blocks = local_blocks(net, images, start, workers=workers, **options)
+        _compute(parts, blocks, keep_duplicates, getattr(images, "limit", None), progress)
+        return _finish(parts, path, images, facts, resumed)
 
-    def elsewhere() -> AbstractContextManager[Iterator[Computed]]:
-        assert engine is not None
-        if isinstance(source, PictureSet):
-            raise ValueError("one part of a split is embedded in this process: leave the engine out")
-        return engine(source, parts.so_far.following, parts.seen())
 
+def _network(model: Any, device: str, fit_steps: int | None) -> tuple[Any, dict[str, Any]]:
+    """The network, and how the table's origin names its source."""
+    if isinstance(model, str | Path):
+        return as_model(model, device=device, fit_steps=fit_steps), {"source": str(model)}
+    return (as_model(model, fit_steps=fit_steps) if fit_steps is not None else model), {}
+
+
+def _plan(
+    net: Any, images: Stream | PictureSet, facts: Mapping[str, Any], reading: object, batch_size: int
+) -> dict[str, Any]:
+    """Everything that a resumed run must have in common with the one before."""
+    if isinstance(images, PictureSet):
+        check_size(net, images)
+        labels = {name: column.tolist() for name, column in images.labels.items()}
+        content: object = (images.files, labels, sample_checksum(images.images))
+    else:
+        content = (images.place, images.identity(), images.limit, reading, READER_VERSION)
+    digest = hashlib.sha256(repr((PIL.__version__, content)).encode("utf-8", "replace")).hexdigest()
+    machine = {"device": str(net.device), "torch": torch.__version__}
+    sizes = {"image_size": net.image_size, "batch_size": batch_size}
+    return {"origin": facts, "pictures": digest, **sizes, **machine}
+
+
+def _compute(
+    parts: Parts, blocks: Any, keep_duplicates: bool, limit: int | None, progress: Progress | None
+) -> None:
+    """Write the parts that are missing. An error removes the folder if nothing was written."""
     try:
-        with here() if engine is None else elsewhere() as computed, _writing(parts) as add:
-            for rows, codes, share in computed:
+        with blocks as made, _writing(parts) as add:
+            for rows, codes, share in in_order(made, parts.seen(), keep_duplicates):
                 check_finite(codes, rows.files)
                 add(rows, codes)
                 if progress is not None:
@@ -167,20 +230,13 @@ def embed_to_file(
         ) from stopped
     if progress is not None:
         progress(parts.so_far.following, parts.so_far.following)
-    return _finish(parts, path, source, facts, resumed)
-
-
-def _computed(model: Any, batch: Batch) -> Computed:
-    if batch.images is None:
-        return batch.rows, {}, batch.share
-    return batch.rows, factor_codes(model, as_batch(batch.images, model.device)), batch.share
 
 
 @contextmanager
 def _writing(parts: Parts) -> Iterator[Callable[[Rows, Mapping[str, np.ndarray]], None]]:
     """Take the rows of batches and write them as parts in a thread of its own, one part at a time.
 
-    Ctrl-C writes what is waiting; any other error drops it.
+    Ctrl-C writes the rows that wait; any other error drops them.
     """
     waiting: list[tuple[Rows, Mapping[str, np.ndarray]]] = []
     written: list[Future[None]] = []
@@ -213,21 +269,18 @@ def _writing(parts: Parts) -> Iterator[Callable[[Rows, Mapping[str, np.ndarray]]
 
 
 def _finish(
-    parts: Parts, path: Path, source: Stream | PictureSet, facts: dict[str, Any], resumed: int
+    parts: Parts, path: Path, images: Stream | PictureSet, facts: dict[str, Any], resumed: int
 ) -> Embedded:
     """Put the parts together, then delete them."""
     so_far = parts.so_far
     if not so_far.rows:
         parts.remove()
-        first = (
-            f"; the first is {so_far.examples[0].file!r}: {so_far.examples[0].reason}"
-            if so_far.skipped
-            else ""
-        )
-        raise ValueError(f"no picture in {source.source} ({source.layout}) can be read{first}")
+        first = so_far.examples[0] if so_far.skipped else None
+        more = f"; the first is {first.file!r}: {first.reason}" if first else ""
+        raise ValueError(f"no image in {images.source} ({images.layout}) can be read{more}")
     factors: dict[str, int] = {}
     labels: list[str] = []
-    known = _known_labels(source)
+    known = _known_labels(images)
 
     def groups() -> Iterator[Columns]:
         for columns in parts.columns(facts, known):
@@ -238,27 +291,15 @@ def _finish(
 
     rows = write_row_groups(path, groups())
     parts.remove()
-    passed_over = () if isinstance(source, PictureSet) else source.passed_over
-    return Embedded(
-        path,
-        rows,
-        factors,
-        tuple(labels),
-        facts,
-        so_far.skipped + len(passed_over),
-        (*passed_over, *so_far.examples),
-        so_far.copies,
-        resumed,
-    )
+    passed_over = () if isinstance(images, PictureSet) else images.passed_over
+    skipped, examples = so_far.skipped + len(passed_over), (*passed_over, *so_far.examples)
+    counts = (skipped, examples, so_far.copies, resumed)
+    return Embedded(path, rows, factors, tuple(labels), facts, *counts, images.source, images.layout)
 
 
-def _known_labels(source: Stream | PictureSet) -> Callable[[np.ndarray], dict[str, np.ndarray]] | None:
-    """Labels by position where they are known without reading pictures."""
-    if isinstance(source, PictureSet):
-        columns = table_labels(source)
-    elif source.table is not None:
-        owners = {} if source.table.partition is None else {"partition": source.table.partition}
-        columns = {**owners, **source.table.labels}
-    else:
+def _known_labels(images: Stream | PictureSet) -> Callable[[np.ndarray], dict[str, np.ndarray]] | None:
+    """Labels by position where they are known without reading images."""
+    if not isinstance(images, PictureSet) and images.table is None:
         return None
+    columns = table_labels(images if isinstance(images, PictureSet) else images.table)
     return lambda positions: {name: column[positions] for name, column in columns.items()}

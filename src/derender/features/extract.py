@@ -141,7 +141,7 @@ def model_facts(model: Any, source: str, layout: str) -> dict[str, Any]:
     return facts
 
 
-def table_labels(pictures: PictureSet) -> dict[str, np.ndarray]:
-    """A picture set's labels, and the owners' split as one more label ``partition`` where there is one."""
+def table_labels(pictures: Any) -> dict[str, np.ndarray]:
+    """An image set's labels, and the owners' split as one more label ``partition`` where there is one."""
     owners = {} if pictures.partition is None else {"partition": pictures.partition}
     return {**owners, **pictures.labels}

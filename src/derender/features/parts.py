@@ -20,7 +20,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from derender.data import Kind, Kinds, SeenPixels, Skipped, column_of
-from derender.features.batches import Rows
+from derender.features.blocks import Rows
 from derender.features.parquet import Columns, factor_column
 from derender.storage.atomic import Damaged, DamageNoticed, atomic_file, measured
 

@@ -1,22 +1,24 @@
-"""Stage 8: which factor made an answer, and where in the picture it was seen.
+"""Which factor made an answer, and where in the image it was seen.
 
-question: label columns as something to ask; probe: a linear answer, kept in a file; shares: integrated
-gradients by factor; explanation: shares over seeds beside controls; cam: maps over the picture; sanity: do
-the maps change with the weights; grouping: what made a cluster, what makes two pictures alike.
+probe: label columns as a question, and a linear probe of it; attribution: integrated gradients by factor,
+maps over the image and their sanity check; explanation: shares over seeds beside controls; grouping: parts
+of clusters and pairs; tables: all of it as tables.
 """
 
-from derender.interpretation.explanation import Explanation, ShareRow, explain_labels
+from derender.interpretation.explanation import Explained, explain, explain_labels
 from derender.interpretation.grouping import ClusterShares, PairParts, cluster_shares, pair_parts
-from derender.interpretation.probe import Probe, fit_probe, load_probe
-from derender.interpretation.question import question
+from derender.interpretation.probe import Probe, fit_probe, load_probe, question
+from derender.interpretation.tables import Explanation, ShareRow
 
 __all__ = [
     "ClusterShares",
+    "Explained",
     "Explanation",
     "PairParts",
     "Probe",
     "ShareRow",
     "cluster_shares",
+    "explain",
     "explain_labels",
     "fit_probe",
     "load_probe",

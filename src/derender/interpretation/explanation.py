@@ -1,105 +1,179 @@
-"""Which factor answers a question: shares over seeds and pictures, beside probes that know nothing.
+"""Which factor answers a question: shares over seeds and images, beside probes that learned nothing.
 
-Every seed draws training rows and fits a probe; shares and scores are of the test rows, which no seed learns
-from. Controls under the same protocol: the same features with labels dealt at random among the training
-rows, and an untrained encoder. ``drop`` is a second opinion without gradients: how much of the AUC is lost
-when one factor's features are exchanged between test pictures. Leaves out maps over the picture (cam.py).
+Every seed chooses training rows and fits a probe; shares and scores are of the test rows, which no seed
+learns from. Controls under the same protocol: the same features with shuffled labels in the training rows,
+and an untrained encoder. ``drop`` is a second opinion without gradients: how much AUC is lost when one
+factor's features are exchanged between test images. Leaves out maps over the image (attribution.py).
 """
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from sklearn.metrics import roc_auc_score
 
+from derender.baselines.controls import untrained_features
+from derender.data import PictureSet, suggestion
 from derender.evaluation.bootstrap import LEVEL, resamples
+from derender.evaluation.clustering_methods import clusterings
+from derender.evaluation.feature_rows import attribute_columns
 from derender.evaluation.linear_head import PAPER_HEAD, HeadSettings
-from derender.evaluation.linear_task import Rows, Task
-from derender.interpretation.probe import Probe, fit_probe
-from derender.interpretation.shares import factor_shares, integrated_gradients
+from derender.evaluation.linear_task import Rows, Task, choose_rows
+from derender.evaluation.score_table import Scores
+from derender.features import FeatureTable, embed_pictures
+from derender.inputs import as_images, as_model
+from derender.interpretation import tables
+from derender.interpretation.attribution import (
+    Similarity,
+    captum_attr,
+    factor_shares,
+    integrated_gradients,
+)
+from derender.interpretation.grouping import ClusterShares, PairParts, cluster_shares, pair_parts
+from derender.interpretation.probe import Probe, fit_probe, question
+from derender.interpretation.tables import Explanation, ShareRow
 
 Features = Mapping[str, np.ndarray]
 BASELINES = ("zero", "mean")
 BOOTSTRAP = 500
+LEARNED_SHARE, LEARNED_MOST = 0.4, 500
 
 
 @dataclass(frozen=True, eq=False)
-class ShareRow:
-    """Shares of one set of features; S seeds, A labels or classes, F factors.
+class Explained:
+    """An explanation of a model's features on images.
 
     Attributes:
-        name: of the features.
-        control: whether it learned nothing.
-        shares: (S, A, F) mean share of |IG| over test pictures, 0..1, each sums to 1 over factors.
-        low, high: (A, F) 95 % interval of the mean over seeds, over resamples of the test pictures.
-        auc: (S, A) area under the ROC curve on the test rows; 0.5 for answers that know nothing, best 1.
-        drop: (S, A, F) how much of it is lost when this factor's features are dealt at random.
-        error: the largest completeness error, relative to the largest change of an answer.
+        shares: the share of each factor in every answer, beside controls.
+        model: the model.
+        images: the images, with labels.
+        task, split: the question, and who learns and who is tested.
+        clusters: parts of the distance between clusters, if requested.
+        pair: two file names and the parts of their distance, if requested.
+        checks: how maps over images answer to fresh weights; filled when they are drawn.
     """
 
-    name: str
-    control: bool
-    shares: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
-    auc: np.ndarray
-    drop: np.ndarray
-    error: float
+    shares: Explanation
+    model: Any
+    images: PictureSet
+    task: Task
+    split: Rows
+    clusters: ClusterShares | None = None
+    pair: tuple[tuple[str, str], PairParts] | None = None
+    checks: Sequence[Similarity] = ()
 
-    def numbers(self, names: Sequence[str], factors: Sequence[str]) -> dict[str, Any]:
-        """As JSON takes it, by label and factor."""
-
-        def one(answer: int) -> dict[str, Any]:
-            parts = {
-                factor: {
-                    "share": self.shares[:, answer, place].mean(),
-                    "low": self.low[answer, place],
-                    "high": self.high[answer, place],
-                    "spread": float(self.shares[:, answer, place].std(ddof=1))
-                    if len(self.shares) > 1
-                    else None,
-                    "drop": self.drop[:, answer, place].mean(),
-                }
-                for place, factor in enumerate(factors)
-            }
-            return {"auc": self.auc[:, answer].mean(), "factors": parts}
-
-        by_name = {name: one(answer) for answer, name in enumerate(names)}
-        return {"control": self.control, "completeness_error": self.error, "answers": by_name}
+    @property
+    def scores(self) -> Scores:
+        """Every table, the numbers as JSON takes them, and verdicts in words."""
+        shown = [tables.share_table(self.shares), tables.drop_table(self.shares)]
+        shown += [tables.sanity_table(self.checks)] if self.checks else []
+        shown += [tables.cluster_share_table(self.clusters)] if self.clusters is not None else []
+        shown += [tables.pair_table(self.pair[1], self.pair[0])] if self.pair is not None else []
+        stuck = (
+            f"not to be trusted, fresh weights give the same map: {m}" for m in tables.untrusted(self.checks)
+        )
+        values = {"source": self.images.source, "sanity": self.checks, "clusters": self.clusters}
+        values |= {**self.shares.numbers(), "pair": None if self.pair is None else self.pair[1]}
+        return Scores(shown, values, [*tables.share_verdicts(self.shares), *stuck])
 
 
-@dataclass(frozen=True, eq=False)
-class Explanation:
-    """What was found.
+def explain(
+    images: PictureSet | str | Path,
+    model: Any = "faces-64",
+    labels: str | Sequence[str] = (),
+    *,
+    bins: int | None = None,
+    min_count: int = 2,
+    dataset: str = "auto",
+    limit: int | None = None,
+    part: str = "all",
+    seeds: int = 3,
+    count: int | None = None,
+    groups: str | None = None,
+    head: str = "logistic",
+    output: str = "logit",
+    baseline: str = "zero",
+    clusters: int | None = None,
+    pair: tuple[str, str] | None = None,
+    batch_size: int = 256,
+    seed: int = 0,
+    device: str = "auto",
+    progress: Callable[[str], Callable[[int, int], object]] = lambda _: lambda _done, _total: None,
+) -> Explained:
+    """Which factor of a model answers a question about images: shares of integrated gradients, with controls.
 
-    Attributes:
-        kind: "labels" or "classes".
-        names: (A) labels or classes.
-        factors: (F) in the features' order.
-        rows: the features in question first, then the controls.
-        probe, shuffled: of the first seed, on the true labels and on labels dealt at random.
-        n_train, n_test: rows.
-        head, output, baseline: how probes were fitted and attributed.
+    Args:
+        images: an image set with labels, or the address of one.
+        model: a trained model or its name.
+        labels: the label column of the question, several of two values each, or none: every yes/no label.
+        bins, min_count: see `interpretation.question`.
+        dataset, limit, part: how an address is read, see `derender.inputs.as_images`.
+        seeds: number of probes to average over.
+        count: images to learn from; by default 2 of 5, at most 500.
+        groups: a label whose rows stay on one side of the split, such as identity.
+        head, output, baseline: see ``explain_labels``.
+        clusters: also find the parts of the distance between so many Ward clusters.
+        pair: also find the parts of the distance between these two images, by file name.
+        batch_size: images at a time; changes speed and memory only.
+        seed: of the first probe, of clusters and pairs; others follow.
+        device: "auto", "cpu" or "cuda".
+        progress: called with the name of each stage; the result is called with (done, total).
+
+    Raises:
+        ValueError: no such label, too few images, or captum is not installed.
     """
+    captum_attr()
+    net = as_model(model, device=device)
+    named = str(model) if isinstance(model, str | Path) else getattr(model, "source", None)
+    reading = {"dataset": dataset, "limit": limit, "part": part, "model": named}
+    images = as_images(images, net.image_size, **reading, progress=progress("reading"))
+    rows = [] if pair is None else [_row_of(images, name) for name in pair]
+    table = embed_pictures(net, images, batch_size=batch_size, progress=progress("embedding"))
+    names = (labels,) if isinstance(labels, str) else tuple(dict.fromkeys(labels)) or attribute_columns(table)
+    if not names:
+        raise ValueError(f"there is no yes/no label; there is {', '.join(table.labels) or 'no label'}")
+    task = question(table.labels, names, bins=bins, min_count=min_count, source=images.source)
+    split = split_rows(task, table, count, range(seed, seed + seeds), groups)
+    untrained = [
+        untrained_features(
+            net, images, seed=one, batch_size=batch_size, progress=progress(f"untrained encoder {one}")
+        ).factors
+        for one in range(seed, seed + seeds)
+    ]
+    shares = explain_labels(
+        table.factors, task, split, untrained=untrained, seeds=range(seed, seed + seeds), head=head,
+        output=output, baseline=baseline, progress=progress("probing"),
+    )  # fmt: skip
+    apart = alike = None
+    if clusters is not None:
+        made = clusterings(table.concatenate(), [clusters], seed=seed)[clusters]
+        apart = cluster_shares(table.factors, made, seed=seed)
+    if pair is not None:
+        alike = pair, pair_parts(table.factors, rows[0], rows[1], seed=seed)
+    return Explained(shares, net, images, task, split, apart, alike)
 
-    kind: str
-    names: tuple[str, ...]
-    factors: tuple[str, ...]
-    rows: tuple[ShareRow, ...]
-    probe: Probe
-    shuffled: Probe
-    n_train: int
-    n_test: int
-    head: str
-    output: str
-    baseline: str
 
-    def numbers(self) -> dict[str, Any]:
-        """Everything as JSON takes it."""
-        facts = {name: getattr(self, name) for name in ("kind", "names", "factors", "n_train", "n_test")}
-        facts |= {name: getattr(self, name) for name in ("head", "output", "baseline")}
-        return {**facts, "rows": {row.name: row.numbers(self.names, self.factors) for row in self.rows}}
+def split_rows(
+    task: Task, table: FeatureTable, count: int | None, seeds: Sequence[int], groups: str | None = None
+) -> Rows:
+    """Half of the images is tested; each seed learns from its own choice of ``count`` others.
+
+    The split of the data's owners holds, unless every labelled image here is in their test part.
+    """
+    wanted = count or max(2, min(LEARNED_MOST, int(LEARNED_SHARE * task.known.sum())))
+    owners = table.labels.get("partition")
+    if owners is not None and (owners[task.known] == "test").all():
+        owners = None
+    sides = table.label(groups) if groups else None
+    return choose_rows(task, table.files, (wanted,), seeds, partition=owners, groups=sides)
+
+
+def _row_of(images: PictureSet, name: str) -> int:
+    if name not in images.files:
+        raise ValueError(f"{images.source} has no image {name!r}{suggestion(name, images.files)}")
+    return images.files.index(name)
 
 
 def explain_labels(
@@ -120,14 +194,14 @@ def explain_labels(
 
     Args:
         features: by factor, (N, D_f).
-        task: what is asked of the N rows.
-        split: who learns (one number of rows, S draws) and who is tested.
+        task: the question.
+        split: training rows (one number of rows, S choices) and test rows.
         untrained: features of untrained encoders, one for each of the first seeds; may be empty.
-        seeds: (S) of probes and shufflings, one for each draw.
+        seeds: (S) of probes and shuffled labels, one for each choice of rows.
         head: "logistic" or the paper's "linear".
         settings: of the paper's head.
-        output: what is attributed, "logit" or "probability".
-        baseline: where the path starts, "zero" (the paper's) or the training rows' "mean".
+        output: the attributed output, "logit" or "probability".
+        baseline: start of the path, "zero" (the paper's) or the training rows' "mean".
         steps: of the quadrature; None for as many as the output needs.
         progress: called with (probes done, probes in all).
     """
@@ -137,8 +211,8 @@ def explain_labels(
         raise ValueError(f"an explanation learns from one number of rows, got {len(split.train)}")
     ((count, train),) = split.train.items()
     if len(train) != len(seeds):
-        raise ValueError(f"{len(seeds)} seeds need as many draws of rows, got {len(train)}")
-    kept: dict[str, list[_Measured]] = {"model": [], "shuffled labels": [], "untrained encoder": []}
+        raise ValueError(f"{len(seeds)} seeds need as many choices of rows, got {len(train)}")
+    measured: dict[str, list[_Measured]] = {"model": [], "shuffled labels": [], "untrained encoder": []}
     total, done = 2 * len(seeds) + min(len(untrained), len(seeds)), 0
     for place, (seed, rows) in enumerate(zip(seeds, train, strict=True)):
         tried = [("model", features, task), ("shuffled labels", features, shuffled(task, rows, seed))]
@@ -147,20 +221,20 @@ def explain_labels(
         for name, values, asked in tried:
             probe = fit_probe(values, asked, rows, head=head, seed=seed, settings=settings)
             start = None if baseline == "zero" else probe.columns(values)[rows].mean(axis=0)
-            kept[name].append(_measure(probe, values, task, split.test, start, output, steps, seed))
+            measured[name].append(_measure(probe, values, task, split.test, start, output, steps, seed))
             done += 1
             if progress is not None:
                 progress(done, total)
-    rows_of = [_row(name, name != "model", runs) for name, runs in kept.items() if runs]
-    first = kept["model"][0].probe
+    rows_of = [_row(name, name != "model", runs) for name, runs in measured.items() if runs]
+    first = measured["model"][0].probe
     return Explanation(
-        task.kind, task.names, first.factors, tuple(rows_of), first, kept["shuffled labels"][0].probe,
+        task.kind, task.names, first.factors, tuple(rows_of), first, measured["shuffled labels"][0].probe,
         count, len(split.test), head, output, baseline,
     )  # fmt: skip
 
 
 def shuffled(task: Task, rows: np.ndarray, seed: int) -> Task:
-    """The same task with the targets of ``rows`` dealt at random among them."""
+    """The same task with the targets of ``rows`` shuffled among them."""
     targets = task.targets.copy()
     targets[rows] = targets[np.random.default_rng(seed).permutation(rows)]
     return replace(task, targets=targets)
@@ -168,7 +242,7 @@ def shuffled(task: Task, rows: np.ndarray, seed: int) -> Task:
 
 @dataclass(frozen=True, eq=False)
 class _Measured:
-    """One probe: per picture (T, A, F) shares (NaN where not asked), AUC and its drop, error and scale."""
+    """One probe: per image (T, A, F) shares (NaN where not asked), AUC and its drop, error and scale."""
 
     probe: Probe
     shares: np.ndarray
@@ -198,7 +272,7 @@ def _measure(
 
 
 def scores(probe: Probe, z: np.ndarray, targets: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """AUC of each answer, (A,), and how much each factor's exchange between pictures takes, (A, F)."""
+    """AUC of each answer, (A,), and how much is lost when each factor is exchanged between images, (A, F)."""
     z, weight = z.astype(np.float64), probe.weight.astype(np.float64)
     parts = [z[:, columns] @ weight[:, columns].T for columns in probe.slices.values()]
     logits = np.sum(parts, axis=0) + probe.bias
@@ -223,9 +297,9 @@ def _auc(targets: np.ndarray, logits: np.ndarray, kind: str) -> np.ndarray:
 
 
 def _row(name: str, control: bool, runs: Sequence[_Measured]) -> ShareRow:
-    pictures = np.stack([run.shares for run in runs])  # (S, T, A, F)
+    every = np.stack([run.shares for run in runs])  # (S, T, A, F)
     per_seed = np.stack([_mean(run.shares) for run in runs])
-    low, high = _interval(_mean(pictures))
+    low, high = _interval(_mean(every))
     scale = max(run.scale for run in runs)
     return ShareRow(
         name,
@@ -248,7 +322,7 @@ def _mean(shares: np.ndarray) -> np.ndarray:
 
 
 def _interval(shares: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(T, A, F) as the ends of the 95 % interval of the mean over pictures, (A, F) each."""
+    """(T, A, F) as the ends of the 95 % interval of the mean over images, (A, F) each."""
     known = np.isfinite(shares).reshape(len(shares), -1).astype(np.float32)
     values = np.where(np.isfinite(shares), shares, 0).reshape(len(shares), -1).astype(np.float32)
     means = []

@@ -1,8 +1,8 @@
-"""What made a cluster, and what makes two pictures alike: exact parts by factor, without a probe.
+"""Parts by factor of what separates a cluster and of the distance of two images: exact, without a probe.
 
 The squared distance between two features that stand side by side is the sum of the squared distances of each
-factor, and their cosine the sum of each factor's part of the inner product: nothing is approximated. What the
-parts say depends on the features' scale, as the clustering itself does; ``ratio`` does not.
+factor, and their cosine the sum of each factor's part of the inner product: nothing is approximated. The
+parts depend on the features' scale, as the clustering itself does; ``ratio`` does not.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,7 +15,7 @@ Features = Mapping[str, np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class ClusterShares:
-    """What sets each cluster apart from all other rows; C clusters, F factors.
+    """Each cluster against all other rows; C clusters, F factors.
 
     Attributes:
         names: (C) of the clusters.
@@ -25,7 +25,7 @@ class ClusterShares:
             0..1, sums to 1 over factors.
         ratio: (C, F) share of the factor's own variance that lies between cluster and rest (eta squared),
             0..1; does not depend on the factor's scale.
-        chance: (C, F) mean ratio for clusters of these sizes, rows dealt at random.
+        chance: (C, F) mean ratio for clusters of these sizes, rows shuffled.
     """
 
     names: tuple[str, ...]
@@ -38,7 +38,7 @@ class ClusterShares:
 
 @dataclass(frozen=True, eq=False)
 class PairParts:
-    """What makes two pictures alike, or different.
+    """Parts of the distance and the cosine of two images.
 
     Attributes:
         factors: (F).
@@ -46,7 +46,7 @@ class PairParts:
         distance_share: (F,) parts of it, sum 1 (0 for identical features).
         cosine: (F,) parts of the cosine of the whole features; their sum is the cosine.
         own_cosine: (F,) cosine of each factor alone, -1..1; NaN where a feature is 0.
-        quantile: (F,) share of all pairs of pictures that lie farther apart in this factor, 0..1; near 1
+        quantile: (F,) share of all pairs of images that lie farther apart in this factor, 0..1; near 1
             where the two are unusually alike.
     """
 
@@ -78,14 +78,14 @@ def cluster_shares(
     names = np.unique(clusters)
     if len(names) < 2:
         raise ValueError(
-            f"a cluster is set apart from others: {len(clusters)} rows form {len(names)} cluster"
+            f"a cluster needs others to compare with: {len(clusters)} rows form {len(names)} cluster"
         )
     member = clusters[:, None] == names  # (N, C)
     centred = [np.asarray(v, np.float64) - np.asarray(v, np.float64).mean(axis=0) for v in features.values()]
     total = np.array([(values**2).sum() for values in centred])
     between = _between(centred, member)
     generator = np.random.default_rng(seed)
-    dealt = [_between(centred, generator.permutation(member)) for _ in range(permutations)]
+    shuffled = [_between(centred, generator.permutation(member)) for _ in range(permutations)]
     sizes = member.sum(axis=0)
     weight = (sizes * (len(clusters) - sizes) / len(clusters))[:, None]
     distance = between / weight
@@ -95,7 +95,7 @@ def cluster_shares(
         sizes,
         _over(distance, distance.sum(axis=1, keepdims=True)),
         _over(between, total),
-        _over(np.mean(dealt, axis=0), total),
+        _over(np.mean(shuffled, axis=0), total),
     )
 
 

@@ -27,12 +27,11 @@ from derender.report import blocks
 from derender.report.blocks import Html
 from derender.report.decomposition import COLUMN_MEANING, decompose_images
 from derender.report.doctor import doctor_blocks
-from derender.report.explanation import share_blocks
+from derender.report.explanation import share_blocks, share_chart
 from derender.report.films import animated_png
 from derender.report.matrices import card_matrices, matrix_sheet
 from derender.report.page import Section
 from derender.report.score_table import factor_table, geometry_table, reconstruction_table
-from derender.report.share_chart import share_chart
 from derender.report.sweeps import relit_and_rotated
 from derender.report.tables_disentanglement import summary_table, swap_tables
 

@@ -1,4 +1,4 @@
-"""Sheets of maps over pictures: the input, then a column for each factor with its share of the answer.
+"""Sheets of maps over images: the input, then a column for each factor with its share of the answer.
 
 The arrangement is that of the paper's figure (Klinghoffer et al., ECCV 2022: input, geometry, albedo, light,
 camera); bright is where, and each map is scaled by its own largest value, so that brightness says where and
@@ -18,11 +18,17 @@ from torch import Tensor
 
 from derender.baselines.controls import untrained_twin
 from derender.features.extract import as_batch
-from derender.interpretation import Explanation
-from derender.interpretation.cam import METHODS, saliency, to_one, upsampled
-from derender.interpretation.probe import Probe
-from derender.interpretation.sanity import Similarity, sanity_check
-from derender.interpretation.shares import factor_shares, integrated_gradients
+from derender.interpretation import Explained, Probe
+from derender.interpretation.attribution import (
+    METHODS,
+    Similarity,
+    factor_shares,
+    integrated_gradients,
+    saliency,
+    sanity_check,
+    to_one,
+    upsampled,
+)
 from derender.report.colours import Images, pictures
 from derender.report.panel import GridLayout, contact_sheet, labelled_grid
 
@@ -32,7 +38,7 @@ BLURRED_PX = 5  # of 64: single pixels say little
 
 
 def overlays(images: Float[Tensor, "n 3 h w"], maps: Float[Tensor, "n y x"]) -> Images:
-    """Maps of any size over grey pictures in 0..1; an empty map leaves the picture grey."""
+    """Maps of any size over grey images in 0..1; an empty map leaves the image grey."""
     size = images.shape[-1]
     heat = to_one(upsampled(maps, size) if maps.shape[-1] != size else smoothed(maps)).cpu().numpy()
     grey = images.mean(dim=1).cpu().numpy()[..., None].repeat(3, axis=-1)
@@ -42,7 +48,7 @@ def overlays(images: Float[Tensor, "n 3 h w"], maps: Float[Tensor, "n y x"]) -> 
 
 
 def smoothed(maps: Float[Tensor, "n h w"]) -> Float[Tensor, "n h w"]:
-    """Means over squares of about a twelfth of the picture's side."""
+    """Means over squares of about a twelfth of the image's side."""
     side = max(1, round(BLURRED_PX * maps.shape[-1] / SHOWN_PX)) // 2 * 2 + 1
     blurred = torch.nn.functional.avg_pool2d(
         maps[:, None], side, stride=1, padding=side // 2, count_include_pad=False
@@ -53,7 +59,7 @@ def smoothed(maps: Float[Tensor, "n h w"]) -> Float[Tensor, "n h w"]:
 def saliency_sheet(
     model: Any, probe: Probe, images: Float[Tensor, "n 3 h w"], target: int, method: str, title: str
 ) -> Image.Image:
-    """One row for each picture: the input and its answer, then each factor's map and share of |IG|."""
+    """One row for each image: the input and its answer, then each factor's map and share of |IG|."""
     with torch.no_grad():
         features = {name: code.float().cpu().numpy() for name, code in model.embed(images).items()}
     attribution, _ = integrated_gradients(probe, probe.columns(features), target)
@@ -76,59 +82,50 @@ def saliency_sheet(
 
 
 def draw_maps(
-    model: Any,
-    found: Explanation,
-    images: np.ndarray,
-    targets: np.ndarray,
-    test: np.ndarray,
+    explained: Explained,
     *,
     labels: int = 3,
     rows: int = 6,
-    seeds: int = 3,
     progress: Callable[[int, int], object] | None = None,
 ) -> tuple[dict[str, dict[str, Image.Image]], list[Similarity]]:
-    """Sheets for the labels that are told best, and the sanity check of the maps on the first of them.
+    """Sheets for the labels with the highest AUC, and the sanity check of the maps on the first of them.
 
     Args:
-        model: that made the features.
-        found: shares and the probe.
-        images: (N, 3, S, S) uint8.
-        targets: (N, A) of the task.
-        test: held-out rows, from which pictures that carry the label are drawn.
+        explained: shares, probes, model and images.
         labels: how many labels.
-        rows: pictures on a sheet.
-        seeds: fresh weights to compare maps with.
+        rows: held-out images with the label on a sheet.
         progress: called with (labels done, labels in all).
     """
-    auc = np.nan_to_num(found.rows[0].auc.mean(axis=0), nan=-1)
+    model, shares, targets = explained.model, explained.shares, explained.task.targets
+    test, seeds = explained.split.test, range(len(shares.rows[0].shares))
+    auc = np.nan_to_num(shares.rows[0].auc.mean(axis=0), nan=-1)
     best = [int(at) for at in np.argsort(-auc, kind="stable") if (targets[test, at] == 1).sum() >= 2][:labels]
     sheets: dict[str, dict[str, Image.Image]] = {}
     checks: list[Similarity] = []
     for place, target in enumerate(best):
         carriers = test[targets[test, target] == 1]
         chosen = np.random.default_rng(0).permutation(carriers)[:rows]
-        batch = as_batch(images[np.sort(chosen)], model.device)
-        name = found.names[target]
+        batch = as_batch(explained.images.images[np.sort(chosen)], model.device)
+        name = shares.names[target]
         sheets[name] = {
-            method: saliency_sheet(model, found.probe, batch, target, method, f"{name}: {method}")
+            method: saliency_sheet(model, shares.probe, batch, target, method, f"{name}: {method}")
             for method in METHODS
         }
         if not checks:
             asked = np.full(len(batch), target)
-            checks = sanity_check(model, found.probe, found.shuffled, batch, asked, seeds=range(seeds))
-            twin = untrained_twin(model, 0)
-            title = f"{name}: grad-cam with fresh weights"
+            checks = sanity_check(model, shares.probe, shares.shuffled, batch, asked, seeds=seeds)
+            fresh, title = untrained_twin(model, 0), f"{name}: grad-cam with fresh weights"
             sheets[name]["fresh weights"] = saliency_sheet(
-                twin, found.probe, batch, target, "grad-cam", title
+                fresh, shares.probe, batch, target, "grad-cam", title
             )
-            sheets[name]["feature"] = feature_sheet(model, batch, found.factors)
+            sheets[name]["feature"] = feature_sheet(model, batch, shares.factors)
         if progress is not None:
             progress(place + 1, len(best))
     return sheets, checks
 
 
 def feature_sheet(model: Any, images: Float[Tensor, "n 3 h w"], factors: Sequence[str]) -> Image.Image:
-    """Where each factor's feature comes from, whatever is asked of it."""
+    """Where each factor's feature comes from, without a question."""
     columns = {"input": pictures(images)}
     columns |= {name: overlays(images, saliency("grad-cam", model, images, name)) for name in factors}
     return labelled_grid(columns, title="the feature itself", layout=GridLayout(cell=128, gap=6, title=18))

@@ -6,7 +6,7 @@ from PIL import Image
 
 from derender.data import read_pictures
 from derender.features import FeatureTable, embed_pictures
-from derender.features.search import nearest
+from derender.features.neighbours import nearest
 from derender.report.viewer.app import Application, Viewer
 from derender.report.viewer.neighbours import Gallery
 from derender.report.viewer.refused import Refused

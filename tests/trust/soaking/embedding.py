@@ -26,9 +26,9 @@ def embed_until_told(folder: Path, model: str) -> None:
         while True:
             source = folder / ("data.zip" if passes % 2 else "data")
             with open_images(source) as stream:
-                rows = embed_to_file(net, stream, out, fresh=True).rows
+                rows = embed_to_file(stream, net, out, fresh=True).rows
             pictures = read_pictures(source, net.image_size, cache=folder / "cache")
-            rows += embed_to_file(net, pictures, out, fresh=True).rows
+            rows += embed_to_file(pictures, net, out, fresh=True).rows
             table = FeatureTable.read(out)
             width = features.transform(pictures.images[:32]).shape[1]
             due = sum(table.factors[name].shape[1] for name in ("geometry", "albedo"))
@@ -40,7 +40,7 @@ def embed_until_told(folder: Path, model: str) -> None:
             time.sleep(PAUSE_SECONDS)
     except KeyboardInterrupt:
         with open_images(folder / "data") as stream:
-            embed_to_file(net, stream, out, fresh=True)
+            embed_to_file(stream, net, out, fresh=True)
 
 
 if __name__ == "__main__":

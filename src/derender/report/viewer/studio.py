@@ -22,7 +22,7 @@ from derender import __version__
 from derender.data import as_float
 from derender.evaluation.out_of_distribution import OUTLIER_PERCENTILE, percentile_of
 from derender.features import FeatureTable, named
-from derender.features.search import nearest, same_picture
+from derender.features.neighbours import nearest, same_picture
 from derender.model import Derenderer
 from derender.report import colours
 from derender.report.mesh import model_mesh

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from sklearn.neighbors import NearestNeighbors
 
-from derender.features import FeatureTable, search
-from derender.features.search import nearest, same_picture
+from derender.features import FeatureTable, neighbours
+from derender.features.neighbours import nearest, same_picture
 
 
 @pytest.fixture
@@ -18,8 +18,8 @@ def table() -> FeatureTable:
 @pytest.mark.parametrize("metric", ["cosine", "euclidean"])
 @pytest.mark.parametrize("factor", ["geometry", "light"])
 def test_same_as_scikit_learn(table, factor, metric, monkeypatch):
-    monkeypatch.setattr(search, "BLOCK_ROWS", 64)
-    monkeypatch.setattr(search, "NUMBERS_AT_ONCE", 1000)
+    monkeypatch.setattr(neighbours, "BLOCK_ROWS", 64)
+    monkeypatch.setattr(neighbours, "NUMBERS_AT_ONCE", 1000)
     rows = table.factors[factor].astype(np.float64)
     query = rows[:7] + 0.1
     found = nearest(table, query, factor, 9, metric=metric)
@@ -57,7 +57,7 @@ def test_equal_rows_come_in_order_and_zero_rows_are_apart():
 
 
 def test_the_same_picture_is_alike_in_every_factor(table, monkeypatch):
-    monkeypatch.setattr(search, "BLOCK_ROWS", 64)
+    monkeypatch.setattr(neighbours, "BLOCK_ROWS", 64)
     for rows in table.factors.values():
         rows[250] = rows[17] * (1 + 1e-6)  # a copy, rounded otherwise
     table.factors["light"][33] = table.factors["light"][17]  # another face in the same light

@@ -1,14 +1,94 @@
-"""Tables of an explanation: shares by factor, what the answer loses without one, maps checked, groups."""
+"""Shares of factors as values and tables: answers by factor, AUC lost without one, maps checked, groups."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from derender.evaluation.score_table import Cell, Column, Interval, Row, ScoreTable, interval_column
-from derender.interpretation import ClusterShares, Explanation, PairParts, ShareRow
-from derender.interpretation.sanity import UNCHANGED, Similarity
+from derender.interpretation.attribution import UNCHANGED, Similarity
+from derender.interpretation.grouping import ClusterShares, PairParts
+from derender.interpretation.probe import Probe
 
-AUC = Column("AUC", note="area under the ROC curve on held-out pictures, chance 0.5, best 1")
+
+@dataclass(frozen=True, eq=False)
+class ShareRow:
+    """Shares of one set of features; S seeds, A labels or classes, F factors.
+
+    Attributes:
+        name: of the features.
+        control: whether it learned nothing.
+        shares: (S, A, F) mean share of |IG| over test images, 0..1, each sums to 1 over factors.
+        low, high: (A, F) 95 % interval of the mean over seeds, over resamples of the test images.
+        auc: (S, A) area under the ROC curve on the test rows; 0.5 at chance, best 1.
+        drop: (S, A, F) how much of it is lost when this factor's features are exchanged between images.
+        error: the largest completeness error, relative to the largest change of an answer.
+    """
+
+    name: str
+    control: bool
+    shares: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    auc: np.ndarray
+    drop: np.ndarray
+    error: float
+
+    def numbers(self, names: Sequence[str], factors: Sequence[str]) -> dict[str, Any]:
+        """As JSON takes it, by label and factor."""
+
+        def one(answer: int) -> dict[str, Any]:
+            parts = {
+                factor: {
+                    "share": self.shares[:, answer, place].mean(),
+                    "low": self.low[answer, place],
+                    "high": self.high[answer, place],
+                    "spread": self.shares[:, answer, place].std(ddof=1) if len(self.shares) > 1 else None,
+                    "drop": self.drop[:, answer, place].mean(),
+                }
+                for place, factor in enumerate(factors)
+            }
+            return {"auc": self.auc[:, answer].mean(), "factors": parts}
+
+        by_name = {name: one(answer) for answer, name in enumerate(names)}
+        return {"control": self.control, "completeness_error": self.error, "answers": by_name}
+
+
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """Shares of every factor, beside controls.
+
+    Attributes:
+        kind: "labels" or "classes".
+        names: (A) labels or classes.
+        factors: (F) in the features' order.
+        rows: the model's features first, then the controls.
+        probe, shuffled: of the first seed, on the true labels and on shuffled labels.
+        n_train, n_test: rows.
+        head, output, baseline: how probes were fitted and attributed.
+    """
+
+    kind: str
+    names: tuple[str, ...]
+    factors: tuple[str, ...]
+    rows: tuple[ShareRow, ...]
+    probe: Probe
+    shuffled: Probe
+    n_train: int
+    n_test: int
+    head: str
+    output: str
+    baseline: str
+
+    def numbers(self) -> dict[str, Any]:
+        """Everything as JSON takes it."""
+        facts = {name: getattr(self, name) for name in ("kind", "names", "factors", "n_train", "n_test")}
+        facts |= {name: getattr(self, name) for name in ("head", "output", "baseline")}
+        return {**facts, "rows": {row.name: row.numbers(self.names, self.factors) for row in self.rows}}
+
+
+AUC = Column("AUC", note="area under the ROC curve on held-out images, chance 0.5, best 1")
 
 
 def share_table(found: Explanation) -> ScoreTable:
@@ -16,7 +96,7 @@ def share_table(found: Explanation) -> ScoreTable:
     columns: list[Column] = []
     for factor in found.factors:
         column = Column(factor, note="share of the sum of |integrated gradients|, 0 to 1")
-        columns += [column, interval_column(column, "pictures")]
+        columns += [column, interval_column(column, "images")]
     model, *controls = found.rows
     rows = [_mean_row(f"mean of {len(found.names)}", model)] if len(found.names) > 1 else []
     for answer, name in enumerate(found.names):
@@ -26,10 +106,10 @@ def share_table(found: Explanation) -> ScoreTable:
             cells += [_number(model.shares[:, answer, place]), Interval(*map(float, ends))]
         rows.append(Row(name, (*cells, _number(model.auc[:, answer]))))
     rows += [_mean_row(row.name, row) for row in controls]
-    what = "yes/no labels" if found.kind == "labels" else "classes, each on its own pictures"
+    what = "yes/no labels" if found.kind == "labels" else "classes, each on its own images"
     seeds = len(model.shares)
     caption = (
-        f"Share of each factor in the answer: {found.head} probe of {found.n_train:,} pictures, "
+        f"Share of each factor in the answer: {found.head} probe of {found.n_train:,} images, "
         f"{found.n_test:,} held out, {seeds} seed{'s' if seeds > 1 else ''}, {len(found.names)} {what}; "
         f"{found.output} from a {found.baseline} baseline, completeness error {model.error:.1e}"
     )
@@ -37,7 +117,7 @@ def share_table(found: Explanation) -> ScoreTable:
 
 
 def drop_table(found: Explanation) -> ScoreTable:
-    """AUC lost when one factor's features are dealt at random among the held-out pictures."""
+    """AUC lost when one factor's features are exchanged between the held-out images."""
     columns = tuple(Column(factor, note="AUC lost without this factor") for factor in found.factors)
     model, *controls = found.rows
     many = len(found.names) > 1
@@ -45,31 +125,31 @@ def drop_table(found: Explanation) -> ScoreTable:
     for answer, name in enumerate(found.names):
         rows.append(Row(name, tuple(_number(part) for part in model.drop[:, answer].T)))
     rows += [Row(row.name, _over_all(row.drop), True) for row in controls]
-    caption = "AUC lost when one factor's features are exchanged between pictures: a check without gradients"
+    caption = "AUC lost when one factor's features are exchanged between images: a check without gradients"
     return ScoreTable(caption, "label" if found.kind == "labels" else "class", columns, rows)
 
 
 def share_verdicts(found: Explanation) -> list[str]:
-    """In words, each factor's mean share beside that of labels dealt at random, largest first."""
+    """In words, each factor's mean share beside that of shuffled labels, largest first."""
     shares = {row.name: np.nanmean(row.shares, axis=(0, 1)) for row in found.rows}
     own, chance = shares["model"], shares["shuffled labels"]
     drop = np.nanmean(found.rows[0].drop, axis=(0, 1))
     return [
         f"{found.factors[place]}: {100 * own[place]:.0f} % of |IG| ({100 * chance[place]:.0f} % where labels "
-        f"are dealt at random); exchanged between pictures it costs {drop[place]:.3f} of the AUC"
+        f"are shuffled); exchanged between images it costs {drop[place]:.3f} of the AUC"
         for place in np.argsort(-own)
     ]
 
 
 def sanity_table(rows: Sequence[Similarity]) -> ScoreTable:
-    """How alike maps stay when weights, labels or the picture change; first what new weights do."""
+    """Similarity of maps when weights, labels or the image change; fresh weights first."""
     columns = (
         Column(
             "new weights", "low", 2, f"Spearman with maps of fresh weights; {UNCHANGED} or more: not trusted"
         ),
         Column("its SSIM", "low", 2, "structural similarity of the same maps"),
-        Column("random labels", "low", 2, "Spearman with maps of a probe of labels dealt at random"),
-        Column("other picture", None, 2, "Spearman with the map of another picture"),
+        Column("shuffled labels", "low", 2, "Spearman with maps of a probe of shuffled labels"),
+        Column("other image", None, 2, "Spearman with the map of another image"),
         Column("empty", None, 2, "share of comparisons left out because a map was empty"),
         Column("changes", None, note="whether new weights change the map"),
     )
@@ -84,26 +164,26 @@ def sanity_table(rows: Sequence[Similarity]) -> ScoreTable:
             fresh.empty, word,
         )  # fmt: skip
         lines.append(Row(f"{method}, {factor}", cells))
-    return ScoreTable("Do maps change with what was learned? Similarity, -1 to 1", "map", columns, lines)
+    return ScoreTable("Do maps change with the learned weights? Similarity, -1 to 1", "map", columns, lines)
 
 
 def untrusted(rows: Sequence[Similarity]) -> list[str]:
-    """The maps that stay as they are with fresh weights."""
+    """The maps that do not change with fresh weights."""
     return [f"{row.method}, {row.factor}" for row in rows if row.trusted is False]
 
 
 def unasked(rows: Sequence[Similarity]) -> list[str]:
-    """The maps that stay as they are where the probe learned labels dealt at random."""
+    """The maps that do not change when the probe learned shuffled labels."""
     stuck = [row for row in rows if row.changed == "shuffled labels" and row.spearman >= UNCHANGED]
     return [f"{row.method}, {row.factor}" for row in stuck]
 
 
 def cluster_share_table(found: ClusterShares) -> ScoreTable:
-    """What set each cluster apart: parts of the distance, and between-variance beside chance."""
-    columns: list[Column] = [Column("pictures")]
+    """Parts of the distance of each cluster from the rest, and between-variance beside chance."""
+    columns: list[Column] = [Column("images")]
     for factor in found.factors:
         columns += [
-            Column(factor, note="share of the squared distance to all other pictures' mean, 0 to 1"),
+            Column(factor, note="share of the squared distance to the mean of all other images, 0 to 1"),
             Column(
                 "ratio", note="share of this factor's variance between cluster and rest; in brackets chance"
             ),
@@ -115,12 +195,12 @@ def cluster_share_table(found: ClusterShares) -> ScoreTable:
             ratio, chance = found.ratio[cluster, place], found.chance[cluster, place]
             cells += [float(found.share[cluster, place]), f"{ratio:.3f} ({chance:.3f})"]
         rows.append(Row(f"cluster {name}", cells))
-    caption = "What set each cluster apart: parts of the squared distance, ratios of variances (by chance)"
+    caption = "Each cluster against the rest: parts of the squared distance, ratios of variances (by chance)"
     return ScoreTable(caption, "cluster", columns, rows)
 
 
 def pair_table(found: PairParts, names: tuple[str, str]) -> ScoreTable:
-    """What makes two pictures alike, by factor and in all."""
+    """Parts of the distance and cosine of two images, by factor and in all."""
     columns = (
         Column("of the distance", note="part of the squared distance, 0 to 1"),
         Column("of the cosine", note="part of the cosine of the whole features; sums to it"),

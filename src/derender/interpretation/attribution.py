@@ -1,0 +1,332 @@
+"""Attribution: each factor's share of an answer, and where in the image its encoder saw it.
+
+Shares: integrated gradients of a probe (Sundararajan et al., ICML 2017), computed by captum. A factor's
+share is that of Klinghoffer et al. (ECCV 2022, caption of the Grad-CAM figure): the sum of |IG| over its
+dimensions, over the sum of all. The path from the baseline b to the feature z is straight, so IG of a
+linear logit is weight times (z - b) exactly; the probability's IG is proportional to it for yes/no labels,
+and the share of an image the same. A zero baseline counts a feature that is large in every image, whether
+or not it distinguishes images; the mean as baseline does not.
+
+Maps: Grad-CAM (Selvaraju et al., ICCV 2017) at the encoder's last spatial convolution, the paper's choice;
+HiResCAM (Draelos and Carin, 2020, arXiv 2011.08891), which multiplies gradient and activation place by
+place; integrated gradients of the pixels through the whole encoder. The answer is the probe's logit by way
+of ONE factor while the others are held. Grad-CAM averages the gradient over places, and these encoders
+weigh every place of the last activations by itself: it can light up where the answer does not look, which
+HiResCAM cannot. Maps are 4 x 4 at the activations: upsampled they show a region, not an outline.
+
+Sanity check of maps: Adebayo et al., Sanity Checks for Saliency Maps, NeurIPS 2018. A map that stays the
+same when the encoder's weights are drawn anew shows the image, not the model: do not trust it. One that
+stays with shuffled labels shows the encoder's interest, whatever the question. ``another picture`` measures
+how much of a map is the same for every image. The verdict goes by Spearman's rank correlation over the
+places of the map; SSIM is that of the maps at the image's size, each divided by its largest value.
+"""
+
+import importlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.stats import rankdata
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from derender.baselines.controls import untrained_twin
+from derender.data import suggestion
+from derender.evaluation.structural_similarity import masked_ssim
+from derender.interpretation.probe import Probe
+from derender.networks.encoders import activations
+
+OUTPUTS = ("logit", "probability")
+STEPS = {"logit": 2, "probability": 32}  # a logit is linear in the features: any number is exact
+NUMBERS_AT_ONCE = 4_000_000
+METHODS = ("grad-cam", "hires-cam", "pixels")
+GREY = 0.5
+PIXEL_STEPS = 16
+UNCHANGED = 0.5
+CHANGES = ("random weights", "shuffled labels", "another picture")
+
+
+def captum_attr() -> ModuleType:
+    """captum's attribution methods; ValueError with the extra to install where it is missing."""
+    try:
+        return importlib.import_module("captum.attr")
+    except ImportError as error:
+        raise ValueError(
+            f"integrated gradients need the package captum, which is not here ({error}): "
+            "pip install 'derender[explain]'"
+        ) from error
+
+
+def integrated_gradients(
+    probe: Probe,
+    features: np.ndarray,
+    target: int,
+    *,
+    baseline: np.ndarray | None = None,
+    output: str = "logit",
+    steps: int | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """The contribution of each dimension to one answer, from the baseline to the image.
+
+    Args:
+        probe: A answers, D features.
+        features: (N, D).
+        target: number of the label or class.
+        baseline: (D,); zero by default, as in the paper.
+        output: "logit" or "probability".
+        steps: of the Gauss-Legendre quadrature; by default as many as the output needs.
+
+    Returns:
+        (N, D) attributions, and (N,) completeness errors: their sum less the change of the answer.
+    """
+    if output not in OUTPUTS:
+        raise ValueError(
+            f"unknown output {output!r}{suggestion(output, OUTPUTS)}; there is {', '.join(OUTPUTS)}"
+        )
+    if features.ndim != 2 or features.shape[1] != probe.weight.shape[1]:
+        raise ValueError(f"the probe takes features (N, {probe.weight.shape[1]}), got {features.shape}")
+    together = output == "probability" and probe.kind == "classes"  # only there the other answers matter
+    rows = slice(None) if together else slice(target, target + 1)
+    weight, bias = (torch.from_numpy(v[rows].astype(np.float64)) for v in (probe.weight, probe.bias))
+
+    def answer(z: Tensor) -> Tensor:
+        logits = z @ weight.T + bias
+        if output == "logit":
+            return logits[:, 0]
+        return logits.softmax(dim=1)[:, target] if together else logits[:, 0].sigmoid()
+
+    steps = STEPS[output] if steps is None else steps
+    method = captum_attr().IntegratedGradients(answer)
+    start = torch.zeros(1, features.shape[1], dtype=torch.float64)
+    if baseline is not None:
+        start = torch.from_numpy(np.asarray(baseline, np.float64)).reshape(1, -1)
+    portion = max(1, NUMBERS_AT_ONCE // (steps * features.shape[1]))
+    found, errors = [], []
+    for first in range(0, len(features), portion):
+        z = torch.from_numpy(features[first : first + portion].astype(np.float64))
+        attribution, delta = method.attribute(z, start, n_steps=steps, return_convergence_delta=True)
+        found.append(attribution.detach().numpy())
+        errors.append(delta.detach().numpy())
+    if not found:
+        return np.zeros((0, features.shape[1])), np.zeros(0)
+    return np.concatenate(found), np.concatenate(errors)
+
+
+def factor_shares(attributions: np.ndarray, probe: Probe) -> np.ndarray:
+    """(N, D) attributions as (N, F) shares of |IG|, which sum to 1; NaN where nothing was attributed."""
+    size = np.abs(attributions)
+    parts = np.stack([size[:, columns].sum(axis=1) for columns in probe.slices.values()], axis=1)
+    total = parts.sum(axis=1, keepdims=True)
+    return np.divide(parts, total, out=np.full_like(parts, np.nan), where=total > 0)
+
+
+def saliency(
+    method: str,
+    model: Any,
+    images: Float[Tensor, "n 3 h w"],
+    factor: str,
+    probe: Probe | None = None,
+    targets: Sequence[int] | np.ndarray = (),
+) -> Float[Tensor, "n height width"]:
+    """A map by the name of its method, none below 0: 4 x 4 for the two CAMs, the image's size for pixels.
+
+    Args:
+        method: "grad-cam", "hires-cam" or "pixels".
+        model: with ``nets[factor].encoder``, which has ``spatial`` and ``to_code``.
+        images: in 0..1.
+        factor: whose encoder.
+        probe: whose logit is explained; None explains the feature itself (half its squared length).
+        targets: (n,) the label or class of each image; needed with a probe.
+    """
+    if method not in METHODS:
+        raise ValueError(
+            f"unknown method {method!r}{suggestion(method, METHODS)}; there is {', '.join(METHODS)}"
+        )
+    weight = None if probe is None else factor_weights(probe, factor, targets).to(images)
+    if weight is not None and len(weight) != len(images):
+        raise ValueError(f"{len(images)} images need as many targets, got {len(weight)}")
+    if method == "pixels":
+        return pixel_attribution(model, images, factor, weight)[0]
+    features, gradient = _at_features(model, images, factor, weight)
+    if method == "grad-cam":
+        gradient = gradient.mean(dim=(2, 3), keepdim=True)
+    maps = (gradient * features).sum(dim=1)
+    own, mirror = maps[: len(images)], maps[len(images) :]
+    return (own + mirror.flip(-1) if len(mirror) else own).relu()
+
+
+def factor_weights(probe: Probe, factor: str, targets: Sequence[int] | np.ndarray) -> Float[Tensor, "n code"]:
+    """The probe's weights on one factor's feature, for the target of each image."""
+    if factor not in probe.sizes:
+        raise ValueError(f"the probe has no factor {factor!r}; it has {', '.join(probe.factors)}")
+    return torch.from_numpy(probe.weight[np.asarray(targets, np.int64), probe.slices[factor]])
+
+
+def score(code: Float[Tensor, "n c"], weight: Tensor | None) -> Float[Tensor, " n"]:
+    """A factor's part of the logit, or half the squared length of its feature.
+
+    Of features that include coordinates of optimised scenes, only the encoder's part, which comes first.
+    """
+    return code.square().sum(dim=1) / 2 if weight is None else (code * weight[:, : code.shape[1]]).sum(dim=1)
+
+
+def _at_features(
+    model: Any, images: Tensor, factor: str, weight: Tensor | None
+) -> tuple[Float[Tensor, "m c y x"], Float[Tensor, "m c y x"]]:
+    """The last spatial features of an encoder, and the gradient of the answer there.
+
+    Where the feature is made of images and their mirror images, those of the mirror images follow.
+    """
+    encoder, mirrors = model.nets[factor].encoder, model.features.mirrors(factor)
+    seen = torch.cat([images, images.flip(-1)]) if mirrors else images
+    with torch.enable_grad():
+        features = encoder.spatial(seen).detach().requires_grad_()
+        active = activations(encoder.to_code(features).flatten(1), features)
+        if mirrors:
+            active = torch.cat(active.chunk(2), dim=1)
+        answer = score(model.features_from({factor: active})[factor], weight).sum()
+        (gradient,) = torch.autograd.grad(answer, features)
+    return features.detach(), gradient
+
+
+def pixel_attribution(
+    model: Any,
+    images: Float[Tensor, "n 3 h w"],
+    factor: str,
+    weight: Tensor | None,
+    steps: int = PIXEL_STEPS,
+) -> tuple[Float[Tensor, "n h w"], Float[Tensor, " n"]]:
+    """|IG| of the pixels from a grey image, summed over colours, and the relative completeness error."""
+
+    def answer(pictures: Tensor, own: Tensor | None = None) -> Tensor:
+        active = model.factor_activations(factor, pictures)
+        return score(model.features_from({factor: active})[factor], own)
+
+    grey = torch.full_like(images[:1], GREY)
+    with torch.enable_grad():
+        attribution, delta = captum_attr().IntegratedGradients(answer).attribute(
+            images, grey, additional_forward_args=weight, n_steps=steps, return_convergence_delta=True,
+            internal_batch_size=max(len(images), 64),
+        )  # fmt: skip
+    attribution, delta = attribution.detach(), delta.detach()
+    change = (attribution.sum(dim=(1, 2, 3)) - delta).abs().max().clamp(min=1e-12)
+    return attribution.abs().sum(dim=1).to(images), (delta.abs() / change).to(images)
+
+
+def upsampled(maps: Float[Tensor, "n y x"], size: int) -> Float[Tensor, "n size size"]:
+    """Maps at the image's size, bilinear between the centres of their cells."""
+    return interpolate(maps[:, None], (size, size), mode="bilinear", align_corners=False)[:, 0]
+
+
+def to_one(maps: Float[Tensor, "n y x"]) -> Float[Tensor, "n y x"]:
+    """Each map divided by its own largest value; an empty map stays empty."""
+    top = maps.amax(dim=(1, 2), keepdim=True)
+    return torch.where(top > 0, maps / top.clamp(min=torch.finfo(maps.dtype).tiny), 0.0)
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """Similarity of a method's maps before and after a change.
+
+    Attributes:
+        method, factor, changed: which maps, and the change: one of ``CHANGES``.
+        spearman: mean rank correlation over images and seeds, -1..1; 1 means unchanged.
+        ssim: mean structural similarity, at most 1.
+        spread: standard deviation of the rank correlation over images and seeds.
+        empty: share of comparisons left out because a map was empty or flat.
+    """
+
+    method: str
+    factor: str
+    changed: str
+    spearman: float
+    ssim: float
+    spread: float
+    empty: float
+
+    @property
+    def trusted(self) -> bool | None:
+        """Whether new weights change the map; None where that was not measured."""
+        if self.changed != "random weights" or not np.isfinite(self.spearman):
+            return None
+        return self.spearman < UNCHANGED
+
+
+def sanity_check(
+    model: Any,
+    probe: Probe,
+    shuffled: Probe | None,
+    images: Tensor,
+    targets: np.ndarray,
+    *,
+    methods: Sequence[str] = METHODS,
+    seeds: Sequence[int] = (0, 1, 2),
+) -> list[Similarity]:
+    """Compare the maps of a model with those of the same networks with fresh weights, and more.
+
+    Args:
+        model: with settings, from which untrained twins are made.
+        probe: whose answers are explained, the same when weights change.
+        shuffled: a probe of shuffled labels, or None.
+        images: (n, 3, s, s) in 0..1, two or more.
+        targets: (n,) the label or class explained for each.
+        methods: of ``METHODS``.
+        seeds: of the fresh weights.
+    """
+    if len(images) < 2:
+        raise ValueError(f"a sanity check compares maps of 2 images or more, got {len(images)}")
+    twins = [untrained_twin(model, seed) for seed in seeds]
+    found = []
+    for method in methods:
+        for factor in probe.factors:
+            own = saliency(method, model, images, factor, probe, targets)
+            others = {
+                "random weights": [saliency(method, twin, images, factor, probe, targets) for twin in twins],
+                "shuffled labels": []
+                if shuffled is None
+                else [saliency(method, model, images, factor, shuffled, targets)],
+                "another picture": [own.roll(1, dims=0)],
+            }
+            size = images.shape[-1]
+            found += [
+                similarity(method, factor, name, own, maps, size) for name, maps in others.items() if maps
+            ]
+    return found
+
+
+def similarity(
+    method: str, factor: str, changed: str, own: Tensor, others: Sequence[Tensor], size: int
+) -> Similarity:
+    """Mean similarity of maps (n, y, x) with each of several others of the same images."""
+    ranks = np.concatenate([spearman(own, other) for other in others])
+    ssim = np.concatenate([_ssim(own, other, size) for other in others])
+    known = np.isfinite(ranks)
+    if not known.any():
+        return Similarity(method, factor, changed, float("nan"), float("nan"), float("nan"), 1.0)
+    return Similarity(
+        method,
+        factor,
+        changed,
+        float(ranks[known].mean()),
+        float(ssim[known].mean()),
+        float(ranks[known].std()),
+        float(1 - known.mean()),
+    )
+
+
+def spearman(first: Tensor, second: Tensor) -> np.ndarray:
+    """Rank correlation over the places of each pair of maps, (n,); NaN where one of them is flat."""
+    a, b = (rankdata(maps.flatten(1).cpu().double().numpy(), axis=1) for maps in (first, second))
+    a, b = a - a.mean(axis=1, keepdims=True), b - b.mean(axis=1, keepdims=True)
+    length = np.sqrt((a**2).sum(axis=1) * (b**2).sum(axis=1))
+    return np.divide((a * b).sum(axis=1), length, out=np.full(len(a), np.nan), where=length > 0)
+
+
+def _ssim(first: Tensor, second: Tensor, size: int) -> np.ndarray:
+    one, other = (upsampled(to_one(m), size)[:, None].expand(-1, 3, -1, -1) for m in (first, second))
+    everywhere = torch.ones(len(first), size, size, device=first.device)
+    return masked_ssim(one, other, everywhere).cpu().numpy()

@@ -1,0 +1,74 @@
+"""Contact sheet of a search: the query, then the nearest images with their distances."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from derender.data import Unreadable, decode, open_images, quiet_pillow, read_picture
+from derender.features.neighbours import Found
+from derender.report.colours import pictures
+from derender.report.panel import GridLayout, contact_sheet
+
+CELL = 160
+
+
+def search_sheet(
+    found: Found,
+    images: str | None = None,
+    *,
+    dataset: str = "auto",
+    progress: Callable[[int, int], object] | None = None,
+) -> tuple[Image.Image, list[str]]:
+    """The sheet, and the names of images that cannot be read and are left out of it.
+
+    Args:
+        found: of `derender.search`.
+        images: the address of the table's images; by default the one that the table records.
+        dataset: layout of the images, or "auto".
+        progress: called with (images read, all).
+
+    Raises:
+        ValueError: the address is not known, or holds none of the images.
+    """
+    address = images if images is not None else str(found.table.origin.get("data", ""))
+    if not address:
+        raise ValueError("the table does not record where its images are: give their address")
+    rows = [*(() if found.own_row is None else (found.own_row,)), *found.rows]
+    read = _read([found.table.files[row] for row in rows], address, dataset, progress)
+    captions = {row: f"{distance:.3f}" for row, distance in zip(found.rows, found.distances, strict=True)}
+    shown = [] if found.own_row is not None else [("query", read_picture(Path(found.like), CELL))]
+    shown += [(captions.get(r, "query"), read[f]) for r in rows if (f := found.table.files[r]) in read]
+    sheet = contact_sheet(
+        [pictures(image[None])[0] for _, image in shown],
+        [caption for caption, _ in shown],
+        across=7,
+        title=f"nearest by {found.factor}",
+        layout=GridLayout(cell=CELL),
+    )
+    return sheet, [found.table.files[row] for row in rows if found.table.files[row] not in read]
+
+
+def _read(
+    files: Sequence[str], address: str, dataset: str, progress: Callable[[int, int], object] | None
+) -> dict[str, np.ndarray]:
+    """Images by name, as far as they can be read; nothing else is decoded."""
+    missing, read = set(files), {}
+    with open_images(address, dataset=dataset) as stream, quiet_pillow():
+        for sample in stream.samples():
+            if sample.file in missing:
+                missing.remove(sample.file)
+                try:
+                    read[sample.file] = decode(sample.read(), CELL, box=sample.box)
+                except (Unreadable, ValueError, OSError):
+                    continue
+                if progress is not None:
+                    progress(len(read), len(files))
+            if not missing:
+                break
+    if not read:
+        raise ValueError(
+            f"{address} holds none of the images found, such as {files[-1]!r}: give another address"
+        )
+    return read
