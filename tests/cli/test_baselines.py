@@ -53,7 +53,7 @@ def test_a_run_has_a_report_and_goes_on(run, faces, capsys):
     assert "Baseline vqvae" in (run / "report.html").read_text()
     assert (run / "model" / "model.safetensors").is_file() and list((run / "samples").glob("*.png"))
     assert main(["train", "--data", str(faces), "--out", str(run), "--resume"]) == 0
-    assert "8 pictures in" in capsys.readouterr().err
+    assert "8 images in" in capsys.readouterr().err
 
 
 def test_embed_then_cluster_as_with_our_own(run, faces, tmp_path, capsys):
