@@ -132,7 +132,7 @@ def test_bad_words_are_one_line(run, faces, tmp_path, refused):
     assert "(N, 3" not in refused(*embed, "--baseline", "pca", "--image-size", "16")
     train = ("train", "--data", faces, "--out", tmp_path / "run")
     assert "did you mean 'simclr'" in refused(*train, "--model", "simcrl")
-    assert "--preset is for our own model" in refused(*train, "--model", "ae", "--preset", "small")
+    assert "preset is for derender models" in refused(*train, "--model", "ae", "--preset", "small")
     assert "'model.codes'" in refused(*train, "--model", "vqvae", "--set", "code=3")
     assert f"{run} trained vqvae, not ae" in refused(
         "train", "--model", "ae", "--data", faces, "--out", run, "--resume"
