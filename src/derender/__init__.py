@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from derender import evaluation as evaluate
+    from derender.data.doctor import doctor
     from derender.evaluation import compare
     from derender.features import DisentangledFeatures, FeatureTable, embed, embed_to_file, search
     from derender.interpretation import explain
@@ -21,6 +22,7 @@ _HOME = {
     "Derenderer": "derender.model",
     "load": "derender.model",
     "Scene": "derender.scene",
+    "doctor": "derender.data.doctor",
     "FeatureTable": "derender.features",
     "DisentangledFeatures": "derender.features",
     "train": "derender.learn",
@@ -57,6 +59,7 @@ __all__ = [
     "Scene",
     "__version__",
     "compare",
+    "doctor",
     "embed",
     "embed_to_file",
     "evaluate",

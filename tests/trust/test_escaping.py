@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from derender.data import PictureSet, Skipped
-from derender.data.doctor import examine
+from derender.data.doctor import doctor
 from derender.evaluation.bootstrap import ScoredRow, estimate, with_verdicts
 from derender.evaluation.linear_task import Rows, task_of
 from derender.evaluation.robustness import CurveResult, RobustnessComparison
@@ -93,7 +93,7 @@ def test_doctor(evil):
     names = tuple(f"{evil}{number}.png" for number in range(24))
     labels = {evil: np.array([evil, "b"] * 12)}
     pictures = PictureSet(images, names, labels, source=evil, skipped=(Skipped(evil, evil),))
-    harmless(doctor_page(pictures, examine(pictures)), evil)
+    harmless(doctor_page(doctor(pictures)), evil)
 
 
 @pytest.mark.parametrize("evil", EVIL)

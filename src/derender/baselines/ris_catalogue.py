@@ -22,7 +22,7 @@ from derender.baselines.model import Images
 from derender.baselines.ris import Ris, RisConfig, RisSettings, nearest_cluster, part_energy, part_matrix
 from derender.baselines.stylegan2_generator import TINY, Generator
 from derender.baselines.training import SheetOf, ShortRun
-from derender.data import PictureSet, read_mask_folder, read_masks, split_indices
+from derender.data import PictureSet, read_masks, split_indices
 from derender.training.batches import random_stream
 from derender.training.loop import SAMPLE_COUNT
 from derender.training.task import TrainResult
@@ -202,7 +202,7 @@ def masked_rows(
     if config.masks is None:
         masked = read_masks(images.source, size)
     else:
-        masked = read_mask_folder(images.source, config.masks, size)
+        masked = read_masks(images.source, size, masks=config.masks)
     train = split_indices(images.files, config.split, seed=config.seed).train
     row_of = {file: row for row, file in enumerate(masked.pictures.files)}
     rows = np.array([row_of[images.files[index]] for index in train])

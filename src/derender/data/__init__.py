@@ -28,7 +28,7 @@ from derender.data.image import READER_VERSION, Unreadable, decode, quiet_pillow
 from derender.data.layouts import LAYOUTS
 from derender.data.layouts.celebamask import MASK_CLASSES
 from derender.data.listing import cache_folder
-from derender.data.masks import MaskedPictures, read_mask_folder, read_masks
+from derender.data.masks import MaskedPictures, read_masks
 from derender.data.names import is_picture, suggestion
 from derender.data.opening import ListedStream, list_images, open_images, open_source, parse_source
 from derender.data.parquet import check_lists, checked_footer
@@ -83,7 +83,6 @@ __all__ = [
     "parse_source",
     "quiet_pillow",
     "read_ground_truth",
-    "read_mask_folder",
     "read_masks",
     "read_picture",
     "read_pictures",

@@ -121,23 +121,20 @@ def _commit(identifier: str, revision: str | None, source: str) -> str:
     _library(source)
     from huggingface_hub import HfApi, errors
 
+    refusals = {
+        errors.GatedRepoError: f"the data set {identifier} is gated: accept its terms at https://huggingface.co/"
+        f"datasets/{identifier} and log in with 'hf auth login'",
+        errors.RepositoryNotFoundError: f"the Hugging Face Hub has no data set {identifier} "
+        "(or it is private): check the id, or log in",
+        errors.HFValidationError: f"{identifier!r} is no id of a Hugging Face data set",
+    }
     try:
         info = HfApi().dataset_info(identifier, revision=revision, timeout=_ANSWER_SECONDS)
-    except errors.GatedRepoError as problem:
+    except (*refusals, errors.HfHubHTTPError, OSError, RuntimeError, _transport_error()) as problem:
+        why = type(problem).__name__
+        failed = f"the Hugging Face Hub cannot be asked for {identifier} ({why}): check the network"
         raise ValueError(
-            f"the data set {identifier} is gated: accept its terms at https://huggingface.co/datasets/"
-            f"{identifier} and log in with 'hf auth login'"
-        ) from problem
-    except errors.RepositoryNotFoundError as problem:
-        raise ValueError(
-            f"the Hugging Face Hub has no data set {identifier} (or it is private): check the id, or log in"
-        ) from problem
-    except errors.HFValidationError as problem:
-        raise ValueError(f"{identifier!r} is no id of a Hugging Face data set ({problem})") from problem
-    except (errors.HfHubHTTPError, OSError, RuntimeError, _transport_error()) as problem:
-        raise ValueError(
-            f"the Hugging Face Hub cannot be asked for {identifier} "
-            f"({type(problem).__name__}): check the network"
+            next((text for kind, text in refusals.items() if isinstance(problem, kind)), failed)
         ) from problem
     return info.sha or "main"
 

@@ -1,15 +1,13 @@
 """Images with a mask each: which class every pixel shows.
 
-Masks lie in the data set itself (``read_masks``: CelebAMask-HQ, rendered sets), or in another folder or zip
-beside images of any layout (``read_mask_folder``): one of class numbers for each, named alike. Masks are
-only ever resized to the nearest value, after the same crop as their image's. A mask in parts is merged as
-CelebAMask-HQ's owners do it (their g_mask.py): the parts are laid over one another in the order of the
-classes, so that a later class hides an earlier one. Leaves out colours as classes, and a number for pixels
-without a class.
+Masks lie in the data set itself (CelebAMask-HQ, rendered sets), or in another folder or zip beside images of
+any layout: one of class numbers for each, named alike. Masks are only ever resized to the nearest value, after
+the same crop as their image's. A mask in parts is merged as CelebAMask-HQ's owners do it (their g_mask.py): the
+parts are laid over one another in the order of the classes, so that a later class hides an earlier one. Leaves
+out colours as classes, and a number for pixels without a class.
 """
 
 import io
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
@@ -47,6 +45,7 @@ def read_masks(
     source: str | Path,
     image_size: int,
     *,
+    masks: str | Path | None = None,
     dataset: str = "auto",
     subset: str | None = None,
     fit: str = "crop",
@@ -58,100 +57,64 @@ def read_masks(
 ) -> MaskedPictures:
     """Read every image of a folder or zip with its mask, both at ``image_size`` x ``image_size``.
 
-    The options are those of ``read_pictures``; ``progress`` counts the images and then, from the start, the
-    masks. A data set without masks is an error, and so is a mask that does not fit its image: one that is
-    missing, has another aspect ratio, is no image of one channel, or holds a number that is no class.
+    The other options are those of ``read_pictures``; ``progress`` counts the images and then, from the start,
+    the masks. A data set without masks is an error, and so is a mask that does not fit its image: one that is
+    missing, is no image of one channel, or holds a number that is no class.
+
+    Args:
+        masks: a folder or zip with a mask for every image: that of ``a/b.jpg`` is ``a/b.png``, or the only
+            ``b.png`` there is. A file ``classes.txt`` among them, or beside their folder as `derender synth`
+            writes it, names the classes, one a line, the first being number 0; else they are called
+            after their numbers. None takes the data set's own masks, with CelebAMask-HQ's classes and the
+            aspect ratio of their images.
     """
-    with list_images(source, dataset=dataset, subset=subset) as listed:
-        _require_all(listed)
-        pictures = read_pictures(
-            source,
-            image_size,
-            dataset=dataset,
-            subset=subset,
-            fit=fit,
-            keep_duplicates=keep_duplicates,
-            limit=limit,
-            cache=cache,
-            workers=workers,
-            progress=progress,
+    if masks is None:
+        listed = list_images(source, dataset=dataset, subset=subset)
+        files, parts, classes = listed.files, parts_of(listed.files), len(MASK_CLASSES)
+        limits = f"0 ({MASK_CLASSES[0]}) to {classes - 1} ({MASK_CLASSES[-1]})"
+    else:
+        listed, files, parts, classes = None, open_source(Path(masks).expanduser()), {}, MOST_CLASSES
+        limits = f"0 to {classes - 1}: give pixels without a class a class of their own"
+    with files:
+        if listed is not None:
+            _require_all(listed)
+        how = {"dataset": dataset, "subset": subset, "fit": fit, "keep_duplicates": keep_duplicates}
+        how |= {"limit": limit, "cache": cache, "workers": workers, "progress": progress}
+        pictures = read_pictures(source, image_size, **how)
+        names = _named_alike(files, pictures.files) if listed is None else pictures.label("mask").tolist()
+        found = np.empty((len(pictures), image_size, image_size), np.uint8)
+
+        def load(row: int) -> None:
+            name = names[row]
+            merged = _merged(files, parts[name]) if name in parts else None
+            mask = _numbers(files, name, classes, limits) if merged is None else merged
+            if listed is not None:
+                _check_shape(files, name, mask.shape, pictures.files[row])
+            square = fit_square(Image.fromarray(mask), image_size, fit, Image.Resampling.NEAREST, 0)
+            found[row] = np.asarray(square)
+
+        pool = ThreadPoolExecutor(workers or usable_cores())
+        try:
+            with quiet_pillow():
+                for done, _ in enumerate(pool.map(load, range(len(pictures))), 1):
+                    if progress is not None:
+                        progress(done, len(pictures))
+        finally:
+            pool.shutdown(cancel_futures=True)
+        names_of_classes = MASK_CLASSES if listed is not None else _class_names(files, found, names)
+    return MaskedPictures(pictures, found, names_of_classes)
+
+
+def _check_shape(files: Source, name: str, shape: tuple[int, ...], image: str) -> None:
+    """A mask has the aspect ratio of its image."""
+    with Image.open(io.BytesIO(files.read(image))) as opened:
+        width, height = upright_size(opened)
+    rows, columns = shape
+    if abs(columns * height - rows * width) > width + height:
+        raise ValueError(
+            f"{name} in {files.path} is {columns} x {rows} and its image {image} {width} x {height}: "
+            f"a mask has the aspect ratio of its image"
         )
-        files, names, parts = listed.files, pictures.label("mask"), parts_of(listed.files)
-        limit_text = f"0 ({MASK_CLASSES[0]}) to {len(MASK_CLASSES) - 1} ({MASK_CLASSES[-1]})"
-
-        def read(row: int) -> UInt8[np.ndarray, "h w"]:
-            name, image = str(names[row]), pictures.files[row]
-            if name in parts:
-                mask = _merged(files, parts[name])
-            else:
-                mask = _class_numbers(files, name, len(MASK_CLASSES), limit_text)
-            with Image.open(io.BytesIO(files.read(image))) as opened:
-                width, height = upright_size(opened)
-            rows, columns = mask.shape
-            if abs(columns * height - rows * width) > width + height:
-                raise ValueError(
-                    f"{name} in {files.path} is {columns} x {rows} and its image {image} {width} x {height}: "
-                    f"a mask has the aspect ratio of its image"
-                )
-            return mask
-
-        masks = _all_masks(read, len(pictures), image_size, fit, workers, progress)
-    return MaskedPictures(pictures, masks, MASK_CLASSES)
-
-
-def read_mask_folder(
-    source: str | Path,
-    masks: str | Path,
-    image_size: int,
-    *,
-    dataset: str = "auto",
-    fit: str = "crop",
-    limit: int | None = None,
-    progress: Progress | None = None,
-) -> MaskedPictures:
-    """Read images as ``read_pictures`` does, and the mask of each, at ``image_size`` x ``image_size``.
-
-    The mask of ``a/b.jpg`` is ``a/b.png``, or the only ``b.png`` there is. A file ``classes.txt`` among the
-    masks, or beside their folder as `derender synth` writes it, names the classes, one a line, the first
-    being number 0; without it they are called after their numbers. An image without a mask is an error, and
-    so is a mask of more than one channel or with a number that is no class.
-    """
-    pictures = read_pictures(source, image_size, dataset=dataset, fit=fit, limit=limit, progress=progress)
-    limit_text = f"0 to {MOST_CLASSES - 1}: give pixels without a class a class of their own"
-    with open_source(Path(masks).expanduser()) as opened:
-        names = _mask_names(opened, pictures.files)
-
-        def read(row: int) -> UInt8[np.ndarray, "h w"]:
-            return _class_numbers(opened, names[row], MOST_CLASSES, limit_text)
-
-        found = _all_masks(read, len(pictures), image_size, fit, None, progress)
-        return MaskedPictures(pictures, found, _class_names(opened, found, names))
-
-
-def _all_masks(
-    read: Callable[[int], UInt8[np.ndarray, "h w"]],
-    count: int,
-    image_size: int,
-    fit: str,
-    workers: int | None,
-    progress: Progress | None,
-) -> UInt8[np.ndarray, "n s s"]:
-    """The mask of every row at one size."""
-    masks = np.empty((count, image_size, image_size), np.uint8)
-
-    def load(row: int) -> None:
-        square = fit_square(Image.fromarray(read(row)), image_size, fit, Image.Resampling.NEAREST, 0)
-        masks[row] = np.asarray(square)
-
-    pool = ThreadPoolExecutor(workers or usable_cores())
-    try:
-        with quiet_pillow():
-            for done, _ in enumerate(pool.map(load, range(count)), 1):
-                if progress is not None:
-                    progress(done, count)
-    finally:
-        pool.shutdown(cancel_futures=True)
-    return masks
 
 
 def _require_all(listed: ListedStream) -> None:
@@ -170,7 +133,7 @@ def _require_all(listed: ListedStream) -> None:
         )
 
 
-def _class_numbers(source: Source, file: str, classes: int, limits: str) -> UInt8[np.ndarray, "h w"]:
+def _numbers(source: Source, file: str, classes: int, limits: str) -> UInt8[np.ndarray, "h w"]:
     """A mask that holds class numbers; a palette's colours do not matter."""
     opened = opened_image(source, file)
     if len(opened.getbands()) > 1:
@@ -201,7 +164,7 @@ def _merged(source: Source, files: dict[int, str]) -> UInt8[np.ndarray, "h w"]:
     return merged
 
 
-def _mask_names(source: Source, images: tuple[str, ...]) -> list[str]:
+def _named_alike(source: Source, images: tuple[str, ...]) -> list[str]:
     by_path = {file.removesuffix(".png"): file for file in source.files if file.endswith(".png")}
     by_stem: dict[str, list[str]] = {}
     for path, file in by_path.items():

@@ -16,7 +16,7 @@ from jaxtyping import UInt8
 
 from derender.baselines.controls import untrained_features
 from derender.data import GroundTruth, PictureSet, as_float
-from derender.data.doctor import examine
+from derender.data.doctor import doctor
 from derender.evaluation import evaluate_factors, evaluate_geometry, evaluate_reconstruction, mean_picture
 from derender.evaluation.disentanglement import evaluate_disentanglement
 from derender.evaluation.linear_task import choose_rows
@@ -82,7 +82,7 @@ def look_at_data(pictures: PictureSet) -> list[Html]:
     sample = _sample(pictures, EXAMINED)
     size = f"All {len(sample):,} pictures" if len(sample) == len(pictures) else f"{len(sample):,} pictures"
     note = blocks.prose(f"{pictures.describe()}. {size} were examined, identical copies left out before.")
-    return [note, *doctor_blocks(sample, examine(sample))]
+    return [note, *doctor_blocks(doctor(sample))]
 
 
 def gather(hand: AtHand, progress: Progress | None = None) -> Evidence:

@@ -110,13 +110,13 @@ class MaskSource:
 
     def read(self, image_size: int) -> "tuple[PictureSet, np.ndarray, tuple[str, ...]]":
         """Pictures, masks and the names of the classes."""
-        from derender.data import read_mask_folder, read_masks
+        from derender.data import read_masks
 
         own = {"dataset": self.dataset, "limit": self.limit}
         with progress_bar("reading") as report:
             if self.masks is None:
                 return read_masks(self.data, image_size, progress=report, **own)
-            return read_mask_folder(self.data, self.masks, image_size, progress=report, **own)
+            return read_masks(self.data, image_size, masks=self.masks, progress=report, **own)
 
 
 @dataclass(frozen=True)

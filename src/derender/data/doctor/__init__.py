@@ -1,31 +1,249 @@
-"""Says whether a set of pictures suits the method, before anyone trains.
+"""Whether a set of images suits the method, before anyone trains: ``doctor``.
 
-originals    sizes and shapes of the files, from their headers
-pixels       brightness, clipping, colour, and the small descriptors that everything else is measured on
-near_copies  pictures that differ by a little shift, brightness or compression only
-structure    what the pictures share at the same place: agreement, symmetry, extent, middle
-kinds        one kind of thing or two; pictures unlike all others
-variety      variety of view and of light
-estimate     a value and its standard error; limits  where each measure turns bad, in one table
-measures     all of it joined; findings  from measures to sentences and a verdict
-examine      a set of pictures in, an examination out
+pixels (sizes, brightness, colour, near copies) and structure (what images share, in what they vary) measure;
+findings makes sentences and a verdict of it, and has every threshold.
 """
 
-from derender.data.doctor.estimate import Estimate
-from derender.data.doctor.examine import EXAMINED_PX, Examination, examine
-from derender.data.doctor.findings import Finding, Level, Verdict
-from derender.data.doctor.measures import Measures
-from derender.data.doctor.originals import Originals, measure_originals
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
-__all__ = [
-    "EXAMINED_PX",
-    "Estimate",
-    "Examination",
-    "Finding",
-    "Level",
-    "Measures",
-    "Originals",
-    "Verdict",
-    "examine",
-    "measure_originals",
-]
+import numpy as np
+from jaxtyping import Float, Int64
+
+from derender.data.doctor import structure
+from derender.data.doctor.findings import CHECKS, Check, Finding, Verdict, findings_of, percent, verdict_of
+from derender.data.doctor.pixels import (
+    Originals,
+    Pixels,
+    measure_originals,
+    measure_pixels,
+    near_copy_groups,
+    shrunk,
+)
+from derender.data.doctor.structure import Axis, Estimate, Halves, jackknife
+from derender.data.names import is_picture
+from derender.data.opening import ListedStream, open_images
+from derender.data.pictures import PictureSet, read_pictures
+
+__all__ = ["CHECKS", "Check", "Examination", "Finding", "Verdict", "doctor", "measure_originals", "percent"]
+
+EXAMINED_PX = 64
+"""Side at which images are read for an examination."""
+
+COMPARED = 4_000
+"""Most distinct images that are compared with one another, evenly spaced."""
+
+FEWEST_COMPARED = 2 * structure.GROUPS
+"""With fewer distinct images nothing can be said about what they share."""
+
+ODD_LIKENESS = 0.15
+"""An image less like the others than this is unlike all of them."""
+
+SHOWN = 8
+"""Images in each row of examples, at most."""
+
+
+@dataclass(frozen=True)
+class Shared:
+    """What distinct images share, and in what they vary (structure.py).
+
+    Attributes:
+        rows: which images were compared.
+        values: agreement, symmetry, fill, view, light, odd, and kinship where it can be judged.
+        axis: where the mean image of edges is symmetric.
+        halves: the two most different groups, or None.
+        orders: pairs of names for the two ends of an order of the compared images, and what orders them.
+    """
+
+    rows: Int64[np.ndarray, " k"]
+    values: Mapping[str, Estimate]
+    axis: Axis
+    halves: Halves | None
+    orders: Mapping[tuple[str, str], Float[np.ndarray, " k"]]
+
+
+@dataclass(frozen=True)
+class Examination:
+    """What was found.
+
+    Attributes:
+        pictures: the images that were examined.
+        verdict: whether the set suits the method.
+        findings: one for each thing that was looked at.
+        values: every measured number by its name in ``CHECKS``.
+        group: the first image of each image's group of copies and near copies.
+        identical: copies to the last pixel, the first of each not counted.
+        originals: sizes of the files, or None for a stream.
+        shared: None where too few distinct images show anything.
+        examples: rows of images by what they show ("most typical", "least typical", "one group", ...).
+    """
+
+    pictures: PictureSet
+    verdict: Verdict
+    findings: tuple[Finding, ...]
+    values: Mapping[str, Estimate]
+    group: Int64[np.ndarray, " n"]
+    identical: int
+    originals: Originals | None
+    shared: Shared | None
+    examples: Mapping[str, tuple[int, ...]]
+
+    @property
+    def mean(self) -> Float[np.ndarray, "3 s s"] | None:
+        """The compared images' mean, 0..1, or None where too few were compared."""
+        rows = None if self.shared is None else self.shared.rows
+        return None if rows is None else self.pictures.images[rows].mean(axis=0, dtype=np.float64) / 255
+
+    def as_json(self) -> dict[str, Any]:
+        """What ``derender doctor --json`` writes."""
+        files, shared = self.pictures.files, self.shared
+        compared = {} if shared is None else {**shared.values, "axis": shared.axis}
+        copies = [(row, first) for row, first in enumerate(self.group) if row != first]
+        return {
+            "source": self.pictures.source,
+            "verdict": self.verdict.word,
+            "because": self.verdict.because,
+            "findings": self.findings,
+            "pictures": len(files),
+            "distinct": len(files) - len(copies),
+            "identical": self.identical,
+            "near_copies": len(copies) - self.identical,
+            "clipped": self.values["clipped"].value,
+            "grey": self.values["grey"].value,
+            "blank": round(self.values["blank"].value * len(files)),
+            "originals": self.originals,
+            "compared": 0 if shared is None else len(shared.rows),
+            "measures": {name: one for name, one in compared.items() if name != "kinship"} or None,
+            "kinship": compared.get("kinship"),
+            "unreadable": self.pictures.skipped,
+            "copies": [{"file": files[row], "first": files[first]} for row, first in copies],
+        }
+
+
+def doctor(
+    images: str | Path | PictureSet,
+    *,
+    dataset: str = "auto",
+    limit: int | None = None,
+    seed: int = 0,
+    progress: Callable[[int, int], object] | None = None,
+) -> Examination:
+    """Say whether images suit the method: copies, crop, symmetry, view and light. Trains nothing.
+
+    Args:
+        images: a folder, zip, shards or data set as ``read_pictures`` takes it; or a set that was read with
+            ``keep_duplicates=True`` at a multiple of 32 pixels.
+        dataset: the layout's name, or "auto" to recognise it.
+        limit: examine at most so many images.
+        seed: of the random splits in two groups; the same images and seed give the same examination.
+        progress: called with (done, total), first of reading, then of examining.
+    """
+    originals = None
+    if not isinstance(images, PictureSet):
+        source = images
+        if Path(source).is_file() and is_picture(str(source)):
+            raise ValueError(f"{source} is one image: a set is examined as a whole, give its folder or zip")
+        how = {"dataset": dataset, "limit": limit, "keep_duplicates": True, "progress": progress}
+        images = read_pictures(source, EXAMINED_PX, **how)
+        with open_images(source, dataset=dataset) as stream:
+            if isinstance(stream, ListedStream):
+                originals = measure_originals(stream.files, images.files, EXAMINED_PX)
+    if len(images) == 0:
+        raise ValueError(f"there is no image to examine in {images.source}")
+    pixels = measure_pixels(images.images, progress)
+    group = near_copy_groups(pixels.tiny)
+    shared = _compare(images, pixels, np.unique(group), np.random.default_rng(seed))
+    values = _counts(images, pixels, group, originals) | ({} if shared is None else shared.values)
+    kept = set(images.files)
+    identical = sum(row.file in kept for row in images.duplicates)
+    copies, details = len(images) - len(np.unique(group)), {}
+    if copies:
+        nearly = copies - identical
+        details["copies"] = f"{copies:,} of {len(images):,}: {identical:,} to the pixel, {nearly:,} nearly"
+    if originals is not None:
+        details["small"] = f"short sides: {originals.median_short:,} pixels in the median"
+    findings = findings_of(values, details, None if shared is None else shared.axis)
+    examples = _examples(pixels, group, shared)
+    verdict = verdict_of(findings)
+    return Examination(images, verdict, findings, values, group, identical, originals, shared, examples)
+
+
+def _counts(
+    images: PictureSet, pixels: Pixels, group: np.ndarray, originals: Originals | None
+) -> dict[str, Estimate]:
+    """What needs no comparison of what different images show."""
+    count, unreadable, distinct = len(images), len(images.skipped), len(np.unique(group))
+    values: dict[str, float] = {
+        "distinct": distinct,
+        "copies": 1 - distinct / count,
+        "unreadable": unreadable / (unreadable + count),
+        "clipped": (pixels.dark + pixels.bright).mean(),
+        "blank": pixels.blank.mean(),
+        "grey": pixels.colourless.mean(),
+    }
+    if originals is not None:
+        values |= {"small": originals.smaller, "oblong": originals.oblong}
+    return {name: Estimate(float(value)) for name, value in values.items()}
+
+
+def _compare(
+    images: PictureSet, pixels: Pixels, distinct: np.ndarray, generator: np.random.Generator
+) -> Shared | None:
+    rows = distinct[~pixels.blank[distinct]]
+    if len(rows) < FEWEST_COMPARED:
+        return None
+    rows = _evenly(rows, COMPARED)
+    parts = np.array_split(rows, -(-len(rows) // 256))
+    grey = np.concatenate([shrunk(images.images[part]) for part in parts])
+    edges, sides, count = (
+        structure.structure_of(structure.edge_cells(grey)),
+        structure.side_light(grey),
+        len(rows),
+    )
+    alike = structure.likeness(edges)
+    odd = float((alike < ODD_LIKENESS).mean())
+    values = {
+        "agreement": jackknife(lambda kept: structure.agreement(edges[kept]), count),
+        "symmetry": jackknife(lambda kept: structure.symmetry(edges[kept]), count),
+        "fill": jackknife(lambda kept: structure.frame_filled(edges[kept]), count),
+        "view": jackknife(lambda kept: structure.view_variety(edges[kept]), count),
+        "light": jackknife(lambda kept: structure.light_variety(sides[kept]), count),
+        "odd": Estimate(odd, float(np.sqrt(odd * (1 - odd) / count))),
+    }
+    orders = {
+        ("least typical", "most typical"): alike,
+        ("nearest their mirror image", "farthest from it"): structure.own_mirror_distance(edges),
+        ("brightest on the right", "brightest on the left"): sides.mean(axis=1),
+    }
+    halves = structure.split_in_two(edges, generator)
+    if halves is not None:
+        values["kinship"] = halves.kinship
+        if halves.kinship.value < (CHECKS["kinship"].objects or 0):
+            orders["one group", "the other group"] = halves.margin
+    return Shared(rows, values, structure.symmetry_axis(grey), halves, orders)
+
+
+def _examples(pixels: Pixels, group: np.ndarray, shared: Shared | None) -> dict[str, tuple[int, ...]]:
+    """Images for the page, by what they show; those of the extremes are extreme, no pick."""
+    examples: dict[str, np.ndarray] = {}
+    copies = np.flatnonzero(group != np.arange(len(group)))
+    if len(copies):
+        some = _evenly(copies, SHOWN // 2)
+        examples["copies, in pairs"] = np.stack([group[some], some], axis=1).ravel()
+    if (blank := np.flatnonzero(pixels.blank)).size:
+        examples["empty"] = _evenly(blank, SHOWN)
+    if shared is None:
+        examples["all distinct"] = _evenly(np.unique(group), SHOWN)
+    elif shared.values["agreement"].value < (CHECKS["agreement"].objects or 0):
+        examples["evenly through the set"] = _evenly(shared.rows, SHOWN)
+    else:
+        for (low, high), values in shared.orders.items():
+            order = shared.rows[np.argsort(values)]
+            examples |= {low: order[:SHOWN], high: order[::-1][:SHOWN]}
+    return {name: tuple(map(int, rows)) for name, rows in examples.items()}
+
+
+def _evenly(rows: np.ndarray, count: int) -> np.ndarray:
+    return rows[np.unique(np.linspace(0, len(rows) - 1, count).astype(int))]

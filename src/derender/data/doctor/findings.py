@@ -1,13 +1,26 @@
-"""What a finding and a verdict are, and how a number with an error is held against a limit."""
+"""From measures to sentences and a verdict: one finding for each thing that was looked at.
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+Every threshold stands in ``CHECKS``. Limits were chosen on one half of the material of docs/doctor.md and
+checked on the other; those marked (*) are conventions: nothing was measured to set them.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Literal
 
-from derender.data.doctor.estimate import Estimate
+from derender.data.doctor.structure import Axis, Estimate
 
 Level = Literal["good", "note", "trouble", "objection", "open"]
 """``trouble``: will struggle; ``objection``: does not suit; ``open``: cannot be judged on this set."""
+
+AXIS_OFFSET = 0.06
+"""An axis of symmetry farther from the middle than this share of the width is off it."""
+
+AXIS_SYMMETRIC = 0.7
+"""Both sides about an axis correlate by this much where it is one."""
+
+NOTE_SHARE = 0.1
+"""Of images that are small, oblong, grey or clipped, a share above this is worth a note (*)."""
 
 
 @dataclass(frozen=True)
@@ -47,28 +60,204 @@ class Verdict:
 def verdict_of(findings: Sequence[Finding]) -> Verdict:
     """The worst level decides; all objections, or else all troubles, are the reasons."""
     objections = tuple(finding.short for finding in findings if finding.level == "objection")
+    troubles = tuple(finding.short for finding in findings if finding.level == "trouble")
     if objections:
         return Verdict("does not suit", objections)
-    troubles = tuple(finding.short for finding in findings if finding.level == "trouble")
-    if troubles:
-        return Verdict("will struggle", troubles)
-    return Verdict("suits")
+    return Verdict("will struggle", troubles) if troubles else Verdict("suits")
 
 
-def judged(value: Estimate, objects: float | None, struggles: float | None) -> tuple[Level, bool]:
-    """The level of a value of which more is better, and whether two standard errors either way keep it there.
+@dataclass(frozen=True)
+class Check:
+    """How a measure is judged and told.
+
+    Attributes:
+        name: of the finding.
+        label: of the measure, in tables.
+        note: what it is, and which way is better.
+        objects: past this a set does not suit; None: it never objects.
+        struggles: past this the method will struggle; None: it never does.
+        good, bad: the finding as a clause, in order and not.
+        advice: what to do about it.
+        noted: of a share (less is better) the value from which on it is worth a note; None for what is better
+            the larger it is.
+    """
+
+    name: str
+    label: str
+    note: str
+    objects: float | None
+    struggles: float | None
+    good: str
+    bad: str
+    advice: str
+    noted: float | None = None
+
+
+CHECKS = {
+    "distinct": Check(
+        *("number", "distinct images", "copies and near copies counted once; more is better", 100, 1000),
+        *("{number} distinct images", "{number} distinct images are too few"),
+        "Add images: a few thousand different ones of the same kind of thing.",
+    ),
+    "copies": Check(
+        *("copies", "copies", "share of all images; less is better", None, 0.3),
+        *("no image is a copy or near copy", "{number} of the images are copies or near copies"),
+        "Training drops copies to the pixel; delete near copies, or some end up on both sides of a split.",
+        0,
+    ),
+    "unreadable": Check(
+        *("files", "unreadable", "share of all files; less is better", None, 0.2),
+        *("every file can be read", "{number} of the files cannot be read"),
+        "They are left out; the list of unreadable files says why.",
+        0,
+    ),
+    "small": Check(
+        *("sizes", "small", "share of files below the examined size; less is better", None, 0.5),
+        *("no file is too small", "{number} of the files are smaller than the examined size"),
+        "Small images are enlarged, which blurs them: find larger ones.",
+        NOTE_SHARE,
+    ),
+    "oblong": Check(
+        *("shapes", "oblong", "share of files far from square; less is better", None, None),
+        *("every file is about square", "{number} of the files are far from square, cropped to their middle"),
+        "Look whether the thing is still in the image, and crop around it if not.",
+        NOTE_SHARE,
+    ),
+    "clipped": Check(
+        *("brightness", "clipped", "mean share of black or white pixels; less is better", None, 0.3),
+        *("no pixel is black or white", "{number} of all pixels are black or white"),
+        "Where pixels are clipped no shading is left: see whether it is the thing or the background.",
+        NOTE_SHARE,
+    ),
+    "blank": Check(
+        *("empty images", "empty", "share of images of one brightness; less is better", None, None),
+        *("no image is empty", "{number} of the images show one brightness only"),
+        "Delete empty images.",
+        0,
+    ),
+    "grey": Check(
+        *("colour", "grey", "share of images without colour", None, None),
+        *("all images are in colour", "{number} of the images are grey"),
+        "Features distinguish grey from colour: leave the fewer out. Of grey images the albedo is grey.",
+        NOTE_SHARE,
+    ),
+    "agreement": Check(
+        *("alignment", "agreement", "mean cosine between the edges of two images; 0: unrelated", 0.1, 0.18),
+        *(
+            "the images show the same thing at the same place",
+            "the images have too little in common at the same place",
+        ),
+        "Take images of one kind of thing, and crop them all alike: the same points at the same place.",
+    ),
+    "kinship": Check(
+        *("kinds", "kinship", "agreement across the two most different groups over that within", 0.45, None),
+        *("even the two most different groups share their structure", "they fall into two kinds of thing"),
+        "One model learns one kind of thing: train on one of the two groups, or on each by itself.",
+    ),
+    "odd": Check(
+        *("out-of-distribution", "unlike the others", "share of images; less is better", None, 0.05),
+        *("no image is unlike the others", "{number} of the images are unlike the others"),
+        "Look at the least typical ones and delete what does not belong.",
+        0.05,
+    ),
+    "symmetry": Check(
+        *("symmetry", "symmetry", "agreement with other mirror images over agreement; best 1", 0.6, 0.85),
+        *("on average left mirrors right", "left does not mirror right (seen from one side only?)"),
+        "One shape explains an image and its mirror image: add views from the other side, or mirror half.",
+    ),
+    "fill": Check(
+        *("crop", "frame filled", "share of the image that the common structure covers", None, 0.56),
+        *("the thing fills the image", "the thing is small in the image"),
+        "Crop more tightly: the thing should fill the image and leave little background.",
+    ),
+    "view": Check(
+        *("view", "variety of view", "distance to the own over that to others' mirror images", None, 0.72),
+        *("the viewpoint varies", "all are seen from the same side"),
+        "Add images with the thing turned left and right: depth shows by what moves.",
+    ),
+    "light": Check(
+        *("light", "variety of light", "standard deviation of left against right", 0.015, 0.035),
+        *("the lighting varies", "all are lit alike"),
+        "Add images lit from the left and from the right: shading shows how the surface bends.",
+    ),
+}
+"""By the names of the measures. Those of distinct, unreadable, small and clipped are conventions."""
+
+
+def judged(value: Estimate, check: Check) -> tuple[Level, bool]:
+    """The level of a value, and whether two standard errors either way keep it there.
 
     An objection needs certainty: a value below ``objects`` by less than two errors is only trouble.
     """
     low, high = value.value - 2 * value.error, value.value + 2 * value.error
+    objects, struggles = check.objects, check.struggles
+    if check.noted is not None:
+        if struggles is not None and value.value > struggles:
+            return "trouble", low > struggles
+        return ("note" if value.value > check.noted else "good"), struggles is None or high <= struggles
     if objects is not None and value.value < objects:
         return ("objection", True) if high < objects else ("trouble", False)
     if struggles is not None and value.value < struggles:
         return "trouble", high < struggles and (objects is None or low >= objects)
-    limit = struggles if struggles is not None else objects
-    return "good", limit is None or low >= limit
+    least = struggles if struggles is not None else objects
+    return "good", least is None or low >= least
 
 
-def doubt(certain: bool) -> str:
-    """What to add in brackets where two standard errors reach across a limit."""
-    return "" if certain else "; too few pictures to be sure"
+def finding_of(name: str, value: Estimate, detail: str = "") -> Finding:
+    """The finding of one check, as a sentence with its number and further details."""
+    check = CHECKS[name]
+    level, certain = judged(value, check)
+    is_share = check.noted is not None
+    number = percent(value.value) if is_share else f"{value.value:,.3g}"
+    if value.value >= 1000:
+        number = f"{value.value:,.0f}"
+    clause = check.good if (value.value == 0 if is_share else level == "good") else check.bad
+    clause = clause.format(number=number)
+    measured = [] if "{number}" in check.bad else [f"{check.label} {number}"]
+    if value.error:
+        measured.append(f"± {percent(2 * value.error) if is_share else format(2 * value.error, '.2g')}")
+    brackets = "; ".join(
+        part for part in (" ".join(measured), "" if certain else "too few images to be sure", detail) if part
+    )
+    text = f"{clause[:1].upper()}{clause[1:]}{f' ({brackets})' if brackets else ''}."
+    if level == "good":
+        return Finding(check.name, level, text, value=value)
+    return Finding(check.name, level, text, check.advice, "" if level == "note" else clause, value)
+
+
+def findings_of(
+    values: Mapping[str, Estimate], details: Mapping[str, str], axis: Axis | None
+) -> tuple[Finding, ...]:
+    """A finding for every value; without an axis nothing was compared, and the rest stays open."""
+    found = {name: finding_of(name, values[name], details.get(name, "")) for name in CHECKS if name in values}
+    if axis is None:
+        text = "Alignment, kinds, symmetry and variety were not measured: too few distinct images."
+        return (*found.values(), Finding("the rest", "open", text))
+    if values["agreement"].value < (CHECKS["agreement"].objects or 0):
+        text = "Kinds, symmetry, crop, view and light cannot be judged where images have so little in common."
+        counted = list(found)[: list(found).index("agreement") + 1]
+        return (*(found[name] for name in counted), Finding("the rest", "open", text))
+    if "kinship" not in found:
+        found["kinship"] = Finding("kinds", "open", "No two groups are large enough to compare.")
+    off = found["symmetry"].level != "good" and axis.correlation > AXIS_SYMMETRIC
+    name, old = ("symmetry", found["symmetry"]) if off else ("fill", found["fill"])
+    if abs(axis.offset) >= AXIS_OFFSET and (off or old.level == "good"):
+        side = "right" if axis.offset > 0 else "left"
+        where = f"Their axis of symmetry lies {percent(abs(axis.offset))} of the width {side} of the middle."
+        advice = f"Crop further to the {side}, so that the axis is in the middle."
+        short, level = "the axis of symmetry is off the middle", old.level if off else "trouble"
+        found[name] = replace(old, level=level, text=f"{old.text} {where}", advice=advice, short=short)
+    if found["light"].level == "objection":  # where both are missing, nothing is left to learn a shape from
+        view = values["view"]
+        if view.value + 2 * view.error < (CHECKS["view"].struggles or 0):
+            found["view"] = replace(found["view"], level="objection")
+        else:
+            found["light"] = replace(found["light"], level="trouble")
+    return tuple(found.values())
+
+
+def percent(share: float) -> str:
+    """A share as people say it; never 0 % for something or 100 % for less than all."""
+    if 0 < share < 0.01:
+        return "under 1 %"
+    return "over 99 %" if 0.99 < share < 1 else f"{100 * share:.0f} %"

@@ -1,34 +1,59 @@
-"""What pictures have in common at the same place, and whether that is symmetric, central and fills the frame.
+"""What images have in common at the same place, in what they vary, and whether they are of one kind.
 
-Each picture becomes a grid of 6 x 6 cells with the strength of edges in eight orientations (after Dalal and
-Triggs, Histograms of Oriented Gradients, 2005), the mean of its row of cells taken off, length 1. Taking off
-rows is what tells an object from a landscape: of pictures that look alike wherever they are shifted sideways
-(noise, textures, sky over hills) nothing is left in common, so their agreement is 0 by construction. Edges do
-not care which side of an outline is darker, so one kind of thing in many colours agrees.
+Each image becomes a grid of 6 x 6 cells with the strength of edges in eight orientations (after Dalal and
+Triggs, Histograms of Oriented Gradients, 2005), the mean of its row of cells taken off, length 1. Taking
+off rows is what distinguishes an object from a landscape: of images that look alike wherever they are
+shifted sideways (noise, textures, sky over hills) nothing is left in common, so their agreement is 0 by
+construction. Edges do not care which side of an outline is darker, so one kind of thing in many colours
+agrees.
+
+View: how far an image is from its own mirror image, against how far it is from other images' mirror images.
+Things seen from the front only are nearly their own mirror images; a turned head or car is not. Light: how
+much brighter the left of the image's middle is than the right, in its upper and its lower half; light from
+the side moves both together, marks and noise do not, so what the halves share is counted. Leaves out light
+from above or below, views that differ by tilt alone, and more than two kinds: three show as two of them
+joined.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, Int64
 
+GROUPS = 12
 CELLS, ORIENTATIONS = 6, 8
 _CELL_PX = 5
 _MARGIN = 0.02
 _MIRRORED = [0, *range(ORIENTATIONS - 1, 0, -1)]
+_SPLITS, _COMPONENTS, _STARTS, _SMALLEST = 8, 16, 3, 5
+_MIDDLE = slice(10, 16), slice(16, 22)  # of 32 pixels, on either side of the middle
+_CLIP = 0.01  # share at each end that is drawn in before standard deviations are taken
 
 
 @dataclass(frozen=True)
-class Axis:
-    """The axis about which the mean picture of edges is most symmetric.
+class Estimate:
+    """A value and its standard error, both in the measure's own unit."""
 
-    Attributes:
-        offset: its distance from the middle as a share of the width; right is positive.
-        correlation: of the two sides about it, -1..1, best 1.
+    value: float
+    error: float = 0.0
+
+
+def jackknife(
+    measure: Callable[[Int64[np.ndarray, " k"]], float], count: int, groups: int = GROUPS
+) -> Estimate:
+    """``measure(rows)`` on all rows, and its standard error from leaving out one group at a time.
+
+    Rows are dealt to the groups in turn; they count as independent, so where images come in families (many
+    of one person) the true error is larger. Source: Shao and Tu, The Jackknife and Bootstrap (1995),
+    chapter 2.3.
     """
-
-    offset: float
-    correlation: float
+    if count < 2 * groups:
+        raise ValueError(f"a jackknife over {groups} groups needs {2 * groups} rows or more, got {count}")
+    rows = np.arange(count)
+    left = np.array([measure(rows[rows % groups != group]) for group in range(groups)])
+    variance = (groups - 1) / groups * np.sum((left - left.mean()) ** 2)
+    return Estimate(float(measure(rows)), float(np.sqrt(variance)))
 
 
 def edge_cells(grey: Float32[np.ndarray, "n 32 32"]) -> Float32[np.ndarray, "n 6 6 8"]:
@@ -41,28 +66,26 @@ def edge_cells(grey: Float32[np.ndarray, "n 32 32"]) -> Float32[np.ndarray, "n 6
     to_upper = (place - np.floor(place)).astype(np.float32)
     cells = np.empty((len(grey), CELLS, CELLS, ORIENTATIONS), np.float32)
     for orientation in range(ORIENTATIONS):
-        share = (lower == orientation) * (1 - to_upper) + (
-            (lower + 1) % ORIENTATIONS == orientation
-        ) * to_upper
+        is_lower, is_upper = lower == orientation, (lower + 1) % ORIENTATIONS == orientation
+        share = is_lower * (1 - to_upper) + is_upper * to_upper
         blocks = (strength * share).reshape(len(grey), CELLS, _CELL_PX, CELLS, _CELL_PX)
         cells[..., orientation] = blocks.sum(axis=(2, 4))
     return cells
 
 
 def structure_of(cells: Float32[np.ndarray, "n 6 6 8"]) -> Float32[np.ndarray, "n 6 6 8"]:
-    """Each picture's edges less the mean of their row of cells, scaled to length 1."""
+    """Each image's edges less the mean of their row of cells, scaled to length 1."""
     rest = cells - cells.mean(axis=2, keepdims=True)
-    length = np.sqrt((rest**2).sum(axis=(1, 2, 3), keepdims=True))
-    return rest / np.maximum(length, 1e-6)
+    return rest / np.maximum(np.sqrt((rest**2).sum(axis=(1, 2, 3), keepdims=True)), 1e-6)
 
 
 def mirrored(cells: Float[np.ndarray, "*n 6 6 8"]) -> Float[np.ndarray, "*n 6 6 8"]:
-    """The same of the pictures seen in a mirror."""
+    """The same of the mirror images."""
     return cells[..., ::-1, :][..., _MIRRORED]
 
 
 def agreement(structure: Float32[np.ndarray, "n 6 6 8"]) -> float:
-    """Mean cosine between two different pictures: 0 nothing in common, 1 all alike.
+    """Mean cosine between two different images: 0 nothing in common, 1 all alike.
 
     Unbiased, so it may fall below 0 by chance.
     """
@@ -72,25 +95,70 @@ def agreement(structure: Float32[np.ndarray, "n 6 6 8"]) -> float:
 
 
 def symmetry(structure: Float32[np.ndarray, "n 6 6 8"]) -> float:
-    """Agreement between pictures and other pictures' mirror images, over agreement: about -1..1, best 1.
+    """Agreement between images and other images' mirror images, over agreement: about -1..1, best 1.
 
-    Unbiased above and below, so that few pictures look no less symmetric than many; it may pass 1 by chance.
+    Unbiased above and below, so that few images look no less symmetric than many; it may pass 1 by chance.
     """
-    total = structure.sum(axis=0, dtype=np.float64)
-    own = float((structure * mirrored(structure)).sum(dtype=np.float64))
-    across = (float((total * mirrored(total)).sum()) - own) / (len(structure) * (len(structure) - 1))
-    return across / max(agreement(structure), 1e-3)
+    return _to_others(structure) / max(agreement(structure), 1e-3)
+
+
+def view_variety(structure: Float32[np.ndarray, "n 6 6 8"]) -> float:
+    """Mean distance to the own mirror image over that to another's: 0 all frontal, 1 from everywhere."""
+    return float(own_mirror_distance(structure).mean() / max(1 - _to_others(structure), 1e-9))
+
+
+def own_mirror_distance(structure: Float32[np.ndarray, "n 6 6 8"]) -> Float[np.ndarray, " n"]:
+    """1 - cosine between each image's structure and that of its mirror image, 0..2."""
+    return 1 - (structure * mirrored(structure)).sum(axis=(1, 2, 3), dtype=np.float64)
+
+
+def _to_others(structure: Float32[np.ndarray, "n 6 6 8"]) -> float:
+    """Mean cosine between images and other images' mirror images."""
+    count, total = len(structure), structure.sum(axis=0, dtype=np.float64)
+    own = (1 - own_mirror_distance(structure)).sum()
+    return float(((total * mirrored(total)).sum() - own) / (count * (count - 1)))
 
 
 def frame_filled(structure: Float32[np.ndarray, "n 6 6 8"]) -> float:
-    """Share of the frame that the mean structure covers, 0..1: (sum of energy)^2 / (cells x sum of squares).
+    """Share of the image that the mean structure covers, 0..1: (sum of energy)^2 / (cells x sum of squares).
 
-    The energy that chance puts into a mean of so few pictures is taken off first.
+    The energy that chance puts into a mean of so few images is taken off first.
     """
     mean = structure.mean(axis=0, dtype=np.float64)
     chance = ((structure**2).mean(axis=(0, 3)) - (mean**2).mean(axis=2)) / (len(structure) - 1)
     energy = np.clip((mean**2).mean(axis=2) - chance, 0, None)
     return float(energy.sum() ** 2 / max(CELLS**2 * float((energy**2).sum()), 1e-18))
+
+
+def side_light(grey: Float32[np.ndarray, "n 32 32"]) -> Float[np.ndarray, "n 2"]:
+    """(left - right) / (left + right) of the middle's upper and lower half, -1..1; above 0: lit from left."""
+    low, high = _MIDDLE
+    halves = []
+    for rows in (low, high):
+        left = grey[:, rows, low].mean(axis=(1, 2), dtype=np.float64)
+        right = grey[:, rows, high].mean(axis=(1, 2), dtype=np.float64)
+        halves.append((left - right) / (left + right + 0.02))
+    return np.stack(halves, axis=1)
+
+
+def light_variety(sides: Float[np.ndarray, "n 2"]) -> float:
+    """Standard deviation of side light that both halves share; 0 (or less, by chance): all lit alike."""
+    upper, lower = (np.clip(half, *np.quantile(half, (_CLIP, 1 - _CLIP))) for half in sides.T)
+    shared = float(np.cov(upper, lower)[0, 1])
+    return float(np.sign(shared) * np.sqrt(abs(shared)))
+
+
+@dataclass(frozen=True)
+class Axis:
+    """The axis about which the mean image of edges is most symmetric.
+
+    Attributes:
+        offset: its distance from the middle as a share of the width; right is positive.
+        correlation: of the two sides about it, -1..1, best 1.
+    """
+
+    offset: float
+    correlation: float
 
 
 def symmetry_axis(grey: Float32[np.ndarray, "n 32 32"], reach: int = 14) -> Axis:
@@ -103,7 +171,7 @@ def symmetry_axis(grey: Float32[np.ndarray, "n 32 32"], reach: int = 14) -> Axis
     mean -= mean.mean(axis=1, keepdims=True)
     width = mean.shape[1]
     found: dict[int, float] = {}
-    for twice in range(-reach, reach + 1):  # twice the distance, in pixels of the small picture
+    for twice in range(-reach, reach + 1):  # twice the distance, in pixels of the small image
         part = mean[:, max(0, twice) : min(width, width + twice)]
         part = part - part.mean(axis=1, keepdims=True)
         found[twice] = float((part * part[:, ::-1]).sum() / max(float((part**2).sum()), 1e-12))
@@ -111,28 +179,62 @@ def symmetry_axis(grey: Float32[np.ndarray, "n 32 32"], reach: int = 14) -> Axis
     return Axis(best / 2 / width, found[best])
 
 
-def explained(
-    grey: Float32[np.ndarray, "n 32 32"], generator: np.random.Generator, components: int = 8
-) -> tuple[float, float]:
-    """Share of unseen pictures' energy that the others' mean and few principal components explain, 0..1.
+def likeness(structure: Float32[np.ndarray, "n 6 6 8"]) -> Float[np.ndarray, " n"]:
+    """Cosine of each image with the mean direction of the others; about 0 for a stranger among them.
 
-    Grey pictures, the mean of each row taken off, length 1; half of them fit, the other half is explained.
-    The second number is that of the same pictures, each continued by its mirror image and rolled sideways by
-    chance: what smoothness alone gives.
+    Where the images agree at all, each has sqrt(agreement) in the mean.
     """
-    there_and_back = np.concatenate([grey, grey[:, :, ::-1]], axis=2)
-    start = generator.integers(0, there_and_back.shape[2], len(grey))
-    columns = (start[:, None] + np.arange(grey.shape[2])) % there_and_back.shape[2]
-    rolled = np.take_along_axis(there_and_back, columns[:, None, :], axis=2)
-    order = generator.permutation(len(grey))
-    return _explained(grey[order], components), _explained(rolled[order], components)
+    rows = structure.reshape(len(structure), -1).astype(np.float64)
+    with_others = (rows @ rows.sum(axis=0) - (rows**2).sum(axis=1)) / (len(rows) - 1)
+    return with_others / np.sqrt(max(agreement(structure), 1e-4))
 
 
-def _explained(grey: np.ndarray, components: int) -> float:
-    rest = (grey - grey.mean(axis=2, keepdims=True)).reshape(len(grey), -1)
-    rest = rest / np.maximum(np.linalg.norm(rest, axis=1, keepdims=True), 1e-6)
-    fit, unseen = rest[::2], rest[1::2]
-    mean = fit.mean(axis=0)
-    directions = np.linalg.svd(fit - mean, full_matrices=False)[2][:components]
-    basis = np.linalg.qr(np.concatenate([mean[None], directions]).T)[0]
-    return float(((unseen @ basis) ** 2).sum() / max(float((unseen**2).sum()), 1e-12))
+@dataclass(frozen=True)
+class Halves:
+    """The two most different groups.
+
+    Attributes:
+        kinship: agreement across the groups over agreement within them; 1 one kind, 0 nothing shared. Median
+            over random splits, with their standard deviation as its error.
+        smaller: share of the images in the smaller group, 0..0.5.
+        margin: how clearly each image is in one group (negative) or the other, in standard deviations.
+    """
+
+    kinship: Estimate
+    smaller: float
+    margin: Float[np.ndarray, " n"]
+
+
+def split_in_two(structure: Float32[np.ndarray, "n 6 6 8"], generator: np.random.Generator) -> Halves | None:
+    """Judge the two most different groups; None where no split leaves both large enough to judge.
+
+    Structure is made blind to left and right first (a car seen from either side is one kind), then split in
+    two by k-means on half of the images; the other half is dealt out and judged.
+    """
+    from sklearn.cluster import KMeans
+    from sklearn.decomposition import PCA
+
+    blind = structure + mirrored(structure)
+    blind = blind / np.maximum(np.sqrt((blind**2).sum(axis=(1, 2, 3), keepdims=True)), 1e-6)
+    rows = blind.reshape(len(blind), -1)
+    kinships, shares, place = [], [], np.zeros(len(blind))
+    for _ in range(_SPLITS):
+        order = generator.permutation(len(blind))
+        fit, judged = order[::2], order[1::2]
+        seed = int(generator.integers(2**31))
+        space = PCA(min(_COMPONENTS, len(fit)), svd_solver="full").fit(rows[fit])
+        means = KMeans(2, init="random", n_init=_STARTS, random_state=seed).fit(space.transform(rows[fit]))
+        first, second = means.cluster_centers_
+        reduced = space.transform(rows)
+        place = reduced @ (second - first) - (second @ second - first @ first) / 2
+        groups = blind[judged][place[judged] <= 0], blind[judged][place[judged] > 0]
+        if min(map(len, groups)) < _SMALLEST:
+            continue
+        across = float((groups[0].mean(axis=0) * groups[1].mean(axis=0)).sum())
+        within = max(agreement(groups[0]), 1e-3) * max(agreement(groups[1]), 1e-3)
+        kinships.append(across / np.sqrt(within))
+        shares.append(min(map(len, groups)) / len(judged))
+    if len(kinships) < _SPLITS // 2:
+        return None
+    kinship = Estimate(float(np.median(kinships)), float(np.std(kinships)))
+    return Halves(kinship, float(np.median(shares)), place / max(float(place.std()), 1e-9))
