@@ -1,10 +1,10 @@
 """Images with a mask each: which class every pixel shows.
 
-Masks lie in the data set itself (CelebAMask-HQ, rendered sets), or in another folder or zip beside images of
-any layout: one of class numbers for each, named alike. Masks are only ever resized to the nearest value, after
-the same crop as their image's. A mask in parts is merged as CelebAMask-HQ's owners do it (their g_mask.py): the
-parts are laid over one another in the order of the classes, so that a later class hides an earlier one. Leaves
-out colours as classes, and a number for pixels without a class.
+Masks lie in the data set itself (CelebAMask-HQ, rendered sets), or in another folder or zip beside images
+of any layout: one of class numbers for each, named alike. Masks are only ever resized to the nearest value,
+after the same crop as their image's. A mask in parts is merged as CelebAMask-HQ's owners do it (their
+g_mask.py): the parts are laid over one another in the order of the classes, so that a later class hides an
+earlier one. Leaves out colours as classes, and a number for pixels without a class.
 """
 
 import io
