@@ -1,107 +1,138 @@
-"""Every layout on a tiny tree as its owners publish it: recognised, named, labels read, faults named."""
+"""Every layout on tiny trees as its owners publish it: recognised, named, labels read, faults named."""
 
+import io
 import math
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
+from tests.data.conftest import noise
 
-from derender.data import LAYOUTS, list_images
+from derender.data import LAYOUTS, list_images, read_pictures
+from derender.data.image import decode
+from derender.data.layouts.cars import CAR_CLASSES, car_class
+from derender.data.layouts.faces import EMOTIONS
+from derender.data.layouts.tables import label_column
 
-ATTRIBUTES = ["Bald", "Smiling", "Young"]
+NAN = math.nan
 
-UTKFACE = [
-    "UTKFace/100_1_0_20170110183726390.jpg.chip.jpg",
-    "UTKFace/24_0_1_20170116220224657 .jpg.chip.jpg",
-    "UTKFace/39_1_20170116174525125.jpg.chip.jpg",
-    "UTKFace/55_0_9_20170116232725357jpg.chip.jpg",
-]
-LFW = [
-    "lfw-deepfunneled/Ann_Lee/Ann_Lee_0001.jpg",
-    "lfw-deepfunneled/Ann_Lee/Ann_Lee_0002.jpg",
-    "lfw-deepfunneled/Bo/Bo_0001.jpg",
-]
-CELEBA = {
-    "img_align_celeba/000001.jpg": None,
-    "img_align_celeba/000002.jpg": None,
-    "img_align_celeba/000003.jpg": None,
-    "list_attr_celeba.txt": "2\nBald Smiling Young \n000001.jpg -1  1  1\n000002.jpg  1 -1 -1\n",
-}
+
+def images(*names: str) -> dict[str, None]:
+    return dict.fromkeys(names)
+
+
+CHIP = "20170110183726390.jpg"
+UTKFACE = images("a/100_1_0_" + CHIP, "a/24_0_1_2017011622022 .jpg", "a/39_1_" + CHIP, "a/55_0_9_" + CHIP)
+LFW = images("lfw/Ann_Lee/Ann_Lee_0001.jpg", "lfw/Bo/Bo_0001.jpg", "lfw/Cy_X/Cy_X_0001.jpg")
+VIEW_1 = {"peopleDevTrain.txt": "2\nAnn_Lee\t1\nOther\t3\n", "peopleDevTest.txt": "1\nBo\t1\n"}
+ALIGNED = images(*(f"img_align_celeba/00000{row}.jpg" for row in (1, 2, 3)))
+ATTRIBUTES = {"list_attr_celeba.txt": "2\nBald Smiling \n000001.jpg -1  1\n000002.jpg  1 -1\n"}
+PARTITION = {"list_eval_partition.txt": "000001.jpg 0\n000002.jpg 1\n000003.jpg 2\n"}
+WILD = {**images(*(f"img_celeba/00000{row}.jpg" for row in (1, 2, 3))), **ATTRIBUTES}
+BOXES = "2\nimage_id x_1 y_1 width height\n000001.jpg    5  6 20  30\n000002.jpg   5  6 40  30\n"
+BOXED = {"list_bbox_celeba.txt": BOXES}
+LANDMARKS = (
+    "2\nlefteye_x lefteye_y righteye_x righteye_y nose_x nose_y "
+    "leftmouth_x leftmouth_y rightmouth_x rightmouth_y\n"
+    "000001.jpg  20 30 30 30 25 35 21 40 29 40\n000002.jpg  20 30 24 30 22 35 20 40 24 40\n"
+)
 PARAMS = "file,identity,expression,strength,ambient,diffuse,light_pitch,light_yaw,pitch,yaw,roll,tx,ty\n"
+FIRST = "images/000000.jpg,7,happy,0.5,0.3,0.6,30,-45,10,20,5,0.001,-0.002\n"
 SYNFACE = {
-    "train/images/000000.jpg": None,
-    "train/images/000001.jpg": None,
-    "train/params.csv": PARAMS
-    + "images/000000.jpg,7,happy,0.5,0.3,0.6,30,-45,10,20,5,0.001,-0.002\n"
-    + "images/000001.jpg,8,sad,,0.3,0.6,0,0,0,0,0,0,0\n",
-    "test_gt/images/000000.jpg": None,
+    **images("train/images/000000.jpg", "train/images/000001.jpg", "test_gt/images/000000.jpg"),
+    "train/params.csv": PARAMS + FIRST + "images/000001.jpg,8,sad,,0.3,0.6,0,0,0,0,0,0,0\n",
     "test_gt/depth/000000.png": None,
     "test_gt/params.csv": PARAMS + "images/000000.jpg,9,fear,0.5,0.3,0.6,0,0,0,0,0,0,0\n",
     "identities.csv": "identity\n7\n",
 }
 SYNCAR = {
-    "train/images/000000.jpg": None,
+    **images("train/images/000000.jpg", "test/images/000000.jpg"),
     "train/params.csv": "file,class,model,elev\nimages/000000.jpg,taxi,a/b,90\n",
-    "test/images/000000.jpg": None,
     "test/params.csv": "file,class,model,elev\nimages/000000.jpg,police,a/c,45\n",
 }
-TRACKS = ["tracks/id1/track_000/000.jpg", "tracks/id1/track_001/000.jpg", "tracks/id2/track_000/000.jpg"]
-MASKS = ["images/0.jpg", "images/1.jpg", "masks/0.png", "masks/1.png"]
-RAFDB = {
-    "basic/EmoLabel/list_patition_label.txt": "train_00001.jpg 5\ntest_0001.jpg 7\n",
-    "basic/Image/aligned/train_00001_aligned.jpg": None,
-    "basic/Image/aligned/test_0001_aligned.jpg": None,
+TRACKS = images(
+    "tracks/id1/track_000/000.jpg", "tracks/id1/track_001/000.jpg", "tracks/id2/track_000/000.jpg"
+)
+RAF = {
+    "basic/EmoLabel/list_patition_label.txt": "".join(f"train_{row:05d}.jpg {row}\n" for row in range(1, 8))
+    + "test_0001.jpg 4\n",
+    **images(*(f"basic/Image/aligned/train_{row:05d}_aligned.jpg" for row in range(1, 9))),
+    **images("basic/Image/aligned/test_0001_aligned.jpg", "basic/Image/original/train_00001.jpg"),
+    "compound/EmoLabel/list_patition_label.txt": "train_0001.jpg 11\n",
 }
-CARS = {
-    "02958343/train/1a2b3c4d5e6f708192a3b4c5d6e7f809_000.png": None,
-    "02958343/test/0a2b3c4d5e6f708192a3b4c5d6e7f80_001.png": None,
+IDS = [f"{row:031x}a" for row in range(6)] + ["1c9725db9005eda1aaa354fd606bff0"]
+CAR_PARTS = ("train", "train", "train", "val", "val", "test", "test")
+CARS = images(*(f"{part}/{name}_0.png" for part, name in zip(CAR_PARTS, IDS, strict=True)))
+SHAPENET = {
+    "metadata.csv": "fullId,wnsynset,wnlemmas,up,front,name,tags\n"
+    f'3dw.{IDS[0]},n1,"cruiser,police cruiser,patrol car,police car",,,Crown Victoria,\n'
+    f'3dw.{IDS[1]},n2,"ambulance",,,"Krankenwagen, weiss","ambulance,red cross"\n'
+    f'3dw.{IDS[2]},n3,"car,auto",,,Lincoln Town Car LIMO,"long"\n'
+    f'3dw.{IDS[3]},n4,"jeep,landrover",,,Wrangler,\n'
+    f'3dw.{IDS[4]},n5,"sports car,sport car",,,Ferrari 458,italy\n'
+    f'3dw.{IDS[6]},n6,"car,auto",,,Jeepney of Manila,"bus"\n'
 }
-FACE_TRACKS = {
-    "buffy_s05e02.ids": "CVHCI_TRACKLABELS_V1\n1 giles\n13 buffy\n",
-    "buffy_s05e02/00001/0001.jpg": None,
-    "buffy_s05e02/00013/0001.jpg": None,
+BUFFY = "CVHCI_TRACKLABELS_V1\n1 giles\n13 buffy\n52 unknown_e02_8\n"
+EPISODES = {
+    "ids/buffy.ids": BUFFY,
+    "ids/bbt.ids": "CVHCI_TRACKLABELS_V1\n1 penny\n2 sheldon\n",
+    **images(
+        "bbt/00001/a b.jpg", "buffy/1/0001.jpg", "buffy/13/0002.jpg", "buffy/99/0001.jpg", "notes/x.jpg"
+    ),
 }
+NESTED = images("Ann/0/0.555.jpg", "Ann/1/0.1.jpg", "Bo/0/0.3.jpg", "Bo/track_002/frame_01.jpg")
+LISTED = (
+    "path,age,kind,smiles,split,id\n"
+    'a b/1.png,31,cat,yes,train,007\nünï/2.png,,"dog, big",,val,12\n"new\nline.png",4.5,,no,test,9\n'
+)
+TABLE = {**images("a b/1.png", "ünï/2.png", "new\nline.png", "other.png"), "data.csv": LISTED}
 
 TREES = {
     "utkface": UTKFACE,
     "lfw": LFW,
-    "celeba": CELEBA,
-    "celebamask": MASKS,
+    "celeba": {**ALIGNED, **ATTRIBUTES},
+    "celebamask": images("images/0.jpg", "images/1.jpg", "masks/0.png", "masks/1.png"),
     "synface": SYNFACE,
     "syncar": SYNCAR,
     "synface_tracks": TRACKS,
-    "rafdb": RAFDB,
-    "depth_pairs": ["train/image/1.png", "train/depth/1.png", "test/image/1.png", "test/depth/1.png"],
-    "shapenet_cars": CARS,
-    "face_tracks": FACE_TRACKS,
-    "table": {"data.csv": "file,kind\na b/1.png,x\n2.png,y\n", "a b/1.png": None, "2.png": None},
-    "classes": ["cats/1.png", "cats/2.png", "dogs/1.png"],
-    "folder": ["1.png", "a/2.png", "b/c/3.png"],
+    "rafdb": RAF,
+    "depth_pairs": images("train/image/1.png", "train/depth/1.png", "test/image/1.png", "test/depth/1.png"),
+    "shapenet_cars": {f"02958343/{file}": None for file in CARS},
+    "face_tracks": EPISODES,
+    "table": TABLE,
+    "classes": images("cats/1.png", "cats/2.png", "dogs/1.png"),
+    "folder": images("1.png", "a/2.png", "b/c/3.png"),
 }
 
 
-def table(source, **options):
-    inventory = list_images(source, **options)
-    inventory.files.close()
-    return inventory.table
+def as_parquet() -> bytes:
+    """The table of ``LISTED``, with its ages as numbers."""
+    stored = io.BytesIO()
+    columns = {
+        "path": ["a b/1.png", "ünï/2.png", "new\nline.png"], "age": [31, None, 4.5],
+        "kind": ["cat", "dog, big", None], "smiles": ["yes", None, "no"],
+        "split": ["train", "val", "test"], "id": ["007", "12", "9"],
+    }  # fmt: skip
+    pq.write_table(pa.table(columns), stored)
+    return stored.getvalue()
 
 
-def test_every_layout_has_a_tree():
-    assert set(TREES) == {layout.name for layout in LAYOUTS}
+def found_in(source, **options):
+    with list_images(source, **options) as found:
+        return found
 
 
 @pytest.mark.parametrize("zipped", [False, True])
 @pytest.mark.parametrize("wrapped", [False, True])
-@pytest.mark.parametrize("name", TREES)
+@pytest.mark.parametrize("name", [layout.name for layout in LAYOUTS])
 def test_recognised_wherever_the_tree_lies(tree, name, zipped, wrapped):
     """As published, and inside a folder that an archive program added."""
-    files = TREES[name] if isinstance(TREES[name], dict) else dict.fromkeys(TREES[name])
-    if wrapped:
-        files = {f"download/{file}": content for file, content in files.items()}
-    inventory = list_images(tree(files, zipped))
-    inventory.files.close()
-    assert inventory.layout == name
-    for column in inventory.table.labels.values():
-        assert len(column) == len(inventory.table.files) > 0
+    around = "download/" if wrapped else ""
+    found = found_in(tree({around + file: content for file, content in TREES[name].items()}, zipped))
+    assert found.layout == name
+    for column in found.table.labels.values():
+        assert len(column) == len(found.table.files) > 0
 
 
 def test_every_published_set_says_where_it_is_and_on_what_terms():
@@ -112,260 +143,334 @@ def test_every_published_set_says_where_it_is_and_on_what_terms():
         assert not layout.home or layout.home.startswith("http"), layout.name
 
 
-def test_utkface_labels_and_missing_race(tree):
-    found = table(tree(UTKFACE))
-    assert found.labels["age"].tolist() == [100, 24, 39, 55]
-    assert found.labels["age"].dtype == np.float32
-    assert found.labels["gender"].tolist() == ["female", "male", "female", "male"]
-    assert found.labels["race"].tolist() == ["white", "black", "", ""]
+RADIANS = {"light_pitch_rad": [math.pi / 6, 0], "light_yaw_rad": [-math.pi / 4, 0]}
+RADIANS |= {f"camera_{axis}_rad": [math.pi / part, 0] for axis, part in (("x", 18), ("y", 9), ("z", 36))}
+OLD = images(*(f"{name}_20170116184028385.jpg" for name in ("116_3_4", "117_0_0", "53__0", "7_1_5")))
+YOUNG = images(*(f"{age}_0_2_{CHIP}" for age in range(1, 20)), "stray.jpg")
+KNOWN = {  # files, how they are read; labels, and partition, subset's files or number of files
+    "utkface": (UTKFACE, {}, {"age": [100, 24, 39, 55], "gender": ["female", "male", "female", "male"],
+                              "race": ["white", "black", "", ""]}, None),
+    "utkface codes": (OLD, {}, {"age": [116, NAN, 53, 7], "gender": ["", "male", "", "female"],
+                                "race": ["other", "white", "white", ""]}, None),
+    "utkface stray": (YOUNG, {}, {"age": [*map(float, sorted(map(str, range(1, 20)))), NAN]}, None),
+    "lfw": (LFW, {}, {"identity": ["Ann_Lee", "Bo", "Cy_X"]}, None),
+    "lfw emotions": ({**LFW, "emotions.csv": "file,emotion\nBo_0001.jpg,happiness\n"}, {},
+                     {"emotion": ["", "happiness", ""]}, None),
+    "lfw view 1": ({**LFW, **VIEW_1, "pairs.txt": "10\t300\n"}, {}, {}, ["train", "test", ""]),
+    "lfw part": ({**LFW, **VIEW_1}, {"subset": "test"}, {"identity": ["Bo"]}, ["test"]),
+    "celeba": ({**ALIGNED, **ATTRIBUTES}, {}, {"Bald": [0, 1, -1], "Smiling": [1, 0, -1]}, None),
+    "celeba lists": ({**ALIGNED, **ATTRIBUTES, **PARTITION, "identity_CelebA.txt": "000001.jpg 2880\n"}, {},
+                     {"identity": ["2880", "", ""]}, ["train", "validation", "test"]),
+    "celeba part": ({**ALIGNED, **ATTRIBUTES, **PARTITION}, {"subset": "val"}, {"Bald": [1]}, ["validation"]),
+    "celeba csv": ({"a/img_align_celeba/000001.jpg": None,
+        "list_attr_celeba.csv": "image_id,Bald\n000001.jpg,1\n",
+                    "list_eval_partition.csv": "image_id,partition\n000001.jpg,2\n"}, {}, {"Bald": [1]},
+                        ["test"]),
+    "celeba both": ({**WILD, **ALIGNED}, {}, {"Bald": [0, 1, -1]}, None),
+    "synface": (SYNFACE, {}, {"identity": ["7", "8"], "expression": ["happy", "sad"], "strength": [0.5, NAN],
+                              "ambient": [0.3, 0.3], "camera_tx": [0.001, 0], **RADIANS}, ["train", "train"]),
+    "synface subset": (SYNFACE, {"subset": "test_gt"}, {"identity": ["9"]}, ["test_gt"]),
+    "synface no row": ({**SYNFACE, "train/images/000002.jpg": None}, {},
+                       {"identity": ["7", "8", ""], "ambient": [0.3, 0.3, NAN]}, ["train"] * 3),
+    "synface pandas": ({**SYNFACE,
+        "train/params.csv": ',file,expression\n0,images/000000.jpg,"two\nlines"\n'}, {},
+                       {"expression": ["two\nlines", ""]}, ["train"] * 2),
+    "syncar": (SYNCAR, {}, {"class": ["taxi"], "model": ["a/b"], "elevation_rad": [math.pi / 2]}, ["train"]),
+    "tracks": ({**TRACKS, "params.csv": PARAMS + FIRST.replace("images/000000",
+        "tracks/id1/track_000/000")}, {},
+               {"identity": ["id1", "id1", "id2"], "track": ["id1/track_000", "id1/track_001",
+               "id2/track_000"],
+                "expression": ["happy", "", ""]}, None),
+    "rafdb": (RAF, {"subset": "train"}, {"emotion": [*EMOTIONS, ""]}, ["train"] * 8),
+    "rafdb spelt right": ({"list_partition_label.txt": "test_1.jpg 1\n", "a/test_1_aligned.jpg": None}, {},
+                          {"emotion": ["surprise"]}, ["test"]),
+    "cars": ({**CARS, **SHAPENET}, {"subset": "train"}, {"model": IDS[:3], "class": list(CAR_CLASSES)[:3]},
+             ["train"] * 3),
+    "cars val": ({**CARS, **SHAPENET}, {"subset": "val"}, {"name": ["Wrangler", "Ferrari 458"],
+                                                          "class": list(CAR_CLASSES)[3:]},
+                                                              ["validation"] * 2),
+    "cars other": ({**CARS, **SHAPENET}, {"subset": "test"}, {"class": ["", ""]}, ["test"] * 2),
+    "cars by ids": (images(*(f"{name}.png" for name in IDS)), {"dataset": "shapenet_cars"},
+        {"model": IDS}, None),
+    "cars by parts": (images("test/images/1.png", "test/depth/1.png", "train/0.png"),
+        {"dataset": "shapenet_cars"},
+                      {}, ["test", "train"]),
+    "episodes": (EPISODES, {}, {"identity": ["penny", "giles", "buffy", "", ""],
+                                "track": ["bbt/1", "buffy/1", "buffy/13", "buffy/99", ""],
+                                "episode": ["bbt", "buffy", "buffy", "buffy", ""],
+                                "frame": ["a b", "0001", "0002", "0001", "x"]}, None),
+    "one episode": (EPISODES, {"subset": "bbt"}, {"identity": ["penny"]}, None),
+    "one list": ({"buffy.ids": BUFFY, "faces/0013/1.jpg": None, "faces/0052/1.jpg": None}, {},
+                 {"identity": ["buffy", "unknown_e02_8"], "track": ["buffy/13", "buffy/52"]}, None),
+    "nested": (NESTED, {}, {"identity": ["Ann", "Ann", "Bo", "Bo"], "frame": ["0.555", "0.1", "0.3",
+        "frame_01"],
+                            "track": ["Ann/0", "Ann/1", "Bo/0", "Bo/track_002"]}, None),
+    "unnumbered": (images("Ann/kitchen/x.jpg", "Bo/bar/y.jpg"), {"dataset": "face_tracks"},
+                   {"track": ["Ann/kitchen", "Bo/bar"]}, None),
+    "csv": (TABLE, {}, {"age": [31, NAN, 4.5], "kind": ["cat", "dog, big", ""], "smiles": [1, -1, 0],
+                        "id": ["007", "12", "9"]}, ["train", "validation", "test"]),
+    "parquet": ({**images("a b/1.png", "ünï/2.png", "new\nline.png"), "data.parquet": as_parquet()}, {},
+                {"age": [31, NAN, 4.5], "smiles": [1, -1, 0], "id": ["007", "12", "9"]},
+                ["train", "validation", "test"]),
+    "a split of one's own": ({"data.csv": "file,split\n1.png,fold1\n", "1.png": None}, {},
+        {"split": ["fold1"]}, None),
+    "relative paths": ({"a/metadata.csv": "file_name,x\n1.png,3\n./2.png,4\n", **images("a/1.png",
+        "a/2.png")}, {},
+                       {"x": [3, 4]}, None),
+    "a table first": ({"data.csv": f"file,mood\n24_0_1_{CHIP},good\n", f"24_0_1_{CHIP}": None}, {},
+                      {"mood": ["good"]}, None),
+    "classes in parts": (images("test/cat/2.png", "train/cat/1.png", "train/dog/1.png", "val/dog/4.png"), {},
+                         {"class": ["cat", "cat", "dog", "dog"]}, ["test", "train", "train", "validation"]),
+    "parts": (images("3.png", "Train/1.png", "test/2.png"), {}, {}, ["", "train", "test"]),
+}  # fmt: skip
 
 
-def test_utkface_codes_out_of_range_are_unknown(tree):
-    """117 is older than anybody there, genders are 0 and 1; one published name has no gender at all."""
-    names = ["117_0_0", "116_3_4", "53__0", "7_1_5"]
-    found = table(tree([f"{name}_20170116184028385.jpg" for name in names]))
-    by_name = dict(zip([file.rsplit("_", 1)[0] for file in found.files], range(4), strict=True))
-    rows = [by_name[name] for name in names]
-    assert np.isnan(found.labels["age"][rows]).tolist() == [True, False, False, False]
-    assert found.labels["gender"][rows].tolist() == ["male", "", "", "female"]
-    assert found.labels["race"][rows].tolist() == ["white", "other", "white", ""]
-
-
-def test_a_stray_name_among_utkface_has_no_labels(tree):
-    files = [f"{age}_0_2_20170110183726390.jpg.chip.jpg" for age in range(1, 20)]
-    found = table(tree([*files, "stray.jpg"]))
-    row = found.files.index("stray.jpg")
-    assert np.isnan(found.labels["age"][row])
-    assert (found.labels["gender"][row], found.labels["race"][row]) == ("", "")
-    assert np.isnan(found.labels["age"]).sum() == 1
-
-
-def test_lfw_identity_and_emotion(tree):
-    plain = table(tree(LFW))
-    assert plain.labels["identity"].tolist() == ["Ann_Lee", "Ann_Lee", "Bo"]
-    assert set(plain.labels) == {"identity"}
-    emotions = "file,emotion\nAnn_Lee_0002.jpg,happiness\n"
-    found = table(tree({**dict.fromkeys(LFW), "emotions.csv": emotions}, name="with_emotions"))
-    assert found.labels["emotion"].tolist() == ["", "happiness", ""]
-
-
-def test_celeba_attributes_with_a_missing_row(tree):
-    found = table(tree(CELEBA))
-    assert list(found.labels) == ATTRIBUTES
-    assert [found.labels[name].tolist() for name in ATTRIBUTES] == [[0, 1, -1], [1, 0, -1], [1, 0, -1]]
-    assert found.labels["Bald"].dtype == np.int8
-    assert found.partition is None
-
-
-def test_celeba_csv_identity_and_partition(tree):
-    files = {file: content for file, content in CELEBA.items() if not file.endswith(".txt")} | {
-        "list_attr_celeba.csv": "image_id,Bald,Smiling\n000001.jpg,-1,1\n000002.jpg,1,-1\n000003.jpg,1,1\n",
-        "identity_CelebA.txt": "000001.jpg 2880\n000003.jpg 12\n",
-        "list_eval_partition.txt": "000001.jpg 0\n000002.jpg 1\n000003.jpg 2\n",
-    }
-    source = tree(files)
-    found = table(source)
-    assert found.labels["Bald"].tolist() == [0, 1, 1]
-    assert found.labels["identity"].tolist() == ["2880", "", "12"]
-    assert found.partition.tolist() == ["train", "validation", "test"]
-    assert table(source, subset="validation").files == ("img_align_celeba/000002.jpg",)
+@pytest.mark.parametrize("name", KNOWN)
+def test_labels_and_parts_are_those_published(tree, name):
+    files, options, labels, partition = KNOWN[name]
+    table = found_in(tree(files), **options).table
+    for column, values in labels.items():
+        if isinstance(values[0], str):
+            assert table.labels[column].tolist() == values, column
+        else:
+            np.testing.assert_allclose(table.labels[column], values, rtol=1e-6, err_msg=column)
+            kinds = (np.dtype(np.float32), np.dtype(np.int8))
+            assert table.labels[column].dtype in kinds
+    assert (None if table.partition is None else table.partition.tolist()) == partition
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
+    ("files", "layout"),
     [
-        (
-            "2\nBald Smiling\n000001.jpg -1 1\n000002.jpg 1\n",
-            r"line 4: expected a name and 2 values of -1 or 1",
-        ),
-        ("1\nBald Smiling\n000001.jpg -1 5\n", r"line 3: expected a name and 2 values"),
-        ("2\n", "cut short"),
-        ("3\nBald\n000001.jpg -1\n", "cut short: its first line says 3 rows and it has 1; copy it again"),
-        ("", "cut short"),
+        (images("cats/siamese/1.jpg", "dogs/pug/2.jpg"), "classes"),
+        (images("train/0/1.png", "train/1/2.png", "test/0/3.png"), "classes"),
+        (images("one/0/1.png", "one/1/2.png"), "classes"),
+        (images("train/1.png", "test/2.png"), "folder"),
+        (images("cat/1.png", "dog/2.png", "3.png"), "folder"),
+        (images("only/1.png", "only/2.png"), "folder"),
+        (images(*(f"{name}.png" for name in IDS)), "folder"),  # scraped images are named by a checksum
+        ({"metadata.csv": "camera,lens\nx,y\n", "1.png": None}, "folder"),
     ],
 )
-def test_celeba_faults_are_named(tree, text, message):
-    with pytest.raises(ValueError, match=r"list_attr_celeba\.txt in .*" + message):
-        list_images(tree({**CELEBA, "list_attr_celeba.txt": text}))
+def test_taken_for_nothing_more_particular(tree, files, layout):
+    assert found_in(tree(files)).layout == layout
 
 
-def test_celeba_without_its_list_says_where_it_is_published(tree):
-    files = [file for file in CELEBA if file.endswith("jpg")]
-    with pytest.raises(
-        ValueError, match=r"has no list_attr_celeba\.txt; CelebA's owners publish it at https"
-    ):
-        list_images(tree(files), dataset="celeba")
-
-
-def test_rendered_labels_are_in_radians(tree):
-    found = table(tree(SYNFACE))
-    assert found.files == ("train/images/000000.jpg", "train/images/000001.jpg")
-    assert found.partition.tolist() == ["train", "train"]
-    assert found.labels["identity"].tolist() == ["7", "8"]
-    assert found.labels["expression"].tolist() == ["happy", "sad"]
-    expected = {
-        "ambient": 0.3,
-        "diffuse": 0.6,
-        "light_pitch_rad": math.pi / 6,
-        "light_yaw_rad": -math.pi / 4,
-        "camera_x_rad": math.pi / 18,
-        "camera_y_rad": math.pi / 9,
-        "camera_z_rad": math.pi / 36,
-        "camera_tx": 0.001,
-        "camera_ty": -0.002,
-    }
-    for name, value in expected.items():
-        assert found.labels[name][0] == pytest.approx(value), name
-    assert np.isnan(found.labels["strength"][1])
-
-
-@pytest.mark.parametrize("zipped", [False, True])
-def test_rendered_subset_by_name_and_by_suffix(tree, zipped):
-    source = tree(SYNFACE, zipped)
-    named = table(source, subset="test_gt")
-    assert named.files == table(f"{source}::test_gt").files == ("test_gt/images/000000.jpg",)
-    assert named.labels["identity"].tolist() == ["9"]
-    with pytest.raises(ValueError, match=r"it has no subset 'tests'; there are 'test_gt', 'train'"):
-        list_images(source, subset="tests")
-    with pytest.raises(ValueError, match=r"names the part 'train', but subset='test_gt' was given too"):
-        list_images(f"{source}::train", subset="test_gt")
-
-
-def test_one_part_of_a_rendered_set_on_its_own(tree):
-    found = table(tree(SYNFACE) / "test_gt")
-    assert found.files == ("images/000000.jpg",)
-    assert found.labels["expression"].tolist() == ["fear"]
-    assert found.partition is None
-
-
-def test_rendered_pictures_without_a_row_have_no_labels(tree):
-    found = table(tree({**SYNFACE, "train/images/000002.jpg": None}))
-    assert found.labels["identity"].tolist() == ["7", "8", ""]
-    assert np.isnan(found.labels["ambient"][2])
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        (PARAMS.replace("file", "name"), "has no column 'file'; its columns are name, identity"),
-        (PARAMS + "images/000000.jpg,7\n", "line 2: expected 13 values as in the header"),
-        (
-            PARAMS + "images/000000.jpg" + ",x" * 12 + "\n",
-            "column 'strength' holds something that is no number",
-        ),
-        (PARAMS + "images/000000.jpg" + ",0" * 13 + "\n", "line 2: expected 13 values as in the header"),
-        (PARAMS + "x" * 200_000, "is no CSV table"),
-        (PARAMS + "images/elsewhere.jpg" + ",0" * 12 + "\n", "names none of the images in train/images"),
-    ],
-)
-def test_rendered_faults_are_named(tree, text, message):
-    with pytest.raises(ValueError, match=message):
-        list_images(tree({**SYNFACE, "train/params.csv": text}), dataset="synface")
-
-
-def test_a_csv_with_an_index_column_and_quoted_newlines(tree):
-    """As pandas writes it."""
-    text = ',file,identity,expression\n0,images/000000.jpg,7,"two\nlines"\n1,images/000001.jpg,8,sad\n'
-    found = table(tree({**SYNFACE, "train/params.csv": text}))
-    assert found.labels["expression"].tolist() == ["two\nlines", "sad"]
-    assert found.labels["identity"].tolist() == ["7", "8"]
-
-
-def test_syncar_labels(tree):
-    found = table(tree(SYNCAR))
-    assert (found.labels["class"].tolist(), found.labels["model"].tolist()) == (["taxi"], ["a/b"])
-    assert found.labels["elevation_rad"][0] == pytest.approx(math.pi / 2)
-
-
-def test_tracks(tree):
-    found = table(tree(TRACKS))
-    assert found.labels["identity"].tolist() == ["id1", "id1", "id2"]
-    assert found.labels["track"].tolist() == ["id1/track_000", "id1/track_001", "id2/track_000"]
-    with pytest.raises(ValueError, match=r"stray\.jpg does not lie in tracks/IDENTITY/TRACK/"):
-        list_images(tree([*TRACKS, "stray.jpg"]), dataset="synface_tracks")
-
-
-def test_tracks_with_parameters(tree):
-    text = PARAMS + f"{TRACKS[2]},1702,happy,1,0.1,0.9,0,90,0,0,0,0,0\n"
-    found = table(tree({**dict.fromkeys(TRACKS), "params.csv": text}))
-    assert found.labels["expression"].tolist() == ["", "", "happy"]
-    assert found.labels["identity"].tolist() == ["id1", "id1", "id2"]
-    assert found.labels["light_yaw_rad"][2] == pytest.approx(math.pi / 2)
-
-
-def test_classes_inside_partitions(tree):
-    found = table(tree(["train/cat/1.png", "train/dog/1.png", "test/cat/2.png", "val/dog/4.png"]))
-    assert found.labels["class"].tolist() == ["cat", "cat", "dog", "dog"]
-    assert found.partition.tolist() == ["test", "train", "train", "validation"]
-
-
-@pytest.mark.parametrize(
-    "files",
-    [["train/1.png", "test/2.png"], ["cat/1.png", "dog/2.png", "3.png"], ["only/1.png", "only/2.png"]],
-)
-def test_what_is_not_one_folder_per_class(tree, files):
-    inventory = list_images(tree(files))
-    assert inventory.layout == "folder"
-    assert inventory.table.labels == {}
-
-
-def test_partition_of_plain_folders(tree):
-    assert table(tree(["Train/1.png", "test/2.png", "3.png"])).partition.tolist() == ["", "train", "test"]
-
-
-def test_sub_folder_as_subset(tree):
+def test_sub_folders_separators_and_names_that_overrule(tree):
     source = tree(["a/1.png", "a/b/2.png", "c/3.png"])
-    assert table(f"{source}::a").files == ("a/1.png", "a/b/2.png")
-    assert table(source, subset="b").files == ("a/b/2.png",)
-    with pytest.raises(ValueError, match=r"no images in a folder 'd'; its folders are a, c"):
-        list_images(source, subset="d")
+    assert found_in(f"{source}::a").table.files == ("a/1.png", "a/b/2.png")
+    assert found_in(source, subset="b").table.files == ("a/b/2.png",)
+    assert found_in(tree(["1.png"], name="odd::name")).table.files == ("1.png",)
+    overruled = found_in(tree(TREES["classes"], name="classes"), dataset="folder")
+    assert (overruled.layout, overruled.table.labels) == ("folder", {})
+    one = found_in(tree(SYNFACE, name="rendered") / "test_gt").table
+    assert (one.files, one.partition) == (("images/000000.jpg",), None)
 
 
-def test_a_path_that_really_holds_the_separator(tree):
-    assert table(tree(["1.png"], name="odd::name")).files == ("1.png",)
+ROW = "images/000000.jpg"
+TRAIN = "train/params.csv"
+AS = {"dataset": "table"}
+LIST_OF_RAF = "basic/EmoLabel/list_patition_label.txt"
+FAULTS = [
+    ({**ALIGNED, "list_attr_celeba.txt": "2\nBald Smiling\n000001.jpg -1 1\n000002.jpg 1\n"}, {},
+     r"list_attr_celeba\.txt in .*line 4: expected a name and 2 values of -1 or 1"),
+    ({**ALIGNED, "list_attr_celeba.txt": "1\nBald Smiling\n000001.jpg -1 5\n"}, {}, "line 3: .* 2 values"),
+    ({**ALIGNED, "list_attr_celeba.txt": "2\n"}, {}, "cut short"),
+    ({**ALIGNED, "list_attr_celeba.txt": ""}, {}, "cut short"),
+    ({**ALIGNED, "list_attr_celeba.txt": "3\nBald\n000001.jpg -1\n"}, {},
+     "says 3 rows and it has 1; copy it"),
+    (ALIGNED, {"dataset": "celeba"}, r"has no list_attr_celeba\.txt; CelebA's owners publish it at https"),
+    (WILD, {}, r"neither list_landmarks_celeba\.txt nor list_bbox_celeba\.txt; the owners publish both at h"),
+    ({**ATTRIBUTES, "img_align_celeba.zip": "x"}, {}, "list of attributes and no images: expected img_align"),
+    ({**WILD, **BOXED, "list_eval_partition.txt": "000001.jpg 3\n"}, {},
+     r"line 1: .* of 0 \(train\), .* got '0"),
+    ({**WILD, **BOXED, "list_eval_partition.txt": "000001.jpg\n"}, {},
+     "line 1: expected a name and 1 values"),
+    ({**WILD, **BOXED, "list_eval_partition.csv": "image_id,partition\n000001.jpg,7\n"}, {},
+     "line 2: .* of 0"),
+    ({**WILD, **BOXED, "identity_CelebA.txt": "000001.jpg 2880 x\n"}, {}, "line 1: expected a name and 1"),
+    ({**WILD, "list_bbox_celeba.txt": BOXES.replace("width", "w")}, {},
+     "no column 'width'; its columns are x_1"),
+    ({**WILD, "list_bbox_celeba.txt": BOXES.replace("40", "forty")}, {}, "holds something that is no number"),
+    ({**WILD, "list_landmarks_celeba.txt": LANDMARKS.replace("2\n", "9\n", 1)}, {},
+     "says 9 rows and it has 2"),
+    ({**ALIGNED, **ATTRIBUTES, **PARTITION}, {"subset": "tests"},
+     "no subset 'tests'; there are test, train, val"),
+    ({**ALIGNED, **ATTRIBUTES}, {"subset": "test"},
+     r"no official split, .*list_eval_partition\.txt is missing"),
+    (SYNFACE, {"subset": "tests"}, "it has no subset 'tests'; there are 'test_gt', 'train'"),
+    ({**SYNFACE, TRAIN: PARAMS.replace("file", "name")}, {"dataset": "synface"},
+     "no column 'file'; its columns are"),
+    ({**SYNFACE, TRAIN: f"{PARAMS}{ROW},7\n"}, {}, "line 2: expected 13 values as in the header"),
+    ({**SYNFACE, TRAIN: f"{PARAMS}{ROW}{',0' * 13}\n"}, {}, "line 2: expected 13 values as in the header"),
+    ({**SYNFACE, TRAIN: f"{PARAMS}{ROW}{',x' * 12}\n"}, {},
+     "column 'strength' holds something that is no number"),
+    ({**SYNFACE, TRAIN: PARAMS + "x" * 200_000}, {}, "is no CSV table"),
+    ({**SYNFACE, TRAIN: f"{PARAMS}images/x.jpg{',0' * 12}\n"}, {},
+     "names none of the images in train/images"),
+    ({**TRACKS, "stray.jpg": None}, {"dataset": "synface_tracks"},
+     r"stray\.jpg does not lie in tracks/IDENTITY/"),
+    (images("1.png"), {"dataset": "lfw"}, r"one folder per person, but 1\.png in .* lies in none"),
+    ({**LFW, "peopleDevTest.txt": "3\nBo\t1\n"}, {}, r"peopleDevTest\.txt in .* is cut short: 1 people of 3"),
+    ({**LFW, "peopleDevTest.txt": ""}, {}, "line 1: expected the number of people"),
+    ({**LFW, "peopleDevTest.txt": "1\nBo x\n"}, {}, "line 2: .* a name and a number of images"),
+    (RAF, {"subset": "val"}, "no subset 'val'; there are test, train"),
+    ({**RAF, LIST_OF_RAF: "a.jpg 5\nb.jpg 8\n"}, {},
+     r"line 2: expected an image and an emotion from 1 \(surprise"),
+    ({**RAF, LIST_OF_RAF: "train_00001.jpg 0\n"}, {}, r"to 7 \(neutral\), got 'train_00001\.jpg 0'"),
+    ({**RAF, LIST_OF_RAF: "5\n"}, {}, "line 1: expected an image and an emotion"),
+    ({**RAF, LIST_OF_RAF: "other.jpg 5\n"}, {},
+     "names none of its images; the first is 'basic/Image/aligned/test"),
+    ({LIST_OF_RAF: "a.jpg 5\n", "basic/aligned.zip": "x"}, {}, r"no aligned images: .* unpack aligned\.zip"),
+    (images("a/test_1_aligned.jpg"), {"dataset": "rafdb"},
+     r"no EmoLabel/list_patition_label\.txt .* on request: h"),
+    (images("1.png"), {"dataset": "shapenet_cars"},
+     "no rendered ShapeNet cars: expected folders train, val and"),
+    ({**CARS, "metadata.csv": "fullId,wnlemmas,name,tags\n3dw.ffff,,x,y\n"}, {},
+     "names none of the models there"),
+    ({**CARS, "metadata.csv": "fullId,name\n3dw.ffff,x\n"}, {},
+     "no column 'wnlemmas'; its columns are fullId"),
+    (images("a/1.jpg"), {"dataset": "face_tracks"},
+     r"1\.jpg does not lie in IDENTITY/TRACK/.*NAME\.ids .*https"),
+    ({**EPISODES, "ids/buffy.ids": "1 giles\n"}, {},
+     r"buffy\.ids in .*, line 1: expected a first line CVHCI_"),
+    ({**EPISODES, "ids/buffy.ids": BUFFY + "x giles\n"}, {}, "line 5: .* got 'x giles'"),
+    ({**EPISODES, "ids/buffy.ids": BUFFY + "14\n"}, {}, "line 5: .* a track's number and a name"),
+    ({**EPISODES, "ids/buffy.ids": BUFFY + "13 dawn\n"}, {}, "line 5: track 13 has two names"),
+    ({"x.ids": BUFFY, "77/1.jpg": None}, {},
+     r"lies in the folder of a track that x\.ids lists .*NUMBER/FRAME"),
+    ({"data.csv": "name,x\n1.png,2\n", "1.png": None}, AS,
+     r"no column of paths \(file, path, .*columns are name, x"),
+    ({"data.csv": "", "1.png": None}, AS, "has no column of paths"),
+    ({"data.csv": "file\n../1.png\n", "1.png": None}, AS,
+     r"row 1: .* relative to the table .* got '\.\./1\.png'"),
+    ({"data.csv": "file\na/../../1.png\n", "1.png": None}, AS, "row 1: expected a path relative"),
+    ({"data.csv": "file\n1.png\n/etc/passwd\n", "1.png": None}, AS,
+     "row 2: .* relative to the table .* got '/etc"),
+    ({"data.csv": "file\nC:\\1.png\n", "1.png": None}, AS, "row 1: expected a path relative"),
+    ({"data.csv": "file,x\n,2\n", "1.png": None}, AS, "row 1: expected a path relative"),
+    ({"data.csv": "file\n1.png\n./1.png\n", "1.png": None}, AS, r"row 2: '1\.png' is there twice"),
+    ({"data.csv": "file,x\n1.png\n", "1.png": None}, AS, "line 2: expected 2 values as in the header"),
+    ({"data.csv": "file\n7.png\n", "1.png": None}, AS,
+     r"'file' of data\.csv .* no image .*: the first is '7\.png'"),
+    ({"data.csv": "file\n", "1.png": None}, AS, "names no image that is there; paths are relative"),
+    ({"data.parquet": b"PAR1", "1.png": None}, {}, r"data\.parquet in .* is no Parquet table"),
+    (images("1.png"), AS, r"has no table of its images: expected data\.csv"),
+    (images("a/1.png", "c/3.png"), {"subset": "d"}, "no images in a folder 'd'; its folders are a, c"),
+    (images("1.png"), {"dataset": "utkfaces"},
+     r"unknown data set 'utkfaces'; did you mean 'utkface'\? \(known: au"),
+    (images("1.png"), {"dataset": "utkface"},
+     r"no image in .*set is named as in UTKFace .*: the first is '1\.png'"),
+    (images("1.png"), {"dataset": "synface"}, r"no params\.csv with an images folder"),
+    (images("1.png"), {"dataset": "celebamask"}, "no images of CelebAMask-HQ"),
+    ({"a.txt": "x", "b.txt": "x", "c.heic": "x", "faces.zip": "x"}, {},
+     r"no images found in .*: looked for .jpg .* 2 of .txt, 1 of .heic, 1 of .zip; .* name that file itself"),
+]  # fmt: skip
 
 
-def test_named_layout_overrules_recognition(tree):
-    source = tree(TREES["classes"])
-    inventory = list_images(source, dataset="folder")
-    assert (inventory.layout, inventory.table.labels) == ("folder", {})
+@pytest.mark.parametrize(("files", "options", "message"), FAULTS, ids=[message for *_, message in FAULTS])
+def test_faults_are_named(tree, files, options, message):
+    with pytest.raises(ValueError, match=message):
+        list_images(tree(files), **options)
 
 
-@pytest.mark.parametrize("name", ["utkface", "synface", "celebamask", "celeba"])
-def test_a_named_layout_that_does_not_fit_says_why(tree, name):
-    with pytest.raises(ValueError, match="set"):
-        list_images(tree(["1.png", "2.png"]), dataset=name)
-
-
-def test_lfw_needs_folders(tree):
-    with pytest.raises(ValueError, match=r"one folder per person, but 1\.png in .* lies in none"):
-        list_images(tree(["1.png"]), dataset="lfw")
-
-
-def test_unknown_layout_names_the_nearest(tree):
-    with pytest.raises(
-        ValueError, match=r"unknown data set 'utkfaces'; did you mean 'utkface'\? \(known: auto, "
-    ):
-        list_images(tree(["1.png"]), dataset="utkfaces")
-
-
-def test_nothing_found_says_what_is_there(tree):
-    source = tree({"a.txt": "x", "b.txt": "x", "c.heic": "x", "faces.zip": "x"})
-    with pytest.raises(ValueError) as problem:
-        list_images(source)
-    message = str(problem.value)
-    assert f"no images found in {source}: looked for .jpg" in message
-    assert "2 of .txt, 1 of .heic, 1 of .zip" in message
-    assert "name that file itself" in message
-
-
-def test_nothing_but_unsafe_names_says_so(tree):
+def test_faults_of_addresses_archives_and_nested_columns(tree, tmp_path, encoded):
+    with pytest.raises(ValueError, match="names the part 'train', but subset='test_gt' was given too"):
+        list_images(f"{tree(SYNFACE)}::train", subset="test_gt")
     with pytest.raises(ValueError, match=r"passed over 1, the first is '\.\./1\.png': unsafe name"):
         list_images(tree(["../1.png"], zipped=True))
-
-
-def test_empty_folder_and_empty_zip(tree, tmp_path):
     (tmp_path / "empty").mkdir()
-    for source in (tmp_path / "empty", tree([], zipped=True)):
+    for source in (tmp_path / "empty", tree([], zipped=True, name="nothing")):
         with pytest.raises(ValueError, match=r"no images found in .*found no files at all"):
             list_images(source)
+    stored = io.BytesIO()
+    pq.write_table(pa.table({"image": [{"bytes": encoded(1), "path": "1.png"}]}), stored)
+    nested = tree({"data.parquet": stored.getvalue(), "1.png": None}, name="nested")
+    with pytest.raises(ValueError, match=r"column 'image' of data\.parquet .* struct<.*kept inside a table"):
+        list_images(nested)
+
+
+@pytest.mark.parametrize(
+    ("cells", "expected"),
+    [
+        (["1", "0", ""], np.array([1, 0, -1], np.int8)),
+        (["True", "no", "NO"], np.array([1, 0, 0], np.int8)),
+        (["1", "0", "2"], np.array([1, 0, 2], np.float32)),
+        (["-1", "1.5e3", ""], np.array([-1, 1500, NAN], np.float32)),
+        (["01", "2"], np.array(["01", "2"])),
+        (["16777217", "2"], np.array(["16777217", "2"])),
+        (["16777216", "2"], np.array([16777216, 2], np.float32)),
+        (["1", "inf"], np.array(["1", "inf"])),
+        ([" x ", "1"], np.array(["x", "1"])),
+        (["", ""], np.array(["", ""])),
+    ],
+)
+def test_what_a_column_is(cells, expected):
+    found = label_column(cells)
+    assert found.dtype.kind == expected.dtype.kind and found.itemsize >= expected.itemsize
+    np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.parametrize(("name", "content"), [("mine.csv", LISTED), ("mine.PARQUET", as_parquet())])
+def test_a_table_given_by_name(tree, name, content, tmp_path):
+    files = [file for file in TABLE if file != "data.csv"]
+    folder = tree({**images(*files), name: content, "gone.csv": "file\nother.png\nx.png\nnotes.txt\n"})
+    pictures = read_pictures(folder / name, 8)
+    assert (pictures.layout, pictures.files) == ("table", tuple(files[:3]))
+    assert (pictures.images == read_pictures(folder, 8, dataset="folder").select([0, 3, 1]).images).all()
+    cached = [read_pictures(folder / name, 8, cache=tmp_path / "cache").images for _ in range(2)]
+    assert (cached[1] == pictures.images).all()
+    assert read_pictures(f"{folder / name}::validation", 8).files == ("ünï/2.png",)
+    assert read_pictures(folder / name, 8, subset="a b").files == ("a b/1.png",)
+    partly = read_pictures(folder / "gone.csv", 8)
+    assert partly.files == ("other.png",) and [row.file for row in partly.skipped] == ["x.png", "notes.txt"]
+
+
+@pytest.mark.parametrize(
+    ("texts", "kind"),
+    [
+        (("Police Jeep", "", "jeep"), "police"),
+        (("stretch_limo", "", ""), "limousine"),
+        (("Limonade van", "policeman's", "car"), ""),
+        (("", "sports cars", ""), "sports"),
+        (("transport car", "", "car"), ""),
+    ],
+)
+def test_the_class_of_a_car_by_whole_words(texts, kind):
+    assert car_class(*texts) == kind
+
+
+def test_cars_of_the_published_size_are_cropped(tree, encoded):
+    contents = {file: encoded(noise(row, 128, 128)) for row, file in enumerate(CARS)}
+    pictures = read_pictures(tree({**contents, **SHAPENET}), 25)
+    crop = np.array([14, 8, 114, 108], np.float32)
+    for file, image in zip(pictures.files, pictures.images, strict=True):
+        assert (image == decode(contents[file], 25, "crop", crop)).all()
+    assert found_in(tree({**CARS, **SHAPENET}, name="small")).table.boxes is None
+
+
+def test_celeba_in_the_wild_is_cropped_by_landmarks_or_boxes(tree):
+    """Eyes' middle (25, 30), 10 apart; mouth's 10 below: side max(40, 36), middle 1 above the eyes."""
+    landmarks = found_in(tree({**WILD, **BOXED, "list_landmarks_celeba.txt": LANDMARKS})).table
+    np.testing.assert_allclose(landmarks.boxes[:2], [[5, 9, 45, 49], [4, 11, 40, 47]])
+    assert np.isnan(landmarks.boxes[2]).all()
+    source = tree({**WILD, **BOXED, **PARTITION}, name="boxes")
+    assert found_in(source).table.boxes[:2].tolist() == [[0, 6, 30, 36], [5, 1, 45, 41]]
+    assert found_in(source, subset="val").table.boxes.tolist() == [[5, 1, 45, 41]]
+
+
+def test_other_boxes_are_other_images_and_one_without_is_listed(tree, encoded, tmp_path):
+    contents = {file: encoded(noise(row, 60, 50)) for row, file in enumerate(WILD) if file.endswith("jpg")}
+    source, sides = tree({**WILD, **contents, **BOXED}), ([0, 6, 30, 36], [5, 1, 45, 41])
+    expected = [
+        decode(content, 10, "crop", np.array(box, np.float32))
+        for content, box in zip(list(contents.values())[:2], sides, strict=True)
+    ]
+    for options in ({}, {"cache": tmp_path / "cache"}, {"cache": tmp_path / "cache"}):
+        pictures = read_pictures(source, 10, **options)
+        assert [row.file for row in pictures.skipped] == ["img_celeba/000003.jpg"]
+        assert "no usable box is known" in pictures.skipped[0].reason
+        assert (pictures.images == np.stack(expected)).all()
+    tree({"list_bbox_celeba.txt": BOXES.replace(" 5  6 20  30", " 9  6 20  30")})
+    second = read_pictures(source, 10, cache=tmp_path / "cache").images
+    assert (second[0] != expected[0]).any() and (second[1] == expected[1]).all()

@@ -184,10 +184,11 @@ def read_directory(stream: io.BufferedIOBase) -> Directory:
 def members_of(directory: Directory) -> tuple[list[str], Int64[np.ndarray, "n 7"]]:
     """The name of every member, cut at its first zero byte, and its row; ValueError if that is damaged."""
     content, at, last = directory.content, 0, len(directory.content) - _ENTRY.size
-    names: list[str] = []
+    written: list[bytes] = []
     numbers = array("q")
+    unpack, shift = _ENTRY.unpack_from, directory.shift
     while at <= last:
-        entry = _ENTRY.unpack_from(content, at)
+        entry = unpack(content, at)
         signature, needed, flags, method, crc, packed, size, name, extra, comment, offset = entry
         if signature != b"PK\1\2":
             raise ValueError("its directory is damaged")
@@ -195,18 +196,22 @@ def members_of(directory: Directory) -> tuple[list[str], Int64[np.ndarray, "n 7"
             raise ValueError(f"it needs version {needed / 10:.1f} of the format")
         begin = at + _ENTRY.size
         at = begin + name + extra + comment
-        names.append(_decoded(content[begin : begin + name], flags))
-        if _IN_EXTRA in (size, packed, offset):
+        written.append(content[begin : begin + name])
+        if size == _IN_EXTRA or packed == _IN_EXTRA or offset == _IN_EXTRA:
             numbers_64 = content[begin + name : begin + name + extra]
             size, packed, offset = _from_extra((size, packed, offset), numbers_64)
-        numbers.extend((offset + directory.shift, 0, packed, size, crc, flags, method))
+        numbers.extend((offset + shift, 0, packed, size, crc, flags, method))
     if at != len(content):
         raise ValueError("its directory is cut short")
     members = np.frombuffer(numbers, np.int64).reshape(-1, len(Member._fields))
     places = np.unique(np.append(members[:, 0], directory.start))
     following = np.searchsorted(places, members[:, 0], "right")
     members[:, 1] = places[np.minimum(following, len(places) - 1)]
-    return names, members
+    joined = b"\0".join(written)
+    if written and joined.isascii() and joined.count(b"\0") == len(written) - 1:
+        return joined.decode("ascii").split("\0"), members
+    flags = members[:, Member._fields.index("flags")].tolist()
+    return [_decoded(name, flag) for name, flag in zip(written, flags, strict=True)], members
 
 
 def _from_extra(values: tuple[int, ...], extra: bytes) -> tuple[int, ...]:
