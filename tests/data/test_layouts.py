@@ -146,13 +146,13 @@ def test_every_published_set_says_where_it_is_and_on_what_terms():
 RADIANS = {"light_pitch_rad": [math.pi / 6, 0], "light_yaw_rad": [-math.pi / 4, 0]}
 RADIANS |= {f"camera_{axis}_rad": [math.pi / part, 0] for axis, part in (("x", 18), ("y", 9), ("z", 36))}
 OLD = images(*(f"{name}_20170116184028385.jpg" for name in ("116_3_4", "117_0_0", "53__0", "7_1_5")))
-YOUNG = images(*(f"{age}_0_2_{CHIP}" for age in range(1, 20)), "stray.jpg")
+YOUNG = images(*(f"{age}_0_2_{CHIP}" for age in range(10, 30)), "stray.jpg")
 KNOWN = {  # files, how they are read; labels, and partition, subset's files or number of files
     "utkface": (UTKFACE, {}, {"age": [100, 24, 39, 55], "gender": ["female", "male", "female", "male"],
                               "race": ["white", "black", "", ""]}, None),
     "utkface codes": (OLD, {}, {"age": [116, NAN, 53, 7], "gender": ["", "male", "", "female"],
                                 "race": ["other", "white", "white", ""]}, None),
-    "utkface stray": (YOUNG, {}, {"age": [*map(float, sorted(map(str, range(1, 20)))), NAN]}, None),
+    "utkface stray": (YOUNG, {}, {"age": [*range(10, 30), NAN]}, None),
     "lfw": (LFW, {}, {"identity": ["Ann_Lee", "Bo", "Cy_X"]}, None),
     "lfw emotions": ({**LFW, "emotions.csv": "file,emotion\nBo_0001.jpg,happiness\n"}, {},
                      {"emotion": ["", "happiness", ""]}, None),
