@@ -20,6 +20,10 @@ MEMORY_LIMIT_MB = 3_000
 """Of a process, interpreter and network included; a picture of 169 million pixels takes 676 MB by itself."""
 
 
+def not_refused(ended: Ended) -> list[str]:
+    return [] if ended.code == 2 else [f"exit code {ended.code}: {ended.said[-400:]}"]
+
+
 def run_all() -> int:
     """The script."""
     faults: list[str] = []
@@ -51,47 +55,21 @@ def run_all() -> int:
                 wrong.append(f"does not count {broken} skipped files: {ended.said[:400]}")
             tell(name, ended, wrong)
         archive = write_hostile_zip(place / "hostile.zip")
-        ended = run_apart(
-            [
-                "embed",
-                "--model",
-                MODEL,
-                "--data",
-                str(archive),
-                "--device",
-                "cpu",
-                "--out",
-                str(place / "Z.parquet"),
-            ],
-            place / "log",
-        )
-        tell(
-            "embed of a zip",
-            ended,
-            [] if ended.code == 0 and "8 skipped" in ended.said else [f"not 8 skipped: {ended.said}"],
-        )
-        files = [
-            str(hostile.folder / name)
-            for name in (*hostile.readable, *hostile.unreadable)
-            if "xff" not in name
-        ]
+        embed = ["embed", "--model", MODEL, "--device", "cpu", "--out", str(place / "Z.parquet")]
+        ended = run_apart([*embed, "--data", str(archive)], place / "log")
+        due = ended.code == 0 and "8 skipped" in ended.said
+        tell("embed of a zip", ended, [] if due else [f"not 8 skipped: {ended.said}"])
+        names = [name for name in (*hostile.readable, *hostile.unreadable) if "xff" not in name]
+        files = [str(hostile.folder / name) for name in names]
         for name, arguments in picture_commands(place, files, files[0]).items():
             ended = run_apart(arguments, place / "log")
             unnamed = named_in(ended.said.replace("\\t", " "), hostile.unreadable)
             wrong = [f"does not name {unnamed}"] if unnamed else []
-            tell(
-                name,
-                ended,
-                wrong if ended.code == 2 else [*wrong, f"exit code {ended.code}: {ended.said[-400:]}"],
-            )
+            tell(name, ended, wrong + not_refused(ended))
         for file in ("empty.png", "nan.tif", "bomb.png", "cut 08 of 16.jpg", "to itself.png", "pipe.png"):
             search = ["search", "--features", str(place / "F.parquet"), "--model", MODEL, "--device", "cpu"]
             ended = run_apart([*search, "--like", str(hostile.folder / file)], place / "log")
-            tell(
-                f"search --like {file}",
-                ended,
-                [] if ended.code == 2 else [f"exit code {ended.code}: {ended.said[-400:]}"],
-            )
+            tell(f"search --like {file}", ended, not_refused(ended))
         faults += (wrong := uploads(hostile))
         print(f"view, every file uploaded: {len(wrong)} answered otherwise than is due {wrong}")
     print(f"{len(faults)} faults")

@@ -20,7 +20,8 @@ from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from killing.attempts import INJECTED, Place, attempt, preload, run_child, small_disk, waited
+from apart import waited
+from killing.attempts import INJECTED, Place, attempt, preload, run_child, small_disk
 from killing.commands import (
     Command,
     compare_command,
@@ -68,7 +69,7 @@ def undisturbed(command: Command, folder: Path, place: Place) -> dict[str, bytes
     folder.mkdir(parents=True)
     began = time.monotonic()
     record = place.log.with_suffix(".modules")
-    code = waited(run_child(command.arguments(folder), place.log, record=record), 900, lambda: False)
+    code = waited(run_child(command.arguments(folder), place.log, record=record), 900)
     if code != CAME_THROUGH:
         raise RuntimeError(f"{command.name} does not come through undisturbed:\n{place.log.read_text()}")
     place.seconds = time.monotonic() - began
@@ -145,9 +146,7 @@ def run(given: argparse.Namespace) -> int:
         data = made_pictures(Path(place) / "pictures")
         commands = {
             "train": lambda: train_command(data, given.images),
-            "embed": lambda: embed_command(
-                Path("rendered-faces-64"), made_pictures(Path(place) / "more", given.pictures)
-            ),
+            "embed": lambda: embed_command(given.model, made_pictures(Path(place) / "more", given.pictures)),
             "compare": lambda: compare_command(
                 [
                     made_table(Path(place) / f"{name}.parquet", seed)
@@ -171,6 +170,7 @@ if __name__ == "__main__":
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--images", type=int, default=96, help="pictures seen in a training")
     parser.add_argument("--pictures", type=int, default=120, help="embedded")
+    parser.add_argument("--model", type=Path, default=Path("rendered-faces-64"), help="that embeds")
     parser.add_argument("--no-mount", action="store_true", help="limit the size of files instead")
     parser.add_argument("--what", default="train,embed,compare")
     sys.exit(run(parser.parse_args()))

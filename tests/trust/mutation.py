@@ -19,11 +19,9 @@ import os
 import re
 import resource
 import shutil
-import signal
 import sys
 import tempfile
 import time
-import traceback
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -33,6 +31,7 @@ import numba
 import pytest
 import torch  # noqa: F401  children find it ready
 import yaml
+from apart import ended, start, waited
 from mutants import ROOT, SOURCE, Mutant, drawn, mutants_of
 
 PARTS = ("scene", "render", "objectives")
@@ -42,14 +41,8 @@ ALSO = {"scene": ("tests/networks/test_factors.py",), "render": (), "objectives"
 IN_A_PROCESS_OF_ITS_OWN = "test_kernels_agree_with_the_definition_in_the_interpreter"
 """Starts Triton's interpreter; only mutants of Triton's files need it, and they run in it anyway."""
 
-ALSO_READY = (
-    "torch._dynamo",
-    "scipy.interpolate",
-    "hypothesis",
-    "pydantic",
-    "PIL.Image",
-    "safetensors.torch",
-)
+ALSO_READY = ("torch._dynamo", "scipy.interpolate", "hypothesis", "pydantic", "PIL.Image")
+ALSO_READY += ("safetensors.torch",)
 """Imported before children are made; some of it imports Triton, too early where its interpreter is needed."""
 
 LISTED = ("file", "where", "before", "after")
@@ -140,10 +133,12 @@ class Workshop:
         if mutant is not None:
             changed.write_text(mutant.text)
         began = time.monotonic()
-        child = os.fork()
-        if child == 0:
-            self._child(tests_of(file), note, triton=group_of(file) == "triton", write=mutant is None)
+        triton, write = group_of(file) == "triton", mutant is None
+        tests = functools.partial(self._child, tests_of(file), note, triton=triton, write=write)
+        child = start(tests, self.folder / "log", failed=98)
         code = waited(child, seconds)
+        if code is None:
+            ended(child, group=True)
         shutil.copy2(kept, changed)  # with its time, by which caches know it
         return Outcome(code, time.monotonic() - began, note.read_text() if note.exists() else "")
 
@@ -153,51 +148,27 @@ class Workshop:
         folder.mkdir(parents=True, exist_ok=True)
         return folder
 
-    def _child(self, tests: Sequence[str], note: Path, *, triton: bool, write: bool) -> None:
-        try:
-            os.setpgrp()
-            log = os.open(self.folder / "log", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
-            for stream in (1, 2):
-                os.dup2(log, stream)
-            resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
-            resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-            os.environ |= {
-                "PYTHONPATH": str(self.package.parent),
-                "DERENDER_SHARED": os.environ.get("DERENDER_SHARED", str(ROOT.parent / "shared")),
-                "NUMBA_CACHE_DIR": str(self.compiled),
-                "HYPOTHESIS_STORAGE_DIRECTORY": str(self.folder / "hypothesis"),
-            }
-            os.environ |= {"TRITON_INTERPRET": "1"} if triton else {}
-            os.environ |= {} if write else {"PYTHONDONTWRITEBYTECODE": "1"}
-            sys.dont_write_bytecode = not write
-            numba.config.CACHE_DIR = str(self.compiled)  # pyright: ignore
-            elsewhere = [
-                path for path in sys.path if Path(path) not in (SOURCE.parent, Path(__file__).parent)
-            ]
-            sys.path[:] = [str(self.package.parent), str(self.folder), *elsewhere]
-            os.chdir(self.folder)
-            options = ["-x", "-q", "--tb=short", "-p", "no:cacheprovider", "-p", "no:xdist"]
-            options += ["-W", "ignore::pytest.PytestAssertRewriteWarning"]
-            options += ["-k", "triton"] if triton else ["-k", f"not {IN_A_PROCESS_OF_ITS_OWN}"]
-            code = pytest.main([*options, *tests], plugins=[FirstFailure(note, self.package)])
-            sys.stdout.flush()
-            os._exit(int(code))
-        except BaseException:
-            traceback.print_exc()
-            os._exit(98)
-
-
-def waited(child: int, seconds: float) -> int | None:
-    """Its exit code, negative for a signal; None where its time was up, and it was ended."""
-    until = time.monotonic() + seconds
-    while time.monotonic() < until:
-        done, status = os.waitpid(child, os.WNOHANG)
-        if done:
-            return os.waitstatus_to_exitcode(status)
-        time.sleep(0.05)
-    os.killpg(child, signal.SIGKILL)
-    os.waitpid(child, 0)
-    return None
+    def _child(self, tests: Sequence[str], note: Path, *, triton: bool, write: bool) -> int:
+        os.setpgrp()
+        resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        os.environ |= {
+            "PYTHONPATH": str(self.package.parent),
+            "DERENDER_SHARED": os.environ.get("DERENDER_SHARED", str(ROOT.parent / "shared")),
+            "NUMBA_CACHE_DIR": str(self.compiled),
+            "HYPOTHESIS_STORAGE_DIRECTORY": str(self.folder / "hypothesis"),
+        }
+        os.environ |= {"TRITON_INTERPRET": "1"} if triton else {}
+        os.environ |= {} if write else {"PYTHONDONTWRITEBYTECODE": "1"}
+        sys.dont_write_bytecode = not write
+        numba.config.CACHE_DIR = str(self.compiled)  # pyright: ignore
+        elsewhere = [path for path in sys.path if Path(path) not in (SOURCE.parent, Path(__file__).parent)]
+        sys.path[:] = [str(self.package.parent), str(self.folder), *elsewhere]
+        os.chdir(self.folder)
+        options = ["-x", "-q", "--tb=short", "-p", "no:cacheprovider", "-p", "no:xdist"]
+        options += ["-W", "ignore::pytest.PytestAssertRewriteWarning"]
+        options += ["-k", "triton"] if triton else ["-k", f"not {IN_A_PROCESS_OF_ITS_OWN}"]
+        return int(pytest.main([*options, *tests], plugins=[FirstFailure(note, self.package)]))
 
 
 def undisturbed(workshop: Workshop, files: Sequence[str]) -> dict[str, float]:
@@ -206,25 +177,25 @@ def undisturbed(workshop: Workshop, files: Sequence[str]) -> dict[str, float]:
     for file in files:
         if group_of(file) in found:
             continue
-        ended = workshop.run(file, 1800, stale={"*"})
-        if ended.code != 0:
+        outcome = workshop.run(file, 1800, stale={"*"})
+        if outcome.code != 0:
             end = (workshop.folder / "log").read_text()[-3000:]
             raise SystemExit(f"{end}\nthe tests of {group_of(file)} do not pass without any mutant")
         shutil.copytree(workshop.compiled, workshop.warm(file), dirs_exist_ok=True)
-        print(f"tests of {group_of(file)}: {ended.seconds:.0f} s", file=sys.stderr, flush=True)
-        found[group_of(file)] = ended.seconds
+        print(f"tests of {group_of(file)}: {outcome.seconds:.0f} s", file=sys.stderr, flush=True)
+        found[group_of(file)] = outcome.seconds
     return found
 
 
 def tried(workshop: Workshop, mutant: Mutant, seconds: float) -> dict[str, Any]:
     """What became of a mutant: "killed", "by time" or "survived"."""
     limit = max(LEAST_SECONDS, TIMES * seconds)
-    ended = workshop.run(mutant.file, limit, stale=compiled_into(mutant.file), mutant=mutant)
-    if ended.code in (98, 99):
+    outcome = workshop.run(mutant.file, limit, stale=compiled_into(mutant.file), mutant=mutant)
+    if outcome.code in (98, 99):
         log = (workshop.folder / "log").read_text()
         raise RuntimeError(f"the copy of the package was not tested:\n{log}")
-    result = "by time" if ended.code is None else "killed" if ended.code else "survived"
-    return {"result": result, "by": ended.by, "code": ended.code, "seconds": round(ended.seconds, 1)}
+    result = "by time" if outcome.code is None else "killed" if outcome.code else "survived"
+    return {"result": result, "by": outcome.by, "code": outcome.code, "seconds": round(outcome.seconds, 1)}
 
 
 def results(workshop: Workshop, mutants: Sequence[Mutant]) -> Iterator[dict[str, Any]]:

@@ -77,16 +77,17 @@ def test_embedding_counts_them_and_names_the_first(corpus, model, tmp_path, caps
     told = tmp_path / "told.json"
     given = [
         "embed",
-        "--model",
-        model,
         "--data",
         str(hostile.folder),
+        "--model",
+        model,
         "--dataset",
         "folder",
         "--device",
         "cpu",
     ]
-    assert main([*given, "--out", str(tmp_path / "F.parquet"), "--json", str(told)]) == 0
+    given += ["--device", "cpu", "--out", str(tmp_path / "F.parquet"), "--json", str(told)]
+    assert main(given) == 0
     assert json.loads(told.read_text())["skipped"] == len(hostile.unreadable)
     said = capsys.readouterr().err
     assert f"{len(hostile.unreadable)} skipped" in said and said.count("\nskipped ") == 5
@@ -162,18 +163,8 @@ def test_names_cannot_steer_the_terminal(corpus, model, tmp_path, capsys):
     for name in ("0.png", "1.png"):
         (tmp_path / name).write_bytes(module.encoded(module.smooth(seed=int(name[0])), "PNG"))
     (tmp_path / evil).write_bytes(b"broken")
-    given = [
-        "embed",
-        "--model",
-        model,
-        "--data",
-        str(tmp_path),
-        "--device",
-        "cpu",
-        "--out",
-        str(tmp_path / "F.parquet"),
-    ]
-    assert main(given) == 0
+    given = ["embed", "--model", model, "--data", str(tmp_path), "--device", "cpu"]
+    assert main([*given, "--out", str(tmp_path / "F.parquet")]) == 0
     assert main(["decompose", str(tmp_path / evil), "--model", model, "--out", str(tmp_path / "out")]) == 2
     said = capsys.readouterr()
     assert "\x1b" not in said.err + said.out and "\x07" not in said.err + said.out

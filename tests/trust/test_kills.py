@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from derender.model import Derenderer
 from derender.storage import atomic
 from derender.storage.atomic import CHECKSUMS, Damaged, DamageNoticed, atomic_folder, check_seal, seal
 from derender.training.checkpoint import (
@@ -211,7 +212,9 @@ def test_a_seal_names_what_has_changed(tmp_path):
 
 def test_a_killed_embedding_is_resumed_to_the_same_table(tmp_path):
     """Three real kills; the script makes as many as it is told, and kills training and comparing too."""
+    model = Derenderer.from_preset("small", seed=0, image_size=32, width=4, light_width=4)
     told = ["--what", "embed", "--kills", "3", "--seed", "1", "--no-mount", "--pictures", "24"]
+    told += ["--model", str(model.save(tmp_path / "model"))]
     done = subprocess.run(
         [sys.executable, str(ROOT / "tests" / "trust" / "kills.py"), *told],
         capture_output=True,

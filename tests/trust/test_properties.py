@@ -1,9 +1,6 @@
 """Laws that hold whatever the numbers are: scale, order, names, mirror images, and the way of computing."""
 
-import importlib.util
 import math
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sklearn.metrics import adjusted_rand_score
+from tests.trust.apart import script
 
 from derender.evaluation.clustering_methods import clusterings
 from derender.evaluation.clustering_scores import cluster_scores
@@ -22,10 +20,7 @@ from derender.objectives.reconstruction import depth_curvature, depth_smoothness
 from derender.render import render
 from derender.scene.camera import rotation_matrix
 
-_spec = importlib.util.spec_from_file_location("agreement", Path(__file__).with_name("agreement.py"))
-assert _spec is not None and _spec.loader is not None
-agreement = sys.modules["agreement"] = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(agreement)
+agreement = script("agreement")
 
 
 def rows_of(count: int = 60, width: int = 5, groups: int = 3) -> np.ndarray:

@@ -2,11 +2,11 @@
 
 import os
 import resource
-import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
 
+from apart import start
 from hostility.files import Hostile
 
 from derender.cli import main
@@ -28,24 +28,13 @@ class Ended:
 
 def run_apart(arguments: list[str], log: Path, *, seconds: int = 600) -> Ended:
     """Run one command in a process of its own."""
-    began = time.monotonic()
-    child = os.fork()
-    if not child:
-        code = 1
-        try:
-            stream = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
-            os.dup2(stream, 1)
-            os.dup2(stream, 2)
-            resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))
-            code = main(arguments)
-        except BaseException:
-            import traceback
 
-            traceback.print_exc()
-        finally:
-            sys.stdout.flush()
-            sys.stderr.flush()
-            os._exit(code)
+    def work() -> int:
+        resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))
+        return main(arguments)
+
+    began = time.monotonic()
+    child = start(work, log)
     _, status, usage = os.wait4(child, 0)
     return Ended(
         os.waitstatus_to_exitcode(status),

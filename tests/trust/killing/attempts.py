@@ -15,26 +15,21 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from apart import ended, start, waited
 from killing.commands import Command
 
 from derender.cli import main
 
 SIGNALS = {"SIGKILL": signal.SIGKILL, "SIGTERM": signal.SIGTERM, "Ctrl-C": signal.SIGINT}
-PRELOADED = (
-    "derender",
-    "torch",
-    "lightning_fabric",
-    "tensorboard",
-    "matplotlib",
-    "sklearn",
-    "scipy",
-    "numba",
-)
+PRELOADED = {
+    *("derender", "torch", "lightning_fabric", "tensorboard"),
+    *("matplotlib", "sklearn", "scipy", "numba"),
+}
 INJECTED = 86
 """The exit code of a process that an injected exception ended."""
 
@@ -58,17 +53,10 @@ def run_child(
         record: takes the names of the modules it has imported in the end, and how many files it has written.
         hold: stops itself in the midst of writing a file: in the writing of this number, after so many calls.
     """
-    log.write_text("")
-    child = os.fork()
-    if child:
-        return child
-    code = 1
-    try:
+
+    def work() -> int:
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
-        stream = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
-        os.dup2(stream, 1)
-        os.dup2(stream, 2)
         if file_limit is not None:
             signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
             resource.setrlimit(resource.RLIMIT_FSIZE, (file_limit, file_limit))
@@ -80,19 +68,15 @@ def run_child(
             timer.start()
         writes = Writes(hold)
         sys.addaudithook(writes.seen)
-        code = main(arguments)
+        try:
+            code = main(arguments)
+        except Injected:
+            return INJECTED
         if record is not None:
             record.write_text("\n".join((str(writes.begun), *sys.modules)))
-    except Injected:
-        code = INJECTED
-    except BaseException:
-        import traceback
+        return code
 
-        traceback.print_exc()
-    finally:
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(code)
+    return start(work, log)
 
 
 def preload(modules: Path) -> None:
@@ -175,17 +159,6 @@ def walk(folder: Path) -> Iterator[os.DirEntry[str]]:
         return
 
 
-def waited(child: int, seconds: float, stop: Callable[[], bool]) -> int | None:
-    """Wait for a child's end, so many seconds, or ``stop``; its exit code, or None while it runs."""
-    until = time.monotonic() + seconds
-    while time.monotonic() < until and not stop():
-        done, status = os.waitpid(child, os.WNOHANG)
-        if done:
-            return os.waitstatus_to_exitcode(status)
-        time.sleep(0.002)
-    return None
-
-
 def stopped(child: int) -> bool:
     """Whether it has stopped itself."""
     status = Path(f"/proc/{child}/stat").read_text()
@@ -234,7 +207,7 @@ def attempt(command: Command, folder: Path, place: Place, cause: str) -> tuple[i
     code, writing = None, False
     if cause in SIGNALS:
         if hold is None:
-            code = waited(child, moment, lambda: False)
+            code = waited(child, moment)
         if code is None and at_write:
             code = waited(child, 120, lambda: stopped(child) if hold else being_written(folder))
             time.sleep(0 if hold else numbers.uniform(0, 0.003))
@@ -242,11 +215,10 @@ def attempt(command: Command, folder: Path, place: Place, cause: str) -> tuple[i
         if code is None:
             os.kill(child, SIGNALS[cause])
             os.kill(child, signal.SIGCONT)
-    code = waited(child, 600, lambda: False) if code is None else code
+    code = waited(child, 600) if code is None else code
     filler.unlink(missing_ok=True)
     if code is None:
-        os.kill(child, signal.SIGKILL)
-        os.waitpid(child, 0)
+        ended(child)
         raise TimeoutError(f"{command.name} did not end within 10 minutes of {cause}")
     return code, writing
 

@@ -14,20 +14,9 @@ from derender.features import FeatureTable
 from derender.model import load
 from derender.storage.atomic import check_seal
 
-TRAINING = (
-    "image_size=32",
-    "width=8",
-    "light_width=4",
-    "batch_size=8",
-    "self_features_steps=2",
-)
-EVERY = (
-    "checkpoint_every=24",
-    "validate_every=48",
-    "sample_every=48",
-    "deterministic=true",
-    "whitening.pictures=8",
-)
+TRAINING = ("image_size=32", "width=8", "light_width=4", "batch_size=8", "self_features_steps=2")
+EVERY = ("checkpoint_every=24", "validate_every=48", "sample_every=48")
+EVERY += ("deterministic=true", "whitening.pictures=8")
 
 
 @dataclass(frozen=True)
@@ -90,16 +79,11 @@ def train_command(data: Path, images: int) -> Command:
 
     def result(folder: Path) -> dict[str, bytes]:
         run = folder / "run"
-        files = [
-            run / "checkpoints" / place / f"{name}.safetensors"
-            for place in ("last", "best")
-            for name in ("model", "optimiser")
+        names = [
+            f"checkpoints/{place}/{name}" for place in ("last", "best") for name in ("model", "optimiser")
         ]
-        files += [
-            run / "model" / "model.safetensors",
-            run / "model" / "whitening.safetensors",
-            run / "perceptual.safetensors",
-        ]
+        names += ["model/model", "model/whitening", "perceptual"]
+        files = [run / f"{name}.safetensors" for name in names]
         return {str(file.relative_to(run)): tensor_bytes(file) for file in files}
 
     return Command("train", arguments, sound, result)
@@ -109,15 +93,10 @@ def embed_command(model: Path, data: Path) -> Command:
     """Embedding of a folder; parts are small here, so that there are many."""
 
     def arguments(folder: Path) -> list[str]:
-        given = ["embed", "--model", str(model), "--data", str(data), "--out", str(folder / "table.parquet")]
-        return [
-            *given,
-            "--device",
-            "cpu",
-            "--batch-size",
-            "4",
-            *(["--force"] if (folder / "table.parquet").exists() else []),
-        ]
+        table = folder / "table.parquet"
+        given = ["embed", "--model", str(model), "--data", str(data), "--out", str(table)]
+        given += ["--device", "cpu", "--batch-size", "4"]
+        return [*given, "--force"] if table.exists() else given
 
     def sound(folder: Path) -> None:
         if (folder / "table.parquet").exists():
@@ -139,15 +118,8 @@ def compare_command(tables: list[Path]) -> Command:
     def arguments(folder: Path) -> list[str]:
         given = ["compare", "--table", "identity", "--resamples", "60", "--cache", str(folder / "cache")]
         named = [text for table in tables for text in ("--features", f"{table.stem}={table}")]
-        return [
-            *given,
-            *named,
-            "--json",
-            str(folder / "scores.json"),
-            "--markdown",
-            str(folder / "scores.md"),
-            "--force",
-        ]
+        written = ["--json", str(folder / "scores.json"), "--markdown", str(folder / "scores.md")]
+        return [*given, *named, *written, "--force"]
 
     def sound(folder: Path) -> None:
         if (folder / "scores.json").exists():

@@ -1,18 +1,18 @@
-"""A version that a listed advisory reaches is pinned or allowed only where the list says why."""
+"""Dependencies: advisories answered, licences listed, lower bounds pinned, tested versions not below them."""
 
-import importlib.util
-from pathlib import Path
+import re
+import tomllib
 
 import pytest
+from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
+from packaging.utils import canonicalize_name
 from packaging.version import Version
+from tests.trust.apart import script
 
-SCRIPT = Path(__file__).with_name("advisories.py")
-spec = importlib.util.spec_from_file_location("advisories", SCRIPT)
-assert spec is not None and spec.loader is not None
-advisories = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(advisories)
-
+advisories = script("advisories")
+ROOT = advisories.ROOT
+BOUNDS = advisories.lower_bounds()
 _, FOUND = advisories.looked_up()
 JUDGED = advisories.versions()
 
@@ -62,3 +62,26 @@ def test_an_old_pin_would_be_found():
 
 def test_the_page_is_current():
     assert advisories.PAGE.read_text() == advisories.page(), "run: python tests/trust/advisories.py"
+
+
+def test_every_package_that_is_asked_for_has_a_licence_on_the_page():
+    development = tomllib.loads((ROOT / "pyproject.toml").read_text())["dependency-groups"]["dev"]
+    page = (ROOT / "docs" / "licences.md").read_text()
+    listed = dict(re.findall(r"^\| \[?([\w.-]+).* \| (.+) \|$", page, re.MULTILINE))
+    names = {*BOUNDS, *(canonicalize_name(Requirement(text).name) for text in development)}
+    assert not names - listed.keys(), "run: python tests/trust/licences.py"
+    assert all(licence.strip() for licence in listed.values())
+
+
+def test_every_lower_bound_is_pinned_as_it_stands():
+    lowest = advisories.pins(ROOT / "constraints-lowest.txt")
+    for name, bound in BOUNDS.items():
+        assert lowest[name] == bound, f"{name}: {lowest[name]} is not the bound {bound}"
+
+
+def test_nothing_is_tested_below_its_bound():
+    newest = advisories.pins(ROOT / "constraints.txt")
+    there = BOUNDS.keys() & newest.keys()
+    assert len(there) > 20
+    for name in there:
+        assert newest[name] >= BOUNDS[name], name
