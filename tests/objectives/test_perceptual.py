@@ -1,6 +1,7 @@
-"""The perceptual loss against closed forms, and what every frozen feature extractor promises."""
+"""The perceptual loss at a resolution of its own, and what every frozen feature extractor promises.
 
-import math
+What it has in common with the photometric loss is in test_reconstruction.py.
+"""
 
 import pytest
 import torch
@@ -23,33 +24,6 @@ class Tiny(PerceptualFeatures):
         nn.init.normal_(layers[0].weight, generator=generator)
         nn.init.zeros_(layers[0].bias)
         super().__init__(layers, (0.5, 0.4, 0.3), (0.2, 0.3, 0.4))
-
-
-def feature_maps(generator, n=2, c=5, h=3, w=4):
-    prediction = torch.randn(n, c, h, w, generator=generator, dtype=torch.float64)
-    target = torch.randn(n, c, h, w, generator=generator, dtype=torch.float64)
-    sigma = 0.2 + torch.rand(n, 1, h, w, generator=generator, dtype=torch.float64)
-    return prediction, target, sigma
-
-
-def test_constant_difference_and_sigma_give_the_closed_form():
-    prediction = torch.full((1, 6, 4, 4), 1.5, dtype=torch.float64)
-    target = torch.full((1, 6, 4, 4), 0.9, dtype=torch.float64)
-    sigma = torch.full((1, 1, 4, 4), 0.4, dtype=torch.float64)
-    mask = torch.ones(1, 16, 16, dtype=torch.float64)
-    expected = 0.6**2 / (2 * 0.4**2) + math.log(0.4)
-    assert perceptual_loss(prediction, target, mask, sigma).item() == pytest.approx(expected, abs=1e-4)
-    assert perceptual_loss(prediction, target, mask, None).item() == pytest.approx(0.36, abs=1e-12)
-
-
-def test_the_best_sigma_is_the_size_of_the_difference():
-    difference = torch.full((1, 3, 1, 1), 0.3, dtype=torch.float64)
-    sigmas = torch.linspace(0.05, 1, 1901, dtype=torch.float64)
-    losses = [
-        perceptual_loss(difference, 0 * difference, torch.ones(1, 4, 4), s.view(1, 1, 1, 1)).item()
-        for s in sigmas
-    ]
-    assert sigmas[int(torch.tensor(losses).argmin())].item() == pytest.approx(0.3, abs=1e-3)
 
 
 def test_a_location_counts_by_the_share_of_its_pixels_that_the_mask_keeps():
@@ -75,54 +49,10 @@ def test_every_picture_has_a_mask_of_its_own(generator):
     assert together.item() == pytest.approx((8 * each[0] + 12 * each[1]).item() / 20, rel=1e-5)
 
 
-def test_gradients_with_respect_to_features_and_sigma(generator):
-    prediction, target, sigma = feature_maps(generator, c=2, h=2, w=2)
-    mask = (torch.rand(2, 6, 6, generator=generator) < 0.5).double()
-    inputs = [value.requires_grad_() for value in (prediction, target, sigma)]
-    assert torch.autograd.gradcheck(lambda p, t, s: perceptual_loss(p, t, mask, s), inputs)
-    assert torch.autograd.gradcheck(lambda p, t: perceptual_loss(p, t, mask, None), inputs[:2])
-
-
-@pytest.mark.parametrize("with_sigma", [True, False])
-def test_an_empty_mask_gives_zero_and_no_gradient(generator, with_sigma):
-    prediction, target, sigma = feature_maps(generator)
-    prediction.requires_grad_()
-    loss = perceptual_loss(prediction, target, torch.zeros(2, 12, 16), sigma if with_sigma else None)
-    loss.backward()
-    assert loss.item() == 0
-    assert torch.equal(prediction.grad, torch.zeros_like(prediction))
-
-
-@pytest.mark.parametrize("with_sigma", [True, False])
-def test_what_stands_outside_the_mask_does_not_matter(generator, with_sigma):
-    prediction, target, sigma = feature_maps(generator)
-    mask = torch.ones(2, 12, 16)
-    mask[:, :4, :4] = 0
-    results = []
-    for value in (0.0, float("nan")):
-        p, s = prediction.clone(), sigma.clone()
-        p[:, :, 0, 0], s[:, :, 0, 0] = value, value
-        p.requires_grad_(), s.requires_grad_()
-        loss = perceptual_loss(p, target, mask, s if with_sigma else None)
-        results.append([loss, *torch.autograd.grad(loss, (p, s) if with_sigma else (p,))])
-    for clean, poisoned in zip(*results, strict=True):
-        torch.testing.assert_close(poisoned, clean, rtol=0, atol=0)
-
-
 def test_sigma_of_another_resolution_is_refused(generator):
-    prediction, target, _ = feature_maps(generator)
+    features = torch.randn(2, 2, 5, 3, 4, generator=generator)
     with pytest.raises(ValueError, match="resolution 3 x 4"):
-        perceptual_loss(prediction, target, torch.ones(2, 12, 16), torch.ones(2, 1, 6, 8))
-
-
-def test_half_precision_is_compared_in_float32(generator):
-    prediction, target, sigma = (value.bfloat16() for value in feature_maps(generator))
-    mask = torch.ones(2, 12, 16)
-    with torch.autocast("cpu", dtype=torch.bfloat16):
-        loss = perceptual_loss(prediction, target, mask, sigma)
-    assert loss.dtype == torch.float32
-    expected = perceptual_loss(prediction.double(), target.double(), mask.double(), sigma.double())
-    assert loss.item() == pytest.approx(expected.item(), rel=1e-5)
+        perceptual_loss(*features, torch.ones(2, 12, 16), torch.ones(2, 1, 6, 8))
 
 
 def test_features_are_normalised_pictures_through_the_layers(generator):

@@ -1,4 +1,4 @@
-"""The photometric losses against closed forms, and the laws that masks obey."""
+"""Photometric and perceptual losses against closed forms, the laws that masks obey, and depth penalties."""
 
 import math
 
@@ -7,6 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from derender.objectives.perceptual import perceptual_loss
 from derender.objectives.reconstruction import (
     SIGMA_FLOOR,
     bounded_sigma,
@@ -27,14 +28,71 @@ def pictures(generator, n=2, h=5, w=7, dtype=torch.float64):
     return prediction, target, mask, sigma
 
 
-def test_constant_error_and_sigma_give_the_closed_form():
-    prediction = torch.full((1, 3, 4, 6), 0.7, dtype=torch.float64)
-    target = torch.full((1, 3, 4, 6), 0.4, dtype=torch.float64)
+both = pytest.mark.parametrize("loss_of", [photometric_loss, perceptual_loss])
+sigma_or_not = pytest.mark.parametrize("with_sigma", [True, False])
+
+
+@both
+def test_constant_error_and_sigma_give_the_closed_form(loss_of):
+    prediction, target = (torch.full((1, 3, 4, 6), value, dtype=torch.float64) for value in (0.7, 0.4))
     sigma = torch.full((1, 1, 4, 6), 0.5, dtype=torch.float64)
     mask = torch.ones(1, 4, 6, dtype=torch.float64)
-    expected = math.sqrt(2) * 0.3 / 0.5 + math.log(0.5)
-    assert photometric_loss(prediction, target, mask, sigma).item() == pytest.approx(expected, abs=1e-5)
-    assert photometric_loss(prediction, target, mask, None).item() == pytest.approx(0.3, abs=1e-12)
+    plain = 0.3 if loss_of is photometric_loss else 0.3**2
+    scaled = math.sqrt(2) * 0.3 / 0.5 if loss_of is photometric_loss else 0.3**2 / (2 * 0.5**2)
+    assert loss_of(prediction, target, mask, sigma).item() == pytest.approx(scaled + math.log(0.5), abs=1e-5)
+    assert loss_of(prediction, target, mask, None).item() == pytest.approx(plain, abs=1e-12)
+
+
+@both
+def test_the_best_sigma_follows_the_error(loss_of):
+    error = torch.full((1, 3, 1, 1), 0.2, dtype=torch.float64)
+    sigmas = torch.linspace(0.05, 1.0, 2001, dtype=torch.float64)
+    losses = [loss_of(0 * error, error, torch.ones(1, 1, 1), s.view(1, 1, 1, 1)).item() for s in sigmas]
+    best = 0.2 * math.sqrt(2) if loss_of is photometric_loss else 0.2
+    assert sigmas[int(torch.tensor(losses).argmin())].item() == pytest.approx(best, abs=1e-3)
+
+
+@both
+def test_gradients_with_respect_to_prediction_target_and_sigma(loss_of, generator):
+    prediction, target, mask, sigma = pictures(generator, n=2, h=3, w=2)
+    inputs = [value.requires_grad_() for value in (prediction, target, sigma)]
+    assert torch.autograd.gradcheck(lambda p, t, s: loss_of(p, t, mask, s), inputs)
+    assert torch.autograd.gradcheck(lambda p, t: loss_of(p, t, mask, None), inputs[:2])
+
+
+@both
+@sigma_or_not
+def test_an_empty_mask_gives_zero_and_no_gradient(loss_of, generator, with_sigma):
+    prediction, target, mask, sigma = pictures(generator)
+    inputs = [prediction.requires_grad_(), *[sigma.requires_grad_()] * with_sigma]
+    loss = loss_of(prediction, target, torch.zeros_like(mask), sigma if with_sigma else None)
+    assert loss.item() == 0
+    assert all((gradient == 0).all() for gradient in torch.autograd.grad(loss, inputs))
+
+
+@both
+@pytest.mark.parametrize("poison", [float("nan"), float("inf"), 1e30])
+@sigma_or_not
+def test_values_outside_the_mask_change_neither_loss_nor_gradient(loss_of, generator, poison, with_sigma):
+    prediction, target, mask, sigma = pictures(generator)
+    results = []
+    for value in (0.0, poison):
+        p, s = (torch.where(mask[:, None] > 0, x, value).requires_grad_() for x in (prediction, sigma))
+        loss = loss_of(p, target, mask, s if with_sigma else None)
+        results.append([loss, *torch.autograd.grad(loss, (p, s) if with_sigma else (p,))])
+    for clean, poisoned in zip(*results, strict=True):
+        torch.testing.assert_close(poisoned, clean, rtol=0, atol=0)
+        assert (clean.dim() == 0) or bool((clean.abs().sum(1)[mask == 0] == 0).all())
+
+
+@both
+def test_half_precision_is_computed_in_float32(loss_of, generator):
+    prediction, target, mask, sigma = (x.bfloat16() for x in pictures(generator))
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        loss = loss_of(prediction, target, mask.float(), sigma)
+    expected = loss_of(prediction.double(), target.double(), mask.double(), sigma.double())
+    assert loss.dtype == torch.float32
+    assert loss.item() == pytest.approx(expected.item(), rel=1e-5)
 
 
 def test_pixel_by_pixel_definition(generator):
@@ -54,52 +112,6 @@ def test_pixel_by_pixel_definition(generator):
         torch.tensor(total / count, dtype=torch.float64),
         **EXACT,
     )
-
-
-def test_the_best_sigma_is_root_two_times_the_error():
-    error = 0.2
-    prediction = torch.zeros(1, 3, 1, 1, dtype=torch.float64)
-    sigmas = torch.linspace(0.05, 1.0, 2001, dtype=torch.float64)
-    losses = [
-        photometric_loss(prediction, prediction + error, torch.ones(1, 1, 1), s.view(1, 1, 1, 1)).item()
-        for s in sigmas
-    ]
-    assert sigmas[int(torch.tensor(losses).argmin())].item() == pytest.approx(math.sqrt(2) * error, abs=1e-3)
-
-
-def test_gradients_with_respect_to_prediction_target_and_sigma(generator):
-    prediction, target, mask, sigma = pictures(generator, n=2, h=3, w=2)
-    inputs = [value.requires_grad_() for value in (prediction, target, sigma)]
-    assert torch.autograd.gradcheck(lambda p, t, s: photometric_loss(p, t, mask, s), inputs)
-    assert torch.autograd.gradcheck(lambda p, t: masked_l1(p, t, mask), inputs[:2])
-
-
-@pytest.mark.parametrize("with_sigma", [True, False])
-def test_an_empty_mask_gives_zero_and_no_gradient(generator, with_sigma):
-    prediction, target, mask, sigma = pictures(generator)
-    prediction.requires_grad_()
-    sigma.requires_grad_()
-    loss = photometric_loss(prediction, target, torch.zeros_like(mask), sigma if with_sigma else None)
-    loss.backward()
-    assert loss.item() == 0
-    assert torch.equal(prediction.grad, torch.zeros_like(prediction))
-    if with_sigma:
-        assert torch.equal(sigma.grad, torch.zeros_like(sigma))
-
-
-@pytest.mark.parametrize("poison", [float("nan"), float("inf"), 1e30])
-@pytest.mark.parametrize("with_sigma", [True, False])
-def test_what_stands_outside_the_mask_changes_neither_loss_nor_gradient(generator, poison, with_sigma):
-    prediction, target, mask, sigma = pictures(generator)
-    results = []
-    for value in (0.0, poison):
-        p, s = (torch.where(mask[:, None] > 0, x, value).requires_grad_() for x in (prediction, sigma))
-        loss = photometric_loss(p, target, mask, s if with_sigma else None)
-        gradients = torch.autograd.grad(loss, (p, s) if with_sigma else (p,))
-        results.append([loss, *gradients])
-    for clean, poisoned in zip(*results, strict=True):
-        torch.testing.assert_close(poisoned, clean, rtol=0, atol=0)
-        assert (clean.dim() == 0) or bool((clean.abs().sum(1)[mask == 0] == 0).all())
 
 
 def test_the_mean_runs_over_all_kept_pixels_of_the_batch_not_over_images(generator):
@@ -142,49 +154,27 @@ def test_a_sigma_of_zero_gives_a_finite_loss_and_gradient(generator):
     assert (raw.grad[mask[:, None] > 0] < 0).all(), "a sigma far below the error must be pushed up again"
 
 
-def test_half_precision_is_computed_in_float32(generator):
-    prediction, target, mask, sigma = (x.bfloat16() for x in pictures(generator))
-    with torch.autocast("cpu", dtype=torch.bfloat16):
-        loss = photometric_loss(prediction, target, mask.float(), sigma)
-    expected = photometric_loss(prediction.double(), target.double(), mask.double(), sigma.double())
-    assert loss.dtype == torch.float32
-    assert loss.item() == pytest.approx(expected.item(), rel=1e-5)
-
-
-def test_smoothness_of_known_surfaces():
+def test_depth_penalties_of_known_surfaces():
     rows, columns = torch.meshgrid(torch.arange(6.0), torch.arange(9.0), indexing="ij")
     assert depth_smoothness(torch.full((2, 6, 9), 1.05)).item() == 0
     ramp = (0.02 * rows + 0.03 * columns)[None]
     assert depth_smoothness(ramp, depth_range=0.2).item() == pytest.approx((0.02 + 0.03) / 0.2, rel=1e-5)
     step = (columns >= 4).float()[None] * 0.2
     assert depth_smoothness(step, depth_range=0.2).item() == pytest.approx(1 / 8, rel=1e-5)
-
-
-def test_smoothness_leaves_the_clamped_border_out(generator):
-    inside = 1 + 0.05 * torch.rand(2, 5, 6, generator=generator)
-    clamped = torch.nn.functional.pad(inside, (2, 2), value=1.04)
-    torch.testing.assert_close(depth_smoothness(clamped, border=2), depth_smoothness(inside))
-    assert depth_smoothness(clamped) != depth_smoothness(inside)
-
-
-def test_curvature_of_known_surfaces(generator):
-    rows, columns = torch.meshgrid(torch.arange(6.0), torch.arange(9.0), indexing="ij")
-    plane = (0.02 * rows - 0.03 * columns + 1)[None]
-    assert depth_curvature(plane).item() == pytest.approx(0, abs=1e-5)
+    assert depth_curvature(ramp + 1).item() == pytest.approx(0, abs=1e-5)
     bowl = (0.01 * rows**2 + 0.02 * columns**2)[None]
     assert depth_curvature(bowl, depth_range=0.2).item() == pytest.approx((0.02 + 0.04) / 0.2, rel=1e-4)
-    clamped = torch.nn.functional.pad(bowl, (2, 2), value=1.04)
-    torch.testing.assert_close(depth_curvature(clamped, border=2), depth_curvature(bowl))
+
+
+@pytest.mark.parametrize(("penalty", "least"), [(depth_smoothness, 2), (depth_curvature, 3)])
+def test_depth_penalties_leave_the_border_out_and_refuse_too_small_maps(penalty, least, generator):
+    inside = 1 + 0.05 * torch.rand(2, 5, 6, generator=generator)
+    clamped = torch.nn.functional.pad(inside, (2, 2), value=1.04)
+    torch.testing.assert_close(penalty(clamped, border=2), penalty(inside))
+    assert penalty(clamped) != penalty(inside)
     depth = torch.rand(1, 4, 4, generator=generator, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(depth_curvature, (depth,))
-    with pytest.raises(ValueError, match="3 rows and 3 columns"):
-        depth_curvature(torch.ones(1, 5, 6), border=2)
+    assert torch.autograd.gradcheck(penalty, (depth,))
+    with pytest.raises(ValueError, match=f"{least} rows and {least} columns"):
+        penalty(torch.ones(1, 5, 3 + least), border=2)
     with pytest.raises(ValueError, match="depth_range must be above 0"):
-        depth_curvature(torch.ones(1, 5, 5), depth_range=-1.0)
-
-
-def test_smoothness_refuses_what_has_no_steps():
-    with pytest.raises(ValueError, match="2 rows and 2 columns"):
-        depth_smoothness(torch.ones(1, 5, 4), border=2)
-    with pytest.raises(ValueError, match="depth_range must be above 0"):
-        depth_smoothness(torch.ones(1, 5, 4), depth_range=0.0)
+        penalty(torch.ones(1, 5, 5), depth_range=0.0)

@@ -197,7 +197,7 @@ def test_bfloat16_autocast_and_channels_last_agree_with_float32(generator):
 
 def test_bad_input_is_named(generator):
     images = as_bytes(blobs(3, generator))
-    with pytest.raises(ValueError, match="at least 2 pictures"):
+    with pytest.raises(ValueError, match="at least 2 images"):
         train_self_features(images[:1], seed=0, steps=1)
     with pytest.raises(ValueError, match="at least 1 step"):
         train_self_features(images, seed=0, steps=0)

@@ -15,11 +15,9 @@ from tests.tolerances import assert_agrees
 from torch import Tensor
 
 from derender.render import available_backends, chosen_backend
-from derender.render.rasterize import reference
-from derender.render.rasterize.choose import CHOOSE
+from derender.render.rasterize import CHOOSE, reference
 from derender.render.triton_launch import triton_installed
-from derender.render.warping.operators import FORWARD
-from derender.render.warping.reference import sample
+from derender.render.warping import FORWARD, sample
 from derender.scene.camera import focal_px, motion, to_camera, unproject
 
 fast = pytest.mark.parametrize("backend", FAST)

@@ -8,10 +8,12 @@ from tests.tolerances import assert_agrees
 from torch.autograd import gradcheck
 
 from derender.scene.camera import (
+    constant,
     focal_px,
     pixel_rays,
     project,
     rotation_matrix,
+    shared_tensor,
     to_camera,
     to_canonical,
     unproject,
@@ -118,3 +120,16 @@ def test_gradients(generator):
 def test_impossible_field_of_view_is_an_error(fov_deg):
     with pytest.raises(ValueError, match="fov_deg must lie between 0 and 180"):
         focal_px(64, fov_deg)
+
+
+def test_a_constant_is_made_once_for_each_kind_and_serves_gradients():
+    like = torch.zeros(2, dtype=torch.float64)
+    with torch.inference_mode():
+        first = constant(((0.0, 1.0), (2.0, 3.5)), like)
+    assert first.tolist() == [[0, 1], [2, 3.5]] and first.dtype == torch.float64
+    assert constant(((0.0, 1.0), (2.0, 3.5)), like) is first
+    assert constant(((0.0, 1.0), (2.0, 3.5)), like.float()) is not first
+    assert shared_tensor((1, 3), like.device, torch.int64).tolist() == [1, 3]
+    factor = torch.ones(2, 2, dtype=torch.float64, requires_grad=True)
+    (factor * first).sum().backward()
+    assert factor.grad is not None and torch.equal(factor.grad, first)

@@ -16,7 +16,7 @@ from torch.nn.functional import pad
 
 from derender.networks.decoders import MapDecoder, VectorDecoder
 from derender.networks.encoders import Encoder, NetworkSettings, UNetEncoder, activations
-from derender.scene.constants import kept
+from derender.scene.camera import shared_tensor
 from derender.scene.perturb import PerturbSettings, exchange, perturb_camera, perturb_light
 from derender.scene.ranges import SceneRanges
 
@@ -126,7 +126,7 @@ def light_from_raw(raw: Float[Tensor, "n 4"], ranges: SceneRanges) -> Float[Tens
 def camera_from_raw(raw: Float[Tensor, "n 6"], ranges: SceneRanges) -> Float[Tensor, "n 6"]:
     """Rotation (radians) and translation from numbers in -1..1."""
     scale = [_radians(ranges.rotation_deg)] * 3 + [ranges.translation_xy] * 2 + [ranges.translation_z]
-    return raw.float() * kept(tuple(scale), raw.device, torch.float32)
+    return raw.float() * shared_tensor(tuple(scale), raw.device, torch.float32)
 
 
 @cache

@@ -1,24 +1,24 @@
 """Pinhole camera and rigid motion: pixels to rays, depth to points, canonical frame to camera frame and back.
 
 Frames: camera at the origin looking along +z, x right, y down. The canonical frame has the same axes; the
-object turns about its centre c = (0, 0, 1). Pixel centres lie at integers, pixels are square, the principal
+object rotates about its centre c = (0, 0, 1). Pixel centres lie at integers, pixels are square, the principal
 point is ((W-1)/2, (H-1)/2). A camera is (rx, ry, rz, tx, ty, tz), radians and scene units.
 Leaves out lens distortion and any focal length that varies over the batch.
 """
 
 import math
+from functools import lru_cache
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from derender.scene.constants import constant
-
 OBJECT_CENTRE = (0.0, 0.0, 1.0)
 
 
 def rotation_matrix(rotation_rad: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """R = Rz Ry Rx: turn about x first (pitch > 0: top towards the camera), then y, then z."""
+    """R = Rz Ry Rx: rotate about x first (pitch > 0: top towards the camera), then y, then z."""
     (cx, cy, cz), (sx, sy, sz) = rotation_rad.cos().unbind(-1), rotation_rad.sin().unbind(-1)
     rows = (
         *(cz * cy, cz * sy * sx - sz * cx, cz * sy * cx + sz * sx),
@@ -69,9 +69,9 @@ def project(
 def motion(camera: Float[Tensor, "n 6"]) -> tuple[Float[Tensor, "n 3 3"], Float[Tensor, "n 3"]]:
     """Rotation R and offset o of canonical points: P_cam = R P + o."""
     rotation, (x, y, z) = rotation_matrix(camera[:, :3]), OBJECT_CENTRE
-    turned_centre = rotation[..., 0] * x + rotation[..., 1] * y + rotation[..., 2] * z
+    rotated_centre = rotation[..., 0] * x + rotation[..., 1] * y + rotation[..., 2] * z
     moved_centre = torch.stack((camera[:, 3] + x, camera[:, 4] + y, camera[:, 5] + z), dim=-1)
-    return rotation, moved_centre - turned_centre
+    return rotation, moved_centre - rotated_centre
 
 
 def to_camera(points: Float[Tensor, "n *grid 3"], camera: Float[Tensor, "n 6"]) -> Float[Tensor, "n *grid 3"]:
@@ -89,3 +89,18 @@ def to_canonical(
     offset = centre - ((centre + camera[:, 3:])[:, None] @ rotation)[:, 0]
     moved = torch.baddbmm(offset[:, None], points.flatten(1, -2), rotation)
     return moved.view(points.shape)
+
+
+def constant(values: Any, like: Tensor) -> Tensor:
+    """Numbers in nested tuples as a tensor like another's dtype and device, made once; never change it."""
+    return shared_tensor(values, like.device, like.dtype)
+
+
+@lru_cache(maxsize=256)
+def shared_tensor(values: Any, device: torch.device, dtype: torch.dtype) -> Tensor:
+    """The tensor of these numbers that every caller shares.
+
+    Making one anew copies it from the host, which waits for the device and cannot be part of a CUDA graph.
+    """
+    with torch.inference_mode(False):  # else it could serve no gradient later
+        return torch.tensor(values, device=device, dtype=dtype)

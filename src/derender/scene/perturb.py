@@ -17,7 +17,7 @@ from jaxtyping import Float, Int64, Shaped
 from pydantic import Field
 from torch import Generator, Tensor
 
-from derender.scene.constants import constant, kept
+from derender.scene.camera import constant, shared_tensor
 from derender.scene.ranges import SceneRanges
 from derender.settings import Settings
 
@@ -92,7 +92,7 @@ def choose_factors(n: int, candidates: Sequence[int], generator: Generator) -> I
     if not candidates:
         raise ValueError("no factor to choose from; name at least one that may be perturbed")
     drawn = torch.randint(len(candidates), (n,), generator=generator, device=generator.device)
-    return kept(tuple(candidates), generator.device, torch.int64)[drawn]
+    return shared_tensor(tuple(candidates), generator.device, torch.int64)[drawn]
 
 
 def _uniform_about(
