@@ -2,7 +2,9 @@
 
 import json
 import math
+import re
 from dataclasses import dataclass
+from pathlib import Path
 
 import pytest
 import torch
@@ -14,6 +16,8 @@ from derender.model import Derenderer, load
 from derender.networks import FACTORS, Factor
 from derender.networks.encoders import activations
 from derender.networks.factors import vector_net
+from derender.postprocess import Features
+from derender.postprocess.whitening import Projection, Whitening
 from derender.presets import ModelSettings
 from derender.render import Rendering, render_scene
 from derender.scene import Scene
@@ -65,6 +69,24 @@ def test_activations_begin_with_the_code_and_end_with_the_spatial_map(model, ima
         torch.testing.assert_close(model.features_from(found)[name], codes[name])  # nothing was fitted yet
         places = model.nets[name].encoder.spatial(images)
         torch.testing.assert_close(found[name][:, code.shape[1] :], places.flatten(1))
+
+
+def test_features_are_exchanged_in_a_model_that_shares_the_weights(model, images):
+    maps = {"geometry": Projection(torch.zeros(256), 2 * torch.eye(256), torch.ones(256))}
+    whitened = model.with_features(Features(Whitening(maps)))
+    assert model.whitening is None and whitened.whitening is not None and not whitened.features.fits_scenes
+    codes, features = model.embed(images), whitened.embed(images)
+    torch.testing.assert_close(features["geometry"], 2 * codes["geometry"])
+    torch.testing.assert_close(features["light"], codes["light"])
+    torch.testing.assert_close(whitened.without_features().embed(images)["geometry"], codes["geometry"])
+    assert all(a is b for a, b in zip(model.parameters(), whitened.parameters(), strict=True))
+
+
+def test_nothing_but_with_features_sets_the_parts_of_features():
+    package = Path(derender.__file__).parent
+    setting = re.compile(r"\.(whitening|fitting)(, \S+)? = ")
+    where = [file.name for file in package.rglob("*.py") if setting.search(file.read_text())]
+    assert where == ["embedding.py"]
 
 
 def test_many_channels_are_averaged_over_places():
