@@ -142,7 +142,7 @@ class Head(nn.Module):
         return self.linear(maps.flatten(1))
 
 
-class Encoder(nn.Module):
+class E4eEncoder(nn.Module):
     """Image in -1..1 to W+ less the mean code."""
 
     def __init__(self, settings: EncoderSettings, codes: int, style_size: int):
@@ -208,7 +208,7 @@ class E4e(BaselineModel):
     def __init__(self, settings: E4eSettings):
         super().__init__(settings)
         codes, size = settings.generator.codes, settings.generator.style_size
-        self.encoder = Encoder(settings, codes, size)
+        self.encoder = E4eEncoder(settings, codes, size)
         self.generator = Generator(settings.generator).requires_grad_(False)
         self.register_buffer("centre", torch.zeros(codes, size))
         self.register_buffer("seen", torch.zeros((), dtype=torch.int64))  # images learnt from

@@ -38,7 +38,7 @@ OpenStream = Callable[[], AbstractContextManager[Stream]]
 
 
 @dataclass(frozen=True)
-class Rows:
+class TableRows:
     """The rows of a table that a block becomes, but for their features.
 
     Attributes:
@@ -62,8 +62,8 @@ class Rows:
     copies: int = 0
 
 
-Computed = tuple[Rows, Mapping[str, np.ndarray], float | None]
-"""Rows of a table, their features by factor (none without rows), and the share of the stream read, 0..1."""
+Computed = tuple[TableRows, Mapping[str, np.ndarray], float | None]
+"""Rows of a table, their features by factor (none without rows), and the share of the stream read."""
 
 
 @dataclass(frozen=True)
@@ -166,7 +166,7 @@ def in_order(blocks: Iterable[Block], seen: SeenPixels, keep_duplicates: bool = 
             for row, outcome in enumerate(chunk.outcomes)
             if isinstance(outcome, Unreadable)
         ]
-        rows = Rows(
+        rows = TableRows(
             tuple(chunk.files[row] for row in chosen),
             positions[kept],
             tuple(digests[row] for row in kept),

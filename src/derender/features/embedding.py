@@ -28,7 +28,7 @@ from derender.data import (
     sample_checksum,
     suggestion,
 )
-from derender.features.blocks import Rows, in_order, local_blocks, ray_blocks
+from derender.features.blocks import TableRows, in_order, local_blocks, ray_blocks
 from derender.features.extract import check_size, embed_pictures, model_facts, table_labels
 from derender.features.parquet import Columns, write_row_groups
 from derender.features.parts import Parts
@@ -233,12 +233,12 @@ def _compute(
 
 
 @contextmanager
-def _writing(parts: Parts) -> Iterator[Callable[[Rows, Mapping[str, np.ndarray]], None]]:
+def _writing(parts: Parts) -> Iterator[Callable[[TableRows, Mapping[str, np.ndarray]], None]]:
     """Take the rows of batches and write them as parts in a thread of its own, one part at a time.
 
     Ctrl-C writes the rows that wait; any other error drops them.
     """
-    waiting: list[tuple[Rows, Mapping[str, np.ndarray]]] = []
+    waiting: list[tuple[TableRows, Mapping[str, np.ndarray]]] = []
     written: list[Future[None]] = []
 
     def write() -> None:
@@ -250,7 +250,7 @@ def _writing(parts: Parts) -> Iterator[Callable[[Rows, Mapping[str, np.ndarray]]
         waiting.clear()
         written.append(pool.submit(parts.write, rows, codes))
 
-    def add(rows: Rows, codes: Mapping[str, np.ndarray]) -> None:
+    def add(rows: TableRows, codes: Mapping[str, np.ndarray]) -> None:
         waiting.append((rows, codes))
         if sum(len(one.files) for one, _ in waiting) >= PART_ROWS:
             write()
