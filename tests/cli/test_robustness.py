@@ -58,7 +58,7 @@ def test_generated_faces_by_angle_and_light(model, tmp_path, capsys):
 def test_pictures_rendered_again_and_pictures_of_known_angles(model, rendered, tmp_path, capsys):
     words = ["evaluate", "robustness", "-m", model, "--axes", "light", *QUICK, "none", "-d", rendered]
     told, _ = run(capsys, *words, "--label", "expression", "--min-count", 4, "--groups", "identity")
-    assert told["pictures"] == "render" and told["how"].endswith("rendered again")
+    assert told["pictures"] == "render" and told["how"].endswith("re-rendered")
     tested = told["curves"]["light"]["n_tested"]
     assert tested[0] == tested[1] and tested[2] == 2 * tested[0]
     told, _ = run(capsys, *words, "--pictures", "truth", "--out", tmp_path / "curves.svg")

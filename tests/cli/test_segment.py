@@ -52,7 +52,7 @@ def test_tables_overlays_and_going_on(parts, tmp_path, capsys, refused):
     text = tmp_path / "table.md"
     assert main([str(word) for word in [*words, "--seeds", 1]]) == 0
     shown = capsys.readouterr()
-    assert "13 pictures learned, 3 tested (by a hash" in shown.out and "2 runs computed, 0 found" in shown.err
+    assert "13 images learned, 3 tested (by a hash" in shown.out and "2 runs computed, 0 found" in shown.err
     assert "pixel colour" in shown.out and "paper: Joint Encoders Frozen" in shown.out
     (sheet,) = out.glob("overlays-*.png")
     with Image.open(sheet) as drawn:

@@ -4,6 +4,7 @@ import json
 import re
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from derender.demo import DemoSettings, demo_page, run_demo
@@ -86,8 +87,9 @@ def test_page_shows_every_column_and_number(told, html):
 def test_sentences_follow_the_numbers(told):
     result, _ = told
     geometry = result.geometry
-    better = replace(geometry.model, side=geometry.plane.side / 100, mad_deg=0.1)
-    worse = replace(geometry.model, side=1.0, mad_deg=179.0)
+    side, mad = geometry.plane.side_each, np.ones_like(geometry.plane.mad_deg_each)
+    better = replace(geometry.model, side_each=side / 100, mad_deg_each=0.1 * mad)
+    worse = replace(geometry.model, side_each=100 * side, mad_deg_each=179.0 * mad)
     for scores, said in ((better, "better than every control"), (worse, "behind the strongest control")):
         changed = replace(
             result, geometry=GeometryResult(scores, geometry.average_depth, geometry.plane, None)
@@ -127,8 +129,10 @@ def test_the_bundled_model_is_beside_and_named(told, html):
 def test_both_models_are_scored_on_the_same_faces(told):
     result, _ = told
     geometry = result.geometry
-    better = replace(geometry, model=replace(geometry.model, side=0.001))
+    each = np.full_like(geometry.model.side_each, 0.001)
+    better = replace(geometry, model=replace(geometry.model, side_each=each))
     table = score_tables(replace(result, bundled_geometry=better))["beside"]
     assert [row.name for row in table.rows][:2] == ["this run", "rendered-faces-64"]
-    assert table.rows[0].cells[0] == 100 * geometry.model.side and table.rows[1].cells[0] == 0.1
+    assert table.rows[0].cells[0] == pytest.approx(100 * geometry.model.side)
+    assert table.rows[1].cells[0] == pytest.approx(0.1)
     assert not table.rows[1].control

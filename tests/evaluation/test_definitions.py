@@ -11,8 +11,9 @@ ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "evaluation.md").read_text()
 TABLES = (
     *("evaluation/clustering", "evaluation/clustering_scores", "evaluation/linear_probing"),
-    *("evaluation/paper_comparison", "evaluation/score_table", "report/score_table"),
-    *("report/tables_disentanglement", "report/tables_segmentation", "report/robustness"),
+    *("evaluation/paper_comparison", "evaluation/score_table", "evaluation/disentanglement/card"),
+    *("evaluation/segmentation/compare", "evaluation/robust/compare"),
+    *("evaluation/depth", "evaluation/factors", "evaluation/pixels"),
 )
 
 

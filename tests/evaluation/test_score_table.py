@@ -16,7 +16,6 @@ from derender.evaluation import (
 )
 from derender.evaluation.bootstrap import Estimate, ScoredRow, constant
 from derender.evaluation.score_table import Column, Interval, Row, Scores, ScoreTable, scored_table
-from derender.report.score_table import geometry_table, reconstruction_table
 
 
 def table(ours: float, controls: dict[str, float | None], best="high") -> ScoreTable:
@@ -63,18 +62,20 @@ def test_rows_must_fit_the_columns():
 
 
 def test_geometry_and_reconstruction_tables_print_in_the_papers_units():
-    each = np.zeros(2)
-
     def scores(side: float) -> GeometryScores:
-        return GeometryScores(side, 1000 * side, 1.0, 0, each, each)
+        each = np.full(2, side)
+        return GeometryScores(side, 1000 * side, 1.0, 0, each, 1000 * each)
 
-    found = geometry_table(GeometryResult(scores(0.01), scores(0.02), scores(0.03), None), 2).values()
+    found = GeometryResult(scores(0.01), scores(0.02), scores(0.03), None).table().values()
     assert found["model"] == {"SIDE x 100": 1.0, "MAD": 10.0, "coverage": 1.0}
     assert list(found) == ["model", "average depth", "plane"]
     with_untrained = GeometryResult(scores(0.01), scores(0.02), scores(0.03), scores(0.04))
-    assert list(geometry_table(with_untrained, 2).values())[-1] == "untrained model"
-    both = [ReconstructionScores(l1, 20.0, 0.9, 0, each, each, 0.5, each) for l1 in (0.05, 0.1)]
-    assert "better than every control" in reconstruction_table(ReconstructionResult(*both), 2).verdict(0)
+    assert list(with_untrained.table().values())[-1] == "untrained model"
+    both = [
+        ReconstructionScores(l1, 20.0, 0.9, 0, *np.full((2, 2), [[l1], [20.0]]), 0.5, np.full(2, 0.5))
+        for l1 in (0.05, 0.1)
+    ]
+    assert "better than every control" in ReconstructionResult(*both).table().verdict(0)
 
 
 TABLE = ScoreTable(

@@ -6,8 +6,8 @@ import numpy as np
 from PIL import Image
 
 from derender.evaluation.bootstrap import ScoredRow, estimate, with_verdicts
-from derender.evaluation.robustness import CurveResult, RobustnessComparison
-from derender.report.robustness import area_table, curve_table, robustness_chart, robustness_page
+from derender.evaluation.robust import CurveResult, RobustnessComparison
+from derender.report.robustness import robustness_chart, robustness_page
 
 
 def made_up() -> RobustnessComparison:
@@ -28,10 +28,10 @@ def made_up() -> RobustnessComparison:
 
 def test_tables_say_what_was_learned_tested_and_lost():
     found = made_up()
-    area = area_table(found, found.curves[0], "accuracy")
+    area, curve, _ = found.tables()
     assert area.caption == (
         "camera yaw, 0 to 40 degrees: accuracy of 2 classes, identity of generated faces; logistic probes on "
-        "19 pictures, 8 to 16 tested, 2 seeds; 3 pictures without label left out"
+        "19 images, 8 to 16 tested, 2 seeds; 3 images without label left out"
     )
     cells = area.values()["albedo"]
     assert [round(float(cells[name]), 3) for name in ("area", "ordinary", "at 40 deg", "lost")] == [
@@ -39,7 +39,7 @@ def test_tables_say_what_was_learned_tested_and_lost():
     ]
     assert area.best(0) == cells["area"] and area.best(5) is None  # to lose nothing is no merit by itself
     assert [row.control for row in area.rows] == [False, True]
-    assert list(curve_table(found.curves[0], "accuracy").values()["majority"]) == ["0", "40"]
+    assert list(curve.values()["majority"]) == ["0", "40"]
 
 
 def test_the_chart_and_the_page_show_every_row():

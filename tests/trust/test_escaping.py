@@ -12,7 +12,7 @@ from derender.data import PictureSet, Skipped
 from derender.data.doctor import doctor
 from derender.evaluation.bootstrap import ScoredRow, estimate, with_verdicts
 from derender.evaluation.linear_task import Rows, task_of
-from derender.evaluation.robustness import CurveResult, RobustnessComparison
+from derender.evaluation.robust import CurveResult, RobustnessComparison
 from derender.evaluation.score_table import Column, Row, ScoreTable
 from derender.interpretation import Explained, cluster_shares, explain_labels, pair_parts
 from derender.report import charts

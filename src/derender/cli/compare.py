@@ -14,7 +14,7 @@ from derender.cli.plan.command import Planned, by_plan
 if TYPE_CHECKING:
     from derender.evaluation import Scores
 
-PAPER_VARIANTS = "joint,geometry,albedo,joint-frozen,random"
+PAPER_VARIANTS = ("joint", "geometry", "albedo", "joint-frozen", "random")
 
 Table = Annotated[
     str | None, typer.Option("--table", help="Clustering, identity, emotion, linear, segmentation or cars.")
@@ -120,29 +120,32 @@ def paper_table(paper: PaperTable, images: options.ImageSet, computed: scoring.C
 
 def segmentation_table(paper: PaperTable, images: options.ImageSet, computed: scoring.Computed) -> "Scores":
     """The table of segmentation, once for each model."""
-    from derender.cli.evaluate.segment import MaskSource, segmented
     from derender.evaluation.memory import memory_in
     from derender.evaluation.paper_tables import SEGMENTATION
     from derender.evaluation.score_table import Scores
+    from derender.evaluation.segmentation import SegmentSettings, segment
+    from derender.inputs import as_model
 
     if paper.features or not paper.model or images.optional_address is None:
         raise ValueError(
             "table 'segmentation' trains nets from a model's encoders, and features do not do: give --model "
             "NAME=MODEL with IMAGES that have masks"
         )
-    source = MaskSource(images.address, paper.masks, images.dataset, images.limit)
     seeds, memory = range(computed.seed, computed.seed + paper.seeds), memory_in(computed.cache)
     tables, values = [], {}
     for name, paths in scoring.named_paths(paper.model, "--model").items():
         if len(paths) > 1:
             raise ValueError(f"two models have the name {name!r}: give each its own")
-        run = segmented(
-            paths[0], source, PAPER_VARIANTS, tuple(seeds), memory, epochs=paper.epochs,
-            resamples=computed.resamples, device=computed.device,
-        )  # fmt: skip
+        with progress_bar(f"training {name}") as progress:
+            run = segment(
+                as_model(paths[0], device=computed.device), images.address, **images.how, masks=paper.masks,
+                variants=PAPER_VARIANTS, seeds=seeds, settings=SegmentSettings(epochs=paper.epochs),
+                resample_count=computed.resamples, memory=memory, progress=progress,
+            )  # fmt: skip
         tables += [
             replace(table, caption=f"{name}: {table.caption}") for table in (run.tables[-1], *run.tables[:-1])
         ]
-        values[name] = {**run.found.numbers(), "differs": run.differs, "paper": SEGMENTATION.paper}
+        own = {"differs": run.result.differs, "paper": SEGMENTATION.paper}
+        values[name] = {**run.result.numbers(), **own}
     numbers = {"table": "segmentation", "number": 3, "parts": values}
     return Scores(tables, numbers, [memory.summary()])

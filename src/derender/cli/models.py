@@ -4,11 +4,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from derender.cli.console import notice, progress_bar, report_images
-from derender.inputs import as_images, as_model, copy_split, device_named, part_of, require_fitting, split_of
+from derender.inputs import as_images, as_model, copy_split, device_named, part_of, split_of
 
 if TYPE_CHECKING:
     from derender.data import PictureSet
-    from derender.evaluation.fitted import FittedModel
     from derender.features import FeatureTable
     from derender.model import Derenderer
     from derender.postprocess.fitting import Fitting
@@ -20,16 +19,6 @@ __all__ = ["chosen_device", "keep_split", "part_of", "split_of"]
 def open_model(source: str, device: str, fit_steps: int | None = None) -> "Derenderer":
     """See `derender.inputs.as_model`."""
     return as_model(source, device=device, fit_steps=fit_steps)
-
-
-def with_fitted_scenes(model: "Derenderer", source: str, steps: int | None) -> "Derenderer | FittedModel":
-    """The model, or with steps one whose scenes are optimised per image in so many."""
-    from derender.evaluation.fitted import FittedModel
-
-    if not steps:
-        return model
-    require_fitting(model, source)
-    return FittedModel(model, steps)
 
 
 def check_maker(model: "Derenderer", source: str, table: "FeatureTable", path: str | Path) -> "Derenderer":

@@ -14,7 +14,7 @@ from derender import __version__
 from derender.data import as_float
 from derender.demo.story import BUNDLED, STAGES, DemoResult
 from derender.evaluation.clustering import clustering_table
-from derender.evaluation.geometry import predicted_depth
+from derender.evaluation.depth import predicted_depth
 from derender.evaluation.score_table import ScoreTable
 from derender.model import Derenderer
 from derender.presets import MODEL_PRESETS
@@ -23,7 +23,6 @@ from derender.report.decomposition import COLUMN_MEANING, decompose_images
 from derender.report.evidence import looping_films
 from derender.report.page import Page, Section
 from derender.report.run import loss_charts
-from derender.report.score_table import factor_table, geometry_table, reconstruction_table
 from derender.report.viewer.examples import rendered_examples
 from derender.scene.normals import normals_from_depth
 from derender.training.config import PRESETS
@@ -73,17 +72,16 @@ def demo_page(result: DemoResult) -> Page:
 
 def score_tables(result: DemoResult) -> dict[str, ScoreTable]:
     """Every table of the page by name."""
-    count = len(result.truth)
-    own = geometry_table(result.geometry, count)
+    own = result.geometry.table()
     tables = {"geometry": own}
     if result.bundled_geometry is not None:
-        other = geometry_table(result.bundled_geometry, count).rows[0]
+        other = result.bundled_geometry.table().rows[0]
         note = "bundled with derender; has not seen faces of this family"
         models = [replace(own.rows[0], name="this run"), replace(other, name=BUNDLED, note=note)]
         tables["beside"] = replace(own, caption=f"{own.caption}: both models", rows=[*models, *own.rows[1:]])
     return tables | {
-        "factors": factor_table(result.factors, count),
-        "reconstruction": reconstruction_table(result.reconstruction, count),
+        "factors": result.factors.table(),
+        "reconstruction": result.reconstruction.table(),
         "clustering": clustering_table(result.clustering),
     }
 

@@ -1,9 +1,8 @@
 """Stage 7: protocols that score features and models, each beside its controls.
 
-A protocol is one call that gives ``Scores``: ``cluster``, ``linear``, ``compare`` (the paper's tables). Every
-function says its range and its best value. Scores on arrays: ``evaluation.disentanglement``,
-``evaluation.segmentation``, ``evaluation.robustness``; joint training: ``evaluation.finetuning``.
-docs/evaluation.md has a table of them.
+A protocol is one call that gives ``Scores``: ``cluster``, ``linear``, ``segment``, ``disentangle``,
+``geometry``, ``reconstruction``, and ``compare`` (the paper's tables). Every function states its range and
+its best value. docs/evaluation.md has a table of them; joint training is in ``evaluation.finetuning``.
 """
 
 from derender.evaluation.bootstrap import Difference, Estimate, ScoredRow, difference, estimate, resamples
@@ -16,6 +15,8 @@ from derender.evaluation.clustering import (
 )
 from derender.evaluation.clustering_methods import clusterings
 from derender.evaluation.clustering_scores import chance_scores, cluster_scores
+from derender.evaluation.depth import GeometryResult, GeometryScores, evaluate_geometry, geometry_scores
+from derender.evaluation.disentanglement import disentangle
 from derender.evaluation.factors import (
     AngleScores,
     FactorResult,
@@ -26,7 +27,6 @@ from derender.evaluation.factors import (
 )
 from derender.evaluation.feature_rows import at_least
 from derender.evaluation.finch import FinchHierarchy, finch, finch_clusters
-from derender.evaluation.geometry import GeometryResult, GeometryScores, evaluate_geometry, geometry_scores
 from derender.evaluation.linear_probes import majority_answers, probe
 from derender.evaluation.linear_probing import (
     LinearComparison,
@@ -37,14 +37,16 @@ from derender.evaluation.linear_probing import (
 )
 from derender.evaluation.linear_task import Rows, Task, choose_rows, task_of
 from derender.evaluation.paper_comparison import compare
-from derender.evaluation.reconstruction import (
+from derender.evaluation.pixels import (
     ReconstructionResult,
     ReconstructionScores,
     evaluate_reconstruction,
     mean_picture,
     reconstruction_scores,
 )
+from derender.evaluation.scenes import geometry, reconstruction
 from derender.evaluation.score_table import Column, Row, Scores, ScoreTable
+from derender.evaluation.segmentation import segment
 from derender.evaluation.ward import cut, ward_tree
 
 __all__ = [
@@ -81,6 +83,7 @@ __all__ = [
     "compare_linear",
     "cut",
     "difference",
+    "disentangle",
     "estimate",
     "evaluate_factors",
     "evaluate_geometry",
@@ -88,6 +91,7 @@ __all__ = [
     "finch",
     "finch_clusters",
     "finch_levels",
+    "geometry",
     "geometry_scores",
     "light_error",
     "linear",
@@ -95,8 +99,10 @@ __all__ = [
     "majority_answers",
     "mean_picture",
     "probe",
+    "reconstruction",
     "reconstruction_scores",
     "resamples",
+    "segment",
     "task_of",
     "ward_tree",
 ]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from derender.evaluation.reconstruction import evaluate_reconstruction
+from derender.evaluation.pixels import evaluate_reconstruction
 from derender.features import Progress, embed_images
 
 if TYPE_CHECKING:

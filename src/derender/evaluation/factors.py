@@ -1,12 +1,13 @@
-"""How far predicted albedo, light and camera are from the true ones, up to what no picture can tell.
+"""How far predicted albedo, light and camera are from the true ones, up to what no image determines.
 
-A picture fixes albedo only up to a factor that the light takes back, and the canonical frame only up to one
+An image fixes albedo only up to a factor that the light compensates, and the canonical frame only up to one
 rotation for the whole model (which way an average face looks is a convention). So: albedo is compared after
-the best scale per picture, and after the best one for the whole set; light in the frame of the camera, as it
+the best scale per image, and after the best one for the whole set; light in the frame of the camera, as it
 is and after the best rotation for the whole set; camera rotation after the best rotation for the whole set.
 Leaves out translations: at 10 degrees of field of view they trade against depth.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,10 +18,26 @@ from torch import Tensor
 
 from derender.data import GroundTruth
 from derender.evaluation.bootstrap import RESAMPLES, ScoredRow
-from derender.evaluation.picture_scores import picture_rows
+from derender.evaluation.depth import angle_deg
+from derender.evaluation.image_scores import Columns, image_rows, image_table
+from derender.evaluation.score_table import Column, ScoreTable
 from derender.features import Progress, map_batches
 from derender.scene.camera import rotation_matrix
 from derender.scene.light import light_direction
+
+FACTORS: Columns = {
+    "albedo": (
+        Column("albedo", "low", 4, "root mean square error after each image's best scale, best 0"),
+        1.0,
+    ),
+    "albedo_global": (Column("one scale", "low", 4, "the same after one scale for all images"), 1.0),
+    "light": (
+        Column("light", "low", 1, "mean angle in degrees between true and predicted direction, best 0"),
+        1.0,
+    ),
+    "aligned": (Column("aligned", "low", 1, "the same after the best rotation of all directions"), 1.0),
+    "camera": (Column("camera", "low", 1, "mean angle in degrees of the remaining rotation, best 0"), 1.0),
+}
 
 
 @dataclass(frozen=True)
@@ -28,9 +45,9 @@ class AngleScores:
     """Angles between predictions and truth.
 
     Attributes:
-        mean_deg: mean over pictures, 0..180, best 0.
-        median_deg: median over pictures, 0..180, best 0.
-        each_deg: (N,) per picture.
+        mean_deg: mean over images, 0..180, best 0.
+        median_deg: median over images, 0..180, best 0.
+        each_deg: (N,) per image.
     """
 
     mean_deg: float
@@ -43,15 +60,15 @@ class FactorResult:
     """A model's errors in albedo, light and camera, each beside the best constant answer.
 
     Attributes:
-        albedo: mean over pictures of ``albedo_error``, in the view of the picture; 0 and up, best 0.
+        albedo: mean over images of ``albedo_error``, in the view of the image; 0 and up, best 0.
         albedo_control: the same of the mean true albedo.
-        albedo_global, albedo_global_control: the same after one scale for all pictures, so that a model that
-            takes bright skin under weak light for dark skin under strong light pays for it.
+        albedo_global, albedo_global_control: the same after one scale for all images, so that a model that
+            confuses bright skin under weak light with dark skin under strong light scores worse.
         light, light_control: of the predictions, and of the mean true direction.
         light_aligned: of the predictions after the best rotation of all of them at once; its control is
             ``light_control`` too, since a rotation brings any constant to the mean direction.
         camera, camera_control: of the predictions, and of a camera that never turns.
-        albedo_each, albedo_global_each: (N,) of the predictions per picture, NaN where prediction and truth
+        albedo_each, albedo_global_each: (N,) of the predictions per image, NaN where prediction and truth
             share no pixel.
         albedo_control_each, albedo_global_control_each: (N,) of the mean true albedo.
     """
@@ -70,6 +87,34 @@ class FactorResult:
     albedo_control_each: np.ndarray
     albedo_global_control_each: np.ndarray
 
+    def rows(
+        self, untrained: "FactorResult | None" = None, resample_count: int = RESAMPLES
+    ) -> tuple[ScoredRow, ...]:
+        """The model, the best constant answers and an untrained model, with intervals; lower is better."""
+        light, albedo = self.light_control, (self.albedo_control_each, self.albedo_global_control_each)
+        constant = (*albedo, light.each_deg, light.each_deg, self.camera_control.each_deg)
+        named = {"model": self._each, "constant answer": constant}
+        named |= {} if untrained is None else {"untrained model": untrained._each}
+        each = {name: dict(zip(FACTORS, values, strict=True)) for name, values in named.items()}
+        return image_rows(each, FACTORS, resample_count=resample_count)
+
+    def table(
+        self, untrained: "FactorResult | None" = None, rows: Sequence[ScoredRow] | None = None
+    ) -> ScoreTable:
+        """Errors of albedo, light and camera beside the controls; with ``rows``, their intervals too."""
+        return image_table(
+            f"Albedo, light and camera on {len(self.albedo_each):,} images",
+            rows or self.rows(untrained, 1),
+            FACTORS,
+            intervals=rows is not None,
+            notes={"constant answer": "mean albedo, mean light, a camera that never turns"},
+        )
+
+    @property
+    def _each(self) -> tuple[np.ndarray, ...]:
+        angles = (self.light, self.light_aligned, self.camera)
+        return (self.albedo_each, self.albedo_global_each, *(angle.each_deg for angle in angles))
+
 
 def albedo_error(
     albedo_pred: Float[Tensor, "n 3 h w"],
@@ -78,16 +123,16 @@ def albedo_error(
     *,
     one_scale: bool = False,
 ) -> Float[Tensor, " n"]:
-    """Root mean square albedo error after the best scale, per picture; 0 and up, best 0.
+    """Root mean square albedo error after the best scale, per image; 0 and up, best 0.
 
-    One scale for the three channels, so a colour cast costs. The scale is each picture's own, and the error
-    at most the root mean square of its true albedo; or, with ``one_scale``, the best for all pictures
+    One scale for the three channels, so a colour cast costs. The scale is each image's own, and the error
+    at most the root mean square of its true albedo; or, with ``one_scale``, the best for all images
     together.
     """
     inside = mask[:, None].expand_as(albedo_true)
     count = inside.sum(dim=(1, 2, 3))
     if bool((count == 0).any()):
-        raise ValueError(f"the mask of {int((count == 0).sum())} pictures is empty: leave these pictures out")
+        raise ValueError(f"the mask of {int((count == 0).sum())} images is empty: leave these images out")
     predicted, true = (torch.where(inside, a.double(), 0.0) for a in (albedo_pred, albedo_true))
     power, match = (p.sum(dim=(1, 2, 3)) for p in (predicted.square(), predicted * true))
     if one_scale:
@@ -118,7 +163,7 @@ def camera_error(camera_pred: Float[Tensor, "n 6"], camera_true: Float[Tensor, "
     """Angle of the rotation left between predicted and true cameras after the best alignment; 0..180
     degrees, best 0.
 
-    The alignment is one rotation A of the canonical frame for all pictures, predicted = true A, by least
+    The alignment is one rotation A of the canonical frame for all images, predicted = true A, by least
     squares. A constant prediction then scores the spread of the true cameras, which is the control to print
     beside it.
     """
@@ -127,19 +172,19 @@ def camera_error(camera_pred: Float[Tensor, "n 6"], camera_true: Float[Tensor, "
     twist = rest - rest.mT
     sine = torch.stack([twist[:, 2, 1], twist[:, 0, 2], twist[:, 1, 0]]).norm(dim=0) / 2
     cosine = (rest.diagonal(dim1=1, dim2=2).sum(dim=1) - 1) / 2
-    return _angles(torch.atan2(sine, cosine))
+    return _angles(torch.rad2deg(torch.atan2(sine, cosine)))
 
 
 def evaluate_factors(
     model: Any, truth: GroundTruth, *, batch_size: int = 64, progress: Progress | None = None
 ) -> FactorResult:
-    """Albedo, light and camera that a model sees in pictures with ground truth, beside constant answers.
+    """Albedo, light and camera that a model predicts for images with ground truth, beside constant answers.
 
     Args:
         model: with ``decompose``, ``render``, ``image_size``, ``device``.
-        truth: pictures with albedo, light, camera and mask at the model's image size.
-        batch_size: pictures at a time; changes speed and memory only.
-        progress: called with (pictures done, pictures in all) after every batch.
+        truth: images with albedo, light, camera and mask at the model's image size.
+        batch_size: images at a time; changes speed and memory only.
+        progress: called with (images done, images in all) after every batch.
     """
     if truth.albedo is None or truth.light is None or truth.camera is None:
         lacking = next(name for name in ("albedo", "light", "camera") if getattr(truth, name) is None)
@@ -153,7 +198,7 @@ def evaluate_factors(
     both = mask & mask_true
     seen = both.any(dim=(1, 2))
     if not bool(seen.any()):
-        raise ValueError("prediction and truth share no pixel in any picture: check the camera or the masks")
+        raise ValueError("prediction and truth share no pixel in any image: check the camera or the masks")
     constant = (albedo_true.sum(dim=0) / mask_true.sum(dim=0).clamp_min(1)).expand_as(albedo_true)
     direction = _light_in_camera(light_true, camera_true)
     own, own_global = torch.full((2, len(albedo)), torch.nan, dtype=torch.float64)
@@ -178,37 +223,10 @@ def evaluate_factors(
     )
 
 
-def factor_rows(
-    result: FactorResult, untrained: FactorResult | None = None, resample_count: int = RESAMPLES
-) -> tuple[ScoredRow, ...]:
-    """The model beside the best constant answers and an untrained model, with intervals; lower is better."""
-
-    def each(one: FactorResult) -> dict[str, np.ndarray]:
-        angles = {"light": one.light, "aligned": one.light_aligned, "camera": one.camera}
-        return {
-            "albedo": one.albedo_each,
-            "albedo_global": one.albedo_global_each,
-            **{name: scores.each_deg for name, scores in angles.items()},
-        }
-
-    light = result.light_control.each_deg
-    constant = {
-        "albedo": result.albedo_control_each,
-        "albedo_global": result.albedo_global_control_each,
-        "light": light,
-        "aligned": light,
-        "camera": result.camera_control.each_deg,
-    }
-    scores = {"model": each(result), "constant answer": constant}
-    if untrained is not None:
-        scores["untrained model"] = each(untrained)
-    return picture_rows(scores, list(scores)[1:], lower=list(constant), resample_count=resample_count)
-
-
 def _predictions(
     model: Any, images: np.ndarray, batch_size: int, progress: Progress | None
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Albedo and mask in the picture's view (rendered under plain ambient light), light, camera."""
+    """Albedo and mask in the image's view (rendered under plain ambient light), light, camera."""
 
     def see(batch: Tensor) -> tuple[Tensor, ...]:
         scene = model.decompose(batch)
@@ -239,10 +257,9 @@ def _nearest_rotation(matrix: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
 
 
 def _between(a: Float[Tensor, "n 3"], b: Float[Tensor, "n 3"]) -> AngleScores:
-    """Angles between directions of any length, exact also where they are small."""
-    return _angles(torch.atan2(torch.linalg.cross(a, b).norm(dim=-1), (a * b).sum(dim=-1)))
+    """Angles between directions of any length."""
+    return _angles(angle_deg(a, b))
 
 
-def _angles(radians: Tensor) -> AngleScores:
-    degrees = torch.rad2deg(radians)
+def _angles(degrees: Tensor) -> AngleScores:
     return AngleScores(degrees.mean().item(), degrees.median().item(), degrees.numpy(force=True))

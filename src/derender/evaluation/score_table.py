@@ -5,7 +5,7 @@ A protocol gives ``Scores``: its tables (the main one first) and its numbers. ``
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import isfinite
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
@@ -200,11 +200,13 @@ class Scores:
         tables: the main table first.
         values: every number by name, as ``--json`` writes it.
         notes: sentences on the result.
+        result: the protocol's own value behind the tables, for charts.
     """
 
     tables: Sequence[ScoreTable]
     values: Mapping[str, Any]
     notes: Sequence[str] = ()
+    result: Any = field(default=None, repr=False)
 
     def __str__(self) -> str:
         return self.to_markdown()

@@ -36,7 +36,7 @@ from torch.nn.functional import interpolate
 
 from derender.baselines.controls import untrained_twin
 from derender.data import suggestion
-from derender.evaluation.structural_similarity import masked_ssim
+from derender.evaluation.pixels import masked_ssim
 from derender.interpretation.probe import Probe
 from derender.networks.encoders import activations
 

@@ -18,7 +18,7 @@ from derender.baselines.controls import untrained_features
 from derender.data import GroundTruth, PictureSet, as_float
 from derender.data.doctor import doctor
 from derender.evaluation import evaluate_factors, evaluate_geometry, evaluate_reconstruction, mean_picture
-from derender.evaluation.disentanglement import evaluate_disentanglement
+from derender.evaluation.disentanglement import disentangle
 from derender.evaluation.linear_task import choose_rows
 from derender.features import embed_pictures
 from derender.interpretation import explain_labels, question
@@ -31,9 +31,7 @@ from derender.report.explanation import share_blocks, share_chart
 from derender.report.films import animated_png
 from derender.report.matrices import card_matrices, matrix_sheet
 from derender.report.page import Section
-from derender.report.score_table import factor_table, geometry_table, reconstruction_table
 from derender.report.sweeps import relit_and_rotated
-from derender.report.tables_disentanglement import summary_table, swap_tables
 
 EXAMINED, SCORED, CARD, EXPLAINED = 1_500, 200, 200, 400  # pictures each part looks at, at most
 SHOWN, FILMED = 5, 2
@@ -148,12 +146,12 @@ def scores(hand: AtHand) -> list[Html]:
     """Reconstruction beside the mean picture and, on rendered data, geometry beside its controls."""
     sample = _sample(hand.held_out.require(1, "a score"), SCORED)
     again = evaluate_reconstruction(hand.model, sample.images, mean=mean_picture(hand.pictures.images))
-    tables = [reconstruction_table(again, len(sample))]
+    tables = [again.table()]
     if hand.truth is not None:
         truth = hand.truth
-        tables.insert(0, geometry_table(evaluate_geometry(hand.model, truth), len(truth)))
+        tables.insert(0, evaluate_geometry(hand.model, truth).table())
         if truth.albedo is not None and truth.light is not None and truth.camera is not None:
-            tables.insert(1, factor_table(evaluate_factors(hand.model, truth), len(truth)))
+            tables.insert(1, evaluate_factors(hand.model, truth).table())
     made = [blocks.prose(f"{hand.which}; few of them, so that this page takes minutes.")]
     for table in tables:
         made += [blocks.prose(f"{table.columns[0].name}: {table.verdict(0)}."), blocks.table(table)]
@@ -169,17 +167,13 @@ def scores(hand: AtHand) -> list[Html]:
 def card(hand: AtHand) -> list[Html]:
     """The disentanglement card from one seed, without scores by dimension."""
     sample = _sample(hand.held_out, CARD)
-    found = evaluate_disentanglement(
-        hand.model, sample, seeds=(0,), dimensions=None, swap_pictures=min(64, len(sample))
-    )
-    summary = summary_table(found)
+    found = disentangle(hand.model, sample, seeds=(0,), dimensions=None, swap_images=min(64, len(sample)))
     sheet = blocks.image(
-        matrix_sheet(card_matrices(found)), "matrices of the features: correlation, CKA, swap test"
+        matrix_sheet(card_matrices(found.result)), "matrices of the features: correlation, CKA, swap test"
     )
     return [
-        blocks.prose(f"Swap test: {summary.verdict(4)}. Decoded: {summary.verdict(6)}."),
-        blocks.table(summary),
-        *(blocks.table(table) for table in swap_tables(found)),
+        blocks.prose(f"{'. '.join(found.notes[:2])}."),
+        *(blocks.table(table) for table in found.tables[:3]),
         blocks.folded("Matrices", sheet),
     ]
 

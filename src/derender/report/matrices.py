@@ -1,4 +1,4 @@
-"""Matrices as one picture: a row of labelled heat maps with their numbers, and whole correlation matrices.
+"""Matrices as one image: a row of labelled heat maps with their numbers, and whole correlation matrices.
 
 One colour scale for the sheet, white at 0. Leaves out computing the matrices and the page
 (``report/page.py``).
@@ -7,6 +7,7 @@ One colour scale for the sheet, white at 0. Leaves out computing the matrices an
 from collections.abc import Sequence
 from dataclasses import dataclass
 from io import BytesIO
+from pathlib import Path
 
 import numpy as np
 from matplotlib import colormaps
@@ -15,6 +16,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from derender.evaluation.disentanglement import DisentanglementCard
+from derender.storage.atomic import atomic_file
 
 MAP = "Blues"
 CELL_NUMBERS_UP_TO = 400  # cells; larger matrices are shown without numbers
@@ -49,62 +51,38 @@ class Matrix:
 
 def card_matrices(card: DisentanglementCard) -> list[Matrix]:
     """The matrices of a disentanglement card, means over seeds, the model's own."""
-    names, scores = card.features, next(iter(card.rows.values()))
-    first = scores[0]
+    names, scores = card.features, card.model_scores
 
-    def mean(values: Sequence[np.ndarray]) -> np.ndarray:
-        return np.mean(values, axis=0)
+    def mean(path: str) -> np.ndarray:
+        return np.mean([scores.get(path) for scores in card.model_scores], axis=0)
 
+    apart, identity = "best: 0 off the diagonal", "row exchanged, column moved; best: identity"
+    whole = "best: white outside the blocks"
+    shown = {
+        "pearson.per_dimension": ("mean |Pearson|", apart),
+        "similarity.cka_unbiased": ("CKA, unbiased", apart),
+        "similarity.cross_r2": ("cross-prediction R2", f"row predicts column; {apart}"),
+    }
+    if scores[0].swap is not None:
+        shown |= {
+            "swap.moved": ("swap: features", identity),
+            "swap.moved_parameters": ("swap: decoded", identity),
+        }
     found = [
-        Matrix(
-            "|Pearson| of all dimensions",
-            card.correlations,
-            names,
-            names,
-            card.dimensions,
-            "best: white outside the blocks",
-        ),
-        Matrix(
-            "mean |Pearson|",
-            mean([s.pearson.per_dimension for s in scores]),
-            names,
-            names,
-            note="best: 0 off the diagonal",
-        ),
-        Matrix(
-            "CKA, unbiased",
-            mean([s.similarity.cka_unbiased for s in scores]),
-            names,
-            names,
-            note="best: 0 off the diagonal",
-        ),
-        Matrix(
-            "cross-prediction R2",
-            mean([s.similarity.cross_r2 for s in scores]),
-            names,
-            names,
-            note="row predicts column; best: 0 off the diagonal",
-        ),
+        Matrix("|Pearson| of all dimensions", card.correlations, names, names, card.dimensions, whole),
+        *(Matrix(title, mean(path), names, names, note=note) for path, (title, note) in shown.items()),
     ]
-    if first.swap is not None:
-        swaps = [s.swap for s in scores if s.swap is not None]
-        note = "row exchanged, column moved; best: identity"
-        found.append(Matrix("swap: features", mean([s.moved for s in swaps]), names, names, note=note))
-        found.append(
-            Matrix("swap: decoded", mean([s.moved_parameters for s in swaps]), names, names, note=note)
-        )
-    if first.truth is not None:
-        truths = [s.truth for s in scores if s.truth is not None]
-        found.append(
-            Matrix(
-                "true factors: R2, accuracy of classes",
-                mean([t.score for t in truths]),
-                names,
-                first.truth.factors,
-                note="held out; best: one dark cell a column, in the right row",
-            )
-        )
+    if (truth := scores[0].truth) is not None:
+        note = "held out; best: one dark cell a column, in the right row"
+        title = "true factors: R2, accuracy of classes"
+        found.append(Matrix(title, mean("truth.score"), names, truth.factors, note=note))
     return found
+
+
+def write_card(card: DisentanglementCard, title: str, file: Path) -> None:
+    """Write all matrices of a card as one PNG."""
+    with atomic_file(file) as temporary:
+        matrix_sheet(card_matrices(card), title).save(temporary, "PNG")
 
 
 def matrix_sheet(matrices: Sequence[Matrix], title: str = "", columns: int = 3) -> Image.Image:
@@ -113,15 +91,13 @@ def matrix_sheet(matrices: Sequence[Matrix], title: str = "", columns: int = 3) 
         raise ValueError("a sheet needs at least one matrix")
     square = [m for m in matrices if m.values.shape[1] < 1.6 * m.values.shape[0]]
     wide = [m for m in matrices if m.values.shape[1] >= 1.6 * m.values.shape[0]]
-    rows = -(-len(square) // columns)
-    figure = Figure(figsize=(3.9 * columns, 3.9 * rows + 3.4 * len(wide)), layout="constrained", dpi=110)
-    grid = figure.add_gridspec(
-        rows + len(wide), columns, height_ratios=[3.9] * rows + [3.4] * len(wide), hspace=0.08, wspace=0.06
-    )
+    heights = [3.9] * -(-len(square) // columns) + [3.4] * len(wide)
+    figure = Figure(figsize=(3.9 * columns, sum(heights)), layout="constrained", dpi=110)
+    grid = figure.add_gridspec(len(heights), columns, height_ratios=heights, hspace=0.08, wspace=0.06)
     for place, matrix in enumerate(square):
         _draw(figure.add_subplot(grid[place // columns, place % columns]), matrix)
-    for place, matrix in enumerate(wide):
-        _draw(figure.add_subplot(grid[rows + place, :]), matrix)
+    for place, matrix in enumerate(wide, len(heights) - len(wide)):
+        _draw(figure.add_subplot(grid[place, :]), matrix)
     if title:
         figure.suptitle(title, fontsize=13)
     stream = BytesIO()

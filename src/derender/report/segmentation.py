@@ -1,17 +1,22 @@
-"""Masks in colours over their pictures, what several nets answered side by side, and a legend.
+"""Masks in colours over their images, the answers of several networks side by side, and a legend.
 
-Left and right of a pair share a hue. Leaves out scores (``tables_segmentation``) and writing files.
+Left and right of a pair share a hue. Leaves out scores (``derender.evaluation.segmentation``).
 """
 
 from collections.abc import Mapping, Sequence
 from math import ceil
+from pathlib import Path
 
 import numpy as np
 from matplotlib.colors import hsv_to_rgb
 from PIL import Image, ImageDraw, ImageFont
 
+from derender.evaluation.memory import content_hash
+from derender.evaluation.segmentation import SegmentationComparison
 from derender.report import colours
+from derender.report.blocks import png_bytes
 from derender.report.colours import Images
+from derender.report.page import write_whole
 from derender.report.panel import INK, PAPER, GridLayout, labelled_grid, shortened
 
 FACE_PALETTE = (
@@ -69,6 +74,15 @@ def segmentation_sheet(
     sheet.paste(grid, (0, 0))
     sheet.paste(key, (0, grid.height))
     return sheet
+
+
+def write_overlays(found: SegmentationComparison, out: Path) -> Path:
+    """Write the sheet of overlays; its name changes with the answers."""
+    answers = {row.scored.name: row.shown for row in found.rows if row.trainable}
+    images, truth = found.data.images[found.shown], found.data.masks[found.shown]
+    sheet = segmentation_sheet(images, truth, answers, found.data.classes)
+    mark = content_hash({"pictures": images, "mask": truth, **answers})[:8]
+    return write_whole(out / f"overlays-{mark}.png", png_bytes(sheet))
 
 
 def legend(classes: Sequence[str], width: int, layout: GridLayout | None = None) -> Image.Image:

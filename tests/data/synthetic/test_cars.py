@@ -12,7 +12,7 @@ from derender.data.synthetic import CAR_LIGHTS, CAR_VIEWS, CarSettings, CarViewS
 from derender.data.synthetic.cars import about_x, class_of, euler_angles, view_rotation
 from derender.data.synthetic.settings import CLASSES
 from derender.data.synthetic.synthetic_set import SyntheticSet
-from derender.evaluation.geometry import geometry_scores
+from derender.evaluation.depth import geometry_scores
 from derender.render import render
 from derender.scene.camera import project, rotation_matrix, to_camera, to_canonical, unproject
 

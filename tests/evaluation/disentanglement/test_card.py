@@ -1,10 +1,16 @@
-"""The whole card: every control is there, seeds repeat it, shuffling takes everything away."""
+"""The whole card: every control is there, seeds repeat it, shuffling takes everything away; its tables."""
 
 import numpy as np
 import pytest
+from tests.evaluation.disentanglement.conftest import card
 
 from derender.data import PictureSet
-from derender.evaluation.disentanglement import dealt, evaluate_disentanglement, random_pixels, shuffled_rows
+from derender.evaluation.disentanglement.card import (
+    disentangle,
+    random_blocks,
+    random_pixels,
+    shuffled_rows,
+)
 from derender.model import Derenderer
 from derender.presets import MODEL_PRESETS
 
@@ -30,9 +36,9 @@ def lit_pictures(count: int = 60) -> PictureSet:
 
 def test_the_card_holds_the_model_and_every_control_and_repeats_itself():
     net, pictures, steps = model(), lit_pictures(), []
-    card = evaluate_disentanglement(
-        net, pictures, seeds=(0, 1), swap_pictures=8, progress=lambda done, total: steps.append((done, total))
-    )
+    card = disentangle(
+        net, pictures, seeds=(0, 1), swap_images=8, progress=lambda done, total: steps.append((done, total))
+    ).result
     assert list(card.rows) == ["model", "untrained encoder", "shuffled rows", "random pixels", "PCA"]
     assert all(len(results) == 2 for results in card.rows.values()) and steps[-1] == (10, 10)
     assert card.features == ("geometry", "albedo", "light", "camera") and card.dimensions == (16,) * 4
@@ -45,7 +51,7 @@ def test_the_card_holds_the_model_and_every_control_and_repeats_itself():
     assert ours.truth is not None and ours.truth.by_dimension is not None and shuffled.truth is not None
     assert ours.truth.by_feature.informativeness > 0.8 > 0.2 > shuffled.truth.by_feature.informativeness
     assert ours.similarity.mean_cross_r2 > 0.5 > 0.1 > shuffled.similarity.mean_cross_r2
-    again = evaluate_disentanglement(net, pictures, seeds=(0,), swap_pictures=8, dimensions=None)
+    again = disentangle(net, pictures, seeds=(0,), swap_images=8, dimensions=None).result
     same = again.rows["untrained encoder"][0]
     assert same.swap is not None and same.swap.ratio == pytest.approx(untrained.swap.ratio, rel=1e-5)
     assert same.truth is not None and same.truth.by_dimension is None
@@ -54,13 +60,13 @@ def test_the_card_holds_the_model_and_every_control_and_repeats_itself():
 def test_without_true_factors_only_their_part_is_missing():
     pictures = lit_pictures(20)
     real = PictureSet(pictures.images, pictures.files, {"age": pictures.labels["light_yaw_rad"]})
-    card = evaluate_disentanglement(model(), real, seeds=(0,), swap_pictures=4)
+    card = disentangle(model(), real, seeds=(0,), swap_images=4).result
     scores = card.rows["model"][0]
     assert scores.truth is None and np.isfinite(scores.pearson.mean_per_dimension)
     with pytest.raises(ValueError, match="the disentanglement card needs 20 pictures or more"):
-        evaluate_disentanglement(model(), pictures.select(slice(0, 19)))
+        disentangle(model(), pictures.select(slice(0, 19)))
     with pytest.raises(ValueError, match="at least one seed"):
-        evaluate_disentanglement(model(), real, seeds=())
+        disentangle(model(), real, seeds=())
 
 
 def test_controls_are_what_they_say():
@@ -76,6 +82,33 @@ def test_controls_are_what_they_say():
     assert len(np.unique(drawn.round())) == 8 and drawn.max() < 12
     assert sum(values.shape[1] for values in random_pixels(images, {"a": 256, "b": 256}, 0).values()) == 12
     components = np.arange(10.0).reshape(2, 5)
-    parts = dealt(components, ["a", "b"], 0)
+    parts = random_blocks(components, ["a", "b"], 0)
     assert [values.shape for values in parts.values()] == [(2, 3), (2, 2)]
     assert sorted(np.concatenate([values[0] for values in parts.values()])) == [0, 1, 2, 3, 4]
+
+
+def test_rows_are_means_with_the_spread_over_seeds_below():
+    table = card().tables()[0]
+    assert [row.name for row in table.rows] == ["model", "  ± 2 seeds", "shuffled rows", "  ± 2 seeds"]
+    assert table.values()["model"]["swap"] == 4.5
+    assert table.rows[1].cells[4] == "0.707" and table.rows[2].cells[4] is None
+    assert "80 images" in table.caption and "2 seeds" in table.caption
+    assert [row.name for row in card(1).tables()[0].rows] == ["model", "shuffled rows"]
+
+
+def test_tables_against_the_true_factors():
+    made = card()
+    truth, dimensions, single = made.tables()[3:]
+    assert truth.values()["model"]["placed"] == 1 and truth.values()["shuffled rows"]["I"] < 0.1
+    assert dimensions.values()["model"]["C, grouped"] > 0.9
+    cells = single.values()["light yaw"]
+    assert list(cells) == ["light", "camera", "all", "all, shuffled", "chance"]
+    assert cells["light"] > 0.99 > 0.2 > cells["camera"] and cells["chance"] == 0
+    assert len(card(known=False).tables()) == 3
+
+
+def test_swap_tables_hold_the_matrix():
+    features, decoded = card().tables()[1:3]
+    assert features.values()["light"] == {"light": 0.9, "camera": 0.3, "picture": 0.9, "left": 0.1}
+    assert features.values()["nothing"]["light"] == 0.45
+    assert decoded.values()["camera"] == {"light": 0.1, "camera": 0.7}

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from derender.evaluation.disentanglement import correlation_matrix, pearson, per_image
+from derender.evaluation.disentanglement.similarity import correlation_matrix, pearson, per_image
 
 
 def features(rows: int = 40, size: int = 6, seed: int = 0) -> dict[str, np.ndarray]:

@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 from sklearn.linear_model import RidgeCV
 
-from derender.evaluation.disentanglement import fit_predict, held_out, linear_cka, r_squared, similarity
+from derender.evaluation.disentanglement.similarity import (
+    fit_predict,
+    held_out,
+    linear_cka,
+    r_squared,
+    similarity,
+)
 
 
 def normal(*shape: int, seed: int = 0) -> np.ndarray:

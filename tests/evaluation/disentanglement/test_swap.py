@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from derender.evaluation.disentanglement import diagonal_over_rest, swap_test
+from derender.evaluation.disentanglement.swap import diagonal_over_rest, swap_test
 from derender.model import Derenderer
 from derender.presets import MODEL_PRESETS
 from derender.render import Rendering
@@ -31,17 +31,17 @@ class Reader(torch.nn.Module):
         super().__init__()
         self.mix, self.covered, self.frozen, self.seen = mix, covered, frozen, []
 
-    def read(self, images):
+    def activations(self, images):
         rows = [images[:, 0, row] * (0 if self.frozen and row == 2 else 1) for row in range(3)]
         mean = torch.stack(rows).sum(dim=0)
         names = (factor.name for factor in FACTORS)
         return {name: (1 - self.mix) * row + self.mix * mean for name, row in zip(names, rows, strict=True)}
 
-    def codes(self, readings):
-        return readings
+    def codes(self, activations):
+        return activations
 
-    def features(self, readings):
-        return readings
+    def features_from(self, activations):
+        return activations
 
     def decode(self, codes):
         depth = codes["geometry"][:, None].expand(-1, 4, 4)

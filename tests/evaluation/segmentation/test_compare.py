@@ -9,36 +9,22 @@ from tests.evaluation.segmentation.conftest import NAMES, bands
 
 from derender import Derenderer
 from derender.evaluation.memory import Memory
-from derender.evaluation.segmentation import (
-    VARIANTS,
-    SegmentSettings,
-    answer,
-    build_variant,
-    chosen_variants,
-    compare_segmentations,
-    count_pixels,
-    divide,
-    segmentation_scores,
-    train_segmenter,
-)
-from derender.evaluation.segmentation.controls import (
+from derender.evaluation.segmentation import VARIANTS, SegmentSettings, divide, segment
+from derender.evaluation.segmentation.compare import count_pixels, resampled_scores
+from derender.evaluation.segmentation.data import (
     by_colour,
     by_components,
     most_frequent,
     most_frequent_at_place,
 )
-from derender.evaluation.segmentation.variants import usual_variants
-from derender.report.tables_segmentation import (
-    beside_the_paper,
-    class_table,
-    segmentation_table,
-)
+from derender.evaluation.segmentation.nets import answer, build_variant, chosen_variants, train_segmenter
 
 QUICK = SegmentSettings(learning_rate=1e-2, epochs=6, batch_size=4)
 
 
-def judged(answers, data):
-    return segmentation_scores(count_pixels(answers, data.masks[data.test], len(data.classes)))
+def mean_iou(answers, data) -> float:
+    counts = count_pixels(answers, data.masks[data.test], len(data.classes))
+    return resampled_scores(counts, np.ones((1, len(counts))))[0, 0]
 
 
 def test_controls_answer_what_they_may_know(data):
@@ -48,13 +34,13 @@ def test_controls_answer_what_they_may_know(data):
     column = [np.bincount(data.masks[data.train, row, 7]).argmax() for row in range(32)]
     assert (place == place[0]).all() and (place[0, :, 7] == column).all()
     colours = by_colour(data, seed=0)
-    assert judged(colours, data).mean_iou > 0.99  # here colour tells all
+    assert mean_iou(colours, data) > 0.99  # here colour tells all
     blind = replace(data, images=np.full_like(data.images, 90))
     assert (by_colour(blind) == most_frequent(data)).all()
     assert colours.shape == truth.shape and colours.dtype == np.uint8
     components = by_components(data)
     assert components.shape == truth.shape and components.dtype == np.uint8
-    assert judged(components, data).mean_iou > judged(place, data).mean_iou + 0.05  # it sees where bands end
+    assert mean_iou(components, data) > mean_iou(place, data) + 0.05  # it sees where bands end
     assert (by_components(blind) == place).all()  # without a picture, how often a class is at a place
 
 
@@ -64,7 +50,7 @@ def test_a_net_learns_and_leaves_the_model_alone(name, data, model, before):
     told = []
     losses = train_segmenter(net, data, 0, QUICK, lambda seen, loss: told.append(seen))
     assert losses[-1] < losses[0] and told[-1] == 6 * len(data.train)
-    assert judged(answer(net, data.images[data.test]), data).mean_iou > 0.5
+    assert mean_iou(answer(net, data.images[data.test]), data) > 0.5
     frozen = build_variant(model, VARIANTS[name], data, seed=0)
     same = [
         torch.equal(a, b)
@@ -113,18 +99,18 @@ def test_a_frozen_random_encoder_has_the_statistics_of_the_training_pictures(dat
 
 
 def test_a_comparison_goes_on_where_it_stopped(data, model, tmp_path, before):
-    settings, variants = QUICK.model_copy(update={"epochs": 1}), chosen_variants(["albedo", "random"])
+    settings, variants = QUICK.model_copy(update={"epochs": 1}), ["albedo", "random"]
     options = {"settings": settings, "resample_count": 20}
     first = Memory(tmp_path)
-    compare_segmentations(model, data, {"random": variants["random"]}, (0,), memory=first, **options)
+    segment(model, data, variants=["random"], seeds=(0,), memory=first, **options)
     assert (first.made, first.recalled) == (1, 0)
     second, told = Memory(tmp_path), []
-    found = compare_segmentations(
-        model, data, variants, (0, 1), memory=second, **options, progress=lambda *at: told.append(at)
-    )
+    options |= {"variants": variants, "seeds": (0, 1)}
+    scores = segment(model, data, memory=second, **options, progress=lambda *at: told.append(at))
+    found = scores.result
     assert (second.made, second.recalled) == (3, 1)
     assert told[-1][:2] == (4 * len(data.train),) * 2
-    again = compare_segmentations(model, data, variants, (0, 1), memory=Memory(tmp_path), **options)
+    again = segment(model, data, memory=Memory(tmp_path), **options).result
     for one, two in zip(found.rows, again.rows, strict=True):
         assert str(one.scored.numbers()["scores"]) == str(two.scored.numbers()["scores"])
         assert (one.shown == two.shown).all() and (one.losses == two.losses).all()
@@ -132,27 +118,27 @@ def test_a_comparison_goes_on_where_it_stopped(data, model, tmp_path, before):
     assert names[:2] == ["albedo encoder", "random start"] and "each place's class" in names
     assert [row.scored.control for row in found.rows] == [False, True, True, True, True, True]
     assert found.rows[0].scored.runs == 2 and found.rows[0].losses.shape == (2, 1)
-    assert found.test_share.sum() == pytest.approx(1) and found.test_share[3] == 0
+    shares = scores.values["test_share"]
+    assert sum(shares.values()) == pytest.approx(1) and shares["nothing"] == 0
     changed = Memory(tmp_path)
     more = {"settings": QUICK.model_copy(update={"epochs": 2}), "resample_count": 20}
-    compare_segmentations(model, data, {"random": variants["random"]}, (0,), memory=changed, **more)
+    segment(model, data, variants=["random"], seeds=(0,), memory=changed, **more)
     assert changed.recalled == 0
 
-    table = segmentation_table(found)
-    assert "24 pictures learned, 16 tested" in table.caption and "3 of 4 classes" in table.caption
+    table, _, classes, paper = scores.tables
+    assert "24 images learned, 16 tested" in table.caption and "3 of 4 classes" in table.caption
     assert table.values()["most frequent class"]["learn"] is None
-    shown = class_table(found).values()
+    shown = classes.values()
     assert list(shown)[-1] == "nothing" and set(shown) == set(NAMES)
-    assert "paper: Joint Encoders" in beside_the_paper(found, "subset").values()
+    assert "paper: Joint Encoders" in paper.values()
 
 
 def test_few_pictures_come_in_small_batches_so_that_there_are_steps_to_learn_in(data, model):
     sizes = {pictures: SegmentSettings().batch_for(pictures) for pictures in (24_127, 1_600, 640)}
     assert sizes == {24_127: 64, 1_600: 5, 640: 2}
     assert SegmentSettings(batch_size=3).batch_for(24_127) == 3
-    found = compare_segmentations(
-        model, data, chosen_variants(["random"]), [0], settings=SegmentSettings(epochs=1), resample_count=2
-    )
+    settings = SegmentSettings(epochs=1)
+    found = segment(model, data, variants=["random"], seeds=[0], settings=settings, resample_count=2).result
     assert found.settings.batch_size == 2  # the table says what was used
     assert found.rows[0].losses.shape == (1, 1)
 
@@ -172,30 +158,30 @@ def test_the_split_is_the_datas_own_or_by_name():
 
 def test_all_that_a_model_has_is_compared_unless_something_is_named(model):
     without = Derenderer.from_preset("small", seed=0, image_size=32, encoder="unet", unet_width=4)
-    assert list(usual_variants(model)) == list(VARIANTS)
-    assert set(VARIANTS) - set(usual_variants(without)) == {"joint-whole"}
+    assert list(chosen_variants(model)) == list(VARIANTS)
+    assert set(VARIANTS) - set(chosen_variants(without)) == {"joint-whole"}
 
 
 def test_bad_input_is_named(data, model):
     pictures, masks = bands(20)
     with pytest.raises(ValueError, match=r"show one class only \(wall\)"):
         divide(pictures, np.ones_like(masks), NAMES)
-    with pytest.raises(ValueError, match="learn from 99 pictures, there are 16"):
+    with pytest.raises(ValueError, match="labelled=99 training images, but there are 16"):
         divide(pictures, masks, NAMES, labelled=99)
-    with pytest.raises(ValueError, match="leaves 1 pictures to learn from and 1 to test on"):
+    with pytest.raises(ValueError, match="leaves 1 images to learn from and 1 to test on"):
         divide(pictures.select([0, 1]), masks[:2], NAMES, test_fraction=0.5)
     with pytest.raises(ValueError, match="no variant 'joined'; did you mean 'joint'"):
-        chosen_variants(["joined"])
+        chosen_variants(model, ["joined"])
     plain = Derenderer.from_preset("small", seed=0, image_size=32, width=4, light_width=4)
     with pytest.raises(ValueError, match=r"no U-Net encoder for geometry.*--set encoder=unet"):
-        compare_segmentations(plain, data, chosen_variants(["geometry"]), (0,))
+        segment(plain, data, variants=["geometry"])
     without = Derenderer.from_preset("small", seed=0, image_size=32, encoder="unet", unet_width=4)
     with pytest.raises(
         ValueError, match="the model has no U-Net decoder: make a copy that has with derender"
     ):
-        compare_segmentations(without, data, chosen_variants(["joint-whole"]), (0,))
+        segment(without, data, variants=["joint-whole"])
     large = replace(
         data, images=np.zeros((40, 3, 64, 64), np.uint8), masks=data.masks.repeat(2, axis=1).repeat(2, axis=2)
     )
     with pytest.raises(ValueError, match="64 pixels wide, the model takes 32"):
-        compare_segmentations(model, large, chosen_variants(["geometry"]), (0,))
+        segment(model, large, variants=["geometry"])

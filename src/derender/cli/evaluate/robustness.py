@@ -14,7 +14,8 @@ from derender.cli.gathered import gathered
 if TYPE_CHECKING:
     from derender.evaluation.feature_rows import FeatureRow
     from derender.evaluation.memory import Memory
-    from derender.evaluation.robustness import Axis, RobustnessComparison, Trial
+    from derender.evaluation.robust import RobustnessComparison, Trial
+    from derender.evaluation.robust.trial import Axis
     from derender.features import FeatureTable
     from derender.model import Derenderer
 
@@ -145,9 +146,8 @@ def robustness(
 
     from derender.cli.models import open_model
     from derender.evaluation.linear_probes import check_head
-    from derender.evaluation.robustness import chosen_axes, compare_robustness
+    from derender.evaluation.robust import chosen_axes, compare_robustness
     from derender.evaluation.score_table import verdict
-    from derender.report.robustness import robustness_tables
 
     check_head(head)
     axes = chosen_axes(
@@ -176,7 +176,7 @@ def robustness(
         )
     notes = [f"{curve.title}: {verdict(curve.rows[score][0], 'area')}" for curve in found.curves]
     values = {"pictures": way, "data": shown.data, "models": model, **found.numbers()}
-    published.show(robustness_tables(found, score), values, [*notes, scoring.remembered(memory)])
+    published.show(found.tables(score), values, [*notes, scoring.remembered(memory)])
     if out is not None:
         draw(found, score, ", ".join(model), out)
         result(f"curves in {out}", published.json_file)
@@ -198,13 +198,13 @@ def make_trial(
     memory: "Memory",
 ) -> "Trial":
     """The pictures, who learns and who is tested."""
-    from derender.evaluation.robustness import (
+    from derender.evaluation.robust import (
         KINDS,
         Recipe,
         checked_levels,
         generated_trial,
         rendered_trial,
-        turned_trial,
+        true_angle_trial,
     )
 
     levels = checked_levels(feature_rows.whole_numbers(shown.angles, "--angles"), axes)
@@ -229,7 +229,7 @@ def make_trial(
     pictures = feature_rows.aligned(pictures, ready.files)
     task = task_of(ready.labels)
     if way == "truth":
-        return turned_trial(pictures, task, axes)
+        return true_angle_trial(pictures, task, axes)
     sides = ready.kept[shown.groups] if shown.groups else None
     learn, test = divide_rows(
         task, ready.files, test_fraction=shown.test_fraction, partition=ready.partition, groups=sides

@@ -1,74 +1,59 @@
 """`derender evaluate segment`: do pre-trained encoders help to find the parts of a face?"""
 
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from derender.cli import feature_rows, options, scoring
-from derender.cli.console import notice, progress_bar, result
+from derender.cli.console import progress_bar, result
 from derender.cli.gathered import gathered
-
-if TYPE_CHECKING:
-    import numpy as np
-
-    from derender.data import PictureSet
-    from derender.evaluation.memory import Memory
-    from derender.evaluation.score_table import ScoreTable
-    from derender.evaluation.segmentation import SegmentationComparison, SegmentationData
 
 Masks = Annotated[
     str | None,
     typer.Option(
         "--masks",
-        help="Folder or zip of masks named as the pictures, if they are not with them.",
+        help="Folder or zip of masks named as the images, if they lie apart.",
         metavar="PATH",
     ),
 ]
 Variants = Annotated[
     str | None,
-    typer.Option(
-        "--variants",
-        help="Nets to train, with commas between; the first is what is asked. Default: all there are.",
-    ),
+    typer.Option("--variants", help="Networks to train, the subject first, with commas; default: all."),
 ]
-Epochs = Annotated[int, typer.Option("--epochs", min=1, metavar="N", help="Of every net.")]
-Seeds = Annotated[int, typer.Option("--seeds", min=1, metavar="N", help="Runs of every net.")]
+Epochs = Annotated[int, typer.Option("--epochs", min=1, metavar="N", help="Epochs of every network.")]
+Seeds = Annotated[int, typer.Option("--seeds", min=1, metavar="N", help="Runs of every network.")]
 BatchSize = Annotated[
     int | None,
-    typer.Option(
-        "--batch-size", min=2, metavar="N", help="Of training; default: 64, fewer where pictures are few."
-    ),
+    typer.Option("--batch-size", min=2, metavar="N", help="Images a step; default: 64, fewer of few images."),
 ]
 TestFraction = Annotated[
     float,
-    typer.Option("--test-fraction", min=0.01, max=0.99, help="Tested, where the data have no partition."),
+    typer.Option("--test-fraction", min=0.01, max=0.99, help="Tested share of data without a partition."),
 ]
 Labelled = Annotated[
-    int | None, typer.Option("--labelled", min=2, metavar="N", help="Learn from so many pictures only.")
+    int | None,
+    typer.Option("--labelled", min=2, metavar="N", help="Number of training images."),
 ]
 Out = Annotated[
     Path | None,
-    typer.Option("--out", "-o", help="Folder for runs (to go on with) and overlays.", metavar="DIR"),
+    typer.Option("--out", "-o", help="Folder for runs (to continue) and overlays.", metavar="DIR"),
 ]
 
 
 def register(group: typer.Typer) -> None:
     group.command(
         "segment",
-        epilog="Example: derender evaluate segment --model runs/unet --data CelebAMask-HQ/ --out segmented/",
+        epilog="Example: derender evaluate segment CelebAMask-HQ/ --model runs/unet --out segmented/",
     )(segment)
 
 
 @gathered
 def segment(
-    model: options.Model,
-    data: options.Data,
+    images: options.ImageSet,
+    trained: options.TrainedModel,
     published: scoring.Published,
     masks: Masks = None,
-    dataset: options.Dataset = "auto",
-    limit: options.Limit = None,
     variants: Variants = None,
     epochs: Epochs = 20,
     seeds: Seeds = 3,
@@ -77,122 +62,29 @@ def segment(
     labelled: Labelled = None,
     resamples: feature_rows.Resamples = 1_000,
     seed: options.Seed = 0,
-    device: options.Device = "auto",
     out: Out = None,
 ) -> None:
     """Do pre-trained U-Net encoders help segmentation? mIoU, mIoU of the ten best classes, pixel accuracy.
 
-    The model must have U-Net encoders: derender unet makes a copy that has. Runs are kept in --out (without
-    it, in the user's cache): the same command again goes on with the next run. Overlays show the pictures
-    themselves: mind who is on them before you pass the folder on.
+    The model must have U-Net encoders: derender unet makes a copy that has. Runs are cached in --out (without
+    it, in the user's cache): the same command continues with the next run. Overlays show the images
+    themselves: consider who is on them before you share the folder.
     """
     published.check()
+    from derender import evaluation
+    from derender.evaluation.segmentation import SegmentSettings
+
     memory = feature_rows.memory_in(None if out is None else str(out / "runs"))
-    run = segmented(
-        model, MaskSource(data, masks, dataset, limit), variants, tuple(range(seed, seed + seeds)),
-        memory, epochs=epochs, batch_size=batch_size, test_fraction=test_fraction, labelled=labelled,
-        resamples=resamples, device=device,
-    )  # fmt: skip
-    if out is not None:
-        result(f"overlays {write_overlays(run, out)}", published.json_file)
-    values = {"model": model, "data": run.source, **run.found.numbers()}
-    published.show(run.tables, values, [scoring.remembered(memory, "runs")])
-
-
-@dataclass(frozen=True)
-class MaskSource:
-    """Where pictures and masks are read from."""
-
-    data: str
-    masks: str | None = None
-    dataset: str = "auto"
-    limit: int | None = None
-
-    def read(self, image_size: int) -> "tuple[PictureSet, np.ndarray, tuple[str, ...]]":
-        """Pictures, masks and the names of the classes."""
-        from derender.data import read_masks
-
-        own = {"dataset": self.dataset, "limit": self.limit}
-        with progress_bar("reading") as report:
-            if self.masks is None:
-                return read_masks(self.data, image_size, progress=report, **own)
-            return read_masks(self.data, image_size, masks=self.masks, progress=report, **own)
-
-
-@dataclass(frozen=True)
-class Segmented:
-    """A comparison, what it was made on, and its tables."""
-
-    found: "SegmentationComparison"
-    divided: "SegmentationData"
-    source: str
-    differs: str
-    tables: "list[ScoreTable]"
-
-
-def segmented(
-    model: str,
-    pictures: MaskSource,
-    variants: str | None,
-    seeds: tuple[int, ...],
-    memory: "Memory",
-    *,
-    epochs: int,
-    batch_size: int | None = None,
-    resamples: int,
-    device: str,
-    test_fraction: float = 0.2,
-    labelled: int | None = None,
-) -> Segmented:
-    """Train every variant of a model's encoders on the masks, beside the controls; None: all it has."""
-    from derender.cli.models import open_model
-    from derender.evaluation.paper_tables import SEGMENTATION
-    from derender.evaluation.segmentation import (
-        SegmentSettings,
-        chosen_variants,
-        compare_segmentations,
-        divide,
-    )
-    from derender.evaluation.segmentation.variants import check_encoders, usual_variants
-    from derender.report.tables_segmentation import segmentation_tables
-
-    named = None if variants is None else [name.strip() for name in variants.split(",") if name.strip()]
-    wanted = {} if named is None else chosen_variants(named)
-    net = open_model(model, device)
-    wanted = wanted or usual_variants(net)
-    check_encoders(net, wanted, model)
-    read = pictures.read(net.image_size)
-    notice(read[0].describe())
-    divided = divide(*read, test_fraction=test_fraction, split_seed=seeds[0], labelled=labelled)
+    names = None if variants is None else [name.strip() for name in variants.split(",") if name.strip()]
     with progress_bar("training") as report:
-        found = compare_segmentations(
-            net,
-            divided,
-            wanted,
-            seeds,
-            settings=SegmentSettings(epochs=epochs, batch_size=batch_size),
-            resample_count=resamples,
-            memory=memory,
-            progress=report,
-        )
-    size = (
-        f"+ {found.n_test:,} pictures at {net.image_size} x {net.image_size}, {len(found.classes)} classes,"
-    )
-    differs = SEGMENTATION.differs(read[0].layout, found.n_train, size)
-    tables = segmentation_tables(found, differs)
-    return Segmented(found, divided, read[0].source, differs, tables)
+        scores = evaluation.segment(
+            trained.open(), images.address, **images.how, masks=masks, test_fraction=test_fraction,
+            labelled=labelled, variants=names, seeds=range(seed, seed + seeds), resample_count=resamples,
+            settings=SegmentSettings(epochs=epochs, batch_size=batch_size), memory=memory, progress=report,
+        )  # fmt: skip
+    if out is not None:
+        from derender.report.segmentation import write_overlays
 
-
-def write_overlays(run: Segmented, out: Path) -> Path:
-    """The sheet of overlays; other answers are another file."""
-    from derender.evaluation.memory import content_hash
-    from derender.report.blocks import png_bytes
-    from derender.report.page import write_whole
-    from derender.report.segmentation import segmentation_sheet
-
-    found = run.found
-    answers = {row.scored.name: row.shown for row in found.rows if row.trainable}
-    pictures, truth = run.divided.images[found.shown], run.divided.masks[found.shown]
-    sheet = segmentation_sheet(pictures, truth, answers, found.classes)
-    mark = content_hash({"pictures": pictures, "mask": truth, **answers})[:8]
-    return write_whole(out / f"overlays-{mark}.png", png_bytes(sheet))
+        result(f"overlays {write_overlays(scores.result, out)}", published.json_file)
+    values = {"model": trained.model, **scores.values}
+    published.show(scores.tables, values, [*scores.notes, scoring.remembered(memory, "runs")])

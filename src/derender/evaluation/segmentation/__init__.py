@@ -1,33 +1,28 @@
 """Face segmentation from pre-trained U-Net encoders, after the paper's Table 3.
 
-pixels: pictures with masks, divided; variants: which encoders; train: how; scores; controls: answers without
-a net; compare: all of it joined.
+data      images with masks, divided; controls without a network
+nets      the networks, their training and their answers
+compare   all of it joined: ``segment``
 """
 
 from derender.evaluation.segmentation.compare import (
     SegmentationComparison,
-    SegmentationRow,
-    compare_segmentations,
+    class_iou,
+    count_pixels,
+    resampled_scores,
+    segment,
 )
-from derender.evaluation.segmentation.pixels import SegmentationData, divide
-from derender.evaluation.segmentation.scores import SegmentationScores, count_pixels, segmentation_scores
-from derender.evaluation.segmentation.train import SegmentSettings, answer, train_segmenter
-from derender.evaluation.segmentation.variants import VARIANTS, Variant, build_variant, chosen_variants
+from derender.evaluation.segmentation.data import SegmentationData, divide
+from derender.evaluation.segmentation.nets import VARIANTS, SegmentSettings
 
 __all__ = [
     "VARIANTS",
     "SegmentSettings",
     "SegmentationComparison",
     "SegmentationData",
-    "SegmentationRow",
-    "SegmentationScores",
-    "Variant",
-    "answer",
-    "build_variant",
-    "chosen_variants",
-    "compare_segmentations",
+    "class_iou",
     "count_pixels",
     "divide",
-    "segmentation_scores",
-    "train_segmenter",
+    "resampled_scores",
+    "segment",
 ]

@@ -1,48 +1,65 @@
-"""All nets and controls on the same pictures: scores over seeds, intervals, who beats the controls.
+"""Face segmentation from pre-trained U-Net encoders: networks and controls on the same images, over seeds.
 
-Every net learns from the same pictures and is tested on the same others. A seed changes fresh weights (the
-decoder's always) and the order of pictures, not the split. What a run found is remembered by the content of
-what made it, so that an interrupted comparison goes on with the next run.
+Source: Klinghoffer et al., ECCV 2022, Sec. 4.7 and Table 3. Every network learns from the same images and is
+tested on the same others. A seed changes fresh weights (the decoder's always) and the order of images, not
+the split. Runs are cached by the content of their inputs, so that an interrupted comparison continues with
+the next run.
+
+Scores: mean intersection over union, that of the ten best classes, and pixel accuracy. Pixels are counted
+image by image and added up before they are divided, so that the same counts give the scores and their
+resamples. A class that no tested mask shows has no IoU and is left out of every mean, for every answer alike:
+answering it still costs the classes whose pixels it takes. Leaves out boundary scores.
 """
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from derender.data import read_masks
 from derender.evaluation.bootstrap import RESAMPLES, ScoredRow, estimate, resamples, with_verdicts
 from derender.evaluation.memory import Memory, content_hash
-from derender.evaluation.segmentation.controls import CONTROLS
-from derender.evaluation.segmentation.pixels import SegmentationData
-from derender.evaluation.segmentation.scores import (
-    SCORES,
-    count_pixels,
-    resampled_scores,
-    segmentation_scores,
+from derender.evaluation.paper_tables import SEGMENTATION
+from derender.evaluation.score_table import Cell, Column, Row, Scores, ScoreTable, scored_table, verdict_table
+from derender.evaluation.segmentation.data import CONTROLS, TEST_FRACTION, SegmentationData, divide
+from derender.evaluation.segmentation.nets import (
+    SegmentSettings,
+    answer,
+    build_variant,
+    chosen_variants,
+    train_segmenter,
 )
-from derender.evaluation.segmentation.train import SegmentSettings, answer, train_segmenter
-from derender.evaluation.segmentation.variants import Variant, build_variant, check_encoders
 from derender.features import model_fingerprint
-from derender.networks.unet import LEVELS_KEPT, SegmentationNet
+from derender.inputs import as_model
 
 SHOWN = 8
+TOP = 10
+COLUMNS = {
+    "mean_iou": Column("mIoU", "high", note="intersection over union, mean over classes, 0 to 1"),
+    "top10_iou": Column("top 10", "high", note="the same over the row's own ten best classes, 0 to 1"),
+    "pixel_accuracy": Column("pixels", "high", note="share of right pixels, 0 to 1"),
+}
+"""By score, all best at 1. ``top10_iou`` is higher by selection alone; background, skin and hair decide
+``pixel_accuracy``."""
 
 Progress = Callable[[int, int, str], object]
-"""Called with (pictures seen in all runs, pictures in all, what is running)."""
+"""Called with (images seen in all runs, images in all, the current run)."""
 
 
 @dataclass(frozen=True)
 class SegmentationRow:
-    """One net or control.
+    """One network or control.
 
     Attributes:
-        scored: name, runs, ``SCORES`` with intervals and spread, and differences to the strongest control.
+        scored: name, runs, ``COLUMNS`` with intervals and standard deviations, and differences to the
+            strongest control.
         class_iou: (C,) mean over runs; NaN for classes that no tested mask shows.
-        trainable: weights that learned; 0 for controls without a net.
+        trainable: number of trained weights; 0 for controls without a network.
         losses: (R, epochs) mean training loss of each run.
-        shown: (K, S, S) answers of the first run for the pictures in ``SegmentationComparison.shown``.
+        shown: (K, S, S) answers of the first run for the images in ``SegmentationComparison.shown``.
     """
 
     scored: ScoredRow
@@ -54,92 +71,159 @@ class SegmentationRow:
 
 @dataclass(frozen=True)
 class SegmentationComparison:
-    """Nets side by side; the first row is what the table is about.
+    """Networks side by side; the first row is the subject of the table.
 
     Attributes:
-        rows: nets in the order asked for, then controls.
-        classes: their names.
-        train_share, test_share: (C,) share of pixels of each class.
-        n_train, n_test: pictures.
-        split: how they were told apart.
+        rows: networks in the order requested, then controls.
+        data: the images and masks.
         seeds: of the runs.
         settings: of the training.
-        shown: (K,) rows of the data that pictures of results show.
+        shown: (K,) rows of the data for overlays.
     """
 
     rows: tuple[SegmentationRow, ...]
-    classes: tuple[str, ...]
-    train_share: np.ndarray
-    test_share: np.ndarray
-    n_train: int
-    n_test: int
-    split: str
+    data: SegmentationData
     seeds: tuple[int, ...]
     settings: SegmentSettings
     shown: np.ndarray
 
+    @property
+    def differs(self) -> str:
+        """The difference between these data and the paper's, in words."""
+        data, side = self.data, self.data.images.shape[-1]
+        size = f"+ {len(data.test):,} pictures at {side} x {side}, {len(data.classes)} classes,"
+        return SEGMENTATION.differs(data.layout, len(data.train), size)
+
     def numbers(self) -> dict[str, Any]:
-        """Everything but pictures, as JSON takes it."""
+        """Everything but images, for JSON."""
+        data = self.data
         rows = {
             row.scored.name: {
                 **row.scored.numbers(),
                 "trainable": row.trainable,
-                "class_iou": dict(zip(self.classes, row.class_iou.tolist(), strict=True)),
+                "class_iou": dict(zip(data.classes, row.class_iou.tolist(), strict=True)),
                 "losses": row.losses.tolist(),
             }
             for row in self.rows
         }
         shares = {
-            part: dict(zip(self.classes, getattr(self, part).tolist(), strict=True))
-            for part in ("train_share", "test_share")
+            part: dict(zip(data.classes, data.shares(chosen).tolist(), strict=True))
+            for part, chosen in (("train_share", data.train), ("test_share", data.test))
         }
-        sizes = {name: getattr(self, name) for name in ("n_train", "n_test", "split", "seeds")}
-        return {**sizes, "settings": self.settings.model_dump(), **shares, "rows": rows}
+        sizes = {"n_train": len(data.train), "n_test": len(data.test), "split": data.split}
+        settings = self.settings.model_dump()
+        return {**sizes, "seeds": self.seeds, "settings": settings, **shares, "rows": rows}
+
+    def tables(self) -> list[ScoreTable]:
+        """Scores, verdicts, classes, and the paper's rows."""
+        scored, trainable = [row.scored for row in self.rows], {r.scored.name: r.trainable for r in self.rows}
+        learn: Mapping[Column, Callable[[ScoredRow], Cell]] = {
+            Column("learn", note="number of trained weights"): lambda row: trainable[row.name] or None
+        }
+        tables = [scored_table(self._caption(), "net", scored, COLUMNS, more=learn)]
+        if any(row.versus for row in scored):
+            tables.append(verdict_table(scored, COLUMNS, "above the strongest control?"))
+        return [*tables, self._class_table(), self._beside_the_paper()]
+
+    def _caption(self) -> str:
+        data = self.data
+        seen = int((data.shares(data.test) > 0).sum())
+        seeds = "1 seed" if len(self.seeds) == 1 else f"{len(self.seeds)} seeds"
+        return (
+            f"segmentation: {len(data.train):,} images learned, {len(data.test):,} tested (by {data.split}), "
+            f"{seen} of {len(data.classes)} classes tested, {self.settings.epochs} epochs, {seeds}"
+        )
+
+    def _class_table(self) -> ScoreTable:
+        """A row for each class, most frequent first: its share of the tested pixels, and each IoU."""
+        nets = [row for row in self.rows if row.trainable]
+        columns = [Column(row.scored.name, None, note="IoU, 0 to 1") for row in nets]
+        share = self.data.shares(self.data.test)
+        rows = [
+            Row(self.data.classes[at], (float(share[at]), *(float(row.class_iou[at]) for row in nets)))
+            for at in np.argsort(-share, kind="stable").tolist()
+        ]
+        shown = (Column("share", note="of the tested pixels"), *columns)
+        return ScoreTable("intersection over union of every class", "class", shown, rows)
+
+    def _beside_the_paper(self) -> ScoreTable:
+        """These networks and controls over the paper's rows; the last column has the differing data."""
+        rows = [
+            Row(one.name, (*(one.scores[name].value for name in COLUMNS), self.differs), one.control)
+            for one in (row.scored for row in self.rows)
+        ]
+        rows += [
+            Row(f"paper: {one.method}", (*(one.scores[n] for n in COLUMNS), one.dataset), note="paper")
+            for one in SEGMENTATION.paper
+        ]
+        columns = (*COLUMNS.values(), Column("data"))
+        return ScoreTable("segmentation, beside the paper's Table 3", "net", columns, rows)
 
 
-def compare_segmentations(
+def segment(
     model: Any,
-    data: SegmentationData,
-    variants: Mapping[str, Variant],
-    seeds: Sequence[int],
+    data: SegmentationData | str | Path,
     *,
+    masks: str | Path | None = None,
+    dataset: str = "auto",
+    limit: int | None = None,
+    test_fraction: float = TEST_FRACTION,
+    labelled: int | None = None,
+    variants: Sequence[str] | None = None,
+    seeds: Sequence[int] = (0, 1, 2),
     settings: SegmentSettings | None = None,
     resample_count: int = RESAMPLES,
     memory: Memory | None = None,
     progress: Progress | None = None,
-) -> SegmentationComparison:
-    """Train every variant once for each seed, and score it beside the controls.
+) -> Scores:
+    """Do pre-trained U-Net encoders help segmentation? Variants trained once a seed beside controls.
 
     Args:
-        model: with U-Net encoders; stays as it was.
-        data: pictures of the model's size with masks, divided.
-        variants: by name (``chosen_variants``).
+        model: with U-Net encoders (or the name or folder of one); stays as it was.
+        data: divided images of the model's size with masks, or the path of a data set with masks.
+        masks: folder or zip of masks named as the images, where the path has none.
+        dataset, limit, test_fraction, labelled: of a path, as in ``read_masks`` and ``divide``.
+        variants: names of ``VARIANTS``, the subject of the table first; by default all the model allows.
         seeds: of fresh weights and orders.
         settings: of the training.
-        resample_count: bootstrap resamples of the tested pictures.
-        memory: where runs are kept.
-        progress: told about every step.
+        resample_count: bootstrap resamples of the tested images.
+        memory: cache of the runs.
+        progress: called after every step.
+
+    Returns:
+        The tables; ``result`` is the ``SegmentationComparison``.
 
     Raises:
-        ValueError: the model has no U-Net encoders, or pictures of another size.
+        ValueError: the model has no U-Net encoders, or images of another size.
     """
+    model = as_model(model)
+    chosen = chosen_variants(model, variants)
+    if not len(seeds):
+        raise ValueError("a comparison needs at least one seed")
+    notes = []
+    if not isinstance(data, SegmentationData):
+
+        def reading(done: int, total: int) -> None:
+            if progress is not None:
+                progress(done, total, "reading")
+
+        read = read_masks(data, model.image_size, masks=masks, dataset=dataset, limit=limit, progress=reading)
+        notes.append(read[0].describe())
+        data = divide(*read, test_fraction=test_fraction, split_seed=seeds[0], labelled=labelled)
     settings, memory = settings or SegmentSettings(), memory or Memory()
     settings = settings.model_copy(update={"batch_size": settings.batch_for(len(data.train))})
-    check_encoders(model, variants)
     side = data.images.shape[-1]
     if side != model.image_size:
         raise ValueError(
-            f"the pictures are {side} pixels wide, the model takes {model.image_size}: "
+            f"the images are {side} pixels wide, the model takes {model.image_size}: "
             f"read them with read_masks(..., {model.image_size})"
         )
-    if not len(seeds):
-        raise ValueError("a comparison needs at least one seed")
     shown = data.test[np.linspace(0, len(data.test) - 1, min(SHOWN, len(data.test))).astype(int)]
     content = content_hash({name: getattr(data, name) for name in ("images", "masks", "train", "test")})
     weights = np.concatenate(list(resamples(len(data.test), resample_count)))
     each = settings.epochs * len(data.train)
-    total, done, rows = each * len(variants) * len(seeds), 0, []
-    for name, variant in variants.items():
+    total, done, rows = each * len(chosen) * len(seeds), 0, []
+    for name, variant in chosen.items():
         runs, trainable = [], 0
         for seed in seeds:
             net = build_variant(model, variant, data, seed)
@@ -147,82 +231,112 @@ def compare_segmentations(
             inputs = {
                 "start": model_fingerprint(net), "frozen": variant.frozen, "data": content, "seed": seed,
                 "settings": settings.model_dump(mode="json"), "classes": len(data.classes),
-                **_statistics(net),
+                "statistics": net.kept_statistics, "decoder": variant.decoder,
             }  # fmt: skip
 
-            def make(
-                net: Any = net, seed: int = seed, before: int = done, note: str = f"{name}, seed {seed}"
-            ):
+            def make(net: Any = net, seed: int = seed, before: int = done, run: str = f"{name}, seed {seed}"):
                 def step(seen: int, loss: float) -> None:
                     if progress is not None:
-                        progress(before + seen, total, f"{note}, loss {loss:.2f}")
+                        progress(before + seen, total, f"{run}, loss {loss:.2f}")
 
                 losses = train_segmenter(net, data, seed, settings, step)
-                return {
-                    **_judged(answer(net, data.images[data.test]), data, shown),
-                    "losses": np.array(losses),
-                }
+                answers = answer(net, data.images[data.test])
+                return {**_counted(answers, data, shown), "losses": np.array(losses)}
 
             runs.append(memory.recall(f"segment-{name}", inputs, make))
             done += each
             if progress is not None:
                 progress(done, total, name)
         rows.append((variant.title, not variant.pretrained, runs, trainable))
-    apart = Memory(memory.folder)  # controls are kept as well, but are no runs
+    apart = Memory(memory.folder)  # controls are cached as well, but are no runs
     for title, control in CONTROLS.items():
-        drawn, runs = seeds if title == "pixel colour" else seeds[:1], []
-        for seed in drawn:
+        runs = []
+        for seed in seeds if title == "pixel colour" else seeds[:1]:
             inputs = {"data": content, "seed": seed, "classes": len(data.classes), "control": title}
-            made = partial(_judged_control, control, data, seed, shown)
+            made = partial(lambda control, seed: _counted(control(data, seed), data, shown), control, seed)
             runs.append(apart.recall("segment-control", inputs, made))
         rows.append((title, True, runs, 0))
     scored = with_verdicts([_scored(title, control, runs, weights) for title, control, runs, _ in rows])
-    return SegmentationComparison(
+    found = SegmentationComparison(
         tuple(_row(one, runs, trainable) for one, (_, _, runs, trainable) in zip(scored, rows, strict=True)),
-        data.classes,
-        data.shares(data.train),
-        data.shares(data.test),
-        len(data.train),
-        len(data.test),
-        data.split,
+        data,
         tuple(seeds),
         settings,
         shown,
     )
+    return Scores(found.tables(), {"data": data.source, **found.numbers()}, notes, result=found)
 
 
-def _statistics(net: SegmentationNet) -> dict[str, Any]:
-    """How the net's BatchNorm differs from that of fresh parts, for the name of a finished run."""
-    if not net.fresh_decoder:
-        return {"decoder": "learnt", "levels kept": LEVELS_KEPT}
-    return {"statistics": "kept"} if net.kept_statistics and not net.frozen else {}
+def count_pixels(answers: np.ndarray, masks: np.ndarray, n_classes: int) -> np.ndarray:
+    """(N, 3, C) int64: of each image and class, right pixels, answered pixels and pixels of the mask.
+
+    Args:
+        answers, masks: (N, H, W) class numbers below ``n_classes``.
+        n_classes: C, two or more.
+    """
+    if answers.shape != masks.shape or not len(masks):
+        raise ValueError(f"answers {answers.shape} and masks {masks.shape} must be alike, and one or more")
+    cell = n_classes * np.arange(len(masks))[:, None, None]
+    kinds = ((cell + masks)[answers == masks], cell + answers, cell + masks)
+    counts = [np.bincount(kind.ravel(), minlength=n_classes * len(masks)) for kind in kinds]
+    return np.stack([count.reshape(len(masks), n_classes) for count in counts], axis=1)
 
 
-def _judged(answers: np.ndarray, data: SegmentationData, shown: np.ndarray) -> dict[str, np.ndarray]:
-    """What is kept of a run's answers for the tested pictures."""
+def class_iou(counts: np.ndarray) -> np.ndarray:
+    """(C,) IoU of each class over (N, 3, C) counts of N images; NaN for one that no mask shows."""
+    return _iou(counts.sum(axis=0)[None])[0]
+
+
+def resampled_scores(counts: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """The scores of ``COLUMNS`` on resamples: (B, 3).
+
+    The ten best classes are those of all images, on every resample.
+
+    Args:
+        counts: (N, 3, C).
+        weights: (B, N) how often each image is drawn.
+    """
+    drawn = (weights.astype(np.float64) @ counts.reshape(len(counts), -1)).reshape(-1, *counts.shape[1:])
+    iou = _iou(drawn)
+    accuracy = drawn[:, 0].sum(axis=1) / drawn[:, 2].sum(axis=1)
+    return np.column_stack((_mean_known(iou), _mean_known(iou[:, best_classes(counts)]), accuracy))
+
+
+def best_classes(counts: np.ndarray, number: int = TOP) -> np.ndarray:
+    """The classes with the highest IoU over all images, best first; at most those that the masks show."""
+    iou = class_iou(counts)
+    order = np.argsort(-np.nan_to_num(iou, nan=-1.0), kind="stable")
+    return order[: min(number, int(np.isfinite(iou).sum()))]
+
+
+def _counted(answers: np.ndarray, data: SegmentationData, shown: np.ndarray) -> dict[str, np.ndarray]:
+    """The cached part of a run's answers for the tested images."""
     counts = count_pixels(answers, data.masks[data.test], len(data.classes))
     return {"counts": counts.astype(np.int32), "shown": answers[np.searchsorted(data.test, shown)]}
-
-
-def _judged_control(
-    control: Callable[..., np.ndarray], data: SegmentationData, seed: int, shown: np.ndarray
-) -> dict[str, np.ndarray]:
-    return _judged(control(data, seed), data, shown)
 
 
 def _scored(
     title: str, control: bool, runs: Sequence[Mapping[str, np.ndarray]], weights: np.ndarray
 ) -> ScoredRow:
-    found = [segmentation_scores(run["counts"]) for run in runs]
+    plain = np.concatenate([resampled_scores(run["counts"], np.ones_like(weights[:1])) for run in runs])
     resampled = np.mean([resampled_scores(run["counts"], weights) for run in runs], axis=0)
-    scores = {
-        score: estimate([getattr(one, score) for one in found], resampled[:, at])
-        for at, score in enumerate(SCORES)
-    }
+    scores = {score: estimate(plain[:, at].tolist(), resampled[:, at]) for at, score in enumerate(COLUMNS)}
     return ScoredRow(title, control, len(runs), scores)
 
 
 def _row(scored: ScoredRow, runs: Sequence[Mapping[str, np.ndarray]], trainable: int) -> SegmentationRow:
-    iou = np.mean([segmentation_scores(run["counts"]).class_iou for run in runs], axis=0)
+    iou = np.mean([class_iou(run["counts"]) for run in runs], axis=0)
     losses = np.array([run["losses"] for run in runs if "losses" in run])
     return SegmentationRow(scored, iou, trainable, losses, runs[0]["shown"])
+
+
+def _iou(counts: np.ndarray) -> np.ndarray:
+    """(B, C) intersection over union of (B, 3, C) counts; NaN for classes that are not there."""
+    right, answered, there = np.moveaxis(counts.astype(np.float64), 1, 0)
+    return np.divide(right, answered + there - right, out=np.full(right.shape, np.nan), where=there > 0)
+
+
+def _mean_known(values: np.ndarray) -> np.ndarray:
+    """Mean over the classes that are there; a resample of images always shows at least one."""
+    known = np.isfinite(values)
+    return np.where(known, values, 0).sum(axis=1) / known.sum(axis=1).clip(min=1)

@@ -5,7 +5,8 @@ import pytest
 
 from derender.evaluation.linear_task import task_of
 from derender.evaluation.memory import Memory
-from derender.evaluation.robustness import Curve, Trial, area_under, compare_robustness
+from derender.evaluation.robust import Curve, Trial, compare_robustness
+from derender.evaluation.robust.compare import area_under
 
 PEOPLE, EACH = 4, 10
 LEVELS = (0.0, 30.0, 60.0)
@@ -99,7 +100,7 @@ def test_a_table_is_recomputed_from_memory(tmp_path):
 
 def test_bad_features_are_refused():
     trial, who, _ = stack()
-    with pytest.raises(ValueError, match="'short' have 3 rows, the trial 200 pictures"):
+    with pytest.raises(ValueError, match="'short' have 3 rows, the trial 200 images"):
         compare_robustness({"short": [np.ones((3, 2))]}, trial, SEEDS)
     with pytest.raises(ValueError, match="and a seed"):
         compare_robustness({"f": [np.eye(PEOPLE)[who]]}, trial, ())

@@ -6,7 +6,7 @@ import torch
 from scipy.ndimage import binary_erosion
 
 from derender.data import GroundTruth, read_ground_truth
-from derender.evaluation.geometry import (
+from derender.evaluation.depth import (
     average_depth,
     erode,
     evaluate_geometry,
@@ -139,7 +139,7 @@ def test_bad_input_is_refused_in_words():
     depth, mask = bumpy(1), everywhere(bumpy(1))
     with pytest.raises(ValueError, match="true masks are empty"):
         geometry_scores(depth, mask, depth, ~mask, FOV_DEG)
-    with pytest.raises(ValueError, match="share no pixel in any picture"):
+    with pytest.raises(ValueError, match="share no pixel in any image"):
         geometry_scores(depth, ~mask, depth, mask, FOV_DEG)
     with pytest.raises(ValueError, match="predicted depth must be positive and finite inside its mask"):
         geometry_scores(depth * torch.nan, mask, depth, mask, FOV_DEG)

@@ -1,9 +1,9 @@
-"""Features under one trial: a probe learned in ordinary light and view, its answers at every angle, the area.
+"""Features on one trial: a probe learns in ordinary light and view and is tested at every angle.
 
 The area under a curve of accuracy over angle is taken by trapezia and divided by the range of angles: 0 to 1,
-best 1, and it equals the accuracy of an answer that does not care for the angle. Every seed learns from its
-own four fifths of what may be learned from. Units (see ``Trial``) are resampled for the intervals, the same
-for all features, all angles and both scores, so that differences are paired.
+best 1, and it equals the accuracy of an answer that does not depend on the angle. Every seed learns from its
+own four fifths of the training rows. Units (see ``Trial``) are resampled for the intervals, the same for all
+features, all angles and both scores, so that differences are paired.
 """
 
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -18,12 +18,17 @@ from derender.evaluation.linear_probes import majority_answers
 from derender.evaluation.linear_probing import count_scores, probe_runs
 from derender.evaluation.linear_task import Task
 from derender.evaluation.memory import Memory
-from derender.evaluation.robustness.trial import Curve, Trial
+from derender.evaluation.robust.trial import Curve, Trial
+from derender.evaluation.score_table import Cell, Column, Row, ScoreTable, scored_table, verdict_table
 
 Progress = Callable[[int, int], object]
-SCORES = ("accuracy", "balanced_accuracy")
+SCORES = {"accuracy": "accuracy", "balanced_accuracy": "balanced accuracy"}
+"""By score, its name in tables and charts."""
 LEARNED_SHARE = 0.8
 ORDINARY, AREA = "ordinary", "area"
+_AREA = Column("area", "high", note="mean height of the curve over the angles, 0 to 1, best 1")
+_ORDINARY = Column("ordinary", "high", note="other images in the light and view of the training images")
+_LOST = Column("lost", None, note="ordinary less area; read it beside ordinary, since chance loses nothing")
 
 
 @dataclass(frozen=True)
@@ -55,10 +60,10 @@ class RobustnessComparison:
 
     Attributes:
         curves: one for each axis.
-        how: where other lights and views come from.
+        how: the source of other lights and views.
         kind, names: of the task.
         head: of the probe.
-        n_learned: rows that each probe learned from, by axis.
+        n_learned: training rows of each probe, by axis.
         n_dropped: rows without a label.
         seeds: of the probes.
     """
@@ -73,7 +78,7 @@ class RobustnessComparison:
     seeds: tuple[int, ...]
 
     def numbers(self) -> dict[str, Any]:
-        """Everything as JSON takes it."""
+        """Everything for JSON."""
         sizes = ("how", "kind", "names", "head", "n_learned", "n_dropped", "seeds")
         curves = {
             curve.name: {
@@ -86,9 +91,49 @@ class RobustnessComparison:
         }
         return {**{name: getattr(self, name) for name in sizes}, "curves": curves}
 
+    def tables(self, score: str = "accuracy") -> list[ScoreTable]:
+        """For every axis the areas, the curve in numbers, and the verdicts against the controls."""
+        tables = []
+        for curve in self.curves:
+            rows, last = curve.rows[score], curve.levels[-1]
+            columns = {
+                AREA: _AREA,
+                ORDINARY: _ORDINARY,
+                level_name(last): Column(f"at {last:.0f} deg", "high", note="the curve's last point"),
+            }
+            lost: Mapping[Column, Callable[[ScoredRow], Cell]] = {
+                _LOST: lambda row: row.scores[ORDINARY].value - row.scores[AREA].value
+            }
+            tables += [
+                scored_table(self._caption(curve, score), "features", rows, columns, more=lost),
+                ScoreTable(
+                    f"{curve.title} in degrees: {SCORES[score]}",
+                    "features",
+                    [Column(f"{level:.0f}", "high") for level in curve.levels],
+                    [Row(row.name, curve.values(row), row.control) for row in rows],
+                ),
+                verdict_table(
+                    rows,
+                    {AREA: Column("area"), ORDINARY: Column("ordinary")},
+                    f"{curve.title}: above the strongest control?",
+                ),
+            ]
+        return tables
+
+    def _caption(self, curve: CurveResult, score: str) -> str:
+        task = f"{len(self.names)} classes"
+        if self.kind != "classes":
+            task = self.names[0] if len(self.names) == 1 else f"{len(self.names)} yes/no labels"
+        caption = (
+            f"{curve.title}, {curve.levels[0]:.0f} to {curve.levels[-1]:.0f} degrees: {SCORES[score]} of "
+            f"{task}, {self.how}; {self.head} probes on {self.n_learned[curve.name]:,} images, "
+            f"{curve.n_tested[0]:,} to {max(curve.n_tested):,} tested, {len(self.seeds)} seeds"
+        )
+        return caption + (f"; {self.n_dropped:,} images without label left out" if self.n_dropped else "")
+
 
 def level_name(level: float) -> str:
-    """An angle as scores are named by it."""
+    """The name of the score at an angle."""
     return f"{level:.4g} deg"
 
 
@@ -117,16 +162,16 @@ def compare_robustness(
     """Probe every row of features along every curve.
 
     Args:
-        features: by name, one (M, D) array for each run of the same thing, of all pictures of the trial;
+        features: by name, one (M, D) array for each run of the same features, of all images of the trial;
             probe seed s uses run s modulo their number.
-        trial: who learns, who is tested.
-        seeds: (S,) draws of what is learned from.
+        trial: training and test rows.
+        seeds: (S,) of the training subsets.
         controls: names of the features that learned nothing.
         head: kind of probe (``linear_probes.PROBES``).
         settings: of the paper's head.
         resample_count: bootstrap resamples of the units.
         seed: of the resamples.
-        memory: where answers are kept.
+        memory: cache of the answers.
         progress: called with (probes done, probes in all).
 
     Raises:
@@ -136,8 +181,8 @@ def compare_robustness(
         for array in arrays:
             if len(array) != len(trial.task):
                 raise ValueError(
-                    f"features {name!r} have {len(array)} rows, the trial {len(trial.task)} pictures: make "
-                    "features of the trial's own pictures"
+                    f"features {name!r} have {len(array)} rows, the trial {len(trial.task)} images: make "
+                    "features of the trial's own images"
                 )
     if not features or not all(features.values()) or not len(seeds):
         raise ValueError("a comparison needs one array of features in each row, and a seed")
@@ -173,7 +218,7 @@ def compare_robustness(
 
 
 def draw_rows(learn: np.ndarray, seeds: Sequence[int]) -> np.ndarray:
-    """(S, n) rows that each seed learns from: four fifths, drawn anew."""
+    """(S, n) training rows of each seed: a random subset of four fifths."""
     count = max(5, round(LEARNED_SHARE * len(learn)))
     return np.stack([np.random.default_rng(seed).permutation(learn)[:count] for seed in seeds])
 
@@ -181,7 +226,7 @@ def draw_rows(learn: np.ndarray, seeds: Sequence[int]) -> np.ndarray:
 def _weights(curve: Curve, unit: np.ndarray, count: int, seed: int) -> list[np.ndarray]:
     """For every point, (B, T) how often each of its rows is drawn: as often as its unit.
 
-    Points that show the same units share their draws; others are drawn apart, so that none is ever empty.
+    Points with the same units share their resamples; others have their own, so that none is ever empty.
     """
     drawn: dict[bytes, np.ndarray] = {}
     found = []

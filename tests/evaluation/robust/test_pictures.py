@@ -1,6 +1,7 @@
 """Where trials come from: the generator, a model that renders again, and true angles of a rendered set."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,26 +11,25 @@ from derender import Derenderer
 from derender.data import PictureSet
 from derender.evaluation.linear_task import task_of
 from derender.evaluation.memory import Memory
-from derender.evaluation.robustness import (
+from derender.evaluation.robust import (
     Recipe,
     checked_levels,
     chosen_axes,
     generated_trial,
     rendered_trial,
-    turned_trial,
+    true_angle_trial,
 )
-from derender.evaluation.robustness.generated import seen
 
 YAW, LIGHT = chosen_axes(["yaw", "light"])
 
 
 def test_generated_faces_stay_the_same_while_one_angle_is_held():
     recipe = Recipe(people=3, learned=3, tested=2, image_size=16)
-    learned, tested = seen(recipe, False, "learned"), seen(recipe, False, "tested")
+    learned, tested = recipe.generate("learned"), recipe.generate("tested")
     assert set(learned.identity) == set(tested.identity)
-    turned = seen(recipe, False, "tested", axis=YAW, angle=-45.0)
+    turned = recipe.generate("tested", axis=YAW, angle=-45.0)
     assert np.degrees(turned.camera[:, 1]) == pytest.approx(np.full(6, -45), abs=1e-3)
-    lit = seen(recipe, False, "tested", axis=LIGHT, angle=60.0)
+    lit = recipe.generate("tested", axis=LIGHT, angle=60.0)
     assert np.degrees(lit.light[:, 3]) == pytest.approx(np.full(6, 60), abs=1e-3)
     assert not lit.light[:, 2].any()
     for made in (turned, lit):
@@ -37,7 +37,7 @@ def test_generated_faces_stay_the_same_while_one_angle_is_held():
         assert made.labels["expression"].tolist() == tested.labels["expression"].tolist()
     assert np.array_equal(turned.light, tested.light) and np.array_equal(lit.camera, tested.camera)
     assert np.array_equal(lit.light[:, :2], tested.light[:, :2])
-    apart = seen(recipe, True, "learned")
+    apart = replace(recipe, label="age").generate("learned")
     assert not set(apart.identity) & set(tested.identity)
 
 
@@ -50,7 +50,7 @@ def test_a_generated_trial_is_made_once(tmp_path):
     recipe_again, memory = Recipe(people=3, learned=3, tested=2, image_size=16), Memory(tmp_path)
     again = generated_trial(recipe_again, (YAW, LIGHT), (0, 30), memory=memory)
     assert memory.recalled == 1 and np.array_equal(again.images, trial.images)
-    expected = seen(recipe, False, "tested", axis=LIGHT, angle=30.0)
+    expected = recipe.generate("tested", axis=LIGHT, angle=30.0)
     assert np.array_equal(trial.images[light.tested[1][6:]], expected.images)
     assert trial.task.targets[light.tested[1][6:]].argmax(1).tolist() == (
         np.unique(expected.identity.astype(str), return_inverse=True)[1].tolist()
@@ -120,7 +120,7 @@ def test_true_angles_divide_tracks():
     labels = {"track": track.astype(str), "camera_y_rad": angle}
     pictures = PictureSet(np.zeros((32, 3, 4, 4), np.uint8), tuple(map(str, range(32))), labels)
     task = task_of({"who": np.array(list("ab"))[track // 2 % 2]})
-    trial = turned_trial(pictures, task, [YAW], portions=2)
+    trial = true_angle_trial(pictures, task, [YAW], portions=2)
     (curve,) = trial.curves
     turn = np.degrees(np.abs(angle))
     assert turn[curve.learn].max() < min(turn[rows].min() for rows in curve.tested[1:])
@@ -128,10 +128,10 @@ def test_true_angles_divide_tracks():
     assert curve.levels[1] == pytest.approx(turn[curve.tested[1]].mean())
     assert np.array_equal(curve.ordinary, curve.tested[0])
     with pytest.raises(ValueError, match="there is no 'light_yaw_rad'"):
-        turned_trial(pictures, task, [LIGHT])
+        true_angle_trial(pictures, task, [LIGHT])
     still = PictureSet(pictures.images, pictures.files, {**labels, "camera_y_rad": np.zeros(32)})
-    with pytest.raises(ValueError, match="turned alike"):
-        turned_trial(still, task, [YAW])
+    with pytest.raises(ValueError, match="all at one angle"):
+        true_angle_trial(still, task, [YAW])
 
 
 def test_light_off_the_front_is_one_angle():
@@ -143,7 +143,7 @@ def test_light_off_the_front_is_one_angle():
 def test_bad_words_are_refused():
     with pytest.raises(ValueError, match="no axis 'yew'; did you mean 'yaw'"):
         chosen_axes(["yew"])
-    with pytest.raises(ValueError, match="generated cars cannot be turned about the axis 'pitch'"):
+    with pytest.raises(ValueError, match="generated cars cannot be rotated about the axis 'pitch'"):
         chosen_axes(["pitch"], "cars")
     with pytest.raises(ValueError, match="two or more that grow"):
         checked_levels((30, 0), [YAW])
@@ -153,7 +153,7 @@ def test_bad_words_are_refused():
         generated_trial(
             Recipe(label="expresion", people=2, learned=1, tested=1, image_size=16), [YAW], (0, 9)
         )
-    with pytest.raises(ValueError, match="fewer than two values of 'identity' have two pictures"):
+    with pytest.raises(ValueError, match="fewer than two values of 'identity' have two images"):
         generated_trial(Recipe(people=2, learned=1, tested=1, image_size=16), [YAW], (0, 9))
     with pytest.raises(ValueError, match="no kind 'face'"):
         Recipe("face")

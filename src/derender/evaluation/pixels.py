@@ -1,0 +1,249 @@
+"""How well a model reconstructs images it has not seen: L1, PSNR and SSIM inside the mask, beside controls.
+
+Controls are the mean image; the images from 64 principal components of their pixels, which know no
+geometry; and an untrained model. The first two are scored inside the model's own masks. A low error alone
+proves nothing about geometry (a copied image has none): read it with evaluation/depth.py.
+
+SSIM: Wang et al., IEEE TIP 2004, computed by torchmetrics: a Gaussian window of 11 x 11 pixels with sigma
+1.5, constants 0.01 and 0.03, images in 0..1, mean over colours. A window that reaches over the edge of the
+mask would compare uncovered pixels, so its centre is left out; with a full mask the score is torchmetrics'
+own, without the same five pixels at the border of the image. Leaves out several scales and learned
+similarities.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from derender.evaluation.bootstrap import RESAMPLES, ScoredRow
+from derender.evaluation.image_scores import Columns, image_rows, image_table
+from derender.evaluation.score_table import Column, ScoreTable
+from derender.features import Progress, map_batches
+
+COMPONENTS = 64
+WINDOW = 11
+SIGMA = 1.5
+AT_A_TIME = 32  # images: convolutions with windows this large take memory
+RECONSTRUCTION: Columns = {
+    "l1": (Column("L1", "low", 4, "mean absolute difference inside the mask, 0 to 1, best 0"), 1.0),
+    "psnr_db": (Column("PSNR", "high", 2, "peak signal-to-noise ratio in decibels"), 1.0),
+    "ssim": (Column("SSIM", "high", note="structural similarity of windows inside the mask, at most 1"), 1.0),
+}
+COVERAGE = Column("coverage", None, note="share of all pixels inside the mask")
+
+
+@dataclass(frozen=True)
+class ReconstructionScores:
+    """Errors inside the mask; means over images.
+
+    Attributes:
+        l1: mean absolute difference, 0..1, best 0.
+        psnr_db: peak signal-to-noise ratio in decibels, 0 and up, more is better; infinite for a perfect
+            copy.
+        coverage: share of all pixels inside the mask, 0..1.
+        n_empty: images with an empty mask, left out of the means.
+        l1_each, psnr_db_each: (N,) per image, NaN where the mask is empty.
+        ssim: structural similarity, -1..1, best 1; mean over the images with a window of 11 x 11 pixels
+            inside the mask, NaN where there is none (or the images are smaller than that).
+        ssim_each: (N,) per image, NaN where there is no such window.
+    """
+
+    l1: float
+    psnr_db: float
+    coverage: float
+    n_empty: int
+    l1_each: np.ndarray
+    psnr_db_each: np.ndarray
+    ssim: float
+    ssim_each: np.ndarray
+
+
+@dataclass(frozen=True)
+class ReconstructionResult:
+    """A model's reconstructions beside its controls.
+
+    Attributes:
+        model: of the renderings.
+        mean_picture: of the mean image in the same masks.
+        components: of the images from principal components in the same masks; None where not requested.
+        untrained: of the same architecture with fresh weights, in its own masks; None without one.
+        n_components: how many principal components.
+    """
+
+    model: ReconstructionScores
+    mean_picture: ReconstructionScores
+    components: ReconstructionScores | None = None
+    untrained: ReconstructionScores | None = None
+    n_components: int = 0
+
+    def _named(self) -> dict[str, ReconstructionScores]:
+        named = {
+            "model": self.model, "mean picture": self.mean_picture,
+            f"PCA ({self.n_components})": self.components, "untrained model": self.untrained,
+        }  # fmt: skip
+        return {name: scores for name, scores in named.items() if scores is not None}
+
+    def rows(self, resample_count: int = RESAMPLES) -> tuple[ScoredRow, ...]:
+        """The model, then its controls, L1, PSNR and SSIM with intervals."""
+        each = {
+            name: dict(zip(RECONSTRUCTION, (s.l1_each, s.psnr_db_each, s.ssim_each), strict=True))
+            for name, s in self._named().items()
+        }
+        return image_rows(each, RECONSTRUCTION, resample_count=resample_count)
+
+    def table(self, rows: Sequence[ScoredRow] | None = None) -> ScoreTable:
+        """Errors of the reconstructions beside the controls; with ``rows``, their intervals too."""
+        return image_table(
+            f"Reconstruction of {len(self.model.l1_each):,} images",
+            rows or self.rows(1),
+            RECONSTRUCTION,
+            intervals=rows is not None,
+            more={COVERAGE: {name: scores.coverage for name, scores in self._named().items()}},
+            notes={"untrained model": "same networks, fresh weights, inside its own mask"},
+        )
+
+
+def reconstruction_scores(
+    prediction: Float[Tensor, "n 3 h w"],
+    target: Float[Tensor, "n 3 h w"],
+    mask: Float[Tensor, "n h w"],
+) -> ReconstructionScores:
+    """Masked L1, PSNR and SSIM of images in 0..1, averaged over pixels, channels, then images."""
+    weight = mask[:, None].double().expand_as(target)
+    total = weight.sum(dim=(1, 2, 3))
+    difference = torch.where(weight > 0, prediction.double() - target.double(), 0.0)
+    l1 = (weight * difference.abs()).sum(dim=(1, 2, 3)) / total
+    psnr = -10 * ((weight * difference.square()).sum(dim=(1, 2, 3)) / total).log10()
+    empty = total == 0
+    if bool(empty.all()):
+        raise ValueError("every mask is empty: the model renders nothing into the image")
+    ssim = torch.full_like(l1, torch.nan)
+    if min(target.shape[-2:]) >= WINDOW:
+        ssim = masked_ssim(prediction, target, mask)
+    return ReconstructionScores(
+        l1=l1[~empty].mean().item(),
+        psnr_db=psnr[~empty].mean().item(),
+        coverage=mask.double().mean().item(),
+        n_empty=int(empty.sum()),
+        l1_each=l1.numpy(force=True),
+        psnr_db_each=psnr.numpy(force=True),
+        ssim=ssim.nanmean().item(),
+        ssim_each=ssim.numpy(force=True),
+    )
+
+
+def mean_picture(images: np.ndarray) -> Float[Tensor, "3 h w"]:
+    """The mean of uint8 images (N, 3, H, W), in 0..1; reads a memory map a part at a time."""
+    if len(images) == 0:
+        raise ValueError("no images to average")
+    total = np.zeros(images.shape[1:])
+    for start in range(0, len(images), 1024):
+        total += images[start : start + 1024].sum(axis=0, dtype=np.float64)
+    return torch.from_numpy((total / len(images) / 255).astype(np.float32))
+
+
+def evaluate_reconstruction(
+    model: Any,
+    images: np.ndarray,
+    *,
+    mean: Float[Tensor, "3 h w"] | None = None,
+    components_of: np.ndarray | None = None,
+    untrained: Any = None,
+    batch_size: int = 64,
+    progress: Progress | None = None,
+) -> ReconstructionResult:
+    """Score a model on uint8 images (N, 3, H, W) it has not seen.
+
+    Args:
+        model: with ``reconstruct`` and ``device``.
+        images: at the model's image size.
+        mean: the control, best made of the training images; by default the mean of ``images`` themselves,
+            which is a little harder to beat.
+        components_of: images that give 64 principal components (fewer where they are fewer than 256), for
+            that control.
+        untrained: the same architecture with fresh weights, for that control.
+        batch_size: images at a time; changes speed and memory only.
+        progress: called with (images done, images in all) after every batch.
+    """
+    mean = mean_picture(images) if mean is None else mean
+
+    def rendered(any_model: Any, report: Progress | None) -> tuple[Tensor, Tensor, Tensor]:
+        def render(batch: Tensor) -> tuple[Tensor, ...]:
+            rendering = any_model.reconstruct(batch)
+            return rendering.image.float().cpu(), batch.cpu(), rendering.mask.float().cpu()
+
+        parts = map_batches(render, any_model, images, batch_size=batch_size, progress=report)
+        image, target, mask = (torch.cat(values) for values in zip(*parts, strict=True))
+        return image, target, mask
+
+    image, target, mask = rendered(model, progress)
+    known = None
+    if components_of is not None:
+        known = reconstruction_scores(from_components(images, components_of), target, mask)
+    return ReconstructionResult(
+        reconstruction_scores(image, target, mask),
+        reconstruction_scores(mean.expand_as(target), target, mask),
+        known,
+        None if untrained is None else reconstruction_scores(*rendered(untrained, None)),
+        0 if components_of is None else component_count(len(components_of)),
+    )
+
+
+def component_count(images: int) -> int:
+    """Number of components from so many images: 64, and at most a quarter of their number."""
+    return max(1, min(COMPONENTS, images // 4))
+
+
+def from_components(images: np.ndarray, fitted: np.ndarray) -> Float[Tensor, "n 3 h w"]:
+    """uint8 images (N, 3, H, W) from their principal components alone, in 0..1.
+
+    Args:
+        images: to show.
+        fitted: (M, 3, H, W) uint8 that give the components.
+    """
+    from sklearn.decomposition import PCA
+
+    pca = PCA(component_count(len(fitted)), random_state=0).fit(_flat(fitted))
+    again = pca.inverse_transform(pca.transform(_flat(images)))
+    return torch.from_numpy(again.astype(np.float32)).clamp(0, 1).reshape(images.shape)
+
+
+def masked_ssim(
+    prediction: Float[Tensor, "n 3 h w"], target: Float[Tensor, "n 3 h w"], mask: Float[Tensor, "n h w"]
+) -> Float[Tensor, " n"]:
+    """SSIM of images in 0..1 over the windows inside the mask, per image; -1..1, best 1.
+
+    NaN where no window of 11 x 11 pixels lies inside the mask. Values outside the mask do not matter, and may
+    be anything, NaN included.
+    """
+    from torchmetrics.functional.image import structural_similarity_index_measure
+
+    if min(target.shape[-2:]) < WINDOW:
+        raise ValueError(
+            f"SSIM needs images of {WINDOW} pixels or more each way, got {tuple(target.shape[-2:])}"
+        )
+    found = []
+    for part in zip(*(values.split(AT_A_TIME) for values in (prediction, target, mask)), strict=True):
+        covered = part[2] > 0
+        hole = torch.nn.functional.pad((~covered).float(), (WINDOW // 2,) * 4, value=1.0)
+        inside = torch.nn.functional.max_pool2d(hole[:, None], WINDOW, stride=1)[:, 0] == 0  # window centres
+        _, similarity = structural_similarity_index_measure(
+            torch.where(covered[:, None], part[0].float(), 0.0),
+            torch.where(covered[:, None], part[1].float(), 0.0),
+            data_range=1.0,
+            sigma=SIGMA,
+            reduction="none",
+            return_full_image=True,
+        )
+        total = torch.where(inside, torch.as_tensor(similarity).mean(dim=1), 0.0).sum(dim=(1, 2))
+        found.append(total.double() / inside.sum(dim=(1, 2)))
+    return torch.cat(found)
+
+
+def _flat(images: np.ndarray) -> np.ndarray:
+    return np.asarray(images, np.float32).reshape(len(images), -1) / 255

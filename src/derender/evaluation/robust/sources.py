@@ -1,0 +1,304 @@
+"""Where the images of a trial come from: a generator, a model that re-renders, or labels of the true angles.
+
+generated  Light and view are known because they were set. Face, expression and background depend on seed and
+           index alone, so the same test images are made again at every angle: only the angle changes along a
+           curve. Each is shown from both sides. Probes learn from the generator's usual light and view. For
+           identity, other images of the same people are tested; for any other label, other people.
+rendered   Real images are decomposed by a model and re-rendered in other light and from other sides.
+           Training images are renderings too (each scene in its own light and view), so that no curve starts
+           with the step from photograph to rendering. Angles are the model's own, since those of a photograph
+           are not known. Where its geometry is wrong the renderings are, and the features of the rendering
+           model have an advantage: read it beside generated images. Pixels that no surface covers take the
+           mean colour of the image's edge, by the rule of training.
+true       For tracks of rendered people, and any rendered set, the least rotated half learns. The unit is
+           the track where there are tracks, else the image. Of every class, the less rotated half of its
+           units is ordinary: three of four learn, the fourth is tested as the curve's first point. The other
+           half is tested, in as many portions as requested, by growing angle. Unlike the other trials, each
+           angle shows other images, which may be hard for other reasons.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import torch
+
+from derender.data import PictureSet, suggestion
+from derender.data.synthetic import CarSettings, FaceSettings, SyntheticSet, cars, faces
+from derender.evaluation.linear_task import Task, task_of
+from derender.evaluation.memory import Memory
+from derender.evaluation.robust.trial import (
+    Axis,
+    Curve,
+    Trial,
+    all_angles,
+    checked_levels,
+    stacked_trial,
+)
+from derender.features import Progress, map_batches, missing, model_fingerprint
+from derender.settings import Settings
+from derender.training.step import fill_uncovered
+
+PORTIONS = 3
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A generator and the names of its settings."""
+
+    generate: Callable[..., SyntheticSet]
+    settings: Callable[..., Settings]
+    images_each: str
+    first_one: str
+    label: str
+
+
+KINDS: Mapping[str, Kind] = {
+    "faces": Kind(faces.generate, FaceSettings, "pictures_per_identity", "first_identity", "identity"),
+    "cars": Kind(cars.generate, CarSettings, "pictures_per_model", "first_model", "class"),
+}
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """The generated images.
+
+    Attributes:
+        kind: of ``KINDS``.
+        label: the question: ``identity``, or a label of the generator. Numbers become "above" or "below" the
+            median of the training images.
+        people: how many (or cars); where other people are tested, so many for training and for tests.
+        learned, tested: images of each.
+        image_size: in pixels.
+        seed: of the generator.
+    """
+
+    kind: str = "faces"
+    label: str = "identity"
+    people: int = 40
+    learned: int = 8
+    tested: int = 2
+    image_size: int = 64
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise ValueError(
+                f"no kind {self.kind!r}{suggestion(self.kind, KINDS)}: there is {', '.join(KINDS)}"
+            )
+        if self.people < 2 or self.learned < 1 or self.tested < 1:
+            raise ValueError(
+                f"generated images need two people or more, each with an image to learn from and one to "
+                f"test; got {self.people} people, {self.learned} and {self.tested} images"
+            )
+
+    @property
+    def apart(self) -> bool:
+        """Whether other people are tested than those of the training images."""
+        return self.label != "identity"
+
+    def generate(
+        self, part: str, count: int | None = None, axis: Axis | None = None, angle: float = 0.0
+    ) -> SyntheticSet:
+        """The training or test images, in usual light and view or at a fixed angle.
+
+        Both parts count people so that numbers agree; indices of images never do, so no seed is shared.
+
+        Args:
+            part: "learned" or "tested".
+            count: only so many of them.
+            axis, angle: the fixed angle, in degrees.
+        """
+        kind, each = KINDS[self.kind], getattr(self, part)
+        start = -(-self.people * self.learned // self.tested)  # people before the first one tested
+        fixed: dict[str, Any] = {kind.images_each: each}
+        if part == "learned":
+            fixed[kind.first_one] = start + self.people if self.apart else start
+        if axis is not None:
+            usual = getattr(kind.settings(), axis.part).model_dump()
+            fixed[axis.part] = {**usual, **axis.fixed[self.kind](angle)}
+        first = 0 if part == "learned" else start * self.tested
+        number = self.people * each if count is None else count
+        return kind.generate(number, self.image_size, self.seed, kind.settings(**fixed), first=first)
+
+
+def generated_trial(
+    recipe: Recipe,
+    axes: Sequence[Axis],
+    levels: Sequence[float],
+    *,
+    memory: Memory | None = None,
+    progress: Progress | None = None,
+) -> Trial:
+    """Generate the images, or find them in the cache.
+
+    Raises:
+        ValueError: an unknown label, impossible angles, fewer than two classes.
+    """
+    levels = checked_levels(levels, axes)
+    sample = recipe.generate("tested", 1)
+    columns = {"identity": sample.identity, **sample.labels}
+    if recipe.label not in columns:
+        raise ValueError(
+            f"generated {recipe.kind} have no label {recipe.label!r}{suggestion(recipe.label, columns)}; "
+            f"there is {', '.join(columns)}"
+        )
+    inputs = {
+        "recipe": {name: getattr(recipe, name) for name in ("kind", "people", "learned", "tested", "seed")},
+        "label": recipe.label, "axes": [axis.name for axis in axes], "levels": list(levels),
+        "sample": sample.images,  # another generator, other images
+    }  # fmt: skip
+
+    def make() -> dict[str, np.ndarray]:
+        parts = {part: recipe.generate(part) for part in ("learned", "tested")}
+        images, asked = [made.images for made in parts.values()], all_angles(axes, levels)
+        total = recipe.people * (recipe.learned + recipe.tested * (1 + len(asked)))
+        for axis, angle in asked:
+            images.append(recipe.generate("tested", axis=axis, angle=angle).images)
+            if progress is not None:
+                progress(sum(map(len, images)), total)
+        found = {"images": np.concatenate(images)}
+        for part, made in parts.items():
+            found |= {
+                part: {"identity": made.identity, **made.labels}[recipe.label],
+                f"who_{part}": made.identity,
+            }
+        return found
+
+    found = (memory or Memory()).recall("generated", inputs, make)
+    n_learn, n_test = len(found["learned"]), len(found["tested"])
+    values = _classes(found["learned"], found["tested"])
+    if len(set(values[:n_learn]) - {""}) < 2:
+        raise ValueError(
+            f"fewer than two values of {recipe.label!r} have two images to learn from: make more people, "
+            "or more images of each"
+        )
+    unit = np.arange(n_learn + n_test)
+    if recipe.apart:
+        people = np.concatenate((found["who_learned"], found["who_tested"]))
+        unit = np.unique(people, return_inverse=True)[1]
+    how, dropped = f"{recipe.label} of generated {recipe.kind}", int(missing(values).sum())
+    task = task_of({recipe.label: values})
+    return stacked_trial(found["images"], task, unit, n_learn, axes, levels, how, dropped)
+
+
+def rendered_trial(
+    model: Any,
+    pictures: PictureSet,
+    task: Task,
+    learn: np.ndarray,
+    test: np.ndarray,
+    axes: Sequence[Axis],
+    levels: Sequence[float],
+    *,
+    groups: np.ndarray | None = None,
+    batch_size: int = 64,
+    memory: Memory | None = None,
+    progress: Progress | None = None,
+) -> Trial:
+    """Re-render the images, or find them in the cache.
+
+    Args:
+        model: with ``decompose``, ``render``, ``device``.
+        pictures: at the model's size.
+        task: targets of each image.
+        learn, test: training and test rows.
+        axes, levels: of the rotations (degrees).
+        groups: (N,) labels whose images are resampled together, such as identities; an image without one, and
+            all without groups, by itself.
+        batch_size: images at a time; changes speed and memory only.
+        memory: cache of the renderings.
+        progress: called with (images decomposed, images in all).
+    """
+    levels = checked_levels(levels, axes)
+    asked, rows = all_angles(axes, levels), np.concatenate((learn, test))
+    inputs = {
+        "weights": model_fingerprint(model), "images": pictures.images[rows], "n_learn": len(learn),
+        "asked": [[axis.name, angle] for axis, angle in asked],
+    }  # fmt: skip
+
+    def rendered(images: np.ndarray, angles: Sequence[tuple[Axis, float] | None]) -> list[np.ndarray]:
+        def render(batch: torch.Tensor) -> list[np.ndarray]:
+            scene, found = model.decompose(batch), []
+            for one in angles:
+                rendering = model.render(scene if one is None else one[0].rotated(scene, one[1]))
+                image = fill_uncovered(rendering.image.float(), rendering.mask.float(), batch)
+                found.append((image.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy())
+            return found
+
+        parts = map_batches(render, model, images, batch_size=batch_size, progress=progress)
+        return [np.concatenate(part) for part in zip(*parts, strict=True)]
+
+    def make() -> dict[str, np.ndarray]:
+        plain, rotated = rendered(pictures.images[rows], [None]), rendered(pictures.images[test], asked)
+        return {"images": np.concatenate((*plain, *rotated))}
+
+    images = (memory or Memory()).recall("rendered", inputs, make)["images"]
+    number = np.arange(len(pictures))
+    if groups is not None:  # an image without a group stands alone
+        number = np.where(
+            missing(groups), len(groups) + number, np.unique(groups.astype(str), return_inverse=True)[1]
+        )
+    chosen = Task(task.kind, task.names, task.targets[rows])
+    how, dropped = f"pictures of {pictures.layout} re-rendered", int((~task.known).sum())
+    return stacked_trial(images, chosen, number[rows], len(learn), axes, levels, how, dropped)
+
+
+def true_angle_trial(
+    pictures: PictureSet, task: Task, axes: Sequence[Axis], *, portions: int = PORTIONS
+) -> Trial:
+    """Divide the images along every axis by their true angles.
+
+    Args:
+        pictures: with labels of light or view.
+        task: targets of each image.
+        axes: of the angles.
+        portions: of the more rotated half.
+
+    Raises:
+        ValueError: there is no label of an angle, or there are too few images.
+    """
+    named = pictures.labels.get("track", np.arange(len(pictures)))
+    unit = np.unique(named, return_inverse=True)[1].astype(np.int64)
+    curves = tuple(_curve(axis, axis.true_deg(pictures.labels), unit, task, portions) for axis in axes)
+    how = f"the less and the more rotated half of {pictures.layout}"
+    return Trial(pictures.images, task, unit, curves, how, int((~task.known).sum()))
+
+
+def _curve(axis: Axis, angle: np.ndarray, unit: np.ndarray, task: Task, portions: int) -> Curve:
+    usable = task.known & np.isfinite(angle)
+    rows_of = {one: np.flatnonzero(usable & (unit == one)) for one in np.unique(unit[usable]).tolist()}
+    by_angle = sorted(rows_of, key=lambda one: (float(angle[rows_of[one]].mean()), one))
+    classes: dict[bytes, list[int]] = {}  # of the first row; all together where labels are several
+    several = task.kind != "classes" and task.targets.shape[1] > 1
+    for one in by_angle:
+        classes.setdefault(b"" if several else task.targets[rows_of[one][0]].tobytes(), []).append(one)
+    near = [members[: len(members) // 2] for members in classes.values()]
+    learn = [one for members in near for place, one in enumerate(members) if place % 4 != 2]
+    taken = {one for members in near for one in members}
+    far = np.array_split(np.array([one for one in by_angle if one not in taken], np.int64), portions)
+
+    def rows(members: Sequence[int] | np.ndarray) -> np.ndarray:
+        return np.sort(np.concatenate([rows_of[int(one)] for one in members] or [np.zeros(0, np.int64)]))
+
+    ordinary = [one for members in near for one in members[2::4]]
+    tested = [rows(part) for part in (ordinary, *(part for part in far if len(part)))]
+    levels = tuple(float(angle[part].mean()) if len(part) else float("nan") for part in tested)
+    if len(levels) < 2 or not all(b - a > 1e-6 for a, b in pairwise(levels)):
+        raise ValueError(
+            f"the true {axis.title} cannot be cut into {portions} portions of growing angle: the images "
+            "are too few, or all at one angle"
+        )
+    return Curve(axis.name, f"true {axis.title}", rows(learn), tested[0], levels, tuple(tested))
+
+
+def _classes(learned: np.ndarray, tested: np.ndarray) -> np.ndarray:
+    """Classes as text, training images first; empty where a class has fewer than two training images."""
+    both = np.concatenate((learned, tested))
+    if both.dtype.kind == "f":
+        return np.where(both > np.median(learned), "above", "below")
+    words = both.astype(str)
+    names, counts = np.unique(words[: len(learned)], return_counts=True)
+    return np.where(np.isin(words, names[counts > 1]), words, "")

@@ -1,0 +1,187 @@
+"""Images with masks, divided into training and test images, and controls without a trained network.
+
+Controls learn from the training images only. Faces are aligned, so the most frequent class at a place already
+draws a face; skin, hair and background differ in colour; and principal components hold the pose of the face.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Int64, UInt8
+
+from derender.data import PictureSet, split_indices
+
+TEST_FRACTION = 0.2
+COLOUR_PIXELS = 20_000
+COMPONENTS = 64
+COMPONENT_IMAGES = 2_000
+_CHUNK = 512
+
+
+@dataclass(frozen=True)
+class SegmentationData:
+    """Images with a mask each, divided.
+
+    Attributes:
+        images: (N, 3, S, S) RGB bytes.
+        masks: (N, S, S) class numbers.
+        classes: the name of every class number.
+        train: rows to learn from.
+        test: rows to be tested on; no others are ever scored.
+        split: the rule of the split, in words.
+        source, layout: of the data set.
+    """
+
+    images: UInt8[np.ndarray, "n 3 s s"]
+    masks: UInt8[np.ndarray, "n s s"]
+    classes: tuple[str, ...]
+    train: Int64[np.ndarray, " l"]
+    test: Int64[np.ndarray, " t"]
+    split: str
+    source: str = ""
+    layout: str = ""
+
+    def shares(self, rows: Int64[np.ndarray, " k"]) -> np.ndarray:
+        """(C,) share of the pixels of these rows that each class has; adds up to 1."""
+        counted = np.bincount(self.masks[rows].ravel(), minlength=len(self.classes))
+        return counted / counted.sum()
+
+
+def divide(
+    pictures: PictureSet,
+    masks: UInt8[np.ndarray, "n s s"],
+    classes: Sequence[str],
+    *,
+    test_fraction: float = TEST_FRACTION,
+    split_seed: int = 0,
+    labelled: int | None = None,
+) -> SegmentationData:
+    """Choose training and test images.
+
+    Where the data bring a partition, its "test" rows are tested, and its "train" rows (all others, where it
+    has no "train") learn. Otherwise files are ordered by a hash of their name and ``split_seed``, and the
+    last of that order are tested.
+
+    Args:
+        pictures, masks, classes: as from ``read_masks``.
+        test_fraction: share of the images that is tested, where the data have no partition.
+        split_seed: of the split and of the choice of ``labelled``.
+        labelled: number of training images; smaller numbers are part of larger ones. None means all.
+
+    Raises:
+        ValueError: nothing to learn from or to test, more requested than there is, or a single class.
+    """
+    if not 0 < test_fraction < 1:
+        raise ValueError(f"the tested share must lie between 0 and 1, got {test_fraction}")
+    partition = pictures.partition
+    if partition is not None and (partition == "test").any():
+        test, train = np.flatnonzero(partition == "test"), np.flatnonzero(partition == "train")
+        train = train if len(train) else np.flatnonzero(partition != "test")
+        rule = "the data's own partition"
+    else:
+        split = split_indices(pictures.files, (1 - test_fraction, 0.0, test_fraction), seed=split_seed)
+        train, test = split.train, split.test
+        rule = f"a hash of the files' names, seed {split_seed}"
+    if len(train) < 2 or not len(test):
+        raise ValueError(
+            f"{pictures.source} leaves {len(train)} images to learn from and {len(test)} to test on: "
+            "bring more images, or another test_fraction"
+        )
+    if labelled is not None:
+        if not 2 <= labelled <= len(train):
+            raise ValueError(
+                f"labelled={labelled:,} training images, but there are {len(train):,}: choose 2 to that many"
+            )
+        train = np.sort(np.random.default_rng(split_seed).permutation(train)[:labelled])
+    seen = np.unique(masks[train])
+    if len(seen) < 2:
+        raise ValueError(
+            f"the {len(train):,} masks to learn from in {pictures.source} show one class only "
+            f"({classes[int(seen[0])]}): segmentation needs two or more"
+        )
+    return SegmentationData(
+        pictures.images, masks, tuple(classes), train, test, rule, pictures.source, pictures.layout
+    )
+
+
+def most_frequent(data: SegmentationData, seed: int = 0) -> np.ndarray:
+    """(T, S, S): always the class with the most training pixels."""
+    return np.full(data.masks[data.test].shape, np.uint8(data.shares(data.train).argmax()), np.uint8)
+
+
+def most_frequent_at_place(data: SegmentationData, seed: int = 0) -> np.ndarray:
+    """(T, S, S): the class that most training masks have at this place; of two even ones the lower."""
+    learned = data.masks[data.train]
+    counts = np.stack([(learned == number).sum(axis=0) for number in range(len(data.classes))])
+    best = counts.argmax(axis=0).astype(np.uint8)
+    return np.broadcast_to(best, data.masks[data.test].shape).copy()
+
+
+def by_colour(data: SegmentationData, seed: int = 0) -> np.ndarray:
+    """(T, S, S): logistic regression from a pixel's red, green and blue alone, on 20,000 training pixels."""
+    from sklearn.linear_model import LogisticRegression
+
+    pixels_each, shape = data.masks[0].size, data.masks[data.test].shape
+    pool = len(data.train) * pixels_each
+    drawn = np.random.default_rng(seed).choice(pool, min(COLOUR_PIXELS, pool), replace=False)
+    rows, places = data.train[drawn // pixels_each], drawn % pixels_each
+    flat = data.images.reshape(len(data.images), 3, pixels_each)
+    classes = data.masks.reshape(len(data.masks), pixels_each)[rows, places]
+    if len(np.unique(classes)) == 1:
+        return np.full(shape, classes[0], np.uint8)
+    regression = LogisticRegression(max_iter=1_000).fit(_scaled(flat[rows, :, places]), classes)
+    answers = [regression.predict(_scaled(flat[row].T)) for row in data.test.tolist()]
+    return np.stack(answers).reshape(shape).astype(np.uint8)
+
+
+def by_components(data: SegmentationData, seed: int = 0) -> np.ndarray:
+    """(T, S, S): the best class of a linear regression from the image's principal components at each place.
+
+    64 components (a quarter of the training images, where that is fewer) of at most 2,000 training images.
+    Scaling them would change nothing. Of two even classes the lower.
+    """
+    from sklearn.decomposition import PCA
+
+    learned = data.masks[data.train].reshape(len(data.train), -1)
+    places = np.linspace(0, len(data.train) - 1, min(len(data.train), COMPONENT_IMAGES)).astype(int)
+    count = max(1, min(COMPONENTS, len(data.train) // 4))
+    pca = PCA(count, random_state=seed).fit(_flat(data, data.train[places]))
+
+    def described(rows: np.ndarray) -> np.ndarray:
+        parts = np.array_split(rows, max(1, len(rows) // _CHUNK))
+        found = np.concatenate([pca.transform(_flat(data, part)) for part in parts])
+        return np.column_stack((np.ones(len(rows)), found))
+
+    tested = described(data.test)
+    solver = np.linalg.pinv(described(data.train))  # (1 + components, training images)
+    best = np.zeros((len(data.test), learned.shape[1]), np.uint8)
+    most = np.full(best.shape, -np.inf)
+    for number in np.unique(learned).tolist():
+        weights = sum(
+            solver[:, start : start + _CHUNK] @ (learned[start : start + _CHUNK] == number)
+            for start in range(0, len(learned), _CHUNK)
+        )
+        favour = tested @ np.asarray(weights)
+        better = favour > most + 1e-9
+        best[better], most[better] = number, favour[better]
+    return best.reshape(len(best), *data.masks.shape[1:])
+
+
+CONTROLS: Mapping[str, Callable[[SegmentationData, int], np.ndarray]] = {
+    "each place's class": most_frequent_at_place,
+    "pixel colour": by_colour,
+    "PCA": by_components,
+    "most frequent class": most_frequent,
+}
+"""By row name."""
+
+
+def _flat(data: SegmentationData, rows: np.ndarray) -> np.ndarray:
+    """Images as rows of numbers in 0..1."""
+    return data.images[rows].reshape(len(rows), -1).astype(np.float32) / 255
+
+
+def _scaled(colours: np.ndarray) -> np.ndarray:
+    """Bytes as numbers in -2..2, where the regression's penalty is mild."""
+    return colours.astype(np.float64) / 63.75 - 2

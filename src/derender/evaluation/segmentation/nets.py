@@ -1,0 +1,203 @@
+"""The networks that are compared, how they are trained, and their answers.
+
+Source: Klinghoffer et al., ECCV 2022, Sec. 4.7 and Table 3: Adam 2e-4 with betas 0.5 and 0.999, 20 epochs.
+Neither the loss nor the batch size is stated: cross-entropy, every pixel alike, and 64, that of the paper's
+other trainings, or fewer where there are few images: in 20 epochs of 80 steps no network learns an eye. The
+paper's only control is one encoder from fresh weights, while its best row joins two; this table adds two
+fresh encoders, trained and frozen. A pre-trained encoder keeps its BatchNorm statistics while its weights
+learn, since few labelled images make small batches with unreliable statistics; a fresh one has none to keep.
+A fresh encoder that is frozen gets those of the training images. The paper's decoder is always fresh; one
+network begins with the decoder that was distilled beside the encoders, and keeps statistics at its finest
+levels only. Leaves out augmentation, class weights and early stopping: the last weights are scored.
+"""
+
+import copy
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from pydantic import Field
+from torch import nn
+from torch.nn.functional import cross_entropy
+
+from derender.data import as_float, suggestion
+from derender.evaluation.segmentation.data import SegmentationData
+from derender.networks.encoders import UNetEncoder
+from derender.networks.unet import SegmentationNet
+from derender.settings import Settings
+from derender.training.process import freed_memory_kept
+
+LARGEST_BATCH, SMALLEST_BATCH, STEPS_AN_EPOCH = 64, 2, 320
+STATISTICS_IMAGES = 512
+
+StepProgress = Callable[[int, float], object]
+"""Called with (images seen, loss) after every step."""
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One row of the table.
+
+    Attributes:
+        title: in tables.
+        factors: whose encoders, joined in this order.
+        pretrained: whether with the model's weights; otherwise fresh ones of the same shape.
+        frozen: whether only the decoder learns; otherwise pre-trained encoders learn with their BatchNorm
+            statistics kept.
+        decoder: whether the decoder, too, begins with the model's weights (all but its last layer); otherwise
+            it is fresh.
+    """
+
+    title: str
+    factors: tuple[str, ...]
+    pretrained: bool
+    frozen: bool
+    decoder: bool = False
+
+
+_ONE, _BOTH = ("geometry",), ("geometry", "albedo")
+VARIANTS: Mapping[str, Variant] = {
+    "joint-whole": Variant("joint, decoder too", _BOTH, pretrained=True, frozen=False, decoder=True),
+    "joint": Variant("joint encoders", _BOTH, pretrained=True, frozen=False),
+    "geometry": Variant("geometry encoder", _ONE, pretrained=True, frozen=False),
+    "albedo": Variant("albedo encoder", ("albedo",), pretrained=True, frozen=False),
+    "joint-frozen": Variant("joint encoders, frozen", _BOTH, pretrained=True, frozen=True),
+    "random": Variant("random start", _ONE, pretrained=False, frozen=False),
+    "joint-random": Variant("random start, joint", _BOTH, pretrained=False, frozen=False),
+    "joint-random-frozen": Variant("random, joint, frozen", _BOTH, pretrained=False, frozen=True),
+}
+"""By name on the command line."""
+
+
+class SegmentSettings(Settings):
+    """Training of a network; without a batch size, ``batch_for`` chooses one."""
+
+    learning_rate: float = Field(default=2e-4, gt=0)
+    betas: tuple[float, float] = (0.5, 0.999)
+    epochs: int = Field(default=20, ge=1)
+    batch_size: int | None = Field(default=None, ge=2)
+
+    def batch_for(self, images: int) -> int:
+        """Images a step: 64, but fewer (2 at least) where an epoch would have less than 320 steps."""
+        return self.batch_size or min(LARGEST_BATCH, max(SMALLEST_BATCH, images // STEPS_AN_EPOCH))
+
+
+def chosen_variants(model: Any, names: Sequence[str] | None = None) -> dict[str, Variant]:
+    """Variants by name, or all that the model allows: a U-Net decoder is needed by some.
+
+    Raises:
+        ValueError: an unknown name (with a suggestion), or the model lacks an encoder or decoder.
+    """
+    own_decoder = getattr(model, "unet_decoder", None) is not None
+    if names is None:
+        names = [name for name, variant in VARIANTS.items() if own_decoder or not variant.decoder]
+    for name in names:
+        if name not in VARIANTS:
+            raise ValueError(
+                f"no variant {name!r}{suggestion(name, VARIANTS)}: there is {', '.join(VARIANTS)}"
+            )
+    if not names:
+        raise ValueError(f"name a variant: there is {', '.join(VARIANTS)}")
+    chosen = {name: VARIANTS[name] for name in dict.fromkeys(names)}
+    for factor in sorted({factor for variant in chosen.values() for factor in variant.factors}):
+        encoder = getattr(model.nets[factor], "encoder", None) if factor in model.nets else None
+        if not isinstance(encoder, UNetEncoder):
+            raise ValueError(
+                f"the model has no U-Net encoder for {factor}, and segmentation needs its skip features: "
+                "make one with derender unet, or train one with derender train --set encoder=unet"
+            )
+    if any(variant.decoder for variant in chosen.values()) and not own_decoder:
+        raise ValueError("the model has no U-Net decoder: make a copy that has with derender unet")
+    return chosen
+
+
+def build_variant(model: Any, variant: Variant, data: SegmentationData, seed: int) -> SegmentationNet:
+    """A network to train; the model stays as it was, and so does torch's global generator.
+
+    The seed makes the decoder and fresh encoders. Variants of equal shape start from the same decoder.
+    """
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        encoders = [copy.deepcopy(model.nets[factor].encoder) for factor in variant.factors]
+        decoder_seed = int(torch.randint(2**31, ()))
+        if not variant.pretrained:
+            for module in (module for encoder in encoders for module in encoder.modules()):
+                if isinstance(module, nn.Conv2d | nn.BatchNorm2d):
+                    module.reset_parameters()
+        torch.manual_seed(decoder_seed)
+        net = SegmentationNet(
+            encoders,
+            len(data.classes),
+            frozen=variant.frozen,
+            kept_statistics=variant.pretrained,
+            decoder=model.unet_decoder if variant.decoder else None,
+        ).to(model.device)
+    if variant.frozen and not variant.pretrained:
+        for encoder in encoders:
+            _set_statistics(encoder, data)
+    return net
+
+
+def train_segmenter(
+    net: SegmentationNet,
+    data: SegmentationData,
+    seed: int,
+    settings: SegmentSettings,
+    progress: StepProgress | None = None,
+) -> list[float]:
+    """Train in place on the training rows; the mean loss of each epoch. The seed orders the images."""
+    device = next(net.parameters()).device
+    net.to(memory_format=torch.channels_last).train()  # pyright: ignore[reportCallIssue]
+    learning = [parameter for parameter in net.parameters() if parameter.requires_grad]
+    optimiser = torch.optim.Adam(learning, lr=settings.learning_rate, betas=settings.betas, fused=True)
+    generator, seen, means = torch.Generator().manual_seed(seed), 0, []
+    batch_size = settings.batch_for(len(data.train))
+    with freed_memory_kept() if device.type == "cpu" else nullcontext():
+        for _ in range(settings.epochs):
+            order = data.train[torch.randperm(len(data.train), generator=generator).numpy()]
+            total = 0.0
+            for start in range(0, len(order), batch_size):
+                rows = order[start : start + batch_size]
+                images = as_float(data.images[rows]).to(device, memory_format=torch.channels_last)
+                truth = torch.from_numpy(data.masks[rows]).to(device).long()
+                loss = cross_entropy(net(images), truth)
+                optimiser.zero_grad(set_to_none=True)
+                loss.backward()
+                optimiser.step()
+                value = loss.item()
+                total, seen = total + value * len(rows), seen + len(rows)
+                if progress is not None:
+                    progress(seen, value)
+            means.append(total / len(order))
+    return means
+
+
+@torch.inference_mode()
+def answer(net: SegmentationNet, images: np.ndarray, batch_size: int = 128) -> np.ndarray:
+    """(N, S, S) uint8: the likeliest class of every pixel of (N, 3, S, S) uint8 images."""
+    device = next(net.parameters()).device
+    net.eval()
+    parts = (images[start : start + batch_size] for start in range(0, len(images), batch_size))
+    logits = (net(as_float(part).to(device)) for part in parts)
+    return np.concatenate([one.argmax(dim=1).to(torch.uint8).cpu().numpy() for one in logits])
+
+
+@torch.no_grad()
+def _set_statistics(encoder: nn.Module, data: SegmentationData) -> None:
+    """Set every BatchNorm to the mean statistics of batches of training images."""
+    norms = [module for module in encoder.modules() if isinstance(module, nn.BatchNorm2d)]
+    usual = [norm.momentum for norm in norms]
+    for norm in norms:
+        norm.reset_running_stats()
+        norm.momentum = None  # a plain mean over batches
+    encoder.train()
+    device = next(encoder.parameters()).device
+    rows = data.train[:STATISTICS_IMAGES]
+    for part in np.array_split(rows, max(1, len(rows) // LARGEST_BATCH)):
+        encoder.spatial(as_float(data.images[part]).to(device))  # type: ignore[operator]
+    encoder.eval()
+    for norm, momentum in zip(norms, usual, strict=True):
+        norm.momentum = momentum

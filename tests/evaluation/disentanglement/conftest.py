@@ -1,0 +1,35 @@
+"""A disentanglement card of features whose scores are known."""
+
+import numpy as np
+
+from derender.evaluation.disentanglement import (
+    DisentanglementCard,
+    FeatureScores,
+    SwapScores,
+    TrueFactor,
+    correlation_matrix,
+    ground_truth_scores,
+    pearson,
+    similarity,
+)
+
+NAMES = ("light", "camera")
+MOVED = np.array([[0.9, 0.3], [0.1, 0.7]])
+
+
+def card(seeds: int = 2, known: bool = True) -> DisentanglementCard:
+    numbers = np.random.default_rng(0).uniform(-1, 1, (80, 2))
+    blocks = {"light": numbers[:, :1], "camera": numbers[:, 1:]}
+    factors = [TrueFactor(f"{name} yaw", numbers[:, k], False, (name,)) for k, name in enumerate(NAMES)]
+
+    def scores(of: dict[str, np.ndarray], seed: int, swap: bool) -> FeatureScores:
+        truth = ground_truth_scores(of, factors, dimensions="lasso", seed=seed) if known else None
+        test = SwapScores(NAMES, MOVED, MOVED, MOVED[0], MOVED[1], MOVED[0] / 2, 4.0 + seed, 4.0, 80)
+        return FeatureScores(pearson(of), similarity(of, seed=seed), truth, test if swap else None)
+
+    noise = {name: values[::-1] for name, values in blocks.items()}
+    rows = {
+        "model": [scores(blocks, seed, True) for seed in range(seeds)],
+        "shuffled rows": [scores(noise, seed, False) for seed in range(seeds)],
+    }
+    return DisentanglementCard(NAMES, rows, correlation_matrix(blocks), (1, 1), 80)

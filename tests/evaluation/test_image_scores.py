@@ -1,0 +1,60 @@
+"""Means over images: intervals, lower is better where it is, missing images left out; tables and verdicts."""
+
+import numpy as np
+import pytest
+
+from derender.evaluation.image_scores import image_rows, image_table, image_verdicts
+from derender.evaluation.score_table import Column
+
+ERROR = np.random.default_rng(0).normal(1.0, 0.2, 400)
+ONE = {"error": (Column("error", "low"), 1.0), "good": (Column("good", "high"), 1.0)}
+
+
+def test_lower_scores_are_better_by_the_controls_surplus():
+    model, plane = image_rows(
+        {"model": {"error": ERROR, "good": ERROR}, "plane": {"error": ERROR + 0.1, "good": ERROR + 0.1}}, ONE
+    )
+    one = model.scores["error"]
+    half = 1.96 * ERROR.std() / 400**0.5
+    assert one.value == pytest.approx(ERROR.mean())
+    assert (one.low, one.high) == pytest.approx((one.value - half, one.value + half), abs=0.003)
+    better, worse = model.versus["error"], model.versus["good"]
+    assert better.rival == "plane" and better.above and better.low == pytest.approx(0.1, abs=1e-6)
+    assert worse.value == pytest.approx(-0.1) and not worse.above and worse.high < 0
+    assert plane.control and not plane.versus
+    near = image_rows(
+        {name: {"error": ERROR + add} for name, add in (("m", 0), ("far", 3), ("near", 1))}, ONE
+    )
+    assert near[0].versus["error"].rival == "near"  # the strongest control has the lowest error
+
+
+def test_images_without_a_score_are_left_out():
+    holes, nothing = ERROR.copy(), np.full(400, np.nan)
+    holes[::2] = np.nan
+    rows = image_rows({"model": {"e": holes, "n": nothing}, "plane": {"e": ERROR, "n": ERROR}}, ONE)
+    found = rows[0].scores["e"]
+    assert found.value == pytest.approx(ERROR[1::2].mean()) and found.low < found.value < found.high
+    assert np.isnan(rows[0].scores["n"].value) and not rows[0].versus["n"].above
+    with pytest.raises(ValueError, match=r"scores of the same images, got \[3, 400\]"):
+        image_rows({"a": {"e": ERROR}, "b": {"e": ERROR[:3]}}, ONE)
+
+
+def test_tables_are_in_the_units_of_their_columns():
+    columns = {"side": (Column("SIDE x 100", "low"), 100.0), "mad": (Column("MAD", "low", 1), 1.0)}
+    side = np.array([0.01, 0.02, 0.03])
+    each = {"model": {"side": side, "mad": 1000 * side}, "plane": {"side": side * 2, "mad": 500 * side}}
+    rows = image_rows(each, columns)
+    table = image_table(
+        "c", rows, columns, more={Column("coverage"): {"model": 0.9}}, notes={"plane": "flat"}
+    )
+    assert [column.name for column in table.columns] == ["SIDE x 100", "95 %", "MAD", "95 %", "coverage"]
+    texts = [text for text, _ in table.texts(table.rows[0])]
+    assert texts == ["2.000", "1.000-3.000", "20.0", "10.0-30.0", "0.900"]
+    assert table.rows[1].control and table.rows[1].cells[-1] is None and table.rows[1].note == "flat"
+    plain = image_table("c", rows, columns, intervals=False)
+    assert plain.rows[1].cells == pytest.approx([4.0, 10.0])
+    side_words, mad_words = image_verdicts(rows[0], columns)
+    assert side_words.startswith(
+        "SIDE x 100: 2.000, better than the strongest control (plane), by +2.000, 95 %"
+    )
+    assert mad_words.startswith("MAD: 20.0, worse than the strongest control (plane), by -10.0")

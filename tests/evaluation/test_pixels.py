@@ -1,0 +1,151 @@
+"""Masked L1, PSNR and SSIM: closed forms, torchmetrics, masks, and the controls."""
+
+import numpy as np
+import pytest
+import torch
+from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
+
+from derender.evaluation import evaluate_reconstruction, mean_picture, reconstruction_scores
+from derender.evaluation.pixels import AT_A_TIME, WINDOW, component_count, from_components, masked_ssim
+
+
+def test_known_differences_give_known_scores():
+    target = torch.full((2, 3, 4, 4), 0.5)
+    prediction = target + torch.tensor([0.1, -0.01])[:, None, None, None]
+    scores = reconstruction_scores(prediction, target, torch.ones(2, 4, 4))
+    np.testing.assert_allclose(scores.l1_each, [0.1, 0.01], rtol=1e-5)
+    np.testing.assert_allclose(scores.psnr_db_each, [20, 40], rtol=1e-5)
+    assert scores.l1 == pytest.approx(0.055) and scores.psnr_db == pytest.approx(30)
+    assert scores.coverage == 1 and scores.n_empty == 0
+
+
+def test_a_copy_scores_the_best_value():
+    target = torch.rand(2, 3, 4, 4)
+    scores = reconstruction_scores(target, target, torch.ones(2, 4, 4))
+    assert scores.l1 == 0 and scores.psnr_db == float("inf")
+
+
+def test_only_the_mask_counts():
+    target = torch.zeros(2, 3, 4, 4)
+    prediction = target.clone()
+    prediction[0, :, :2] = 0.2
+    prediction[0, :, 2:] = torch.nan
+    mask = torch.zeros(2, 4, 4)
+    mask[0, :2] = 1
+    scores = reconstruction_scores(prediction, target, mask)
+    assert scores.l1 == pytest.approx(0.2) and scores.coverage == 0.25 and scores.n_empty == 1
+    assert np.isnan(scores.l1_each[1]) and np.isnan(scores.psnr_db_each[1])
+    with pytest.raises(ValueError, match="every mask is empty"):
+        reconstruction_scores(prediction, target, torch.zeros(2, 4, 4))
+
+
+class Copy(torch.nn.Module):
+    """Gives the picture back, a little darker, in the upper half."""
+
+    device = torch.device("cpu")
+
+    def reconstruct(self, images):
+        self.image = images * 0.9
+        self.mask = torch.zeros(images[:, 0].shape)
+        self.mask[:, :2] = 1
+        return self
+
+
+def test_the_mean_picture_is_scored_in_the_same_masks():
+    images = np.random.default_rng(0).integers(0, 256, (7, 3, 4, 4), dtype=np.uint8)
+    result = evaluate_reconstruction(Copy(), images, batch_size=3)
+    floats = images / 255
+    assert result.model.l1 == pytest.approx(0.1 * floats[:, :, :2].mean(), rel=1e-5)
+    mean = floats.mean(axis=0)
+    assert result.mean_picture.l1 == pytest.approx(np.abs(floats - mean)[:, :, :2].mean(), rel=1e-5)
+    black = evaluate_reconstruction(Copy(), images, mean=torch.zeros(3, 4, 4))
+    assert black.mean_picture.l1 == pytest.approx(floats[:, :, :2].mean(), rel=1e-5)
+    assert result.model.coverage == result.mean_picture.coverage == 0.5
+
+
+def test_the_mean_of_many_images_is_exact_and_of_none_an_error():
+    images = np.full((2500, 3, 2, 2), 255, np.uint8)
+    images[:625] = 0
+    np.testing.assert_allclose(mean_picture(images), 0.75)
+    with pytest.raises(ValueError, match="no images"):
+        mean_picture(images[:0])
+
+
+def test_components_copy_what_lies_in_their_span():
+    """Pictures of two varying numbers come back from two components or more, others only nearly."""
+    generator = np.random.default_rng(0)
+    basis, mixed = generator.uniform(0, 1, (2, 3, 4, 4)), generator.uniform(0, 1, (40, 2))
+    images = (np.einsum("nk,kchw->nchw", mixed, basis) * 127).round().astype(np.uint8)
+    again = from_components(images, images)
+    assert again.shape == images.shape and component_count(40) == 10
+    assert (again - torch.from_numpy(images / 255)).abs().max() < 0.01
+    noise = generator.integers(0, 256, images.shape, dtype=np.uint8)
+    assert (from_components(noise, images) - torch.from_numpy(noise / 255)).abs().mean() > 0.1
+
+
+def pair(count: int = 2, height: int = 24, width: int = 29) -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    target = torch.rand(count, 3, height, width, generator=generator)
+    return (target + 0.2 * torch.rand(target.shape, generator=generator)).clamp(0, 1), target
+
+
+def test_with_a_full_mask_the_scores_are_those_of_torchmetrics():
+    prediction, target = pair()
+    full = torch.ones(2, 24, 29)
+    oracle = structural_similarity_index_measure(prediction, target, data_range=1.0, reduction="none")
+    cropped = [
+        p[..., 5:-5, 5:-5] for p in (prediction, target)
+    ]  # torchmetrics blurs the border by reflection
+    assert cropped[0].shape == (2, 3, 14, 19)
+    whole = structural_similarity_index_measure(
+        prediction, target, data_range=1.0, reduction="none", return_full_image=True
+    )[1]
+    expected = whole[..., 5:-5, 5:-5].mean(dim=(1, 2, 3))
+    torch.testing.assert_close(masked_ssim(prediction, target, full).float(), expected, rtol=1e-4, atol=1e-5)
+    assert (masked_ssim(prediction, target, full) - oracle).abs().max() < 0.05
+    scores = reconstruction_scores(prediction, target, full)
+    each = [
+        peak_signal_noise_ratio(p, t, data_range=1.0).item() for p, t in zip(prediction, target, strict=True)
+    ]
+    assert scores.psnr_db_each.tolist() == pytest.approx(each, rel=1e-5)
+    assert scores.ssim == pytest.approx(expected.mean().item(), rel=1e-4)
+
+
+def test_a_copy_is_best_and_noise_is_near_nothing():
+    prediction, target = pair()
+    full = torch.ones(2, 24, 29)
+    assert masked_ssim(target, target, full).tolist() == pytest.approx([1, 1], abs=1e-5)
+    noise = torch.rand(target.shape, generator=torch.Generator().manual_seed(5))
+    assert masked_ssim(noise, target, full).abs().max() < 0.2 < masked_ssim(prediction, target, full).min()
+
+
+def test_what_lies_outside_the_mask_does_not_matter():
+    prediction, target = pair()
+    mask = torch.zeros(2, 24, 29)
+    mask[:, 3:20, 2:25] = 1
+    expected = masked_ssim(prediction, target, mask)
+    for rubbish in (0.0, 7.0, float("nan")):
+        dirty = [torch.where(mask[:, None] > 0, p, torch.tensor(rubbish)) for p in (prediction, target)]
+        torch.testing.assert_close(masked_ssim(*dirty, mask), expected, rtol=1e-5, atol=1e-6)
+    cut = [p[:, :, 3:20, 2:25] for p in (prediction, target)]
+    torch.testing.assert_close(expected, masked_ssim(*cut, torch.ones(2, 17, 23)), rtol=1e-5, atol=1e-6)
+
+
+def test_many_pictures_score_as_each_by_itself():
+    prediction, target = pair(count=AT_A_TIME + 3, height=12, width=13)
+    mask = torch.ones(len(target), 12, 13)
+    each = [masked_ssim(*(v[i : i + 1] for v in (prediction, target, mask))) for i in (0, 31, 32, 34)]
+    found = masked_ssim(prediction, target, mask)[[0, 31, 32, 34]]
+    torch.testing.assert_close(found, torch.cat(each), rtol=1e-5, atol=1e-6)
+
+
+def test_masks_too_small_for_a_window_have_no_score():
+    prediction, target = pair()
+    mask = torch.zeros(2, 24, 29)
+    mask[0, : WINDOW - 1], mask[1] = 1, 1
+    found = masked_ssim(prediction, target, mask)
+    assert found.isnan().tolist() == [True, False]
+    scores = reconstruction_scores(prediction, target, mask)
+    assert scores.ssim == pytest.approx(found[1].item()) and scores.n_empty == 0
+    with pytest.raises(ValueError, match=r"11 pixels or more each way, got \(8, 8\)"):
+        masked_ssim(prediction[..., :8, :8], target[..., :8, :8], mask[..., :8, :8])
