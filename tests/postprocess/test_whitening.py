@@ -1,4 +1,4 @@
-"""Whitening: planted nuisance goes, planted identity stays; what is said of units and rank holds."""
+"""Whitening: planted nuisance goes, planted identity stays; units and rank are as documented."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from safetensors.torch import save_file
 
 from derender.postprocess.whitening import Scatter, Whitening, fit_projection
 
-VIEWS, PICTURES, SIZE = 5, 400, 12
+VIEWS, IMAGES, SIZE = 5, 400, 12
 
 
 def planted(seed: int = 0) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -17,14 +17,14 @@ def planted(seed: int = 0) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     of the light's axes.
     """
     generator = torch.Generator().manual_seed(seed)
-    codes = 0.05 * torch.randn(VIEWS, PICTURES, SIZE, generator=generator)
-    codes[..., :3] += torch.randn(1, PICTURES, 3, generator=generator)
-    codes[..., 3:6] += 10 * torch.randn(VIEWS, PICTURES, 3, generator=generator)
+    codes = 0.05 * torch.randn(VIEWS, IMAGES, SIZE, generator=generator)
+    codes[..., :3] += torch.randn(1, IMAGES, 3, generator=generator)
+    codes[..., 3:6] += 10 * torch.randn(VIEWS, IMAGES, 3, generator=generator)
     rotation = torch.linalg.qr(torch.randn(SIZE, SIZE, generator=generator))[0]
     return codes @ rotation, rotation[:3], rotation[3:6]
 
 
-def test_what_light_moves_is_shrunk_and_what_tells_pictures_apart_is_kept():
+def test_directions_of_lighting_shrink_and_discriminative_ones_are_kept():
     codes, told, lit = planted()
     found = fit_projection(Scatter.of(codes), directions=3, shrinkage=1e-6)
     kept = (told @ found.map).norm(dim=1)
@@ -42,7 +42,7 @@ def test_renderings_of_one_picture_differ_by_one_in_every_kept_direction():
     found = fit_projection(Scatter.of(codes), directions=5, shrinkage=0.0)
     features = (codes - found.mean) @ found.map
     within = (features - features.mean(dim=0)).flatten(0, 1)
-    covariance = within.T @ within / (PICTURES * (VIEWS - 1))
+    covariance = within.T @ within / (IMAGES * (VIEWS - 1))
     values = torch.linalg.eigvalsh(covariance)
     assert values[-5:] == pytest.approx(np.ones(5), abs=2e-3)
     assert values[:-5].abs().max() < 1e-4
@@ -56,7 +56,7 @@ def test_at_evenness_one_pictures_differ_alike_in_every_kept_direction():
         found = fit_projection(Scatter.of(codes), 5, 0.0, evenness=evenness)
         features = (readings - found.mean) @ found.map.double()
         within = (features - features.mean(dim=0)).flatten(0, 1)
-        total = within.T @ within / (PICTURES * (VIEWS - 1)) + torch.cov(features.mean(0).T, correction=0)
+        total = within.T @ within / (IMAGES * (VIEWS - 1)) + torch.cov(features.mean(0).T, correction=0)
         variances = torch.linalg.eigvalsh(total)[-5:].numpy()
         expected = (1 + found.ratios.double()) ** (1 - evenness) * 2**evenness
         assert variances == pytest.approx(expected.sort().values.numpy(), rel=1e-3)
@@ -71,7 +71,7 @@ def test_an_affine_change_of_the_codes_changes_no_distance():
     assert torch.allclose(*distances, rtol=2e-2)
 
 
-def test_readings_longer_than_the_code_give_features_of_its_size_and_tell_what_the_code_does_not():
+def test_activations_longer_than_the_code_give_features_of_its_size_and_distinguish_more():
     told, _, _ = planted(0)
     code, _, lit = planted(1)
     code = code - code @ lit.T @ lit  # the code itself is told apart by other pictures' axes
@@ -80,7 +80,7 @@ def test_readings_longer_than_the_code_give_features_of_its_size_and_tell_what_t
     features = (torch.cat([code, told], dim=2) - found.mean) @ found.map
     assert torch.linalg.matrix_rank(features.flatten(0, 1), rtol=1e-4) == 6
     within = (features - features.mean(dim=0)).flatten(0, 1)
-    assert torch.linalg.eigvalsh(within.T @ within)[-6:].max() < 1.1 * PICTURES * (VIEWS - 1)
+    assert torch.linalg.eigvalsh(within.T @ within)[-6:].max() < 1.1 * IMAGES * (VIEWS - 1)
     assert (features.mean(dim=0)[:, None] - features.mean(dim=0)).norm(dim=2).median() > 20
 
 
@@ -96,7 +96,7 @@ def test_features_stand_in_the_place_of_the_code_that_they_are_nearest_to():
     assert (together - torch.diag(together.diagonal())).abs().max() < 0.3
 
 
-def test_codes_where_readings_are_needed_are_refused():
+def test_codes_where_activations_are_needed_are_refused():
     whitening = Whitening({"geometry": fit_projection(Scatter.of(planted()[0]), 3, 0.1)})
     with pytest.raises(ValueError, match="features of geometry are made of 12 numbers, got 7"):
         whitening({"geometry": torch.zeros(2, 7)})
@@ -110,7 +110,7 @@ def test_codes_that_never_move_are_survived():
 
 
 @pytest.mark.parametrize("shape", [(1, 10, 4), (3, 1, 4)])
-def test_one_view_or_one_picture_says_nothing(shape):
+def test_one_view_or_one_image_is_refused(shape):
     with pytest.raises(ValueError, match="at least 2 views of 2 images"):
         fit_projection(Scatter.of(torch.zeros(shape)), 2, 0.1)
 

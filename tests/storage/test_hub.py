@@ -1,4 +1,4 @@
-"""Models given away: what save_pretrained writes, what reaches the Hub, what comes back, what is refused."""
+"""Released models: what save_pretrained writes, what reaches the Hub, what comes back, what is refused."""
 
 import json
 import shutil
@@ -89,16 +89,16 @@ def test_a_pushed_model_comes_back_the_same(model, fake):
         torch.testing.assert_close(back.embed(images())[name], feature, rtol=0, atol=0)
 
 
-def test_the_card_says_what_was_told_and_how_to_load_it(model, fake):
+def test_the_card_states_data_licence_scores_and_how_to_load_it(model, fake):
     model.push_to_hub("me/faces", data="9 pictures of mugs", licence="CC0-1.0", scores="MAD 11 degrees.")
     card = (fake.place / "me" / "faces" / "README.md").read_text()
     assert card.startswith("---\nlibrary_name: derender\n") and 'license: "cc0-1.0"\n' in card
     assert 'derender.load("me/faces")' in card
-    for told in ("9 pictures of mugs", "MAD 11 degrees.", "32 x 32", "**Licence**: CC0-1.0"):
-        assert told in card
+    for stated in ("9 pictures of mugs", "MAD 11 degrees.", "32 x 32", "**Licence**: CC0-1.0"):
+        assert stated in card
 
 
-def test_a_model_that_nobody_describes_is_not_given_away(model, fake):
+def test_a_model_without_a_description_is_not_uploaded(model, fake):
     with pytest.raises(ValueError, match="has no card: state what it was trained on"):
         model.push_to_hub("me/faces", data="mugs")
     assert not fake.asked
