@@ -37,8 +37,8 @@ def test_the_interval_of_a_share_is_the_known_one():
     error = 1.96 * (0.75 * 0.25 / 400) ** 0.5
     assert found.low == pytest.approx(0.75 - error, abs=0.004)
     assert found.high == pytest.approx(0.75 + error, abs=0.004)
-    assert np.isnan(found.spread)
-    assert estimate([0.7, 0.8], np.zeros(3)).spread == pytest.approx(0.1 / 2**0.5)
+    assert np.isnan(found.deviation)
+    assert estimate([0.7, 0.8], np.zeros(3)).deviation == pytest.approx(0.1 / 2**0.5)
 
 
 def test_centred_resamples_lie_about_the_value():

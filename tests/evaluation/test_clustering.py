@@ -133,7 +133,7 @@ def test_true_groups_win_and_say_so():
     ours = rows["ours"]
     assert all(ours.scores[score].value == pytest.approx(1) for score in METRICS)
     assert all(one.above for one in ours.versus.values())
-    assert rows["noise"].runs == 3 and rows["noise"].scores["accuracy"].spread > 0
+    assert rows["noise"].runs == 3 and rows["noise"].scores["accuracy"].deviation > 0
     assert rows["majority"].scores["accuracy"].value == pytest.approx(1 / 3)
     assert rows["majority"].scores["nmi"].value == rows["majority"].scores["ari"].value == 0
     assert abs(rows["chance"].scores["ari"].value) < 0.03
@@ -148,7 +148,7 @@ def test_intervals_hold_the_value_and_shuffled_labels_are_at_chance():
     assert not any(shuffled.rows[0].versus[score].above for score in ("accuracy", "nmi", "ari", "hungarian"))
     chance = shuffled.rows[-1].scores
     for name in METRICS:
-        assert abs(shuffled.rows[0].scores[name].value - chance[name].value) < 4 * chance[name].spread
+        assert abs(shuffled.rows[0].scores[name].value - chance[name].value) < 4 * chance[name].deviation
 
 
 def test_several_labels_are_the_mean_of_each_alone():

@@ -312,7 +312,7 @@ def test_features_that_hold_the_labels_are_above_every_control(tmp_path):
     logistic = next(part for part in found.parts if (part.head, part.count) == ("logistic", 60))
     ours, noise, majority = logistic.rows
     assert ours.versus["accuracy"].above and ours.versus["balanced_accuracy"].above
-    assert ours.scores["accuracy"].value > 0.85 and ours.runs == 3 and ours.scores["accuracy"].spread > 0
+    assert ours.scores["accuracy"].value > 0.85 and ours.runs == 3 and ours.scores["accuracy"].deviation > 0
     assert noise.scores["balanced_accuracy"].value == pytest.approx(0.5, abs=0.08)
     expected = linear_scores(
         task.targets[rows.test], majority_answers(task, rows.train[60], 100)[0], "labels"

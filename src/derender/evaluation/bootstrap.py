@@ -25,14 +25,14 @@ class Estimate:
     Attributes:
         value: on the rows as they are; mean over runs.
         low, high: the 95 % interval over resamples of the rows; NaN where there is none.
-        spread: standard deviation over runs (seeds); NaN for a single run.
+        deviation: standard deviation over runs (seeds); NaN for a single run.
         resampled: (B,) the score on each resample.
     """
 
     value: float
     low: float
     high: float
-    spread: float
+    deviation: float
     resampled: np.ndarray = field(repr=False)
 
 
@@ -82,7 +82,7 @@ class ScoredRow:
     def numbers(self) -> dict[str, Any]:
         """Everything but the resamples, as JSON takes it."""
         scores = {
-            name: {part: getattr(one, part) for part in ("value", "low", "high", "spread")}
+            name: {"value": one.value, "low": one.low, "high": one.high, "spread": one.deviation}
             for name, one in self.scores.items()
         }
         return {"control": self.control, "runs": self.runs, "scores": scores, "versus": dict(self.versus)}
@@ -116,13 +116,13 @@ def estimate(
     if centred:
         resampled = np.minimum(resampled - resampled.mean() + value, most)
     low, high = _interval(resampled)
-    spread = float(np.std(runs, ddof=1)) if len(runs) > 1 else float("nan")
-    return Estimate(value, low, high, spread, resampled)
+    deviation = float(np.std(runs, ddof=1)) if len(runs) > 1 else float("nan")
+    return Estimate(value, low, high, deviation, resampled)
 
 
-def constant(value: float, count: int = RESAMPLES, spread: float = float("nan")) -> Estimate:
+def constant(value: float, count: int = RESAMPLES, deviation: float = float("nan")) -> Estimate:
     """A score that does not depend on the rows drawn, such as a chance level."""
-    return Estimate(value, float("nan"), float("nan"), spread, np.full(count, value))
+    return Estimate(value, float("nan"), float("nan"), deviation, np.full(count, value))
 
 
 def difference(ours: Estimate, rivals: Mapping[str, Estimate], *, lower: bool = False) -> Difference:

@@ -310,8 +310,8 @@ def _row(
         for at, score in enumerate(SCORES[:2])
     }
     precision = [run.average_precision for run in runs]
-    spread = float(np.std(precision, ddof=1)) if len(precision) > 1 else float("nan")
-    scores["average_precision"] = constant(float(np.mean(precision)), len(weights), spread)
+    deviation = float(np.std(precision, ddof=1)) if len(precision) > 1 else float("nan")
+    scores["average_precision"] = constant(float(np.mean(precision)), len(weights), deviation)
     return ScoredRow(name, control, len(runs), scores)
 
 

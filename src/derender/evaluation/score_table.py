@@ -251,7 +251,7 @@ def scored_table(
         if name in (main if intervals is None else intervals):
             shown[interval_column(column)] = lambda row, name=name: interval_of(row, name)
         if name in (main if deviations is None else deviations):
-            shown[deviation_column(column)] = lambda row, name=name: row.scores[name].spread
+            shown[deviation_column(column)] = lambda row, name=name: row.scores[name].deviation
     shown |= more or {}
     cells = [Row(row.name, [cell(row) for cell in shown.values()], row.control) for row in rows]
     return ScoreTable(caption, first, tuple(shown), cells)

@@ -117,7 +117,8 @@ def rows_from(values: Mapping[str, Any]) -> list[ScoredRow]:
     nothing = np.empty(0)
 
     def numbers(one: Mapping[str, Any]) -> dict[str, Any]:
-        return {part: float("nan") if value is None else value for part, value in one.items()}
+        named = {"deviation" if part == "spread" else part: value for part, value in one.items()}
+        return {part: float("nan") if value is None else value for part, value in named.items()}
 
     return [
         ScoredRow(
@@ -176,7 +177,7 @@ def set_tables(one: ScoredQuestion, methods: Sequence[str]) -> list[ScoreTable]:
         if name in found:
             row = found[name]
             values = (row.scores[score].value for score in others)
-            scored = (row.scores[first].value, interval_of(row, first), row.scores[first].spread, *values)
+            scored = (row.scores[first].value, interval_of(row, first), row.scores[first].deviation, *values)
             rows.append(Row(name, (*scored, *cost), row.control))
         elif name in one.absent:
             why = shorten(one.absent[name], LONGEST_REASON, placeholder=" ...")

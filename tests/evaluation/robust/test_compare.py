@@ -93,7 +93,7 @@ def test_a_table_is_recomputed_from_memory(tmp_path):
     memory = Memory(tmp_path)
     again = compare_robustness(features, trial, SEEDS, memory=memory, resample_count=20)
     assert (memory.made, memory.recalled) == (0, 3) and again.numbers() == first.numbers()
-    assert rows_of(first)["two runs"].scores["area"].spread > 0.1
+    assert rows_of(first)["two runs"].scores["area"].deviation > 0.1
     numbers = first.numbers()["curves"]["light"]
     assert numbers["levels_deg"] == LEVELS and numbers["accuracy"]["truth"]["scores"]["area"]["low"] == 1
 
