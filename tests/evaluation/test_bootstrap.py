@@ -3,14 +3,7 @@
 import numpy as np
 import pytest
 
-from derender.evaluation.bootstrap import (
-    ScoredRow,
-    constant,
-    difference,
-    estimate,
-    resamples,
-    with_verdicts,
-)
+from derender.evaluation.bootstrap import ScoredRow, constant, difference, estimate, resamples, with_verdicts
 
 
 def all_weights(n_rows: int, count: int, seed: int = 0) -> np.ndarray:

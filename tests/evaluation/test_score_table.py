@@ -8,12 +8,7 @@ import sys
 import numpy as np
 import pytest
 
-from derender.evaluation import (
-    GeometryResult,
-    GeometryScores,
-    ReconstructionResult,
-    ReconstructionScores,
-)
+from derender.evaluation import GeometryResult, GeometryScores, ReconstructionResult, ReconstructionScores
 from derender.evaluation.bootstrap import Estimate, ScoredRow, constant
 from derender.evaluation.score_table import Column, Interval, Row, Scores, ScoreTable, scored_table
 

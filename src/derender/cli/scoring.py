@@ -25,7 +25,7 @@ Features = Annotated[
 ]
 AModel = Annotated[
     str | None,
-    typer.Option("--model", "-m", help=f"Instead of --features, with IMAGES: {options.MODELS.lower()}"),
+    typer.Option("--model", "-m", help=f"Instead of --features, with IMAGES. {options.MODELS}"),
 ]
 Factors = Annotated[str, typer.Option("--factors", help="Features to use, with commas between, or all.")]
 MinCount = Annotated[

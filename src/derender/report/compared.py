@@ -5,8 +5,8 @@ score, its interval and the row's cost. What failed or is missing says so in its
 (``derender.cli.plan``).
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from math import isfinite
 from textwrap import shorten
 from typing import Any
@@ -23,9 +23,7 @@ from derender.evaluation.score_table import (
     Column,
     Row,
     ScoreTable,
-    deviation_column,
-    interval_column,
-    interval_of,
+    scored_table,
     verdict_table,
 )
 from derender.report.charts import SERIES, side_by_side
@@ -96,25 +94,24 @@ def scores_from(
     question: Mapping[str, Any], costs: Mapping[str, Cost], absent: Mapping[str, str]
 ) -> list[ScoredQuestion]:
     """The scores of a question as JSON keeps them: one of clusters, or one for each head and count."""
-    name = str(question["name"])
+    name, how = str(question["name"]), (costs, absent)
     if question["protocol"] == "cluster":
         about = about_clustering(question["method"], question["n_rows"], question["labels"])
-        return [ScoredQuestion(name, "cluster", about, rows_from(question["rows"]), costs, absent)]
+        return [ScoredQuestion(name, "cluster", about, rows_from(question["rows"]), *how)]
     kind = "classes" if question["kind"] == "classes" else "yes/no labels"
-    found = []
-    for part in question["parts"]:
-        about = (
-            f"{PROBE_NAMES.get(part['head'], part['head'])}, {part['labels']:,} labelled rows, "
-            f"{question['n_test']:,} tested, {len(question['names'])} {kind}, {len(question['seeds'])} seeds"
+    about = f"{question['n_test']:,} tested, {len(question['names'])} {kind}, {len(question['seeds'])} seeds"
+    return [
+        ScoredQuestion(
+            name, "linear", f"{PROBE_NAMES.get(head, head)}, {count:,} labelled rows, {about}",
+            rows_from(part["rows"]), *how, head, count,
         )
-        rows = rows_from(part["rows"])
-        found.append(ScoredQuestion(name, "linear", about, rows, costs, absent, part["head"], part["labels"]))
-    return found
+        for part in question["parts"]
+        for head, count in [(part["head"], part["labels"])]
+    ]  # fmt: skip
 
 
 def rows_from(values: Mapping[str, Any]) -> list[ScoredRow]:
-    """Rows as JSON keeps them: without resamples, null for what is no number."""
-    nothing = np.empty(0)
+    """Rows as JSON keeps them: without resamples, null for NaN."""
 
     def numbers(one: Mapping[str, Any]) -> dict[str, Any]:
         named = {"deviation" if part == "spread" else part: value for part, value in one.items()}
@@ -122,70 +119,59 @@ def rows_from(values: Mapping[str, Any]) -> list[ScoredRow]:
 
     return [
         ScoredRow(
-            name,
-            row["control"],
-            row["runs"],
-            {score: Estimate(**numbers(one), resampled=nothing) for score, one in row["scores"].items()},
+            name, row["control"], row["runs"],
+            {score: Estimate(**numbers(one), resampled=np.empty(0)) for score, one in row["scores"].items()},
             {score: Difference(**numbers(one)) for score, one in row["versus"].items()},
         )
         for name, row in values.items()
-    ]
+    ]  # fmt: skip
 
 
 def protocol_table(scores: Sequence[ScoredQuestion], methods: Sequence[str]) -> ScoreTable:
-    """The one table: a row for each method and control, two scores for each data set, and the cost.
+    """The one table: a row for each method and control, the main scores of each data set, and the cost.
 
     Args:
         scores: of one protocol; of the linear one those with ``SUMMARY_HEAD`` are shown.
         methods: in order; controls come after them.
     """
     shown = _shown(scores)
-    first, second = ("accuracy", "nmi") if shown[0].protocol == "cluster" else ("balanced_accuracy", None)
+    protocol = shown[0].protocol
+    main = ("accuracy", "nmi") if protocol == "cluster" else ("balanced_accuracy",)
     columns: list[Column] = []
     for one in shown:
-        head = one.name if one.protocol == "cluster" else f"{one.name}, {one.count:,} labels"
-        columns.append(Column(f"{head}: {one.columns[first].name}", "high", note=one.about))
-        if second is not None:
-            columns.append(Column("NMI", "high"))
+        head = f"{one.name}, {one.count:,} labels" if one.count else one.name
+        columns.append(Column(f"{head}: {one.columns[main[0]].name}", "high", note=one.about))
+        columns += [Column(one.columns[name].name, "high") for name in main[1:]]
     by_name = [{row.name: row for row in one.rows} for one in shown]
-    controls = list(dict.fromkeys(name for rows in by_name for name in rows if name not in methods))
     rows = []
-    for name in (*methods, *controls):
+    for name in dict.fromkeys((*methods, *(name for found in by_name for name in found))):
         cells: list[Cell] = []
         for one, found in zip(shown, by_name, strict=True):
-            row = found.get(name)
-            if row is None:
-                cells.append(one.absent[name].partition(":")[0] if name in one.absent else None)
-            else:
-                cells.append(row.scores[first].value)
-            if second is not None:
-                cells.append(None if row is None else row.scores[second].value)
+            word = one.absent[name].partition(":")[0] if name in one.absent else None
+            missing = (word, *(None for _ in main[1:]))
+            cells += [found[name].scores[score].value for score in main] if name in found else missing
         control = any(found[name].control for found in by_name if name in found)
         rows.append(Row(name, (*cells, *_cells(_together(shown, name))), control))
-    caption = "Clustering" if shown[0].protocol == "cluster" else f"Few labels, {PROBE_NAMES[shown[0].head]}"
+    caption = "Clustering" if protocol == "cluster" else f"Few labels, {PROBE_NAMES[shown[0].head]}"
     caption += ": all data sets; training time is the sum over training sets"
     return ScoreTable(caption, "features", (*columns, *COST_COLUMNS), rows)
 
 
 def set_tables(one: ScoredQuestion, methods: Sequence[str]) -> list[ScoreTable]:
     """One data set's own table, with every score, interval and cost, and who is above the controls."""
-    columns, (first, *others) = one.columns, one.columns
-    found = {row.name: row for row in one.rows}
-    rows = []
-    for name in (*methods, *(name for name in found if name not in methods)):
-        cost = _cells(one.costs.get(name, Cost()))
-        if name in found:
-            row = found[name]
-            values = (row.scores[score].value for score in others)
-            scored = (row.scores[first].value, interval_of(row, first), row.scores[first].deviation, *values)
-            rows.append(Row(name, (*scored, *cost), row.control))
-        elif name in one.absent:
-            why = shorten(one.absent[name], LONGEST_REASON, placeholder=" ...")
-            rows.append(Row(name, (why, None, None, *(None for _ in others), *cost)))
-    ends = interval_column(columns[first]), deviation_column(columns[first])
-    shown = (columns[first], *ends, *(columns[name] for name in others), *COST_COLUMNS)
-    verdict = verdict_table(one.rows, columns, f"{one.name}, above the strongest control? {one.about}")
-    return [ScoreTable(f"{one.name}: {one.about}", "features", shown, rows), verdict]
+    costs: dict[Column, Callable[[ScoredRow], Cell]] = {
+        column: lambda row, place=place: _cells(one.costs.get(row.name, Cost()))[place]
+        for place, column in enumerate(COST_COLUMNS)
+    }
+    table = scored_table(f"{one.name}: {one.about}", "features", one.rows, one.columns, more=costs)
+    found = {row.name: row for row in table.rows}
+    blank = [None] * (len(table.columns) - 1 - len(COST_COLUMNS))
+    for name in one.absent.keys() - found.keys():
+        why = shorten(one.absent[name], LONGEST_REASON, placeholder=" ...")
+        found[name] = Row(name, (why, *blank, *_cells(one.costs.get(name, Cost()))))
+    order = dict.fromkeys((*methods, *(row.name for row in table.rows)))
+    verdict = verdict_table(one.rows, one.columns, f"{one.name}, above the strongest control? {one.about}")
+    return [replace(table, rows=[found[name] for name in order if name in found]), verdict]
 
 
 def protocol_picture(scores: Sequence[ScoredQuestion], methods: Sequence[str]) -> tuple[str, bytes]:
@@ -204,12 +190,7 @@ def protocol_picture(scores: Sequence[ScoredQuestion], methods: Sequence[str]) -
         for one in shown
     }
     size = (max(7.2, 1.6 + 2.1 * len(panels)), 0.9 + 0.3 * len(every))
-    return side_by_side(panels, one_word(shown[0].columns[score].name), size)
-
-
-def one_word(score: str) -> str:
-    """What stands under a picture."""
-    return {"balanced": "balanced accuracy"}.get(score, score)
+    return side_by_side(panels, score.replace("_", " "), size)
 
 
 def _panel(one: ScoredQuestion, names: Sequence[str], score: str) -> Any:
@@ -249,17 +230,16 @@ def _shown(scores: Sequence[ScoredQuestion]) -> list[ScoredQuestion]:
 def _together(scores: Sequence[ScoredQuestion], name: str) -> Cost:
     """A method's cost over several data sets: trainings that several share count once."""
     costs = [one.costs[name] for one in scores if name in one.costs]
-    if not costs:
-        return Cost()
     trained = {(cost.seconds, cost.images) for cost in costs if cost.seconds is not None}
     embedding = [cost.embedding_seconds for cost in costs if cost.embedding_seconds is not None]
+
+    def first(field: str) -> int | None:
+        return next((value for cost in costs if (value := getattr(cost, field)) is not None), None)
+
     return Cost(
-        next((cost.parameters for cost in costs if cost.parameters is not None), None),
-        sum(seconds for seconds, _ in trained if seconds is not None) if trained else None,
-        next((cost.images for cost in costs if cost.images is not None), None),
-        next((cost.numbers for cost in costs if cost.numbers is not None), None),
-        float(np.mean(embedding)) if embedding else None,
-    )
+        first("parameters"), sum(seconds for seconds, _ in trained) if trained else None, first("images"),
+        first("numbers"), float(np.mean(embedding)) if embedding else None,
+    )  # fmt: skip
 
 
 def _cells(cost: Cost) -> tuple[Cell, ...]:

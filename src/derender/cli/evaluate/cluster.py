@@ -14,7 +14,7 @@ MeanBy = Annotated[
 ]
 Clusters = Annotated[
     int | None,
-    typer.Option("--clusters", min=1, metavar="N", help="Number of clusters; default: of classes."),
+    typer.Option("--clusters", min=1, metavar="N", help="Number of clusters; default: one for each class."),
 ]
 
 
