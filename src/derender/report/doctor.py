@@ -66,21 +66,13 @@ def doctor_blocks(examination: Examination) -> list[Html]:
 
 def measure_table(examination: Examination) -> ScoreTable:
     """Every measured number with its range and its limits."""
-    columns = (
-        Column("value", None, 3),
-        Column("±", None, 3, "two standard errors"),
-        Column("will struggle", None, 3, "limit"),
-        Column("does not suit", None, 3, "limit"),
-    )
-    rows = [
-        Row(
-            check.label,
-            (value.value, 2 * value.error or None, check.struggles, check.objects),
-            note=check.note,
-        )
-        for name, check in CHECKS.items()
-        if (value := examination.values.get(name)) is not None
-    ]
+    notes = {"value": "", "±": "two standard errors", "will struggle": "limit", "does not suit": "limit"}
+    columns = [Column(name, None, 3, note) for name, note in notes.items()]
+    rows = []
+    for name, check in CHECKS.items():
+        if (one := examination.values.get(name)) is not None:
+            cells = (one.value, 2 * one.error or None, check.struggles, check.objects)
+            rows.append(Row(check.label, cells, note=check.note))
     compared = 0 if examination.shared is None else len(examination.shared.rows)
     caption = f"{len(examination.pictures):,} images, {compared:,} distinct ones compared"
     return ScoreTable(caption, "measure", columns, rows)

@@ -155,7 +155,7 @@ def doctor(
     pixels = measure_pixels(images.images, progress)
     group = near_copy_groups(pixels.tiny)
     shared = _compare(images, pixels, np.unique(group), np.random.default_rng(seed))
-    values = _counts(images, pixels, group, originals) | ({} if shared is None else shared.values)
+    values = {**_counts(images, pixels, group, originals), **({} if shared is None else shared.values)}
     kept = set(images.files)
     identical = sum(row.file in kept for row in images.duplicates)
     copies, details = len(images) - len(np.unique(group)), {}

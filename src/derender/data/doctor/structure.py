@@ -17,6 +17,7 @@ joined.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Float32, Int64
@@ -223,7 +224,8 @@ def split_in_two(structure: Float32[np.ndarray, "n 6 6 8"], generator: np.random
         fit, judged = order[::2], order[1::2]
         seed = int(generator.integers(2**31))
         space = PCA(min(_COMPONENTS, len(fit)), svd_solver="full").fit(rows[fit])
-        means = KMeans(2, init="random", n_init=_STARTS, random_state=seed).fit(space.transform(rows[fit]))
+        how: dict[str, Any] = {"init": "random", "n_init": _STARTS, "random_state": seed}
+        means = KMeans(2, **how).fit(space.transform(rows[fit]))
         first, second = means.cluster_centers_
         reduced = space.transform(rows)
         place = reduced @ (second - first) - (second @ second - first @ first) / 2
