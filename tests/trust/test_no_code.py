@@ -43,7 +43,7 @@ NEVER = {
     *("shutil.unpack_archive", "torch.hub.load", "torch.jit.load"),
 }
 NEVER_METHODS = {"extract", "extractall", "read_pickle", "full_load", "unsafe_load"}
-BETWEEN_OWN_PROCESSES = {"features/ray_engine.py": {"pickle.loads", "pickle.dumps"}}
+BETWEEN_OWN_PROCESSES = {"features/blocks.py": {"pickle.loads", "pickle.dumps"}}
 """What our actors hand back through Ray, which sends pickles between its processes anyhow; never a file."""
 
 NEEDED = {"torch.load": ("weights_only", True), "np.load": ("allow_pickle", False)}
