@@ -14,8 +14,6 @@ from derender.cli.plan.command import Planned, by_plan
 if TYPE_CHECKING:
     from derender.evaluation import Scores
 
-PAPER_VARIANTS = ("joint", "geometry", "albedo", "joint-frozen", "random")
-
 Table = Annotated[
     str | None, typer.Option("--table", help="Clustering, identity, emotion, linear, segmentation or cars.")
 ]
@@ -96,56 +94,22 @@ def compare(
 def paper_table(paper: PaperTable, images: options.ImageSet, computed: scoring.Computed) -> "Scores":
     """The table that was requested."""
     from derender import evaluation
-    from derender.evaluation.paper_tables import table_named
+    from derender.evaluation.paper_tables import TABLES
     from derender.features import FeatureTable
 
-    table_named(str(paper.table))
-    if paper.table == "segmentation":
-        return segmentation_table(paper, images, computed)
-    if paper.masks is not None:
+    if paper.table == "segmentation" and paper.features:
+        raise ValueError("table 'segmentation' trains a model's encoders, features do not do: give --model")
+    if paper.table != "segmentation" and paper.masks is not None:
         raise ValueError(f"--masks goes with --table segmentation, not with {paper.table}")
     tables = scoring.named_paths(paper.features or (), "--features")
     models = scoring.named_paths(paper.model or (), "--model")
-    if not tables and not models:
+    if not tables and not models and paper.table in TABLES:
         raise ValueError("give --features NAME=FILE.parquet, or --model NAME=MODEL with IMAGES")
     sources = {name: [FeatureTable.read(path) for path in paths] for name, paths in tables.items()}
     with progress_bar("scoring") as progress:
         return evaluation.compare(
             str(paper.table), {**sources, **models}, images.optional_address, **images.how, **vars(computed),
-            factors=scoring.names_of(paper.factors), method=paper.method,
-            counts=scoring.numbers_of(paper.counts, "--counts"), seeds=paper.seeds,
+            factors=scoring.names_of(paper.factors), masks=paper.masks, epochs=paper.epochs,
+            method=paper.method,            counts=scoring.numbers_of(paper.counts, "--counts"), seeds=paper.seeds,
             finetune=paper.finetune, untrained_seeds=paper.untrained_seeds, progress=progress,
         )  # fmt: skip
-
-
-def segmentation_table(paper: PaperTable, images: options.ImageSet, computed: scoring.Computed) -> "Scores":
-    """The table of segmentation, once for each model."""
-    from derender.evaluation.memory import memory_in
-    from derender.evaluation.paper_tables import SEGMENTATION
-    from derender.evaluation.score_table import Scores
-    from derender.evaluation.segmentation import SegmentSettings, segment
-    from derender.inputs import as_model
-
-    if paper.features or not paper.model or images.optional_address is None:
-        raise ValueError(
-            "table 'segmentation' trains nets from a model's encoders, and features do not do: give --model "
-            "NAME=MODEL with IMAGES that have masks"
-        )
-    seeds, memory = range(computed.seed, computed.seed + paper.seeds), memory_in(computed.cache)
-    tables, values = [], {}
-    for name, paths in scoring.named_paths(paper.model, "--model").items():
-        if len(paths) > 1:
-            raise ValueError(f"two models have the name {name!r}: give each its own")
-        with progress_bar(f"training {name}") as progress:
-            run = segment(
-                as_model(paths[0], device=computed.device), images.address, **images.how, masks=paper.masks,
-                variants=PAPER_VARIANTS, seeds=seeds, settings=SegmentSettings(epochs=paper.epochs),
-                resample_count=computed.resamples, memory=memory, progress=progress,
-            )  # fmt: skip
-        tables += [
-            replace(table, caption=f"{name}: {table.caption}") for table in (run.tables[-1], *run.tables[:-1])
-        ]
-        own = {"differs": run.result.differs, "paper": SEGMENTATION.paper}
-        values[name] = {**run.result.numbers(), **own}
-    numbers = {"table": "segmentation", "number": 3, "parts": values}
-    return Scores(tables, numbers, [memory.summary()])

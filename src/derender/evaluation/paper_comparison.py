@@ -47,7 +47,10 @@ from derender.evaluation.score_table import (
     scored_table,
     verdict_table,
 )
+from derender.evaluation.segmentation import SegmentSettings, segment
 from derender.inputs import as_model
+
+PAPER_VARIANTS = ("joint", "geometry", "albedo", "joint-frozen", "random")
 
 
 def compare(
@@ -60,6 +63,8 @@ def compare(
     counts: Sequence[int] = (100, 500, 1_000),
     seeds: int = 5,
     finetune: bool = False,
+    masks: str | Path | None = None,
+    epochs: int = 20,
     untrained_seeds: int = 3,
     resamples: int = RESAMPLES,
     seed: int = 0,
@@ -72,14 +77,15 @@ def compare(
     """One of the paper's tables for several features and models, beside the paper's numbers and controls.
 
     Args:
-        table: "clustering", "identity", "emotion", "linear" or "cars".
+        table: "clustering", "identity", "emotion", "linear", "cars", or "segmentation" (of models alone).
         features: by row name, feature tables and models, or several runs (seeds) of the same.
         images: a data set or its address: of the models, and of the controls.
         factors: features to use, side by side; None means all.
         method: of clustering tables: "ward", "finch" or "k-means".
         counts: of the linear table: numbers of labelled rows to learn from.
-        seeds: random training subsets.
+        seeds: random training subsets; of segmentation runs of each net.
         finetune: of the linear table: also train the encoders of the models with the head.
+        masks, epochs: of segmentation: a folder of masks that are not with the images; of training.
         untrained_seeds: untrained encoders to average over.
         resamples: bootstrap resamples of the rows.
         seed: the first seed.
@@ -92,7 +98,21 @@ def compare(
         ValueError: an unknown table, or labels, factors or images that do not fit.
     """
     spec, memory = table_named(table), memory_in(cache)
-    models = model_sources(features)
+    models, runs = model_sources(features), range(seed, seed + seeds)
+    if spec.kind == "segment":
+        if images is None or isinstance(images, PictureSet) or not models or len(models) < len(features):
+            raise ValueError(
+                f"table {table!r} trains nets from a model's encoders, and features do not do: give models "
+                "and the address of images that have masks"
+            )
+        read_as = {"masks": masks, "dataset": dataset, "limit": limit}
+        how_trained = {"settings": SegmentSettings(epochs=epochs), "resample_count": resamples}
+        return segmentation_table(
+            spec, models, device, data=images, seeds=runs, memory=memory, progress=progress, **read_as,
+            **how_trained,
+        )  # fmt: skip
+    if masks is not None:
+        raise ValueError(f"masks go with the table of segmentation, not with {table}")
     if models and images is None:
         raise ValueError(f"model {next(iter(models))!r} needs images to embed: give images")
     if finetune and (spec.kind != "linear" or not models):
@@ -104,7 +124,7 @@ def compare(
         progress=progress,
     )  # fmt: skip
     how = How(
-        method, tuple(counts), range(seed, seed + seeds), resamples, seed, memory, progress,
+        method, tuple(counts), runs, resamples, seed, memory, progress,
         Finetuning(models, read, factors, device) if finetune and read is not None else None,
     )  # fmt: skip
     parts = [part for part in spec.parts if part.columns(rows[0].tables[0])]
@@ -202,11 +222,29 @@ def linear_part(spec: TableSpec, part: Part, rows: Sequence[FeatureRow], how: Ho
     return tables, {**found.numbers(), "differs": differs, "paper": part.paper}, notes
 
 
+def segmentation_table(
+    spec: TableSpec, models: Mapping[str, Sequence[ModelSource]], device: str, memory: Memory, **how: Any
+) -> Scores:
+    """The table of segmentation, once for each model; further arguments as of ``segment``."""
+    tables: list[ScoreTable] = []
+    values = {}
+    for name, (model, *others) in models.items():
+        if others:
+            raise ValueError(f"two models have the name {name!r}: give each its own")
+        found = segment(as_model(model, device=device), variants=PAPER_VARIANTS, memory=memory, **how)
+        shown = (found.tables[-1], *found.tables[:-1])
+        tables += [replace(table, caption=f"{name}: {table.caption}") for table in shown]
+        paper = {"differs": found.result.differs, "paper": spec.parts[0].paper}
+        values[name] = {**found.result.numbers(), **paper}
+    numbers = {"table": spec.name, "number": spec.number, "parts": values}
+    return Scores(tables, numbers, [memory.summary()])
+
+
 RUNNERS: dict[str, Callable[[TableSpec, Part, Sequence[FeatureRow], How], PartOutcome]] = {
     "cluster": cluster_part,
     "linear": linear_part,
 }
-"""By kind of table."""
+"""By kind of table; segmentation takes models instead of features."""
 
 
 def beside_the_paper(
