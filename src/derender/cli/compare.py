@@ -110,6 +110,6 @@ def paper_table(paper: PaperTable, images: options.ImageSet, computed: scoring.C
         return evaluation.compare(
             str(paper.table), {**sources, **models}, images.optional_address, **images.how, **vars(computed),
             factors=scoring.names_of(paper.factors), masks=paper.masks, epochs=paper.epochs,
-            method=paper.method,            counts=scoring.numbers_of(paper.counts, "--counts"), seeds=paper.seeds,
+            method=paper.method, counts=scoring.numbers_of(paper.counts, "--counts"), seeds=paper.seeds,
             finetune=paper.finetune, untrained_seeds=paper.untrained_seeds, progress=progress,
         )  # fmt: skip
