@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from derender.baselines.controls import control_features
     from derender.baselines.model import load_baseline
-    from derender.baselines.registry import BASELINES, open_baseline, train_baseline
+    from derender.baselines.registry import BASELINES, embed_baseline, open_baseline, train_baseline
     from derender.baselines.training import baseline_config, image_size_of, read_any_config, stored_config
 
 _HOME = {
-    **dict.fromkeys(("BASELINES", "open_baseline", "train_baseline"), "registry"),
+    **dict.fromkeys(("BASELINES", "embed_baseline", "open_baseline", "train_baseline"), "registry"),
     **dict.fromkeys(("baseline_config", "image_size_of", "read_any_config", "stored_config"), "training"),
     "control_features": "controls",
     "load_baseline": "model",
@@ -23,6 +23,7 @@ __all__ = [
     "BASELINES",
     "baseline_config",
     "control_features",
+    "embed_baseline",
     "image_size_of",
     "load_baseline",
     "open_baseline",

@@ -4,12 +4,14 @@ The class of a row holds the rest: its features, its losses and the settings of 
 """
 
 import importlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from derender.baselines.model import BaselineModel
+    from derender.features import Embedded
     from derender.settings import Settings
 
 
@@ -113,6 +115,51 @@ def open_baseline(
     if features is not None:
         net.choose(tuple(features))
     return net.to(device_named(device))
+
+
+def embed_baseline(
+    name: str,
+    images: Any,
+    out: str | Path,
+    source: str | None = None,
+    *,
+    features: Sequence[str] | None = None,
+    image_size: int = 64,
+    components: int = 64,
+    seed: int = 0,
+    device: str = "auto",
+    progress: Callable[[int, int], object] | None = None,
+    reading: Mapping[str, Any] | None = None,
+    **how: Any,
+) -> "Embedded":
+    """Write the feature table of a baseline or a control.
+
+    Args:
+        name: of the baseline.
+        images: an address, or an image set.
+        out: the parquet file.
+        source, features, image_size, seed, device: see ``open_baseline``.
+        components: numbers in pca and noise.
+        reading: how an address is read: ``dataset``, ``part`` and ``limit``.
+        how: further keywords of `derender.embed_to_file`, for baselines with a network.
+        progress: called with (images done, images in all).
+    """
+    from derender.baselines.controls import control_features
+    from derender.features import Embedded, embed_to_file
+
+    if row_of(name).opener:
+        net = open_baseline(name, source, device=device, features=features, image_size=image_size, seed=seed)
+        origin = {"source": source, "baseline": name}
+        return embed_to_file(images, net, out, **(reading or {}), origin=origin, progress=progress, **how)
+    table = control_features(
+        name, images, **(reading or {}), model=source, image_size=image_size, components=components,
+        seed=seed, progress=progress,
+    )  # fmt: skip
+    table.write(out)
+    widths = {factor: values.shape[1] for factor, values in table.factors.items()}
+    facts = table.origin["data"], table.origin["layout"]
+    origin = dict(table.origin)
+    return Embedded(Path(out), len(table), widths, tuple(table.labels), origin, 0, (), 0, 0, *facts)
 
 
 def _resolve(place: str) -> Any:

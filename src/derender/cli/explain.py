@@ -22,12 +22,9 @@ Out = Annotated[
 ]
 Seeds = Annotated[int, typer.Option(min=1, help="Number of probes to average over.", metavar="N")]
 Count = Annotated[
-    int | None,
-    typer.Option(min=2, help="Number of images to learn from; by default 2 of 5, at most 500.", metavar="N"),
+    int | None, typer.Option(min=2, help="Number of images to learn from; default: 2 of 5.", metavar="N")
 ]
-Groups = Annotated[
-    str | None, typer.Option(help="Label whose rows stay on one side of the split, as identity.")
-]
+Groups = Annotated[str | None, typer.Option(help="Label whose rows stay together, such as identity.")]
 Head = Annotated[str, typer.Option(help="logistic, or linear: the paper's head.")]
 Target = Annotated[str, typer.Option("--output", help="Attributed output: logit or probability.")]
 Start = Annotated[str, typer.Option(help="Start of the path: zero (the paper's) or mean.")]

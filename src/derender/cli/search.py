@@ -10,24 +10,16 @@ from derender.cli.console import notice, progress_bar, show_scores, visible
 from derender.cli.gathered import gathered
 
 LABELS_SHOWN = 4
-Table = Annotated[
-    str, typer.Option("--features", "-f", help="A table made by derender embed.", metavar="FILE.parquet")
-]
-Like = Annotated[
-    str, typer.Option("--like", help="An image, or the file name of a row of the table.", metavar="IMAGE")
-]
-Factor = Annotated[str, typer.Option("--factor", help="Factor that has to be alike.", metavar="NAME")]
+Table = Annotated[str, typer.Option("--features", "-f", help="A table of derender embed.", metavar="FILE")]
+Like = Annotated[str, typer.Option(help="An image, or the file name of a row of the table.", metavar="IMAGE")]
+Factor = Annotated[str, typer.Option(help="Factor that has to be alike.", metavar="NAME")]
 Count = Annotated[int, typer.Option("-k", min=1, metavar="N", help="Number of rows to find.")]
-Metric = Annotated[str, typer.Option("--metric", help="Distance: cosine or euclidean.", metavar="NAME")]
+Metric = Annotated[str, typer.Option(help="Distance: cosine or euclidean.", metavar="NAME")]
 Copies = Annotated[bool, typer.Option("--copies", help="Find the image itself too, and copies of it.")]
-Maker = Annotated[
-    str | None,
-    typer.Option("--model", "-m", help="The model that made the table: for an image.", metavar="MODEL"),
-]
+Maker = Annotated[str | None, typer.Option("--model", "-m", help="Model of the table.", metavar="MODEL")]
 Sheet = Annotated[Path | None, typer.Option("--out", "-o", help="Also draw the result.", metavar="FILE.png")]
 Images = Annotated[
-    str | None,
-    typer.Option("--data", "-d", help="Address of the table's images, if it has changed.", metavar="IMAGES"),
+    str | None, typer.Option("--data", "-d", help="New address of the table's images.", metavar="IMAGES")
 ]
 
 
