@@ -90,9 +90,9 @@ def test_bad_words(model, rendered, tmp_path, capsys):
     assert "--angles 'wide' should read like" in refused("--angles", "wide")
     assert "no label 'hairs'; did you mean 'hair'" in refused("--label", "hairs", "--people", 2)
     assert "'facess' is unknown; did you mean 'faces'" in refused("--pictures", "facess")
-    assert "take no --data" in refused("--pictures", "cars", "-d", rendered)
-    assert "need --data" in refused("--pictures", "truth")
-    assert "are asked one --label" in refused("--attributes")
+    assert "take no images" in refused("--pictures", "cars", "-d", rendered)
+    assert "need images" in refused("--pictures", "truth")
+    assert "are asked one label" in refused("--attributes")
     assert "unknown label 'smile'" in refused("-d", rendered, "-l", "smile")
     assert "must end in .svg, .png, .html" in refused("--out", tmp_path / "curves.pdf")
     taken = tmp_path / "taken.svg"

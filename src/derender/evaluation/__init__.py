@@ -1,8 +1,8 @@
 """Stage 7: protocols that score features and models, each beside its controls.
 
 A protocol is one call that gives ``Scores``: ``cluster``, ``linear``, ``segment``, ``disentangle``,
-``geometry``, ``reconstruction``, and ``compare`` (the paper's tables). Every function states its range and
-its best value. docs/evaluation.md has a table of them; joint training is in ``evaluation.finetuning``.
+``geometry``, ``reconstruction``, ``robustness``, and ``compare`` (the paper's tables). Every function states
+its range and its best value. docs/evaluation.md has a table of them.
 """
 
 from derender.evaluation.bootstrap import Difference, Estimate, ScoredRow, difference, estimate, resamples
@@ -44,6 +44,7 @@ from derender.evaluation.pixels import (
     mean_picture,
     reconstruction_scores,
 )
+from derender.evaluation.robust.protocol import robustness
 from derender.evaluation.scenes import geometry, reconstruction
 from derender.evaluation.score_table import Column, Row, Scores, ScoreTable
 from derender.evaluation.segmentation import segment
@@ -102,6 +103,7 @@ __all__ = [
     "reconstruction",
     "reconstruction_scores",
     "resamples",
+    "robustness",
     "segment",
     "task_of",
     "ward_tree",

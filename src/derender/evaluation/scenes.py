@@ -18,7 +18,6 @@ from derender.evaluation.depth import GEOMETRY, GeometryResult, evaluate_geometr
 from derender.evaluation.factors import FACTORS, FactorResult, evaluate_factors
 from derender.evaluation.image_scores import image_verdicts
 from derender.evaluation.memory import Memory
-from derender.evaluation.memory_values import recall_value
 from derender.evaluation.pixels import (
     RECONSTRUCTION,
     ReconstructionResult,
@@ -67,8 +66,8 @@ def geometry(
     known = {name: getattr(exact, name) for name in names if getattr(exact, name) is not None}
     inputs = {**_facts(model), **known, "seed": seed, "fitted": fit_steps or 0}
     scored, twin, kept = _optimised(model, fit_steps), untrained_twin(model, seed), memory or Memory()
-    found = recall_value(
-        kept, "geometry", inputs, GeometryResult,
+    found = kept.recall_value(
+        "geometry", inputs, GeometryResult,
         lambda: evaluate_geometry(scored, exact, batch_size=batch_size, untrained=twin, progress=progress),
     )  # fmt: skip
     rows = {"geometry": found.rows(resample_count)}
@@ -76,8 +75,8 @@ def geometry(
     values: dict[str, Any] = {"pictures": len(exact), "geometry": found}
     if {"albedo", "light", "camera"} <= set(known):
         factors, fresh = (
-            recall_value(
-                kept, f"factors-{name}", inputs, FactorResult,
+            kept.recall_value(
+                f"factors-{name}", inputs, FactorResult,
                 lambda one=one: evaluate_factors(one, exact, batch_size=batch_size),
             )
             for name, one in (("model", scored), ("untrained", twin))
@@ -86,8 +85,8 @@ def geometry(
         tables.append(factors.table(fresh, rows["factors"]))
         notes += image_verdicts(rows["factors"][0], FACTORS)
         values |= {"factors": factors, "factors_untrained": fresh}
-    again = recall_value(
-        kept, "reconstruction", inputs, ReconstructionResult,
+    again = kept.recall_value(
+        "reconstruction", inputs, ReconstructionResult,
         lambda: evaluate_reconstruction(
             scored, exact.images, components_of=exact.images, untrained=twin, batch_size=batch_size
         ),
@@ -128,8 +127,8 @@ def reconstruction(
         **_facts(model), "images": pictures.images, "fitted": known, "seed": seed, "fit_steps": fit_steps or 0
     }  # fmt: skip
     scored = _optimised(model, fit_steps)
-    found = recall_value(
-        memory or Memory(), "reconstruction", inputs, ReconstructionResult,
+    found = (memory or Memory()).recall_value(
+        "reconstruction", inputs, ReconstructionResult,
         lambda: evaluate_reconstruction(
             scored, pictures.images, mean=mean_picture(known), components_of=chosen,
             untrained=untrained_twin(model, seed), batch_size=batch_size, progress=progress,

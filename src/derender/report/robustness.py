@@ -4,13 +4,15 @@ The chart has a panel for each axis; controls are grey and dashed, and shaded is
 interval of the first features covers. Leaves out computing anything (``derender.evaluation.robust``).
 """
 
+from pathlib import Path
+
 from matplotlib.axes import Axes
 
 from derender.evaluation.robust import CurveResult, RobustnessComparison
 from derender.evaluation.robust.compare import AREA, SCORES, level_name
 from derender.report import blocks
 from derender.report.charts import SERIES, side_by_side
-from derender.report.page import Page, Section
+from derender.report.page import Page, Section, write_whole
 
 CONTROL_LINES = ((0, (5, 2)), (0, (1, 1)), (0, (3, 1, 1, 1)), (0, (6, 1, 1, 1, 1, 1)))
 
@@ -75,3 +77,12 @@ def robustness_page(found: RobustnessComparison, model: str, score: str = "accur
         sections,
         f"Model: {model}. Definitions: docs/evaluation.md.",
     )
+
+
+def write_curves(found: RobustnessComparison, score: str, model: str, file: Path) -> None:
+    """Write the chart (.svg, .png) or the page (.html)."""
+    if file.suffix.lower() == ".html":
+        robustness_page(found, model, score).write(file)
+        return
+    svg, png = robustness_chart(found, score)
+    write_whole(file, png if file.suffix.lower() == ".png" else svg.encode())

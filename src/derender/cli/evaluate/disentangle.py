@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from derender.cli import feature_rows, options, scoring
+from derender.cli import options, scoring
 from derender.cli.console import progress_bar, refuse_existing_file, result
 from derender.cli.gathered import gathered
 
@@ -48,7 +48,7 @@ def disentangle(
     dimensions: Dimensions = "lasso",
     batch_size: options.BatchSize = 64,
     seed: options.Seed = 0,
-    cache: feature_rows.Cache = None,
+    cache: scoring.Cache = None,
 ) -> None:
     """Does each feature hold its own factor? Correlation, CKA, swap test; on rendered data DCI, MIG, SAP."""
     if dimensions not in ("lasso", "trees", "none"):
@@ -59,8 +59,9 @@ def disentangle(
         refuse_existing_file(out, published.force)
     published.check()
     from derender import evaluation
+    from derender.evaluation.memory import memory_in
 
-    model, memory = trained.open(), feature_rows.memory_in(cache)
+    model, memory = trained.open(), memory_in(cache)
     pictures = images.read(model.image_size, model=trained.model)
     with progress_bar("scoring", "steps") as report:
         scores = evaluation.disentangle(

@@ -2,7 +2,7 @@
 
 import typer
 
-from derender.cli import feature_rows, options, scoring
+from derender.cli import options, scoring
 from derender.cli.console import progress_bar
 from derender.cli.gathered import gathered
 
@@ -21,9 +21,9 @@ def geometry(
     published: scoring.Published,
     batch_size: options.BatchSize = 64,
     fit_steps: options.FitSteps = None,
-    resamples: feature_rows.Resamples = 1_000,
+    resamples: scoring.Resamples = 1_000,
     seed: options.Seed = 0,
-    cache: feature_rows.Cache = None,
+    cache: scoring.Cache = None,
 ) -> None:
     """Is the geometry the true one? SIDE and MAD on rendered images with exact depth, beside controls.
 
@@ -32,8 +32,9 @@ def geometry(
     published.check()
     from derender import evaluation
     from derender.data import read_ground_truth
+    from derender.evaluation.memory import memory_in
 
-    model, memory = trained.open(), feature_rows.memory_in(cache)
+    model, memory = trained.open(), memory_in(cache)
     truth = read_ground_truth(images.address, limit=images.limit, image_size=model.image_size)
     with progress_bar("decomposing") as report:
         scores = evaluation.geometry(

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from derender.cli import feature_rows, options, scoring
+from derender.cli import options, scoring
 from derender.cli.console import notice, progress_bar
 from derender.cli.gathered import gathered
 
@@ -33,9 +33,9 @@ def reconstruction(
     batch_size: options.BatchSize = 64,
     fit_steps: options.FitSteps = None,
     store: Store = False,
-    resamples: feature_rows.Resamples = 1_000,
+    resamples: scoring.Resamples = 1_000,
     seed: options.Seed = 0,
-    cache: feature_rows.Cache = None,
+    cache: scoring.Cache = None,
 ) -> None:
     """How well are images reconstructed? L1, PSNR and SSIM inside the mask, beside controls.
 
@@ -43,11 +43,12 @@ def reconstruction(
     """
     published.check()
     from derender import evaluation
+    from derender.evaluation.memory import memory_in
     from derender.inputs import part_of
     from derender.storage.folder import model_folder
     from derender.training.held_out_errors import errors_of, write_errors
 
-    model, memory = trained.open(), feature_rows.memory_in(cache)
+    model, memory = trained.open(), memory_in(cache)
     known = replace(images, part="all").read(model.image_size)
     chosen = part_of(known, images.part, trained.model)
     learned = known if images.part == "all" else part_of(known, "train", trained.model)

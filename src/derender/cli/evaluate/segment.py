@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from derender.cli import feature_rows, options, scoring
+from derender.cli import options, scoring
 from derender.cli.console import progress_bar, result
 from derender.cli.gathered import gathered
 
@@ -60,7 +60,7 @@ def segment(
     batch_size: BatchSize = None,
     test_fraction: TestFraction = 0.2,
     labelled: Labelled = None,
-    resamples: feature_rows.Resamples = 1_000,
+    resamples: scoring.Resamples = 1_000,
     seed: options.Seed = 0,
     out: Out = None,
 ) -> None:
@@ -72,9 +72,10 @@ def segment(
     """
     published.check()
     from derender import evaluation
+    from derender.evaluation.memory import memory_in
     from derender.evaluation.segmentation import SegmentSettings
 
-    memory = feature_rows.memory_in(None if out is None else str(out / "runs"))
+    memory = memory_in(None if out is None else str(out / "runs"))
     names = None if variants is None else [name.strip() for name in variants.split(",") if name.strip()]
     with progress_bar("training") as report:
         scores = evaluation.segment(

@@ -33,7 +33,6 @@ from derender.evaluation.disentanglement.similarity import (
 )
 from derender.evaluation.disentanglement.swap import SwapScores, swap_test
 from derender.evaluation.memory import Memory
-from derender.evaluation.memory_values import recall_value
 from derender.evaluation.score_table import Column, Interval, Row, Scores, ScoreTable, interval_column
 from derender.features import embed_images, model_fingerprint
 from derender.features.table import check_finite
@@ -349,8 +348,8 @@ def _card(
     for seed in seeds:
         for name, make in made.items():
             keys = {"row": name, "seed": seed, "dimensions": dimensions, "swap_pictures": swap_images}
-            one = recall_value(
-                kept, "card", {**inputs, **keys}, FeatureScores, lambda make=make, seed=seed: make(seed)
+            one = kept.recall_value(
+                "card", {**inputs, **keys}, FeatureScores, lambda make=make, seed=seed: make(seed)
             )
             rows[name].append(one)
             if progress is not None:
