@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from derender.cli import main
-from derender.report.viewer.examples import rendered_examples
+from derender.report.viewer.neighbours import rendered_examples
 from derender.scene.crop_search import Crop
 
 KNOWN = "rendered-faces-64"

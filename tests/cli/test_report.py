@@ -41,21 +41,21 @@ def test_page_with_data_tells_of_its_held_out_part(run, photos, tmp_path):
     words = ["--data", str(photos), "--out", str(out), "--json", str(told)]
     assert main(["report", str(run), *words]) == 0
     html = out.read_text()
-    assert "The 10 pictures of the run" in html and "test part" in html
+    assert "The 10 images of the run" in html and "test part" in html
     assert "<b>.png" not in html and "&lt;b&gt;.png" in html
-    assert "64 of 96 planned pictures were seen" in html
+    assert "64 of 96 planned images were seen" in html
     assert not re.search(r'(?:src|href)="(?!data:|#)', html)
     failed = json.loads(told.read_text())["failed"]
     assert [reason.partition(":")[0] for reason in failed] == [
         "Does each feature hold its own factor?",  # of 10 pictures
-        "Which factor answers",
+        "Labels explained by factors",
     ]
-    assert all(name in html for name in ("Films", "Scores beside controls", "Taken apart"))
+    assert all(name in html for name in ("Films", "Scores beside controls", "Decomposed"))
 
 
 def test_page_without_data_or_model_says_what_is_missing(run, photos, tmp_path, capsys):
     assert main(["report", str(run)]) == 0
-    assert "add --data" in capsys.readouterr().err
+    assert "add images" in capsys.readouterr().err
     assert (run / "report.html").read_text().count("<section") == 3
     for file in (run / "model").iterdir():
         file.unlink()
@@ -73,7 +73,7 @@ def test_bad_questions(run, photos, tmp_path, capsys):
         return capsys.readouterr().err.strip().splitlines()[-1]
 
     assert "no run in" in refused(tmp_path)
-    assert "--truth and --label need --data" in refused(run, "--label", "age")
+    assert "--truth and --label need images" in refused(run, "--label", "age")
     assert "has no label 'age'" in refused(run, "--data", photos, "--label", "age")
     taken = tmp_path / "taken.html"
     taken.write_text("mine")

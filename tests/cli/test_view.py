@@ -101,7 +101,7 @@ def test_a_port_in_use_is_one_error(model, refused):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         line = refused("view", "-m", model, "--port", port)
-    assert f"port {port} of 127.0.0.1 is in use: choose another --port" in line
+    assert f"port {port} of 127.0.0.1 is in use: choose another port" in line
 
 
 def test_what_is_refused(model, photos, refused, tmp_path):
@@ -134,7 +134,7 @@ def test_it_answers_until_ctrl_c(model, photos, tmp_path):
         try:
             url = _url(process, told)
             with urllib.request.urlopen(url, timeout=60) as page:
-                assert b"A picture taken apart" in page.read()
+                assert b"An image, decomposed" in page.read()
             foreign = urllib.request.Request(url, headers={"Host": "rebound.example"})
             with pytest.raises(urllib.error.HTTPError, match="421") as answer:
                 urllib.request.urlopen(foreign, timeout=60)

@@ -5,7 +5,7 @@ import pytest
 
 from derender import Derenderer
 from derender.data import PictureSet
-from derender.report.evidence import AtHand, gather, label_to_ask
+from derender.report.evidence import Subject, gather, suitable_label
 
 COUNT = 48
 
@@ -32,9 +32,9 @@ def pictures() -> PictureSet:
 def test_everything_that_can_be_told_is_told_and_escaped(model, pictures):
     pytest.importorskip("captum")
     done = []
-    found = gather(AtHand(model, pictures, pictures, "All of them"), lambda *step: done.append(step))
+    found = gather(Subject(model, pictures, pictures, "All of them"), lambda *step: done.append(step))
     assert [section.short for section in found.sections] == [
-        *("Data", "Taken apart", "Films", "Scores", "Card", "Explained")
+        *("Data", "Decomposed", "Films", "Scores", "Card", "Explained")
     ]
     assert found.failed == [] and done == [(step, 6) for step in range(7)]
     html = "".join(block for section in found.sections for block in section.blocks)
@@ -46,16 +46,16 @@ def test_everything_that_can_be_told_is_told_and_escaped(model, pictures):
 
 def test_parts_that_cannot_be_made_are_named_with_their_reason(model, pictures):
     few = pictures.select(slice(3))
-    found = gather(AtHand(model, few, few.select(slice(0)), "None"))
+    found = gather(Subject(model, few, few.select(slice(0)), "None"))
     assert [section.short for section in found.sections] == ["Data"]
     assert len(found.failed) == 5
     assert "needs 1 pictures or more" in found.failed[0]
     assert "no label of 2 to 12 classes" in found.failed[-1]
 
 
-def test_the_label_to_ask_has_few_classes_with_pictures_enough(pictures):
-    assert label_to_ask(pictures) == ("tone",)
+def test_the_suitable_label_has_few_classes_with_pictures_enough(pictures):
+    assert suitable_label(pictures) == ("tone",)
     names = np.array([f"id{number}" for number in range(COUNT)])
     rare = np.where(np.arange(COUNT) < 5, "rare", "usual")
     alone = PictureSet(pictures.images, pictures.files, {"identity": names, "rare": rare})
-    assert label_to_ask(alone) == ()
+    assert suitable_label(alone) == ()

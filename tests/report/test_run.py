@@ -25,7 +25,7 @@ def test_page_of_a_run_shows_curves_samples_settings_and_what_failed(tmp_path):
     html = run_page(run.path).html()
     assert html.count("<svg") == 2 and "held out" in html
     assert "The watcher stopped this run." in html and "depth is &lt;flat&gt;" in html
-    assert "After 32 pictures." in html and "After 96 pictures." in html
+    assert "After 32 images." in html and "After 96 images." in html
     assert "<dt>seed</dt><dd>7</dd>" in html and "<dt>pictures</dt><dd>12</dd>" in html
 
 
@@ -34,7 +34,7 @@ def test_the_page_says_of_which_weights_the_model_is(tmp_path, keep, told):
     run = start_run(tmp_path / "run", resolve("small", [f"keep={keep}"]), {}, "cpu")
     for images, loss in ((32, 1.0), (64, 0.5), (96, 0.75)):
         append_metrics(run, {"kind": "validation", "images": images, "seconds": 1.0, "loss": loss})
-    said = "<dt>weights of the model</dt><dd>after 64 pictures, the best on held-out ones</dd>"
+    said = "<dt>weights of the model</dt><dd>after 64 images, the best on held-out ones</dd>"
     assert (said in run_page(run.path).html()) == told
 
 
@@ -43,7 +43,7 @@ def test_only_first_last_and_evenly_chosen_samples_are_shown(tmp_path):
     for images in range(1, 21):
         Image.new("RGB", (8, 8)).save(run.samples / f"{images:09d}.png")
     html = run_page(run.path).html()
-    shown = [number for number in range(1, 21) if f"After {number} pictures." in html]
+    shown = [number for number in range(1, 21) if f"After {number} images." in html]
     assert len(shown) == 4 and shown[0] == 1 and shown[-1] == 20
 
 

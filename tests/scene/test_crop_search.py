@@ -6,7 +6,7 @@ import torch
 from torch.nn.functional import interpolate
 
 import derender
-from derender.report.viewer.examples import rendered_examples
+from derender.report.viewer.neighbours import rendered_examples
 from derender.scene.crop_search import (
     WHOLE,
     Crop,

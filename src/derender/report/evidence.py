@@ -1,26 +1,29 @@
-"""What can be told of a trained model once pictures are at hand: sections for the page of its run.
+"""Sections for the page of a run once images are given: data, decompositions, films, scores, card, factors.
 
-The data examined, held-out pictures taken apart, films, scores beside controls, the disentanglement card, and
-which factor answers a label. Every part looks at few pictures, so that a page takes minutes; the commands
-``derender evaluate`` and ``explain`` measure with more. A part that cannot be made is named with its reason.
-Leaves out what a run wrote itself (``run``).
+Every part looks at few images, so that a page takes minutes; ``derender evaluate`` and ``derender explain``
+measure with more. A part that cannot be made is listed with its reason. Leaves out the run's own record
+(``run``).
 """
 
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import UInt8
 
 from derender.baselines.controls import untrained_features
-from derender.data import GroundTruth, PictureSet, as_float
-from derender.data.doctor import doctor
+from derender.baselines.training import read_any_config
+from derender.data import GroundTruth, PictureSet, as_float, read_ground_truth, split_indices
+from derender.data.doctor import EXAMINED_PX, doctor
 from derender.evaluation import evaluate_factors, evaluate_geometry, evaluate_reconstruction, mean_picture
 from derender.evaluation.disentanglement import disentangle
 from derender.evaluation.linear_task import choose_rows
 from derender.features import embed_pictures
+from derender.inputs import as_images, as_model
 from derender.interpretation import explain_labels, question
 from derender.model import Derenderer
 from derender.report import blocks
@@ -33,8 +36,8 @@ from derender.report.matrices import card_matrices, matrix_sheet
 from derender.report.page import Section
 from derender.report.sweeps import relit_and_rotated
 
-EXAMINED, SCORED, CARD, EXPLAINED = 1_500, 200, 200, 400  # pictures each part looks at, at most
-SHOWN, FILMED = 5, 2
+EXAMINED, SCORED, CARD, EXPLAINED = 1_500, 200, 200, 400  # images each part looks at, at most
+SHOWN, FILMED, TRUTH_SHOWN = 5, 2, 100
 FILM_WIDTH = 256
 FEWEST_OF_A_CLASS, MOST_CLASSES = 10, 12
 
@@ -43,88 +46,149 @@ Progress = Callable[[int, int], object]
 
 @dataclass(frozen=True)
 class Evidence:
-    """Sections for a page, and what could not be made.
-
-    Attributes:
-        sections: in reading order.
-        failed: a sentence for each part that is missing, with the reason.
-    """
+    """Sections for a page, and a sentence for each part that is missing, with the reason."""
 
     sections: Sequence[Section]
     failed: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
-class AtHand:
-    """A model and pictures to tell about.
+class Subject:
+    """A model and images to report on.
 
     Attributes:
         model: trained.
-        pictures: all there are, at the model's size.
+        images: all there are, at the model's size.
         held_out: those of them the model was not trained on, or all where they are of another set.
-        which: what ``held_out`` is, in words.
-        truth: rendered pictures with exact maps, if there are any.
-        labels: columns to ask which factor answers them.
+        which: a description of ``held_out``.
+        truth: rendered images with exact maps, if there are any.
+        labels: columns to explain by factors.
     """
 
     model: Derenderer
-    pictures: PictureSet
+    images: PictureSet
     held_out: PictureSet
     which: str
     truth: GroundTruth | None = None
     labels: Sequence[str] = ()
 
 
+def run_evidence(
+    run: str | Path,
+    images: PictureSet | str | Path,
+    *,
+    truth: str | Path | None = None,
+    labels: Sequence[str] = (),
+    dataset: str = "auto",
+    limit: int | None = None,
+    device: str = "auto",
+    progress: Progress | None = None,
+) -> Evidence:
+    """Everything that can be reported of a run's model and images.
+
+    A run without a model (a baseline, a collapse, a run that has just begun) has only its images examined.
+
+    Args:
+        run: a run folder.
+        images: a set of images or its address: those it was trained with, or others.
+        truth: address of rendered images with exact depth, to score geometry.
+        labels: columns to explain by factors; by default the first suitable one.
+        dataset, limit: how the address is read.
+        device: "auto", "cpu" or "cuda".
+        progress: called with (parts done, parts in all).
+    """
+    try:
+        model, missing = as_model(run, device=device), ""
+    except (ValueError, FileNotFoundError) as reason:
+        model, missing = None, f"Everything about the model: {reason}"
+    size = EXAMINED_PX if model is None else model.image_size
+    images = as_images(images, size, dataset=dataset, limit=limit)
+    for name in labels:
+        images.label(name)
+    if model is None:
+        return Evidence([Section("The data", look_at_data(images), "Data")], [missing])
+    held_out, which = _held_out(Path(run), images)
+    known = None
+    if truth is not None:
+        known = read_ground_truth(truth, limit=TRUTH_SHOWN, image_size=model.image_size)
+    return gather(Subject(model, images, held_out, which, known, labels), progress)
+
+
+def _held_out(run: Path, images: PictureSet) -> tuple[PictureSet, str]:
+    """The images that the run did not train on, if these are its own; otherwise all."""
+    config = read_any_config(run)
+    if len(images) != recorded_environment(run).get("pictures"):
+        return images, f"All {len(images):,} images of {images.source}; the run was trained with others"
+    split = split_indices(images.files, config.split, seed=config.seed)
+    for name in ("test", "validation"):
+        rows = getattr(split, name)
+        if len(rows):
+            return images.select(rows), f"The {len(rows):,} images of the run's {name} part"
+    return images, "The images it was trained with, since it held none back"
+
+
+def recorded_environment(run: Path) -> dict[str, Any]:
+    """The versions, device and counts that a run recorded, in one level; empty where it recorded none."""
+    file = run / "environment.json"
+    if not file.is_file():
+        return {}
+    try:
+        values = json.loads(file.read_text())
+    except json.JSONDecodeError:
+        return {file.name: "damaged"}
+    flat: dict[str, Any] = {}
+    for key, value in values.items():
+        flat |= value if isinstance(value, dict) else {key: value}
+    return {key: value for key, value in flat.items() if value is not None}
+
+
 def look_at_data(pictures: PictureSet) -> list[Html]:
-    """The doctor's findings on a sample of the pictures."""
+    """The doctor's findings on a sample of the images."""
     sample = _sample(pictures, EXAMINED)
-    size = f"All {len(sample):,} pictures" if len(sample) == len(pictures) else f"{len(sample):,} pictures"
+    size = f"All {len(sample):,} images" if len(sample) == len(pictures) else f"{len(sample):,} images"
     note = blocks.prose(f"{pictures.describe()}. {size} were examined, identical copies left out before.")
     return [note, *doctor_blocks(doctor(sample))]
 
 
-def gather(hand: AtHand, progress: Progress | None = None) -> Evidence:
-    """Everything that can be told; ``progress`` is called with (parts done, parts in all)."""
+def gather(subject: Subject, progress: Progress | None = None) -> Evidence:
+    """Every section that can be made; ``progress`` is called with (parts done, parts in all)."""
     parts: dict[tuple[str, str], Callable[[], list[Html]]] = {
-        ("The data", "Data"): lambda: look_at_data(hand.pictures),
-        ("Pictures it did not learn from, taken apart", "Taken apart"): lambda: decompositions(hand),
-        ("Light and view moved", "Films"): lambda: moved(hand),
-        ("Scores beside controls", "Scores"): lambda: scores(hand),
-        ("Does each feature hold its own factor?", "Card"): lambda: card(hand),
-        ("Which factor answers", "Explained"): lambda: explained(hand),
+        ("The data", "Data"): lambda: look_at_data(subject.images),
+        ("Held-out images, decomposed", "Decomposed"): lambda: _decomposed(subject),
+        ("Light and view moved", "Films"): lambda: _films(subject),
+        ("Scores beside controls", "Scores"): lambda: _scores(subject),
+        ("Does each feature hold its own factor?", "Card"): lambda: _card(subject),
+        ("Labels explained by factors", "Explained"): lambda: _explained(subject),
     }
     sections, failed = [], []
     for done, ((title, short), make) in enumerate(parts.items()):
         if progress is not None:
             progress(done, len(parts))
         try:
-            made = make()
+            sections.append(Section(title, make(), short))
         except ValueError as reason:
             failed.append(f"{title}: {reason}")
-            continue
-        sections.append(Section(title, made, short))
     if progress is not None:
         progress(len(parts), len(parts))
     return Evidence(sections, failed)
 
 
-def decompositions(hand: AtHand) -> list[Html]:
-    """A few pictures in their factors, rendered again, in other light and from another side."""
-    sample = _sample(hand.held_out.require(1, "a decomposition"), SHOWN)
-    drawn = decompose_images(hand.model, as_float(sample.images).to(hand.model.device))
-    caption = f"{hand.which}, evenly chosen by their order. Every column is made from the picture alone."
+def _decomposed(subject: Subject) -> list[Html]:
+    sample = _sample(subject.held_out.require(1, "a decomposition"), SHOWN)
+    drawn = decompose_images(subject.model, as_float(sample.images).to(subject.model.device))
+    caption = f"{subject.which}, evenly chosen by their order. Every column is made from the image alone."
+    names = [Path(name).name for name in sample.files]
     return [
-        blocks.image_grid(drawn.columns, [Path(name).name for name in sample.files], caption, COLUMN_MEANING),
+        blocks.image_grid(drawn.columns, names, caption, COLUMN_MEANING),
         blocks.definitions(COLUMN_MEANING),
     ]
 
 
-def moved(hand: AtHand) -> list[Html]:
-    """Short films of some of the same images."""
-    sample = _sample(hand.held_out.require(1, "a film"), SHOWN).select(slice(FILMED))
+def _films(subject: Subject) -> list[Html]:
+    sample = _sample(subject.held_out.require(1, "a film"), SHOWN).select(slice(FILMED))
     names = [Path(name).name for name in sample.files]
     caption = "Only light or camera moves. Empty parts are those that the frontal view does not show."
-    return [looping_films(hand.model, sample.images, names, caption)]
+    return [looping_films(subject.model, sample.images, names, caption)]
 
 
 def looping_films(
@@ -142,32 +206,32 @@ def looping_films(
     return blocks.figure(blocks.row_of(items), caption)
 
 
-def scores(hand: AtHand) -> list[Html]:
+def _scores(subject: Subject) -> list[Html]:
     """Reconstruction beside the mean picture and, on rendered data, geometry beside its controls."""
-    sample = _sample(hand.held_out.require(1, "a score"), SCORED)
-    again = evaluate_reconstruction(hand.model, sample.images, mean=mean_picture(hand.pictures.images))
+    sample = _sample(subject.held_out.require(1, "a score"), SCORED)
+    again = evaluate_reconstruction(subject.model, sample.images, mean=mean_picture(subject.images.images))
     tables = [again.table()]
-    if hand.truth is not None:
-        truth = hand.truth
-        tables.insert(0, evaluate_geometry(hand.model, truth).table())
+    if subject.truth is not None:
+        truth = subject.truth
+        tables.insert(0, evaluate_geometry(subject.model, truth).table())
         if truth.albedo is not None and truth.light is not None and truth.camera is not None:
-            tables.insert(1, evaluate_factors(hand.model, truth).table())
-    made = [blocks.prose(f"{hand.which}; few of them, so that this page takes minutes.")]
+            tables.insert(1, evaluate_factors(subject.model, truth).table())
+    made = [blocks.prose(f"{subject.which}; few of them, so that this page takes minutes.")]
     for table in tables:
         made += [blocks.prose(f"{table.columns[0].name}: {table.verdict(0)}."), blocks.table(table)]
-    if hand.truth is None:
+    if subject.truth is None:
         made.append(
             blocks.prose(
-                "These pictures have no exact depth, so whether the geometry is right cannot be scored here."
+                "These images have no exact depth, so whether the geometry is right cannot be scored here."
             )
         )
     return made
 
 
-def card(hand: AtHand) -> list[Html]:
+def _card(subject: Subject) -> list[Html]:
     """The disentanglement card from one seed, without scores by dimension."""
-    sample = _sample(hand.held_out, CARD)
-    found = disentangle(hand.model, sample, seeds=(0,), dimensions=None, swap_images=min(64, len(sample)))
+    sample = _sample(subject.held_out, CARD)
+    found = disentangle(subject.model, sample, seeds=(0,), dimensions=None, swap_images=min(64, len(sample)))
     sheet = blocks.image(
         matrix_sheet(card_matrices(found.result)), "matrices of the features: correlation, CKA, swap test"
     )
@@ -178,26 +242,26 @@ def card(hand: AtHand) -> list[Html]:
     ]
 
 
-def explained(hand: AtHand) -> list[Html]:
-    """Shares of the factors in the answers of a probe, beside controls."""
-    columns = hand.held_out.labels
-    names = tuple(hand.labels) or label_to_ask(hand.held_out)
+def _explained(subject: Subject) -> list[Html]:
+    """Shares of the factors in the predictions of a probe, beside controls."""
+    columns = subject.held_out.labels
+    names = tuple(subject.labels) or suitable_label(subject.held_out)
     if not names:
-        told = ", ".join(columns) or "none"
-        raise ValueError(f"no label of 2 to {MOST_CLASSES} classes to ask for (labels: {told}); add --label")
-    sample = _sample(hand.held_out, EXPLAINED)
+        known = ", ".join(columns) or "none"
+        raise ValueError(f"no label of 2 to {MOST_CLASSES} classes (labels: {known}): name one")
+    sample = _sample(subject.held_out, EXPLAINED)
     task = question(sample.labels, names, source=sample.source)
     count = max(2, int(0.4 * task.known.sum()))
-    table = embed_pictures(hand.model, sample)
+    table = embed_pictures(subject.model, sample)
     split = choose_rows(task, sample.files, (count,), (0,))
-    fresh = untrained_features(hand.model, sample, seed=0).factors
+    fresh = untrained_features(subject.model, sample, seed=0).factors
     found = explain_labels(table.factors, task, split, untrained=[fresh], seeds=(0,))
-    asked = f"Asked of {len(sample):,} pictures, one seed: {', '.join(names)}."
-    return [blocks.prose(asked), *share_blocks(found, share_chart(found)[0])]
+    note = f"Explained on {len(sample):,} images, one seed: {', '.join(names)}."
+    return [blocks.prose(note), *share_blocks(found, share_chart(found)[0])]
 
 
-def label_to_ask(pictures: PictureSet) -> tuple[str, ...]:
-    """The first column of text whose classes are few and each has pictures enough; empty for none."""
+def suitable_label(pictures: PictureSet) -> tuple[str, ...]:
+    """The first column of text with few classes that each have enough images; empty for none."""
     for name, column in pictures.labels.items():
         if column.dtype.kind not in "USO":
             continue
@@ -208,7 +272,7 @@ def label_to_ask(pictures: PictureSet) -> tuple[str, ...]:
 
 
 def _sample(pictures: PictureSet, most: int) -> PictureSet:
-    """At most so many pictures, evenly through the set."""
+    """At most so many images, evenly through the set."""
     if len(pictures) <= most:
         return pictures
     return pictures.select(np.linspace(0, len(pictures) - 1, most).round().astype(int))

@@ -16,10 +16,9 @@ pytest.importorskip("uvicorn", reason="the viewer's packages are not installed: 
 
 from derender import Derenderer
 from derender.report.viewer.app import Application, Viewer
-from derender.report.viewer.examples import Example
+from derender.report.viewer.neighbours import Example
 from derender.report.viewer.server import serving
-from derender.report.viewer.shelf import Shelf
-from derender.report.viewer.studio import Studio
+from derender.report.viewer.studio import Shelf, Studio
 
 SIZE = 32
 

@@ -14,10 +14,9 @@ import trimesh
 from derender import load
 from derender.data.synthetic import faces
 from derender.report.viewer.app import Application, Viewer
-from derender.report.viewer.examples import rendered_examples
+from derender.report.viewer.neighbours import rendered_examples
 from derender.report.viewer.server import BoundedProtocol, serving
-from derender.report.viewer.shelf import Shelf
-from derender.report.viewer.studio import Studio
+from derender.report.viewer.studio import Shelf, Studio
 from derender.scene.crop_search import Crop
 from derender.storage.folder import model_folder
 from derender.training.held_out_errors import read_errors
@@ -36,9 +35,18 @@ def test_about_says_what_there_is(client):
 
 def test_a_picture_is_taken_apart_and_shown(client):
     found = client.opened(0)
-    assert set(found) == {"picture", "light", "camera", "l1", "l1_as_read", "percentile", "side", "odd"}
-    assert 0 < found["l1"] < 1 and found["percentile"] is None and found["odd"] is False
-    assert found["l1_as_read"] is None
+    assert set(found) == {
+        "picture",
+        "light",
+        "camera",
+        "l1",
+        "l1_feed_forward",
+        "percentile",
+        "side",
+        "out_of_distribution",
+    }
+    assert 0 < found["l1"] < 1 and found["percentile"] is None and found["out_of_distribution"] is False
+    assert found["l1_feed_forward"] is None
     own = client.post("/api/view", {"picture": found["picture"]})
     assert (own.status, own.headers["content-type"]) == (200, "image/png")
     assert own.image.shape == (32, 64, 4)
@@ -52,9 +60,9 @@ def test_a_fitted_scene_is_nearer_to_the_picture():
     read, fitted = (
         Studio(model, "faces", held_out=held_out, fit_steps=steps).open(face) for steps in (0, 10)
     )
-    assert fitted["l1_as_read"] == pytest.approx(read["l1"])
+    assert fitted["l1_feed_forward"] == pytest.approx(read["l1"])
     assert fitted["l1"] < 0.9 * read["l1"]
-    assert fitted["percentile"] == read["percentile"] is not None  # of what encoders say
+    assert fitted["percentile"] == read["percentile"] is not None  # of the feed-forward scene
     assert fitted["light"] != read["light"] and fitted["camera"] != read["camera"]
 
 
@@ -209,10 +217,10 @@ def test_a_wider_picture_is_shown_in_the_part_that_the_model_knows():
     wide = np.random.default_rng(0).integers(0, 256, (3, 8, 8), dtype=np.uint8).repeat(16, 1).repeat(16, 2)
     left, top, side = Crop(0.5, 0.0, 0.2).corner(128)
     wide[:, top : top + side, left : left + side] = face
-    framed, whole = Studio(model, "faces", framed=True), Studio(model, "faces")
+    framed, whole = Studio(model, "faces", cropped=True), Studio(model, "faces")
     assert (framed.reading_size, whole.reading_size) == (128, 64)
     found = framed.open(wide)
     assert found["side"] == 0.5
-    np.testing.assert_array_equal(framed.shelf.get(found["picture"]).picture, face)
+    np.testing.assert_array_equal(framed.shelf.get(found["picture"]).pixels, face)
     assert found["l1"] == pytest.approx(whole.open(face)["l1"])
     assert framed.open(face)["side"] == 1.0  # of the model's own size: as it is

@@ -5,7 +5,7 @@ from contextlib import ExitStack
 import numpy as np
 import pytest
 
-from derender.report.viewer.bodies import Body, Uploads
+from derender.report.viewer.app import Body, Uploads
 
 
 def begun(uploads: Uploads, stack: ExitStack, content: bytes, seconds_ago: float) -> Body:

@@ -15,11 +15,9 @@ from derender import load
 from derender.data.synthetic import faces
 from derender.features import FeatureTable, embed_images
 from derender.report.viewer.app import Application, Viewer
-from derender.report.viewer.examples import Example
-from derender.report.viewer.neighbours import Gallery
+from derender.report.viewer.neighbours import Example, Gallery
 from derender.report.viewer.server import serving
-from derender.report.viewer.shelf import Shelf
-from derender.report.viewer.studio import Studio
+from derender.report.viewer.studio import Shelf, Studio
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 CHROMIUM = os.environ.get("DERENDER_CHROMIUM") or shutil.which("chromium") or shutil.which("google-chrome")
@@ -175,7 +173,7 @@ def test_what_is_wrong_is_said_and_the_page_goes_on(page, rendered):
             "#file-second",
             {"name": f"{number}.png", "mimeType": "image/png", "buffer": png(rendered[number])},
         )
-        page.wait_for_selector(f'#second[alt="second picture: {number}.png"]')
+        page.wait_for_selector(f'#second[alt="second image: {number}.png"]')
     set_slider(page, "camera-yaw", 30)  # opens it again
     assert "no longer kept" not in page.inner_text("#status")
 

@@ -5,7 +5,7 @@ import pytest
 
 from derender import load
 from derender.evaluation.out_of_distribution import OUTLIER_PERCENTILE, reconstruction_percentile
-from derender.report.viewer.examples import named_examples, rendered_examples
+from derender.report.viewer.neighbours import named_examples, rendered_examples
 from derender.storage.folder import bundled_models, model_folder
 from derender.training.held_out_errors import read_errors
 

@@ -10,8 +10,7 @@ import pytest
 from PIL import Image
 
 from derender.report.viewer.app import BODY_LIMIT_BYTES
-from derender.report.viewer.intake import PIXEL_LIMIT, pixels_of
-from derender.report.viewer.refused import Refused
+from derender.report.viewer.questions import PIXEL_LIMIT, Refused, pixels_of
 
 
 def png_that_claims(width: int, height: int) -> bytes:

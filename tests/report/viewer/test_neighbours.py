@@ -9,10 +9,9 @@ from derender.features import FeatureTable, embed_pictures
 from derender.features.neighbours import nearest
 from derender.report.viewer.app import Application, Viewer
 from derender.report.viewer.neighbours import Gallery
-from derender.report.viewer.refused import Refused
+from derender.report.viewer.questions import Refused
 from derender.report.viewer.server import serving
-from derender.report.viewer.shelf import Shelf
-from derender.report.viewer.studio import Studio
+from derender.report.viewer.studio import Shelf, Studio
 
 SIZE = 32
 
@@ -77,7 +76,7 @@ def test_a_table_whose_pictures_are_gone_still_serves(table):
 
 def test_another_data_set_is_refused(table, tmp_path):
     Image.new("RGB", (8, 8)).save(tmp_path / "other.png")
-    with pytest.raises(ValueError, match=r"holds none of the table's pictures, such as '0.png'"):
+    with pytest.raises(ValueError, match=r"holds none of the table's images, such as '0.png'"):
         Gallery(table, str(tmp_path))
     with pytest.raises(ValueError, match="is not here"):
         Gallery(table, str(tmp_path / "nowhere"))

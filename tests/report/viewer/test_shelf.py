@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 import torch
 
-from derender.report.viewer.refused import Refused
-from derender.report.viewer.shelf import Shelf, TakenApart
+from derender.report.viewer.questions import Refused
+from derender.report.viewer.studio import Shelf, ShownImage
 from derender.scene import Scene
 
 
 @pytest.fixture
-def taken() -> TakenApart:
+def taken() -> ShownImage:
     scene = Scene(torch.ones(1, 4, 4), torch.zeros(1, 3, 4, 4), torch.zeros(1, 4), torch.zeros(1, 6))
-    return TakenApart(np.zeros((3, 4, 4), np.uint8), scene, {}, 0.0)
+    return ShownImage(np.zeros((3, 4, 4), np.uint8), scene, {})
 
 
 def test_the_longest_unused_goes_first(taken):
@@ -25,7 +25,7 @@ def test_the_longest_unused_goes_first(taken):
     assert len(shelf) == 3
     for name in (first, third, fourth):
         assert shelf.get(name) is taken
-    with pytest.raises(Refused, match="no longer kept") as refused:
+    with pytest.raises(Refused, match="no longer stored") as refused:
         shelf.get(second)
     assert refused.value.status == 410
 

@@ -9,10 +9,9 @@ import pytest
 
 from derender.report.viewer import app
 from derender.report.viewer.app import DRAINED_AT_MOST_BYTES, Application, Viewer
-from derender.report.viewer.intake import BODY_LIMIT_BYTES
+from derender.report.viewer.questions import BODY_LIMIT_BYTES
 from derender.report.viewer.server import BoundedProtocol, serving
-from derender.report.viewer.shelf import Shelf
-from derender.report.viewer.studio import Studio
+from derender.report.viewer.studio import Shelf, Studio
 
 CHUNKED = "Transfer-Encoding: chunked\r\n"
 

@@ -94,8 +94,7 @@ def uploads(hostile: Hostile) -> list[str]:
     from derender.model import load
     from derender.report.viewer.app import Application, Viewer
     from derender.report.viewer.server import serving
-    from derender.report.viewer.shelf import Shelf
-    from derender.report.viewer.studio import Studio
+    from derender.report.viewer.studio import Shelf, Studio
 
     faults = []
     with serving(Application(Viewer(Studio(load(MODEL), "m", Shelf(2))))) as url:

@@ -1,6 +1,6 @@
-"""The addresses of the page and what answers them, within bounds of size, time and number.
+"""The addresses of the page and their answers, within bounds of size, time and number.
 
-Nothing in a request can name a file: the page's own files are read once at the start, pictures are known by
+Nothing in a request can name a file: the page's own files are read once at the start, images are known by
 names that the shelf made up, examples and rows by number. Bodies are read up to a limit, and all uploads
 together keep no more than another; decoding and computing have one thread each, so that a heavy upload does
 not hold up the sliders of others.
@@ -8,15 +8,16 @@ not hold up the sliders of others.
 
 import asyncio
 import json
-from collections.abc import Awaitable, Callable, Sequence
+import time
+from collections.abc import Awaitable, Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from functools import partial
 from importlib.resources import files
+from pathlib import Path
 from typing import Any
 
-import numpy as np
-from jaxtyping import UInt8
 from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect, Request
@@ -24,15 +25,26 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
 from derender import __version__
+from derender.features import FeatureTable
+from derender.inputs import require_fitting
+from derender.model import Derenderer
 from derender.report.colours import pictures
-from derender.report.viewer.bodies import Body, Uploads
-from derender.report.viewer.examples import Example
+from derender.report.opening import held_out_errors, read_file
 from derender.report.viewer.guard import Guard
-from derender.report.viewer.intake import BODY_LIMIT_BYTES, PIXEL_LIMIT, pixels_of, too_large
-from derender.report.viewer.neighbours import Gallery
-from derender.report.viewer.questions import LARGEST_SIZE, NeighbourQuestion, Q, Question, read_question
-from derender.report.viewer.refused import Refused
-from derender.report.viewer.studio import Studio, data_url
+from derender.report.viewer.neighbours import Example, Gallery, named_examples, rendered_examples
+from derender.report.viewer.questions import (
+    BODY_LIMIT_BYTES,
+    LARGEST_SIZE,
+    PIXEL_LIMIT,
+    NeighbourQuestion,
+    Q,
+    Question,
+    Refused,
+    pixels_of,
+    read_question,
+    too_large,
+)
+from derender.report.viewer.studio import KEPT, Shelf, Studio, data_url
 
 BODY_SECONDS = 30.0
 WORK_SECONDS = 30.0
@@ -55,17 +67,122 @@ PAGE_FILES = {
 
 @dataclass
 class Viewer:
-    """What is shown.
-
-    Attributes:
-        studio: the model.
-        examples: pictures to begin with.
-        gallery: rows to find neighbours among, or None.
-    """
+    """A model, images to begin with, and rows to find neighbours among."""
 
     studio: Studio
     examples: Sequence[Example] = ()
     gallery: Gallery | None = None
+
+
+@dataclass(eq=False)
+class Body:
+    """One body as it arrives: its kept content, all bytes received, and since when (a monotonic clock).
+
+    ``whole``: nothing more will come. ``dropped``: it made room for others, and nothing of it is kept.
+    """
+
+    content: bytearray = field(default_factory=bytearray)
+    received: int = 0
+    whole: bool = False
+    dropped: bool = False
+    began_s: float = field(default_factory=time.monotonic)
+
+    def take(self, part: bytes) -> None:
+        self.received += len(part)
+        if not self.dropped:
+            self.content += part
+
+    def drop(self) -> None:
+        self.dropped = True
+        self.content.clear()
+
+    def speed(self, now_s: float) -> float:
+        """Bytes a second since it began."""
+        return self.received / max(now_s - self.began_s, 1e-6)
+
+
+class Uploads:
+    """The uploads that arrive or wait to be decoded: at most ``limit_bytes`` of them all, in memory only.
+
+    No upload waits for another. Beyond the bound the slowest of those that still arrive is dropped, so that
+    one that stalls or trickles does not hold up the others.
+    """
+
+    def __init__(self, limit_bytes: int):
+        self.limit_bytes = limit_bytes
+        self._bodies: set[Body] = set()
+
+    @contextmanager
+    def one(self) -> Iterator[Body]:
+        """A body that counts meanwhile."""
+        body = Body()
+        self._bodies.add(body)
+        try:
+            yield body
+        finally:
+            self._bodies.remove(body)
+
+    @property
+    def kept_bytes(self) -> int:
+        return sum(len(body.content) for body in self._bodies)
+
+    def make_room(self) -> None:
+        """Drop the slowest that still arrive until the others fit; to be called after every part."""
+        while self.kept_bytes > self.limit_bytes:
+            now_s = time.monotonic()
+            arriving = [body for body in self._bodies if body.content and not body.whole]
+            min(arriving, key=lambda body: body.speed(now_s)).drop()
+
+
+def open_viewer(
+    model: Derenderer,
+    source: str,
+    images: Sequence[Path] = (),
+    *,
+    table: FeatureTable | None = None,
+    data: str | None = None,
+    dataset: str = "auto",
+    keep: int = KEPT,
+    fit_steps: int = 0,
+    cropped: bool = False,
+) -> tuple[Viewer, list[str]]:
+    """A model with images to begin with and rows to search, and notes on what is missing.
+
+    Args:
+        model: trained.
+        source: where it was loaded from.
+        images: image files to begin with; without any, rendered ones for the bundled models.
+        table: features made by this model, for nearest neighbours.
+        data: place of the table's images, if not as the table records it.
+        dataset: layout of that place.
+        keep: opened images held in memory.
+        fit_steps: of test-time optimisation of each scene.
+        cropped: search the part of each image that the model reconstructs best.
+    """
+    if fit_steps:
+        require_fitting(model, source)
+    gallery = None
+    if table is not None:
+        if not set(table.factors) & set(model.nets):
+            raise ValueError(
+                f"the table has none of the factors of {source}: make it again with derender embed"
+            )
+        gallery = Gallery(table, data, dataset)
+    studio = Studio(model, Path(source).name, Shelf(keep), held_out_errors(source), table, fit_steps, cropped)
+    read: dict[Path, Any] = {}
+    problems: dict[Path, str] = {}
+    for path in dict.fromkeys(images):
+        try:
+            read[path] = read_file(path, studio.reading_size)
+        except (ValueError, OSError) as problem:
+            problems[path] = " ".join(str(problem).split())
+    if problems and not read:
+        raise ValueError(next(iter(problems.values())))
+    notes = [f"left out {path}: {reason}" for path, reason in problems.items()]
+    if gallery is not None and gallery.without_pictures:
+        notes.append(f"neighbours are shown without images: {gallery.without_pictures}")
+    examples = named_examples(read) if images else rendered_examples(source, model.image_size)
+    return Viewer(studio, examples, gallery), notes
 
 
 Answer = Callable[[Request], Awaitable[Response]]
@@ -75,7 +192,7 @@ class Application:
     """The answers, and the threads that work them out; an ASGI application as ``guarded``.
 
     Args:
-        viewer: what is shown.
+        viewer: the content.
         host: the address that the server listens on.
         body_seconds: within which a body has to arrive.
         work_seconds: within which an answer has to be there, waiting for others included.
@@ -111,7 +228,7 @@ class Application:
         routes = [
             Route(path, partial(self.answered, answer), methods=["POST"]) for path, answer in posts.items()
         ]
-        routes += [Route(path, _constant(*file), methods=["GET"]) for path, file in PAGE_FILES.items()]
+        routes += [Route(path, _page_file(*file), methods=["GET"]) for path, file in PAGE_FILES.items()]
         routes.append(Route("/api/about", partial(self.answered, self.about), methods=["GET"]))
         handlers: dict[Any, Any] = {HTTPException: _plain_error}
         self.guarded = Guard(Starlette(routes=routes, exception_handlers=handlers), host)
@@ -124,7 +241,7 @@ class Application:
             self.viewer.gallery.close()
 
     async def answered(self, answer: Answer, request: Request) -> Response:
-        """The answer, or a sentence that says why not."""
+        """The answer, or the reason of a refusal."""
         try:
             return await answer(request)
         except Refused as refused:
@@ -133,61 +250,50 @@ class Application:
             return Response(status_code=400)
 
     async def about(self, request: Request) -> Response:
-        """What the page has to know to draw itself."""
-        studio, gallery = self.viewer.studio, self.viewer.gallery
-        ranges = studio.model.settings.ranges
-        own = studio.model.image_size
-        sizes = sorted({own, *(size for size in (128, 256, LARGEST_SIZE) if size > own)})
+        """All that the page needs to draw itself."""
         examples = [
             {"name": example.name, "image": data_url(pictures(example.picture[None])[0])}
             for example in self.viewer.examples
         ]
         table = None
-        if gallery is not None:
-            factors = [name for name in gallery.table.factors if name in studio.model.nets]
+        if (gallery := self.viewer.gallery) is not None:
+            factors = [name for name in gallery.table.factors if name in self.viewer.studio.model.nets]
             table = {"rows": len(gallery.table), "factors": factors, "note": gallery.without_pictures}
         return JSONResponse(
             {
                 "derender": __version__,
-                "model": studio.name,
-                "sizes": sizes,
-                "fov_deg": studio.model.fov_deg,
-                "rotation_deg": ranges.rotation_deg,
-                "translation": [ranges.translation_xy, ranges.translation_xy, max(ranges.translation_z, 0.1)],
                 "body_limit_bytes": BODY_LIMIT_BYTES,
                 "pixel_limit": PIXEL_LIMIT,
-                "kept": studio.shelf.limit,
                 "examples": examples,
                 "table": table,
+                **self.viewer.studio.about(LARGEST_SIZE),
             }
         )
 
     async def open_upload(self, request: Request) -> Response:
-        """Take the picture in the body apart."""
+        """Decompose the image in the body."""
         with self._uploads.one() as body:
             await self._receive(request, body, BODY_LIMIT_BYTES)
-            size = self.viewer.studio.reading_size
-            picture = await self._work(self._decoding, _decoded, body, size)
-        return await self._opened(picture)
+            pixels = await self._work(self._decoding, _decoded, body, self.viewer.studio.reading_size)
+        return await self._opened(pixels)
 
     async def open_example(self, request: Request) -> Response:
-        """Take one of the examples apart."""
+        """Decompose one of the examples."""
         number = request.path_params["number"]
         if not 0 <= number < len(self.viewer.examples):
             raise Refused(404, f"there is no example {number}")
         return await self._opened(self.viewer.examples[number].picture)
 
     async def open_row(self, request: Request) -> Response:
-        """Take the picture of one row of the table apart."""
+        """Decompose the image of one row of the table."""
         gallery = self.viewer.gallery
         if gallery is None:
             raise Refused(404, "there is no table: start the viewer with --features FILE.parquet")
-        size = self.viewer.studio.model.image_size
-        picture = await self._work(self._decoding, gallery.picture, request.path_params["number"], size)
-        return await self._opened(picture)
+        number, size = request.path_params["number"], self.viewer.studio.model.image_size
+        return await self._opened(await self._work(self._decoding, gallery.picture, number, size))
 
     async def factors(self, request: Request) -> Response:
-        """The maps of a picture, by name, as images inside JSON."""
+        """The maps of an image, by name, as images inside JSON."""
         question = await self._question(request, Question)
         maps = await self._work(self._computing, self.viewer.studio.maps, question)
         return JSONResponse({name: data_url(image) for name, image in maps.items()})
@@ -199,7 +305,7 @@ class Application:
         return Response(text, media_type="application/json")
 
     async def neighbours(self, request: Request) -> Response:
-        """The rows nearest to a picture by one factor, with their pictures where those are here."""
+        """The rows nearest to an image by one factor, with their images where those are here."""
         question = await self._question(request, NeighbourQuestion)
         found = await self._work(self._computing, self.viewer.studio.neighbours, question)
         gallery = self.viewer.gallery
@@ -215,8 +321,8 @@ class Application:
         question = await self._question(request, Question)
         return Response(await self._work(self._computing, make, question), media_type=media_type)
 
-    async def _opened(self, picture: Any) -> Response:
-        return JSONResponse(await self._work(self._computing, self.viewer.studio.open, picture))
+    async def _opened(self, pixels: Any) -> Response:
+        return JSONResponse(await self._work(self._computing, self.viewer.studio.open, pixels))
 
     async def _work(self, pool: ThreadPoolExecutor, function: Callable[..., Any], *arguments: Any) -> Any:
         """Have a thread do it, in turn; ``Refused`` (503) if too many wait or it takes too long."""
@@ -256,19 +362,19 @@ class Application:
         body.whole = True
 
 
-def _decoded(body: Body, size: int) -> UInt8[np.ndarray, "3 s s"]:
+def _decoded(body: Body, size: int) -> Any:
     return pixels_of(bytes(body.content), size)
 
 
 def _thumbnail(gallery: Gallery, row: int) -> str | None:
-    """A row's picture inside JSON, or None where it cannot be shown."""
+    """A row's image inside JSON, or None where it cannot be shown."""
     try:
         return data_url(pictures(gallery.picture(row, THUMBNAIL)[None])[0])
     except Refused:
         return None
 
 
-def _constant(name: str, media_type: str) -> Answer:
+def _page_file(name: str, media_type: str) -> Answer:
     """An answer that is one of the page's own files, read now."""
     content = (files("derender.report.viewer") / "page" / name).read_bytes()
 

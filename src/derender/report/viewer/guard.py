@@ -1,10 +1,10 @@
-"""Whom the server answers, and what browsers are told about its answers.
+"""Requests that the server accepts, and the headers of its answers.
 
 A page on another site can make a visitor's browser send requests here. Three checks stop it: the Host header
 must name this machine and not a foreign name that was made to point here (DNS rebinding); a request that
 changes or computes something must come from the page itself (Origin, Sec-Fetch-Site) and carry a header that
-no form can send; and no answer may be framed, embedded, sniffed or stored. Leaves out passwords: who may
-reach the address may use the page.
+no form can send; and no answer may be framed, embedded, sniffed or stored. Leaves out passwords: everyone who
+can reach the address can use the page.
 """
 
 import ipaddress
@@ -31,11 +31,11 @@ SECURITY_HEADERS = {
 
 
 class Guard:
-    """Wraps an application; answers what it must not see by itself.
+    """An application that answers only requests of its own page.
 
     Args:
-        app: what is guarded.
-        host: the address that the server was told to listen on.
+        app: the application.
+        host: the address that the server listens on.
     """
 
     def __init__(self, app: ASGIApp, host: str):
@@ -85,9 +85,8 @@ class Guard:
 def allowed_host(header: str, bound: str) -> bool:
     """Whether a Host header names this machine.
 
-    A server on a loopback address answers to loopback names only; one that was told to listen elsewhere also
-    to any numeric address (which no foreign name server can hand out), to the name it was given and to the
-    machine's own.
+    A server on a loopback address answers to loopback names only; one that listens elsewhere also to any
+    numeric address (which no foreign name server can hand out), to that address's name and to the machine's.
     """
     name = _name_of(header)
     if name is None:

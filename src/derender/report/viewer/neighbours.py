@@ -1,33 +1,75 @@
-"""Rows of a feature table with their pictures, which are asked for by row number and in no other way.
+"""Images that the page offers: examples to begin with, and rows of a feature table by number.
 
-The files are those that the table's own data set lists; folders, zips and tables of paths are read in place.
-Of what comes as a stream only (tar shards, Hugging Face) no picture can be shown, since one is reached only
-by reading all before it.
+Rendered faces lie beside this file in faces.png, one row: eight of the 800 images that ``rendered-faces-64``
+was tested on, evenly spaced (geometry ICT-FaceKit, MIT; skins MakeHuman, CC0). They show no real person, and
+no model saw them in training. Cars lie in cars.png: eight of the 1,000 that ``cars-64`` was tested on, evenly
+by class (Kenney and Quaternius, CC0). Rows of a table are read from folders, zips and tables of paths in
+place; a stream (tar shards, Hugging Face) is read only from its beginning, so its images are not shown.
 """
 
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.resources import files
+from io import BytesIO
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
+from PIL import Image
 
 from derender.data import ListedStream, open_images, parse_source
 from derender.features import FeatureTable
-from derender.report.viewer.intake import pixels_of
-from derender.report.viewer.refused import Refused
+from derender.report.viewer.questions import Refused, pixels_of
 
+ROWS = {"faces-64": "faces.png", "rendered-faces-64": "faces.png", "cars-64": "cars.png"}
 LABELS_SHOWN = 4
 
 
+@dataclass(frozen=True)
+class Example:
+    """An image to choose.
+
+    Attributes:
+        name: shown on the page.
+        picture: its pixels at the model's size.
+    """
+
+    name: str
+    picture: UInt8[np.ndarray, "3 s s"]
+
+
+def named_examples(images: Mapping[Path, np.ndarray]) -> list[Example]:
+    """Images by file name."""
+    return [Example(path.name, pixels) for path, pixels in images.items()]
+
+
+def rendered_examples(model: str, image_size: int) -> list[Example]:
+    """Rendered faces or cars for the bundled models; none for other models."""
+    if model not in ROWS:
+        return []
+    content = files("derender.report.viewer").joinpath(ROWS[model]).read_bytes()
+    with Image.open(BytesIO(content)) as row:
+        row.load()
+    examples = []
+    for number in range(row.width // row.height):
+        tile = row.crop((number * row.height, 0, (number + 1) * row.height, row.height))
+        pixels = np.asarray(tile.convert("RGB").resize((image_size, image_size), Image.Resampling.LANCZOS))
+        name = f"rendered {ROWS[model].removesuffix('s.png')} {number + 1}"
+        examples.append(Example(name, np.moveaxis(pixels, -1, 0).copy()))
+    return examples
+
+
 class Gallery:
-    """A table and where its pictures lie.
+    """A table and the place of its images.
 
     Args:
         table: made by ``derender embed``.
-        source: where the pictures lie; what the table says if None.
+        source: place of the images; by default as the table records it.
         dataset: the layout's name, or "auto".
 
     Attributes:
-        without_pictures: why none can be shown, or "".
+        without_pictures: why no image can be shown, or "".
     """
 
     def __init__(self, table: FeatureTable, source: str | None = None, dataset: str = "auto"):
@@ -44,30 +86,27 @@ class Gallery:
         files = () if self._listed is None else self._listed.table.files
         self._position = {file: row for row, file in enumerate(files)}
         if source is not None and not any(file in self._position for file in table.files):
-            raise ValueError(f"{source} holds none of the table's pictures, such as {table.files[0]!r}")
+            raise ValueError(f"{source} holds none of the table's images, such as {table.files[0]!r}")
 
     def about(self, row: int) -> dict[str, Any]:
         """Name and labels of a row, as text."""
         labels = [name for name in self.table.labels if name != "partition"][:LABELS_SHOWN]
-        return {
-            "row": row,
-            "file": self.table.files[row],
-            "labels": {name: str(self.table.labels[name][row]) for name in labels},
-        }
+        shown = {name: str(self.table.labels[name][row]) for name in labels}
+        return {"row": row, "file": self.table.files[row], "labels": shown}
 
     def picture(self, row: int, size: int) -> UInt8[np.ndarray, "3 s s"]:
-        """The picture of a row; ``Refused`` (404, 413, 415) where it cannot be shown."""
+        """The image of a row; ``Refused`` (404, 413, 415) where it cannot be shown."""
         if not 0 <= row < len(self.table):
             raise Refused(404, f"the table has {len(self.table):,} rows, there is no row {row}")
         file = self.table.files[row]
         if self._listed is None or file not in self._position:
-            raise Refused(404, "the picture of this row is not here: name its place with --data")
+            raise Refused(404, "the image of this row is not here: name its place with --data")
         boxes = self._listed.table.boxes
         box = None if boxes is None else boxes[self._position[file]]
         try:
             encoded = self._listed.files.read(file)
         except (ValueError, OSError) as problem:
-            raise Refused(404, "the picture of this row can no longer be read") from problem
+            raise Refused(404, "the image of this row can no longer be read") from problem
         return pixels_of(encoded, size, box)
 
     def close(self) -> None:
@@ -77,11 +116,11 @@ class Gallery:
 
 def _listed(place: str, dataset: str) -> ListedStream:
     if not place:
-        raise ValueError("the table does not say where its pictures lie: name the place with --data")
+        raise ValueError("the table does not record the place of its images: name it with --data")
     if not parse_source(place)[0].exists():
-        raise ValueError(f"{place} is not here: name the place of the pictures with --data")
+        raise ValueError(f"{place} is not here: name the place of the images with --data")
     stream = open_images(place, dataset=dataset)
     if isinstance(stream, ListedStream):
         return stream
     stream.close()
-    raise ValueError(f"{place} can only be read from its beginning: pictures of rows are not shown")
+    raise ValueError(f"{place} can only be read from its beginning: images of rows are not shown")

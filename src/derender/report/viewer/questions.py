@@ -1,34 +1,54 @@
-"""What a page may ask: which picture, which factors from another one, which light and view, how large.
+"""Requests of the page, checked: image, factors of another image, light, camera, size; uploads to pixels.
 
-Every number has bounds and every name a pattern; whatever else is sent is refused. Nothing here can name a
-file. Angles are degrees, since people read them; ``light_row`` and ``camera_row`` give radians.
+Every number has bounds and every name a pattern; anything else is refused. Nothing here can name a file, and
+an upload is decoded by its own content, never by its name or stated type (data/decode.py, with tighter bounds
+than a data set needs). Angles are degrees here; ``light_row`` and ``camera_row`` give radians.
 """
 
 from math import degrees, radians
 from typing import Annotated, Literal, TypeVar
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
+from PIL.Image import DecompressionBombError
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from torch import Tensor
 
-from derender.report.viewer.refused import Refused
+from derender.data import Unreadable, decode, quiet_pillow
 
 LARGEST_SIZE = 512
-SWAPPED = ("geometry", "albedo")
-"""Factors that are taken from another picture by its name; light and camera travel as numbers."""
+BODY_LIMIT_BYTES = 20_000_000
+PIXEL_LIMIT = 40_000_000
+"""Fewer than any decompression bomb needs, more than most cameras take."""
 
-PictureId = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{22}$")]
+KINDS = "JPEG, PNG, WebP, AVIF, BMP, GIF, TIFF, PPM"
+
+ImageId = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{22}$")]
 Angle = Annotated[float, Field(ge=-89, le=89)]
 Strength = Annotated[float, Field(ge=0, le=2)]
 Shift = Annotated[float, Field(ge=-0.5, le=0.5)]
 
 
-class _Asked(BaseModel):
+class Refused(Exception):
+    """A request that is not granted.
+
+    Attributes:
+        status: HTTP status, 4xx or 503.
+        message: the reason and the remedy, in one sentence for the person at the page.
+    """
+
+    def __init__(self, status: int, message: str):
+        super().__init__(message)
+        self.status = status
+        self.message = message
+
+
+class _Checked(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, strict=True)
 
 
-class Light(_Asked):
+class Light(_Checked):
     """Ambient and diffuse strength, pitch and yaw in degrees (conventions.md)."""
 
     ambient: Strength
@@ -45,7 +65,7 @@ class Light(_Asked):
         return torch.tensor([[self.ambient, self.diffuse, radians(self.pitch_deg), radians(self.yaw_deg)]])
 
 
-class Camera(_Asked):
+class Camera(_Checked):
     """Rotation about x, y, z in degrees and translation in scene units (conventions.md)."""
 
     rotation_deg: Annotated[list[Angle], Field(min_length=3, max_length=3)]
@@ -60,39 +80,64 @@ class Camera(_Asked):
         return torch.tensor([[*map(radians, self.rotation_deg), *self.translation]])
 
 
-class Question(_Asked):
-    """A picture as it is to be shown.
+class Question(_Checked):
+    """An image as it is to be shown.
 
     Attributes:
         picture: the name it got when it was opened.
-        swaps: other opened pictures that give their geometry or albedo.
-        light: instead of the picture's own.
-        camera: instead of the picture's own.
+        swaps: other opened images that give their geometry or albedo.
+        light: instead of the image's own.
+        camera: instead of the image's own.
         size: side in pixels; the model's own if left out, and never less.
     """
 
-    picture: PictureId
-    swaps: dict[Literal["geometry", "albedo"], PictureId] = {}
+    picture: ImageId
+    swaps: dict[Literal["geometry", "albedo"], ImageId] = {}
     light: Light | None = None
     camera: Camera | None = None
     size: Annotated[int, Field(ge=8, le=LARGEST_SIZE)] | None = None
 
 
 class NeighbourQuestion(Question):
-    """A picture whose nearest rows are wanted, by one factor."""
+    """An image whose nearest rows are requested, by one factor."""
 
     factor: Annotated[str, Field(max_length=64)]
     k: Annotated[int, Field(ge=1, le=48)] = 12
 
 
-Q = TypeVar("Q", bound=_Asked)
+Q = TypeVar("Q", bound=_Checked)
 
 
 def read_question(kind: type[Q], body: bytes) -> Q:
-    """The question in a request's body; anything else is refused with the first thing that is wrong."""
+    """The question in a request's body; anything else is refused with its first mistake."""
     try:
         return kind.model_validate_json(body)
     except ValidationError as problem:
         first = problem.errors(include_url=False, include_input=False, include_context=False)[0]
         where = ".".join(map(str, first["loc"])) or "the request"
         raise Refused(422, f"{where}: {first['msg']}") from problem
+
+
+def too_large() -> Refused:
+    return Refused(
+        413, f"this file is larger than {BODY_LIMIT_BYTES // 10**6} MB: make the image smaller first"
+    )
+
+
+def pixels_of(encoded: bytes, image_size: int, box: np.ndarray | None = None) -> UInt8[np.ndarray, "3 s s"]:
+    """Decode one image, cut to its centre square; ``Refused`` (413 or 415) if that is impossible."""
+    if len(encoded) > BODY_LIMIT_BYTES:
+        raise too_large()
+    if not encoded:
+        raise Refused(415, f"this file is empty: choose an image ({KINDS})")
+    try:
+        with quiet_pillow():
+            return decode(encoded, image_size, box=box, pixel_limit=PIXEL_LIMIT)
+    except Unreadable as problem:
+        if "million pixels" in str(problem) or isinstance(problem.__cause__, DecompressionBombError):
+            most = f"{PIXEL_LIMIT // 10**6} million pixels"
+            raise Refused(413, f"this image has more than {most}: make it smaller first") from problem
+        reason = " ".join(str(problem).split())[:200]
+        raise Refused(
+            415, f"this file cannot be read: {reason}; whatever its name, choose an image ({KINDS})"
+        ) from problem

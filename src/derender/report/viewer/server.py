@@ -1,19 +1,23 @@
-"""uvicorn on a listening socket, with bounds on time and on the number of connections."""
+"""A listening socket, and uvicorn on it, with bounds on time and on the number of connections.
+
+The socket is opened before anything slow is loaded, so that a port in use is one error at once.
+"""
 
 import asyncio
+import errno
 import logging
 import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
 from threading import Thread
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import h11
 import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from derender.report.viewer.app import Application
-from derender.report.viewer.listener import address_of, listen
+if TYPE_CHECKING:
+    from derender.report.viewer.app import Application
 
 HEAD_SECONDS = 10.0
 TAKING_SECONDS = 30.0
@@ -22,8 +26,46 @@ CONNECTIONS_AT_MOST = 256
 HEAD_LIMIT_BYTES = 16_384
 
 
+def listen(host: str, port: int) -> socket.socket:
+    """A listening socket; port 0 takes any free one.
+
+    Raises:
+        ValueError: the port is in use or not allowed, or the address is not one of this machine.
+    """
+    if not 0 <= port <= 65535:
+        raise ValueError(f"port must lie in 0..65535, got {port}: 0 takes any free one")
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(
+            host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+        )[0]
+    except OSError as problem:
+        raise ValueError(f"host {host} is no address of this machine: use 127.0.0.1") from problem
+    listener = socket.socket(family, kind, protocol)
+    try:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind(address)
+        listener.listen(128)
+    except OSError as problem:
+        listener.close()
+        reasons = {
+            errno.EADDRINUSE: f"port {port} of {host} is in use: choose another port, or 0 for any free one",
+            errno.EACCES: f"port {port} needs more rights: choose a port above 1023, or 0",
+        }
+        other = f"cannot listen on {host} port {port} ({problem.strerror}): use host 127.0.0.1"
+        raise ValueError(reasons.get(problem.errno or 0, other)) from problem
+    listener.setblocking(False)
+    return listener
+
+
+def address_of(listener: socket.socket, host: str) -> str:
+    """The address to open in a browser."""
+    port = listener.getsockname()[1]
+    shown = {"0.0.0.0": "127.0.0.1", "::": "[::1]", "": "127.0.0.1"}.get(host, host)
+    return f"http://{f'[{shown}]' if ':' in shown and not shown.startswith('[') else shown}:{port}/"
+
+
 class BoundedProtocol(H11Protocol):
-    """uvicorn's protocol, which also ends who sends no head, or a body without end, or takes no answer."""
+    """uvicorn's protocol, which also ends connections without head, with endless bodies, or that stall."""
 
     head_seconds = HEAD_SECONDS
     taking_seconds = TAKING_SECONDS
@@ -78,10 +120,10 @@ class BoundedProtocol(H11Protocol):
             self.transport.close()
 
 
-def server_for(application: Application, **settings: Any) -> uvicorn.Server:
-    """uvicorn with our bounds; keywords change its own settings."""
+def server_for(application: "Application", **settings: Any) -> uvicorn.Server:
+    """uvicorn with these bounds; keywords change its own settings."""
     logging.getLogger("uvicorn.error").setLevel(logging.ERROR)
-    chosen: dict[str, Any] = {
+    bounded: dict[str, Any] = {
         "http": BoundedProtocol,
         "ws": "none",
         "lifespan": "off",
@@ -94,12 +136,11 @@ def server_for(application: Application, **settings: Any) -> uvicorn.Server:
         "timeout_graceful_shutdown": 2,
         "limit_concurrency": CONNECTIONS_AT_MOST,
         "h11_max_incomplete_event_size": HEAD_LIMIT_BYTES,
-        **settings,
     }
-    return uvicorn.Server(uvicorn.Config(application.guarded, **chosen))
+    return uvicorn.Server(uvicorn.Config(application.guarded, **{**bounded, **settings}))
 
 
-def serve(application: Application, listener: socket.socket) -> None:
+def serve(application: "Application", listener: socket.socket) -> None:
     """Answer until Ctrl-C or SIGTERM."""
     try:
         server_for(application).run(sockets=[listener])
@@ -109,8 +150,8 @@ def serve(application: Application, listener: socket.socket) -> None:
 
 
 @contextmanager
-def serving(application: Application, host: str = "127.0.0.1", port: int = 0) -> Iterator[str]:
-    """Answer in a thread of its own meanwhile; gives the address."""
+def serving(application: "Application", host: str = "127.0.0.1", port: int = 0) -> Iterator[str]:
+    """Answer in a thread meanwhile; gives the address."""
     listener = listen(host, port)
     server = server_for(application)
     thread = Thread(target=server.run, kwargs={"sockets": [listener]}, name="view-server")

@@ -1,14 +1,19 @@
-"""What a page asks for, made: pictures taken apart, shown in another light and view, as maps, mesh, archive.
+"""Requests of the page, answered: images opened, shown under other light and view, as maps, mesh, archive.
 
-Takes questions and gives bytes and plain values; knows no HTTP. Factors of several pictures are joined at the
-model's size and enlarged afterwards (scene/enlarge.py). Not safe for several threads at once: the server
-gives it one. Leaves out the pictures' own detail as texture.
+Takes questions and gives bytes and plain values; knows no HTTP. Opened images stay in memory only, a bounded
+number of them. Factors of several images are joined at the model's size and enlarged afterwards
+(scene/enlarge.py). Not safe for several threads at once: the server gives it one. Leaves out the images' own
+detail as texture.
 """
 
 import base64
 import io
 import json
+import secrets
+import threading
 import zipfile
+from collections import OrderedDict
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from math import isfinite
 from typing import Any
@@ -27,34 +32,81 @@ from derender.model import Derenderer
 from derender.report import colours
 from derender.report.mesh import model_mesh
 from derender.report.panel import labelled_grid, strip
-from derender.report.viewer.questions import Camera, Light, NeighbourQuestion, Question
-from derender.report.viewer.refused import Refused
-from derender.report.viewer.shelf import Shelf, TakenApart
+from derender.report.viewer.questions import Camera, Light, NeighbourQuestion, Question, Refused
 from derender.scene import Scene
-from derender.scene.crop_search import SEARCH_SCALE, as_bytes, best_crops
+from derender.scene.crop_search import SEARCH_SCALE, WHOLE, as_bytes, best_crops
 from derender.scene.enlarge import at_size
 from derender.scene.light import lambert_shading
 from derender.scene.normals import normals_from_depth
 from derender.training.held_out_errors import HeldOutErrors, masked_l1, reconstruction_errors
 
+KEPT = 64
+OFFERED_SIZES = (128, 256)
 
-def reading_size(model: Derenderer, framed: bool) -> int:
-    """Side at which pictures are read, in pixels: larger where the best part of each is looked for."""
-    return model.image_size * (SEARCH_SCALE if framed else 1)
+
+@dataclass(frozen=True)
+class ShownImage:
+    """One opened image.
+
+    Attributes:
+        pixels: at the model's size.
+        scene: one scene, on the CPU.
+        features: by factor, (D,) each.
+    """
+
+    pixels: UInt8[np.ndarray, "3 s s"]
+    scene: Scene
+    features: Mapping[str, np.ndarray]
+
+
+class Shelf:
+    """At most ``limit`` opened images by names that cannot be guessed; safe to use from several threads.
+
+    When it is full, the image leaves that was not requested for longest.
+    """
+
+    def __init__(self, limit: int = KEPT):
+        if limit < 2:
+            raise ValueError(f"a shelf needs room for 2 images or more, for swaps; got {limit}")
+        self.limit = limit
+        self._images: OrderedDict[str, ShownImage] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def __len__(self) -> int:
+        return len(self._images)
+
+    def put(self, image: ShownImage) -> str:
+        """Store an image; returns its name."""
+        name = secrets.token_urlsafe(16)
+        with self._lock:
+            self._images[name] = image
+            while len(self._images) > self.limit:
+                self._images.popitem(last=False)
+        return name
+
+    def get(self, name: str) -> ShownImage:
+        """The image of that name, which now counts as used; ``Refused`` (410) if it has left."""
+        with self._lock:
+            if name not in self._images:
+                raise Refused(
+                    410, f"this image is no longer stored (the last {self.limit} are): open it again"
+                )
+            self._images.move_to_end(name)
+            return self._images[name]
 
 
 @dataclass
 class Studio:
-    """A model and the pictures opened with it.
+    """A model and the images opened with it.
 
     Attributes:
         model: in evaluation mode.
-        name: what the page calls the model.
-        shelf: where opened pictures are kept.
+        name: of the model, on the page.
+        shelf: the opened images.
         held_out: reconstruction errors that were stored with the model; None if there are none.
         table: features to look for neighbours in; None for none.
-        fit_steps: of each scene to its picture (``model.fit_scenes``); 0 shows what encoders say.
-        framed: whether of a picture larger than the model's the part is taken that it renders again best.
+        fit_steps: of test-time optimisation of each scene; 0 shows feed-forward scenes.
+        cropped: whether the part of a larger image is searched that the model reconstructs best.
     """
 
     model: Derenderer
@@ -63,67 +115,77 @@ class Studio:
     held_out: HeldOutErrors | None = None
     table: FeatureTable | None = None
     fit_steps: int = 0
-    framed: bool = False
+    cropped: bool = False
 
     @property
     def reading_size(self) -> int:
-        """Side of the pictures that ``open`` should be given."""
-        return reading_size(self.model, self.framed)
+        """Side of the images that ``open`` takes, in pixels: larger where crops are searched."""
+        return self.model.image_size * (SEARCH_SCALE if self.cropped else 1)
 
-    def open(self, picture: UInt8[np.ndarray, "3 s s"]) -> dict[str, Any]:
-        """Take a picture apart and keep it; gives its name, its light and camera, how well it is rebuilt."""
-        side = 1.0
-        if self.framed and picture.shape[-1] != self.model.image_size:
-            larger = torch.from_numpy(picture[None])
-            (framing,) = best_crops(self.model, larger)
-            side = framing.side
-            picture = as_bytes(framing.cut(larger, self.model.image_size))[0].numpy()
+    def about(self, largest_size: int) -> dict[str, Any]:
+        """The model's name, sizes to draw at, ranges of the camera, and the number of images in memory."""
+        own, ranges = self.model.image_size, self.model.settings.ranges
+        return {
+            "model": self.name,
+            "sizes": sorted({own, *(size for size in (*OFFERED_SIZES, largest_size) if size > own)}),
+            "fov_deg": self.model.fov_deg,
+            "rotation_deg": ranges.rotation_deg,
+            "translation": [ranges.translation_xy, ranges.translation_xy, max(ranges.translation_z, 0.1)],
+            "kept": self.shelf.limit,
+        }
+
+    def open(self, pixels: UInt8[np.ndarray, "3 s s"]) -> dict[str, Any]:
+        """Decompose an image and store it; returns its name, light, camera and reconstruction error.
+
+        The percentile is that of the feed-forward reconstruction.
+        """
+        crop = WHOLE
+        if self.cropped and pixels.shape[-1] != self.model.image_size:
+            larger = torch.from_numpy(pixels[None])
+            (crop,) = best_crops(self.model, larger)
+            pixels = as_bytes(crop.cut(larger, self.model.image_size))[0].numpy()
         with torch.inference_mode():
-            images = as_float(picture[None]).to(self.model.device)
-            activations = self.model.activations(images)
-            errors = reconstruction_errors(self.model, picture[None])
+            images = as_float(pixels[None]).to(self.model.device)
+            features = self.model.embed(images)
+            errors = reconstruction_errors(self.model, pixels[None])
             if self.fit_steps:
                 scene = self.model.fit_scenes(images, self.fit_steps).scene
-                shown = masked_l1(self.model.render(scene), images)
+                l1 = float(masked_l1(self.model.render(scene), images)[0])
             else:
-                scene, shown = self.model.decode(self.model.codes(activations)), errors
-        scene, l1 = scene.to("cpu"), float(shown[0])
-        rows = {
-            name: code[0].float().cpu().numpy()
-            for name, code in self.model.features_from(activations).items()
-        }
-        name = self.shelf.put(TakenApart(picture, scene, rows, l1))
+                scene, l1 = self.model.decompose(images), float(errors[0])
+        rows = {name: row[0].float().cpu().numpy() for name, row in features.items()}
+        scene = scene.to("cpu")
         percentile = None if self.held_out is None else float(percentile_of(errors, self.held_out)[0])
         return {
-            "picture": name,
+            "picture": self.shelf.put(ShownImage(pixels, scene, rows)),
             "light": Light.of(scene.light[0]).model_dump(),
             "camera": Camera.of(scene.camera[0]).model_dump(),
             "l1": l1 if isfinite(l1) else None,
-            "l1_as_read": float(errors[0]) if self.fit_steps and isfinite(errors[0]) else None,
+            "l1_feed_forward": float(errors[0]) if self.fit_steps and isfinite(errors[0]) else None,
             "percentile": percentile,
-            "side": side,
-            "odd": percentile is not None and percentile > OUTLIER_PERCENTILE,
+            "side": crop.side,
+            "out_of_distribution": percentile is not None and percentile > OUTLIER_PERCENTILE,
         }
 
     def scene(self, question: Question) -> Scene:
-        """The scene that is asked for, at its size."""
+        """The requested scene, at its size."""
         scene = self.shelf.get(question.picture).scene
+        parameters = {factor.name: factor.parameter for factor in self.model.factors}
         for factor, other in question.swaps.items():
-            parameter = {"geometry": "depth", "albedo": "albedo"}[factor]
-            scene = scene.with_parameters(**{parameter: getattr(self.shelf.get(other).scene, parameter)})
+            parameter = parameters[factor]
+            donor = self.shelf.get(other).scene
+            scene = scene.with_parameters(**{parameter: donor.parameters[parameter]})
         if question.light is not None:
             scene = scene.with_parameters(light=question.light.light_row())
         if question.camera is not None:
             scene = scene.with_parameters(camera=question.camera.camera_row())
-        size = self.model.image_size if question.size is None else question.size
-        return at_size(scene, max(size, self.model.image_size))
+        return at_size(scene, max(question.size or 0, self.model.image_size))
 
     def view(self, question: Question) -> bytes:
         """The rendering and, right of it, the shading, as one PNG; transparent where nothing is seen."""
         with torch.inference_mode():
             scene = self.scene(question)
-            images = (self._rendered(scene), self._shading(scene))
-        return _png(strip(list(images)), quick=True)
+            return _png(strip([self._rendered(scene), self._shading(scene)]), quick=True)
 
     def picture(self, question: Question) -> bytes:
         """The rendering alone, as a PNG with transparency."""
@@ -131,31 +193,28 @@ class Studio:
             return _png(self._rendered(self.scene(question)))
 
     def maps(self, question: Question) -> dict[str, Image.Image]:
-        """Input, its reconstruction, what is asked for, and the factors of that, by name."""
-        found = self.shelf.get(question.picture)
+        """Input, its reconstruction, the requested view, and the factors of that, by name."""
+        opened = self.shelf.get(question.picture)
         with torch.inference_mode():
             scene = self.scene(question)
-            own = at_size(found.scene, scene.depth.shape[-1])
-            normal = normals_from_depth(scene.depth, self.model.fov_deg)
             return {
-                "input": colours.pictures(found.picture[None])[0],
-                "reconstruction": self._rendered(own),
+                "input": colours.pictures(opened.pixels[None])[0],
+                "reconstruction": self._rendered(at_size(opened.scene, scene.depth.shape[-1])),
                 "view": self._rendered(scene),
                 "depth": colours.depth_maps(scene.depth)[0],
-                "normals": colours.normal_maps(normal)[0],
+                "normals": colours.normal_maps(normals_from_depth(scene.depth, self.model.fov_deg))[0],
                 "albedo": colours.pictures(scene.albedo)[0],
                 "shading": self._shading(scene),
             }
 
     def panel(self, question: Question) -> bytes:
         """All maps with their names in one PNG."""
-        return _png(_panel(self.maps(question)))
+        return _panel(self.maps(question))
 
     def archive(self, question: Question) -> bytes:
         """A ZIP: the panel, every map, the mesh, and the settings."""
         maps = self.maps(question)
-        files = {"panel.png": _png(_panel(maps))}
-        files |= {f"{name}.png": _png(image) for name, image in maps.items()}
+        files = {"panel.png": _panel(maps)} | {f"{name}.png": _png(image) for name, image in maps.items()}
         files["surface.glb"] = self.mesh(question)
         files["settings.json"] = (json.dumps(self.settings(question), indent=1) + "\n").encode()
         packed = io.BytesIO()
@@ -168,35 +227,32 @@ class Studio:
         """The surface in its canonical view as GLB; ``Refused`` (422) where there is none."""
         scene = self.scene(question)
         try:
-            made = model_mesh(self.model, scene)
+            return model_mesh(self.model, scene).files("surface")["surface.glb"]
         except ValueError as problem:
             raise Refused(422, str(problem)) from problem
-        return made.files("surface")["surface.glb"]
 
     def settings(self, question: Question) -> dict[str, Any]:
-        """Light and camera in numbers, and what made the picture."""
+        """Light and camera in numbers, and how the image was made."""
         scene = self.shelf.get(question.picture).scene
-        light = question.light or Light.of(scene.light[0])
-        camera = question.camera or Camera.of(scene.camera[0])
         return {
             "derender": __version__,
             "model": self.name,
-            "light": light.model_dump(),
-            "camera": camera.model_dump(),
+            "light": (question.light or Light.of(scene.light[0])).model_dump(),
+            "camera": (question.camera or Camera.of(scene.camera[0])).model_dump(),
             "from_another_picture": sorted(question.swaps),
             "size": max(question.size or 0, self.model.image_size),
         }
 
     def neighbours(self, question: NeighbourQuestion) -> list[tuple[int, float]]:
-        """Rows nearest by one factor of the picture that gives it, and distances; not that picture itself."""
+        """Rows nearest by one factor of the image that gives it, and distances; without that image itself."""
         if self.table is None:
             raise Refused(404, "there is no table to look in: start the viewer with --features FILE.parquet")
         other = dict(question.swaps).get(question.factor, question.picture)  # type: ignore[call-overload]
-        codes = self.shelf.get(other).codes
+        features = self.shelf.get(other).features
         try:
-            code = named(codes, question.factor, "factor")
-            itself = same_picture(self.table, codes)
-            found = nearest(self.table, code, question.factor, question.k, exclude=itself.tolist())
+            feature = named(features, question.factor, "factor")
+            itself = same_picture(self.table, features)
+            found = nearest(self.table, feature, question.factor, question.k, exclude=itself.tolist())
         except ValueError as problem:
             raise Refused(422, str(problem)) from problem
         return list(zip(found.rows[0].tolist(), found.distances[0].tolist(), strict=True))
@@ -215,8 +271,8 @@ def data_url(image: Image.Image) -> str:
     return "data:image/png;base64," + base64.b64encode(_png(image, quick=True)).decode()
 
 
-def _panel(maps: dict[str, Image.Image]) -> Image.Image:
-    return labelled_grid({name: [image] for name, image in maps.items()})
+def _panel(maps: Mapping[str, Image.Image]) -> bytes:
+    return _png(labelled_grid({name: [image] for name, image in maps.items()}))
 
 
 def _png(image: Image.Image, quick: bool = False) -> bytes:

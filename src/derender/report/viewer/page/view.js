@@ -1,14 +1,14 @@
 "use strict";
-// The page: asks the server for pictures of what the controls say, the newest wish first, never two at a time.
+// The page: asks the server for images at the controls' settings, the newest first, never two at a time.
 
 const $ = (id) => document.getElementById(id);
 const NAMES = {
-  input: "the picture the model was given",
-  reconstruction: "rendered again from the four factors as found",
+  input: "the image as the model takes it",
+  reconstruction: "rendered from the four factors",
   depth: "bright is near, dark is far",
   normals: "red to the right, green up, blue to the viewer",
-  albedo: "colour with the light taken away",
-  shading: "what the light adds",
+  albedo: "colour without lighting",
+  shading: "lighting on the surface",
 };
 const LIGHT = [
   ["ambient", "ambient", 0, 1.2, 0.01, ""],
@@ -56,7 +56,7 @@ function question(more = {}) {
   return { picture: first.picture, swaps, light: now.light, camera: now.camera, size: now.size, ...more };
 }
 
-// Ask about the pictures on the page; those the program no longer keeps are opened again first.
+// Ask about the images on the page; those that are no longer stored are opened again first.
 async function askAbout(path, more = {}) {
   try {
     return await ask(path, question(more));
@@ -226,9 +226,9 @@ function asFound(kind) {
 
 async function opened(source, name, image) {
   if (source instanceof Blob && source.size > about.body_limit_bytes) {
-    throw new Error(`This file is larger than ${Math.round(about.body_limit_bytes / 1e6)} MB: make the picture smaller first.`);
+    throw new Error(`This file is larger than ${Math.round(about.body_limit_bytes / 1e6)} MB: make the image smaller first.`);
   }
-  say(`Taking ${name} apart.`);
+  say(`Decomposing ${name}.`);
   const found = await (await request(source)).json();
   return { ...found, source, name, image };
 }
@@ -239,14 +239,14 @@ async function openFirst(source, name, image = null, button = null) {
     for (const kind of ["light", "camera"]) asFound(kind);
     showSliders();
     press("examples", button);
-    const asRead = first.l1_as_read === null ? "" : `; ${first.l1_as_read.toFixed(3)} as read, before it was fitted`;
-    const error = first.l1 === null ? "the model renders nothing into it" : `mean difference ${first.l1.toFixed(3)} where the surface is seen${asRead}`;
+    const before = first.l1_feed_forward === null ? "" : `; ${first.l1_feed_forward.toFixed(3)} before optimisation`;
+    const error = first.l1 === null ? "the model renders nothing into it" : `mean difference ${first.l1.toFixed(3)} where the surface is seen${before}`;
     const beaten = first.percentile >= 100 ? "any" : `${Math.floor(first.percentile)} %`;
-    const rank = first.percentile === null ? "" : `, more than for ${beaten} of the pictures the model was checked on`;
-    const part = first.side === 1 ? "" : ` Shown is the part of it that the model renders again best, ${Math.round(100 * first.side)} % of its side.`;
+    const rank = first.percentile === null ? "" : `, more than for ${beaten} of the images the model was validated on`;
+    const part = first.side === 1 ? "" : ` Shown is the part of it that the model reconstructs best, ${Math.round(100 * first.side)} % of its side.`;
     say(`${name}: ${error}${rank}.${part}`);
-    $("odd").hidden = !first.odd;
-    $("odd").textContent = "This picture is rendered again worse than nearly all the model was checked on: it may not be what the model knows. Read its factors with care.";
+    $("unlike").hidden = !first.out_of_distribution;
+    $("unlike").textContent = "This image is reconstructed worse than nearly all the model was validated on: it may be out-of-distribution. Read its factors with care.";
     $("work").hidden = false;
     times.length = 0;
     await refreshAll();
@@ -259,9 +259,9 @@ async function openSecond(source, name, image = null, button = null) {
     second = await opened(source, name, image ?? URL.createObjectURL(source));
     press("examples-second", button);
     $("second").src = second.image;
-    $("second").alt = `second picture: ${name}`;
+    $("second").alt = `second image: ${name}`;
     $("second").hidden = $("swaps").hidden = false;
-    say(`${name} is the second picture. Choose what to take from it.`);
+    say(`${name} is the second image. Choose a factor to take from it.`);
     for (const kind of ["light", "camera"]) if (now.swaps.has(kind)) asFound(kind);
     showSliders();
     if (now.swaps.size) await refreshAll();
@@ -363,7 +363,7 @@ function connect() {
 function buildNeighbours() {
   if (!about.table || !about.table.factors.length) return;
   $("near").hidden = false;
-  $("near-note").textContent = `Among ${about.table.rows.toLocaleString("en")} pictures, by cosine distance.${about.table.note ? ` No pictures: ${about.table.note}.` : " Choose one to take it apart."}`;
+  $("near-note").textContent = `Among ${about.table.rows.toLocaleString("en")} images, by cosine distance.${about.table.note ? ` No images: ${about.table.note}.` : " Choose one to decompose it."}`;
   about.table.factors.forEach((factor, place) => {
     const button = document.createElement("button");
     button.type = "button";
@@ -391,7 +391,7 @@ async function begin() {
   connect();
   const start = about.examples[0];
   if (start) await openFirst("api/examples/0", start.name, start.image, $("examples").firstElementChild);
-  else say("Drop a picture to begin.");
+  else say("Drop an image to begin.");
 }
 
 begin().catch((problem) => say(problem.message, true));
