@@ -20,7 +20,7 @@ from derender.baselines.e4e import (
 from derender.baselines.model import LossInputs
 from derender.baselines.stylegan2_generator import GeneratorSettings
 from derender.baselines.training import BaselineTask
-from derender.report.baseline_sheet import baseline_sheet
+from derender.report.run import baseline_sheet
 from derender.training.checkpoint import WEIGHTS_FILE
 from derender.training.loop import train_task
 from derender.training.run_folder import read_metrics

@@ -15,8 +15,7 @@ from derender.baselines import baseline_config, load_baseline, read_any_config
 from derender.baselines.registry import config_type
 from derender.baselines.training import BaselineTask
 from derender.features import embed_pictures
-from derender.report.baseline_sheet import baseline_sheet
-from derender.report.run import run_page
+from derender.report.run import baseline_sheet, run_page
 from derender.training import resolve, train
 from derender.training.checkpoint import WEIGHTS_FILE
 from derender.training.config import config_from_tree

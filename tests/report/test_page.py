@@ -40,7 +40,7 @@ def full_page(text: str = "plain") -> str:
         blocks.row_of([(blocks.film(films.animated_png([picture(1), picture(2)]), picture(), text), text)]),
         blocks.image_grid({text: [picture()]}, [text], text, {text: text}),
         blocks.table(table),
-        blocks.chart(charts.curves({text: ([0, 1], [2, 3])}, text, text, {text: 2.5}), text, text),
+        blocks.chart(charts.curves({text: ([0, 1], [2, 3])}, text, text), text, text),
         blocks.chart(charts.bars({text: 1.0, "b": 2.0}, text, [text], (text, 0.5)), text, text),
     ]
     return Page(text, text, [Section(text, parts, text)], text).html()

@@ -8,6 +8,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from hashlib import sha256
 from io import BytesIO, StringIO
+from itertools import cycle
 from typing import Any
 
 import matplotlib
@@ -17,53 +18,38 @@ from matplotlib.ticker import FuncFormatter
 
 SERIES = ("#3b82f6", "#f59e0b", "#10b981", "#ec4899", "#8b5cf6", "#64748b")
 INK = "#010203"
-"""Stands for currentColor until the SVG text is written: the colour of the page's text, light or dark."""
+"""Becomes currentColor when the SVG text is written: the colour of the page's text, light or dark."""
 _STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",
     "svg.hashsalt": "derender",
     "font.family": "sans-serif",
     "font.size": 10,
     "text.parse_math": False,  # names of classes and files are no formulas
-    "text.color": INK,
-    "axes.edgecolor": INK,
-    "axes.labelcolor": INK,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.linewidth": 0.6,
-    "xtick.color": INK,
-    "ytick.color": INK,
-    "xtick.major.width": 0.6,
-    "ytick.major.width": 0.6,
-    "grid.color": INK,
+    **dict.fromkeys(
+        ("text.color", "axes.edgecolor", "axes.labelcolor", "xtick.color", "ytick.color", "grid.color"), INK
+    ),
+    **dict.fromkeys(("axes.spines.top", "axes.spines.right", "legend.frameon"), False),
+    **dict.fromkeys(("axes.linewidth", "xtick.major.width", "ytick.major.width"), 0.6),
     "grid.alpha": 0.12,
     "grid.linewidth": 0.7,
-    "legend.frameon": False,
 }
 
 
-def curves(
-    series: Mapping[str, tuple[Sequence[float], Sequence[float]]],
-    x_label: str,
-    y_label: str,
-    levels: Mapping[str, float] | None = None,
-    size: tuple[float, float] = (7.2, 2.9),
-) -> str:
-    """Lines by name, each (x values, y values), and dashed ``levels`` (controls) by name, as SVG text."""
+def curves(series: Mapping[str, tuple[Sequence[float], Sequence[float]]], x_label: str, y_label: str) -> str:
+    """Lines by name, each (x values, y values), as SVG text."""
     if not series:
         raise ValueError("a chart needs at least one series")
     with matplotlib.rc_context(_STYLE):
-        figure, axes = _axes(size)
-        for (name, (x, y)), colour in zip(series.items(), _cycle(len(series)), strict=True):
+        figure, (axes,) = _axes((7.2, 2.9))
+        for (name, (x, y)), colour in zip(series.items(), cycle(SERIES), strict=False):
             axes.plot(x, y, color=colour, linewidth=1.8, label=name, marker="o" if len(x) < 2 else None)
-        for name, level in (levels or {}).items():
-            axes.axhline(level, color=INK, alpha=0.55, linewidth=1, linestyle=(0, (4, 3)))
-            axes.annotate(name, (1, level), xycoords=("axes fraction", "data"), xytext=(-2, 3),
-                          textcoords="offset points", ha="right", fontsize=9, alpha=0.75)  # fmt: skip
         axes.set_xlabel(x_label)
         axes.set_ylabel(y_label)
         axes.grid(True)
         axes.margins(x=0.01)
-        axes.xaxis.set_major_formatter(FuncFormatter(_spoken))
+        axes.xaxis.set_major_formatter(
+            FuncFormatter(lambda value, _: f"{value:,.0f}" if float(value).is_integer() else f"{value:g}")
+        )
         if len(series) > 1:
             figure.legend(loc="outside upper left", ncols=min(len(series), 3))  # seen where charts scroll
         return _svg(figure)
@@ -79,7 +65,7 @@ def bars(
     if not values:
         raise ValueError("a chart needs at least one bar")
     with matplotlib.rc_context(_STYLE):
-        figure, axes = _axes((7.2, 0.6 + 0.34 * len(values)))
+        figure, (axes,) = _axes((7.2, 0.6 + 0.34 * len(values)))
         names = list(values)[::-1]
         tints = [SERIES[0] if name in highlighted else "#94a3b8" for name in names]
         drawn = axes.barh(names, [values[name] for name in names], color=tints, height=0.66)
@@ -102,16 +88,13 @@ def side_by_side(
 ) -> tuple[str, bytes]:
     """Panels by title with one vertical axis, each drawn by its function, as SVG text and as PNG.
 
-    What the first panel labels is explained below them all, in so many columns (by default in one line).
+    A legend of the first panel's labels lies below them all, in so many columns (by default in one line).
     """
     if not panels:
         raise ValueError("a chart needs at least one panel")
     with matplotlib.rc_context(_STYLE):
-        figure = Figure(figsize=size, layout="constrained")
-        figure.patch.set_alpha(0)
-        drawn = figure.subplots(1, len(panels), sharex=True, sharey=True, squeeze=False)[0]
+        figure, drawn = _axes(size, len(panels))
         for axes, (title, draw) in zip(drawn, panels.items(), strict=True):
-            axes.patch.set_alpha(0)
             draw(axes)
             axes.set_title(title, fontsize=10)
             axes.set_xlabel(x_label)
@@ -119,54 +102,39 @@ def side_by_side(
         if handles:
             figure.legend(handles, labels, loc="outside lower left", ncols=columns or len(handles))
         svg = _svg(figure)
-        figure.patch.set(facecolor="white", alpha=1)  # a picture file has no page behind it
+        figure.patch.set(facecolor="white", alpha=1)  # an image file has no page behind it
         stream = BytesIO()
         figure.savefig(stream, format="png", dpi=150, metadata={"Software": None})
         return svg, stream.getvalue()
 
 
-def _axes(size: tuple[float, float]) -> tuple[Figure, Axes]:
+def _axes(size: tuple[float, float], count: int = 1) -> tuple[Figure, Sequence[Axes]]:
+    """A transparent figure with so many axes in a row."""
     figure = Figure(figsize=size, layout="constrained")
-    figure.patch.set_alpha(0)
-    axes = figure.add_subplot()
-    axes.patch.set_alpha(0)
-    return figure, axes
-
-
-def _spoken(value: float, _: int | None = None) -> str:
-    """A tick of a count: 10,000, and 0.5 as it is."""
-    return f"{value:,.0f}" if float(value).is_integer() else f"{value:g}"
-
-
-def _cycle(count: int) -> list[str]:
-    return [SERIES[index % len(SERIES)] for index in range(count)]
+    drawn = figure.subplots(1, count, sharex=True, sharey=True, squeeze=False)[0]
+    for part in (figure, *drawn):
+        part.patch.set_alpha(0)
+    return figure, drawn
 
 
 def _svg(figure: Figure) -> str:
     """The figure's SVG element alone: no prologue, no metadata, ids of its own, the page's colour."""
     stream = StringIO()
-    figure.savefig(
-        stream, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None}
-    )
+    figure.savefig(stream, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
     text = stream.getvalue()
-    text = text[text.index("<svg") :]
-    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
+    text = re.sub(r"<metadata>.*?</metadata>", "", text[text.index("<svg") :], flags=re.DOTALL)
     text = text.replace(INK, "currentColor")
-    text = re.sub(r'(<svg[^>]*?) width="[^"]*"', r"\1", text, count=1)
-    text = re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", text, count=1)
+    for name in ("width", "height"):
+        text = re.sub(rf'(<svg[^>]*?) {name}="[^"]*"', r"\1", text, count=1)
     text = re.sub(r"font: ([\d.]+)px [^;\"]*", r"font-size: \1px", text)
-    text = re.sub(r"font-family: [^;\"]*;?", "", text)
-    return _own_ids(text)
+    return _own_ids(re.sub(r"font-family: [^;\"]*;?", "", text))
 
 
 def _own_ids(svg: str) -> str:
     """Ids of one chart must not meet those of another: keep the referenced ones, with a prefix."""
     prefix = "c" + sha256(svg.encode()).hexdigest()[:8]
     used = set(re.findall(r'(?:url\(#|href="#)([^)"]+)', svg))
-
-    def renamed(match: re.Match[str]) -> str:
-        return f' id="{prefix}-{match[1]}"' if match[1] in used else ""
-
-    svg = re.sub(r' id="([^"]+)"', renamed, svg)
-    svg = re.sub(r"url\(#", f"url(#{prefix}-", svg)
-    return re.sub(r'href="#', f'href="#{prefix}-', svg)
+    svg = re.sub(
+        r' id="([^"]+)"', lambda match: f' id="{prefix}-{match[1]}"' if match[1] in used else "", svg
+    )
+    return svg.replace("url(#", f"url(#{prefix}-").replace('href="#', f'href="#{prefix}-')

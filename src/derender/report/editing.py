@@ -11,11 +11,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
-import numpy as np
 from PIL import Image
 
 from derender.evaluation.out_of_distribution import OUTLIER_PERCENTILE
-from derender.report.opening import ImageOpener, OpenedImage
+from derender.report.opening import ImageOpener, OpenedImage, readable
 from derender.report.panel import Sheets
 from derender.scene.crop_search import WHOLE, Crop
 from derender.storage.atomic import atomic_file, atomic_folder
@@ -115,9 +114,11 @@ def write_images(
 
     Raises:
         FileExistsError: something would be replaced, and ``force`` is off.
-        ValueError: no image can be read, or what was requested is impossible.
+        ValueError: no image can be read, or the edit is impossible.
     """
-    read, refused = _readable(opener, paths)
+    read, refused = readable(paths, opener.read)
+    if not read:
+        raise ValueError("give at least one image")
     with_sheet = len(read) > 1 if sheet is None else sheet
     sheets, records = Sheets(), []
     folders = _free_places(list(read), out, sheets.rows if with_sheet else None, force)
@@ -138,22 +139,6 @@ def write_images(
     percentiles = {str(one.path): one.percentile for one in every if one.percentile is not None}
     crops = {str(one.path): one.crop for one in every} if opener.options.cropped else {}
     return WrittenImages(out, records, files, refused, percentiles, crops)
-
-
-def _readable(
-    opener: ImageOpener, paths: Sequence[Path]
-) -> tuple[dict[Path, tuple[np.ndarray, Crop]], dict[str, str]]:
-    """The images that can be read, and reasons why the others cannot."""
-    read: dict[Path, tuple[np.ndarray, Crop]] = {}
-    refused: dict[str, str] = {}
-    for path in dict.fromkeys(paths):
-        try:
-            read[path] = opener.read(path)
-        except (ValueError, OSError) as problem:
-            refused[str(path)] = " ".join(str(problem).split())
-    if not read:
-        raise ValueError(next(iter(refused.values()), "give at least one image"))
-    return read, refused
 
 
 def _free_places(images: Sequence[Path], out: Path, sheet_rows: int | None, force: bool) -> list[Path]:

@@ -11,7 +11,6 @@ have holes. Values are stored as they are: images are sRGB-coded, as is a base c
 closing the back, several objects, and compressed geometry.
 """
 
-import io
 import re
 from dataclasses import dataclass
 from math import ceil, cos, radians
@@ -59,11 +58,39 @@ class Mesh:
     def files(self, name: str, form: str = "glb") -> dict[str, bytes]:
         """File name to content: ``NAME.glb``, or ``NAME.obj``, ``NAME.mtl`` and ``NAME.png``.
 
-        OBJ knows no names with spaces; such characters become underscores.
+        The material is the albedo without gloss, seen from both sides. OBJ knows no names with spaces; such
+        characters become underscores.
         """
+        import trimesh
+        from trimesh.exchange.gltf import export_glb
+        from trimesh.exchange.obj import export_obj
+        from trimesh.visual import TextureVisuals
+        from trimesh.visual.material import PBRMaterial, SimpleMaterial
+
+        def shape(material: Any) -> Any:
+            visual = TextureVisuals(uv=self.uv, material=material)
+            return trimesh.Trimesh(
+                self.vertices, self.faces, vertex_normals=self.normals, visual=visual, process=False
+            )
+
         if checked_format(form) == "glb":
-            return {f"{name}.glb": _glb(self)}
-        return _obj(self, re.sub(r"[^\w.-]", "_", name))
+            material = PBRMaterial(
+                name="albedo", baseColorTexture=self.texture, metallicFactor=0.0, roughnessFactor=1.0,
+                doubleSided=True,
+            )  # fmt: skip
+            scene = trimesh.Scene(shape(material))
+            return {f"{name}.glb": bytes(export_glb(scene, include_normals=True))}
+        name = re.sub(r"[^\w.-]", "_", name)
+        matt = SimpleMaterial(image=self.texture, diffuse=[255] * 4, ambient=[0] * 4, specular=[0] * 4)
+        matt.name = name
+        text, beside = export_obj(
+            shape(matt), include_normals=True, return_texture=True, mtl_name=f"{name}.mtl"
+        )
+        return {
+            f"{name}.obj": text.encode(),
+            f"{name}.mtl": beside[f"{name}.mtl"],
+            f"{name}.png": beside[f"{name}.png"],
+        }
 
 
 @dataclass(frozen=True)
@@ -184,41 +211,3 @@ def _faces(cells: np.ndarray, width: int) -> np.ndarray:
     a = row * width + column
     b, c, d = a + width, a + 1, a + width + 1
     return np.concatenate((np.stack((a, b, c), axis=1), np.stack((c, b, d), axis=1)))
-
-
-def _glb(mesh: Mesh) -> bytes:
-    import trimesh
-    from trimesh.exchange.gltf import export_glb
-    from trimesh.visual import TextureVisuals
-    from trimesh.visual.material import PBRMaterial
-
-    material = PBRMaterial(
-        name="albedo",
-        baseColorTexture=mesh.texture,
-        metallicFactor=0.0,
-        roughnessFactor=1.0,
-        doubleSided=True,
-    )
-    visual = TextureVisuals(uv=mesh.uv, material=material)
-    made: Any = trimesh.Trimesh(
-        mesh.vertices, mesh.faces, vertex_normals=mesh.normals, visual=visual, process=False
-    )
-    return bytes(export_glb(trimesh.Scene(made), include_normals=True))
-
-
-def _obj(mesh: Mesh, name: str) -> dict[str, bytes]:
-    """Written here, since trimesh chooses the names of material and texture itself."""
-    lines = io.StringIO()
-    lines.write(f"# x right, y up, z towards the viewer\nmtllib {name}.mtl\no {name}\nusemtl albedo\n")
-    for word, rows in (("v", mesh.vertices), ("vt", mesh.uv), ("vn", mesh.normals)):
-        np.savetxt(lines, rows, fmt=f"{word} " + " ".join(["%.7g"] * rows.shape[1]))
-    numbers = mesh.faces + 1
-    np.savetxt(lines, np.repeat(numbers, 3, axis=1), fmt="f %d/%d/%d %d/%d/%d %d/%d/%d")
-    texture = io.BytesIO()
-    mesh.texture.save(texture, format="PNG")
-    material = f"newmtl albedo\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd {name}.png\n"
-    return {
-        f"{name}.obj": lines.getvalue().encode(),
-        f"{name}.mtl": material.encode(),
-        f"{name}.png": texture.getvalue(),
-    }

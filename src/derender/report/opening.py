@@ -7,10 +7,10 @@ command line imports this module for its help. Leaves out edits and writing (``e
 """
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 if TYPE_CHECKING:
     import numpy as np
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from derender.scene.crop_search import Crop
     from derender.training.held_out_errors import HeldOutErrors
 
+T = TypeVar("T")
 CHOICES = {"texture": ("model", "original"), "crop": ("whole", "auto")}
 FILM_KINDS = ("gif", "mp4")
 EDIT_SIZE, MESH_SIZE = 256, 128
@@ -37,23 +38,13 @@ class ImageOptions:
     """How an image is read and its scene drawn."""
 
     size: int | None = option(
-        None,
-        "Side of the output in pixels (default: 256, mesh 128, decompose the model's).",
-        min=8,
-        max=4096,
-        metavar="N",
+        None, "Side of the output: 256, of meshes 128, of decompositions the model's.", min=8, max=4096
     )
     texture: str = option(
-        "model",
-        "model: its albedo. original: the image's own detail where it shows.",
-        metavar="model|original",
+        "model", "model: its albedo. original: the image's own detail.", metavar="model|original"
     )
     fit_steps: int | None = option(
-        None,
-        "Optimise each scene against its image by rendering, in N steps (60, say; slow).",
-        min=0,
-        max=10_000,
-        metavar="N",
+        None, "Optimise each scene against its image in N steps (60, say; slow).", min=0, max=10_000
     )
     crop: str = option(
         "whole", "auto: the part of each image that the model reconstructs best.", metavar="whole|auto"
@@ -210,6 +201,20 @@ class ImageOpener:
                 pixels = picture_on_grid(pixels, own)
             scene = scene.with_parameters(albedo=picture_albedo(pixels, scene, self.model.fov_deg))
         return replace(image, scene=scene)
+
+
+def readable(paths: Sequence[Path], read: Callable[[Path], T]) -> tuple[dict[Path, T], dict[str, str]]:
+    """Every file that can be read, and reasons why the others cannot; none at all is an error."""
+    found: dict[Path, T] = {}
+    refused: dict[str, str] = {}
+    for path in dict.fromkeys(paths):
+        try:
+            found[path] = read(path)
+        except (ValueError, OSError) as problem:
+            refused[str(path)] = " ".join(str(problem).split())
+    if refused and not found:
+        raise ValueError(next(iter(refused.values())))
+    return found, refused
 
 
 def read_file(path: Path, size: int) -> "np.ndarray":

@@ -3,7 +3,7 @@
 With ``evidence`` (data, decompositions, films, scores, card, explanation) the page holds that, too.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from io import BytesIO
 from math import isfinite
 from pathlib import Path
@@ -15,15 +15,17 @@ from torch import Tensor
 
 from derender.baselines.training import read_any_config
 from derender.model import Derenderer
-from derender.report import blocks, charts
+from derender.report import blocks, charts, colours
 from derender.report.decomposition import decompose_images
 from derender.report.evidence import Evidence, recorded_environment
 from derender.report.page import Page, Section
+from derender.report.panel import labelled_grid
 from derender.settings import Settings
 from derender.training.config import TrainConfig, setting_names
 from derender.training.run_folder import RunFolder, read_metrics
 
 SHEETS_SHOWN, SHEET_PX = 4, 1080
+Columns = Callable[[Any, Tensor], Mapping[str, Tensor]]
 CHARTS = (
     ("l1", "L1", "Mean absolute difference between image and reconstruction, inside the mask."),
     (
@@ -33,7 +35,8 @@ CHARTS = (
         "of sigma is part of it.",
     ),
 )
-BASELINE_CHARTS = (
+BASELINE_Columns = Callable[[Any, Tensor], Mapping[str, Tensor]]
+CHARTS = (
     ("l1", "L1", "Mean absolute difference between image and reconstruction."),
     ("loss", "loss", "Validation loss on held-out images."),
 )
@@ -42,6 +45,16 @@ BASELINE_CHARTS = (
 def decomposition_sheet(model: Derenderer, pictures: Float[Tensor, "n 3 h w"]) -> Image.Image:
     """Decompositions of some images: a labelled panel with a row for each."""
     return decompose_images(model, pictures).sheet()
+
+
+def baseline_sheet(columns_of: Columns) -> Callable[[Any, Float[Tensor, "n 3 h w"]], Image.Image]:
+    """A function of a baseline and images (0..1) that draws a row for each image, a column for each kind."""
+
+    def sheet(model: Any, pictures: Float[Tensor, "n 3 h w"]) -> Image.Image:
+        columns = columns_of(model, pictures)
+        return labelled_grid({name: colours.pictures(values) for name, values in columns.items()})
+
+    return sheet
 
 
 def run_page(folder: str | Path, evidence: Evidence | None = None) -> Page:

@@ -71,8 +71,7 @@ def _train(
 ) -> Any:
     from derender.cli.models import chosen_device
     from derender.data import read_pictures
-    from derender.report.baseline_sheet import baseline_sheet
-    from derender.report.run import decomposition_sheet
+    from derender.report.run import baseline_sheet, decomposition_sheet
     from derender.training.derender_task import train
 
     learnt, in_the_loop = plan.train[job.where], plan.kind(job.method) not in WITHOUT_LOOP

@@ -29,7 +29,7 @@ from derender.features import FeatureTable
 from derender.inputs import require_fitting
 from derender.model import Derenderer
 from derender.report.colours import pictures
-from derender.report.opening import held_out_errors, read_file
+from derender.report.opening import held_out_errors, read_file, readable
 from derender.report.viewer.guard import Guard
 from derender.report.viewer.neighbours import Example, Gallery, named_examples, rendered_examples
 from derender.report.viewer.questions import (
@@ -169,15 +169,7 @@ def open_viewer(
             )
         gallery = Gallery(table, data, dataset)
     studio = Studio(model, Path(source).name, Shelf(keep), held_out_errors(source), table, fit_steps, cropped)
-    read: dict[Path, Any] = {}
-    problems: dict[Path, str] = {}
-    for path in dict.fromkeys(images):
-        try:
-            read[path] = read_file(path, studio.reading_size)
-        except (ValueError, OSError) as problem:
-            problems[path] = " ".join(str(problem).split())
-    if problems and not read:
-        raise ValueError(next(iter(problems.values())))
+    read, problems = readable(images, lambda path: read_file(path, studio.reading_size))
     notes = [f"left out {path}: {reason}" for path, reason in problems.items()]
     if gallery is not None and gallery.without_pictures:
         notes.append(f"neighbours are shown without images: {gallery.without_pictures}")
@@ -225,12 +217,12 @@ class Application:
             "/api/archive": partial(self.made, studio.archive, "application/zip"),
             "/api/settings": self.settings,
         }
-        routes = [
-            Route(path, partial(self.answered, answer), methods=["POST"]) for path, answer in posts.items()
-        ]
-        routes += [Route(path, _page_file(*file), methods=["GET"]) for path, file in PAGE_FILES.items()]
-        routes.append(Route("/api/about", partial(self.answered, self.about), methods=["GET"]))
-        handlers: dict[Any, Any] = {HTTPException: _plain_error}
+        gets = {path: _page_file(*file) for path, file in PAGE_FILES.items()} | {"/api/about": self.about}
+        routes = [Route(path, answer, methods=["POST"]) for path, answer in posts.items()]
+        routes += [Route(path, answer, methods=["GET"]) for path, answer in gets.items()]
+        handlers: dict[Any, Any] = {
+            HTTPException: _no_such_address, Refused: _refusal, ClientDisconnect: _gone,
+        }  # fmt: skip
         self.guarded = Guard(Starlette(routes=routes, exception_handlers=handlers), host)
 
     def close(self) -> None:
@@ -239,15 +231,6 @@ class Application:
         self._decoding.shutdown(cancel_futures=True)
         if self.viewer.gallery is not None:
             self.viewer.gallery.close()
-
-    async def answered(self, answer: Answer, request: Request) -> Response:
-        """The answer, or the reason of a refusal."""
-        try:
-            return await answer(request)
-        except Refused as refused:
-            return JSONResponse({"error": refused.message}, refused.status)
-        except ClientDisconnect:
-            return Response(status_code=400)
 
     async def about(self, request: Request) -> Response:
         """All that the page needs to draw itself."""
@@ -384,6 +367,13 @@ def _page_file(name: str, media_type: str) -> Answer:
     return answer
 
 
-async def _plain_error(request: Request, problem: HTTPException) -> Response:
-    """No such address, or not by this method."""
+async def _no_such_address(request: Request, problem: HTTPException) -> Response:
     return JSONResponse({"error": problem.detail}, problem.status_code, headers=problem.headers)
+
+
+async def _refusal(request: Request, refused: Refused) -> Response:
+    return JSONResponse({"error": refused.message}, refused.status)
+
+
+async def _gone(request: Request, problem: ClientDisconnect) -> Response:
+    return Response(status_code=400)
