@@ -32,7 +32,8 @@ from derender.model import Derenderer, load
 from derender.report.run import decomposition_sheet
 from derender.settings import Settings
 from derender.training.config import TrainConfig, resolve
-from derender.training.loop import Progress, TrainResult, train
+from derender.training.derender_task import train
+from derender.training.task import Progress, TrainResult
 
 Report = Callable[[str, int, int, str], None]
 """Called with (stage, done, total, note)."""
@@ -216,7 +217,7 @@ def run_demo(
 
 
 def _generated(
-    count: int, size: int, seed: int, progress: Callable[[int, int], object] | None = None
+    count: int, size: int, seed: int, progress: Callable[[int, int], None] | None = None
 ) -> tuple[PictureSet, GroundTruth]:
     """Generated faces as a set of images, and with everything that made them."""
     made = faces.generate(count, size, seed, progress=progress)

@@ -35,8 +35,7 @@ CHARTS = (
         "of sigma is part of it.",
     ),
 )
-BASELINE_Columns = Callable[[Any, Tensor], Mapping[str, Tensor]]
-CHARTS = (
+BASELINE_CHARTS = (
     ("l1", "L1", "Mean absolute difference between image and reconstruction."),
     ("loss", "loss", "Validation loss on held-out images."),
 )
