@@ -111,7 +111,7 @@ def side_by_side(
 def _axes(size: tuple[float, float], count: int = 1) -> tuple[Figure, Sequence[Axes]]:
     """A transparent figure with so many axes in a row."""
     figure = Figure(figsize=size, layout="constrained")
-    drawn = figure.subplots(1, count, sharex=True, sharey=True, squeeze=False)[0]
+    drawn = list(figure.subplots(1, count, sharex=True, sharey=True, squeeze=False)[0])
     for part in (figure, *drawn):
         part.patch.set_alpha(0)
     return figure, drawn
