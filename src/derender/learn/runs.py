@@ -7,10 +7,9 @@ from typing import Any
 from derender.baselines import baseline_config, image_size_of, stored_config, train_baseline
 from derender.data import PictureSet
 from derender.inputs import as_images, device_named
-from derender.report.baseline_sheet import baseline_sheet
 from derender.report.evidence import Evidence, look_at_data
 from derender.report.page import Section
-from derender.report.run import decomposition_sheet, run_page
+from derender.report.run import baseline_sheet, decomposition_sheet, run_page
 from derender.training import derender_task
 from derender.training.config import (
     TrainConfig,

@@ -36,19 +36,19 @@ from derender.report.viewer.questions import (
     BODY_LIMIT_BYTES,
     LARGEST_SIZE,
     PIXEL_LIMIT,
-    NeighbourQuestion,
+    NeighbourRequest,
     Q,
-    Question,
     Refused,
+    ViewRequest,
     pixels_of,
-    read_question,
+    read_request,
     too_large,
 )
 from derender.report.viewer.studio import KEPT, Shelf, Studio, data_url
 
 BODY_SECONDS = 30.0
 WORK_SECONDS = 30.0
-QUESTION_LIMIT_BYTES = 10_000
+REQUEST_LIMIT_BYTES = 10_000
 UPLOADS_LIMIT_BYTES = 10 * BODY_LIMIT_BYTES
 """Of all uploads together that arrive or wait to be decoded."""
 
@@ -277,19 +277,19 @@ class Application:
 
     async def factors(self, request: Request) -> Response:
         """The maps of an image, by name, as images inside JSON."""
-        question = await self._question(request, Question)
+        question = await self._question(request, ViewRequest)
         maps = await self._work(self._computing, self.viewer.studio.maps, question)
         return JSONResponse({name: data_url(image) for name, image in maps.items()})
 
     async def settings(self, request: Request) -> Response:
         """Light and camera as JSON."""
-        question = await self._question(request, Question)
+        question = await self._question(request, ViewRequest)
         text = json.dumps(self.viewer.studio.settings(question), indent=1) + "\n"
         return Response(text, media_type="application/json")
 
     async def neighbours(self, request: Request) -> Response:
         """The rows nearest to an image by one factor, with their images where those are here."""
-        question = await self._question(request, NeighbourQuestion)
+        question = await self._question(request, NeighbourRequest)
         found = await self._work(self._computing, self.viewer.studio.neighbours, question)
         gallery = self.viewer.gallery
         assert gallery is not None, "a studio with a table has a gallery"
@@ -299,9 +299,9 @@ class Application:
             rows.append({**gallery.about(row), "distance": distance, "image": image})
         return JSONResponse({"factor": question.factor, "rows": rows})
 
-    async def made(self, make: Callable[[Question], bytes], media_type: str, request: Request) -> Response:
+    async def made(self, make: Callable[[ViewRequest], bytes], media_type: str, request: Request) -> Response:
         """Bytes that the studio makes for a question."""
-        question = await self._question(request, Question)
+        question = await self._question(request, ViewRequest)
         return Response(await self._work(self._computing, make, question), media_type=media_type)
 
     async def _opened(self, pixels: Any) -> Response:
@@ -322,8 +322,8 @@ class Application:
 
     async def _question(self, request: Request, kind: type[Q]) -> Q:
         body = Body()
-        await self._receive(request, body, QUESTION_LIMIT_BYTES)
-        return read_question(kind, bytes(body.content))
+        await self._receive(request, body, REQUEST_LIMIT_BYTES)
+        return read_request(kind, bytes(body.content))
 
     async def _receive(self, request: Request, body: Body, limit: int) -> None:
         """Fill ``body``; ``Refused`` if it is too large (413), too slow (408) or had to make room (503)."""

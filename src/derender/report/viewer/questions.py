@@ -80,7 +80,7 @@ class Camera(_Checked):
         return torch.tensor([[*map(radians, self.rotation_deg), *self.translation]])
 
 
-class Question(_Checked):
+class ViewRequest(_Checked):
     """An image as it is to be shown.
 
     Attributes:
@@ -98,7 +98,7 @@ class Question(_Checked):
     size: Annotated[int, Field(ge=8, le=LARGEST_SIZE)] | None = None
 
 
-class NeighbourQuestion(Question):
+class NeighbourRequest(ViewRequest):
     """An image whose nearest rows are requested, by one factor."""
 
     factor: Annotated[str, Field(max_length=64)]
@@ -108,7 +108,7 @@ class NeighbourQuestion(Question):
 Q = TypeVar("Q", bound=_Checked)
 
 
-def read_question(kind: type[Q], body: bytes) -> Q:
+def read_request(kind: type[Q], body: bytes) -> Q:
     """The question in a request's body; anything else is refused with its first mistake."""
     try:
         return kind.model_validate_json(body)

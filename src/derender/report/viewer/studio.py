@@ -32,7 +32,7 @@ from derender.model import Derenderer
 from derender.report import colours
 from derender.report.mesh import model_mesh
 from derender.report.panel import labelled_grid, strip
-from derender.report.viewer.questions import Camera, Light, NeighbourQuestion, Question, Refused
+from derender.report.viewer.questions import Camera, Light, NeighbourRequest, Refused, ViewRequest
 from derender.scene import Scene
 from derender.scene.crop_search import SEARCH_SCALE, WHOLE, as_bytes, best_crops
 from derender.scene.enlarge import at_size
@@ -167,7 +167,7 @@ class Studio:
             "out_of_distribution": percentile is not None and percentile > OUTLIER_PERCENTILE,
         }
 
-    def scene(self, question: Question) -> Scene:
+    def scene(self, question: ViewRequest) -> Scene:
         """The requested scene, at its size."""
         scene = self.shelf.get(question.picture).scene
         parameters = {factor.name: factor.parameter for factor in self.model.factors}
@@ -181,18 +181,18 @@ class Studio:
             scene = scene.with_parameters(camera=question.camera.camera_row())
         return at_size(scene, max(question.size or 0, self.model.image_size))
 
-    def view(self, question: Question) -> bytes:
+    def view(self, question: ViewRequest) -> bytes:
         """The rendering and, right of it, the shading, as one PNG; transparent where nothing is seen."""
         with torch.inference_mode():
             scene = self.scene(question)
             return _png(strip([self._rendered(scene), self._shading(scene)]), quick=True)
 
-    def picture(self, question: Question) -> bytes:
+    def picture(self, question: ViewRequest) -> bytes:
         """The rendering alone, as a PNG with transparency."""
         with torch.inference_mode():
             return _png(self._rendered(self.scene(question)))
 
-    def maps(self, question: Question) -> dict[str, Image.Image]:
+    def maps(self, question: ViewRequest) -> dict[str, Image.Image]:
         """Input, its reconstruction, the requested view, and the factors of that, by name."""
         opened = self.shelf.get(question.picture)
         with torch.inference_mode():
@@ -207,11 +207,11 @@ class Studio:
                 "shading": self._shading(scene),
             }
 
-    def panel(self, question: Question) -> bytes:
+    def panel(self, question: ViewRequest) -> bytes:
         """All maps with their names in one PNG."""
         return _panel(self.maps(question))
 
-    def archive(self, question: Question) -> bytes:
+    def archive(self, question: ViewRequest) -> bytes:
         """A ZIP: the panel, every map, the mesh, and the settings."""
         maps = self.maps(question)
         files = {"panel.png": _panel(maps)} | {f"{name}.png": _png(image) for name, image in maps.items()}
@@ -223,7 +223,7 @@ class Studio:
                 archive.writestr(name, content)
         return packed.getvalue()
 
-    def mesh(self, question: Question) -> bytes:
+    def mesh(self, question: ViewRequest) -> bytes:
         """The surface in its canonical view as GLB; ``Refused`` (422) where there is none."""
         scene = self.scene(question)
         try:
@@ -231,7 +231,7 @@ class Studio:
         except ValueError as problem:
             raise Refused(422, str(problem)) from problem
 
-    def settings(self, question: Question) -> dict[str, Any]:
+    def settings(self, question: ViewRequest) -> dict[str, Any]:
         """Light and camera in numbers, and how the image was made."""
         scene = self.shelf.get(question.picture).scene
         return {
@@ -243,7 +243,7 @@ class Studio:
             "size": max(question.size or 0, self.model.image_size),
         }
 
-    def neighbours(self, question: NeighbourQuestion) -> list[tuple[int, float]]:
+    def neighbours(self, question: NeighbourRequest) -> list[tuple[int, float]]:
         """Rows nearest by one factor of the image that gives it, and distances; without that image itself."""
         if self.table is None:
             raise Refused(404, "there is no table to look in: start the viewer with --features FILE.parquet")
