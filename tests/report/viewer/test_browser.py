@@ -175,7 +175,7 @@ def test_what_is_wrong_is_said_and_the_page_goes_on(page, rendered):
         )
         page.wait_for_selector(f'#second[alt="second image: {number}.png"]')
     set_slider(page, "camera-yaw", 30)  # opens it again
-    assert "no longer kept" not in page.inner_text("#status")
+    assert "no longer stored" not in page.inner_text("#status")
 
 
 def test_it_fits_a_phone_and_follows_the_dark(browser, address):
