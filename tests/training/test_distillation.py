@@ -21,7 +21,7 @@ from derender.training.distillation import (
 
 FRAMES = CropSettings(nearer=1.15, farther=1.9, shift=0.25)
 LESSONS = RefiningSettings(
-    images=480, batch_size=16, learning_rate=5e-4, fit_steps=8, rendered=0.25, worst=0, picture_weight=0
+    images=192, batch_size=8, learning_rate=5e-4, fit_steps=8, rendered=0.25, worst=0, picture_weight=0
 )
 SHORT = RefineConfig.model_validate(
     {
@@ -144,7 +144,7 @@ def test_pictures_in_other_frames_come_with_the_camera_that_sees_them_so(model, 
 
 
 def test_a_copy_taught_so_steps_back_from_smaller_faces(model, images):
-    taught = refine(model, images, images, framed(images=1600, rendered=0, fit_steps=8), seed=5).model
+    taught = refine(model, images, images, framed(images=480, rendered=0, fit_steps=4), seed=5).model
     assert taught.settings.ranges.translation_z == pytest.approx(0.9 / 0.75)
     assert model.settings.ranges.translation_z == 0
     pictures = images.float() / 255

@@ -42,7 +42,7 @@ def said_jointly(model, images) -> torch.Tensor:
     return model.unet_decoder([torch.cat(level, dim=1) for level in levels])
 
 
-SHORT = UNetSettings(images=480, batch_size=8, unet_width=4, learning_rate=3e-3)
+SHORT = UNetSettings(images=96, batch_size=8, unet_width=4, learning_rate=3e-3)
 
 
 @pytest.fixture(scope="module")
@@ -126,8 +126,8 @@ def test_the_decoder_is_saved_with_the_copy(taught, images, tmp_path):
 
 def test_it_learns_what_the_model_says():
     model = derender.load("rendered-faces-64")
-    images = torch.from_numpy(faces.generate(48, image_size=64, seed=9).images)
-    settings = UNetSettings(images=960, batch_size=16, unet_width=4, learning_rate=5e-3)
+    images = torch.from_numpy(faces.generate(24, image_size=64, seed=9).images)
+    settings = UNetSettings(images=480, batch_size=12, unet_width=4, learning_rate=5e-3)
     taught = distil_unets(model, images, settings)
     hardly = distil_unets(model, images, settings.model_copy(update={"images": 16}))
     assert taught.errors["place"] < 0.75 * hardly.errors["place"]

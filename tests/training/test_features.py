@@ -1,0 +1,201 @@
+"""Features of a trained model: whitened ones move less with other factors; fitting has its own maps."""
+
+import numpy as np
+import pytest
+import torch
+
+import derender
+from derender.data.synthetic import faces
+from derender.evaluation.disentanglement.swap import swap_test
+from derender.features.extract import model_fingerprint
+from derender.postprocess import Features
+from derender.postprocess.fitting import Fitting, FittingSettings, coordinates_of
+from derender.postprocess.morphable import MorphableMaps
+from derender.scene.perturb import PerturbSettings
+from derender.storage.folder import FITTING_FILE, WHITENING_FILE
+from derender.training.config import FeatureSettings, WhiteningSettings, with_changes
+from derender.training.features import BATCH_SIZE, fit_whitening, make_features, make_fitting
+
+SETTINGS = WhiteningSettings(pictures=80, views=2, directions=16, spatial=False)
+CODES_OF_VECTORS = SETTINGS.model_copy(update={"vectors": False})
+FITTING = FittingSettings(coordinates=12, steps=4, weight=0.5)
+
+
+@pytest.fixture(scope="module")
+def plain() -> derender.Derenderer:
+    """A bundled model whose features are its codes."""
+    return derender.load("rendered-faces-64").without_features()
+
+
+@pytest.fixture(scope="module")
+def images() -> torch.Tensor:
+    return torch.from_numpy(faces.generate(BATCH_SIZE + 1, image_size=64, seed=5).images)
+
+
+def whitened(model, images, settings=SETTINGS, seed=0) -> derender.Derenderer:
+    return model.with_features(Features(fit_whitening(model, images, settings, PerturbSettings(), seed=seed)))
+
+
+@pytest.fixture(scope="module")
+def white(plain, images) -> derender.Derenderer:
+    return whitened(plain, images[:80])
+
+
+@pytest.fixture(scope="module")
+def fitted(images) -> derender.Derenderer:
+    model = derender.load("rendered-faces-64")
+    fitting = make_fitting(model, images[:24], FITTING)
+    return model.with_features(Features(model.whitening, fitting))
+
+
+def test_features_of_unseen_images_follow_other_factors_less_than_codes(plain, white, images):
+    before, after = (swap_test(model, images[-32:].numpy()).moved for model in (plain, white))
+    for place in range(4):
+        others = np.arange(4) != place
+        assert after[others, place].mean() < 0.9 * before[others, place].mean()
+    for place in (2, 3):
+        assert after[place, place] > 0.95 * before[place, place]
+
+
+def test_scenes_are_those_of_the_codes_and_the_fingerprint_changes(plain, white, images):
+    some = images[:4].float() / 255
+    with torch.no_grad():
+        codes, features = white.encode(some), white.embed(some)
+        assert torch.equal(white.decompose(some).depth, white.decode(codes).depth)
+    for name, feature in features.items():
+        assert feature.shape == codes[name].shape and not torch.allclose(feature, codes[name])
+    assert model_fingerprint(plain) != model_fingerprint(white)
+
+
+def test_light_and_camera_keep_their_codes_without_vectors(plain, white, images):
+    model = whitened(plain, images[:80], CODES_OF_VECTORS)
+    for name in ("geometry_map", "albedo_map"):
+        assert torch.equal(model.whitening.get_buffer(name), white.whitening.get_buffer(name))
+    with torch.no_grad():
+        codes, features = model.encode(images[:4] / 255), model.embed(images[:4] / 255)
+    assert all(torch.equal(features[name], codes[name]) for name in ("light", "camera"))
+
+
+def test_a_last_batch_of_one_image_is_left_out_of_exchanges(plain, images):
+    settings = SETTINGS.model_copy(update={"pictures": BATCH_SIZE + 1, "views": 1, "mirrored": False})
+    found = fit_whitening(plain, images, settings, PerturbSettings())
+    assert bool(found.get_buffer("camera_map").isfinite().all())
+
+
+@pytest.mark.parametrize("mirrored", [True, False])
+def test_a_mirror_image_has_the_features_of_the_image_where_both_are_read(plain, images, tmp_path, mirrored):
+    changes = {"mirrored": mirrored, "pictures": 16, "spatial": mirrored, "vectors": False}
+    model = whitened(plain, images, SETTINGS.model_copy(update=changes))
+    again = derender.load(model.save(tmp_path / "model"))
+    some = images[:6].float() / 255
+    with torch.no_grad():
+        one, two, kept = model.embed(some), model.embed(some.flip(-1)), again.embed(some)
+    for name in ("geometry", "albedo"):
+        assert torch.allclose(one[name], two[name], atol=1e-4) is mirrored
+        assert torch.equal(kept[name], one[name])
+    assert not torch.allclose(one["camera"], two["camera"], atol=1e-2)
+
+
+def test_whitening_depends_on_the_seed_and_not_on_earlier_features(white, images):
+    few = CODES_OF_VECTORS.model_copy(update={"pictures": 16})
+    bare = white.without_features()
+    one, two, other = (
+        fit_whitening(model, images, few, PerturbSettings(), seed=seed)
+        for model, seed in ((white, 0), (bare, 0), (bare, 1))
+    )
+    assert torch.equal(one.get_buffer("albedo_map"), two.get_buffer("albedo_map"))
+    assert not torch.equal(one.get_buffer("albedo_map"), other.get_buffer("albedo_map"))
+
+
+@pytest.mark.parametrize("file", [WHITENING_FILE, FITTING_FILE])
+def test_a_damaged_file_is_named(fitted, tmp_path, file):
+    folder = fitted.save(tmp_path / "model")
+    (folder / file).write_bytes(b"not a safetensors file")
+    with pytest.raises(ValueError, match="is damaged"):
+        derender.load(folder)
+
+
+def test_fitted_renderings_come_nearer_to_the_image(fitted, images):
+    some = images[:8].float() / 255
+    found = fitted.fit_scenes(some, 20)
+    assert found.after.mean() < 0.9 * found.before.mean()
+    predicted, optimised = (fitted.render(scene) for scene in (fitted.decompose(some), found.scene))
+    both = (predicted.mask * optimised.mask)[:, None]
+    apart = [((made.image - some).abs() * both).sum() / both.sum() for made in (predicted, optimised)]
+    assert both.mean() > 0.5 and apart[1] < 0.9 * apart[0]
+
+
+def test_light_and_camera_stay_where_something_is_rendered(fitted, monkeypatch):
+    for rate in ("_LIGHT_RATE", "_ROTATION_RATE", "_TRANSLATION_RATE"):
+        monkeypatch.setattr(f"derender.postprocess.fitting.{rate}", 1.0)
+    scene = fitted.fit_scenes(torch.rand(4, 3, 64, 64, generator=torch.Generator().manual_seed(0)), 8).scene
+    assert scene.light[:, :2].min() >= 0.02 and scene.light[:, :2].max() <= 1.2
+    assert scene.light[:, 2:].abs().rad2deg().max() <= 80.001
+    assert scene.camera[:, :3].abs().rad2deg().max() <= 75.001
+    assert scene.camera[:, 3:].abs().max() == pytest.approx(0.4)  # held there, and no further
+
+
+def test_fitted_coordinates_follow_the_feed_forward_features_with_the_set_length(fitted, images):
+    some = images[:24].float() / 255
+    features, activations = fitted.embed(some), fitted.activations(some)
+    plain = fitted.with_features(fitted.features.with_steps(0)).embed(some)
+    squares = {"plain": 0.0, "fitted": 0.0}
+    for name in ("geometry", "albedo"):
+        size = plain[name].shape[1]
+        assert torch.equal(features[name][:, :size], plain[name])
+        expected = fitted.fitting.features(activations[coordinates_of(name)])
+        assert torch.equal(features[name][:, size:], expected) and expected.shape == (24, 12)
+        squares["plain"] += float(plain[name].square().sum())
+        squares["fitted"] += float(expected.square().sum())
+    assert all(torch.equal(features[name], plain[name]) for name in ("light", "camera"))
+    assert (squares["fitted"] / squares["plain"]) ** 0.5 == pytest.approx(0.5, rel=0.01)
+
+
+def test_steps_are_part_of_the_fingerprint_and_fitting_is_saved(fitted, images, tmp_path):
+    before, other = model_fingerprint(fitted), fitted.with_features(fitted.features.with_steps(7))
+    assert model_fingerprint(other) != before
+    assert model_fingerprint(other.with_features(other.features.with_steps(4))) == before
+    again = derender.load(fitted.save(tmp_path / "fitted"))
+    one, two = fitted.embed(images[:2].float() / 255), again.embed(images[:2].float() / 255)
+    assert all(torch.equal(one[name], two[name]) for name in one)
+
+
+def test_maps_of_another_size_are_refused_when_a_model_is_loaded(tmp_path):
+    small = derender.Derenderer.from_preset("small", image_size=32, width=8, light_width=4, code_size=16)
+    maps = {"depth": torch.rand(4, 64, 64), "albedo": torch.rand(4, 3, 64, 64)}
+    fitting = Fitting(MorphableMaps.of(maps, 2), FittingSettings())
+    small.with_features(Features(fitting=fitting)).save(tmp_path / "small")
+    with pytest.raises(ValueError, match=r"is damaged \(it fits depth of \(64, 64\)"):
+        derender.load(tmp_path / "small")
+    with pytest.raises(ValueError, match="derender whiten --model"):
+        small.fit_scenes(torch.rand(1, 3, 32, 32))
+
+
+def test_a_feature_keeps_its_size(plain, images):
+    few = ("pictures=16", "views=1", "spatial=false", "directions=8", "vectors=false")
+    changes = (*few, "examples=16", "coordinates=12", "steps=2")
+    model = make_features(plain, images[:24], with_changes(FeatureSettings(), changes))
+    features = model.embed(images[:3].float() / 255)
+    assert {name: value.shape for name, value in features.items()} == dict.fromkeys(features, (3, 256))
+    assert float(features["geometry"][:, -12:].abs().sum()) > 0
+
+
+def test_a_fitting_does_not_depend_on_an_earlier_one(fitted, images):
+    again = make_fitting(fitted, images[:24], FITTING)
+    for name, value in fitted.fitting.tensors().items():
+        torch.testing.assert_close(again.tensors()[name], value)
+
+
+def test_what_makes_no_sense_is_named(plain, images):
+    for changes, message in (
+        (("coordinates=256", "steps=1"), "leave none of a feature's 256"),
+        (("steps=-1",), "fitting.steps"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            make_features(plain, images, with_changes(FeatureSettings(), ("pictures=4", *changes)))
+    with pytest.raises(ValueError, match="at least 2 images, got 1"):
+        make_fitting(plain, images[:1], FittingSettings())
+    broken = derender.load("rendered-faces-64")
+    next(broken.nets["albedo"].decoder.parameters()).data.fill_(float("nan"))
+    with pytest.raises(ValueError, match="fitting: NaN or infinity in albedo of images 0"):
+        make_fitting(broken, images[:4], FittingSettings())

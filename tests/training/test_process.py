@@ -1,0 +1,63 @@
+"""The process of a run: torch's switch goes back, freed memory is reused, torchmetrics stays whole."""
+
+import resource
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from derender.training.process import deterministic_algorithms, freed_memory_kept
+
+SCORE = "from torchmetrics.functional.classification import multiclass_stat_scores as score"
+
+
+@pytest.mark.parametrize("before", [False, True])
+@pytest.mark.parametrize("deterministic", [False, True])
+def test_the_switch_is_turned_back(before, deterministic):
+    torch.use_deterministic_algorithms(before, warn_only=before)
+    try:
+        with pytest.raises(KeyError), deterministic_algorithms(deterministic):
+            assert torch.are_deterministic_algorithms_enabled() is deterministic
+            raise KeyError
+        assert torch.are_deterministic_algorithms_enabled() is before
+        assert torch.is_deterministic_algorithms_warn_only_enabled() is before
+    finally:
+        torch.use_deterministic_algorithms(False)
+
+
+def page_faults_of_ten_blocks() -> int:
+    """Minor faults while a block of 64 MB is filled and freed ten times."""
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    for _ in range(10):
+        torch.ones(16 * 2**20)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="mallopt is glibc's")
+def test_freed_memory_is_reused_inside_the_block():
+    page_faults_of_ten_blocks()
+    outside = page_faults_of_ten_blocks()
+    with freed_memory_kept() as kept:
+        if not kept:
+            pytest.skip("the C library has no mallopt")
+        page_faults_of_ten_blocks()
+        inside = page_faults_of_ten_blocks()
+    assert outside > 1_000 and inside < outside / 4
+
+
+@pytest.mark.parametrize("order", ["fabric first", "torchmetrics first"])
+def test_fabric_comes_without_torchmetrics_which_stays_whole(order):
+    fabric = """
+import sys
+from derender.training.distributed import DDPStrategy, Fabric
+loaded = sorted(name for name in sys.modules if name.split(".")[0] == "torchmetrics")
+"""
+    code = f"{fabric}assert not loaded, loaded\n{SCORE}" if order == "fabric first" else f"{SCORE}{fabric}"
+    code += """
+import torch
+assert score(torch.tensor([0, 1]), torch.tensor([0, 1]), num_classes=2, average="none").shape == (2, 5)
+assert Fabric(accelerator="cpu", devices=1).world_size == 1
+"""
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert ended.returncode == 0, ended.stderr
