@@ -26,8 +26,8 @@ def model() -> derender.Derenderer:
 
 @pytest.fixture(scope="module")
 def faces_known() -> torch.Tensor:
-    """Five rendered faces that the model was tested on, (5, 3, 64, 64) in 0..1."""
-    examples = rendered_examples("rendered-faces-64", 64)[:5]
+    """Three rendered faces that the model was tested on, (3, 3, 64, 64) in 0..1."""
+    examples = rendered_examples("rendered-faces-64", 64)[:3]
     return torch.from_numpy(np.stack([example.picture for example in examples])).float() / 255
 
 
@@ -35,7 +35,7 @@ def faces_known() -> torch.Tensor:
 def laid_in(faces_known) -> torch.Tensor:
     """The same, each smaller and off the middle of a larger picture with something else around it."""
     size = 160
-    coarse = torch.rand(5, 3, 6, 6, generator=torch.Generator().manual_seed(0))
+    coarse = torch.rand(3, 3, 6, 6, generator=torch.Generator().manual_seed(0))
     canvas = interpolate(coarse, size=(size, size), mode="bicubic").clamp(0, 1)
     left, top, side = TRUE.corner(size)
     canvas[:, :, top : top + side, left : left + side] = interpolate(
@@ -49,11 +49,11 @@ def test_the_part_that_holds_what_the_model_knows_is_found(model, laid_in):
     near = [
         abs(one.side - 0.7) < 0.11 and abs(one.across - 0.1) + abs(one.down - 0.2) < 0.21 for one in found
     ]
-    assert sum(near) == 5
+    assert sum(near) == 3
 
 
 def test_what_the_model_knows_as_it_is_stays_whole(model, faces_known):
-    assert best_crops(model, as_bytes(faces_known)).count(WHOLE) >= 4
+    assert best_crops(model, as_bytes(faces_known)).count(WHOLE) >= 2
 
 
 def test_the_part_is_rendered_again_better(model, laid_in):
@@ -67,7 +67,7 @@ def test_errors_are_shares_of_the_pictures_variance(model, faces_known):
     with torch.inference_mode():
         seen = model.reconstruct(pictures)
     (found,) = crop_errors(model, bytes_, [WHOLE], batch_size=3)
-    for row in range(5):
+    for row in range(3):
         inside = seen.mask[row] > 0
         target, drawn = pictures[row][:, inside].numpy(), seen.image[row][:, inside].numpy()
         variance = ((target - target.mean(axis=1, keepdims=True)) ** 2).sum()

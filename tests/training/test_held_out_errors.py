@@ -82,7 +82,7 @@ def test_too_few_pictures_leave_nothing(tmp_path, pictures):
     folder = net.save(tmp_path / "model")
     assert store_errors(folder, torch.from_numpy(pictures[:19])) is None
     assert read_errors(folder) is None
-    with pytest.raises(ValueError, match="errors of 20 pictures or more"):
+    with pytest.raises(ValueError, match="errors need 20 images or more"):
         errors_of(net, pictures[:19])
 
 

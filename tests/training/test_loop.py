@@ -205,7 +205,7 @@ def test_the_command_says_of_which_weights_the_model_is(worsening, tmp_path, cap
     told += ["--preset", "small", "--data", str(tmp_path / "folder"), "--out", str(tmp_path / "run")]
     assert main(["train", *told]) == 0
     said = " ".join(capsys.readouterr().err.split())
-    assert re.search(r"the model has the weights of (32|64) pictures, the best on held-out ones", said)
+    assert re.search(r"the model has the weights of (32|64) images, the best on held-out ones", said)
     assert main(["train", *told, "--set", "keep=last", "--resume"]) == 0
     assert "the model has the weights" not in capsys.readouterr().err
     assert_model_is_of(tmp_path / "run", "last")

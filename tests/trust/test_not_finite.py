@@ -265,7 +265,7 @@ def test_embedding(model, stage, bad):
 
 def test_held_out_errors(model):
     spoil(model.nets["albedo"].decoder, nan)
-    with pytest.raises(NotFinite, match="the reconstructions of 20 of 20 pictures are no numbers"):
+    with pytest.raises(NotFinite, match="the reconstructions of 20 of 20 images are NaN"):
         errors_of(model, picture_set().images, batch_size=1)
 
 

@@ -59,7 +59,6 @@ def finetune(
     its split is scored beside the majority and beside heads on the frozen features that training began with.
     """
     from derender import learn
-    from derender.report.tables_finetuning import finetuning_table
     from derender.training.config import to_yaml
 
     published.check()
@@ -79,5 +78,5 @@ def finetune(
     result(f"model {made.run.folder}", published.json_file)
     result(f"report {out / 'report.html'}", published.json_file)
     values = {"run": made.run, "report": out / "report.html", "scores": made.scores.numbers()}
-    table = finetuning_table(made.scores, made.start or "fresh weights")
+    table = made.scores.table(made.start or "fresh weights")
     published.show([table], values, [*notes, scoring.remembered(memory)])

@@ -76,6 +76,7 @@ def train(
     dataset: str = "auto",
     limit: int | None = None,
     device: str = "auto",
+    page: bool = True,
     on_images: OnImages | None = None,
     progress: Callable[[Progress], None] | None = None,
 ) -> TrainResult:
@@ -94,6 +95,7 @@ def train(
         dataset: the layout's name, or "auto" to recognise it.
         limit: read at most so many images.
         device: "auto", "cpu" or "cuda".
+        page: write a report page, for which the data are examined.
         on_images: called with the images once they are read.
         progress: called after every step.
 
@@ -128,7 +130,7 @@ def train(
         result = train_baseline(config, images, out, sample_sheet=baseline_sheet, **how)
     writes = this_rank_writes()
     leave()
-    if writes:
+    if writes and page:
         examined = Evidence([Section("The data", look_at_data(images), "Data")])
         run_page(out, examined).write(out / "report.html")
     return result

@@ -8,7 +8,7 @@ import json
 import math
 from collections.abc import Iterable, Mapping
 from reprlib import Repr
-from typing import Any, Literal, TypeVar, overload
+from typing import Any, Literal, TypeVar
 
 import yaml
 from pydantic import Field, ValidationError, field_validator
@@ -231,11 +231,7 @@ def with_changes(config: Config, overrides: Iterable[str] = (), **explicit: Any)
     return config_from_tree(tree, type(config))
 
 
-@overload
-def config_from_tree(tree: Mapping[str, Any]) -> TrainConfig: ...
-@overload
-def config_from_tree(tree: Mapping[str, Any], kind: type[Config]) -> Config: ...
-def config_from_tree(tree: Mapping[str, Any], kind: type[Settings] = TrainConfig) -> Settings:
+def config_from_tree(tree: Mapping[str, Any], kind: type[Any] = TrainConfig) -> Any:
     """Check plain values (from YAML or JSON) and give the configuration, or one clear error."""
     try:
         return kind.model_validate(tree)

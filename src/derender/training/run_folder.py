@@ -7,11 +7,10 @@ tensorboard/.
 import json
 import platform
 import subprocess
-from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from reprlib import Repr
-from typing import Any, overload
+from typing import Any
 
 import torch
 import yaml
@@ -19,7 +18,7 @@ import yaml
 from derender.data import PictureSet, Split
 from derender.settings import Settings
 from derender.storage.atomic import atomic_file, remove_abandoned
-from derender.training.config import Config, TrainConfig, config_from_tree, to_yaml, without_removed
+from derender.training.config import TrainConfig, config_from_tree, to_yaml, without_removed
 
 FORMAT = 1
 """Of config.yaml, which says so in its first line; one that does not is of this format, too."""
@@ -34,49 +33,22 @@ _BEGUN = ("environment.json", ".environment.json-", ".config.yaml-")  # there be
 _REPORTED_PACKAGES = ("derender", "torch", "numpy", "numba", "lightning-fabric", "safetensors", "pillow")
 
 
-@dataclass(frozen=True)
 class RunFolder:
-    """Paths inside one run."""
+    """Paths inside one run; ``previous`` is the checkpoint before the last."""
 
-    path: Path
-
-    @property
-    def config(self) -> Path:
-        return self.path / "config.yaml"
-
-    @property
-    def metrics(self) -> Path:
-        return self.path / "metrics.jsonl"
-
-    @property
-    def samples(self) -> Path:
-        return self.path / "samples"
-
-    @property
-    def last(self) -> Path:
-        return self.path / "checkpoints" / "last"
-
-    @property
-    def previous(self) -> Path:
-        """The checkpoint before the last."""
-        return self.path / "checkpoints" / "previous"
-
-    @property
-    def best(self) -> Path:
-        return self.path / "checkpoints" / "best"
+    def __init__(self, path: Path):
+        self.path = path
+        self.config, self.metrics = path / "config.yaml", path / "metrics.jsonl"
+        self.last, self.previous, self.best = (
+            path / "checkpoints" / name for name in ("last", "previous", "best")
+        )
+        self.samples, self.model = path / "samples", path / "model"
+        self.perceptual = path / "perceptual.safetensors"
 
     @property
     def resumable(self) -> bool:
         """Whether there is a checkpoint to go on from."""
         return self.last.exists() or self.previous.exists()
-
-    @property
-    def model(self) -> Path:
-        return self.path / "model"
-
-    @property
-    def perceptual(self) -> Path:
-        return self.path / "perceptual.safetensors"
 
 
 def start_run(path: Path, config: Settings, data: dict[str, Any], device: str) -> RunFolder:
@@ -135,21 +107,17 @@ def reopen_run(path: Path, config: Settings) -> RunFolder:
     return run
 
 
-@overload
-def read_config(path: Path) -> TrainConfig: ...
-@overload
-def read_config(path: Path, kind: type[Config]) -> Config: ...
-def read_config(path: Path, kind: type[Settings] = TrainConfig) -> Settings:
+def read_config(path: Path, kind: type[Any] = TrainConfig) -> Any:
     """The configuration of a run, which must be of this kind.
 
     Raises:
         ValueError: it is damaged, or the run trained something else.
     """
     tree = read_config_tree(path)
-    trained, asked = (tree.get("baseline"), kind.model_fields.get("baseline"))
-    wanted = None if asked is None else asked.default
-    if trained != wanted:
-        names = [f"the baseline {name}" if name else "a derender model" for name in (trained, wanted)]
+    expected = kind.model_fields.get("baseline")
+    trained, name = tree.get("baseline"), None if expected is None else expected.default
+    if trained != name:
+        names = [f"the baseline {one}" if one else "a derender model" for one in (trained, name)]
         raise ValueError(f"{path} is a run of {names[0]}, not of {names[1]}: give another run folder")
     return config_from_tree(tree, kind)
 
@@ -219,13 +187,20 @@ def drop_metrics_after(run: RunFolder, images: int) -> None:
 
 def environment(device: str) -> dict[str, Any]:
     """Versions, machine and commit, to repeat the run."""
+    command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "HEAD"]
+    try:
+        commit = subprocess.run(
+            command, capture_output=True, text=True, timeout=5, check=False
+        ).stdout.strip()
+    except (OSError, subprocess.TimeoutExpired):
+        commit = ""
     return {
         "python": platform.python_version(),
         "platform": platform.platform(terse=True),
         "processor_threads": torch.get_num_threads(),
         "device": device,
         "packages": {name: _version(name) for name in _REPORTED_PACKAGES},
-        "commit": _commit(),
+        "commit": commit or None,
     }
 
 
@@ -253,19 +228,3 @@ def _version(package: str) -> str | None:
         return version(package)
     except PackageNotFoundError:
         return None
-
-
-def _commit() -> str | None:
-    """The commit of the source tree, if the package runs from one."""
-    source = Path(__file__).resolve().parent
-    try:
-        found = subprocess.run(
-            ["git", "-C", str(source), "rev-parse", "HEAD"],
-            capture_output=True,
-            text=True,
-            timeout=5,
-            check=False,
-        )
-    except (OSError, subprocess.TimeoutExpired):
-        return None
-    return found.stdout.strip() or None

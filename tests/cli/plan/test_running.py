@@ -13,9 +13,9 @@ import pytest
 from PIL import Image
 
 from derender.cli import main
-from derender.cli.plan import embedding, running, training
-from derender.cli.plan.jobs import Place, jobs_of
+from derender.cli.plan import sweep
 from derender.cli.plan.settings import read_plan
+from derender.cli.plan.sweep import Sweep, jobs_of, run_progress
 from derender.training import loop
 
 PLAN = """
@@ -120,7 +120,7 @@ def test_killed_in_the_middle_it_ends_with_the_very_table(plan, whole):
     words = ["compare", "--plan", str(plan), "--out", str(out)]
     done = subprocess.run([sys.executable, "-c", KILLED, *words], capture_output=True, timeout=250)
     assert done.returncode == -signal.SIGKILL
-    assert training.run_progress(out / "runs" / "colours" / "ae")["images"] == 32
+    assert run_progress(out / "runs" / "colours" / "ae")["images"] == 32
     assert not (out / "clustering.json").exists()
     assert main(words) == 0
     assert scores(out) == scores(whole)
@@ -138,12 +138,11 @@ def test_the_budget_ends_a_training_and_leaves_tables(plan, whole, monkeypatch, 
     clock = SimpleNamespace(time=lambda: now[0], perf_counter=time.perf_counter)
     with monkeypatch.context() as patch:  # every step takes a minute
         patch.setattr(loop._Run, "step", slow_step)
-        for module in (running, embedding, training):
-            patch.setattr(module, "time", clock)
+        patch.setattr(sweep, "time", clock)
         assert main([*words, "--minutes", "1.5"]) == 0
     said = capsys.readouterr().err
     assert "the budget is used; the same command goes on where it stopped" in said
-    assert training.run_progress(out / "runs" / "colours" / "ae")["images"] == 32
+    assert run_progress(out / "runs" / "colours" / "ae")["images"] == 32
     assert "missing: train ae on colours: the budget was used before it was trained (32 of 64" in said
     told = json.loads((out / "clustering.json").read_text())
     assert "ae" not in told["questions"][0]["rows"] and "pixels" in told["questions"][0]["rows"]
@@ -162,15 +161,14 @@ def test_worker_processes_do_the_same(plan, whole):
 
 
 def test_a_worker_that_was_killed_costs_itself_alone(plan, tmp_path):
-    place = Place(tmp_path)
-    standing = running._Standing(read_plan(plan), place, "cpu", None, print)
+    standing = Sweep(read_plan(plan), tmp_path)
     job = jobs_of(standing.plan)[0]
-    note = running._left_nothing(standing, job, -signal.SIGKILL)
-    assert note.state == "failed" and "was killed by SIGKILL" in note.why and place.note(job) == note
+    note = standing.left_nothing(job, -signal.SIGKILL)
+    assert note.state == "failed" and "was killed by SIGKILL" in note.why and standing.note(job) == note
 
 
 def test_two_at_once_in_one_folder_are_refused(plan, tmp_path, capsys):
-    with running._alone(tmp_path / "out"):
+    with sweep.alone(tmp_path / "out"):
         (tmp_path / "out" / "plan.yaml").write_text("")
         assert main(["compare", "--plan", str(plan), "--out", str(tmp_path / "out")]) == 2
     assert "another derender compare works in" in capsys.readouterr().err

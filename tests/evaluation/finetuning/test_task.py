@@ -20,7 +20,6 @@ from derender.evaluation.finetuning import (
 from derender.evaluation.finetuning.joint import RENDERING_TERMS, FinetuneStep
 from derender.evaluation.memory import Memory
 from derender.report.run import run_page
-from derender.report.tables_finetuning import finetuning_table
 from derender.training.batches import random_stream
 from derender.training.checkpoint import WEIGHTS_FILE
 from derender.training.config import PRESETS, FinetuneConfig, with_changes
@@ -162,13 +161,13 @@ def test_it_learns_beside_the_controls_and_leaves_its_start_alone(pictures, tmp_
     targets[one.target.split.train[:3]] = -1
     fewer = replace(one, target=replace(one.target, asked=replace(one.target.asked, targets=targets)))
     some = score_finetuned(tuned, fewer, resample_count=50, memory=second)
-    assert some.n_unlabelled == 3 and "3 pictures without label" in finetuning_table(some, "fresh").caption
+    assert some.n_unlabelled == 3 and "3 pictures without label" in some.table("fresh").caption
     rows = {row.name: row.scores["balanced_accuracy"].value for row in found.rows}
     assert rows["fine-tuned"] > 0.9 and rows["majority"] == 0.5
     assert (found.kind, found.n_train, found.n_test) == ("labels", 24, 24) and found.versus[
         "accuracy"
     ].rival != "fine-tuned"
-    table = finetuning_table(found, "fresh weights").values()
+    table = found.table("fresh weights").values()
     controls = ["untrained encoder, logistic", "PCA (6), logistic", "pixels, logistic", "majority"]
     assert list(table) == ["fine-tuned", "frozen, logistic", "frozen, paper's head", *controls]
     assert rows["pixels, logistic"] > 0.9  # brightness is in the pixels themselves

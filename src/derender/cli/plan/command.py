@@ -3,16 +3,11 @@
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from derender.cli.console import notice, result, show_scores, write_json
-
-if TYPE_CHECKING:
-    from derender.cli.plan.jobs import Place
-    from derender.cli.plan.settings import Plan
-
 
 PANEL = "Many methods on many data sets"
 
@@ -64,16 +59,21 @@ def by_plan(
     json_file: str | None,
 ) -> None:
     """Do a plan, or go on with it, and show the one table of each protocol."""
-    from derender.cli.plan.jobs import Place
+    from derender.cli.plan import jobs
     from derender.cli.plan.outcome import write_outcome
-    from derender.cli.plan.running import run_plan
     from derender.cli.plan.settings import read_plan
+    from derender.cli.plan.sweep import Sweep, jobs_of
     from derender.storage.atomic import atomic_file
     from derender.training.config import to_yaml
 
     plan = read_plan(file)
     if dry_run:
-        tell(plan, None if out is None else Place(out), json_file)
+        notes = {job.name: None if out is None else Sweep(plan, out).note(job) for job in jobs_of(plan)}
+        states = {name: "to do" if note is None else note.state for name, note in notes.items()}
+        for name, state in states.items():
+            result(f"{name}: {state}", json_file)
+        notice(", ".join(f"{count} {state}" for state, count in Counter(states.values()).items()))
+        write_json(json_file, {"jobs": states, "plan": plan.model_dump(mode="json")})
         return
     if out is None:
         raise ValueError("--plan needs --out DIR: a folder for runs, tables and pictures")
@@ -83,35 +83,21 @@ def by_plan(
         raise ValueError(f"{out} is not empty and holds no comparison: choose another --out")
     with atomic_file(out / "plan.yaml") as temporary:
         temporary.write_text(to_yaml(plan))
-    place = Place(out)
+    work = {"train": jobs.train, "embed": jobs.embed, "score": jobs.score}
+    sweep = Sweep(plan, out, device, work)
     try:
-        notes = run_plan(plan, place, workers=workers, minutes=minutes, device=device, say=notice)
+        sweep.do_all(workers, minutes)
     except KeyboardInterrupt as stop:
         raise KeyboardInterrupt("stopped and saved; the same command goes on where it stopped") from stop
-    outcome = write_outcome(plan, place, notes)
+    outcome = write_outcome(sweep)
     for table in outcome.tables:
         show_scores(table, json_file)
-    for sentence in outcome.failed:
-        notice(f"failed: {sentence}")
-    for sentence in outcome.missing:
-        notice(f"missing: {sentence}")
+    for state, sentences in (("failed", outcome.failed), ("missing", outcome.missing)):
+        for sentence in sentences:
+            notice(f"{state}: {sentence}")
     if outcome.missing:
         notice("the budget is used; the same command goes on where it stopped")
     for written in outcome.files:
         result(str(written), json_file)
     values = {"out": out, "files": outcome.files, "failed": outcome.failed, "missing": outcome.missing}
     write_json(json_file, {**values, "tables": [table.values() for table in outcome.tables]})
-
-
-def tell(plan: "Plan", place: "Place | None", json_file: str | None) -> None:
-    """Every job and how it ended the last time."""
-    from derender.cli.plan.jobs import jobs_of
-
-    told = {}
-    for job in jobs_of(plan):
-        note = None if place is None else place.note(job)
-        told[job.name] = "to do" if note is None else note.state
-    for name, state in told.items():
-        result(f"{name}: {state}", json_file)
-    notice(", ".join(f"{count} {state}" for state, count in Counter(told.values()).items()))
-    write_json(json_file, {"jobs": told, "plan": plan.model_dump(mode="json")})

@@ -1,22 +1,29 @@
-"""What a comparison leaves: for each protocol one table (Markdown, LaTeX, HTML, JSON) and one picture.
+"""The files of a comparison: for each protocol one table (Markdown, LaTeX, HTML, JSON) and one chart.
 
-Made anew from the notes of all jobs every time, so they always show what is there.
+Made anew from the notes of all jobs every time, so they always show the present results.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from derender.cli.console import write_json
-from derender.cli.plan.jobs import Job, Note, Place
 from derender.cli.plan.settings import OURS, Plan
-
-if TYPE_CHECKING:
-    from derender.evaluation.score_table import ScoreTable
-    from derender.report.compared import Cost, ScoredQuestion
+from derender.cli.plan.sweep import Job, Note, Sweep
+from derender.evaluation.score_table import Scores, ScoreTable
+from derender.report.compared import (
+    Cost,
+    ScoredQuestion,
+    protocol_picture,
+    protocol_table,
+    scores_from,
+    set_tables,
+)
+from derender.report.comparison import comparison_page
+from derender.report.page import write_whole
 
 NAMES = {"cluster": "clustering", "linear": "linear"}
 MISSING = {"failed": "failed", "stopped": "missing"}
@@ -24,79 +31,73 @@ MISSING = {"failed": "failed", "stopped": "missing"}
 
 @dataclass(frozen=True)
 class Outcome:
-    """What there is to tell.
+    """The results of a comparison.
 
     Attributes:
         tables: the one table of each protocol.
         files: everything that was written.
-        failed: sentences on what went wrong.
-        missing: sentences on what the budget left undone.
+        failed: sentences on failures.
+        missing: sentences on jobs that the budget left undone.
     """
 
-    tables: "list[ScoreTable]"
+    tables: list[ScoreTable]
     files: list[Path]
     failed: list[str]
     missing: list[str]
 
 
-def write_outcome(plan: Plan, place: Place, notes: Mapping[Job, Note]) -> Outcome:
+def write_outcome(sweep: Sweep) -> Outcome:
     """Write every protocol's files beside the plan.
 
     Raises:
         ValueError: nothing at all could be scored.
     """
-    from derender.evaluation.score_table import Scores
-    from derender.report.compared import protocol_picture, protocol_table, scores_from, set_tables
-    from derender.report.comparison import comparison_page
-    from derender.report.page import write_whole
-
-    found: dict[str, list[ScoredQuestion]] = {}
-    kept: dict[str, list[Any]] = {}
+    plan, notes = sweep.plan, sweep.notes
+    questions: dict[str, list[ScoredQuestion]] = {}
+    values: dict[str, list[Any]] = {}
     for job, note in notes.items():
         if job.kind == "score" and note.state == "done":
-            costs = {**_costs(plan, job, notes), **_control_costs(note)}
-            absent = _absent(plan, job, notes)
+            costs, absent = _costs(plan, job, notes), _absent(plan, job, notes)
             for question in note.facts["questions"]:
                 protocol = question["protocol"]
-                found.setdefault(protocol, []).extend(scores_from(question, costs, absent))
-                kept.setdefault(protocol, []).append({**question, "costs": costs, "absent": absent})
+                questions.setdefault(protocol, []).extend(scores_from(question, costs, absent))
+                values.setdefault(protocol, []).append({**question, "costs": costs, "absent": absent})
     failed, missing = _sentences(notes, "failed"), _sentences(notes, "stopped")
-    if not found:
+    if not questions:
         raise ValueError(f"nothing could be scored: {'; '.join([*failed, *missing])}")
-    tables, files = [], []
-    for protocol, scores in found.items():
+    outcome = Outcome([], [], failed, missing)
+    for protocol, scores in questions.items():
         methods = plan.rows()
         summary = protocol_table(scores, methods)
-        every = [summary, *(table for one in scores for table in set_tables(one, methods))]
-        shown = Scores(every, {})
+        tables = [summary, *(table for one in scores for table in set_tables(one, methods))]
         svg, png = protocol_picture(scores, methods)
         page = comparison_page(
-            f"{NAMES[protocol].capitalize()}: {', '.join(one['name'] for one in kept[protocol])}",
-            every,
+            f"{NAMES[protocol].capitalize()}: {', '.join(one['name'] for one in values[protocol])}",
+            tables,
             lead=_lead(plan, missing),
             facts=_facts(plan),
             failed=[*failed, *missing],
             picture=svg,
         )
-        target = place.path / NAMES[protocol]
-        told = "".join(f"\n- {sentence}" for sentence in (*failed, *missing))
-        notes_text = f"\nFailed or missing:\n{told}\n" if told else ""
-        for suffix, text in (
-            (".md", shown.to_markdown() + notes_text),
-            (".tex", shown.to_latex()),
-            (".html", page.html()),
-            (".svg", standing_alone(svg)),
-        ):
-            files.append(write_whole(target.with_suffix(suffix), text.encode()))
-        files.append(write_whole(target.with_suffix(".png"), png))
-        values = {"protocol": protocol, "questions": kept[protocol], "failed": failed, "missing": missing}
-        write_json(str(target.with_suffix(".json")), {**values, "plan": plan.model_dump(mode="json")})
-        files.append(target.with_suffix(".json"))
-        tables.append(summary)
-    return Outcome(tables, files, failed, missing)
+        target, text = sweep.path / NAMES[protocol], Scores(tables, {})
+        notes_text = "".join(f"\n- {sentence}" for sentence in (*failed, *missing))
+        notes_text = f"\nFailed or missing:\n{notes_text}\n" if notes_text else ""
+        contents = {
+            ".md": (text.to_markdown() + notes_text).encode(),
+            ".tex": text.to_latex().encode(),
+            ".html": page.html().encode(),
+            ".svg": _standalone(svg).encode(),
+            ".png": png,
+        }
+        files = [write_whole(target.with_suffix(suffix), content) for suffix, content in contents.items()]
+        numbers = {"protocol": protocol, "questions": values[protocol], "failed": failed, "missing": missing}
+        write_json(str(target.with_suffix(".json")), {**numbers, "plan": plan.model_dump(mode="json")})
+        outcome.files.extend([*files, target.with_suffix(".json")])
+        outcome.tables.append(summary)
+    return outcome
 
 
-def standing_alone(svg: str) -> str:
+def _standalone(svg: str) -> str:
     """A page's chart as a file of its own: on white, dark ink, with the name space that files need."""
     head, rest = svg.split(">", 1)
     if "xmlns=" not in head:
@@ -105,9 +106,8 @@ def standing_alone(svg: str) -> str:
     return f'{head} color="#1e293b" font-family="sans-serif">{ground}{rest}'
 
 
-def _costs(plan: Plan, job: Job, notes: Mapping[Job, Note]) -> "dict[str, Cost]":
-    from derender.report.compared import Cost
-
+def _costs(plan: Plan, job: Job, notes: Mapping[Job, Note]) -> dict[str, Cost]:
+    """The cost of every row: of methods by their own jobs, of controls by the scores' job."""
     costs = {}
     for method in plan.rows():
         mine = [one for one in job.after if one.method == method]
@@ -116,23 +116,16 @@ def _costs(plan: Plan, job: Job, notes: Mapping[Job, Note]) -> "dict[str, Cost]"
         if not done:
             continue
         seconds = [run["seconds"] for run in runs if run.get("seconds") is not None]
-        embedding = [facts["seconds_a_picture"] for facts in done]
         costs[method] = Cost(
             done[0]["parameters"] or None,
             float(np.mean(seconds)) if seconds else None,
             next((run["images"] for run in runs if run.get("images")), None),
             done[0]["numbers"],
-            float(np.mean(embedding)),
+            float(np.mean([facts["seconds_a_picture"] for facts in done])),
         )
-    return costs
-
-
-def _control_costs(note: Note) -> "dict[str, Cost]":
-    from derender.report.compared import Cost
-
-    return {
-        name: Cost(parameters=facts["parameters"], numbers=facts["numbers"])
-        for name, facts in note.facts["controls"].items()
+    controls = notes[job].facts["controls"].items()
+    return costs | {
+        name: Cost(parameters=facts["parameters"], numbers=facts["numbers"]) for name, facts in controls
     }
 
 
@@ -147,26 +140,24 @@ def _absent(plan: Plan, job: Job, notes: Mapping[Job, Note]) -> dict[str, str]:
 
 
 def _sentences(notes: Mapping[Job, Note], state: str) -> list[str]:
-    """What ended so, each reason once, with the first job that had it."""
-    told: dict[tuple[str, str], str] = {}
+    """The jobs that ended so, each reason once, with the first job that had it."""
+    sentences: dict[tuple[str, str], str] = {}
     for job, note in notes.items():
         if note.state == state:
             trained = job.after[0].where if job.kind == "embed" and job.after else job.where
-            told.setdefault((f"{job.method} {trained}", note.why), f"{job.name}: {note.why}")
-    return list(told.values())
+            sentences.setdefault((f"{job.method} {trained}", note.why), f"{job.name}: {note.why}")
+    return list(sentences.values())
 
 
 def _lead(plan: Plan, missing: list[str]) -> str:
     text = f"Every method that is trained here saw {plan.images:,} pictures of the same training part."
     if plan.seeds == 1:
         text += " One training seed each: intervals speak of which pictures were scored, not of trainings."
-    if missing:
-        text += " The budget was used before everything was done: rows are missing."
-    return text
+    return f"{text} The budget was used before everything was done: rows are missing." if missing else text
 
 
 def _facts(plan: Plan) -> dict[str, object]:
-    trained = ", ".join(f"{name} ({pictures.data})" for name, pictures in plan.train.items())
+    trained = ", ".join(f"{name} ({images.data})" for name, images in plan.train.items())
     ours = [name for name in plan.rows() if plan.kind(name) == OURS]
     return {
         "methods": ", ".join(plan.rows()),

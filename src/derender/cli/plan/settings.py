@@ -1,16 +1,16 @@
-"""What a plan file says: pictures to learn from, methods, data sets to score, and how.
+"""A plan file: images to learn from, methods, data sets to score, and how.
 
-A plan is YAML or TOML. Unknown names are errors that name the nearest, and everything that can be wrong
-without looking at pictures is found before anything is trained.
+A plan is YAML or TOML. Unknown names are errors with a suggestion, and every mistake that shows without
+images is found before anything is trained.
 """
 
 import json
 import tomllib
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import yaml
-from pydantic import Field, field_validator
+from pydantic import BeforeValidator, Field, field_validator
 
 from derender.baselines import baseline_config
 from derender.baselines.registry import BASELINES, CONTROLS, TRAINED
@@ -22,13 +22,15 @@ from derender.training.config import config_from_tree, resolve
 OURS = "derender"
 KINDS = (OURS, *BASELINES)
 ALWAYS_THERE = ("pixels", "pca", "untrained")  # every table has these controls
-WITHOUT_LOOP = ("resnet18", "ris")  # trained, but not by the training loop: no number of pictures seen
+WITHOUT_LOOP = ("resnet18", "ris")  # trained, but not by the training loop: no number of images seen
 RESERVED = ("images", "split", "seed")  # the plan's own
-Protocol = Literal["cluster", "linear"]
+
+ONE_OR_MANY = BeforeValidator(lambda one: (one,) if isinstance(one, str) else one)
+Names = Annotated[tuple[str, ...], ONE_OR_MANY]
 
 
 class TrainingSet(Settings):
-    """Pictures to learn from; all methods get the same ones."""
+    """Images to learn from; all methods get the same ones."""
 
     data: str
     dataset: str = "auto"
@@ -43,46 +45,34 @@ class Method(Settings):
     preset: str = "small"  # of derender
     settings: dict[str, Any] = Field(default_factory=dict)  # of its trainings, as --set key=value
     settings_on: dict[str, dict[str, Any]] = Field(default_factory=dict)  # further ones, by training set
-    features: tuple[str, ...] = ()  # which; by default geometry and albedo, or a baseline's first
+    features: Names = ()  # which; by default geometry and albedo, or a baseline's first
     whitened: bool = True  # of derender: features as the model gives them, or its codes
     like: str | None = None  # another method whose runs this one takes instead of training its own
-    runs: dict[str, str] = Field(default_factory=dict)  # by training set: a run folder that is there already
+    runs: dict[str, str] = Field(default_factory=dict)  # by training set: an existing run folder
     model: str | None = None  # one trained model for all data sets: a folder, a name, a Hub id
-
-    @field_validator("features", mode="before")
-    @classmethod
-    def _one_or_many(cls, value: object) -> object:
-        return (value,) if isinstance(value, str) else value
 
 
 class ScoredSet(Settings):
-    """Pictures to score: a question of the paper's tables, or labels of one's own."""
+    """Images to score: by a table of the paper, or by labels."""
 
     data: str
     dataset: str = "auto"
     limit: int | None = Field(default=None, ge=1)
     trained_on: str | None = None  # training set of the methods that are scored here
     part: Literal["all", "train", "validation", "test"] = "all"  # of that training set's split
-    protocols: tuple[Protocol, ...] = ("cluster",)
+    protocols: Annotated[tuple[Literal["cluster", "linear"], ...], ONE_OR_MANY] = ("cluster",)
     table: str | None = None  # one of the paper's: identity, emotion, clustering, linear, cars
-    label: tuple[str, ...] = ()
-    mean_by: tuple[str, ...] = ()
+    label: Names = ()
+    mean_by: Names = ()
     min_count: int = Field(default=1, ge=1)
     max_count: int | None = Field(default=None, ge=1)
-
-    @field_validator("label", "mean_by", "protocols", mode="before")
-    @classmethod
-    def _one_or_many(cls, value: object) -> object:
-        return (value,) if isinstance(value, str) else value
 
 
 class Plan(Settings):
     """A comparison, whole."""
 
-    images: int = Field(default=20_000, ge=1)  # pictures that every training sees, repeats counted
-    settings: dict[str, Any] = Field(
-        default_factory=dict
-    )  # of every training that the loop does, as --set key=value
+    images: int = Field(default=20_000, ge=1)  # images that every training sees, repeats counted
+    settings: dict[str, Any] = Field(default_factory=dict)  # of every training in the loop, as --set
     seeds: int = Field(default=1, ge=1)  # trainings of each method, on each training set
     image_size: int = Field(default=64, ge=8)  # of methods without a network of a fixed size
     train: dict[str, TrainingSet] = Field(default_factory=dict)
@@ -90,14 +80,14 @@ class Plan(Settings):
     score: dict[str, ScoredSet] = Field(default_factory=dict)
     clustering: Literal["ward", "finch", "k-means"] = "ward"
     counts: tuple[int, ...] = (100, 500, 1_000)  # labelled rows of the linear protocol
-    draws: int = Field(default=5, ge=1)  # of these rows
+    draws: int = Field(default=5, ge=1)  # random subsets of these rows
     untrained_seeds: int = Field(default=3, ge=1)
     resamples: int = Field(default=1_000, ge=2)
 
     @field_validator("methods", mode="before")
     @classmethod
     def _named(cls, value: object) -> object:
-        """A list of names, or names with nothing behind them, are methods as they come."""
+        """A list of names, or names with nothing behind them, are methods by their kind."""
         if isinstance(value, list) and all(isinstance(name, str) for name in value):
             value = dict.fromkeys(value)
         if isinstance(value, dict):
@@ -105,7 +95,7 @@ class Plan(Settings):
         return value
 
     def kind(self, name: str) -> str:
-        """What a method is: ``derender`` or a baseline's name."""
+        """``derender`` or a baseline's name."""
         method = self.methods[name]
         if method.like is not None:
             return self.kind(method.like)
@@ -113,8 +103,7 @@ class Plan(Settings):
 
     def source(self, name: str) -> str:
         """The method whose runs this one uses: mostly itself."""
-        like = self.methods[name].like
-        return name if like is None else like
+        return self.methods[name].like or name
 
     def is_trained(self, name: str) -> bool:
         """Whether it has a run for each training set."""
@@ -126,9 +115,9 @@ class Plan(Settings):
 
     def configuration(self, name: str, trained_on: str, seed: int) -> Any:
         """The settings of one training."""
-        kind, method, pictures = self.kind(name), self.methods[name], self.train[trained_on]
+        kind, method = self.kind(name), self.methods[name]
         own = {**method.settings, **method.settings_on.get(trained_on, {})}
-        common: dict[str, Any] = {"split": pictures.split, "seed": seed}
+        common: dict[str, Any] = {"split": self.train[trained_on].split, "seed": seed}
         if kind not in WITHOUT_LOOP:
             common |= {"images": self.images}
             own = {**self.settings, **own}
@@ -162,48 +151,41 @@ def read_plan(path: str | Path) -> Plan:
 
 
 def check(plan: Plan) -> None:
-    """What does not fit together in a plan is an error, before anything is done."""
+    """Parts of a plan that do not fit together are an error, before anything is done."""
     if not plan.methods or not plan.score:
         raise ValueError("a plan needs at least one of methods: and one of score:")
-    for group in (plan.train, plan.methods, plan.score):
-        for name in group:
-            if not name or set(name) & set('/\\:*?"<>|') or name.startswith("."):
-                raise ValueError(f"the name {name!r} cannot be a folder's: leave out / \\ : * ? and the like")
-    for name in plan.methods:
-        _check_method(plan, name)
+    for name in (*plan.train, *plan.methods, *plan.score):
+        if not name or set(name) & set('/\\:*?"<>|') or name.startswith("."):
+            raise ValueError(f"the name {name!r} cannot be a folder's: leave out / \\ : * ? and the like")
+    for name, method in plan.methods.items():
+        _check_method(plan, name, method)
     for name, scored in plan.score.items():
         _check_scored(plan, name, scored)
+    used = {scored.trained_on for scored in plan.score.values()}
     for name in plan.rows():
         if plan.is_trained(name) and plan.source(name) == name:
-            for trained_on in used_training_sets(plan):
-                if trained_on not in plan.methods[name].runs:
-                    plan.configuration(name, trained_on, 0)
+            for trained_on in used & plan.train.keys() - plan.methods[name].runs.keys():
+                plan.configuration(name, str(trained_on), 0)
 
 
-def used_training_sets(plan: Plan) -> list[str]:
-    """Those that something is scored after, in the order of the plan."""
-    used = {scored.trained_on for scored in plan.score.values()}
-    return [name for name in plan.train if name in used]
-
-
-def _check_method(plan: Plan, name: str) -> None:
-    method = plan.methods[name]
+def _check_method(plan: Plan, name: str, method: Method) -> None:
+    own = bool(method.settings or method.settings_on or method.runs)
     if method.like is not None:
         _known("like", method.like, plan.methods)
         if plan.methods[method.like].like is not None:
             raise ValueError(f"method {name!r} is like {method.like!r}, which is like another: name that one")
-        if method.kind or method.settings or method.settings_on or method.runs or method.model:
+        if own or method.kind or method.model:
             raise ValueError(f"method {name!r} is like {method.like!r}: it takes features and whitened alone")
     kind = plan.kind(name)
     if kind not in KINDS:
-        raise ValueError(f"method {name!r} is of no known kind{suggestion(kind, KINDS)}: choose {_or(KINDS)}")
+        choices = ", ".join(KINDS)
+        raise ValueError(f"method {name!r} is of no known kind{suggestion(kind, KINDS)}: choose {choices}")
     for where in (*method.runs, *method.settings_on):
         _known("training set", where, plan.train)
     for settings in (plan.settings, method.settings, *method.settings_on.values()):
-        for key in RESERVED:
-            if key in settings:
-                raise ValueError(f"{key} is the plan's own and the same for all: not in settings of {name!r}")
-    if (method.settings or method.settings_on or method.runs) and kind not in (OURS, *TRAINED):
+        for key in set(RESERVED) & settings.keys():
+            raise ValueError(f"{key} is the plan's own and the same for all: not in settings of {name!r}")
+    if own and kind not in (OURS, *TRAINED):
         raise ValueError(f"method {name!r} ({kind}) is not trained here: leave settings and runs out")
     if method.model is not None and (kind in CONTROLS or method.runs):
         raise ValueError(f"method {name!r}: model is one trained network; leave it or runs out")
@@ -243,10 +225,5 @@ def _check_scored(plan: Plan, name: str, scored: ScoredSet) -> None:
 
 def _known(what: str, name: str, names: Any) -> None:
     if name not in names:
-        raise ValueError(
-            f"unknown {what} {name!r}{suggestion(name, names)}; there is {', '.join(names) or 'none'}"
-        )
-
-
-def _or(names: Any) -> str:
-    return ", ".join(names)
+        known = ", ".join(names) or "none"
+        raise ValueError(f"unknown {what} {name!r}{suggestion(name, names)}; there is {known}")

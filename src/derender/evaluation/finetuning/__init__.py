@@ -3,7 +3,7 @@
 from derender.evaluation.finetuning.joint import (
     FinetunedModel,
     FinetuneTask,
-    Target,
+    JointLabels,
     TargetHead,
     load_finetuned,
     target_loss,
@@ -15,7 +15,7 @@ __all__ = [
     "FinetuneScores",
     "FinetuneTask",
     "FinetunedModel",
-    "Target",
+    "JointLabels",
     "TargetHead",
     "load_finetuned",
     "score_finetuned",

@@ -115,7 +115,7 @@ def load_finetuned(source: str | Path, *, device: str | torch.device = "cpu") ->
 
 
 @dataclass(frozen=True)
-class Target:
+class JointLabels:
     """The labels of a joint training, and the part of them that it may see.
 
     Attributes:
@@ -129,7 +129,7 @@ class Target:
     split: Split
 
 
-def target_of(pictures: PictureSet, config: FinetuneConfig) -> Target:
+def target_of(pictures: PictureSet, config: FinetuneConfig) -> JointLabels:
     """The labels that the configuration names, -1 where training must not see them.
 
     Raises:
@@ -165,7 +165,7 @@ def target_of(pictures: PictureSet, config: FinetuneConfig) -> Target:
     visible = np.full_like(asked.targets, -1)
     for rows in (labelled, split.validation):
         visible[rows] = asked.targets[rows]
-    return Target(asked, visible, split)
+    return JointLabels(asked, visible, split)
 
 
 @dataclass(frozen=True)
@@ -181,7 +181,7 @@ class FinetuneTask(TrainingTask):
 
     config: FinetuneConfig
     images: UInt8[np.ndarray, "n 3 h w"]
-    target: Target
+    target: JointLabels
     start: Derenderer | None = None
     outside_loss: tuple[str, ...] = RENDERING_TERMS
 

@@ -14,9 +14,10 @@ from derender.baselines.controls import pca_features, pixel_features, untrained_
 from derender.data import PictureSet
 from derender.evaluation.bootstrap import RESAMPLES, Difference, ScoredRow, difference
 from derender.evaluation.finetuning.joint import FinetunedModel, FinetuneTask
-from derender.evaluation.linear_probing import compare_linear
+from derender.evaluation.linear_probing import LINEAR_COLUMNS, compare_linear
 from derender.evaluation.linear_task import Rows, Task
 from derender.evaluation.memory import Memory
+from derender.evaluation.score_table import ScoreTable, scored_table
 from derender.features import embed_images, map_batches, model_fingerprint
 from derender.inputs import Progress
 
@@ -53,6 +54,21 @@ class FinetuneScores:
         }
         sizes = {name: getattr(self, name) for name in ("kind", "names", "n_train", "n_test", "n_unlabelled")}
         return {**sizes, "rows": {row.name: row.numbers() for row in self.rows}, "versus": versus}
+
+    def table(self, began: str) -> ScoreTable:
+        """A row each; ``began`` names the model whose frozen features the heads take."""
+        count = len(self.names)
+        task = f"{count} classes" if self.kind == "classes" else f"mean of {count} yes/no labels"
+        caption = (
+            f"{task}: {self.n_train:,} labelled pictures learned, {self.n_test:,} held out; frozen features of "
+            f"{began}"
+        )
+        if self.n_unlabelled:
+            caption += f"; {self.n_unlabelled:,} pictures without label never asked"
+        both = ("accuracy", "balanced_accuracy")
+        return scored_table(
+            caption, "trained on labels", self.rows, LINEAR_COLUMNS, intervals=both, deviations=()
+        )
 
 
 def score_finetuned(

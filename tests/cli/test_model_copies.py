@@ -1,0 +1,169 @@
+"""`derender whiten`, `refine` and `unet`: copies of a model, their measurements and refusals."""
+
+import json
+
+import pytest
+import torch
+from PIL import Image
+
+import derender
+from derender.cli import main
+from derender.data import read_pictures
+from derender.data.synthetic import faces
+from derender.training.held_out_errors import read_errors
+
+KNOWN = "rendered-faces-64"
+FEW = ("pictures=8", "views=1", "spatial=false", "directions=8", "examples=12")
+SHORT = ("images=16", "batch_size=8", "fitted=8", "fit_steps=1", "whitening.pictures=8", "views=1")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("faces")
+    for index, image in enumerate(faces.generate(200, image_size=64, seed=9).images):
+        Image.fromarray(image.transpose(1, 2, 0)).save(folder / f"{index:03d}.png")
+    return folder
+
+
+def run(command, folder, out, *settings, words=(), model=KNOWN) -> int:
+    changes = [f"--set={setting}" for setting in settings]
+    return main([command, str(folder), "-m", str(model), "-o", str(out), *changes, *words])
+
+
+@pytest.fixture(scope="module")
+def fits(folder, tmp_path_factory):
+    """A model that can fit scenes within 10 coordinates, and does so only on request."""
+    made = tmp_path_factory.mktemp("models") / "fits"
+    assert run("whiten", folder, made, *FEW, "coordinates=10", words=("--limit", "24")) == 0
+    assert not derender.load(made).features.fits_scenes
+    return made
+
+
+def test_a_whitened_copy_has_other_features_and_the_same_scenes(folder, tmp_path, capsys):
+    few = ("views=2", "directions=8", "spatial=false")
+    assert run("whiten", folder, tmp_path / "mine", *few, words=("--limit", "24", "--json", "-")) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["pictures"] == 24 and len(told["between_over_within"]["geometry"]) == 8
+    one, two = derender.load(KNOWN), derender.load(tmp_path / "mine")
+    assert torch.linalg.matrix_rank(two.whitening.get_buffer("albedo_map"), rtol=1e-3) == 8
+    image = torch.rand(1, 3, 64, 64)
+    assert torch.equal(one.decompose(image).depth, two.decompose(image).depth)
+    assert not torch.equal(one.embed(image)["albedo"], two.embed(image)["albedo"])
+
+
+def test_mean_only_moves_features_to_a_mean_of_zero_and_no_distance(folder, tmp_path, capsys):
+    words = ("--limit", "24", "--mean-only")
+    assert run("whiten", folder, tmp_path / "mine", words=words) == 0
+    one, two = derender.load(KNOWN), derender.load(tmp_path / "mine")
+    images = torch.from_numpy(read_pictures(folder, 64, limit=24).images).float() / 255
+    before, after = (
+        model.features_from(model.activations(images))["albedo"][:, :192] for model in (one, two)
+    )
+    assert before.mean(dim=0).norm() > 0.05 * before.std(dim=0).norm()
+    assert after.mean(dim=0).norm() < 1e-4 * before.norm(dim=1).mean()
+    torch.testing.assert_close(torch.cdist(after, after), torch.cdist(before, before), atol=1e-2, rtol=1e-3)
+    assert run("whiten", folder, tmp_path / "other", "views=2", words=words) == 2
+    assert "leave out settings" in capsys.readouterr().err
+    two.without_features().save(tmp_path / "codes")
+    assert run("whiten", folder, tmp_path / "x", words=words, model=tmp_path / "codes") == 2
+    assert "not whitened" in capsys.readouterr().err
+
+
+def test_features_hold_fitted_scenes_where_steps_are_set(folder, tmp_path, capsys):
+    made, table = tmp_path / "fitted", tmp_path / "table.parquet"
+    steps = ("coordinates=10", "steps=3", "weight=2")
+    assert run("whiten", folder, made, *FEW, *steps, words=("--limit", "24")) == 0
+    model = derender.load(made)
+    assert model.features.fits_scenes and model.fitting.settings.weight == 2
+    sizes = {name: value.shape[1] for name, value in model.embed(torch.rand(1, 3, 64, 64)).items()}
+    assert sizes == dict.fromkeys(("geometry", "albedo", "light", "camera"), 256)
+    embed = ["embed", str(folder), "-m", str(made), "--limit", "6", "-o", str(table)]
+    assert main([*embed, "--fit-steps", "0", "--json", "-"]) == 0
+    assert '"geometry": 246' in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("command", ["decompose", "relight", "rotate", "mesh"])
+def test_images_are_made_of_fitted_scenes(fits, folder, tmp_path, command):
+    given = [command, "-m", str(fits), str(folder / "000.png")]
+    extra = ["--film", "none"] if command in ("relight", "rotate") else []
+    for name, steps in (("plain", []), ("fitted", ["--fit-steps", "12"])):
+        assert main([*given, *extra, "-o", str(tmp_path / name), *steps]) == 0
+    one, two = (sorted((tmp_path / name / "000").iterdir()) for name in ("plain", "fitted"))
+    assert [path.name for path in one] == [path.name for path in two]
+    assert any(a.read_bytes() != b.read_bytes() for a, b in zip(one, two, strict=True))
+
+
+def test_a_table_of_fitted_scenes_is_searched_as_it_was_made(fits, folder, tmp_path, capsys):
+    table, given = tmp_path / "table.parquet", ["-m", str(fits)]
+    words = ["--limit", "10", "-o", str(table), "--fit-steps", "3"]
+    assert main(["embed", str(folder), *given, *words]) == 0
+    read = derender.FeatureTable.read(table)
+    assert read.factors["geometry"].shape == (10, 266)
+    like = str(folder / read.files[3])
+    search = ["search", "--features", str(table), "--like", like, *given, "--factor", "geometry"]
+    capsys.readouterr()
+    assert main([*search, "--copies", "--json", "-"]) == 0
+    first = json.loads(capsys.readouterr().out)["found"][0]
+    assert first["file"] == read.files[3] and first["distance"] == pytest.approx(0, abs=1e-4)
+
+
+def test_a_model_that_cannot_fit_is_told_how_to(folder, tmp_path, capsys):
+    derender.load(KNOWN).without_features().save(tmp_path / "plain")
+    plain, steps = ["-m", str(tmp_path / "plain")], ["--fit-steps", "5"]
+    for words in (
+        ["embed", str(folder), *plain, "-o", str(tmp_path / "t.parquet"), *steps],
+        ["decompose", str(folder / "000.png"), *plain, "-o", str(tmp_path / "apart"), *steps],
+        ["refine", str(folder), *plain, "-o", str(tmp_path / "mine")],
+    ):
+        assert main(words) == 2
+        assert "derender whiten" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["plain"]
+
+
+def test_a_refined_copy_comes_with_its_measurements(folder, tmp_path, capsys):
+    settings = (*SHORT, "spatial=false", "steps=2")
+    assert run("refine", folder, tmp_path / "mine", *settings, words=("--json", "-")) == 0
+    shown = capsys.readouterr()
+    told = json.loads(shown.out)
+    assert told["pictures"] == 180 and told["held_out"] == 20
+    assert told["errors"]["before"] > told["errors"]["fitted"] > 0
+    assert "20 held-out images: reconstructed with an error of" in shown.err
+    assert set(told["gaps"]) == {"depth", "albedo", "light", "camera"}
+    copy, errors = derender.load(tmp_path / "mine"), read_errors(tmp_path / "mine")
+    assert copy.fitting.settings.steps == 2 and copy.whitening is not None and errors.pictures == 20
+
+
+def test_a_copy_with_u_nets_comes_with_its_errors(folder, tmp_path, capsys):
+    short = ("images=16", "batch_size=8", "unet_width=4")
+    assert run("unet", folder, tmp_path / "mine", *short, words=("--limit", "12", "--json", "-")) == 0
+    shown = capsys.readouterr()
+    told = json.loads(shown.out)
+    assert told["pictures"] == 12 and told["errors"]["place"] > 0
+    assert "mean errors against rendered-faces-64: place" in shown.err
+    copy = derender.load(tmp_path / "mine")
+    assert copy.settings.network.encoder == "unet" and copy.whitening is None and copy.fitting is None
+
+
+@pytest.mark.parametrize(
+    ("command", "setting", "message"),
+    [
+        ("whiten", "direction=8", "whitening.directions"),
+        ("whiten", "pictures=0", "2 images or more"),
+        ("whiten", "views=0", "greater than"),
+        ("refine", "image=8", "images"),
+        ("refine", "rendered=1.5", "less than or equal to 1"),
+        ("unet", "precision=16", "precision"),
+        ("unet", "batch_size=1", "greater"),
+    ],
+)
+def test_settings_that_make_no_sense_are_named(folder, tmp_path, capsys, command, setting, message):
+    assert run(command, folder, tmp_path / "mine", setting) == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "mine").exists()
+
+
+@pytest.mark.parametrize("command", ["whiten", "refine", "unet"])
+def test_an_existing_model_is_not_replaced_unasked(folder, tmp_path, capsys, command):
+    (tmp_path / "mine").mkdir()
+    assert run(command, folder, tmp_path / "mine") == 2
+    assert "add --force" in capsys.readouterr().err
