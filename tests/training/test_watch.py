@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,9 +14,9 @@ from derender.data.synthetic import faces
 from derender.scene import Scene
 from derender.scene.ranges import SceneRanges
 from derender.training import resolve, train
-from derender.training.loop import FIRST_KEPT_IMAGES
+from derender.training import watch as watching
 from derender.training.run_folder import read_metrics
-from derender.training.watch import SIGNS, Watcher, measure
+from derender.training.watch import SIGNS, Finding, Watcher, measure
 
 RANGES = SceneRanges()
 STEP = 500
@@ -149,15 +150,11 @@ def test_measurements_of_known_scenes():
     )
 
 
-COLLAPSING = ["image_size=32", "width=4", "light_width=4", "batch_size=16", "perceptual=none"]
-COLLAPSING += [
-    "curvature_weight=0",
-    "learning_rate=8e-3",
-    "weight_decay=0",
-    "warmup_images=0",
-    "final_rate=1",
-]
-COLLAPSING += ["images=16000", "whitening.pictures=0", "fitting.examples=0"]
+COLLAPSING = ["image_size=32", "width=8", "light_width=4", "batch_size=16", "perceptual=none", "images=4000"]
+COLLAPSING += ["curvature_weight=0", "learning_rate=1e-2", "weight_decay=0", "warmup_images=0"]
+COLLAPSING += ["final_rate=1", "whitening.pictures=0", "fitting.examples=0"]
+SOONER = 5
+"""By how much the clock of the watcher is faster in a real collapse."""
 
 
 @pytest.mark.parametrize(
@@ -174,37 +171,43 @@ def test_a_memory_that_no_watcher_gave_is_refused(memory):
         Watcher.remembering(RANGES, BATCH, memory)
 
 
-def test_a_real_collapse_is_caught_within_20000_images_while_its_loss_still_falls(tmp_path, monkeypatch):
-    """With the intervals of the preset: the last good state must be there without anybody asking for it.
+def pictures_of(images) -> PictureSet:
+    return PictureSet(images=images, files=tuple(f"{i:04d}.png" for i in range(len(images))))
 
-    If there was one: under torch 2.6 cameras of this run are at their bound from picture 320 on, for good.
-    """
-    healthy, look = [], Watcher.look
 
-    def noted(watcher: Watcher, images: int, *rest):
-        findings = look(watcher, images, *rest)
-        if not watcher.uneasy:
-            healthy.append(images)
-        return findings
-
-    monkeypatch.setattr(Watcher, "look", noted)
-    images = faces.generate(600, image_size=32, seed=0).images
-    pictures = PictureSet(images=images, files=tuple(f"{i:04d}.png" for i in range(len(images))))
+def test_a_real_collapse_is_caught_while_its_loss_still_falls(tmp_path, monkeypatch):
+    for name in ("PERSISTENCE_IMAGES", "MEMORY_IMAGES"):
+        monkeypatch.setattr(watching, name, getattr(watching, name) / SOONER)
+    signs = [
+        replace(sign, grace_images=sign.grace_images // SOONER, usual_images=sign.usual_images // SOONER)
+        for sign in SIGNS
+    ]
+    monkeypatch.setattr(watching, "SIGNS", tuple(signs))
+    pictures = pictures_of(faces.generate(200, image_size=32, seed=0).images)
     result = train(resolve("small", COLLAPSING), pictures, tmp_path / "run")
-    assert result.stopped == "collapse"
-    assert result.images < 20_000
-    signs = {finding.sign for finding in result.findings if finding.fatal}
-    assert signs & {"saturated depth", "torn depth", "view at its bound"}
+    assert result.stopped == "collapse" and result.images < 4_000
+    found = {finding.sign for finding in result.findings if finding.fatal}
+    assert found & {"saturated depth", "torn depth", "view at its bound"}
     rows = read_metrics(tmp_path / "run")
     errors = [row["l1"] for row in rows if row["kind"] == "train"]
-    assert errors[-1] < 0.6 * errors[0]  # the pictures look better all the while; 0.52 with torch 2.15
-    assert signs <= set(rows[-1])
-    if healthy[-1] < FIRST_KEPT_IMAGES:
-        assert not (tmp_path / "run/checkpoints/last").exists()
-        return
-    last_good = kept_images(tmp_path / "run")
-    assert 300 <= last_good < result.images - 3_000
-    assert last_good in {row["images"] for row in rows if row["kind"] == "validation"}
-    with torch.no_grad():
-        scene = derender.load(tmp_path / "run").decompose(torch.from_numpy(images[:64]).float() / 255)
-    assert measure(scene, RANGES)["view_at_bound"] < 0.5  # what is loaded is not what collapsed
+    assert errors[-1] < 0.7 * errors[0]  # the images look better all the while; 0.56 with torch 2.15
+    assert found <= set(rows[-1])
+
+
+def test_the_last_good_state_is_kept_without_anybody_asking_for_it(tmp_path, monkeypatch):
+    """With the intervals of the preset, and a sign that is on from picture 400 on."""
+    judge = Watcher.judge
+
+    def ill(watcher: Watcher, images: int, *rest):
+        judge(watcher, images, *rest)
+        watcher.uneasy = images > 400
+        return (Finding("a sign", "of collapse", "stop", True),) if images >= 704 else ()
+
+    monkeypatch.setattr(Watcher, "judge", ill)
+    pictures = pictures_of(faces.generate(60, image_size=32, seed=0).images)
+    result = train(resolve("small", [*COLLAPSING, "learning_rate=1e-4"]), pictures, tmp_path / "run")
+    assert (result.stopped, result.images) == ("collapse", 704)
+    rows = read_metrics(tmp_path / "run")
+    assert [row["images"] for row in rows if row["kind"] == "validation"] == [320]
+    assert kept_images(tmp_path / "run") == 320
+    assert derender.load(tmp_path / "run").image_size == 32

@@ -60,8 +60,8 @@ class FinetuneScores:
         count = len(self.names)
         task = f"{count} classes" if self.kind == "classes" else f"mean of {count} yes/no labels"
         caption = (
-            f"{task}: {self.n_train:,} labelled pictures learned, {self.n_test:,} held out; frozen features of "
-            f"{began}"
+            f"{task}: {self.n_train:,} labelled pictures learned, {self.n_test:,} held out; frozen features "
+            f"of {began}"
         )
         if self.n_unlabelled:
             caption += f"; {self.n_unlabelled:,} pictures without label never asked"
