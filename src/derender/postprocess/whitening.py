@@ -195,12 +195,14 @@ class Whitening(nn.Module):
         projections = {}
         for name in [key.removesuffix("_map") for key in tensors if key.endswith("_map")]:
             try:
-                own = Projection(*(tensors[f"{name}_{part}"].float() for part in ("mean", "map", "ratios")))
+                mean, chart, ratios = (
+                    tensors[f"{name}_{part}"].float() for part in ("mean", "map", "ratios")
+                )
             except KeyError as error:
                 raise ValueError(f"it has no {error.args[0]!r}") from error
-            if own.map.ndim != 2 or len(own.map) != len(own.mean) or own.ratios.ndim != 1:
-                raise ValueError(f"{name}: a map of {tuple(own.map.shape)} beside a mean of {len(own.mean)}")
-            projections[name] = own
+            if chart.ndim != 2 or len(chart) != len(mean) or ratios.ndim != 1:
+                raise ValueError(f"{name}: a map of {tuple(chart.shape)} beside a mean of {len(mean)}")
+            projections[name] = Projection(mean, chart, ratios)
         alone = {name for name in projections if f"{name}{_ALONE}" in tensors or _MIRRORED not in tensors}
         return cls(projections, mirrored=projections.keys() - alone)
 
