@@ -119,11 +119,12 @@ def test_swap_of_a_picture_with_itself_changes_nothing(model, photos, tmp_path):
 
 
 def test_mesh_opens_elsewhere_and_takes_the_pictures_own_texture(model, photos, tmp_path):
-    for texture in ("model", "original"):
-        words = ["-m", model, str(photos / "0.png"), "-o", str(tmp_path / texture), "--size", "48"]
-        assert main(["mesh", *words, "--texture", texture, "--json", str(tmp_path / "told.json")]) == 0
+    for name, detail in {"own": [], "model": ["--detail", "model"], "old": ["--texture", "original"]}.items():
+        words = ["-m", model, str(photos / "0.png"), "-o", str(tmp_path / name), "--size", "48"]
+        assert main(["mesh", *words, *detail, "--json", str(tmp_path / "told.json")]) == 0
     told = json.loads((tmp_path / "told.json").read_text())["pictures"][0]
-    content = (tmp_path / "original" / "0" / "0.glb").read_bytes()
+    content = (tmp_path / "own" / "0" / "0.glb").read_bytes()
+    assert content == (tmp_path / "old" / "0" / "0.glb").read_bytes()
     read = trimesh.load(io.BytesIO(content), file_type="glb", force="mesh", process=False)
     assert len(read.vertices) == told["vertices"] and len(read.faces) == told["faces"]
     assert told["trimmed"] > 2 / 48
@@ -136,7 +137,7 @@ def test_mesh_opens_elsewhere_and_takes_the_pictures_own_texture(model, photos, 
 def test_decompose_at_another_size_with_a_sheet(model, photos, tmp_path):
     out = tmp_path / "out"
     names = [str(photos / "0.png"), str(photos / "1.png")]
-    words = ["--size", "48", "--texture", "original", "--sheet"]
+    words = ["--size", "48", "--detail", "photo", "--sheet"]
     assert main(["decompose", "-m", model, *names, "-o", str(out), *words]) == 0
     with np.load(out / "1" / "scene.npz") as scene:
         assert scene["depth"].shape == (48, 48) and scene["albedo"].shape == (3, 48, 48)
@@ -195,9 +196,7 @@ def test_bad_questions_about_pictures(model, photos, tmp_path, refused):
     assert "reach must lie between" in refused("rotate", *given, "--reach", "120")
     assert "reach must be above 0" in refused("relight", *given, "--reach", "0")
     assert "size 16 is below the model's 32" in refused("relight", *given, "--size", "16")
-    assert "unknown texture 'orginal'; did you mean 'original'" in refused(
-        "mesh", *given, "--texture", "orginal"
-    )
+    assert "unknown detail 'foto'; did you mean 'photo'" in refused("mesh", *given, "--detail", "foto")
     assert "unknown format 'gbl'; did you mean 'glb'" in refused("mesh", *given, "--format", "gbl")
     assert "unknown kind of film 'avi'" in refused("rotate", *given, "--film", "avi")
     assert not out.exists()

@@ -30,5 +30,5 @@ def decompose(
     """Write a folder per image: panel.png, one PNG per factor, scene.json and scene.npz."""
     from derender.report.decomposition import decomposed
 
-    opener = opener_of(model, how)
+    opener = opener_of(model, how, default_detail="model")
     files.edit(opener, partial(decomposed, opener.model), output, sheet=sheet)

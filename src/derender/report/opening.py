@@ -1,9 +1,10 @@
 """Options of the image commands, and opening images by them: files become pixels and scenes.
 
 An image is read (cropped on request), decomposed, optimised per image on request, enlarged, and given its own
-texture on request. Each field of ``ImageOptions`` is an option of every image command (``cli/gathered.py``):
-a new one is a field here and its use in ``ImageOpener``. Heavy packages are imported where they are used: the
-command line imports this module for its help. Leaves out edits and writing (``editing``).
+texture unless that is declined. Each field of ``ImageOptions`` is an option of every image command
+(``cli/gathered.py``): a new one is a field here and its use in ``ImageOpener``. Heavy packages are imported
+where they are used: the command line imports this module for its help. Leaves out edits and writing
+(``editing``).
 """
 
 import warnings
@@ -22,7 +23,8 @@ if TYPE_CHECKING:
     from derender.training.held_out_errors import HeldOutErrors
 
 T = TypeVar("T")
-CHOICES = {"texture": ("model", "original"), "crop": ("whole", "auto")}
+CHOICES = {"detail": ("photo", "model"), "crop": ("whole", "auto")}
+OLD_TEXTURES = {"original": "photo", "model": "model"}
 FILM_KINDS = ("gif", "mp4")
 EDIT_SIZE, MESH_SIZE = 256, 128
 """Default sides of the output in pixels; decompositions have the model's own."""
@@ -40,9 +42,12 @@ class ImageOptions:
     size: int | None = option(
         None, "Side of the output: 256, of meshes 128, of decompositions the model's.", min=8, max=4096
     )
-    texture: str = option(
-        "model", "model: its albedo. original: the image's own detail.", metavar="model|original"
+    detail: str | None = option(
+        None,
+        "photo: texture from the image itself. model: the model's albedo. Decompositions default to model.",
+        metavar="photo|model",
     )
+    texture: str | None = option(None, "Old spelling of detail.", hidden=True)
     fit_steps: int | None = option(
         None, "Optimise each scene against its image in N steps (60, say; slow).", min=0, max=10_000
     )
@@ -55,8 +60,12 @@ class ImageOptions:
     def __post_init__(self) -> None:
         if self.frame is not None:
             object.__setattr__(self, "crop", self.frame)
+        if self.texture is not None:
+            _require_known("texture", self.texture, tuple(OLD_TEXTURES))
+            object.__setattr__(self, "detail", OLD_TEXTURES[self.texture])
         for name, known in CHOICES.items():
-            _require_known(name, getattr(self, name), known)
+            if (value := getattr(self, name)) is not None:
+                _require_known(name, value, known)
 
     @property
     def cropped(self) -> bool:
@@ -122,6 +131,7 @@ class ImageOpener:
         model: trained.
         options: how images are read and drawn.
         default_size: side of the output where ``options`` names none; never below the model's.
+        default_detail: "photo" or "model", where ``options`` names none.
         held_out: reconstruction errors that were stored with the model (``held_out_errors``).
 
     Raises:
@@ -134,10 +144,12 @@ class ImageOpener:
         options: ImageOptions | None = None,
         *,
         default_size: int = 0,
+        default_detail: str = "photo",
         held_out: "HeldOutErrors | None" = None,
     ):
         self.model, self.options, self.held_out = model, options or ImageOptions(), held_out
         self.size = self.options.size or max(default_size, model.image_size)
+        self.detail = self.options.detail or default_detail
         if self.size < model.image_size:
             raise ValueError(f"size {self.size} is below the model's {model.image_size}: give that or more")
 
@@ -188,14 +200,14 @@ class ImageOpener:
         ]
 
     def finer(self, image: OpenedImage) -> OpenedImage:
-        """The image with its scene at the output's size and, on request, its own texture."""
+        """The image with its scene at the output's size and, unless declined, its own texture."""
         from derender.data import as_float
         from derender.report.texture import picture_albedo, picture_on_grid
         from derender.scene.enlarge import at_size
 
         own, size = self.model.image_size, self.size
         scene = at_size(image.scene, size)
-        if self.options.texture == "original":
+        if self.detail == "photo":
             pixels = as_float(read_crop(image.path, image.crop, size)[None]).to(scene.depth)
             if size != own:
                 pixels = picture_on_grid(pixels, own)
