@@ -1,10 +1,10 @@
-"""Pictures per second of embedding beside training, and the memory that embedding takes at some sizes.
+"""Images per second of embedding beside training, and the memory that embedding takes at some sizes.
 
 Speed: the same networks (preset paper) take turns at a training step (float32; networks in bfloat16), at
-encoding pictures that are in memory, and at `derender embed`'s whole way from JPEGs in a tar to a parquet
+encoding images that are in memory, and at `derender embed`'s whole way from JPEGs in a tar to a parquet
 file, both in float32. Before any clock runs, both ways of embedding must give the same numbers.
 Memory: a model that computes next to nothing, and writes as many numbers as a real one, reads streams of
-pictures that are made up as they are asked for, all different; each size runs in a process of its own, whose
+images that are made up as they are asked for, all different; each size runs in a process of its own, whose
 highest resident memory is reported.
 
     python benchmarks/embedding.py --rounds 3 --json embedding.json
@@ -42,12 +42,12 @@ CODES = {"geometry": 256, "albedo": 256, "light": 256, "camera": 256}
 
 
 class MadeUp(Stream):
-    """Pictures of SIZE x SIZE that all differ, made when they are read."""
+    """Images of SIZE x SIZE that all differ, made when they are read."""
 
     layout = "made up"
 
     def __init__(self, count: int):
-        self.source = f"{count} pictures"
+        self.source = f"{count} images"
         self.count = count
         self.pixels = np.random.default_rng(0).integers(0, 256, SIZE * SIZE * 3, dtype=np.uint8)
 
@@ -101,7 +101,7 @@ def seconds(work: Callable[[], object], clock: Callable[[], float] = time.perf_c
 def measure_speed(
     batch: int, count: int, rounds: int, clock: Callable[[], float]
 ) -> dict[str, dict[str, float]]:
-    """Pictures per second of each way: median, least and most of the rounds after one to warm up."""
+    """Images per second of each way: median, least and most of the rounds after one to warm up."""
     torch.manual_seed(0)
     halved = OurStep(Derenderer(CONFIG.model), Vgg16Features(), "bf16-mixed")
     trained = OurStep(Derenderer(CONFIG.model), Vgg16Features(), "32-true")
@@ -143,7 +143,7 @@ def measure_speed(
 
 
 def measure_memory(count: int) -> dict[str, float]:
-    """Embed so many pictures in this process; its highest resident memory before and after, in MB."""
+    """Embed so many images in this process; its highest resident memory before and after, in MB."""
     with tempfile.TemporaryDirectory() as name:
         embed_to_file(MadeUp(600), Idle(), Path(name) / "warm.parquet", workers=2)
         before = peak_mb()
@@ -174,8 +174,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--batch", type=int, default=64, help="pictures in a training step (default 64)")
-    parser.add_argument("--count", type=int, default=1024, help="pictures to embed (default 1024)")
+    parser.add_argument("--batch", type=int, default=64, help="images in a training step (default 64)")
+    parser.add_argument("--count", type=int, default=1024, help="images to embed (default 1024)")
     parser.add_argument("--rounds", type=int, default=3, help="timed rounds after one to warm up (default 3)")
     parser.add_argument("--threads", type=int, default=os.cpu_count(), help="torch's threads")
     parser.add_argument(

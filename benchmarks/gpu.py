@@ -4,9 +4,9 @@ Checks first: the Triton renderer against its plain torch definition at every si
 and gradients, and whether runs repeat; the training step's loss against that of the official step, done
 literally. Then times: renderer, training step (float32, bfloat16, with LOOCC; plain, as a CUDA graph,
 compiled) beside the literal one in the same run, thirty epochs of the training command's own loop on as many
-pictures as UTKFace has (or on ``--data``), embedding, and the memory a picture takes in training at 64, 128
+images as UTKFace has (or on ``--data``), embedding, and the memory an image takes in training at 64, 128
 and 256 pixels, whole and in chunks. In the end the numbers stand beside what is aimed at. A part that fails
-is reported as a failure and the rest goes on; the file is written after each part. Weights and pictures are
+is reported as a failure and the rest goes on; the file is written after each part. Weights and images are
 random: neither changes the work.
 
     python benchmarks/gpu.py --json benchmarks/results/gpu.json
@@ -70,7 +70,7 @@ class Sizes:
     embedded: int = 1024
     pictures: int = UTKFACE_PICTURES
     epochs: tuple[str, ...] = ("batch_size=256", "precision=bf16-mixed")
-    measured: tuple[tuple[int, int], ...] = ((64, 64), (128, 32), (256, 16))  # pixels, pictures
+    measured: tuple[tuple[int, int], ...] = ((64, 64), (128, 32), (256, 16))  # pixels, images
     modes: tuple[str, ...] = ("plain", "graph", "compiled")
     chunks: tuple[int, ...] = (1, 8)
     data: str | None = None
@@ -119,7 +119,7 @@ def surfaces(count: int, size: int, device: str) -> list[Tensor]:
 
 
 def render_both_ways(values: list[Tensor], backend: str) -> dict[str, Tensor]:
-    """Picture, depth, mask and the gradient of each input for random cotangents."""
+    """Image, depth, mask and the gradient of each input for random cotangents."""
     result = render(*values, FOV_DEG, backend)
     draw = torch.Generator().manual_seed(1)
     outputs = (result.image, result.depth)
@@ -278,7 +278,7 @@ def time_embedding(sizes: Sizes) -> dict[str, Any]:
 
 
 def measure_memory(sizes: Sizes) -> dict[str, Any]:
-    """Peak memory of a bfloat16 LOOCC step per picture, above what the networks and their gradients take."""
+    """Peak memory of a bfloat16 LOOCC step per image, above what the networks and their gradients take."""
     rows = []
     for pixels, count, chunks in [(*one, chunks) for one in sizes.measured for chunks in sizes.chunks]:
         peaks = []
@@ -344,7 +344,7 @@ def main() -> None:
         "--json", type=Path, default=Path("gpu.json"), help="where results go (default gpu.json)"
     )
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS), help="only these")
-    parser.add_argument("--data", help="pictures of the part epochs (default: noise, as many as UTKFace has)")
+    parser.add_argument("--data", help="images of the part epochs (default: noise, as many as UTKFace has)")
     parser.add_argument("--dry-run", action="store_true", help="tiny sizes on the CPU, in the interpreter")
     options = parser.parse_args()
     if options.dry_run and os.environ.get("TRITON_INTERPRET") != "1":

@@ -1,7 +1,7 @@
 """Embedding through Ray beside one process: the same table, a worker killed on the way, one worker and two.
 
-Pictures are made up and lie in a folder; the model is the preset ``small`` with random weights. First the
-tables must agree (bit for bit, as no picture is unreadable or a copy), also after a worker was killed while
+Images are made up and lie in a folder; the model is the preset ``small`` with random weights. First the
+tables must agree (bit for bit, as no image is unreadable or a copy), also after a worker was killed while
 the run went on; then clocks run. Needs Ray: pip install 'derender[ray]'.
 
     python benchmarks/ray_embedding.py --count 2000 --json ray_embedding.json
@@ -66,7 +66,7 @@ def words_of(pid: int) -> bytes:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--count", type=int, default=2_000, help="pictures (default 2,000)")
+    parser.add_argument("--count", type=int, default=2_000, help="images (default 2,000)")
     parser.add_argument("--json", type=Path, help="also write the numbers, machine and versions here")
     options = parser.parse_args()
     torch.set_num_threads(1)

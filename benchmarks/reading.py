@@ -1,7 +1,7 @@
 """How long it takes until a very large folder, zip or set of shards is known, at first and later.
 
 Made-up sets of tiny files lie in a temporary folder: a folder of class folders, a zip, tars. A start is what
-a command does before the first picture is decoded: list, recognise the layout, read labels, ask every file's
+a command does before the first image is decoded: list, recognise the layout, read labels, ask every file's
 size and time of change (``identity``). The first start has no index to go by, later ones have the
 remembered one where there is one. Every start runs in a process of its own; imports are not counted. First it
 is shown that an added, a removed and a changed file are seen, in a folder and in a zip that are just large
@@ -93,7 +93,7 @@ def start(source: Path) -> dict[str, Any]:
 
 
 def start_shards(source: Path) -> dict[str, Any]:
-    """Seconds until training on shards could begin: the first time every picture is decoded."""
+    """Seconds until training on shards could begin: the first time every image is decoded."""
     began, cpu = time.perf_counter(), time.process_time()
     pictures = read_pictures(source, 8)
     total = int(pictures.images[:: max(1, len(pictures) // 64)].sum())

@@ -101,9 +101,9 @@ READERS: dict[str, Reader] = {
     "rasterize_peers": rasterize_peers,
     "embedding": embedding,
     "bench": bench,
-    "embedding_memory": by_row("memory of embedding {pictures:,} pictures", "{peak_mb:,.0f} MB"),
+    "embedding_memory": by_row("memory of embedding {pictures:,} images", "{peak_mb:,.0f} MB"),
     "step_memory": by_row(
-        "memory of a step, {size} px, batch {batch}, {chunks} chunks", "{mb_per_picture:,.0f} MB a picture"
+        "memory of a step, {size} px, batch {batch}, {chunks} chunks", "{mb_per_picture:,.0f} MB an image"
     ),
     "reading": reading,
     "clustering": clustering,

@@ -69,7 +69,7 @@ def agreement(table: FeatureTable) -> None:
 
 
 def in_memory(table: FeatureTable, rounds: int) -> dict[str, dict[str, float]]:
-    """One query and 64, by either distance, and looking for the picture itself."""
+    """One query and 64, by either distance, and looking for the image itself."""
     rows = table.factors["geometry"]
     codes = {name: values[7] for name, values in table.factors.items()}
     taken = {"same_picture": best_of(rounds, lambda: same_picture(table, codes))}

@@ -1,4 +1,4 @@
-"""Pictures a second of the generators of faces and cars, all ground truth included: in memory and on disk.
+"""Images a second of the generators of faces and cars, all ground truth included: in memory and on disk.
 
 First it is shown that one thread and all threads make the same bytes. Wall time says what a user waits, and
 is true on a quiet machine only; CPU time (of all threads together) moves less with other work. The load says
@@ -77,7 +77,7 @@ def measure(name: str, count: int, rounds: int, size: int, threads: int) -> dict
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="Speed of the generators of faces and cars.")
-    parser.add_argument("--count", type=int, default=1024, help="pictures in a round")
+    parser.add_argument("--count", type=int, default=1024, help="images in a round")
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--image-size", type=int, default=64)
     parser.add_argument("--threads", type=int, default=os.cpu_count() or 1)

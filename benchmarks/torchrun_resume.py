@@ -1,6 +1,6 @@
 """A real torchrun: two processes train, then one or two go on; the curves must be those of one process.
 
-Pictures are made up, the model is tiny, all on the CPU (gloo). Four runs: one process all the way; two
+Images are made up, the model is tiny, all on the CPU (gloo). Four runs: one process all the way; two
 processes that stop half-way; a copy of that run gone on with by one process, another by two. Every loss that
 was logged must agree. Times are given, start of the processes included; they say little on a shared machine.
 
@@ -72,7 +72,7 @@ def largest_difference(run: Path, expected: Path) -> float:
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument(
-        "--images", type=int, default=64, help="pictures shown before the resume; as many after"
+        "--images", type=int, default=64, help="images shown before the resume; as many after"
     )
     parser.add_argument("--json", type=Path, help="also write the numbers, machine and versions here")
     options = parser.parse_args()

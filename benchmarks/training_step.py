@@ -3,7 +3,7 @@
 Before any clock runs, both steps get the same weights and must give the same loss (1e-5 relative, float32)
 and the same gradients (1e-2 of each tensor's norm: where rounding moves a ReLU or a bilinear cell across an
 edge, the literal step differs from itself in another memory format by a few 1e-3). Then they take turns, so
-that a busy moment of the machine hits all of them; ratios come from medians over rounds. Pictures and VGG's
+that a busy moment of the machine hits all of them; ratios come from medians over rounds. Images and VGG's
 weights are random: neither changes the work.
 
     python benchmarks/training_step.py --rounds 5 --json training_step.json
@@ -86,7 +86,7 @@ class Row:
 
 
 def in_order(module: nn.Module) -> Iterator[nn.Parameter]:
-    """A network's parameters in the order in which pictures meet them."""
+    """A network's parameters in the order in which images meet them."""
     yield from module.parameters()
 
 
@@ -188,7 +188,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--batch", type=int, default=64, help="pictures in a batch (default 64)")
+    parser.add_argument("--batch", type=int, default=64, help="images in a batch (default 64)")
     parser.add_argument("--rounds", type=int, default=5, help="timed rounds after one to warm up (default 5)")
     parser.add_argument(
         "--threads", type=int, default=os.cpu_count(), help="torch's threads (default: every core)"

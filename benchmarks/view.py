@@ -1,4 +1,4 @@
-"""Pictures per second of the viewer: one client, then many at once, each moving light and camera.
+"""Images per second of the viewer: one client, then many at once, each moving light and camera.
 
 The server runs in a process of its own, the clients in threads of another, on one machine and share its
 cores; the clients' time is small. Every answer is checked: a PNG of the right size, and not the one before.
@@ -65,7 +65,7 @@ def visit(host: str, port: int, number: int, size: int, seconds: float, together
             refused += 1
             continue
         assert content[PNG_SIZE] == (2 * size).to_bytes(4, "big") + size.to_bytes(4, "big")
-        assert content != before, "the light moved and the picture did not"
+        assert content != before, "the light moved and the image did not"
         before = content
         taken.append(time.perf_counter() - began)
     connection.close()
@@ -94,7 +94,7 @@ def main() -> None:
     parser.add_argument(
         "--clients", type=int, nargs="+", default=[1, 20], help="how many at once (default 1 20)"
     )
-    parser.add_argument("--size", type=int, default=64, help="side of the pictures (default 64)")
+    parser.add_argument("--size", type=int, default=64, help="side of the images (default 64)")
     parser.add_argument("--seconds", type=float, default=10, help="for each number of clients (default 10)")
     parser.add_argument("--json", type=Path, help="also write the numbers, machine and versions here")
     options = parser.parse_args()

@@ -54,7 +54,7 @@ RANGES = {  # first and last vertex: part, colour (None: skin)
     "right sclera": (23021, 23790, "r_eye", (0.86, 0.83, 0.81)),
     "right iris": (23791, 24590, "r_eye", (0.22, 0.14, 0.09)),
 }
-PICTURE_CM = 16.6  # the mesh is in centimetres; as much as this spans the picture
+PICTURE_CM = 16.6  # the mesh is in centimetres; as much as this spans the image
 BEHIND_CM = 14.5  # points so far behind the nose tip are cut off
 
 

@@ -1,10 +1,10 @@
-"""docs/gallery.md and its pictures, made anew by one command from rendered faces and cars and trained models.
+"""docs/gallery.md and its images, made anew by one command from rendered faces and cars and trained models.
 
     python examples/gallery.py                                          # faces and cars of `derender synth`
     python examples/gallery.py --data faces.zip::test --label expression --cars cars.zip::test # other ones
 
-Every picture is what a command wrote; the page says which. Only rendered data belongs in a gallery: show no
-picture of a real person. The whole folder of pictures is replaced, and kept under 4 MB.
+Every image is what a command wrote; the page says which. Only rendered data belongs in a gallery: show no
+image of a real person. The whole folder of images is replaced, and kept under 4 MB.
 """
 
 import argparse
@@ -26,7 +26,7 @@ FACES, SEARCHED = 4, 400
 FILM = ("--size", "160", "--frames", "24", "--seconds", "2.4", "--film", "gif", "--stills", "5")
 SHOWN = (
     (
-        "Taken apart",
+        "Decomposed",
         {
             "decompose.png": "Four faces: input, reconstruction, depth, normals, albedo, shading, another "
             "light, another view"
@@ -109,12 +109,12 @@ def main() -> int:
         draw_cars(some_pictures(cars, work / "cars", "car"), work, drawn)
         size = sum(picture.stat().st_size for picture in drawn.iterdir())
         if size > MOST_BYTES:
-            raise SystemExit(f"the pictures take {size:,} bytes, more than {MOST_BYTES:,}")
+            raise SystemExit(f"the images take {size:,} bytes, more than {MOST_BYTES:,}")
         shutil.rmtree(PICTURES, ignore_errors=True)
         shutil.copytree(drawn, PICTURES)
     given = {"data": asked.data, "cars": asked.cars}
     PAGE.write_text(page(asked.model, asked.label, asked.credit, given), encoding="utf-8")
-    print(f"{PAGE} and {size / 1e6:.1f} MB of pictures")
+    print(f"{PAGE} and {size / 1e6:.1f} MB of images")
     return 0
 
 
@@ -126,7 +126,7 @@ def run(*arguments: str) -> None:
 
 
 def some_pictures(data: str, folder: Path, thing: str) -> list[str]:
-    """A few pictures of the data, evenly chosen, as files."""
+    """A few images of the data, evenly chosen, as files."""
     from derender.data import read_pictures
 
     pictures = read_pictures(data, 64, limit=FACES)
@@ -182,7 +182,7 @@ def draw_cars(cars: Sequence[str], work: Path, out: Path) -> None:
 
 
 def keep(source: Path, target: Path, width: int = 1100) -> None:
-    """A picture at most so wide, with 256 colours, dithered: depth and normals show no steps."""
+    """An image at most so wide, with 256 colours, dithered: depth and normals show no steps."""
     with Image.open(source) as picture:
         drawn = picture.convert("RGBA")
     small = Image.new("RGB", drawn.size, "white")
@@ -253,7 +253,7 @@ def inner_points(count: int) -> np.ndarray:
 def seen(
     x: np.ndarray, y: np.ndarray, nearness: np.ndarray, colours: np.ndarray, side: int, finer: int = 2
 ) -> np.ndarray:
-    """(side, side, 3) picture on white of points, x right and y up from its middle: the nearest wins."""
+    """(side, side, 3) image on white of points, x right and y up from its middle: the nearest wins."""
     large = side * finer
     column = np.round(large / 2 + finer * x).astype(int)
     row = np.round(large / 2 - finer * y).astype(int)
@@ -270,8 +270,8 @@ def page(model: str, label: str, credit: str, sources: Mapping[str, str | None])
     given = "".join(f" --{word} {Path(source).name}" for word, source in sources.items() if source)
     lines = [
         "# Gallery",
-        f"Everything here was made from single pictures by the models `{name}` and `cars-64`, with "
-        f"`python examples/gallery.py{given}`.\n{credit} No picture was chosen: they are evenly spaced "
+        f"Everything here was made from single images by the models `{name}` and `cars-64`, with "
+        f"`python examples/gallery.py{given}`.\n{credit} No image was chosen: they are evenly spaced "
         "through the data.\nThe commands are told in [pictures.md](pictures.md) and "
         "[explain.md](explain.md).",
     ]

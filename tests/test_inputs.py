@@ -35,7 +35,7 @@ def test_an_address_is_read_at_the_size_asked_for(tmp_path):
         Image.new("RGB", (10, 10), (40 * row, 10, 10)).save(tmp_path / f"{row}.png")
     assert as_images(tmp_path, 8).images.shape == (3, 3, 8, 8)
     assert len(as_images(tmp_path, 8, limit=2)) == 2
-    with pytest.raises(ValueError, match="needs 4 pictures or more"):
+    with pytest.raises(ValueError, match="needs 4 images or more"):
         as_images(tmp_path, 8, at_least=4)
 
 

@@ -109,7 +109,7 @@ def test_each_feature_decides_its_own_parameter_only(model, images):
 @pytest.mark.parametrize(
     ("shape", "dtype", "message"),
     [
-        ((2, 3, 64, 64), torch.float32, r"takes pictures of shape \(N, 3, 32, 32\), got \(2, 3, 64, 64\)"),
+        ((2, 3, 64, 64), torch.float32, r"takes images of shape \(N, 3, 32, 32\), got \(2, 3, 64, 64\)"),
         ((3, 32, 32), torch.float32, r"got \(3, 32, 32\)"),
         ((2, 3, 32, 32), torch.uint8, "divide uint8 by 255"),
     ],

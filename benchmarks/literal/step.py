@@ -20,7 +20,7 @@ NETS = ("geometry", "albedo", "light", "camera", "confidence")
 
 
 class LiteralStep(nn.Module):
-    """Networks, optimisers and the loss; call ``step`` once per batch of pictures in 0..1."""
+    """Networks, optimisers and the loss; call ``step`` once per batch of images in 0..1."""
 
     def __init__(self) -> None:
         super().__init__()

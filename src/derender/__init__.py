@@ -1,4 +1,4 @@
-"""Take pictures apart into geometry, albedo, light and camera.
+"""Decompose images into geometry, albedo, light and camera.
 
 Everything public is reached from here and imported on first use, so that
 ``import derender`` costs no more than finding the package.
@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from derender.evaluation import compare
     from derender.features import DisentangledFeatures, FeatureTable, embed, embed_to_file, search
     from derender.interpretation import explain
+    from derender.learn import finetune, refine, train, unet, whiten
     from derender.model import Derenderer, load
     from derender.scene import Scene
 
@@ -64,8 +65,13 @@ __all__ = [
     "embed_to_file",
     "evaluate",
     "explain",
+    "finetune",
     "load",
+    "refine",
     "search",
+    "train",
+    "unet",
+    "whiten",
 ]
 
 

@@ -1,4 +1,4 @@
-"""Small pictures with something in them to learn: two colours, a place, and a label for each."""
+"""Small images with something in them to learn: two colours, a place, and a label for each."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from derender.data import PictureSet
 
 @pytest.fixture(scope="session")
 def blobs() -> PictureSet:
-    """48 pictures of 32x32: a bright square on a dark ground, left (label 0) or right (label 1)."""
+    """48 images of 32x32: a bright square on a dark ground, left (label 0) or right (label 1)."""
     random = np.random.default_rng(0)
     images = random.integers(0, 60, (48, 3, 32, 32), dtype=np.uint8)
     side = np.arange(48) % 2

@@ -1,4 +1,4 @@
-"""Controls are what they say, keep the pictures' names and labels, and repeat for the same seed."""
+"""Controls are what they say, keep the images' names and labels, and repeat for the same seed."""
 
 import numpy as np
 import pytest

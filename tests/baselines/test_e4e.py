@@ -100,7 +100,7 @@ def test_codes_are_released_one_by_one():
 
 
 def test_losses_are_zero_for_what_the_generator_made_from_its_mean_code(model, generator):
-    """With an encoder that says nothing the inversion is the mean code's picture."""
+    """With an encoder that says nothing the inversion is the mean code's image."""
     model.centre.copy_(torch.randn(6, generator=generator).expand(8, -1))
     for head in model.encoder.heads:
         head.linear.weight.data.zero_()

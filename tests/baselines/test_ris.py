@@ -175,13 +175,13 @@ def test_taking_a_part_changes_its_place_alone(catalogue, generator):
 
 
 def test_retrieval_by_part_sees_that_part_alone(catalogue, generator):
-    """Among codes mixed of two pictures, each part finds the one that it comes from."""
+    """Among codes mixed of two images, each part finds the one that it comes from."""
     model = catalogue
     net = model.e4e.generator
     styles = torch.cat(net.styles(torch.randn(6, SIZES.codes, 8, generator=generator)), dim=1)
     skin = model.row("skin") > 0
     mixed = styles.clone()
-    mixed[:, skin] = styles.roll(1, dims=0)[:, skin]  # picture i has the skin of picture i - 1
+    mixed[:, skin] = styles.roll(1, dims=0)[:, skin]  # image i has the skin of image i - 1
     columns = {part: (styles * model.row(part)).numpy() for part in ("hair", "skin")}
     table = FeatureTable(tuple(f"{n}.png" for n in range(6)), columns, {}, {})
     for part, shift in (("hair", 0), ("skin", -1)):

@@ -1,4 +1,4 @@
-"""What each network of a StyleGAN2 is moved by, its regularisers, and how held-out pictures judge it."""
+"""What each network of a StyleGAN2 is moved by, its regularisers, and how held-out images judge it."""
 
 from contextlib import nullcontext
 
@@ -72,7 +72,7 @@ def test_r1_weighs_by_size_and_batch_unless_told(model, generator):
 
 
 def test_path_lengths_are_those_of_the_jacobian(model, generator):
-    """One column for each number of W+, by central differences of the pictures."""
+    """One column for each number of W+, by central differences of the images."""
     net, w = model.learner.double(), torch.randn(2, TINY.codes, 6, generator=generator, dtype=torch.float64)
     state = generator.get_state()
     found = path_lengths(net, w, generator)
@@ -125,7 +125,7 @@ def test_energy_distance_is_zero_for_one_distribution_only(generator):
     assert energy_distance(first, second + 1) > 0.2
     ends = energy_distance(torch.tensor([[0.0], [0.0]]), torch.tensor([[3.0], [3.0]]))
     assert ends == 6
-    assert energy_distance(first[:1], second) == 0  # one picture says nothing
+    assert energy_distance(first[:1], second) == 0  # one image says nothing
 
 
 def test_held_out_pictures_are_judged_by_samples_of_the_average(model, generator):

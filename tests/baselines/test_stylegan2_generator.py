@@ -160,7 +160,7 @@ def test_the_deviation_map_is_that_of_the_group(generator):
 
 
 def scipy_upfirdn(picture, taps, up, padding):
-    """scipy's, along both axes, of one picture padded after the zeros were put in."""
+    """scipy's, along both axes, of one image padded after the zeros were put in."""
     for axis in (0, 1):
         spread = np.apply_along_axis(lambda row: signal.upfirdn([1.0], row, up=up), axis, picture)
         missing = picture.shape[axis] * up - spread.shape[axis]  # scipy ends at the last pixel
@@ -204,7 +204,7 @@ def test_the_filter_keeps_brightness_and_mirrors(generator):
 
 
 def by_one_kernel_a_picture(images, weight, style, demodulate, up):
-    """The paper's form: weights are modulated and demodulated for each picture, then convolved in groups."""
+    """The paper's form: weights are modulated and demodulated for each image, then convolved in groups."""
     n, inputs = images.shape[:2]
     outputs, _, kernel, _ = weight.shape
     own = weight[None] / (inputs * kernel**2) ** 0.5 * style[:, None, :, None, None]

@@ -1,4 +1,4 @@
-"""ResNet-18 is ResNet-18, learns labels from few pictures, and looks at no others."""
+"""ResNet-18 is ResNet-18, learns labels from few images, and looks at no others."""
 
 import numpy as np
 import pytest

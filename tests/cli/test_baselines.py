@@ -17,7 +17,7 @@ SETTINGS = [word for setting in TINY for word in ("--set", setting)]
 
 @pytest.fixture(scope="module")
 def faces(tmp_path_factory) -> Path:
-    """24 pictures in the folders of two classes."""
+    """24 images in the folders of two classes."""
     folder, random = tmp_path_factory.mktemp("cli") / "faces", np.random.default_rng(0)
     for index in range(24):
         picture = Image.fromarray(random.integers(0, 256, (4, 4, 3), dtype=np.uint8)).resize((32, 32))

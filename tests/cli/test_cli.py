@@ -1,4 +1,4 @@
-"""The command line as a person meets it: help, a story from pictures to scores, and ways to get it wrong."""
+"""The command line as a person meets it: help, a story from images to scores, and ways to get it wrong."""
 
 import json
 import os
@@ -163,7 +163,7 @@ def test_geometry_and_reconstruction_of_generated_faces(run, faces, capsys):
     )
     shown = capsys.readouterr()
     assert json.loads(shown.out)["pictures"] == 2  # a tenth of 24
-    assert "mean picture" in shown.err
+    assert "mean image" in shown.err
 
 
 def test_decompose_writes_panels_factors_and_numbers(run, faces, tmp_path, refused, capsys):
@@ -229,12 +229,12 @@ def test_bad_data(refused, tmp_path):
     assert str(missing) in refused(*train, "--data", missing)
     empty = tmp_path / "empty"
     empty.mkdir()
-    assert "no pictures" in refused(*train, "--data", empty)
+    assert "no images" in refused(*train, "--data", empty)
     assert "'utkface'" in refused(*train, "--data", empty, "--dataset", "utkfac")
     single = tmp_path / "single"
     single.mkdir()
     Image.new("RGB", (8, 8)).save(single / "a.png")
-    assert "only one picture" in refused(*train, "--data", single)
+    assert "only one image" in refused(*train, "--data", single)
     assert not (tmp_path / "run").exists()
 
 
@@ -283,7 +283,7 @@ def test_ctrl_c_says_how_to_go_on(faces, tmp_path, monkeypatch, capsys):
     from derender.training.process import TrainingInterrupted
 
     def interrupted(*_, **__):
-        raise TrainingInterrupted("stopped after 32 pictures; run the same command with --resume to go on")
+        raise TrainingInterrupted("stopped after 32 images; run the same command with --resume to go on")
 
     monkeypatch.setattr(derender_task, "train", interrupted)
     assert main(["train", "--data", str(faces), "--out", str(tmp_path / "run"), *SETTINGS]) == 130

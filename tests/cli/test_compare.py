@@ -18,7 +18,7 @@ QUICK = ["--resamples", "20", "--untrained-seeds", "2", "--cache"]
 
 @pytest.fixture(scope="module")
 def people(tmp_path_factory) -> Path:
-    """Pictures of four made-up people, one folder each, told apart by their colour."""
+    """Images of four made-up people, one folder each, distinguished by their colour."""
     folder, rng = tmp_path_factory.mktemp("compare") / "people", np.random.default_rng(0)
     for row in range(ROWS):
         colour = np.array([[200, 40, 40], [40, 200, 40], [40, 40, 200], [200, 200, 40]])[row % 4]
@@ -36,7 +36,7 @@ def model(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def smiling(people, tmp_path_factory) -> Path:
-    """Some of the pictures, labelled as CelebA's are."""
+    """Some of the images, labelled as CelebA's are."""
     folder = tmp_path_factory.mktemp("compare") / "celeba"
     (folder / "img_align_celeba").mkdir(parents=True)
     lines = ["24", "smiles bald rare"]
@@ -205,10 +205,10 @@ def test_bad_input_is_one_line(tables, model, people, refused, tmp_path):
     assert "unknown head 'svm'" in refused(*linear, "--attributes", "--counts", "20", "--heads", "svm")
     assert "finetune trains the encoders" in refused(*linear, "--attributes", "--finetune")
     compare = ("compare", "--table", "identity", "--cache", "none", "-f", f"good={good}")
-    assert "different pictures, in 192 of 192 rows" in refused(*compare, "-f", f"b={tables['elsewhere']}")
+    assert "different images, in 192 of 192 rows" in refused(*compare, "-f", f"b={tables['elsewhere']}")
     mixed = ("-f", f"n={tables['noise']}", "-f", f"n={tables['wide']}")
     assert "row 'n' mixes features of different models" in refused(*compare, *mixed)
-    assert "are not among the pictures" in refused(*compare, "-d", people)
+    assert "are not among the images" in refused(*compare, "-d", people)
     assert "unknown table 'identities'; did you mean 'identity'" in refused(
         "compare", "--table", "identities"
     )

@@ -17,7 +17,7 @@ TRUE = Crop(0.7, 0.1, 0.2)
 
 @pytest.fixture(scope="module")
 def photos(tmp_path_factory) -> Path:
-    """Two rendered faces: one as the model knows it, one small and off the middle of a wider picture."""
+    """Two rendered faces: one as the model knows it, one small and off the middle of a wider image."""
     folder = tmp_path_factory.mktemp("framing")
     near, far = (example.picture.transpose(1, 2, 0) for example in rendered_examples(KNOWN, 64)[2:4])
     Image.fromarray(near).save(folder / "near.png")

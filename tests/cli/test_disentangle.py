@@ -1,4 +1,4 @@
-"""`evaluate disentangle` and `evaluate geometry`: pictures drawn, numbers told, bad words refused."""
+"""`evaluate disentangle` and `evaluate geometry`: images drawn, numbers told, bad words refused."""
 
 import json
 from pathlib import Path
@@ -76,7 +76,7 @@ def test_bad_words(model, rendered, tmp_path, capsys):
     taken.write_bytes(b"mine")
     assert "--force" in refused("--out", taken) and taken.read_bytes() == b"mine"
     assert "choose lasso, trees or none" in refused("--dimensions", "forest")
-    assert "needs 20 pictures or more" in refused("--limit", "5")
+    assert "needs 20 images or more" in refused("--limit", "5")
 
 
 def test_geometry_of_pictures_beside_depth_maps(model, made, tmp_path, capsys):
@@ -112,7 +112,7 @@ def test_geometry_of_pictures_beside_depth_maps(model, made, tmp_path, capsys):
     assert side["value"] == pytest.approx(ours["geometry"]["model"]["side"])
     assert side["low"] <= side["value"] <= side["high"]
     rows = ours["intervals"]["reconstruction"]
-    assert list(rows) == ["model", "mean picture", "PCA (1)", "untrained model"]
+    assert list(rows) == ["model", "mean image", "PCA (1)", "untrained model"]
     assert rows["model"]["versus"]["l1"]["rival"] in rows
     assert 0 < ours["factors"]["albedo"] <= ours["factors"]["albedo_global"]
     assert ours["factors"]["light_aligned"]["mean_deg"] <= ours["factors"]["light"]["mean_deg"] + 1

@@ -12,7 +12,7 @@ from derender.cli import main
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Twenty-six pictures of noise, one of them twice, and one that cannot be read."""
+    """Twenty-six images of noise, one of them twice, and one that cannot be read."""
     made = tmp_path / "set"
     made.mkdir()
     for number, picture in enumerate(
@@ -63,7 +63,7 @@ def test_what_is_no_set_of_pictures_is_refused(folder: Path, tmp_path: Path, cap
     empty.mkdir()
     broken.mkdir()
     (broken / "a.png").write_bytes(b"no picture")
-    text.write_text("no picture")
+    text.write_text("no image")
     assert "no images found" in refused(capsys, "doctor", empty)
     assert "none of the 1 images" in refused(capsys, "doctor", broken)
     assert "is no folder, zip or image" in refused(capsys, "doctor", text)

@@ -17,7 +17,7 @@ ROOM = ["--cache", "none", "--resamples", "10"]
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
-    """A model whose weights are no numbers, rendered pictures, and tables of features."""
+    """A model whose weights are no numbers, rendered images, and tables of features."""
     made = tmp_path_factory.mktemp("inputs")
     net = Derenderer.from_preset("small", seed=0, image_size=32, width=4, light_width=4, code_size=8)
     with torch.no_grad():

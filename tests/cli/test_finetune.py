@@ -58,9 +58,7 @@ def test_from_a_run_to_features_and_scores(run, faces, tmp_path, capsys, refused
     words += ["--markdown", text, "--latex", typeset, "--html", page, "--cache", tmp_path / "cache"]
     assert main([str(word) for word in words]) == 0
     shown = capsys.readouterr()
-    assert (
-        "20 labelled pictures learned, 8 held out" in " ".join(shown.out.split()) and "against" in shown.err
-    )
+    assert "20 labelled images learned, 8 held out" in " ".join(shown.out.split()) and "against" in shown.err
     told = json.loads(numbers.read_text())["scores"]
     frozen = ["frozen, logistic", "frozen, paper's head"]
     controls = ["untrained encoder, logistic", "PCA (6), logistic", "pixels, logistic", "majority"]

@@ -26,7 +26,7 @@ def settings(*pairs: str) -> list[str]:
 
 @pytest.fixture(scope="module")
 def faces(tmp_path_factory) -> Path:
-    """24 pictures, and for each a mask whose upper third is class 1."""
+    """24 images, and for each a mask whose upper third is class 1."""
     folder, random = tmp_path_factory.mktemp("generators") / "faces", np.random.default_rng(0)
     mask = np.zeros((32, 32), np.uint8)
     mask[:10] = 1
@@ -63,7 +63,7 @@ def test_a_generator_its_inversion_and_its_parts(faces, e4e, tmp_path, capsys):
     train = ["train", "--model", "ris", "-d", data, "--out", tmp_path / "ris"]
     own = settings(f"e4e={e4e}", f"masks={faces / 'masks'}", "image_size=32", "clusters=3", "samples=16")
     assert run(*train, *own) == 0
-    assert "24 pictures" in capsys.readouterr().err
+    assert "24 images" in capsys.readouterr().err
     (sheet,) = (tmp_path / "ris" / "samples").iterdir()
     assert sheet.suffix == ".png"
     assert run(*embed, "ris", "--model", tmp_path / "ris") == 0

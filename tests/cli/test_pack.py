@@ -125,5 +125,5 @@ def test_unknown_kinds_of_maps_and_one_picture_are_refused(unpacked, pictures, t
     assert "choose bytes or float16" in capsys.readouterr().err
     assert not (tmp_path / "p").exists()
     model = load(unpacked)
-    with pytest.raises(ValueError, match="two pictures"):
+    with pytest.raises(ValueError, match="two images"):
         copy_cost(model, model, np.asarray(pictures[:1]))

@@ -29,7 +29,7 @@ def model(tmp_path_factory) -> str:
 
 @pytest.fixture(scope="module")
 def photos(tmp_path_factory) -> Path:
-    """Six pictures of coloured noise, 64 pixels wide."""
+    """Six images of coloured noise, 64 pixels wide."""
     folder = tmp_path_factory.mktemp("pictures") / "photos"
     folder.mkdir()
     for number in range(6):
@@ -103,7 +103,7 @@ def test_rotate_writes_films_anyone_can_play(model, photos, tmp_path):
     assert (out / "0" / "film.gif").read_bytes()[:4] == b"GIF8"
     camera = json.loads((out / "0" / "moved.json").read_text())["stills"][0]["camera"]
     assert np.degrees(camera[:2]).tolist() == pytest.approx([5, -40], abs=1e-3)
-    assert not (out / "sheet.png").exists()  # one picture needs none
+    assert not (out / "sheet.png").exists()  # one image needs none
 
 
 def test_swap_of_a_picture_with_itself_changes_nothing(model, photos, tmp_path):
@@ -236,7 +236,7 @@ def test_bad_searches(table, model, photos, tmp_path, refused):
 
 
 def test_pictures_unlike_what_the_model_was_validated_on_are_named(model, photos, tmp_path, capsys):
-    """Errors kept with a copy of the model decide which pictures are named; they never stop a command."""
+    """Errors kept with a copy of the model decide which images are named; they never stop a command."""
     known = Path(shutil.copytree(model, tmp_path / "known"))
     one, two = photos / "0.png", photos / "1.png"
     words = ["--size", "32", "--film", "none", "--stills", "2"]

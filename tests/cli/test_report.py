@@ -26,7 +26,7 @@ def photos(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def run(tmp_path) -> Path:
-    """A run that was stopped early, with a small model; it was given 40 pictures."""
+    """A run that was stopped early, with a small model; it was given 40 images."""
     settings = ["model.network.image_size=32", "model.network.width=4", "model.network.light_width=4"]
     config = resolve("small", [*settings, "images=96", "split=[0.5,0.25,0.25]"])
     folder = start_run(tmp_path / "run", config, {"pictures": 40}, "cpu")
@@ -47,7 +47,7 @@ def test_page_with_data_tells_of_its_held_out_part(run, photos, tmp_path):
     assert not re.search(r'(?:src|href)="(?!data:|#)', html)
     failed = json.loads(told.read_text())["failed"]
     assert [reason.partition(":")[0] for reason in failed] == [
-        "Does each feature hold its own factor?",  # of 10 pictures
+        "Does each feature hold its own factor?",  # of 10 images
         "Labels explained by factors",
     ]
     assert all(name in html for name in ("Films", "Scores beside controls", "Decomposed"))

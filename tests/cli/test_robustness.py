@@ -1,4 +1,4 @@
-"""`derender evaluate robustness`: curves of generated and real pictures, charts, and ways to get it wrong."""
+"""`derender evaluate robustness`: curves of generated and real images, charts, and ways to get it wrong."""
 
 import json
 from pathlib import Path

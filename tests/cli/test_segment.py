@@ -79,9 +79,7 @@ def test_the_papers_table_beside_the_papers_numbers(parts, tmp_path, capsys, ref
     assert main([str(word) for word in [*words, 1, *files]]) == 0
     told = json.loads(capsys.readouterr().out)
     ours = told["parts"]["ours"]
-    assert told["number"] == 3 and ours["differs"].startswith(
-        "subset: 13 + 3 pictures at 32 x 32, 19 classes"
-    )
+    assert told["number"] == 3 and ours["differs"].startswith("subset: 13 + 3 images at 32 x 32, 19 classes")
     names = ["joint encoders", "geometry encoder", "albedo encoder", "joint encoders, frozen", "random start"]
     names += ["each place's class", "pixel colour", "PCA", "most frequent class"]
     assert list(ours["rows"]) == names and len(ours["paper"]) == 5

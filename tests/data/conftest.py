@@ -1,4 +1,4 @@
-"""Makes small pictures and trees of them; none shows anything but noise and ramps."""
+"""Makes small images and trees of them; none shows anything but noise and ramps."""
 
 import io
 import zipfile
@@ -31,7 +31,7 @@ def encoded() -> Callable[..., bytes]:
 
 @pytest.fixture
 def tree(tmp_path: Path, encoded) -> Callable[..., Path]:
-    """``tree(files, zipped)`` writes a folder or zip: each name gets its own picture or what is given."""
+    """``tree(files, zipped)`` writes a folder or zip: each name gets its own image or what is given."""
 
     def make(
         files: list[str] | dict[str, bytes | str | None], zipped: bool = False, name: str = "set"

@@ -1,4 +1,4 @@
-"""Which part of each picture is read: decoding cuts it out first, and a list of one's own can name it."""
+"""Which part of each image is read: decoding cuts it out first, and a list of one's own can name it."""
 
 import io
 
@@ -56,7 +56,7 @@ def test_a_box_in_a_turned_picture_is_in_upright_pixels():
 
 
 def test_a_box_holds_where_the_jpeg_is_decoded_at_a_reduced_scale(encoded):
-    """A ramp says where the pixels came from: the mean of each column is its place in the picture."""
+    """A ramp says where the pixels came from: the mean of each column is its place in the image."""
     ramp = np.broadcast_to(np.linspace(0, 255, 1024)[None, :, None], (512, 1024, 3)).astype(np.uint8)
     jpeg = encoded(ramp, "JPEG", quality=95)
     part = decode(jpeg, 16, "crop", box(256, 100, 640, 484)).mean(axis=(0, 1))
@@ -75,7 +75,7 @@ HEADER = "file,left,top,width,height"
 
 @pytest.fixture
 def wild(tree, encoded):
-    """``wild({file: text})`` is CelebA in the wild, three pictures of 40 x 34 pixels, with these lists."""
+    """``wild({file: text})`` is CelebA in the wild, three images of 40 x 34 pixels, with these lists."""
 
     def make(lists: dict[str, str], zipped: bool = False):
         pictures = {f"Img/img_celeba/{name}": encoded(noise(i, 40, 34)) for i, name in enumerate(NAMES)}

@@ -1,4 +1,4 @@
-"""Large sets in a memory map: the same pictures as in memory, kept, checked, made again after any change."""
+"""Large sets in a memory map: the same images as in memory, kept, checked, made again after any change."""
 
 import errno
 import os
@@ -16,7 +16,7 @@ from derender.data import pictures as pictures_module
 
 @pytest.fixture
 def decoded(monkeypatch) -> list[int]:
-    """How many pictures each real decoding read."""
+    """How many images each real decoding read."""
     counts, real = [], pictures_module.decoded
 
     def counting(*of, **options):

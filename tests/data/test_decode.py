@@ -104,7 +104,7 @@ def test_integers_beyond_sixteen_bits_are_refused(encoded):
 @pytest.mark.parametrize("orientation", range(1, 9))
 @pytest.mark.parametrize("form", ["JPEG", "PNG", "TIFF", "WEBP"])
 def test_exif_orientation_is_applied(encoded, orientation, form):
-    """A picture stored turned, with the tag that says so, reads as the upright one."""
+    """An image stored turned, with the tag that says so, reads as the upright one."""
     upright = Image.new("RGB", (16, 16), "white")
     upright.paste("black", (0, 0, 8, 8))
     upright.paste("red", (8, 0, 16, 8))

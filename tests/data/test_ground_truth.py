@@ -18,7 +18,7 @@ ROWS = [
 
 @pytest.fixture
 def rendered(tree, encoded):
-    """``rendered(**changed)``: two pictures of 6 x 4 with maps; names given None are left out."""
+    """``rendered(**changed)``: two images of 6 x 4 with maps; names given None are left out."""
 
     def make(changed: dict[str, bytes | None] | None = None, zipped: bool = False):
         rng = np.random.default_rng(0)

@@ -29,7 +29,7 @@ def png(array: np.ndarray, mode: str | None = None) -> bytes:
 
 
 def part(rows: slice, columns: slice, size: int = 16, mode: str = "L") -> bytes:
-    """One part as published: white on black, half the picture's size."""
+    """One part as published: white on black, half the image's size."""
     mask = np.zeros((size, size), np.uint8)
     mask[rows, columns] = 255
     return png(mask, mode)
@@ -95,14 +95,14 @@ def test_merged_masks_are_resized_to_the_nearest_value(tree, merged, zipped):
 
 @pytest.mark.parametrize("fit", ["crop", "pad", "stretch"])
 def test_a_mask_stays_on_its_picture(tree, fit):
-    """A picture that is painted as its mask: after any fit, bright is where the class is."""
+    """An image that is painted as its mask: after any fit, bright is where the class is."""
     mask = np.zeros((40, 64), np.uint8)
     mask[10:30, 20:50] = 13
     bright = np.repeat((mask[..., None] > 0).astype(np.uint8) * 255, 3, axis=-1)
     small = png(np.ascontiguousarray(mask[::2, ::2]))
     pictures, masks, _ = read_masks(tree({"images/0.png": png(bright), "masks/0.png": small}), 64, fit=fit)
     shown = pictures.images[0].mean(axis=0) > 127
-    if fit == "pad":  # white above and below the picture is no hair
+    if fit == "pad":  # white above and below the image is no hair
         shown[:12] = shown[52:] = False
     assert (shown == (masks[0] == 13)).mean() > 0.97
     assert (masks[0] == 13).sum() > 500
@@ -118,7 +118,7 @@ def test_a_palette_holds_class_numbers(tree, merged):
 
 
 def test_rows_belong_together_when_some_are_left_out(tree, merged):
-    """A copy, an unreadable picture and a limit take their masks with them."""
+    """A copy, an unreadable image and a limit take their masks with them."""
     files = {**merged, "images/3.jpg": merged["images/0.jpg"], "masks/3.png": merged["masks/0.png"]}
     pictures, masks, _ = read_masks(tree({**files, "images/1.jpg": b"no picture"}), 32)
     assert pictures.files == ("images/0.jpg", "images/2.jpg")
@@ -236,7 +236,7 @@ def test_a_set_without_masks_says_as_what_it_was_read(tree):
 
 
 def test_parts_and_class_numbers_say_the_same(tree):
-    """A mask taken apart into one picture per class, as published, is put together again."""
+    """A mask decomposed into one image per class, as published, is put together again."""
     numbers = np.random.default_rng(0).integers(0, 19, (2, 16, 16)).astype(np.uint8)
     files = {f"CelebA-HQ-img/{row}.jpg": picture(row, 16) for row in range(2)}
     for row, mask in enumerate(numbers):

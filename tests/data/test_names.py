@@ -1,4 +1,4 @@
-"""Which names are pictures', which are hidden, and how odd bytes are written."""
+"""Which names are images', which are hidden, and how odd bytes are written."""
 
 import os
 

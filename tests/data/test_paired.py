@@ -1,4 +1,4 @@
-"""Pictures beside depth maps: how values become depth, which picture goes with which map, what is refused."""
+"""Images beside depth maps: how values become depth, which image goes with which map, what is refused."""
 
 import io
 
@@ -14,7 +14,7 @@ SIZE = 12
 
 @pytest.fixture
 def pairs(tree, encoded):
-    """``pairs(bits, names)`` writes three test pictures and two training pictures with their maps."""
+    """``pairs(bits, names)`` writes three test images and two training images with their maps."""
 
     def make(bits: int = 8, names: tuple[str, str] = ("image", "depth"), extra: dict | None = None, **how):
         largest = 2**bits - 1

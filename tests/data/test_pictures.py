@@ -25,9 +25,7 @@ def test_one_picture_file(tree):
     folder = tree(["1.png", "2.png"])
     pictures = read_pictures(folder / "2.png", 8)
     assert pictures.files == ("2.png",)
-    with pytest.raises(
-        ValueError, match="training needs 2 pictures or more, and only one picture was found in"
-    ):
+    with pytest.raises(ValueError, match="training needs 2 images or more, and only one image was found in"):
         pictures.require(2)
     assert pictures.require(1) is pictures
 
@@ -47,7 +45,7 @@ def test_unreadable_files_are_skipped_with_reasons_and_labels_stay_aligned(tree,
     jpeg = encoded(np.random.default_rng(0).integers(0, 256, (99, 99, 3), dtype=np.uint8), "JPEG")
     files = {
         "cat/1.png": None,
-        "cat/2.png": "no picture",
+        "cat/2.png": "no image",
         "cat/3.png": None,
         "dog/1.jpg": jpeg[:800],
         "dog/2.png": None,
@@ -63,11 +61,11 @@ def test_unreadable_files_are_skipped_with_reasons_and_labels_stay_aligned(tree,
     assert reasons["dog/3.png"] == "empty file"
     for row, seed in enumerate((0, 2, 4)):
         np.testing.assert_array_equal(pictures.images[row], read_picture(encoded(seed), 8))
-    assert "3 pictures" in pictures.describe() and "3 skipped" in pictures.describe()
+    assert "3 images" in pictures.describe() and "3 skipped" in pictures.describe()
 
 
 def test_copies_are_dropped_by_content(tree, encoded):
-    """The same pixels in another format are the same picture."""
+    """The same pixels in another format are the same image."""
     files = {
         "cat/1.png": encoded(1),
         "cat/2.png": encoded(2),
@@ -97,7 +95,7 @@ def test_only_unreadable_files(tree):
 def test_a_copy_of_one_picture_is_too_few(tree, encoded):
     pictures = read_pictures(tree({"a.png": encoded(1), "b.png": encoded(1), "c.png": "text"}), 8)
     with pytest.raises(
-        ValueError, match=r"only one picture was found in .* \(2 more were unreadable or identical"
+        ValueError, match=r"only one image was found in .* \(2 more were unreadable or identical"
     ):
         pictures.require(2)
 

@@ -83,7 +83,7 @@ def test_lfw_people(shared_data):
 
 
 def test_celebamask_masks(shared_data):
-    """Skin and hair are most of a face's picture, the middle of the picture is no background."""
+    """Skin and hair are most of a face's image, the middle of the image is no background."""
     pictures, masks, classes = read_masks(shared_data("data/celebamask128.zip"), 64, limit=100)
     assert (len(pictures), masks.shape, classes) == (100, (100, 64, 64), MASK_CLASSES)
     shares = np.bincount(masks.ravel(), minlength=19) / masks.size
@@ -99,7 +99,7 @@ def test_tracks(shared_data):
 
 
 def test_synface_ground_truth_explains_its_pictures(shared_data):
-    """Depth, normals, albedo, light and camera fit together: shading by them gives the stored picture."""
+    """Depth, normals, albedo, light and camera fit together: shading by them gives the stored image."""
     truth = read_ground_truth(shared_data("data/synface64.zip"), limit=40)
     assert 0.93 < truth.depth[truth.mask].min() < truth.depth[truth.mask].max() < 1.16
     pitch, yaw = truth.light[:, 2], truth.light[:, 3]

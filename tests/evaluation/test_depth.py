@@ -206,12 +206,12 @@ def test_a_model_of_another_size_is_refused_in_words():
     model = Oracle(torch.ones(1, 64, 64), torch.ones(1, 64, 64))
     with pytest.raises(ValueError, match="ground truth is 33 pixels wide, the model takes 64"):
         evaluate_geometry(model, truth)
-    with pytest.raises(ValueError, match="no pictures"):
+    with pytest.raises(ValueError, match="no images"):
         predicted_depth(model, truth.images[:0])
 
 
 def test_controls_on_rendered_faces_reach_what_is_known(shared_data):
-    """Average depth 1.51e-2 and 22.4 degrees, plane 2.28e-2 and 38.9 over all 800 pictures; here over 200."""
+    """Average depth 1.51e-2 and 22.4 degrees, plane 2.28e-2 and 38.9 over all 800 images; here over 200."""
     truth = read_ground_truth(shared_data("data/synface64.zip"), limit=200)
     average, plane_scores = geometry_controls(truth, FOV_DEG)
     assert average.side == pytest.approx(1.51e-2, abs=0.06e-2)

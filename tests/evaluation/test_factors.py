@@ -1,4 +1,4 @@
-"""Errors of albedo, light and camera: zero up to what no picture can tell, known on closed forms."""
+"""Errors of albedo, light and camera: zero up to what no image can tell, known on closed forms."""
 
 from dataclasses import replace
 

@@ -52,10 +52,10 @@ def test_classes_are_chosen_by_size():
     [
         ([], "at least one feature table"),
         ([row("a", table()), row("a", table())], "two rows have the name 'a'"),
-        ([row("a", table()), row("b", table("abc"))], "'a' have 6 rows and 'b' 3: .* same pictures"),
+        ([row("a", table()), row("b", table("abc"))], "'a' have 6 rows and 'b' 3: .* same images"),
         (
             [row("a", table()), row("b", table("abcxyf"))],
-            r"different pictures, in 2 of 6 rows \(d and x\): embed the same data",
+            r"different images, in 2 of 6 rows \(d and x\): embed the same data",
         ),
         ([row("a", table(), table(dimensions=3))], "row 'a' mixes features of different models"),
         (

@@ -1,4 +1,4 @@
-"""A picture's percentile: known answers, and other things than faces shown to a model of faces."""
+"""An image's percentile: known answers, and other things than faces shown to a model of faces."""
 
 import numpy as np
 import pytest

@@ -62,11 +62,11 @@ def test_parts_find_their_labels():
 
 def test_a_part_says_what_differs():
     assert EMOTION.differs("rafdb", 3_068).startswith("subset: 3,068 rows of rafdb; the paper: 3,068")
-    told = SEGMENTATION.differs("celebamask", 640, "+ 160 pictures at 64 x 64, 19 classes,")
+    told = SEGMENTATION.differs("celebamask", 640, "+ 160 images at 64 x 64, 19 classes,")
     assert told.startswith(
-        "subset: 640 + 160 pictures at 64 x 64, 19 classes, of celebamask; the paper: 24,127"
+        "subset: 640 + 160 images at 64 x 64, 19 classes, of celebamask; the paper: 24,127"
     )
-    assert EMOTION.differs("lfw", 500).startswith("stand-in: 500 rows of lfw for 3,068 pictures of RAF-DB")
+    assert EMOTION.differs("lfw", 500).startswith("stand-in: 500 rows of lfw for 3,068 images of RAF-DB")
 
 
 def test_tables_are_known_by_name():

@@ -40,7 +40,7 @@ def test_only_the_mask_counts():
 
 
 class Copy(torch.nn.Module):
-    """Gives the picture back, a little darker, in the upper half."""
+    """Gives the image back, a little darker, in the upper half."""
 
     device = torch.device("cpu")
 
@@ -72,7 +72,7 @@ def test_the_mean_of_many_images_is_exact_and_of_none_an_error():
 
 
 def test_components_copy_what_lies_in_their_span():
-    """Pictures of two varying numbers come back from two components or more, others only nearly."""
+    """Images of two varying numbers come back from two components or more, others only nearly."""
     generator = np.random.default_rng(0)
     basis, mixed = generator.uniform(0, 1, (2, 3, 4, 4)), generator.uniform(0, 1, (40, 2))
     images = (np.einsum("nk,kchw->nchw", mixed, basis) * 127).round().astype(np.uint8)

@@ -1,4 +1,4 @@
-"""A tiny model and picture set with the interfaces that features need."""
+"""A tiny model and image set with the interfaces that features need."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ SIZE = 8
 
 
 class TinyModel(nn.Module):
-    """Two factors of 3 and 2 numbers: fixed random projections of the picture, one with a BatchNorm."""
+    """Two factors of 3 and 2 numbers: fixed random projections of the image, one with a BatchNorm."""
 
     def __init__(self, seed: int = 0):
         super().__init__()

@@ -27,7 +27,7 @@ def png(seed: int) -> bytes:
 
 
 def contents() -> dict[str, bytes]:
-    """Pictures in two classes, some unreadable, some copies of earlier ones, also at the very end."""
+    """Images in two classes, some unreadable, some copies of earlier ones, also at the very end."""
     files = {f"{'cat' if row % 3 else 'dog'}/{row:03d}.png": png(row) for row in range(COUNT)}
     names = list(files)
     for row in (0, 5, 31, 32, 70, COUNT - 1):
@@ -45,7 +45,7 @@ def small_parts(monkeypatch, tmp_path):
 
 @pytest.fixture(params=["folder", "zip", "shards"])
 def source(request, tmp_path) -> str:
-    """The same pictures in three forms; the shards bring labels of several kinds along."""
+    """The same images in three forms; the shards bring labels of several kinds along."""
     files = contents()
     if request.param == "folder":
         for name, data in files.items():

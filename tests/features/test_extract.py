@@ -47,13 +47,13 @@ def test_progress_counts_pictures(model, pictures):
 def test_bad_input_is_refused_in_words(model, pictures):
     model.image_size = 16
     with pytest.raises(
-        ValueError, match="pictures are 8x8, the model takes 16x16: read them with image_size=16"
+        ValueError, match="images are 8x8, the model takes 16x16: read them with image_size=16"
     ):
         embed_pictures(model, pictures)
     model.image_size = 8
     with pytest.raises(ValueError, match="batch_size must be 1 or more, got 0"):
         embed_pictures(model, pictures, batch_size=0)
-    with pytest.raises(ValueError, match="no pictures"):
+    with pytest.raises(ValueError, match="no images"):
         embed_pictures(model, pictures.select([]))
     model.b[:] = torch.nan
     with pytest.raises(ValueError, match=r"factor 'albedo' is not finite in 11 of 11 rows, first in 0\.png"):

@@ -109,14 +109,14 @@ def test_bad_input_is_refused_in_words(model, pictures):
     for wrong, message in [
         (
             pictures.images[:, :, :4],
-            r"expected pictures \(N, 3, 8, 8\) or \(N, 8, 8, 3\), got shape \(11, 3, 4, 8\)",
+            r"expected images \(N, 3, 8, 8\) or \(N, 8, 8, 3\), got shape \(11, 3, 4, 8\)",
         ),
         (pictures.images[0], r"got shape \(3, 8, 8\)"),
-        (pictures.images.astype(np.int64), "expected pictures in uint8 or floats in 0..1, got int64"),
+        (pictures.images.astype(np.int64), "expected images in uint8 or floats in 0..1, got int64"),
         (pictures.images.astype(np.float32), "must lie in 0..1 without NaN: divide by 255"),
         (np.full((1, 3, 8, 8), np.nan), "must lie in 0..1 without NaN"),
         ("one.png", "got the one path 'one.png': give a list of paths"),
-        ([None, None], "expected paths of pictures, got NoneType"),
+        ([None, None], "expected paths of images, got NoneType"),
     ]:
         with pytest.raises(ValueError, match=message):
             transformer.transform(wrong)

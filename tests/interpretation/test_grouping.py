@@ -1,4 +1,4 @@
-"""Clusters and pairs taken apart by factor: sums, known answers, invariances."""
+"""Clusters and pairs decomposed by factor: sums, known answers, invariances."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Maps over the picture: where a network looks, what changes them, exact sums."""
+"""Maps over the image: where a network looks, what changes them, exact sums."""
 
 import numpy as np
 import pytest

@@ -82,7 +82,7 @@ def test_pictures_far_from_zero_are_normalised_as_exactly(generator):
     weight, bias = torch.ones(8), torch.zeros(8)
     result = fast(values, weight, bias, 2, 0.0, EPSILON)
     exact = functional.relu(functional.group_norm(values.double(), 2))
-    # float32 pictures near 1000 are themselves rounded to 6e-5, and scale and shift are float32
+    # float32 images near 1000 are themselves rounded to 6e-5, and scale and shift are float32
     assert (result.double() - exact).abs().max() < 5e-4
 
 

@@ -1,4 +1,4 @@
-"""Networks: the paper's parameter counts, every picture size, bounded outputs."""
+"""Networks: the paper's parameter counts, every image size, bounded outputs."""
 
 import pytest
 import torch
@@ -32,7 +32,7 @@ def test_the_four_nets_together_have_the_papers_total():
 
 
 def multiplications(model: Derenderer) -> int:
-    """Multiplications of one picture taken apart, counted at every convolution and linear layer."""
+    """Multiplications of one image decomposed, counted at every convolution and linear layer."""
     counted = 0
 
     def count(layer, inputs, output):

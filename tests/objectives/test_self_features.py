@@ -21,7 +21,7 @@ QUICK = SelfTraining(widths=(8, 8, 16), batch=8, places=8, crop=24, projection=1
 
 
 def blobs(n: int, generator: Generator, size: int = 32) -> torch.Tensor:
-    """Pictures of smooth random colour with a few sharp discs: detail at several scales."""
+    """Images of smooth random colour with a few sharp discs: detail at several scales."""
     smooth = functional.interpolate(torch.rand(n, 3, 5, 5, generator=generator), size, mode="bicubic").clamp(
         0, 1
     )

@@ -1,4 +1,4 @@
-"""Fitting by rendering: known scenes are found again, each picture by itself; damaged files are refused."""
+"""Fitting by rendering: known scenes are found again, each image by itself; damaged files are refused."""
 
 import math
 

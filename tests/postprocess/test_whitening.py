@@ -11,9 +11,9 @@ VIEWS, IMAGES, SIZE = 5, 400, 12
 
 
 def planted(seed: int = 0) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Codes in which axes 0..2 say which picture it is and axes 3..5, far larger, how it was lit.
+    """Codes in which axes 0..2 say which image it is and axes 3..5, far larger, how it was lit.
 
-    All axes are mixed by a rotation. Gives codes (views, pictures, size), the directions of the picture's and
+    All axes are mixed by a rotation. Gives codes (views, images, size), the directions of the image's and
     of the light's axes.
     """
     generator = torch.Generator().manual_seed(seed)
@@ -74,7 +74,7 @@ def test_an_affine_change_of_the_codes_changes_no_distance():
 def test_activations_longer_than_the_code_give_features_of_its_size_and_distinguish_more():
     told, _, _ = planted(0)
     code, _, lit = planted(1)
-    code = code - code @ lit.T @ lit  # the code itself is told apart by other pictures' axes
+    code = code - code @ lit.T @ lit  # the code itself is distinguished by other images' axes
     found = fit_projection(Scatter.of(torch.cat([code, told], dim=2)), 6, 1e-6, size=SIZE)
     assert found.map.shape == (2 * SIZE, SIZE)
     features = (torch.cat([code, told], dim=2) - found.mean) @ found.map

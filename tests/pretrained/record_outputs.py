@@ -1,4 +1,4 @@
-"""Outputs of the shipped models on generated pictures; run as a script, it records them.
+"""Outputs of the shipped models on generated images; run as a script, it records them.
 
 Record again only where a shipped model is exchanged on purpose: test_outputs.py compares every change of the
 code with the recorded files. Maps are stored at every fourth pixel.
@@ -20,7 +20,7 @@ ENCODED = {"rendered-faces-64": 192}  # columns of features before the coordinat
 
 
 def pictures_of(name: str) -> torch.Tensor:
-    """(3, 3, 64, 64) in 0..1: generated pictures of the model's kind of object."""
+    """(3, 3, 64, 64) in 0..1: generated images of the model's kind of object."""
     images = PICTURES[name](COUNT, 64, seed=SEED).images
     return torch.from_numpy(np.ascontiguousarray(images)).float() / 255
 

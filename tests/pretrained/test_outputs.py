@@ -22,7 +22,7 @@ def test_a_shipped_model_gives_its_recorded_outputs(name):
     expected = load_file(record.FOLDER / f"{name}.safetensors")
     np.testing.assert_allclose(
         record.pictures_of(name).numpy()[..., ::8, ::8], expected.pop("pictures"), atol=1e-6,
-        err_msg="the generated pictures have changed, so nothing can be said of the model",
+        err_msg="the generated images have changed, so nothing can be said of the model",
     )  # fmt: skip
     found = record.outputs_of(name)
     assert found.keys() == expected.keys()

@@ -1,4 +1,4 @@
-"""Scenes to render, and what a picture of them must be."""
+"""Scenes to render, and what an image of them must be."""
 
 import torch
 from torch import Tensor

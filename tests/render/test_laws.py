@@ -316,7 +316,7 @@ def test_a_mesh_without_area_shows_nothing(backend):
 @pytest.mark.parametrize(("beyond_px", "covered"), [(0.08, True), (0.12, False)])
 @pytest.mark.parametrize("side", ["left", "right", "top", "bottom"])
 def test_a_large_triangle_reaches_a_ten_thousandth_beyond_its_edge(backend, side, beyond_px, covered):
-    """Two triangles some thousand pixels large, one edge just short of one of the picture's four pixels."""
+    """Two triangles some thousand pixels large, one edge just short of one of the image's four pixels."""
     short = torch.tensor([-1000.0, 1 - beyond_px], dtype=torch.float64)
     short = 1 - short.flip(0) if side in ("left", "top") else short
     other, focal = torch.tensor([-1000.0, 1000.0], dtype=torch.float64), 10.0

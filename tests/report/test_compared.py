@@ -1,4 +1,4 @@
-"""One table and one picture of many data sets: what failed keeps its place, shared trainings count once."""
+"""One table and one image of many data sets: what failed keeps its place, shared trainings count once."""
 
 from derender.report.compared import Cost, protocol_picture, protocol_table, scores_from, set_tables
 
@@ -40,7 +40,7 @@ def test_rows_are_methods_then_controls_and_what_failed_keeps_its_place():
     values = dict(zip((column.name for column in table.columns), table.rows[0].cells, strict=True))
     assert (values["lfw: accuracy"], values["cars: accuracy"], values["numbers"]) == (0.5, 0.6, 8)
     assert values["training, s"] == 12  # lfw and utk share a run
-    assert abs(values["ms a picture"] - 5 / 3) < 1e-9
+    assert abs(values["ms an image"] - 5 / 3) < 1e-9
     assert table.rows[1].cells[:6] == ("failed", None, 0.4, 0.4, "missing", None)
     assert table.best(0) == 0.5
     own, verdicts = set_tables(scores[0], ["ours", "vqvae"])

@@ -1,4 +1,4 @@
-"""The doctor's page tells every finding, escapes what it quotes, and shows the pictures it names."""
+"""The doctor's page tells every finding, escapes what it quotes, and shows the images it names."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""What is told of a model with pictures at hand; a part that cannot be made is named, the others stand."""
+"""What is told of a model with images at hand; a part that cannot be made is named, the others stand."""
 
 import numpy as np
 import pytest
@@ -39,7 +39,7 @@ def test_everything_that_can_be_told_is_told_and_escaped(model, pictures):
     assert found.failed == [] and done == [(step, 6) for step in range(7)]
     html = "".join(block for section in found.sections for block in section.blocks)
     assert "<script>" not in html and "&lt;script&gt;.png" in html
-    for told in ("All of them", "mean picture", "no exact depth", "shuffled labels", "tone", "Swap test"):
+    for told in ("All of them", "mean image", "no exact depth", "shuffled labels", "tone", "Swap test"):
         assert told in html
     assert html.count("prefers-reduced-motion") == 2
 
@@ -49,7 +49,7 @@ def test_parts_that_cannot_be_made_are_named_with_their_reason(model, pictures):
     found = gather(Subject(model, few, few.select(slice(0)), "None"))
     assert [section.short for section in found.sections] == ["Data"]
     assert len(found.failed) == 5
-    assert "needs 1 pictures or more" in found.failed[0]
+    assert "needs 1 images or more" in found.failed[0]
     assert "no label of 2 to 12 classes" in found.failed[-1]
 
 

@@ -16,7 +16,7 @@ SIZE = 24
 
 
 def nosed() -> Scene:
-    """A plane with a nose in the upper right of the picture; nose red, upper half green, lower half blue."""
+    """A plane with a nose in the upper right of the image; nose red, upper half green, lower half blue."""
     axis = torch.linspace(-1, 1, SIZE)
     y, x = axis[:, None].expand(SIZE, SIZE), axis.expand(SIZE, SIZE)
     bump = torch.exp(-12 * ((x - 0.4) ** 2 + (y + 0.4) ** 2))
@@ -41,7 +41,7 @@ def colour_at(mesh: trimesh.Trimesh, vertex: int, texture: Image.Image) -> np.nd
 
 def test_axes_of_the_mesh(from_glb):
     nose = from_glb.vertices[:, 2].argmax()  # nearest to the viewer, who stands at +z
-    assert (from_glb.vertices[nose][:2] > 0.02).all()  # right and up, as in the picture
+    assert (from_glb.vertices[nose][:2] > 0.02).all()  # right and up, as in the image
     assert from_glb.vertices[nose][2] == pytest.approx(0.03, abs=1e-3)
     assert np.abs(from_glb.vertices[:, 2].min()) < 1e-6  # the plane through the object's centre
     width = np.ptp(from_glb.vertices[:, 0])

@@ -1,4 +1,4 @@
-"""Albedo taken back from a picture: exact where it can be seen, the model's where it cannot."""
+"""Albedo taken back from an image: exact where it can be seen, the model's where it cannot."""
 
 from dataclasses import replace
 
@@ -58,7 +58,7 @@ def test_in_the_dark_the_models_albedo_stays(painted):
 
 
 def test_a_large_picture_meets_the_enlarged_grid():
-    """Value = place in the picture, 0 at its left edge and 1 at its right one."""
+    """Value = place in the image, 0 at its left edge and 1 at its right one."""
     size, model_size = 64, 8
     across = (torch.arange(size) + 0.5) / size
     picture = across.expand(1, 3, size, size)

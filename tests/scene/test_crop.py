@@ -1,4 +1,4 @@
-"""Scenes of pictures in other frames, rendered, show the pictures so framed; ranges give the camera room."""
+"""Scenes of images in other frames, rendered, show the images so framed; ranges give the camera room."""
 
 import pytest
 import torch

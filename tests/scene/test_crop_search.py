@@ -1,4 +1,4 @@
-"""The part of a picture that a model should be shown."""
+"""The part of an image that a model should be shown."""
 
 import numpy as np
 import pytest
@@ -33,7 +33,7 @@ def faces_known() -> torch.Tensor:
 
 @pytest.fixture(scope="module")
 def laid_in(faces_known) -> torch.Tensor:
-    """The same, each smaller and off the middle of a larger picture with something else around it."""
+    """The same, each smaller and off the middle of a larger image with something else around it."""
     size = 160
     coarse = torch.rand(3, 3, 6, 6, generator=torch.Generator().manual_seed(0))
     canvas = interpolate(coarse, size=(size, size), mode="bicubic").clamp(0, 1)

@@ -1,4 +1,4 @@
-"""The conventions against pictures somebody else rendered: synface64's exact depth, normals and light."""
+"""The conventions against images somebody else rendered: synface64's exact depth, normals and light."""
 
 import csv
 import io

@@ -78,7 +78,7 @@ def with_errors(folder: Path) -> Path:
 
 
 def test_a_pushed_model_comes_back_the_same(model, fake):
-    address = model.push_to_hub("me/faces", data="my own pictures", licence="MIT", private=True)
+    address = model.push_to_hub("me/faces", data="my own images", licence="MIT", private=True)
     assert address == "https://huggingface.co/me/faces"
     assert fake.asked[0] == {"repo_id": "me/faces", "private": True, "exist_ok": True}
     assert fake.asked[1]["uploaded"] == "me/faces"
@@ -90,11 +90,11 @@ def test_a_pushed_model_comes_back_the_same(model, fake):
 
 
 def test_the_card_states_data_licence_scores_and_how_to_load_it(model, fake):
-    model.push_to_hub("me/faces", data="9 pictures of mugs", licence="CC0-1.0", scores="MAD 11 degrees.")
+    model.push_to_hub("me/faces", data="9 images of mugs", licence="CC0-1.0", scores="MAD 11 degrees.")
     card = (fake.place / "me" / "faces" / "README.md").read_text()
     assert card.startswith("---\nlibrary_name: derender\n") and 'license: "cc0-1.0"\n' in card
     assert 'derender.load("me/faces")' in card
-    for stated in ("9 pictures of mugs", "MAD 11 degrees.", "32 x 32", "**Licence**: CC0-1.0"):
+    for stated in ("9 images of mugs", "MAD 11 degrees.", "32 x 32", "**Licence**: CC0-1.0"):
         assert stated in card
 
 

@@ -1,4 +1,4 @@
-"""Batches are a function of seed and position; the learning rate one of pictures seen."""
+"""Batches are a function of seed and position; the learning rate one of images seen."""
 
 import threading
 
@@ -11,7 +11,7 @@ from derender.training.config import OptimiserSettings
 
 
 def numbered(count: int) -> torch.Tensor:
-    """Pictures whose first pixel row holds their own number, left to right ascending."""
+    """Images whose first pixel row holds their own number, left to right ascending."""
     images = torch.zeros(count, 3, 4, 4, dtype=torch.uint8)
     images[:] = torch.arange(count, dtype=torch.uint8)[:, None, None, None]
     images[..., 0] = 255

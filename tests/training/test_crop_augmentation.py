@@ -1,4 +1,4 @@
-"""Pictures in other frames: what moves where, how many, and that features can learn to disregard it."""
+"""Images in other frames: what moves where, how many, and that features can learn to disregard it."""
 
 import pytest
 import torch
@@ -12,7 +12,7 @@ STILL = {"nearer": 1, "farther": 1, "shift": 0, "roll_deg": 0}
 
 
 def spot(row: int, column: int) -> Tensor:
-    """A dark picture of 33 pixels with one bright pixel, whose middle is pixel (16, 16)."""
+    """A dark image of 33 pixels with one bright pixel, whose middle is pixel (16, 16)."""
     image = torch.zeros(1, 3, 33, 33)
     image[:, :, row, column] = 1
     return image

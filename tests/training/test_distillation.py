@@ -48,7 +48,7 @@ def images():
 
 @pytest.fixture(scope="module")
 def refined(model, images):
-    """Taught by few pictures of a kind the model does not know, and measured on the same."""
+    """Taught by few images of a kind the model does not know, and measured on the same."""
     return refine(model, images, images, SHORT, seed=5)
 
 
@@ -138,7 +138,7 @@ def test_pictures_in_other_frames_come_with_the_camera_that_sees_them_so(model, 
     assert (as_it_is[0] | as_it_is[1]).all()
     again = model.render(scene)
     errors = [masked_l1(again.image[rows], shown[rows], again.mask[rows]) for rows in (moved, ~moved)]
-    assert errors[0] < 1.3 * errors[1], "the moved scenes render the framed pictures"
+    assert errors[0] < 1.3 * errors[1], "the moved scenes render the framed images"
     still = model.render(scene.with_parameters(camera=scene.camera * torch.tensor([1, 1, 1, 0, 0, 0])))
     assert masked_l1(still.image[moved], shown[moved], still.mask[moved]) > 1.35 * errors[0]
 

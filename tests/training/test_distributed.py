@@ -1,4 +1,4 @@
-"""Two processes train as one does: same losses, same gradients, same pictures, one voice."""
+"""Two processes train as one does: same losses, same gradients, same images, one voice."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""Errors of held-out pictures: measured as the evaluation measures them, kept with the model, read back."""
+"""Errors of held-out images: measured as the evaluation measures them, kept with the model, read back."""
 
 import json
 from types import SimpleNamespace
@@ -20,7 +20,7 @@ from derender.training.held_out_errors import (
 
 
 class Darker:
-    """Renders every picture a fifth darker, its left half only; black pictures not at all."""
+    """Renders every image a fifth darker, its left half only; black images not at all."""
 
     device, training = torch.device("cpu"), False
 

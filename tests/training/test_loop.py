@@ -276,7 +276,7 @@ def test_a_damaged_checkpoint_is_named(pictures, tmp_path):
 
 
 def test_one_picture_or_too_few_for_a_batch_is_refused_before_a_folder_is_made(pictures, tmp_path):
-    with pytest.raises(ValueError, match="only one picture was found"):
+    with pytest.raises(ValueError, match="only one image was found"):
         train(resolve("small", TINY), pictures.select([0]), tmp_path / "run")
     with pytest.raises(ValueError, match="batch_size 64 is more than the 48 training images"):
         train(resolve("small", [*TINY, "batch_size=64"]), pictures, tmp_path / "run")

@@ -36,7 +36,7 @@ def images():
 
 
 def said_jointly(model, images) -> torch.Tensor:
-    """What the decoder over both encoders says of each pixel of pictures."""
+    """What the decoder over both encoders says of each pixel of images."""
     pictures = images.float() / 255
     levels = zip(*(model.nets[name].encoder.skips(pictures) for name in PIXEL_CHANNELS), strict=True)
     return model.unet_decoder([torch.cat(level, dim=1) for level in levels])
@@ -96,7 +96,7 @@ def test_pictures_and_what_is_said_of_them_move_together(model, images):
     torch.testing.assert_close(moved["geometry"][:2], maps["geometry"][:2], atol=1e-5, rtol=0)
     assert not torch.allclose(shown[2:], pictures[2:], atol=0.1)
     inside = mask[2:].bool()
-    # lit otherwise, a picture is an affine function of the albedo that moved with it
+    # lit otherwise, an image is an affine function of the albedo that moved with it
     for picture, albedo, kept in zip(shown[2:], moved["albedo"][2:], inside, strict=True):
         seen, meant = picture[0][kept], albedo[0][kept]
         within = (seen > 0.02) & (seen < 0.98)

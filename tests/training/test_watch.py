@@ -59,12 +59,12 @@ FAILED_SCENES = {
     "hollow depth": with_depth(lambda depth: 2.0 - depth),
     "view at its bound": with_column("camera", 1, math.radians(59.5)),
     "light at its bound": with_column("light", 3, math.radians(-44.5)),
-    "albedo copies the picture": with_column("light", 1, 0.0),
+    "albedo copies the image": with_column("light", 1, 0.0),
 }
 
 
 def kept_images(run: Path) -> int:
-    """Pictures seen by the last checkpoint."""
+    """Images seen by the last checkpoint."""
     return json.loads((run / "checkpoints/last/state.json").read_text())["state"]["images"]
 
 
@@ -195,7 +195,7 @@ def test_a_real_collapse_is_caught_while_its_loss_still_falls(tmp_path, monkeypa
 
 
 def test_the_last_good_state_is_kept_without_anybody_asking_for_it(tmp_path, monkeypatch):
-    """With the intervals of the preset, and a sign that is on from picture 400 on."""
+    """With the intervals of the preset, and a sign that is on from image 400 on."""
     judge = Watcher.judge
 
     def ill(watcher: Watcher, images: int, *rest):

@@ -5,7 +5,7 @@
 float32 with the numba kernels is what the others are held against: float32 with the plain torch kernels
 (other sums, same definition), networks in bfloat16, and networks through torch.compile: traced only
 (``aot_eager``), and as compiled machine code (``inductor``) where a C++ compiler is found. The same weights,
-pictures and perturbations go into each; a training is chaotic, so what must agree stands in ``BOUNDS``.
+images and perturbations go into each; a training is chaotic, so what must agree stands in ``BOUNDS``.
 """
 
 import argparse
@@ -118,7 +118,7 @@ def run(given: argparse.Namespace) -> int:
     """The script."""
     expected = course(FLOAT32, given.steps)
     print(
-        f"{given.steps} steps of {BATCH} pictures of {SIZE} x {SIZE}; L1 {expected.l1[0]:.4f} at first, ",
+        f"{given.steps} steps of {BATCH} images of {SIZE} x {SIZE}; L1 {expected.l1[0]:.4f} at first, ",
         end="",
     )
     print(f"{expected.end:.4f} in the last tenth with {FLOAT32.name}")

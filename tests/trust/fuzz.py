@@ -1,4 +1,4 @@
-"""Feeds broken configurations, tables, models, checkpoints, caches, archives and pictures to their readers.
+"""Feeds broken configurations, tables, models, checkpoints, caches, archives and images to their readers.
 
     python tests/trust/fuzz.py --inputs 100000 --seed 0
 

@@ -1,4 +1,4 @@
-"""Pictures that are broken, odd or meant to do harm, made on the spot, and every command that reads pictures.
+"""Images that are broken, odd or meant to do harm, made on the spot, and every command that reads images.
 
     python tests/trust/hostile.py
 
@@ -17,7 +17,7 @@ from hostility.commands import MODEL, Ended, commands, picture_commands, run_apa
 from hostility.files import labelled, named_in, write_hostile, write_hostile_zip
 
 MEMORY_LIMIT_MB = 3_000
-"""Of a process, interpreter and network included; a picture of 169 million pixels takes 676 MB by itself."""
+"""Of a process, interpreter and network included; an image of 169 million pixels takes 676 MB by itself."""
 
 
 def not_refused(ended: Ended) -> list[str]:
@@ -43,7 +43,7 @@ def run_all() -> int:
         os.environ["DERENDER_CACHE"] = str(place / "cache")
         hostile = write_hostile(place / "hostile")
         print(
-            f"{len(hostile.readable)} odd pictures, {len(hostile.unreadable)} that cannot be read", flush=True
+            f"{len(hostile.readable)} odd images, {len(hostile.unreadable)} that cannot be read", flush=True
         )
         data, broken = labelled(place / "classes", hostile)
         for name, (arguments, due) in commands(place, data).items():

@@ -168,7 +168,7 @@ if __name__ == "__main__":
     )
     parser.add_argument("--kills", type=int, default=30, help="of each command")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--images", type=int, default=96, help="pictures seen in a training")
+    parser.add_argument("--images", type=int, default=96, help="images seen in a training")
     parser.add_argument("--pictures", type=int, default=120, help="embedded")
     parser.add_argument("--model", type=Path, default=Path("rendered-faces-64"), help="that embeds")
     parser.add_argument("--no-mount", action="store_true", help="limit the size of files instead")

@@ -4,7 +4,7 @@
 
 One ``derender train`` that checkpoints and validates often, one process that embeds again and again by the
 Python API (soaking/embedding.py), ``derender embed`` as a command once a minute, and ``derender view`` under
-many clients (soaking/clients.py), all on generated pictures in a temporary folder. Memory, descriptors,
+many clients (soaking/clients.py), all on generated images in a temporary folder. Memory, descriptors,
 threads, children and files are sampled (soaking/measure.py) and have to be flat after the first quarter
 (soaking/flat.py). Then all are told to end, and nothing may be left but a run that can be resumed, which it
 is. Linux only.
@@ -145,7 +145,7 @@ class Soak:
         return (*given, "--preset", "small", "--start-from", MODEL, "--device", "cpu", *settings)
 
     def begin(self) -> int:
-        """Make pictures and a table, start everything; gives the viewer's port."""
+        """Make images and a table, start everything; gives the viewer's port."""
         data, said = self.folder / "data", self.folder / "viewer.json"
         self.run("synth", "synth", "faces", "--out", str(data), "--count", str(PICTURES), "--no-truth")
         shutil.make_archive(str(data), "zip", data)
@@ -317,7 +317,7 @@ def told(soak: Soak, verdicts: dict[str, dict[str, Verdict]]) -> str:
         "",
         soak.answers.markdown(),
         "",
-        f"{soak.images:,} pictures trained on with {soak.validations} validations; {soak.commands} times "
+        f"{soak.images:,} images trained on with {soak.validations} validations; {soak.commands} times "
         f"embedded by command, {soak.passes:,} passes in one process. Odd lines ended: {held or 'none'}.",
         "",
         *(f"FAULT: {fault}" for fault in soak.faults),

@@ -24,7 +24,7 @@ def test_readers_refuse_what_is_broken_and_nothing_else_escapes():
 def test_what_a_search_by_coverage_starts_from_is_read_and_rubbish_is_refused(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(SCRIPT.parent))
     module = importlib.import_module("fuzzing.targets")
-    made_again = {"remembered results (npz)", "decoded pictures (cache)"}
+    made_again = {"remembered results (npz)", "decoded images (cache)"}
     searched = 0
     for target in module.targets(tmp_path):
         for whole in target.wholes:

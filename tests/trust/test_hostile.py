@@ -1,4 +1,4 @@
-"""Broken, odd and hostile pictures through the commands: counted, named, and never a traceback.
+"""Broken, odd and hostile images through the commands: counted, named, and never a traceback.
 
 What a command does with a folder and with files it is given is tried on one of each kind here; hostile.py
 tries every command.

@@ -56,7 +56,7 @@ def net() -> Net:
 
 @pytest.fixture
 def run(net, tmp_path) -> Path:
-    """A run whose last checkpoint is of 16 pictures, the previous one of 8."""
+    """A run whose last checkpoint is of 16 images, the previous one of 8."""
     for images in (8, 16):
         net.save(tmp_path / "run", images)
     return tmp_path / "run"

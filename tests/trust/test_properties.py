@@ -122,7 +122,7 @@ def mirrored(depth, albedo, light, camera):
 
 
 def test_a_mirrored_scene_costs_what_the_scene_costs():
-    """Every loss of a picture and its scene is that of their mirror images, but for the cells' diagonals."""
+    """Every loss of an image and its scene is that of their mirror images, but for the cells' diagonals."""
     scene = bumpy_scene()
     picture = torch.rand(3, 3, 14, 17, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
     sigma = torch.rand(3, 1, 14, 17, dtype=torch.float64, generator=torch.Generator().manual_seed(3)) + 0.1

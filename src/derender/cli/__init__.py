@@ -41,7 +41,7 @@ from derender.cli.console import damage_as_notices, visible
 
 app = typer.Typer(
     name="derender",
-    help="Take pictures apart into geometry, albedo, light and camera. Start with: derender demo",
+    help="Decompose images into geometry, albedo, light and camera. Start with: derender demo",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from derender.evaluation.score_table import ScoreTable
 
 NAMED = 5
-"""So many unreadable pictures are named."""
+"""So many unreadable images are named."""
 
 PLAIN_LINE_EVERY_SECONDS = 30.0
 

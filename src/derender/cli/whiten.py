@@ -12,7 +12,7 @@ Changes = Annotated[
     list[str] | None,
     typer.Option(
         "--set", metavar="KEY=VALUE",
-        help="pictures, views, spatial, mirrored, directions, shrinkage, evenness, vectors, vector_power of "
+        help="images, views, spatial, mirrored, directions, shrinkage, evenness, vectors, vector_power of "
         "whitening; examples, coordinates, steps, prior, tolerance, weight of fitting; the size of "
         "perturbations, as perturb.light_deg.",
     ),

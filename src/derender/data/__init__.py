@@ -5,7 +5,7 @@ source, folder_source, zip_source   named files; listing: what is remembered of 
 layouts/      how data sets lie: recognised, and read into a table of files and labels
 stream        images one after another; shards (WebDataset), huggingface
 decode        one image; decoding: a stream, on every core
-pictures      a stream collected into an array: read_pictures; cache: large sets in a memory map
+images      a stream collected into an array: read_pictures; cache: large sets in a memory map
 masks, ground_truth   images with masks, with exact maps
 splits        which rows are for training, validation, test
 parquet       a parquet footer, checked before it is believed

@@ -31,7 +31,7 @@ class MaskedPictures(NamedTuple):
     """What ``read_masks`` returns.
 
     Attributes:
-        pictures: the images with their labels and partition.
+        images: the images with their labels and partition.
         masks: (N, S, S) the class number of every pixel, a row for each image.
         classes: the name of every class number.
     """

@@ -7,13 +7,13 @@ SUFFIXES = (
     *(".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".webp", ".avif", ".bmp", ".gif"),
     *(".tif", ".tiff", ".ppm", ".pgm", ".pnm"),
 )
-"""File names that end in one of these are taken for pictures."""
+"""File names that end in one of these are taken for images."""
 
 _SUFFIXES = frozenset(SUFFIXES)
 
 
 def is_picture(file: str) -> bool:
-    """Whether the name has a picture's suffix; nothing but a suffix is no picture's name."""
+    """Whether the name has an image's suffix; nothing but a suffix is no image's name."""
     dot = file.rfind(".")
     return dot > 0 and file[dot - 1] != "/" and file[dot:].lower() in _SUFFIXES
 

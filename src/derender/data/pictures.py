@@ -103,12 +103,12 @@ class PictureSet:
     def require(self, minimum: int, purpose: str = "training") -> "PictureSet":
         """The set itself if it holds enough images; otherwise an error that says so."""
         if len(self) < minimum:
-            found = "only one picture was" if len(self) == 1 else f"only {len(self)} pictures were"
+            found = "only one image was" if len(self) == 1 else f"only {len(self)} images were"
             left_out = len(self.skipped) + len(self.duplicates)
             note = f" ({left_out} more were unreadable or identical copies)" if left_out else ""
             raise ValueError(
-                f"{purpose} needs {minimum:,} pictures or more, and {found} found "
-                f"in {self.source}{note}; add pictures"
+                f"{purpose} needs {minimum:,} images or more, and {found} found "
+                f"in {self.source}{note}; add images"
             )
         return self
 
@@ -188,11 +188,11 @@ def check_pictures(images: Tensor, size: int) -> None:
     """Images of another shape than (N, 3, size, size), or of whole numbers, are an error."""
     if images.ndim != 4 or images.shape[1:] != (3, size, size):
         raise ValueError(
-            f"this model takes pictures of shape (N, 3, {size}, {size}), got {tuple(images.shape)}: "
+            f"this model takes images of shape (N, 3, {size}, {size}), got {tuple(images.shape)}: "
             f"read them with derender.data.read_pictures(..., image_size={size}) or resize them"
         )
     if not images.is_floating_point():
-        raise ValueError(f"pictures must be floating point in 0..1, got {images.dtype}: divide uint8 by 255")
+        raise ValueError(f"images must be floating point in 0..1, got {images.dtype}: divide uint8 by 255")
 
 
 def refuse_not_finite(images: Tensor) -> None:
@@ -200,9 +200,7 @@ def refuse_not_finite(images: Tensor) -> None:
     if images.device.type != "cpu" or torch.compiler.is_compiling() or bool(images.isfinite().all()):
         return
     first = int(images.isfinite().flatten(1).all(dim=1).int().argmin())
-    raise ValueError(
-        f"picture {first} of {len(images)} holds values that are not finite: give numbers in 0..1"
-    )
+    raise ValueError(f"image {first} of {len(images)} holds values that are not finite: give numbers in 0..1")
 
 
 @dataclass

@@ -97,7 +97,7 @@ def _summary(result: DemoResult, tables: Mapping[str, ScoreTable]) -> list[block
         "Depth error, SIDE x 100": _tile(tables["geometry"], 0, ("average depth", "plane")),
         "Normals, mean angle in degrees": _tile(tables["geometry"], 1, ("average depth", "plane")),
         "Identity, cluster accuracy": _tile(tables["clustering"], 0, ("chance",)),
-        "Reconstruction, L1": _tile(tables["reconstruction"], 0, ("mean picture",)),
+        "Reconstruction, L1": _tile(tables["reconstruction"], 0, ("mean image",)),
     }
     usual, seen = PRESETS[result.config.preset].images, result.trained.images
     length = f"Training saw {seen:,} images (repeats counted)"

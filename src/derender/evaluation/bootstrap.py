@@ -1,7 +1,7 @@
 """How sure a score is: resamples of the rows, intervals, and differences to the strongest control.
 
 Source: Efron's percentile bootstrap. Rows are drawn with replacement; what was fitted (clusters, heads)
-stays as it is, so an interval speaks of which pictures happened to be scored and not of another training.
+stays as it is, so an interval speaks of which images happened to be scored and not of another training.
 All features of a table are scored on the same resamples, which makes their differences paired. Leaves out
 corrections for many comparisons: of twenty rows that are no better than a control, half a one is called
 better by chance.

@@ -1,7 +1,7 @@
-"""How near a copy of a model comes to the model: its features and its renderings of the same pictures.
+"""How near a copy of a model comes to the model: its features and its renderings of the same images.
 
-Rounding weights moves every feature a little; the unit is how far two of these pictures are apart. What a
-score makes of that is asked of the copy itself (a cut of a tree may turn on one picture).
+Rounding weights moves every feature a little; the unit is how far two of these images are apart. What a
+score makes of that is asked of the copy itself (a cut of a tree may turn on one image).
 """
 
 from dataclasses import dataclass
@@ -21,9 +21,9 @@ class CopyCost:
     """What changed.
 
     Attributes:
-        moved: by factor, how far a picture's feature moved, mean over pictures, over how far two pictures'
+        moved: by factor, how far an image's feature moved, mean over images, over how far two images'
             features are apart (root mean square); 0: not at all.
-        l1, l1_before: mean absolute error of the pictures rendered again, 0..1, inside each one's mask.
+        l1, l1_before: mean absolute error of the images re-rendered, 0..1, inside each one's mask.
     """
 
     moved: dict[str, float]
@@ -34,15 +34,15 @@ class CopyCost:
 def copy_cost(
     model: "Derenderer", copy: "Derenderer", images: np.ndarray, *, progress: Progress | None = None
 ) -> CopyCost:
-    """Compare a copy of a model with it on uint8 pictures (N, 3, H, W).
+    """Compare a copy of a model with it on uint8 images (N, 3, H, W).
 
-    ``progress`` is called with (features made, features to make), two of each picture.
+    ``progress`` is called with (features made, features to make), two of each image.
 
     Raises:
-        ValueError: fewer than two pictures, or other factors.
+        ValueError: fewer than two images, or other factors.
     """
     if len(images) < 2:
-        raise ValueError(f"two pictures or more are needed to compare models, got {len(images)}")
+        raise ValueError(f"two images or more are needed to compare models, got {len(images)}")
     names = [[factor.name for factor in one.factors] for one in (model, copy)]
     if names[0] != names[1]:
         raise ValueError(f"the models have other factors: {', '.join(names[0])}; {', '.join(names[1])}")
@@ -57,7 +57,7 @@ def copy_cost(
     moved = {}
     for name in names[0]:
         own, other = (np.asarray(one[name], np.float64) for one in passes)
-        apart = np.sqrt(2 * own.var(axis=0, ddof=1).sum())  # of two pictures drawn at random
+        apart = np.sqrt(2 * own.var(axis=0, ddof=1).sum())  # of two images drawn at random
         moved[name] = float(np.linalg.norm(own - other, axis=1).mean() / apart) if apart else 0.0
     errors = [evaluate_reconstruction(one, images).model.l1 for one in (copy, model)]
     return CopyCost(moved, *errors)

@@ -226,7 +226,7 @@ def aligned(images: PictureSet, files: Sequence[str]) -> PictureSet:
     absent = [file for file in files if file not in place]
     if absent:
         raise ValueError(
-            f"{len(absent)} of {len(files)} rows of the table are not among the pictures of "
+            f"{len(absent)} of {len(files)} rows of the table are not among the images of "
             f"{images.source} (first {absent[0]}): give the data that the table was made from"
         )
     return images.select([place[file] for file in files])
@@ -257,7 +257,7 @@ def attribute_labels(table: FeatureTable, least: int = 1) -> tuple[tuple[str, ..
         raise ValueError(f"there is no yes/no label; there is {', '.join(table.labels) or 'no label'}")
     rows = "no row" if least == 1 else f"fewer than {least} rows"
     if not names:
-        raise ValueError(f"every yes/no label has {rows} of one of its answers: give more pictures")
+        raise ValueError(f"every yes/no label has {rows} of one of its answers: give more images")
     left = [name for name in columns if name not in names]
     return names, [f"left out, with {rows} of one of their answers: {', '.join(left)}"] if left else []
 
@@ -370,12 +370,12 @@ def _check_same_images(name: str, first: FeatureTable, other_name: str, other: F
     if len(first) != len(other):
         raise ValueError(
             f"features {name!r} have {len(first)} rows and {other_name!r} {len(other)}: one table compares "
-            "features of the same pictures; embed the same data for each"
+            "features of the same images; embed the same data for each"
         )
     differing = [(a, b) for a, b in zip(first.files, other.files, strict=True) if a != b]
     if differing:
         raise ValueError(
-            f"features {name!r} and {other_name!r} are of different pictures, in {len(differing)} of "
+            f"features {name!r} and {other_name!r} are of different images, in {len(differing)} of "
             f"{len(first)} rows ({differing[0][0]} and {differing[0][1]}): embed the same data for each"
         )
 

@@ -47,11 +47,11 @@ def finetune(
     Args:
         model: with ``nets[factor].encode`` and ``device``.
         images: (N, 3, H, W) uint8.
-        task: what is asked of the N pictures.
+        task: what is asked of the N images.
         rows: (n,) training rows.
         tested: (T,) rows to answer for.
         factors: whose encoders.
-        seed: of the head's start and the order of pictures.
+        seed: of the head's start and the order of images.
         settings: of the training.
         progress: called with (epochs done, epochs in all).
     """

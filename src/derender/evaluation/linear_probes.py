@@ -2,7 +2,7 @@
 
 ``linear`` is the paper's head, ``centred`` the same on features whose mean over the training rows is 0,
 ``logistic`` a penalised regression, ``k-NN`` the ten nearest by cosine of centred features, ``majority`` the
-share of each value among the training rows, which knows no picture.
+share of each value among the training rows, which knows no image.
 """
 
 from collections.abc import Sequence

@@ -235,7 +235,7 @@ def compare_linear(
             if len(array) != len(task):
                 raise ValueError(
                     f"features {name!r} have {len(array)} rows, the labels {len(task)}: all features of one "
-                    "table must be of the same pictures"
+                    "table must be of the same images"
                 )
     truth = task.targets[rows.test]
     weights = np.concatenate(list(resamples(len(rows.test), resample_count)))

@@ -126,21 +126,21 @@ IDENTITY = Part(
 )  # fmt: skip
 EMOTION = Part(
     "emotion", ("emotion", "expression"), _PAPER["emotion"], ("rafdb",),
-    "3,068 pictures of RAF-DB, 7 emotions",
+    "3,068 images of RAF-DB, 7 emotions",
 )  # fmt: skip
 FACE_ATTRIBUTES = Part(
     ATTRIBUTES, (ATTRIBUTES,), _PAPER["attributes"], ("celeba",),
-    "6,000 pictures of CelebA, mean of 40 attributes",
+    "6,000 images of CelebA, mean of 40 attributes",
 )  # fmt: skip
 CARS = Part(
-    "cars", ("class",), _PAPER["cars"], ("shapenet_cars",), "1,000 pictures of ShapeNet cars, 5 classes"
+    "cars", ("class",), _PAPER["cars"], ("shapenet_cars",), "1,000 images of ShapeNet cars, 5 classes"
 )
 LINEAR = Part(
-    ATTRIBUTES, (ATTRIBUTES,), _PAPER["linear"], ("celeba",), "6,000 pictures of CelebA, 40 attributes"
+    ATTRIBUTES, (ATTRIBUTES,), _PAPER["linear"], ("celeba",), "6,000 images of CelebA, 40 attributes"
 )
 SEGMENTATION = Part(
     "segmentation", ("mask",), _PAPER["segmentation"], ("celebamask",),
-    "24,127 + 2,885 pictures of CelebAMask-HQ at 64 x 64, 19 classes",
+    "24,127 + 2,885 images of CelebAMask-HQ at 64 x 64, 19 classes",
 )  # fmt: skip
 
 TABLES: dict[str, TableSpec] = {

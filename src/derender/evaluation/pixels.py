@@ -83,7 +83,7 @@ class ReconstructionResult:
 
     def _named(self) -> dict[str, ReconstructionScores]:
         named = {
-            "model": self.model, "mean picture": self.mean_picture,
+            "model": self.model, "mean image": self.mean_picture,
             f"PCA ({self.n_components})": self.components, "untrained model": self.untrained,
         }  # fmt: skip
         return {name: scores for name, scores in named.items() if scores is not None}

@@ -1,4 +1,4 @@
-"""From a model and pictures to a FeatureTable."""
+"""From a model and images to a FeatureTable."""
 
 import hashlib
 from collections.abc import Callable, Iterator, Mapping
@@ -36,15 +36,15 @@ def map_batches(
     batch_size: int,
     progress: Progress | None = None,
 ) -> list[T]:
-    """Results of a function of pictures in 0..1 on the model's device, batch by batch, without gradients.
+    """Results of a function of images in 0..1 on the model's device, batch by batch, without gradients.
 
-    The model is in evaluation mode meanwhile, and afterwards as it was. Pictures are (N, 3, H, W), uint8 or
+    The model is in evaluation mode meanwhile, and afterwards as it was. Images are (N, 3, H, W), uint8 or
     float.
     """
     if batch_size < 1:
         raise ValueError(f"batch_size must be 1 or more, got {batch_size}")
     if len(images) == 0:
-        raise ValueError("there are no pictures")
+        raise ValueError("there are no images")
     results = []
     with evaluating(model):
         for start in range(0, len(images), batch_size):
@@ -67,7 +67,7 @@ def evaluating(model: Any) -> Iterator[None]:
 
 
 def as_batch(images: np.ndarray, device: torch.device) -> Tensor:
-    """Pictures, uint8 or float in 0..1, as a float32 tensor of 0..1 on a device; bytes travel as bytes.
+    """Images, uint8 or float in 0..1, as a float32 tensor of 0..1 on a device; bytes travel as bytes.
 
     Channels lie together in memory, which convolutions and normalisation are fastest with.
     """
@@ -85,7 +85,7 @@ def factor_codes(model: Any, batch: Tensor) -> dict[str, np.ndarray]:
 def embed_images(
     model: Any, images: np.ndarray, *, batch_size: int = 256, progress: Progress | None = None
 ) -> dict[str, np.ndarray]:
-    """Features of pictures (N, 3, H, W), uint8 or float in 0..1, by factor: each (N, D) float32."""
+    """Features of images (N, 3, H, W), uint8 or float in 0..1, by factor: each (N, D) float32."""
     parts = map_batches(partial(factor_codes, model), model, images, batch_size=batch_size, progress=progress)
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
@@ -98,13 +98,13 @@ def embed_pictures(
     progress: Progress | None = None,
     origin: Mapping[str, Any] | None = None,
 ) -> FeatureTable:
-    """Run a model's encoders over a picture set.
+    """Run a model's encoders over an image set.
 
     Args:
-        model: a module with ``embed(pictures in 0..1) -> {factor: (N, D)}``, ``device`` and ``image_size``.
-        pictures: read at the model's image size; their labels and the owners' split go into the table.
-        batch_size: pictures at a time; changes speed and memory only.
-        progress: called with (pictures done, pictures in all) after every batch.
+        model: a module with ``embed(images in 0..1) -> {factor: (N, D)}``, ``device`` and ``image_size``.
+        images: read at the model's image size; their labels and the owners' split go into the table.
+        batch_size: images at a time; changes speed and memory only.
+        progress: called with (images done, images in all) after every batch.
         origin: further facts for the table, such as the model's path and preset; they win over those found
             here.
     """
@@ -115,12 +115,12 @@ def embed_pictures(
 
 
 def check_size(model: Any, pictures: PictureSet) -> None:
-    """Pictures of another size than the model's are an error."""
+    """Images of another size than the model's are an error."""
     size = model.image_size
     if tuple(pictures.images.shape[-2:]) != (size, size):
         height, width = pictures.images.shape[-2:]
         raise ValueError(
-            f"the pictures are {height}x{width}, the model takes {size}x{size}: "
+            f"the images are {height}x{width}, the model takes {size}x{size}: "
             f"read them with image_size={size}"
         )
 

@@ -119,7 +119,7 @@ def read_columns(path: Path, only: str | None = None) -> Columns:
         raise ValueError(f"{path} is not a readable parquet file: make it with 'derender embed'") from error
     if "file" not in table.column_names:
         found = ", ".join(table.column_names) or "no columns"
-        raise ValueError(f"{path} has no column 'file' (it has {found}): add one with the pictures' names")
+        raise ValueError(f"{path} has no column 'file' (it has {found}): add one with the images' names")
     described = _described(table.schema.metadata, path)
     others = [name for name in table.column_names if name != "file"]
     factors = [name for name in names if name not in left_out]

@@ -1,4 +1,4 @@
-"""FeatureTable: one row per picture, one feature per factor, labels, and where it all came from.
+"""FeatureTable: one row per image, one feature per factor, labels, and where it all came from.
 
 The value that travels through the right half of the program. Leaves out how features are made (extract.py,
 baselines/) and every score (evaluation/).
@@ -37,10 +37,10 @@ def named(values: Mapping[str, Any], name: str, kind: str) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class FeatureTable:
-    """N pictures, one feature per factor each.
+    """N images, one feature per factor each.
 
     Attributes:
-        files: where each row's picture came from.
+        files: where each row's image came from.
         factors: by name, (N, D) float32, finite; D may differ between factors.
         labels: by name, (N,) of any kind; ``missing`` says which values stand for unknown.
         origin: what made the table (model, version, preset, data): anything JSON can hold.
@@ -145,7 +145,7 @@ def check_names(factors: Iterable[str], labels: Iterable[str]) -> None:
 
 
 def check_finite(factors: Mapping[str, np.ndarray], files: Sequence[str]) -> None:
-    """A feature that is no finite number is an error that names the first picture concerned."""
+    """A feature that is no finite number is an error that names the first image concerned."""
     for name, values in factors.items():
         finite = np.isfinite(values).all(axis=1)
         if not finite.all():

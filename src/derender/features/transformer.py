@@ -16,15 +16,15 @@ from derender.features.table import named
 
 
 class DisentangledFeatures(TransformerMixin, BaseEstimator):
-    """scikit-learn transformer: pictures in, features of the chosen factors out.
+    """scikit-learn transformer: images in, features of the chosen factors out.
 
-    Pictures are an array (N, 3, H, W) or (N, H, W, 3), uint8 or float in 0..1, at the model's size, or a
+    Images are an array (N, 3, H, W) or (N, H, W, 3), uint8 or float in 0..1, at the model's size, or a
     sequence of paths (read and resized). Nothing is learned in ``fit``; the model is loaded on first use.
 
     Args:
         model: a run folder, a saved folder, a Hub id, or a model.
         factors: which features, in which order; None means all of the model's.
-        batch_size: pictures at a time.
+        batch_size: images at a time.
         device: where to run ("cpu", "cuda"); None loads to the CPU and leaves a given model where it is.
     """
 
@@ -41,7 +41,7 @@ class DisentangledFeatures(TransformerMixin, BaseEstimator):
         self.device = device
 
     def fit(self, X: Any = None, y: Any = None) -> "DisentangledFeatures":
-        """Load the model and check the factors' names; pictures and labels are not looked at."""
+        """Load the model and check the factors' names; images and labels are not looked at."""
         self._widths()
         return self
 
@@ -96,9 +96,9 @@ class DisentangledFeatures(TransformerMixin, BaseEstimator):
 
 
 def as_pictures(X: Any, image_size: int) -> np.ndarray:
-    """Pictures in any of the forms DisentangledFeatures takes, as (N, 3, S, S), uint8 or float32 in 0..1."""
+    """Images in any of the forms DisentangledFeatures takes, as (N, 3, S, S), uint8 or float32 in 0..1."""
     if isinstance(X, (str, os.PathLike)):
-        raise ValueError(f"expected several pictures, got the one path {str(X)!r}: give a list of paths")
+        raise ValueError(f"expected several images, got the one path {str(X)!r}: give a list of paths")
     array = X.detach().cpu().numpy() if isinstance(X, torch.Tensor) else np.asarray(X)
     if array.size and array.dtype.kind in "UO":
         return np.stack([_from_path(item, image_size) for item in array.reshape(-1).tolist()])
@@ -106,21 +106,19 @@ def as_pictures(X: Any, image_size: int) -> np.ndarray:
         array = np.moveaxis(array, 3, 1)
     if array.ndim != 4 or array.shape[1:] != (3, image_size, image_size):
         raise ValueError(
-            f"expected pictures (N, 3, {image_size}, {image_size}) or (N, {image_size}, {image_size}, 3), "
+            f"expected images (N, 3, {image_size}, {image_size}) or (N, {image_size}, {image_size}, 3), "
             f"got shape {array.shape}: resize them, or give a list of paths"
         )
     if array.dtype == np.uint8:
         return array
     if array.dtype.kind != "f":
-        raise ValueError(f"expected pictures in uint8 or floats in 0..1, got {array.dtype}: convert them")
+        raise ValueError(f"expected images in uint8 or floats in 0..1, got {array.dtype}: convert them")
     if not np.isfinite(array).all() or array.min(initial=0) < 0 or array.max(initial=0) > 1:
-        raise ValueError(
-            "pictures given as floats must lie in 0..1 without NaN: divide by 255, or pass uint8"
-        )
+        raise ValueError("images given as floats must lie in 0..1 without NaN: divide by 255, or pass uint8")
     return np.ascontiguousarray(array, np.float32)
 
 
 def _from_path(item: Any, image_size: int) -> np.ndarray:
     if not isinstance(item, (str, os.PathLike)):
-        raise ValueError(f"expected paths of pictures, got {type(item).__name__}: give paths or an array")
+        raise ValueError(f"expected paths of images, got {type(item).__name__}: give paths or an array")
     return read_picture(Path(item), image_size)

@@ -47,7 +47,7 @@ METHODS = ("grad-cam", "hires-cam", "pixels")
 GREY = 0.5
 PIXEL_STEPS = 16
 UNCHANGED = 0.5
-CHANGES = ("random weights", "shuffled labels", "another picture")
+CHANGES = ("random weights", "shuffled labels", "another image")
 
 
 def captum_attr() -> ModuleType:
@@ -289,7 +289,7 @@ def sanity_check(
                 "shuffled labels": []
                 if shuffled is None
                 else [saliency(method, model, images, factor, shuffled, targets)],
-                "another picture": [own.roll(1, dims=0)],
+                "another image": [own.roll(1, dims=0)],
             }
             size = images.shape[-1]
             found += [

@@ -157,7 +157,7 @@ def sanity_table(rows: Sequence[Similarity]) -> ScoreTable:
     lines = []
     for method, factor in dict.fromkeys((row.method, row.factor) for row in rows):
         fresh = found[method, factor, "random weights"]
-        labels, other = (found.get((method, factor, name)) for name in ("shuffled labels", "another picture"))
+        labels, other = (found.get((method, factor, name)) for name in ("shuffled labels", "another image"))
         word = {True: "yes", False: "no", None: "-"}[fresh.trusted]
         cells: tuple[Cell, ...] = (
             fresh.spearman, fresh.ssim, labels and labels.spearman, other and other.spearman,

@@ -1,13 +1,13 @@
-"""Stage 9: results as pictures and pages.
+"""Stage 9: results as images and pages.
 
 colours       values to 8-bit images
 panel         labelled grids of images
 figures       a decomposition as images
 films         the light going round, the object turning; as PNG, GIF and MP4
 sweeps        one scene in many lights, from many sides, with parts of another
-texture       albedo from the picture itself
+texture       albedo from the image itself
 mesh          a scene's surface for other programs; mesh_files: GLB and OBJ
-sheets        contact sheets over many pictures
+sheets        contact sheets over many images
 charts        curves and bars as SVG
 score_table   scores beside controls as a value
 blocks, page  one self-contained HTML file

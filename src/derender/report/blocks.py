@@ -114,7 +114,7 @@ def image_grid(
     """Images in rows (one per input) and named columns; each image's alt text is its column and row name."""
     count = same_length(list(columns.values()))
     if len(row_names) != count:
-        raise ValueError(f"expected {count} row names, one per picture; got {len(row_names)}")
+        raise ValueError(f"expected {count} row names, one per image; got {len(row_names)}")
     rows = [
         (row, [image(images[index], f"{name}: {row}") for name, images in columns.items()])
         for index, row in enumerate(row_names)

@@ -23,7 +23,7 @@ def pictures(values: Tensor | np.ndarray, mask: Tensor | np.ndarray | None = Non
     """(N, 3, H, W) colours, uint8 or float 0..1, as images; pixels outside ``mask`` are transparent."""
     colours = as_numpy(values)
     if colours.ndim != 4 or colours.shape[1] != 3:
-        raise ValueError(f"pictures must have shape (N, 3, H, W); got {colours.shape}")
+        raise ValueError(f"images must have shape (N, 3, H, W); got {colours.shape}")
     return _images(np.moveaxis(colours, 1, -1), mask)
 
 

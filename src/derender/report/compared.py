@@ -1,4 +1,4 @@
-"""Many methods on many data sets: one table and one picture for each protocol, with what every row cost.
+"""Many methods on many data sets: one table and one image for each protocol, with what every row cost.
 
 Rows are methods and controls, columns data sets. Under the one table each data set has its own, with every
 score, its interval and the row's cost. What failed or is missing says so in its place. Leaves out computing
@@ -40,9 +40,9 @@ class Cost:
     Attributes:
         parameters: of all its networks.
         seconds: of training, resumed parts included; mean over seeds.
-        images: pictures seen in it, repeats counted.
-        numbers: that describe a picture.
-        embedding_seconds: for one picture.
+        images: images seen in it, repeats counted.
+        numbers: that describe an image.
+        embedding_seconds: for one image.
     """
 
     parameters: int | None = None
@@ -82,11 +82,11 @@ class ScoredQuestion:
 
 
 COST_COLUMNS = (
-    Column("numbers", None, note="that describe a picture"),
+    Column("numbers", None, note="that describe an image"),
     Column("parameters", None, note="of all networks that were trained"),
-    Column("pictures seen", None, note="in training, repeats counted"),
+    Column("images seen", None, note="in training, repeats counted"),
     Column("training, s", None, 0, note="wall time of the training loop, whatever else the machine did"),
-    Column("ms a picture", None, 2, note="to embed, likewise"),
+    Column("ms an image", None, 2, note="to embed, likewise"),
 )
 
 
@@ -219,7 +219,7 @@ def _panel(one: ScoredQuestion, names: Sequence[str], score: str) -> Any:
 
 
 def _shown(scores: Sequence[ScoredQuestion]) -> list[ScoredQuestion]:
-    """What the one table and the picture show."""
+    """What the one table and the image show."""
     if not scores:
         raise ValueError("there is nothing to show: no data set was scored")
     heads = [one.head for one in scores]

@@ -33,7 +33,7 @@ def comparison_page(
         lead: one or two sentences under the heading.
         facts: what was compared and how: models, data, seeds, settings.
         failed: a sentence for whatever is missing, with the reason.
-        picture: SVG text that stands over the tables; the first of them then has no chart of its own.
+        image: SVG text that stands over the tables; the first of them then has no chart of its own.
     """
     if not tables:
         raise ValueError("a comparison needs at least one table")
@@ -70,7 +70,7 @@ def chart_of(table: ScoreTable) -> list[Html]:
 
 
 def _above(number: int, table: ScoreTable, picture: str | None) -> list[Html]:
-    """What stands over a table: its chart, or over the first the picture that was given."""
+    """What stands over a table: its chart, or over the first the image that was given."""
     if picture is None or number > 1:
         return chart_of(table)
     return [

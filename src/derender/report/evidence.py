@@ -207,7 +207,7 @@ def looping_films(
 
 
 def _scores(subject: Subject) -> list[Html]:
-    """Reconstruction beside the mean picture and, on rendered data, geometry beside its controls."""
+    """Reconstruction beside the mean image and, on rendered data, geometry beside its controls."""
     sample = _sample(subject.held_out.require(1, "a score"), SCORED)
     again = evaluate_reconstruction(subject.model, sample.images, mean=mean_picture(subject.images.images))
     tables = [again.table()]

@@ -39,9 +39,9 @@ def palette(n_classes: int) -> np.ndarray:
 
 
 def overlays(pictures: np.ndarray, masks: np.ndarray, n_classes: int, *, scale: int = 1) -> Images:
-    """Masks (N, S, S) in colours over pictures (N, 3, S, S) uint8; every pixel becomes ``scale`` squared."""
+    """Masks (N, S, S) in colours over images (N, 3, S, S) uint8; every pixel becomes ``scale`` squared."""
     if pictures.shape != (len(masks), 3, *masks.shape[1:]):
-        raise ValueError(f"pictures {pictures.shape} and masks {masks.shape} must be of one size and number")
+        raise ValueError(f"images {pictures.shape} and masks {masks.shape} must be of one size and number")
     ground = np.moveaxis(pictures, 1, -1).astype(np.float32)
     mixed = (1 - OPACITY) * ground + OPACITY * palette(n_classes)[masks]
     return colours.pictures(_larger(np.moveaxis(np.rint(mixed).astype(np.uint8), -1, 1), scale))
@@ -54,10 +54,10 @@ def segmentation_sheet(
     classes: Sequence[str],
     layout: GridLayout | None = None,
 ) -> Image.Image:
-    """A row for each picture: itself, its mask, every answer; the legend of the classes below.
+    """A row for each image: itself, its mask, every answer; the legend of the classes below.
 
     Args:
-        pictures: (N, 3, S, S) uint8.
+        images: (N, 3, S, S) uint8.
         masks: (N, S, S) true class numbers.
         answers: by column name, (N, S, S).
         classes: the name of every class number.

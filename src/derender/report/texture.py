@@ -1,9 +1,9 @@
-"""Albedo from the picture itself: what the model has blurred, taken back from the pixels it was given.
+"""Albedo from the image itself: what the model has blurred, taken back from the pixels it was given.
 
-The picture divided by the model's shading, seen in the picture's own view, is albedo wherever the model's
+The image divided by the model's shading, seen in the image's own view, is albedo wherever the model's
 geometry and light are right. Each canonical point looks it up where the camera sees that point; where it is
-hidden, turned away, outside the picture or nearly dark, the model's albedo stays, and the two are blended in
-between. So the scene's own rendering gives the picture back where the surface is seen. Leaves out filling the
+hidden, turned away, outside the image or nearly dark, the model's albedo stays, and the two are blended in
+between. So the scene's own rendering gives the image back where the surface is seen. Leaves out filling the
 hidden side from its mirror image, and anything that repairs wrong geometry.
 """
 
@@ -22,19 +22,19 @@ from derender.scene.normals import normals_from_depth
 FACING = (
     0.15,
     0.40,
-)  # cosine between surface and ray: below the first the model's albedo, above the picture's
+)  # cosine between surface and ray: below the first the model's albedo, above the image's
 LIT = (0.10, 0.25)  # shading, likewise
 HIDDEN_BEHIND = 0.01  # scene units that a point may lie behind what is seen there
-FEATHER_SHARE = 1 / 32  # width of the blend, of the picture's width
+FEATHER_SHARE = 1 / 32  # width of the blend, of the image's width
 
 
 def picture_albedo(
     pictures: Float[Tensor, "n 3 h w"], scene: Scene, fov_deg: float
 ) -> Float[Tensor, "n 3 h w"]:
-    """Albedo (0..1) in the canonical view from pictures (0..1) at the size of their scenes."""
+    """Albedo (0..1) in the canonical view from images (0..1) at the size of their scenes."""
     if pictures.shape != scene.albedo.shape:
         raise ValueError(
-            f"pictures and scenes need one size, got {tuple(pictures.shape)} and "
+            f"images and scenes need one size, got {tuple(pictures.shape)} and "
             f"{tuple(scene.albedo.shape)}: enlarge the scenes with derender.scene.enlarge.at_size"
         )
     share, looked_up = _seen(pictures, scene, fov_deg)
@@ -42,20 +42,20 @@ def picture_albedo(
 
 
 def picture_on_grid(picture: Float[Tensor, "n 3 s s"], model_size: int) -> Float[Tensor, "n 3 s s"]:
-    """A large picture on the grid of an enlarged scene, whose outermost centres are the model's own.
+    """A large image on the grid of an enlarged scene, whose outermost centres are the model's own.
 
-    Resizing keeps the picture's edges in place, enlarging a scene keeps its outermost pixel centres: half a
+    Resizing keeps the image's edges in place, enlarging a scene keeps its outermost pixel centres: half a
     pixel of the model's at each side falls away.
     """
     size = picture.shape[-1]
-    centre = 0.5 / model_size  # of the model's outermost pixel, as a share of the picture
+    centre = 0.5 / model_size  # of the model's outermost pixel, as a share of the image
     places = torch.linspace(centre, 1 - centre, size, dtype=torch.float64) * size - 0.5
     along = cubic_weights(places, size, "sharp").to(picture)
     return (along @ picture @ along.T).clamp(0, 1)
 
 
 def _seen(pictures: Tensor, scene: Scene, fov_deg: float) -> tuple[Tensor, Tensor]:
-    """Share (N, 1, H, W) of each canonical point's albedo that the picture can tell, and that albedo."""
+    """Share (N, 1, H, W) of each canonical point's albedo that the image can tell, and that albedo."""
     height, width = scene.depth.shape[-2:]
     shading = lambert_shading(normals_from_depth(scene.depth, fov_deg), scene.light)
     view = warp(shading, scene.depth, scene.camera, fov_deg)

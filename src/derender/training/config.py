@@ -50,7 +50,7 @@ class ObjectiveSettings(Settings):
 
 
 class WhiteningSettings(Settings):
-    """How activations become features after training (postprocess/whitening.py); 0 pictures: codes are."""
+    """How activations become features after training (postprocess/whitening.py); 0 images: codes are."""
 
     pictures: int = Field(default=3_000, ge=0)  # training images that are re-rendered
     views: int = Field(default=4, ge=1)  # renderings of each

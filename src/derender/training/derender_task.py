@@ -45,7 +45,7 @@ def train(
 
     Args:
         config: see `derender.training.config.resolve`.
-        pictures: at the model's image size.
+        images: at the model's image size.
         out: a new folder, or with ``resume`` the folder of an unfinished run.
         sample_sheet: draws a sheet for a few held-out images from time to time.
         progress: called after every step.

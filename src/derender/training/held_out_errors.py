@@ -40,7 +40,7 @@ class HeldOutErrors:
 
     Attributes:
         quantiles: (101,) the masked L1 (0..1) that 0, 1, ... 100 % of the images do not exceed.
-        pictures: how many there were.
+        images: how many there were.
     """
 
     quantiles: Float[np.ndarray, " 101"]

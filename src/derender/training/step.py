@@ -145,9 +145,9 @@ def training_step(
 def perturb_one_factor(
     model: Derenderer, scene: Scene, objective: ObjectiveSettings, generator: Generator, ranks: Ranks = ALONE
 ) -> tuple[Scene, Int[Tensor, " n"]]:
-    """Change one factor of every scene, drawn per picture; also which, as an index into ``model.factors``.
+    """Change one factor of every scene, drawn per image; also which, as an index into ``model.factors``.
 
-    Ranks that share a batch draw for all of it, so that each picture gets what one process would give it.
+    Ranks that share a batch draw for all of it, so that each image gets what one process would give it.
 
     Raises:
         ValueError: the model has none of the factors that ``objective.loocc`` names, or cannot perturb one.

@@ -99,7 +99,7 @@ SIGNS = (
         advice="look at the samples; a smaller learning_rate or a wider light_deg may help",
     ),
     Sign(
-        "albedo copies the picture", "shading_contrast", 0.004, above=False, fatal=False,
+        "albedo copies the image", "shading_contrast", 0.004, above=False, fatal=False,
         text="shading is the same everywhere (contrast {value:.2%}), so albedo is the image itself",
         advice="raise flip_weight, or check that images show the object from the front, roughly symmetric",
     ),
@@ -245,7 +245,7 @@ def measure(scene: Scene, ranges: SceneRanges) -> dict[str, float]:
     depth_at_bound, view_at_bound, light_at_bound: shares, 0..1. depth_spread: standard deviation of a depth
     map over its range. depth_roughness: mean step between neighbours over that deviation. bulge: how far
     the rim lies behind the middle, over the range; negative is hollow. shading_contrast: standard deviation
-    of the shading in a picture over its mean.
+    of the shading in an image over its mean.
     """
     depth = _inside(scene.depth, ranges)
     low, high = ranges.depth_min, ranges.depth_max

@@ -52,7 +52,7 @@ main(sys.argv[1:])
 
 @pytest.fixture(scope="module")
 def plan(tmp_path_factory) -> Path:
-    """Forty pictures of four made-up people, told apart by their colour, and a plan that scores them."""
+    """Forty images of four made-up people, distinguished by their colour, and a plan that scores them."""
     folder, rng = tmp_path_factory.mktemp("plan"), np.random.default_rng(0)
     for row in range(40):
         colour = np.array([[200, 40, 40], [40, 200, 40], [40, 40, 200], [200, 200, 40]])[row % 4]

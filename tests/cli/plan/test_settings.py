@@ -88,7 +88,7 @@ label = "identity"
         ("table: identity", "table: segmentation", "segmentation trains nets of its own"),
         ("table: identity", "table: identity, label: x", "needs a table (identity, emotion, ...) or a label"),
         ("table: identity", "table: identity, min_count: 3", "go with label, not with table"),
-        ("trained_on: faces", "trained_on: faces, part: test", "is of faces.zip, the pictures of 'faces'"),
+        ("trained_on: faces", "trained_on: faces, part: test", "is of faces.zip, the images of 'faces'"),
         ("data: lfw.zip", "data: faces.zip, part: test", "part goes with seeds: 1"),
         ("  lfw:", "  ../lfw:", "cannot be a folder's"),
         ("  hog:", "  hog: {settings: {a: 1}}", "(hog) is not trained here"),

@@ -1,4 +1,4 @@
-"""Sets of pictures made here, good and bad for the method; no picture shows anybody."""
+"""Sets of images made here, good and bad for the method; no image shows anybody."""
 
 from functools import cache
 
@@ -32,7 +32,7 @@ def generated(kind: str, count: int = COUNT) -> np.ndarray:
 
 
 def landscapes(count: int, generator: np.random.Generator) -> np.ndarray:
-    """Sky, hills and trees, each picture with its own horizon, colours and clouds."""
+    """Sky, hills and trees, each image with its own horizon, colours and clouds."""
     down, across = np.mgrid[:SIDE, :SIDE] / SIDE
     made = np.empty((count, 3, SIDE, SIDE))
     for picture in made:
@@ -63,7 +63,7 @@ def noise(count: int, generator: np.random.Generator) -> np.ndarray:
 
 
 def moved(images: np.ndarray, generator: np.random.Generator, reach: int = 19) -> np.ndarray:
-    """Each picture shifted by chance, its edges continued."""
+    """Each image shifted by chance, its edges continued."""
     wide = np.pad(images, ((0, 0), (0, 0), (reach, reach), (reach, reach)), mode="edge")
     corners = generator.integers(0, 2 * reach + 1, (len(images), 2))
     return np.stack(

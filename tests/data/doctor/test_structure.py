@@ -1,4 +1,4 @@
-"""Laws of what is measured: exact where a picture can be made for which the answer is known."""
+"""Laws of what is measured: exact where an image can be made for which the answer is known."""
 
 import numpy as np
 import pytest
@@ -156,7 +156,7 @@ def test_near_copies_are_grouped_under_the_first(numbers):
     assert group[:30].tolist() == list(range(30))
     assert len(np.unique(group[30:70])) <= 4 and group[30:70].min() == 30
     assert group[70:72].tolist() == [0, 1]
-    assert group[72:].tolist() == [72, 72], "blank pictures are copies of one another"
+    assert group[72:].tolist() == [72, 72], "blank images are copies of one another"
     assert near_copy_groups(measure_pixels(images[:1]).tiny).tolist() == [0]
 
 

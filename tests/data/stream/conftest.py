@@ -1,4 +1,4 @@
-"""Writes shards: ``shard(name, {member: content})`` where None is a small picture of its own."""
+"""Writes shards: ``shard(name, {member: content})`` where None is a small image of its own."""
 
 import io
 import tarfile

@@ -30,7 +30,7 @@ def pixels(seed: int) -> np.ndarray:
 
 @pytest.fixture
 def rows():
-    """``rows(count, first)``: pictures of their own, a class, a number, a text, a list."""
+    """``rows(count, first)``: images of their own, a class, a number, a text, a list."""
 
     def make(count: int, first: int = 0, **more: object):
         features = datasets.Features(

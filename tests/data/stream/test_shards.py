@@ -1,4 +1,4 @@
-"""WebDataset: the pictures and labels that were packed, whatever the packing; damage is listed, not fatal."""
+"""WebDataset: the images and labels that were packed, whatever the packing; damage is listed, not fatal."""
 
 import io
 import json
@@ -19,7 +19,7 @@ def cache(tmp_path, monkeypatch) -> Path:
 
 
 def members(count: int, first: int = 0) -> dict[str, bytes | str | None]:
-    """Pictures with a class and a JSON object each; the seed of picture i is 3 i from the shard's first."""
+    """Images with a class and a JSON object each; the seed of image i is 3 i from the shard's first."""
     written: dict[str, bytes | str | None] = {}
     for row in range(first, first + count):
         written[f"{row:04d}.png"] = None
@@ -48,7 +48,7 @@ def test_pictures_and_labels_are_those_packed(shard, encoded, name, mode):
 
 def test_the_same_as_the_folder_it_was_packed_from(tree, shard, encoded):
     """Order, pixels, unreadable ones and copies as if the members lay in a folder."""
-    files = {"a.png": None, "b.png": "no picture", "c.png": encoded(0), "d.png": None, "e.jpg": b""}
+    files = {"a.png": None, "b.png": "no image", "c.png": encoded(0), "d.png": None, "e.jpg": b""}
     folder = read_pictures(tree(files), 8)
     packed = read_pictures(shard("x.tar", files), 8)
     strip = len("x.tar/")
@@ -90,13 +90,13 @@ def test_braces():
             list(expand_braces(bad))
 
 
-@pytest.mark.parametrize("where", ["inside a picture", "inside a header", "between members"])
+@pytest.mark.parametrize("where", ["inside an image", "inside a header", "between members"])
 def test_of_a_truncated_shard_counts_what_comes_before(shard, where):
     path = shard("cut.tar", {f"{row}.png": None for row in range(10)})
     with tarfile.open(path) as tar:
         seventh = tar.getmembers()[7]
     cut = {
-        "inside a picture": seventh.offset_data + 100,
+        "inside an image": seventh.offset_data + 100,
         "inside a header": seventh.offset + 200,
         "between members": seventh.offset,
     }[where]
@@ -179,7 +179,7 @@ def test_labels_that_are_missing_mixed_too_large_or_no_labels(shard):
             "4.json": "[1, 2]",
             "5.png": None,
             "5.json": "{",
-            "6.txt": "a caption without a picture",
+            "6.txt": "a caption without an image",
         },
     )
     pictures = read_pictures(path, 8)

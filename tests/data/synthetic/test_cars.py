@@ -1,4 +1,4 @@
-"""Procedural cars: reproducible to the byte, exactly symmetric, and every truth map explains its picture."""
+"""Procedural cars: reproducible to the byte, exactly symmetric, and every truth map explains its image."""
 
 import numpy as np
 import pytest
@@ -83,8 +83,8 @@ def test_frontal_pictures_are_their_own_mirror_images():
 
 
 def test_the_renderer_makes_the_picture_from_the_stored_truth():
-    """Depth and albedo of a frontal picture are canonical maps: rendered with its light they are the
-    picture."""
+    """Depth and albedo of a frontal image are canonical maps: rendered with its light they are the
+    image."""
     settings = CarSettings(view=CAR_VIEWS["frontal"], pictures_per_model=1)
     made = cars.generate(3, image_size=128, seed=5, settings=settings)
     depth = torch.from_numpy(np.where(made.mask, made.depth, 1.08).astype(np.float32))
@@ -128,7 +128,7 @@ def test_unprojected_points_lie_on_the_canonical_surface():
 
 
 def distance(turned: SyntheticSet, ahead: SyntheticSet, n: int, camera: np.ndarray) -> np.ndarray:
-    """Distance along z of picture n's points, taken back by ``camera``, from the surface seen from ahead."""
+    """Distance along z of image n's points, taken back by ``camera``, from the surface seen from ahead."""
     seen = unproject(torch.from_numpy(turned.depth[n : n + 1]), turned.fov_deg)
     points = to_canonical(seen, torch.from_numpy(camera[None]))[0][torch.from_numpy(turned.mask[n])]
     column, row = project(points, 64, 64, turned.fov_deg).round().int().clamp(0, 63).numpy().T

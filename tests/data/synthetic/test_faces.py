@@ -1,4 +1,4 @@
-"""Procedural faces: reproducible to the byte, and every truth map explains its picture."""
+"""Procedural faces: reproducible to the byte, and every truth map explains its image."""
 
 import numpy as np
 import pytest
@@ -49,7 +49,7 @@ def test_unprojected_points_lie_on_the_canonical_surface():
 def distance_to_frontal(
     turned: SyntheticSet, frontal: SyntheticSet, n: int, camera: np.ndarray
 ) -> np.ndarray:
-    """Distance along z of picture n's points, taken back by ``camera``, from the frontal surface."""
+    """Distance along z of image n's points, taken back by ``camera``, from the frontal surface."""
     seen = unproject(torch.from_numpy(turned.depth[n : n + 1]), turned.fov_deg)
     points = to_canonical(seen, torch.from_numpy(camera[None]))[0].numpy()
     x, y, z = points[turned.mask[n]].T
@@ -191,7 +191,7 @@ def test_yaw_and_light_turn_the_way_the_conventions_say():
 
 
 def test_rendering_the_truth_again_gives_the_picture():
-    """Depth, albedo and light through the project's own renderer, in the frame of each picture."""
+    """Depth, albedo and light through the project's own renderer, in the frame of each image."""
     made = faces.generate(12, seed=3, settings=FaceSettings(view=AHEAD))
     depth = torch.from_numpy(np.where(made.mask, made.depth, 1.15))
     again = render(
@@ -224,7 +224,7 @@ def test_rendering_the_canonical_truth_with_the_stored_camera_gives_the_turned_p
 
 
 def grey_levels_apart(image: torch.Tensor, made: SyntheticSet) -> np.ndarray:
-    """Differences well inside the face, as the picture stores them."""
+    """Differences well inside the face, as the image stores them."""
     return np.abs(image.clamp(0, 1).numpy() * 255 - made.images).mean(axis=1)[inner(made.mask, 3)]
 
 

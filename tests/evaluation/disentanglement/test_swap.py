@@ -23,7 +23,7 @@ FACTORS = tuple(Named(*pair) for pair in (("geometry", "depth"), ("albedo", "alb
 
 
 class Reader(torch.nn.Module):
-    """Pictures of 4 x 4 whose rows 0, 1, 2 hold depth, albedo and light; ``mix`` adds every row to each."""
+    """Images of 4 x 4 whose rows 0, 1, 2 hold depth, albedo and light; ``mix`` adds every row to each."""
 
     factors, device = FACTORS, torch.device("cpu")
 
@@ -104,7 +104,7 @@ def test_what_never_differs_has_no_unit():
 
 def test_ratio_and_bad_input():
     assert diagonal_over_rest(np.array([[0.8, 0.1], [0.3, 0.4]])) == pytest.approx(3)
-    with pytest.raises(ValueError, match="two pictures or more, got 1"):
+    with pytest.raises(ValueError, match="two images or more, got 1"):
         swap_test(Reader(0), pictures(1))
 
 

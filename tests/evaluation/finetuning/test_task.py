@@ -29,7 +29,7 @@ from derender.training.task import compute_step, network_precision
 
 TINY = ["image_size=32", "width=4", "light_width=4", "perceptual=none", "batch_size=8", "patience=99"]
 TINY += ["validate_every=32", "checkpoint_every=32", "deterministic=true", "watch=false", "warmup_images=0"]
-TINY += ["final_rate=1"]  # resuming with more pictures goes on at the same rate
+TINY += ["final_rate=1"]  # resuming with more images goes on at the same rate
 
 
 @pytest.fixture(autouse=True)
@@ -40,7 +40,7 @@ def _restore_determinism():
 
 @pytest.fixture(scope="module")
 def pictures() -> PictureSet:
-    """Bright and dark pictures of which some carry no label; three shades; a value that never changes."""
+    """Bright and dark images of which some carry no label; three shades; a value that never changes."""
     random = np.random.default_rng(0)
     shade = np.arange(60) % 3
     images = random.integers(0, 60, (60, 3, 32, 32)) + 80 * shade[:, None, None, None]
@@ -111,7 +111,7 @@ def test_a_resumed_run_ends_with_the_very_weights_and_the_model_loads(pictures, 
     kinds = [row["kind"] for row in read_metrics(tmp_path / "whole")]
     assert kinds.count("validation") == 2
     judged = [row for row in read_metrics(tmp_path / "whole") if row["kind"] == "validation"]
-    assert all(row["loss"] == row["target"] for row in judged)  # held-out pictures are judged by the task
+    assert all(row["loss"] == row["target"] for row in judged)  # held-out images are judged by the task
 
     model = derender.load(tmp_path / "whole")
     images = torch.from_numpy(pictures.images[:4]).float() / 255
@@ -161,7 +161,7 @@ def test_it_learns_beside_the_controls_and_leaves_its_start_alone(pictures, tmp_
     targets[one.target.split.train[:3]] = -1
     fewer = replace(one, target=replace(one.target, asked=replace(one.target.asked, targets=targets)))
     some = score_finetuned(tuned, fewer, resample_count=50, memory=second)
-    assert some.n_unlabelled == 3 and "3 pictures without label" in some.table("fresh").caption
+    assert some.n_unlabelled == 3 and "3 images without label" in some.table("fresh").caption
     rows = {row.name: row.scores["balanced_accuracy"].value for row in found.rows}
     assert rows["fine-tuned"] > 0.9 and rows["majority"] == 0.5
     assert (found.kind, found.n_train, found.n_test) == ("labels", 24, 24) and found.versus[
@@ -237,5 +237,5 @@ def test_bad_input_is_named_before_a_folder_is_made(pictures, tmp_path):
     with pytest.raises(ValueError, match=r"the head in .* is damaged"):
         load_finetuned(saved)
     nothing = replace(one.target.asked, targets=np.full_like(one.target.asked.targets, -1))
-    with pytest.raises(ValueError, match="test part has 0 pictures with a label"):
+    with pytest.raises(ValueError, match="test part has 0 images with a label"):
         score_finetuned(one.build(), replace(one, target=replace(one.target, asked=nothing)))

@@ -1,4 +1,4 @@
-"""Where trials come from: the generator, a model that renders again, and true angles of a rendered set."""
+"""Where trials come from: the generator, a model that re-renders, and true angles of a rendered set."""
 
 import math
 from dataclasses import replace

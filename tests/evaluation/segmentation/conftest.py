@@ -1,4 +1,4 @@
-"""Pictures that masks can be read from: three bands, each of its own colour, at places that vary."""
+"""Images that masks can be read from: three bands, each of its own colour, at places that vary."""
 
 import numpy as np
 import pytest

@@ -41,7 +41,7 @@ def test_controls_answer_what_they_may_know(data):
     components = by_components(data)
     assert components.shape == truth.shape and components.dtype == np.uint8
     assert mean_iou(components, data) > mean_iou(place, data) + 0.05  # it sees where bands end
-    assert (by_components(blind) == place).all()  # without a picture, how often a class is at a place
+    assert (by_components(blind) == place).all()  # without an image, how often a class is at a place
 
 
 @pytest.mark.parametrize("name", ["joint-whole", "joint", "joint-frozen", "random"])

@@ -24,7 +24,7 @@ SIZE = 32
 
 
 def _encoded(seed: int) -> bytes:
-    """A picture of coloured noise, as a file's bytes."""
+    """An image of coloured noise, as a file's bytes."""
     coarse = np.random.default_rng(seed).integers(0, 256, (6, 6, 3), dtype=np.uint8)
     stream = io.BytesIO()
     Image.fromarray(coarse).resize((48, 40)).save(stream, format="PNG")
@@ -88,7 +88,7 @@ class Client:
         return self("POST", path, body, headers)
 
     def opened(self, seed: int = 0) -> dict[str, Any]:
-        """What the server says of a new picture."""
+        """What the server says of a new image."""
         reply = self.post("/api/pictures", _encoded(seed))
         assert reply.status == 200, reply.body
         return reply.json
@@ -108,7 +108,7 @@ def picture() -> np.ndarray:
 
 @pytest.fixture(scope="session")
 def client(model, picture):
-    """A viewer with one example and room for four pictures."""
+    """A viewer with one example and room for four images."""
     viewer = Viewer(Studio(model, "<b>tiny</b>", Shelf(4)), [Example("<img src=x>", picture)])
     with serving(Application(viewer)) as url:
         yield Client(url)

@@ -1,4 +1,4 @@
-"""Pictures come in, answers come out, and nothing but the page's own files is ever served."""
+"""Images come in, answers come out, and nothing but the page's own files is ever served."""
 
 import io
 import json

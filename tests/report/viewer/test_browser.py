@@ -1,4 +1,4 @@
-"""The page in a real browser: drop a file, drag a slider, the picture changes, the export downloads."""
+"""The page in a real browser: drop a file, drag a slider, the image changes, the export downloads."""
 
 import io
 import json
@@ -111,7 +111,7 @@ def test_drop_a_file_drag_a_slider_save(page, rendered, tmp_path):
     left = pixels(page, "#view")
     set_slider(page, "light-yaw", -60)
     right = pixels(page, "#view")
-    half = left.shape[1] // 2  # yaw > 0 lights the left of the picture
+    half = left.shape[1] // 2  # yaw > 0 lights the left of the image
     change = left - right
     assert change[:, : half // 2].mean() > 3 > -3 > change[:, -half // 2 :].mean()
     assert np.abs(pixels(page, "#map-shading")).mean() > 1
@@ -157,7 +157,7 @@ def test_orbit_swap_and_neighbours_by_keyboard(page):
     names = page.locator("#near-rows button span:last-child").all_inner_texts()
     assert sorted(names) == ["b.png", "c.png"]  # not a<b>.png itself
     page.click('#near-factors [data-factor="albedo"]')
-    page.wait_for_selector('#near-rows button:has-text("a<b>.png")')  # near to the second picture, c.png
+    page.wait_for_selector('#near-rows button:has-text("a<b>.png")')  # near to the second image, c.png
     assert page.locator('#near-rows button:has-text("c.png")').count() == 0
     assert page.locator("#near-rows b, #examples i").count() == 0  # names are text
 

@@ -1,4 +1,4 @@
-"""The pictures that the page begins with are such as the bundled models know."""
+"""The images that the page begins with are such as the bundled models know."""
 
 import numpy as np
 import pytest

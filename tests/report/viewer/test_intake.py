@@ -1,4 +1,4 @@
-"""What is no picture, lies, or would fill the memory is refused with a sentence; what is one is read."""
+"""What is no image, lies, or would fill the memory is refused with a sentence; what is one is read."""
 
 import io
 import struct

@@ -1,4 +1,4 @@
-"""Rows near to a picture, with pictures read from the table's own data and by number only."""
+"""Rows near to an image, with images read from the table's own data and by number only."""
 
 import numpy as np
 import pytest

@@ -55,7 +55,7 @@ def bytes_like(*wholes: bytes) -> st.SearchStrategy[bytes]:
 
 
 def encoded_pictures() -> list[bytes]:
-    """A small picture in every format that is read."""
+    """A small image in every format that is read."""
     noise = np.random.default_rng(0).integers(0, 256, (9, 11, 3), dtype=np.uint8)
     picture, deep = Image.fromarray(noise), Image.fromarray(noise[..., 0].astype(np.uint16) * 257)
     found = []
@@ -75,7 +75,7 @@ def encoded_pictures() -> list[bytes]:
 
 
 def packed(kind: int) -> bytes:
-    """A zip of three pictures and a list."""
+    """A zip of three images and a list."""
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w", kind) as archive:
         members = {f"class {row % 2}/{row}.png": one for row, one in enumerate(encoded_pictures()[:3])}

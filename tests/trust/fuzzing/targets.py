@@ -243,7 +243,7 @@ def targets(place: Path) -> Iterator[Target]:
         read_pictures(pictures, 8, cache=place / "rows", workers=1)
 
     cached = rows.read_bytes()
-    yield Target("decoded pictures (cache)", 0.005, bytes_like(cached), rows_bytes, [cached])
+    yield Target("decoded images (cache)", 0.005, bytes_like(cached), rows_bytes, [cached])
 
     def metrics(content: bytes) -> None:
         (place / "metrics.jsonl").write_bytes(content)

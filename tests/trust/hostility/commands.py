@@ -1,4 +1,4 @@
-"""Every command that reads pictures, run in a process of its own, and uploads of them to the viewer."""
+"""Every command that reads images, run in a process of its own, and uploads of them to the viewer."""
 
 import os
 import resource

@@ -1,4 +1,4 @@
-"""Pictures that are broken, odd or meant to do harm, made on the spot, and an archive of the kind."""
+"""Images that are broken, odd or meant to do harm, made on the spot, and an archive of the kind."""
 
 import io
 import os
@@ -28,7 +28,7 @@ class Hostile:
 
     Attributes:
         folder: where.
-        readable: names of files that are pictures, odd as they may be.
+        readable: names of files that are images, odd as they may be.
         unreadable: names of files that have to be skipped and named.
     """
 
@@ -38,7 +38,7 @@ class Hostile:
 
 
 def smooth(size: tuple[int, int] = (48, 40), seed: int = 0) -> Image.Image:
-    """A picture that differs with the seed."""
+    """An image that differs with the seed."""
     small = np.random.default_rng(seed).integers(0, 256, (5, 5, 3), dtype=np.uint8)
     return Image.fromarray(small).resize(size)
 
@@ -76,7 +76,7 @@ def float_tiff(value: float) -> bytes:
 
 
 def odd_pictures() -> dict[str, bytes]:
-    """Files that are pictures, by name."""
+    """Files that are images, by name."""
     rotated = Image.Exif()
     rotated[0x0112] = 6
     damaged_exif = b"Exif\0\0II*\0\xff\xff\xff\xff" + bytes(20)
@@ -111,7 +111,7 @@ def odd_pictures() -> dict[str, bytes]:
 
 
 def broken_pictures(steps: int = 16) -> dict[str, bytes]:
-    """Files that are no usable pictures, by name; cut off after every ``1/steps`` of five formats."""
+    """Files that are no usable images, by name; cut off after every ``1/steps`` of five formats."""
     found = {
         "empty.png": b"",
         "text.jpg": b"this is a letter",
@@ -194,7 +194,7 @@ def write_hostile_zip(file: Path) -> Path:
 
 
 def labelled(folder: Path, hostile: Hostile) -> tuple[Path, int]:
-    """The same files in two classes, with 12 plain pictures each; and how many of them cannot be read."""
+    """The same files in two classes, with 12 plain images each; and how many of them cannot be read."""
     for number, name in enumerate(("a", "b")):
         (folder / name).mkdir(parents=True)
         for row in range(12):

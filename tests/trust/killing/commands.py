@@ -39,7 +39,7 @@ class Command:
 
 
 def made_pictures(folder: Path, count: int = 40, size: int = 32) -> Path:
-    """A folder of smooth random pictures, a tenth of them broken."""
+    """A folder of smooth random images, a tenth of them broken."""
     folder.mkdir(parents=True)
     random_numbers = np.random.default_rng(0)
     for number in range(count):

@@ -45,7 +45,7 @@ def pictures(count: int = 2) -> torch.Tensor:
 
 
 def numbers_of(model: Derenderer) -> dict[str, list]:
-    """What a model says of two pictures: features, light, camera; depth, albedo, rendering at nine places."""
+    """What a model says of two images: features, light, camera; depth, albedo, rendering at nine places."""
     with torch.no_grad():
         scene, features = model.decompose(pictures()), model.embed(pictures())
         image = model.render(scene).image

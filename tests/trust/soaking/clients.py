@@ -1,6 +1,6 @@
 """Clients that use a running viewer as its page does, all at once, and one that does what no browser would.
 
-Each client opens pictures (uploads, examples, rows of the table), drags light and camera, swaps factors, asks
+Each client opens images (uploads, examples, rows of the table), drags light and camera, swaps factors, asks
 for neighbours, saves, and sometimes goes away without taking its answer. What comes back is looked at: kind,
 content, and whether it belongs to the question. Leaves out who runs the server (../soak.py).
 """
@@ -121,7 +121,7 @@ class Visitor(threading.Thread):
     Args:
         port: of the viewer on this machine.
         number: tells visitors apart, and seeds what they do.
-        uploads: encoded pictures.
+        uploads: encoded images.
         rows: in the viewer's table.
         pause_seconds: mean time between two requests.
         answers: where waits are noted.
@@ -157,7 +157,7 @@ class Visitor(threading.Thread):
             self.line = None
 
     def session(self) -> None:
-        """Load the page, open a picture or two, and play."""
+        """Load the page, open an image or two, and play."""
         for path in ("/", "/view.css", "/view.js", "/surface.js"):
             self.ask("page", path, check=lambda body: len(body) > 100, method="GET")
         about = json.loads(
@@ -190,7 +190,7 @@ class Visitor(threading.Thread):
                 self.abandon(question)
 
     def opened(self, examples: int) -> dict[str, Any]:
-        """What the viewer says of a picture from one of the three sources."""
+        """What the viewer says of an image from one of the three sources."""
         source = self.draw.choice(("upload", "upload", "example", "row"))
         path, body = {
             "upload": ("/api/pictures", self.draw.choice(self.uploads)),
@@ -202,7 +202,7 @@ class Visitor(threading.Thread):
         )
 
     def question(self, first: dict[str, Any], second: dict[str, Any] | None) -> dict[str, Any]:
-        """What the page sends: the picture under some light and view, perhaps with another's factor."""
+        """What the page sends: the image under some light and view, perhaps with another's factor."""
         draw = self.draw.uniform
         light = {
             "ambient": draw(0, 1),
@@ -355,7 +355,7 @@ class Nuisance(threading.Thread):
 
 
 def encoded(files: Sequence[Path]) -> list[bytes]:
-    """Pictures as people have them: larger than the model's, in several formats."""
+    """Images as people have them: larger than the model's, in several formats."""
     found = []
     for number, file in enumerate(files):
         stream, side = io.BytesIO(), (64, 300, 1200)[number % 3]

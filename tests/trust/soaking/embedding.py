@@ -1,8 +1,8 @@
-"""Embeds the same pictures again and again in one process, by every way of the Python API, until SIGTERM.
+"""Embeds the same images again and again in one process, by every way of the Python API, until SIGTERM.
 
     python tests/trust/soaking/embedding.py FOLDER MODEL
 
-FOLDER holds data/ and data.zip; tables go to its tables/, decoded pictures to its cache/.
+FOLDER holds data/ and data.zip; tables go to its tables/, decoded images to its cache/.
 """
 
 import signal

@@ -76,7 +76,7 @@ def by_plan(
         write_json(json_file, {"jobs": states, "plan": plan.model_dump(mode="json")})
         return
     if out is None:
-        raise ValueError("--plan needs --out DIR: a folder for runs, tables and pictures")
+        raise ValueError("--plan needs --out DIR: a folder for runs, tables and images")
     if out.exists() and not out.is_dir():
         raise ValueError(f"{out} is a file: give --out the name of a folder")
     if out.is_dir() and any(out.iterdir()) and not (out / "plan.yaml").is_file():

@@ -59,11 +59,11 @@ def train(sweep: Sweep, job: Job, progress: Progress) -> dict[str, Any]:
         if not sweep.over:
             raise
         images = run_progress(run)["images"]
-        seen = f" ({images:,} of {plan.images:,} pictures seen)" if images else ""
+        seen = f" ({images:,} of {plan.images:,} images seen)" if images else ""
         raise BudgetUsed(f"the budget was used before it was trained{seen}") from stop
     if result.stopped == "collapse":
         signs = "; ".join(f"{finding.sign}: {finding.text}" for finding in result.findings)
-        raise Collapsed(f"stopped by the watcher after {result.images:,} pictures ({signs})")
+        raise Collapsed(f"stopped by the watcher after {result.images:,} images ({signs})")
     facts = {"images": result.images, "seconds": result.seconds, "stopped": result.stopped}
     return {**_run_facts(kind, run), **facts}
 

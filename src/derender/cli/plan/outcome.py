@@ -150,9 +150,9 @@ def _sentences(notes: Mapping[Job, Note], state: str) -> list[str]:
 
 
 def _lead(plan: Plan, missing: list[str]) -> str:
-    text = f"Every method that is trained here saw {plan.images:,} pictures of the same training part."
+    text = f"Every method that is trained here saw {plan.images:,} images of the same training part."
     if plan.seeds == 1:
-        text += " One training seed each: intervals speak of which pictures were scored, not of trainings."
+        text += " One training seed each: intervals speak of which images were scored, not of trainings."
     return f"{text} The budget was used before everything was done: rows are missing." if missing else text
 
 
@@ -163,7 +163,7 @@ def _facts(plan: Plan) -> dict[str, object]:
         "methods": ", ".join(plan.rows()),
         "ours": ", ".join(ours) or "none",
         "trained on": trained or "nothing",
-        "pictures seen": f"{plan.images:,}",
+        "images seen": f"{plan.images:,}",
         "seeds": plan.seeds,
         "settings of all trainings": ", ".join(f"{k}={v}" for k, v in plan.settings.items()) or "none",
     }

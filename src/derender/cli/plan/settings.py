@@ -216,7 +216,7 @@ def _check_scored(plan: Plan, name: str, scored: ScoredSet) -> None:
     if scored.part != "all":
         if (scored.data, scored.dataset, scored.limit) != (learnt.data, learnt.dataset, learnt.limit):
             raise ValueError(
-                f"score {name!r}: part {scored.part} is of {learnt.data}, the pictures of "
+                f"score {name!r}: part {scored.part} is of {learnt.data}, the images of "
                 f"{scored.trained_on!r}: give the same data, dataset and limit"
             )
         if plan.seeds > 1:

@@ -200,7 +200,7 @@ class Sweep:
         if not self.over or job.kind == "score":
             return None
         images = run_progress(self.run(job))["images"] if job.kind == "train" else None
-        seen = f" ({images:,} of {self.plan.images:,} pictures seen)" if images else ""
+        seen = f" ({images:,} of {self.plan.images:,} images seen)" if images else ""
         return self.leave(job, Note(key, "stopped", f"the budget was used before its turn{seen}"))
 
     def perform(self, job: Job) -> Note:

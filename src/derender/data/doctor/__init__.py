@@ -69,7 +69,7 @@ class Examination:
     """What was found.
 
     Attributes:
-        pictures: the images that were examined.
+        images: the images that were examined.
         verdict: whether the set suits the method.
         findings: one for each thing that was looked at.
         values: every measured number by its name in ``CHECKS``.

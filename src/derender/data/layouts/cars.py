@@ -1,9 +1,9 @@
 """ShapeNet's cars, rendered: folders train, val and test of images whose paths hold the model's id.
 
 unsup3d released the images that the paper uses (github.com/elliottwu/unsup3d, issue 18): 28,000, 7,000
-and 7,000. Pictures of 128 x 128 are cropped to rows 8 to 108 and columns 14 to 114; of any other size,
+and 7,000. Images of 128 x 128 are cropped to rows 8 to 108 and columns 14 to 114; of any other size,
 whole. We could not see the archive itself: which model an image shows is read from an id in its path as
-ShapeNet's are (24 to 32 hexadecimal digits). Pictures named by such digits may be anything, so the layout
+ShapeNet's are (24 to 32 hexadecimal digits). Images named by such digits may be anything, so the layout
 is recognised by itself only beside ShapeNet's table or below a folder 02958343, the number of its cars;
 else ask for it by name.
 

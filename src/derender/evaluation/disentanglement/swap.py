@@ -84,7 +84,7 @@ def swap_test(
         progress: called with (renderings done, renderings in all).
     """
     if len(images) < 2:
-        raise ValueError(f"the swap test needs two pictures or more, got {len(images)}")
+        raise ValueError(f"the swap test needs two images or more, got {len(images)}")
     parameters = {factor.name: factor.parameter for factor in model.factors}
     donor = derangement(len(images), torch.Generator().manual_seed(seed))
     total, done = len(images) * (len(parameters) + 1), 0

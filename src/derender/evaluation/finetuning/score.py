@@ -1,4 +1,4 @@
-"""Joint training on held-out pictures, beside heads on the frozen features it began with, and controls.
+"""Joint training on held-out images, beside heads on the frozen features it began with, and controls.
 
 The test part of the run's own split is scored; neither training nor the choice of weights saw it. The heads
 on frozen features (the paper's, and penalised logistic regression) learn from the very same labels, and so
@@ -34,8 +34,8 @@ class FinetuneScores:
             balanced_accuracy and average_precision (0..1, best 1) of each, the first two with intervals.
         versus: by score, the fine-tuned model against the best of the others.
         kind, names: of the task.
-        n_train, n_test: labelled pictures learned from, and tested.
-        n_unlabelled: pictures of the run without any of the labels: rendered, never asked.
+        n_train, n_test: labelled images learned from, and tested.
+        n_unlabelled: images of the run without any of the labels: rendered, never asked.
     """
 
     rows: tuple[ScoredRow, ...]
@@ -60,11 +60,11 @@ class FinetuneScores:
         count = len(self.names)
         task = f"{count} classes" if self.kind == "classes" else f"mean of {count} yes/no labels"
         caption = (
-            f"{task}: {self.n_train:,} labelled pictures learned, {self.n_test:,} held out; frozen features "
+            f"{task}: {self.n_train:,} labelled images learned, {self.n_test:,} held out; frozen features "
             f"of {began}"
         )
         if self.n_unlabelled:
-            caption += f"; {self.n_unlabelled:,} pictures without label never asked"
+            caption += f"; {self.n_unlabelled:,} images without label never asked"
         both = ("accuracy", "balanced_accuracy")
         return scored_table(
             caption, "trained on labels", self.rows, LINEAR_COLUMNS, intervals=both, deviations=()
@@ -82,15 +82,15 @@ def score_finetuned(
     """Score a trained model on the task's test part; what took long is kept in ``memory``.
 
     Raises:
-        ValueError: no tested picture has a label.
+        ValueError: no tested image has a label.
     """
     target = task.target
     test = target.split.test[target.asked.known[target.split.test]]
     train = target.split.train[(target.visible[target.split.train] >= 0).any(axis=1)]
     if len(test) < 2:
         raise ValueError(
-            f"the test part has {len(test)} pictures with a label, two are needed to score: "
-            "bring more pictures, or set a larger test share in split="
+            f"the test part has {len(test)} images with a label, two are needed to score: "
+            "bring more images, or set a larger test share in split="
         )
     memory, rows = memory or Memory(), np.concatenate([train, test])
 
@@ -141,14 +141,14 @@ def score_finetuned(
 
 
 def _codes(model: Any, task: FinetuneTask, rows: np.ndarray, memory: Memory) -> np.ndarray:
-    """(R, D) features of some rows of the task's pictures, those that the head reads side by side."""
+    """(R, D) features of some rows of the task's images, those that the head reads side by side."""
     inputs = {"weights": model_fingerprint(model), "images": task.images[rows]}
     codes = memory.recall("embedding", inputs, lambda: embed_images(model, task.images[rows]))
     return np.concatenate([codes[name] for name in task.config.target.factors], axis=1)
 
 
 def _controls(start: Any, task: FinetuneTask, rows: np.ndarray, memory: Memory) -> dict[str, np.ndarray]:
-    """(R, D) features that learned nothing, of some rows of the task's pictures."""
+    """(R, D) features that learned nothing, of some rows of the task's images."""
     twin, train = untrained_twin(start, task.config.seed), task.target.split.train
     shown, fitted = (PictureSet(task.images[some], tuple(map(str, some.tolist()))) for some in (rows, train))
     components = max(1, min(64, len(fitted) // 4))

@@ -73,7 +73,7 @@ def robustness(
     Args:
         models: a model, or several by name; the first one re-renders, and is the subject of the tables.
         images: to re-render, or with true angles among their labels; None where images are generated.
-        pictures: "faces" or "cars" (generated), "render" or "truth"; by default faces, with images render.
+        images: "faces" or "cars" (generated), "render" or "truth"; by default faces, with images render.
         label: the question: by default identity, of cars their class; several yes/no labels are averaged.
         attributes: ask every yes/no label of the images.
         min_count, max_count: leave out classes of fewer rows; use at most so many rows of a class.
@@ -97,13 +97,13 @@ def robustness(
     """
     way = pictures or ("faces" if images is None else "render")
     if way not in WAYS:
-        raise ValueError(f"pictures {way!r} is unknown{suggestion(way, WAYS)}: choose {', '.join(WAYS)}")
+        raise ValueError(f"images {way!r} is unknown{suggestion(way, WAYS)}: choose {', '.join(WAYS)}")
     generated, names = way in KINDS, [label] if isinstance(label, str) else list(label or ())
     if generated == (images is not None):
         what = "are generated and take no images" if generated else "need images"
-        raise ValueError(f"pictures {way!r} {what}")
+        raise ValueError(f"images {way!r} {what}")
     if generated and (attributes or groups or len(names) > 1):
-        raise ValueError(f"pictures {way!r} are asked one label; attributes and groups need images")
+        raise ValueError(f"images {way!r} are asked one label; attributes and groups need images")
     if score not in SCORES:
         raise ValueError(f"unknown score {score!r}{suggestion(score, SCORES)}: choose {', '.join(SCORES)}")
     check_head(head)

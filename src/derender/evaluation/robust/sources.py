@@ -202,7 +202,7 @@ def rendered_trial(
 
     Args:
         model: with ``decompose``, ``render``, ``device``.
-        pictures: at the model's size.
+        images: at the model's size.
         task: targets of each image.
         learn, test: training and test rows.
         axes, levels: of the rotations (degrees).
@@ -242,7 +242,7 @@ def rendered_trial(
             missing(groups), len(groups) + number, np.unique(groups.astype(str), return_inverse=True)[1]
         )
     chosen = Task(task.kind, task.names, task.targets[rows])
-    how, dropped = f"pictures of {pictures.layout} re-rendered", int((~task.known).sum())
+    how, dropped = f"images of {pictures.layout} re-rendered", int((~task.known).sum())
     return stacked_trial(images, chosen, number[rows], len(learn), axes, levels, how, dropped)
 
 
@@ -252,7 +252,7 @@ def true_angle_trial(
     """Divide the images along every axis by their true angles.
 
     Args:
-        pictures: with labels of light or view.
+        images: with labels of light or view.
         task: targets of each image.
         axes: of the angles.
         portions: of the more rotated half.

@@ -91,7 +91,7 @@ class SegmentationComparison:
     def differs(self) -> str:
         """The difference between these data and the paper's, in words."""
         data, side = self.data, self.data.images.shape[-1]
-        size = f"+ {len(data.test):,} pictures at {side} x {side}, {len(data.classes)} classes,"
+        size = f"+ {len(data.test):,} images at {side} x {side}, {len(data.classes)} classes,"
         return SEGMENTATION.differs(data.layout, len(data.train), size)
 
     def numbers(self) -> dict[str, Any]:

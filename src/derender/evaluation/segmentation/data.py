@@ -64,7 +64,7 @@ def divide(
     last of that order are tested.
 
     Args:
-        pictures, masks, classes: as from ``read_masks``.
+        images, masks, classes: as from ``read_masks``.
         test_fraction: share of the images that is tested, where the data have no partition.
         split_seed: of the split and of the choice of ``labelled``.
         labelled: number of training images; smaller numbers are part of larger ones. None means all.

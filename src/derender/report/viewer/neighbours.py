@@ -32,7 +32,7 @@ class Example:
 
     Attributes:
         name: shown on the page.
-        picture: its pixels at the model's size.
+        image: its pixels at the model's size.
     """
 
     name: str

@@ -84,7 +84,7 @@ class ViewRequest(_Checked):
     """An image as it is to be shown.
 
     Attributes:
-        picture: the name it got when it was opened.
+        image: the name it got when it was opened.
         swaps: other opened images that give their geometry or albedo.
         light: instead of the image's own.
         camera: instead of the image's own.
