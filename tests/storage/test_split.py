@@ -7,9 +7,9 @@ from PIL import Image
 
 import derender
 from derender.cli import main
-from derender.cli.models import keep_split, part_of, split_of
 from derender.data import read_pictures
 from derender.data.synthetic import faces
+from derender.inputs import copy_split, part_of, split_of
 from derender.storage.folder import SPLIT_FILE, SplitRecord, read_split, write_split
 from derender.training.config import TrainConfig
 from derender.training.run_folder import start_run
@@ -87,5 +87,5 @@ def test_it_goes_with_weights_that_are_given_away(tmp_path):
     write_split(tmp_path / "own", RECORD)
     given = derender.load(tmp_path / "own").save_pretrained(tmp_path / "given", data="heads", licence="MIT")
     assert json.loads((given / SPLIT_FILE).read_text())["seed"] == 4
-    keep_split(given, str(tmp_path / "nowhere"))
+    copy_split(given, str(tmp_path / "nowhere"))
     assert read_split(given) == RECORD, "a model that says nothing takes nothing away"

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from derender.cli import feature_rows, scoring
+from derender.cli import scoring
 from derender.cli.console import progress_bar, result, write_json
 from derender.cli.gathered import gathered
 from derender.cli.options import Device, ImageSet, Settings
@@ -51,7 +51,7 @@ def register(app: typer.Typer) -> None:
 @gathered
 def finetune(
     images: ImageSet, out: OutRun, published: scoring.Published, choices: Choices, dry_run: DryRun = False,
-    device: Device = "auto", cache: feature_rows.Cache = None,
+    device: Device = "auto", cache: scoring.Cache = None,
 ) -> None:  # fmt: skip
     """Train the encoders with a head on labels and with the rendering objective at once, then score them.
 
@@ -59,6 +59,7 @@ def finetune(
     its split is scored beside the majority and beside heads on the frozen features that training began with.
     """
     from derender import learn
+    from derender.evaluation.memory import memory_in
     from derender.training.config import to_yaml
 
     published.check()
@@ -67,7 +68,7 @@ def finetune(
         result(to_yaml(config).rstrip(), published.json_file)
         write_json(published.json_file, config.model_dump(mode="json"))
         return
-    memory = feature_rows.memory_in(cache)
+    memory = memory_in(cache)
     with progress_bar("reading") as report:
         made = learn.finetune(
             images.address, out=out, **images.how, device=device, memory=memory, on_images=report_read,

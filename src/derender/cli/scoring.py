@@ -74,7 +74,7 @@ class Labels:
 
 
 @dataclass(frozen=True)
-class Subject:
+class ScoredSubject:
     """The features that are scored: one table or one model."""
 
     features: Features = None

@@ -57,15 +57,15 @@ def view(
 
     listener = listen(host, port)
     try:
-        from derender.cli.models import check_maker
         from derender.features import FeatureTable
+        from derender.features.neighbours import maker_of
         from derender.report.viewer.app import Application, open_viewer
         from derender.report.viewer.guard import is_loopback
 
         loaded, table = model.open(), None
         if features is not None:
             table = FeatureTable.read(features)
-            loaded = check_maker(loaded, model.model, table, features)
+            loaded = maker_of(table, loaded, str(features))
         viewer, notes = open_viewer(
             loaded, model.model, images or [], table=table, data=data, dataset=dataset, keep=keep,
             fit_steps=fit_steps or 0, cropped=cropped,

@@ -42,7 +42,7 @@ from derender.data.pictures import (
 )
 from derender.data.source import Skipped, nearest_sibling
 from derender.data.splits import Split, split_indices
-from derender.data.stream import Kind, Kinds, Sample, Stream, Value, column_of
+from derender.data.stream import Kinds, Sample, Stream, Value, ValueKind, column_of
 
 __all__ = [
     "LAYOUTS",
@@ -51,7 +51,6 @@ __all__ = [
     "Decoded",
     "Duplicate",
     "GroundTruth",
-    "Kind",
     "Kinds",
     "ListedStream",
     "MaskedPictures",
@@ -64,6 +63,7 @@ __all__ = [
     "Stream",
     "Unreadable",
     "Value",
+    "ValueKind",
     "ahead",
     "as_float",
     "cache_folder",

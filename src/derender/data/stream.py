@@ -100,7 +100,7 @@ def label_name(name: str) -> str:
     return "original_file" if name == "file" else name
 
 
-class Kind(StrEnum):
+class ValueKind(StrEnum):
     """What a column of labels holds."""
 
     TEXT = "text"
@@ -108,7 +108,7 @@ class Kind(StrEnum):
     FLAG = "flag"
 
 
-class Kinds(dict[str, Kind | None]):
+class Kinds(dict[str, ValueKind | None]):
     """The kind of each column so far; None while only unknown values were seen.
 
     A column of several kinds is text, and so are whole numbers that float32 cannot hold (above 2^24:
@@ -120,27 +120,27 @@ class Kinds(dict[str, Kind | None]):
         for name, value in labels.items():
             self.join(name, _kind(value))
 
-    def join(self, name: str, kind: Kind | None) -> None:
+    def join(self, name: str, kind: ValueKind | None) -> None:
         """Take a kind into account that a column has elsewhere."""
         known = self.get(name)
-        self[name] = kind if known is None else known if kind in (None, known) else Kind.TEXT
+        self[name] = kind if known is None else known if kind in (None, known) else ValueKind.TEXT
 
 
-def column_of(name: str, rows: Iterable[Mapping[str, Value]], kind: Kind | str | None) -> np.ndarray:
+def column_of(name: str, rows: Iterable[Mapping[str, Value]], kind: ValueKind | str | None) -> np.ndarray:
     """One column of labels of a given kind; unknown values are "", NaN or -1."""
     values: Sequence[Value] = [row.get(name) for row in rows]
-    if kind == Kind.NUMBER:
+    if kind == ValueKind.NUMBER:
         return number_column(np.nan if value is None else float(value) for value in values)
-    if kind == Kind.FLAG:
+    if kind == ValueKind.FLAG:
         return np.array([-1 if value is None else int(value) for value in values], np.int8)
     return text_column("" if value is None else str(value) for value in values)
 
 
-def _kind(value: Value) -> Kind | None:
+def _kind(value: Value) -> ValueKind | None:
     if value is None:
         return None
     if isinstance(value, bool):
-        return Kind.FLAG
+        return ValueKind.FLAG
     if isinstance(value, int):
-        return Kind.NUMBER if abs(value) <= _EXACT_IN_FLOAT32 else Kind.TEXT
-    return Kind.NUMBER if isinstance(value, float) else Kind.TEXT
+        return ValueKind.NUMBER if abs(value) <= _EXACT_IN_FLOAT32 else ValueKind.TEXT
+    return ValueKind.NUMBER if isinstance(value, float) else ValueKind.TEXT

@@ -138,12 +138,13 @@ def search(
 def maker_of(table: FeatureTable, model: Any, name: str = "the table", *, device: str = "auto") -> Any:
     """The model that made a table, with as many steps of test-time optimisation; another one is an error."""
     net, steps = as_model(model, device=device), table.origin.get("fit_steps")
+    source = model if isinstance(model, str | Path) else net.source or "this model"
     if net.fitting is not None and isinstance(steps, int):
         net = as_model(net, fit_steps=max(0, steps))
     made_by, weights = table.origin.get("weights"), model_fingerprint(net)
     if made_by not in (None, weights):
         raise ValueError(
-            f"{name} was made by another model (weights {made_by}, {model} has {weights}): "
+            f"{name} was made by another model (weights {made_by}, {source} has {weights}): "
             "give that one, or make the table again with derender embed"
         )
     return net

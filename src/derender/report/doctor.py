@@ -13,7 +13,7 @@ from PIL import Image
 
 from derender import __version__
 from derender.data import PictureSet
-from derender.data.doctor import CHECKS, Examination, Finding
+from derender.data.doctor import CHECKS, CheckFinding, Examination
 from derender.evaluation.score_table import Column, Row, ScoreTable
 from derender.report import blocks, colours
 from derender.report.blocks import Html
@@ -94,7 +94,7 @@ def _verdict(examination: Examination) -> list[Html]:
     return lines
 
 
-def _sentence(finding: Finding) -> Html:
+def _sentence(finding: CheckFinding) -> Html:
     advice = f" {finding.advice}" if finding.advice else ""
     return blocks.prose(blocks.strong(f"{_SIGNS[finding.level]}{finding.name}: "), finding.text, advice)
 

@@ -11,8 +11,8 @@ from tests.data.doctor import made
 
 from derender.data import Duplicate, Skipped, open_source, read_pictures
 from derender.data.doctor import CHECKS, doctor, measure_originals
-from derender.data.doctor.findings import Finding, judged, verdict_of
-from derender.data.doctor.structure import Estimate
+from derender.data.doctor.findings import CheckFinding, judged, verdict_of
+from derender.data.doctor.structure import JackknifeEstimate
 
 
 def levels(examination) -> dict[str, str]:
@@ -106,20 +106,20 @@ def test_fifty_faces_are_judged_with_wider_errors_than_all():
 
 def test_an_objection_needs_certainty():
     check, one_sided = (replace(CHECKS["symmetry"], objects=limit, struggles=0.2) for limit in (0.1, None))
-    assert judged(Estimate(0.05, 0.01), check) == ("objection", True)
-    assert judged(Estimate(0.05, 0.04), check) == ("trouble", False)
-    assert judged(Estimate(0.15, 0.01), check) == ("trouble", True)
-    assert judged(Estimate(0.15, 0.04), check) == ("trouble", False)
-    assert judged(Estimate(0.25, 0.04), check) == ("good", False)
-    assert judged(Estimate(0.25, 0.01), check) == ("good", True)
-    assert judged(Estimate(0.05, 0.01), one_sided) == ("trouble", True)
-    assert judged(Estimate(0.3, 0.01), replace(one_sided, noted=0.1)) == ("trouble", True)
-    assert judged(Estimate(0.15), replace(one_sided, noted=0.1)) == ("note", True)
+    assert judged(JackknifeEstimate(0.05, 0.01), check) == ("objection", True)
+    assert judged(JackknifeEstimate(0.05, 0.04), check) == ("trouble", False)
+    assert judged(JackknifeEstimate(0.15, 0.01), check) == ("trouble", True)
+    assert judged(JackknifeEstimate(0.15, 0.04), check) == ("trouble", False)
+    assert judged(JackknifeEstimate(0.25, 0.04), check) == ("good", False)
+    assert judged(JackknifeEstimate(0.25, 0.01), check) == ("good", True)
+    assert judged(JackknifeEstimate(0.05, 0.01), one_sided) == ("trouble", True)
+    assert judged(JackknifeEstimate(0.3, 0.01), replace(one_sided, noted=0.1)) == ("trouble", True)
+    assert judged(JackknifeEstimate(0.15), replace(one_sided, noted=0.1)) == ("note", True)
 
 
 def test_the_worst_finding_makes_the_verdict():
-    good, trouble = Finding("a", "good", "."), Finding("b", "trouble", ".", short="b is bad")
-    objection = Finding("c", "objection", ".", short="c is worse")
+    good, trouble = CheckFinding("a", "good", "."), CheckFinding("b", "trouble", ".", short="b is bad")
+    objection = CheckFinding("c", "objection", ".", short="c is worse")
     assert verdict_of([good]).text == "suits"
     assert verdict_of([good, trouble, trouble]).text == "will struggle, because b is bad; b is bad"
     assert verdict_of([trouble, objection]).because == ("c is worse",)

@@ -27,7 +27,7 @@ def register(group: typer.Typer) -> None:
 @gathered
 def cluster(
     images: options.ImageSet,
-    subject: scoring.Subject,
+    subject: scoring.ScoredSubject,
     labels: scoring.Labels,
     computed: scoring.Computed,
     published: scoring.Published,

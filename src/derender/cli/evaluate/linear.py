@@ -40,7 +40,7 @@ def register(group: typer.Typer) -> None:
 @gathered
 def linear(
     images: options.ImageSet,
-    subject: scoring.Subject,
+    subject: scoring.ScoredSubject,
     labels: scoring.Labels,
     computed: scoring.Computed,
     published: scoring.Published,

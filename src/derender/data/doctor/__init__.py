@@ -13,7 +13,15 @@ import numpy as np
 from jaxtyping import Float, Int64
 
 from derender.data.doctor import structure
-from derender.data.doctor.findings import CHECKS, Check, Finding, Verdict, findings_of, percent, verdict_of
+from derender.data.doctor.findings import (
+    CHECKS,
+    Check,
+    CheckFinding,
+    Verdict,
+    findings_of,
+    percent,
+    verdict_of,
+)
 from derender.data.doctor.pixels import (
     Originals,
     Pixels,
@@ -22,12 +30,21 @@ from derender.data.doctor.pixels import (
     near_copy_groups,
     shrunk,
 )
-from derender.data.doctor.structure import Axis, Estimate, Halves, jackknife
+from derender.data.doctor.structure import Halves, JackknifeEstimate, SymmetryAxis, jackknife
 from derender.data.names import is_picture
 from derender.data.opening import ListedStream, open_images
 from derender.data.pictures import PictureSet, read_pictures
 
-__all__ = ["CHECKS", "Check", "Examination", "Finding", "Verdict", "doctor", "measure_originals", "percent"]
+__all__ = [
+    "CHECKS",
+    "Check",
+    "CheckFinding",
+    "Examination",
+    "Verdict",
+    "doctor",
+    "measure_originals",
+    "percent",
+]
 
 EXAMINED_PX = 64
 """Side at which images are read for an examination."""
@@ -58,8 +75,8 @@ class Shared:
     """
 
     rows: Int64[np.ndarray, " k"]
-    values: Mapping[str, Estimate]
-    axis: Axis
+    values: Mapping[str, JackknifeEstimate]
+    axis: SymmetryAxis
     halves: Halves | None
     orders: Mapping[tuple[str, str], Float[np.ndarray, " k"]]
 
@@ -82,8 +99,8 @@ class Examination:
 
     pictures: PictureSet
     verdict: Verdict
-    findings: tuple[Finding, ...]
-    values: Mapping[str, Estimate]
+    findings: tuple[CheckFinding, ...]
+    values: Mapping[str, JackknifeEstimate]
     group: Int64[np.ndarray, " n"]
     identical: int
     originals: Originals | None
@@ -172,7 +189,7 @@ def doctor(
 
 def _counts(
     images: PictureSet, pixels: Pixels, group: np.ndarray, originals: Originals | None
-) -> dict[str, Estimate]:
+) -> dict[str, JackknifeEstimate]:
     """What needs no comparison of what different images show."""
     count, unreadable, distinct = len(images), len(images.skipped), len(np.unique(group))
     values: dict[str, float] = {
@@ -185,7 +202,7 @@ def _counts(
     }
     if originals is not None:
         values |= {"small": originals.smaller, "oblong": originals.oblong}
-    return {name: Estimate(float(value)) for name, value in values.items()}
+    return {name: JackknifeEstimate(float(value)) for name, value in values.items()}
 
 
 def _compare(
@@ -210,7 +227,7 @@ def _compare(
         "fill": jackknife(lambda kept: structure.frame_filled(edges[kept]), count),
         "view": jackknife(lambda kept: structure.view_variety(edges[kept]), count),
         "light": jackknife(lambda kept: structure.light_variety(sides[kept]), count),
-        "odd": Estimate(odd, float(np.sqrt(odd * (1 - odd) / count))),
+        "odd": JackknifeEstimate(odd, float(np.sqrt(odd * (1 - odd) / count))),
     }
     orders = {
         ("least typical", "most typical"): alike,

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from derender.data.doctor.structure import Axis, Estimate
+from derender.data.doctor.structure import JackknifeEstimate, SymmetryAxis
 
 Level = Literal["good", "note", "trouble", "objection", "open"]
 """``trouble``: will struggle; ``objection``: does not suit; ``open``: cannot be judged on this set."""
@@ -24,7 +24,7 @@ NOTE_SHARE = 0.1
 
 
 @dataclass(frozen=True)
-class Finding:
+class CheckFinding:
     """One thing that was looked at.
 
     Attributes:
@@ -41,7 +41,7 @@ class Finding:
     text: str
     advice: str = ""
     short: str = ""
-    value: Estimate | None = None
+    value: JackknifeEstimate | None = None
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Verdict:
         return f"{self.word}, because {'; '.join(self.because)}" if self.because else self.word
 
 
-def verdict_of(findings: Sequence[Finding]) -> Verdict:
+def verdict_of(findings: Sequence[CheckFinding]) -> Verdict:
     """The worst level decides; all objections, or else all troubles, are the reasons."""
     objections = tuple(finding.short for finding in findings if finding.level == "objection")
     troubles = tuple(finding.short for finding in findings if finding.level == "trouble")
@@ -184,7 +184,7 @@ CHECKS = {
 """By the names of the measures. Those of distinct, unreadable, small and clipped are conventions."""
 
 
-def judged(value: Estimate, check: Check) -> tuple[Level, bool]:
+def judged(value: JackknifeEstimate, check: Check) -> tuple[Level, bool]:
     """The level of a value, and whether two standard errors either way keep it there.
 
     An objection needs certainty: a value below ``objects`` by less than two errors is only trouble.
@@ -203,7 +203,7 @@ def judged(value: Estimate, check: Check) -> tuple[Level, bool]:
     return "good", least is None or low >= least
 
 
-def finding_of(name: str, value: Estimate, detail: str = "") -> Finding:
+def finding_of(name: str, value: JackknifeEstimate, detail: str = "") -> CheckFinding:
     """The finding of one check, as a sentence with its number and further details."""
     check = CHECKS[name]
     level, certain = judged(value, check)
@@ -221,24 +221,24 @@ def finding_of(name: str, value: Estimate, detail: str = "") -> Finding:
     )
     text = f"{clause[:1].upper()}{clause[1:]}{f' ({brackets})' if brackets else ''}."
     if level == "good":
-        return Finding(check.name, level, text, value=value)
-    return Finding(check.name, level, text, check.advice, "" if level == "note" else clause, value)
+        return CheckFinding(check.name, level, text, value=value)
+    return CheckFinding(check.name, level, text, check.advice, "" if level == "note" else clause, value)
 
 
 def findings_of(
-    values: Mapping[str, Estimate], details: Mapping[str, str], axis: Axis | None
-) -> tuple[Finding, ...]:
+    values: Mapping[str, JackknifeEstimate], details: Mapping[str, str], axis: SymmetryAxis | None
+) -> tuple[CheckFinding, ...]:
     """A finding for every value; without an axis nothing was compared, and the rest stays open."""
     found = {name: finding_of(name, values[name], details.get(name, "")) for name in CHECKS if name in values}
     if axis is None:
         text = "Alignment, kinds, symmetry and variety were not measured: too few distinct images."
-        return (*found.values(), Finding("the rest", "open", text))
+        return (*found.values(), CheckFinding("the rest", "open", text))
     if values["agreement"].value < (CHECKS["agreement"].objects or 0):
         text = "Kinds, symmetry, crop, view and light cannot be judged where images have so little in common."
         counted = list(found)[: list(found).index("agreement") + 1]
-        return (*(found[name] for name in counted), Finding("the rest", "open", text))
+        return (*(found[name] for name in counted), CheckFinding("the rest", "open", text))
     if "kinship" not in found:
-        found["kinship"] = Finding("kinds", "open", "No two groups are large enough to compare.")
+        found["kinship"] = CheckFinding("kinds", "open", "No two groups are large enough to compare.")
     off = found["symmetry"].level != "good" and axis.correlation > AXIS_SYMMETRIC
     name, old = ("symmetry", found["symmetry"]) if off else ("fill", found["fill"])
     if abs(axis.offset) >= AXIS_OFFSET and (off or old.level == "good"):

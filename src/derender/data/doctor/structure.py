@@ -33,7 +33,7 @@ _CLIP = 0.01  # share at each end that is drawn in before standard deviations ar
 
 
 @dataclass(frozen=True)
-class Estimate:
+class JackknifeEstimate:
     """A value and its standard error, both in the measure's own unit."""
 
     value: float
@@ -42,7 +42,7 @@ class Estimate:
 
 def jackknife(
     measure: Callable[[Int64[np.ndarray, " k"]], float], count: int, groups: int = GROUPS
-) -> Estimate:
+) -> JackknifeEstimate:
     """``measure(rows)`` on all rows, and its standard error from leaving out one group at a time.
 
     Rows are dealt to the groups in turn; they count as independent, so where images come in families (many
@@ -54,7 +54,7 @@ def jackknife(
     rows = np.arange(count)
     left = np.array([measure(rows[rows % groups != group]) for group in range(groups)])
     variance = (groups - 1) / groups * np.sum((left - left.mean()) ** 2)
-    return Estimate(float(measure(rows)), float(np.sqrt(variance)))
+    return JackknifeEstimate(float(measure(rows)), float(np.sqrt(variance)))
 
 
 def edge_cells(grey: Float32[np.ndarray, "n 32 32"]) -> Float32[np.ndarray, "n 6 6 8"]:
@@ -150,7 +150,7 @@ def light_variety(sides: Float[np.ndarray, "n 2"]) -> float:
 
 
 @dataclass(frozen=True)
-class Axis:
+class SymmetryAxis:
     """The axis about which the mean image of edges is most symmetric.
 
     Attributes:
@@ -162,7 +162,7 @@ class Axis:
     correlation: float
 
 
-def symmetry_axis(grey: Float32[np.ndarray, "n 32 32"], reach: int = 14) -> Axis:
+def symmetry_axis(grey: Float32[np.ndarray, "n 32 32"], reach: int = 14) -> SymmetryAxis:
     """Look for an axis in steps of half a pixel, at most ``reach`` of them to either side.
 
     An axis off the middle has to be better than the middle by 0.02.
@@ -177,7 +177,7 @@ def symmetry_axis(grey: Float32[np.ndarray, "n 32 32"], reach: int = 14) -> Axis
         part = part - part.mean(axis=1, keepdims=True)
         found[twice] = float((part * part[:, ::-1]).sum() / max(float((part**2).sum()), 1e-12))
     best = max(found, key=lambda twice: (found[twice] - _MARGIN * (twice != 0), -abs(twice)))
-    return Axis(best / 2 / width, found[best])
+    return SymmetryAxis(best / 2 / width, found[best])
 
 
 def likeness(structure: Float32[np.ndarray, "n 6 6 8"]) -> Float[np.ndarray, " n"]:
@@ -201,7 +201,7 @@ class Halves:
         margin: how clearly each image is in one group (negative) or the other, in standard deviations.
     """
 
-    kinship: Estimate
+    kinship: JackknifeEstimate
     smaller: float
     margin: Float[np.ndarray, " n"]
 
@@ -238,5 +238,5 @@ def split_in_two(structure: Float32[np.ndarray, "n 6 6 8"], generator: np.random
         shares.append(min(map(len, groups)) / len(judged))
     if len(kinships) < _SPLITS // 2:
         return None
-    kinship = Estimate(float(np.median(kinships)), float(np.std(kinships)))
+    kinship = JackknifeEstimate(float(np.median(kinships)), float(np.std(kinships)))
     return Halves(kinship, float(np.median(shares)), place / max(float(place.std()), 1e-9))
