@@ -1,7 +1,7 @@
 """How near a copy of a model comes to the model: its features and its renderings of the same images.
 
 Rounding weights moves every feature a little; the unit is how far two of these images are apart. What a
-score makes of that is asked of the copy itself (a cut of a tree may turn on one image).
+score makes of that has to be measured with the copy itself (a cut of a tree may depend on one image).
 """
 
 from dataclasses import dataclass

@@ -47,7 +47,7 @@ def finetune(
     Args:
         model: with ``nets[factor].encode`` and ``device``.
         images: (N, 3, H, W) uint8.
-        task: what is asked of the N images.
+        task: targets of the N images.
         rows: (n,) training rows.
         tested: (T,) rows to answer for.
         factors: whose encoders.

@@ -42,7 +42,7 @@ def probe(
     Args:
         head: one of ``PROBES``.
         features: (N, D), finite.
-        task: what is asked of the N rows.
+        task: targets of the N rows.
         rows: (S, n) training rows.
         tested: (T,) rows to answer for; they take no part in any choice.
         seeds: (S,) of starts and folds.

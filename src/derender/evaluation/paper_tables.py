@@ -35,7 +35,7 @@ class PaperRow:
 
 @dataclass(frozen=True)
 class RowRules:
-    """Which rows a question is asked of; see ``feature_rows.prepare``."""
+    """Which rows a question is evaluated on; see ``feature_rows.prepare``."""
 
     mean_by: tuple[str, ...] = ()
     min_count: int = 1

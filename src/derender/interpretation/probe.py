@@ -250,7 +250,7 @@ def fit_probe(
 
     Args:
         features: by factor, (N, D_f), finite.
-        task: what is asked of the N rows.
+        task: targets of the N rows.
         rows: (n,) training rows.
         head: "logistic" or "linear".
         seed: of folds, or of the start and the order of rows.
