@@ -240,7 +240,7 @@ def test_bad_data(refused, tmp_path):
 
 def test_nothing_is_written_over(run, faces, refused, tmp_path):
     assert "--resume" in refused("train", "--data", faces, "--out", run, *SETTINGS)
-    assert "another --out" in refused("synth", "faces", "--out", faces)
+    assert "choose another folder" in refused("synth", "faces", "--out", faces)
     assert "is not empty" in refused("demo", "--out", faces)
     there = tmp_path / "there.parquet"
     there.write_text("mine")
