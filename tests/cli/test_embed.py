@@ -82,7 +82,9 @@ def test_ctrl_c_leaves_only_what_the_next_run_goes_on_with(model, tmp_path, caps
     )
     assert set(tmp_path.iterdir()) - before == {tmp_path / "f.parquet.partial"}
     assert embed(model, data, out, "--limit", "12") == 2
-    assert "holds an unfinished table that was made otherwise (differs in images)" in capsys.readouterr().err
+    assert (
+        "holds an unfinished table that was made otherwise (differs in pictures)" in capsys.readouterr().err
+    )
     assert embed(model, data, out) == 0
     assert "8 of them from the run before" in capsys.readouterr().err
     assert sum(calls) == 24, "twenty images, and the four that were interrupted"

@@ -90,7 +90,7 @@ def result(text: str, json_file: str | None) -> None:
 
 
 @contextmanager
-def progress_bar(description: str, unit: str = "pictures") -> Iterator[Callable[..., None]]:
+def progress_bar(description: str, unit: str = "images") -> Iterator[Callable[..., None]]:
     """A progress bar on standard error: call the given function with (done, total) and, if any, a note.
 
     Where standard error is no terminal, a plain line appears every half minute instead.

@@ -8,7 +8,7 @@ import typer
 
 from derender.baselines.registry import BASELINES
 from derender.cli import options
-from derender.cli.console import NAMED, notice, progress_bar, visible
+from derender.cli.console import NAMED, notice, progress_bar, refuse_existing_file, visible
 from derender.cli.gathered import gathered
 
 NAMES = ", ".join(BASELINES)
@@ -50,7 +50,7 @@ def embed(
     Images are read, embedded and written as they come, so memory does not grow with their number. A run that
     was stopped goes on where it was when the command is given again.
     """
-    output.refuse_existing(out)
+    refuse_existing_file(out, output.force)
     import derender
 
     name, source, checkpoint = baselines.baseline, model or baselines.checkpoint, baselines.checkpoint

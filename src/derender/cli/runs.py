@@ -18,10 +18,10 @@ OutRun = Annotated[
 Resume = Annotated[bool, typer.Option("--resume", help="Go on with the run in --out.")]
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Show all settings and stop.")]
 PHASES = {
-    "reading": ("reading", "pictures"),
-    "train": ("training", "pictures"),
+    "reading": ("reading", "images"),
+    "train": ("training", "images"),
     "perceptual": ("perceptual features", "steps"),
-    "features": ("whitening features", "pictures"),
+    "features": ("whitening features", "images"),
     "scoring": ("scoring", "heads"),
 }
 

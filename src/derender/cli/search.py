@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from derender.cli import options
-from derender.cli.console import notice, progress_bar, show_scores, visible
+from derender.cli.console import notice, progress_bar, refuse_existing_file, show_scores, visible
 from derender.cli.gathered import gathered
 
 LABELS_SHOWN = 4
@@ -36,7 +36,7 @@ def search(
 ) -> None:  # fmt: skip
     """Find the same geometry under any lighting, the same lighting on anything: nearest by one factor."""
     if out is not None:
-        output.refuse_existing(out)
+        refuse_existing_file(out, output.force)
         if out.suffix.lower() != ".png":
             raise ValueError(f"{out} is no PNG: give --out a name that ends in .png")
     import derender

@@ -114,7 +114,7 @@ class PictureSet:
 
     def describe(self) -> str:
         """One line: how many images, of which layout, what was left out."""
-        noun = "picture" if len(self) == 1 else "pictures"
+        noun = "image" if len(self) == 1 else "images"
         parts = [f"{len(self):,} {noun} from {self.source} ({self.layout})"]
         if self.skipped:
             parts.append(f"{len(self.skipped):,} skipped")

@@ -206,7 +206,7 @@ class Sweep:
     def perform(self, job: Job) -> Note:
         """Do one job and leave its note, whatever happens in it."""
         try:
-            with progress_bar(job.name, unit="steps" if job.kind == "score" else "pictures") as progress:
+            with progress_bar(job.name, unit="steps" if job.kind == "score" else "images") as progress:
                 note = Note(self.key(job), "done", facts=self.work[job.kind](self, job, progress))
         except BudgetUsed as error:
             note = Note(self.key(job), "stopped", str(error))
