@@ -229,15 +229,15 @@ def time_training(sizes: Sizes) -> dict[str, Any]:
 
 def time_epochs(sizes: Sizes) -> dict[str, Any]:
     """Thirty epochs of the real loop: reading ahead, watcher, validation, checkpoints and all."""
-    from derender.data import PictureSet, read_pictures, split_indices
+    from derender.data import ImageSet, read_images, split_indices
     from derender.training import resolve, train
 
     size = next((int(one[11:]) for one in sizes.epochs if one.startswith("image_size=")), 64)
     if sizes.data is not None:
-        pictures = read_pictures(sizes.data, size)
+        pictures = read_images(sizes.data, size)
     else:
         noise = np.random.default_rng(0).integers(0, 256, (sizes.pictures, 3, size, size), dtype=np.uint8)
-        pictures = PictureSet(noise, tuple(f"{row:06d}.png" for row in range(len(noise))), source="noise")
+        pictures = ImageSet(noise, tuple(f"{row:06d}.png" for row in range(len(noise))), source="noise")
     settings = ["loocc=light+camera", "perceptual=self", "whitening.pictures=0", *sizes.epochs]
     settings += ["watch=false"] if sizes.data is None else []
     config = resolve("paper", settings)

@@ -33,7 +33,7 @@ from typing import Any
 from machine import describe_machine
 from PIL import Image
 
-from derender.data import list_images, open_source, read_pictures
+from derender.data import list_images, open_source, read_images
 from derender.data.listing import REMEMBERED_FROM
 
 CLASSES = 20
@@ -95,7 +95,7 @@ def start(source: Path) -> dict[str, Any]:
 def start_shards(source: Path) -> dict[str, Any]:
     """Seconds until training on shards could begin: the first time every image is decoded."""
     began, cpu = time.perf_counter(), time.process_time()
-    pictures = read_pictures(source, 8)
+    pictures = read_images(source, 8)
     total = int(pictures.images[:: max(1, len(pictures) // 64)].sum())
     return {
         "files": len(pictures), "mark": str(total),

@@ -127,9 +127,9 @@ def run(*arguments: str) -> None:
 
 def some_pictures(data: str, folder: Path, thing: str) -> list[str]:
     """A few images of the data, evenly chosen, as files."""
-    from derender.data import read_pictures
+    from derender.data import read_images
 
-    pictures = read_pictures(data, 64, limit=FACES)
+    pictures = read_images(data, 64, limit=FACES)
     folder.mkdir()
     names = []
     for number, picture in enumerate(pictures.images, 1):

@@ -6,15 +6,15 @@ import torch
 from PIL import Image
 
 import derender
-from derender.data import PictureSet
+from derender.data import ImageSet
 from derender.inputs import as_images, as_model, device_named, part_of
 from derender.storage.folder import SplitRecord, write_split
 
 
 @pytest.fixture
-def image_set() -> PictureSet:
+def image_set() -> ImageSet:
     images = np.arange(20 * 3 * 8 * 8, dtype=np.uint32).astype(np.uint8).reshape(20, 3, 8, 8)
-    return PictureSet(images, tuple(f"{row}.png" for row in range(20)))
+    return ImageSet(images, tuple(f"{row}.png" for row in range(20)))
 
 
 @pytest.fixture

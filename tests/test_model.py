@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import derender
-from derender.data import check_pictures, read_ground_truth
+from derender.data import check_images, read_ground_truth
 from derender.evaluation import evaluate_geometry
 from derender.model import Derenderer, load
 from derender.networks import FACTORS, Factor
@@ -116,7 +116,7 @@ def test_each_feature_decides_its_own_parameter_only(model, images):
 )
 def test_wrong_pictures_are_named(model, shape, dtype, message):
     with pytest.raises(ValueError, match=message):
-        check_pictures(torch.zeros(shape, dtype=dtype), model.image_size)
+        check_images(torch.zeros(shape, dtype=dtype), model.image_size)
 
 
 def test_same_seed_same_weights_and_the_global_generator_is_left_alone():

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import torch
 
-from derender.data import PictureSet, read_pictures, split_indices, suggestion
+from derender.data import ImageSet, read_images, split_indices, suggestion
 from derender.model import Derenderer, load
 from derender.storage.folder import SplitRecord, model_folder, read_split, write_split
 from derender.training.config import TrainConfig
@@ -60,7 +60,7 @@ def require_fitting(model: Derenderer, source: str = "this model") -> None:
 
 
 def as_images(
-    images: PictureSet | str | Path,
+    images: ImageSet | str | Path,
     image_size: int,
     *,
     dataset: str = "auto",
@@ -70,7 +70,7 @@ def as_images(
     at_least: int = 1,
     keep_duplicates: bool = False,
     progress: Progress | None = None,
-) -> PictureSet:
+) -> ImageSet:
     """Decoded images: a set that is read already is returned as it is, an address is read.
 
     Args:
@@ -84,15 +84,15 @@ def as_images(
         keep_duplicates: keep every one of identical images.
         progress: called with (done, total) while reading.
     """
-    if not isinstance(images, PictureSet):
-        images = read_pictures(
+    if not isinstance(images, ImageSet):
+        images = read_images(
             images, image_size, dataset=dataset, limit=limit, keep_duplicates=keep_duplicates,
             progress=progress,
         )  # fmt: skip
     return part_of(images, part, model).require(at_least)
 
 
-def part_of(images: PictureSet, part: str, model: str | Path | None) -> PictureSet:
+def part_of(images: ImageSet, part: str, model: str | Path | None) -> ImageSet:
     """The images of one part of the split of ``model``: a run, or a model that was saved from one."""
     if part not in PARTS:
         raise ValueError(f"unknown part {part!r}{suggestion(part, PARTS)}: choose {', '.join(PARTS)}")

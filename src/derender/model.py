@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from derender.data import check_pictures, refuse_not_finite
+from derender.data import check_images, refuse_not_finite
 from derender.networks import FACTORS, Factor, NetworkSettings
 from derender.networks.confidence import Confidence, ConfidenceNet
 from derender.networks.unet import pixel_decoder
@@ -104,7 +104,7 @@ class Derenderer(EmbeddingModel, Shareable):
 
     def encode(self, images: Float[Tensor, "n 3 h w"]) -> dict[str, Float[Tensor, "n code"]]:
         """One code per factor for images in 0..1, by factor name: what ``decode`` takes."""
-        check_pictures(images, self.image_size)
+        check_images(images, self.image_size)
         return {factor.name: self.nets[factor.name].encode(images) for factor in self.factors}  # type: ignore[operator]
 
     def decode(self, codes: Mapping[str, Float[Tensor, "n code"]]) -> Scene:
@@ -128,7 +128,7 @@ class Derenderer(EmbeddingModel, Shareable):
 
     def confidence(self, images: Float[Tensor, "n 3 h w"]) -> Confidence:
         """Where the reconstruction is expected to fail (used in training)."""
-        check_pictures(images, self.image_size)
+        check_images(images, self.image_size)
         return self.nets["confidence"](images)
 
     def mirror(self, scene: Scene) -> Scene:

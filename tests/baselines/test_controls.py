@@ -14,13 +14,13 @@ from derender.baselines.controls import (
     untrained_twin,
 )
 from derender.baselines.model import optional
-from derender.data import PictureSet
+from derender.data import ImageSet
 from derender.features import embed_pictures, model_fingerprint
 
 
-def pictures(count: int = 30, size: int = 8, seed: int = 0) -> PictureSet:
+def pictures(count: int = 30, size: int = 8, seed: int = 0) -> ImageSet:
     images = np.random.default_rng(seed).integers(0, 256, (count, 3, size, size), dtype=np.uint8)
-    return PictureSet(
+    return ImageSet(
         images, tuple(f"{i}.png" for i in range(count)), {"who": np.arange(count) % 3}, source="made"
     )
 
@@ -95,10 +95,10 @@ def test_untrained_features_are_those_of_the_twin(small):
     assert table.origin["settings"]["network"]["image_size"] == small.image_size
 
 
-def stripes(*images: np.ndarray) -> PictureSet:
+def stripes(*images: np.ndarray) -> ImageSet:
     stack = np.stack([np.broadcast_to(image.astype(np.uint8), (3, 32, 32)) for image in images])
     files = tuple(f"{i}.png" for i in range(len(images)))
-    return PictureSet(stack, files, {"n": np.arange(len(images))}, source="made")
+    return ImageSet(stack, files, {"n": np.arange(len(images))}, source="made")
 
 
 WAVE = 100 + 60 * np.sin(np.arange(32) / 2)
@@ -107,7 +107,7 @@ WAVE = 100 + 60 * np.sin(np.arange(32) / 2)
 def test_sizes_and_the_known_number_at_64():
     table = hog_features(stripes(np.tile(WAVE, (32, 1))))
     assert table.factors["hog"].shape == (1, 3 * 3 * 2 * 2 * 9)
-    large = PictureSet(np.zeros((1, 3, 64, 64), np.uint8), ("a",), source="made")
+    large = ImageSet(np.zeros((1, 3, 64, 64), np.uint8), ("a",), source="made")
     assert hog_features(large).factors["hog"].shape == (1, 1764)
     assert table.origin["control"] == "hog" and table.label("n").tolist() == [0]
 

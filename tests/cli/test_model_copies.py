@@ -8,7 +8,7 @@ from PIL import Image
 
 import derender
 from derender.cli import main
-from derender.data import read_pictures
+from derender.data import read_images
 from derender.data.synthetic import faces
 from derender.training.held_out_errors import read_errors
 
@@ -55,7 +55,7 @@ def test_mean_only_moves_features_to_a_mean_of_zero_and_no_distance(folder, tmp_
     words = ("--limit", "24", "--mean-only")
     assert run("whiten", folder, tmp_path / "mine", words=words) == 0
     one, two = derender.load(KNOWN), derender.load(tmp_path / "mine")
-    images = torch.from_numpy(read_pictures(folder, 64, limit=24).images).float() / 255
+    images = torch.from_numpy(read_images(folder, 64, limit=24).images).float() / 255
     before, after = (
         model.features_from(model.activations(images))["albedo"][:, :192] for model in (one, two)
     )

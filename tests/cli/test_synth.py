@@ -8,7 +8,7 @@ import pytest
 
 from derender import Derenderer
 from derender.cli import main
-from derender.data import read_pictures
+from derender.data import read_images
 from derender.presets import MODEL_PRESETS
 
 
@@ -44,7 +44,7 @@ def test_single_settings_identities_and_expressions(folder):
 def test_tracks_are_laid_out_by_identity_and_track(folder):
     rows = made(folder, "tracks", "--identities", "2", "--tracks", "3", "--frames", "2")
     assert len(rows) == 12 and rows[7]["file"] == "tracks/id0001/track_000/001.jpg"
-    assert len(read_pictures(folder / "tracks", 16)) == 12
+    assert len(read_images(folder / "tracks", 16)) == 12
     assert not (folder / "tracks" / "depth").exists()
 
 

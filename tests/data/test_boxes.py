@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 from tests.data.conftest import noise
 
-from derender.data import Unreadable, list_images, read_pictures
+from derender.data import Unreadable, list_images, read_images
 from derender.data.image import decode
 
 
@@ -111,7 +111,7 @@ def test_a_list_beside_celeba_in_the_wild_comes_before_the_rule(wild, file, text
 
 
 def test_pictures_are_cut_by_the_list(wild, encoded):
-    read = read_pictures(wild({"boxes.csv": "\n".join([HEADER, *SIZED])}), 10)
+    read = read_images(wild({"boxes.csv": "\n".join([HEADER, *SIZED])}), 10)
     for i, sides in enumerate(ROWS):
         assert (read.images[i] == decode(encoded(noise(i, 40, 34)), 10, "crop", box(*sides))).all()
 

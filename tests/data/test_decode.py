@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from derender.data import image as module
-from derender.data import read_picture
+from derender.data import read_image
 from derender.data.image import FITS, Unreadable
 
 MODE_NAMES = ["grey", "bilevel", "palette", "opaque", "clear", "translucent", "grey-alpha"]
@@ -25,12 +25,12 @@ def flat(colour: tuple[int, ...] | int, mode: str, size: tuple[int, int] = (16, 
 
 def test_rgb_of_the_right_size_is_untouched(encoded):
     array = np.random.default_rng(0).integers(0, 256, (12, 12, 3), dtype=np.uint8)
-    np.testing.assert_array_equal(read_picture(encoded(array), 12), array.transpose(2, 0, 1))
+    np.testing.assert_array_equal(read_image(encoded(array), 12), array.transpose(2, 0, 1))
 
 
 def test_bytes_and_file_agree(encoded, tmp_path):
     (tmp_path / "a.png").write_bytes(encoded(3))
-    np.testing.assert_array_equal(read_picture(tmp_path / "a.png", 8), read_picture(encoded(3), 8))
+    np.testing.assert_array_equal(read_image(tmp_path / "a.png", 8), read_image(encoded(3), 8))
 
 
 @pytest.mark.parametrize(
@@ -52,7 +52,7 @@ def test_bytes_and_file_agree(encoded, tmp_path):
 )
 def test_modes(encoded, picture, form, expected):
     options = {"quality": 100} if form == "JPEG" else {}
-    pixels = read_picture(encoded(picture, form, **options), 16)
+    pixels = read_image(encoded(picture, form, **options), 16)
     np.testing.assert_allclose(pixels[:, 8, 8].astype(int), expected, atol=2 if form == "JPEG" else 0)
 
 
@@ -60,7 +60,7 @@ def test_palette_with_transparent_colour(encoded):
     picture = flat((10, 200, 30), "RGB").convert("P", palette=Image.Palette.ADAPTIVE)
     index = picture.getpixel((0, 0))
     np.testing.assert_array_equal(
-        read_picture(encoded(picture, transparency=index), 16)[:, 0, 0], (255, 255, 255)
+        read_image(encoded(picture, transparency=index), 16)[:, 0, 0], (255, 255, 255)
     )
 
 
@@ -69,7 +69,7 @@ def test_sixteen_bits_are_scaled_not_clipped(encoded, form):
     picture = Image.fromarray(RAMP.astype(np.uint16) * 257)
     if form == "PPM":
         picture = picture.convert("I")  # which every version of Pillow writes as 16 bits there
-    np.testing.assert_array_equal(read_picture(encoded(picture, form), 12), np.stack([RAMP] * 3))
+    np.testing.assert_array_equal(read_image(encoded(picture, form), 12), np.stack([RAMP] * 3))
 
 
 def png(width: int, height: int, bits: int, colour_type: int, rows: bytes) -> bytes:
@@ -87,18 +87,18 @@ def png(width: int, height: int, bits: int, colour_type: int, rows: bytes) -> by
 
 def test_sixteen_bit_colour(encoded):
     row = b"\0" + b"".join(struct.pack(">HHH", 0x2010, 0x8020, 0xFFFF) for _ in range(4))
-    np.testing.assert_array_equal(read_picture(png(4, 4, 16, 2, row * 4), 4)[:, 0, 0], (0x20, 0x80, 0xFF))
+    np.testing.assert_array_equal(read_image(png(4, 4, 16, 2, row * 4), 4)[:, 0, 0], (0x20, 0x80, 0xFF))
 
 
 @pytest.mark.parametrize("value", [-1.0, 2.0, float("nan")])
 def test_floats_outside_their_range_are_refused(encoded, value):
     with pytest.raises(Unreadable, match=r"outside 0\.\.1"):
-        read_picture(encoded(flat(value, "F"), "TIFF"), 16)
+        read_image(encoded(flat(value, "F"), "TIFF"), 16)
 
 
 def test_integers_beyond_sixteen_bits_are_refused(encoded):
     with pytest.raises(Unreadable, match=r"outside 0\.\.65535"):
-        read_picture(encoded(flat(70_000, "I"), "TIFF"), 16)
+        read_image(encoded(flat(70_000, "I"), "TIFF"), 16)
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
@@ -123,7 +123,7 @@ def test_exif_orientation_is_applied(encoded, orientation, form):
     options = (
         {"quality": 95, "subsampling": 0} if form == "JPEG" else {"lossless": True} if form == "WEBP" else {}
     )
-    pixels = read_picture(encoded(stored, form, exif=exif, **options), 16)
+    pixels = read_image(encoded(stored, form, exif=exif, **options), 16)
     corners = pixels[:, [2, 2, 13, 13], [2, 13, 2, 13]].T.astype(int)
     np.testing.assert_allclose(corners, [(0, 0, 0), (255, 0, 0), (255,) * 3, (255,) * 3], atol=12)
 
@@ -131,7 +131,7 @@ def test_exif_orientation_is_applied(encoded, orientation, form):
 def test_damaged_exif_counts_as_none(encoded):
     plain = encoded(7, "JPEG")
     damaged = encoded(7, "JPEG", exif=b"Exif\0\0II*\0\xff\xff\xff\xff")
-    np.testing.assert_array_equal(read_picture(damaged, 12), read_picture(plain, 12))
+    np.testing.assert_array_equal(read_image(damaged, 12), read_image(plain, 12))
 
 
 @pytest.mark.parametrize("form", ["GIF", "WEBP", "PNG", "TIFF"])
@@ -139,7 +139,7 @@ def test_first_frame_of_an_animation(encoded, form):
     first, second = flat((255, 0, 0), "RGB"), flat((0, 0, 255), "RGB")
     options = {"lossless": True} if form == "WEBP" else {}
     content = encoded(first, form, save_all=True, append_images=[second], **options)
-    np.testing.assert_array_equal(read_picture(content, 16)[:, 0, 0], (255, 0, 0))
+    np.testing.assert_array_equal(read_image(content, 16)[:, 0, 0], (255, 0, 0))
 
 
 def striped(width: int, height: int) -> Image.Image:
@@ -155,14 +155,14 @@ def striped(width: int, height: int) -> Image.Image:
 
 @pytest.mark.parametrize("size", [(36, 12), (12, 36), (90, 30)])
 def test_crop_keeps_the_centre(encoded, size):
-    pixels = read_picture(encoded(striped(*size)), 12, fit="crop")
+    pixels = read_image(encoded(striped(*size)), 12, fit="crop")
     assert (pixels == np.array([0, 255, 0])[:, None, None]).mean() > 0.99
 
 
 @pytest.mark.parametrize("wide", [True, False])
 def test_pad_and_stretch(encoded, wide):
     content = encoded(striped(36, 12) if wide else striped(12, 36))
-    padded, stretched = (read_picture(content, 12, fit=fit) for fit in ("pad", "stretch"))
+    padded, stretched = (read_image(content, 12, fit=fit) for fit in ("pad", "stretch"))
     if not wide:
         padded, stretched = padded.transpose(0, 2, 1), stretched.transpose(0, 2, 1)
     assert (padded[:, :4] == 255).all() and (padded[:, 8:] == 255).all()
@@ -174,13 +174,13 @@ def test_unknown_fit_names_the_nearest(encoded):
     with pytest.raises(
         ValueError, match=r"unknown fit 'crops'; did you mean 'crop'\? \(known: crop, pad, stretch\)"
     ):
-        read_picture(encoded(0), 8, fit="crops")
+        read_image(encoded(0), 8, fit="crops")
 
 
 def test_resizing_is_antialiased(encoded):
     """A fine checkerboard shrinks to grey; picking single pixels would give black or white."""
     board = ((np.indices((256, 256)).sum(0) % 2) * 255).astype(np.uint8)
-    pixels = read_picture(encoded(board), 16)
+    pixels = read_image(encoded(board), 16)
     assert np.abs(pixels.astype(int) - 128).max() <= 3
 
 
@@ -191,37 +191,37 @@ def test_reduced_jpeg_decoding_agrees_with_full(encoded, monkeypatch):
     )
     content = encoded(array, "JPEG", quality=95)
     for fit in FITS:
-        reduced = read_picture(content, 32, fit=fit).astype(int)
+        reduced = read_image(content, 32, fit=fit).astype(int)
         with monkeypatch.context() as patch:
             patch.setattr(module, "_reduce_while_decoding", lambda *_: None)
-            full = read_picture(content, 32, fit=fit).astype(int)
+            full = read_image(content, 32, fit=fit).astype(int)
         assert np.abs(reduced - full).max() <= 3
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 300), (300, 1), (2, 3)])
 @pytest.mark.parametrize("fit", FITS)
 def test_tiny_and_narrow_pictures(encoded, size, fit):
-    assert read_picture(encoded(flat((9, 9, 9), "RGB", size)), 8, fit=fit).shape == (3, 8, 8)
+    assert read_image(encoded(flat((9, 9, 9), "RGB", size)), 8, fit=fit).shape == (3, 8, 8)
 
 
 def test_huge_pictures_are_refused_before_decoding():
     huge = png(30_000, 30_000, 8, 2, b"")
     with pytest.raises(Unreadable, match=r"30000 x 30000 is more than 170 million|exceeds limit"):
-        read_picture(huge, 16)
+        read_image(huge, 16)
     with pytest.raises(Unreadable, match="13500 x 13000 is more than 170 million"):
-        read_picture(png(13_500, 13_000, 8, 2, b""), 16)
+        read_image(png(13_500, 13_000, 8, 2, b""), 16)
 
 
 def test_large_pictures_within_the_limit_raise_no_warning(encoded, monkeypatch):
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 3_000)
     monkeypatch.setattr(module, "_LARGE_PIXELS", 1_000)
-    assert read_picture(encoded(flat((5, 6, 7), "RGB", (64, 64))), 16)[:, 0, 0].tolist() == [5, 6, 7]
+    assert read_image(encoded(flat((5, 6, 7), "RGB", (64, 64))), 16)[:, 0, 0].tolist() == [5, 6, 7]
 
 
 def test_truncated_jpeg_has_a_reason(encoded):
     content = encoded(np.random.default_rng(0).integers(0, 256, (200, 200, 3), dtype=np.uint8), "JPEG")
     with pytest.raises(Unreadable, match=r"the given bytes cannot be used as an image: damaged .*truncated"):
-        read_picture(content[: len(content) // 2], 16)
+        read_image(content[: len(content) // 2], 16)
 
 
 @pytest.mark.parametrize(
@@ -229,12 +229,12 @@ def test_truncated_jpeg_has_a_reason(encoded):
 )
 def test_what_is_no_picture_has_a_reason(content):
     with pytest.raises(Unreadable, match=r"not an image in a known format|damaged"):
-        read_picture(content, 16)
+        read_image(content, 16)
 
 
 def test_missing_file_is_an_os_error(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"gone\.png"):
-        read_picture(tmp_path / "gone.png", 16)
+        read_image(tmp_path / "gone.png", 16)
 
 
 def _samples() -> list[bytes]:
@@ -266,6 +266,6 @@ def test_no_damage_raises_anything_but_unreadable(content, data):
         damaged[data.draw(st.integers(0, len(damaged) - 1))] = data.draw(st.integers(0, 255))
     cut = data.draw(st.integers(1, len(damaged)))
     try:
-        assert read_picture(bytes(damaged[:cut]), 8).shape == (3, 8, 8)
+        assert read_image(bytes(damaged[:cut]), 8).shape == (3, 8, 8)
     except Unreadable as problem:
         assert "cannot be used as an image" in str(problem)

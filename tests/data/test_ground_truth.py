@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from derender.data import read_ground_truth, read_pictures
+from derender.data import read_ground_truth, read_images
 from derender.data.synthetic import faces, write
 
 HEADER = "file,identity,expression,ambient,diffuse,light_pitch,light_yaw,pitch,yaw,roll,tx,ty\n"
@@ -159,6 +159,6 @@ def test_what_our_generator_writes_is_read_back(tmp_path):
         (truth.camera, made.camera, 1e-6),
     ]:
         np.testing.assert_allclose(read, written, atol=error)
-    pictures = read_pictures(tmp_path / "faces", 32)
+    pictures = read_images(tmp_path / "faces", 32)
     assert pictures.layout == "synface"
     np.testing.assert_array_equal(pictures.images, truth.images)

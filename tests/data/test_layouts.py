@@ -9,7 +9,7 @@ import pyarrow.parquet as pq
 import pytest
 from tests.data.conftest import noise
 
-from derender.data import LAYOUTS, list_images, read_pictures
+from derender.data import LAYOUTS, list_images, read_images
 from derender.data.image import decode
 from derender.data.layouts.cars import CAR_CLASSES, car_class
 from derender.data.layouts.faces import EMOTIONS
@@ -415,14 +415,14 @@ def test_what_a_column_is(cells, expected):
 def test_a_table_given_by_name(tree, name, content, tmp_path):
     files = [file for file in TABLE if file != "data.csv"]
     folder = tree({**images(*files), name: content, "gone.csv": "file\nother.png\nx.png\nnotes.txt\n"})
-    pictures = read_pictures(folder / name, 8)
+    pictures = read_images(folder / name, 8)
     assert (pictures.layout, pictures.files) == ("table", tuple(files[:3]))
-    assert (pictures.images == read_pictures(folder, 8, dataset="folder").select([0, 3, 1]).images).all()
-    cached = [read_pictures(folder / name, 8, cache=tmp_path / "cache").images for _ in range(2)]
+    assert (pictures.images == read_images(folder, 8, dataset="folder").select([0, 3, 1]).images).all()
+    cached = [read_images(folder / name, 8, cache=tmp_path / "cache").images for _ in range(2)]
     assert (cached[1] == pictures.images).all()
-    assert read_pictures(f"{folder / name}::validation", 8).files == ("ünï/2.png",)
-    assert read_pictures(folder / name, 8, subset="a b").files == ("a b/1.png",)
-    partly = read_pictures(folder / "gone.csv", 8)
+    assert read_images(f"{folder / name}::validation", 8).files == ("ünï/2.png",)
+    assert read_images(folder / name, 8, subset="a b").files == ("a b/1.png",)
+    partly = read_images(folder / "gone.csv", 8)
     assert partly.files == ("other.png",) and [row.file for row in partly.skipped] == ["x.png", "notes.txt"]
 
 
@@ -442,7 +442,7 @@ def test_the_class_of_a_car_by_whole_words(texts, kind):
 
 def test_cars_of_the_published_size_are_cropped(tree, encoded):
     contents = {file: encoded(noise(row, 128, 128)) for row, file in enumerate(CARS)}
-    pictures = read_pictures(tree({**contents, **SHAPENET}), 25)
+    pictures = read_images(tree({**contents, **SHAPENET}), 25)
     crop = np.array([14, 8, 114, 108], np.float32)
     for file, image in zip(pictures.files, pictures.images, strict=True):
         assert (image == decode(contents[file], 25, "crop", crop)).all()
@@ -467,10 +467,10 @@ def test_other_boxes_are_other_images_and_one_without_is_listed(tree, encoded, t
         for content, box in zip(list(contents.values())[:2], sides, strict=True)
     ]
     for options in ({}, {"cache": tmp_path / "cache"}, {"cache": tmp_path / "cache"}):
-        pictures = read_pictures(source, 10, **options)
+        pictures = read_images(source, 10, **options)
         assert [row.file for row in pictures.skipped] == ["img_celeba/000003.jpg"]
         assert "no usable box is known" in pictures.skipped[0].reason
         assert (pictures.images == np.stack(expected)).all()
     tree({"list_bbox_celeba.txt": BOXES.replace(" 5  6 20  30", " 9  6 20  30")})
-    second = read_pictures(source, 10, cache=tmp_path / "cache").images
+    second = read_images(source, 10, cache=tmp_path / "cache").images
     assert (second[0] != expected[0]).any() and (second[1] == expected[1]).all()

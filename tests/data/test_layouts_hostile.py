@@ -4,14 +4,14 @@ import zipfile
 
 import pytest
 
-from derender.data import list_images, read_masks, read_pictures, zip_source
+from derender.data import list_images, read_images, read_masks, zip_source
 
 NAMES = ["ann lee", "ÄÖ ß 日本", "two\nlines", "quote\"'", "tab\there"]
 
 
 @pytest.mark.parametrize("zipped", [False, True])
 def test_names_with_spaces_unicode_and_newlines(tree, zipped):
-    pictures = read_pictures(tree([f"{name}/{name} 1.png" for name in NAMES], zipped), 8)
+    pictures = read_images(tree([f"{name}/{name} 1.png" for name in NAMES], zipped), 8)
     assert pictures.layout == "classes"
     assert sorted(pictures.labels["class"]) == sorted(NAMES)
     assert pictures.skipped == ()
@@ -19,20 +19,20 @@ def test_names_with_spaces_unicode_and_newlines(tree, zipped):
 
 @pytest.mark.parametrize("zipped", [False, True])
 def test_such_names_in_published_layouts(tree, zipped):
-    people = read_pictures(tree([f"{name}/{name}_0001.jpg" for name in NAMES], zipped), 8)
+    people = read_images(tree([f"{name}/{name}_0001.jpg" for name in NAMES], zipped), 8)
     assert people.layout == "lfw"
     assert sorted(people.labels["identity"]) == sorted(NAMES)
     files = {"x y.ids": "CVHCI_TRACKLABELS_V1\n3 Ann Lee\n", "x y/03/日本 1.jpg": None}
-    assert read_pictures(tree(files, zipped, name="tracks"), 8).labels["identity"].tolist() == ["Ann Lee"]
+    assert read_images(tree(files, zipped, name="tracks"), 8).labels["identity"].tolist() == ["Ann Lee"]
     raf = {"list_patition_label.txt": "test_two words.jpg 2\n", "test_two words_aligned.jpg": None}
-    assert read_pictures(tree(raf, zipped, name="raf"), 8).labels["emotion"].tolist() == ["fear"]
+    assert read_images(tree(raf, zipped, name="raf"), 8).labels["emotion"].tolist() == ["fear"]
 
 
 def test_loops_of_links_end_in_published_layouts(tree):
     folder = tree({"list_attr_celeba.txt": "1\nBald\n000001.jpg 1\n", "img_align_celeba/000001.jpg": None})
     (folder / "img_align_celeba" / "again").symlink_to(folder, target_is_directory=True)
     (folder / "self").symlink_to("self")
-    pictures = read_pictures(folder, 8)
+    pictures = read_images(folder, 8)
     assert pictures.files == ("img_align_celeba/000001.jpg",)
     assert [row.file for row in pictures.skipped] == ["self"]
 
@@ -48,7 +48,7 @@ def bomb(path, names, monkeypatch):
 def test_a_picture_that_is_a_bomb_is_skipped(tree, monkeypatch):
     path = tree(["a.png"], zipped=True)
     bomb(path, ["b.png"], monkeypatch)
-    pictures = read_pictures(path, 8)
+    pictures = read_images(path, 8)
     assert pictures.files == ("a.png",)
     assert [row.reason for row in pictures.skipped] == ["unpacks to 3 MiB, more than 1 MiB"]
 
@@ -75,7 +75,7 @@ def test_unsafe_names_in_a_zip_never_reach_a_layout(tree):
         "a/../../2.png": None,
         "good/3.png": None,
     }
-    pictures = read_pictures(tree(files, zipped=True), 8)
+    pictures = read_images(tree(files, zipped=True), 8)
     assert (pictures.layout, pictures.files) == ("folder", ("good/3.png",))
     assert len(pictures.skipped) == 3
     assert all("unsafe name in the zip" in row.reason for row in pictures.skipped)

@@ -128,7 +128,7 @@ def test_rows_belong_together_when_some_are_left_out(tree, merged):
     limited = read_masks(
         tree(files), 8, limit=2, keep_duplicates=True, progress=lambda *step: seen.append(step)
     )
-    assert (len(limited.pictures), limited.masks.shape) == (2, (2, 8, 8))
+    assert (len(limited.images), limited.masks.shape) == (2, (2, 8, 8))
     assert seen == [(2, 2), (1, 2), (2, 2)]
 
 
@@ -142,9 +142,9 @@ def test_official_parts_and_attributes(tree, published):
     }
     source = tree(files)
     found = read_masks(source, 8)
-    assert found.pictures.partition.tolist() == ["train", "train", "test"]
-    assert found.pictures.labels["Bald"].tolist() == [0, 1, -1]
-    assert [file[-5:] for file in read_masks(source, 8, subset="test").pictures.files] == ["2.jpg"]
+    assert found.images.partition.tolist() == ["train", "train", "test"]
+    assert found.images.labels["Bald"].tolist() == [0, 1, -1]
+    assert [file[-5:] for file in read_masks(source, 8, subset="test").images.files] == ["2.jpg"]
     assert len(read_masks(f"{source}::train", 8).masks) == 2
     with pytest.raises(ValueError, match="no subset 'validation'; there are test, train"):
         read_masks(source, 8, subset="validation")
@@ -157,7 +157,7 @@ def test_attributes_by_way_of_celebas_own_list(tree, published):
         "list_attr_celeba.txt": "1\nBald Young\n119614.jpg 1 -1\n",
         "list_eval_partition.txt": "119614.jpg 1\n",
     }
-    pictures = read_masks(tree(files), 8).pictures
+    pictures = read_masks(tree(files), 8).images
     assert pictures.layout == "celebamask"
     assert (pictures.labels["Bald"].tolist(), pictures.labels["Young"].tolist()) == ([1, -1], [0, -1])
     assert pictures.partition.tolist() == ["validation", ""]

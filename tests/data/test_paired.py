@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from derender.data import read_ground_truth, read_pictures
+from derender.data import read_ground_truth, read_images
 from derender.data.layouts.depth_pairs import DEPTH_RANGE
 
 SIZE = 12
@@ -71,16 +71,16 @@ def test_maps_shrink_with_their_pictures_over_the_object_alone(tree, encoded):
 
 
 def test_pictures_are_read_without_their_maps(pairs):
-    pictures = read_pictures(pairs(), SIZE, keep_duplicates=True)
+    pictures = read_images(pairs(), SIZE, keep_duplicates=True)
     assert pictures.layout == "depth_pairs" and len(pictures) == 5
     assert all("/image/" in file for file in pictures.files)
     assert pictures.partition is not None and sorted(pictures.partition) == ["test"] * 3 + ["train"] * 2
-    one = read_pictures(f"{pairs(name='b')}::train", SIZE, keep_duplicates=True)
+    one = read_images(f"{pairs(name='b')}::train", SIZE, keep_duplicates=True)
     assert len(one) == 2
 
 
 def test_a_folder_that_merely_is_called_image_is_no_such_set(tree):
-    pictures = read_pictures(tree(["image/a.png", "image/b.png", "depth/a.png"]), 12)
+    pictures = read_images(tree(["image/a.png", "image/b.png", "depth/a.png"]), 12)
     assert pictures.layout != "depth_pairs" and len(pictures) == 3
 
 

@@ -12,8 +12,8 @@ from derender.data import (
     list_images,
     quiet_pillow,
     read_ground_truth,
+    read_images,
     read_masks,
-    read_pictures,
     split_indices,
 )
 from derender.data.layouts import layout_named
@@ -49,7 +49,7 @@ def test_every_archive_is_recognised_and_whole(shared_data, source, layout, coun
 
 
 def test_utkface_labels(shared_data):
-    pictures = read_pictures(shared_data("data/utkface64.zip"), 64, limit=300)
+    pictures = read_images(shared_data("data/utkface64.zip"), 64, limit=300)
     assert len(pictures) == 300
     assert set(pictures.label("race")) <= {"white", "black", "asian", "indian", "other"}
     assert (pictures.label("age").min(), pictures.label("age").max()) > (0, 90)
@@ -93,7 +93,7 @@ def test_celebamask_masks(shared_data):
 
 
 def test_tracks(shared_data):
-    pictures = read_pictures(shared_data("data/synface_tracks64.zip"), 64)
+    pictures = read_images(shared_data("data/synface_tracks64.zip"), 64)
     assert len(np.unique(pictures.label("identity"))) == 12
     assert len(np.unique(pictures.label("track"))) == 240
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from sklearn.metrics import adjusted_rand_score, f1_score, normalized_mutual_info_score
 
 from derender.baselines.controls import pca_features, pixel_features
-from derender.data import read_pictures
+from derender.data import read_images
 from derender.evaluation import at_least, chance_scores, cluster, cluster_scores, compare_clusterings
 from derender.evaluation.clustering import clustering_table, finch_levels, finch_table
 from derender.evaluation.clustering_scores import CLUSTER_COLUMNS, METRICS, scores_of_counts
@@ -288,7 +288,7 @@ def accuracy(table, **how) -> tuple[float, float, dict]:
 
 def test_pixels_on_lfw_reach_what_is_known(shared_data):
     """31 people, 20 images each: 0.24 by pixels, 0.13 by chance."""
-    pixels = pixel_features(read_pictures(shared_data("data/lfw64.zip"), 64))
+    pixels = pixel_features(read_images(shared_data("data/lfw64.zip"), 64))
     own, chance, values = accuracy(pixels, min_count=20, max_count=20)
     assert (values["n_rows"], values["labels"]) == (620, {"identity": 31})
     assert (own, chance) == (pytest.approx(0.237, abs=0.01), pytest.approx(0.13, abs=0.01))
@@ -296,7 +296,7 @@ def test_pixels_on_lfw_reach_what_is_known(shared_data):
 
 def test_pixels_on_tracks_reach_what_is_known(shared_data):
     """240 tracks of 12 rendered people: 0.23 by pixels; PCA is no better."""
-    images = read_pictures(shared_data("data/synface_tracks64.zip"), 64)
+    images = read_images(shared_data("data/synface_tracks64.zip"), 64)
     how = {"mean_by": ("identity", "track")}
     own, chance, values = accuracy(pixel_features(images), **how)
     assert (values["n_rows"], values["labels"]) == (240, {"identity": 12})

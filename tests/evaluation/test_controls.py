@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from derender.data import PictureSet
+from derender.data import ImageSet
 from derender.data.synthetic import faces
 from derender.evaluation.controls import Renderings, component_count, whitened, whitened_components
 from derender.evaluation.memory import Memory
@@ -68,7 +68,7 @@ def test_another_encoder_is_whitened_by_its_own_codes_of_the_renderings(renderin
 
 
 def test_components_are_whitened_and_cached(renderings, images, tmp_path):
-    pictures = PictureSet(images[40:], tuple("abcdefgh"))
+    pictures = ImageSet(images[40:], tuple("abcdefgh"))
     assert component_count(renderings.images) == 10
     keeping = Renderings(renderings.model, renderings.images, SETTINGS, memory=Memory(tmp_path))
     one, two = (whitened_components(keeping, pictures).factors["pca"] for _ in range(2))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import derender
-from derender.data import read_pictures
+from derender.data import read_images
 from derender.evaluation.out_of_distribution import (
     OUTLIER_PERCENTILE,
     percentile_of,
@@ -40,8 +40,8 @@ def test_rendered_faces_are_known_to_the_bundled_model_and_cars_are_not(shared_d
     net = derender.load("rendered-faces-64")
     held_out = read_errors(model_folder("rendered-faces-64"))
     assert held_out is not None
-    faces = read_pictures(f"{shared_data('data/synface64.zip')}::test_gt", 64, limit=48).images
-    cars = read_pictures(str(shared_data("data/syncar64.zip")), 64, limit=24).images
+    faces = read_images(f"{shared_data('data/synface64.zip')}::test_gt", 64, limit=48).images
+    cars = read_images(str(shared_data("data/syncar64.zip")), 64, limit=24).images
     assert np.median(reconstruction_percentile(net, faces, held_out)) == pytest.approx(50, abs=20)
     assert (reconstruction_percentile(net, cars, held_out) > OUTLIER_PERCENTILE).all()
     assert errors_of(net, faces).quantiles[50] == pytest.approx(held_out.quantiles[50], rel=0.15)

@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch import nn
 
-from derender.data import PictureSet
+from derender.data import ImageSet
 
 SIZE = 8
 
@@ -36,9 +36,9 @@ def model() -> TinyModel:
 
 
 @pytest.fixture
-def pictures() -> PictureSet:
+def pictures() -> ImageSet:
     images = np.random.default_rng(0).integers(0, 256, (11, 3, SIZE, SIZE), dtype=np.uint8)
     labels = {"identity": np.array(["a", "b", "", "c", "a", "b", "c", "a", "b", "c", "a"])}
     partition = np.array(["train"] * 6 + ["test"] * 5)
     files = tuple(f"{i}.png" for i in range(11))
-    return PictureSet(images, files, labels, partition=partition, source="made")
+    return ImageSet(images, files, labels, partition=partition, source="made")

@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 from PIL import Image
 
-from derender.data import open_images, read_pictures
+from derender.data import open_images, read_images
 from derender.features import FeatureTable, embed_pictures, embed_to_file, embedding
 from derender.features.blocks import BlockEmbedder
 
@@ -86,7 +86,7 @@ def assert_same(path: Path, expected: FeatureTable) -> None:
 def in_memory(model, source: str, path: Path, **options) -> FeatureTable:
     """The table of the whole set in memory, once through a file as any table goes."""
     return FeatureTable.read(
-        embed_pictures(model, read_pictures(source, 8, **options), batch_size=16).write(path)
+        embed_pictures(model, read_images(source, 8, **options), batch_size=16).write(path)
     )
 
 
@@ -166,7 +166,7 @@ def test_a_stopped_run_goes_on_to_the_same_table(model, source, tmp_path, stop_a
 
 @pytest.mark.parametrize("source", ["shards"], indirect=True)
 def test_a_set_is_written_as_a_stream_is(model, source, tmp_path):
-    pictures = read_pictures(source, 8)
+    pictures = read_images(source, 8)
     part = pictures.select(np.arange(len(pictures)) % 2 == 0)
     expected = FeatureTable.read(embed_pictures(model, part, batch_size=16).write(tmp_path / "m.parquet"))
 

@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 
-from derender.data import PictureSet
+from derender.data import ImageSet
 from derender.features import FeatureTable, embed_to_file, embedding
 from derender.storage.atomic import DamageNoticed
 
 
 @pytest.fixture
-def pictures() -> PictureSet:
+def pictures() -> ImageSet:
     images = np.random.default_rng(0).integers(0, 256, (60, 3, 8, 8), dtype=np.uint8)
-    return PictureSet(images, tuple(f"{number}.png" for number in range(60)), source="made")
+    return ImageSet(images, tuple(f"{number}.png" for number in range(60)), source="made")
 
 
 @pytest.fixture

@@ -5,7 +5,7 @@ import pytest
 from PIL import Image
 
 import derender
-from derender.data import PictureSet
+from derender.data import ImageSet
 from derender.learn import finetune_settings, run_settings
 
 TINY = {
@@ -15,10 +15,10 @@ TINY = {
 
 
 @pytest.fixture(scope="module")
-def images() -> PictureSet:
+def images() -> ImageSet:
     pixels = np.random.default_rng(0).integers(0, 256, (40, 3, 32, 32), dtype=np.uint8)
     labels = {"bright": np.arange(40) % 2}
-    return PictureSet(pixels, tuple(f"{row:02d}.png" for row in range(40)), labels, source="made by the test")
+    return ImageSet(pixels, tuple(f"{row:02d}.png" for row in range(40)), labels, source="made by the test")
 
 
 @pytest.fixture(scope="module")

@@ -4,17 +4,17 @@ from dataclasses import replace
 
 import numpy as np
 
-from derender.data import PictureSet, Skipped
+from derender.data import ImageSet, Skipped
 from derender.data.doctor import doctor
 from derender.report.doctor import doctor_page, measure_table
 
 
-def pictures(count: int) -> PictureSet:
+def pictures(count: int) -> ImageSet:
     """Noise with one copy, and an unreadable file with a hostile name."""
     images = np.random.default_rng(0).integers(0, 256, (count, 3, 64, 64), dtype=np.uint8)
     images[1] = images[0]
     names = tuple(f"n{number}.png" for number in range(count))
-    return PictureSet(images, names, source="made", skipped=(Skipped("<b>x.png", "empty file"),))
+    return ImageSet(images, names, source="made", skipped=(Skipped("<b>x.png", "empty file"),))
 
 
 def test_every_finding_and_the_verdict_are_on_the_page():

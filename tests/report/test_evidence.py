@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from derender import Derenderer
-from derender.data import PictureSet
+from derender.data import ImageSet
 from derender.report.evidence import Subject, gather, suitable_label
 
 COUNT = 48
@@ -16,12 +16,12 @@ def model() -> Derenderer:
 
 
 @pytest.fixture(scope="module")
-def pictures() -> PictureSet:
+def pictures() -> ImageSet:
     """Coloured noise, brighter where the label says so; one name is markup."""
     generator = np.random.default_rng(0)
     bright = np.arange(COUNT) % 2
     images = generator.integers(0, 156, (COUNT, 3, 4, 4)) + 100 * bright[:, None, None, None]
-    return PictureSet(
+    return ImageSet(
         images.repeat(8, axis=2).repeat(8, axis=3).astype(np.uint8),
         ("<script>.png", *(f"{number}.png" for number in range(1, COUNT))),
         {"number": np.arange(COUNT), "tone": np.where(bright, "bright", "dark")},
@@ -57,5 +57,5 @@ def test_the_suitable_label_has_few_classes_with_pictures_enough(pictures):
     assert suitable_label(pictures) == ("tone",)
     names = np.array([f"id{number}" for number in range(COUNT)])
     rare = np.where(np.arange(COUNT) < 5, "rare", "usual")
-    alone = PictureSet(pictures.images, pictures.files, {"identity": names, "rare": rare})
+    alone = ImageSet(pictures.images, pictures.files, {"identity": names, "rare": rare})
     assert suitable_label(alone) == ()

@@ -7,7 +7,7 @@ from PIL import Image
 
 import derender
 from derender.cli import main
-from derender.data import read_pictures
+from derender.data import read_images
 from derender.data.synthetic import faces
 from derender.inputs import copy_split, part_of, split_of
 from derender.storage.folder import SPLIT_FILE, SplitRecord, read_split, write_split
@@ -62,7 +62,7 @@ def test_copies_of_copies_have_the_parts_of_the_run(run, pictures, tmp_path):
         told += ["--set", "pictures=8", "--set", "views=1", "--set", "directions=4", "--set", "spatial=false"]
         assert main(told) == 0
     assert main(["pack", "-m", str(tmp_path / "run"), "-o", str(tmp_path / "small")]) == 0
-    every = read_pictures(pictures, 64)
+    every = read_images(pictures, 64)
     for part in ("train", "validation", "test"):
         asked = [set(part_of(every, part, str(tmp_path / name)).files) for name in COPIES]
         assert asked[0] == asked[1] == asked[2] == asked[3] and 0 < len(asked[0]) < 30

@@ -13,7 +13,7 @@ import pytest
 import torch
 from PIL import Image
 
-from derender.data import read_pictures
+from derender.data import read_images
 from derender.training import resolve, train
 from derender.training.batches import Batches
 from derender.training.distributed import ALONE, Ranks
@@ -111,7 +111,7 @@ def test_two_processes_train_one_run_that_one_process_can_go_on_with(folder, tmp
     assert "stopped by: images" in said
     environment = json.loads((run / "environment.json").read_text())
     assert environment["device"] == "2 x cpu"
-    pictures = read_pictures(str(folder), 32)
+    pictures = read_images(str(folder), 32)
     train(resolve("small", [*TINY, "images=32"]), pictures, tmp_path / "alone", accelerator="cpu")
     for place in (run, tmp_path / "alone"):
         train(resolve("small", [*TINY, "images=48"]), pictures, place, resume=True, accelerator="cpu")

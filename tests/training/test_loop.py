@@ -18,7 +18,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 import derender
 from derender.cli import main
-from derender.data import PictureSet
+from derender.data import ImageSet
 from derender.storage.atomic import DamageNoticed
 from derender.training import TrainingInterrupted, resolve, train
 from derender.training.batches import Batches
@@ -45,13 +45,11 @@ def _restore_determinism():
 
 
 @pytest.fixture(scope="module")
-def pictures() -> PictureSet:
+def pictures() -> ImageSet:
     noise = np.random.default_rng(0)
     smooth = noise.integers(0, 256, (60, 3, 4, 4), dtype=np.uint8)
     images = np.repeat(np.repeat(smooth, 8, axis=2), 8, axis=3)
-    return PictureSet(
-        images=images, files=tuple(f"{i:03d}.png" for i in range(60)), source="made by the test"
-    )
+    return ImageSet(images=images, files=tuple(f"{i:03d}.png" for i in range(60)), source="made by the test")
 
 
 def weights(run) -> dict[str, torch.Tensor]:

@@ -8,7 +8,7 @@ import torch
 from safetensors.torch import load_file
 
 import derender
-from derender.data import PictureSet
+from derender.data import ImageSet
 from derender.training import resolve, train
 from derender.training.checkpoint import WEIGHTS_FILE
 from derender.training.derender_task import DerenderTask
@@ -25,11 +25,9 @@ def _restore_determinism():
 
 
 @pytest.fixture(scope="module")
-def pictures() -> PictureSet:
+def pictures() -> ImageSet:
     images = np.random.default_rng(0).integers(0, 256, (40, 3, 32, 32), dtype=np.uint8)
-    return PictureSet(
-        images=images, files=tuple(f"{i:03d}.png" for i in range(40)), source="made by the test"
-    )
+    return ImageSet(images=images, files=tuple(f"{i:03d}.png" for i in range(40)), source="made by the test")
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import derender
-from derender.data import PictureSet
+from derender.data import ImageSet
 from derender.data.synthetic import faces
 from derender.scene import Scene
 from derender.scene.ranges import SceneRanges
@@ -171,8 +171,8 @@ def test_a_memory_that_no_watcher_gave_is_refused(memory):
         Watcher.remembering(RANGES, BATCH, memory)
 
 
-def pictures_of(images) -> PictureSet:
-    return PictureSet(images=images, files=tuple(f"{i:04d}.png" for i in range(len(images))))
+def pictures_of(images) -> ImageSet:
+    return ImageSet(images=images, files=tuple(f"{i:04d}.png" for i in range(len(images))))
 
 
 def test_a_real_collapse_is_caught_while_its_loss_still_falls(tmp_path, monkeypatch):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from derender.data import PictureSet, Skipped
+from derender.data import ImageSet, Skipped
 from derender.data.doctor import doctor
 from derender.evaluation.bootstrap import ScoredRow, estimate, with_verdicts
 from derender.evaluation.linear_task import Rows, task_of
@@ -92,7 +92,7 @@ def test_doctor(evil):
     images[1] = images[0]
     names = tuple(f"{evil}{number}.png" for number in range(24))
     labels = {evil: np.array([evil, "b"] * 12)}
-    pictures = PictureSet(images, names, labels, source=evil, skipped=(Skipped(evil, evil),))
+    pictures = ImageSet(images, names, labels, source=evil, skipped=(Skipped(evil, evil),))
     harmless(doctor_page(doctor(pictures)), evil)
 
 
@@ -116,7 +116,7 @@ def test_explanation(evil):
     task = task_of({evil: classes})
     shares = explain_labels(features, task, rows, seeds=(0,))
     sheets = {evil: {"grad-cam": Image.new("RGB", (8, 8))}}
-    images = PictureSet(np.zeros((1, 3, 8, 8), np.uint8), (evil,), source=evil)
+    images = ImageSet(np.zeros((1, 3, 8, 8), np.uint8), (evil,), source=evil)
     pair = (evil, evil), pair_parts(features, 0, 1)
     model, clusters = SimpleNamespace(source=evil), cluster_shares(features, np.arange(90) % 2)
     found = Explained(shares, model, images, task, rows, clusters, pair)

@@ -15,7 +15,7 @@ import pytest
 
 import derender
 from derender.cli import main
-from derender.data import Unreadable, read_picture, read_pictures
+from derender.data import Unreadable, read_image, read_images
 from derender.data.folder_source import FolderSource
 
 
@@ -36,7 +36,7 @@ def model(tmp_path_factory) -> str:
 
 def test_every_odd_picture_is_read_and_every_broken_one_named(corpus):
     _, hostile = corpus
-    pictures = read_pictures(hostile.folder, 16, dataset="folder")
+    pictures = read_images(hostile.folder, 16, dataset="folder")
     assert sorted(pictures.files) == sorted(hostile.readable)
     assert sorted(row.file for row in pictures.skipped) == sorted(hostile.unreadable)
     assert all(row.reason for row in pictures.skipped)
@@ -47,19 +47,19 @@ def test_a_picture_alone_is_read_as_in_a_folder(corpus):
     _, hostile = corpus
     for name in hostile.readable:
         if "\\" not in name:
-            assert read_picture(hostile.folder / name, 16).shape == (3, 16, 16)
+            assert read_image(hostile.folder / name, 16).shape == (3, 16, 16)
     for name in hostile.unreadable:
         with pytest.raises((Unreadable, OSError)):
-            read_picture(hostile.folder / name, 16)
+            read_image(hostile.folder / name, 16)
 
 
 def test_exif_turns_a_picture_and_an_animation_gives_its_first_frame(corpus):
     module, hostile = corpus
-    turned = read_picture(hostile.folder / "rotated.jpg", 16, fit="stretch").astype(int)
-    plain = read_picture(module.encoded(module.smooth(seed=20), "JPEG"), 16, fit="stretch").astype(int)
+    turned = read_image(hostile.folder / "rotated.jpg", 16, fit="stretch").astype(int)
+    plain = read_image(module.encoded(module.smooth(seed=20), "JPEG"), 16, fit="stretch").astype(int)
     assert np.abs(turned - np.rot90(plain, -1, (1, 2))).mean() < 3 < np.abs(turned - plain).mean()
-    first = read_picture(module.encoded(module.smooth(seed=16), "PNG"), 16)
-    assert np.array_equal(read_picture(hostile.folder / "animated.png", 16), first)
+    first = read_image(module.encoded(module.smooth(seed=16), "PNG"), 16)
+    assert np.array_equal(read_image(hostile.folder / "animated.png", 16), first)
 
 
 def test_the_doctor_names_every_broken_file(corpus, tmp_path, capsys):
@@ -106,7 +106,7 @@ def test_files_by_name_are_done_and_the_broken_ones_named(corpus, model, tmp_pat
 def test_a_zip_gives_its_pictures_and_writes_nothing(corpus, tmp_path):
     module, _ = corpus
     archive = module.write_hostile_zip(tmp_path / "deep" / "er" / "hostile.zip")
-    pictures = read_pictures(archive, 16)
+    pictures = read_images(archive, 16)
     assert pictures.files == tuple(f"good/{number}.png" for number in range(4))
     reasons = {row.file: row.reason for row in pictures.skipped}
     assert sum("unsafe name" in reason for reason in reasons.values()) == 5
@@ -127,7 +127,7 @@ def test_a_file_that_goes_between_listing_and_reading_is_skipped(corpus, tmp_pat
         return read(source, file)
 
     monkeypatch.setattr(FolderSource, "read", gone)
-    pictures = read_pictures(tmp_path, 16)
+    pictures = read_images(tmp_path, 16)
     assert pictures.files == ("0.png", "2.png")
     assert [row.file for row in pictures.skipped] == ["1.png"]
 
@@ -149,7 +149,7 @@ def test_files_and_folders_without_permission_are_skipped_and_named(corpus, tmp_
 
     monkeypatch.setattr(Path, "open", refusing(Path.open))
     monkeypatch.setattr(os, "scandir", refusing(os.scandir))
-    pictures = read_pictures(tmp_path, 16)
+    pictures = read_images(tmp_path, 16)
     assert pictures.files == ("0.png", "3.png")
     assert {row.file: row.reason for row in pictures.skipped} == {
         "1.png": f"cannot be read: {os.strerror(errno.EACCES)}",
@@ -175,4 +175,4 @@ def test_devices_and_pipes_are_refused_at_once(corpus):
     _, hostile = corpus
     for path in (hostile.folder / "pipe.png", Path("/dev/zero")):
         with pytest.raises(Unreadable, match="not a regular file"):
-            read_picture(path, 16)
+            read_image(path, 16)

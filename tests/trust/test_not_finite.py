@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from derender.data import PictureSet
+from derender.data import ImageSet
 from derender.features.extract import embed_pictures
 from derender.model import Derenderer
 from derender.networks.confidence import Confidence
@@ -177,9 +177,9 @@ def test_first_not_finite_names_the_first():
     assert first_not_finite([("a", good), ("b", bad), ("c", bad)]) == "b"
 
 
-def picture_set(count: int = 20) -> PictureSet:
+def picture_set(count: int = 20) -> ImageSet:
     pixels = np.random.default_rng(0).integers(0, 256, (count, 3, SIZE, SIZE), dtype=np.uint8)
-    return PictureSet(images=pixels, files=tuple(f"{number:03d}.png" for number in range(count)))
+    return ImageSet(images=pixels, files=tuple(f"{number:03d}.png" for number in range(count)))
 
 
 def run_of(spoiler: Callable[[Derenderer], None], folder, monkeypatch, *settings: str) -> tuple[Finding, ...]:

@@ -12,7 +12,7 @@ from tests.trust.apart import script
 
 import derender
 from derender.baselines import load_baseline
-from derender.data import read_pictures
+from derender.data import read_images
 from derender.data.cache import _MARK, read_cache
 from derender.features import FeatureTable, missing
 from derender.interpretation.probe import Probe, load_probe
@@ -175,11 +175,11 @@ def test_a_cache_from_the_future_is_made_again(tmp_path):
     pictures.mkdir()
     for number in range(2):
         Image.new("RGB", (8, 8), (40 * number, 9, 9)).save(pictures / f"{number}.png")
-    rows = read_pictures(pictures, 8, cache=tmp_path / "kept", workers=1).images
+    rows = read_images(pictures, 8, cache=tmp_path / "kept", workers=1).images
     (file,) = (tmp_path / "kept").iterdir()
     whole = file.read_bytes()
     assert whole.endswith(_MARK) and _MARK.endswith(b"2\n")
     file.write_bytes(whole[: -len(_MARK)] + _MARK.replace(b"2\n", b"3\n"))
     assert read_cache(file, "any", 8) is None
-    assert (read_pictures(pictures, 8, cache=tmp_path / "kept", workers=1).images == rows).all()
+    assert (read_images(pictures, 8, cache=tmp_path / "kept", workers=1).images == rows).all()
     assert file.read_bytes().endswith(_MARK)

@@ -15,7 +15,7 @@ import torch
 from sklearn.decomposition import PCA
 
 from derender.baselines.model import optional
-from derender.data import PictureSet
+from derender.data import ImageSet
 from derender.features import FeatureTable, Progress, embed_pictures, table_labels
 from derender.inputs import as_images, part_of
 from derender.model import load
@@ -25,7 +25,7 @@ ORIENTATIONS, BLOCK_CELLS = 9, 2
 
 def control_features(
     name: str,
-    images: PictureSet | str | Path,
+    images: ImageSet | str | Path,
     *,
     image_size: int = 64,
     dataset: str = "auto",
@@ -59,17 +59,17 @@ def control_features(
     return makers[name]()
 
 
-def pixel_features(images: PictureSet) -> FeatureTable:
+def pixel_features(images: ImageSet) -> FeatureTable:
     """Pixels themselves, in 0..1, flattened: factor ``pixels``."""
     return control_table(images, "pixels", _flat(images), {})
 
 
 def pca_features(
-    images: PictureSet,
+    images: ImageSet,
     *,
     components: int = 64,
     whiten: bool = True,
-    fit_on: PictureSet | None = None,
+    fit_on: ImageSet | None = None,
     seed: int = 0,
 ) -> FeatureTable:
     """Principal components of the pixels: factor ``pca``.
@@ -97,7 +97,7 @@ def pca_features(
     return control_table(images, "pca", pca.transform(_flat(images)), facts)
 
 
-def hog_features(images: PictureSet, *, cell_px: int = 8, progress: Progress | None = None) -> FeatureTable:
+def hog_features(images: ImageSet, *, cell_px: int = 8, progress: Progress | None = None) -> FeatureTable:
     """Histograms of oriented gradients, factor ``hog``; each block of 36 has length 1 at most.
 
     Args:
@@ -129,7 +129,7 @@ def hog_features(images: PictureSet, *, cell_px: int = 8, progress: Progress | N
     return control_table(images, "hog", np.stack(rows), facts)
 
 
-def noise_features(images: PictureSet, *, dimensions: int = 64, seed: int = 0) -> FeatureTable:
+def noise_features(images: ImageSet, *, dimensions: int = 64, seed: int = 0) -> FeatureTable:
     """Normal noise independent of the images, factor ``noise``: the chance level of any protocol."""
     noise = np.random.default_rng(seed).standard_normal((len(images), dimensions))
     return control_table(images, "noise", noise, {"seed": seed})
@@ -144,7 +144,7 @@ def untrained_twin(model: Any, seed: int) -> Any:
 
 def untrained_features(
     model: Any,
-    images: PictureSet,
+    images: ImageSet,
     *,
     seed: int = 0,
     batch_size: int = 256,
@@ -163,13 +163,11 @@ def open_untrained(name: str, source: str | None, image_size: int, seed: int) ->
     return untrained_twin(load(source), seed)
 
 
-def _flat(images: PictureSet) -> np.ndarray:
+def _flat(images: ImageSet) -> np.ndarray:
     return np.asarray(images.images, np.float32).reshape(len(images), -1) / 255
 
 
-def control_table(
-    images: PictureSet, name: str, values: np.ndarray, facts: Mapping[str, Any]
-) -> FeatureTable:
+def control_table(images: ImageSet, name: str, values: np.ndarray, facts: Mapping[str, Any]) -> FeatureTable:
     """One factor (N, D) as a table, with the images' names and labels; ``facts`` go into its origin."""
     origin = {"data": images.source, "layout": images.layout, "control": name, **facts}
     return FeatureTable(images.files, {name: values.astype(np.float32)}, table_labels(images), origin)

@@ -22,7 +22,7 @@ from derender.baselines.model import Images
 from derender.baselines.ris import Ris, RisConfig, RisSettings, nearest_cluster, part_energy, part_matrix
 from derender.baselines.stylegan2_generator import TINY, Generator
 from derender.baselines.training import SheetOf, ShortRun
-from derender.data import PictureSet, read_masks, split_indices
+from derender.data import ImageSet, read_masks, split_indices
 from derender.training.batches import random_stream
 from derender.training.loop import SAMPLE_COUNT
 from derender.training.task import TrainResult
@@ -191,7 +191,7 @@ def _activations(net: Generator, w_plus: Float[Tensor, "n codes d"]) -> dict[int
 
 
 def masked_rows(
-    images: PictureSet, config: RisConfig
+    images: ImageSet, config: RisConfig
 ) -> tuple[Images, Float[Tensor, "n p h w"], tuple[str, ...]]:
     """The training part's images, their part maps and the parts' names.
 
@@ -204,16 +204,16 @@ def masked_rows(
     else:
         masked = read_masks(images.source, size, masks=config.masks)
     train = split_indices(images.files, config.split, seed=config.seed).train
-    row_of = {file: row for row, file in enumerate(masked.pictures.files)}
+    row_of = {file: row for row, file in enumerate(masked.images.files)}
     rows = np.array([row_of[images.files[index]] for index in train])
     masks = torch.from_numpy(masked.masks[rows].astype(np.int64))
     parts, names = grouped_parts(masks, masked.classes, FACE_PARTS)
-    return torch.from_numpy(masked.pictures.images[rows]).float() / 255, parts, names
+    return torch.from_numpy(masked.images.images[rows]).float() / 255, parts, names
 
 
 def train_ris(
     config: RisConfig,
-    images: PictureSet,
+    images: ImageSet,
     out: str | Path,
     *,
     sample_sheet: SheetOf | None = None,

@@ -20,7 +20,7 @@ from torch.nn.functional import cross_entropy
 from derender.baselines.augment import AugmentSettings, augment
 from derender.baselines.model import BaselineModel, BaselineSettings, Images, optional
 from derender.baselines.training import ShortRun
-from derender.data import PictureSet, as_float, split_indices
+from derender.data import ImageSet, as_float, split_indices
 from derender.features import map_batches, missing
 from derender.settings import Settings
 from derender.training.task import TrainResult
@@ -92,7 +92,7 @@ class Resnet18(BaselineModel):
         return {"pooled": pooled, "logits": self.net.classifier(pooled)}
 
 
-def labelled_rows(images: PictureSet, config: SupervisedConfig) -> np.ndarray:
+def labelled_rows(images: ImageSet, config: SupervisedConfig) -> np.ndarray:
     """Rows of the images to learn from: of the training part, drawn by the seed, every label known.
 
     Raises:
@@ -113,7 +113,7 @@ def labelled_rows(images: PictureSet, config: SupervisedConfig) -> np.ndarray:
 
 
 def train_resnet18(
-    images: PictureSet,
+    images: ImageSet,
     config: SupervisedConfig,
     *,
     device: str | torch.device = "cpu",
@@ -159,7 +159,7 @@ def train_resnet18(
 
 
 def encode_labels(
-    images: PictureSet, labels: tuple[str, ...], rows: np.ndarray
+    images: ImageSet, labels: tuple[str, ...], rows: np.ndarray
 ) -> tuple[dict[str, tuple[str, ...]], Int64[Tensor, "n labels"]]:
     """Class names of every label among these rows, in order, and each row's class numbers."""
     names, columns = {}, []
@@ -181,7 +181,7 @@ def label_loss(
     return torch.stack([cross_entropy(part, targets[:, i]) for i, part in enumerate(parts)]).mean()
 
 
-def accuracy(model: Resnet18, images: PictureSet) -> dict[str, float]:
+def accuracy(model: Resnet18, images: ImageSet) -> dict[str, float]:
     """Share of right answers for every label among images where it is known, 0 to 1; NaN if nowhere."""
     parts = map_batches(lambda batch: model.logits(batch).cpu().numpy(), model, images.images, batch_size=256)
     answers, found, start = np.concatenate(parts), {}, 0
@@ -196,7 +196,7 @@ def accuracy(model: Resnet18, images: PictureSet) -> dict[str, float]:
 
 
 def train_supervised(
-    config: SupervisedConfig, images: PictureSet, out: str | Path, *, sample_sheet: Any = None, **how: Any
+    config: SupervisedConfig, images: ImageSet, out: str | Path, *, sample_sheet: Any = None, **how: Any
 ) -> TrainResult:
     """Train into a new run folder; see `registry.train_baseline`. Minutes, no resume, no sample sheet.
 

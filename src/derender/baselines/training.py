@@ -15,7 +15,7 @@ from torch import Generator, Tensor, nn
 
 from derender.baselines.model import BaselineModel, Images, LossInputs
 from derender.baselines.registry import config_type, network_type
-from derender.data import PictureSet, Split, split_indices
+from derender.data import ImageSet, Split, split_indices
 from derender.settings import Settings
 from derender.training.config import FinetuneConfig, TrainConfig, with_changes
 from derender.training.loop import train_task
@@ -74,7 +74,7 @@ def image_size_of(config: Any) -> int:
 
 
 def train_in_loop(
-    config: Any, images: PictureSet, out: str | Path, *, sample_sheet: SheetOf | None = None, **how: Any
+    config: Any, images: ImageSet, out: str | Path, *, sample_sheet: SheetOf | None = None, **how: Any
 ) -> TrainResult:
     """Train a baseline in the common loop; see `registry.train_baseline`."""
     task = BaselineTask(config)
@@ -159,7 +159,7 @@ class ShortRun:
     def __init__(
         self,
         config: Any,
-        images: PictureSet,
+        images: ImageSet,
         out: str | Path,
         *,
         resume: bool = False,

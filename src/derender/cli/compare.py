@@ -63,7 +63,7 @@ def register(app: typer.Typer) -> None:
 
 @gathered
 def compare(
-    images: options.ImageSet,
+    images: options.DataOptions,
     paper: PaperTable,
     computed: scoring.Computed,
     published: scoring.Published,
@@ -75,7 +75,7 @@ def compare(
     """
     if planned.plan is not None:
         rest = (images, paper, replace(computed, device="auto"), replace(published, json_file=None))
-        if rest != (options.ImageSet(), PaperTable(), scoring.Computed(), scoring.Published()):
+        if rest != (options.DataOptions(), PaperTable(), scoring.Computed(), scoring.Published()):
             raise ValueError(
                 "--plan says what is compared and how, and --out gets every form of its tables: beside them "
                 "go --workers, --minutes, --dry-run, --device and --json alone"
@@ -91,7 +91,7 @@ def compare(
     published.publish(paper_table(paper, images, computed))
 
 
-def paper_table(paper: PaperTable, images: options.ImageSet, computed: scoring.Computed) -> "Scores":
+def paper_table(paper: PaperTable, images: options.DataOptions, computed: scoring.Computed) -> "Scores":
     """The table that was requested."""
     from derender import evaluation
     from derender.evaluation.paper_tables import TABLES

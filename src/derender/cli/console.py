@@ -32,7 +32,7 @@ from rich.text import Text
 from derender.storage.atomic import DamageNoticed
 
 if TYPE_CHECKING:
-    from derender.data import PictureSet
+    from derender.data import ImageSet
     from derender.evaluation.score_table import ScoreTable
 
 NAMED = 5
@@ -57,7 +57,7 @@ def visible(text: str, kept: str = "\n") -> str:
     return "".join(char if char in kept or char.isprintable() else repr(char)[1:-1] for char in text)
 
 
-def report_images(pictures: "PictureSet") -> None:
+def report_images(pictures: "ImageSet") -> None:
     """What was read, and the first of what was left out by name."""
     notice(pictures.describe())
     for row in pictures.skipped[:NAMED]:

@@ -7,7 +7,7 @@ import typer
 
 from derender.cli.console import notice, progress_bar, refuse_existing_file
 from derender.cli.gathered import gathered
-from derender.cli.options import ImageSet, Output, Seed
+from derender.cli.options import DataOptions, Output, Seed
 
 UNREADABLE_NAMED = 5
 _WORDS = {"objection": "NO", "trouble": "!", "note": "note", "open": "?", "good": "ok"}
@@ -18,7 +18,7 @@ def register(app: typer.Typer) -> None:
 
 
 def doctor(
-    image_set: ImageSet,
+    image_set: DataOptions,
     output: Output,
     out: Annotated[
         Path | None,
@@ -35,8 +35,8 @@ def doctor(
 
     with progress_bar("examining") as report:
         found = examine(image_set.address, **image_set.how, seed=seed, progress=report)
-    notice(found.pictures.describe())
-    skipped = found.pictures.skipped
+    notice(found.images.describe())
+    skipped = found.images.skipped
     for row in skipped[:UNREADABLE_NAMED]:
         notice(f"unreadable: {row.file}: {row.reason}")
     if len(skipped) > UNREADABLE_NAMED:

@@ -8,7 +8,7 @@ import typer
 from derender.cli import scoring
 from derender.cli.console import progress_bar, result, write_json
 from derender.cli.gathered import gathered
-from derender.cli.options import Device, ImageSet, Settings
+from derender.cli.options import DataOptions, Device, Settings
 from derender.cli.runs import DryRun, OutRun, Resume, report_read, report_run, show_progress
 
 
@@ -50,8 +50,8 @@ def register(app: typer.Typer) -> None:
 
 @gathered
 def finetune(
-    images: ImageSet, out: OutRun, published: scoring.Published, choices: Choices, dry_run: DryRun = False,
-    device: Device = "auto", cache: scoring.Cache = None,
+    images: DataOptions, out: OutRun, published: scoring.Published, choices: Choices,
+    dry_run: DryRun = False, device: Device = "auto", cache: scoring.Cache = None,
 ) -> None:  # fmt: skip
     """Train the encoders with a head on labels and with the rendering objective at once, then score them.
 

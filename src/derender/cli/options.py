@@ -13,7 +13,7 @@ import typer
 from derender.cli.console import progress_bar, refuse_existing, report_images, result, write_json
 
 if TYPE_CHECKING:
-    from derender.data import PictureSet
+    from derender.data import ImageSet
     from derender.model import Derenderer
 
 MODELS = (
@@ -100,7 +100,7 @@ class Output:
 
 
 @dataclass(frozen=True)
-class ImageSet:
+class DataOptions:
     """The images of a command: one data set, by address."""
 
     images: Images = None
@@ -127,7 +127,7 @@ class ImageSet:
         """How the address is read: keywords of library calls (`derender.inputs.as_images`)."""
         return {"dataset": self.dataset, "limit": self.limit}
 
-    def read(self, image_size: int, **how: Any) -> "PictureSet":
+    def read(self, image_size: int, **how: Any) -> "ImageSet":
         """The decoded images, with a progress bar and a line on what was read and left out."""
         from derender.inputs import as_images
 
@@ -138,7 +138,7 @@ class ImageSet:
 
 
 @dataclass(frozen=True)
-class PartOfImages(ImageSet):
+class PartOfImages(DataOptions):
     """The images of a command, or one part of a training split."""
 
     part: Part = "all"

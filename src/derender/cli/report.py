@@ -32,7 +32,7 @@ def register(app: typer.Typer) -> None:
 @gathered
 def report(
     run: Run,
-    images: options.ImageSet,
+    images: options.DataOptions,
     output: Output,
     truth: Truth = None,
     label: Labels = None,

@@ -9,7 +9,7 @@ import typer
 from derender.cli.console import duration, notice, report_images
 
 if TYPE_CHECKING:
-    from derender.data import PictureSet
+    from derender.data import ImageSet
     from derender.training import Progress, TrainResult
 
 OutRun = Annotated[
@@ -40,7 +40,7 @@ def show_progress(report: Callable[..., None]) -> "Callable[[Progress], None]":
     return show
 
 
-def report_read(images: "PictureSet") -> None:
+def report_read(images: "ImageSet") -> None:
     """Note what was read, and on which terms."""
     report_images(images)
     if images.terms:

@@ -6,7 +6,7 @@ import typer
 
 from derender.cli.console import is_main_process, progress_bar, result, write_json
 from derender.cli.gathered import gathered
-from derender.cli.options import Device, ImageSet, Json, Settings
+from derender.cli.options import DataOptions, Device, Json, Settings
 from derender.cli.runs import DryRun, OutRun, Resume, report_read, report_run, show_progress
 
 Network = Annotated[
@@ -44,9 +44,10 @@ def register(app: typer.Typer) -> None:
 
 @gathered
 def train(
-    images: ImageSet, out: OutRun, model: Network = None, preset: Preset = None, start_from: StartFrom = None,
-    loocc: Loocc = None, generator: Generator = None, config: ConfigFile = None, settings: Settings = None,
-    resume: Resume = False, dry_run: DryRun = False, device: Device = "auto", json_file: Json = None,
+    images: DataOptions, out: OutRun, model: Network = None, preset: Preset = None,
+    start_from: StartFrom = None, loocc: Loocc = None, generator: Generator = None,
+    config: ConfigFile = None, settings: Settings = None, resume: Resume = False,
+    dry_run: DryRun = False, device: Device = "auto", json_file: Json = None,
 ) -> None:  # fmt: skip
     """Learn to decompose images from a folder of unlabelled images of one kind of object."""
     from derender import learn

@@ -5,7 +5,7 @@ source, folder_source, zip_source   named files; listing: what is remembered of 
 layouts/      how data sets lie: recognised, and read into a table of files and labels
 stream        images one after another; shards (WebDataset), huggingface
 decode        one image; decoding: a stream, on every core
-images      a stream collected into an array: read_pictures; cache: large sets in a memory map
+image_set   a stream collected into an array: read_images; cache: large sets in a memory map
 masks, ground_truth   images with masks, with exact maps
 splits        which rows are for training, validation, test
 parquet       a parquet footer, checked before it is believed
@@ -24,25 +24,30 @@ from derender.data.decoding import (
     usable_cores,
 )
 from derender.data.ground_truth import GroundTruth, read_ground_truth
-from derender.data.image import READER_VERSION, Unreadable, decode, quiet_pillow, read_picture
+from derender.data.image import READER_VERSION, Unreadable, decode, quiet_pillow, read_image
+from derender.data.image_set import (
+    Duplicate,
+    ImageSet,
+    as_float,
+    check_images,
+    read_images,
+    refuse_not_finite,
+)
 from derender.data.layouts import LAYOUTS
 from derender.data.layouts.celebamask import MASK_CLASSES
 from derender.data.listing import cache_folder
-from derender.data.masks import MaskedPictures, read_masks
-from derender.data.names import is_picture, suggestion
+from derender.data.masks import MaskedImages, read_masks
+from derender.data.names import is_image, suggestion
 from derender.data.opening import ListedStream, list_images, open_images, open_source, parse_source
 from derender.data.parquet import check_lists, checked_footer
-from derender.data.pictures import (
-    Duplicate,
-    PictureSet,
-    as_float,
-    check_pictures,
-    read_pictures,
-    refuse_not_finite,
-)
 from derender.data.source import Skipped, nearest_sibling
 from derender.data.splits import Split, split_indices
 from derender.data.stream import Kinds, Sample, Stream, Value, ValueKind, column_of
+
+PictureSet = ImageSet  # the names of before, while callers change
+read_pictures = read_images
+read_picture = read_image
+check_pictures = check_images
 
 __all__ = [
     "LAYOUTS",
@@ -51,10 +56,10 @@ __all__ = [
     "Decoded",
     "Duplicate",
     "GroundTruth",
+    "ImageSet",
     "Kinds",
     "ListedStream",
-    "MaskedPictures",
-    "PictureSet",
+    "MaskedImages",
     "Progress",
     "Sample",
     "SeenPixels",
@@ -67,15 +72,15 @@ __all__ = [
     "ahead",
     "as_float",
     "cache_folder",
+    "check_images",
     "check_lists",
-    "check_pictures",
     "checked_footer",
     "column_of",
     "decode",
     "decode_samples",
     "decoded",
     "estimated_total",
-    "is_picture",
+    "is_image",
     "list_images",
     "nearest_sibling",
     "open_images",
@@ -83,9 +88,9 @@ __all__ = [
     "parse_source",
     "quiet_pillow",
     "read_ground_truth",
+    "read_image",
+    "read_images",
     "read_masks",
-    "read_picture",
-    "read_pictures",
     "refuse_not_finite",
     "sample_checksum",
     "split_indices",

@@ -19,7 +19,7 @@ from jaxtyping import Int64
 
 from derender.data import listing
 from derender.data.listing import ListedSource, Listing
-from derender.data.names import is_hidden, is_picture, printable
+from derender.data.names import is_hidden, is_image, printable
 from derender.data.source import read_bounded
 
 SAMPLED = 1_000
@@ -64,7 +64,7 @@ class FolderSource(ListedSource):
         for path, changed in known.proof["folders"]:
             if changed > settled or _stamp(f"{root}/{path}")[1] != changed:
                 return False
-        checked = {row for row, path in enumerate(files) if not is_picture(path)}
+        checked = {row for row, path in enumerate(files) if not is_image(path)}
         checked |= set(np.linspace(0, len(files) - 1, SAMPLED).astype(int).tolist())
         return all(_stamp(f"{root}/{files[row]}") == tuple(stamps[row].tolist()) for row in checked)
 

@@ -74,7 +74,7 @@ class Unreadable(ValueError):
     """This image cannot be used; the message is the reason in a few words."""
 
 
-def read_picture(
+def read_image(
     picture: str | Path | bytes, image_size: int, *, fit: str = "crop"
 ) -> UInt8[np.ndarray, "3 s s"]:
     """Read one image, from a file or from its encoded bytes, as RGB of ``image_size`` x ``image_size``.

@@ -18,16 +18,16 @@ from PIL import Image
 
 from derender.data.decoding import Progress, usable_cores
 from derender.data.image import fit_square, opened_image, quiet_pillow, upright_size
+from derender.data.image_set import ImageSet, read_images
 from derender.data.layouts.celebamask import MASK_CLASSES, parts_of
 from derender.data.opening import ListedStream, list_images, open_source
-from derender.data.pictures import PictureSet, read_pictures
 from derender.data.source import Source
 
 CLASSES_FILE = "classes.txt"
 MOST_CLASSES = 255  # 255 itself marks pixels without a class in many sets
 
 
-class MaskedPictures(NamedTuple):
+class MaskedImages(NamedTuple):
     """What ``read_masks`` returns.
 
     Attributes:
@@ -36,7 +36,7 @@ class MaskedPictures(NamedTuple):
         classes: the name of every class number.
     """
 
-    pictures: PictureSet
+    images: ImageSet
     masks: UInt8[np.ndarray, "n s s"]
     classes: tuple[str, ...]
 
@@ -54,10 +54,10 @@ def read_masks(
     cache: str | Path | None = None,
     workers: int | None = None,
     progress: Progress | None = None,
-) -> MaskedPictures:
+) -> MaskedImages:
     """Read every image of a folder or zip with its mask, both at ``image_size`` x ``image_size``.
 
-    The other options are those of ``read_pictures``; ``progress`` counts the images and then, from the start,
+    The other options are those of ``read_images``; ``progress`` counts the images and then, from the start,
     the masks. A data set without masks is an error, and so is a mask that does not fit its image: one that is
     missing, is no image of one channel, or holds a number that is no class.
 
@@ -80,7 +80,7 @@ def read_masks(
             _require_all(listed)
         how = {"dataset": dataset, "subset": subset, "fit": fit, "keep_duplicates": keep_duplicates}
         how |= {"limit": limit, "cache": cache, "workers": workers, "progress": progress}
-        pictures = read_pictures(source, image_size, **how)
+        pictures = read_images(source, image_size, **how)
         names = _named_alike(files, pictures.files) if listed is None else pictures.label("mask").tolist()
         found = np.empty((len(pictures), image_size, image_size), np.uint8)
 
@@ -102,7 +102,7 @@ def read_masks(
         finally:
             pool.shutdown(cancel_futures=True)
         names_of_classes = MASK_CLASSES if listed is not None else _class_names(files, found, names)
-    return MaskedPictures(pictures, found, names_of_classes)
+    return MaskedImages(pictures, found, names_of_classes)
 
 
 def _check_shape(files: Source, name: str, shape: tuple[int, ...], image: str) -> None:

@@ -12,7 +12,7 @@ SUFFIXES = (
 _SUFFIXES = frozenset(SUFFIXES)
 
 
-def is_picture(file: str) -> bool:
+def is_image(file: str) -> bool:
     """Whether the name has an image's suffix; nothing but a suffix is no image's name."""
     dot = file.rfind(".")
     return dot > 0 and file[dot - 1] != "/" and file[dot:].lower() in _SUFFIXES

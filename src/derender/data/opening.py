@@ -24,7 +24,7 @@ from derender.data.huggingface import HuggingFaceStream, is_saved
 from derender.data.layouts import layout_named, recognise
 from derender.data.layouts.layout import Layout, Table
 from derender.data.layouts.tables import TableSource, holds_paths, is_table
-from derender.data.names import SUFFIXES, is_hidden, is_picture, suggestion
+from derender.data.names import SUFFIXES, is_hidden, is_image, suggestion
 from derender.data.shards import SHARD_SUFFIXES, ShardStream, find_shards, part_of_shards
 from derender.data.source import FileSource, Source, nearest_sibling
 from derender.data.stream import Sample, Stream
@@ -229,7 +229,7 @@ def _kind_of(path: Path, written: str) -> str | None:
     if "{" in str(path) and str(path).endswith(SHARD_SUFFIXES):
         return "webdataset"
     known = (".zip", ".parquet", ".csv", *SHARD_SUFFIXES)
-    could_be_one = _IDENTIFIER.fullmatch(written) and not is_picture(written)
+    could_be_one = _IDENTIFIER.fullmatch(written) and not is_image(written)
     return "huggingface" if could_be_one and not written.lower().endswith(known) else None
 
 
@@ -237,7 +237,7 @@ def _kind_of_folder(folder: Path) -> str | None:
     """Shards or a library's files, if no image lies among the first files in it."""
     kind = None
     for name in islice(_names(folder), _ENTRIES_LOOKED_AT):
-        if is_picture(name):
+        if is_image(name):
             return None
         if name.lower().endswith(SHARD_SUFFIXES):
             kind = kind or "webdataset"

@@ -23,7 +23,7 @@ from itertools import islice, product
 from pathlib import Path
 
 from derender.data.layouts.layout import PARTITION_NAMES
-from derender.data.names import is_hidden, is_picture, printable
+from derender.data.names import is_hidden, is_image, printable
 from derender.data.source import FILE_LIMIT_BYTES, stamps_of
 from derender.data.stream import Sample, Stream, Value, label_name, unreadable
 
@@ -108,7 +108,7 @@ class ShardStream(Stream):
 
     def _take(self, group: "_Group", ending: str, tar: tarfile.TarFile, member: tarfile.TarInfo) -> None:
         """Read a member if it is needed: an image, the one that was asked for, or labels."""
-        needed = is_picture(f"x.{ending}") if self.column is None else ending == self.column
+        needed = is_image(f"x.{ending}") if self.column is None else ending == self.column
         if not needed and ending not in _LABELS:
             return
         if member.size > FILE_LIMIT_BYTES:

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Int64
 
-from derender.data.names import is_picture, printable, suggestion
+from derender.data.names import is_image, printable, suggestion
 
 FILE_LIMIT_BYTES = 512 << 20
 """No single file larger than this is read: a bound on memory, and on what a zip bomb can unpack to."""
@@ -66,11 +66,11 @@ class Source(ABC):
     @cached_property
     def images(self) -> tuple[str, ...]:
         """The files with an image's suffix."""
-        return tuple(file for file in self.files if is_picture(file))
+        return tuple(file for file in self.files if is_image(file))
 
     @cached_property
     def _by_name(self) -> dict[str, str]:
-        others = [file for file in self.files if not is_picture(file)]  # of images there may be millions
+        others = [file for file in self.files if not is_image(file)]  # of images there may be millions
         deepest_first = sorted(others, key=lambda file: (file.count("/"), file), reverse=True)
         return {file.rpartition("/")[2]: file for file in deepest_first}
 
@@ -133,5 +133,5 @@ def nearest_sibling(path: Path) -> str:
     except OSError:
         return ""
     suffixes = (".zip", ".tar")
-    readable = [one for one in entries if is_picture(one.name) or one.suffix in suffixes or one.is_dir()]
+    readable = [one for one in entries if is_image(one.name) or one.suffix in suffixes or one.is_dir()]
     return suggestion(path.name, [one.name for one in readable])

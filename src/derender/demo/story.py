@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import Field
 
 from derender.baselines.controls import pca_features, pixel_features, untrained_features, untrained_twin
-from derender.data import GroundTruth, PictureSet
+from derender.data import GroundTruth, ImageSet
 from derender.data.synthetic import faces
 from derender.evaluation import (
     ClusterComparison,
@@ -119,7 +119,7 @@ class DemoResult:
     model: Derenderer
     bundled: Derenderer
     bundled_geometry: GeometryResult | None
-    seen: PictureSet
+    seen: ImageSet
     truth: GroundTruth
     geometry: GeometryResult
     factors: FactorResult
@@ -218,7 +218,7 @@ def run_demo(
 
 def _generated(
     count: int, size: int, seed: int, progress: Callable[[int, int], None] | None = None
-) -> tuple[PictureSet, GroundTruth]:
+) -> tuple[ImageSet, GroundTruth]:
     """Generated faces as a set of images, and with everything that made them."""
     made = faces.generate(count, size, seed, progress=progress)
     files = tuple(f"face-{row:05d}" for row in range(count))
@@ -231,4 +231,4 @@ def _generated(
         albedo=made.albedo.astype(np.float32) / 255, mask=made.mask, light=made.light,
         camera=made.camera, files=files, labels=labels,
     )  # fmt: skip
-    return PictureSet(made.images, files, labels, layout="generated", source="generated faces"), truth
+    return ImageSet(made.images, files, labels, layout="generated", source="generated faces"), truth

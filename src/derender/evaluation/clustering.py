@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from scipy.sparse import csr_array
 
-from derender.data import PictureSet
+from derender.data import ImageSet
 from derender.evaluation.bootstrap import (
     RESAMPLES,
     ScoredRow,
@@ -63,7 +63,7 @@ def cluster(
     features: FeatureSource,
     label: str | Sequence[str] | None = None,
     *,
-    images: PictureSet | str | Path | None = None,
+    images: ImageSet | str | Path | None = None,
     attributes: bool = False,
     factors: Sequence[str] | None = DEFAULT_FACTORS,
     method: str = "ward",
@@ -72,7 +72,7 @@ def cluster(
     min_count: int = 1,
     max_count: int | None = None,
     untrained_seeds: int = 3,
-    whiten_on: PictureSet | str | Path | None = None,
+    whiten_on: ImageSet | str | Path | None = None,
     resamples: int = RESAMPLES,
     seed: int = 0,
     dataset: str = "auto",

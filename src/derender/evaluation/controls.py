@@ -25,7 +25,7 @@ from torch import Tensor
 
 from derender.baselines import read_any_config
 from derender.baselines.controls import control_table, pca_features, pixel_features, untrained_twin
-from derender.data import PictureSet
+from derender.data import ImageSet
 from derender.evaluation.feature_rows import (
     FeatureRow,
     FeatureSource,
@@ -63,7 +63,7 @@ def subject_and_controls(
     *,
     memory: Memory,
     device: str = "auto",
-    whiten_on: PictureSet | str | Path | None = None,
+    whiten_on: ImageSet | str | Path | None = None,
     progress: StageProgress | None = None,
 ) -> list[FeatureRow]:
     """The row of one table or model, and behind it the controls of its images.
@@ -131,14 +131,14 @@ def image_notes(images: SizedImages | None) -> list[str]:
 
 
 def control_rows(
-    images: PictureSet,
+    images: ImageSet,
     settings: ModelSettings | None,
     factors: Sequence[str] | None,
     seeds: Sequence[int],
     *,
     memory: Memory,
     device: str = "auto",
-    fit_on: PictureSet | None = None,
+    fit_on: ImageSet | None = None,
     progress: StageProgress | None = None,
 ) -> list[FeatureRow]:
     """The controls of every protocol on features: an untrained encoder, PCA and pixels.
@@ -214,8 +214,8 @@ class Renderings:
 def whitened_rows(
     model: Derenderer,
     name: str,
-    images: PictureSet,
-    lent: PictureSet,
+    images: ImageSet,
+    lent: ImageSet,
     settings: FeatureSettings,
     factors: Sequence[str] | None,
     seeds: Sequence[int],
@@ -272,7 +272,7 @@ def component_count(images: np.ndarray) -> int:
 
 
 def whitened_components(
-    renderings: Renderings, images: PictureSet, progress: Progress | None = None
+    renderings: Renderings, images: ImageSet, progress: Progress | None = None
 ) -> FeatureTable:
     """Principal components of the images that lend their renderings, whitened by these: factor ``pca``."""
     count = component_count(renderings.images)

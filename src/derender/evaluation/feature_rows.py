@@ -12,7 +12,7 @@ from typing import Any, TypeGuard
 
 import numpy as np
 
-from derender.data import PictureSet
+from derender.data import ImageSet
 from derender.evaluation.memory import Memory
 from derender.features import FeatureTable, embed_pictures, missing, model_fingerprint, table_labels
 from derender.inputs import Progress, as_images, as_model
@@ -77,17 +77,17 @@ class SizedImages:
 
     def __init__(
         self,
-        images: PictureSet | str | Path,
+        images: ImageSet | str | Path,
         *,
         dataset: str = "auto",
         limit: int | None = None,
         progress: StageProgress | None = None,
     ):
         self._images, self._how, self._progress = images, {"dataset": dataset, "limit": limit}, progress
-        self._read: dict[int, PictureSet] = {}
+        self._read: dict[int, ImageSet] = {}
         self.notes: list[str] = []
 
-    def at(self, image_size: int) -> PictureSet:
+    def at(self, image_size: int) -> ImageSet:
         """The images at a side in pixels."""
         if image_size not in self._read:
             found = as_images(
@@ -106,7 +106,7 @@ class SizedImages:
         return self._read[image_size]
 
 
-def sized(images: PictureSet | str | Path | None, **how: Any) -> SizedImages | None:
+def sized(images: ImageSet | str | Path | None, **how: Any) -> SizedImages | None:
     """``SizedImages`` of a set or an address; None without images."""
     return None if images is None else SizedImages(images, **how)
 
@@ -197,7 +197,7 @@ def one_row(
 
 
 def embedded_table(
-    model: Derenderer, images: PictureSet, memory: Memory, progress: Progress | None = None
+    model: Derenderer, images: ImageSet, memory: Memory, progress: Progress | None = None
 ) -> FeatureTable:
     """A model's features of images, cached by the content of both."""
     weights = model_fingerprint(model)
@@ -210,7 +210,7 @@ def embedded_table(
 
 
 def cached_table(
-    memory: Memory, what: str, inputs: Mapping[str, Any], images: PictureSet, make: Callable[[], FeatureTable]
+    memory: Memory, what: str, inputs: Mapping[str, Any], images: ImageSet, make: Callable[[], FeatureTable]
 ) -> FeatureTable:
     """A feature table whose arrays are cached; names and labels come from the images."""
     factors = memory.recall(what, inputs, lambda: dict(make().factors))
@@ -218,7 +218,7 @@ def cached_table(
     return FeatureTable(images.files, factors, table_labels(images), origin)
 
 
-def aligned(images: PictureSet, files: Sequence[str]) -> PictureSet:
+def aligned(images: ImageSet, files: Sequence[str]) -> ImageSet:
     """The images with these names, in this order."""
     if images.files == tuple(files):
         return images

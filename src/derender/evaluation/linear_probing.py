@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from sklearn.metrics import average_precision_score
 
-from derender.data import PictureSet
+from derender.data import ImageSet
 from derender.evaluation.bootstrap import RESAMPLES, ScoredRow, constant, estimate, resamples, with_verdicts
 from derender.evaluation.controls import image_notes, subject_and_controls
 from derender.evaluation.feature_rows import (
@@ -59,7 +59,7 @@ def linear(
     features: FeatureSource,
     label: str | Sequence[str] | None = None,
     *,
-    images: PictureSet | str | Path | None = None,
+    images: ImageSet | str | Path | None = None,
     attributes: bool = False,
     factors: Sequence[str] | None = DEFAULT_FACTORS,
     counts: Sequence[int] = (100, 500, 1_000),
@@ -72,7 +72,7 @@ def linear(
     min_count: int = 1,
     max_count: int | None = None,
     untrained_seeds: int = 5,
-    whiten_on: PictureSet | str | Path | None = None,
+    whiten_on: ImageSet | str | Path | None = None,
     resamples: int = RESAMPLES,
     seed: int = 0,
     dataset: str = "auto",

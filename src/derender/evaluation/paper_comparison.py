@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from derender.data import PictureSet
+from derender.data import ImageSet
 from derender.evaluation.bootstrap import RESAMPLES, ScoredRow
 from derender.evaluation.clustering import clustering_table, compare_clusterings
 from derender.evaluation.clustering_methods import METHODS
@@ -56,7 +56,7 @@ PAPER_VARIANTS = ("joint", "geometry", "albedo", "joint-frozen", "random")
 def compare(
     table: str,
     features: Mapping[str, FeatureSource | Sequence[FeatureSource]],
-    images: PictureSet | str | Path | None = None,
+    images: ImageSet | str | Path | None = None,
     *,
     factors: Sequence[str] | None = DEFAULT_FACTORS,
     method: str = "ward",
@@ -100,7 +100,7 @@ def compare(
     spec, memory = table_named(table), memory_in(cache)
     models, runs = model_sources(features), range(seed, seed + seeds)
     if spec.kind == "segment":
-        if images is None or isinstance(images, PictureSet) or not models or len(models) < len(features):
+        if images is None or isinstance(images, ImageSet) or not models or len(models) < len(features):
             raise ValueError(
                 f"table {table!r} trains nets from a model's encoders, and features do not do: give models "
                 "and the address of images that have masks"

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from derender.baselines.controls import untrained_twin
-from derender.data import GroundTruth, PictureSet, read_ground_truth
+from derender.data import GroundTruth, ImageSet, read_ground_truth
 from derender.evaluation.bootstrap import RESAMPLES
 from derender.evaluation.depth import GEOMETRY, GeometryResult, evaluate_geometry
 from derender.evaluation.factors import FACTORS, FactorResult, evaluate_factors
@@ -99,9 +99,9 @@ def geometry(
 
 def reconstruction(
     model: Derenderer | str | Path,
-    images: PictureSet | str | Path,
+    images: ImageSet | str | Path,
     *,
-    training_images: PictureSet | None = None,
+    training_images: ImageSet | None = None,
     fit_steps: int | None = None,
     resample_count: int = RESAMPLES,
     seed: int = 0,

@@ -19,7 +19,7 @@ from jaxtyping import Int64
 
 from derender.data import (
     Decoded,
-    PictureSet,
+    ImageSet,
     Sample,
     SeenPixels,
     Skipped,
@@ -90,7 +90,7 @@ def computed_block(model: Any, chunk: Decoded) -> Block:
 @contextmanager
 def local_blocks(
     model: Any,
-    source: Stream | PictureSet,
+    source: Stream | ImageSet,
     start: int,
     *,
     batch_size: int,
@@ -99,7 +99,7 @@ def local_blocks(
 ) -> Iterator[Iterator[Block]]:
     """The blocks from sample ``start`` on, computed in this process while a pool decodes ahead."""
     with quiet_pillow(), evaluating(model), ExitStack() as stack:
-        if isinstance(source, PictureSet):
+        if isinstance(source, ImageSet):
             chunks = _of_set(source, start, batch_size)
         else:
             pixels = decoded(source, model.image_size, fit=fit, start=start, workers=workers)
@@ -107,7 +107,7 @@ def local_blocks(
         yield (computed_block(model, chunk) for chunk in chunks)
 
 
-def _of_set(images: PictureSet, start: int, size: int) -> Iterator[Decoded]:
+def _of_set(images: ImageSet, start: int, size: int) -> Iterator[Decoded]:
     for first in range(start, len(images), size):
         files, pixels = images.files[first : first + size], np.array(images.images[first : first + size])
         n, share = len(files), (first + len(files)) / len(images)

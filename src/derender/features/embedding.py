@@ -20,7 +20,7 @@ import torch
 
 from derender.data import (
     READER_VERSION,
-    PictureSet,
+    ImageSet,
     Skipped,
     Stream,
     estimated_total,
@@ -82,7 +82,7 @@ class Embedded:
 
 
 def embed(
-    images: PictureSet | str | Path,
+    images: ImageSet | str | Path,
     model: Any = "faces-64",
     *,
     dataset: str = "auto",
@@ -112,7 +112,7 @@ def embed(
 
 
 def embed_to_file(
-    images: Stream | PictureSet | str | Path,
+    images: Stream | ImageSet | str | Path,
     model: Any,
     out: str | Path,
     *,
@@ -168,7 +168,7 @@ def embed_to_file(
                 split = {**made_by, **(origin or {})}.get("source")
                 how = {"dataset": dataset, "limit": limit, "part": part, "model": split}
                 images = as_images(address, net.image_size, **how)
-        assert isinstance(images, Stream | PictureSet)
+        assert isinstance(images, Stream | ImageSet)
         facts = {**model_facts(net, images.source, images.layout), **made_by, **(origin or {})}
         plan = _plan(net, images, facts, (fit, keep_duplicates), batch_size)
         path = Path(out)
@@ -192,10 +192,10 @@ def _network(model: Any, device: str, fit_steps: int | None) -> tuple[Any, dict[
 
 
 def _plan(
-    net: Any, images: Stream | PictureSet, facts: Mapping[str, Any], reading: object, batch_size: int
+    net: Any, images: Stream | ImageSet, facts: Mapping[str, Any], reading: object, batch_size: int
 ) -> dict[str, Any]:
     """Everything that a resumed run must have in common with the one before."""
-    if isinstance(images, PictureSet):
+    if isinstance(images, ImageSet):
         check_size(net, images)
         labels = {name: column.tolist() for name, column in images.labels.items()}
         content: object = (images.files, labels, sample_checksum(images.images))
@@ -269,7 +269,7 @@ def _writing(parts: Parts) -> Iterator[Callable[[TableRows, Mapping[str, np.ndar
 
 
 def _finish(
-    parts: Parts, path: Path, images: Stream | PictureSet, facts: dict[str, Any], resumed: int
+    parts: Parts, path: Path, images: Stream | ImageSet, facts: dict[str, Any], resumed: int
 ) -> Embedded:
     """Put the parts together, then delete them."""
     so_far = parts.so_far
@@ -291,15 +291,15 @@ def _finish(
 
     rows = write_row_groups(path, groups())
     parts.remove()
-    passed_over = () if isinstance(images, PictureSet) else images.passed_over
+    passed_over = () if isinstance(images, ImageSet) else images.passed_over
     skipped, examples = so_far.skipped + len(passed_over), (*passed_over, *so_far.examples)
     counts = (skipped, examples, so_far.copies, resumed)
     return Embedded(path, rows, factors, tuple(labels), facts, *counts, images.source, images.layout)
 
 
-def _known_labels(images: Stream | PictureSet) -> Callable[[np.ndarray], dict[str, np.ndarray]] | None:
+def _known_labels(images: Stream | ImageSet) -> Callable[[np.ndarray], dict[str, np.ndarray]] | None:
     """Labels by position where they are known without reading images."""
-    if not isinstance(images, PictureSet) and images.table is None:
+    if not isinstance(images, ImageSet) and images.table is None:
         return None
-    columns = table_labels(images if isinstance(images, PictureSet) else images.table)
+    columns = table_labels(images if isinstance(images, ImageSet) else images.table)
     return lambda positions: {name: column[positions] for name, column in columns.items()}

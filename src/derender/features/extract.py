@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 import derender
-from derender.data import PictureSet, as_float
+from derender.data import ImageSet, as_float
 from derender.features.table import FeatureTable
 
 Progress = Callable[[int, int], object]
@@ -92,7 +92,7 @@ def embed_images(
 
 def embed_pictures(
     model: Any,
-    pictures: PictureSet,
+    pictures: ImageSet,
     *,
     batch_size: int = 256,
     progress: Progress | None = None,
@@ -114,7 +114,7 @@ def embed_pictures(
     return FeatureTable(pictures.files, factors, table_labels(pictures), facts)
 
 
-def check_size(model: Any, pictures: PictureSet) -> None:
+def check_size(model: Any, pictures: ImageSet) -> None:
     """Images of another size than the model's are an error."""
     size = model.image_size
     if tuple(pictures.images.shape[-2:]) != (size, size):

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from derender.data import nearest_sibling, read_picture, suggestion
+from derender.data import nearest_sibling, read_image, suggestion
 from derender.features.extract import embed_images, model_fingerprint
 from derender.features.table import FeatureTable, named
 from derender.inputs import as_model
@@ -120,7 +120,7 @@ def search(
             raise FileNotFoundError(f"{like} is no image file{nearest_sibling(Path(like))}")
         net, own_row = maker_of(rows, model, name, device=device), None
         unchecked = rows.origin.get("weights") is None
-        image = read_picture(Path(like), net.image_size)
+        image = read_image(Path(like), net.image_size)
         codes = {key: values[0] for key, values in embed_images(net, image[None]).items()}
         if factor not in codes:
             raise ValueError(f"{model} makes no {factor!r}; it makes {', '.join(codes)}")

@@ -10,7 +10,7 @@ import torch
 from sklearn.base import BaseEstimator, TransformerMixin
 
 import derender
-from derender.data import read_picture
+from derender.data import read_image
 from derender.features.extract import embed_images
 from derender.features.table import named
 
@@ -121,4 +121,4 @@ def as_pictures(X: Any, image_size: int) -> np.ndarray:
 def _from_path(item: Any, image_size: int) -> np.ndarray:
     if not isinstance(item, (str, os.PathLike)):
         raise ValueError(f"expected paths of images, got {type(item).__name__}: give paths or an array")
-    return read_picture(Path(item), image_size)
+    return read_image(Path(item), image_size)

@@ -15,7 +15,7 @@ import numpy as np
 from sklearn.metrics import roc_auc_score
 
 from derender.baselines.controls import untrained_features
-from derender.data import PictureSet, suggestion
+from derender.data import ImageSet, suggestion
 from derender.evaluation.bootstrap import LEVEL, resamples
 from derender.evaluation.clustering_methods import clusterings
 from derender.evaluation.feature_rows import attribute_columns
@@ -57,7 +57,7 @@ class Explained:
 
     shares: Explanation
     model: Any
-    images: PictureSet
+    images: ImageSet
     task: Task
     split: Rows
     clusters: ClusterShares | None = None
@@ -80,7 +80,7 @@ class Explained:
 
 
 def explain(
-    images: PictureSet | str | Path,
+    images: ImageSet | str | Path,
     model: Any = "faces-64",
     labels: str | Sequence[str] = (),
     *,
@@ -170,7 +170,7 @@ def split_rows(
     return choose_rows(task, table.files, (wanted,), seeds, partition=owners, groups=sides)
 
 
-def _row_of(images: PictureSet, name: str) -> int:
+def _row_of(images: ImageSet, name: str) -> int:
     if name not in images.files:
         raise ValueError(f"{images.source} has no image {name!r}{suggestion(name, images.files)}")
     return images.files.index(name)

@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-from derender.data import PictureSet, split_indices
+from derender.data import ImageSet, split_indices
 from derender.inputs import as_images, as_model, copy_split
 from derender.learn.runs import Changes, OnImages, texts_of
 from derender.model import Derenderer
@@ -48,7 +48,7 @@ class ModelCopy:
 
 def whiten(
     model: Derenderer | str | Path,
-    images: PictureSet | str | Path,
+    images: ImageSet | str | Path,
     *,
     out: str | Path,
     settings: Changes = (),
@@ -92,7 +92,7 @@ def whiten(
 
 def refine(
     model: Derenderer | str | Path,
-    images: PictureSet | str | Path,
+    images: ImageSet | str | Path,
     *,
     out: str | Path,
     settings: Changes = (),
@@ -130,7 +130,7 @@ def refine(
 
 def unet(
     model: Derenderer | str | Path,
-    images: PictureSet | str | Path,
+    images: ImageSet | str | Path,
     *,
     out: str | Path,
     settings: Changes = (),
@@ -164,7 +164,7 @@ class _Copying:
     def __init__(
         self,
         model: Derenderer | str | Path,
-        images: PictureSet | str | Path,
+        images: ImageSet | str | Path,
         out: Path,
         at_least: int,
         *,

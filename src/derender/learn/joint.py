@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from derender.baselines import read_any_config
-from derender.data import PictureSet
+from derender.data import ImageSet
 from derender.evaluation.finetuning import (
     FinetuneScores,
     FinetuneTask,
@@ -102,7 +102,7 @@ def finetune_settings(
 
 
 def finetune(
-    images: PictureSet | str | Path,
+    images: ImageSet | str | Path,
     *,
     out: str | Path,
     dataset: str = "auto",
@@ -169,7 +169,7 @@ def finetune(
     return Finetuned(run, scores, config.start)
 
 
-def _attributes(images: PictureSet) -> list[str]:
+def _attributes(images: ImageSet) -> list[str]:
     """Every yes/no column that has both values."""
     varied = [
         name

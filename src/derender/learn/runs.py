@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from derender.baselines import baseline_config, image_size_of, stored_config, train_baseline
-from derender.data import PictureSet
+from derender.data import ImageSet
 from derender.inputs import as_images, device_named
 from derender.report.evidence import Evidence, look_at_data
 from derender.report.page import Section
@@ -20,7 +20,7 @@ from derender.training.distributed import first_then_others, leave, open_fabric,
 from derender.training.run_folder import read_settings, refuse_taken
 from derender.training.task import Progress, TrainResult
 
-OnImages = Callable[[PictureSet], object]
+OnImages = Callable[[ImageSet], object]
 """Called with the images once they are read."""
 Changes = Mapping[str, Any] | Sequence[str]
 """Settings by dotted name, or ``key=value`` texts."""
@@ -63,7 +63,7 @@ def run_settings(
 
 
 def train(
-    images: PictureSet | str | Path,
+    images: ImageSet | str | Path,
     *,
     out: str | Path,
     model: str | None = None,

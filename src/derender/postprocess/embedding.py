@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from derender.data import check_pictures, refuse_not_finite
+from derender.data import check_images, refuse_not_finite
 from derender.networks import Factor
 from derender.postprocess.features import Features
 from derender.postprocess.fitting import STEPS, Fitted, Fitting, coordinates_of
@@ -83,7 +83,7 @@ class EmbeddingModel(nn.Module):
         Where ``features`` needs them, those of the mirror image follow, and coordinates of the fitted scene
         come under keys of their own (`coordinates_of`).
         """
-        check_pictures(images, self.image_size)
+        check_images(images, self.image_size)
         found = {factor.name: self.factor_activations(factor.name, images) for factor in self.factors}
         if self.features.fits_scenes:
             scene = self.decode(self.codes(found))

@@ -12,7 +12,7 @@ import numpy as np
 from PIL import Image
 
 from derender import __version__
-from derender.data import PictureSet
+from derender.data import ImageSet
 from derender.data.doctor import CHECKS, CheckFinding, Examination
 from derender.evaluation.score_table import Column, Row, ScoreTable
 from derender.report import blocks, colours
@@ -48,7 +48,7 @@ def doctor_page(examination: Examination) -> Page:
     sections.append(Section("The numbers", list(_numbers(examination)), "Numbers"))
     return Page(
         "Does this set suit the method?",
-        f"{examination.pictures.describe()}. Examined without training anything.",
+        f"{examination.images.describe()}. Examined without training anything.",
         sections,
         f"derender {__version__}. This page holds images of the set: share it as you would the set itself.",
     )
@@ -74,7 +74,7 @@ def measure_table(examination: Examination) -> ScoreTable:
             cells = (one.value, 2 * one.error or None, check.struggles, check.objects)
             rows.append(Row(check.label, cells, note=check.note))
     compared = 0 if examination.shared is None else len(examination.shared.rows)
-    caption = f"{len(examination.pictures):,} images, {compared:,} distinct ones compared"
+    caption = f"{len(examination.images):,} images, {compared:,} distinct ones compared"
     return ScoreTable(caption, "measure", columns, rows)
 
 
@@ -82,8 +82,8 @@ def _verdict(examination: Examination) -> list[Html]:
     verdict, values = examination.verdict, examination.values
     reasons = f": {'; '.join(verdict.because)}." if verdict.because else "."
     tiles = {
-        "distinct images": (f"{values['distinct'].value:,.0f}", f"of {len(examination.pictures):,} readable"),
-        "unreadable": (f"{len(examination.pictures.skipped):,}", "left out"),
+        "distinct images": (f"{values['distinct'].value:,.0f}", f"of {len(examination.images):,} readable"),
+        "unreadable": (f"{len(examination.images.skipped):,}", "left out"),
     }
     if "agreement" in values:
         least = CHECKS["agreement"].struggles
@@ -110,11 +110,11 @@ def _examples(examination: Examination) -> list[Html]:
         caption = "The mean of the distinct images compared. Where they are aligned, it shows a thing."
         figures.append(blocks.figure(blocks.row_of(row), caption))
     for title, rows in examination.examples.items():
-        figures.append(_strip(examination.pictures, title, rows))
+        figures.append(_strip(examination.images, title, rows))
     return figures
 
 
-def _strip(pictures: PictureSet, title: str, rows: tuple[int, ...]) -> Html:
+def _strip(pictures: ImageSet, title: str, rows: tuple[int, ...]) -> Html:
     """Images side by side with transparent gaps."""
     images = colours.pictures(np.stack([pictures.images[row] for row in rows]))
     width, height = images[0].size
@@ -132,7 +132,7 @@ def _numbers(examination: Examination) -> Iterable[Html]:
         yield blocks.facts(
             {name.replace("_", " "): one for name, one in asdict(examination.originals).items()}
         )
-    if skipped := examination.pictures.skipped:
+    if skipped := examination.images.skipped:
         listed = {row.file: row.reason for row in skipped[:UNREADABLE_SHOWN]}
         more = len(skipped) - len(listed)
         rest = [blocks.prose(f"and {more:,} more")] if more > 0 else []

@@ -17,7 +17,7 @@ from jaxtyping import UInt8
 
 from derender.baselines.controls import untrained_features
 from derender.baselines.training import read_any_config
-from derender.data import GroundTruth, PictureSet, as_float, read_ground_truth, split_indices
+from derender.data import GroundTruth, ImageSet, as_float, read_ground_truth, split_indices
 from derender.data.doctor import EXAMINED_PX, doctor
 from derender.evaluation import evaluate_factors, evaluate_geometry, evaluate_reconstruction, mean_picture
 from derender.evaluation.disentanglement import disentangle
@@ -66,8 +66,8 @@ class Subject:
     """
 
     model: Derenderer
-    images: PictureSet
-    held_out: PictureSet
+    images: ImageSet
+    held_out: ImageSet
     which: str
     truth: GroundTruth | None = None
     labels: Sequence[str] = ()
@@ -75,7 +75,7 @@ class Subject:
 
 def run_evidence(
     run: str | Path,
-    images: PictureSet | str | Path,
+    images: ImageSet | str | Path,
     *,
     truth: str | Path | None = None,
     labels: Sequence[str] = (),
@@ -114,7 +114,7 @@ def run_evidence(
     return gather(Subject(model, images, held_out, which, known, labels), progress)
 
 
-def _held_out(run: Path, images: PictureSet) -> tuple[PictureSet, str]:
+def _held_out(run: Path, images: ImageSet) -> tuple[ImageSet, str]:
     """The images that the run did not train on, if these are its own; otherwise all."""
     config = read_any_config(run)
     if len(images) != recorded_environment(run).get("pictures"):
@@ -142,7 +142,7 @@ def recorded_environment(run: Path) -> dict[str, Any]:
     return {key: value for key, value in flat.items() if value is not None}
 
 
-def look_at_data(pictures: PictureSet) -> list[Html]:
+def look_at_data(pictures: ImageSet) -> list[Html]:
     """The doctor's findings on a sample of the images."""
     sample = _sample(pictures, EXAMINED)
     size = f"All {len(sample):,} images" if len(sample) == len(pictures) else f"{len(sample):,} images"
@@ -260,7 +260,7 @@ def _explained(subject: Subject) -> list[Html]:
     return [blocks.prose(note), *share_blocks(found, share_chart(found)[0])]
 
 
-def suitable_label(pictures: PictureSet) -> tuple[str, ...]:
+def suitable_label(pictures: ImageSet) -> tuple[str, ...]:
     """The first column of text with few classes that each have enough images; empty for none."""
     for name, column in pictures.labels.items():
         if column.dtype.kind not in "USO":
@@ -271,7 +271,7 @@ def suitable_label(pictures: PictureSet) -> tuple[str, ...]:
     return ()
 
 
-def _sample(pictures: PictureSet, most: int) -> PictureSet:
+def _sample(pictures: ImageSet, most: int) -> ImageSet:
     """At most so many images, evenly through the set."""
     if len(pictures) <= most:
         return pictures

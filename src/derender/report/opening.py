@@ -231,13 +231,13 @@ def readable(paths: Sequence[Path], read: Callable[[Path], T]) -> tuple[dict[Pat
 
 def read_file(path: Path, size: int) -> "np.ndarray":
     """One image file, (3, size, size) uint8; a path that leads nowhere or to a folder is an error."""
-    from derender.data import nearest_sibling, read_picture
+    from derender.data import nearest_sibling, read_image
 
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist{nearest_sibling(path)}")
     if path.is_dir():
         raise IsADirectoryError(f"{path} is a folder: name images, such as {path / '*.jpg'}")
-    return read_picture(path, size)
+    return read_image(path, size)
 
 
 def read_crop(path: Path, crop: "Crop", size: int) -> "np.ndarray":

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from derender.data import Unreadable, decode, open_images, quiet_pillow, read_picture
+from derender.data import Unreadable, decode, open_images, quiet_pillow, read_image
 from derender.features.neighbours import Found
 from derender.report.colours import pictures
 from derender.report.panel import GridLayout, contact_sheet
@@ -38,7 +38,7 @@ def search_sheet(
     rows = [*(() if found.own_row is None else (found.own_row,)), *found.rows]
     read = _read([found.table.files[row] for row in rows], address, dataset, progress)
     captions = {row: f"{distance:.3f}" for row, distance in zip(found.rows, found.distances, strict=True)}
-    shown = [] if found.own_row is not None else [("query", read_picture(Path(found.like), CELL))]
+    shown = [] if found.own_row is not None else [("query", read_image(Path(found.like), CELL))]
     shown += [(captions.get(r, "query"), read[f]) for r in rows if (f := found.table.files[r]) in read]
     sheet = contact_sheet(
         [pictures(image[None])[0] for _, image in shown],

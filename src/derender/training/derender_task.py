@@ -11,7 +11,7 @@ import torch
 from jaxtyping import UInt8
 from torch import Generator, Tensor, nn
 
-from derender.data import PictureSet, split_indices
+from derender.data import ImageSet, split_indices
 from derender.model import Derenderer, load
 from derender.objectives import load_vgg16
 from derender.objectives.perceptual import build_perceptual
@@ -33,7 +33,7 @@ from derender.training.watch import Watcher
 
 def train(
     config: TrainConfig,
-    pictures: PictureSet,
+    pictures: ImageSet,
     out: str | Path,
     *,
     resume: bool = False,

@@ -20,7 +20,7 @@ from PIL import Image
 from torch import Tensor, nn
 from torch.utils.tensorboard.writer import SummaryWriter
 
-from derender.data import PictureSet, split_indices
+from derender.data import ImageSet, split_indices
 from derender.storage.atomic import atomic_file
 from derender.training.batches import Batches, Reader, batches_of, random_stream
 from derender.training.checkpoint import ModelOfRun, TrainState, resume_from, save_checkpoint
@@ -65,7 +65,7 @@ SampleSheet = Callable[[Any, Tensor], Image.Image]
 
 def train_task(
     task: TrainingTask,
-    pictures: PictureSet,
+    pictures: ImageSet,
     out: str | Path,
     *,
     resume: bool = False,

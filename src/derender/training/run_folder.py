@@ -15,7 +15,7 @@ from typing import Any
 import torch
 import yaml
 
-from derender.data import PictureSet, Split
+from derender.data import ImageSet, Split
 from derender.settings import Settings
 from derender.storage.atomic import atomic_file, remove_abandoned
 from derender.training.config import TrainConfig, config_from_tree, to_yaml, without_removed
@@ -204,7 +204,7 @@ def environment(device: str) -> dict[str, Any]:
     }
 
 
-def describe_data(pictures: PictureSet, split: Split) -> dict[str, Any]:
+def describe_data(pictures: ImageSet, split: Split) -> dict[str, Any]:
     """The data of a run, for its environment.json."""
     return {
         "layout": pictures.layout,

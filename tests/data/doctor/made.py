@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from derender.data.pictures import PictureSet
+from derender.data.image_set import ImageSet
 from derender.data.synthetic import faces
 from derender.data.synthetic.settings import FaceSettings, LightSettings, ViewSettings
 
@@ -78,6 +78,6 @@ def copies(count: int, generator: np.random.Generator) -> np.ndarray:
     return np.clip(shifted * gain + generator.normal(0, 2, shifted.shape), 0, 255).astype(np.uint8)
 
 
-def as_set(images: np.ndarray, **more) -> PictureSet:
+def as_set(images: np.ndarray, **more) -> ImageSet:
     names = tuple(f"{number:05}.png" for number in range(len(images)))
-    return PictureSet(np.ascontiguousarray(images), names, source="made", **more)
+    return ImageSet(np.ascontiguousarray(images), names, source="made", **more)

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 from tests.data.doctor import made
 
-from derender.data import Duplicate, Skipped, open_source, read_pictures
+from derender.data import Duplicate, Skipped, open_source, read_images
 from derender.data.doctor import CHECKS, doctor, measure_originals
 from derender.data.doctor.findings import CheckFinding, judged, verdict_of
 from derender.data.doctor.structure import JackknifeEstimate
@@ -173,13 +173,13 @@ def test_sizes_come_from_the_headers(tmp_path: Path):
 @pytest.mark.parametrize("name", ["utkface64", "lfw64", "celeba64", "synface64", "syncar64"])
 def test_the_development_sets_suit_but_for_their_number(name, shared_data):
     path = shared_data(f"data/{name}.zip")
-    found = doctor(read_pictures(path, 64, limit=400, keep_duplicates=True, workers=1))
+    found = doctor(read_images(path, 64, limit=400, keep_duplicates=True, workers=1))
     assert [f.name for f in found.findings if f.level in ("trouble", "objection")] == ["number"]
 
 
 def test_faces_and_cars_are_two_kinds(shared_data):
     halves = [
-        read_pictures(shared_data(f"data/{name}.zip"), 64, limit=150, workers=1).images
+        read_images(shared_data(f"data/{name}.zip"), 64, limit=150, workers=1).images
         for name in ("utkface64", "syncar64")
     ]
     found = doctor(made.as_set(np.concatenate(halves)))
@@ -202,6 +202,6 @@ def test_a_zip_is_examined_like_a_folder(tmp_path: Path):
         for name in names:
             archive.write(name, name.name)
     (inside, beside) = (
-        doctor(read_pictures(where, 64, keep_duplicates=True)) for where in (tmp_path / "set.zip", tmp_path)
+        doctor(read_images(where, 64, keep_duplicates=True)) for where in (tmp_path / "set.zip", tmp_path)
     )
     assert inside.findings == beside.findings

@@ -9,7 +9,7 @@ import pyarrow.parquet as pq
 import pytest
 from PIL import Image as Pillow
 
-from derender.data import read_picture, read_pictures
+from derender.data import read_image, read_images
 
 datasets = pytest.importorskip("datasets", reason="needs the extra: pip install 'derender[huggingface]'")
 
@@ -76,25 +76,25 @@ def test_parquet_as_on_the_hub(rows, places):
     rows(3).to_parquet(folder / "train-00000-of-00002.parquet")
     rows(4, 3).to_parquet(folder / "train-00001-of-00002.parquet")
     rows(2, 50).to_parquet(folder / "test-00000-of-00001.parquet")
-    check(read_pictures("set", 9), 7)
-    check(read_pictures("set", 9), 7)  # from the cache
-    assert read_pictures("set::test", 9).files == ("test/00000000", "test/00000001")
-    every = read_pictures("set::all", 9)
+    check(read_images("set", 9), 7)
+    check(read_images("set", 9), 7)  # from the cache
+    assert read_images("set::test", 9).files == ("test/00000000", "test/00000001")
+    every = read_images("set::all", 9)
     assert every.partition.tolist().count("train") == 7 and every.partition.tolist().count("test") == 2
-    assert len(read_pictures("set", 9, limit=2)) == 2
+    assert len(read_images("set", 9, limit=2)) == 2
     with pytest.raises(ValueError, match=r"set::tset: it has no split 'tset'; did you mean 'test'\?"):
-        read_pictures("set::tset", 9)
+        read_images("set::tset", 9)
     single = folder / "test-00000-of-00001.parquet"
-    assert len(read_pictures(single, 9)) == 2
+    assert len(read_images(single, 9)) == 2
 
 
 def test_saved_to_disk(rows, places):
     rows(6).save_to_disk("one")
-    check(read_pictures("one", 9), 6)
+    check(read_images("one", 9), 6)
     datasets.DatasetDict({"train": rows(5), "test": rows(2)}).save_to_disk("two")
-    check(read_pictures("two", 9), 5)
-    assert len(read_pictures("two::test", 9)) == 2
-    assert len(read_pictures("two::all", 9, keep_duplicates=True)) == 7
+    check(read_images("two", 9), 5)
+    assert len(read_images("two::test", 9)) == 2
+    assert len(read_images("two::all", 9, keep_duplicates=True)) == 7
 
 
 def test_a_stream_goes_on_in_the_middle_of_its_splits(rows, places):
@@ -114,10 +114,10 @@ def test_a_folder_of_pictures_asked_for_as_a_data_set(places, encoded):
     for name in ("cat/1.png", "dog/2.png"):
         (places / "tree" / name).parent.mkdir(parents=True, exist_ok=True)
         (places / "tree" / name).write_bytes(encoded(len(name) + ord(name[0])))
-    assert read_pictures("tree", 12).layout == "classes"
-    streamed = read_pictures("tree", 12, dataset="huggingface")
+    assert read_images("tree", 12).layout == "classes"
+    streamed = read_images("tree", 12, dataset="huggingface")
     assert streamed.files == ("train/00000000-1.png", "train/00000001-2.png")
-    np.testing.assert_array_equal(streamed.images[0], read_picture(places / "tree/cat/1.png", 12))
+    np.testing.assert_array_equal(streamed.images[0], read_image(places / "tree/cat/1.png", 12))
 
 
 def test_no_picture_column_and_several(rows, places):
@@ -125,16 +125,16 @@ def test_no_picture_column_and_several(rows, places):
     with pytest.raises(
         ValueError, match=r"none\.parquet has no column of images; its columns are label \(int64\)"
     ):
-        read_pictures("none.parquet", 9)
+        read_images("none.parquet", 9)
     rows(5, other=1).to_parquet("both.parquet")
     with pytest.raises(
         ValueError,
         match=r"several columns of images \(photo, other\); name one: 'both\.parquet\?column=photo'",
     ):
-        read_pictures("both.parquet", 9)
-    check(read_pictures("both.parquet?column=other", 9), 5)
+        read_images("both.parquet", 9)
+    check(read_images("both.parquet?column=other", 9), 5)
     with pytest.raises(ValueError, match=r"no column of images 'photos'; did you mean 'photo'"):
-        read_pictures("both.parquet?column=photos", 9)
+        read_images("both.parquet?column=photos", 9)
 
 
 def test_rows_that_only_point_at_a_file_outside_are_not_followed(places, encoded):
@@ -144,7 +144,7 @@ def test_rows_that_only_point_at_a_file_outside_are_not_followed(places, encoded
     schema = datasets.Features({"image": datasets.Image()}).arrow_schema
     pointing = [{"bytes": None, "path": "../secret.png"}, {"bytes": None, "path": "in.png"}, None]
     pq.write_table(pa.table({"image": pointing}, schema=schema), "set/rows.parquet")
-    pictures = read_pictures("set/rows.parquet", 12)
+    pictures = read_images("set/rows.parquet", 12)
     assert len(pictures) == 1
     assert "which is not in the data set" in pictures.skipped[0].reason
     assert pictures.skipped[1].reason == "no image in this row"
@@ -163,18 +163,18 @@ def test_a_path_wins_and_an_id_that_cannot_be_reached_names_both_readings(places
     (places / "owner").mkdir()
     (places / "owner" / "name").mkdir()
     (places / "owner" / "name" / "a.png").write_bytes(encoded(1))
-    assert len(read_pictures("owner/name", 8)) == 1
+    assert len(read_images("owner/name", 8)) == 1
     assert not asked
     with pytest.raises(
         ValueError,
         match=r"owner/nam does not exist here; did you mean 'name'\?; "
         r"and the Hugging Face Hub cannot be asked for owner/nam \(OSError\): check the network",
     ):
-        read_pictures("owner/nam", 8)
+        read_images("owner/nam", 8)
     assert asked == ["owner/nam"]
     for path in ("./owner/nam", "owner/nam.zip", "owner/x.jpg", "owner/nam/more"):
         with pytest.raises(ValueError, match="does not exist"):
-            read_pictures(path, 8)
+            read_images(path, 8)
     assert len(asked) == 1
 
 
@@ -189,9 +189,9 @@ def test_what_the_hub_answers_is_told(monkeypatch):
     with pytest.raises(
         ValueError, match=r"owner/none does not exist here.*and the Hugging Face Hub has no data set"
     ):
-        read_pictures("owner/none", 8)
+        read_images("owner/none", 8)
     with pytest.raises(ValueError, match="no folder here and no id"):
-        read_pictures("not an id", 8, dataset="huggingface")
+        read_images("not an id", 8, dataset="huggingface")
 
 
 def test_an_id_is_loaded_at_the_commit_the_hub_names(rows, places, monkeypatch):
@@ -208,7 +208,7 @@ def test_an_id_is_loaded_at_the_commit_the_hub_names(rows, places, monkeypatch):
     answer = type("Info", (), {"sha": "abc123"})
     monkeypatch.setattr(huggingface_hub.HfApi, "dataset_info", lambda self, name, **_: answer)
     monkeypatch.setattr(datasets, "load_dataset", load)
-    check(read_pictures("owner/name?config=small", 9), 5)
+    check(read_images("owner/name?config=small", 9), 5)
     assert seen == [("owner/name", "small", "abc123", True)]
 
 
@@ -217,4 +217,4 @@ def test_the_missing_library_is_named_with_its_extra(places, monkeypatch):
     with pytest.raises(
         ValueError, match=r"needs the package datasets: pip install 'derender\[huggingface\]'"
     ):
-        read_pictures("owner/name", 8)
+        read_images("owner/name", 8)

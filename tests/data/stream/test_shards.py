@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from derender.data import read_picture, read_pictures
+from derender.data import read_image, read_images
 from derender.data.shards import expand_braces, find_shards
 
 
@@ -32,11 +32,11 @@ def members(count: int, first: int = 0) -> dict[str, bytes | str | None]:
     ("name", "mode"), [("a.tar", "w"), ("a.tar.gz", "w:gz"), ("a.tar.xz", "w:xz"), ("a.tar.bz2", "w:bz2")]
 )
 def test_pictures_and_labels_are_those_packed(shard, encoded, name, mode):
-    pictures = read_pictures(shard(name, members(70), mode), 12)
+    pictures = read_images(shard(name, members(70), mode), 12)
     assert pictures.layout == "webdataset"
     assert pictures.files == tuple(f"{name}/{row:04d}.png" for row in range(70))
     for row in (0, 31, 32, 69):
-        np.testing.assert_array_equal(pictures.images[row], read_picture(encoded(3 * row), 12))
+        np.testing.assert_array_equal(pictures.images[row], read_image(encoded(3 * row), 12))
     assert pictures.label("class").tolist() == [str(row % 3) for row in range(70)]
     assert pictures.label("who").tolist() == [f"p{row}" for row in range(70)]
     assert pictures.label("age").dtype == np.float32
@@ -49,8 +49,8 @@ def test_pictures_and_labels_are_those_packed(shard, encoded, name, mode):
 def test_the_same_as_the_folder_it_was_packed_from(tree, shard, encoded):
     """Order, pixels, unreadable ones and copies as if the members lay in a folder."""
     files = {"a.png": None, "b.png": "no image", "c.png": encoded(0), "d.png": None, "e.jpg": b""}
-    folder = read_pictures(tree(files), 8)
-    packed = read_pictures(shard("x.tar", files), 8)
+    folder = read_images(tree(files), 8)
+    packed = read_images(shard("x.tar", files), 8)
     strip = len("x.tar/")
     assert tuple(file[strip:] for file in packed.files) == folder.files
     np.testing.assert_array_equal(packed.images, folder.images)
@@ -60,7 +60,7 @@ def test_the_same_as_the_folder_it_was_packed_from(tree, shard, encoded):
     assert [(row.file[strip:], row.first[strip:]) for row in packed.duplicates] == [
         (row.file, row.first) for row in folder.duplicates
     ]
-    kept = read_pictures(shard("x.tar", files), 8, keep_duplicates=True)
+    kept = read_images(shard("x.tar", files), 8, keep_duplicates=True)
     assert len(kept) == 3 and kept.duplicates == packed.duplicates
 
 
@@ -69,17 +69,17 @@ def test_names_with_braces_a_folder_and_its_parts(shard, tmp_path):
         shard(f"set/train-{number:03d}.tar", members(4, 4 * number), first=100 * number)
     shard("set/val-000.tar", members(2, 50), first=500)
     pattern = str(tmp_path / "set" / "train-{000..002}.tar")
-    assert len(read_pictures(pattern, 8)) == 12
-    assert len(read_pictures(str(tmp_path / "set" / "{train,val}-000.tar"), 8)) == 6
-    whole = read_pictures(tmp_path / "set", 8)
+    assert len(read_images(pattern, 8)) == 12
+    assert len(read_images(str(tmp_path / "set" / "{train,val}-000.tar"), 8)) == 6
+    whole = read_images(tmp_path / "set", 8)
     assert whole.partition.tolist() == ["train"] * 12 + ["validation"] * 2
-    assert len(read_pictures(f"{tmp_path / 'set'}::val", 8)) == 2
-    assert len(read_pictures(tmp_path / "set", 8, subset="train", limit=5)) == 5
+    assert len(read_images(f"{tmp_path / 'set'}::val", 8)) == 2
+    assert len(read_images(tmp_path / "set", 8, subset="train", limit=5)) == 5
     assert len(find_shards(tmp_path / "set", "set")) == 4
     with pytest.raises(ValueError, match=r"no shards of a part 'tes'; there are set, train, val"):
-        read_pictures(f"{tmp_path / 'set'}::tes", 8)
+        read_images(f"{tmp_path / 'set'}::tes", 8)
     with pytest.raises(ValueError, match=r"2 of the 5 shards of .* do not exist; the first is .*train-003"):
-        read_pictures(str(tmp_path / "set" / "train-{000..004}.tar"), 8)
+        read_images(str(tmp_path / "set" / "train-{000..004}.tar"), 8)
 
 
 def test_braces():
@@ -101,7 +101,7 @@ def test_of_a_truncated_shard_counts_what_comes_before(shard, where):
         "between members": seventh.offset,
     }[where]
     path.write_bytes(path.read_bytes()[:cut])
-    pictures = read_pictures(path, 8)
+    pictures = read_images(path, 8)
     assert pictures.files == tuple(f"cut.tar/{row}.png" for row in range(7))
     (fault,) = pictures.skipped
     assert fault.file == "cut.tar" and "damaged or cut short, what comes before counts" in fault.reason
@@ -119,7 +119,7 @@ def test_a_damaged_shard_does_not_end_the_others(shard, tmp_path):
     with tarfile.open(header) as tar:
         raw[tar.getmembers()[2].offset + 150] ^= 0xFF
     header.write_bytes(raw)
-    pictures = read_pictures(tmp_path / "s", 8)
+    pictures = read_images(tmp_path / "s", 8)
     count = sum(file.startswith("3.tar.gz") for file in pictures.files)
     assert 10 < count <= 40
     assert len(pictures) == 3 + count + 2
@@ -134,13 +134,13 @@ def test_several_pictures_in_a_sample_are_a_question(shard):
         ValueError,
         match=r"'1' in p\.tar has several images \(jpg, seg\.png\); name one: '.*p\.tar\?column=jpg'",
     ):
-        read_pictures(path, 8)
-    jpgs = read_pictures(f"{path}?column=jpg", 8)
+        read_images(path, 8)
+    jpgs = read_images(f"{path}?column=jpg", 8)
     assert jpgs.files == ("p.tar/1.jpg", "p.tar/2.jpg")
     assert [row.reason for row in jpgs.skipped] == ["no 'jpg' in this sample (it has seg.png)"]
-    assert len(read_pictures(f"{path}?column=seg.png", 8)) == 3
+    assert len(read_images(f"{path}?column=seg.png", 8)) == 3
     with pytest.raises(ValueError, match=r"unknown option 'colum'; did you mean 'column'"):
-        read_pictures(f"{path}?colum=jpg", 8)
+        read_images(f"{path}?colum=jpg", 8)
 
 
 def test_hostile_names_and_members_write_nothing_and_read_nothing_outside(shard, tmp_path, encoded):
@@ -161,7 +161,7 @@ def test_hostile_names_and_members_write_nothing_and_read_nothing_outside(shard,
             info.type, info.linkname = kind, str(tmp_path / "secret.png")
             tar.addfile(info)
     before = sorted(file for file in tmp_path.rglob("*") if "cache" not in file.parts)
-    pictures = read_pictures(path, 8)
+    pictures = read_images(path, 8)
     assert len(pictures) == 3
     assert sorted(file for file in tmp_path.rglob("*") if "cache" not in file.parts) == before
 
@@ -182,7 +182,7 @@ def test_labels_that_are_missing_mixed_too_large_or_no_labels(shard):
             "6.txt": "a caption without an image",
         },
     )
-    pictures = read_pictures(path, 8)
+    pictures = read_images(path, 8)
     labels = {name: column.tolist() for name, column in pictures.labels.items()}
     assert labels.pop("late")[2] == 2.5
     assert labels == {
@@ -196,39 +196,39 @@ def test_labels_that_are_missing_mixed_too_large_or_no_labels(shard):
 
 def test_it_is_decoded_once_and_again_after_a_change(shard, cache, encoded):
     path = shard("c.tar", members(5))
-    first = read_pictures(path, 8)
+    first = read_images(path, 8)
     assert isinstance(first.images, np.memmap)
     (file,) = cache.iterdir()
     made = file.stat().st_mtime_ns
-    again = read_pictures(path, 8)
+    again = read_images(path, 8)
     assert file.stat().st_mtime_ns == made
     np.testing.assert_array_equal(first.images, again.images)
     assert again.labels.keys() == first.labels.keys()
     shard("c.tar", members(6))
-    assert len(read_pictures(path, 8)) == 6
+    assert len(read_images(path, 8)) == 6
     assert len(list(cache.iterdir())) == 1
 
 
 def test_nothing_usable_and_an_interruption_leave_nothing(shard, cache, tmp_path):
     with pytest.raises(ValueError, match=r"no image in .*e\.tar \(webdataset\): it is empty"):
-        read_pictures(shard("e.tar", {}), 8)
+        read_images(shard("e.tar", {}), 8)
     with pytest.raises(ValueError, match=r"the first is 't\.tar/1': no image in this sample \(it has txt\)"):
-        read_pictures(shard("t.tar", {"1.txt": "x"}), 8)
+        read_images(shard("t.tar", {"1.txt": "x"}), 8)
     (tmp_path / "folder").mkdir()
     with pytest.raises(ValueError, match="holds no shards"):
-        read_pictures(tmp_path / "folder", 8, dataset="webdataset")
+        read_images(tmp_path / "folder", 8, dataset="webdataset")
 
     def stop(done: int, total: int) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        read_pictures(shard("i.tar", members(40)), 8, progress=stop)
+        read_images(shard("i.tar", members(40)), 8, progress=stop)
     assert list(cache.iterdir()) == []
 
 
 def test_progress_ends_at_the_total(shard):
     calls = []
-    read_pictures(shard("n.tar", members(70)), 8, progress=lambda done, total: calls.append((done, total)))
+    read_images(shard("n.tar", members(70)), 8, progress=lambda done, total: calls.append((done, total)))
     assert [done for done, _ in calls] == [32, 64, 70, 70]
     assert all(done <= total <= 80 for done, total in calls) and calls[-1] == (70, 70)
 
@@ -236,4 +236,4 @@ def test_progress_ends_at_the_total(shard):
 def test_a_folder_with_a_picture_beside_a_tar_is_a_folder(shard, tmp_path, encoded):
     shard("f/a.tar", members(3))
     (tmp_path / "f" / "own.png").write_bytes(encoded(1))
-    assert read_pictures(tmp_path / "f", 8).files == ("own.png",)
+    assert read_images(tmp_path / "f", 8).files == ("own.png",)

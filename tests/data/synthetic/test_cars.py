@@ -7,7 +7,7 @@ from scipy.ndimage import binary_erosion
 from scipy.spatial import cKDTree
 
 from derender.data.ground_truth import read_ground_truth
-from derender.data.pictures import read_pictures
+from derender.data.image_set import read_images
 from derender.data.synthetic import CAR_LIGHTS, CAR_VIEWS, CarSettings, CarViewSettings, cars, write
 from derender.data.synthetic.cars import about_x, class_of, euler_angles, view_rotation
 from derender.data.synthetic.settings import CLASSES
@@ -194,7 +194,7 @@ def test_shifts_keep_cars_inside_the_picture():
 
 def test_written_sets_read_back_as_rendered_cars(sample, tmp_path):
     folder = write(sample, tmp_path / "cars")
-    pictures, truth = read_pictures(folder, 64), read_ground_truth(folder)
+    pictures, truth = read_images(folder, 64), read_ground_truth(folder)
     assert pictures.layout == "syncar" and len(pictures.images) == 32
     assert pictures.labels["class"].tolist() == sample.labels["class"].tolist()
     assert (truth.mask == sample.mask).all() and np.abs(truth.depth - sample.depth).max() < 0.4 / 65535

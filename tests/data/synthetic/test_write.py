@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from derender.data import read_pictures
+from derender.data import read_images
 from derender.data.ground_truth import read_ground_truth
 from derender.data.masks import read_masks
 from derender.data.synthetic import FaceSettings, faces, write, write_tracks
@@ -108,7 +108,7 @@ def test_parts_are_written_as_class_numbers_with_their_names(made, folder):
 def test_parts_read_back_as_masks_for_segmentation(made, folder):
     read = read_masks(folder, 64)
     assert read.classes == made.part_names and (read.masks == made.parts).all()
-    assert read.pictures.label("age").tolist() == made.labels["age"].tolist()
+    assert read.images.label("age").tolist() == made.labels["age"].tolist()
 
 
 def test_tracks_read_back_as_tracks(tmp_path):
@@ -121,7 +121,7 @@ def test_tracks_read_back_as_tracks(tmp_path):
         "tracks/id0000/track_000/002.jpg",
         "tracks/id0000/track_001/000.jpg",
     ]
-    read = read_pictures(folder, 16)
+    read = read_images(folder, 16)
     assert len(read) == 12 and len(set(read.label("track").tolist())) >= 2
     assert len(set(read.label("identity").tolist())) == 2
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from tests.evaluation.disentanglement.conftest import card
 
-from derender.data import PictureSet
+from derender.data import ImageSet
 from derender.evaluation.disentanglement.card import (
     disentangle,
     random_blocks,
@@ -23,7 +23,7 @@ def model() -> Derenderer:
     return Derenderer.seeded(settings.model_copy(update={"network": network}), 3).eval()
 
 
-def lit_pictures(count: int = 60) -> PictureSet:
+def lit_pictures(count: int = 60) -> ImageSet:
     """Ramps whose slopes are labelled as light: any encoder sees them."""
     rng = np.random.default_rng(0)
     slopes = rng.uniform(-1, 1, (count, 2)).astype(np.float32)
@@ -31,7 +31,7 @@ def lit_pictures(count: int = 60) -> PictureSet:
     ramps = 0.5 + 0.2 * (slopes[:, :1, None] * axis + slopes[:, 1:, None] * axis[:, None])
     images = np.repeat(ramps[:, None] * 255, 3, axis=1).astype(np.uint8)
     labels = {"light_yaw_rad": slopes[:, 0], "light_pitch_rad": slopes[:, 1]}
-    return PictureSet(images, tuple(map(str, range(count))), labels)
+    return ImageSet(images, tuple(map(str, range(count))), labels)
 
 
 def test_the_card_holds_the_model_and_every_control_and_repeats_itself():
@@ -59,7 +59,7 @@ def test_the_card_holds_the_model_and_every_control_and_repeats_itself():
 
 def test_without_true_factors_only_their_part_is_missing():
     pictures = lit_pictures(20)
-    real = PictureSet(pictures.images, pictures.files, {"age": pictures.labels["light_yaw_rad"]})
+    real = ImageSet(pictures.images, pictures.files, {"age": pictures.labels["light_yaw_rad"]})
     card = disentangle(model(), real, seeds=(0,), swap_images=4).result
     scores = card.rows["model"][0]
     assert scores.truth is None and np.isfinite(scores.pearson.mean_per_dimension)

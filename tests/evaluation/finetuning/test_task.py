@@ -9,7 +9,7 @@ from safetensors.torch import load_file
 from torch.nn.functional import cross_entropy
 
 import derender
-from derender.data import PictureSet
+from derender.data import ImageSet
 from derender.evaluation.finetuning import (
     FinetuneTask,
     load_finetuned,
@@ -39,7 +39,7 @@ def _restore_determinism():
 
 
 @pytest.fixture(scope="module")
-def pictures() -> PictureSet:
+def pictures() -> ImageSet:
     """Bright and dark images of which some carry no label; three shades; a value that never changes."""
     random = np.random.default_rng(0)
     shade = np.arange(60) % 3
@@ -53,7 +53,7 @@ def pictures() -> PictureSet:
         "same": np.zeros(60, np.int8),
     }
     files = tuple(f"{row:02d}.png" for row in range(60))
-    return PictureSet(images.astype(np.uint8), files, labels, source="made by the test")
+    return ImageSet(images.astype(np.uint8), files, labels, source="made by the test")
 
 
 def config(*more: str, labels=("shade",), **explicit) -> FinetuneConfig:

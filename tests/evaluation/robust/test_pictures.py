@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from derender import Derenderer
-from derender.data import PictureSet
+from derender.data import ImageSet
 from derender.evaluation.linear_task import task_of
 from derender.evaluation.memory import Memory
 from derender.evaluation.robust import (
@@ -87,7 +87,7 @@ def test_a_rendered_trial_changes_the_angle_alone():
     settings = Derenderer.from_preset("small", image_size=32, width=4, light_width=4).settings
     model = Derenderer.seeded(settings, 0, renderer=renderer).eval()
     images = np.random.default_rng(0).integers(0, 256, (8, 3, 32, 32), dtype=np.uint8)
-    pictures = PictureSet(images, tuple("abcdefgh"))
+    pictures = ImageSet(images, tuple("abcdefgh"))
     task = task_of({"who": np.array(list("xyxyxyxy"))})
     learn, test = np.arange(6), np.array([6, 7])
     trial = rendered_trial(model, pictures, task, learn, test, (YAW, LIGHT), (0, 40))
@@ -118,7 +118,7 @@ def test_true_angles_divide_tracks():
     track = np.repeat(np.arange(tracks), frames)
     angle = np.radians(np.where(track % 2, 1, -1) * (3.0 * track + 1))
     labels = {"track": track.astype(str), "camera_y_rad": angle}
-    pictures = PictureSet(np.zeros((32, 3, 4, 4), np.uint8), tuple(map(str, range(32))), labels)
+    pictures = ImageSet(np.zeros((32, 3, 4, 4), np.uint8), tuple(map(str, range(32))), labels)
     task = task_of({"who": np.array(list("ab"))[track // 2 % 2]})
     trial = true_angle_trial(pictures, task, [YAW], portions=2)
     (curve,) = trial.curves
@@ -129,7 +129,7 @@ def test_true_angles_divide_tracks():
     assert np.array_equal(curve.ordinary, curve.tested[0])
     with pytest.raises(ValueError, match="there is no 'light_yaw_rad'"):
         true_angle_trial(pictures, task, [LIGHT])
-    still = PictureSet(pictures.images, pictures.files, {**labels, "camera_y_rad": np.zeros(32)})
+    still = ImageSet(pictures.images, pictures.files, {**labels, "camera_y_rad": np.zeros(32)})
     with pytest.raises(ValueError, match="all at one angle"):
         true_angle_trial(still, task, [YAW])
 

@@ -5,14 +5,14 @@ import pytest
 import torch
 
 from derender import Derenderer
-from derender.data import PictureSet
+from derender.data import ImageSet
 from derender.evaluation.segmentation import SegmentationData, divide
 
 COLOURS = np.array([[200, 30, 30], [30, 200, 30], [30, 30, 200], [120, 120, 120]], np.uint8)
 NAMES = ("sky", "wall", "floor", "nothing")
 
 
-def bands(count: int = 40, size: int = 32) -> tuple[PictureSet, np.ndarray]:
+def bands(count: int = 40, size: int = 32) -> tuple[ImageSet, np.ndarray]:
     """Bands of sky, wall and floor with edges that move; the fourth class is never shown."""
     random = np.random.default_rng(0)
     masks = np.zeros((count, size, size), np.uint8)
@@ -22,7 +22,7 @@ def bands(count: int = 40, size: int = 32) -> tuple[PictureSet, np.ndarray]:
         mask[second:] = 2
     images = np.moveaxis(COLOURS[masks], -1, 1).astype(int) + random.integers(-20, 20, (count, 3, size, size))
     files = tuple(f"{row:03d}.png" for row in range(count))
-    return PictureSet(images.clip(0, 255).astype(np.uint8), files, source="made by the test"), masks
+    return ImageSet(images.clip(0, 255).astype(np.uint8), files, source="made by the test"), masks
 
 
 @pytest.fixture(scope="session")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from derender.data import read_pictures
+from derender.data import read_images
 from derender.features import FeatureTable, embed_pictures
 from derender.features.neighbours import nearest
 from derender.report.viewer.app import Application, Viewer
@@ -27,7 +27,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def table(model, folder) -> FeatureTable:
-    return embed_pictures(model, read_pictures(folder, SIZE), origin={"data": str(folder)})
+    return embed_pictures(model, read_images(folder, SIZE), origin={"data": str(folder)})
 
 
 def test_neighbours_of_a_picture_of_the_table(model, folder, table, client):

@@ -25,7 +25,7 @@ from fuzzing.inputs import (
 from hypothesis import strategies as st
 
 import derender
-from derender.data import checked_footer, decode, open_source, quiet_pillow, read_pictures
+from derender.data import checked_footer, decode, open_source, quiet_pillow, read_images
 from derender.data.cache import cache_file, read_cache
 from derender.evaluation.memory import Memory
 from derender.features import FeatureTable
@@ -197,7 +197,7 @@ def targets(place: Path) -> Iterator[Target]:
 
     def data_set(content: bytes) -> None:
         archive.write_bytes(content)
-        read_pictures(archive, 8, workers=1)
+        read_images(archive, 8, workers=1)
 
     yield Target("data set in a zip", 0.005, bytes_like(zips[0]), data_set, zips[:1])
 
@@ -205,7 +205,7 @@ def targets(place: Path) -> Iterator[Target]:
 
     def shard_bytes(content: bytes) -> None:
         shard.write_bytes(content)
-        read_pictures(shard, 8, workers=1, cache=place / "cache")
+        read_images(shard, 8, workers=1, cache=place / "cache")
 
     yield Target("data set in a tar shard", 0.005, bytes_like(tarred()), shard_bytes, [tarred()])
 
@@ -233,14 +233,14 @@ def targets(place: Path) -> Iterator[Target]:
     for number, content in enumerate(encoded_pictures()[:2]):
         (pictures / f"{number}.png").write_bytes(content)
         os.utime(pictures / f"{number}.png", (0, 0))
-    read_pictures(pictures, 8, cache=place / "rows", workers=1)
+    read_images(pictures, 8, cache=place / "rows", workers=1)
     (rows,) = (place / "rows").iterdir()
     assert cache_file(place / "rows", "pictures", ("x",)).parent == rows.parent
 
     def rows_bytes(content: bytes) -> None:
         rows.write_bytes(content)
         read_cache(rows, "fingerprint", 8)
-        read_pictures(pictures, 8, cache=place / "rows", workers=1)
+        read_images(pictures, 8, cache=place / "rows", workers=1)
 
     cached = rows.read_bytes()
     yield Target("decoded images (cache)", 0.005, bytes_like(cached), rows_bytes, [cached])

@@ -10,7 +10,7 @@ import sys
 import time
 from pathlib import Path
 
-from derender.data import open_images, read_pictures
+from derender.data import open_images, read_images
 from derender.features import DisentangledFeatures, FeatureTable, embed_to_file
 from derender.model import load
 from derender.storage.atomic import atomic_file
@@ -27,7 +27,7 @@ def embed_until_told(folder: Path, model: str) -> None:
             source = folder / ("data.zip" if passes % 2 else "data")
             with open_images(source) as stream:
                 rows = embed_to_file(stream, net, out, fresh=True).rows
-            pictures = read_pictures(source, net.image_size, cache=folder / "cache")
+            pictures = read_images(source, net.image_size, cache=folder / "cache")
             rows += embed_to_file(pictures, net, out, fresh=True).rows
             table = FeatureTable.read(out)
             width = features.transform(pictures.images[:32]).shape[1]

@@ -26,7 +26,7 @@ def register(group: typer.Typer) -> None:
 
 @gathered
 def cluster(
-    images: options.ImageSet,
+    images: options.DataOptions,
     subject: scoring.ScoredSubject,
     labels: scoring.Labels,
     computed: scoring.Computed,

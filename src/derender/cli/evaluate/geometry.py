@@ -16,7 +16,7 @@ def register(group: typer.Typer) -> None:
 
 @gathered
 def geometry(
-    images: options.ImageSet,
+    images: options.DataOptions,
     trained: options.TrainedModel,
     published: scoring.Published,
     batch_size: options.BatchSize = 64,

@@ -39,7 +39,7 @@ def register(group: typer.Typer) -> None:
 
 @gathered
 def linear(
-    images: options.ImageSet,
+    images: options.DataOptions,
     subject: scoring.ScoredSubject,
     labels: scoring.Labels,
     computed: scoring.Computed,

@@ -65,7 +65,7 @@ def register(group: typer.Typer) -> None:
 
 @gathered
 def robustness(
-    images: options.ImageSet,
+    images: options.DataOptions,
     trial: TrialOptions,
     labels: scoring.Labels,
     computed: scoring.Computed,

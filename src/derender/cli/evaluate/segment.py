@@ -50,7 +50,7 @@ def register(group: typer.Typer) -> None:
 
 @gathered
 def segment(
-    images: options.ImageSet,
+    images: options.DataOptions,
     trained: options.TrainedModel,
     published: scoring.Published,
     masks: Masks = None,

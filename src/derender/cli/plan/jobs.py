@@ -14,7 +14,7 @@ from derender.baselines.registry import CONTROLS
 from derender.cli.console import plain
 from derender.cli.plan.settings import OURS, WITHOUT_LOOP
 from derender.cli.plan.sweep import COMPONENTS, BudgetUsed, Collapsed, Job, Sweep, run_progress
-from derender.data import PictureSet, split_indices
+from derender.data import ImageSet, split_indices
 from derender.evaluation.clustering import compare_clusterings
 from derender.evaluation.controls import control_rows
 from derender.evaluation.feature_rows import FeatureRow, aligned, attribute_columns, prepare
@@ -164,7 +164,7 @@ def _opened(sweep: Sweep, name: str, source: str | None) -> Any:
     return model if method.whitened else model.without_features()
 
 
-def _scored_images(sweep: Sweep, where: str, image_size: int, run: str | None = None) -> PictureSet:
+def _scored_images(sweep: Sweep, where: str, image_size: int, run: str | None = None) -> ImageSet:
     """The images to score: all, or a part of the training set's split, which ``run`` must have kept."""
     scored = sweep.plan.score[where]
     images = as_images(scored.data, image_size, dataset=scored.dataset, limit=scored.limit)

@@ -31,9 +31,9 @@ from derender.data.doctor.pixels import (
     shrunk,
 )
 from derender.data.doctor.structure import Halves, JackknifeEstimate, SymmetryAxis, jackknife
-from derender.data.names import is_picture
+from derender.data.image_set import ImageSet, read_images
+from derender.data.names import is_image
 from derender.data.opening import ListedStream, open_images
-from derender.data.pictures import PictureSet, read_pictures
 
 __all__ = [
     "CHECKS",
@@ -97,7 +97,7 @@ class Examination:
         examples: rows of images by what they show ("most typical", "least typical", "one group", ...).
     """
 
-    pictures: PictureSet
+    images: ImageSet
     verdict: Verdict
     findings: tuple[CheckFinding, ...]
     values: Mapping[str, JackknifeEstimate]
@@ -111,15 +111,15 @@ class Examination:
     def mean(self) -> Float[np.ndarray, "3 s s"] | None:
         """The compared images' mean, 0..1, or None where too few were compared."""
         rows = None if self.shared is None else self.shared.rows
-        return None if rows is None else self.pictures.images[rows].mean(axis=0, dtype=np.float64) / 255
+        return None if rows is None else self.images.images[rows].mean(axis=0, dtype=np.float64) / 255
 
     def as_json(self) -> dict[str, Any]:
         """What ``derender doctor --json`` writes."""
-        files, shared = self.pictures.files, self.shared
+        files, shared = self.images.files, self.shared
         compared = {} if shared is None else {**shared.values, "axis": shared.axis}
         copies = [(row, first) for row, first in enumerate(self.group) if row != first]
         return {
-            "source": self.pictures.source,
+            "source": self.images.source,
             "verdict": self.verdict.word,
             "because": self.verdict.because,
             "findings": self.findings,
@@ -134,13 +134,13 @@ class Examination:
             "compared": 0 if shared is None else len(shared.rows),
             "measures": {name: one for name, one in compared.items() if name != "kinship"} or None,
             "kinship": compared.get("kinship"),
-            "unreadable": self.pictures.skipped,
+            "unreadable": self.images.skipped,
             "copies": [{"file": files[row], "first": files[first]} for row, first in copies],
         }
 
 
 def doctor(
-    images: str | Path | PictureSet,
+    images: str | Path | ImageSet,
     *,
     dataset: str = "auto",
     limit: int | None = None,
@@ -150,7 +150,7 @@ def doctor(
     """Say whether images suit the method: copies, crop, symmetry, view and light. Trains nothing.
 
     Args:
-        images: a folder, zip, shards or data set as ``read_pictures`` takes it; or a set that was read with
+        images: a folder, zip, shards or data set as ``read_images`` takes it; or a set that was read with
             ``keep_duplicates=True`` at a multiple of 32 pixels.
         dataset: the layout's name, or "auto" to recognise it.
         limit: examine at most so many images.
@@ -158,12 +158,12 @@ def doctor(
         progress: called with (done, total), first of reading, then of examining.
     """
     originals = None
-    if not isinstance(images, PictureSet):
+    if not isinstance(images, ImageSet):
         source = images
-        if Path(source).is_file() and is_picture(str(source)):
+        if Path(source).is_file() and is_image(str(source)):
             raise ValueError(f"{source} is one image: a set is examined as a whole, give its folder or zip")
         how = {"dataset": dataset, "limit": limit, "keep_duplicates": True, "progress": progress}
-        images = read_pictures(source, EXAMINED_PX, **how)
+        images = read_images(source, EXAMINED_PX, **how)
         with open_images(source, dataset=dataset) as stream:
             if isinstance(stream, ListedStream):
                 originals = measure_originals(stream.files, images.files, EXAMINED_PX)
@@ -188,7 +188,7 @@ def doctor(
 
 
 def _counts(
-    images: PictureSet, pixels: Pixels, group: np.ndarray, originals: Originals | None
+    images: ImageSet, pixels: Pixels, group: np.ndarray, originals: Originals | None
 ) -> dict[str, JackknifeEstimate]:
     """What needs no comparison of what different images show."""
     count, unreadable, distinct = len(images), len(images.skipped), len(np.unique(group))
@@ -206,7 +206,7 @@ def _counts(
 
 
 def _compare(
-    images: PictureSet, pixels: Pixels, distinct: np.ndarray, generator: np.random.Generator
+    images: ImageSet, pixels: Pixels, distinct: np.ndarray, generator: np.random.Generator
 ) -> Shared | None:
     rows = distinct[~pixels.blank[distinct]]
     if len(rows) < FEWEST_COMPARED:

@@ -33,7 +33,7 @@ from derender.data.layouts.layout import (
     read_csv,
     text_column,
 )
-from derender.data.names import is_picture
+from derender.data.names import is_image
 from derender.data.parquet import check_lists, checked_footer
 from derender.data.source import Skipped, Source, read_bounded, stamps_of
 
@@ -57,7 +57,7 @@ class TableSource(Source):
         self._folder = path.parent
         self.files = (self.table,)
         _, paths, _ = _columns(self, self.table)
-        there = {file for file in paths if is_picture(file) and self._is_file(file)}
+        there = {file for file in paths if is_image(file) and self._is_file(file)}
         self.files = tuple(sorted({self.table, *there}))
 
     def _is_file(self, file: str) -> bool:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from derender.baselines.controls import pca_features, untrained_twin
-from derender.data import PictureSet
+from derender.data import ImageSet
 from derender.evaluation.bootstrap import LEVEL
 from derender.evaluation.disentanglement.ground_truth import (
     GroundTruthScores,
@@ -241,7 +241,7 @@ class DisentanglementCard:
 
 def disentangle(
     model: Any,
-    images: PictureSet | str | Path,
+    images: ImageSet | str | Path,
     *,
     seeds: Sequence[int] = (0, 1, 2),
     dimensions: str | None = "lasso",
@@ -287,7 +287,7 @@ def disentangle(
 
 def _card(
     model: Any,
-    pictures: PictureSet,
+    pictures: ImageSet,
     seeds: Sequence[int],
     dimensions: str | None,
     swap_images: int,

@@ -19,7 +19,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Generator, Tensor, nn
 
-from derender.data import PictureSet, Split, split_indices, suggestion
+from derender.data import ImageSet, Split, split_indices, suggestion
 from derender.evaluation.linear_head import head_loss, probabilities
 from derender.evaluation.linear_task import Task, task_of
 from derender.model import Derenderer, load
@@ -129,7 +129,7 @@ class JointLabels:
     split: Split
 
 
-def target_of(pictures: PictureSet, config: FinetuneConfig) -> JointLabels:
+def target_of(pictures: ImageSet, config: FinetuneConfig) -> JointLabels:
     """The labels that the configuration names, -1 where training must not see them.
 
     Raises:

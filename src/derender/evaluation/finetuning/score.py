@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from derender.baselines.controls import pca_features, pixel_features, untrained_twin
-from derender.data import PictureSet
+from derender.data import ImageSet
 from derender.evaluation.bootstrap import RESAMPLES, Difference, ScoredRow, difference
 from derender.evaluation.finetuning.joint import FinetunedModel, FinetuneTask
 from derender.evaluation.linear_probing import LINEAR_COLUMNS, compare_linear
@@ -150,7 +150,7 @@ def _codes(model: Any, task: FinetuneTask, rows: np.ndarray, memory: Memory) -> 
 def _controls(start: Any, task: FinetuneTask, rows: np.ndarray, memory: Memory) -> dict[str, np.ndarray]:
     """(R, D) features that learned nothing, of some rows of the task's images."""
     twin, train = untrained_twin(start, task.config.seed), task.target.split.train
-    shown, fitted = (PictureSet(task.images[some], tuple(map(str, some.tolist()))) for some in (rows, train))
+    shown, fitted = (ImageSet(task.images[some], tuple(map(str, some.tolist()))) for some in (rows, train))
     components = max(1, min(64, len(fitted) // 4))
     pca = memory.recall(
         "pca",

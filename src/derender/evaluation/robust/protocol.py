@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from derender.data import PictureSet, suggestion
+from derender.data import ImageSet, suggestion
 from derender.evaluation.bootstrap import RESAMPLES
 from derender.evaluation.controls import control_rows
 from derender.evaluation.feature_rows import (
@@ -41,7 +41,7 @@ WAYS = (*KINDS, "render", "truth")
 
 def robustness(
     models: Mapping[str, ModelSource] | ModelSource,
-    images: PictureSet | str | Path | None = None,
+    images: ImageSet | str | Path | None = None,
     *,
     pictures: str | None = None,
     label: str | Sequence[str] | None = None,
@@ -165,6 +165,6 @@ def robustness(
     )
     notes += [f"{len(trial.images):,} images: {trial.how}"]
     notes += [f"{curve.title}: {verdict(curve.rows[score][0], AREA)}" for curve in found.curves]
-    address = images.source if isinstance(images, PictureSet) else images
+    address = images.source if isinstance(images, ImageSet) else images
     values = {"pictures": way, "data": None if address is None else str(address), **found.numbers()}
     return Scores(found.tables(score), values, [*notes, memory.summary()], result=found)

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from derender.data import PictureSet, suggestion
+from derender.data import ImageSet, suggestion
 from derender.data.synthetic import CarSettings, FaceSettings, SyntheticSet, cars, faces
 from derender.evaluation.linear_task import Task, task_of
 from derender.evaluation.memory import Memory
@@ -186,7 +186,7 @@ def generated_trial(
 
 def rendered_trial(
     model: Any,
-    pictures: PictureSet,
+    pictures: ImageSet,
     task: Task,
     learn: np.ndarray,
     test: np.ndarray,
@@ -247,7 +247,7 @@ def rendered_trial(
 
 
 def true_angle_trial(
-    pictures: PictureSet, task: Task, axes: Sequence[Axis], *, portions: int = PORTIONS
+    pictures: ImageSet, task: Task, axes: Sequence[Axis], *, portions: int = PORTIONS
 ) -> Trial:
     """Divide the images along every axis by their true angles.
 

@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Int64, UInt8
 
-from derender.data import PictureSet, suggestion
+from derender.data import ImageSet, suggestion
 from derender.evaluation.linear_task import Task
 from derender.scene import Scene
 
@@ -211,11 +211,9 @@ class Trial:
                 raise ValueError(f"{curve.title}: {len(both)} units would be both learned from and tested")
 
     @property
-    def pictures(self) -> PictureSet:
+    def pictures(self) -> ImageSet:
         """All images, to compute features of."""
-        return PictureSet(
-            self.images, tuple(f"{row:06d}" for row in range(len(self.images))), source=self.how
-        )
+        return ImageSet(self.images, tuple(f"{row:06d}" for row in range(len(self.images))), source=self.how)
 
     @property
     def learned(self) -> np.ndarray:

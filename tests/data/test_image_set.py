@@ -1,4 +1,4 @@
-"""read_pictures from end to end: order, labels aligned with what was kept, copies, faults, progress."""
+"""read_images from end to end: order, labels aligned with what was kept, copies, faults, progress."""
 
 from dataclasses import replace
 
@@ -6,24 +6,24 @@ import numpy as np
 import pytest
 import torch
 
-from derender.data import as_float, read_picture, read_pictures
+from derender.data import as_float, read_image, read_images
 
 
 @pytest.mark.parametrize("zipped", [False, True])
 @pytest.mark.parametrize("workers", [1, 4])
 def test_pictures_in_the_order_of_their_names(tree, encoded, zipped, workers):
     names = [f"{row:03d}.png" for row in range(100)]
-    pictures = read_pictures(tree(names, zipped), 8, workers=workers)
+    pictures = read_images(tree(names, zipped), 8, workers=workers)
     assert pictures.files == tuple(names)
     assert pictures.images.dtype == np.uint8
     assert pictures.images.shape == (100, 3, 8, 8)
     for row in (0, 31, 32, 99):
-        np.testing.assert_array_equal(pictures.images[row], read_picture(encoded(row), 8))
+        np.testing.assert_array_equal(pictures.images[row], read_image(encoded(row), 8))
 
 
 def test_one_picture_file(tree):
     folder = tree(["1.png", "2.png"])
-    pictures = read_pictures(folder / "2.png", 8)
+    pictures = read_images(folder / "2.png", 8)
     assert pictures.files == ("2.png",)
     with pytest.raises(ValueError, match="training needs 2 images or more, and only one image was found in"):
         pictures.require(2)
@@ -37,7 +37,7 @@ def test_mixed_sizes_and_modes_become_one_array(tree, encoded):
         "c.png": None,
         "d.jpg": encoded(np.zeros((300, 200, 3), np.uint8), "JPEG"),
     }
-    pictures = read_pictures(tree(files), 8)
+    pictures = read_images(tree(files), 8)
     assert pictures.images.shape == (4, 3, 8, 8)
 
 
@@ -51,7 +51,7 @@ def test_unreadable_files_are_skipped_with_reasons_and_labels_stay_aligned(tree,
         "dog/2.png": None,
         "dog/3.png": b"",
     }
-    pictures = read_pictures(tree(files), 8)
+    pictures = read_images(tree(files), 8)
     assert pictures.files == ("cat/1.png", "cat/3.png", "dog/2.png")
     assert pictures.label("class").tolist() == ["cat", "cat", "dog"]
     reasons = {row.file: row.reason for row in pictures.skipped}
@@ -60,7 +60,7 @@ def test_unreadable_files_are_skipped_with_reasons_and_labels_stay_aligned(tree,
     assert "truncated" in reasons["dog/1.jpg"]
     assert reasons["dog/3.png"] == "empty file"
     for row, seed in enumerate((0, 2, 4)):
-        np.testing.assert_array_equal(pictures.images[row], read_picture(encoded(seed), 8))
+        np.testing.assert_array_equal(pictures.images[row], read_image(encoded(seed), 8))
     assert "3 images" in pictures.describe() and "3 skipped" in pictures.describe()
 
 
@@ -73,14 +73,14 @@ def test_copies_are_dropped_by_content(tree, encoded):
         "dog/2.png": encoded(1),
     }
     source = tree(files)
-    pictures = read_pictures(source, 12)
+    pictures = read_images(source, 12)
     assert pictures.files == ("cat/1.png", "cat/2.png")
     assert [(row.file, row.first) for row in pictures.duplicates] == [
         ("dog/1.bmp", "cat/1.png"),
         ("dog/2.png", "cat/1.png"),
     ]
     assert "2 identical copies dropped" in pictures.describe()
-    kept = read_pictures(source, 12, keep_duplicates=True)
+    kept = read_images(source, 12, keep_duplicates=True)
     assert len(kept) == 4
     assert kept.duplicates == pictures.duplicates
     assert "2 identical copies kept" in kept.describe()
@@ -89,11 +89,11 @@ def test_copies_are_dropped_by_content(tree, encoded):
 def test_only_unreadable_files(tree):
     source = tree({"a.png": "text", "b.jpg": "text"})
     with pytest.raises(ValueError, match=r"none of the 2 images in .* the first is 'a\.png': not an image"):
-        read_pictures(source, 8)
+        read_images(source, 8)
 
 
 def test_a_copy_of_one_picture_is_too_few(tree, encoded):
-    pictures = read_pictures(tree({"a.png": encoded(1), "b.png": encoded(1), "c.png": "text"}), 8)
+    pictures = read_images(tree({"a.png": encoded(1), "b.png": encoded(1), "c.png": "text"}), 8)
     with pytest.raises(
         ValueError, match=r"only one image was found in .* \(2 more were unreadable or identical"
     ):
@@ -101,13 +101,13 @@ def test_a_copy_of_one_picture_is_too_few(tree, encoded):
 
 
 def test_limit_takes_evenly_spaced_pictures(tree):
-    pictures = read_pictures(tree([f"{row}.png" for row in range(10)]), 8, limit=4)
+    pictures = read_images(tree([f"{row}.png" for row in range(10)]), 8, limit=4)
     assert pictures.files == ("0.png", "3.png", "6.png", "9.png")
 
 
 def test_progress_counts_up_to_the_total(tree):
     calls = []
-    read_pictures(
+    read_images(
         tree([f"{row}.png" for row in range(70)]), 8, progress=lambda done, total: calls.append((done, total))
     )
     assert [total for _, total in calls] == [70] * len(calls)
@@ -119,11 +119,11 @@ def test_an_error_in_progress_ends_the_work(tree):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        read_pictures(tree([f"{row}.png" for row in range(70)]), 8, progress=stop)
+        read_images(tree([f"{row}.png" for row in range(70)]), 8, progress=stop)
 
 
 def test_select(tree):
-    pictures = read_pictures(
+    pictures = read_images(
         tree(["train/cat/1.png", "train/dog/1.png", "test/cat/2.png", "test/dog/3.png"]), 8
     )
     for rows in ([3, 0], np.array([3, 0])):
@@ -138,17 +138,17 @@ def test_select(tree):
 
 
 def test_unknown_label_names_those_there_are(tree):
-    pictures = read_pictures(tree(["cat/1.png", "dog/1.png"]), 8)
+    pictures = read_images(tree(["cat/1.png", "dog/1.png"]), 8)
     with pytest.raises(
         ValueError, match=r"\(classes\) has no label 'clas'; did you mean 'class'\?; it has class"
     ):
         pictures.label("clas")
     with pytest.raises(ValueError, match="it has no labels"):
-        read_pictures(tree(["1.png"], name="plain"), 8).label("class")
+        read_images(tree(["1.png"], name="plain"), 8).label("class")
 
 
 def test_misaligned_columns_are_refused(tree):
-    pictures = read_pictures(tree(["1.png", "2.png"]), 8)
+    pictures = read_images(tree(["1.png", "2.png"]), 8)
     with pytest.raises(ValueError, match="2 images, but 3 values in 'age'"):
         replace(pictures, labels={"age": np.zeros(3)})
 
@@ -158,7 +158,7 @@ def test_misaligned_columns_are_refused(tree):
 )
 def test_bad_options(tree, option, message):
     with pytest.raises(ValueError, match=message):
-        read_pictures(tree(["1.png"]), **{"image_size": 8, **option})
+        read_images(tree(["1.png"]), **{"image_size": 8, **option})
 
 
 def test_as_float():

@@ -1,4 +1,4 @@
-"""From any source to one array of decoded images with their labels: ``read_pictures``.
+"""From any source to one array of decoded images with their labels: ``read_images``.
 
 There is one way to read: a stream of samples, decoded in order on every core. What is known to fit lies in
 memory; everything else is appended to a cache file, decoded once, and mapped into memory, so that training
@@ -41,7 +41,7 @@ class Duplicate:
 
 
 @dataclass(frozen=True)
-class PictureSet:
+class ImageSet:
     """Decoded images, their labels, and what was left out.
 
     Attributes:
@@ -77,7 +77,7 @@ class PictureSet:
     def __len__(self) -> int:
         return len(self.files)
 
-    def select(self, indices: Shaped[np.ndarray, " k"] | list[int] | slice) -> "PictureSet":
+    def select(self, indices: Shaped[np.ndarray, " k"] | list[int] | slice) -> "ImageSet":
         """The same set with only these rows: numbers, a true/false mask, or a slice.
 
         A slice shares the images' memory; other choices copy them.
@@ -100,7 +100,7 @@ class PictureSet:
             )
         return self.labels[name]
 
-    def require(self, minimum: int, purpose: str = "training") -> "PictureSet":
+    def require(self, minimum: int, purpose: str = "training") -> "ImageSet":
         """The set itself if it holds enough images; otherwise an error that says so."""
         if len(self) < minimum:
             found = "only one image was" if len(self) == 1 else f"only {len(self)} images were"
@@ -130,7 +130,7 @@ class PictureSet:
         return ", ".join(parts)
 
 
-def read_pictures(
+def read_images(
     source: str | Path,
     image_size: int,
     *,
@@ -143,7 +143,7 @@ def read_pictures(
     memory_limit_bytes: int = MEMORY_LIMIT_BYTES,
     workers: int | None = None,
     progress: Progress | None = None,
-) -> PictureSet:
+) -> ImageSet:
     """Read every image of a source at ``image_size`` x ``image_size``.
 
     Args:
@@ -184,12 +184,12 @@ def as_float(images: UInt8[np.ndarray, "*n 3 h w"] | UInt8[Tensor, "*n 3 h w"]) 
     return tensor.to(torch.float32) / 255
 
 
-def check_pictures(images: Tensor, size: int) -> None:
+def check_images(images: Tensor, size: int) -> None:
     """Images of another shape than (N, 3, size, size), or of whole numbers, are an error."""
     if images.ndim != 4 or images.shape[1:] != (3, size, size):
         raise ValueError(
             f"this model takes images of shape (N, 3, {size}, {size}), got {tuple(images.shape)}: "
-            f"read them with derender.data.read_pictures(..., image_size={size}) or resize them"
+            f"read them with derender.data.read_images(..., image_size={size}) or resize them"
         )
     if not images.is_floating_point():
         raise ValueError(f"images must be floating point in 0..1, got {images.dtype}: divide uint8 by 255")
@@ -321,7 +321,7 @@ def nothing_readable(stream: Stream, skipped: list[Skipped]) -> ValueError:
     return ValueError(f"none of the {len(skipped):,} images in {where} can be read; {first}")
 
 
-def _joined(stream: Stream, images: np.ndarray, content: Mapping[str, Any]) -> PictureSet:
+def _joined(stream: Stream, images: np.ndarray, content: Mapping[str, Any]) -> ImageSet:
     """The rows with their labels: those of the stream's table, or those that came with each."""
     files, partition = tuple(content["files"]), content["partition"]
     if stream.table is None:
@@ -335,7 +335,7 @@ def _joined(stream: Stream, images: np.ndarray, content: Mapping[str, Any]) -> P
         row_of = {file: row for row, file in enumerate(stream.table.files)}
         table = stream.table.select(np.array([row_of[file] for file in files], np.int64))
         labels, partition = table.labels, table.partition
-    return PictureSet(
+    return ImageSet(
         images=images,
         files=files,
         labels=labels,
