@@ -1,6 +1,6 @@
 """`derender compare`: one of the paper's tables for other features, or by plan many methods trained here."""
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -80,8 +80,7 @@ def compare(
                 "--plan says what is compared and how, and --out gets every form of its tables: beside them "
                 "go --workers, --minutes, --dry-run, --device and --json alone"
             )
-        how = {name: value for name, value in asdict(planned).items() if name not in ("plan", "out")}
-        by_plan(planned.plan, planned.out, device=computed.device, json_file=published.json_file, **how)
+        by_plan(planned, computed.device, published.json_file)
         return
     if planned != Planned():
         raise ValueError("--out, --workers, --minutes and --dry-run go with --plan FILE")

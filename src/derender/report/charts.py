@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
 SERIES = ("#3b82f6", "#f59e0b", "#10b981", "#ec4899", "#8b5cf6", "#64748b")
+CONTROL_COLOUR = "#94a3b8"
 INK = "#010203"
 """Becomes currentColor when the SVG text is written: the colour of the page's text, light or dark."""
 _STYLE: dict[Any, Any] = {
@@ -67,7 +68,7 @@ def bars(
     with matplotlib.rc_context(_STYLE):
         figure, (axes,) = _axes((7.2, 0.6 + 0.34 * len(values)))
         names = list(values)[::-1]
-        tints = [SERIES[0] if name in highlighted else "#94a3b8" for name in names]
+        tints = [SERIES[0] if name in highlighted else CONTROL_COLOUR for name in names]
         drawn = axes.barh(names, [values[name] for name in names], color=tints, height=0.66)
         axes.bar_label(drawn, fmt="%.3g", padding=4, fontsize=9)
         axes.margins(x=0.12)

@@ -5,9 +5,9 @@ score, its interval and the row's cost. What failed or is missing says so in its
 (``derender.cli.plan``).
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from math import isfinite
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from math import isfinite, nan
 from textwrap import shorten
 from typing import Any
 
@@ -18,38 +18,20 @@ from derender.evaluation.bootstrap import Difference, Estimate, ScoredRow
 from derender.evaluation.clustering import about_clustering
 from derender.evaluation.clustering_scores import CLUSTER_COLUMNS
 from derender.evaluation.linear_probing import LINEAR_COLUMNS, PROBE_NAMES
-from derender.evaluation.score_table import (
-    Cell,
-    Column,
-    Row,
-    ScoreTable,
-    scored_table,
-    verdict_table,
-)
-from derender.report.charts import SERIES, side_by_side
+from derender.evaluation.score_table import Cell, Column, Row, ScoreTable, scored_table, verdict_table
+from derender.report.charts import CONTROL_COLOUR, INK, SERIES, side_by_side
 
 LONGEST_REASON = 60  # characters of it in a cell; the page and the Markdown say it whole
-CONTROL_COLOUR = "#94a3b8"
 SUMMARY_HEAD = "logistic"  # the head of the linear protocol that the one table shows
-
-
-@dataclass(frozen=True)
-class Cost:
-    """What a row cost on one data set; None where there is nothing to tell.
-
-    Attributes:
-        parameters: of all its networks.
-        seconds: of training, resumed parts included; mean over seeds.
-        images: images seen in it, repeats counted.
-        numbers: that describe an image.
-        embedding_seconds: for one image.
-    """
-
-    parameters: int | None = None
-    seconds: float | None = None
-    images: int | None = None
-    numbers: int | None = None
-    embedding_seconds: float | None = None
+COST_COLUMNS = {
+    "numbers": Column("numbers", None, note="that describe an image"),
+    "parameters": Column("parameters", None, note="of all networks that were trained"),
+    "images": Column("images seen", None, note="in training, repeats counted"),
+    "seconds": Column("training, s", None, 0, note="wall time of the training loop, whatever else ran"),
+    "embedding_seconds": Column("ms an image", None, 2, note="to embed, likewise"),
+}
+"""A row's cost on one data set by name; None where there is nothing to tell."""
+Costs = Mapping[str, Mapping[str, float | None]]
 
 
 @dataclass(frozen=True)
@@ -57,74 +39,73 @@ class ScoredQuestion:
     """One question under one protocol (and one head at one number of labels, for the linear one).
 
     Attributes:
-        name: of the data set, and of the question if it has several.
-        protocol: "cluster" or "linear".
+        name: of the data set, and of the question if it has several; then the number of labels.
         about: rows, classes and the like, in words.
+        columns: the protocol's scores.
+        main: those of them in the one table; the first is drawn.
         rows: methods and controls.
-        costs: by row.
-        absent: by method, why it is not among the rows.
+        costs: by row, each by the names of ``COST_COLUMNS``.
+        absent: by method, why it is not among the rows: "failed: ..." or "missing: ...".
         head, count: of the linear protocol.
     """
 
     name: str
-    protocol: str
     about: str
-    rows: Sequence[ScoredRow]
-    costs: Mapping[str, Cost] = field(default_factory=dict)
-    absent: Mapping[str, str] = field(default_factory=dict)
+    columns: Mapping[str, Column]
+    main: tuple[str, ...]
+    rows: Mapping[str, ScoredRow]
+    costs: Costs
+    absent: Mapping[str, str]
     head: str = ""
     count: int = 0
 
-    @property
-    def columns(self) -> Mapping[str, Column]:
-        """The protocol's scores."""
-        return CLUSTER_COLUMNS if self.protocol == "cluster" else LINEAR_COLUMNS
+    def cost(self, name: str) -> list[Cell]:
+        """The cells of a row's cost."""
+        return _cost_cells(self.costs.get(name, {}))
+
+    def absence(self, name: str) -> str | None:
+        """``failed`` or ``missing``; None where nothing is known of the method."""
+        return self.absent[name].partition(":")[0] if name in self.absent else None
 
 
-COST_COLUMNS = (
-    Column("numbers", None, note="that describe an image"),
-    Column("parameters", None, note="of all networks that were trained"),
-    Column("images seen", None, note="in training, repeats counted"),
-    Column("training, s", None, 0, note="wall time of the training loop, whatever else the machine did"),
-    Column("ms an image", None, 2, note="to embed, likewise"),
-)
-
-
-def scores_from(
-    question: Mapping[str, Any], costs: Mapping[str, Cost], absent: Mapping[str, str]
-) -> list[ScoredQuestion]:
+def scores_from(question: Mapping[str, Any], costs: Costs, absent: Mapping[str, str]) -> list[ScoredQuestion]:
     """The scores of a question as JSON keeps them: one of clusters, or one for each head and count."""
-    name, how = str(question["name"]), (costs, absent)
+    name = str(question["name"])
     if question["protocol"] == "cluster":
         about = about_clustering(question["method"], question["n_rows"], question["labels"])
-        return [ScoredQuestion(name, "cluster", about, rows_from(question["rows"]), *how)]
+        rows = _rows_from(question["rows"])
+        return [ScoredQuestion(name, about, CLUSTER_COLUMNS, ("accuracy", "nmi"), rows, costs, absent)]
     kind = "classes" if question["kind"] == "classes" else "yes/no labels"
     about = f"{question['n_test']:,} tested, {len(question['names'])} {kind}, {len(question['seeds'])} seeds"
     return [
         ScoredQuestion(
-            name, "linear", f"{PROBE_NAMES.get(head, head)}, {count:,} labelled rows, {about}",
-            rows_from(part["rows"]), *how, head, count,
+            f"{name}, {part['labels']:,} labels",
+            f"{PROBE_NAMES.get(part['head'], part['head'])}, {about}",
+            LINEAR_COLUMNS, ("balanced_accuracy",), _rows_from(part["rows"]), costs, absent,
+            part["head"], part["labels"],
         )
         for part in question["parts"]
-        for head, count in [(part["head"], part["labels"])]
     ]  # fmt: skip
 
 
-def rows_from(values: Mapping[str, Any]) -> list[ScoredRow]:
+def _rows_from(values: Mapping[str, Any]) -> dict[str, ScoredRow]:
     """Rows as JSON keeps them: without resamples, null for NaN."""
 
-    def numbers(one: Mapping[str, Any]) -> dict[str, Any]:
-        named = {"deviation" if part == "spread" else part: value for part, value in one.items()}
-        return {part: float("nan") if value is None else value for part, value in named.items()}
+    def estimate(one: Mapping[str, float | None]) -> Estimate:
+        numbers = [
+            nan if (value := one[part]) is None else value for part in ("value", "low", "high", "spread")
+        ]
+        return Estimate(*numbers, np.empty(0))
 
-    return [
-        ScoredRow(
+    return {
+        name: ScoredRow(
             name, row["control"], row["runs"],
-            {score: Estimate(**numbers(one), resampled=np.empty(0)) for score, one in row["scores"].items()},
-            {score: Difference(**numbers(one)) for score, one in row["versus"].items()},
+            {score: estimate(one) for score, one in row["scores"].items()},
+            {score: Difference(**{part: nan if value is None else value for part, value in one.items()})
+             for score, one in row["versus"].items()},
         )
         for name, row in values.items()
-    ]  # fmt: skip
+    }  # fmt: skip
 
 
 def protocol_table(scores: Sequence[ScoredQuestion], methods: Sequence[str]) -> ScoreTable:
@@ -135,42 +116,43 @@ def protocol_table(scores: Sequence[ScoredQuestion], methods: Sequence[str]) -> 
         methods: in order; controls come after them.
     """
     shown = _shown(scores)
-    protocol = shown[0].protocol
-    main = ("accuracy", "nmi") if protocol == "cluster" else ("balanced_accuracy",)
-    columns: list[Column] = []
-    for one in shown:
-        head = f"{one.name}, {one.count:,} labels" if one.count else one.name
-        columns.append(Column(f"{head}: {one.columns[main[0]].name}", "high", note=one.about))
-        columns += [Column(one.columns[name].name, "high") for name in main[1:]]
-    by_name = [{row.name: row for row in one.rows} for one in shown]
+    columns = [
+        replace(one.columns[score], name=f"{one.name}: {one.columns[score].name}", note=one.about)
+        if score == one.main[0]
+        else replace(one.columns[score], note="")
+        for one in shown
+        for score in one.main
+    ]
     rows = []
-    for name in dict.fromkeys((*methods, *(name for found in by_name for name in found))):
+    for name in dict.fromkeys((*methods, *(name for one in shown for name in one.rows))):
         cells: list[Cell] = []
-        for one, found in zip(shown, by_name, strict=True):
-            word = one.absent[name].partition(":")[0] if name in one.absent else None
-            missing = (word, *(None for _ in main[1:]))
-            cells += [found[name].scores[score].value for score in main] if name in found else missing
-        control = any(found[name].control for found in by_name if name in found)
-        rows.append(Row(name, (*cells, *_cells(_together(shown, name))), control))
-    caption = "Clustering" if protocol == "cluster" else f"Few labels, {PROBE_NAMES[shown[0].head]}"
+        for one in shown:
+            if name in one.rows:
+                cells += [one.rows[name].scores[score].value for score in one.main]
+            else:
+                cells += [one.absence(name), *(None for _ in one.main[1:])]
+        control = any(one.rows[name].control for one in shown if name in one.rows)
+        rows.append(Row(name, (*cells, *_whole_cost(shown, name)), control))
+    caption = f"Few labels, {PROBE_NAMES[shown[0].head]}" if shown[0].head else "Clustering"
     caption += ": all data sets; training time is the sum over training sets"
-    return ScoreTable(caption, "features", (*columns, *COST_COLUMNS), rows)
+    return ScoreTable(caption, "features", (*columns, *COST_COLUMNS.values()), rows)
 
 
 def set_tables(one: ScoredQuestion, methods: Sequence[str]) -> list[ScoreTable]:
     """One data set's own table, with every score, interval and cost, and who is above the controls."""
-    costs: dict[Column, Callable[[ScoredRow], Cell]] = {
-        column: lambda row, place=place: _cells(one.costs.get(row.name, Cost()))[place]
-        for place, column in enumerate(COST_COLUMNS)
+    rows = list(one.rows.values())
+    costs = {
+        column: lambda row, place=place: one.cost(row.name)[place]
+        for place, column in enumerate(COST_COLUMNS.values())
     }
-    table = scored_table(f"{one.name}: {one.about}", "features", one.rows, one.columns, more=costs)
+    table = scored_table(f"{one.name}: {one.about}", "features", rows, one.columns, more=costs)
     found = {row.name: row for row in table.rows}
     blank = [None] * (len(table.columns) - 1 - len(COST_COLUMNS))
     for name in one.absent.keys() - found.keys():
         why = shorten(one.absent[name], LONGEST_REASON, placeholder=" ...")
-        found[name] = Row(name, (why, *blank, *_cells(one.costs.get(name, Cost()))))
-    order = dict.fromkeys((*methods, *(row.name for row in table.rows)))
-    verdict = verdict_table(one.rows, one.columns, f"{one.name}, above the strongest control? {one.about}")
+        found[name] = Row(name, (why, *blank, *one.cost(name)))
+    order = dict.fromkeys((*methods, *one.rows))
+    verdict = verdict_table(rows, one.columns, f"{one.name}, above the strongest control? {one.about}")
     return [replace(table, rows=[found[name] for name in order if name in found]), verdict]
 
 
@@ -180,68 +162,54 @@ def protocol_picture(scores: Sequence[ScoredQuestion], methods: Sequence[str]) -
     Whiskers are 95 % intervals. Of the linear protocol the largest number of labels is shown.
     """
     shown = _shown(scores)
-    if shown[0].protocol == "linear":
-        most = {one.name: max(other.count for other in shown if other.name == one.name) for one in shown}
-        shown = [one for one in shown if one.count == most[one.name]]
-    score = "accuracy" if shown[0].protocol == "cluster" else "balanced_accuracy"
-    every = list(dict.fromkeys((*methods, *(row.name for one in shown for row in one.rows))))
-    panels = {
-        f"{one.name}, {one.count:,} labels" if one.count else one.name: _panel(one, every, score)
-        for one in shown
-    }
-    size = (max(7.2, 1.6 + 2.1 * len(panels)), 0.9 + 0.3 * len(every))
-    return side_by_side(panels, score.replace("_", " "), size)
+    most = max(one.count for one in shown)
+    shown = [one for one in shown if one.count == most]
+    names = list(dict.fromkeys((*methods, *(name for one in shown for name in one.rows))))
+    score = shown[0].main[0]
 
-
-def _panel(one: ScoredQuestion, names: Sequence[str], score: str) -> Any:
-    found = {row.name: row for row in one.rows}
-
-    def draw(axes: Axes) -> None:
+    def panel(axes: Axes, one: ScoredQuestion) -> None:
         for place, name in enumerate(reversed(names)):
-            row = found.get(name)
-            if row is None:
-                why = one.absent[name].partition(":")[0] if name in one.absent else ""
+            if (row := one.rows.get(name)) is None:
                 axes.barh(name, 0)
-                axes.annotate(why, (0, place), xytext=(3, 0), textcoords="offset points", va="center",
-                              fontsize=8, alpha=0.75)  # fmt: skip
+                axes.annotate(one.absence(name) or "", (0, place), xytext=(3, 0), textcoords="offset points",
+                              va="center", fontsize=8, alpha=0.75)  # fmt: skip
                 continue
-            estimate = row.scores[score]
-            axes.barh(name, estimate.value, color=CONTROL_COLOUR if row.control else SERIES[0], height=0.66)
-            if isfinite(estimate.low):
-                axes.plot(
-                    [estimate.low, estimate.high], [name, name], color="#010203", alpha=0.6, linewidth=1
-                )
+            own = row.scores[score]
+            axes.barh(name, own.value, color=CONTROL_COLOUR if row.control else SERIES[0], height=0.66)
+            if isfinite(own.low):
+                axes.plot([own.low, own.high], [name, name], color=INK, alpha=0.6, linewidth=1)
         axes.tick_params(axis="y", length=0)
         axes.grid(True, axis="x")
         axes.set_axisbelow(True)
 
-    return draw
+    size = (max(7.2, 1.6 + 2.1 * len(shown)), 0.9 + 0.3 * len(names))
+    panels = {one.name: lambda axes, one=one: panel(axes, one) for one in shown}
+    return side_by_side(panels, score.replace("_", " "), size)
 
 
 def _shown(scores: Sequence[ScoredQuestion]) -> list[ScoredQuestion]:
-    """What the one table and the image show."""
-    if not scores:
-        raise ValueError("there is nothing to show: no data set was scored")
-    heads = [one.head for one in scores]
-    head = SUMMARY_HEAD if SUMMARY_HEAD in heads else heads[0]
+    """What the one table and the image show: one head."""
+    heads = {one.head for one in scores}
+    head = SUMMARY_HEAD if SUMMARY_HEAD in heads else scores[0].head
     return [one for one in scores if one.head == head]
 
 
-def _together(scores: Sequence[ScoredQuestion], name: str) -> Cost:
+def _whole_cost(scores: Sequence[ScoredQuestion], name: str) -> list[Cell]:
     """A method's cost over several data sets: trainings that several share count once."""
     costs = [one.costs[name] for one in scores if name in one.costs]
-    trained = {(cost.seconds, cost.images) for cost in costs if cost.seconds is not None}
-    embedding = [cost.embedding_seconds for cost in costs if cost.embedding_seconds is not None]
+    known = {
+        part: [value for cost in costs if (value := cost.get(part)) is not None] for part in COST_COLUMNS
+    }
+    whole = {part: values[0] for part, values in known.items() if values}
+    trained = {(cost.get("images"), cost["seconds"]) for cost in costs if cost.get("seconds") is not None}
+    if trained:
+        whole["seconds"] = sum(seconds for _, seconds in trained)
+    if known["embedding_seconds"]:
+        whole["embedding_seconds"] = float(np.mean(known["embedding_seconds"]))
+    return _cost_cells(whole)
 
-    def first(field: str) -> int | None:
-        return next((value for cost in costs if (value := getattr(cost, field)) is not None), None)
 
-    return Cost(
-        first("parameters"), sum(seconds for seconds, _ in trained) if trained else None, first("images"),
-        first("numbers"), float(np.mean(embedding)) if embedding else None,
-    )  # fmt: skip
-
-
-def _cells(cost: Cost) -> tuple[Cell, ...]:
-    each = None if cost.embedding_seconds is None else 1_000 * cost.embedding_seconds
-    return (cost.numbers, cost.parameters, cost.images, cost.seconds, each)
+def _cost_cells(cost: Mapping[str, Any]) -> list[Cell]:
+    each = cost.get("embedding_seconds")
+    shown = {**cost, "embedding_seconds": None if each is None else 1_000 * each}
+    return [shown.get(part) for part in COST_COLUMNS]

@@ -3,13 +3,15 @@
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from derender.cli.console import notice, result, show_scores, write_json
 
-PANEL = "Many methods on many data sets"
+
+def _option(*names: str, **how: Any) -> Any:
+    return typer.Option(*names, rich_help_panel="Many methods on many data sets", **how)
 
 
 @dataclass(frozen=True)
@@ -18,58 +20,35 @@ class Planned:
 
     plan: Annotated[
         Path | None,
-        typer.Option(
-            "--plan", metavar="FILE", rich_help_panel=PANEL,
-            help="YAML or TOML file of methods and data sets to train, embed and score.",
-        ),
-    ] = None  # fmt: skip
+        _option("--plan", metavar="FILE", help="YAML or TOML file of methods and data sets to compare."),
+    ] = None
     out: Annotated[
         Path | None,
-        typer.Option(
-            "--out", "-o", metavar="DIR", rich_help_panel=PANEL,
-            help="Folder of --plan for runs, tables and charts; an existing one is resumed.",
-        ),
-    ] = None  # fmt: skip
+        _option("--out", "-o", metavar="DIR", help="Folder of --plan for runs, tables and charts; resumed."),
+    ] = None
     workers: Annotated[
-        int,
-        typer.Option(
-            "--workers", min=1, metavar="N", help="Number of jobs of --plan at a time.", rich_help_panel=PANEL
-        ),
+        int, _option("--workers", min=1, metavar="N", help="Number of jobs of --plan at a time.")
     ] = 1
     minutes: Annotated[
         float | None,
-        typer.Option(
-            "--minutes", min=0, metavar="M", rich_help_panel=PANEL,
-            help="Minutes after which --plan stops, and scores the finished jobs.",
-        ),
-    ] = None  # fmt: skip
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="List the jobs of --plan, and stop.", rich_help_panel=PANEL)
-    ] = False
+        _option("--minutes", min=0, metavar="M", help="Minutes after which --plan scores what is finished."),
+    ] = None
+    dry_run: Annotated[bool, _option("--dry-run", help="List the jobs of --plan, and stop.")] = False
 
 
-def by_plan(
-    file: Path,
-    out: Path | None,
-    *,
-    workers: int,
-    minutes: float | None,
-    device: str,
-    dry_run: bool,
-    json_file: str | None,
-) -> None:
+def by_plan(planned: Planned, device: str, json_file: str | None) -> None:
     """Do a plan, or go on with it, and show the one table of each protocol."""
-    from derender.cli.plan import jobs
+    from derender.cli.plan.jobs import Comparison, jobs_of
     from derender.cli.plan.outcome import write_outcome
     from derender.cli.plan.settings import read_plan
-    from derender.cli.plan.sweep import Sweep, jobs_of
+    from derender.cli.plan.sweep import do_all
     from derender.storage.atomic import atomic_file
     from derender.training.config import to_yaml
 
-    plan = read_plan(file)
-    if dry_run:
-        notes = {job.name: None if out is None else Sweep(plan, out).note(job) for job in jobs_of(plan)}
-        states = {name: "to do" if note is None else note.state for name, note in notes.items()}
+    plan, out = read_plan(str(planned.plan)), planned.out
+    if planned.dry_run:
+        notes = {job.name: out and Comparison(plan, out).note(job) for job in jobs_of(plan)}
+        states = {name: note.state if note else "to do" for name, note in notes.items()}
         for name, state in states.items():
             result(f"{name}: {state}", json_file)
         notice(", ".join(f"{count} {state}" for state, count in Counter(states.values()).items()))
@@ -83,21 +62,15 @@ def by_plan(
         raise ValueError(f"{out} is not empty and holds no comparison: choose another --out")
     with atomic_file(out / "plan.yaml") as temporary:
         temporary.write_text(to_yaml(plan))
-    work = {"train": jobs.train, "embed": jobs.embed, "score": jobs.score}
-    sweep = Sweep(plan, out, device, work)
-    try:
-        sweep.do_all(workers, minutes)
-    except KeyboardInterrupt as stop:
-        raise KeyboardInterrupt("stopped and saved; the same command goes on where it stopped") from stop
-    outcome = write_outcome(sweep)
-    for table in outcome.tables:
+    at = Comparison(plan, out, device)
+    tables, values = write_outcome(at, do_all(at, planned.workers, planned.minutes))
+    for table in tables:
         show_scores(table, json_file)
-    for state, sentences in (("failed", outcome.failed), ("missing", outcome.missing)):
-        for sentence in sentences:
+    for state in ("failed", "missing"):
+        for sentence in values[state]:
             notice(f"{state}: {sentence}")
-    if outcome.missing:
+    if values["missing"]:
         notice("the budget is used; the same command goes on where it stopped")
-    for written in outcome.files:
+    for written in values["files"]:
         result(str(written), json_file)
-    values = {"out": out, "files": outcome.files, "failed": outcome.failed, "missing": outcome.missing}
-    write_json(json_file, {**values, "tables": [table.values() for table in outcome.tables]})
+    write_json(json_file, values)

@@ -1,125 +1,265 @@
-"""The three kinds of a plan's jobs, each one or two library calls; they return the facts of their notes."""
+"""The jobs of a plan, what each leaves in the comparison's folder, and the library calls that do them.
 
+A job leaves a note beside its result: a key (the hash of its inputs), how it ended, its cost. A job whose
+note has the same key is not repeated; a training goes on from its last checkpoint.
+"""
+
+import json
+import re
 import shutil
 import signal
 import time
-from collections.abc import Callable
-from dataclasses import asdict
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass
+from math import inf
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
+
+from pydantic import Field
 
 from derender import learn
-from derender.baselines import control_features, load_baseline, open_baseline, read_any_config
+from derender.baselines import control_features, load_baseline, open_baseline
 from derender.baselines.registry import CONTROLS
 from derender.cli.console import plain
-from derender.cli.plan.settings import OURS, WITHOUT_LOOP
-from derender.cli.plan.sweep import COMPONENTS, BudgetUsed, Collapsed, Job, Sweep, run_progress
+from derender.cli.plan.settings import OURS, WITHOUT_LOOP, Plan
 from derender.data import ImageSet, split_indices
 from derender.evaluation.clustering import compare_clusterings
-from derender.evaluation.controls import control_rows
+from derender.evaluation.controls import architecture, control_rows
 from derender.evaluation.feature_rows import FeatureRow, aligned, attribute_columns, prepare
 from derender.evaluation.linear_probing import compare_prepared
-from derender.evaluation.memory import Memory
+from derender.evaluation.memory import Memory, content_hash
 from derender.evaluation.paper_tables import ATTRIBUTES, RowRules, table_named
 from derender.features import FeatureTable, embed_pictures
-from derender.inputs import as_images, as_model, device_named
+from derender.inputs import as_images, as_model, device_named, split_of
 from derender.model import Derenderer
 from derender.presets import MODEL_PRESETS
+from derender.settings import Settings
+from derender.storage.atomic import atomic_file
 from derender.training import TrainingInterrupted
 
-Progress = Callable[..., None]
+COMPONENTS = 64  # of pca and noise
+SCORING = {"clustering", "counts", "draws", "untrained_seeds", "resamples", "image_size"}
+Facts = dict[str, Any]
 
 
-def train(sweep: Sweep, job: Job, progress: Progress) -> dict[str, Any]:
+class Collapsed(ValueError):
+    """A training that would collapse again."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """One training, feature table or set of scores.
+
+    Attributes:
+        kind: which of them.
+        method: whose; empty for scores, which are those of all methods.
+        where: the training set of a training, else the scored set.
+        seed: of the training.
+        after: jobs that must have ended, well or not.
+    """
+
+    kind: Literal["train", "embed", "score"]
+    method: str
+    where: str
+    seed: int = 0
+    after: tuple["Job", ...] = ()
+
+    @property
+    def name(self) -> str:
+        """In words."""
+        relation = {"train": "on", "embed": "of", "score": ""}[self.kind]
+        run = f" seed {self.seed}" if self.seed else ""
+        return " ".join(f"{self.kind} {self.method}{run} {relation} {self.where}".split())
+
+    @property
+    def slug(self) -> str:
+        """As a file's name; no two jobs of a plan share one."""
+        words = "-".join((self.kind, self.where, self.method, str(self.seed)))
+        return f"{re.sub('[^A-Za-z0-9]+', '-', words)}-{content_hash({'name': words})[:6]}"
+
+
+class Note(Settings):
+    """How a job ended: ``why`` it is not done, and whether that is ``final``; its results and its cost."""
+
+    job: str
+    key: str
+    state: Literal["done", "failed", "stopped"] = "done"
+    why: str = ""
+    final: bool = False
+    facts: Facts = Field(default_factory=dict)
+
+
+def jobs_of(plan: Plan) -> list[Job]:
+    """All of a plan's jobs, each after those it needs; trainings in the order of the plan's data sets."""
+    jobs: dict[Job, None] = {}
+    scores: list[Job] = []
+    for name, scored in plan.score.items():
+        tables = []
+        for method in plan.rows():
+            trained = plan.is_trained(method)
+            for seed in range(plan.seeds if trained else 1):
+                training = Job("train", plan.source(method), str(scored.trained_on), seed)
+                tables.append(Job("embed", method, name, seed, (training,) if trained else ()))
+                jobs |= dict.fromkeys((*tables[-1].after, tables[-1]))
+        scores.append(Job("score", "", name, 0, tuple(tables)))
+    return [*jobs, *scores]
+
+
+@dataclass
+class Comparison:
+    """A plan in its folder; the budget ends at ``deadline``, in seconds since 1970."""
+
+    plan: Plan
+    path: Path
+    device: str = "auto"
+    deadline: float = inf
+
+    @property
+    def over(self) -> bool:
+        """Whether the budget is used."""
+        return time.time() >= self.deadline
+
+    def run(self, job: Job) -> Path:
+        """The run folder of a training."""
+        given = self.plan.methods[job.method].runs.get(job.where)
+        name = job.method if job.seed == 0 else f"{job.method}-seed{job.seed}"
+        return self.path / "runs" / job.where / name if given is None else Path(given)
+
+    def result(self, job: Job) -> Path:
+        """The run folder of a training, else the table of features."""
+        return self.run(job) if job.kind == "train" else self.file("features", job, ".parquet")
+
+    def file(self, folder: str, job: Job, suffix: str) -> Path:
+        """A job's file: its ``.json`` in jobs, ``.parquet`` in features, or ``.log`` in logs."""
+        return self.path / folder / f"{job.slug}{suffix}"
+
+    def note(self, job: Job) -> Note | None:
+        """The note that a job left; None without one that can be read."""
+        try:
+            return Note.model_validate_json(self.file("jobs", job, ".json").read_bytes())
+        except (FileNotFoundError, ValueError):
+            return None
+
+    def leave(self, job: Job, state: str = "done", why: str = "", **more: Any) -> Note:
+        """Write a job's note."""
+        note = Note(job=job.name, key=self.key(job), state=state, why=why, **more)  # pyright: ignore[reportArgumentType]
+        with atomic_file(self.file("jobs", job, ".json")) as temporary:
+            temporary.write_text(note.model_dump_json(indent=1))
+        return note
+
+    def key(self, job: Job) -> str:
+        """Changes with the settings and files of a job, and with the results of those before it."""
+        plan, method = self.plan, self.plan.methods.get(job.method)
+        source = plan.train[job.where] if job.kind == "train" else plan.score[job.where]
+        read = {"data", "dataset", "limit", "part", "split"} if method else None
+        before = [
+            [one.method, one.seed, note.key, note.state] for one in job.after if (note := self.note(one))
+        ]
+        inputs = {"before": before, "images": source.model_dump(mode="json", include=read)}
+        inputs["files"] = [_file_facts(source.data)]
+        if job.kind == "score":
+            inputs["how"] = plan.model_dump(mode="json", include=SCORING)
+        elif job.kind == "embed":
+            inputs["method"] = [
+                plan.kind(job.method),
+                method.model,
+                method.features,
+                method.whitened,
+                plan.image_size,
+            ]
+        elif job.where in method.runs:
+            run = self.run(job)
+            inputs["files"] += [
+                _file_facts(run / name) for name in ("model/model.safetensors", "model.safetensors")
+            ]
+        else:
+            inputs["config"] = plan.configuration(job.method, job.where, job.seed).model_dump(mode="json")
+        return content_hash(inputs)
+
+
+def train(at: Comparison, job: Job, progress: Callable[..., None]) -> Facts:
     """Train, or go on with it, or take the run that is there."""
-    plan, run = sweep.plan, sweep.run(job)
+    plan, run, facts = at.plan, at.run(job), {}
     kind, in_the_loop = plan.kind(job.method), plan.kind(job.method) not in WITHOUT_LOOP
-    if job.where in plan.methods[job.method].runs:
-        if job.seed:
-            raise ValueError(f"{run} is one run: give seeds: 1, or let {job.method} be trained here")
-        return _run_facts(kind, run)
-    resume = in_the_loop and (run / "config.yaml").is_file()
-    if run.exists() and not resume:  # killed at its very beginning, or nothing to go on with
-        shutil.rmtree(run)
-    learnt = plan.train[job.where]
+    if job.where not in plan.methods[job.method].runs:
+        resume = in_the_loop and (run / "config.yaml").is_file()
+        if run.exists() and not resume:  # killed at its very beginning, or nothing to go on with
+            shutil.rmtree(run)
 
-    def watch(at: Any) -> None:
-        progress(at.done, at.total, f"{at.images_per_second:.0f} pictures/s")
-        if sweep.over:
-            if at.phase != "train" or not in_the_loop:
-                raise BudgetUsed
-            signal.raise_signal(signal.SIGTERM)  # the loop saves and stops after this step
+        def watch(now: Any) -> None:
+            progress(now.done, now.total, f"{now.images_per_second:.0f} pictures/s")
+            if at.over and in_the_loop and now.phase == "train":
+                signal.raise_signal(signal.SIGTERM)  # the loop saves and stops after this step
+            elif at.over:
+                raise TrainingInterrupted
 
-    try:
+        learnt, config = plan.train[job.where], plan.configuration(job.method, job.where, job.seed)
         result = learn.train(
-            learnt.data, out=run, config=plan.configuration(job.method, job.where, job.seed), resume=resume,
-            dataset=learnt.dataset, limit=learnt.limit, device=sweep.device, page=False, progress=watch,
+            learnt.data, out=run, config=config, resume=resume, dataset=learnt.dataset, limit=learnt.limit,
+            device=at.device, page=False, progress=watch,
         )  # fmt: skip
-    except (TrainingInterrupted, BudgetUsed) as stop:
-        if not sweep.over:
-            raise
-        images = run_progress(run)["images"]
-        seen = f" ({images:,} of {plan.images:,} images seen)" if images else ""
-        raise BudgetUsed(f"the budget was used before it was trained{seen}") from stop
-    if result.stopped == "collapse":
-        signs = "; ".join(f"{finding.sign}: {finding.text}" for finding in result.findings)
-        raise Collapsed(f"stopped by the watcher after {result.images:,} images ({signs})")
-    facts = {"images": result.images, "seconds": result.seconds, "stopped": result.stopped}
-    return {**_run_facts(kind, run), **facts}
+        if result.stopped == "collapse":
+            signs = "; ".join(f"{finding.sign}: {finding.text}" for finding in result.findings)
+            raise Collapsed(f"stopped by the watcher after {result.images:,} images ({signs})")
+        facts = {"images": result.images, "seconds": result.seconds, "stopped": result.stopped}
+    elif job.seed:
+        raise ValueError(f"{run} is one run: give seeds: 1, or let {job.method} be trained here")
+    model = as_model(run, device="cpu") if kind == OURS else load_baseline(run, kind)
+    return {"run": str(run), "parameters": _parameters(model), **run_progress(run), **facts}
 
 
-def embed(sweep: Sweep, job: Job, progress: Progress) -> dict[str, Any]:
+def embed(at: Comparison, job: Job, progress: Callable[..., None]) -> Facts:
     """Write the feature table of a scored set by one method."""
-    plan, kind = sweep.plan, sweep.plan.kind(job.method)
-    method, parameters = plan.methods[job.method], 0
+    plan, method, kind = at.plan, at.plan.methods[job.method], at.plan.kind(job.method)
+    source = str(at.run(job.after[0])) if job.after else plan.methods[plan.source(job.method)].model
+    net, size = None, plan.image_size
+    if kind == OURS:
+        net = as_model(str(source), device=at.device)
+        net = net if method.whitened else net.without_features()
+    elif kind not in CONTROLS:
+        device, chosen = device_named(at.device), method.features or None
+        net = open_baseline(kind, source, device=device, features=chosen, image_size=size)
+    images = _scored_images(at, job, size if net is None else net.image_size, source if job.after else None)
 
     def watch(done: int, total: int) -> None:
         progress(done, total)
-        if sweep.over and done < total:
-            raise BudgetUsed("the budget was used before its features were made")
+        if at.over and done < total:
+            raise TrainingInterrupted
 
-    if kind in CONTROLS:
-        images = _scored_images(sweep, job.where, plan.image_size)
-        began = time.perf_counter()
+    began = time.perf_counter()
+    if net is None:
         table = control_features(kind, images, components=COMPONENTS, seed=job.seed, progress=watch)
     else:
-        source = plan.methods[plan.source(job.method)].model
-        source = str(sweep.run(job.after[0])) if job.after else source
-        net = _opened(sweep, job.method, source)
-        images = _scored_images(sweep, job.where, net.image_size, source if job.after else None)
-        parameters = sum(values.numel() for values in net.parameters())
-        began = time.perf_counter()
         table = embed_pictures(net, images, progress=watch)
     seconds = time.perf_counter() - began
-    table.write(sweep.features(job))
+    table.write(at.result(job))
     factors = method.features or (("geometry", "albedo") if kind == OURS else tuple(table.factors))
     return {
-        "rows": len(table),
-        "factors": list(factors),
-        "numbers": int(table.concatenate(factors).shape[1]),
-        "parameters": parameters,
-        "seconds_a_picture": seconds / len(table),
-    }
+        "rows": len(table), "factors": list(factors), "numbers": int(table.concatenate(factors).shape[1]),
+        "parameters": 0 if net is None else _parameters(net), "seconds_a_picture": seconds / len(table),
+    }  # fmt: skip
 
 
-def score(sweep: Sweep, job: Job, progress: Progress) -> dict[str, Any]:
+def score(at: Comparison, job: Job, progress: Callable[..., None]) -> Facts:
     """Score the finished methods on one set, beside controls; the others' notes say why they are missing."""
-    plan, scored, memory = sweep.plan, sweep.plan.score[job.where], Memory(sweep.path / "memory")
-    rows = []
+    plan, memory, rows = at.plan, Memory(at.path / "memory"), []
     for method in plan.rows():
-        notes = {one: sweep.note(one) for one in job.after if one.method == method}
-        done = {one: note for one, note in notes.items() if note is not None and note.state == "done"}
+        notes = {one: at.note(one) for one in job.after if one.method == method}
+        done = {one: note.facts for one, note in notes.items() if note is not None and note.state == "done"}
         if done:
-            tables = tuple(FeatureTable.read(sweep.features(one)) for one in done)
-            factors = tuple(next(iter(done.values())).facts["factors"])
+            tables = tuple(FeatureTable.read(at.result(one)) for one in done)
+            factors = tuple(next(iter(done.values()))["factors"])
             rows.append(FeatureRow(method, tables, factors, "control" in tables[0].origin))
-    images = _scored_images(sweep, job.where, plan.image_size)
-    if rows:
-        images = aligned(images, rows[0].tables[0].files)
-    settings, factors = _architecture(sweep, job.where), ("geometry", "albedo")
-    seeds = range(plan.untrained_seeds)
-    controls = control_rows(images, settings, factors, seeds, memory=memory, device=sweep.device)
-    parameters = sum(values.numel() for values in Derenderer.seeded(settings, 0).parameters())
+    small, size = MODEL_PRESETS["small"], plan.image_size
+    network = small.network.model_copy(update={"image_size": size})
+    settings = architecture(rows)
+    if settings is None or settings.network.image_size != size:
+        settings = small.model_copy(update={"network": network})
+    images = _scored_images(at, job, size)
+    images = aligned(images, rows[0].tables[0].files) if rows else images
+    seeds, factors = range(plan.untrained_seeds), ("geometry", "albedo")
+    controls = control_rows(images, settings, factors, seeds, memory=memory, device=at.device)
+    parameters = _parameters(Derenderer.seeded(settings, 0))
     facts = {
         row.name: {
             "numbers": int(row.tables[0].concatenate(row.factors).shape[1]),
@@ -127,87 +267,70 @@ def score(sweep: Sweep, job: Job, progress: Progress) -> dict[str, Any]:
         }
         for row in controls
     }
-    rows += controls
     found = []
-    for name, columns, rules in _questions(sweep, job.where, rows[0].tables[0]):
-        ready = prepare(rows, columns, **asdict(rules))
-        for protocol in scored.protocols:
-            how: dict[str, Any] = {"resample_count": plan.resamples, "memory": memory}
+    for name, columns, rules in _questions(at, job, (*rows, *controls)[0].tables[0]):
+        ready = prepare([*rows, *controls], columns, **asdict(rules))
+        how: dict[str, Any] = {"resample_count": plan.resamples, "memory": memory}
+        for protocol in plan.score[job.where].protocols:
             if protocol == "cluster":
-                groups = {"controls": ready.controls, "method": plan.clustering, **how}
-                numbers = compare_clusterings(ready.features, ready.labels, **groups).numbers()
-                numbers.pop("per_label")
+                how_grouped = {"controls": ready.controls, "method": plan.clustering, **how}
+                result = compare_clusterings(ready.features, ready.labels, **how_grouped)
             else:
-                numbers = compare_prepared(ready, plan.counts, tuple(range(plan.draws)), **how).numbers()
+                result = compare_prepared(ready, plan.counts, tuple(range(plan.draws)), **how)
+            numbers = {key: value for key, value in result.numbers().items() if key != "per_label"}
             found.append(plain({"name": name, "protocol": protocol, **numbers}))
     return {"questions": found, "controls": facts}
 
 
-def _run_facts(kind: str, run: Path) -> dict[str, Any]:
-    """Parameters, and images seen and seconds by the last checkpoint."""
-    model: Any = as_model(run, device="cpu") if kind == OURS else load_baseline(run, kind)
-    parameters = sum(values.numel() for values in model.parameters())
-    return {"run": str(run), "parameters": parameters, **run_progress(run)}
-
-
-def _opened(sweep: Sweep, name: str, source: str | None) -> Any:
-    """The network of a method, ready to embed."""
-    method, kind = sweep.plan.methods[name], sweep.plan.kind(name)
-    if kind != OURS:
-        device = device_named(sweep.device)
-        return open_baseline(
-            kind, source, device=device, features=method.features or None, image_size=sweep.plan.image_size
-        )
-    if source is None:
-        raise ValueError(f"method {name!r} has neither runs nor a model")
-    model = as_model(source, device=sweep.device)
-    return model if method.whitened else model.without_features()
-
-
-def _scored_images(sweep: Sweep, where: str, image_size: int, run: str | None = None) -> ImageSet:
+def _scored_images(at: Comparison, job: Job, image_size: int, run: str | None = None) -> ImageSet:
     """The images to score: all, or a part of the training set's split, which ``run`` must have kept."""
-    scored = sweep.plan.score[where]
+    scored = at.plan.score[job.where]
     images = as_images(scored.data, image_size, dataset=scored.dataset, limit=scored.limit)
     if scored.part == "all":
         return images
-    learnt = sweep.plan.train[str(scored.trained_on)]
-    if run is not None and (Path(run) / "config.yaml").is_file():
-        config = read_any_config(Path(run))
-        if (tuple(config.split), config.seed) != (tuple(learnt.split), 0):
-            raise ValueError(
-                f"{run} was trained with split {list(config.split)} and seed {config.seed}, the plan's is "
-                f"{list(learnt.split)} and 0: part {scored.part} would hold images that it saw"
-            )
-    split = split_indices(images.files, learnt.split, seed=0)
-    return images.select(getattr(split, scored.part)).require(2, f"the {scored.part} part")
+    shares = at.plan.train[str(scored.trained_on)].split
+    record = None if run is None else split_of(run)
+    if record is not None and (record.shares, record.seed) != (shares, 0):
+        raise ValueError(
+            f"{run} was trained with split {list(record.shares)} and seed {record.seed}, the plan's is "
+            f"{list(shares)} and 0: part {scored.part} would hold images that it saw"
+        )
+    rows = getattr(split_indices(images.files, shares, seed=0), scored.part)
+    return images.select(rows).require(2, f"the {scored.part} part")
 
 
-def _architecture(sweep: Sweep, where: str) -> Any:
-    """Settings of the untrained encoder: the first trained derender method's, or those of preset small."""
-    plan, trained_on = sweep.plan, sweep.plan.score[where].trained_on
-    own = [name for name in plan.rows() if plan.kind(name) == OURS and plan.is_trained(name)]
-    if own and trained_on is not None:
-        settings = plan.configuration(plan.source(own[0]), trained_on, 0).model
-        if settings.network.image_size == plan.image_size:
-            return settings
-    small = MODEL_PRESETS["small"]
-    network = small.network.model_copy(update={"image_size": plan.image_size})
-    return small.model_copy(update={"network": network})
-
-
-def _questions(sweep: Sweep, where: str, table: FeatureTable) -> list[tuple[str, tuple[str, ...], RowRules]]:
+def _questions(
+    at: Comparison, job: Job, table: FeatureTable
+) -> Iterable[tuple[str, tuple[str, ...], RowRules]]:
     """Names, label columns and row rules of a scored set's questions, by the labels it has."""
-    scored = sweep.plan.score[where]
-    have = ", ".join(table.labels) or "none"
+    scored, have = at.plan.score[job.where], ", ".join(table.labels) or "none"
     if scored.table is None:
         columns = attribute_columns(table) if scored.label == (ATTRIBUTES,) else scored.label
         if not columns:
             raise ValueError(f"{scored.data} has no yes/no label; it has {have}")
-        for column in (*columns, *scored.mean_by):
-            table.label(column)
-        return [(where, tuple(columns), RowRules(scored.mean_by, scored.min_count, scored.max_count))]
+        return [(job.where, columns, RowRules(scored.mean_by, scored.min_count, scored.max_count))]
     parts = [part for part in table_named(scored.table).parts if part.columns(table)]
     if not parts:
         raise ValueError(f"table {scored.table!r} needs other labels than {scored.data} has ({have})")
-    names = [f"{where} {part.name}" if len(parts) > 1 else where for part in parts]
-    return [(name, part.columns(table), part.rows(table)) for name, part in zip(names, parts, strict=True)]
+    named = {f"{job.where} {part.name}" if len(parts) > 1 else job.where: part for part in parts}
+    return [(name, part.columns(table), part.rows(table)) for name, part in named.items()]
+
+
+def run_progress(run: Path) -> Facts:
+    """Images seen and seconds of training by the last checkpoint; None where there is none."""
+    try:
+        state = json.loads((run / "checkpoints" / "last" / "state.json").read_text())["state"]
+        return {"images": state["images"], "seconds": state["seconds"]}
+    except (OSError, ValueError, KeyError, TypeError):
+        return {"images": None, "seconds": None}
+
+
+def _parameters(model: Any) -> int:
+    return sum(values.numel() for values in model.parameters())
+
+
+def _file_facts(path: str | Path) -> list[Any]:
+    """A data set's path, and size and time where it is one file."""
+    file = Path(str(path).partition("::")[0])
+    status = file.stat() if file.is_file() else None
+    return [str(path)] if status is None else [str(path), status.st_size, status.st_mtime_ns]

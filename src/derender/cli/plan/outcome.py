@@ -3,153 +3,129 @@
 Made anew from the notes of all jobs every time, so they always show the present results.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
 
 from derender.cli.console import write_json
+from derender.cli.plan.jobs import Comparison, Job, Note
 from derender.cli.plan.settings import OURS, Plan
-from derender.cli.plan.sweep import Job, Note, Sweep
 from derender.evaluation.score_table import Scores, ScoreTable
-from derender.report.compared import (
-    Cost,
-    ScoredQuestion,
-    protocol_picture,
-    protocol_table,
-    scores_from,
-    set_tables,
-)
+from derender.report.compared import COST_COLUMNS, protocol_picture, protocol_table, scores_from, set_tables
 from derender.report.comparison import comparison_page
 from derender.report.page import write_whole
 
 NAMES = {"cluster": "clustering", "linear": "linear"}
 MISSING = {"failed": "failed", "stopped": "missing"}
+Notes = Mapping[Job, Note]
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """The results of a comparison.
-
-    Attributes:
-        tables: the one table of each protocol.
-        files: everything that was written.
-        failed: sentences on failures.
-        missing: sentences on jobs that the budget left undone.
-    """
-
-    tables: list[ScoreTable]
-    files: list[Path]
-    failed: list[str]
-    missing: list[str]
-
-
-def write_outcome(sweep: Sweep) -> Outcome:
-    """Write every protocol's files beside the plan.
+def write_outcome(at: Comparison, notes: Notes) -> tuple[list[ScoreTable], dict[str, Any]]:
+    """Write every protocol's files beside the plan; gives the one table of each, and what ``--json`` says.
 
     Raises:
         ValueError: nothing at all could be scored.
     """
-    plan, notes = sweep.plan, sweep.notes
-    questions: dict[str, list[ScoredQuestion]] = {}
-    values: dict[str, list[Any]] = {}
-    for job, note in notes.items():
-        if job.kind == "score" and note.state == "done":
-            costs, absent = _costs(plan, job, notes), _absent(plan, job, notes)
-            for question in note.facts["questions"]:
-                protocol = question["protocol"]
-                questions.setdefault(protocol, []).extend(scores_from(question, costs, absent))
-                values.setdefault(protocol, []).append({**question, "costs": costs, "absent": absent})
-    failed, missing = _sentences(notes, "failed"), _sentences(notes, "stopped")
-    if not questions:
-        raise ValueError(f"nothing could be scored: {'; '.join([*failed, *missing])}")
-    outcome = Outcome([], [], failed, missing)
-    for protocol, scores in questions.items():
-        methods = plan.rows()
-        summary = protocol_table(scores, methods)
-        tables = [summary, *(table for one in scores for table in set_tables(one, methods))]
+    plan, methods = at.plan, at.plan.rows()
+    summaries, files = [], []
+    reasons = {word: _sentences(notes, state) for state, word in MISSING.items()}
+    absent = [*reasons["failed"], *reasons["missing"]]
+    for protocol, name in NAMES.items():
+        questions = [
+            {**question, "costs": _costs(plan, job, notes), "absent": _absent(plan, job, notes)}
+            for job, note in notes.items()
+            if job.kind == "score" and note.state == "done"
+            for question in note.facts["questions"]
+            if question["protocol"] == protocol
+        ]
+        if not questions:
+            continue
+        scores = [score for one in questions for score in scores_from(one, one["costs"], one["absent"])]
+        tables = [
+            protocol_table(scores, methods),
+            *(table for one in scores for table in set_tables(one, methods)),
+        ]
         svg, png = protocol_picture(scores, methods)
         page = comparison_page(
-            f"{NAMES[protocol].capitalize()}: {', '.join(one['name'] for one in values[protocol])}",
-            tables,
-            lead=_lead(plan, missing),
-            facts=_facts(plan),
-            failed=[*failed, *missing],
-            picture=svg,
-        )
-        target, text = sweep.path / NAMES[protocol], Scores(tables, {})
-        notes_text = "".join(f"\n- {sentence}" for sentence in (*failed, *missing))
-        notes_text = f"\nFailed or missing:\n{notes_text}\n" if notes_text else ""
+            f"{name.capitalize()}: {', '.join(one['name'] for one in questions)}", tables,
+            lead=_lead(plan, bool(reasons["missing"])), facts=_facts(plan), failed=absent, picture=svg,
+        )  # fmt: skip
+        text, target = Scores(tables, {}), at.path / name
+        listed = "".join(f"\n- {sentence}" for sentence in absent)
         contents = {
-            ".md": (text.to_markdown() + notes_text).encode(),
-            ".tex": text.to_latex().encode(),
-            ".html": page.html().encode(),
-            ".svg": _standalone(svg).encode(),
+            ".md": text.to_markdown() + (f"\nFailed or missing:\n{listed}\n" if absent else ""),
+            ".tex": text.to_latex(),
+            ".html": page.html(),
+            ".svg": _standalone(svg),
             ".png": png,
         }
-        files = [write_whole(target.with_suffix(suffix), content) for suffix, content in contents.items()]
-        numbers = {"protocol": protocol, "questions": values[protocol], "failed": failed, "missing": missing}
-        write_json(str(target.with_suffix(".json")), {**numbers, "plan": plan.model_dump(mode="json")})
-        outcome.files.extend([*files, target.with_suffix(".json")])
-        outcome.tables.append(summary)
-    return outcome
+        for suffix, content in contents.items():
+            content = content if isinstance(content, bytes) else content.encode()
+            files.append(write_whole(target.with_suffix(suffix), content))
+        files.append(target.with_suffix(".json"))
+        values = {"protocol": protocol, "questions": questions, **reasons}
+        write_json(str(files[-1]), {**values, "plan": plan.model_dump(mode="json")})
+        summaries.append(tables[0])
+    if not summaries:
+        raise ValueError(f"nothing could be scored: {'; '.join(absent)}")
+    shown = [table.values() for table in summaries]
+    return summaries, {"out": at.path, "files": files, **reasons, "tables": shown}
 
 
 def _standalone(svg: str) -> str:
     """A page's chart as a file of its own: on white, dark ink, with the name space that files need."""
     head, rest = svg.split(">", 1)
-    if "xmlns=" not in head:
-        head += ' xmlns="http://www.w3.org/2000/svg"'
+    space = "" if "xmlns=" in head else ' xmlns="http://www.w3.org/2000/svg"'
     ground = '<rect width="100%" height="100%" fill="#fff"/>'
-    return f'{head} color="#1e293b" font-family="sans-serif">{ground}{rest}'
+    return f'{head}{space} color="#1e293b" font-family="sans-serif">{ground}{rest}'
 
 
-def _costs(plan: Plan, job: Job, notes: Mapping[Job, Note]) -> dict[str, Cost]:
+def _costs(plan: Plan, job: Job, notes: Notes) -> dict[str, dict[str, Any]]:
     """The cost of every row: of methods by their own jobs, of controls by the scores' job."""
     costs = {}
     for method in plan.rows():
         mine = [one for one in job.after if one.method == method]
         done = [notes[one].facts for one in mine if notes[one].state == "done"]
         runs = [notes[one.after[0]].facts for one in mine if one.after]
-        if not done:
-            continue
-        seconds = [run["seconds"] for run in runs if run.get("seconds") is not None]
-        costs[method] = Cost(
-            done[0]["parameters"] or None,
-            float(np.mean(seconds)) if seconds else None,
-            next((run["images"] for run in runs if run.get("images")), None),
-            done[0]["numbers"],
-            float(np.mean([facts["seconds_a_picture"] for facts in done])),
-        )
-    controls = notes[job].facts["controls"].items()
-    return costs | {
-        name: Cost(parameters=facts["parameters"], numbers=facts["numbers"]) for name, facts in controls
+        if done:
+            costs[method] = {
+                "parameters": done[0]["parameters"] or None,
+                "seconds": _mean(run.get("seconds") for run in runs),
+                "images": next((run["images"] for run in runs if run.get("images")), None),
+                "numbers": done[0]["numbers"],
+                "embedding_seconds": _mean(facts["seconds_a_picture"] for facts in done),
+            }
+    unknown = dict.fromkeys(COST_COLUMNS)
+    return costs | {name: {**unknown, **facts} for name, facts in notes[job].facts["controls"].items()}
+
+
+def _mean(values: Iterable[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return float(np.mean(known)) if known else None
+
+
+def _absent(plan: Plan, job: Job, notes: Notes) -> dict[str, str]:
+    """Why a method has no row, in a few words that begin with failed or missing."""
+    mine = {method: [notes[one] for one in job.after if one.method == method] for method in plan.rows()}
+    return {
+        method: f"{MISSING[own[0].state]}: {own[0].why}"
+        for method, own in mine.items()
+        if not any(note.state == "done" for note in own)
     }
 
 
-def _absent(plan: Plan, job: Job, notes: Mapping[Job, Note]) -> dict[str, str]:
-    """Why a method has no row, in a few words that begin with failed or missing."""
-    absent = {}
-    for method in plan.rows():
-        mine = [notes[one] for one in job.after if one.method == method]
-        if not any(note.state == "done" for note in mine):
-            absent[method] = f"{MISSING[mine[0].state]}: {mine[0].why}"
-    return absent
-
-
-def _sentences(notes: Mapping[Job, Note], state: str) -> list[str]:
+def _sentences(notes: Notes, state: str) -> list[str]:
     """The jobs that ended so, each reason once, with the first job that had it."""
-    sentences: dict[tuple[str, str], str] = {}
+    sentences: dict[tuple[str, str, str], str] = {}
     for job, note in notes.items():
         if note.state == state:
             trained = job.after[0].where if job.kind == "embed" and job.after else job.where
-            sentences.setdefault((f"{job.method} {trained}", note.why), f"{job.name}: {note.why}")
+            sentences.setdefault((job.method, trained, note.why), f"{job.name}: {note.why}")
     return list(sentences.values())
 
 
-def _lead(plan: Plan, missing: list[str]) -> str:
+def _lead(plan: Plan, missing: bool) -> str:
     text = f"Every method that is trained here saw {plan.images:,} images of the same training part."
     if plan.seeds == 1:
         text += " One training seed each: intervals speak of which images were scored, not of trainings."
@@ -157,12 +133,11 @@ def _lead(plan: Plan, missing: list[str]) -> str:
 
 
 def _facts(plan: Plan) -> dict[str, object]:
-    trained = ", ".join(f"{name} ({images.data})" for name, images in plan.train.items())
     ours = [name for name in plan.rows() if plan.kind(name) == OURS]
     return {
         "methods": ", ".join(plan.rows()),
         "ours": ", ".join(ours) or "none",
-        "trained on": trained or "nothing",
+        "trained on": ", ".join(f"{name} ({one.data})" for name, one in plan.train.items()) or "nothing",
         "images seen": f"{plan.images:,}",
         "seeds": plan.seeds,
         "settings of all trainings": ", ".join(f"{k}={v}" for k, v in plan.settings.items()) or "none",
