@@ -31,7 +31,7 @@ COST_COLUMNS = {
     "embedding_seconds": Column("ms an image", None, 2, note="to embed, likewise"),
 }
 """A row's cost on one data set by name; None where there is nothing to tell."""
-Costs = Mapping[str, Mapping[str, float | None]]
+Costs = Mapping[str, Mapping[str, Any]]
 
 
 @dataclass(frozen=True)
@@ -91,18 +91,15 @@ def scores_from(question: Mapping[str, Any], costs: Costs, absent: Mapping[str, 
 def _rows_from(values: Mapping[str, Any]) -> dict[str, ScoredRow]:
     """Rows as JSON keeps them: without resamples, null for NaN."""
 
-    def estimate(one: Mapping[str, float | None]) -> Estimate:
-        numbers = [
-            nan if (value := one[part]) is None else value for part in ("value", "low", "high", "spread")
-        ]
-        return Estimate(*numbers, np.empty(0))
+    def numbers(one: Mapping[str, Any]) -> dict[str, Any]:
+        named = {"deviation" if part == "spread" else part: value for part, value in one.items()}
+        return {part: nan if value is None else value for part, value in named.items()}
 
     return {
         name: ScoredRow(
             name, row["control"], row["runs"],
-            {score: estimate(one) for score, one in row["scores"].items()},
-            {score: Difference(**{part: nan if value is None else value for part, value in one.items()})
-             for score, one in row["versus"].items()},
+            {score: Estimate(**numbers(one), resampled=np.empty(0)) for score, one in row["scores"].items()},
+            {score: Difference(**numbers(one)) for score, one in row["versus"].items()},
         )
         for name, row in values.items()
     }  # fmt: skip

@@ -6,16 +6,16 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from filelock import FileLock
 from PIL import Image
 
 from derender.cli import main
-from derender.cli.plan import sweep
+from derender.cli.plan.jobs import Comparison, jobs_of, run_progress
 from derender.cli.plan.settings import read_plan
-from derender.cli.plan.sweep import Sweep, jobs_of, run_progress
+from derender.cli.plan.sweep import died
 from derender.training import loop
 
 PLAN = """
@@ -135,15 +135,14 @@ def test_the_budget_ends_a_training_and_leaves_tables(plan, whole, monkeypatch, 
         now[0] += 60
         return step(run)
 
-    clock = SimpleNamespace(time=lambda: now[0], perf_counter=time.perf_counter)
     with monkeypatch.context() as patch:  # every step takes a minute
         patch.setattr(loop._Run, "step", slow_step)
-        patch.setattr(sweep, "time", clock)
+        patch.setattr(time, "time", lambda: now[0])
         assert main([*words, "--minutes", "1.5"]) == 0
     said = capsys.readouterr().err
     assert "the budget is used; the same command goes on where it stopped" in said
     assert run_progress(out / "runs" / "colours" / "ae")["images"] == 32
-    assert "missing: train ae on colours: the budget was used before it was trained (32 of 64" in said
+    assert "missing: train ae on colours: the budget was used before it was done (32 of 64" in said
     told = json.loads((out / "clustering.json").read_text())
     assert "ae" not in told["questions"][0]["rows"] and "pixels" in told["questions"][0]["rows"]
     assert told["questions"][0]["absent"]["ae"].startswith("missing: ")
@@ -161,15 +160,16 @@ def test_worker_processes_do_the_same(plan, whole):
 
 
 def test_a_worker_that_was_killed_costs_itself_alone(plan, tmp_path):
-    standing = Sweep(read_plan(plan), tmp_path)
-    job = jobs_of(standing.plan)[0]
-    note = standing.left_nothing(job, -signal.SIGKILL)
-    assert note.state == "failed" and "was killed by SIGKILL" in note.why and standing.note(job) == note
+    at = Comparison(read_plan(plan), tmp_path)
+    job = jobs_of(at.plan)[0]
+    note = died(at, job, -signal.SIGKILL)
+    assert note.state == "failed" and "was killed by SIGKILL" in note.why and at.note(job) == note
 
 
 def test_two_at_once_in_one_folder_are_refused(plan, tmp_path, capsys):
-    with sweep.alone(tmp_path / "out"):
-        (tmp_path / "out" / "plan.yaml").write_text("")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "plan.yaml").write_text("")
+    with FileLock(tmp_path / "out" / ".lock"):
         assert main(["compare", "--plan", str(plan), "--out", str(tmp_path / "out")]) == 2
     assert "another derender compare works in" in capsys.readouterr().err
 

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
+from derender.cli.plan.jobs import jobs_of
 from derender.cli.plan.settings import read_plan
-from derender.cli.plan.sweep import jobs_of
 
 GOOD = """
 images: 1000

@@ -9,11 +9,11 @@ import re
 import shutil
 import signal
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from math import inf
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TextIO
 
 from pydantic import Field
 
@@ -25,17 +25,19 @@ from derender.cli.plan.settings import OURS, WITHOUT_LOOP, Plan
 from derender.data import ImageSet, split_indices
 from derender.evaluation.clustering import compare_clusterings
 from derender.evaluation.controls import architecture, control_rows
-from derender.evaluation.feature_rows import FeatureRow, aligned, attribute_columns, prepare
+from derender.evaluation.feature_rows import FeatureRow, aligned, attribute_labels, prepare
 from derender.evaluation.linear_probing import compare_prepared
 from derender.evaluation.memory import Memory, content_hash
 from derender.evaluation.paper_tables import ATTRIBUTES, RowRules, table_named
 from derender.features import FeatureTable, embed_pictures
-from derender.inputs import as_images, as_model, device_named, split_of
+from derender.inputs import as_images, as_model, split_of
 from derender.model import Derenderer
 from derender.presets import MODEL_PRESETS
 from derender.settings import Settings
 from derender.storage.atomic import atomic_file
+from derender.storage.folder import SplitRecord
 from derender.training import TrainingInterrupted
+from derender.training.config import with_changes
 
 COMPONENTS = 64  # of pca and noise
 SCORING = {"clustering", "counts", "draws", "untrained_seeds", "resamples", "image_size"}
@@ -119,19 +121,23 @@ class Comparison:
         """Whether the budget is used."""
         return time.time() >= self.deadline
 
-    def run(self, job: Job) -> Path:
-        """The run folder of a training."""
-        given = self.plan.methods[job.method].runs.get(job.where)
-        name = job.method if job.seed == 0 else f"{job.method}-seed{job.seed}"
-        return self.path / "runs" / job.where / name if given is None else Path(given)
-
-    def result(self, job: Job) -> Path:
-        """The run folder of a training, else the table of features."""
-        return self.run(job) if job.kind == "train" else self.file("features", job, ".parquet")
-
     def file(self, folder: str, job: Job, suffix: str) -> Path:
         """A job's file: its ``.json`` in jobs, ``.parquet`` in features, or ``.log`` in logs."""
         return self.path / folder / f"{job.slug}{suffix}"
+
+    def result(self, job: Job) -> Path:
+        """The run folder of a training, the table of features, or the note that holds the scores."""
+        if job.kind != "train":
+            return self.file("features", job, ".parquet") if job.method else self.file("jobs", job, ".json")
+        name = job.method if job.seed == 0 else f"{job.method}-seed{job.seed}"
+        given = self.plan.methods[job.method].runs.get(job.where)
+        return self.path / "runs" / job.where / name if given is None else Path(given)
+
+    def log(self, job: Job) -> TextIO:
+        """The open file for the words of a worker and the traceback of a failure."""
+        file = self.file("logs", job, ".log")
+        file.parent.mkdir(parents=True, exist_ok=True)
+        return file.open("a")
 
     def note(self, job: Job) -> Note | None:
         """The note that a job left; None without one that can be read."""
@@ -140,46 +146,55 @@ class Comparison:
         except (FileNotFoundError, ValueError):
             return None
 
-    def leave(self, job: Job, state: str = "done", why: str = "", **more: Any) -> Note:
+    def leave(self, job: Job, **how: Any) -> Note:
         """Write a job's note."""
-        note = Note(job=job.name, key=self.key(job), state=state, why=why, **more)  # pyright: ignore[reportArgumentType]
+        note = Note(job=job.name, key=self.key(job), **how)
         with atomic_file(self.file("jobs", job, ".json")) as temporary:
             temporary.write_text(note.model_dump_json(indent=1))
         return note
 
+    def known(self, job: Job) -> Note | None:
+        """The note of a job that need not be done, or can no longer be."""
+        note = self.note(job)
+        needed = self.note(job.after[0]) if job.kind == "embed" and job.after else None
+        ended = note is not None and (note.final or (note.state == "done" and self.result(job).exists()))
+        if note is not None and ended and note.key == self.key(job):
+            return note
+        if needed is not None and needed.state != "done":
+            return self.leave(job, state=needed.state, why=needed.why, final=needed.final)
+        return self.stopped(job) if self.over and job.kind != "score" else None
+
+    def stopped(self, job: Job) -> Note:
+        """Leave the note of a job that the end of the budget stopped, or kept from beginning."""
+        images = run_progress(self.result(job))["images"] if job.kind == "train" else None
+        seen = f" ({images:,} of {self.plan.images:,} images seen)" if images else ""
+        return self.leave(job, state="stopped", why=f"the budget was used before it was done{seen}")
+
     def key(self, job: Job) -> str:
         """Changes with the settings and files of a job, and with the results of those before it."""
-        plan, method = self.plan, self.plan.methods.get(job.method)
+        plan, method, run = self.plan, self.plan.methods.get(job.method), self.result(job)
         source = plan.train[job.where] if job.kind == "train" else plan.score[job.where]
-        read = {"data", "dataset", "limit", "part", "split"} if method else None
-        before = [
-            [one.method, one.seed, note.key, note.state] for one in job.after if (note := self.note(one))
-        ]
-        inputs = {"before": before, "images": source.model_dump(mode="json", include=read)}
-        inputs["files"] = [_file_facts(source.data)]
-        if job.kind == "score":
-            inputs["how"] = plan.model_dump(mode="json", include=SCORING)
+        read, files = {"data", "dataset", "limit", "part", "split"}, [source.data.partition("::")[0]]
+        if method is None:
+            how, read = plan.model_dump(mode="json", include=SCORING), None
         elif job.kind == "embed":
-            inputs["method"] = [
-                plan.kind(job.method),
-                method.model,
-                method.features,
-                method.whitened,
-                plan.image_size,
-            ]
+            model = plan.methods[plan.source(job.method)].model
+            how = [plan.kind(job.method), model, method.features, method.whitened, plan.image_size]
         elif job.where in method.runs:
-            run = self.run(job)
-            inputs["files"] += [
-                _file_facts(run / name) for name in ("model/model.safetensors", "model.safetensors")
-            ]
+            how = str(run)
+            files += [run / "model" / "model.safetensors", run / "model.safetensors"]
         else:
-            inputs["config"] = plan.configuration(job.method, job.where, job.seed).model_dump(mode="json")
-        return content_hash(inputs)
+            how = plan.configuration(job.method, job.where, job.seed).model_dump(mode="json")
+        found = [file.stat() for file in map(Path, files) if file.is_file()]
+        before = [(note.key, note.state) for one in job.after if (note := self.note(one))]
+        images = source.model_dump(mode="json", include=read)
+        times = [(file.st_size, file.st_mtime_ns) for file in found]
+        return content_hash({"images": images, "how": how, "files": times, "before": before})
 
 
 def train(at: Comparison, job: Job, progress: Callable[..., None]) -> Facts:
     """Train, or go on with it, or take the run that is there."""
-    plan, run, facts = at.plan, at.run(job), {}
+    plan, run, facts = at.plan, at.result(job), {}
     kind, in_the_loop = plan.kind(job.method), plan.kind(job.method) not in WITHOUT_LOOP
     if job.where not in plan.methods[job.method].runs:
         resume = in_the_loop and (run / "config.yaml").is_file()
@@ -187,7 +202,7 @@ def train(at: Comparison, job: Job, progress: Callable[..., None]) -> Facts:
             shutil.rmtree(run)
 
         def watch(now: Any) -> None:
-            progress(now.done, now.total, f"{now.images_per_second:.0f} pictures/s")
+            progress(now.done, now.total, f"{now.images_per_second:.0f} images/s")
             if at.over and in_the_loop and now.phase == "train":
                 signal.raise_signal(signal.SIGTERM)  # the loop saves and stops after this step
             elif at.over:
@@ -205,20 +220,20 @@ def train(at: Comparison, job: Job, progress: Callable[..., None]) -> Facts:
     elif job.seed:
         raise ValueError(f"{run} is one run: give seeds: 1, or let {job.method} be trained here")
     model = as_model(run, device="cpu") if kind == OURS else load_baseline(run, kind)
-    return {"run": str(run), "parameters": _parameters(model), **run_progress(run), **facts}
+    return {"run": str(run), "parameters": parameter_count(model), **run_progress(run), **facts}
 
 
 def embed(at: Comparison, job: Job, progress: Callable[..., None]) -> Facts:
     """Write the feature table of a scored set by one method."""
     plan, method, kind = at.plan, at.plan.methods[job.method], at.plan.kind(job.method)
-    source = str(at.run(job.after[0])) if job.after else plan.methods[plan.source(job.method)].model
+    source = str(at.result(job.after[0])) if job.after else plan.methods[plan.source(job.method)].model
     net, size = None, plan.image_size
     if kind == OURS:
         net = as_model(str(source), device=at.device)
         net = net if method.whitened else net.without_features()
     elif kind not in CONTROLS:
-        device, chosen = device_named(at.device), method.features or None
-        net = open_baseline(kind, source, device=device, features=chosen, image_size=size)
+        chosen = method.features or None
+        net = open_baseline(kind, source, device=at.device, features=chosen, image_size=size)
     images = _scored_images(at, job, size if net is None else net.image_size, source if job.after else None)
 
     def watch(done: int, total: int) -> None:
@@ -234,15 +249,13 @@ def embed(at: Comparison, job: Job, progress: Callable[..., None]) -> Facts:
     seconds = time.perf_counter() - began
     table.write(at.result(job))
     factors = method.features or (("geometry", "albedo") if kind == OURS else tuple(table.factors))
-    return {
-        "rows": len(table), "factors": list(factors), "numbers": int(table.concatenate(factors).shape[1]),
-        "parameters": 0 if net is None else _parameters(net), "seconds_a_picture": seconds / len(table),
-    }  # fmt: skip
+    parameters = None if net is None else parameter_count(net)
+    return {"factors": factors, "parameters": parameters, "seconds_a_picture": seconds / len(table)}
 
 
 def score(at: Comparison, job: Job, progress: Callable[..., None]) -> Facts:
     """Score the finished methods on one set, beside controls; the others' notes say why they are missing."""
-    plan, memory, rows = at.plan, Memory(at.path / "memory"), []
+    plan, scored, memory, rows = at.plan, at.plan.score[job.where], Memory(at.path / "memory"), []
     for method in plan.rows():
         notes = {one: at.note(one) for one in job.after if one.method == method}
         done = {one: note.facts for one, note in notes.items() if note is not None and note.state == "done"}
@@ -250,28 +263,28 @@ def score(at: Comparison, job: Job, progress: Callable[..., None]) -> Facts:
             tables = tuple(FeatureTable.read(at.result(one)) for one in done)
             factors = tuple(next(iter(done.values()))["factors"])
             rows.append(FeatureRow(method, tables, factors, "control" in tables[0].origin))
-    small, size = MODEL_PRESETS["small"], plan.image_size
-    network = small.network.model_copy(update={"image_size": size})
-    settings = architecture(rows)
-    if settings is None or settings.network.image_size != size:
-        settings = small.model_copy(update={"network": network})
-    images = _scored_images(at, job, size)
+    settings = architecture(rows) or with_changes(MODEL_PRESETS["small"], [f"image_size={plan.image_size}"])
+    images = _scored_images(at, job, settings.network.image_size)
     images = aligned(images, rows[0].tables[0].files) if rows else images
-    seeds, factors = range(plan.untrained_seeds), ("geometry", "albedo")
-    controls = control_rows(images, settings, factors, seeds, memory=memory, device=at.device)
-    parameters = _parameters(Derenderer.seeded(settings, 0))
-    facts = {
-        row.name: {
-            "numbers": int(row.tables[0].concatenate(row.factors).shape[1]),
-            "parameters": parameters if row.name.startswith("untrained") else None,
-        }
-        for row in controls
-    }
-    found = []
-    for name, columns, rules in _questions(at, job, (*rows, *controls)[0].tables[0]):
-        ready = prepare([*rows, *controls], columns, **asdict(rules))
-        how: dict[str, Any] = {"resample_count": plan.resamples, "memory": memory}
-        for protocol in plan.score[job.where].protocols:
+    seeds = range(plan.untrained_seeds)
+    rows += control_rows(images, settings, ("geometry", "albedo"), seeds, memory=memory, device=at.device)
+    table, found = rows[0].tables[0], []
+    questions = {job.where: (scored.label, RowRules(scored.mean_by, scored.min_count, scored.max_count))}
+    if scored.label == (ATTRIBUTES,):
+        questions[job.where] = attribute_labels(table)[0], questions[job.where][1]
+    if scored.table is not None:
+        parts = [part for part in table_named(scored.table).parts if part.columns(table)]
+        if not parts:
+            have = ", ".join(table.labels) or "none"
+            raise ValueError(f"table {scored.table!r} needs other labels than {scored.data} has ({have})")
+        names = {part.name: f"{job.where} {part.name}" if len(parts) > 1 else job.where for part in parts}
+        questions = {names[part.name]: (part.columns(table), part.rows(table)) for part in parts}
+    for name, (columns, rules) in questions.items():
+        ready, how = (
+            prepare(rows, columns, **asdict(rules)),
+            {"resample_count": plan.resamples, "memory": memory},
+        )
+        for protocol in scored.protocols:
             if protocol == "cluster":
                 how_grouped = {"controls": ready.controls, "method": plan.clustering, **how}
                 result = compare_clusterings(ready.features, ready.labels, **how_grouped)
@@ -279,7 +292,12 @@ def score(at: Comparison, job: Job, progress: Callable[..., None]) -> Facts:
                 result = compare_prepared(ready, plan.counts, tuple(range(plan.draws)), **how)
             numbers = {key: value for key, value in result.numbers().items() if key != "per_label"}
             found.append(plain({"name": name, "protocol": protocol, **numbers}))
-    return {"questions": found, "controls": facts}
+    widths = {row.name: int(row.tables[0].concatenate(row.factors).shape[1]) for row in rows}
+    return {
+        "questions": found,
+        "numbers": widths,
+        "untrained": parameter_count(Derenderer.seeded(settings, 0)),
+    }
 
 
 def _scored_images(at: Comparison, job: Job, image_size: int, run: str | None = None) -> ImageSet:
@@ -288,32 +306,15 @@ def _scored_images(at: Comparison, job: Job, image_size: int, run: str | None = 
     images = as_images(scored.data, image_size, dataset=scored.dataset, limit=scored.limit)
     if scored.part == "all":
         return images
-    shares = at.plan.train[str(scored.trained_on)].split
-    record = None if run is None else split_of(run)
-    if record is not None and (record.shares, record.seed) != (shares, 0):
+    wanted = SplitRecord(at.plan.train[str(scored.trained_on)].split, 0)
+    kept = wanted if run is None else split_of(run) or wanted
+    if kept != wanted:
         raise ValueError(
-            f"{run} was trained with split {list(record.shares)} and seed {record.seed}, the plan's is "
-            f"{list(shares)} and 0: part {scored.part} would hold images that it saw"
+            f"{run} was trained with split {list(kept.shares)} and seed {kept.seed}, the plan's is "
+            f"{list(wanted.shares)} and 0: part {scored.part} would hold images that it saw"
         )
-    rows = getattr(split_indices(images.files, shares, seed=0), scored.part)
+    rows = getattr(split_indices(images.files, wanted.shares, seed=0), scored.part)
     return images.select(rows).require(2, f"the {scored.part} part")
-
-
-def _questions(
-    at: Comparison, job: Job, table: FeatureTable
-) -> Iterable[tuple[str, tuple[str, ...], RowRules]]:
-    """Names, label columns and row rules of a scored set's questions, by the labels it has."""
-    scored, have = at.plan.score[job.where], ", ".join(table.labels) or "none"
-    if scored.table is None:
-        columns = attribute_columns(table) if scored.label == (ATTRIBUTES,) else scored.label
-        if not columns:
-            raise ValueError(f"{scored.data} has no yes/no label; it has {have}")
-        return [(job.where, columns, RowRules(scored.mean_by, scored.min_count, scored.max_count))]
-    parts = [part for part in table_named(scored.table).parts if part.columns(table)]
-    if not parts:
-        raise ValueError(f"table {scored.table!r} needs other labels than {scored.data} has ({have})")
-    named = {f"{job.where} {part.name}" if len(parts) > 1 else job.where: part for part in parts}
-    return [(name, part.columns(table), part.rows(table)) for name, part in named.items()]
 
 
 def run_progress(run: Path) -> Facts:
@@ -325,12 +326,6 @@ def run_progress(run: Path) -> Facts:
         return {"images": None, "seconds": None}
 
 
-def _parameters(model: Any) -> int:
+def parameter_count(model: Any) -> int:
+    """Numbers that are learned, of all networks."""
     return sum(values.numel() for values in model.parameters())
-
-
-def _file_facts(path: str | Path) -> list[Any]:
-    """A data set's path, and size and time where it is one file."""
-    file = Path(str(path).partition("::")[0])
-    status = file.stat() if file.is_file() else None
-    return [str(path)] if status is None else [str(path), status.st_size, status.st_mtime_ns]

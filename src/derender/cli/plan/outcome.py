@@ -3,7 +3,7 @@
 Made anew from the notes of all jobs every time, so they always show the present results.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -83,26 +83,25 @@ def _standalone(svg: str) -> str:
 
 def _costs(plan: Plan, job: Job, notes: Notes) -> dict[str, dict[str, Any]]:
     """The cost of every row: of methods by their own jobs, of controls by the scores' job."""
-    costs = {}
-    for method in plan.rows():
-        mine = [one for one in job.after if one.method == method]
-        done = [notes[one].facts for one in mine if notes[one].state == "done"]
-        runs = [notes[one.after[0]].facts for one in mine if one.after]
-        if done:
-            costs[method] = {
-                "parameters": done[0]["parameters"] or None,
-                "seconds": _mean(run.get("seconds") for run in runs),
-                "images": next((run["images"] for run in runs if run.get("images")), None),
-                "numbers": done[0]["numbers"],
-                "embedding_seconds": _mean(facts["seconds_a_picture"] for facts in done),
-            }
-    unknown = dict.fromkeys(COST_COLUMNS)
-    return costs | {name: {**unknown, **facts} for name, facts in notes[job].facts["controls"].items()}
-
-
-def _mean(values: Iterable[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return float(np.mean(known)) if known else None
+    facts = notes[job].facts
+    costs = {
+        name: {**dict.fromkeys(COST_COLUMNS), "numbers": size} for name, size in facts["numbers"].items()
+    }
+    costs["untrained encoder"]["parameters"] = facts["untrained"]
+    for method in costs.keys() & set(plan.rows()):
+        done = [one for one in job.after if one.method == method and notes[one].state == "done"]
+        tables, runs = (
+            [notes[one].facts for one in done],
+            [notes[one.after[0]].facts for one in done if one.after],
+        )
+        seconds = [run["seconds"] for run in runs if run.get("seconds") is not None]
+        costs[method] |= {
+            "parameters": tables[0]["parameters"],
+            "seconds": float(np.mean(seconds)) if seconds else None,
+            "images": next((run["images"] for run in runs if run.get("images")), None),
+            "embedding_seconds": float(np.mean([one["seconds_a_picture"] for one in tables])),
+        }
+    return costs
 
 
 def _absent(plan: Plan, job: Job, notes: Notes) -> dict[str, str]:
@@ -111,18 +110,18 @@ def _absent(plan: Plan, job: Job, notes: Notes) -> dict[str, str]:
     return {
         method: f"{MISSING[own[0].state]}: {own[0].why}"
         for method, own in mine.items()
-        if not any(note.state == "done" for note in own)
+        if all(note.state != "done" for note in own)
     }
 
 
 def _sentences(notes: Notes, state: str) -> list[str]:
-    """The jobs that ended so, each reason once, with the first job that had it."""
-    sentences: dict[tuple[str, str, str], str] = {}
-    for job, note in notes.items():
-        if note.state == state:
-            trained = job.after[0].where if job.kind == "embed" and job.after else job.where
-            sentences.setdefault((job.method, trained, note.why), f"{job.name}: {note.why}")
-    return list(sentences.values())
+    """The jobs that ended so; features whose training ended so are not named again."""
+    return [
+        f"{job.name}: {note.why}"
+        for job, note in notes.items()
+        if note.state == state
+        and not (job.kind == "embed" and any(notes[one].state == state for one in job.after))
+    ]
 
 
 def _lead(plan: Plan, missing: bool) -> str:

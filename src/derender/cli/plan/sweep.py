@@ -1,4 +1,4 @@
-"""All jobs of a plan, each done once: features and scores before further trainings, until the budget is used.
+"""All jobs of a plan, each done once: a training with the features that need it, then scores.
 
 With several workers each job has a process of its own, so that one that is killed costs itself alone, and
 ends with its parent.
@@ -11,7 +11,8 @@ import sys
 import threading
 import time
 import traceback
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from collections import defaultdict
+from concurrent.futures import ThreadPoolExecutor
 from math import inf
 from multiprocessing import connection
 
@@ -19,21 +20,11 @@ import torch
 from filelock import FileLock, Timeout
 
 from derender.cli.console import duration, notice, progress_bar
-from derender.cli.plan.jobs import (
-    Collapsed,
-    Comparison,
-    Job,
-    Note,
-    embed,
-    jobs_of,
-    run_progress,
-    score,
-    train,
-)
+from derender.cli.plan.jobs import Collapsed, Comparison, Job, Note, embed, jobs_of, score, train
 from derender.training import TrainingInterrupted
 
 GRACE_SECONDS = 30.0  # after the budget, for a worker to save
-WORK = {"score": score, "embed": embed, "train": train}  # in the order of preference
+WORK = {"train": train, "embed": embed, "score": score}
 
 
 def do_all(at: Comparison, workers: int = 1, minutes: float | None = None) -> dict[Job, Note]:
@@ -44,47 +35,41 @@ def do_all(at: Comparison, workers: int = 1, minutes: float | None = None) -> di
     Raises:
         ValueError: another process works in the folder.
     """
-    jobs, notes, began = jobs_of(at.plan), {}, {}
-    running: dict[Future[Note], Job] = {}
-
-    def next_job() -> Job | None:
-        waiting = [job for job in jobs if job not in notes and job not in began]
-        ready = [job for job in waiting if notes.keys() >= set(job.after)]
-        for job in sorted(ready, key=lambda one: list(WORK).index(one.kind)):
-            if (note := _known(at, job, notes)) is None:
-                began[job] = time.perf_counter()
-                return job
-            notes[job] = note
-        return next_job() if ready else None
-
-    def ended(job: Job, note: Note) -> None:
-        notes[job] = note
-        took = duration(time.perf_counter() - began[job])
-        why = "" if note.state == "done" else f": {note.why}"
-        notice(f"[{len(notes)}/{len(jobs)}] {job.name}: {note.state}{why} ({took})")
-
+    jobs, notes = jobs_of(at.plan), {}
     at.deadline = inf if minutes is None else time.time() + 60 * minutes
+    lanes: dict[Job, list[Job]] = defaultdict(list)
+    for job in jobs:
+        lanes[job.after[0] if job.kind == "embed" and job.after else job].append(job)
+    scores = [lane for lane in lanes.values() if lane[0].kind == "score"]
+
+    def do(lane: list[Job]) -> None:
+        for job in lane:
+            note, began = at.known(job), time.perf_counter()
+            if note is None:
+                note = perform(at, job) if workers == 1 else _apart(at, job)
+                why = "" if note.state == "done" else f": {note.why}"
+                took = duration(time.perf_counter() - began)
+                notice(f"[{len(notes) + 1}/{len(jobs)}] {job.name}: {note.state}{why} ({took})")
+            notes[job] = note
+
     at.path.mkdir(parents=True, exist_ok=True)
     if workers > 1:
         os.environ.setdefault("OMP_NUM_THREADS", str(max(1, torch.get_num_threads() // workers)))
     try:
         with FileLock(at.path / ".lock", timeout=0), ThreadPoolExecutor(workers) as pool:
-            while True:
-                while len(running) < workers and (job := next_job()) is not None:
-                    if workers == 1:
-                        ended(job, perform(at, job))
-                    else:
-                        running[pool.submit(_apart, at, job)] = job
-                if not running:
-                    return notes
-                for done in wait(running, return_when=FIRST_COMPLETED).done:
-                    ended(running.pop(done), done.result())
+            try:
+                for stage in ([lane for lane in lanes.values() if lane not in scores], scores):
+                    list((map if workers == 1 else pool.map)(do, stage))
+            finally:
+                for process in multiprocessing.active_children():
+                    process.terminate()
     except Timeout as error:
         raise ValueError(
             f"another derender compare works in {at.path}: wait for it, or choose another --out"
         ) from error
     except KeyboardInterrupt as stop:
         raise KeyboardInterrupt("stopped and saved; the same command goes on where it stopped") from stop
+    return {job: notes[job] for job in jobs}
 
 
 def perform(at: Comparison, job: Job) -> Note:
@@ -95,34 +80,14 @@ def perform(at: Comparison, job: Job) -> Note:
     except TrainingInterrupted:
         if not at.over:
             raise
-        return at.leave(job, "stopped", f"the budget was used before it was done{_seen(at, job)}")
+        return at.stopped(job)
     except Exception as error:
-        log = at.file("logs", job, ".log")
-        log.parent.mkdir(parents=True, exist_ok=True)
-        with log.open("a") as stream:
+        with at.log(job) as stream:
             traceback.print_exc(file=stream)
         why, kind = " ".join(str(error).split()), type(error).__name__
         if not why or not isinstance(error, ValueError | OSError):
             why = f"{kind}: {why}".rstrip(": ")
-        return at.leave(job, "failed", why, final=isinstance(error, Collapsed))
-
-
-def _known(at: Comparison, job: Job, notes: dict[Job, Note]) -> Note | None:
-    """The note of a job that need not be done, or can no longer be."""
-    note, made = at.note(job), job.kind == "score" or at.result(job).exists()
-    if note is not None and note.key == at.key(job) and (note.final or (note.state == "done" and made)):
-        return note
-    if job.kind == "embed":
-        for before in (notes[one] for one in job.after if notes[one].state != "done"):
-            return at.leave(job, before.state, before.why, final=before.final)
-    if at.over and job.kind != "score":
-        return at.leave(job, "stopped", f"the budget was used before its turn{_seen(at, job)}")
-    return None
-
-
-def _seen(at: Comparison, job: Job) -> str:
-    images = run_progress(at.run(job))["images"] if job.kind == "train" else None
-    return f" ({images:,} of {at.plan.images:,} images seen)" if images else ""
+        return at.leave(job, state="failed", why=why, final=isinstance(error, Collapsed))
 
 
 def _apart(at: Comparison, job: Job) -> Note:
@@ -130,8 +95,8 @@ def _apart(at: Comparison, job: Job) -> Note:
     at.file("jobs", job, ".json").unlink(missing_ok=True)
     process = multiprocessing.get_context("spawn").Process(target=_work, args=(at, job))
     process.start()
-    left = inf if job.kind == "score" else at.deadline + GRACE_SECONDS - time.time()
-    process.join(min(max(left, 0), threading.TIMEOUT_MAX))
+    endless = job.kind == "score" or at.deadline == inf
+    process.join(None if endless else max(0.0, at.deadline + GRACE_SECONDS - time.time()))
     process.terminate()
     process.join()
     return at.note(job) or died(at, job, process.exitcode or 0)
@@ -140,17 +105,16 @@ def _apart(at: Comparison, job: Job) -> Note:
 def died(at: Comparison, job: Job, code: int) -> Note:
     """The note of a process that ended without one."""
     if at.over and job.kind != "score":
-        return at.leave(job, "stopped", "the budget was used while it was under way")
+        return at.stopped(job)
     how = f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
-    return at.leave(job, "failed", f"its process {how}: see {at.file('logs', job, '.log')}")
+    why = f"its process {how}: see {at.file('logs', job, '.log')}"
+    return at.leave(job, state="failed", why=why)
 
 
 def _work(at: Comparison, job: Job) -> None:
     """A worker process: one job, its words in a file."""
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    log = at.file("logs", job, ".log")
-    log.parent.mkdir(parents=True, exist_ok=True)
-    with log.open("a") as stream:
+    with at.log(job) as stream:
         os.dup2(stream.fileno(), sys.stdout.fileno())
         os.dup2(stream.fileno(), sys.stderr.fileno())
     try:
