@@ -6,6 +6,9 @@ import pytest
 from derender import Derenderer
 from derender.data import ImageSet
 from derender.report.evidence import Subject, gather, suitable_label
+from derender.report.run import run_page
+from derender.training.config import resolve
+from derender.training.run_folder import start_run
 
 COUNT = 48
 
@@ -29,16 +32,14 @@ def pictures() -> ImageSet:
     )
 
 
-def test_everything_that_can_be_told_is_told_and_escaped(model, pictures):
+def test_everything_that_can_be_told_is_told_and_escaped(model, pictures, tmp_path):
     pytest.importorskip("captum")
     done = []
     found = gather(Subject(model, pictures, pictures, "All of them"), lambda *step: done.append(step))
-    assert [section.short for section in found.sections] == [
-        *("Data", "Decomposed", "Films", "Scores", "Card", "Explained")
-    ]
+    assert list(found.sections) == ["data", "decomposed", "films", "scores", "card", "explained"]
     assert found.failed == [] and done == [(step, 6) for step in range(7)]
-    html = "".join(block for section in found.sections for block in section.blocks)
-    assert "<script>" not in html and "&lt;script&gt;.png" in html
+    html = run_page(start_run(tmp_path / "run", resolve("small"), {}, "cpu").path, found).html()
+    assert "<script>.png" not in html and "&lt;script&gt;.png" in html
     for told in ("All of them", "mean image", "no exact depth", "shuffled labels", "tone", "Swap test"):
         assert told in html
     assert html.count("prefers-reduced-motion") == 2
@@ -47,7 +48,7 @@ def test_everything_that_can_be_told_is_told_and_escaped(model, pictures):
 def test_parts_that_cannot_be_made_are_named_with_their_reason(model, pictures):
     few = pictures.select(slice(3))
     found = gather(Subject(model, few, few.select(slice(0)), "None"))
-    assert [section.short for section in found.sections] == ["Data"]
+    assert list(found.sections) == ["data"]
     assert len(found.failed) == 5
     assert "needs 1 images or more" in found.failed[0]
     assert "no label of 2 to 12 classes" in found.failed[-1]

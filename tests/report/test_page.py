@@ -11,10 +11,21 @@ import pytest
 from PIL import Image
 
 from derender.evaluation.score_table import Column, Row, ScoreTable
-from derender.report import blocks, charts, films
-from derender.report.page import Page, Section, write_whole
+from derender.report import charts, films
+from derender.report.page import TEMPLATES, Page, data_uri, write_whole
 
 HOSTILE = "<script>alert('x')</script>\"&"
+EVERY_BLOCK = TEMPLATES.from_string("""{% extends "page.html" %}{% import "blocks.html" as b %}
+{% block main %}{% call b.section(sections, text, text) %}
+<p>{{ text }}<strong>{{ text }}</strong></p>
+{{ b.key_figures({text: (text, text)}) }}{{ b.facts({text: text}) }}{{ b.definitions({text: text}) }}
+{% call b.folded(text) %}{{ text }}{% endcall %}
+{% call b.figure(text) %}{% call b.scroll(text) %}{{ b.image(picture, text) }}{% endcall %}{% endcall %}
+{{ b.row_of([(picture, text, text)], 64) }}{{ b.films([(film, picture, text)], text) }}
+{{ b.image_grid({text: [picture]}, [text], text, {text: text}) }}{{ b.table(table) }}
+{% for svg in svgs %}{{ b.chart(svg, text, text) }}{% endfor %}
+{% endcall %}{% endblock %}""")
+ONE_TABLE = TEMPLATES.from_string("""{% import "blocks.html" as b %}{{ b.table(table) }}""")
 
 
 def picture(level: int = 90) -> Image.Image:
@@ -23,27 +34,13 @@ def picture(level: int = 90) -> Image.Image:
 
 def full_page(text: str = "plain") -> str:
     """One of every block, with ``text`` wherever a text goes."""
-    table = ScoreTable(
-        text,
-        text,
-        [Column(text, "high", note=text)],
-        [Row(text, [0.5], note=text), Row("control", [text], control=True)],
-    )
-    parts = [
-        blocks.prose(text, blocks.strong(text), blocks.code(text)),
-        blocks.listing(text),
-        blocks.key_figures({text: (text, text)}),
-        blocks.facts({text: text}),
-        blocks.definitions({text: text}),
-        blocks.folded(text, blocks.prose(text)),
-        blocks.figure(blocks.wide(blocks.image(picture(), text), text), text),
-        blocks.row_of([(blocks.film(films.animated_png([picture(1), picture(2)]), picture(), text), text)]),
-        blocks.image_grid({text: [picture()]}, [text], text, {text: text}),
-        blocks.table(table),
-        blocks.chart(charts.curves({text: ([0, 1], [2, 3])}, text, text), text, text),
-        blocks.chart(charts.bars({text: 1.0, "b": 2.0}, text, [text], (text, 0.5)), text, text),
-    ]
-    return Page(text, text, [Section(text, parts, text)], text).html()
+    columns, rows = [Column(text, "high", note=text)], [Row(text, [0.5], note=text), Row("c", [text], True)]
+    curves = charts.curves({text: ([0, 1], [2, 3])}, text, text)
+    bars = charts.bars({text: 1.0, "b": 2.0}, text, [text], (text, 0.5))
+    film = films.animated_png([picture(1), picture(2)])
+    table = ScoreTable(text, text, columns, rows)
+    values = {"text": text, "picture": picture(), "film": film, "table": table, "svgs": [curves, bars]}
+    return Page(EVERY_BLOCK, text, text, values, text).html()
 
 
 class Elements(HTMLParser):
@@ -122,7 +119,7 @@ def test_table_marks_the_best_and_gives_numbers_to_sort_by():
         Row("pixels", [0.5, 2.0, 7], True),
         Row("none", [None, float("nan"), "-"], True),
     ]
-    html = blocks.table(ScoreTable("scores", "features", columns, rows))
+    html = ONE_TABLE.render(table=ScoreTable("scores", "features", columns, rows))
     best = re.findall(r'<td data-value="([^"]+)" class="best"', html)
     assert best == ["0.5", "2"]
     assert html.count('class="none"') == 2
@@ -132,24 +129,20 @@ def test_table_marks_the_best_and_gives_numbers_to_sort_by():
 def test_a_sentence_in_a_cell_may_break_and_a_short_word_may_not():
     long = "failed: the weights are not here, fetch them once"
     table = ScoreTable("scores", "features", [Column("why")], [Row("a", [long]), Row("b", ["0.1-0.2"])])
-    html = blocks.table(table)
+    html = ONE_TABLE.render(table=table)
     assert f'<td class="words">{long}</td>' in html and "<td>0.1-0.2</td>" in html
     assert ".numbers td.words { white-space: normal;" in full_page()
 
 
-def test_grid_and_image_reject_what_does_not_fit():
-    with pytest.raises(ValueError, match="same number of images"):
-        blocks.image_grid({"a": [picture()], "b": []}, ["x"], "")
-    with pytest.raises(ValueError, match="expected 1 row names"):
-        blocks.image_grid({"a": [picture()]}, [], "")
+def test_bytes_that_are_no_image_and_empty_charts_are_refused():
     with pytest.raises(ValueError, match="PNG, GIF or JPEG"):
-        blocks.image(b"<svg onload=alert(1)>", "x")
+        data_uri(b"<svg onload=alert(1)>")
     with pytest.raises(ValueError, match="at least one series"):
         charts.curves({}, "x", "y")
 
 
 def test_write_is_whole_and_leaves_the_old_file_on_failure(tmp_path: Path, monkeypatch):
-    page = Page("title", "lead", [Section("one", [blocks.prose("text")])])
+    page = Page("comparison.html", "title", "lead", {"tables": [], "failed": ["text"], "settings": {}})
     file = page.write(tmp_path / "new" / "folder" / "page.html")
     assert file.read_text() == page.html()
 

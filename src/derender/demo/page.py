@@ -1,10 +1,12 @@
 """The demo's report: images, and numbers beside controls, of the trained and of the bundled model.
 
-Every sentence about a number is made by comparing it. Leaves out computing (``story``).
+Every sentence about a number is made by comparing it. Leaves out computing (``story``) and the words of the
+page (``report/templates/demo.html``).
 """
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,10 +20,10 @@ from derender.evaluation.depth import predicted_depth
 from derender.evaluation.score_table import ScoreTable
 from derender.model import Derenderer
 from derender.presets import MODEL_PRESETS
-from derender.report import blocks, colours
+from derender.report import colours
 from derender.report.decomposition import COLUMN_MEANING, decompose_images
 from derender.report.evidence import looping_films
-from derender.report.page import Page, Section
+from derender.report.page import DIRECTIONS, Page
 from derender.report.run import loss_charts
 from derender.report.viewer.neighbours import rendered_examples
 from derender.scene.normals import normals_from_depth
@@ -36,36 +38,66 @@ ENDED = {
     "patience": "no more improvement on held-out images",
     "collapse": "the watcher",
 }
-EMPTY_PARTS = "Empty parts are those that the frontal view does not show."
+Pixels = UInt8[np.ndarray, "n 3 h w"]
 
 
 def demo_page(result: DemoResult) -> Page:
     """The whole report of one demo."""
     rows = shown_rows(result)
     images, tables = result.truth.images[rows], score_tables(result)
-    films = looping_films(
-        result.model,
-        images[: result.settings.films],
-        [f"unseen face {row + 1}" for row in range(min(len(rows), result.settings.films))],
-        f"From one image each: only light or camera moves, everything else stays. {EMPTY_PARTS}",
-    )
+    filmed = images[: result.settings.films]
+    names = [f"unseen face {row + 1}" for row in range(len(images))]
+    known = np.stack([one.picture for one in rendered_examples(BUNDLED, result.bundled.image_size)])
+    models = {"this run": result.model, BUNDLED: result.bundled}
+    same_size = result.model.image_size == result.bundled.image_size
+    tiles = {
+        "Depth error, SIDE x 100": _tile(tables["geometry"], 0, "average depth", "plane"),
+        "Normals, mean angle in degrees": _tile(tables["geometry"], 1, "average depth", "plane"),
+        "Identity, cluster accuracy": _tile(tables["clustering"], 0, "chance"),
+        "Reconstruction, L1": _tile(tables["reconstruction"], 0, "mean image"),
+    }
+    verdicts = {
+        "Depth": tables["geometry"].verdict(0),
+        "Normals": tables["geometry"].verdict(1),
+        "Clusters by identity": tables["clustering"].verdict(0),
+        "Reconstruction": tables["reconstruction"].verdict(0),
+    }
+    values = {
+        "result": result,
+        "usual": PRESETS[result.config.preset].images,
+        "tables": tables,
+        "tiles": tiles,
+        "verdicts": verdicts,
+        "inputs": colours.pictures(result.seen.images[:: max(1, len(result.seen) // INPUTS_SHOWN)]),
+        "inputs_shown": INPUTS_SHOWN,
+        "names": names,
+        "meaning": COLUMN_MEANING,
+        "decomposed": decompose_images(result.model, as_float(images)).columns,
+        "films": looping_films(result.model, filmed, names[: len(filmed)]),
+        "bundled": BUNDLED,
+        "same_size": same_size,
+        "bundled_films": looping_films(
+            result.bundled,
+            known[:BUNDLED_SHOWN],
+            [f"rendered face {number + 1}, by {BUNDLED}" for number in range(BUNDLED_SHOWN)],
+        ),
+        "known_names": [f"rendered face {number + 1}" for number in range(len(known[::2]))],
+        "beside_known": _beside(models if same_size else {BUNDLED: result.bundled}, known[::2]),
+        "beside": _beside(models, images[:BUNDLED_SHOWN]) if same_size else {},
+        "geometry": _beside_truth(result, rows),
+        "people": len(np.unique(result.identities)),
+        "clusters": _clusters(result),
+        "charts": loss_charts(read_metrics(result.trained.folder)),
+        "training": _training(result),
+        "presets": ", ".join(MODEL_PRESETS),
+    }
     return Page(
+        "demo.html",
         "Images decomposed",
         "derender was given faces without a single label and learned to decompose each one into geometry, "
         "albedo, light and camera, by reconstructing it. One run on this machine made this page; every "
         "number was measured in it.",
-        [
-            Section("Results", _summary(result, tables), "Summary"),
-            Section("Unseen faces, decomposed", _decomposed(result.model, images), "Decomposed"),
-            Section("Move the light, turn the head", [films], "Moved"),
-            Section("The bundled model", _bundled(result, images, tables), "Beside it"),
-            Section("Is the geometry real?", _geometry(result, rows, tables), "Geometry"),
-            Section(
-                "Clusters of people, without labels", _clusters(result, tables["clustering"]), "Clusters"
-            ),
-            Section("Training", _training(result), "Training"),
-            Section("With your own images", _next_steps(), "Next"),
-        ],
+        values,
         f"derender {__version__}. The faces are generated; they show no real person.",
     )
 
@@ -92,140 +124,27 @@ def shown_rows(result: DemoResult) -> np.ndarray:
     return np.linspace(0, len(result.truth) - 1, count).round().astype(int)
 
 
-def _summary(result: DemoResult, tables: Mapping[str, ScoreTable]) -> list[blocks.Html]:
-    tiles = {
-        "Depth error, SIDE x 100": _tile(tables["geometry"], 0, ("average depth", "plane")),
-        "Normals, mean angle in degrees": _tile(tables["geometry"], 1, ("average depth", "plane")),
-        "Identity, cluster accuracy": _tile(tables["clustering"], 0, ("chance",)),
-        "Reconstruction, L1": _tile(tables["reconstruction"], 0, ("mean image",)),
-    }
-    usual, seen = PRESETS[result.config.preset].images, result.trained.images
-    length = f"Training saw {seen:,} images (repeats counted)"
-    if seen < usual:
-        length += f"; an ordinary run of the same preset sees {usual:,}"
-    verdicts = {
-        "Depth": tables["geometry"].verdict(0),
-        "Normals": tables["geometry"].verdict(1),
-        "Clusters by identity": tables["clustering"].verdict(0),
-        "Reconstruction": tables["reconstruction"].verdict(0),
-    }
-    warnings = [
-        blocks.prose(blocks.strong("Warning of the watcher: "), finding.text)
-        for finding in result.trained.findings
-    ]
-    inputs = colours.pictures(result.seen.images[:: max(1, len(result.seen) // INPUTS_SHOWN)][:INPUTS_SHOWN])
-    return [
-        blocks.key_figures(tiles),
-        blocks.prose(f"All on {len(result.truth):,} generated faces of people not in training. {length}."),
-        *warnings,
-        blocks.definitions(verdicts),
-        blocks.figure(
-            blocks.row_of([(blocks.image(image, "a training face", 86), "") for image in inputs]),
-            f"Training images: {len(result.seen):,} generated faces, in varied lighting and viewpoint.",
-        ),
-    ]
-
-
-def _tile(table: ScoreTable, column: int, controls: tuple[str, ...]) -> tuple[str, str]:
+def _tile(table: ScoreTable, column: int, *controls: str) -> tuple[str, str]:
     """The first row's number, and those of some controls."""
     head = table.columns[column]
     cells = {row.name: head.text(row.cells[column]) for row in table.rows}
-    better = "lower is better" if head.best == "low" else "higher is better"
-    return cells[table.rows[0].name], ", ".join(
-        [f"{name} {cells[name]}" for name in controls]
-    ) + f"; {better}"
+    beside = ", ".join(f"{name} {cells[name]}" for name in controls)
+    return cells[table.rows[0].name], f"{beside}; {DIRECTIONS[head.best]}"
 
 
-def _decomposed(model: Derenderer, images: UInt8[np.ndarray, "n 3 h w"]) -> list[blocks.Html]:
-    caption = "Each row is one unseen image, evenly chosen through the set before anything was scored."
-    columns = decompose_images(model, as_float(images)).columns
-    return [_grid(columns, "unseen face", caption, COLUMN_MEANING), blocks.definitions(COLUMN_MEANING)]
-
-
-def _grid(
-    columns: Mapping[str, colours.Images],
-    name: str,
-    caption: str,
-    meaning: Mapping[str, str] | None = None,
-) -> blocks.Html:
-    """A grid whose rows are numbered faces."""
-    names = [f"{name} {number + 1}" for number in range(len(next(iter(columns.values()))))]
-    return blocks.image_grid(columns, names, caption, meaning, show_names=False)
-
-
-def _bundled(
-    result: DemoResult, images: UInt8[np.ndarray, "n 3 h w"], tables: Mapping[str, ScoreTable]
-) -> list[blocks.Html]:
-    """Faces of the family that the bundled model knows, then the demo's own faces by both models."""
-    own, bundled = result.model, result.bundled
-    known = np.stack([example.picture for example in rendered_examples(BUNDLED, bundled.image_size)])
-    models = {BUNDLED: bundled}
-    both = "; this run's model takes images of another size."
-    if own.image_size == bundled.image_size:
-        models, both = {"this run": own, BUNDLED: bundled}, ", by both models."
-
-    def beside(shown: UInt8[np.ndarray, "n 3 h w"]) -> dict[str, colours.Images]:
-        """Inputs, then what each model makes of them."""
-        columns: dict[str, colours.Images] = {"input": colours.pictures(shown)}
-        for name, model in models.items():
-            drawn = decompose_images(model, as_float(shown)).columns
-            columns |= {f"{column}, {name}": drawn[column] for column in COLUMNS_BESIDE}
-        return columns
-
-    shown = known[:BUNDLED_SHOWN]
-    names = [f"rendered face {number + 1}, by {BUNDLED}" for number in range(len(shown))]
-    made = [
-        blocks.prose(
-            blocks.code(BUNDLED),
-            " was trained beforehand, on rendered faces of another family, and is installed with derender: ",
-            blocks.code(f'derender.load("{BUNDLED}")'),
-            ". Neither model saw any of these images in training.",
-        ),
-        looping_films(bundled, shown, names, f"Made by {BUNDLED} from one image each."),
-        _grid(
-            beside(known[::2]), "rendered face", f"Faces of the family that {BUNDLED} was trained on{both}"
-        ),
-    ]
-    if "beside" in tables:
-        caption = (
-            "Faces of the family that this run was trained on, by both models. Most have hair or beards: "
-            f"{BUNDLED} has seen bald heads only."
-        )
-        made += [
-            _grid(beside(images[:BUNDLED_SHOWN]), "unseen face", caption),
-            blocks.table(tables["beside"]),
-        ]
-    return made
-
-
-def _geometry(result: DemoResult, rows: np.ndarray, tables: Mapping[str, ScoreTable]) -> list[blocks.Html]:
-    return [
-        blocks.prose(
-            "The faces were generated, so their true depth is known. ",
-            blocks.strong("SIDE"),
-            " is the error of depth up to scale, ",
-            blocks.strong("MAD"),
-            " the mean angle between predicted and true surface directions; both are measured inside "
-            "the face and are 0 for perfect geometry. The average depth of all these faces is a hard "
-            "control: it knows the shape of a face.",
-        ),
-        blocks.table(tables["geometry"]),
-        _grid(
-            _beside_truth(result, rows),
-            "unseen face",
-            "Predicted and true surface in the view of the image, inside the true outline. "
-            "Depth is brighter where nearer, each column on its own scale.",
-        ),
-        blocks.table(tables["factors"]),
-        blocks.table(tables["reconstruction"]),
-    ]
+def _beside(models: Mapping[str, Derenderer], images: Pixels) -> dict[str, colours.Images]:
+    """Inputs, then what each model makes of them."""
+    columns = {"input": colours.pictures(images)}
+    for name, model in models.items():
+        drawn = decompose_images(model, as_float(images)).columns
+        columns |= {f"{column}, {name}": drawn[column] for column in COLUMNS_BESIDE}
+    return columns
 
 
 def _beside_truth(result: DemoResult, rows: np.ndarray) -> dict[str, colours.Images]:
     truth, model = result.truth, result.model
-    images = truth.images[rows]
+    images, mask = truth.images[rows], truth.mask[rows]
     depth, covered = predicted_depth(model, images)
-    mask = truth.mask[rows]
     both = (covered & torch.as_tensor(mask)).float()
     filled = torch.where(covered, depth, torch.ones_like(depth))
     columns = {
@@ -246,42 +165,27 @@ def _beside_truth(result: DemoResult, rows: np.ndarray) -> dict[str, colours.Ima
     return columns
 
 
-def _clusters(result: DemoResult, table: ScoreTable) -> list[blocks.Html]:
-    people = len(np.unique(result.identities))
-    figures = []
-    for members, caption in _purest_to_most_mixed(result):
-        faces = zip(colours.pictures(result.truth.images[members]), result.identities[members], strict=True)
-        row = [(blocks.image(image, f"a face of {name}", 64), name) for image, name in faces]
-        figures.append(blocks.figure(blocks.row_of(row), caption))
-    return [
-        blocks.prose(
-            f"The unseen faces show {people} people in changing light, view and expression. "
-            f"Ward clustering sorted their geometry and albedo features into {people} groups."
-        ),
-        blocks.definitions({f"{table.columns[column].name}": table.verdict(column) for column in (0, 1, 2)}),
-        blocks.table(table),
-        blocks.folded("Some of the clusters", *figures),
-    ]
-
-
-def _purest_to_most_mixed(result: DemoResult) -> list[tuple[np.ndarray, str]]:
-    """Members of some clusters from the purest to the most mixed, with a caption each."""
+def _clusters(result: DemoResult) -> list[tuple[list[Any], str]]:
+    """Faces of some clusters from the purest to the most mixed, with a caption each."""
     groups = []
     for cluster in np.unique(result.clusters):
         members = np.flatnonzero(result.clusters == cluster)
         counts = np.unique(result.identities[members], return_counts=True)[1]
         groups.append((counts.max() / len(members), members))
     groups.sort(key=lambda group: (-group[0], -len(group[1])))
-    picks = np.unique(np.linspace(0, len(groups) - 1, CLUSTERS_SHOWN).round().astype(int))
-    return [
-        (members[:MEMBERS_SHOWN], f"{len(members)} images, {100 * purity:.0f} % of one person")
-        for purity, members in (groups[pick] for pick in picks)
-    ]
+    shown = []
+    for pick in np.unique(np.linspace(0, len(groups) - 1, CLUSTERS_SHOWN).round().astype(int)):
+        purity, members = groups[pick]
+        faces = colours.pictures(result.truth.images[members[:MEMBERS_SHOWN]])
+        names = result.identities[members[:MEMBERS_SHOWN]]
+        row = [(face, f"a face of {name}", name) for face, name in zip(faces, names, strict=True)]
+        shown.append((row, f"{len(members)} images, {100 * purity:.0f} % of one person"))
+    return shown
 
 
-def _training(result: DemoResult) -> list[blocks.Html]:
+def _training(result: DemoResult) -> dict[str, object]:
     trained = result.trained
-    facts = {
+    return {
         **{stage: f"{result.seconds[stage]:.0f} s" for stage in STAGES if stage in result.seconds},
         "images seen": f"{trained.images:,}",
         "images per second": f"{trained.images_per_second:.0f}",
@@ -291,18 +195,3 @@ def _training(result: DemoResult) -> list[blocks.Html]:
         "seed": result.seed,
         "threads": torch.get_num_threads(),
     }
-    return [*loss_charts(read_metrics(trained.folder)), blocks.facts(facts)]
-
-
-def _next_steps() -> list[blocks.Html]:
-    return [
-        blocks.prose(
-            "Any folder or zip of images of one kind of thing, roughly centred and aligned, will do; "
-            f"no labels are read. Presets: {', '.join(MODEL_PRESETS)}."
-        ),
-        blocks.listing(
-            "derender train photos/ --preset small --out runs/mine\n"
-            "derender decompose --model runs/mine photo.jpg --out decomposed/\n"
-            "derender embed photos/ --model runs/mine --out features.parquet"
-        ),
-    ]

@@ -8,7 +8,6 @@ from derender.baselines import baseline_config, image_size_of, stored_config, tr
 from derender.data import ImageSet
 from derender.inputs import as_images, device_named
 from derender.report.evidence import Evidence, look_at_data
-from derender.report.page import Section
 from derender.report.run import baseline_sheet, decomposition_sheet, run_page
 from derender.training import derender_task
 from derender.training.config import (
@@ -131,7 +130,7 @@ def train(
     writes = this_rank_writes()
     leave()
     if writes and page:
-        examined = Evidence([Section("The data", look_at_data(images), "Data")])
+        examined = Evidence({"data": look_at_data(images)})
         run_page(out, examined).write(out / "report.html")
     return result
 

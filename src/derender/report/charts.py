@@ -34,26 +34,27 @@ _STYLE: dict[Any, Any] = {
     "grid.alpha": 0.12,
     "grid.linewidth": 0.7,
 }
+Draw = Callable[[Axes], object]
 
 
 def curves(series: Mapping[str, tuple[Sequence[float], Sequence[float]]], x_label: str, y_label: str) -> str:
     """Lines by name, each (x values, y values), as SVG text."""
     if not series:
         raise ValueError("a chart needs at least one series")
-    with matplotlib.rc_context(_STYLE):
-        figure, (axes,) = _axes((7.2, 2.9))
+
+    def draw(axes: Axes) -> None:
         for (name, (x, y)), colour in zip(series.items(), cycle(SERIES), strict=False):
-            axes.plot(x, y, color=colour, linewidth=1.8, label=name, marker="o" if len(x) < 2 else None)
-        axes.set_xlabel(x_label)
+            marker, label = "o" if len(x) < 2 else None, name if len(series) > 1 else None
+            axes.plot(x, y, color=colour, linewidth=1.8, label=label, marker=marker)
         axes.set_ylabel(y_label)
         axes.grid(True)
         axes.margins(x=0.01)
         axes.xaxis.set_major_formatter(
             FuncFormatter(lambda value, _: f"{value:,.0f}" if float(value).is_integer() else f"{value:g}")
         )
-        if len(series) > 1:
-            figure.legend(loc="outside upper left", ncols=min(len(series), 3))  # seen where charts scroll
-        return _svg(figure)
+
+    legend = {"loc": "outside upper left", "ncols": min(len(series), 3)}  # seen where charts scroll
+    return _drawn({"": draw}, x_label, (7.2, 2.9), legend)[0]
 
 
 def bars(
@@ -63,11 +64,9 @@ def bars(
     level: tuple[str, float] | None = None,
 ) -> str:
     """One bar a name, ``highlighted`` ones in colour, and a dashed ``level`` (chance), as SVG text."""
-    if not values:
-        raise ValueError("a chart needs at least one bar")
-    with matplotlib.rc_context(_STYLE):
-        figure, (axes,) = _axes((7.2, 0.6 + 0.34 * len(values)))
-        names = list(values)[::-1]
+    names = list(values)[::-1]
+
+    def draw(axes: Axes) -> None:
         tints = [SERIES[0] if name in highlighted else CONTROL_COLOUR for name in names]
         drawn = axes.barh(names, [values[name] for name in names], color=tints, height=0.66)
         axes.bar_label(drawn, fmt="%.3g", padding=4, fontsize=9)
@@ -76,16 +75,13 @@ def bars(
             axes.axvline(level[1], color=INK, alpha=0.6, linewidth=1, linestyle=(0, (4, 3)))
             axes.annotate(level[0], (level[1], 1), xycoords=("data", "axes fraction"), xytext=(0, 2),
                           textcoords="offset points", ha="center", fontsize=9, alpha=0.75)  # fmt: skip
-        axes.set_xlabel(x_label)
         axes.tick_params(axis="y", length=0)
-        return _svg(figure)
+
+    return _drawn({"": draw}, x_label, (7.2, 0.6 + 0.34 * len(values)), {})[0]
 
 
 def side_by_side(
-    panels: Mapping[str, Callable[[Axes], None]],
-    x_label: str,
-    size: tuple[float, float],
-    columns: int | None = None,
+    panels: Mapping[str, Draw], x_label: str, size: tuple[float, float], columns: int | None = None
 ) -> tuple[str, bytes]:
     """Panels by title with one vertical axis, each drawn by its function, as SVG text and as PNG.
 
@@ -93,29 +89,30 @@ def side_by_side(
     """
     if not panels:
         raise ValueError("a chart needs at least one panel")
-    with matplotlib.rc_context(_STYLE):
-        figure, drawn = _axes(size, len(panels))
-        for axes, (title, draw) in zip(drawn, panels.items(), strict=True):
-            draw(axes)
-            axes.set_title(title, fontsize=10)
-            axes.set_xlabel(x_label)
-        handles, labels = drawn[0].get_legend_handles_labels()
-        if handles:
-            figure.legend(handles, labels, loc="outside lower left", ncols=columns or len(handles))
-        svg = _svg(figure)
-        figure.patch.set(facecolor="white", alpha=1)  # an image file has no page behind it
-        stream = BytesIO()
-        figure.savefig(stream, format="png", dpi=150, metadata={"Software": None})
-        return svg, stream.getvalue()
+    return _drawn(panels, x_label, size, {"loc": "outside lower left", "ncols": columns or 99})
 
 
-def _axes(size: tuple[float, float], count: int = 1) -> tuple[Figure, Sequence[Axes]]:
-    """A transparent figure with so many axes in a row."""
+@matplotlib.rc_context(_STYLE)
+def _drawn(
+    panels: Mapping[str, Draw], x_label: str, size: tuple[float, float], legend: dict[str, Any]
+) -> tuple[str, bytes]:
+    """SVG text on a transparent ground, and PNG on white."""
     figure = Figure(figsize=size, layout="constrained")
-    drawn = list(figure.subplots(1, count, sharex=True, sharey=True, squeeze=False)[0])
-    for part in (figure, *drawn):
-        part.patch.set_alpha(0)
-    return figure, drawn
+    drawn = list(figure.subplots(1, len(panels), sharex=True, sharey=True, squeeze=False)[0])
+    for axes, (title, draw) in zip(drawn, panels.items(), strict=True):
+        draw(axes)
+        axes.set_title(title, fontsize=10)
+        axes.set_xlabel(x_label)
+        axes.patch.set_alpha(0)
+    handles, labels = drawn[0].get_legend_handles_labels()
+    if handles:
+        figure.legend(handles, labels, **{**legend, "ncols": min(legend["ncols"], len(handles))})
+    figure.patch.set_alpha(0)
+    svg = _svg(figure)
+    figure.patch.set(facecolor="white", alpha=1)  # an image file has no page behind it
+    stream = BytesIO()
+    figure.savefig(stream, format="png", dpi=150, metadata={"Software": None})
+    return svg, stream.getvalue()
 
 
 def _svg(figure: Figure) -> str:
@@ -128,14 +125,10 @@ def _svg(figure: Figure) -> str:
     for name in ("width", "height"):
         text = re.sub(rf'(<svg[^>]*?) {name}="[^"]*"', r"\1", text, count=1)
     text = re.sub(r"font: ([\d.]+)px [^;\"]*", r"font-size: \1px", text)
-    return _own_ids(re.sub(r"font-family: [^;\"]*;?", "", text))
-
-
-def _own_ids(svg: str) -> str:
-    """Ids of one chart must not meet those of another: keep the referenced ones, with a prefix."""
-    prefix = "c" + sha256(svg.encode()).hexdigest()[:8]
-    used = set(re.findall(r'(?:url\(#|href="#)([^)"]+)', svg))
-    svg = re.sub(
-        r' id="([^"]+)"', lambda match: f' id="{prefix}-{match[1]}"' if match[1] in used else "", svg
+    text = re.sub(r"font-family: [^;\"]*;?", "", text)
+    prefix = "c" + sha256(text.encode()).hexdigest()[:8]  # ids of one chart must not meet those of another
+    used = set(re.findall(r'(?:url\(#|href="#)([^)"]+)', text))
+    text = re.sub(
+        r' id="([^"]+)"', lambda match: f' id="{prefix}-{match[1]}"' if match[1] in used else "", text
     )
-    return svg.replace("url(#", f"url(#{prefix}-").replace('href="#', f'href="#{prefix}-')
+    return text.replace("url(#", f"url(#{prefix}-").replace('href="#', f'href="#{prefix}-')

@@ -4,22 +4,21 @@ Every function takes one array for a whole set and uses one range for all of it,
 side can be compared. Leaves out layout (see ``panel``) and anything that needs a model.
 """
 
-from collections.abc import Sequence
-
 import numpy as np
 from matplotlib import colormaps
 from PIL import Image
 from torch import Tensor
 
 Images = list[Image.Image]
+Values = Tensor | np.ndarray
 
 
-def as_numpy(values: Tensor | np.ndarray) -> np.ndarray:
+def as_numpy(values: Values) -> np.ndarray:
     """The same values as a numpy array, wherever the tensor lives."""
     return values.detach().cpu().float().numpy() if isinstance(values, Tensor) else np.asarray(values)
 
 
-def pictures(values: Tensor | np.ndarray, mask: Tensor | np.ndarray | None = None) -> Images:
+def pictures(values: Values, mask: Values | None = None) -> Images:
     """(N, 3, H, W) colours, uint8 or float 0..1, as images; pixels outside ``mask`` are transparent."""
     colours = as_numpy(values)
     if colours.ndim != 4 or colours.shape[1] != 3:
@@ -27,21 +26,16 @@ def pictures(values: Tensor | np.ndarray, mask: Tensor | np.ndarray | None = Non
     return _images(np.moveaxis(colours, 1, -1), mask)
 
 
-def depth_range(depth: Tensor | np.ndarray, mask: Tensor | np.ndarray | None = None) -> tuple[float, float]:
+def depth_range(depth: Values, mask: Values | None = None) -> tuple[float, float]:
     """Nearest and farthest depth worth showing: 1st and 99th percentile of all covered pixels."""
     values = as_numpy(depth)
-    covered = values[as_numpy(mask) > 0.5] if mask is not None else values.ravel()
-    covered = covered[np.isfinite(covered)]
-    if covered.size == 0:
-        return 0.0, 1.0
-    near, far = np.percentile(covered, (1, 99))
+    covered = values[np.isfinite(values) & (True if mask is None else as_numpy(mask) > 0.5)]
+    near, far = np.percentile(covered, (1, 99)) if covered.size else (0.0, 1.0)
     return float(near), float(far)
 
 
 def depth_maps(
-    depth: Tensor | np.ndarray,
-    mask: Tensor | np.ndarray | None = None,
-    limits: tuple[float, float] | None = None,
+    depth: Values, mask: Values | None = None, limits: tuple[float, float] | None = None
 ) -> Images:
     """(N, H, W) depth as images, near is bright; one range for the whole set."""
     near, far = limits or depth_range(depth, mask)
@@ -50,24 +44,23 @@ def depth_maps(
     return _images(colormaps["magma"](nearness)[..., :3], mask)
 
 
-def normal_maps(normal: Tensor | np.ndarray, mask: Tensor | np.ndarray | None = None) -> Images:
+def normal_maps(normal: Values, mask: Values | None = None) -> Images:
     """(N, H, W, 3) inward unit normals (y down) in the colours of a tangent-space normal map.
 
     Red grows to the right, green upwards, blue towards the viewer, all of the OUTWARD normal.
     """
-    inward = as_numpy(normal)
-    outward_right_up_viewer = inward * np.array([-1.0, 1.0, 1.0])
+    outward_right_up_viewer = as_numpy(normal) * np.array([-1.0, 1.0, 1.0])
     return _images((outward_right_up_viewer + 1) / 2, mask)
 
 
-def shading_maps(shading: Tensor | np.ndarray, mask: Tensor | np.ndarray | None = None) -> Images:
+def shading_maps(shading: Values) -> Images:
     """(N, 1, H, W) shading as grey images; white is 1, or the 99th percentile where that is more."""
-    grey = as_numpy(shading)[:, 0]
+    grey = as_numpy(shading)[:, 0, :, :, None]
     white = max(1.0, float(np.percentile(grey, 99))) if grey.size else 1.0
-    return _images(np.repeat(grey[..., None] / white, 3, axis=-1), mask)
+    return _images(np.repeat(grey / white, 3, axis=-1), None)
 
 
-def any_maps(values: Tensor | np.ndarray) -> Images:
+def any_maps(values: Values) -> Images:
     """The parameter of any further factor as images: (N, 3, H, W) colours or (N, H, W) levels; else none."""
     maps = as_numpy(values)
     if maps.ndim == 3:
@@ -75,13 +68,13 @@ def any_maps(values: Tensor | np.ndarray) -> Images:
     return pictures(maps) if maps.ndim == 4 and maps.shape[1] == 3 else []
 
 
-def _images(colours: np.ndarray, mask: Tensor | np.ndarray | None) -> Images:
+def _images(colours: np.ndarray, mask: Values | None) -> Images:
     """(N, H, W, 3) floats 0..1 or uint8, and a mask (N, H, W) or None, as RGB or RGBA images."""
     pixels = colours if colours.dtype == np.uint8 else np.rint(np.clip(colours, 0, 1) * 255).astype(np.uint8)
-    if mask is None:
-        return [Image.fromarray(np.ascontiguousarray(row)) for row in pixels]
-    opacity = np.rint(np.clip(as_numpy(mask).astype(np.float32), 0, 1) * 255).astype(np.uint8)
-    return [Image.fromarray(np.dstack(pair)) for pair in zip(pixels, opacity, strict=True)]
+    if mask is not None:
+        opacity = np.clip(as_numpy(mask).astype(np.float32), 0, 1)[..., None]
+        pixels = np.concatenate([pixels, np.rint(opacity * 255).astype(np.uint8)], axis=-1)
+    return [Image.fromarray(np.ascontiguousarray(row)) for row in pixels]
 
 
 def on_background(image: Image.Image, background: tuple[int, int, int] = (255, 255, 255)) -> Image.Image:
@@ -97,11 +90,3 @@ def enlarged(image: Image.Image, width: int) -> Image.Image:
     """The image at ``width`` pixels, aspect kept, by bicubic interpolation (smooth) in either direction."""
     height = max(1, round(image.height * width / image.width))
     return image.resize((width, height), Image.Resampling.BICUBIC)
-
-
-def same_length(columns: Sequence[Sequence[object]]) -> int:
-    """How many rows all columns have; ValueError where they differ."""
-    lengths = {len(column) for column in columns}
-    if len(lengths) != 1:
-        raise ValueError(f"all columns of a grid need the same number of images; got {sorted(lengths)}")
-    return lengths.pop()

@@ -5,15 +5,14 @@ Leaves out computing anything (``derender.evaluation``).
 
 from collections.abc import Mapping, Sequence
 from math import isfinite
-from textwrap import shorten
 
 from derender import __version__
 from derender.evaluation.score_table import ScoreTable
-from derender.report import blocks, charts
-from derender.report.blocks import Html
-from derender.report.page import Page, Section
+from derender.report import charts
+from derender.report.page import DIRECTIONS, Page
 
-LONGEST_HEAD = 40
+Chart = tuple[str, str, str]
+"""SVG text, its alternative text and its caption."""
 
 
 def comparison_page(
@@ -33,52 +32,31 @@ def comparison_page(
         lead: one or two sentences under the heading.
         facts: what was compared and how: models, data, seeds, settings.
         failed: a sentence for whatever is missing, with the reason.
-        image: SVG text that stands over the tables; the first of them then has no chart of its own.
+        picture: SVG text over the tables; the first of them then has no chart of its own.
     """
     if not tables:
         raise ValueError("a comparison needs at least one table")
-    sections = [
-        Section(f"{number}. {table.caption}", [*_above(number, table, picture), blocks.table(table)],
-                _short(number, table))
-        for number, table in enumerate(tables, 1)
-    ]  # fmt: skip
-    missing = [blocks.prose(reason) for reason in failed]
-    sections.append(
-        Section("What failed", missing or [blocks.prose("Nothing that was noticed.")], "Failed"),
-    )
+    drawn = [chart_of(table) for table in tables]
+    if picture is not None:
+        caption = "What learned nothing is grey; whiskers are 95 % intervals."
+        drawn[0] = picture, tables[0].caption, caption
     settings = {**(facts or {}), "derender": __version__}
-    sections.append(Section("What was compared, and how", [blocks.facts(settings)], "Settings"))
-    return Page(title, lead, sections, f"derender {__version__}")
+    shown = list(zip(tables, drawn, strict=True))
+    return Page("comparison.html", title, lead, {"tables": shown, "failed": failed, "settings": settings})
 
 
-def chart_of(table: ScoreTable) -> list[Html]:
-    """Bars of the first column that is a score, controls in grey; nothing where there are fewer than two."""
+def chart_of(table: ScoreTable) -> Chart | None:
+    """Bars of the first column that is a score, controls in grey; None where there are fewer than two."""
     for place, column in enumerate(table.columns):
+        cells = {row.name: row.cells[place] for row in table.rows}
         values = {
-            row.name: float(cell)
-            for row in table.rows
-            if isinstance(cell := row.cells[place], float | int) and isfinite(cell)
+            name: float(cell)
+            for name, cell in cells.items()
+            if isinstance(cell, float | int) and isfinite(cell)
         }
-        if column.best is None or len(values) < 2:
-            continue
-        models = [row.name for row in table.rows if not row.control]
-        better = {"high": "more is better", "low": "less is better"}[column.best]
-        svg = charts.bars(values, f"{column.name} ({better})", models)
-        alt = f"{column.name} of {', '.join(f'{name} {column.text(v)}' for name, v in values.items())}"
-        return [blocks.chart(svg, alt, f"{column.name}; what learned nothing is grey.")]
-    return []
-
-
-def _above(number: int, table: ScoreTable, picture: str | None) -> list[Html]:
-    """What stands over a table: its chart, or over the first the image that was given."""
-    if picture is None or number > 1:
-        return chart_of(table)
-    return [
-        blocks.chart(picture, table.caption, "What learned nothing is grey; whiskers are 95 % intervals.")
-    ]
-
-
-def _short(number: int, table: ScoreTable) -> str:
-    """The table's name in the navigation."""
-    head = table.caption.partition(":")[0].partition(";")[0]
-    return f"{number} {shorten(head, LONGEST_HEAD, placeholder='…')}".strip()
+        if column.best is not None and len(values) > 1:
+            models = [row.name for row in table.rows if not row.control]
+            svg = charts.bars(values, f"{column.name} ({DIRECTIONS[column.best]})", models)
+            alt = f"{column.name} of {', '.join(f'{name} {column.text(v)}' for name, v in values.items())}"
+            return svg, alt, f"{column.name}; what learned nothing is grey."
+    return None

@@ -6,8 +6,8 @@ measure with more. A part that cannot be made is listed with its reason. Leaves 
 """
 
 import json
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -26,29 +26,27 @@ from derender.features import embed_pictures
 from derender.inputs import as_images, as_model
 from derender.interpretation import explain_labels, question
 from derender.model import Derenderer
-from derender.report import blocks
-from derender.report.blocks import Html
 from derender.report.decomposition import COLUMN_MEANING, decompose_images
-from derender.report.doctor import doctor_blocks
-from derender.report.explanation import share_blocks, share_chart
+from derender.report.doctor import doctor_values
+from derender.report.explanation import share_chart, share_values
 from derender.report.films import animated_png
 from derender.report.matrices import card_matrices, matrix_sheet
-from derender.report.page import Section
 from derender.report.sweeps import relit_and_rotated
 
 EXAMINED, SCORED, CARD, EXPLAINED = 1_500, 200, 200, 400  # images each part looks at, at most
 SHOWN, FILMED, TRUTH_SHOWN = 5, 2, 100
-FILM_WIDTH = 256
 FEWEST_OF_A_CLASS, MOST_CLASSES = 10, 12
 
 Progress = Callable[[int, int], object]
+Values = dict[str, Any]
+"""What a section of ``templates/run.html`` shows, by name."""
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """Sections for a page, and a sentence for each part that is missing, with the reason."""
+    """Values of sections by name, and a sentence for each part that is missing, with the reason."""
 
-    sections: Sequence[Section]
+    sections: Mapping[str, Values] = field(default_factory=dict)
     failed: Sequence[str] = ()
 
 
@@ -106,11 +104,9 @@ def run_evidence(
     for name in labels:
         images.label(name)
     if model is None:
-        return Evidence([Section("The data", look_at_data(images), "Data")], [missing])
+        return Evidence({"data": look_at_data(images)}, [missing])
     held_out, which = _held_out(Path(run), images)
-    known = None
-    if truth is not None:
-        known = read_ground_truth(truth, limit=TRUTH_SHOWN, image_size=model.image_size)
+    known = None if truth is None else read_ground_truth(truth, limit=TRUTH_SHOWN, image_size=size)
     return gather(Subject(model, images, held_out, which, known, labels), progress)
 
 
@@ -121,8 +117,7 @@ def _held_out(run: Path, images: ImageSet) -> tuple[ImageSet, str]:
         return images, f"All {len(images):,} images of {images.source}; the run was trained with others"
     split = split_indices(images.files, config.split, seed=config.seed)
     for name in ("test", "validation"):
-        rows = getattr(split, name)
-        if len(rows):
+        if len(rows := getattr(split, name)):
             return images.select(rows), f"The {len(rows):,} images of the run's {name} part"
     return images, "The images it was trained with, since it held none back"
 
@@ -142,137 +137,108 @@ def recorded_environment(run: Path) -> dict[str, Any]:
     return {key: value for key, value in flat.items() if value is not None}
 
 
-def look_at_data(pictures: ImageSet) -> list[Html]:
+def look_at_data(images: ImageSet) -> Values:
     """The doctor's findings on a sample of the images."""
-    sample = _sample(pictures, EXAMINED)
-    size = f"All {len(sample):,} images" if len(sample) == len(pictures) else f"{len(sample):,} images"
-    note = blocks.prose(f"{pictures.describe()}. {size} were examined, identical copies left out before.")
-    return [note, *doctor_blocks(doctor(sample))]
+    sample = _sample(images, EXAMINED)
+    size = f"All {len(sample):,} images" if len(sample) == len(images) else f"{len(sample):,} images"
+    return {"source": images.describe(), "size": size, "found": doctor_values(doctor(sample))}
 
 
 def gather(subject: Subject, progress: Progress | None = None) -> Evidence:
     """Every section that can be made; ``progress`` is called with (parts done, parts in all)."""
-    parts: dict[tuple[str, str], Callable[[], list[Html]]] = {
-        ("The data", "Data"): lambda: look_at_data(subject.images),
-        ("Held-out images, decomposed", "Decomposed"): lambda: _decomposed(subject),
-        ("Light and view moved", "Films"): lambda: _films(subject),
-        ("Scores beside controls", "Scores"): lambda: _scores(subject),
-        ("Does each feature hold its own factor?", "Card"): lambda: _card(subject),
-        ("Labels explained by factors", "Explained"): lambda: _explained(subject),
+    parts: dict[str, tuple[str, Callable[[Subject], Values]]] = {
+        "data": ("The data", lambda subject: look_at_data(subject.images)),
+        "decomposed": ("Held-out images, decomposed", _decomposed),
+        "films": ("Light and view moved", _films),
+        "scores": ("Scores beside controls", _scores),
+        "card": ("Does each feature hold its own factor?", _card),
+        "explained": ("Labels explained by factors", _explained),
     }
-    sections, failed = [], []
-    for done, ((title, short), make) in enumerate(parts.items()):
-        if progress is not None:
-            progress(done, len(parts))
+    progress = progress or (lambda done, total: None)
+    sections, failed = {}, []
+    for done, (name, (title, make)) in enumerate(parts.items()):
+        progress(done, len(parts))
         try:
-            sections.append(Section(title, make(), short))
+            sections[name] = make(subject)
         except ValueError as reason:
             failed.append(f"{title}: {reason}")
-    if progress is not None:
-        progress(len(parts), len(parts))
+    progress(len(parts), len(parts))
     return Evidence(sections, failed)
 
 
-def _decomposed(subject: Subject) -> list[Html]:
+def _decomposed(subject: Subject) -> Values:
     sample = _sample(subject.held_out.require(1, "a decomposition"), SHOWN)
     drawn = decompose_images(subject.model, as_float(sample.images).to(subject.model.device))
-    caption = f"{subject.which}, evenly chosen by their order. Every column is made from the image alone."
     names = [Path(name).name for name in sample.files]
-    return [
-        blocks.image_grid(drawn.columns, names, caption, COLUMN_MEANING),
-        blocks.definitions(COLUMN_MEANING),
-    ]
+    return {"which": subject.which, "columns": drawn.columns, "names": names, "meaning": COLUMN_MEANING}
 
 
-def _films(subject: Subject) -> list[Html]:
+def _films(subject: Subject) -> Values:
     sample = _sample(subject.held_out.require(1, "a film"), SHOWN).select(slice(FILMED))
-    names = [Path(name).name for name in sample.files]
-    caption = "Only light or camera moves. Empty parts are those that the frontal view does not show."
-    return [looping_films(subject.model, sample.images, names, caption)]
+    return {"films": looping_films(subject.model, sample.images, [Path(name).name for name in sample.files])}
 
 
 def looping_films(
-    model: Derenderer, images: UInt8[np.ndarray, "n 3 h w"], names: Sequence[str], caption: str
-) -> Html:
-    """A film of each image: the light goes round, the object rotates."""
+    model: Derenderer, images: UInt8[np.ndarray, "n 3 h w"], names: Sequence[str]
+) -> list[tuple[bytes, Any, str]]:
+    """A film of each image with a still and its name: the light goes round, the object rotates."""
     with torch.no_grad():
         scenes = model.decompose(as_float(images).to(model.device))
-    items = []
-    for index, name in enumerate(names):
-        frames = relit_and_rotated(scenes[index], model.render)
-        alt = f"{name}: the light goes round, the object rotates"
-        film = blocks.film(animated_png(frames), frames[len(frames) // 4], alt, FILM_WIDTH)
-        items.append((film, name))
-    return blocks.figure(blocks.row_of(items), caption)
-
-
-def _scores(subject: Subject) -> list[Html]:
-    """Reconstruction beside the mean image and, on rendered data, geometry beside its controls."""
-    sample = _sample(subject.held_out.require(1, "a score"), SCORED)
-    again = evaluate_reconstruction(subject.model, sample.images, mean=mean_picture(subject.images.images))
-    tables = [again.table()]
-    if subject.truth is not None:
-        truth = subject.truth
-        tables.insert(0, evaluate_geometry(subject.model, truth).table())
-        if truth.albedo is not None and truth.light is not None and truth.camera is not None:
-            tables.insert(1, evaluate_factors(subject.model, truth).table())
-    made = [blocks.prose(f"{subject.which}; few of them, so that this page takes minutes.")]
-    for table in tables:
-        made += [blocks.prose(f"{table.columns[0].name}: {table.verdict(0)}."), blocks.table(table)]
-    if subject.truth is None:
-        made.append(
-            blocks.prose(
-                "These images have no exact depth, so whether the geometry is right cannot be scored here."
-            )
-        )
-    return made
-
-
-def _card(subject: Subject) -> list[Html]:
-    """The disentanglement card from one seed, without scores by dimension."""
-    sample = _sample(subject.held_out, CARD)
-    found = disentangle(subject.model, sample, seeds=(0,), dimensions=None, swap_images=min(64, len(sample)))
-    sheet = blocks.image(
-        matrix_sheet(card_matrices(found.result)), "matrices of the features: correlation, CKA, swap test"
-    )
+    loops = [relit_and_rotated(scenes[index], model.render) for index in range(len(names))]
     return [
-        blocks.prose(f"{'. '.join(found.notes[:2])}."),
-        *(blocks.table(table) for table in found.tables[:3]),
-        blocks.folded("Matrices", sheet),
+        (animated_png(frames), frames[len(frames) // 4], name)
+        for frames, name in zip(loops, names, strict=True)
     ]
 
 
-def _explained(subject: Subject) -> list[Html]:
+def _scores(subject: Subject) -> Values:
+    """Reconstruction beside the mean image and, on rendered data, geometry beside its controls."""
+    sample = _sample(subject.held_out.require(1, "a score"), SCORED)
+    again = evaluate_reconstruction(subject.model, sample.images, mean=mean_picture(subject.images.images))
+    tables, truth = [], subject.truth
+    if truth is not None:
+        tables.append(evaluate_geometry(subject.model, truth).table())
+        if truth.albedo is not None and truth.light is not None and truth.camera is not None:
+            tables.append(evaluate_factors(subject.model, truth).table())
+    return {"which": subject.which, "tables": [*tables, again.table()], "depth_known": truth is not None}
+
+
+def _card(subject: Subject) -> Values:
+    """The disentanglement card from one seed, without scores by dimension."""
+    sample = _sample(subject.held_out, CARD)
+    found = disentangle(subject.model, sample, seeds=(0,), dimensions=None, swap_images=min(64, len(sample)))
+    sheet = matrix_sheet(card_matrices(found.result))
+    return {"notes": ". ".join(found.notes[:2]), "tables": found.tables[:3], "matrices": sheet}
+
+
+def _explained(subject: Subject) -> Values:
     """Shares of the factors in the predictions of a probe, beside controls."""
-    columns = subject.held_out.labels
     names = tuple(subject.labels) or suitable_label(subject.held_out)
     if not names:
-        known = ", ".join(columns) or "none"
+        known = ", ".join(subject.held_out.labels) or "none"
         raise ValueError(f"no label of 2 to {MOST_CLASSES} classes (labels: {known}): name one")
     sample = _sample(subject.held_out, EXPLAINED)
     task = question(sample.labels, names, source=sample.source)
-    count = max(2, int(0.4 * task.known.sum()))
+    split = choose_rows(task, sample.files, (max(2, int(0.4 * task.known.sum())),), (0,))
     table = embed_pictures(subject.model, sample)
-    split = choose_rows(task, sample.files, (count,), (0,))
     fresh = untrained_features(subject.model, sample, seed=0).factors
     found = explain_labels(table.factors, task, split, untrained=[fresh], seeds=(0,))
-    note = f"Explained on {len(sample):,} images, one seed: {', '.join(names)}."
-    return [blocks.prose(note), *share_blocks(found, share_chart(found)[0])]
+    shares = share_values(found, share_chart(found)[0])
+    return {"count": f"{len(sample):,}", "names": ", ".join(names), "shares": shares}
 
 
-def suitable_label(pictures: ImageSet) -> tuple[str, ...]:
+def suitable_label(images: ImageSet) -> tuple[str, ...]:
     """The first column of text with few classes that each have enough images; empty for none."""
-    for name, column in pictures.labels.items():
-        if column.dtype.kind not in "USO":
-            continue
-        values, counts = np.unique(column[column != ""].astype(str), return_counts=True)
-        if 2 <= len(values) <= MOST_CLASSES and counts.min() >= FEWEST_OF_A_CLASS:
-            return (name,)
+    for name, column in images.labels.items():
+        if column.dtype.kind in "USO":
+            values, counts = np.unique(column[column != ""].astype(str), return_counts=True)
+            if 2 <= len(values) <= MOST_CLASSES and counts.min() >= FEWEST_OF_A_CLASS:
+                return (name,)
     return ()
 
 
-def _sample(pictures: ImageSet, most: int) -> ImageSet:
+def _sample(images: ImageSet, most: int) -> ImageSet:
     """At most so many images, evenly through the set."""
-    if len(pictures) <= most:
-        return pictures
-    return pictures.select(np.linspace(0, len(pictures) - 1, most).round().astype(int))
+    if len(images) <= most:
+        return images
+    return images.select(np.linspace(0, len(images) - 1, most).round().astype(int))

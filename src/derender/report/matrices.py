@@ -16,9 +16,9 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from derender.evaluation.disentanglement import DisentanglementCard
-from derender.storage.atomic import atomic_file
+from derender.report.page import png_bytes, write_whole
 
-MAP = "Blues"
+MAP = colormaps["Blues"].with_extremes(bad="#d9d9d9")
 CELL_NUMBERS_UP_TO = 400  # cells; larger matrices are shown without numbers
 
 
@@ -42,55 +42,48 @@ class Matrix:
     note: str = ""
 
     def __post_init__(self) -> None:
-        expected = (
-            (len(self.rows), len(self.columns)) if self.sizes is None else (sum(self.sizes), sum(self.sizes))
-        )
+        whole = None if self.sizes is None else sum(self.sizes)
+        expected = (whole or len(self.rows), whole or len(self.columns))
         if self.values.shape != expected:
             raise ValueError(f"{self.title}: a matrix {self.values.shape} does not fit its names {expected}")
 
 
 def card_matrices(card: DisentanglementCard) -> list[Matrix]:
     """The matrices of a disentanglement card, means over seeds, the model's own."""
-    names, scores = card.features, card.model_scores
-
-    def mean(path: str) -> np.ndarray:
-        return np.mean([scores.get(path) for scores in card.model_scores], axis=0)
-
+    names, first = card.features, card.model_scores[0]
     apart, identity = "best: 0 off the diagonal", "row exchanged, column moved; best: identity"
-    whole = "best: white outside the blocks"
-    shown = {
-        "pearson.per_dimension": ("mean |Pearson|", apart),
-        "similarity.cka_unbiased": ("CKA, unbiased", apart),
-        "similarity.cross_r2": ("cross-prediction R2", f"row predicts column; {apart}"),
-    }
-    if scores[0].swap is not None:
-        shown |= {
-            "swap.moved": ("swap: features", identity),
-            "swap.moved_parameters": ("swap: decoded", identity),
-        }
-    found = [
-        Matrix("|Pearson| of all dimensions", card.correlations, names, names, card.dimensions, whole),
-        *(Matrix(title, mean(path), names, names, note=note) for path, (title, note) in shown.items()),
+    shown = [
+        ("pearson.per_dimension", "mean |Pearson|", apart, names),
+        ("similarity.cka_unbiased", "CKA, unbiased", apart, names),
+        ("similarity.cross_r2", "cross-prediction R2", f"row predicts column; {apart}", names),
     ]
-    if (truth := scores[0].truth) is not None:
+    if first.swap is not None:
+        shown += [
+            ("swap.moved", "swap: features", identity, names),
+            ("swap.moved_parameters", "swap: decoded", identity, names),
+        ]
+    if first.truth is not None:
         note = "held out; best: one dark cell a column, in the right row"
-        title = "true factors: R2, accuracy of classes"
-        found.append(Matrix(title, mean("truth.score"), names, truth.factors, note=note))
+        shown.append(("truth.score", "true factors: R2, accuracy of classes", note, first.truth.factors))
+    whole = "best: white outside the blocks"
+    found = [Matrix("|Pearson| of all dimensions", card.correlations, names, names, card.dimensions, whole)]
+    for path, title, note, columns in shown:
+        mean = np.mean([scores.get(path) for scores in card.model_scores], axis=0)
+        found.append(Matrix(title, mean, names, columns, note=note))
     return found
 
 
 def write_card(card: DisentanglementCard, title: str, file: Path) -> None:
     """Write all matrices of a card as one PNG."""
-    with atomic_file(file) as temporary:
-        matrix_sheet(card_matrices(card), title).save(temporary, "PNG")
+    write_whole(file, png_bytes(matrix_sheet(card_matrices(card), title)))
 
 
 def matrix_sheet(matrices: Sequence[Matrix], title: str = "", columns: int = 3) -> Image.Image:
     """All matrices on one white sheet; a matrix that is much wider than high takes a row of its own."""
     if not matrices:
         raise ValueError("a sheet needs at least one matrix")
-    square = [m for m in matrices if m.values.shape[1] < 1.6 * m.values.shape[0]]
-    wide = [m for m in matrices if m.values.shape[1] >= 1.6 * m.values.shape[0]]
+    wide = [matrix for matrix in matrices if matrix.values.shape[1] >= 1.6 * matrix.values.shape[0]]
+    square = [matrix for matrix in matrices if matrix not in wide]
     heights = [3.9] * -(-len(square) // columns) + [3.4] * len(wide)
     figure = Figure(figsize=(3.9 * columns, sum(heights)), layout="constrained", dpi=110)
     grid = figure.add_gridspec(len(heights), columns, height_ratios=heights, hspace=0.08, wspace=0.06)
@@ -101,14 +94,13 @@ def matrix_sheet(matrices: Sequence[Matrix], title: str = "", columns: int = 3) 
     if title:
         figure.suptitle(title, fontsize=13)
     stream = BytesIO()
-    figure.savefig(stream, format="png", facecolor="white", metadata={"Software": None})
-    return Image.open(BytesIO(stream.getvalue())).convert("RGB")
+    figure.savefig(stream, format="png", facecolor="white")
+    return Image.open(stream).convert("RGB")
 
 
 def _draw(axes: Axes, matrix: Matrix) -> None:
-    colours = colormaps[MAP].with_extremes(bad="#d9d9d9")
-    values = np.ma.masked_invalid(matrix.values)
-    axes.imshow(np.clip(values, 0, 1), cmap=colours, vmin=0, vmax=1, aspect="auto", interpolation="nearest")
+    values = np.clip(np.ma.masked_invalid(matrix.values), 0, 1)
+    axes.imshow(values, cmap=MAP, vmin=0, vmax=1, aspect="auto", interpolation="nearest")
     if matrix.sizes is None:
         axes.set_xticks(range(len(matrix.columns)), matrix.columns)
         axes.set_yticks(range(len(matrix.rows)), matrix.rows)
@@ -122,13 +114,11 @@ def _draw(axes: Axes, matrix: Matrix) -> None:
         middles = ends - np.asarray(matrix.sizes) / 2 - 0.5
         axes.set_xticks(middles, matrix.columns)
         axes.set_yticks(middles, matrix.rows)
-        for end in ends[:-1]:
-            axes.axhline(end - 0.5, color="#444", linewidth=0.6)
-            axes.axvline(end - 0.5, color="#444", linewidth=0.6)
-    crowded = len(matrix.columns) > 6
+        for end in ends[:-1] - 0.5:
+            axes.axhline(end, color="#444", linewidth=0.6)
+            axes.axvline(end, color="#444", linewidth=0.6)
     axes.tick_params(length=0, labelsize=8)
-    axes.tick_params(axis="x", rotation=30 if crowded else 0)
+    axes.tick_params(axis="x", rotation=30 if len(matrix.columns) > 6 else 0)
     axes.set_title(matrix.title, fontsize=10, loc="left")
     axes.set_xlabel(matrix.note, fontsize=8, color="#555")
-    for spine in axes.spines.values():
-        spine.set_visible(False)
+    axes.spines[:].set_visible(False)

@@ -1,26 +1,37 @@
-"""One self-contained HTML file: sections of blocks, style and script inline, nothing fetched from anywhere.
+"""One self-contained HTML file: a template with its values, style and script inline, nothing fetched.
 
 The page carries a content security policy that forbids every connection and every script but its own, so the
-browser itself enforces it. Leaves out the blocks (see ``blocks``); markup is in ``templates/page.html``.
+browser itself enforces it. Each page has a template in ``templates/``, which extends ``page.html`` and draws
+with the macros of ``blocks.html``. Every text is escaped there; images become data URIs.
 """
 
 from base64 import b64encode
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from hashlib import sha256
+from io import BytesIO
+from math import isfinite
 from pathlib import Path
+from typing import Any
 
-from derender.report.blocks import TEMPLATES, Html
+from jinja2 import Environment, PackageLoader, StrictUndefined, Template
+from markupsafe import Markup
+from PIL import Image
+
+from derender import __version__
+from derender.evaluation.score_table import Interval, ScoreTable
 from derender.storage.atomic import atomic_file
 
-
-@dataclass(frozen=True)
-class Section:
-    """A heading, the blocks under it, and the word that names it in the page's navigation."""
-
-    title: str
-    blocks: Sequence[Html]
-    short: str = ""
+LONGEST_WORD = 24  # characters of a cell that is kept on one line
+TEMPLATES = Environment(
+    loader=PackageLoader("derender.report"),
+    autoescape=True,
+    trim_blocks=True,
+    lstrip_blocks=True,
+    keep_trailing_newline=True,
+    undefined=StrictUndefined,
+)
+DIRECTIONS = {"high": "higher is better", "low": "lower is better", None: ""}
 
 
 @dataclass(frozen=True)
@@ -28,22 +39,26 @@ class Page:
     """A whole report.
 
     Attributes:
+        template: the name of one, or one; its block ``main`` holds the sections.
         title: the heading and the browser's title.
         lead: one or two sentences under it.
-        sections: in reading order.
+        values: what the template shows, by name.
         footer: where the page comes from; plain text.
     """
 
+    template: str | Template
     title: str
     lead: str
-    sections: Sequence[Section]
-    footer: str = ""
+    values: Mapping[str, Any] = field(default_factory=dict)
+    footer: str = f"derender {__version__}"
 
     def html(self) -> str:
         """The complete document."""
         script = TEMPLATES.get_template("page.js").render()
         digest = b64encode(sha256(script.encode()).digest()).decode()
-        return TEMPLATES.get_template("page.html").render(page=self, script=Html(script), digest=digest)
+        return TEMPLATES.get_template(self.template).render(
+            **self.values, page=self, sections=[], script=Markup(script), digest=digest
+        )
 
     def write(self, path: str | Path) -> Path:
         """Write the document to ``path``; whole or not at all."""
@@ -52,7 +67,46 @@ class Page:
 
 def write_whole(path: str | Path, content: bytes) -> Path:
     """Write a file whole or not at all; a failure leaves the old one. Makes the folder."""
-    path = Path(path)
-    with atomic_file(path) as temporary:
+    with atomic_file(Path(path)) as temporary:
         temporary.write_bytes(content)
-    return path
+    return Path(path)
+
+
+def png_bytes(image: Image.Image) -> bytes:
+    """A compact PNG file."""
+    stream = BytesIO()
+    image.save(stream, format="PNG", optimize=True)
+    return stream.getvalue()
+
+
+def data_uri(source: Image.Image | bytes) -> str:
+    """An image, or the bytes of a PNG, GIF or JPEG file, as a page holds it."""
+    content = source if isinstance(source, bytes) else png_bytes(source)
+    kinds = {b"\x89PNG": "png", b"GIF8": "gif", b"\xff\xd8\xff": "jpeg"}
+    kind = next((name for start, name in kinds.items() if content.startswith(start)), None)
+    if kind is None:
+        raise ValueError("a page takes PNG, GIF or JPEG bytes; these are none of them")
+    return f"data:image/{kind};base64,{b64encode(content).decode()}"
+
+
+def html_cells(scores: ScoreTable, row: Any) -> list[tuple[str, dict[str, str]]]:
+    """Text and attributes of each cell of a row: the number to sort by, its share of the largest, a class."""
+    cells = []
+    for place, (column, cell) in enumerate(zip(scores.columns, row.cells, strict=True)):
+        text, attributes = column.text(cell), {}
+        if isinstance(cell, str | Interval):
+            attributes = {"class": "words"} if len(text) > LONGEST_WORD else {}  # a sentence may break
+        elif cell is None or not isfinite(cell):
+            attributes = {"class": "none"}
+        else:
+            attributes["data-value"] = f"{float(cell):.9g}"
+            if cell == scores.best(place):
+                attributes["class"] = "best"
+            if column.best and (largest := scores.largest(place)) > 0:
+                attributes["style"] = f"--share:{abs(cell) / largest:.3f}"
+        cells.append((text, attributes))
+    return cells
+
+
+TEMPLATES.filters |= {"uri": data_uri, "cells": html_cells}
+TEMPLATES.globals |= {"directions": DIRECTIONS}

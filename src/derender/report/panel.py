@@ -1,16 +1,15 @@
 """Labelled grids of images drawn into one image: panels, contact sheets, and sheets of many rows.
 
 Leaves out where the images come from (``decomposition``, ``edits``) and writing files. In an HTML page use
-``blocks.image_grid``, whose labels are text.
+the macro ``image_grid`` of ``templates/blocks.html``, whose labels are text.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from math import ceil
 
 from PIL import Image, ImageDraw, ImageFont
 
-from derender.report.colours import Images, enlarged, on_background, same_length
+from derender.report.colours import Images, enlarged, on_background
 
 INK = (28, 30, 34)
 FAINT = (120, 124, 132)
@@ -30,22 +29,6 @@ class GridLayout:
     label: int = 17
     title: int = 24
 
-    def top(self, title: str) -> int:
-        """Where the grid begins below its title, if it has one."""
-        return self.margin + (self.title + self.label if title else 0)
-
-    def sheet(self, width: int, height: int, title: str) -> tuple[Image.Image, ImageDraw.ImageDraw, Font]:
-        """An empty sheet with its title, what draws on it, and the font of its labels."""
-        sheet = Image.new("RGB", (width, height), PAPER)
-        draw = ImageDraw.Draw(sheet)
-        if title:
-            draw.text((self.margin, self.margin), title, INK, ImageFont.load_default(self.title))
-        return sheet, draw, ImageFont.load_default(self.label)
-
-    def height_of(self, images: Images) -> int:
-        """Height of the tallest image at the width of a cell."""
-        return max(enlarged(image, self.cell).height for image in images)
-
 
 def labelled_grid(
     columns: Mapping[str, Images],
@@ -54,28 +37,14 @@ def labelled_grid(
     layout: GridLayout | None = None,
 ) -> Image.Image:
     """One row per image, one column per entry of ``columns`` under its name; row labels at the left."""
-    layout = layout or GridLayout()
-    rows = same_length(list(columns.values()))
+    lengths = sorted({len(images) for images in columns.values()})
+    if len(lengths) != 1:
+        raise ValueError(f"all columns of a grid need the same number of images; got {lengths}")
+    rows = lengths[0]
     if row_labels is not None and len(row_labels) != rows:
         raise ValueError(f"expected {rows} row labels, one per image; got {len(row_labels)}")
-    labels = row_labels or []
-    left = layout.margin + _label_width(labels, layout)
-    top = layout.top(title) + layout.label + layout.gap
-    heights = [layout.height_of([images[row] for images in columns.values()]) for row in range(rows)]
-    width = left + len(columns) * (layout.cell + layout.gap) - layout.gap + layout.margin
-    height = top + sum(heights) + layout.gap * (rows - 1) + layout.margin
-    sheet, draw, font = layout.sheet(width, height, title)
-    tops = [top + sum(heights[:row]) + layout.gap * row for row in range(rows)]
-    for index, (name, images) in enumerate(columns.items()):
-        x = left + index * (layout.cell + layout.gap)
-        label = shortened(name, font, layout.cell)
-        draw.text((x + layout.cell // 2, top - layout.gap), label, INK, font, anchor="ms")
-        for image, y in zip(images, tops, strict=True):
-            sheet.paste(on_background(enlarged(image, layout.cell), PAPER), (x, y))
-    for label, y, row_height in zip(labels, tops, heights, strict=False):
-        text = shortened(label, font, left - layout.margin - 2 * layout.gap)
-        draw.text((left - 2 * layout.gap, y + row_height // 2), text, FAINT, font, anchor="rm")
-    return sheet
+    cells = [list(row) for row in zip(*columns.values(), strict=True)]
+    return _grid(cells, layout or GridLayout(), title, heads=list(columns), labels=row_labels or [])
 
 
 def contact_sheet(
@@ -86,25 +55,56 @@ def contact_sheet(
     layout: GridLayout | None = None,
 ) -> Image.Image:
     """Many images in reading order, ``across`` a row, each with its caption below."""
-    layout = layout or GridLayout(cell=96, gap=6, label=13)
     if not images:
         raise ValueError("a contact sheet needs at least one image")
     if captions is not None and len(captions) != len(images):
         raise ValueError(f"expected {len(images)} captions, one per image; got {len(captions)}")
-    across = min(across, len(images))
-    cell_height = layout.height_of(images) + (layout.label + layout.gap if captions is not None else 0)
-    width = 2 * layout.margin + across * (layout.cell + layout.gap) - layout.gap
-    rows, top = ceil(len(images) / across), layout.top(title)
-    height = top + rows * (cell_height + layout.gap) - layout.gap + layout.margin
-    sheet, draw, font = layout.sheet(width, height, title)
-    for index, image in enumerate(images):
-        x = layout.margin + index % across * (layout.cell + layout.gap)
-        y = top + index // across * (cell_height + layout.gap)
-        sheet.paste(on_background(enlarged(image, layout.cell), PAPER), (x, y))
-        if captions is not None:
-            text = shortened(captions[index], font, layout.cell)
-            place = (x + layout.cell // 2, y + cell_height - layout.gap // 2)
-            draw.text(place, text, FAINT, font, anchor="ms")
+    rows = [images[start : start + across] for start in range(0, len(images), across)]
+    return _grid(rows, layout or GridLayout(cell=96, gap=6, label=13), title, captions=captions or [])
+
+
+def _grid(
+    rows: Sequence[Images],
+    layout: GridLayout,
+    title: str,
+    *,
+    heads: Sequence[str] = (),
+    labels: Sequence[str] = (),
+    captions: Sequence[str] = (),
+) -> Image.Image:
+    """Images in rows with heads over columns, labels at the left of rows, and captions in reading order."""
+    font, line = ImageFont.load_default(layout.label), layout.label + layout.gap
+    left, step = layout.margin, layout.cell + layout.gap
+    if labels:
+        widest = max(font.getlength(" ".join(label.split())) for label in labels)
+        left += min(round(widest), 2 * layout.cell) + 2 * layout.gap
+    top = layout.margin + (layout.title + layout.label if title else 0) + (line if heads else 0)
+    scaled = [[on_background(enlarged(image, layout.cell), PAPER) for image in row] for row in rows]
+    heights = [max(image.height for image in row) + (line if captions else 0) for row in scaled]
+    width = left + len(rows[0]) * step - layout.gap + layout.margin
+    height = top + sum(heights) + layout.gap * (len(rows) - 1) + layout.margin
+    sheet = Image.new("RGB", (width, height), PAPER)
+    draw = ImageDraw.Draw(sheet)
+
+    def write(text: str, x: int, y: int, colour: tuple[int, int, int], room: int, anchor: str) -> None:
+        draw.text((x, y), shortened(text, font, room), colour, font, anchor=anchor)
+
+    if title:
+        draw.text((layout.margin, layout.margin), title, INK, ImageFont.load_default(layout.title))
+    for column, head in enumerate(heads):
+        write(head, left + column * step + layout.cell // 2, top - layout.gap, INK, layout.cell, "ms")
+    captions_left, y = iter(captions), top
+    for number, (row, height) in enumerate(zip(scaled, heights, strict=True)):
+        if labels:
+            room = left - layout.margin - 2 * layout.gap
+            write(labels[number], left - 2 * layout.gap, y + height // 2, FAINT, room, "rm")
+        for column, image in enumerate(row):
+            x = left + column * step
+            sheet.paste(image, (x, y))
+            if captions:
+                middle, below = x + layout.cell // 2, y + height - layout.gap // 2
+                write(next(captions_left), middle, below, FAINT, layout.cell, "ms")
+        y += height + layout.gap
     return sheet
 
 
@@ -134,21 +134,21 @@ class Sheets:
 
     def drawn(self) -> Images:
         """The sheets, in order; none where nothing was added."""
+        parts = [slice(start, start + self.rows) for start in range(0, len(self), self.rows)]
         return [
             labelled_grid(
-                {name: images[start : start + self.rows] for name, images in self._columns.items()},
-                self._labels[start : start + self.rows],
+                {name: images[part] for name, images in self._columns.items()}, self._labels[part],
                 layout=self.layout,
             )
-            for start in range(0, len(self), self.rows)
-        ]
+            for part in parts
+        ]  # fmt: skip
 
 
 def strip(images: Images, gap: int = 0) -> Image.Image:
     """Images in one row without labels, transparency kept."""
     if not images:
         raise ValueError("a strip needs at least one image")
-    width = sum(image.width for image in images) + gap * (len(images) - 1)
+    width = sum(image.width + gap for image in images) - gap
     row = Image.new("RGBA", (width, max(image.height for image in images)), (0, 0, 0, 0))
     x = 0
     for image in images:
@@ -167,11 +167,3 @@ def shortened(text: str, font: Font, width: int) -> str:
         if font.getlength(short) <= width:
             return short
     return text[:1]
-
-
-def _label_width(labels: Sequence[str], layout: GridLayout) -> int:
-    if not labels:
-        return 0
-    font = ImageFont.load_default(layout.label)
-    widest = max(font.getlength(" ".join(label.split())) for label in labels)
-    return min(round(widest), 2 * layout.cell) + 2 * layout.gap

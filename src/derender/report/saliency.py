@@ -35,50 +35,46 @@ from derender.report.panel import GridLayout, contact_sheet, labelled_grid
 STRENGTH = 0.75
 SHOWN_PX = 64
 BLURRED_PX = 5  # of 64: single pixels say little
+LAYOUT = GridLayout(cell=128, gap=6, label=13, title=18)
+Pixels = Float[Tensor, "n 3 h w"]
 
 
-def overlays(images: Float[Tensor, "n 3 h w"], maps: Float[Tensor, "n y x"]) -> Images:
-    """Maps of any size over grey images in 0..1; an empty map leaves the image grey."""
+def overlays(images: Pixels, maps: Float[Tensor, "n y x"]) -> Images:
+    """Maps of any size over grey images in 0..1; an empty map leaves the image grey.
+
+    Maps of the images' size are smoothed over squares of about a twelfth of their side.
+    """
     size = images.shape[-1]
-    heat = to_one(upsampled(maps, size) if maps.shape[-1] != size else smoothed(maps)).cpu().numpy()
-    grey = images.mean(dim=1).cpu().numpy()[..., None].repeat(3, axis=-1)
-    opacity = STRENGTH * heat[..., None]
-    blended = grey * (1 - opacity) + colormaps["inferno"](heat)[..., :3] * opacity
+    if maps.shape[-1] == size:
+        side = max(1, round(BLURRED_PX * size / SHOWN_PX)) // 2 * 2 + 1
+        how = {"stride": 1, "padding": side // 2, "count_include_pad": False}
+        heat = to_one(torch.nn.functional.avg_pool2d(maps[:, None], side, **how)[:, 0])
+    else:
+        heat = to_one(upsampled(maps, size))
+    heat, grey = heat.cpu().numpy()[..., None], images.mean(dim=1).cpu().numpy()[..., None]
+    blended = grey * (1 - STRENGTH * heat) + colormaps["inferno"](heat[..., 0])[..., :3] * STRENGTH * heat
     return pictures(np.moveaxis(blended, -1, 1))
 
 
-def smoothed(maps: Float[Tensor, "n h w"]) -> Float[Tensor, "n h w"]:
-    """Means over squares of about a twelfth of the image's side."""
-    side = max(1, round(BLURRED_PX * maps.shape[-1] / SHOWN_PX)) // 2 * 2 + 1
-    blurred = torch.nn.functional.avg_pool2d(
-        maps[:, None], side, stride=1, padding=side // 2, count_include_pad=False
-    )
-    return blurred[:, 0]
-
-
 def saliency_sheet(
-    model: Any, probe: Probe, images: Float[Tensor, "n 3 h w"], target: int, method: str, title: str
+    model: Any, probe: Probe, images: Pixels, target: int, method: str, title: str
 ) -> Image.Image:
     """One row for each image: the input and its answer, then each factor's map and share of |IG|."""
     with torch.no_grad():
         features = {name: code.float().cpu().numpy() for name, code in model.embed(images).items()}
     attribution, _ = integrated_gradients(probe, probe.columns(features), target)
-    shares = factor_shares(attribution, probe)
-    answer = probe.probabilities(features)[:, target]
+    shares, answers = factor_shares(attribution, probe), probe.probabilities(features)[:, target]
     targets = [target] * len(images)
-    columns = {
-        name: overlays(images, saliency(method, model, images, name, probe, targets))
-        for name in probe.factors
-    }
-    inputs, cells, captions = pictures(images), [], []
-    for row in range(len(images)):
-        cells.append(inputs[row])
-        captions.append(f"input, p = {answer[row]:.2f}")
-        for place, name in enumerate(probe.factors):
-            cells.append(columns[name][row])
-            captions.append(f"{name} {100 * shares[row, place]:.0f} %")
-    layout = GridLayout(cell=128, gap=6, label=13, title=18)
-    return contact_sheet(cells, captions, across=1 + len(probe.factors), title=title, layout=layout)
+    columns = [pictures(images)]
+    columns += [
+        overlays(images, saliency(method, model, images, name, probe, targets)) for name in probe.factors
+    ]
+    captions = []
+    for answer, row in zip(answers, shares, strict=True):
+        captions.append(f"input, p = {answer:.2f}")
+        captions += [f"{name} {100 * share:.0f} %" for name, share in zip(probe.factors, row, strict=True)]
+    cells = [cell for row in zip(*columns, strict=True) for cell in row]
+    return contact_sheet(cells, captions, across=len(columns), title=title, layout=LAYOUT)
 
 
 def draw_maps(
@@ -97,7 +93,7 @@ def draw_maps(
         progress: called with (labels done, labels in all).
     """
     model, shares, targets = explained.model, explained.shares, explained.task.targets
-    test, seeds = explained.split.test, range(len(shares.rows[0].shares))
+    probe, test, seeds = shares.probe, explained.split.test, range(len(shares.rows[0].shares))
     auc = np.nan_to_num(shares.rows[0].auc.mean(axis=0), nan=-1)
     best = [int(at) for at in np.argsort(-auc, kind="stable") if (targets[test, at] == 1).sum() >= 2][:labels]
     sheets: dict[str, dict[str, Image.Image]] = {}
@@ -107,28 +103,26 @@ def draw_maps(
         chosen = np.random.default_rng(0).permutation(carriers)[:rows]
         batch = as_batch(explained.images.images[np.sort(chosen)], model.device)
         name = shares.names[target]
-        sheets[name] = {
-            method: saliency_sheet(model, shares.probe, batch, target, method, f"{name}: {method}")
+        made = sheets[name] = {
+            method: saliency_sheet(model, probe, batch, target, method, f"{name}: {method}")
             for method in METHODS
         }
         if not checks:
             asked = np.full(len(batch), target)
-            checks = sanity_check(model, shares.probe, shares.shuffled, batch, asked, seeds=seeds)
+            checks = sanity_check(model, probe, shares.shuffled, batch, asked, seeds=seeds)
             fresh, title = untrained_twin(model, 0), f"{name}: grad-cam with fresh weights"
-            sheets[name]["fresh weights"] = saliency_sheet(
-                fresh, shares.probe, batch, target, "grad-cam", title
-            )
-            sheets[name]["feature"] = feature_sheet(model, batch, shares.factors)
+            made["fresh weights"] = saliency_sheet(fresh, probe, batch, target, "grad-cam", title)
+            made["feature"] = feature_sheet(model, batch, shares.factors)
         if progress is not None:
             progress(place + 1, len(best))
     return sheets, checks
 
 
-def feature_sheet(model: Any, images: Float[Tensor, "n 3 h w"], factors: Sequence[str]) -> Image.Image:
+def feature_sheet(model: Any, images: Pixels, factors: Sequence[str]) -> Image.Image:
     """Where each factor's feature comes from, without a question."""
     columns = {"input": pictures(images)}
     columns |= {name: overlays(images, saliency("grad-cam", model, images, name)) for name in factors}
-    return labelled_grid(columns, title="the feature itself", layout=GridLayout(cell=128, gap=6, title=18))
+    return labelled_grid(columns, title="the feature itself", layout=LAYOUT)
 
 
 def safe_name(name: str) -> str:

@@ -6,20 +6,17 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from derender.data import Unreadable, decode, open_images, quiet_pillow, read_image
+from derender.data import Unreadable, decode, open_images, quiet_pillow, read_picture
 from derender.features.neighbours import Found
 from derender.report.colours import pictures
 from derender.report.panel import GridLayout, contact_sheet
 
 CELL = 160
+Progress = Callable[[int, int], object]
 
 
 def search_sheet(
-    found: Found,
-    images: str | None = None,
-    *,
-    dataset: str = "auto",
-    progress: Callable[[int, int], object] | None = None,
+    found: Found, images: str | None = None, *, dataset: str = "auto", progress: Progress | None = None
 ) -> tuple[Image.Image, list[str]]:
     """The sheet, and the names of images that cannot be read and are left out of it.
 
@@ -35,23 +32,20 @@ def search_sheet(
     address = images if images is not None else str(found.table.origin.get("data", ""))
     if not address:
         raise ValueError("the table does not record where its images are: give their address")
-    rows = [*(() if found.own_row is None else (found.own_row,)), *found.rows]
-    read = _read([found.table.files[row] for row in rows], address, dataset, progress)
-    captions = {row: f"{distance:.3f}" for row, distance in zip(found.rows, found.distances, strict=True)}
-    shown = [] if found.own_row is not None else [("query", read_image(Path(found.like), CELL))]
-    shown += [(captions.get(r, "query"), read[f]) for r in rows if (f := found.table.files[r]) in read]
-    sheet = contact_sheet(
-        [pictures(image[None])[0] for _, image in shown],
-        [caption for caption, _ in shown],
-        across=7,
-        title=f"nearest by {found.factor}",
-        layout=GridLayout(cell=CELL),
-    )
-    return sheet, [found.table.files[row] for row in rows if found.table.files[row] not in read]
+    captions = {found.table.files[row]: "query" for row in [found.own_row] if row is not None}
+    for row, distance in zip(found.rows, found.distances, strict=True):
+        captions.setdefault(found.table.files[row], f"{distance:.3f}")
+    read = _read(list(captions), address, dataset, progress)
+    shown = [] if found.own_row is not None else [("query", read_picture(Path(found.like), CELL))]
+    shown += [(caption, read[file]) for file, caption in captions.items() if file in read]
+    names, drawn = [caption for caption, _ in shown], pictures(np.stack([image for _, image in shown]))
+    title, layout = f"nearest by {found.factor}", GridLayout(cell=CELL)
+    sheet = contact_sheet(drawn, names, across=7, title=title, layout=layout)
+    return sheet, [file for file in captions if file not in read]
 
 
 def _read(
-    files: Sequence[str], address: str, dataset: str, progress: Callable[[int, int], object] | None
+    files: Sequence[str], address: str, dataset: str, progress: Progress | None
 ) -> dict[str, np.ndarray]:
     """Images by name, as far as they can be read; nothing else is decoded."""
     missing, read = set(files), {}

@@ -14,9 +14,8 @@ from PIL import Image, ImageDraw, ImageFont
 from derender.evaluation.memory import content_hash
 from derender.evaluation.segmentation import SegmentationComparison
 from derender.report import colours
-from derender.report.blocks import png_bytes
 from derender.report.colours import Images
-from derender.report.page import write_whole
+from derender.report.page import png_bytes, write_whole
 from derender.report.panel import INK, PAPER, GridLayout, labelled_grid, shortened
 
 FACE_PALETTE = (
@@ -32,19 +31,18 @@ OPACITY = 0.62
 
 def palette(n_classes: int) -> np.ndarray:
     """(C, 3) uint8: the faces' colours, then further ones spaced by the golden angle."""
-    more = np.arange(max(0, n_classes - len(FACE_PALETTE)))
-    hues = np.stack([(0.11 + 0.618034 * more) % 1, np.full(len(more), 0.75), np.full(len(more), 0.9)], axis=1)
-    further = np.rint(hsv_to_rgb(hues) * 255).astype(np.uint8).reshape(-1, 3)
-    return np.concatenate([np.array(FACE_PALETTE, np.uint8), further])[:n_classes]
+    more = [(0.11 + 0.618034 * place) % 1 for place in range(n_classes - len(FACE_PALETTE))]
+    further = [np.rint(255 * hsv_to_rgb((hue, 0.75, 0.9))) for hue in more]
+    return np.array([*FACE_PALETTE, *further], np.uint8)[:n_classes]
 
 
 def overlays(pictures: np.ndarray, masks: np.ndarray, n_classes: int, *, scale: int = 1) -> Images:
     """Masks (N, S, S) in colours over images (N, 3, S, S) uint8; every pixel becomes ``scale`` squared."""
     if pictures.shape != (len(masks), 3, *masks.shape[1:]):
         raise ValueError(f"images {pictures.shape} and masks {masks.shape} must be of one size and number")
-    ground = np.moveaxis(pictures, 1, -1).astype(np.float32)
-    mixed = (1 - OPACITY) * ground + OPACITY * palette(n_classes)[masks]
-    return colours.pictures(_larger(np.moveaxis(np.rint(mixed).astype(np.uint8), -1, 1), scale))
+    tints = np.moveaxis(palette(n_classes)[masks], -1, 1)
+    mixed = (1 - OPACITY) * pictures.astype(np.float32) + OPACITY * tints
+    return _larger(np.rint(mixed).astype(np.uint8), scale)
 
 
 def segmentation_sheet(
@@ -57,15 +55,15 @@ def segmentation_sheet(
     """A row for each image: itself, its mask, every answer; the legend of the classes below.
 
     Args:
-        images: (N, 3, S, S) uint8.
+        pictures: (N, 3, S, S) uint8.
         masks: (N, S, S) true class numbers.
         answers: by column name, (N, S, S).
         classes: the name of every class number.
         layout: sizes in pixels.
     """
     layout = layout or GridLayout()
-    scale = max(1, ceil(layout.cell / masks.shape[-1]))  # pixels stay squares when the grid shrinks them
-    columns = {"picture": colours.pictures(_larger(pictures, scale))}
+    scale = ceil(layout.cell / masks.shape[-1])  # pixels stay squares when the grid shrinks them
+    columns = {"picture": _larger(pictures, scale)}
     for name, shown in {"mask": masks, **answers}.items():
         columns[name] = overlays(pictures, shown, len(classes), scale=scale)
     grid = labelled_grid(columns, layout=layout)
@@ -85,25 +83,22 @@ def write_overlays(found: SegmentationComparison, out: Path) -> Path:
     return write_whole(out / f"overlays-{mark}.png", png_bytes(sheet))
 
 
-def legend(classes: Sequence[str], width: int, layout: GridLayout | None = None) -> Image.Image:
+def legend(classes: Sequence[str], width: int, layout: GridLayout) -> Image.Image:
     """A swatch and a name for each class, in as many columns as fit into ``width`` pixels."""
-    layout = layout or GridLayout()
-    font = ImageFont.load_default(layout.label)
-    swatch, gap = layout.label + 4, layout.gap
-    widest = max(ceil(font.getlength(name)) for name in classes)
-    cell = min(swatch + 3 * gap + widest, width - 2 * layout.margin)
-    across = max(1, (width - 2 * layout.margin) // cell)
-    down = ceil(len(classes) / across)
-    key = Image.new("RGB", (width, down * (swatch + gap) + layout.margin), PAPER)
+    font, gap, margin = ImageFont.load_default(layout.label), layout.gap, layout.margin
+    swatch, widest = layout.label + 4, max(ceil(font.getlength(name)) for name in classes)
+    cell = min(swatch + 3 * gap + widest, width - 2 * margin)
+    across = max(1, (width - 2 * margin) // cell)
+    key = Image.new("RGB", (width, ceil(len(classes) / across) * (swatch + gap) + margin), PAPER)
     draw = ImageDraw.Draw(key)
     for number, (name, colour) in enumerate(zip(classes, palette(len(classes)).tolist(), strict=True)):
-        x, y = layout.margin + number % across * cell, number // across * (swatch + gap)
+        x, y = margin + number % across * cell, number // across * (swatch + gap)
         draw.rectangle((x, y, x + swatch, y + swatch), fill=tuple(colour))
         room = max(1, cell - swatch - 2 * gap)
         draw.text((x + swatch + gap, y + swatch // 2), shortened(name, font, room), INK, font, anchor="lm")
     return key
 
 
-def _larger(pictures: np.ndarray, scale: int) -> np.ndarray:
+def _larger(images: np.ndarray, scale: int) -> Images:
     """Every pixel of (N, 3, S, S) repeated ``scale`` times each way."""
-    return pictures.repeat(scale, axis=2).repeat(scale, axis=3)
+    return colours.pictures(images.repeat(scale, axis=2).repeat(scale, axis=3))

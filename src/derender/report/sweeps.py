@@ -46,14 +46,10 @@ def lights_around(
 
     ``strength`` is ambient plus diffuse light; with its own light's, an image stays as bright as it is.
     """
-    _within("reach", reach_deg)
-    _within("pitch", pitch_deg)
+    pitch, yaw = _around(t, reach_deg, pitch_deg)
     if not 0 <= strength < inf:
         raise ValueError(f"the strength of a light must be 0 or more, got {strength}: give such a number")
-    ambient = AMBIENT_SHARE * strength
-    light = torch.tensor([ambient, strength - ambient, radians(pitch_deg), 0.0]).repeat(len(t), 1)
-    light[:, 3] = radians(reach_deg) * (2 * t - 1)
-    return light
+    return _light(strength, pitch, yaw)
 
 
 def lights_between(
@@ -68,22 +64,17 @@ def cameras_around(t: Float[Tensor, " k"], reach_deg: float, pitch_deg: float = 
 
     ``pitch_deg`` > 0 brings its top forward. No shift, no roll: yaw 0 and pitch 0 show the canonical view.
     """
-    _within("reach", reach_deg)
-    _within("pitch", pitch_deg)
-    camera = torch.zeros(len(t), 6)
-    camera[:, 0] = radians(pitch_deg)
-    camera[:, 1] = radians(reach_deg) * (2 * t - 1)
-    return camera
+    pitch, yaw = _around(t, reach_deg, pitch_deg)
+    return torch.stack((pitch, yaw, *[torch.zeros(len(t))] * 4), dim=1)
 
 
 def varied(scene: Scene, **parameters: Tensor) -> Scene:
     """One scene once for each row of the given parameters, with those in place of its own."""
     if len(scene) != 1:
         raise ValueError(f"a sweep shows one scene, got {len(scene)}: pass scene[index]")
-    counts = {len(value) for value in parameters.values()}
-    if len(counts) != 1:
-        raise ValueError(f"the parameters of a sweep need one number of rows, got {sorted(counts)}")
-    (count,) = counts
+    count, *others = {len(value) for value in parameters.values()}
+    if others:
+        raise ValueError(f"the parameters of a sweep need one number of rows, got {sorted([count, *others])}")
     repeated = scene.detach().map(lambda value: value.expand(count, *value.shape[1:]))
     return repeated.with_parameters(**{name: value.to(scene.depth) for name, value in parameters.items()})
 
@@ -93,30 +84,26 @@ def swapped(scene: Scene, donor: Scene, parameter: str) -> Scene:
     if len(donor) != 1:
         raise ValueError(f"a swap takes from one scene, got {len(donor)}: pass donor[index]")
     if parameter not in donor.parameters:
-        raise ValueError(
-            f"the other scene has no {parameter!r}; this scene has {', '.join(donor.parameters)}"
-        )
+        names = ", ".join(donor.parameters)
+        raise ValueError(f"the other scene has no {parameter!r}; this scene has {names}")
     value = donor.parameters[parameter]
     return scene.with_parameters(**{parameter: value.expand(len(scene), *value.shape[1:])})
 
 
+@torch.no_grad()
 def drawn(scene: Scene, render: Render) -> Images:
     """Renderings as images, transparent where nothing is seen; few at a time, so that large ones fit."""
     images: Images = []
-    with torch.no_grad():
-        for start in range(0, len(scene), FRAMES_AT_ONCE):
-            rendering = render(scene[start : start + FRAMES_AT_ONCE])
-            images += pictures(rendering.image, rendering.mask)
+    for start in range(0, len(scene), FRAMES_AT_ONCE):
+        rendering = render(scene[start : start + FRAMES_AT_ONCE])
+        images += pictures(rendering.image, rendering.mask)
     return images
 
 
 def circling_light(scene: Scene, frames: int = LOOP_FRAMES, reach_deg: float = LOOP_LIGHT_DEG) -> Scene:
     """One scene while a light as strong as its own goes round once, ``reach_deg`` off the axis; a loop."""
-    angle, strength = _angles(frames), float(scene.light[0, :2].sum())
-    light = torch.tensor([AMBIENT_SHARE * strength, (1 - AMBIENT_SHARE) * strength, 0.0, 0.0])
-    light = light.repeat(frames, 1)
-    light[:, 2] = radians(reach_deg) * 0.6 * angle.cos()
-    light[:, 3] = radians(reach_deg) * angle.sin()
+    angle, reach = _angles(frames), radians(reach_deg)
+    light = _light(float(scene.light[0, :2].sum()), 0.6 * reach * angle.cos(), reach * angle.sin())
     return varied(scene, light=light)
 
 
@@ -139,9 +126,16 @@ def _angles(frames: int) -> Float[Tensor, " k"]:
     return 2 * pi * torch.arange(frames) / frames
 
 
-def _within(name: str, angle_deg: float, limit_deg: float = 90) -> None:
-    if not -limit_deg < angle_deg < limit_deg:
-        raise ValueError(
-            f"{name} must lie between -{limit_deg} and {limit_deg} degrees, got {angle_deg}: "
-            "give a smaller angle"
-        )
+def _light(strength: float, pitch: Tensor, yaw: Tensor) -> Float[Tensor, "k 4"]:
+    ambient = torch.full_like(yaw, AMBIENT_SHARE * strength)
+    return torch.stack((ambient, strength - ambient, pitch, yaw), dim=1)
+
+
+def _around(t: Tensor, reach_deg: float, pitch_deg: float) -> tuple[Tensor, Tensor]:
+    """Pitch and yaw in radians, from one side to the other."""
+    for name, angle_deg in (("reach", reach_deg), ("pitch", pitch_deg)):
+        if not -90 < angle_deg < 90:
+            raise ValueError(
+                f"{name} must lie between -90 and 90 degrees, got {angle_deg}: give a smaller angle"
+            )
+    return torch.full_like(t, radians(pitch_deg)), radians(reach_deg) * (2 * t - 1)
