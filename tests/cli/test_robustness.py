@@ -84,12 +84,14 @@ def test_bad_words(model, rendered, tmp_path, capsys):
         assert main([str(word) for word in whole]) == 2
         return capsys.readouterr().err.strip().splitlines()[-1]
 
-    assert "no axis 'lihgt'; did you mean 'light'" in refused("--axes", "lihgt")
+    assert "unknown axis 'lihgt'; did you mean 'light'" in refused("--axes", "lihgt")
     assert "two or more that grow" in refused("--angles", "30")
     assert "within 0..60 degrees for pitch" in refused("--axes", "pitch")
     assert "--angles 'wide' should read like" in refused("--angles", "wide")
-    assert "no label 'hairs'; did you mean 'hair'" in refused("--label", "hairs", "--people", 2)
-    assert "'facess' is unknown; did you mean 'faces'" in refused("--pictures", "facess")
+    assert "unknown label of generated faces 'hairs'; did you mean 'hair'" in refused(
+        "--label", "hairs", "--people", 2
+    )
+    assert "unknown kind of images 'facess'; did you mean 'faces'" in refused("--pictures", "facess")
     assert "take no images" in refused("--pictures", "cars", "-d", rendered)
     assert "need images" in refused("--pictures", "truth")
     assert "are asked one label" in refused("--attributes")

@@ -8,7 +8,7 @@ import torch
 
 from derender.data import ImageSet
 from derender.data.synthetic import faces
-from derender.evaluation.controls import Renderings, component_count, whitened, whitened_components
+from derender.evaluation.controls import Renderings
 from derender.evaluation.memory import Memory
 from derender.features import embed_images
 from derender.model import Derenderer
@@ -33,13 +33,12 @@ def net(seed: int) -> Derenderer:
 
 
 def test_a_model_whitens_itself_as_training_does(renderings):
-    found = whitened(renderings, renderings.model).whitening
+    found = renderings.whiten(renderings.model).whitening
     expected = fit_whitening(
         renderings.model,
         torch.from_numpy(renderings.images),
         SETTINGS.whitening,
         SETTINGS.perturb,
-        seed=renderings.seed,
     )
     assert found is not None and sorted(found.names) == ["albedo", "geometry"]
     for name, value in found.named_buffers():
@@ -48,9 +47,9 @@ def test_a_model_whitens_itself_as_training_does(renderings):
 
 
 def test_features_there_are_already_change_nothing(renderings, images):
-    fitted = whitened(renderings, renderings.model)
+    fitted = renderings.whiten(renderings.model)
     assert fitted.whitening is not None and fitted.whitening.mirrored
-    again = whitened(replace(renderings, model=fitted), fitted)
+    again = replace(renderings, model=fitted).whiten(fitted)
     expected = embed_images(fitted, images)
     for name, feature in embed_images(again, images).items():
         np.testing.assert_array_equal(feature, expected[name])
@@ -58,21 +57,21 @@ def test_features_there_are_already_change_nothing(renderings, images):
 
 def test_another_encoder_is_whitened_by_its_own_codes_of_the_renderings(renderings, images):
     other = net(1)
-    found = whitened(renderings, other)
+    found = renderings.whiten(other)
     features, codes = (embed_images(one, images) for one in (found, other))
     assert np.linalg.matrix_rank(features["geometry"]) <= 6 < np.linalg.matrix_rank(codes["geometry"])
     np.testing.assert_allclose(features["light"], codes["light"], rtol=1e-5)
-    own = whitened(renderings, renderings.model).whitening
+    own = renderings.whiten(renderings.model).whitening
     assert own is not None and found.whitening is not None
     assert not torch.allclose(found.whitening.get_buffer("geometry_map"), own.get_buffer("geometry_map"))
 
 
 def test_components_are_whitened_and_cached(renderings, images, tmp_path):
     pictures = ImageSet(images[40:], tuple("abcdefgh"))
-    assert component_count(renderings.images) == 10
-    keeping = Renderings(renderings.model, renderings.images, SETTINGS, memory=Memory(tmp_path))
-    one, two = (whitened_components(keeping, pictures).factors["pca"] for _ in range(2))
-    assert keeping.memory is not None and (keeping.memory.made, keeping.memory.recalled) == (1, 1)
+    assert renderings.n_components == 10
+    keeping = replace(renderings, memory=Memory(tmp_path))
+    one, two = (keeping.components(pictures).factors["pca"] for _ in range(2))
+    assert (keeping.memory.made, keeping.memory.recalled) == (1, 1)
     np.testing.assert_array_equal(one, two)
     assert one.shape == (8, 10) and np.linalg.matrix_rank(one) <= 6
-    np.testing.assert_allclose(one, whitened_components(renderings, pictures).factors["pca"], rtol=1e-5)
+    np.testing.assert_allclose(one, renderings.components(pictures).factors["pca"], rtol=1e-5)

@@ -22,11 +22,11 @@ def row(name: str, *tables: FeatureTable, factors=("geometry",), control=False) 
 
 def test_features_labels_and_controls_are_handed_on():
     rows = [row("ours", table()), row("pixels", table(seed=1), table(seed=2), factors=None, control=True)]
-    ready = prepare(rows, ("who",), keep=("track",))
+    ready = prepare(rows, ("who",))
     assert [len(arrays) for arrays in ready.features.values()] == [1, 2]
     assert ready.features["pixels"][0].shape == (6, 3) and ready.controls == ("pixels",)
     np.testing.assert_array_equal(ready.labels["who"], WHO)
-    np.testing.assert_array_equal(ready.kept["track"], TRACK)
+    np.testing.assert_array_equal(ready.table.label("track"), TRACK)
 
 
 def test_tracks_are_averaged_in_every_row_by_the_first_rows_labels():
@@ -42,7 +42,7 @@ def test_tracks_are_averaged_in_every_row_by_the_first_rows_labels():
 
 def test_classes_are_chosen_by_size():
     ready = prepare([row("ours", table())], ("who",), min_count=3, max_count=2)
-    assert ready.labels["who"].tolist() == ["bob", "bob", ""] and ready.files == ("c", "d", "f")
+    assert ready.labels["who"].tolist() == ["bob", "bob", ""] and ready.table.files == ("c", "d", "f")
     with pytest.raises(ValueError, match="go with one label, not with 2"):
         prepare([row("ours", table())], ("who", "track"), min_count=2)
 

@@ -13,9 +13,16 @@ from sklearn.neighbors import KNeighborsClassifier
 
 from derender import Derenderer
 from derender.evaluation.linear_finetune import finetune
-from derender.evaluation.linear_head import HeadSettings, train_heads
 from derender.evaluation.linear_logistic import axes_of, fit_logistic, solve_logistic
-from derender.evaluation.linear_probes import HEADS, PROBES, majority_answers, nearest_answers, probe
+from derender.evaluation.linear_probes import (
+    HEADS,
+    PROBES,
+    HeadSettings,
+    majority_answers,
+    nearest_answers,
+    probe,
+    train_heads,
+)
 from derender.evaluation.linear_probing import compare_linear, count_scores, linear_scores
 from derender.evaluation.linear_task import Task, choose_rows, task_of
 from derender.evaluation.memory import Memory

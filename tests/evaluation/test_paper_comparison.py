@@ -5,11 +5,7 @@ import re
 import numpy as np
 import pytest
 
-from derender.evaluation import compare, compare_clusterings
-from derender.evaluation.clustering_scores import CLUSTER_COLUMNS
-from derender.evaluation.linear_probing import LINEAR_COLUMNS, compare_linear, linear_part_table
-from derender.evaluation.linear_task import choose_rows, task_of
-from derender.evaluation.paper_comparison import beside_the_paper, beside_the_papers_heads
+from derender.evaluation import compare
 from derender.evaluation.paper_tables import (
     CARS,
     EMOTION,
@@ -20,7 +16,6 @@ from derender.evaluation.paper_tables import (
     TABLES,
     table_named,
 )
-from derender.evaluation.score_table import verdict_table
 from derender.features import FeatureTable
 
 
@@ -84,58 +79,46 @@ FEATURES = {
 }
 
 
-def test_the_papers_lines_stand_below_ours():
-    found = compare_clusterings(FEATURES, {"who": WHO}, controls=("noise",), resample_count=50)
-    columns = {name: CLUSTER_COLUMNS[name] for name in ("accuracy", "f1")}
-    rows = ("features", found.rows, columns, EMOTION.paper, "stand-in: made up")
-    values = beside_the_paper("Table 1", *rows, interval="accuracy").values()
-    assert values["paper: Ours - LOOCC-L"] == {
-        "accuracy": 0.4058, "F1": 0.3014, "95 %": None, "data": "RAF-DB"
-    }  # fmt: skip
-    assert values["ours"]["data"] == "stand-in: made up"
+def tables_of(repeats: int = 1) -> dict[str, list[FeatureTable]]:
+    labels = {"expression": np.array(list("abc"))[WHO], "smiles": (WHO == 0).astype(np.int8)}
+    labels = {name: np.repeat(values, repeats) for name, values in labels.items()}
+    files = tuple(map(str, range(60 * repeats)))
+    return {
+        name: [
+            FeatureTable(files, {"geometry": one, "albedo": one}, labels, {"layout": "lfw"})
+            for one in (np.repeat(run, repeats, axis=0) for run in runs)
+        ]
+        for name, runs in FEATURES.items()
+    }
 
 
 def test_linear_tables_and_the_papers():
-    task = task_of({"a": (WHO == 0).astype(np.int8)})
-    rows = choose_rows(task, [str(row) for row in range(60)], (10, 20), (0, 1))
-    found = compare_linear(
-        FEATURES, task, rows, (0, 1), controls=("noise",), heads=("linear", "k-NN"), resample_count=50
-    )
-    part = linear_part_table(found, found.parts[0])
-    assert "10 labelled rows, the paper's head, frozen features: 30 rows tested" in part.caption
-    assert [column.name for column in part.columns] == ["accuracy", "95 %", "±", "balanced", "AP"]
-    judged = verdict_table(found.parts[0].rows, LINEAR_COLUMNS, "above?")
-    assert [row.name for row in judged.rows] == ["ours: accuracy", "ours: balanced"]
-    table = beside_the_papers_heads("attributes", 2, LINEAR.paper, found, "subset")
-    assert [column.name for column in table.columns] == ["10 frozen", "20 frozen", "data"]
-    assert not any(row.note for row in table.rows)  # the paper has no numbers for 10 and 20 labels
-    wide = compare_linear(
-        {"ours": [np.repeat(FEATURES["ours"][0], 4, axis=0)]},
-        wide_task := task_of({"a": np.repeat(WHO == 0, 4).astype(np.int8)}),
-        choose_rows(wide_task, [str(row) for row in range(240)], (100,), (0, 1)),
-        (0, 1), heads=("linear",), resample_count=20,
-    )  # fmt: skip
-    values = beside_the_papers_heads("attributes", 2, LINEAR.paper, wide, "subset").values()
+    how = {"seeds": 2, "resamples": 20, "cache": "none"}
+    beside, first, judged, *_ = compare("linear", tables_of(), counts=(10, 20), **how).tables
+    assert [column.name for column in beside.columns] == ["10 frozen", "20 frozen", "data"]
+    assert not any(row.note for row in beside.rows)  # the paper has no numbers for 10 and 20 labels
+    assert "10 labelled rows, the paper's head, frozen features: 30 rows tested" in first.caption
+    assert [column.name for column in first.columns] == ["accuracy", "95 %", "±", "balanced", "AP"]
+    assert [row.name for row in judged.rows][:2] == ["ours: accuracy", "ours: balanced"]
+    values = compare("linear", tables_of(4), counts=(100,), **how).tables[0].values()
     assert values["paper: Ours - LOOCC-LV"] == {"100 frozen": 0.8226, "data": "CelebA"}
     assert "paper: Supervised ResNet-18" not in values  # it has no frozen head
 
 
 def test_one_call_compares_tables_beside_the_papers_lines():
-    labels = {"expression": np.array(list("abc"))[WHO]}
-    files = tuple(map(str, range(60)))
-    rows = {
-        name: [
-            FeatureTable(files, {"geometry": one, "albedo": one}, labels, {"layout": "lfw"}) for one in runs
-        ]
-        for name, runs in FEATURES.items()
-    }
+    rows = tables_of()
     found = compare("emotion", rows, resamples=20, cache="none")
     assert found.values["parts"]["emotion"]["differs"].startswith("stand-in: 60 rows of lfw")
+    values = found.tables[0].values()
+    assert values["paper: Ours - LOOCC-L"] == {
+        "accuracy": 0.4058, "F1": 0.3014, "95 %": None, "data": "RAF-DB"
+    }  # fmt: skip
+    assert values["ours"]["data"] == found.values["parts"]["emotion"]["differs"]
     assert found.to_pandas().loc["paper: RIS", "accuracy"] == 0.3862
     assert found.values["parts"]["emotion"]["rows"]["noise"]["runs"] == 2
     for wrong, message in (
         (("emotion", {}), "at least one feature table"),
-        (("cars", rows), r"needs labels \(class\), the features have expression"),
+        (("cars", rows), r"needs labels \(class\), the features have expression, smiles"),
         (("emotions", rows), "did you mean 'emotion'"),
         (("emotion", {"m": "faces-64"}), "model 'm' needs images"),
     ):

@@ -8,7 +8,7 @@ better by chance.
 """
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,9 @@ import numpy as np
 RESAMPLES = 1_000
 LEVEL = 0.95
 CHUNK_BYTES = 64 << 20
+Runs = Sequence[float] | np.ndarray
+"""A score of each run."""
+NAN = float("nan")
 
 
 @dataclass(frozen=True)
@@ -38,8 +41,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Difference:
-    """A score less that of the strongest control, on the same resamples; where lower is better the other way
-    round, so that above 0 is better.
+    """A score less that of the strongest control on the same resamples; above 0 is better, whichever end is.
 
     Attributes:
         rival: the strongest control's name.
@@ -100,9 +102,7 @@ def resamples(n_rows: int, count: int = RESAMPLES, seed: int = 0) -> Iterator[np
         yield np.bincount(drawn.ravel(), minlength=size * n_rows).reshape(size, n_rows).astype(np.float32)
 
 
-def estimate(
-    runs: Sequence[float], resampled: np.ndarray, *, centred: bool = False, most: float = np.inf
-) -> Estimate:
+def estimate(runs: Runs, resampled: np.ndarray, *, centred: bool = False, most: float = np.inf) -> Estimate:
     """The mean over runs with its percentile interval.
 
     Args:
@@ -115,14 +115,23 @@ def estimate(
     value = float(np.mean(runs))
     if centred:
         resampled = np.minimum(resampled - resampled.mean() + value, most)
-    low, high = _interval(resampled)
-    deviation = float(np.std(runs, ddof=1)) if len(runs) > 1 else float("nan")
-    return Estimate(value, low, high, deviation, resampled)
+    return Estimate(value, *_interval(resampled), _deviation(runs), resampled)
 
 
-def constant(value: float, count: int = RESAMPLES, deviation: float = float("nan")) -> Estimate:
-    """A score that does not depend on the rows drawn, such as a chance level."""
-    return Estimate(value, float("nan"), float("nan"), deviation, np.full(count, value))
+def constant(runs: float | Runs, count: int = RESAMPLES) -> Estimate:
+    """A score that does not depend on the rows drawn, such as a chance level: one, or one for each run."""
+    value = float(np.mean(runs))
+    return Estimate(value, NAN, NAN, _deviation(np.atleast_1d(runs)), np.full(count, value))
+
+
+def scored_row(
+    name: str, control: bool, scores: Sequence[str], runs: np.ndarray, resampled: np.ndarray, **how: Any
+) -> ScoredRow:
+    """A row of (runs, scores) values and (B, scores) means on resamples; ``how`` is that of ``estimate``."""
+    columns = zip(scores, np.transpose(runs), np.transpose(resampled), strict=True)
+    return ScoredRow(
+        name, control, len(runs), {one: estimate(own, drawn, **how) for one, own, drawn in columns}
+    )
 
 
 def difference(ours: Estimate, rivals: Mapping[str, Estimate], *, lower: bool = False) -> Difference:
@@ -137,7 +146,7 @@ def difference(ours: Estimate, rivals: Mapping[str, Estimate], *, lower: bool = 
     name = max(known, key=lambda rival: sign * rivals[rival].value)
     low, high = _interval(sign * (ours.resampled - rivals[name].resampled))
     if np.isnan(ours.low):
-        low = high = float("nan")
+        low = high = NAN
     return Difference(name, sign * (ours.value - rivals[name].value), low, high, above=low > 0)
 
 
@@ -148,19 +157,21 @@ def with_verdicts(rows: Sequence[ScoredRow], *, lower: Collection[str] = ()) -> 
     """
     controls = [row for row in rows if row.control]
 
-    def judged(row: ScoredRow) -> ScoredRow:
-        if row.control or not controls:
-            return row
-        versus = {
-            name: difference(ours, rivals, lower=name in lower)
-            for name, ours in row.scores.items()
-            if (rivals := {c.name: c.scores[name] for c in controls if name in c.scores})
+    def versus(row: ScoredRow) -> dict[str, Difference]:
+        rivals = {name: {c.name: c.scores[name] for c in controls if name in c.scores} for name in row.scores}
+        return {
+            name: difference(row.scores[name], own, lower=name in lower)
+            for name, own in rivals.items()
+            if own
         }
-        return ScoredRow(row.name, row.control, row.runs, row.scores, versus)
 
-    return tuple(judged(row) for row in rows)
+    return tuple(row if row.control else replace(row, versus=versus(row)) for row in rows)
 
 
 def _interval(values: np.ndarray) -> tuple[float, float]:
     low, high = np.quantile(values, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
     return float(low), float(high)
+
+
+def _deviation(runs: Runs) -> float:
+    return float(np.std(runs, ddof=1)) if len(runs) > 1 else NAN

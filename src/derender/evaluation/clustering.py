@@ -8,21 +8,19 @@ Source: Klinghoffer et al., ECCV 2022, Sec. 4: Ward's hierarchical clustering wi
     clusters with rows dealt at random.
 """
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.sparse import csr_array
 
-from derender.data import ImageSet
 from derender.evaluation.bootstrap import (
     RESAMPLES,
     ScoredRow,
     constant,
-    estimate,
     resamples,
+    scored_row,
     with_verdicts,
 )
 from derender.evaluation.clustering_methods import METHODS, approximation, clusterings, finch_hierarchy
@@ -35,16 +33,10 @@ from derender.evaluation.clustering_scores import (
     encoded,
     scores_of_counts,
 )
-from derender.evaluation.controls import image_notes, subject_and_controls
-from derender.evaluation.feature_rows import (
-    DEFAULT_FACTORS,
-    FeatureSource,
-    StageProgress,
-    chosen_labels,
-    prepare,
-    sized,
-)
-from derender.evaluation.memory import Memory, memory_in
+from derender.evaluation.controls import subject_and_controls
+from derender.evaluation.feature_rows import FeatureSource, check_lengths, chosen_labels, prepare
+from derender.evaluation.memory import Memory
+from derender.evaluation.options import Options
 from derender.evaluation.score_table import (
     Column,
     Row,
@@ -63,78 +55,50 @@ def cluster(
     features: FeatureSource,
     label: str | Sequence[str] | None = None,
     *,
-    images: ImageSet | str | Path | None = None,
     attributes: bool = False,
-    factors: Sequence[str] | None = DEFAULT_FACTORS,
     method: str = "ward",
     clusters: int | None = None,
     mean_by: Sequence[str] = (),
     min_count: int = 1,
     max_count: int | None = None,
-    untrained_seeds: int = 3,
-    whiten_on: ImageSet | str | Path | None = None,
-    resamples: int = RESAMPLES,
-    seed: int = 0,
-    dataset: str = "auto",
-    limit: int | None = None,
-    device: str = "auto",
-    cache: Memory | str | Path | None = None,
-    progress: StageProgress | None = None,
+    **options: Any,
 ) -> Scores:
     """Cluster features and score the clusters by labels, beside controls; every score is best at 1.
 
     Args:
         features: a feature table or its ``.parquet`` file; a model or its name, with ``images``.
         label: the label column of the classes; of several the mean.
-        images: a data set or its address: of the model, and of the controls. Without it there are no pixels,
-            PCA and untrained encoder to compare with.
         attributes: score by every yes/no label instead of ``label``.
-        factors: features to use, side by side; None means all.
         method: "ward", "finch" or "k-means".
         clusters: their number; by default one for each class.
         mean_by: average features first over rows that share these labels, as for face tracks.
         min_count, max_count: leave out classes of fewer rows; use at most so many rows of a class.
-        untrained_seeds: untrained encoders to average over.
-        whiten_on: also score the model without whitening, and controls whitened by its renderings of these
-            images.
-        resamples: bootstrap resamples of the rows.
-        seed: of resamples, k-means and untrained encoders.
-        dataset, limit: how ``images`` are read.
-        device: of models.
-        cache: folder of cached results, "none" for none; by default the user's.
-        progress: called with (done, total, description=..., unit=...).
+        options: images, factors, seed, resamples, cache, ...: the fields of ``Options``.
 
     Raises:
         ValueError: labels, factors or images do not fit.
     """
-    memory = memory_in(cache)
-    read = sized(images, dataset=dataset, limit=limit, progress=progress)
-    rows = subject_and_controls(
-        features, read, factors, range(seed, seed + untrained_seeds), memory=memory, device=device,
-        whiten_on=whiten_on, progress=progress,
-    )  # fmt: skip
+    how = Options(**options)
+    rows = subject_and_controls(features, how)
     names, left_out = chosen_labels(rows[0].tables[0], label, attributes)
     ready = prepare(rows, names, mean_by=mean_by, min_count=min_count, max_count=max_count)
     found = compare_clusterings(
         ready.features, ready.labels, controls=ready.controls, method=method, n_clusters=clusters,
-        resample_count=resamples, seed=seed, memory=memory,
+        resample_count=how.resamples, seed=how.seed, memory=how.memory,
     )  # fmt: skip
-    tables, levels = clustering_tables(found), {}
+    caption = "Above the strongest control? (paired resamples of the rows)"
+    tables = [clustering_table(found), verdict_table(found.rows, CLUSTER_COLUMNS, caption)]
+    levels = {}
     if method == "finch" and len(names) == 1:
         for row in rows:
-            levels[row.name] = finch_levels(ready.features[row.name][0], ready.labels[names[0]], memory)
+            levels[row.name] = finch_levels(ready.features[row.name][0], ready.labels[names[0]], how.memory)
             tables.append(finch_table(row.name, levels[row.name], found.labels[names[0]]))
     approximate = approximation(method, found.n_rows)
-    notes = [
-        *image_notes(read),
-        *left_out,
-        verdict(found.rows[0], "accuracy"),
-        *([approximate] if approximate else []),
-    ]
+    notes = [*how.notes, *left_out, verdict(found.rows[0], "accuracy"), *filter(None, [approximate])]
     if ready.n_dropped:
         notes.append(f"{ready.n_dropped:,} rows without a label of {', '.join((*names, *mean_by))} left out")
     more = {"approximation": approximate, "n_dropped_before": ready.n_dropped, "finch": levels}
-    return Scores(tables, {**found.numbers(), **more}, [*notes, memory.summary()])
+    return Scores(tables, {**found.numbers(), **more}, [*notes, how.memory.summary()])
 
 
 @dataclass(frozen=True)
@@ -162,11 +126,6 @@ class ClusterComparison:
     def numbers(self) -> dict[str, Any]:
         """Everything as JSON takes it."""
         return {**vars(self), "rows": {row.name: row.numbers() for row in self.rows}}
-
-    @property
-    def about(self) -> str:
-        """Method, rows and labels in words."""
-        return about_clustering(self.method, self.n_rows, self.labels)
 
 
 def about_clustering(method: str, n_rows: int, labels: Mapping[str, int]) -> str:
@@ -199,60 +158,107 @@ def compare_clusterings(
         seed: of the resamples and of k-means.
         memory: where trees are cached.
     """
-    labelled = _labelled(features, labels)
-    numbers = {name: _numbered(np.asarray(values)[labelled], name) for name, values in labels.items()}
+    if not labels or not features or not all(features.values()):
+        raise ValueError("clustering needs at least one label and one array of features in each row")
+    columns = {name: np.asarray(values) for name, values in labels.items()}
+    check_lengths(features, len(next(iter(columns.values()))))
+    labelled = ~np.all([missing(values) for values in columns.values()], axis=0)
+    numbers = {name: _numbered(values[labelled], name) for name, values in columns.items()}
     sizes = {name: int(values.max()) + 1 for name, values in numbers.items()}
     clusters = {name: n_clusters or size for name, size in sizes.items()}
-    method_seeds = range(seed, seed + K_MEANS_SEEDS) if method == "k-means" else (seed,)
-    n_rows = int(labelled.sum())
+    n_rows, once = int(labelled.sum()), np.ones((1, labelled.sum()), np.float32)
 
     runs: dict[str, list[dict[str, np.ndarray]]] = {}
     for name, arrays in features.items():
         runs[name] = []
         for array in arrays:
-            for one in method_seeds:
+            for one in range(seed, seed + (K_MEANS_SEEDS if method == "k-means" else 1)):
                 own = np.asarray(array)[labelled]
                 cuts = clusterings(own, clusters.values(), method, seed=one, memory=memory)
                 runs[name].append({label: cuts[count] for label, count in clusters.items()})
+    first = next(iter(runs.values()))[0]
     runs["majority"] = [dict.fromkeys(labels, np.zeros(n_rows, np.int64))]
 
-    tables = [_CountTables(numbers, run) for assignments in runs.values() for run in assignments]
-    plain = [table.scores(np.ones((1, n_rows), np.float32))[0] for table in tables]
-    portions = [
-        np.stack([table.scores(weights).mean(axis=1) for table in tables])
-        for weights in resamples(n_rows, resample_count, seed)
-    ]
-    resampled = np.concatenate(portions, axis=1)  # (runs, resamples, scores)
-    rows, per_label, start = [], {}, 0
-    for name, assignments in runs.items():
-        part = slice(start, start + len(assignments))
-        control = name in controls or name == "majority"
-        rows.append(_row(name, np.array(plain[part]), resampled[part], control))
+    scorers = {name: [_scorer(numbers, run) for run in own] for name, own in runs.items()}
+    drawn: dict[str, list[np.ndarray]] = {name: [] for name in runs}
+    for weights in resamples(n_rows, resample_count, seed):
+        for name, own in scorers.items():
+            drawn[name].append(np.stack([score(weights).mean(axis=1) for score in own]))
+    rows, per_label = [], {}
+    for name, own in scorers.items():
+        plain = np.stack([score(once)[0] for score in own])  # (runs, labels, scores)
+        resampled = np.concatenate(drawn[name], axis=1).mean(axis=0)
+        quiet = name in controls or name == "majority"
+        rows.append(
+            scored_row(name, quiet, tuple(METRICS), plain.mean(axis=1), resampled, centred=True, most=1.0)
+        )
         per_label[name] = {
-            label: dict(zip(METRICS, plain[start][at].tolist(), strict=True))
-            for at, label in enumerate(labels)
+            label: dict(zip(METRICS, values, strict=True))
+            for label, values in zip(labels, plain[0].tolist(), strict=True)
         }
-        start += len(assignments)
-    rows.append(_chance(numbers, next(iter(runs.values()))[0], resample_count))
+    orders = [np.random.default_rng(one).permutation(n_rows) for one in SEEDS]
+    deals = [{label: clustered[order] for label, clustered in first.items()} for order in orders]
+    chance = np.stack([_scorer(numbers, deal)(once)[0].mean(axis=0) for deal in deals], axis=1)
+    found = {score: constant(own, resample_count) for score, own in zip(METRICS, chance, strict=True)}
+    rows.append(ScoredRow("chance", True, len(deals), found))
     n_missing = sum(int((values < 0).sum()) for values in numbers.values())
     dropped = int((~labelled).sum())
     return ClusterComparison(with_verdicts(rows), method, sizes, n_rows, dropped, n_missing, per_label)
 
 
+def _numbered(values: np.ndarray, name: str) -> np.ndarray:
+    """Classes as integers from 0, -1 where missing."""
+    known = ~missing(values)
+    classes = np.full(len(values), -1, np.int64)
+    if known.any():
+        classes[known] = encoded(values[known])
+    count = int(classes.max(initial=-1)) + 1
+    if count < 2:
+        raise ValueError(
+            f"clustering needs at least two classes, the {int(known.sum())} labelled rows of {name!r} have "
+            f"{count}: choose another label column"
+        )
+    if count == known.sum():
+        raise ValueError(
+            f"every one of the {int(known.sum())} labelled rows of {name!r} is a class of its own: choose a "
+            "label column whose values repeat"
+        )
+    return classes
+
+
+def _scorer(
+    numbers: Mapping[str, np.ndarray], assignment: Mapping[str, np.ndarray]
+) -> Callable[[np.ndarray], np.ndarray]:
+    """Scores of one clustering: how often each row is drawn, (B, N), to (B, labels, scores).
+
+    The tables of counts of all labels are one product with one sparse matrix.
+    """
+    shapes, rows, cells, start = [], [], [], 0
+    for name, classes in numbers.items():
+        shapes.append((int(classes.max()) + 1, int(assignment[name].max()) + 1))
+        rows.append(np.flatnonzero(classes >= 0))
+        cells.append(start + (classes * shapes[-1][1] + assignment[name])[rows[-1]])
+        start += shapes[-1][0] * shapes[-1][1]
+    at = np.concatenate(cells), np.concatenate(rows)
+    shape = start, len(next(iter(numbers.values())))
+    matrix = csr_array((np.ones(len(at[0]), np.float32), at), shape=shape)
+    ends = np.cumsum([classes * clusters for classes, clusters in shapes])[:-1]
+
+    def scores(weights: np.ndarray) -> np.ndarray:
+        parts = zip(np.split((matrix @ weights.T).T, ends, axis=1), shapes, strict=True)
+        return np.stack([scores_of_counts(part.reshape(-1, *shape)) for part, shape in parts], axis=1)
+
+    return scores
+
+
 def clustering_table(found: ClusterComparison) -> ScoreTable:
     """One row for each feature and control, every score."""
-    caption = found.about
+    caption = about_clustering(found.method, found.n_rows, found.labels)
     if found.n_dropped:
         caption += f"; {found.n_dropped:,} rows without label left out"
     if found.n_missing:
         caption += f"; {found.n_missing:,} single labels unknown"
     return scored_table(caption, "features", found.rows, CLUSTER_COLUMNS)
-
-
-def clustering_tables(found: ClusterComparison) -> list[ScoreTable]:
-    """Scores, and the differences to the strongest control."""
-    caption = "Above the strongest control? (paired resamples of the rows)"
-    return [clustering_table(found), verdict_table(found.rows, CLUSTER_COLUMNS, caption)]
 
 
 @dataclass(frozen=True)
@@ -287,97 +293,9 @@ def finch_table(name: str, levels: Sequence[Level], classes: int) -> ScoreTable:
         CLUSTER_COLUMNS["nmi"],
         CLUSTER_COLUMNS["ari"],
     )
-    rows = [
-        Row(
-            f"{level.clusters:,} clusters",
-            (level.scores["accuracy"], level.chance["accuracy"], level.scores["nmi"], level.scores["ari"]),
-        )
-        for level in levels
+    cells = [
+        (one.scores["accuracy"], one.chance["accuracy"], one.scores["nmi"], one.scores["ari"])
+        for one in levels
     ]
+    rows = [Row(f"{level.clusters:,} clusters", own) for level, own in zip(levels, cells, strict=True)]
     return ScoreTable(f"FINCH on {name}: partitions found, {classes} classes", "partition", columns, rows)
-
-
-class _CountTables:
-    """The table of counts of each label as a product of how often each row is drawn: one sparse matrix."""
-
-    def __init__(self, numbers: Mapping[str, np.ndarray], assignment: Mapping[str, np.ndarray]):
-        self.shapes, rows, cells, start = [], [], [], 0
-        for name, classes in numbers.items():
-            shape = int(classes.max()) + 1, int(assignment[name].max()) + 1
-            known = np.flatnonzero(classes >= 0)
-            rows.append(known)
-            cells.append(start + classes[known] * shape[1] + assignment[name][known])
-            self.shapes.append(shape)
-            start += shape[0] * shape[1]
-        n_rows = len(next(iter(numbers.values())))
-        at = np.concatenate(cells), np.concatenate(rows)
-        self.matrix = csr_array((np.ones(len(at[0]), np.float32), at), shape=(start, n_rows))
-
-    def scores(self, weights: np.ndarray) -> np.ndarray:
-        """(B, labels, scores) of B resamples, given how often each row is drawn, (B, N)."""
-        counts, found, start = (self.matrix @ weights.T).T, [], 0
-        for shape in self.shapes:
-            size = shape[0] * shape[1]
-            found.append(scores_of_counts(counts[:, start : start + size].reshape(-1, *shape)))
-            start += size
-        return np.stack(found, axis=1)
-
-
-def _row(name: str, plain: np.ndarray, resampled: np.ndarray, control: bool) -> ScoredRow:
-    """From (runs, labels, scores) and (runs, B, scores) of resamples."""
-    scores = {
-        score: estimate(
-            plain[:, :, at].mean(axis=1).tolist(), resampled[:, :, at].mean(axis=0), centred=True, most=1.0
-        )
-        for at, score in enumerate(METRICS)
-    }
-    return ScoredRow(name, control, len(plain), scores)
-
-
-def _chance(numbers: Mapping[str, np.ndarray], assignment: Mapping[str, np.ndarray], count: int) -> ScoredRow:
-    deals = []
-    for seed in SEEDS:
-        order = np.random.default_rng(seed).permutation(len(next(iter(numbers.values()))))
-        dealt = _CountTables(numbers, {name: clusters[order] for name, clusters in assignment.items()})
-        deals.append(dealt.scores(np.ones((1, len(order)), np.float32))[0].mean(axis=0))
-    mean, deviation = np.mean(deals, axis=0), np.std(deals, axis=0, ddof=1)
-    scores = {
-        score: constant(float(mean[at]), count, float(deviation[at])) for at, score in enumerate(METRICS)
-    }
-    return ScoredRow("chance", True, len(deals), scores)
-
-
-def _labelled(features: Mapping[str, Sequence[np.ndarray]], labels: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Which rows carry a label at all, (N,) bool, once everything is of one length."""
-    if not labels or not features or not all(features.values()):
-        raise ValueError("clustering needs at least one label and one array of features in each row")
-    n_rows = len(next(iter(labels.values())))
-    for what, length in (
-        *((f"features {name!r}", len(array)) for name, arrays in features.items() for array in arrays),
-        *((f"label {name!r}", len(values)) for name, values in labels.items()),
-    ):
-        if length != n_rows:
-            raise ValueError(
-                f"{what} has {length} rows, the others {n_rows}: all features and labels of one table must "
-                "be of the same images"
-            )
-    return ~np.all([missing(np.asarray(values)) for values in labels.values()], axis=0)
-
-
-def _numbered(values: np.ndarray, name: str) -> np.ndarray:
-    """Classes as integers from 0, -1 where missing."""
-    known = ~missing(values)
-    classes = np.full(len(values), -1, np.int64)
-    if known.any():
-        classes[known] = encoded(values[known])
-    if classes.max(initial=-1) < 1:
-        raise ValueError(
-            f"clustering needs at least two classes, the {int(known.sum())} labelled rows of {name!r} have "
-            f"{classes.max(initial=-1) + 1}: choose another label column"
-        )
-    if classes.max() + 1 == known.sum():
-        raise ValueError(
-            f"every one of the {int(known.sum())} labelled rows of {name!r} is a class of its own: choose a "
-            "label column whose values repeat"
-        )
-    return classes

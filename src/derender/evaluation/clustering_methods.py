@@ -6,16 +6,17 @@ cosine as in its paper. Above ``EXACT_ROWS`` rows all are approximate, and ``app
 """
 
 from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 from sklearn.cluster import KMeans, MiniBatchKMeans
 
-from derender.data import suggestion
 from derender.evaluation import neighbours
 from derender.evaluation.finch import FinchHierarchy, finch, finch_clusters
 from derender.evaluation.memory import Memory
 from derender.evaluation.neighbours import finite_rows
 from derender.evaluation.ward import LEAVES, LeafTree, cut, cut_leaves, ward_in_cells, ward_tree
+from derender.features import named
 
 METHODS = {"ward": "Ward clustering", "finch": "FINCH clustering", "k-means": "k-means"}
 """By name, as tables call it."""
@@ -53,10 +54,7 @@ def clusterings(
     """
     memory, wanted = memory or Memory(), sorted(set(counts))
     features = finite_rows(features, "clustering")
-    if method not in METHODS:
-        raise ValueError(
-            f"unknown method {method!r}{suggestion(method, METHODS)}; there is {', '.join(METHODS)}"
-        )
+    named(METHODS, method, "method")
     for count in wanted:
         if not 1 <= count <= len(features):
             raise ValueError(
@@ -66,37 +64,31 @@ def clusterings(
     if method == "finch":
         hierarchy = finch_hierarchy(features, memory)
         return {count: finch_clusters(features, count, hierarchy) for count in wanted}
-    if method == "k-means":
-        return {
-            count: memory.recall(
-                "k-means",
-                {**inputs, "seed": seed, "clusters": count},
-                lambda count=count: _k_means(features, count, seed),
-            )["clusters"]
-            for count in wanted
-        }
-    if len(features) > neighbours.EXACT_ROWS:
+    if method == "ward" and len(features) > neighbours.EXACT_ROWS:
         leaves = LeafTree(**memory.recall("ward-cells", inputs, lambda: vars(ward_in_cells(features))))
         return {count: cut_leaves(leaves, count) for count in wanted}
-    tree = memory.recall("ward", inputs, lambda: {"tree": ward_tree(features)})["tree"]
-    return {count: cut(tree, count) for count in wanted}
+    if method == "ward":
+        tree = memory.recall_one("ward", inputs, lambda: ward_tree(features))
+        return {count: cut(tree, count) for count in wanted}
+
+    def k_means(count: int) -> np.ndarray:
+        how: dict[str, Any] = {"n_clusters": count, "n_init": 10, "random_state": seed}
+        many = len(features) > neighbours.EXACT_ROWS
+        means = MiniBatchKMeans(batch_size=_MINI_BATCH, **how) if many else KMeans(**how)
+        return np.asarray(means.fit(features.astype(np.float32, copy=False)).labels_, np.int64)
+
+    return {
+        count: memory.recall_one(
+            "k-means", {**inputs, "seed": seed, "clusters": count}, lambda count=count: k_means(count)
+        )
+        for count in wanted
+    }
 
 
 def finch_hierarchy(features: np.ndarray, memory: Memory | None = None) -> FinchHierarchy:
     """FINCH's partitions, cached."""
     features = finite_rows(features, "FINCH")
-
-    def make() -> dict[str, np.ndarray]:
-        return {"partitions": np.array(finch(features).partitions)}
-
-    partitions = (memory or Memory()).recall("finch", {"features": features}, make)["partitions"]
-    return FinchHierarchy(tuple(partitions))
-
-
-def _k_means(features: np.ndarray, count: int, seed: int) -> dict[str, np.ndarray]:
-    if len(features) > neighbours.EXACT_ROWS:
-        means = MiniBatchKMeans(count, n_init=10, batch_size=_MINI_BATCH, random_state=seed)  # pyright: ignore[reportArgumentType]
-    else:
-        means = KMeans(count, n_init=10, random_state=seed)  # pyright: ignore[reportArgumentType]
-    fitted = means.fit(features.astype(np.float32, copy=False))
-    return {"clusters": np.asarray(fitted.labels_, np.int64)}
+    found = (memory or Memory()).recall_one(
+        "finch", {"features": features}, lambda: np.array(finch(features).partitions)
+    )
+    return FinchHierarchy(tuple(found))

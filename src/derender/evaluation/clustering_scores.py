@@ -8,8 +8,6 @@ cluster is the majority's share: read no score without its chance level.
 """
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -20,32 +18,10 @@ from derender.features import missing
 
 SEEDS = tuple(range(10))
 
-
-@dataclass(frozen=True)
-class Counts:
-    """Tables of counts of B clusterings: (B, classes, clusters) numbers of rows, each with at least one."""
-
-    table: np.ndarray
-
-    @cached_property
-    def total(self) -> np.ndarray:
-        """(B,) rows."""
-        return self.table.sum(axis=(1, 2))
-
-    @cached_property
-    def by_class(self) -> np.ndarray:
-        """(B, classes) rows."""
-        return self.table.sum(axis=2)
-
-    @cached_property
-    def by_cluster(self) -> np.ndarray:
-        """(B, clusters) rows."""
-        return self.table.sum(axis=1)
-
-
-Metric = Callable[[Counts], np.ndarray]
+Metric = Callable[[np.ndarray], np.ndarray]
+"""(B,) scores of (B, classes, clusters) numbers of rows; each of the B tables has at least one."""
 METRICS: dict[str, Metric] = {}
-"""By name: (B,) scores of B tables of counts. Every score is best at 1."""
+"""By name. Every score is best at 1."""
 CLUSTER_COLUMNS: dict[str, Column] = {}
 
 
@@ -60,67 +36,63 @@ def metric(name: str, shown: str, note: str) -> Callable[[Metric], Metric]:
 
 
 @metric("accuracy", "accuracy", "weighted purity, 0 to 1")
-def purity(counts: Counts) -> np.ndarray:
+def purity(table: np.ndarray) -> np.ndarray:
     """The paper's accuracy: the share of rows that carry their cluster's majority label."""
-    return counts.table.max(axis=1).sum(axis=1) / counts.total
+    return table.max(axis=1).sum(axis=1) / table.sum(axis=(1, 2))
 
 
 @metric("f1", "F1", "weighted F1 of majority labels, 0 to 1")
-def majority_f1(counts: Counts) -> np.ndarray:
+def majority_f1(table: np.ndarray) -> np.ndarray:
     """Weighted F1 of clusters that answer their majority label."""
-    table, by_class = counts.table, counts.by_class
+    by_class = table.sum(axis=2)
     answers = table.argmax(axis=1)[:, None] == np.arange(table.shape[1])[:, None]  # (B, classes, clusters)
-    answered = (answers * counts.by_cluster[:, None]).sum(axis=2)
+    answered = (answers * table.sum(axis=1)[:, None]).sum(axis=2)
     right = (answers * table).sum(axis=2)
     f1 = np.divide(2 * right, answered + by_class, out=np.zeros_like(right), where=answered + by_class > 0)
     return (by_class * f1).sum(axis=1) / by_class.sum(axis=1)
 
 
 @metric("nmi", "NMI", "normalised mutual information, 0 to 1")
-def mutual_information(counts: Counts) -> np.ndarray:
+def mutual_information(table: np.ndarray) -> np.ndarray:
     """Mutual information over the mean entropy; 1 where both sides are one group, as in scikit-learn."""
-    table, by_class, by_cluster, total = counts.table, counts.by_class, counts.by_cluster, counts.total
-    class_entropy = np.log(total) - xlogy(by_class, by_class).sum(axis=1) / total
-    cluster_entropy = np.log(total) - xlogy(by_cluster, by_cluster).sum(axis=1) / total
-    joint_entropy = np.log(total) - xlogy(table, table).sum(axis=(1, 2)) / total
-    information = np.maximum(class_entropy + cluster_entropy - joint_entropy, 0)
-    mean = (class_entropy + cluster_entropy) / 2
-    single = ((by_class > 0).sum(axis=1) == 1) & ((by_cluster > 0).sum(axis=1) == 1)
+    total, sides = table.sum(axis=(1, 2)), (table.sum(axis=2), table.sum(axis=1))
+    classes, clusters = (np.log(total) - xlogy(side, side).sum(axis=1) / total for side in sides)
+    joint = np.log(total) - xlogy(table, table).sum(axis=(1, 2)) / total
+    mean = (classes + clusters) / 2
+    single = np.all([(side > 0).sum(axis=1) == 1 for side in sides], axis=0)
+    information = np.maximum(classes + clusters - joint, 0)
     values = np.divide(information, mean, out=np.zeros_like(mean), where=~single & (mean > 0))
     return np.where(single, 1.0, values)
 
 
 @metric("hungarian", "matched", "share of rows under the best one-to-one matching, 0 to 1")
-def matched(counts: Counts) -> np.ndarray:
+def matched(table: np.ndarray) -> np.ndarray:
     """The share of rows under the best one-to-one matching of clusters to classes."""
-    table = counts.table
     if table.shape[1:] == (2, 2):
         straight, crossed = table[:, 0, 0] + table[:, 1, 1], table[:, 0, 1] + table[:, 1, 0]
-        return np.maximum(straight, crossed) / counts.total
-    return np.array([one[linear_sum_assignment(one, maximize=True)].sum() for one in table]) / counts.total
+        return np.maximum(straight, crossed) / table.sum(axis=(1, 2))
+    best = [one[linear_sum_assignment(one, maximize=True)].sum() for one in table]
+    return np.array(best) / table.sum(axis=(1, 2))
 
 
 @metric("ari", "ARI", "adjusted Rand index, 0 for random clusters, at most 1")
-def adjusted_rand(counts: Counts) -> np.ndarray:
+def adjusted_rand(table: np.ndarray) -> np.ndarray:
     """Pairs that lie together on both sides, beyond chance, -0.5 to 1; 1 where there is no doubt."""
 
     def pairs(values: np.ndarray) -> np.ndarray:
         return values * (values - 1) / 2
 
-    together = pairs(counts.table).sum(axis=(1, 2))
-    in_class, in_cluster = pairs(counts.by_class).sum(axis=1), pairs(counts.by_cluster).sum(axis=1)
-    all_pairs = np.maximum(pairs(counts.total), 1)
-    expected = in_class * in_cluster / all_pairs
+    together = pairs(table).sum(axis=(1, 2))
+    in_class, in_cluster = (pairs(table.sum(axis=axis)).sum(axis=1) for axis in (2, 1))
+    expected = in_class * in_cluster / np.maximum(pairs(table.sum(axis=(1, 2))), 1)
     most = (in_class + in_cluster) / 2
     same = (together == in_class) & (together == in_cluster)
-    values = np.divide(together - expected, most - expected, out=np.ones_like(most), where=~same)
-    return np.where(same, 1.0, values)
+    return np.divide(together - expected, most - expected, out=np.ones_like(most), where=~same)
 
 
 def scores_of_counts(counts: np.ndarray) -> np.ndarray:
     """Every score of ``METRICS`` of (B, classes, clusters) counts: (B, scores)."""
-    tables = Counts(np.asarray(counts, np.float64))
-    return np.column_stack([score(tables) for score in METRICS.values()])
+    return np.column_stack([score(np.asarray(counts, np.float64)) for score in METRICS.values()])
 
 
 def cluster_scores(labels: np.ndarray, assignment: np.ndarray) -> dict[str, float]:

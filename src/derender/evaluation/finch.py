@@ -34,18 +34,14 @@ class FinchHierarchy:
 def finch(features: np.ndarray) -> FinchHierarchy:
     """FINCH's whole hierarchy over the rows of (N, D) features."""
     features = finite_rows(features, "FINCH")
-    partitions = [_linked(nearest_rows(features)[0])]
-    while True:
-        fine = partitions[-1]
-        count = int(fine.max()) + 1
-        if count < 2:
-            break
-        groups = _linked(nearest_rows(_means(features, fine))[0])
+    partitions = [_linked(features)]
+    while (count := int(partitions[-1].max()) + 1) > 1:
+        groups = _linked(_means(features, partitions[-1]))
         left = int(groups.max()) + 1
         if left == 1 or count - left <= 1:
             break
-        partitions.append(groups[fine])
-    return FinchHierarchy(tuple(by_appearance(partition) for partition in partitions))
+        partitions.append(groups[partitions[-1]])
+    return FinchHierarchy(tuple(map(by_appearance, partitions)))
 
 
 def finch_clusters(
@@ -67,13 +63,14 @@ def finch_clusters(
             f"cannot make {n_clusters}: ask for 1 to {hierarchy.counts[0]}, or use Ward"
         )
     level = max(number for number, count in enumerate(hierarchy.counts) if count >= n_clusters)
-    return _merged(features, hierarchy.partitions[level], hierarchy.counts[level] - n_clusters)
+    partition, merges = hierarchy.partitions[level], hierarchy.counts[level] - n_clusters
+    return by_appearance(_merged(features, partition, merges)[partition]) if merges else partition
 
 
-def _linked(nearest: np.ndarray) -> np.ndarray:
-    """Connected parts of the links row -> nearest."""
-    rows = np.arange(len(nearest))
-    links = csr_array((np.ones(len(rows)), (rows, nearest)), shape=(len(rows), len(rows)))
+def _linked(rows: np.ndarray) -> np.ndarray:
+    """Connected parts of the links from each row to its nearest."""
+    count = len(rows)
+    links = csr_array((np.ones(count), (np.arange(count), nearest_rows(rows)[0])), shape=(count, count))
     return connected_components(links, directed=True, connection="weak")[1]
 
 
@@ -84,16 +81,16 @@ def _means(features: np.ndarray, partition: np.ndarray) -> np.ndarray:
 
 
 def _merged(features: np.ndarray, partition: np.ndarray, merges: int) -> np.ndarray:
-    """Merge the nearest pair of means so many times; only rows that a merge touches are looked up again."""
-    if not merges:
-        return partition
+    """The cluster that each becomes when the nearest pair of means is merged so many times.
+
+    Only clusters that a merge touches look for their nearest again.
+    """
     means, sizes = _means(features, partition), np.bincount(partition).astype(np.float64)
     alive, into = np.ones(len(means), bool), np.arange(len(means))
     nearest, distance = nearest_rows(means)
     for _ in range(merges):
-        first = int(np.where(alive, distance, np.inf).argmin())
-        second = int(nearest[first])
-        first, second = min(first, second), max(first, second)
+        pair = int(np.where(alive, distance, np.inf).argmin())
+        first, second = sorted((pair, int(nearest[pair])))
         means[first] += (means[second] - means[first]) * sizes[second] / (sizes[first] + sizes[second])
         sizes[first] += sizes[second]
         alive[second], into[into == second] = False, first
@@ -110,4 +107,4 @@ def _merged(features: np.ndarray, partition: np.ndarray, merges: int) -> np.ndar
         gap = 1 - unit_rows(means[others]) @ unit_rows(means[[first]])[0]
         closer = (gap < distance[others]) & (others != first)
         nearest[others[closer]], distance[others[closer]] = first, gap[closer]
-    return by_appearance(into[partition])
+    return into

@@ -8,8 +8,7 @@ Source: Klinghoffer et al., ECCV 2022, Sec. 4.4 and Table 2 ("Finetune"). Encode
 """
 
 import copy
-import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,13 +17,12 @@ from torch import nn
 
 from derender.data import as_float
 from derender.evaluation.controls import UNTRAINED
-from derender.evaluation.feature_rows import Prepared, StageProgress, stage
-from derender.evaluation.linear_head import PAPER_HEAD, HeadSettings, head_loss, probabilities
-from derender.evaluation.linear_probes import probe_runs
+from derender.evaluation.feature_rows import ModelSource, Prepared
+from derender.evaluation.linear_probes import PAPER_HEAD, HeadSettings, head_loss, probabilities, probe_runs
 from derender.evaluation.linear_task import Rows, Task
-from derender.evaluation.memory import Memory
+from derender.evaluation.options import Options
 from derender.features import model_fingerprint
-from derender.inputs import Progress
+from derender.inputs import Progress, as_model
 from derender.model import Derenderer
 
 
@@ -88,69 +86,62 @@ def finetune(
 
 
 def finetuned_answers(
-    models: Mapping[str, Sequence[Derenderer]],
-    images_of: Callable[[int], np.ndarray],
+    models: Mapping[str, Sequence[ModelSource]],
     ready: Prepared,
     task: Task,
     split: Rows,
     seeds: Sequence[int],
-    factors: Sequence[str] | None,
     settings: HeadSettings,
-    memory: Memory,
-    progress: StageProgress | None = None,
+    options: Options,
 ) -> dict[str, dict[int, np.ndarray]]:
     """By row name and number of labels, (S, T, A) answers: models, untrained ones, and other controls' heads.
 
     Args:
         models: by row name, one for each run; seed s trains run s modulo their number.
-        images_of: the images of the task's rows at a size in pixels, (N, 3, H, W) uint8.
         ready: the rows of features; its controls without an encoder answer by the head alone.
         task, split, seeds: the targets, the rows of each seed, and the seeds.
-        factors: the encoders that are trained; None means all.
         settings: of the paper's head.
-        memory: where answers are cached.
-        progress: called while training.
+        options: images, factors (the encoders that are trained), cache and progress.
     """
-    images_of = functools.cache(images_of)
 
     def answers(model: Derenderer, count: int, at: int, what: str) -> np.ndarray:
-        rows, images = split.train[count][at], images_of(model.image_size)
-        chosen = list(factors or (factor.name for factor in model.factors))
+        rows, images = split.train[count][at], options.at(model.image_size, ready.table.files).images
+        chosen = list(options.chosen or (factor.name for factor in model.factors))
         inputs = {
             "weights": model_fingerprint(model), "images": images, "targets": task.targets, "kind": task.kind,
             "rows": rows, "tested": split.test, "seed": seeds[at], "factors": chosen,
             "settings": settings.model_dump(),
         }  # fmt: skip
-        shown = stage(progress, f"fine-tuning {what}, {count:,} labels, seed {seeds[at]}", "epochs")
-
-        def make() -> dict[str, np.ndarray]:
-            found = finetune(
-                model, images, task, rows, split.test,
-                factors=chosen, seed=seeds[at], settings=settings, progress=shown,
-            )  # fmt: skip
-            return {"probabilities": found}
-
-        return memory.recall("finetuned", inputs, make)["probabilities"]
-
-    first = next(iter(models.values()))[0]
-
-    def untrained(at: int) -> Derenderer:
-        fresh = Derenderer.seeded(first.settings, seeds[at], factors=first.factors)
-        return fresh.to(first.device).eval()
-
-    found: dict[str, dict[int, np.ndarray]] = {name: {} for name in (*models, UNTRAINED)}
-    seeded = range(len(seeds))
-    for count in split.train:
-        for name, runs in models.items():
-            found[name][count] = np.stack([answers(runs[at % len(runs)], count, at, name) for at in seeded])
-        found[UNTRAINED][count] = np.stack(
-            [answers(untrained(at), count, at, f"an {UNTRAINED}") for at in seeded]
+        progress = options.stage(f"fine-tuning {what}, {count:,} labels, seed {seeds[at]}", "epochs")
+        how: dict[str, Any] = {
+            "factors": chosen,
+            "seed": seeds[at],
+            "settings": settings,
+            "progress": progress,
+        }
+        return options.memory.recall_one(
+            "finetuned", inputs, lambda: finetune(model, images, task, rows, split.test, **how)
         )
+
+    trained = {name: [as_model(run, device=options.device) for run in runs] for name, runs in models.items()}
+    first = next(iter(trained.values()))[0]
+    fresh = [
+        Derenderer.seeded(first.settings, seed, factors=first.factors).to(first.device).eval()
+        for seed in seeds
+    ]
+    found = {
+        name: {
+            count: np.stack([answers(runs[at % len(runs)], count, at, name) for at in range(len(seeds))])
+            for count in split.train
+        }
+        for name, runs in {**trained, UNTRAINED: fresh}.items()
+    }
     for name in ready.controls:
         if not name.startswith(UNTRAINED):
-            own = ready.features[name]
             found[name] = {
-                count: probe_runs("linear", own, task, rows, split.test, seeds, settings, memory)
+                count: probe_runs(
+                    "linear", ready.features[name], task, rows, split.test, seeds, settings, options.memory
+                )
                 for count, rows in split.train.items()
             }
     return found

@@ -30,9 +30,11 @@ class Axes:
 
     def apply(self, features: np.ndarray) -> np.ndarray:
         """(N, D) features as (N, R)."""
-        blocks = [features[start : start + BLOCK_ROWS] for start in range(0, len(features), BLOCK_ROWS)]
-        turned = [((np.asarray(b, np.float64) - self.mean) / self.scale) @ self.rotation for b in blocks]
-        return np.concatenate(turned) if turned else np.zeros((0, self.rotation.shape[1]))
+        found = np.empty((len(features), self.rotation.shape[1]))
+        for start in range(0, len(features), BLOCK_ROWS):
+            block = np.asarray(features[start : start + BLOCK_ROWS], np.float64)
+            found[start : start + BLOCK_ROWS] = ((block - self.mean) / self.scale) @ self.rotation
+        return found
 
 
 def axes_of(features: np.ndarray) -> Axes:
@@ -42,12 +44,11 @@ def axes_of(features: np.ndarray) -> Axes:
     scale = np.where(deviation > 1e-8 * max(deviation.max(), 1e-300), deviation, np.inf)
     scale *= max(np.isfinite(scale).sum(), 1) ** 0.5
     rows = (features - mean) / scale
-    if rows.shape[0] < rows.shape[1]:
-        value, vector = np.linalg.eigh(rows @ rows.T)
-        kept = value > max(value.max(), 0) * 1e-10
-        return Axes(mean, scale, rows.T @ (vector[:, kept] / np.sqrt(value[kept])))
-    value, vector = np.linalg.eigh(rows.T @ rows)
-    return Axes(mean, scale, vector[:, value > max(value.max(), 0) * 1e-10])
+    wide = rows.shape[0] < rows.shape[1]
+    value, vector = np.linalg.eigh(rows @ rows.T if wide else rows.T @ rows)
+    kept = value > max(value.max(), 0) * 1e-10
+    vector = vector[:, kept]
+    return Axes(mean, scale, rows.T @ (vector / np.sqrt(value[kept])) if wide else vector)
 
 
 def fit_logistic(
@@ -80,23 +81,20 @@ def fit_logistic(
             "labelled rows or more; give more, or choose the linear or the k-NN head"
         )
     axes = axes_of(features)
-    rows, labels, groups = axes.apply(features), np.asarray(targets, np.float64), targets.shape[1]
+    rows, labels = axes.apply(features), np.asarray(targets, np.float64)
     fold = np.random.default_rng(seed).permutation(len(rows)) % folds
-    learned = np.repeat(
-        [fold != number for number in range(folds)], len(penalties), axis=0
-    ).T  # (n, problems)
-    c = np.tile(np.asarray(penalties, np.float64), folds)
-    weights = solve_logistic(rows.astype(np.float32), labels, learned, c, kind, tolerance=1e-3)
-    loss = _losses(_logits(rows.astype(np.float32), weights), labels, kind)  # (n, problems, A or 1)
+    learned = np.repeat([fold != number for number in range(folds)], len(penalties), axis=0).T
+    single, c = rows.astype(np.float32), np.tile(np.asarray(penalties, np.float64), folds)
+    weights = solve_logistic(single, labels, learned, c, kind, tolerance=1e-3)
+    loss = _losses(_logits(single, weights), labels, kind)  # (n, problems, A or 1)
     loss = np.where(learned[:, :, None], 0.0, loss).reshape(len(rows), folds, len(penalties), -1)
     chosen = np.asarray(penalties)[loss.sum(axis=(0, 1)).argmin(axis=0)]  # (A,) or (1,)
-    distinct = np.unique(chosen)
+    distinct, own = np.unique(chosen, return_inverse=True)
     every = np.ones((len(rows), len(distinct)), bool)
-    final = solve_logistic(rows, labels, every, distinct, kind, tolerance=1e-5)
-    own = np.searchsorted(distinct, chosen)
-    answer = _logits(axes.apply(tested), final)
-    picked = answer[:, own, np.arange(groups)] if kind == "labels" else answer[:, own[0]]
-    return (expit(picked) if kind == "labels" else softmax(picked, axis=1)), chosen
+    answer = _logits(axes.apply(tested), solve_logistic(rows, labels, every, distinct, kind))
+    if kind == "classes":
+        return softmax(answer[:, own[0]], axis=1), chosen
+    return expit(answer[:, own, np.arange(labels.shape[1])]), chosen
 
 
 def solve_logistic(
@@ -122,9 +120,8 @@ def solve_logistic(
     """
     dtype = rows.dtype
     design = np.column_stack((rows, np.ones(len(rows), dtype)))
-    known = (targets >= 0).astype(dtype)
     truth = np.maximum(targets, 0).astype(dtype)[:, None]
-    counted = (learned[:, :, None] & (known > 0)[:, None]).astype(dtype)
+    counted = (learned[:, :, None] & (targets >= 0)[:, None]).astype(dtype)
     ridge = np.append(np.ones(rows.shape[1]), 0.0)[:, None, None].astype(dtype)
     curve = 0.25 if kind == "labels" else 0.5
     bound = curve * (design.astype(np.float64) ** 2).sum(axis=0)[:, None, None] * c[None, :, None] + ridge
@@ -134,44 +131,34 @@ def solve_logistic(
     weights = ahead = found.copy()
     momentum, start, left = np.ones((1, len(c), 1), dtype), None, np.arange(len(c))
     for step in range(most_steps):
-        logits = _logits_of(design, ahead)
+        logits = np.tensordot(design, ahead, axes=1)
         answer = expit(logits) if kind == "labels" else softmax(logits, axis=2)
-        slope = _slope(design, (answer - truth) * counted) * strength + ridge * ahead
+        slope = np.tensordot(design.T, (answer - truth) * counted, axes=1) * strength + ridge * ahead
         moved = ahead - slope / bound
         change = moved - weights
-        uphill = (slope * change).sum(axis=(0, 2)) > 0
-        momentum[:, uphill] = 1  # forgotten
+        momentum[:, (slope * change).sum(axis=(0, 2)) > 0] = 1  # uphill: forgotten
         following = (1 + np.sqrt(1 + 4 * momentum**2)) / 2
         ahead = moved + (momentum - 1) / following * change
         weights, momentum = moved, following
         if step % 10 == 0:
             size = np.sqrt((slope.astype(np.float64) ** 2 / bound).sum(axis=0))
             start = np.maximum(size, 1e-12) if start is None else start
-            solved = (size <= tolerance * start).all(axis=1)
-            if solved.any():
-                found[:, left[solved]] = moved[:, solved]
-                rest = ~solved
-                left, start, momentum = left[rest], start[rest], momentum[:, rest]
-                weights, ahead, counted = weights[:, rest], ahead[:, rest], counted[:, rest]
-                bound, strength = bound[:, rest], strength[:, rest]
+            rest = ~(size <= tolerance * start).all(axis=1)
+            if not rest.all():
+                found[:, left[~rest]] = moved[:, ~rest]
+                left, start = left[rest], start[rest]
+                momentum, weights, ahead, counted, bound, strength = (
+                    one[:, rest] for one in (momentum, weights, ahead, counted, bound, strength)
+                )
             if not len(left):
                 return found
     found[:, left] = weights
     return found
 
 
-def _logits_of(design: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    problems = int(np.prod(weights.shape[1:]))  # constant features leave no axis: 0 weights, many problems
-    return (design @ weights.reshape(len(weights), problems)).reshape(len(design), *weights.shape[1:])
-
-
-def _slope(design: np.ndarray, residual: np.ndarray) -> np.ndarray:
-    return (design.T @ residual.reshape(len(design), -1)).reshape(design.shape[1], *residual.shape[1:])
-
-
 def _logits(rows: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """(N, P, A) logits of (N, R) rows."""
-    return _logits_of(rows, weights[:-1]) + weights[-1]
+    return np.tensordot(rows, weights[:-1], axes=1) + weights[-1]
 
 
 def _losses(logits: np.ndarray, targets: np.ndarray, kind: str) -> np.ndarray:

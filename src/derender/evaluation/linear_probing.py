@@ -11,57 +11,60 @@ which needs no threshold, is the label's share for answers that know nothing.
 """
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from sklearn.metrics import average_precision_score
 
-from derender.data import ImageSet
-from derender.evaluation.bootstrap import RESAMPLES, ScoredRow, constant, estimate, resamples, with_verdicts
-from derender.evaluation.controls import image_notes, subject_and_controls
+from derender.evaluation.bootstrap import (
+    RESAMPLES,
+    ScoredRow,
+    constant,
+    resamples,
+    scored_row,
+    with_verdicts,
+)
+from derender.evaluation.controls import subject_and_controls
 from derender.evaluation.feature_rows import (
-    DEFAULT_FACTORS,
     FeatureSource,
+    ModelSource,
     Prepared,
-    StageProgress,
-    aligned,
+    check_lengths,
     chosen_labels,
     is_model,
     prepare,
-    sized,
-    stage,
 )
 from derender.evaluation.linear_finetune import finetuned_answers
-from derender.evaluation.linear_head import PAPER_HEAD, HeadSettings
-from derender.evaluation.linear_probes import HEADS, check_head, majority_answers, probe_runs
+from derender.evaluation.linear_probes import (
+    HEADS,
+    PAPER_HEAD,
+    PROBES,
+    HeadSettings,
+    majority_answers,
+    probe_runs,
+)
 from derender.evaluation.linear_task import Rows, Task, choose_rows, task_of
-from derender.evaluation.memory import Memory, memory_in
+from derender.evaluation.memory import Memory
+from derender.evaluation.options import Options
 from derender.evaluation.score_table import Column, Scores, ScoreTable, scored_table, verdict_table
-from derender.inputs import Progress, as_model
+from derender.features import named
+from derender.inputs import Progress
 
 LINEAR_COLUMNS = {
     "accuracy": Column("accuracy", "high", note="share of right answers at threshold 0.5, 0 to 1"),
     "balanced_accuracy": Column("balanced", "high", note="mean recall over values or classes, 0 to 1"),
     "average_precision": Column("AP", "high", note="average precision, 0 to 1"),
 }
-PROBE_NAMES = {
-    "linear": "the paper's head, frozen features",
-    "centred": "the paper's head, frozen features, centred",
-    "logistic": "penalised logistic regression",
-    "k-NN": "10 nearest neighbours",
-    "fine-tuned": "the paper's head, encoders trained too",
-}
+FINETUNED = "fine-tuned"
+PROBE_NAMES = {**PROBES, FINETUNED: "the paper's head, encoders trained too"}
 
 
 def linear(
     features: FeatureSource,
     label: str | Sequence[str] | None = None,
     *,
-    images: ImageSet | str | Path | None = None,
     attributes: bool = False,
-    factors: Sequence[str] | None = DEFAULT_FACTORS,
     counts: Sequence[int] = (100, 500, 1_000),
     heads: Sequence[str] = HEADS,
     seeds: int = 5,
@@ -72,23 +75,14 @@ def linear(
     min_count: int = 1,
     max_count: int | None = None,
     untrained_seeds: int = 5,
-    whiten_on: ImageSet | str | Path | None = None,
-    resamples: int = RESAMPLES,
-    seed: int = 0,
-    dataset: str = "auto",
-    limit: int | None = None,
-    device: str = "auto",
-    cache: Memory | str | Path | None = None,
-    progress: StageProgress | None = None,
+    **options: Any,
 ) -> Scores:
     """Probe features with linear heads that learn from few labels, beside controls; every score is best at 1.
 
     Args:
         features: a feature table or its ``.parquet`` file; a model or its name, with ``images``.
         label: one column of classes, or columns of two values.
-        images: a data set or its address: of the model, and of the controls.
         attributes: probe every yes/no label instead of ``label``.
-        factors: features to use, side by side; None means all.
         counts: numbers of labelled rows to learn from.
         heads: probes: "linear" (the paper's), "centred", "logistic", "k-NN".
         seeds: random training subsets.
@@ -97,45 +91,26 @@ def linear(
         finetune: also train the model's encoders with the head.
         epochs: of the paper's head.
         min_count, max_count: leave out classes of fewer rows; use at most so many rows of a class.
-        untrained_seeds: untrained encoders to average over.
-        whiten_on, resamples, dataset, limit, device, cache, progress: see ``cluster``.
-        seed: the first seed of training subsets and untrained encoders; of resamples.
+        untrained_seeds: number of untrained encoders to average over.
+        options: images, factors, seed, resamples, cache, ...: the fields of ``Options``.
 
     Raises:
         ValueError: labels, factors, counts or images do not fit.
     """
     for head in heads:
-        check_head(head)
+        named(PROBES, head, "head")
     if finetune and not is_model(features):
         raise ValueError("finetune trains the encoders: give a model and images")
-    memory = memory_in(cache)
-    read = sized(images, dataset=dataset, limit=limit, progress=progress)
-    rows = subject_and_controls(
-        features, read, factors, range(seed, seed + untrained_seeds), memory=memory, device=device,
-        whiten_on=whiten_on, progress=progress,
-    )  # fmt: skip
+    how = Options(untrained_seeds=untrained_seeds, **options)
+    rows = subject_and_controls(features, how)
     names, left_out = chosen_labels(rows[0].tables[0], label, attributes, least=2)
-    kept = [groups] if groups else []
-    ready = prepare(rows, names, min_count=min_count, max_count=max_count, keep=kept)
-    task, subsets = task_of(ready.labels), range(seed, seed + seeds)
-    split = choose_rows(
-        task, ready.files, counts, subsets, test_fraction=test_fraction, partition=ready.partition,
-        groups=ready.kept[groups] if groups else None,
+    ready = prepare(rows, names, min_count=min_count, max_count=max_count)
+    found = compare_prepared(
+        ready, counts, how.seeds(seeds), how, heads=heads, settings=HeadSettings(epochs=epochs),
+        models={rows[0].name: [features]} if finetune and is_model(features) else {},
+        test_fraction=test_fraction, groups=ready.table.label(groups) if groups else None,
     )  # fmt: skip
-    settings, tuned = HeadSettings(epochs=epochs), None
-    if finetune:
-        assert read is not None and is_model(features)
-        tuned = finetuned_answers(
-            {rows[0].name: [as_model(features, device=device)]},
-            lambda size: aligned(read.at(size), ready.files).images,
-            ready, task, split, subsets, factors, settings, memory, progress,
-        )  # fmt: skip
-    found = compare_linear(
-        ready.features, task, split, subsets, controls=ready.controls, heads=heads, finetuned=tuned,
-        settings=settings, resample_count=resamples, memory=memory,
-        progress=stage(progress, "probing", "probes"),
-    )  # fmt: skip
-    notes = [*image_notes(read), *left_out, memory.summary()]
+    notes = [*how.notes, *left_out, how.memory.summary()]
     return Scores(linear_tables(found), {**found.numbers(), "labels": names}, notes)
 
 
@@ -169,35 +144,37 @@ class LinearComparison:
 
     def numbers(self) -> dict[str, Any]:
         """Everything as JSON takes it."""
-        sizes = {name: getattr(self, name) for name in ("kind", "names", "n_test", "n_dropped", "seeds")}
         parts = [
             {"head": part.head, "labels": part.count, "rows": {row.name: row.numbers() for row in part.rows}}
             for part in self.parts
         ]
-        return {**sizes, "parts": parts}
+        return {**vars(self), "parts": parts}
 
 
 def compare_prepared(
     ready: Prepared,
     counts: Sequence[int],
     seeds: Sequence[int],
+    options: Options,
     *,
-    resample_count: int = RESAMPLES,
-    memory: Memory | None = None,
-    progress: Progress | None = None,
+    heads: Sequence[str] = HEADS,
+    settings: HeadSettings = PAPER_HEAD,
+    models: Mapping[str, Sequence[ModelSource]] | None = None,
+    **rows: Any,
 ) -> LinearComparison:
-    """Ask rows that were put side by side for all their labels, in their owners' split where there is one."""
+    """Ask rows that were put side by side for all their labels, in their owners' split where there is one.
+
+    ``models``, by name, are trained together with the head; ``rows`` are test_fraction and groups of
+    ``choose_rows``.
+    """
     task = task_of(ready.labels)
+    split = choose_rows(task, counts=counts, seeds=seeds, **ready.split, **rows)
+    tuned = finetuned_answers(models, ready, task, split, seeds, settings, options) if models else None
     return compare_linear(
-        ready.features,
-        task,
-        choose_rows(task, ready.files, counts, seeds, partition=ready.partition),
-        seeds,
-        controls=ready.controls,
-        resample_count=resample_count,
-        memory=memory,
-        progress=progress,
-    )
+        ready.features, task, split, seeds, controls=ready.controls, heads=heads, finetuned=tuned,
+        settings=settings, resample_count=options.resamples, memory=options.memory,
+        progress=options.stage("probing", "probes"),
+    )  # fmt: skip
 
 
 def compare_linear(
@@ -230,30 +207,40 @@ def compare_linear(
         memory: where answers are kept.
         progress: called with (probes done, probes in all).
     """
-    for name, arrays in features.items():
-        for array in arrays:
-            if len(array) != len(task):
-                raise ValueError(
-                    f"features {name!r} have {len(array)} rows, the labels {len(task)}: all features of one "
-                    "table must be of the same images"
-                )
+    check_lengths(features, len(task))
     truth = task.targets[rows.test]
     weights = np.concatenate(list(resamples(len(rows.test), resample_count)))
     total, done, parts = len(heads) * len(rows.train) * len(features), 0, []
-    for head in heads:
+    for head in (*heads, *([FINETUNED] if finetuned else [])):
         for count, own in rows.train.items():
             answers: dict[str, np.ndarray] = {}
-            for name, arrays in features.items():
+            if head == FINETUNED:
+                answers = {name: by_count[count] for name, by_count in (finetuned or {}).items()}
+            for name, arrays in features.items() if head != FINETUNED else ():
                 answers[name] = probe_runs(head, arrays, task, own, rows.test, seeds, settings, memory)
                 done += 1
                 if progress is not None:
                     progress(done, total)
-            parts.append(_part(head, count, answers, task, own, truth, weights, controls))
-    for count, own in rows.train.items() if finetuned else ():
-        answers = {name: by_count[count] for name, by_count in (finetuned or {}).items()}
-        parts.append(_part("fine-tuned", count, answers, task, own, truth, weights, controls))
+            answers["majority"] = majority_answers(task, own, len(truth))
+            scored = [
+                _row(name, name in controls or name == "majority", one, truth, task.kind, weights)
+                for name, one in answers.items()
+            ]
+            parts.append(LinearPart(head, count, with_verdicts(scored)))
     dropped = int((~task.known).sum())
     return LinearComparison(tuple(parts), task.kind, task.names, len(rows.test), dropped, tuple(seeds))
+
+
+def _row(
+    name: str, control: bool, answers: np.ndarray, truth: np.ndarray, kind: str, weights: np.ndarray
+) -> ScoredRow:
+    """Scores of (S, T, A) answers; average precision has no interval."""
+    runs = [linear_scores(truth, answer, kind) for answer in answers]
+    resampled = np.mean([count_scores(truth, answer, kind, weights) for answer in answers], axis=0)
+    plain = np.array([(run.accuracy, run.balanced_accuracy) for run in runs])
+    row = scored_row(name, control, ("accuracy", "balanced_accuracy"), plain, resampled)
+    precision = constant([run.average_precision for run in runs], len(weights))
+    return replace(row, scores={**row.scores, "average_precision": precision})
 
 
 def linear_tables(found: LinearComparison) -> list[ScoreTable]:
@@ -267,55 +254,15 @@ def linear_tables(found: LinearComparison) -> list[ScoreTable]:
 
 def linear_part_table(found: LinearComparison, part: LinearPart) -> ScoreTable:
     """One head at one number of labels: a row for each feature and control."""
-    what = asked_labels(found.kind, len(found.names))
+    count = len(found.names)
+    asked = f"{count} classes" if found.kind == "classes" else f"mean of {count} yes/no labels"
     caption = (
-        f"{part.count:,} labelled rows, {PROBE_NAMES.get(part.head, part.head)}: {found.n_test:,} rows "
-        f"tested, {what}, {len(found.seeds)} seeds"
+        f"{part.count:,} labelled rows, {PROBE_NAMES[part.head]}: {found.n_test:,} rows tested, {asked}, "
+        f"{len(found.seeds)} seeds"
     )
     if found.n_dropped:
         caption += f"; {found.n_dropped:,} rows without label left out"
     return scored_table(caption, "features", part.rows, LINEAR_COLUMNS)
-
-
-def asked_labels(kind: str, count: int) -> str:
-    """The labels of a task in words."""
-    return f"{count} classes" if kind == "classes" else f"mean of {count} yes/no labels"
-
-
-def _part(
-    head: str,
-    count: int,
-    answers: Mapping[str, np.ndarray],
-    task: Task,
-    rows: np.ndarray,
-    truth: np.ndarray,
-    weights: np.ndarray,
-    controls: Collection[str],
-) -> LinearPart:
-    everything = {**answers, "majority": majority_answers(task, rows, len(truth))}
-    scored = [
-        _row(name, one, truth, task.kind, weights, name in controls or name == "majority")
-        for name, one in everything.items()
-    ]
-    return LinearPart(head, count, with_verdicts(scored))
-
-
-def _row(
-    name: str, answers: np.ndarray, truth: np.ndarray, kind: str, weights: np.ndarray, control: bool
-) -> ScoredRow:
-    runs = [linear_scores(truth, answer, kind) for answer in answers]
-    resampled = np.mean([count_scores(truth, answer, kind, weights) for answer in answers], axis=0)
-    scores = {
-        score: estimate([getattr(run, score) for run in runs], resampled[:, at])
-        for at, score in enumerate(SCORES[:2])
-    }
-    precision = [run.average_precision for run in runs]
-    deviation = float(np.std(precision, ddof=1)) if len(precision) > 1 else float("nan")
-    scores["average_precision"] = constant(float(np.mean(precision)), len(weights), deviation)
-    return ScoredRow(name, control, len(runs), scores)
-
-
-SCORES = ("accuracy", "balanced_accuracy", "average_precision")
 
 
 @dataclass(frozen=True)
@@ -339,13 +286,14 @@ def linear_scores(targets: np.ndarray, probabilities: np.ndarray, kind: str) -> 
     Values and classes that no row has do not count.
     """
     accuracy, balanced = count_scores(targets, probabilities, kind, np.ones((1, len(targets)), np.float32))[0]
-    precisions = []
-    for truth, answer in zip(targets.T, probabilities.T, strict=True):
-        rows = truth >= 0
-        if (truth == 1).any():
-            precisions.append(average_precision_score(truth[rows], answer[rows]))
-    precision = float(np.mean(precisions)) if precisions else float("nan")
-    return LinearScores(float(accuracy), float(balanced), precision)
+    precisions = [
+        average_precision_score(truth[truth >= 0], answer[truth >= 0])
+        for truth, answer in zip(targets.T, probabilities.T, strict=True)
+        if (truth == 1).any()
+    ]
+    return LinearScores(
+        float(accuracy), float(balanced), float(np.mean(precisions)) if precisions else float("nan")
+    )
 
 
 def count_scores(
@@ -364,19 +312,15 @@ def count_scores(
     if kind == "classes":
         right = probabilities.argmax(axis=1) == targets.argmax(axis=1)
         hits, sizes = weights @ (positive * right[:, None]), weights @ positive
-        return np.column_stack((hits.sum(axis=1) / sizes.sum(axis=1), _mean(hits, sizes)))
+        balanced = np.nanmean(_share(hits, sizes), axis=1)
+        return np.column_stack((hits.sum(axis=1) / sizes.sum(axis=1), balanced))
     answered = probabilities > 0.5
     yes, no = weights @ (positive * answered), weights @ (negative * ~answered)
     positives, negatives = weights @ positive, weights @ negative
     recalls = np.stack((_share(yes, positives), _share(no, negatives)))
-    balanced = np.nanmean(recalls, axis=0).mean(axis=1)
-    return np.column_stack((_mean(yes + no, positives + negatives), balanced))
+    accuracy = np.nanmean(_share(yes + no, positives + negatives), axis=1)
+    return np.column_stack((accuracy, np.nanmean(recalls, axis=0).mean(axis=1)))
 
 
 def _share(hits: np.ndarray, sizes: np.ndarray) -> np.ndarray:
     return np.divide(hits, sizes, out=np.full_like(hits, np.nan), where=sizes > 0)
-
-
-def _mean(hits: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """Mean share over those labels or classes that have rows."""
-    return np.nanmean(_share(hits, sizes), axis=1)

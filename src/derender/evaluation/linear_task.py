@@ -37,6 +37,10 @@ class Task:
         """(N,) bool: rows that carry a label at all."""
         return np.any(self.targets >= 0, axis=1)
 
+    def select(self, rows: np.ndarray) -> "Task":
+        """The task of some rows."""
+        return Task(self.kind, self.names, self.targets[rows])
+
 
 @dataclass(frozen=True)
 class Rows:
@@ -65,15 +69,15 @@ def task_of(labels: Mapping[str, np.ndarray]) -> Task:
     if not many:
         targets = np.column_stack([numbers for _, numbers in columns.values()])
         return Task("labels", tuple(columns), targets.astype(np.int8))
+    values, numbers = columns[many[0]]
     if len(columns) > 1:
         raise ValueError(
-            f"label {many[0]!r} has {len(columns[many[0]][0])} classes and cannot be asked together with "
-            "others: name it alone, or only labels of two values"
+            f"label {many[0]!r} has {len(values)} classes and cannot be asked together with others: name it "
+            "alone, or only labels of two values"
         )
-    values, numbers = columns[many[0]]
     targets = (numbers[:, None] == np.arange(len(values))).astype(np.int8)
     targets[numbers < 0] = -1
-    return Task("classes", tuple(str(value) for value in values), targets)
+    return Task("classes", tuple(map(str, values)), targets)
 
 
 def choose_rows(
@@ -81,10 +85,7 @@ def choose_rows(
     files: Sequence[str],
     counts: Sequence[int] = (100, 500, 1_000),
     seeds: Sequence[int] = (0, 1, 2, 3, 4),
-    *,
-    test_fraction: float = 0.5,
-    partition: np.ndarray | None = None,
-    groups: np.ndarray | None = None,
+    **how: Any,
 ) -> Rows:
     """Test rows and, for every seed, nested training rows.
 
@@ -93,11 +94,9 @@ def choose_rows(
         files: names of the N rows; the split goes by a hash of these.
         counts: numbers of labelled rows to learn from.
         seeds: each draws its own training rows.
-        test_fraction: share of the rows that is tested.
-        partition: the owners' split; where it has "test" rows, these are tested and no others.
-        groups: (N,) labels that must not lie on both sides, such as identities; rows without one stand alone.
+        how: test_fraction, partition and groups, see ``divide_rows``.
     """
-    pool, test = divide_rows(task, files, test_fraction=test_fraction, partition=partition, groups=groups)
+    pool, test = divide_rows(task, files, **how)
     if not len(seeds):
         raise ValueError("a linear probe needs at least one seed")
     if not len(counts) or min(counts) < 2 or max(counts) > len(pool) or len(test) < 2:
@@ -117,20 +116,27 @@ def divide_rows(
     partition: np.ndarray | None = None,
     groups: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Labelled rows that may be learned from, and those that are tested; arguments as in ``choose_rows``."""
-    known = task.known
-    if partition is not None and (np.asarray(partition) == "test").any():
-        tested = np.asarray(partition) == "test"
+    """Labelled rows that may be learned from, and those that are tested.
+
+    Args:
+        task: rows without a label are left out.
+        files: names of the N rows; the split goes by a hash of these.
+        test_fraction: share of the rows that is tested.
+        partition: the owners' split; where it has "test" rows, these are tested and no others.
+        groups: (N,) labels that must not lie on both sides, such as identities; rows without one stand alone.
+    """
+    known, tested = task.known, np.asarray(partition) == "test"
+    if tested.any():
         return np.flatnonzero(known & ~tested), np.flatnonzero(known & tested)
     if not 0 < test_fraction < 1:
         raise ValueError(f"the tested share must lie between 0 and 1, got {test_fraction}")
     split = split_indices(files, (1 - test_fraction, 0.0, test_fraction), groups=groups)
     learn, test = split.train[known[split.train]], split.test[known[split.test]]
     if groups is not None and task.kind == "classes" and len(learn) and len(test):
-        learned, tested = (np.any(task.targets[rows] > 0, axis=0) for rows in (learn, test))
-        if not (learned & tested).any():
+        shown, asked = (np.any(task.targets[rows] > 0, axis=0) for rows in (learn, test))
+        if not (shown & asked).any():
             raise ValueError(
-                f"none of the {int(tested.sum())} classes tested is learned from: rows of a group stay on "
+                f"none of the {int(asked.sum())} classes tested is learned from: rows of a group stay on "
                 "one side, and these groups hold whole classes; choose other --groups, or none"
             )
     return learn, test
@@ -148,10 +154,11 @@ def _column(values: np.ndarray, name: str) -> tuple[list[Any], np.ndarray]:
     number = {value: at for at, value in enumerate(distinct)}
     numbers = np.full(len(values), -1, np.int64)
     numbers[known] = [number[value] for value in values[known].tolist()]
-    rarest = int(np.bincount(numbers[known]).argmin())
-    if (numbers == rarest).sum() < 2:
+    counts = np.bincount(numbers[known])
+    if counts.min() < 2:
         raise ValueError(
-            f"class {distinct[rarest]!r} of label {name!r} has one row, which cannot be both learned and "
-            "tested: leave this class out (where there is --min-count, give 2), or choose another label"
+            f"class {distinct[counts.argmin()]!r} of label {name!r} has one row, which cannot be both "
+            "learned and tested: leave this class out (where there is --min-count, give 2), or choose "
+            "another label"
         )
     return distinct, numbers

@@ -26,10 +26,8 @@ Arrays = dict[str, np.ndarray]
 NAMES = "names of all arrays"
 """Stands beside the arrays in a file: one that a damaged directory of the zip hides is missed."""
 
-_DAMAGED = (
-    *(OSError, ValueError, EOFError, LookupError, RuntimeError),
-    *(zipfile.BadZipFile, zlib.error, struct.error),
-)
+_BROKEN_ZIP = (zipfile.BadZipFile, zlib.error, struct.error)
+_DAMAGED = (OSError, ValueError, EOFError, LookupError, RuntimeError, *_BROKEN_ZIP)
 
 
 class Memory:
@@ -54,21 +52,23 @@ class Memory:
             inputs: everything that decides the result: arrays, and settings that JSON can hold.
             make: computes it.
         """
-        if self.folder is None:
-            self.made += 1
-            return make()
-        file = self.folder / f"{what}-{content_hash(inputs)[:24]}.npz"
-        if file.exists():
-            cached = _read(file)
-            if cached is not None:
+        file = None if self.folder is None else self.folder / f"{what}-{content_hash(inputs)[:24]}.npz"
+        if file is not None and file.exists():
+            if (cached := _read(file)) is not None:
                 self.recalled += 1
                 return cached
             warnings.warn(DamageNoticed(f"{file} is damaged: computed again"), stacklevel=2)
         arrays = make()
-        with atomic_file(file) as temporary, temporary.open("wb") as stream:
-            np.savez(stream, **arrays, **{NAMES: np.array(list(arrays))})  # pyright: ignore[reportArgumentType]
+        if file is not None:
+            with atomic_file(file) as temporary, temporary.open("wb") as stream:
+                np.savez(stream, **arrays, **{NAMES: np.array(list(arrays))})  # pyright: ignore[reportArgumentType]
         self.made += 1
         return arrays
+
+    def recall_one(self, what: str, inputs: Mapping[str, Any], make: Callable[[], np.ndarray]) -> np.ndarray:
+        """The same for a single array."""
+        (found,) = self.recall(what, inputs, lambda: {"value": make()}).values()
+        return found
 
     def recall_value(self, what: str, inputs: Mapping[str, Any], kind: type[T], make: Callable[[], T]) -> T:
         """The same for a dataclass ``kind`` of numbers, texts, arrays, tuples, mappings and such dataclasses.
@@ -110,8 +110,17 @@ def content_hash(inputs: Mapping[str, Any]) -> str:
 def packed(value: Any) -> Arrays:
     """A dataclass as arrays by name; the array ``value`` holds all other fields as one line of JSON."""
     arrays: Arrays = {}
-    fields = _without_arrays(value, "", arrays)
-    return {"value": np.array(json.dumps(fields, default=lambda number: number.item())), **arrays}
+
+    def plain(one: Any) -> Any:
+        if isinstance(one, np.ndarray):
+            name = f"array {len(arrays)}"
+            arrays[name] = one
+            return {"array": name}
+        if dataclasses.is_dataclass(one):
+            return {field.name: getattr(one, field.name) for field in dataclasses.fields(one)}
+        return dict(one) if isinstance(one, Mapping) else one.item()
+
+    return {"value": np.array(json.dumps(value, default=plain)), **arrays}
 
 
 def unpacked(kind: type[T], arrays: Mapping[str, np.ndarray]) -> T:
@@ -119,32 +128,20 @@ def unpacked(kind: type[T], arrays: Mapping[str, np.ndarray]) -> T:
     return _built(kind, json.loads(str(arrays["value"])), arrays)
 
 
-def _without_arrays(value: Any, path: str, arrays: Arrays) -> Any:
-    """A value as JSON takes it; its arrays go into ``arrays`` under their path, which replaces them."""
-    if isinstance(value, np.ndarray):
-        arrays[path] = value
-        return {"array": path}
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        value = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
-    if isinstance(value, Mapping):
-        return {name: _without_arrays(one, f"{path}.{name}", arrays) for name, one in value.items()}
-    if isinstance(value, tuple | list):
-        return [_without_arrays(one, f"{path}.{place}", arrays) for place, one in enumerate(value)]
-    return value
-
-
 def _built(kind: Any, value: Any, arrays: Mapping[str, np.ndarray]) -> Any:
-    if isinstance(value, dict) and set(value) == {"array"}:
+    if isinstance(value, list):
+        return tuple(value)
+    if not isinstance(value, dict):
+        return value
+    if set(value) == {"array"}:
         return arrays[value["array"]]
-    if value is None:
-        return None
-    classes = [
+    known = [
         one for one in (kind, *get_args(kind)) if isinstance(one, type) and dataclasses.is_dataclass(one)
     ]
-    if classes:
-        hints = get_type_hints(classes[0])
-        return classes[0](**{name: _built(hints[name], one, arrays) for name, one in value.items()})
-    return tuple(value) if isinstance(value, list) else value
+    if not known:
+        return value
+    hints = get_type_hints(known[0])
+    return known[0](**{name: _built(hints[name], one, arrays) for name, one in value.items()})
 
 
 def _read(file: Path) -> Arrays | None:
@@ -154,7 +151,7 @@ def _read(file: Path) -> Arrays | None:
             arrays = {name: stored[name] for name in stored.files}
         if not all(isinstance(values, np.ndarray) for values in arrays.values()):
             return None
-        names = arrays.pop(NAMES).tolist() if NAMES in arrays else list(arrays)
+        names = arrays.pop(NAMES, np.array(list(arrays))).tolist()
         return arrays if arrays and sorted(names) == sorted(arrays) else None
     except _DAMAGED:
         return None

@@ -10,11 +10,10 @@ import csv
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.resources import files
-from typing import Literal
+from typing import Any, Literal
 
-from derender.data import suggestion
 from derender.evaluation.feature_rows import attribute_columns
-from derender.features import FeatureTable
+from derender.features import FeatureTable, named
 
 ATTRIBUTES = "attributes"
 
@@ -33,13 +32,16 @@ class PaperRow:
     scores: Mapping[str, float]
 
 
-@dataclass(frozen=True)
-class RowRules:
-    """Which rows a question is evaluated on; see ``feature_rows.prepare``."""
-
-    mean_by: tuple[str, ...] = ()
-    min_count: int = 1
-    max_count: int | None = None
+def _lines(part: str) -> tuple[PaperRow, ...]:
+    """The paper's lines of a part, in its order."""
+    text = (files("derender.evaluation") / "paper_tables.csv").read_text(encoding="utf-8")
+    found = []
+    for line in csv.DictReader(text.splitlines()):
+        if line.pop("part") == part:
+            method, dataset = line.pop("method"), line.pop("dataset")
+            scores = {name: float(value) for name, value in line.items() if value}
+            found.append(PaperRow(method, dataset, scores))
+    return tuple(found)
 
 
 @dataclass(frozen=True)
@@ -51,18 +53,17 @@ class Part:
         labels: label columns that may answer it, the first one present; ``attributes`` stands for every
             yes/no column.
         paper: the paper's lines.
-        layouts: layouts that are the paper's own data; all others stand in.
+        layout: the layout of the paper's own data; all others stand in.
         in_the_paper: what the paper used, in words.
-        min_count, max_count: rows of a class that are used where the label is single.
+        size: rows of a class that are used where the label is single; None means all.
     """
 
     name: str
     labels: tuple[str, ...]
     paper: tuple[PaperRow, ...]
-    layouts: tuple[str, ...]
+    layout: str
     in_the_paper: str
-    min_count: int = 1
-    max_count: int | None = None
+    size: int | None = None
 
     def columns(self, table: FeatureTable) -> tuple[str, ...]:
         """The label columns of a table that answer the question; empty if it has none."""
@@ -70,18 +71,36 @@ class Part:
             return attribute_columns(table)
         return next(((name,) for name in self.labels if name in table.labels), ())
 
-    def rows(self, table: FeatureTable) -> RowRules:
-        """Which rows of a table are asked: the mean over each track where people have tracks."""
+    def rows(self, table: FeatureTable) -> dict[str, Any]:
+        """Which rows of a table are asked, as ``prepare`` takes it: the mean over each track of a person."""
         if self.name == "identity" and "track" in table.labels:
-            return RowRules((*self.columns(table), "track"))
-        return RowRules() if self.max_count is None else RowRules((), self.min_count, self.max_count)
+            return {"mean_by": (*self.columns(table), "track")}
+        return {} if self.size is None else {"min_count": self.size, "max_count": self.size}
 
     def differs(self, layout: str, n_rows: int, rows: str = "rows") -> str:
         """What to know before comparing a result on these data with the paper's."""
         own = f"{n_rows:,} {rows} of {layout}"
-        if layout in self.layouts:
+        if layout == self.layout:
             return f"subset: {own}; the paper: {self.in_the_paper}"
         return f"stand-in: {own} for {self.in_the_paper}"
+
+
+IDENTITY = Part(
+    "identity", ("identity",), _lines("identity"), "face_tracks",
+    "644 tracks of 5 people (BBT) and 568 of 6 (Buffy)", size=20,
+)  # fmt: skip
+EMOTION = Part(
+    "emotion", ("emotion", "expression"), _lines("emotion"), "rafdb", "3,068 images of RAF-DB, 7 emotions"
+)
+FACE_ATTRIBUTES = Part(
+    ATTRIBUTES, (ATTRIBUTES,), _lines(ATTRIBUTES), "celeba", "6,000 images of CelebA, mean of 40 attributes"
+)
+CARS = Part("cars", ("class",), _lines("cars"), "shapenet_cars", "1,000 images of ShapeNet cars, 5 classes")
+LINEAR = Part(ATTRIBUTES, (ATTRIBUTES,), _lines("linear"), "celeba", "6,000 images of CelebA, 40 attributes")
+SEGMENTATION = Part(
+    "segmentation", ("mask",), _lines("segmentation"), "celebamask",
+    "24,127 + 2,885 images of CelebAMask-HQ at 64 x 64, 19 classes",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -101,48 +120,6 @@ class TableSpec:
     parts: tuple[Part, ...]
 
 
-def table_named(name: str) -> TableSpec:
-    """One of ``TABLES``; an unknown name is an error that names the nearest."""
-    if name not in TABLES:
-        raise ValueError(f"unknown table {name!r}{suggestion(name, TABLES)}; there is {', '.join(TABLES)}")
-    return TABLES[name]
-
-
-def _paper() -> dict[str, tuple[PaperRow, ...]]:
-    """The paper's lines by part, in its order."""
-    text = (files("derender.evaluation") / "paper_tables.csv").read_text(encoding="utf-8")
-    found: dict[str, tuple[PaperRow, ...]] = {}
-    for line in csv.DictReader(text.splitlines()):
-        part, method, dataset = (line.pop(name) for name in ("part", "method", "dataset"))
-        scores = {name: float(value) for name, value in line.items() if value}
-        found[part] = (*found.get(part, ()), PaperRow(method, dataset, scores))
-    return found
-
-
-_PAPER = _paper()
-IDENTITY = Part(
-    "identity", ("identity",), _PAPER["identity"], ("face_tracks",),
-    "644 tracks of 5 people (BBT) and 568 of 6 (Buffy)", min_count=20, max_count=20,
-)  # fmt: skip
-EMOTION = Part(
-    "emotion", ("emotion", "expression"), _PAPER["emotion"], ("rafdb",),
-    "3,068 images of RAF-DB, 7 emotions",
-)  # fmt: skip
-FACE_ATTRIBUTES = Part(
-    ATTRIBUTES, (ATTRIBUTES,), _PAPER["attributes"], ("celeba",),
-    "6,000 images of CelebA, mean of 40 attributes",
-)  # fmt: skip
-CARS = Part(
-    "cars", ("class",), _PAPER["cars"], ("shapenet_cars",), "1,000 images of ShapeNet cars, 5 classes"
-)
-LINEAR = Part(
-    ATTRIBUTES, (ATTRIBUTES,), _PAPER["linear"], ("celeba",), "6,000 images of CelebA, 40 attributes"
-)
-SEGMENTATION = Part(
-    "segmentation", ("mask",), _PAPER["segmentation"], ("celebamask",),
-    "24,127 + 2,885 images of CelebAMask-HQ at 64 x 64, 19 classes",
-)  # fmt: skip
-
 TABLES: dict[str, TableSpec] = {
     spec.name: spec
     for spec in (
@@ -155,3 +132,8 @@ TABLES: dict[str, TableSpec] = {
     )
 }
 """By name, in the order of the paper's tables: parts of one come after the whole."""
+
+
+def table_named(name: str) -> TableSpec:
+    """One of ``TABLES``; an unknown name is an error that names the nearest."""
+    return named(TABLES, name, "table")

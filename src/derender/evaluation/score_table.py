@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from math import isfinite
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
-from derender.evaluation.bootstrap import ScoredRow
+from derender.evaluation.bootstrap import NAN, ScoredRow
 
 if TYPE_CHECKING:
     import pandas
@@ -24,6 +24,7 @@ class Interval(NamedTuple):
 
 Cell = float | int | str | Interval | None
 ARROWS = {"high": " ↑", "low": " ↓", None: ""}
+LATEX_ARROWS = {"high": r" $\uparrow$", "low": r" $\downarrow$", None: ""}
 
 
 @dataclass(frozen=True)
@@ -109,7 +110,7 @@ class ScoreTable:
 
     def largest(self, column: int) -> float:
         """The largest absolute number of a column, 0 without any."""
-        return max((abs(value) for value in self.numbers(column)), default=0.0)
+        return max(map(abs, self.numbers(column)), default=0.0)
 
     def texts(self, row: Row) -> list[tuple[str, bool]]:
         """Each cell of a row as text, and whether it is the best of its column."""
@@ -125,20 +126,20 @@ class ScoreTable:
 
     def verdict(self, column: int) -> str:
         """In words: whether the first row is better than every control in one column."""
-        column_, (first, *others) = self.columns[column], self.rows
-        value, sign = _number(first.cells[column]), -1 if column_.best == "low" else 1
+        head, (first, *others) = self.columns[column], self.rows
+        value, shown = _number(first.cells[column]), head.text(first.cells[column])
         rivals = {row.name: score for row in others if (score := _number(row.cells[column])) is not None}
         if value is None or not rivals:
-            return f"{first.name}: {column_.text(first.cells[column])} ({column_.name})"
+            return f"{first.name}: {shown} ({head.name})"
+        sign = -1 if head.best == "low" else 1
         name, strongest = max(rivals.items(), key=lambda rival: sign * rival[1])
-        shown, other = column_.text(first.cells[column]), column_.text(strongest)
         if sign * value > sign * strongest:
-            return f"better than every control: {shown} against {other} ({name})"
+            return f"better than every control: {shown} against {head.text(strongest)} ({name})"
         if value == strongest:
             return f"level with the strongest control: {shown} ({name})"
         beaten = [rival for rival, score in rivals.items() if sign * value > sign * score]
         rest = f", but ahead of {', '.join(beaten)}" if beaten else ""
-        return f"behind the strongest control: {shown} against {other} ({name}){rest}"
+        return f"behind the strongest control: {shown} against {head.text(strongest)} ({name}){rest}"
 
     def to_pandas(self) -> "pandas.DataFrame":
         """A data frame with one row for each row, named by it, and a last column ``control`` (bool).
@@ -156,40 +157,42 @@ class ScoreTable:
         for place, column in enumerate(self.columns):
             cells = [row.cells[place] for row in self.rows]
             if any(isinstance(cell, Interval) for cell in cells):
-                nothing = Interval(float("nan"), float("nan"))
-                ends = [cell if isinstance(cell, Interval) else nothing for cell in cells]
-                data[f"{column.of} low".lstrip()] = [one.low for one in ends]
-                data[f"{column.of} high".lstrip()] = [one.high for one in ends]
+                both = [cell if isinstance(cell, Interval) else Interval(NAN, NAN) for cell in cells]
+                ends = {"low": [one.low for one in both], "high": [one.high for one in both]}
             else:
-                data[f"{column.of} {column.name}".lstrip()] = cells
+                ends = {column.name: cells}
+            data |= {f"{column.of} {end}".lstrip(): values for end, values in ends.items()}
         names = pandas.Index([row.name for row in self.rows], name=self.first)
         return pandas.DataFrame({**data, "control": [row.control for row in self.rows]}, index=names)
 
     def to_markdown(self) -> str:
         """The caption, a table with the best of each column bold and controls in italics, and the notes."""
         heads = [self.first, *(column.head for column in self.columns)]
-        lines = [_bars(map(_markdown, heads)), _bars([":---", *("---:" for _ in self.columns)])]
-        for row in self.rows:
-            name = f"*{_markdown(row.name)}*" if row.control else _markdown(row.name)
-            cells = [f"**{_markdown(text)}**" if best else _markdown(text) for text, best in self.texts(row)]
-            lines.append(_bars([name, *cells]))
+        lines = [map(_markdown, heads), [":---", *("---:" for _ in self.columns)]]
+        lines += self._marked(_markdown, "*{}*", "**{}**")
         notes = "; ".join(f"{column.name}: {column.note}" for column in self.columns if column.note)
-        return "\n".join([self.caption, "", *lines, *(["", notes] if notes else []), ""])
+        table = ["| " + " | ".join(cells) + " |" for cells in lines]
+        return "\n".join([self.caption, "", *table, *(["", notes] if notes else []), ""])
 
     def to_latex(self) -> str:
         """A table environment; it needs ``\\usepackage{booktabs}``."""
-        arrows = {"high": r" $\uparrow$", "low": r" $\downarrow$", None: ""}
-        heads = [_latex(self.first), *(_latex(column.name) + arrows[column.best] for column in self.columns)]
-        lines = []
-        for row in self.rows:
-            name = rf"\textit{{{_latex(row.name)}}}" if row.control else _latex(row.name)
-            texts = [(_latex(text), best) for text, best in self.texts(row)]
-            cells = [rf"\textbf{{{text}}}" if best else text for text, best in texts]
-            lines.append(" & ".join([name, *cells]) + r" \\")
+        heads = [_latex(column.name) + LATEX_ARROWS[column.best] for column in self.columns]
+        lines = [[_latex(self.first), *heads], *self._marked(_latex, r"\textit{{{}}}", r"\textbf{{{}}}")]
+        head, *rows = (" & ".join(cells) + r" \\" for cells in lines)
         begin = [r"\begin{table}", r"\centering", rf"\caption{{{_latex(self.caption)}}}"]
-        rules = [rf"\begin{{tabular}}{{l{'r' * len(self.columns)}}}", r"\toprule", " & ".join(heads) + r" \\"]
+        begin += [rf"\begin{{tabular}}{{l{'r' * len(self.columns)}}}", r"\toprule", head, r"\midrule"]
         end = [r"\bottomrule", r"\end{tabular}", r"\end{table}", ""]
-        return "\n".join([*begin, *rules, r"\midrule", *lines, *end])
+        return "\n".join([*begin, *rows, *end])
+
+    def _marked(self, escape: Callable[[str], str], control: str, best: str) -> list[list[str]]:
+        """Escaped names and cells, those of controls and the best of each column in their marks."""
+        return [
+            [
+                (control if row.control else "{}").format(escape(row.name)),
+                *((best if marked else "{}").format(escape(text)) for text, marked in self.texts(row)),
+            ]
+            for row in self.rows
+        ]
 
 
 @dataclass(frozen=True)
@@ -240,8 +243,8 @@ def scored_table(
         caption, first: of the table.
         rows: in the order of display.
         columns: by score, in the order of display.
-        intervals: scores followed by their 95 % interval; by default the first.
-        deviations: scores followed by their standard deviation over seeds; by default the first.
+        intervals, deviations: scores followed by their 95 % interval, and by their standard deviation over
+            seeds; by default the first.
         more: further columns, each with the function that gives its cell.
     """
     main = list(columns)[:1]
@@ -251,7 +254,9 @@ def scored_table(
         if name in (main if intervals is None else intervals):
             shown[interval_column(column)] = lambda row, name=name: interval_of(row, name)
         if name in (main if deviations is None else deviations):
-            shown[deviation_column(column)] = lambda row, name=name: row.scores[name].deviation
+            note = f"standard deviation of {column.name} over seeds"
+            spread = Column("±", None, column.digits, note, column.name)
+            shown[spread] = lambda row, name=name: row.scores[name].deviation
     shown |= more or {}
     cells = [Row(row.name, [cell(row) for cell in shown.values()], row.control) for row in rows]
     return ScoreTable(caption, first, tuple(shown), cells)
@@ -263,14 +268,18 @@ def interval_column(column: Column, over: str = "scored rows") -> Column:
     return Column("95 %", None, column.digits, note, column.name)
 
 
-def deviation_column(column: Column) -> Column:
-    """The column that holds the standard deviation of another one's score."""
-    return Column("±", None, column.digits, f"standard deviation of {column.name} over seeds", column.name)
-
-
 def interval_of(row: ScoredRow, score: str, scale: float = 1.0) -> Interval:
     """The interval of one score, times ``scale``."""
     return Interval(scale * row.scores[score].low, scale * row.scores[score].high)
+
+
+VERDICT_COLUMNS = (
+    Column("difference", None, note="to the strongest control, on the same resamples"),
+    Column("low"),
+    Column("high"),
+    Column("strongest control"),
+    Column("above", note="whether the whole 95 % interval lies above 0"),
+)
 
 
 def verdict_table(rows: Sequence[ScoredRow], columns: Mapping[str, Column], caption: str) -> ScoreTable:
@@ -284,14 +293,7 @@ def verdict_table(rows: Sequence[ScoredRow], columns: Mapping[str, Column], capt
         for name, one in row.versus.items()
         if name in columns and isfinite(row.scores[name].low)
     ]
-    shown = (
-        Column("difference", None, note="to the strongest control, on the same resamples"),
-        Column("low"),
-        Column("high"),
-        Column("strongest control"),
-        Column("above", note="whether the whole 95 % interval lies above 0"),
-    )
-    return ScoreTable(caption, "features: score", shown, found)
+    return ScoreTable(caption, "features: score", VERDICT_COLUMNS, found)
 
 
 def verdict(row: ScoredRow, score: str) -> str:
@@ -308,10 +310,6 @@ def verdict(row: ScoredRow, score: str) -> str:
 
 def _number(cell: Cell) -> float | None:
     return cell if isinstance(cell, float | int) and isfinite(cell) else None
-
-
-def _bars(cells: Sequence[str] | map) -> str:
-    return "| " + " | ".join(cells) + " |"
 
 
 def _markdown(text: str) -> str:

@@ -37,13 +37,19 @@ def ward_tree(features: np.ndarray, sizes: np.ndarray | None = None) -> np.ndarr
     count = len(means)
     sizes = np.ones(count) if sizes is None else np.array(sizes, np.float64)
     dtype = np.float64 if count <= FLOAT64_ROWS else np.float32
-    cluster = np.arange(count)  # the cluster's number, of each place
-    height = np.zeros(count)  # at which it was made
+    cluster, height = (
+        np.arange(count),
+        np.zeros(count),
+    )  # of each place: its number, the height it was made at
     nearest, distance = np.zeros(count, np.int64), np.zeros(count)
-    stale, merges = np.arange(count), []
+    stale, merges, done = np.arange(count), [], 0
     while True:
         _look(means, sizes, stale, nearest, distance, dtype)
-        first, second = _pairs(sizes, nearest, distance)
+        alive, places = sizes > 0, np.arange(len(sizes))
+        first = np.flatnonzero((nearest[nearest] == places) & (places < nearest) & alive)
+        if len(first) == 0:  # rounding left no pair that is each other's nearest
+            first = np.array([np.where(alive, distance, np.inf).argmin()])
+        second = nearest[first]
         gap = ((means[first] - means[second]) ** 2).sum(axis=1)
         total = sizes[first] + sizes[second]
         made = np.sqrt(2 * sizes[first] * sizes[second] / total * gap)
@@ -51,10 +57,10 @@ def ward_tree(features: np.ndarray, sizes: np.ndarray | None = None) -> np.ndarr
         merges.append(np.column_stack((cluster[first], cluster[second], made, total)))
         means[first] += (means[second] - means[first]) * (sizes[second] / total)[:, None]
         sizes[first], sizes[second], height[first] = total, 0, made
-        done = sum(map(len, merges))
+        cluster[first] = count + done + np.arange(len(first))
+        done += len(first)
         if done == count - 1:
             return _in_order(np.concatenate(merges), count)
-        cluster[first] = count + done - len(first) + np.arange(len(first))
         touched = np.zeros(len(means), bool)
         touched[first] = touched[second] = True
         stale = np.flatnonzero((touched | touched[nearest]) & (sizes > 0))
@@ -103,17 +109,23 @@ def ward_in_cells(
     features: np.ndarray, leaves: int = LEAVES, rows_per_cell: int = CELL_ROWS, seed: int = 0
 ) -> LeafTree:
     """Approximate Ward over the rows of (N, D) features; at most as many leaves as rows."""
-    features = finite_rows(features, "Ward clustering")
-    points = features.astype(np.float32, copy=False)
+    points = finite_rows(features, "Ward clustering").astype(np.float32, copy=False)
     groups = members(cells(points, rows_per_cell, seed))
     trees = list(of_each(lambda cell: _tree(points[groups[cell]]), groups))
-    kept = _counts([tree[:, 2] for tree in trees], min(leaves, len(points)))
+    # the cheapest merges of all cells are made until so many clusters are left
+    heights = np.concatenate([tree[:, 2] for tree in trees])
+    cell = np.repeat(np.arange(len(groups)), [len(tree) for tree in trees])
+    merges = max(0, len(points) - max(min(leaves, len(points)), len(groups)))
+    merged = np.bincount(cell[np.argsort(heights, kind="stable")[:merges]], minlength=len(groups))
     leaf, made = np.zeros(len(points), np.int64), 0
-    for rows, tree, count in zip(groups, trees, kept, strict=True):
-        leaf[rows] = made + (cut(tree, count) if len(rows) > 1 else 0)
-        made += count
-    means, sizes = _means(points, leaf, made)
-    return LeafTree(leaf, _tree(means, sizes))
+    for rows, tree, fewer in zip(groups, trees, merged.tolist(), strict=True):
+        leaf[rows] = made + cut(tree, len(rows) - fewer)
+        made += len(rows) - fewer
+    sizes, sums = np.bincount(leaf, minlength=made), np.zeros((made, points.shape[1]))
+    for rows in np.array_split(np.argsort(leaf, kind="stable"), max(1, len(points) // 65_536)):
+        held, first = np.unique(leaf[rows], return_index=True)
+        sums[held] += np.add.reduceat(points[rows].astype(np.float64), first, axis=0)
+    return LeafTree(leaf, _tree(sums / sizes[:, None], sizes))
 
 
 def cut_leaves(found: LeafTree, n_clusters: int) -> np.ndarray:
@@ -124,31 +136,11 @@ def cut_leaves(found: LeafTree, n_clusters: int) -> np.ndarray:
             f"Ward by cells keeps {leaves} leaves of {len(found.leaf)} rows, cannot make {n_clusters} "
             f"clusters: ask for 1 to {leaves}"
         )
-    top = cut(found.tree, n_clusters) if leaves > 1 else np.zeros(1, np.int64)
-    return by_appearance(top[found.leaf])
+    return by_appearance(cut(found.tree, n_clusters)[found.leaf])
 
 
 def _tree(points: np.ndarray, sizes: np.ndarray | None = None) -> np.ndarray:
     return ward_tree(points, sizes) if len(points) > 1 else np.zeros((0, 4))
-
-
-def _counts(heights: list[np.ndarray], leaves: int) -> list[int]:
-    """Into how many clusters each cell is cut when the cheapest merges of all cells are made first."""
-    merges = max(0, sum(len(one) + 1 for one in heights) - max(leaves, len(heights)))
-    cell = np.repeat(np.arange(len(heights)), [len(one) for one in heights])
-    cheapest = np.argsort(np.concatenate(heights), kind="stable")[:merges]
-    made = np.bincount(cell[cheapest], minlength=len(heights))
-    return [len(one) + 1 - int(done) for one, done in zip(heights, made, strict=True)]
-
-
-def _means(points: np.ndarray, leaf: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Mean (float64) and number of rows of each leaf."""
-    sizes = np.bincount(leaf, minlength=count)
-    sums = np.zeros((count, points.shape[1]))
-    for rows in np.array_split(np.argsort(leaf, kind="stable"), max(1, len(points) // 65_536)):
-        held, first = np.unique(leaf[rows], return_index=True)
-        sums[held] += np.add.reduceat(points[rows].astype(np.float64), first, axis=0)
-    return sums / sizes[:, None], sizes
 
 
 def _look(
@@ -176,15 +168,6 @@ def _look(
             better = found < best
             best[better], where[better] = found[better], at[better] + left
         nearest[rows], distance[rows] = where, best
-
-
-def _pairs(sizes: np.ndarray, nearest: np.ndarray, distance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """All pairs that are each other's nearest; if rounding left none, the nearest pair of all."""
-    places = np.arange(len(sizes))
-    first = np.flatnonzero((nearest[nearest] == places) & (places < nearest) & (sizes > 0))
-    if len(first) == 0:
-        first = np.array([np.where(sizes > 0, distance, np.inf).argmin()])
-    return first, nearest[first]
 
 
 def _in_order(merges: np.ndarray, count: int) -> np.ndarray:

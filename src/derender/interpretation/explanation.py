@@ -19,7 +19,7 @@ from derender.data import ImageSet, suggestion
 from derender.evaluation.bootstrap import LEVEL, resamples
 from derender.evaluation.clustering_methods import clusterings
 from derender.evaluation.feature_rows import attribute_columns
-from derender.evaluation.linear_head import PAPER_HEAD, HeadSettings
+from derender.evaluation.linear_probes import PAPER_HEAD, HeadSettings
 from derender.evaluation.linear_task import Rows, Task, choose_rows
 from derender.evaluation.score_table import Scores
 from derender.features import FeatureTable, embed_pictures

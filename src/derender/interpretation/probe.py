@@ -3,7 +3,7 @@
 A question is label columns: classes as they are, numbers cut into bins of equal size.
 
 Two ways to fit: ``logistic``, the penalised regression of ``evaluation/linear_logistic.py`` (its weights
-taken back to the features as they are), and ``linear``, the paper's head of ``evaluation/linear_head.py``.
+taken back to the features as they are), and ``linear``, the paper's head of ``evaluation/linear_probes.py``.
 Weights of classes are centred over the classes, which changes no probability and makes the logit of a class
 its lead over the mean. Leaves out scores (``derender.evaluation``).
 """
@@ -21,8 +21,8 @@ from safetensors.numpy import load_file, save_file
 from scipy.special import expit, softmax
 
 from derender.data import suggestion
-from derender.evaluation.linear_head import PAPER_HEAD, HeadSettings, head_loss
 from derender.evaluation.linear_logistic import axes_of, fit_logistic, solve_logistic
+from derender.evaluation.linear_probes import PAPER_HEAD, HeadSettings, head_loss
 from derender.evaluation.linear_task import Task, task_of
 from derender.features import missing
 from derender.storage.atomic import atomic_folder

@@ -100,7 +100,7 @@ def test_a_table_is_recomputed_from_memory(tmp_path):
 
 def test_bad_features_are_refused():
     trial, who, _ = stack()
-    with pytest.raises(ValueError, match="'short' have 3 rows, the trial 200 images"):
+    with pytest.raises(ValueError, match="'short' have 3 rows, the labels 200"):
         compare_robustness({"short": [np.ones((3, 2))]}, trial, SEEDS)
     with pytest.raises(ValueError, match="and a seed"):
         compare_robustness({"f": [np.eye(PEOPLE)[who]]}, trial, ())

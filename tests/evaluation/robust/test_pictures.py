@@ -141,7 +141,7 @@ def test_light_off_the_front_is_one_angle():
 
 
 def test_bad_words_are_refused():
-    with pytest.raises(ValueError, match="no axis 'yew'; did you mean 'yaw'"):
+    with pytest.raises(ValueError, match="unknown axis 'yew'; did you mean 'yaw'"):
         chosen_axes(["yew"])
     with pytest.raises(ValueError, match="generated cars cannot be rotated about the axis 'pitch'"):
         chosen_axes(["pitch"], "cars")
@@ -149,11 +149,13 @@ def test_bad_words_are_refused():
         checked_levels((30, 0), [YAW])
     with pytest.raises(ValueError, match=r"within 0\.\.85 degrees"):
         checked_levels((0, 90), [YAW])
-    with pytest.raises(ValueError, match="have no label 'expresion'; did you mean 'expression'"):
+    with pytest.raises(
+        ValueError, match="unknown label of generated faces 'expresion'; did you mean 'expression'"
+    ):
         generated_trial(
             Recipe(label="expresion", people=2, learned=1, tested=1, image_size=16), [YAW], (0, 9)
         )
     with pytest.raises(ValueError, match="fewer than two values of 'identity' have two images"):
         generated_trial(Recipe(people=2, learned=1, tested=1, image_size=16), [YAW], (0, 9))
-    with pytest.raises(ValueError, match="no kind 'face'"):
+    with pytest.raises(ValueError, match="unknown kind 'face'"):
         Recipe("face")

@@ -10,7 +10,7 @@ import shutil
 import signal
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from math import inf
 from pathlib import Path
 from typing import Any, Literal, TextIO
@@ -25,10 +25,11 @@ from derender.cli.plan.settings import OURS, WITHOUT_LOOP, Plan
 from derender.data import ImageSet, split_indices
 from derender.evaluation.clustering import compare_clusterings
 from derender.evaluation.controls import architecture, control_rows
-from derender.evaluation.feature_rows import FeatureRow, aligned, attribute_labels, prepare
+from derender.evaluation.feature_rows import FeatureRow, chosen_labels, prepare
 from derender.evaluation.linear_probing import compare_prepared
-from derender.evaluation.memory import Memory, content_hash
-from derender.evaluation.paper_tables import ATTRIBUTES, RowRules, table_named
+from derender.evaluation.memory import content_hash
+from derender.evaluation.options import Options, aligned
+from derender.evaluation.paper_tables import ATTRIBUTES, table_named
 from derender.features import FeatureTable, embed_pictures
 from derender.inputs import as_images, as_model, split_of
 from derender.model import Derenderer
@@ -255,7 +256,9 @@ def embed(at: Comparison, job: Job, progress: Callable[..., None]) -> Facts:
 
 def score(at: Comparison, job: Job, progress: Callable[..., None]) -> Facts:
     """Score the finished methods on one set, beside controls; the others' notes say why they are missing."""
-    plan, scored, memory, rows = at.plan, at.plan.score[job.where], Memory(at.path / "memory"), []
+    plan, scored, rows = at.plan, at.plan.score[job.where], []
+    seeds, cache = plan.untrained_seeds, at.path / "memory"
+    how = Options(untrained_seeds=seeds, resamples=plan.resamples, device=at.device, cache=cache)
     for method in plan.rows():
         notes = {one: at.note(one) for one in job.after if one.method == method}
         done = {one: note.facts for one, note in notes.items() if note is not None and note.state == "done"}
@@ -266,12 +269,12 @@ def score(at: Comparison, job: Job, progress: Callable[..., None]) -> Facts:
     settings = architecture(rows) or with_changes(MODEL_PRESETS["small"], [f"image_size={plan.image_size}"])
     images = _scored_images(at, job, settings.network.image_size)
     images = aligned(images, rows[0].tables[0].files) if rows else images
-    seeds = range(plan.untrained_seeds)
-    rows += control_rows(images, settings, ("geometry", "albedo"), seeds, memory=memory, device=at.device)
+    rows += control_rows(images, settings, how)
     table, found = rows[0].tables[0], []
-    questions = {job.where: (scored.label, RowRules(scored.mean_by, scored.min_count, scored.max_count))}
-    if scored.label == (ATTRIBUTES,):
-        questions[job.where] = attribute_labels(table)[0], questions[job.where][1]
+    labels, rules = scored.label, scored.model_dump(include={"mean_by", "min_count", "max_count"})
+    if labels == (ATTRIBUTES,):
+        labels, _ = chosen_labels(table, None, True)
+    questions = {job.where: (labels, rules)}
     if scored.table is not None:
         parts = [part for part in table_named(scored.table).parts if part.columns(table)]
         if not parts:
@@ -280,16 +283,15 @@ def score(at: Comparison, job: Job, progress: Callable[..., None]) -> Facts:
         names = {part.name: f"{job.where} {part.name}" if len(parts) > 1 else job.where for part in parts}
         questions = {names[part.name]: (part.columns(table), part.rows(table)) for part in parts}
     for name, (columns, rules) in questions.items():
-        ready, how = (
-            prepare(rows, columns, **asdict(rules)),
-            {"resample_count": plan.resamples, "memory": memory},
-        )
+        ready = prepare(rows, columns, **rules)
         for protocol in scored.protocols:
             if protocol == "cluster":
-                how_grouped = {"controls": ready.controls, "method": plan.clustering, **how}
-                result = compare_clusterings(ready.features, ready.labels, **how_grouped)
+                result = compare_clusterings(
+                    ready.features, ready.labels, controls=ready.controls, method=plan.clustering,
+                    resample_count=plan.resamples, memory=how.memory,
+                )  # fmt: skip
             else:
-                result = compare_prepared(ready, plan.counts, tuple(range(plan.draws)), **how)
+                result = compare_prepared(ready, plan.counts, how.seeds(plan.draws), how)
             numbers = {key: value for key, value in result.numbers().items() if key != "per_label"}
             found.append(plain({"name": name, "protocol": protocol, **numbers}))
     widths = {row.name: int(row.tables[0].concatenate(row.factors).shape[1]) for row in rows}

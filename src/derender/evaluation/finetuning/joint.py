@@ -20,7 +20,7 @@ from jaxtyping import Float, UInt8
 from torch import Generator, Tensor, nn
 
 from derender.data import ImageSet, Split, split_indices, suggestion
-from derender.evaluation.linear_head import head_loss, probabilities
+from derender.evaluation.linear_probes import head_loss, probabilities
 from derender.evaluation.linear_task import Task, task_of
 from derender.model import Derenderer, load
 from derender.objectives.perceptual_features import PerceptualFeatures

@@ -6,22 +6,21 @@ own four fifths of the training rows. Units (see ``Trial``) are resampled for th
 features, all angles and both scores, so that differences are paired.
 """
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from derender.evaluation.bootstrap import RESAMPLES, ScoredRow, estimate, resamples, with_verdicts
-from derender.evaluation.linear_head import PAPER_HEAD, HeadSettings
-from derender.evaluation.linear_probes import majority_answers
-from derender.evaluation.linear_probing import count_scores, probe_runs
-from derender.evaluation.linear_task import Task
+from derender.evaluation.bootstrap import RESAMPLES, ScoredRow, resamples, scored_row, with_verdicts
+from derender.evaluation.feature_rows import check_lengths
+from derender.evaluation.linear_probes import PAPER_HEAD, HeadSettings, majority_answers, probe_runs
+from derender.evaluation.linear_probing import count_scores
 from derender.evaluation.memory import Memory
 from derender.evaluation.robust.trial import Curve, Trial
-from derender.evaluation.score_table import Cell, Column, Row, ScoreTable, scored_table, verdict_table
+from derender.evaluation.score_table import Column, Row, ScoreTable, scored_table, verdict_table
+from derender.inputs import Progress
 
-Progress = Callable[[int, int], object]
 SCORES = {"accuracy": "accuracy", "balanced_accuracy": "balanced accuracy"}
 """By score, its name in tables and charts."""
 LEARNED_SHARE = 0.8
@@ -79,7 +78,6 @@ class RobustnessComparison:
 
     def numbers(self) -> dict[str, Any]:
         """Everything for JSON."""
-        sizes = ("how", "kind", "names", "head", "n_learned", "n_dropped", "seeds")
         curves = {
             curve.name: {
                 "title": curve.title,
@@ -89,34 +87,23 @@ class RobustnessComparison:
             }
             for curve in self.curves
         }
-        return {**{name: getattr(self, name) for name in sizes}, "curves": curves}
+        return {**vars(self), "curves": curves}
 
     def tables(self, score: str = "accuracy") -> list[ScoreTable]:
         """For every axis the areas, the curve in numbers, and the verdicts against the controls."""
         tables = []
         for curve in self.curves:
             rows, last = curve.rows[score], curve.levels[-1]
-            columns = {
-                AREA: _AREA,
-                ORDINARY: _ORDINARY,
-                level_name(last): Column(f"at {last:.0f} deg", "high", note="the curve's last point"),
-            }
-            lost: Mapping[Column, Callable[[ScoredRow], Cell]] = {
-                _LOST: lambda row: row.scores[ORDINARY].value - row.scores[AREA].value
-            }
+            at_last = Column(f"at {last:.0f} deg", "high", note="the curve's last point")
+            lost = {_LOST: lambda row: row.scores[ORDINARY].value - row.scores[AREA].value}
+            columns = {AREA: _AREA, ORDINARY: _ORDINARY, level_name(last): at_last}
+            angles = [Column(f"{level:.0f}", "high") for level in curve.levels]
+            points = [Row(row.name, curve.values(row), row.control) for row in rows]
+            judged = {AREA: Column("area"), ORDINARY: Column("ordinary")}
             tables += [
                 scored_table(self._caption(curve, score), "features", rows, columns, more=lost),
-                ScoreTable(
-                    f"{curve.title} in degrees: {SCORES[score]}",
-                    "features",
-                    [Column(f"{level:.0f}", "high") for level in curve.levels],
-                    [Row(row.name, curve.values(row), row.control) for row in rows],
-                ),
-                verdict_table(
-                    rows,
-                    {AREA: Column("area"), ORDINARY: Column("ordinary")},
-                    f"{curve.title}: above the strongest control?",
-                ),
+                ScoreTable(f"{curve.title} in degrees: {SCORES[score]}", "features", angles, points),
+                verdict_table(rows, judged, f"{curve.title}: above the strongest control?"),
             ]
         return tables
 
@@ -139,10 +126,9 @@ def level_name(level: float) -> str:
 
 def area_under(levels: Sequence[float], values: np.ndarray) -> np.ndarray:
     """Area under (..., L) values over L growing levels, divided by their range; by trapezia."""
-    x = np.asarray(levels, np.float64)
+    x, y = np.asarray(levels, np.float64), np.asarray(values, np.float64)
     if len(x) < 2 or (np.diff(x) <= 0).any():
         raise ValueError(f"an area needs two growing levels or more, got {list(levels)}")
-    y = np.asarray(values, np.float64)
     return np.asarray(((y[..., 1:] + y[..., :-1]) / 2 * np.diff(x)).sum(axis=-1) / (x[-1] - x[0]))
 
 
@@ -177,50 +163,71 @@ def compare_robustness(
     Raises:
         ValueError: features of another number of rows, no seed, no features.
     """
-    for name, arrays in features.items():
-        for array in arrays:
-            if len(array) != len(trial.task):
-                raise ValueError(
-                    f"features {name!r} have {len(array)} rows, the trial {len(trial.task)} images: make "
-                    "features of the trial's own images"
-                )
+    task = trial.task
+    check_lengths(features, len(task))
     if not features or not all(features.values()) or not len(seeds):
         raise ValueError("a comparison needs one array of features in each row, and a seed")
-    shared: dict[bytes, list[Curve]] = {}
+    shared: dict[bytes, list[Curve]] = {}  # curves that learn from the same rows
     for curve in trial.curves:
         shared.setdefault(curve.learn.tobytes(), []).append(curve)
-    total, done, results = len(shared) * len(features), 0, {}
+    total, done, results, n_learned = len(shared) * len(features), 0, {}, {}
     for curves in shared.values():
         learn = curves[0].learn
+        count = max(5, round(LEARNED_SHARE * len(learn)))
+        draws = np.stack([np.random.default_rng(one).permutation(learn)[:count] for one in seeds])
         tested = np.unique(np.concatenate([rows for curve in curves for rows in curve.points]))
-        draws = draw_rows(learn, seeds)
         answers = {}
         for name, arrays in features.items():
-            answers[name] = probe_runs(head, arrays, trial.task, draws, tested, seeds, settings, memory)
+            answers[name] = probe_runs(head, arrays, task, draws, tested, seeds, settings, memory)
             done += 1
             if progress is not None:
                 progress(done, total)
-        answers["majority"] = majority_answers(trial.task, draws, len(tested))
-        quiet = {*controls, "majority"}
+        answers["majority"] = majority_answers(task, draws, len(tested))
         for curve in curves:
-            weights = _weights(curve, trial.unit, resample_count, seed)
-            results[curve.name] = _result(curve, answers, trial.task, tested, weights, quiet)
+            rows = _scored(curve, trial, answers, tested, {*controls, "majority"}, resample_count, seed)
+            sizes = tuple(map(len, curve.points))
+            results[curve.name] = CurveResult(curve.name, curve.title, curve.levels, sizes, rows)
+            n_learned[curve.name] = count
+    ordered = tuple(results[curve.name] for curve in trial.curves)
     return RobustnessComparison(
-        tuple(results[curve.name] for curve in trial.curves),
-        trial.how,
-        trial.task.kind,
-        trial.task.names,
-        head,
-        {curve.name: draw_rows(curve.learn, seeds[:1]).shape[1] for curve in trial.curves},
-        trial.n_dropped,
-        tuple(seeds),
+        ordered, trial.how, task.kind, task.names, head, n_learned, trial.n_dropped, tuple(seeds)
     )
 
 
-def draw_rows(learn: np.ndarray, seeds: Sequence[int]) -> np.ndarray:
-    """(S, n) training rows of each seed: a random subset of four fifths."""
-    count = max(5, round(LEARNED_SHARE * len(learn)))
-    return np.stack([np.random.default_rng(seed).permutation(learn)[:count] for seed in seeds])
+def _scored(
+    curve: Curve,
+    trial: Trial,
+    answers: Mapping[str, np.ndarray],
+    tested: np.ndarray,
+    controls: Collection[str],
+    count: int,
+    seed: int,
+) -> dict[str, tuple[ScoredRow, ...]]:
+    """By score, a row for each of the (S, T, A) answers for the rows ``tested``."""
+    truths = [trial.task.targets[rows] for rows in curve.points]
+    places = [np.searchsorted(tested, rows) for rows in curve.points]
+    once = [np.ones((1, len(rows)), np.float32) for rows in curve.points]
+    weights = _weights(curve, trial.unit, count, seed)
+    names = (ORDINARY, AREA, *map(level_name, curve.levels))
+
+    def scores(run: np.ndarray, drawn: Sequence[np.ndarray]) -> np.ndarray:
+        """(B, points, 2) both scores, given how often each row of a point is drawn, (B, T) each."""
+        asked = zip(truths, places, drawn, strict=True)
+        return np.stack(
+            [count_scores(truth, run[at], trial.task.kind, own) for truth, at, own in asked], axis=1
+        )
+
+    def with_area(points: np.ndarray) -> np.ndarray:
+        return np.column_stack((points[:, :1], area_under(curve.levels, points[:, 1:]), points[:, 1:]))
+
+    found: dict[str, list[ScoredRow]] = {score: [] for score in SCORES}
+    for name, runs in answers.items():
+        plain = np.concatenate([scores(run, once) for run in runs])
+        resampled = np.mean([scores(run, weights) for run in runs], axis=0)
+        for at, rows in enumerate(found.values()):
+            both = with_area(plain[:, :, at]), with_area(resampled[:, :, at])
+            rows.append(scored_row(name, name in controls, names, *both))
+    return {score: with_verdicts(rows) for score, rows in found.items()}
 
 
 def _weights(curve: Curve, unit: np.ndarray, count: int, seed: int) -> list[np.ndarray]:
@@ -237,50 +244,3 @@ def _weights(curve: Curve, unit: np.ndarray, count: int, seed: int) -> list[np.n
             drawn[key] = np.concatenate(list(resamples(len(names), count, seed + 1_000 * len(drawn))))
         found.append(drawn[key][:, number])
     return found
-
-
-def _result(
-    curve: Curve,
-    answers: Mapping[str, np.ndarray],
-    task: Task,
-    tested: np.ndarray,
-    weights: Sequence[np.ndarray],
-    controls: Collection[str],
-) -> CurveResult:
-    places = [np.searchsorted(tested, rows) for rows in curve.points]
-    truths = [task.targets[rows] for rows in curve.points]
-    once = [np.ones((1, len(rows)), np.float32) for rows in curve.points]
-    found: dict[str, list[ScoredRow]] = {score: [] for score in SCORES}
-    for name, runs in answers.items():
-        plain = np.stack([_scores(truths, places, run, task.kind, once) for run in runs])  # (S, points, 2)
-        resampled = np.mean([_scores(truths, places, run, task.kind, weights) for run in runs], axis=0)
-        for at, score in enumerate(SCORES):
-            own, drawn = plain[:, :, 0, at], resampled[:, :, at]  # (S, points), (points, B)
-            scores = {ORDINARY: estimate(own[:, 0].tolist(), drawn[0])}
-            area = area_under(curve.levels, own[:, 1:])
-            scores[AREA] = estimate(area.tolist(), area_under(curve.levels, drawn[1:].T))
-            for place, level in enumerate(curve.levels, 1):
-                scores[level_name(level)] = estimate(own[:, place].tolist(), drawn[place])
-            found[score].append(ScoredRow(name, name in controls, len(runs), scores))
-    return CurveResult(
-        curve.name,
-        curve.title,
-        curve.levels,
-        tuple(len(rows) for rows in curve.points),
-        {score: with_verdicts(rows) for score, rows in found.items()},
-    )
-
-
-def _scores(
-    truths: Sequence[np.ndarray],
-    places: Sequence[np.ndarray],
-    run: np.ndarray,
-    kind: str,
-    weights: Sequence[np.ndarray],
-) -> np.ndarray:
-    """(points, B, 2) both scores at every point, given how often each of its rows is drawn, (B, T) each."""
-    found = [
-        count_scores(truth, run[place], kind, weight)
-        for truth, place, weight in zip(truths, places, weights, strict=True)
-    ]
-    return np.stack(found)

@@ -25,19 +25,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from derender.data import ImageSet, suggestion
+from derender.data import ImageSet
 from derender.data.synthetic import CarSettings, FaceSettings, SyntheticSet, cars, faces
 from derender.evaluation.linear_task import Task, task_of
 from derender.evaluation.memory import Memory
-from derender.evaluation.robust.trial import (
-    Axis,
-    Curve,
-    Trial,
-    all_angles,
-    checked_levels,
-    stacked_trial,
-)
-from derender.features import Progress, map_batches, missing, model_fingerprint
+from derender.evaluation.robust.trial import Axis, Curve, Trial, all_angles, checked_levels, stacked_trial
+from derender.features import Progress, map_batches, missing, model_fingerprint, named
 from derender.settings import Settings
 from derender.training.step import fill_uncovered
 
@@ -84,20 +77,12 @@ class Recipe:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise ValueError(
-                f"no kind {self.kind!r}{suggestion(self.kind, KINDS)}: there is {', '.join(KINDS)}"
-            )
+        named(KINDS, self.kind, "kind")
         if self.people < 2 or self.learned < 1 or self.tested < 1:
             raise ValueError(
                 f"generated images need two people or more, each with an image to learn from and one to "
                 f"test; got {self.people} people, {self.learned} and {self.tested} images"
             )
-
-    @property
-    def apart(self) -> bool:
-        """Whether other people are tested than those of the training images."""
-        return self.label != "identity"
 
     def generate(
         self, part: str, count: int | None = None, axis: Axis | None = None, angle: float = 0.0
@@ -114,11 +99,11 @@ class Recipe:
         kind, each = KINDS[self.kind], getattr(self, part)
         start = -(-self.people * self.learned // self.tested)  # people before the first one tested
         fixed: dict[str, Any] = {kind.images_each: each}
-        if part == "learned":
-            fixed[kind.first_one] = start + self.people if self.apart else start
+        if part == "learned":  # of another label than identity other people are tested
+            fixed[kind.first_one] = start + (self.people if self.label != "identity" else 0)
         if axis is not None:
             usual = getattr(kind.settings(), axis.part).model_dump()
-            fixed[axis.part] = {**usual, **axis.fixed[self.kind](angle)}
+            fixed[axis.part] = {**usual, **axis.fixed(self.kind, angle)}
         first = 0 if part == "learned" else start * self.tested
         number = self.people * each if count is None else count
         return kind.generate(number, self.image_size, self.seed, kind.settings(**fixed), first=first)
@@ -139,12 +124,7 @@ def generated_trial(
     """
     levels = checked_levels(levels, axes)
     sample = recipe.generate("tested", 1)
-    columns = {"identity": sample.identity, **sample.labels}
-    if recipe.label not in columns:
-        raise ValueError(
-            f"generated {recipe.kind} have no label {recipe.label!r}{suggestion(recipe.label, columns)}; "
-            f"there is {', '.join(columns)}"
-        )
+    named({"identity": sample.identity, **sample.labels}, recipe.label, f"label of generated {recipe.kind}")
     inputs = {
         "recipe": {name: getattr(recipe, name) for name in ("kind", "people", "learned", "tested", "seed")},
         "label": recipe.label, "axes": [axis.name for axis in axes], "levels": list(levels),
@@ -152,31 +132,33 @@ def generated_trial(
     }  # fmt: skip
 
     def make() -> dict[str, np.ndarray]:
-        parts = {part: recipe.generate(part) for part in ("learned", "tested")}
-        images, asked = [made.images for made in parts.values()], all_angles(axes, levels)
-        total = recipe.people * (recipe.learned + recipe.tested * (1 + len(asked)))
+        images, found, asked = [], {}, all_angles(axes, levels)
+        for part in ("learned", "tested"):
+            made = recipe.generate(part)
+            images.append(made.images)
+            found[part] = {"identity": made.identity, **made.labels}[recipe.label]
+            found[f"who_{part}"] = made.identity
+        total = sum(map(len, images)) + len(asked) * len(images[1])
         for axis, angle in asked:
             images.append(recipe.generate("tested", axis=axis, angle=angle).images)
             if progress is not None:
                 progress(sum(map(len, images)), total)
-        found = {"images": np.concatenate(images)}
-        for part, made in parts.items():
-            found |= {
-                part: {"identity": made.identity, **made.labels}[recipe.label],
-                f"who_{part}": made.identity,
-            }
-        return found
+        return {"images": np.concatenate(images), **found}
 
     found = (memory or Memory()).recall("generated", inputs, make)
-    n_learn, n_test = len(found["learned"]), len(found["tested"])
-    values = _classes(found["learned"], found["tested"])
+    n_learn, values = len(found["learned"]), np.concatenate((found["learned"], found["tested"]))
+    if values.dtype.kind == "f":
+        values = np.where(values > np.median(found["learned"]), "above", "below")
+    else:  # a class with fewer than two training images is not asked
+        names, counts = np.unique(values[:n_learn].astype(str), return_counts=True)
+        values = np.where(np.isin(values.astype(str), names[counts > 1]), values.astype(str), "")
     if len(set(values[:n_learn]) - {""}) < 2:
         raise ValueError(
             f"fewer than two values of {recipe.label!r} have two images to learn from: make more people, "
             "or more images of each"
         )
-    unit = np.arange(n_learn + n_test)
-    if recipe.apart:
+    unit = np.arange(len(values))
+    if recipe.label != "identity":
         people = np.concatenate((found["who_learned"], found["who_tested"]))
         unit = np.unique(people, return_inverse=True)[1]
     how, dropped = f"{recipe.label} of generated {recipe.kind}", int(missing(values).sum())
@@ -194,7 +176,6 @@ def rendered_trial(
     levels: Sequence[float],
     *,
     groups: np.ndarray | None = None,
-    batch_size: int = 64,
     memory: Memory | None = None,
     progress: Progress | None = None,
 ) -> Trial:
@@ -202,13 +183,12 @@ def rendered_trial(
 
     Args:
         model: with ``decompose``, ``render``, ``device``.
-        images: at the model's size.
+        pictures: at the model's size.
         task: targets of each image.
         learn, test: training and test rows.
         axes, levels: of the rotations (degrees).
         groups: (N,) labels whose images are resampled together, such as identities; an image without one, and
             all without groups, by itself.
-        batch_size: images at a time; changes speed and memory only.
         memory: cache of the renderings.
         progress: called with (images decomposed, images in all).
     """
@@ -219,7 +199,7 @@ def rendered_trial(
         "asked": [[axis.name, angle] for axis, angle in asked],
     }  # fmt: skip
 
-    def rendered(images: np.ndarray, angles: Sequence[tuple[Axis, float] | None]) -> list[np.ndarray]:
+    def rendered(rows: np.ndarray, angles: Sequence[tuple[Axis, float] | None]) -> list[np.ndarray]:
         def render(batch: torch.Tensor) -> list[np.ndarray]:
             scene, found = model.decompose(batch), []
             for one in angles:
@@ -228,22 +208,18 @@ def rendered_trial(
                 found.append((image.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy())
             return found
 
-        parts = map_batches(render, model, images, batch_size=batch_size, progress=progress)
+        parts = map_batches(render, model, pictures.images[rows], batch_size=64, progress=progress)
         return [np.concatenate(part) for part in zip(*parts, strict=True)]
 
-    def make() -> dict[str, np.ndarray]:
-        plain, rotated = rendered(pictures.images[rows], [None]), rendered(pictures.images[test], asked)
-        return {"images": np.concatenate((*plain, *rotated))}
-
-    images = (memory or Memory()).recall("rendered", inputs, make)["images"]
+    images = (memory or Memory()).recall_one(
+        "rendered", inputs, lambda: np.concatenate((*rendered(rows, [None]), *rendered(test, asked)))
+    )
     number = np.arange(len(pictures))
     if groups is not None:  # an image without a group stands alone
-        number = np.where(
-            missing(groups), len(groups) + number, np.unique(groups.astype(str), return_inverse=True)[1]
-        )
-    chosen = Task(task.kind, task.names, task.targets[rows])
+        group = np.unique(groups.astype(str), return_inverse=True)[1]
+        number = np.where(missing(groups), len(groups) + number, group)
     how, dropped = f"images of {pictures.layout} re-rendered", int((~task.known).sum())
-    return stacked_trial(images, chosen, number[rows], len(learn), axes, levels, how, dropped)
+    return stacked_trial(images, task.select(rows), number[rows], len(learn), axes, levels, how, dropped)
 
 
 def true_angle_trial(
@@ -252,7 +228,7 @@ def true_angle_trial(
     """Divide the images along every axis by their true angles.
 
     Args:
-        images: with labels of light or view.
+        pictures: with labels of light or view.
         task: targets of each image.
         axes: of the angles.
         portions: of the more rotated half.
@@ -260,8 +236,8 @@ def true_angle_trial(
     Raises:
         ValueError: there is no label of an angle, or there are too few images.
     """
-    named = pictures.labels.get("track", np.arange(len(pictures)))
-    unit = np.unique(named, return_inverse=True)[1].astype(np.int64)
+    tracks = pictures.labels.get("track", np.arange(len(pictures)))
+    unit = np.unique(tracks, return_inverse=True)[1].astype(np.int64)
     curves = tuple(_curve(axis, axis.true_deg(pictures.labels), unit, task, portions) for axis in axes)
     how = f"the less and the more rotated half of {pictures.layout}"
     return Trial(pictures.images, task, unit, curves, how, int((~task.known).sum()))
@@ -276,29 +252,19 @@ def _curve(axis: Axis, angle: np.ndarray, unit: np.ndarray, task: Task, portions
     for one in by_angle:
         classes.setdefault(b"" if several else task.targets[rows_of[one][0]].tobytes(), []).append(one)
     near = [members[: len(members) // 2] for members in classes.values()]
-    learn = [one for members in near for place, one in enumerate(members) if place % 4 != 2]
     taken = {one for members in near for one in members}
     far = np.array_split(np.array([one for one in by_angle if one not in taken], np.int64), portions)
 
     def rows(members: Sequence[int] | np.ndarray) -> np.ndarray:
         return np.sort(np.concatenate([rows_of[int(one)] for one in members] or [np.zeros(0, np.int64)]))
 
+    learn = rows([one for members in near for place, one in enumerate(members) if place % 4 != 2])
     ordinary = [one for members in near for one in members[2::4]]
-    tested = [rows(part) for part in (ordinary, *(part for part in far if len(part)))]
+    tested = tuple(rows(part) for part in (ordinary, *(part for part in far if len(part))))
     levels = tuple(float(angle[part].mean()) if len(part) else float("nan") for part in tested)
     if len(levels) < 2 or not all(b - a > 1e-6 for a, b in pairwise(levels)):
         raise ValueError(
             f"the true {axis.title} cannot be cut into {portions} portions of growing angle: the images "
             "are too few, or all at one angle"
         )
-    return Curve(axis.name, f"true {axis.title}", rows(learn), tested[0], levels, tuple(tested))
-
-
-def _classes(learned: np.ndarray, tested: np.ndarray) -> np.ndarray:
-    """Classes as text, training images first; empty where a class has fewer than two training images."""
-    both = np.concatenate((learned, tested))
-    if both.dtype.kind == "f":
-        return np.where(both > np.median(learned), "above", "below")
-    words = both.astype(str)
-    names, counts = np.unique(words[: len(learned)], return_counts=True)
-    return np.where(np.isin(words, names[counts > 1]), words, "")
+    return Curve(axis.name, f"true {axis.title}", learn, tested[0], levels, tested)

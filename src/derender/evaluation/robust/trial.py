@@ -6,21 +6,19 @@ axes of charts show them; 0 is the front. Leaves out where images come from (sou
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Int64, UInt8
 
-from derender.data import ImageSet, suggestion
+from derender.data import ImageSet
 from derender.evaluation.linear_task import Task
+from derender.features import named
 from derender.scene import Scene
 
 LEVELS = (0.0, 15.0, 30.0, 45.0, 60.0, 75.0)
-MOST_DEG = 85.0
-Fixed = Mapping[str, tuple[float, float]]
-"""Ranges of a generator's settings that hold an angle fixed, by name."""
 
 
 @dataclass(frozen=True)
@@ -31,38 +29,41 @@ class Axis:
         name: of the option.
         title: in tables and charts.
         part: of a generator's settings, "view" or "light".
-        fixed: by kind of generated image, the settings of that part for an angle in degrees.
+        settings: by kind of generated image, the name of the angle's range (degrees) in that part.
         column: of a scene's camera or light.
-        cleared: columns that are set to 0, so that the angle is the whole angle.
         truth: labels (radians) of the angle; with two, the angle of a light's direction off the front.
+        cleared: the column that is set to 0, so that the angle is the whole angle, ...
+        held: ... and the setting of generated images that is 0 for the same reason.
         most_deg: the largest angle.
     """
 
     name: str
     title: str
     part: str
-    fixed: Mapping[str, Callable[[float], Fixed]]
+    settings: Mapping[str, str]
     column: int
-    cleared: tuple[int, ...]
     truth: tuple[str, ...]
-    most_deg: float = MOST_DEG
+    cleared: int | None = None
+    held: str | None = None
+    most_deg: float = 85.0
+
+    def fixed(self, kind: str, angle_deg: float) -> dict[str, tuple[float, float]]:
+        """Ranges of a generator's settings that hold the angle fixed."""
+        found = {self.settings[kind]: (angle_deg, angle_deg)}
+        return found if self.held is None else {**found, self.held: (0.0, 0.0)}
 
     def rotated(self, scene: Scene, angle_deg: float) -> Scene:
         """The scenes at this angle instead of their own; sign as in docs/conventions.md."""
         name = "camera" if self.part == "view" else "light"
         values = scene.parameters[name].clone()
-        values[:, list(self.cleared)] = 0
+        if self.cleared is not None:
+            values[:, self.cleared] = 0
         values[:, self.column] = math.radians(angle_deg)
         return scene.with_parameters(**{name: values})
 
     def true_deg(self, labels: Mapping[str, np.ndarray]) -> np.ndarray:
-        """(N,) angles off the front by the labels, in degrees, 0 or more.
-
-        Raises:
-            ValueError: there is no label of the angle.
-        """
-        absent = [name for name in self.truth if name not in labels]
-        if absent:
+        """(N,) angles off the front by the labels, in degrees, 0 or more; without these labels an error."""
+        if absent := [name for name in self.truth if name not in labels]:
             raise ValueError(
                 f"the true {self.title} is not among the labels (there is no {absent[0]!r}): give rendered "
                 "images with a params.csv, as derender synth writes them"
@@ -73,32 +74,19 @@ class Axis:
         return np.degrees(np.arctan(np.hypot(*(np.tan(angle) for angle in angles))))
 
 
-def _both(angle: float) -> tuple[float, float]:
-    return (angle, angle)
-
-
+_PITCH, _YAW = {"faces": "pitch_deg", "cars": "pitch_deg"}, {"faces": "yaw_deg", "cars": "yaw_deg"}
 AXES: Mapping[str, Axis] = {
     axis.name: axis
     for axis in (
+        Axis("yaw", "camera yaw", "view", {**_YAW, "cars": "azimuth_deg"}, 1, ("camera_y_rad",)),
+        Axis("pitch", "camera pitch", "view", {"faces": "pitch_deg"}, 0, ("camera_x_rad",), most_deg=60.0),
         Axis(
-            "yaw", "camera yaw", "view",
-            {"faces": lambda a: {"yaw_deg": _both(a)}, "cars": lambda a: {"azimuth_deg": _both(a)}},
-            1, (), ("camera_y_rad",),
+            "light", "light from the side", "light", _YAW, 3, ("light_yaw_rad", "light_pitch_rad"),
+            cleared=2, held="pitch_deg",
         ),
         Axis(
-            "pitch", "camera pitch", "view",
-            {"faces": lambda a: {"pitch_deg": _both(a)}},
-            0, (), ("camera_x_rad",), most_deg=60.0,
-        ),
-        Axis(
-            "light", "light from the side", "light",
-            dict.fromkeys(("faces", "cars"), lambda a: {"yaw_deg": _both(a), "pitch_deg": (0.0, 0.0)}),
-            3, (2,), ("light_yaw_rad", "light_pitch_rad"),
-        ),
-        Axis(
-            "light-pitch", "light from above and below", "light",
-            dict.fromkeys(("faces", "cars"), lambda a: {"pitch_deg": _both(a), "yaw_deg": (0.0, 0.0)}),
-            2, (3,), ("light_pitch_rad",),
+            "light-pitch", "light from above and below", "light", _PITCH, 2, ("light_pitch_rad",),
+            cleared=3, held="yaw_deg",
         ),
     )
 }  # fmt: skip
@@ -107,26 +95,25 @@ AXES: Mapping[str, Axis] = {
 
 def chosen_axes(names: Sequence[str], kind: str | None = None) -> tuple[Axis, ...]:
     """Axes by name; an unknown one, or one about which generated images cannot be rotated, is an error."""
-    for name in names:
-        if name not in AXES:
-            raise ValueError(f"no axis {name!r}{suggestion(name, AXES)}: there is {', '.join(AXES)}")
-        if kind is not None and kind not in AXES[name].fixed:
-            raise ValueError(f"generated {kind} cannot be rotated about the axis {name!r}: leave it out")
     if not names:
         raise ValueError(f"name an axis: there is {', '.join(AXES)}")
-    return tuple(AXES[name] for name in dict.fromkeys(names))
+    axes = tuple(named(AXES, name, "axis") for name in dict.fromkeys(names))
+    for axis in axes:
+        if kind is not None and kind not in axis.settings:
+            raise ValueError(f"generated {kind} cannot be rotated about the axis {axis.name!r}: leave it out")
+    return axes
 
 
 def checked_levels(levels: Sequence[float], axes: Sequence[Axis]) -> tuple[float, ...]:
     """Angles in degrees, checked against the largest of every axis."""
-    most = min(axis.most_deg for axis in axes)
-    found = tuple(float(level) for level in levels)
+    most, found = min(axis.most_deg for axis in axes), tuple(map(float, levels))
+    words = ", ".join(f"{level:g}" for level in found) or "none"
     if len(found) < 2 or any(b <= a for a, b in pairwise(found)):
-        raise ValueError(f"angles must be two or more that grow, such as 0,30,60; got {_words(found)}")
+        raise ValueError(f"angles must be two or more that grow, such as 0,30,60; got {words}")
     if found[0] < 0 or found[-1] > most:
         raise ValueError(
             f"angles must lie within 0..{most:g} degrees for {', '.join(axis.name for axis in axes)}, "
-            f"got {_words(found)}"
+            f"got {words}"
         )
     return found
 
@@ -139,10 +126,6 @@ def either_side(level: float) -> tuple[float, ...]:
 def all_angles(axes: Sequence[Axis], levels: Sequence[float]) -> list[tuple[Axis, float]]:
     """Every axis at every level to either side, in the order of a trial's images."""
     return [(axis, angle) for axis in axes for level in levels for angle in either_side(level)]
-
-
-def _words(levels: Sequence[float]) -> str:
-    return ", ".join(f"{level:g}" for level in levels) or "none"
 
 
 @dataclass(frozen=True)
@@ -192,19 +175,12 @@ class Trial:
     n_dropped: int = 0
 
     def __post_init__(self) -> None:
-        if not len(self.images) == len(self.task) == len(self.unit):
-            raise ValueError(
-                f"a trial needs a target and a unit for every image, got {len(self.images)} images, "
-                f"{len(self.task)} targets and {len(self.unit)} units"
-            )
         for curve in self.curves:
-            if len(curve.levels) != len(curve.tested) or any(b <= a for a, b in pairwise(curve.levels)):
-                raise ValueError(f"curve {curve.name!r} needs growing angles with rows for each")
-            if len(curve.learn) < 5 or not all(len(rows) for rows in curve.points):
+            sizes = [len(rows) for rows in curve.points]
+            if len(curve.learn) < 5 or 0 in sizes:
                 raise ValueError(
-                    f"{curve.title}: {len(curve.learn)} rows to learn from and "
-                    f"{', '.join(str(len(rows)) for rows in curve.points)} to be tested on: five and one "
-                    "are the least; give more images"
+                    f"{curve.title}: {len(curve.learn)} rows to learn from and {', '.join(map(str, sizes))} "
+                    "to be tested on: five and one are the least; give more images"
                 )
             both = np.intersect1d(self.unit[curve.learn], self.unit[np.concatenate(curve.points)])
             if len(both):
@@ -213,7 +189,8 @@ class Trial:
     @property
     def pictures(self) -> ImageSet:
         """All images, to compute features of."""
-        return ImageSet(self.images, tuple(f"{row:06d}" for row in range(len(self.images))), source=self.how)
+        files = tuple(f"{row:06d}" for row in range(len(self.images)))
+        return ImageSet(self.images, files, source=self.how)
 
     @property
     def learned(self) -> np.ndarray:
@@ -233,26 +210,16 @@ def stacked_trial(
 ) -> Trial:
     """A trial of ``n_learn`` training images, T test images, and these at ``all_angles``, in this order.
 
-    Args:
-        images: (M, 3, S, S) the whole stack.
-        task, unit: of the training and test images; rows without a label are left out.
-        n_learn: number of training images.
-        axes, levels: of the curves.
-        how, n_dropped: as in ``Trial``.
+    Rows without a label are neither learned from nor tested.
     """
     test = np.arange(n_learn, len(task))
     shown = np.concatenate((np.arange(len(task)), np.tile(test, len(all_angles(axes, levels)))))
-    task = Task(task.kind, task.names, task.targets[shown])
-    known, start = task.known, n_learn
-
-    def next_rows(count: int) -> np.ndarray:
-        nonlocal start
-        start += count
-        return start - count + np.flatnonzero(known[start - count : start])
-
-    learn, ordinary = np.flatnonzero(known[:n_learn]), next_rows(len(test))
-    curves = []
-    for axis in axes:
-        tested = tuple(next_rows(len(test) * len(either_side(level))) for level in levels)
-        curves.append(Curve(axis.name, axis.title, learn, ordinary, levels, tested))
-    return Trial(images, task, unit[shown].astype(np.int64), tuple(curves), how, n_dropped)
+    sides = [len(test) * len(either_side(level)) for _ in axes for level in levels]
+    parts = np.split(np.arange(len(shown)), np.cumsum([n_learn, len(test), *sides])[:-1])
+    known = task.known[shown]
+    learn, ordinary, *tested = (rows[known[rows]] for rows in parts)
+    curves = tuple(
+        Curve(axis.name, axis.title, learn, ordinary, levels, tuple(tested[at : at + len(levels)]))
+        for axis, at in zip(axes, range(0, len(tested), len(levels)), strict=True)
+    )
+    return Trial(images, task.select(shown), unit[shown].astype(np.int64), curves, how, n_dropped)

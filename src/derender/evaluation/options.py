@@ -1,0 +1,107 @@
+"""How protocols on features run: one frozen value, whose fields are keywords of every such protocol."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from derender.data import ImageSet
+from derender.evaluation.bootstrap import RESAMPLES
+from derender.evaluation.memory import Memory, memory_in
+from derender.inputs import Progress, as_images
+
+DEFAULT_FACTORS = ("geometry", "albedo")
+NAMED = 5
+"""So many skipped images are named."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Keywords of every protocol on features.
+
+    Attributes:
+        images: a data set or its address: of models, and of the controls. Without it there are no pixels, PCA
+            and untrained encoder to compare with.
+        factors: features to use, side by side; None means all.
+        untrained_seeds: number of untrained encoders to average over.
+        whiten_on: also score the model without whitening, and controls whitened by its renderings of these
+            images.
+        resamples: bootstrap resamples of the rows.
+        seed: the first seed of every random choice: resamples, subsets, k-means, untrained encoders.
+        dataset, limit: how an address of images is read, see ``derender.inputs.as_images``.
+        device: of models that are loaded here.
+        cache: folder of cached results, "none" for none; by default the user's.
+        progress: called with (done, total, description=..., unit=...).
+        notes: sentences on the images read so far.
+    """
+
+    images: ImageSet | str | Path | None = None
+    factors: Sequence[str] | None = DEFAULT_FACTORS
+    untrained_seeds: int = 3
+    whiten_on: ImageSet | str | Path | None = None
+    resamples: int = RESAMPLES
+    seed: int = 0
+    dataset: str = "auto"
+    limit: int | None = None
+    device: str = "auto"
+    cache: Memory | str | Path | None = None
+    progress: Callable[..., object] | None = None
+    notes: list[str] = field(default_factory=list, init=False)
+    _read: dict[int, ImageSet] = field(default_factory=dict, init=False, repr=False)
+
+    @cached_property
+    def memory(self) -> Memory:
+        """The cache."""
+        return memory_in(self.cache)
+
+    @property
+    def chosen(self) -> tuple[str, ...] | None:
+        """``factors`` as a tuple."""
+        return None if self.factors is None else tuple(self.factors)
+
+    def seeds(self, count: int) -> tuple[int, ...]:
+        """So many seeds, from ``seed`` on."""
+        return tuple(range(self.seed, self.seed + count))
+
+    def stage(self, description: str, unit: str = "images") -> Progress | None:
+        """A callback of one stage's (done, total), which names the stage."""
+        progress = self.progress
+        if progress is None:
+            return None
+        return lambda done, total: progress(done, total, description=description, unit=unit)
+
+    def at(self, image_size: int, files: Sequence[str] | None = None) -> ImageSet:
+        """The images at a side in pixels, read once for each; with ``files`` these, in this order."""
+        if image_size not in self._read:
+            assert self.images is not None
+            how: dict[str, Any] = {"dataset": self.dataset, "limit": self.limit}
+            found = as_images(self.images, image_size, **how, progress=self.stage("reading"))
+            if found.images.shape[-1] != image_size:
+                raise ValueError(
+                    f"the images have {found.images.shape[-1]} pixels a side and {image_size} are needed: "
+                    "give the address of the data set instead"
+                )
+            self.notes.append(found.describe())
+            self.notes.extend(f"skipped {row.file}: {row.reason}" for row in found.skipped[:NAMED])
+            if len(found.skipped) > NAMED:
+                self.notes.append(f"and {len(found.skipped) - NAMED:,} more skipped")
+            self._read[image_size] = found
+        read = self._read[image_size]
+        return read if files is None else aligned(read, files)
+
+
+def aligned(images: ImageSet, files: Sequence[str]) -> ImageSet:
+    """The images with these names, in this order."""
+    if images.files == tuple(files):
+        return images
+    place = {file: row for row, file in enumerate(images.files)}
+    absent = [file for file in files if file not in place]
+    if absent:
+        raise ValueError(
+            f"{len(absent)} of {len(files)} rows of the table are not among the images of "
+            f"{images.source} (first {absent[0]}): give the data that the table was made from"
+        )
+    return images.select(np.array([place[file] for file in files]))
