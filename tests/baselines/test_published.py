@@ -1,19 +1,25 @@
-"""Published files: every key and shape by name, the numbers that come back, and files that are refused.
+"""Networks of others: every key and shape by name, the numbers that come back, and files that are refused.
 
-No published file is at hand; the lists below are written out from the architecture (the published layout of
+No published StyleGAN2 or e4e is at hand; the lists below are written out from the architecture (the layout of
 stylegan2-pytorch and encoder4editing), by another way than the library's, and files are made from them.
 """
 
+import json
 import os
 import pickle
 from argparse import Namespace
 
 import pytest
 import torch
+from torch.nn.functional import interpolate
+from transformers import Dinov2Config, Dinov2Model, ViTConfig, ViTModel
 
 from derender.baselines.e4e import E4e, E4eSettings
 from derender.baselines.published import (
     GENERATOR_NAMES,
+    IMAGENET_MEAN,
+    IMAGENET_STD,
+    Dinov2,
     encoder_names,
     load_published_e4e,
     load_published_generator,
@@ -22,7 +28,7 @@ from derender.baselines.published import (
 from derender.baselines.stylegan2_generator import FILTER, Generator, GeneratorSettings
 from derender.storage.tensors import reads_safely
 
-pytestmark = pytest.mark.skipif(not reads_safely(), reason="this PyTorch is not trusted with pickles")
+reads_pickles = pytest.mark.skipif(not reads_safely(), reason="this PyTorch is not trusted with pickles")
 
 CONFIG_F = {4: 512, 8: 512, 16: 512, 32: 512, 64: 512, 128: 256, 256: 128, 512: 64, 1024: 32}
 LITTLE = {4: 6, 8: 6, 16: 6, 32: 3}
@@ -187,6 +193,7 @@ def test_the_encoders_layout_is_the_published_one(size, heads):
         assert tuple(model.centre.shape) == (18, 512)
 
 
+@reads_pickles
 def test_a_generator_file_becomes_ours(generator_weights, tmp_path):
     path = save({"g_ema": generator_weights, "latent_avg": torch.zeros(8)}, tmp_path / "generator.pt")
     net = load_published_generator(path)
@@ -198,68 +205,52 @@ def test_a_generator_file_becomes_ours(generator_weights, tmp_path):
     assert torch.equal(net.mapping.layers[1].bias, generator_weights["style.2.bias"])
     assert torch.equal(net.fixed_noise()[6], generator_weights["noises.noise_6"])
     assert net(torch.ones(1, 8), net.fixed_noise()).isfinite().all()
-
-
-def test_early_files_have_no_noise_maps(generator_weights, tmp_path):
     kept = {name: value for name, value in generator_weights.items() if not name.startswith("noises")}
-    path = save({"g_ema": kept}, tmp_path / "generator.pt")
-    first, second = (load_published_generator(path).fixed_noise() for _ in range(2))
+    early = save({"g_ema": kept}, tmp_path / "early.pt")  # such files have no noise maps
+    first, second = (load_published_generator(early).fixed_noise() for _ in range(2))
     assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
 
 
+@reads_pickles
 @pytest.mark.parametrize("zipped", [True, False], ids=["zip", "legacy"])
 def test_an_e4e_file_becomes_ours(e4e_content, tmp_path, zipped):
     path = tmp_path / "e4e.pt"
     torch.save(e4e_content, path, _use_new_zipfile_serialization=zipped)
-    model = load_published_e4e(path)
+    model, state = load_published_e4e(path), e4e_content["state_dict"]
     assert model.settings.units == (2, 1, 3, 1) and model.settings.width == 4
     assert (model.image_size, model.settings.reduction, model.settings.generator.image_size) == (64, 2, 32)
-    state = e4e_content["state_dict"]
     assert torch.equal(model.centre, e4e_content["latent_avg"])
-    assert torch.equal(
-        model.encoder.stages[2][1].excite.weight, state["encoder.body.4.res_layer.5.fc2.weight"]
-    )
+    excite = model.encoder.stages[2][1].excite.weight
+    assert torch.equal(excite, state["encoder.body.4.res_layer.5.fc2.weight"])
     assert torch.equal(model.generator.constant, state["decoder.input.input"])
     found = model.embed(torch.rand(2, 3, 64, 64))["w+"]
     assert found.shape == (2, 64) and not model.training
+    one_for_all = e4e_content | {"latent_avg": e4e_content["latent_avg"][0]}
+    model = load_published_e4e(save(one_for_all, path))
+    assert torch.equal(model.centre, one_for_all["latent_avg"].expand(8, -1))
 
 
-def test_one_mean_code_serves_all_layers(e4e_content, tmp_path):
-    e4e_content["latent_avg"] = e4e_content["latent_avg"][0]
-    model = load_published_e4e(save(e4e_content, tmp_path / "e4e.pt"))
-    assert torch.equal(model.centre, e4e_content["latent_avg"].expand(8, -1))
-
-
-def changed(weights, **changes):
-    """The weights with some replaced; None leaves one out. Dots are written as double underscores."""
-    found = dict(weights)
-    for name, value in changes.items():
-        found.pop(name.replace("__", "."), None)
-        if value is not None:
-            found[name.replace("__", ".")] = value
-    return found
-
-
+@reads_pickles
 @pytest.mark.parametrize(
-    ("changes", "told"),
+    ("key", "value", "told"),
     [
-        ({"convs__1__activate__bias": None}, "it has no 'convs.1.activate.bias'"),
-        (
-            {"convs__1__activate__bias": torch.zeros(4)},
-            r"'convs.1.activate.bias' has shape \(4,\), expected \(6,\)",
-        ),
-        ({"convs__0__conv__blur__kernel": torch.ones(4, 4)}, "'convs.0.conv.blur.kernel' is not the filter"),
-        ({"extra": torch.zeros(1)}, "it has 'extra', which ours lacks"),
-        ({"input__input": None}, "has no 'input.input'"),
-        ({"style__1__weight": torch.zeros(3)}, "'style.1.weight' has shape"),
+        ("convs.1.activate.bias", None, "it has no 'convs.1.activate.bias'"),
+        ("convs.1.activate.bias", torch.zeros(4), r"s.1.activate.bias' has shape \(4,\), expected \(6,\)"),
+        ("convs.0.conv.blur.kernel", torch.ones(4, 4), "'convs.0.conv.blur.kernel' is not the filter"),
+        ("extra", torch.zeros(1), "it has 'extra', which ours lacks"),
+        ("input.input", None, "has no 'input.input'"),
+        ("style.1.weight", torch.zeros(3), "'style.1.weight' has shape"),
+        ("input.input", torch.zeros(3), "is of another architecture: "),
     ],
 )
-def test_another_architecture_is_named_by_its_first_key(generator_weights, tmp_path, changes, told):
-    path = save({"g_ema": changed(generator_weights, **changes)}, tmp_path / "generator.pt")
+def test_another_architecture_is_named_by_its_first_key(generator_weights, tmp_path, key, value, told):
+    generator_weights |= {key: value}
+    kept = {name: tensor for name, tensor in generator_weights.items() if tensor is not None}
     with pytest.raises(ValueError, match=told):
-        load_published_generator(path)
+        load_published_generator(save({"g_ema": kept}, tmp_path / "generator.pt"))
 
 
+@reads_pickles
 def test_a_generator_is_no_encoder(generator_weights, e4e_content, tmp_path):
     generator_file = save({"g_ema": generator_weights}, tmp_path / "generator.pt")
     encoder_file = save(e4e_content, tmp_path / "e4e.pt")
@@ -282,6 +273,7 @@ class Attack:
         return os.system, (self.command,)
 
 
+@reads_pickles
 @pytest.mark.parametrize("as_torch_file", [True, False])
 def test_a_file_that_wants_to_run_code_is_refused(tmp_path, as_torch_file):
     path, trace = tmp_path / "e4e.pt", tmp_path / "it-ran"
@@ -295,6 +287,7 @@ def test_a_file_that_wants_to_run_code_is_refused(tmp_path, as_torch_file):
     assert not trace.exists()
 
 
+@reads_pickles
 def test_damaged_and_missing_files_are_one_clear_error(e4e_content, tmp_path):
     path = save(e4e_content, tmp_path / "e4e.pt")
     whole = path.read_bytes()
@@ -307,3 +300,62 @@ def test_damaged_and_missing_files_are_one_clear_error(e4e_content, tmp_path):
         load_published_e4e(tmp_path / "nowhere.pt")
     with pytest.raises(ValueError, match="no weights by name"):
         load_published_generator(save({"g_ema": [1, 2]}, path))
+
+
+TINY = {
+    "hidden_size": 8,
+    "num_hidden_layers": 2,
+    "num_attention_heads": 2,
+    "image_size": 28,
+    "patch_size": 14,
+}
+
+
+@pytest.fixture(scope="module")
+def dinov2(tmp_path_factory, seeded):
+    """A tiny DINOv2 with random weights in a folder, and the network itself."""
+    folder, net = tmp_path_factory.mktemp("dinov2"), seeded(Dinov2Model, Dinov2Config(**TINY)).eval()
+    net.save_pretrained(folder)
+    return folder, net
+
+
+def test_features_of_dinov2_are_the_class_token_and_the_mean_patch(dinov2):
+    folder, net = dinov2
+    model = Dinov2.open(str(folder), image_size=32, enlarged=28)
+    model.choose(("class", "patches"))
+    images = torch.rand(3, 3, 32, 32)
+    features = model.embed(images)
+    large = interpolate(images, (28, 28), mode="bicubic", antialias=True).clamp(0, 1)
+    mean, std = (torch.tensor(values).view(3, 1, 1) for values in (IMAGENET_MEAN, IMAGENET_STD))
+    with torch.no_grad():
+        tokens = net(pixel_values=(large - mean) / std).last_hidden_state
+    torch.testing.assert_close(features["class"], tokens[:, 0])
+    torch.testing.assert_close(features["patches"], tokens[:, 1:].mean(dim=1))
+    assert not model.training and not any(value.requires_grad for value in model.parameters())
+
+
+def test_other_weights_than_a_dinov2_in_one_safetensors_file_are_refused(dinov2, tmp_path):
+    _, net = dinov2
+    pickled, other, deeper, parts = (tmp_path / name for name in ("pickled", "other", "deeper", "parts"))
+    net.config.save_pretrained(pickled)
+    (pickled / "pytorch_model.bin").write_bytes(pickle.dumps(Attack(f"touch {tmp_path / 'it-ran'}")))
+    ViTModel(ViTConfig(**TINY, intermediate_size=8)).save_pretrained(other)
+    net.save_pretrained(deeper)
+    Dinov2Config(**{**TINY, "num_hidden_layers": 3}).save_pretrained(deeper)
+    net.config.save_pretrained(parts)  # an index of shards, which could name files outside the folder
+    names = dict.fromkeys(net.state_dict(), "../deeper/model.safetensors")
+    (parts / "model.safetensors.index.json").write_text(json.dumps({"metadata": {}, "weight_map": names}))
+    for source, told in (
+        (tmp_path / "x.pth", r"x\.pth has no model\.safetensors: .*pickles, which can run code"),
+        (pickled, "pickles, which can run code, are not opened"),
+        (other, "is a vit, expected a dinov2"),
+        (deeper, r"of another architecture: it has no 'encoder\.layer\.2"),
+        (parts, r"parts has no model\.safetensors: .*weights in several parts"),
+        (
+            "someone/none",
+            "weights someone/none are not in the Hugging Face cache.*'hf download someone/none'",
+        ),
+    ):
+        with pytest.raises(ValueError, match=told):
+            Dinov2.open(str(source))
+    assert not (tmp_path / "it-ran").exists()

@@ -3,19 +3,24 @@
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from derender import FeatureTable
 from derender.baselines import load_baseline
 from derender.baselines.e4e import E4e, E4eSettings
-from derender.baselines.ris import RisConfig, nearest_cluster, part_energy, part_matrix
-from derender.baselines.ris_catalogue import (
+from derender.baselines.ris import (
+    RisConfig,
     build_catalogue,
-    clustered_layer,
-    grouped_parts,
+    masked_rows,
     name_clusters,
+    nearest_cluster,
+    part_energy,
+    part_matrix,
     spherical_kmeans,
 )
 from derender.baselines.stylegan2_generator import Generator, GeneratorSettings, style_layers
+from derender.data import read_images
+from derender.data.masks import MASK_CLASSES
 from derender.features.neighbours import nearest
 
 PARTS = ("hair", "skin", "nose", "mouth")  # of the planted generator: quarters of the width, left to right
@@ -59,7 +64,7 @@ def catalogue(planted):
     """Four clusters, named by masks of the four quarters."""
     images = torch.rand(8, 3, 32, 32, generator=torch.Generator().manual_seed(1))
     parts = torch.eye(4).repeat_interleave(8, dim=1)[None, :, None].expand(8, -1, 32, -1)
-    return build_catalogue(planted, images, parts, PARTS, RisConfig(image_size=32, clusters=4, samples=20))[0]
+    return build_catalogue(planted, images, parts, PARTS, RisConfig(image_size=32, clusters=4, samples=20))
 
 
 def test_spherical_kmeans_finds_directions_whatever_their_length(generator):
@@ -87,10 +92,8 @@ def test_small_parts_get_the_cluster_where_they_gather():
     eye = torch.zeros(10, 100)
     eye[9, :60] = 1
     eye[0, :5] = 1
-    found, shares = name_clusters(clusters, 3, torch.stack([1 - eye, eye])[None])
+    found = name_clusters(clusters, 3, torch.stack([1 - eye, eye])[None])
     assert found.tolist() == [0, 1, 0]  # cluster 2 was never seen: the largest part
-    torch.testing.assert_close(shares[1], torch.tensor([0.4, 0.6]))
-    assert shares[2].tolist() == [0, 0]
 
 
 def test_scores_are_mean_energy_over_a_part(generator):
@@ -126,25 +129,30 @@ def test_the_rules_of_the_matrix_for_the_published_network(generator):
     assert (matrix[2, :100] > 0.99).all()
     torch.testing.assert_close((matrix[8] + matrix[2])[:2_048][~colour[:2_048]], torch.ones(2_048 - 512))
     assert (matrix[8, 2_048:] == 0).all()
-    with pytest.raises(ValueError, match="8 parts and 9088 style channels expected"):
-        part_matrix(scores[:, :9], layers, parts)
 
 
-def test_classes_become_parts():
-    masks = torch.tensor([[[0, 4], [5, 10]]])
-    found, parts = grouped_parts(
-        masks, ("background", *(f"c{n}" for n in range(3)), "l_eye", "r_eye", *"abcd", "nose"),
-        {"l_eye": "eyes", "r_eye": "eyes"},
-    )  # fmt: skip
-    assert parts == ("background", "eyes", "nose")
-    assert found.tolist() == [[[[1, 0], [0, 0]], [[0, 1], [1, 0]], [[0, 0], [0, 1]]]]
+def test_classes_become_parts(tmp_path):
+    """Of CelebAMask-HQ's classes, in images of which the training part is used."""
+    for folder in ("images", "masks"):
+        (tmp_path / folder).mkdir()
+    mask = np.zeros((32, 32), np.uint8)
+    mask[:8], mask[8:16], mask[16:24] = 4, 5, 2
+    for number in range(10):
+        Image.new("RGB", (32, 32), (25 * number, 0, 0)).save(tmp_path / "images" / f"{number}.png")
+        Image.fromarray(mask).save(tmp_path / "masks" / f"{number}.png")
+    (tmp_path / "masks" / "classes.txt").write_text("\n".join(MASK_CLASSES))
+    images = read_images(tmp_path / "images", 32)
+    inputs, parts, names = masked_rows(images, RisConfig(image_size=32, masks=str(tmp_path / "masks")))
+    assert len(inputs) == len(parts) == 8 and names == ("background", "nose", "eyes")
+    assert parts[0, :, ::8, 0].tolist() == [[0, 0, 0, 1], [0, 0, 1, 0], [1, 1, 0, 0]]
 
 
-def test_the_clustered_layer_is_the_last_at_its_resolution(planted):
-    layers = planted.generator.layers
-    assert clustered_layer(planted.generator, 32) == len(layers) - 1
-    for side, wanted in ((16, 16), (20, 16), (4, 4), (1000, 32)):
-        assert layers[clustered_layer(planted.generator, side)].resolution == wanted
+@pytest.mark.parametrize(("side", "wanted"), [(32, 32), (16, 16), (20, 16), (4, 4), (1000, 32)])
+def test_the_clustered_layer_is_the_last_at_its_resolution(side, wanted, planted):
+    config = RisConfig(image_size=32, clusters=2, samples=2, cluster_side=side)
+    model = build_catalogue(planted, torch.rand(1, 3, 32, 32), torch.ones(1, 1, 32, 32), ("all",), config)
+    sizes = [layer.resolution for layer in planted.generator.layers]
+    assert model.settings.cluster_layer == max(n for n, size in enumerate(sizes) if size == wanted)
 
 
 def test_a_planted_catalogue_is_found(catalogue, planted):

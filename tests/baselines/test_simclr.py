@@ -1,36 +1,102 @@
-"""SimCLR: its loss against another implementation, its views, and what it needs for physical ones."""
+"""SimCLR: its augmentations obey their laws, its loss another implementation's, physical views re-render."""
 
-from contextlib import nullcontext
+import math
 
 import pytest
 import torch
 from pytorch_metric_learning.losses import NTXentLoss
 
-from derender.baselines.augment import AugmentSettings
-from derender.baselines.model import LossInputs
 from derender.baselines.simclr import (
+    LUMINANCE,
+    AugmentSettings,
     Simclr,
     SimclrConfig,
     SimclrObjective,
     SimclrSettings,
+    augment,
+    blur,
+    crop,
+    grey,
+    jitter,
     physical_view,
-    twin_found,
+    rotate_hue,
     views_of,
 )
 from derender.model import Derenderer
 from derender.scene.perturb import PerturbSettings
 
+OFF = AugmentSettings(crop_from=1.0, aspect=1.0, flip=0, jitter=0, grey=0, blur=0)
+STILL = AugmentSettings(brightness=0, contrast=0, saturation=0, hue_deg=0)
 TINY = SimclrSettings(image_size=32, width=8, code_size=16, projection=6)
 
 
-def config(objective: SimclrObjective) -> SimclrConfig:
-    return SimclrConfig(model=TINY, objective=objective)
+@pytest.fixture
+def images() -> torch.Tensor:
+    return torch.rand(6, 3, 20, 24, generator=torch.Generator().manual_seed(1))
 
 
-def model() -> Simclr:
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(0)
-        return Simclr(TINY)
+def drawn(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def test_views_stay_in_range_repeat_for_a_generator_and_differ_between_images(images):
+    torch.testing.assert_close(augment(images, OFF, drawn()), images)
+    first, again, other = (augment(images, AugmentSettings(), drawn(seed)) for seed in (0, 0, 1))
+    assert torch.equal(first, again) and not torch.equal(first, other)
+    assert first.shape == images.shape and 0 <= first.min() <= first.max() <= 1
+    views = augment(images[:1].expand(6, -1, -1, -1), AugmentSettings(), drawn())
+    assert all(not torch.equal(views[0], views[i]) for i in range(1, 6))
+
+
+def test_a_flip_is_certain_or_as_probable_as_told(images):
+    flipped = augment(images, OFF.model_copy(update={"flip": 1.0}), drawn())
+    torch.testing.assert_close(flipped, images.flip(-1))
+    ramp = torch.linspace(0, 1, 2).expand(2000, 3, 1, 2)
+    half = augment(ramp, OFF.model_copy(update={"flip": 0.5, "blur_px": (0.1, 0.1)}), drawn())
+    assert 0.46 < half[:, 0, 0, 0].mean() < 0.54
+
+
+def test_a_crop_lies_inside_the_image():
+    for seed in range(20):
+        ramp = torch.linspace(0, 1, 24).expand(50, 3, 20, 24)
+        part = crop(ramp, AugmentSettings(crop_from=0.1), drawn(seed))
+        assert part.min() >= 0 and part.max() <= 1
+        widths = part[:, 0, 0, -1] - part[:, 0, 0, 0]
+        assert widths.min() > math.sqrt(0.1 * 0.75) - 2 / 24 and widths.max() <= 1
+        assert (part[:, 0, 0].diff(dim=1) >= -1e-6).all()
+
+
+def test_grey_is_the_luminance_and_hue_turns_red_to_green_and_leaves_grey(images):
+    colourless = grey(images)
+    luminance = sum(w * images[:, i] for i, w in enumerate(LUMINANCE))
+    torch.testing.assert_close(colourless, luminance[:, None].expand_as(images))
+    red, third = torch.tensor([1.0, 0, 0]).view(1, 3, 1, 1), torch.tensor([2 * math.pi / 3])
+    torch.testing.assert_close(rotate_hue(red, third).flatten(), torch.tensor([0.0, 1, 0]), atol=1e-6, rtol=0)
+    angle = torch.full((6,), 0.7)
+    torch.testing.assert_close(rotate_hue(rotate_hue(images, angle), -angle), images, atol=1e-5, rtol=0)
+    torch.testing.assert_close(rotate_hue(colourless, angle), colourless, atol=1e-5, rtol=0)
+
+
+def test_jitter_without_strength_is_nothing_brightness_scales_saturation_leaves_the_luminance(images):
+    images = 0.3 + 0.4 * images
+    torch.testing.assert_close(jitter(images, STILL, drawn()), images, atol=1e-5, rtol=0)
+    gain = jitter(images, STILL.model_copy(update={"brightness": 0.2}), drawn()) / images
+    torch.testing.assert_close(gain, gain[:, :1, :1, :1].expand_as(gain), atol=1e-5, rtol=0)
+    assert gain.min() >= 0.8 and gain.max() <= 1.2
+    pale = jitter(images, STILL.model_copy(update={"saturation": 0.3}), drawn())
+    torch.testing.assert_close(grey(pale), grey(images), atol=1e-5, rtol=0)
+    assert not torch.allclose(pale, images, atol=1e-3)
+
+
+def test_blur_keeps_a_flat_image_and_a_dot_becomes_the_gaussian():
+    flat = torch.full((2, 3, 9, 11), 0.4)
+    torch.testing.assert_close(blur(flat, (0.5, 2.0), drawn()), flat)
+    dot = torch.zeros(1, 3, 15, 15)
+    dot[..., 7, 7] = 1
+    x = torch.arange(-7, 8).float()
+    bell = torch.where(x.abs() <= 3, (-0.5 * x.square()).exp(), 0.0)
+    spread = blur(dot, (1.0, 1.0), drawn())[0, 0]
+    torch.testing.assert_close(spread, torch.outer(bell, bell) / bell.sum() ** 2, atol=1e-6, rtol=0)
 
 
 @pytest.fixture(scope="module")
@@ -38,45 +104,45 @@ def physics() -> Derenderer:
     return Derenderer.from_preset("small", seed=0, image_size=32, width=8, light_width=4).eval()
 
 
-def test_the_loss_is_nt_xent_of_the_projections():
-    net, images = model(), torch.rand(5, 3, 32, 32)
-    objective = SimclrObjective(temperature=0.2)
+def config(objective: SimclrObjective) -> SimclrConfig:
+    return SimclrConfig(model=TINY, objective=objective)
+
+
+def test_the_loss_is_nt_xent_of_the_projections(seeded, losses):
+    net, images = seeded(Simclr, TINY), torch.rand(5, 3, 32, 32)
     noisy = lambda images, generator: images + torch.rand(images.shape, generator=generator) / 4  # noqa: E731
-    terms = net.losses(
-        images, LossInputs(config(objective), torch.Generator().manual_seed(3), nullcontext, noisy)
-    )
-    generator = torch.Generator().manual_seed(3)
+    terms = losses(net, images, config(SimclrObjective(temperature=0.2)), 3, noisy)
+    generator = drawn(3)
     views = [noisy(images, generator), noisy(images, generator)]
     codes = torch.cat([net.head(net.encoder(view)) for view in views])
     oracle = NTXentLoss(temperature=0.2)(codes, torch.arange(5).repeat(2))
     torch.testing.assert_close(terms["nt_xent"], oracle)
-    torch.testing.assert_close(terms["found"], twin_found(codes[:5], codes[5:]))
 
 
-def test_twin_found_is_one_for_twins_and_low_for_strangers():
-    codes = torch.randn(40, 8, generator=torch.Generator().manual_seed(0))
-    assert twin_found(codes, 3 * codes) == 1
-    assert twin_found(codes, codes.roll(1, dims=0)) == 0
-    assert twin_found(codes, torch.randn(40, 8, generator=torch.Generator().manual_seed(1))) < 0.2
+def test_found_is_one_for_twins_and_low_for_strangers(seeded, losses):
+    net, images = seeded(Simclr, TINY), torch.rand(12, 3, 32, 32)
+    assert losses(net, images, config(SimclrObjective()), aid=lambda images, _: images)["found"] == 1
+    turns = iter((0, 1))
+    strangers = lambda images, _: images.roll(next(turns), dims=0)  # noqa: E731
+    assert losses(net, images, config(SimclrObjective()), aid=strangers)["found"] == 0
 
 
-def test_learning_tells_pictures_apart(blobs):
+def test_learning_tells_images_apart(blobs, seeded, losses):
     images = torch.from_numpy(blobs.images[:12]).float() / 255
-    objective, net = SimclrObjective(augment=AugmentSettings(crop_from=0.8, blur=0, grey=0)), model().train()
-    views = views_of(config(objective), torch.device("cpu"))
-    optimiser, generator = torch.optim.Adam(net.parameters(), 3e-3), torch.Generator().manual_seed(0)
-    losses = []
+    own = config(SimclrObjective(augment=AugmentSettings(crop_from=0.8, blur=0, grey=0)))
+    net, views = seeded(Simclr, TINY).train(), views_of(own, torch.device("cpu"))
+    optimiser, generator, history = torch.optim.Adam(net.parameters(), 3e-3), drawn(), []
     for _ in range(40):
-        loss = net.losses(images, LossInputs(config(objective), generator, nullcontext, views))["nt_xent"]
+        loss = losses(net, images, own, generator, views)["nt_xent"]
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
-        losses.append(loss.item())
-    assert sum(losses[-5:]) < 0.8 * sum(losses[:5])
+        history.append(loss.item())
+    assert sum(history[-5:]) < 0.8 * sum(history[:5])
 
 
-def test_features_come_before_the_head():
-    net, images = model().eval(), torch.rand(3, 3, 32, 32)
+def test_features_come_before_the_head(seeded):
+    net, images = seeded(Simclr, TINY).eval(), torch.rand(3, 3, 32, 32)
     assert list(net.embed(images)) == ["features"]
     net.choose(("projection", "features"))
     made = net.embed(images)
@@ -85,50 +151,39 @@ def test_features_come_before_the_head():
 
 
 def test_physical_views_without_any_change_are_the_reconstruction(physics):
-    images = torch.rand(3, 3, 32, 32, generator=torch.Generator().manual_seed(0))
+    images = torch.rand(3, 3, 32, 32, generator=drawn())
     still = PerturbSettings(ambient=0, diffuse=0, light_deg=0, camera_pitch_deg=0, camera_yaw_deg=0)
-    rendering = physics.reconstruct(images)
-    view = physical_view(physics, images, still, torch.Generator())
+    rendering, view = physics.reconstruct(images), physical_view(physics, images, still, drawn())
     seen = rendering.mask[:, None].expand_as(view) > 0
     torch.testing.assert_close(view[seen], rendering.image.clamp(0, 1)[seen], atol=1e-5, rtol=1e-4)
 
 
 def test_physical_views_change_light_and_camera_and_nothing_else(physics, monkeypatch):
-    images = torch.rand(4, 3, 32, 32, generator=torch.Generator().manual_seed(0))
-    asked, render = [], physics.render
-
-    def watched(scene):
-        asked.append(scene)
-        return render(scene)
-
-    monkeypatch.setattr(physics, "render", watched)
-    first, second = (
-        physical_view(physics, images, PerturbSettings(), torch.Generator().manual_seed(seed))
-        for seed in (0, 1)
-    )
+    images, asked, render = torch.rand(4, 3, 32, 32, generator=drawn()), [], physics.render
+    monkeypatch.setattr(physics, "render", lambda scene: asked.append(scene) or render(scene))
+    first, second = (physical_view(physics, images, PerturbSettings(), drawn(seed)) for seed in (0, 1))
     scene = physics.decompose(images)
     assert len(asked) == 2
-    for drawn in asked:
-        torch.testing.assert_close(drawn.depth, scene.depth)
-        torch.testing.assert_close(drawn.albedo, scene.albedo)
-        assert not torch.isclose(drawn.light, scene.light).any()
-        assert not torch.isclose(drawn.camera[:, :2], scene.camera[:, :2]).any()
-        torch.testing.assert_close(drawn.camera[:, 2:], scene.camera[:, 2:])
+    for changed in asked:
+        torch.testing.assert_close(changed.depth, scene.depth)
+        torch.testing.assert_close(changed.albedo, scene.albedo)
+        assert not torch.isclose(changed.light, scene.light).any()
+        assert not torch.isclose(changed.camera[:, :2], scene.camera[:, :2]).any()
+        torch.testing.assert_close(changed.camera[:, 2:], scene.camera[:, 2:])
     assert not torch.equal(first, second) and first.min() >= 0 and first.max() <= 1
 
 
 def test_physical_views_need_a_model_of_that_size(physics, tmp_path):
-    with pytest.raises(ValueError, match="views=physical and physics=RUN"):
-        SimclrObjective(views="physical")
-    with pytest.raises(ValueError, match="views=physical and physics=RUN"):
-        SimclrObjective(physics="runs/x")
+    cpu = torch.device("cpu")
+    for wrong in ({"views": "physical"}, {"physics": "runs/x"}):
+        with pytest.raises(ValueError, match="views=physical and physics=RUN"):
+            SimclrObjective(**wrong)
     missing = SimclrObjective(views="physical", physics=str(tmp_path / "none"))
     with pytest.raises(FileNotFoundError, match="no model at"):
-        views_of(config(missing), torch.device("cpu"))
+        views_of(config(missing), cpu)
     saved = SimclrObjective(views="physical", physics=str(physics.save(tmp_path / "physics")))
     with pytest.raises(ValueError, match="takes images of 32 pixels, this run of 64: set image_size=32"):
-        views_of(SimclrConfig(objective=saved), torch.device("cpu"))
-    views = views_of(config(saved), torch.device("cpu"))
+        views_of(SimclrConfig(objective=saved), cpu)
     images = torch.rand(2, 3, 32, 32)
-    expected = physical_view(physics, images, saved.perturb, torch.Generator().manual_seed(5))
-    torch.testing.assert_close(views(images, torch.Generator().manual_seed(5)), expected)
+    expected = physical_view(physics, images, saved.perturb, drawn(5))
+    torch.testing.assert_close(views_of(config(saved), cpu)(images, drawn(5)), expected)

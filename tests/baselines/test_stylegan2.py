@@ -1,55 +1,51 @@
 """What each network of a StyleGAN2 is moved by, its regularisers, and how held-out images judge it."""
 
-from contextlib import nullcontext
-
 import pytest
 import torch
 from torch import nn
 
-from derender.baselines.model import LossInputs
 from derender.baselines.stylegan2 import (
     AdversarialObjective,
+    Discriminator,
+    EqualConv,
     Stylegan,
     StyleganConfig,
     energy_distance,
     mixed_w,
     path_lengths,
-    path_penalty,
     r1_penalty,
-    r1_weight_of,
 )
 from derender.baselines.stylegan2_generator import GeneratorSettings
 
 TINY = GeneratorSettings(image_size=8, style_size=6, mapping_layers=2, channel_base=32, channel_max=6)
 
 
-def losses(model, images, objective, generator):
-    return model.losses(images, LossInputs(StyleganConfig(objective=objective), generator, nullcontext))
+def config(**objective) -> StyleganConfig:
+    return StyleganConfig(objective=AdversarialObjective(**objective))
 
 
 @pytest.fixture
-def model():
-    torch.manual_seed(0)
-    return Stylegan(TINY).train()
+def model(seeded):
+    return seeded(Stylegan, TINY).train()
 
 
-def test_each_loss_moves_its_own_network(model, generator):
-    images = torch.rand(4, 3, 8, 8, generator=generator)
-    terms = losses(model, images, AdversarialObjective(), generator)
+@pytest.fixture
+def images(generator):
+    return torch.rand(4, 3, 8, 8, generator=generator)
+
+
+def test_each_loss_moves_its_own_network(model, images, generator, losses):
+    terms = losses(model, images, config(), generator)
     assert set(terms) == {"generator", "discriminator", "r1", "path"}  # the first step has both regularisers
-    moved = {
-        "generator": model.learner, "path": model.learner,
-        "discriminator": model.discriminator, "r1": model.discriminator,
-    }  # fmt: skip
     for name, term in terms.items():
         model.zero_grad()
         term.backward(retain_graph=True)
+        moved = model.learner if name in ("generator", "path") else model.discriminator
         for net in (model.learner, model.discriminator):
             touched = any(value.grad is not None and value.grad.any() for value in net.parameters())
-            assert touched == (net is moved[name]), name
+            assert touched == (net is moved), name
     assert not any(value.requires_grad for value in model.generator.parameters())
-    again = losses(model, images, AdversarialObjective(), generator)
-    assert set(again) == {"generator", "discriminator"}
+    assert set(losses(model, images, config(), generator)) == {"generator", "discriminator"}
 
 
 def test_r1_of_a_linear_score_is_half_its_squared_slope(generator):
@@ -58,17 +54,13 @@ def test_r1_of_a_linear_score_is_half_its_squared_slope(generator):
     torch.testing.assert_close(found, score[1].weight.square().sum() / 2)
 
 
-def test_r1_weighs_by_size_and_batch_unless_told(model, generator):
-    by_size = AdversarialObjective()
-    assert r1_weight_of(by_size, 1024, 32) == pytest.approx(6.5536)
-    assert r1_weight_of(by_size, 64, 32) == pytest.approx(0.0256)
-    assert r1_weight_of(AdversarialObjective(r1_weight=0.0), 64, 32) == 0
-    images = torch.rand(4, 3, 8, 8, generator=generator)
+def test_r1_weighs_by_size_and_batch_unless_told(model, images, losses):
     found = []
-    for objective in (by_size, AdversarialObjective(r1_weight=3.0)):
+    for objective in ({}, {"r1_weight": 3.0}, {"r1_weight": 0.0}):
         model.steps.zero_()
-        found.append(losses(model, images, objective, generator)["r1"])
+        found.append(losses(model, images, config(**objective)).get("r1"))
     torch.testing.assert_close(found[1], 3 / (2e-4 * 64 / 4) * found[0])
+    assert found[2] is None
 
 
 def test_path_lengths_are_those_of_the_jacobian(model, generator):
@@ -82,19 +74,18 @@ def test_path_lengths_are_those_of_the_jacobian(model, generator):
     numbers = TINY.codes * 6
     steps = 1e-5 * torch.eye(numbers, dtype=torch.float64).reshape(numbers, TINY.codes, 6)
     with torch.no_grad():
-        for picture in range(2):
-            here = [level[picture : picture + 1] for level in noise]
-            after, before = (net(w[picture] + sign * steps, here) for sign in (1, -1))
-            pulled = ((after - before) / 2e-5 * direction[picture]).sum(dim=(1, 2, 3))
+        for one in range(2):
+            here = [level[one : one + 1] for level in noise]
+            after, before = (net(w[one] + sign * steps, here) for sign in (1, -1))
+            pulled = ((after - before) / 2e-5 * direction[one]).sum(dim=(1, 2, 3))
             wanted = (pulled.square().sum() / TINY.codes).sqrt()
-            torch.testing.assert_close(found[picture].detach(), wanted, rtol=1e-6, atol=0.0)
+            torch.testing.assert_close(found[one].detach(), wanted, rtol=1e-6, atol=0.0)
 
 
-def test_path_penalty_moves_its_mean_towards_the_lengths(model, generator):
-    objective = AdversarialObjective(path_decay=1.0)
-    penalty = path_penalty(model, 2, objective, generator)
-    assert model.path_length > 0 and penalty >= 0
-    alone = path_penalty(model, 1, objective, generator)
+def test_the_path_penalty_moves_its_mean_towards_the_lengths(model, images, losses):
+    assert losses(model, images, config(path_decay=1.0))["path"] > 0 < model.path_length
+    model.steps.zero_()
+    alone = losses(model, images[:1], config(path_decay=1.0))["path"]
     torch.testing.assert_close(alone, torch.zeros(()))  # one length is its own mean
 
 
@@ -102,8 +93,7 @@ def test_mixing_changes_the_code_at_one_depth(model, generator):
     plain = mixed_w(model.learner, 5, 0.0, generator)
     assert torch.equal(plain, plain[:, :1].expand_as(plain))
     mixed = mixed_w(model.learner, 50, 1.0, generator)
-    changes = (mixed[:, 1:] != mixed[:, :-1]).any(dim=2).sum(dim=1)
-    assert (changes == 1).all()
+    assert ((mixed[:, 1:] != mixed[:, :-1]).any(dim=2).sum(dim=1) == 1).all()
 
 
 def test_the_average_follows_at_its_half_life(model):
@@ -123,19 +113,35 @@ def test_energy_distance_is_zero_for_one_distribution_only(generator):
     first, second = (torch.randn(400, 4, generator=generator) for _ in range(2))
     assert energy_distance(first, second).abs() < 0.02
     assert energy_distance(first, second + 1) > 0.2
-    ends = energy_distance(torch.tensor([[0.0], [0.0]]), torch.tensor([[3.0], [3.0]]))
-    assert ends == 6
+    assert energy_distance(torch.zeros(2, 1), torch.full((2, 1), 3.0)) == 6
     assert energy_distance(first[:1], second) == 0  # one image says nothing
 
 
-def test_held_out_pictures_are_judged_by_samples_of_the_average(model, generator):
-    terms = losses(
-        model.eval(), torch.rand(6, 3, 8, 8, generator=generator), AdversarialObjective(), generator
+def test_held_out_images_are_judged_by_samples_of_the_average(model, images, losses):
+    assert set(losses(model.eval(), images, config())) == {"energy"} and model.steps == 0
+    whole, again, half, none = (
+        model.sample(3, torch.Generator().manual_seed(5), truncation=strength)
+        for strength in (1.0, 1.0, 0.5, 0.0)
     )
-    assert set(terms) == {"energy"} and model.steps == 0
-    samples = model.sample(3, torch.Generator().manual_seed(5))
-    assert samples.shape == (3, 3, 8, 8) and samples.min() >= 0 and samples.max() <= 1
-    assert torch.equal(samples, model.sample(3, torch.Generator().manual_seed(5)))
-    centre = model.sample(2, generator, truncation=0.0)
-    torch.testing.assert_close(centre[0], centre[1])
-    assert [column.shape for column in model.shown(samples, None).values()] == 7 * [samples.shape]
+    assert whole.shape == (3, 3, 8, 8) and whole.min() >= 0 and whole.max() <= 1
+    assert torch.equal(whole, again)
+    torch.testing.assert_close(none, none[:1].expand_as(none))
+    assert (half - none).abs().mean() < (whole - none).abs().mean()
+    assert [column.shape for column in model.shown(whole, None).values()] == 7 * [whole.shape]
+
+
+def test_features_of_the_discriminator_do_not_see_the_batch_but_scores_see_their_group(seeded, generator):
+    settings = GeneratorSettings(image_size=16, style_size=12, channel_base=128, channel_max=10)
+    net = seeded(Discriminator, settings).requires_grad_(False)
+    images = torch.randn(8, 3, 16, 16, generator=generator)
+    torch.testing.assert_close(net.describe(images)[2:3], net.describe(images[2:3]), rtol=1e-4, atol=1e-5)
+    changed = images.clone()
+    changed[1] += 1
+    differ = (net(images) - net(changed)).abs() > 1e-6
+    assert differ.tolist() == [False, True] * 4  # image i is compared with those equal to i modulo 2
+
+
+def test_an_equalised_convolution_keeps_the_variance(seeded, generator):
+    conv = seeded(EqualConv, 32, 32, 3, active=False, seed=1)
+    inner = conv(torch.randn(4, 32, 20, 20, generator=generator))[..., 1:-1, 1:-1]
+    assert inner.var().item() == pytest.approx(1, rel=0.1)

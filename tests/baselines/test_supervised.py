@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import torch
-from torch.nn.functional import cross_entropy
 
 from derender.baselines import load_baseline, read_any_config
 from derender.baselines.supervised import (
@@ -13,10 +12,7 @@ from derender.baselines.supervised import (
     SupervisedConfig,
     accuracy,
     encode_labels,
-    label_loss,
     labelled_rows,
-    train_resnet18,
-    train_supervised,
 )
 from derender.data import split_indices
 from derender.features import embed_pictures, model_fingerprint
@@ -42,7 +38,7 @@ def test_it_has_the_parameters_of_resnet18():
 
 def test_it_learns_from_few_labels_and_repeats(blobs, tmp_path):
     state = torch.random.get_rng_state()
-    result = train_supervised(FEW, blobs, tmp_path / "run")
+    result = Resnet18.train_into(FEW, blobs, tmp_path / "run")
     assert torch.equal(torch.random.get_rng_state(), state)
     losses = [row["loss"] for row in read_metrics(tmp_path / "run") if row["kind"] == "train"]
     assert len(losses) == 18 and np.mean(losses[-3:]) < 0.6 * np.mean(losses[:3])
@@ -50,14 +46,15 @@ def test_it_learns_from_few_labels_and_repeats(blobs, tmp_path):
     assert read_any_config(tmp_path / "run") == FEW and result.images == 144
     assert model.settings.classes == {"side": ("0", "1")}
     test = blobs.select(split_indices(blobs.files, FEW.split, seed=0).test)
-    assert set(accuracy(model, test)) == {"side"}
+    assert set(accuracy(model, test)) == {"accuracy side"}
     model.choose(("pooled", "logits"))
     table = embed_pictures(model, blobs)
     assert {name: values.shape[1] for name, values in table.factors.items()} == {"pooled": 64, "logits": 2}
     other = blobs.select(np.arange(48))
     hidden = sorted(set(range(48)) - set(labelled_rows(blobs, FEW).tolist()))
     other.images[hidden] = 0
-    assert model_fingerprint(train_resnet18(other, FEW)) == model_fingerprint(model)
+    Resnet18.train_into(FEW, other, tmp_path / "other")
+    assert model_fingerprint(load_baseline(tmp_path / "other")) == model_fingerprint(model)
 
 
 def test_accuracy_counts_right_answers_among_known_labels(blobs):
@@ -69,7 +66,7 @@ def test_accuracy_counts_right_answers_among_known_labels(blobs):
         model.net.classifier[-1].bias.copy_(torch.tensor([0.0, 1.0, 1.0, 0.0]))  # always 1, always dark
     given = blobs.select(np.arange(10))
     given.labels["shade"][:] = ["dark", "light", "", "", "", "", "", "", "", ""]
-    assert accuracy(model, given) == {"side": 0.5, "shade": 0.5}
+    assert accuracy(model, given) == {"accuracy side": 0.5, "accuracy shade": 0.5}
 
 
 def test_labelled_rows_are_of_the_training_part_and_known(blobs):
@@ -89,22 +86,22 @@ def test_every_label_has_its_own_classes(blobs):
     names, targets = encode_labels(blobs, ("shade", "side"), np.array([3, 0]))
     assert names == {"shade": ("dark", "light"), "side": ("0", "1")}
     assert targets.tolist() == [[1, 1], [0, 0]]
-    logits = torch.randn(2, 4)
-    expected = (cross_entropy(logits[:, :2], targets[:, 0]) + cross_entropy(logits[:, 2:], targets[:, 1])) / 2
-    torch.testing.assert_close(label_loss(logits, targets, [2, 2]), expected)
+    model = Resnet18(Resnet18Settings(image_size=32, width=4, classes=names))
+    logits, parts = (
+        model.describe(torch.rand(2, 3, 32, 32))["logits"],
+        model.label_logits(torch.rand(2, 3, 32, 32)),
+    )
+    assert logits.shape == (2, 4) and [part.shape for part in parts] == [(2, 2), (2, 2)]
 
 
 def test_bad_labels_are_refused_before_a_folder_is_made(blobs, tmp_path):
-    for changes, message in [
-        (
-            ["labels=[]"],
-            "name a label to learn, as in --set labels=NAME; the images have side, shade, same",
-        ),
-        (["labels=sid"], "no label 'sid'; did you mean 'side'"),
-        (["labelled=39"], r"39 labelled images were requested, the training part has 38 with side"),
+    known = "name a label to learn, as in --set labels=NAME; the images have side, shade, same"
+    for change, message in [
+        ("labels=[]", known),
+        ("labels=sid", "no label 'sid'; did you mean 'side'"),
+        ("labelled=39", r"39 labelled images were requested, the training part has 38 with side"),
+        ("labels=same", "label 'same' has one value only"),
     ]:
         with pytest.raises(ValueError, match=message):
-            train_supervised(with_changes(FEW, changes), blobs, tmp_path / "run")
+            Resnet18.train_into(with_changes(FEW, [change]), blobs, tmp_path / "run")
     assert not (tmp_path / "run").exists()
-    with pytest.raises(ValueError, match="label 'same' has one value only"):
-        train_resnet18(blobs, with_changes(FEW, ["labels=same"]))

@@ -1,39 +1,124 @@
 """Other ways to make a feature table, for comparison: networks that are trained here or by others, controls.
 
-registry: one row each; model: the base of those with a network; training: their runs; controls: the others.
-Names below are imported on first use, so that the registry costs nothing.
+Everything is imported on first use. The class of a network holds its features, losses and settings
+(model.py).
 """
 
 import importlib
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from derender.baselines.controls import control_features
-    from derender.baselines.model import load_baseline
-    from derender.baselines.registry import BASELINES, embed_baseline, open_baseline, train_baseline
-    from derender.baselines.training import baseline_config, image_size_of, read_any_config, stored_config
+    from derender.features import Embedded
 
-_HOME = {
-    **dict.fromkeys(("BASELINES", "embed_baseline", "open_baseline", "train_baseline"), "registry"),
-    **dict.fromkeys(("baseline_config", "image_size_of", "read_any_config", "stored_config"), "training"),
-    "control_features": "controls",
-    "load_baseline": "model",
+NETWORKS: Mapping[str, str] = {
+    "vqvae": "autoencoders.Vqvae",
+    "simclr": "simclr.Simclr",
+    "ae": "autoencoders.Autoencoder",
+    "beta-vae": "autoencoders.BetaVae",
+    "resnet18": "supervised.Resnet18",
+    "stylegan2": "stylegan2.Stylegan",
+    "e4e": "e4e.E4e",
+    "ris": "ris.Ris",
+    "dinov2": "published.Dinov2",
+    "untrained": "controls.Untrained",
 }
-__all__ = [
-    "BASELINES",
-    "baseline_config",
-    "control_features",
-    "embed_baseline",
-    "image_size_of",
-    "load_baseline",
-    "open_baseline",
-    "read_any_config",
-    "stored_config",
-    "train_baseline",
-]
+"""Classes of those with a network, as ``module.name`` in this package."""
+CONTROLS = ("pixels", "pca", "hog", "noise")
+"""Those without: `control_features` makes their tables."""
+BASELINES = (*NETWORKS, *CONTROLS)
+TRAINED = tuple(name for name in NETWORKS if name not in ("dinov2", "untrained"))
+_HOME = {
+    **dict.fromkeys(("baseline_config", "image_size_of", "load_baseline"), "model"),
+    **dict.fromkeys(("read_any_config", "stored_config"), "model"),
+    "control_features": "controls",
+}
 
 
 def __getattr__(name: str) -> Any:
-    if name in _HOME:
-        return getattr(importlib.import_module(f"derender.baselines.{_HOME[name]}"), name)
-    raise AttributeError(f"module 'derender.baselines' has no attribute {name!r}")
+    if name not in _HOME:
+        raise AttributeError(f"module 'derender.baselines' has no attribute {name!r}")
+    return getattr(importlib.import_module(f"derender.baselines.{_HOME[name]}"), name)
+
+
+def network_type(name: str, among: Sequence[str] = TRAINED) -> Any:
+    """The class of a baseline that is trained here; an unknown name is an error that suggests the closest."""
+    from derender.data import suggestion
+
+    if name not in among:
+        raise ValueError(f"no baseline {name!r}{suggestion(name, among)}: choose one of {', '.join(among)}")
+    if name in CONTROLS:
+        raise ValueError(f"the baseline {name} has no network: its table comes from control_features")
+    module, _, kind = NETWORKS[name].partition(".")
+    return getattr(importlib.import_module(f"derender.baselines.{module}"), kind)
+
+
+def train_baseline(config: Any, images: Any, out: Any, **how: Any) -> Any:
+    """Train a baseline into a run folder, as its configuration (``baseline_config``) says.
+
+    ``images`` are an image set at the configured size, ``out`` is a new folder; ``resume``, ``progress``,
+    ``accelerator``, ``sample_sheet`` and the `TrainResult` are those of `derender.training.train`.
+    """
+    return network_type(config.baseline).train_into(config, images, out, **how)
+
+
+def open_baseline(
+    name: str, source: str | None = None, *, device: str = "auto", features: Sequence[str] | None = None,
+    image_size: int = 64, seed: int = 0,
+) -> Any:  # fmt: skip
+    """A network that embeds images.
+
+    Args:
+        name: of a baseline that has a network.
+        source: its run folder; for e4e or its generator also a published .pt file; for dinov2 an id or a
+            folder of weights (default: facebook/dinov2-small); for untrained the derender model to copy.
+        device: "auto", "cpu" or "cuda".
+        features: names of the features to compute; by default the baseline's first.
+        image_size: side of the input images, where the network does not fix it (dinov2).
+        seed: of the fresh weights of untrained.
+
+    Raises:
+        ValueError: unknown name or feature, no source where one is needed, or damaged weights.
+        FileNotFoundError: there is no such source.
+    """
+    from derender.inputs import device_named
+
+    net = network_type(name, BASELINES).open(source, image_size=image_size, seed=seed)
+    if features is not None:
+        net.choose(tuple(features))
+    return net.to(device_named(device))
+
+
+def embed_baseline(
+    name: str, images: Any, out: str | Path, source: str | None = None, *,
+    features: Sequence[str] | None = None, image_size: int = 64, components: int = 64, seed: int = 0,
+    device: str = "auto", progress: Callable[[int, int], object] | None = None,
+    reading: Mapping[str, Any] | None = None, **how: Any,
+) -> "Embedded":  # fmt: skip
+    """Write the feature table of a baseline or a control; arguments as for ``open_baseline``, and:
+
+    Args:
+        images: an address, or an image set.
+        out: the parquet file.
+        components: numbers in pca and noise.
+        progress: called with (images done, images in all).
+        reading: how an address is read: ``dataset``, ``part`` and ``limit``.
+        how: further keywords of `derender.embed_to_file`, for baselines with a network.
+    """
+    from derender.baselines.controls import control_features
+    from derender.features import Embedded, embed_to_file
+
+    reading = reading or {}
+    if name not in CONTROLS:
+        net = open_baseline(name, source, device=device, features=features, image_size=image_size, seed=seed)
+        origin = {"source": source, "baseline": name}
+        return embed_to_file(images, net, out, **reading, origin=origin, progress=progress, **how)
+    table = control_features(
+        name, images, **reading, model=source, image_size=image_size, components=components, seed=seed,
+        progress=progress,
+    )  # fmt: skip
+    table.write(out)
+    widths, origin = {name: table.factors[name].shape[1]}, dict(table.origin)
+    facts = origin["data"], origin["layout"]
+    return Embedded(Path(out), len(table), widths, tuple(table.labels), origin, 0, (), 0, 0, *facts)

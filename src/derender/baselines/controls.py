@@ -2,7 +2,7 @@
 
 A learned feature has to beat these. On 1,000 labels of CelebA, PCA reaches a balanced accuracy of 0.674 and
 an untrained encoder 0.662. Histograms of oriented gradients: Dalal and Triggs (CVPR 2005), as scikit-image
-(BSD) computes them: nine orientations, cells of 8x8 pixels, blocks of 2x2 cells, L2-Hys; 1,764 numbers for
+(BSD) computes them: nine orientations, cells of 8x8 pixels, blocks of 2x2 cells, L2-Hys; 1,764 numbers at
 64x64 pixels.
 """
 
@@ -36,10 +36,10 @@ def control_features(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> FeatureTable:
-    """The table of a control by its name: pixels, pca, hog or noise.
+    """The table of a control by its name, pixels, pca, hog or noise, which is also that of its only factor.
 
     Args:
-        name: of the control; also the name of its only factor.
+        name: of the control.
         images: an image set, or the address of one.
         image_size, dataset, limit, part, model: how an address is read, see `derender.inputs.as_images`. The
             principal components of a part are those of the training part.
@@ -49,14 +49,24 @@ def control_features(
     """
     whole = as_images(images, image_size, dataset=dataset, limit=limit)
     chosen = part_of(whole, part, model)
+    if name == "pixels":
+        return pixel_features(chosen)
+    if name == "hog":
+        return hog_features(chosen, progress=progress)
+    if name == "noise":
+        return noise_features(chosen, dimensions=components, seed=seed)
     fit_on = chosen if part == "all" else part_of(whole, "train", model)
-    makers = {
-        "pixels": lambda: pixel_features(chosen),
-        "pca": lambda: pca_features(chosen, components=components, fit_on=fit_on, seed=seed),
-        "hog": lambda: hog_features(chosen, progress=progress),
-        "noise": lambda: noise_features(chosen, dimensions=components, seed=seed),
-    }
-    return makers[name]()
+    return pca_features(chosen, components=components, fit_on=fit_on, seed=seed)
+
+
+def control_table(images: ImageSet, name: str, values: np.ndarray, facts: Mapping[str, Any]) -> FeatureTable:
+    """One factor (N, D) as a table, with the images' names and labels; ``facts`` go into its origin."""
+    origin = {"data": images.source, "layout": images.layout, "control": name, **facts}
+    return FeatureTable(images.files, {name: values.astype(np.float32)}, table_labels(images), origin)
+
+
+def _flat(images: ImageSet) -> np.ndarray:
+    return np.asarray(images.images, np.float32).reshape(len(images), -1) / 255
 
 
 def pixel_features(images: ImageSet) -> FeatureTable:
@@ -65,35 +75,29 @@ def pixel_features(images: ImageSet) -> FeatureTable:
 
 
 def pca_features(
-    images: ImageSet,
-    *,
-    components: int = 64,
-    whiten: bool = True,
-    fit_on: ImageSet | None = None,
-    seed: int = 0,
+    images: ImageSet, *, components: int = 64, fit_on: ImageSet | None = None, seed: int = 0
 ) -> FeatureTable:
-    """Principal components of the pixels: factor ``pca``.
+    """Principal components of the pixels, each of variance 1: factor ``pca``.
 
     Args:
         images: N images to describe.
         components: how many.
-        whiten: scale every component to variance 1.
         fit_on: images that give the components; by default ``images`` themselves.
         seed: of the randomised solver.
     """
     source = images if fit_on is None else fit_on
-    limit = min(len(source), int(np.prod(source.images.shape[1:])))
+    shape = source.images.shape[1:]
+    limit = min(len(source), int(np.prod(shape)))
     if not 1 <= components <= limit:
         raise ValueError(
             f"{components} components cannot be had from {len(source)} images: ask for 1 to {limit}"
         )
-    if source.images.shape[1:] != images.images.shape[1:]:
+    if shape != images.images.shape[1:]:
         raise ValueError(
-            f"PCA fitted on images {source.images.shape[1:]} does not take {images.images.shape[1:]}: "
-            "read both at one size"
+            f"PCA fitted on images {shape} does not take {images.images.shape[1:]}: read both at one size"
         )
-    pca = PCA(components, whiten=whiten, random_state=seed).fit(_flat(source))
-    facts = {"components": components, "whiten": whiten, "fitted_on": len(source), "seed": seed}
+    pca = PCA(components, whiten=True, random_state=seed).fit(_flat(source))
+    facts = {"components": components, "whiten": True, "fitted_on": len(source), "seed": seed}
     return control_table(images, "pca", pca.transform(_flat(images)), facts)
 
 
@@ -106,25 +110,22 @@ def hog_features(images: ImageSet, *, cell_px: int = 8, progress: Progress | Non
         progress: called with (images done, images in all).
     """
     height, width = images.images.shape[-2:]
-    if not 1 <= cell_px <= min(height, width) // BLOCK_CELLS:
+    largest = min(height, width) // BLOCK_CELLS
+    if not 1 <= cell_px <= largest:
         raise ValueError(
             f"cells of {cell_px} pixels do not fit {BLOCK_CELLS} a side into {height}x{width}: "
-            f"ask for 1 to {min(height, width) // BLOCK_CELLS}"
+            f"ask for 1 to {largest}"
         )
     hog = optional("skimage.feature", "the baseline hog").hog
     rows = []
-    for row, image in enumerate(images.images):
+    for image in images.images:
         values = hog(
-            np.moveaxis(np.asarray(image), 0, -1),
-            orientations=ORIENTATIONS,
-            pixels_per_cell=(cell_px, cell_px),
-            cells_per_block=(BLOCK_CELLS, BLOCK_CELLS),
-            block_norm="L2-Hys",
-            channel_axis=-1,
-        )
+            np.moveaxis(np.asarray(image), 0, -1), orientations=ORIENTATIONS, block_norm="L2-Hys",
+            pixels_per_cell=(cell_px, cell_px), cells_per_block=(BLOCK_CELLS, BLOCK_CELLS), channel_axis=-1,
+        )  # fmt: skip
         rows.append(values.astype(np.float32))
-        if progress is not None and (row % 64 == 63 or row == len(images) - 1):
-            progress(row + 1, len(images))
+        if progress is not None and (len(rows) % 64 == 0 or len(rows) == len(images)):
+            progress(len(rows), len(images))
     facts = {"orientations": ORIENTATIONS, "cell_px": cell_px, "block": BLOCK_CELLS}
     return control_table(images, "hog", np.stack(rows), facts)
 
@@ -143,31 +144,20 @@ def untrained_twin(model: Any, seed: int) -> Any:
 
 
 def untrained_features(
-    model: Any,
-    images: ImageSet,
-    *,
-    seed: int = 0,
-    batch_size: int = 256,
-    progress: Progress | None = None,
+    model: Any, images: ImageSet, *, seed: int = 0, batch_size: int = 256, progress: Progress | None = None
 ) -> FeatureTable:
     """Features of the same architecture with fresh weights: the model's own factors."""
-    twin = untrained_twin(model, seed)
     origin = {"control": "untrained", "seed": seed}
+    twin = untrained_twin(model, seed)
     return embed_pictures(twin, images, batch_size=batch_size, progress=progress, origin=origin)
 
 
-def open_untrained(name: str, source: str | None, image_size: int, seed: int) -> Any:
-    """The untrained twin of a derender model; see `registry.open_baseline`."""
-    if source is None:
-        raise ValueError(f"the baseline {name} needs a model: the derender model whose networks it copies")
-    return untrained_twin(load(source), seed)
+class Untrained:
+    """The untrained twin of a derender model, among the baselines with a network."""
 
-
-def _flat(images: ImageSet) -> np.ndarray:
-    return np.asarray(images.images, np.float32).reshape(len(images), -1) / 255
-
-
-def control_table(images: ImageSet, name: str, values: np.ndarray, facts: Mapping[str, Any]) -> FeatureTable:
-    """One factor (N, D) as a table, with the images' names and labels; ``facts`` go into its origin."""
-    origin = {"data": images.source, "layout": images.layout, "control": name, **facts}
-    return FeatureTable(images.files, {name: values.astype(np.float32)}, table_labels(images), origin)
+    @staticmethod
+    def open(source: str | Path | None, *, image_size: int = 0, seed: int = 0) -> Any:
+        """See `registry.open_baseline`."""
+        if source is None:
+            raise ValueError("the baseline untrained needs a model: the derender model to copy")
+        return untrained_twin(load(source), seed)

@@ -1,39 +1,47 @@
 """e4e: an encoder from an image to the W+ code of a StyleGAN2 generator that stays as it is.
 
 Source: Tov et al., *Designing an Encoder for StyleGAN Image Manipulation* (SIGGRAPH 2021), whose body is that
-of ArcFace (an improved residual net with squeeze-and-excitation, 50 layers) and whose heads are pSp's
-(Richardson et al., CVPR 2021): maps at 1/16, 1/8 and 1/4 of the image feed 3 coarse, 4 middle and all finer
-codes. The first head gives one code for all layers, the others what each adds to it, and the generator's mean
-code is added at the end. The published network takes 256 pixels and gives 18 x 512 numbers.
+of ArcFace (an improved residual net with squeeze-and-excitation) and whose heads are pSp's (Richardson et
+al., CVPR 2021): maps at 1/16, 1/8 and 1/4 of the image feed 3 coarse, 4 middle and all finer codes. The first
+head gives one code for all layers, the others what each adds to it; the generator's mean code is added at the
+end.
 
-Losses: squared error and perceptual distance between image and inversion; codes are released one after the
-other, and their difference from the first is kept small, so that W+ stays near W. The perceptual features
-are our own, learnt without labels from the same images. Instead of e4e's discriminator of codes the first
-code is drawn towards the mean code. Leaves out the identity loss, which needs a face recogniser.
+Losses: squared error and perceptual distance (features learnt without labels from the same images) between
+image and inversion; codes are released one after the other, and their difference from the first is kept
+small, so that W+ stays near W. Instead of e4e's discriminator of codes the first code is drawn towards the
+mean code. Leaves out the identity loss, which needs a face recogniser.
 """
 
-from collections.abc import Callable
 from itertools import pairwise
 from math import log2
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 from jaxtyping import Float, UInt8
-from pydantic import Field, field_validator
+from pydantic import AfterValidator, Field, PositiveInt
 from torch import Tensor, nn
 from torch.nn.functional import adaptive_avg_pool2d, interpolate, leaky_relu, mse_loss
 
 from derender.baselines.model import (
+    ADAM,
     BaselineModel,
     BaselineSettings,
+    Features,
     Images,
+    LoopModel,
     LossInputs,
     load_baseline,
-    open_run,
 )
 from derender.baselines.stylegan2 import CENTRE_LATENTS, Stylegan
-from derender.baselines.stylegan2_generator import EqualLinear, Generator, GeneratorSettings
+from derender.baselines.stylegan2_generator import (
+    Codes,
+    EqualLinear,
+    Generator,
+    GeneratorSettings,
+    Maps,
+    power_of_two,
+)
 from derender.objectives.perceptual import build_perceptual
 from derender.objectives.perceptual_features import PerceptualFeatures
 from derender.objectives.self_features import SelfFeatures, load_self_features
@@ -41,6 +49,7 @@ from derender.settings import Settings
 from derender.storage.atomic import atomic_file
 from derender.training.batches import random_stream
 from derender.training.config import LoopSettings, OptimiserSettings
+from derender.training.task import PhaseProgress
 
 FIRST_MIDDLE, FIRST_FINE = 3, 7  # numbers of the codes
 
@@ -48,24 +57,10 @@ FIRST_MIDDLE, FIRST_FINE = 3, 7  # numbers of the codes
 class EncoderSettings(BaselineSettings):
     """Sizes; the defaults are small. The published encoder has 256, 64, (3, 4, 14, 3) and 16."""
 
-    image_size: int = 64
+    image_size: Annotated[int, AfterValidator(power_of_two)] = Field(default=64, ge=32)
     width: int = Field(default=16, ge=1)
-    units: tuple[int, int, int, int] = (1, 1, 2, 1)
+    units: tuple[PositiveInt, PositiveInt, PositiveInt, PositiveInt] = (1, 1, 2, 1)
     reduction: int = Field(default=4, ge=1)
-
-    @field_validator("image_size")
-    @classmethod
-    def _power_of_two(cls, value: int) -> int:
-        if value < 32 or value.bit_count() != 1:
-            raise ValueError(f"e4e takes images of 32, 64, 128, 256, ... pixels, not {value}")
-        return value
-
-    @field_validator("units")
-    @classmethod
-    def _some_units(cls, value: tuple[int, int, int, int]) -> tuple[int, int, int, int]:
-        if min(value) < 1:
-            raise ValueError(f"every stage needs at least one unit, got {value}")
-        return value
 
 
 class E4eSettings(EncoderSettings):
@@ -93,7 +88,7 @@ class E4eConfig(LoopSettings):
     model: EncoderSettings = EncoderSettings()
     objective: InversionObjective = InversionObjective()
     batch_size: int = Field(default=16, ge=2)
-    optimiser: OptimiserSettings = OptimiserSettings(learning_rate=1e-3, weight_decay=0.0)
+    optimiser: OptimiserSettings = ADAM
     channels_last: bool = False
 
 
@@ -102,24 +97,19 @@ class Unit(nn.Module):
 
     def __init__(self, inputs: int, outputs: int, stride: int, reduction: int):
         super().__init__()
-        same = inputs == outputs
-        self.shortcut = None if same else nn.Conv2d(inputs, outputs, 1, stride, bias=False)
-        self.shortcut_norm = None if same else nn.BatchNorm2d(outputs)
+        same, narrow = inputs == outputs, max(1, outputs // reduction)
+        self.shortcut = nn.MaxPool2d(1, stride) if same else nn.Conv2d(inputs, outputs, 1, stride, bias=False)
+        self.shortcut_norm = nn.Identity() if same else nn.BatchNorm2d(outputs)
         self.norm = nn.BatchNorm2d(inputs)
         self.first = nn.Conv2d(inputs, outputs, 3, padding=1, bias=False)
         self.active = nn.PReLU(outputs)
         self.second = nn.Conv2d(outputs, outputs, 3, stride, padding=1, bias=False)
         self.last_norm = nn.BatchNorm2d(outputs)
-        narrow = max(1, outputs // reduction)
         self.squeeze = nn.Conv2d(outputs, narrow, 1, bias=False)
         self.excite = nn.Conv2d(narrow, outputs, 1, bias=False)
-        self.stride = stride
 
-    def forward(self, maps: Float[Tensor, "n i h w"]) -> Float[Tensor, "n o h2 w2"]:
-        if self.shortcut is None or self.shortcut_norm is None:
-            passed = maps[:, :, :: self.stride, :: self.stride]
-        else:
-            passed = self.shortcut_norm(self.shortcut(maps))
+    def forward(self, maps: Maps) -> Maps:
+        passed = self.shortcut_norm(self.shortcut(maps))
         change = self.last_norm(self.second(self.active(self.first(self.norm(maps)))))
         gate = self.excite(self.squeeze(adaptive_avg_pool2d(change, 1)).relu()).sigmoid()
         return change * gate + passed
@@ -131,12 +121,10 @@ class Head(nn.Module):
     def __init__(self, inputs: int, outputs: int, side: int):
         super().__init__()
         widths = [inputs, *[outputs] * int(log2(side))]
-        self.convs = nn.ModuleList(
-            nn.Conv2d(before, after, 3, 2, padding=1) for before, after in pairwise(widths)
-        )
+        self.convs = nn.ModuleList(nn.Conv2d(*pair, 3, 2, padding=1) for pair in pairwise(widths))
         self.linear = EqualLinear(outputs, outputs)
 
-    def forward(self, maps: Float[Tensor, "n i s s"]) -> Float[Tensor, "n o"]:
+    def forward(self, maps: Maps) -> Float[Tensor, "n o"]:
         for conv in self.convs:
             maps = leaky_relu(conv(maps))
         return self.linear(maps.flatten(1))
@@ -151,42 +139,28 @@ class E4eEncoder(nn.Module):
         widths = (width, width, 2 * width, 4 * width, 8 * width)
         self.stem = nn.Conv2d(3, width, 3, padding=1, bias=False)
         self.stem_norm, self.stem_active = nn.BatchNorm2d(width), nn.PReLU(width)
-        self.stages = nn.ModuleList(
-            nn.Sequential(
-                *(
-                    Unit(before if i == 0 else after, after, 2 if i == 0 else 1, settings.reduction)
-                    for i in range(count)
-                )
-            )
-            for before, after, count in zip(widths[:-1], widths[1:], settings.units, strict=True)
-        )
+        self.stages = nn.ModuleList()
+        for (before, after), count in zip(pairwise(widths), settings.units, strict=True):
+            rest = (Unit(after, after, 1, settings.reduction) for _ in range(count - 1))
+            self.stages.append(nn.Sequential(Unit(before, after, 2, settings.reduction), *rest))
         self.to_middle = nn.Conv2d(widths[3], widths[4], 1)
         self.to_fine = nn.Conv2d(widths[2], widths[4], 1)
-        self.heads = nn.ModuleList(
-            Head(widths[4], style_size, side // self._stride(code)) for code in range(codes)
-        )
+        strides = [16 if code < FIRST_MIDDLE else 8 if code < FIRST_FINE else 4 for code in range(codes)]
+        self.heads = nn.ModuleList(Head(widths[4], style_size, side // stride) for stride in strides)
 
-    @staticmethod
-    def _stride(code: int) -> int:
-        return 16 if code < FIRST_MIDDLE else 8 if code < FIRST_FINE else 4
-
-    def forward(self, images: Images, *, released: int) -> Float[Tensor, "n codes d"]:
+    def forward(self, images: Images, *, released: int) -> Codes:
         """``released``: the number of the last code that may differ from the first; at 0 all are the same."""
-        maps = self.stem_active(self.stem_norm(self.stem(images)))
         half, quarter, eighth, sixteenth = self.stages
-        at_4 = quarter(half(maps))
+        at_4 = quarter(half(self.stem_active(self.stem_norm(self.stem(images)))))
         at_8 = eighth(at_4)
         coarse = sixteenth(at_8)
         middle = _as_large(coarse, at_8) + self.to_middle(at_8)
         fine = _as_large(middle, at_4) + self.to_fine(at_4)
-        first = self.heads[0](coarse)
-        codes = [first]
-        for code, head in enumerate(list(self.heads)[1:], 1):
-            if code > released:
-                codes.append(first)
-                continue
-            source = coarse if code < FIRST_MIDDLE else middle if code < FIRST_FINE else fine
-            codes.append(first + head(source))
+        sources = [coarse] * FIRST_MIDDLE + [middle] * (FIRST_FINE - FIRST_MIDDLE) + [fine] * len(self.heads)
+        codes = [self.heads[0](coarse)]
+        for code, (head, source) in enumerate(zip(self.heads, sources, strict=False)):
+            if code:
+                codes.append(codes[0] + head(source) if code <= released else codes[0])
         return torch.stack(codes, dim=1)
 
 
@@ -194,7 +168,7 @@ def _as_large(maps: Tensor, like: Tensor) -> Tensor:
     return interpolate(maps, like.shape[-2:], mode="bilinear", align_corners=True)
 
 
-class E4e(BaselineModel):
+class E4e(LoopModel):
     """Encoder and the generator that it inverts. Feature: ``w+``, flattened (9,216 at 1024 pixels)."""
 
     name, settings_type, config_type = "e4e", E4eSettings, E4eConfig
@@ -215,28 +189,36 @@ class E4e(BaselineModel):
         self.register_buffer("released", torch.tensor(codes))
 
     @classmethod
+    def open(cls, source: str | Path | None, *, image_size: int = 0, seed: int = 0) -> BaselineModel:
+        """The encoder of a run, or a published one (a .pt file); see `registry.open_baseline`."""
+        if source is not None and Path(source).suffix.lower() == ".pt":
+            from derender.baselines.published import load_published_e4e
+
+            return load_published_e4e(source)
+        return super().open(source)
+
+    @classmethod
     def build(cls, config: E4eConfig) -> "E4e":
         """The untrained encoder with the generator that the configuration names and its mean code."""
         generator = open_generator(config.objective.generator)
         model = cls(E4eSettings(**config.model.model_dump(), generator=generator.settings))
         model.generator.load_state_dict(generator.state_dict())
         model.released.fill_(0)
-        centre = generator.mean_w(CENTRE_LATENTS, random_stream(config.seed, "perturb", 0))
-        model.centre.copy_(centre.expand_as(model.centre))
+        latents = generator.random_w(CENTRE_LATENTS, random_stream(config.seed, "perturb", 0))
+        model.centre.copy_(latents.mean(dim=0).expand_as(model.centre))
         return model
 
     @staticmethod
     def prepare(
-        config: E4eConfig, images: UInt8[Tensor, "n 3 h w"], file: Path, progress: Callable[[int, int], None]
+        config: E4eConfig, images: UInt8[Tensor, "n 3 h w"], file: Path, progress: PhaseProgress
     ) -> PerceptualFeatures | None:
         """Features learnt from the images; None if they have no weight."""
-        objective = config.objective
-        if objective.perceptual_weight == 0:
+        if config.objective.perceptual_weight == 0:
             return None
         if file.exists():
             return load_self_features(file).to(images.device)
         features = build_perceptual(
-            "self", images, seed=config.seed, steps=objective.self_features_steps,
+            "self", images, seed=config.seed, steps=config.objective.self_features_steps,
             progress=lambda done, total, _: progress(done, total), device=images.device,
         )  # fmt: skip
         assert isinstance(features, SelfFeatures)
@@ -244,15 +226,15 @@ class E4e(BaselineModel):
             features.save(temporary)
         return features
 
-    def invert(self, images: Images) -> Float[Tensor, "n codes d"]:
+    def invert(self, images: Images) -> Codes:
         """W+ of images in 0..1."""
         return self.encoder(2 * images - 1, released=int(self.released)) + self.centre
 
-    def rebuild(self, w_plus: Float[Tensor, "n codes d"]) -> Images:
+    def rebuild(self, w_plus: Codes) -> Images:
         """The generator's images, about 0..1, with the noise stored with its weights."""
         return self.generator(w_plus, self.generator.fixed_noise()) / 2 + 0.5
 
-    def describe(self, images: Images) -> dict[str, Float[Tensor, "n _"]]:
+    def describe(self, images: Images) -> Features:
         return {"w+": self.invert(images).flatten(1)}
 
     def shown(self, images: Images, config: Any) -> dict[str, Images]:
@@ -260,18 +242,23 @@ class E4e(BaselineModel):
         return {"input": images, "inversion": again.clamp(0, 1)}
 
     def losses(self, images: Images, run: LossInputs) -> dict[str, Tensor]:
-        """Squared error and perceptual distance of inversions in 0..1, two regularisers; beside them L1."""
+        """Squared error and perceptual distance of inversions in 0..1, two regularisers; beside them L1.
+
+        After ``first_release`` images the second code may differ from the first, then one more at a time.
+        """
         objective: InversionObjective = run.config.objective
         if self.training:
-            self.released.fill_(released_codes(objective, int(self.seen)))
+            free = int(self.seen) - objective.first_release
+            self.released.fill_(max(0, free // objective.release_every + 1))
             self.seen += len(images)
         with run.precision():
             w_plus = self.invert(images)
             again = self.rebuild(w_plus)
+        difference = w_plus[:, 1:] - w_plus[:, :1]
         again = adaptive_avg_pool2d(again.float(), images.shape[-1])
         terms = {
             "reconstruction": mse_loss(again, images),
-            "delta": objective.delta_weight * code_deltas(w_plus),
+            "delta": objective.delta_weight * (difference.square().sum(2) + 1e-12).sqrt().sum(1).mean(),
             "prior": objective.prior_weight * (w_plus[:, 0] - self.centre[0]).square().sum(dim=1).mean(),
             "l1": (again.detach().clamp(0, 1) - images).abs().mean(),
         }
@@ -281,24 +268,8 @@ class E4e(BaselineModel):
         return terms
 
 
-def released_codes(objective: InversionObjective, images: int) -> int:
-    """The number of the last code that may differ from the first after so many images."""
-    return max(0, (images - objective.first_release) // objective.release_every + 1)
-
-
-def code_deltas(w_plus: Float[Tensor, "n codes d"]) -> Float[Tensor, ""]:
-    """Sum over codes of their mean distance from the first; 0 is a code of W."""
-    difference = w_plus[:, 1:] - w_plus[:, :1]
-    return (difference.square().sum(dim=2) + 1e-12).sqrt().sum(dim=1).mean()
-
-
 def open_generator(source: str | Path | None) -> Generator:
-    """The averaged generator of a run of ours, or a published one (a .pt file).
-
-    Raises:
-        FileNotFoundError: there is no such file or run.
-        ValueError: no source, damaged, needs code to be run, or no generator.
-    """
+    """The averaged generator of a run of ours, or a published one (a .pt file)."""
     if source is None:
         raise ValueError(
             "name the generator to invert, as in --set generator=RUN (a run of derender train --model "
@@ -311,12 +282,3 @@ def open_generator(source: str | Path | None) -> Generator:
     model = load_baseline(source, "stylegan2")
     assert isinstance(model, Stylegan)
     return model.generator
-
-
-def open_e4e(name: str, source: str | Path | None, image_size: int = 0, seed: int = 0) -> E4e:
-    """The encoder of a run, or a published one (a .pt file); see `registry.open_baseline`."""
-    if source is not None and Path(source).suffix.lower() == ".pt":
-        from derender.baselines.published import load_published_e4e
-
-        return load_published_e4e(source)
-    return open_run(name, source)

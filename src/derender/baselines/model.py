@@ -1,12 +1,15 @@
-"""The base of every baseline with a network: its features, its losses in training, and its saved folder.
+"""The base of every baseline with a network: its features, its losses, its saved folder and its training run.
 
-The folder holds `config.json` (which baseline, its settings) and `model.safetensors`, nothing that can run
-code; pickles (.pth, .pt, .ckpt) are never opened. Leaves out the training itself (training.py).
+A saved folder holds `config.json` (which baseline, its settings) and `model.safetensors`, nothing that can
+run code; pickles are never opened. Checkpoints, exact resume, early stop and reports are those of our own
+model (training/loop.py).
 """
 
 import importlib
 import json
-from collections.abc import Callable
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -17,19 +20,38 @@ from jaxtyping import Float, UInt8
 from pydantic import ValidationError
 from torch import Generator, Tensor, nn
 
-from derender.baselines.registry import network_type
-from derender.data import suggestion
+from derender.baselines import network_type
+from derender.data import ImageSet, split_indices, suggestion
 from derender.settings import Settings
 from derender.storage.atomic import atomic_folder
 from derender.storage.tensors import read_tensors, write_tensors
+from derender.training import run_folder
 from derender.training.checkpoint import fit_weights
-from derender.training.task import Precision
+from derender.training.config import FinetuneConfig, OptimiserSettings, TrainConfig, with_changes
+from derender.training.loop import train_task
+from derender.training.task import (
+    Held,
+    PhaseProgress,
+    Precision,
+    Progress,
+    StepLosses,
+    TrainingTask,
+    TrainResult,
+)
+from derender.training.watch import FiniteWatch
 
 FORMAT = 1
 WEIGHTS_FILE, CONFIG_FILE = "model.safetensors", "config.json"
+PICKLES = (".pth", ".pt", ".ckpt", ".pkl", ".pickle", ".bin")
+ADAM = OptimiserSettings(learning_rate=1e-3, weight_decay=0.0)
+"""The optimiser of most baselines."""
+OUTSIDE_LOSS = ("l1", "codes_used", "active", "found")
+"""Numbers that ``losses`` returns beside the losses."""
 Images = Float[Tensor, "n 3 h w"]
 """Images, in 0..1 where nothing else is said."""
-PICKLES = (".pth", ".pt", ".ckpt", ".pkl", ".pickle", ".bin")
+Features = dict[str, Float[Tensor, "n _"]]
+SheetOf = Callable[[Callable[[Any, Tensor], dict[str, Tensor]]], Any]
+"""Makes the loop's drawing function from one that gives images by column."""
 
 
 def optional(package: str, needed_for: str) -> ModuleType:
@@ -43,38 +65,19 @@ def optional(package: str, needed_for: str) -> ModuleType:
         ) from error
 
 
-@dataclass(frozen=True)
-class LossInputs:
-    """Everything that losses depend on besides network and images.
-
-    Attributes:
-        config: settings of the run.
-        generator: of all randomness.
-        precision: makes the context in which the network computes.
-        aid: the result of ``BaselineModel.prepare``.
-    """
-
-    config: Any
-    generator: Generator
-    precision: Precision
-    aid: Any = None
-
-
 class BaselineSettings(Settings):
     """The settings that every baseline has: the side of its input images, in pixels."""
 
     image_size: int = 64
 
 
-class BaselineModel(nn.Module):
+class BaselineModel(nn.Module, ABC):
     """A network that computes one or more features of an image.
 
     Attributes:
-        name: its row in the registry.
+        name: its name in the package's list.
         features: every feature it can compute; the first is the default.
-        settings_type: of the network, as its saved folder has them.
-        config_type: settings of a training run; its ``model`` is what ``build`` starts from.
-        not_judged: names of losses that say nothing about held-out images.
+        settings_type, config_type: settings of the network, and of a training run.
         chosen: the features that ``embed`` returns.
     """
 
@@ -82,31 +85,17 @@ class BaselineModel(nn.Module):
     features: ClassVar[tuple[str, ...]]
     settings_type: ClassVar[type[BaselineSettings]]
     config_type: ClassVar[type[Settings]]
-    not_judged: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, settings: BaselineSettings):
         super().__init__()
-        self.settings = settings
-        self.chosen = self.features[:1]
+        self.settings, self.chosen = settings, self.features[:1]
 
     @classmethod
-    def build(cls, config: Any) -> "BaselineModel":
-        """The untrained network of a run; an error if the configuration names something that is missing."""
-        return cls(config.model)
-
-    @staticmethod
-    def prepare(
-        config: Any, images: UInt8[Tensor, "n 3 h w"], file: Path, progress: Callable[[int, int], None]
-    ) -> Any:
-        """The ``aid`` that the losses need besides the network, from the training images; None if nothing.
-
-        ``file`` keeps it for a resumed run.
-        """
-        return None
-
-    def losses(self, images: Images, run: LossInputs) -> dict[str, Tensor]:
-        """Losses and other numbers of a batch in 0..1, by name (training.OUTSIDE_LOSS names the others)."""
-        raise NotImplementedError
+    def open(cls, source: str | Path | None, *, image_size: int = 0, seed: int = 0) -> "BaselineModel":
+        """A trained one; see `open_baseline`."""
+        if source is None:
+            raise ValueError(f"the baseline {cls.name} needs a model: its run folder")
+        return load_baseline(source, cls.name)
 
     @property
     def image_size(self) -> int:
@@ -117,11 +106,11 @@ class BaselineModel(nn.Module):
     def device(self) -> torch.device:
         return next(self.parameters()).device
 
-    def describe(self, images: Images) -> dict[str, Float[Tensor, "n _"]]:
+    @abstractmethod
+    def describe(self, images: Images) -> Features:
         """Every feature of images in 0..1, by name."""
-        raise NotImplementedError
 
-    def embed(self, images: Images) -> dict[str, Float[Tensor, "n _"]]:
+    def embed(self, images: Images) -> Features:
         """The chosen features of images in 0..1, by name."""
         size = self.image_size
         if tuple(images.shape[1:]) != (3, size, size):
@@ -132,20 +121,13 @@ class BaselineModel(nn.Module):
         every = self.describe(images)
         return {name: every[name] for name in self.chosen}
 
-    def shown(self, images: Images, config: Any) -> dict[str, Images]:
-        """Images for a sample sheet of a run, by column: the input and the network's output."""
-        return {"input": images}
-
     def choose(self, names: tuple[str, ...]) -> None:
         """Make ``embed`` return these features from now on."""
-        for name in names:
+        for name in names or ("",):
             if name not in self.features:
-                raise ValueError(
-                    f"{self.name} has no feature {name!r}{suggestion(name, self.features)}; "
-                    f"it has {', '.join(self.features)}"
-                )
-        if not names:
-            raise ValueError(f"name at least one feature; {self.name} has {', '.join(self.features)}")
+                close = suggestion(name, self.features)
+                known = ", ".join(self.features)
+                raise ValueError(f"{self.name} has no feature {name!r}{close}; it has {known}")
         self.chosen = tuple(names)
 
     def save(self, folder: str | Path, *, overwrite: bool = False) -> Path:
@@ -163,28 +145,24 @@ class BaselineModel(nn.Module):
 def load_baseline(source: str | Path, name: str | None = None) -> BaselineModel:
     """The baseline saved in a run folder or a model folder, in evaluation mode, without gradient.
 
-    Args:
-        source: the folder.
-        name: which baseline it has to be; None accepts any.
+    ``name`` says which baseline it has to be; None accepts any.
 
     Raises:
         FileNotFoundError: there is no such folder.
         ValueError: it is a pickle, damaged, of another architecture, another baseline, or none.
     """
     folder = _folder_of(Path(source))
-    config = _config_of(folder)
-    stored, file = str(config["baseline"]), folder / WEIGHTS_FILE
+    config, file = _config_of(folder), folder / WEIGHTS_FILE
+    stored = str(config["baseline"])
     if name not in (None, stored):
         raise ValueError(f"{folder} holds the baseline {stored!r}, asked for {name}")
     kind = network_type(stored)
     try:
-        model = kind(kind.settings_type.model_validate(config["settings"]))
+        model: BaselineModel = kind(kind.settings_type.model_validate(config["settings"]))
     except ValidationError as error:
         first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"])
-        raise ValueError(
-            f"{folder / CONFIG_FILE}: setting {key!r}: {first['msg']}; train it again"
-        ) from error
+        setting = f"setting {'.'.join(map(str, first['loc']))!r}: {first['msg']}"
+        raise ValueError(f"{folder / CONFIG_FILE}: {setting}; train it again") from error
     try:
         weights = read_tensors(file)
     except (ValueError, OSError) as error:
@@ -196,28 +174,16 @@ def load_baseline(source: str | Path, name: str | None = None) -> BaselineModel:
     return model.eval().requires_grad_(False)
 
 
-def open_run(name: str, source: str | Path | None, image_size: int = 0, seed: int = 0) -> Any:
-    """A saved baseline of that name; see `registry.open_baseline`."""
-    if source is None:
-        raise ValueError(f"the baseline {name} needs a model: its run folder")
-    return load_baseline(source, name)
-
-
 def _folder_of(source: Path) -> Path:
-    if source.suffix.lower() in PICKLES:
-        raise ValueError(
-            f"{source} is a pickle, which can run code when it is read: give a run folder with "
-            f"{WEIGHTS_FILE} in it"
-        )
     for candidate in (source, source / "model"):
-        if (candidate / CONFIG_FILE).is_file() and (candidate / WEIGHTS_FILE).is_file():
+        if all((candidate / file).is_file() for file in (CONFIG_FILE, WEIGHTS_FILE)):
             return candidate
-    pickles = sorted(p.name for p in source.iterdir() if p.suffix in PICKLES) if source.is_dir() else []
-    if pickles:
-        raise ValueError(
-            f"{source} holds {pickles[0]}, a pickle, which can run code when it is read; it is not opened: "
-            f"save the weights as {WEIGHTS_FILE}"
-        )
+    for file in (source, *(sorted(source.iterdir()) if source.is_dir() else ())):
+        if file.suffix.lower() in PICKLES:
+            raise ValueError(
+                f"{file} is a pickle, which can run code when it is read, and is not opened: give a run "
+                f"folder with {WEIGHTS_FILE} in it"
+            )
     raise FileNotFoundError(
         f"no baseline at {source} (expected {CONFIG_FILE} and {WEIGHTS_FILE} there or in 'model'): "
         "give a run folder made by 'derender train --model NAME'"
@@ -225,12 +191,11 @@ def _folder_of(source: Path) -> Path:
 
 
 def _config_of(folder: Path) -> dict[str, Any]:
-    file = folder / CONFIG_FILE
     try:
-        config = json.loads(file.read_text())
+        config = json.loads((folder / CONFIG_FILE).read_text())
         version, complete = config["format"], isinstance(config.get("settings"), dict)
-    except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
-        raise ValueError(f"{file} is damaged: copy or train the model again") from error
+    except (ValueError, LookupError, TypeError, RecursionError):
+        version, complete, config = 0, False, {"baseline": None}
     if not isinstance(version, int) or version > FORMAT:
         raise ValueError(
             f"{folder} was saved in format {version}, this version reads up to {FORMAT}: update derender"
@@ -238,5 +203,181 @@ def _config_of(folder: Path) -> dict[str, Any]:
     if "baseline" not in config:
         raise ValueError(f"{folder} holds a derender model and no baseline: leave the baseline's name out")
     if not complete:
-        raise ValueError(f"{file} is damaged: copy or train the model again")
+        raise ValueError(f"{folder / CONFIG_FILE} is damaged: copy or train the model again")
     return config
+
+
+@dataclass(frozen=True)
+class LossInputs:
+    """What losses depend on besides network and images; ``aid`` is the result of ``LoopModel.prepare``."""
+
+    config: Any
+    generator: Generator
+    precision: Precision
+    aid: Any = None
+
+
+class LoopModel(BaselineModel):
+    """A baseline that learns in the common training loop; its configuration's ``model`` has the sizes.
+
+    ``not_judged`` names losses that say nothing about held-out images.
+    """
+
+    not_judged: ClassVar[tuple[str, ...]] = ()
+
+    @classmethod
+    def build(cls, config: Any) -> "LoopModel":
+        """The untrained network of a run; an error if the configuration names something that is missing."""
+        return cls(config.model)
+
+    @staticmethod
+    def prepare(config: Any, images: UInt8[Tensor, "n 3 h w"], file: Path, progress: PhaseProgress) -> Any:
+        """What the losses need besides the network, from the training images; ``file`` keeps it."""
+        return None
+
+    @abstractmethod
+    def losses(self, images: Images, run: LossInputs) -> dict[str, Tensor]:
+        """Losses and other numbers (OUTSIDE_LOSS) of a batch in 0..1, by name."""
+
+    @abstractmethod
+    def shown(self, images: Images, config: Any) -> dict[str, Images]:
+        """Images for a sample sheet of a run, by column: the input and the network's output."""
+
+    @classmethod
+    def train_into(
+        cls,
+        config: Any,
+        images: ImageSet,
+        out: str | Path,
+        *,
+        sample_sheet: SheetOf | None = None,
+        **how: Any,
+    ) -> TrainResult:
+        """Train in the common loop; see `train_baseline`."""
+        task = BaselineTask(config)
+        sheet = None if sample_sheet is None else sample_sheet(task.shown)
+        return train_task(task, images, out, sample_sheet=sheet, **how)
+
+
+@dataclass(frozen=True)
+class BaselineTask(TrainingTask):
+    """Train a baseline as its configuration says."""
+
+    config: Any
+
+    @property
+    def network(self) -> type[LoopModel]:
+        return network_type(self.config.baseline)
+
+    @property
+    def outside_loss(self) -> tuple[str, ...]:
+        """Names of numbers by which held-out images are not judged."""
+        return (*OUTSIDE_LOSS, *self.network.not_judged)
+
+    def check(self) -> None:
+        """A missing package or model is an error before a folder is made."""
+        self.build()
+
+    def build(self) -> LoopModel:
+        """The untrained network; torch's global generator is left as it was."""
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(self.config.seed)
+            return self.network.build(self.config)
+
+    def step_module(
+        self, model: nn.Module, run: run_folder.RunFolder, images: UInt8[Tensor, "n 3 h w"],
+        progress: PhaseProgress,
+    ) -> "BaselineStep":  # fmt: skip
+        aid = self.network.prepare(self.config, images, run.perceptual, progress)
+        return BaselineStep(model, self.config, aid)
+
+    def watch(self, memory: dict[str, Any]) -> FiniteWatch:
+        """Stops a run whose loss is NaN or infinite."""
+        return FiniteWatch()
+
+    def shown(self, model: LoopModel, images: Images) -> dict[str, Tensor]:
+        """Images for a sample sheet, by column."""
+        return model.shown(images, self.config)
+
+
+class BaselineStep(nn.Module):
+    """A baseline and its losses; a batch goes in, the total and the result come out."""
+
+    def __init__(self, model: nn.Module, config: Any, aid: Any):
+        super().__init__()
+        self.model, self.config = model, config
+        self.aid = [aid]  # in a list: its weights are not this module's
+
+    def forward(
+        self, images: Tensor, generator: Generator, precision: Precision, *_: Any
+    ) -> tuple[Tensor, Held]:
+        assert isinstance(self.model, LoopModel)
+        terms = self.model.losses(images, LossInputs(self.config, generator, precision, self.aid[0]))
+        total = torch.stack([term for name, term in terms.items() if name not in OUTSIDE_LOSS]).sum()
+        return total, Held(StepLosses(total, {name: term.detach() for name, term in terms.items()}))
+
+
+class ShortRun:
+    """A run folder filled in one go of minutes, without checkpoints; arguments as for `train_baseline`."""
+
+    def __init__(
+        self, config: Any, images: ImageSet, out: str | Path, *, resume: bool = False,
+        progress: Callable[[Progress], None] | None = None, accelerator: str = "cpu",
+    ):  # fmt: skip
+        if resume:
+            raise ValueError(
+                f"{config.baseline} trains in minutes and is not resumed: train it again into another folder"
+            )
+        self.split = split_indices(images.files, config.split, seed=config.seed)
+        data = run_folder.describe_data(images, self.split)
+        self.folder = run_folder.start_run(Path(out), config, data, accelerator)
+        self.report, self.began = progress or (lambda _: None), time.perf_counter()
+
+    @property
+    def seconds(self) -> float:
+        """Time since the start."""
+        return time.perf_counter() - self.began
+
+    def note(self, done: int, total: int, terms: dict[str, float] | None = None) -> None:
+        """Report progress, in images."""
+        self.report(Progress("train", done, total, done / self.seconds, terms))
+
+    def record(self, kind: str, images: int, numbers: dict[str, float]) -> None:
+        """A line of metrics.jsonl."""
+        row = {"kind": kind, "images": images, "seconds": round(self.seconds, 2), **numbers}
+        run_folder.append_metrics(self.folder, row)
+
+    def finish(self, model: BaselineModel, images: int, numbers: dict[str, float]) -> TrainResult:
+        """Save the model; ``numbers`` are the last scores by name."""
+        seconds = self.seconds
+        model.save(self.folder.model)
+        return TrainResult(self.folder.path, images, seconds, images / seconds, numbers, "images", ())
+
+
+def baseline_config(name: str, overrides: Sequence[str] = ()) -> Settings:
+    """The settings of a baseline's run, with ``key=value`` changes."""
+    return with_changes(network_type(name).config_type(), overrides)
+
+
+def read_any_config(path: Path) -> Any:
+    """The configuration of a run: of our model, a fine-tuning, or a baseline."""
+    tree = run_folder.read_config_tree(path)
+    name, ours = tree.get("baseline"), FinetuneConfig if "target" in tree else TrainConfig
+    return run_folder.read_config(path, ours if name is None else network_type(str(name)).config_type)
+
+
+def stored_config(run: Path, name: str) -> Any:
+    """The settings of a run to go on with, which has to be of ``name`` ("derender": of any)."""
+    config = read_any_config(run)
+    if isinstance(config, FinetuneConfig):
+        raise ValueError(f"{run} was made by derender finetune: go on with derender finetune --resume")
+    trained = getattr(config, "baseline", "derender")
+    if name not in ("derender", trained):
+        raise ValueError(f"{run} trained {trained}, not {name}: give model {trained} or another folder")
+    return config
+
+
+def image_size_of(config: Any) -> int:
+    """Side of the images that a run takes, in pixels."""
+    model = getattr(config, "model", config)
+    return getattr(model, "network", model).image_size

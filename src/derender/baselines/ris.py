@@ -1,33 +1,50 @@
 """Retrieve in Style as a baseline: the style-space code of an image, weighted by each part's row of a matrix.
 
 Source: Chong et al., *Retrieve in Style* (ICCV 2021), after Collins et al., *Editing in Style* (CVPR 2020).
-Features of a part are style space times how much of each channel belongs to the part; images are compared by
-cosine. With the published FFHQ networks 8 parts have 8 x 9,088 numbers. The image is inverted by e4e.
+Features of a part are style space times how much of each channel belongs to the part (8 x 9,088 numbers with
+the published FFHQ networks); images are compared by cosine and inverted by e4e.
 
-A channel's score for a part is its squared, instance-normalised activation averaged over the part. A softmax
-over parts at temperature 0.1, cut below 0.8, assigns a channel to a part, if to any. Channels that make
-colours belong to none; those of the four coarsest layers (2,048 in the published network) rotate the head and
-belong to hair alone, the rest of them to the pose. Leaves out the masks that name the parts
-(ris_catalogue.py).
+The catalogue: clusters are found among the activations of random images of the generator, by spherical
+k-means of squared activations of a 32x32 layer. Images with part masks, inverted, show which part each
+cluster is (in the source people name the 18 clusters); the clusters then mark the parts in the random images.
+A channel's score for a part is its squared, instance-normalised activation there, averaged. A softmax over
+parts at temperature 0.1, cut below 0.8, assigns a channel to a part, if to any. Channels that make colours
+belong to none; those of the four coarsest layers (2,048 in the published network) belong to hair alone, the
+rest of them to the pose.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int64
 from pydantic import Field
+from torch import Generator as RandomGenerator
 from torch import Tensor
-from torch.nn.functional import adaptive_avg_pool2d, interpolate
+from torch.nn.functional import adaptive_avg_pool2d, interpolate, normalize, one_hot
 
 from derender.baselines.e4e import E4e, E4eSettings
-from derender.baselines.model import BaselineModel, Images
-from derender.baselines.stylegan2_generator import TINY, StyleLayer
-from derender.data import suggestion
+from derender.baselines.model import BaselineModel, Features, Images, SheetOf, ShortRun
+from derender.baselines.stylegan2_generator import TINY, Codes, Maps, StyleLayer
+from derender.data import ImageSet, read_masks, split_indices, suggestion
 from derender.settings import Settings
+from derender.training.batches import random_stream
+from derender.training.loop import SAMPLE_COUNT
+from derender.training.task import TrainResult
 
 COARSE_LAYERS = 4  # styles at 4 and 8 pixels, before the first that paints 8 pixels' colours
 HAIR, POSE = "hair", "pose"
+FACE_PARTS = {
+    **dict.fromkeys(("l_ear", "r_ear", "ear_r"), "ears"),
+    **dict.fromkeys(("l_eye", "r_eye", "l_brow", "r_brow", "eye_g"), "eyes"),
+    **dict.fromkeys(("mouth", "u_lip", "l_lip"), "mouth"),
+    **dict.fromkeys(("neck", "neck_l", "cloth"), "neck"),
+    "hat": "hair",
+}
+"""CelebAMask-HQ's classes as eight parts; other classes keep their names."""
+BATCH = 16
 
 
 class RisConfig(Settings):
@@ -66,21 +83,17 @@ class Ris(BaselineModel):
 
     def __init__(self, settings: RisSettings):
         super().__init__(settings)
-        own = set(RisSettings.model_fields) - set(E4eSettings.model_fields)
-        self.e4e = E4e(E4eSettings(**settings.model_dump(exclude=own)))
+        self.e4e = E4e(E4eSettings(**settings.model_dump(include=set(E4eSettings.model_fields))))
         self.features = (*settings.parts, POSE)  # pyright: ignore[reportAttributeAccessIssue]
         self.chosen = self.features
-        layers = self.e4e.generator.layers
-        width = layers[settings.cluster_layer].channels
-        self.register_buffer("centres", torch.zeros(settings.clusters, width))
+        widths = [layer.channels for layer in self.e4e.generator.layers]
+        self.register_buffer("centres", torch.zeros(settings.clusters, widths[settings.cluster_layer]))
         self.register_buffer("cluster_part", torch.zeros(settings.clusters, dtype=torch.int64))
-        channels = sum(layer.channels for layer in layers)
-        self.register_buffer("matrix", torch.zeros(len(self.features), channels))
+        self.register_buffer("matrix", torch.zeros(len(self.features), sum(widths)))
 
     def styles(self, images: Images) -> Float[Tensor, "n s"]:
         """Style space of images in 0..1."""
-        net = self.e4e.generator
-        return torch.cat(net.styles(self.e4e.invert(images)), dim=1)
+        return torch.cat([*self.e4e.generator.styles(self.e4e.invert(images))], dim=1)
 
     def row(self, part: str) -> Float[Tensor, " s"]:
         """How much of each style channel belongs to a part, 0..1."""
@@ -89,14 +102,15 @@ class Ris(BaselineModel):
             raise ValueError(f"no part {part!r}{suggestion(part, self.features)}; there is {known}")
         return self.matrix[self.features.index(part)]
 
-    def describe(self, images: Images) -> dict[str, Float[Tensor, "n _"]]:
+    def describe(self, images: Images) -> Features:
         styles = self.styles(images)
         return {part: styles * self.row(part) for part in self.features}
 
     def rebuild(self, styles: Float[Tensor, "n s"]) -> Images:
         """Images, about 0..1, from style space."""
         net = self.e4e.generator
-        return net.synthesise(net.split_styles(styles), net.fixed_noise()) / 2 + 0.5
+        layers = styles.split([layer.channels for layer in net.layers], dim=1)
+        return net.synthesise(layers, net.fixed_noise()) / 2 + 0.5
 
     def swapped(self, images: Images, others: Images, part: str) -> Float[Tensor, "n 3 h2 w2"]:
         """Inversions of images with one part taken from others."""
@@ -104,18 +118,189 @@ class Ris(BaselineModel):
         return self.rebuild(own + self.row(part) * (other - own))
 
     def shown(self, images: Images, config: Any = None) -> dict[str, Images]:
-        side = images.shape[-1]
         columns = {"input": images, "inversion": self.rebuild(self.styles(images))}
         for part in self.features:
             columns[f"{part} of the next"] = self.swapped(images, images.roll(-1, dims=0), part)
+        side = images.shape[-1]
         return {name: adaptive_avg_pool2d(column, side).clamp(0, 1) for name, column in columns.items()}
 
+    @classmethod
+    def train_into(
+        cls, config: RisConfig, images: ImageSet, out: str | Path, *, sample_sheet: SheetOf | None = None,
+        resume: bool = False, accelerator: str = "cpu", **how: Any,
+    ) -> TrainResult:  # fmt: skip
+        """Build a catalogue into a new run folder; see `registry.train_baseline`. No resume.
 
-def nearest_cluster(
-    activation: Float[Tensor, "n c h w"], centres: Float[Tensor, "k c"]
-) -> Int64[Tensor, "n h w"]:
+        Raises:
+            FileExistsError: the folder is not empty.
+            ValueError: no encoder was named, or the images have no masks.
+        """
+        if config.e4e is None and not resume:
+            raise ValueError(
+                "name the encoder whose generator is catalogued, as in --set e4e=RUN (a run of derender "
+                "train --model e4e) or a published file"
+            )
+        e4e = E4e.open(config.e4e).to(accelerator)
+        assert isinstance(e4e, E4e)
+        if e4e.image_size != config.image_size:
+            raise ValueError(
+                f"{config.e4e} takes images of {e4e.image_size} pixels: set image_size={e4e.image_size}"
+            )
+        inputs, parts, names = masked_rows(images, config)
+        run = ShortRun(config, images, out, resume=resume, accelerator=accelerator, **how)
+        inputs, parts = inputs.to(accelerator), parts.to(accelerator)
+        model = build_catalogue(e4e, inputs, parts, names, config, progress=run.note)
+        channels = {part: float(model.row(part).gt(0).sum()) for part in model.features}
+        run.record("train", len(inputs), channels)
+        if sample_sheet is not None:
+            sheet = sample_sheet(cls.shown)(model, inputs[:SAMPLE_COUNT])
+            sheet.save(run.folder.samples / f"{len(inputs):09d}.png")
+        return run.finish(model, len(inputs), channels)
+
+
+def masked_rows(
+    images: ImageSet, config: RisConfig
+) -> tuple[Images, Float[Tensor, "n p h w"], tuple[str, ...]]:
+    """The training part's images, a map of 0 and 1 for every part that occurs, and the parts' names.
+
+    Raises:
+        ValueError: some images have no masks.
+    """
+    where: dict[str, Any] = {} if config.masks is None else {"masks": config.masks}
+    masked = read_masks(images.source, config.image_size, **where)
+    row_of = {file: row for row, file in enumerate(masked.images.files)}
+    train = split_indices(images.files, config.split, seed=config.seed).train
+    rows = np.array([row_of[images.files[index]] for index in train])
+    masks = torch.from_numpy(masked.masks[rows].astype(np.int64))
+    named = [FACE_PARTS.get(name, name) for name in masked.classes]
+    present = {named[number] for number in masks.unique().tolist()}
+    names = tuple(part for part in dict.fromkeys(named) if part in present)
+    table = torch.tensor([[float(part == name) for name in names] for part in named])
+    inputs = torch.from_numpy(masked.images.images[rows]).float() / 255
+    return inputs, table[masks].movedim(-1, 1), names
+
+
+def build_catalogue(
+    e4e: E4e,
+    images: Images,
+    parts: Float[Tensor, "n p h w"],
+    names: tuple[str, ...],
+    config: RisConfig,
+    *,
+    progress: Callable[[int, int], None] = lambda _done, _total: None,
+) -> Ris:
+    """Cluster, name and score: a model ready to embed.
+
+    Args:
+        e4e: the inversion and its generator.
+        images: in 0..1 at the encoder's size.
+        parts: 1 where a pixel shows the part and 0 elsewhere.
+        names: of the parts.
+        config: sizes and the seed.
+        progress: called with (images done, all).
+    """
+    net, total, done = e4e.generator, 2 * config.samples + len(images), 0
+
+    def activations(rows: Tensor, to_codes: Callable[[Tensor], Codes]):
+        """For each batch of rows, the activation that each style scales."""
+        nonlocal done
+        for batch in rows.split(BATCH):
+            seen: list[Tensor] = []
+            with torch.no_grad():
+                net.synthesise(net.styles(to_codes(batch)), net.fixed_noise(), seen)
+            yield seen
+            done += len(batch)
+            progress(done, total)
+
+    sizes = [layer.resolution for layer in net.layers]  # the last layer of that side, or of the next smaller
+    side = max(size for size in sizes if size <= max(config.cluster_side, min(sizes)))
+    layer = len(sizes) - 1 - sizes[::-1].index(side)
+    random = random_stream(config.seed, "perturb", 1)
+    w, places = net.random_w(config.samples, random), []
+    for seen in activations(w, net.w_plus):
+        squared = seen[layer].square().movedim(1, -1).flatten(0, 2)
+        chosen = torch.randperm(len(squared), generator=random)[: 64 * len(seen[layer])]
+        places.append(squared[chosen.to(squared.device)])
+    centres = spherical_kmeans(torch.cat(places), config.clusters, random)
+
+    clusters = [nearest_cluster(seen[layer], centres) for seen in activations(images, e4e.invert)]
+    at_side = adaptive_avg_pool2d(parts, side)
+    cluster_part = name_clusters(torch.cat(clusters), config.clusters, at_side)
+
+    energy: list[Any] = [0.0] * len(net.layers)
+    area: list[Any] = [0.0] * len(net.layers)
+    for seen in activations(w, net.w_plus):
+        shown = cluster_part[nearest_cluster(seen[layer], centres)]
+        masks = one_hot(shown, len(names)).movedim(-1, 1).to(w)
+        for number, activation in enumerate(seen):
+            more, places_of = part_energy(activation, masks)
+            energy[number] = energy[number] + more
+            area[number] = area[number] + places_of[:, None].clamp(min=TINY)
+    scores = torch.cat([e / a for e, a in zip(energy, area, strict=True)], dim=1)
+    matrix = part_matrix(
+        scores, net.layers, names, temperature=config.temperature, threshold=config.threshold
+    )
+    own = {"parts": names, "clusters": config.clusters, "cluster_layer": layer}
+    model = Ris(RisSettings(**e4e.settings.model_dump(), **own)).to(images.device)
+    model.e4e.load_state_dict(e4e.state_dict())
+    for name, value in (("centres", centres), ("cluster_part", cluster_part), ("matrix", matrix)):
+        model.get_buffer(name).copy_(value)
+    return model.eval().requires_grad_(False)
+
+
+def spherical_kmeans(
+    vectors: Float[Tensor, "n c"], clusters: int, generator: RandomGenerator, *, rounds: int = 50
+) -> Float[Tensor, "k c"]:
+    """Centres of unit length such that rows have large cosines with their nearest one.
+
+    Initial centres are far from each other (as in k-means++); a cluster that loses all rows gets the row that
+    is farthest from its own centre. Ends when no row changes its cluster.
+
+    Raises:
+        ValueError: there are fewer rows than clusters.
+    """
+    if len(vectors) < clusters:
+        raise ValueError(
+            f"{clusters} clusters need at least as many places, got {len(vectors)}: give more images"
+        )
+    rows = normalize(vectors, dim=1)
+    centres = rows[torch.randint(len(rows), (1,), generator=generator).to(rows.device)]
+    while len(centres) < clusters:
+        far = (1 - (rows @ centres.T).amax(dim=1)).clamp(min=TINY)
+        drawn = torch.multinomial(far.cpu(), 1, generator=generator).to(rows.device)
+        centres = torch.cat([centres, rows[drawn]])
+    assigned = torch.full((len(rows),), -1, device=rows.device)
+    for _ in range(rounds):
+        cosine, found = (rows @ centres.T).max(dim=1)
+        if torch.equal(found, assigned):
+            break
+        assigned = found
+        sums = torch.zeros_like(centres).index_add_(0, assigned, rows)
+        empty = torch.bincount(assigned, minlength=clusters) == 0
+        sums[empty] = rows[cosine.argsort()[: int(empty.sum())]]
+        centres = normalize(sums, dim=1)
+    return centres
+
+
+def nearest_cluster(activation: Maps, centres: Float[Tensor, "k c"]) -> Int64[Tensor, "n h w"]:
     """The cluster of every place, by the direction of its squared activation."""
     return torch.einsum("nchw,kc->nkhw", activation.square(), centres).argmax(dim=1)
+
+
+def name_clusters(
+    clusters: Int64[Tensor, "n h w"], count: int, parts: Float[Tensor, "n p h w"]
+) -> Int64[Tensor, " k"]:
+    """The part of each of ``count`` clusters.
+
+    ``parts`` are shares of every place. A cluster goes to the part with the largest share * log(share / the
+    part's share of everything), so that small parts are found where they gather. A cluster without places
+    goes to the part that has most.
+    """
+    member, flat = one_hot(clusters, count).flatten(0, 2).to(parts), parts.movedim(1, -1).flatten(0, 2)
+    shares = (member.T @ flat) / member.sum(dim=0).clamp(min=1)[:, None]
+    overall = flat.mean(dim=0)
+    gain = torch.where(shares > 0, shares * (shares / overall.clamp(min=TINY)).clamp(min=TINY).log(), 0.0)
+    return torch.where(member.sum(dim=0) == 0, overall.argmax(), gain.argmax(dim=1))
 
 
 def part_energy(
@@ -123,9 +308,9 @@ def part_energy(
 ) -> tuple[Float[Tensor, "p c"], Float[Tensor, " p"]]:
     """Summed squared, instance-normalised activation of every channel over every part, and the parts' areas.
 
-    The first over the second is a part's score: 1 on average over all places. The distance from the
-    channel's mean is squared: a channel that is on in most of the image scores highest where it is off.
-    ``parts`` are shares of every place, at any resolution.
+    The first over the second is a part's score: 1 on average over all places. The distance from the channel's
+    mean is squared: a channel that is on in most of the image scores highest where it is off. ``parts`` are
+    shares of every place, at any resolution.
     """
     size = (activation.shape[2], activation.shape[3])
     shrinks = size[0] <= parts.shape[-2]
@@ -136,23 +321,10 @@ def part_energy(
 
 
 def part_matrix(
-    scores: Float[Tensor, "p s"],
-    layers: Sequence[StyleLayer],
-    parts: Sequence[str],
-    *,
-    temperature: float = 0.1,
-    threshold: float = 0.8,
-) -> Float[Tensor, "p1 s"]:
-    """How much of each style channel belongs to each part, 0..1; the last row is the pose.
-
-    Raises:
-        ValueError: scores do not fit parts or layers.
-    """
-    channels = sum(layer.channels for layer in layers)
-    if tuple(scores.shape) != (len(parts), channels):
-        raise ValueError(
-            f"scores of {len(parts)} parts and {channels} style channels expected, got {tuple(scores.shape)}"
-        )
+    scores: Float[Tensor, "p s"], layers: Sequence[StyleLayer], parts: Sequence[str], *,
+    temperature: float = 0.1, threshold: float = 0.8,
+) -> Float[Tensor, "p1 s"]:  # fmt: skip
+    """How much of each style channel belongs to each part, 0..1; the last row is the pose."""
     matrix = (scores / temperature).softmax(dim=0)
     matrix = torch.where(matrix >= threshold, matrix, 0.0)
     widths = torch.tensor([layer.channels for layer in layers])
@@ -160,9 +332,7 @@ def part_matrix(
     coarse = of_channel < COARSE_LAYERS
     colour = torch.tensor([layer.colour for layer in layers], device=scores.device)[of_channel]
     matrix[:, colour] = 0
-    for row, part in enumerate(parts):
-        if part != HAIR:
-            matrix[row, coarse] = 0
-    hair = matrix[list(parts).index(HAIR)] if HAIR in parts else torch.zeros_like(matrix[0])
-    pose = torch.where(coarse & ~colour, 1 - hair, 0.0)
+    is_hair = torch.tensor([part == HAIR for part in parts], device=scores.device)
+    matrix[~is_hair[:, None] & coarse] = 0
+    pose = torch.where(coarse & ~colour, 1 - matrix[is_hair].sum(dim=0), 0.0)
     return torch.cat([matrix, pose[None]])

@@ -1,17 +1,16 @@
-"""SimCLR: an encoder that recognises two views of one image among all others.
+"""SimCLR: an encoder that recognises two views of one image among all others; and the augmentations.
 
 Source: Chen et al., *A Simple Framework for Contrastive Learning of Visual Representations* (ICML 2020): a
 projection head of two layers that is left out of the feature, NT-Xent at temperature 0.5. The encoder is that
-of our geometry net, so only its training signal differs. Two kinds of views:
-
-- ordinary: crop, flip, colour jitter, grey and blur (augment.py);
-- physical: renderings alone; a trained derender model decomposes each image, and both views show the scene
-  under other lighting and from another viewpoint, sampled as in LOOCC. What differs between views is then
-  exactly what the feature should not depend on.
-
-Leaves out LARS and batches of thousands.
+of our geometry net, so only its training signal differs. Ordinary views: crop, flip, colour jitter, grey and
+blur, each random for every image, with half the source's strengths for colours; crops keep more of the image
+by default. Physical views: a trained derender model decomposes each image, and both views show the scene
+under other lighting and from another viewpoint, sampled as in LOOCC; what differs between views is then
+exactly what the feature should not depend on. Leaves out LARS, batches of thousands, and hue in HSV: colours
+rotate about the grey axis of RGB.
 """
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
@@ -20,10 +19,10 @@ import torch
 from jaxtyping import Float, UInt8
 from pydantic import Field, model_validator
 from torch import Generator, Tensor, nn
+from torch.nn.functional import affine_grid, conv2d, grid_sample, normalize, pad
 
-from derender.baselines.augment import AugmentSettings, augment
-from derender.baselines.autoencoder import AutoencoderSettings
-from derender.baselines.model import BaselineModel, Images, LossInputs
+from derender.baselines.autoencoders import AutoencoderSettings
+from derender.baselines.model import Features, Images, LoopModel, LossInputs
 from derender.model import Derenderer, load
 from derender.objectives.loocc import nt_xent
 from derender.scene.perturb import PerturbSettings, perturb_camera, perturb_light
@@ -31,8 +30,101 @@ from derender.settings import Settings
 from derender.training.batches import random_stream
 from derender.training.config import LoopSettings, OptimiserSettings
 from derender.training.step import fill_uncovered
+from derender.training.task import PhaseProgress
 
+LUMINANCE = (0.299, 0.587, 0.114)
 Views = Callable[[Images, Generator], Images]
+
+
+class AugmentSettings(Settings):
+    """Strengths and probabilities; 0 switches one off (``crop_from`` 1 and ``aspect`` 1 do so with crops)."""
+
+    crop_from: float = Field(default=0.3, gt=0, le=1)  # smallest share of the area that a crop keeps
+    aspect: float = Field(default=4 / 3, ge=1)  # largest width over height of a crop, and its inverse
+    flip: float = Field(default=0.5, ge=0, le=1)
+    jitter: float = Field(default=0.8, ge=0, le=1)
+    brightness: float = Field(default=0.4, ge=0, lt=1)
+    contrast: float = Field(default=0.4, ge=0, lt=1)
+    saturation: float = Field(default=0.4, ge=0, lt=1)
+    hue_deg: float = Field(default=36.0, ge=0, le=180)
+    grey: float = Field(default=0.2, ge=0, le=1)
+    blur: float = Field(default=0.5, ge=0, le=1)
+    blur_px: tuple[float, float] = (0.1, 1.0)  # standard deviation, smallest and largest
+
+
+def augment(images: Images, settings: AugmentSettings, generator: Generator) -> Images:
+    """A random view of every image, in 0..1; the same generator gives the same views."""
+
+    def where(probability: float, changed: Tensor) -> Tensor:
+        chosen = torch.rand(len(images), generator=generator) < probability
+        return torch.where(chosen.to(images.device)[:, None, None, None], changed, images)
+
+    images = crop(images, settings, generator)
+    images = where(settings.flip, images.flip(-1))
+    images = where(settings.jitter, jitter(images, settings, generator))
+    images = where(settings.grey, grey(images))
+    return where(settings.blur, blur(images, settings.blur_px, generator))
+
+
+def crop(images: Images, settings: AugmentSettings, generator: Generator) -> Images:
+    """A part of every image, inside it, stretched to the full size (bilinear)."""
+    count, widest = len(images), math.log(settings.aspect)
+    area = _uniform((count,), settings.crop_from, 1.0, generator)
+    stretch = _uniform((count,), -widest, widest, generator).exp()
+    sides = torch.stack([(area * stretch).sqrt(), (area / stretch).sqrt()], dim=1).clamp(max=1.0)
+    centre = _uniform((count, 2), -1.0, 1.0, generator) * (1 - sides)  # -1..1 spans the image
+    change = torch.cat([torch.diag_embed(sides), centre[:, :, None]], dim=2).to(images)
+    grid = affine_grid(change, list(images.shape), align_corners=False)
+    return grid_sample(images, grid, padding_mode="border", align_corners=False)
+
+
+def jitter(images: Images, settings: AugmentSettings, generator: Generator) -> Images:
+    """Brightness, contrast about the image's mean grey, saturation about each pixel's grey, hue."""
+    shape, hue = (len(images), 1, 1, 1), math.radians(settings.hue_deg)
+
+    def away_from(centre: Tensor | float, strength: float) -> Tensor:
+        gain = _uniform(shape, 1 - strength, 1 + strength, generator).to(images)
+        return (centre + (images - centre) * gain).clamp(0, 1)
+
+    images = away_from(0.0, settings.brightness)
+    images = away_from(grey(images).mean(dim=(1, 2, 3), keepdim=True), settings.contrast)
+    images = away_from(grey(images), settings.saturation)
+    return rotate_hue(images, _uniform((len(images),), -hue, hue, generator).to(images)).clamp(0, 1)
+
+
+def rotate_hue(images: Images, angle_rad: Float[Tensor, " n"]) -> Images:
+    """Colours rotated about the grey axis of RGB; greys stay."""
+    cosine, sine = angle_rad.cos(), angle_rad.sin()
+    same = cosine + (1 - cosine) / 3
+    ahead = (1 - cosine) / 3 - sine / math.sqrt(3)
+    behind = (1 - cosine) / 3 + sine / math.sqrt(3)
+    rows = [(same, ahead, behind), (behind, same, ahead), (ahead, behind, same)]
+    rotation = torch.stack([torch.stack(row, dim=1) for row in rows], dim=1)
+    return torch.einsum("nij,njhw->nihw", rotation, images)
+
+
+def grey(images: Images) -> Images:
+    """Luminance in all three channels (ITU-R BT.601)."""
+    weights = torch.tensor(LUMINANCE, device=images.device, dtype=images.dtype).view(1, 3, 1, 1)
+    return (images * weights).sum(dim=1, keepdim=True).expand_as(images)
+
+
+def blur(images: Images, sigma_px: tuple[float, float], generator: Generator) -> Images:
+    """Gaussian blur with a standard deviation drawn for every image; borders are mirrored."""
+    count, channels, height, width = images.shape
+    sigma = _uniform((count, 1), *sigma_px, generator).to(images)
+    reach = min(math.ceil(3 * sigma_px[1]), height - 1, width - 1)
+    steps = torch.arange(-reach, reach + 1, device=images.device)
+    kernel = (-0.5 * (steps / sigma).square()).exp()
+    kernel = (kernel / kernel.sum(dim=1, keepdim=True)).repeat_interleave(channels, dim=0)
+    flat = images.reshape(1, count * channels, height, width)
+    flat = conv2d(pad(flat, (reach, reach, 0, 0), "reflect"), kernel[:, None, None, :], groups=len(kernel))
+    flat = conv2d(pad(flat, (0, 0, reach, reach), "reflect"), kernel[:, None, :, None], groups=len(kernel))
+    return flat.reshape(images.shape)
+
+
+def _uniform(shape: tuple[int, ...], low: float, high: float, generator: Generator) -> Tensor:
+    return low + (high - low) * torch.rand(shape, generator=generator)
 
 
 class SimclrSettings(AutoencoderSettings):
@@ -67,7 +159,7 @@ class SimclrConfig(LoopSettings):
     optimiser: OptimiserSettings = OptimiserSettings(learning_rate=1e-3, weight_decay=1e-6)
 
 
-class Simclr(BaselineModel):
+class Simclr(LoopModel):
     """Encoder and projection head. Features: ``features`` (the encoder's code) and ``projection``."""
 
     name, settings_type, config_type = "simclr", SimclrSettings, SimclrConfig
@@ -88,14 +180,11 @@ class Simclr(BaselineModel):
 
     @staticmethod
     def prepare(
-        config: SimclrConfig,
-        images: UInt8[Tensor, "n 3 h w"],
-        file: Path,
-        progress: Callable[[int, int], None],
+        config: SimclrConfig, images: UInt8[Tensor, "n 3 h w"], file: Path, progress: PhaseProgress
     ) -> Views:
         return views_of(config, images.device)
 
-    def describe(self, images: Images) -> dict[str, Float[Tensor, "n _"]]:
+    def describe(self, images: Images) -> Features:
         code = self.encoder(images)
         return {"features": code, "projection": self.head(code)}
 
@@ -109,18 +198,11 @@ class Simclr(BaselineModel):
             seen = torch.cat([run.aid(images, run.generator), run.aid(images, run.generator)])
         with run.precision():
             first, second = self.head(self.encoder(seen)).float().chunk(2)
-        return {
-            "nt_xent": nt_xent(first, second, run.config.objective.temperature),
-            "found": twin_found(first.detach(), second.detach()),
-        }
-
-
-def twin_found(first: Float[Tensor, "n d"], second: Float[Tensor, "n d"]) -> Float[Tensor, ""]:
-    """Share of the 2N views whose most similar other view is the other one of the same image, 0 to 1."""
-    codes = nn.functional.normalize(torch.cat([first, second]), dim=1)
-    similarity = (codes @ codes.T).fill_diagonal_(float("-inf"))
-    twin = (torch.arange(len(codes), device=codes.device) + len(first)) % len(codes)
-    return (similarity.argmax(dim=1) == twin).float().mean()
+        codes = normalize(torch.cat([first, second]).detach(), dim=1)
+        nearest = (codes @ codes.T).fill_diagonal_(float("-inf")).argmax(dim=1)
+        twin = torch.arange(len(codes), device=codes.device).roll(len(first))
+        loss = nt_xent(first, second, run.config.objective.temperature)
+        return {"nt_xent": loss, "found": (nearest == twin).float().mean()}
 
 
 def views_of(config: SimclrConfig, device: torch.device) -> Views:

@@ -1,12 +1,11 @@
 """StyleGAN2 as a baseline: its discriminator, and how it and the generator learn against each other.
 
-Source: Karras et al. (CVPR 2020): non-saturating logistic loss; R1 on real images every 16th step and path
-lengths every 4th, both weighted by their interval; style mixing; the generator that samples is a moving
-average, its half-life 10,000 images and at most a twentieth of those seen (as in *Training GANs with Limited
-Data*, 2020). The map of group deviations is that of *Progressive Growing of GANs* (ICLR 2018). Both networks
-see one batch of fakes and move in the same step, with one optimiser, so that the common training loop fits.
-Held-out images are judged by the energy distance between them and samples. Leaves out augmentation of the
-discriminator's input.
+Source: Karras et al. (CVPR 2020): non-saturating logistic loss; R1 and path lengths in every 16th and 4th
+step, weighted by their interval; style mixing. The generator that samples is a moving average, its half-life
+10,000 images and at most a twentieth of those seen (*Training GANs with Limited Data*, 2020). The map of
+group deviations: *Progressive Growing of GANs* (ICLR 2018). Both networks see one batch of fakes and move in
+the same step, with one optimiser, so that the common training loop fits. Held-out images are judged by the
+energy distance between them and samples. Leaves out augmentation of the discriminator's input.
 """
 
 from copy import deepcopy
@@ -22,15 +21,17 @@ from torch import Tensor, nn
 from torch.func import functional_call
 from torch.nn.functional import adaptive_avg_pool2d, conv2d, leaky_relu, softplus
 
-from derender.baselines.model import BaselineModel, Images, LossInputs
+from derender.baselines.model import Features, Images, LoopModel, LossInputs
 from derender.baselines.stylegan2_generator import (
     FILTER,
     GAIN,
     SLOPE,
     TINY,
+    Codes,
     EqualLinear,
     Generator,
     GeneratorSettings,
+    Maps,
     upfirdn,
 )
 from derender.settings import Settings
@@ -40,14 +41,16 @@ from derender.training.config import LoopSettings, OptimiserSettings
 GROUP = 4
 JUDGED_SIDE = 16  # held-out images and samples are compared at most this large
 CENTRE_LATENTS = 4_096
-R1_PER_PIXEL = 2e-4
+R1_PER_PIXEL = (
+    2e-4  # 6.6 at 1024 pixels and 0.026 at 64 in batches of 32, as its gradient is summed over pixels
+)
 SHOWN = 6
 
 
 class AdversarialObjective(Settings):
     """Weights and intervals of the regularisers, style mixing, and the moving average."""
 
-    r1_weight: float | None = Field(default=None, ge=0)  # None: by size and batch, see ``r1_weight_of``
+    r1_weight: float | None = Field(default=None, ge=0)  # None: R1_PER_PIXEL x pixels / batch
     r1_every: int = Field(default=16, ge=1)
     path_weight: float = Field(default=2.0, ge=0)
     path_every: int = Field(default=4, ge=1)
@@ -83,17 +86,16 @@ class EqualConv(nn.Module):
         self.down = down
         self.register_buffer("taps", torch.tensor(FILTER), persistent=False)
 
-    def forward(self, images: Float[Tensor, "n i h w"]) -> Float[Tensor, "n o h2 w2"]:
-        weight = self.weight / sqrt(self.weight[0].numel())
-        kernel, bias = weight.shape[-1], self.bias
+    def forward(self, images: Maps) -> Maps:
+        weight, bias = self.weight / sqrt(self.weight[0].numel()), self.bias
+        kernel = weight.shape[-1]
+        stride, padding = (2, 0) if self.down else (1, kernel // 2)
         if bias is not None:
             weight, bias = GAIN * weight, GAIN * bias  # as well as behind the activation, and cheaper
         if self.down:
             around = len(FILTER) - 2 + kernel - 1
             images = upfirdn(images, self.taps, padding=((around + 1) // 2, around // 2))
-            made = conv2d(images, weight, bias, stride=2)
-        else:
-            made = conv2d(images, weight, bias, padding=kernel // 2)
+        made = conv2d(images, weight, bias, stride, padding)
         return made if bias is None else leaky_relu(made, SLOPE)
 
 
@@ -106,7 +108,7 @@ class ResidualDown(nn.Module):
         self.second = EqualConv(inputs, outputs, 3, down=True)
         self.skip = EqualConv(inputs, outputs, 1, down=True, active=False)
 
-    def forward(self, images: Float[Tensor, "n i h w"]) -> Float[Tensor, "n o h2 w2"]:
+    def forward(self, images: Maps) -> Maps:
         return (self.second(self.first(images)) + self.skip(images)) / sqrt(2)
 
 
@@ -115,19 +117,23 @@ class Discriminator(nn.Module):
 
     def __init__(self, settings: GeneratorSettings):
         super().__init__()
-        channels, sizes = settings.channels, settings.resolutions[::-1]
-        self.from_rgb = EqualConv(3, channels(sizes[0]), 1)
-        self.blocks = nn.Sequential(
-            *(ResidualDown(channels(whole), channels(half)) for whole, half in pairwise(sizes))
-        )
-        width = channels(4)
-        self.last_conv = EqualConv(width + 1, width, 3)
-        self.hidden = EqualLinear(16 * width, width, active=True)
-        self.score = EqualLinear(width, 1)
+        widths = [settings.channels(size) for size in settings.resolutions[::-1]]
+        last = widths[-1]
+        self.from_rgb = EqualConv(3, widths[0], 1)
+        self.blocks = nn.Sequential(*(ResidualDown(whole, half) for whole, half in pairwise(widths)))
+        self.last_conv = EqualConv(last + 1, last, 3)
+        self.hidden = EqualLinear(16 * last, last, active=True)
+        self.score = EqualLinear(last, 1)
 
     def describe(self, images: Images, *, group: int = 1) -> Float[Tensor, "n d"]:
-        """The last hidden layer. With ``group`` 1 no image affects another's."""
-        maps = with_group_deviation(self.blocks(self.from_rgb(images)), group)
+        """The last hidden layer. With ``group`` 1 no image affects another's.
+
+        One map more is the mean standard deviation over the group: the images equal modulo n / ``group``.
+        """
+        maps = self.blocks(self.from_rgb(images))
+        variance = maps.reshape(group, len(maps) // group, -1).var(dim=0, unbiased=False)
+        extra = (variance + TINY).sqrt().mean(dim=1).repeat(group)[:, None, None, None]
+        maps = torch.cat([maps, extra.expand(-1, 1, *maps.shape[2:])], dim=1)
         return self.hidden(self.last_conv(maps).flatten(1))
 
     def forward(self, images: Images) -> Float[Tensor, " n"]:
@@ -136,18 +142,7 @@ class Discriminator(nn.Module):
         return self.score(self.describe(images, group=group))[:, 0]
 
 
-def with_group_deviation(maps: Float[Tensor, "n c h w"], group: int) -> Float[Tensor, "n c1 h w"]:
-    """The maps and one more: the mean standard deviation over each group of images.
-
-    Image i is in the group of images i modulo n / group.
-    """
-    n, _, height, width = maps.shape
-    variance = maps.reshape(group, n // group, -1).var(dim=0, unbiased=False)
-    extra = (variance + TINY).sqrt().mean(dim=1).repeat(group)[:, None, None, None]
-    return torch.cat([maps, extra.expand(n, 1, height, width)], dim=1)
-
-
-class Stylegan(BaselineModel):
+class Stylegan(LoopModel):
     """Generator, its moving average, and discriminator. Feature: the discriminator's last hidden layer."""
 
     name, settings_type, config_type = "stylegan2", GeneratorSettings, StyleganConfig
@@ -165,7 +160,7 @@ class Stylegan(BaselineModel):
         self.register_buffer("steps", torch.zeros((), dtype=torch.int64))
         self.register_buffer("path_length", torch.zeros(()))
 
-    def describe(self, images: Images) -> dict[str, Float[Tensor, "n _"]]:
+    def describe(self, images: Images) -> Features:
         return {"discriminator": self.discriminator.describe(2 * images - 1)}
 
     @torch.no_grad()
@@ -174,7 +169,7 @@ class Stylegan(BaselineModel):
         net = self.generator
         w = net.random_w(count, generator)
         if truncation != 1:
-            w = torch.lerp(net.mean_w(CENTRE_LATENTS, generator).expand_as(w), w, truncation)
+            w = torch.lerp(net.random_w(CENTRE_LATENTS, generator).mean(dim=0).expand_as(w), w, truncation)
         return (net(w, net.random_noise(count, generator)) / 2 + 0.5).clamp(0, 1)
 
     def shown(self, images: Images, config: Any) -> dict[str, Images]:
@@ -186,10 +181,9 @@ class Stylegan(BaselineModel):
         """Count a step, and move the averaged generator towards the learner as it is now."""
         self.steps += 1
         span = min(half_life, max(int(self.steps) * batch // 20, 1))
-        keep = 0.5 ** (batch / span)
         learnt = self.learner.state_dict()
         for name, value in self.generator.state_dict().items():
-            value.lerp_(learnt[name], 1 - keep)
+            value.lerp_(learnt[name], 1 - 0.5 ** (batch / span))
 
     def losses(self, images: Images, run: LossInputs) -> dict[str, Tensor]:
         """Losses of both networks, each blind to the other's weights; of held-out images the energy distance.
@@ -198,42 +192,39 @@ class Stylegan(BaselineModel):
         weighted.
         """
         if not self.training:
-            samples = self.sample(len(images), run.generator)
-            return {"energy": energy_distance(_for_judging(images), _for_judging(samples))}
-        n, net, objective = len(images), self.learner, run.config.objective
+            small = min(JUDGED_SIDE, images.shape[-1])
+            both = images.float(), self.sample(len(images), run.generator)
+            return {
+                "energy": energy_distance(*(adaptive_avg_pool2d(each, small).flatten(1) for each in both))
+            }
+        n, net, judge, objective = len(images), self.learner, self.discriminator, run.config.objective
         self.average(n, objective.average_images)
-        step = int(self.steps) - 1
-        real = 2 * images - 1
+        step, real = int(self.steps) - 1, 2 * images - 1
         with run.precision():
             w_plus = mixed_w(net, n, objective.mixing, run.generator)
             fake = net(w_plus, net.random_noise(n, run.generator))
-            frozen = {name: value.detach() for name, value in self.discriminator.named_parameters()}
+            frozen = {name: value.detach() for name, value in judge.named_parameters()}
             terms = {
-                "generator": softplus(-functional_call(self.discriminator, frozen, (fake,))).float().mean(),
-                "discriminator": softplus(self.discriminator(fake.detach())).float().mean()
-                + softplus(-self.discriminator(real)).float().mean(),
+                "generator": softplus(-functional_call(judge, frozen, (fake,))).float().mean(),
+                "discriminator": softplus(judge(fake.detach())).float().mean()
+                + softplus(-judge(real)).float().mean(),
             }
-        r1_weight = r1_weight_of(objective, real.shape[-1], n)
+        r1_weight = objective.r1_weight
+        if r1_weight is None:
+            r1_weight = R1_PER_PIXEL * real.shape[-1] ** 2 / n
         if r1_weight and step % objective.r1_every == 0:
-            terms["r1"] = r1_weight * objective.r1_every * r1_penalty(self.discriminator, real)
+            terms["r1"] = r1_weight * objective.r1_every * r1_penalty(judge, real)
         if objective.path_weight and step % objective.path_every == 0:
-            penalty = path_penalty(self, max(n // 2, 1), objective, run.generator)
+            lengths = path_lengths(
+                net, mixed_w(net, max(n // 2, 1), objective.mixing, run.generator), run.generator
+            )
+            self.path_length.lerp_(lengths.detach().mean(), objective.path_decay)
+            penalty = (lengths - self.path_length).square().mean()
             terms["path"] = objective.path_weight * objective.path_every * penalty
         return terms
 
 
-def r1_weight_of(objective: AdversarialObjective, side: int, batch: int) -> float:
-    """The weight of R1 in the settings, or 2e-4 for each pixel of an image over the images of a batch.
-
-    So in *Training GANs with Limited Data* (2020): 6.6 at 1024 pixels and 0.026 at 64, in batches of 32. A
-    gradient is summed over pixels: a weight for large images blinds the discriminator to small ones.
-    """
-    return R1_PER_PIXEL * side**2 / batch if objective.r1_weight is None else objective.r1_weight
-
-
-def mixed_w(
-    net: Generator, count: int, mixing: float, generator: RandomGenerator
-) -> Float[Tensor, "n codes d"]:
+def mixed_w(net: Generator, count: int, mixing: float, generator: RandomGenerator) -> Codes:
     """W+ of random latents; a share ``mixing`` of them changes to a second latent at a random layer."""
     first, second = net.w_plus(net.random_w(2 * count, generator)).chunk(2)
     codes = net.settings.codes
@@ -244,16 +235,14 @@ def mixed_w(
     return torch.where(later[:, :, None], second, first)
 
 
-def r1_penalty(discriminator: nn.Module, real: Float[Tensor, "n 3 h w"]) -> Float[Tensor, ""]:
+def r1_penalty(discriminator: nn.Module, real: Images) -> Float[Tensor, ""]:
     """Half the mean squared norm of the score's gradient with respect to real images; 0 is flat."""
     real = real.detach().requires_grad_(True)
     (gradient,) = torch.autograd.grad(discriminator(real).sum(), real, create_graph=True)
     return gradient.square().sum(dim=(1, 2, 3)).mean() / 2
 
 
-def path_lengths(
-    net: Generator, w_plus: Float[Tensor, "n codes d"], generator: RandomGenerator
-) -> Float[Tensor, " n"]:
+def path_lengths(net: Generator, w_plus: Codes, generator: RandomGenerator) -> Float[Tensor, " n"]:
     """How far an image moves, in a random direction, for a unit step of W+: |J^T y| over the codes' mean."""
     if not w_plus.requires_grad:
         w_plus = w_plus.requires_grad_(True)
@@ -263,29 +252,9 @@ def path_lengths(
     return gradient.square().sum(dim=2).mean(dim=1).sqrt()
 
 
-def path_penalty(
-    model: Stylegan, count: int, objective: AdversarialObjective, generator: RandomGenerator
-) -> Float[Tensor, ""]:
-    """Mean squared difference of path lengths from their moving mean, which it moves; 0 is best."""
-    w_plus = mixed_w(model.learner, count, objective.mixing, generator)
-    lengths = path_lengths(model.learner, w_plus, generator)
-    with torch.no_grad():
-        model.path_length.lerp_(lengths.mean(), objective.path_decay)
-    return (lengths - model.path_length).square().mean()
-
-
 def energy_distance(first: Float[Tensor, "n d"], second: Float[Tensor, "m d"]) -> Float[Tensor, ""]:
     """Unbiased energy distance over sqrt(d); about 0 for two samples of one distribution, larger is worse."""
     if min(len(first), len(second)) < 2:
         return torch.zeros((), device=first.device)
-
-    def within(rows: Tensor) -> Tensor:
-        return torch.cdist(rows, rows).sum() / (len(rows) * (len(rows) - 1))
-
-    between = torch.cdist(first, second).mean()
-    return (2 * between - within(first) - within(second)) / sqrt(first.shape[1])
-
-
-def _for_judging(images: Images) -> Float[Tensor, "n d"]:
-    side = min(JUDGED_SIDE, images.shape[-1])
-    return adaptive_avg_pool2d(images.float(), side).flatten(1)
+    within = [torch.cdist(rows, rows).sum() / (len(rows) * (len(rows) - 1)) for rows in (first, second)]
+    return (2 * torch.cdist(first, second).mean() - within[0] - within[1]) / sqrt(first.shape[1])

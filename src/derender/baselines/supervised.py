@@ -2,11 +2,9 @@
 
 Source: He et al., *Deep Residual Learning* (CVPR 2016); the network is transformers' (Apache-2.0), configured
 as ResNet-18, with fresh weights: nothing is downloaded. It learns every label column at once, one softmax for
-each, on 100, 500 or 1,000 images of the training part. Feature: ``pooled``, the 512 numbers before the
-classifier. Leaves out pre-training.
+each, on 100, 500 or 1,000 images of the training part. Leaves out pre-training.
 """
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,9 +15,15 @@ from pydantic import Field, field_validator
 from torch import Generator, Tensor
 from torch.nn.functional import cross_entropy
 
-from derender.baselines.augment import AugmentSettings, augment
-from derender.baselines.model import BaselineModel, BaselineSettings, Images, optional
-from derender.baselines.training import ShortRun
+from derender.baselines.model import (
+    BaselineModel,
+    BaselineSettings,
+    Features,
+    Images,
+    ShortRun,
+    optional,
+)
+from derender.baselines.simclr import AugmentSettings, augment
 from derender.data import ImageSet, as_float, split_indices
 from derender.features import map_batches, missing
 from derender.settings import Settings
@@ -60,7 +64,7 @@ class SupervisedConfig(Settings):
 
 
 class Resnet18(BaselineModel):
-    """ResNet-18. Features: ``pooled`` (512 numbers) and ``logits`` (one for every class)."""
+    """ResNet-18. Features: ``pooled`` (the 512 numbers before the classifier), ``logits`` (one per class)."""
 
     name, settings_type, config_type = "resnet18", Resnet18Settings, SupervisedConfig
     features = ("pooled", "logits")
@@ -70,26 +74,68 @@ class Resnet18(BaselineModel):
         super().__init__(settings)
         library = optional("transformers", "the baseline resnet18")
         shape = library.ResNetConfig(
-            num_channels=3,
-            embedding_size=settings.width,
+            num_channels=3, embedding_size=settings.width, depths=[2, 2, 2, 2], layer_type="basic",
             hidden_sizes=[settings.width * 2**stage for stage in range(4)],
-            depths=[2, 2, 2, 2],
-            layer_type="basic",
-            num_labels=sum(len(names) for names in settings.classes.values()),
-        )
+            num_labels=sum(map(len, settings.classes.values())),
+        )  # fmt: skip
         self.net = library.ResNetForImageClassification(shape)
 
-    def pooled(self, images: Images) -> Float[Tensor, "n d"]:
-        """The mean over places of the last feature map, for images in 0..1."""
-        return self.net.resnet(images * 2 - 1).pooler_output.flatten(1)
-
-    def logits(self, images: Images) -> Float[Tensor, "n classes"]:
-        """One number for every class of every label, label after label."""
-        return self.net.classifier(self.pooled(images))
-
-    def describe(self, images: Images) -> dict[str, Float[Tensor, "n _"]]:
-        pooled = self.pooled(images)
+    def describe(self, images: Images) -> Features:
+        pooled = self.net.resnet(images * 2 - 1).pooler_output.flatten(1)
         return {"pooled": pooled, "logits": self.net.classifier(pooled)}
+
+    def label_logits(self, images: Images) -> tuple[Float[Tensor, "n _"], ...]:
+        """Scores of the classes, one matrix for each label."""
+        sizes = [len(names) for names in self.settings.classes.values()]
+        return self.describe(images)["logits"].split(sizes, dim=1)
+
+    @classmethod
+    def train_into(
+        cls, config: SupervisedConfig, images: ImageSet, out: str | Path, *, sample_sheet: Any = None,
+        accelerator: str = "cpu", **how: Any,
+    ) -> TrainResult:  # fmt: skip
+        """Train on ``config.labelled`` images; see `registry.train_baseline`. No resume, no sample sheet.
+
+        The same seed gives the same weights; torch's global generator is left as it was.
+
+        Raises:
+            FileExistsError: the folder is not empty.
+            ValueError: too few images with these labels.
+        """
+        rows = labelled_rows(images, config)  # wrong labels are an error before a folder is made
+        names, targets = encode_labels(images, config.labels, rows)
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(config.seed)
+            size = images.images.shape[-1]
+            model = cls(Resnet18Settings(image_size=size, width=config.width, classes=names))
+        run = ShortRun(config, images, out, accelerator=accelerator, **how)
+        inputs, wanted = as_float(images.images[rows]).to(accelerator), targets.to(accelerator)
+        model = model.to(accelerator).train()
+        rate, decay = config.learning_rate, config.weight_decay
+        optimiser = torch.optim.AdamW(model.parameters(), rate, weight_decay=decay)
+        batch = min(config.batch_size, len(rows))
+        each = len(rows) // batch * batch
+        total, seen = config.epochs * each, 0
+        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, total // batch)
+        generator = Generator().manual_seed(config.seed)
+        for _ in range(config.epochs):
+            for chosen in torch.randperm(len(rows), generator=generator)[:each].to(accelerator).split(batch):
+                parts = model.label_logits(augment(inputs[chosen], config.augment, generator))
+                answers = zip(parts, wanted[chosen].unbind(1), strict=True)
+                loss = torch.stack([cross_entropy(part, right) for part, right in answers]).mean()
+                optimiser.zero_grad(set_to_none=True)
+                loss.backward()
+                optimiser.step()
+                schedule.step()
+                seen += batch
+                run.note(seen, total, {"loss": loss.item()})
+                run.record("train", seen, {"loss": loss.item(), "images_per_second": seen / run.seconds})
+        model.eval().requires_grad_(False)
+        scores = {}
+        if len(run.split.validation):
+            scores = accuracy(model, images.select(run.split.validation))
+            run.record("validation", seen, scores)
+        return run.finish(model, seen, scores)
 
 
 def labelled_rows(images: ImageSet, config: SupervisedConfig) -> np.ndarray:
@@ -112,112 +158,28 @@ def labelled_rows(images: ImageSet, config: SupervisedConfig) -> np.ndarray:
     return rows[: config.labelled]
 
 
-def train_resnet18(
-    images: ImageSet,
-    config: SupervisedConfig,
-    *,
-    device: str | torch.device = "cpu",
-    progress: Callable[[int, int, float], None] | None = None,
-) -> Resnet18:
-    """A ResNet-18 trained on ``config.labelled`` images, ready to embed.
-
-    The same seed gives the same weights; torch's global generator is left as it was.
-
-    Args:
-        images: with these labels; only the labelled rows are used.
-        config: how.
-        device: where.
-        progress: called with (images seen, in all, loss) after every step.
-    """
-    rows = labelled_rows(images, config)
-    names, targets = encode_labels(images, config.labels, rows)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(config.seed)
-        size = images.images.shape[-1]
-        model = Resnet18(Resnet18Settings(image_size=size, width=config.width, classes=names))
-    inputs, wanted = as_float(images.images[rows]).to(device), targets.to(device)
-    model = model.to(device).train()
-    optimiser = torch.optim.AdamW(model.parameters(), config.learning_rate, weight_decay=config.weight_decay)
-    batch = min(config.batch_size, len(rows))
-    per_epoch = len(rows) // batch
-    total = config.epochs * per_epoch
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, total)
-    generator, sizes = Generator().manual_seed(config.seed), [len(found) for found in names.values()]
-    for epoch in range(config.epochs):
-        order = torch.randperm(len(rows), generator=generator).to(device)
-        for within in range(per_epoch):
-            chosen = order[within * batch : (within + 1) * batch]
-            seen = augment(inputs[chosen], config.augment, generator)
-            loss = label_loss(model.logits(seen), wanted[chosen], sizes)
-            optimiser.zero_grad(set_to_none=True)
-            loss.backward()
-            optimiser.step()
-            schedule.step()
-            if progress is not None:
-                progress((epoch * per_epoch + within + 1) * batch, total * batch, loss.item())
-    return model.eval().requires_grad_(False)
-
-
 def encode_labels(
     images: ImageSet, labels: tuple[str, ...], rows: np.ndarray
 ) -> tuple[dict[str, tuple[str, ...]], Int64[Tensor, "n labels"]]:
     """Class names of every label among these rows, in order, and each row's class numbers."""
     names, columns = {}, []
     for label in labels:
-        values = images.label(label)[rows]
-        classes, numbers = np.unique(values, return_inverse=True)
+        classes, numbers = np.unique(images.label(label)[rows], return_inverse=True)
         if len(classes) < 2:
             raise ValueError(f"label {label!r} has one value only ({classes[0]}) in {len(rows)} images")
-        names[label] = tuple(str(value) for value in classes)
+        names[label] = tuple(map(str, classes))
         columns.append(torch.from_numpy(numbers.reshape(-1).astype(np.int64)))
     return names, torch.stack(columns, dim=1)
 
 
-def label_loss(
-    logits: Float[Tensor, "n classes"], targets: Int64[Tensor, "n labels"], sizes: list[int]
-) -> Float[Tensor, ""]:
-    """Cross entropy among every label's own classes, mean over labels; at least 0."""
-    parts = logits.split(sizes, dim=1)
-    return torch.stack([cross_entropy(part, targets[:, i]) for i, part in enumerate(parts)]).mean()
-
-
 def accuracy(model: Resnet18, images: ImageSet) -> dict[str, float]:
-    """Share of right answers for every label among images where it is known, 0 to 1; NaN if nowhere."""
-    parts = map_batches(lambda batch: model.logits(batch).cpu().numpy(), model, images.images, batch_size=256)
-    answers, found, start = np.concatenate(parts), {}, 0
-    for label, names in model.settings.classes.items():
+    """By ``accuracy LABEL``: share of right answers where the label is known, 0 to 1; NaN if nowhere."""
+    found = {}
+    batches = map_batches(model.label_logits, model, images.images, batch_size=256)
+    for (label, names), parts in zip(model.settings.classes.items(), zip(*batches, strict=True), strict=True):
         values = images.label(label)
         known = ~missing(values)
-        best = np.array(names)[answers[:, start : start + len(names)].argmax(axis=1)]
+        best = np.array(names)[torch.cat(parts).argmax(dim=1).cpu().numpy()]
         right = best[known] == values[known].astype(str)
-        found[label] = float(right.mean()) if known.any() else float("nan")
-        start += len(names)
+        found[f"accuracy {label}"] = float(right.mean()) if known.any() else float("nan")
     return found
-
-
-def train_supervised(
-    config: SupervisedConfig, images: ImageSet, out: str | Path, *, sample_sheet: Any = None, **how: Any
-) -> TrainResult:
-    """Train into a new run folder; see `registry.train_baseline`. Minutes, no resume, no sample sheet.
-
-    Raises:
-        FileExistsError: the folder is not empty.
-        ValueError: too few images with these labels.
-    """
-    labelled_rows(images, config)  # wrong labels are an error before a folder is made
-    optional("transformers", "the baseline resnet18")
-    run, seen = ShortRun(config, images, out, **how), 0
-
-    def note(done: int, total: int, loss: float) -> None:
-        nonlocal seen
-        seen = done
-        run.note(done, total, {"loss": loss})
-        run.record("train", done, {"loss": loss, "images_per_second": done / run.seconds})
-
-    model = train_resnet18(images, config, device=run.accelerator, progress=note)
-    scores = {}
-    if len(run.split.validation):
-        right = accuracy(model, images.select(run.split.validation))
-        scores = {f"accuracy {label}": value for label, value in right.items()}
-        run.record("validation", seen, scores)
-    return run.finish(model, seen, scores)

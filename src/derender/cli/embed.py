@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
-from derender.baselines.registry import BASELINES
+from derender.baselines import BASELINES
 from derender.cli import options
 from derender.cli.console import NAMED, notice, progress_bar, refuse_existing_file, visible
 from derender.cli.gathered import gathered

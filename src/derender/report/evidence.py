@@ -15,8 +15,8 @@ import numpy as np
 import torch
 from jaxtyping import UInt8
 
+from derender.baselines import read_any_config
 from derender.baselines.controls import untrained_features
-from derender.baselines.training import read_any_config
 from derender.data import GroundTruth, ImageSet, as_float, read_ground_truth, split_indices
 from derender.data.doctor import EXAMINED_PX, doctor
 from derender.evaluation import evaluate_factors, evaluate_geometry, evaluate_reconstruction, mean_picture

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
-from derender.baselines.training import read_any_config
+from derender.baselines import read_any_config
 from derender.model import Derenderer
 from derender.report import charts, colours
 from derender.report.decomposition import decompose_images

@@ -18,8 +18,7 @@ from typing import Any, Literal, TextIO
 from pydantic import Field
 
 from derender import learn
-from derender.baselines import control_features, load_baseline, open_baseline
-from derender.baselines.registry import CONTROLS
+from derender.baselines import CONTROLS, control_features, load_baseline, open_baseline
 from derender.cli.console import plain
 from derender.cli.plan.settings import OURS, WITHOUT_LOOP, Plan
 from derender.data import ImageSet, split_indices

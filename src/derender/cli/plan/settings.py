@@ -12,8 +12,7 @@ from typing import Annotated, Any, Literal
 import yaml
 from pydantic import BeforeValidator, Field
 
-from derender.baselines import baseline_config
-from derender.baselines.registry import BASELINES, CONTROLS, TRAINED
+from derender.baselines import BASELINES, CONTROLS, TRAINED, baseline_config
 from derender.data import suggestion
 from derender.evaluation.paper_tables import table_named
 from derender.settings import Settings

@@ -1,0 +1,294 @@
+"""Autoencoders: plain, beta-VAE and VQ-VAE; each becomes a code and an image again, without any physics.
+
+Plain: encoder and map decoder of our albedo net, 12,982,848 parameters, least squares. beta-VAE: the same
+with a normal posterior over the code; source Higgins et al., *beta-VAE* (ICLR 2017), Bernoulli likelihood as
+there, divided by the number of colour values in an image so that both terms have one scale.
+
+VQ-VAE: source van den Oord et al., *Neural Discrete Representation Learning* (2017), in the size that the
+paper compares with (two convolutions k4 s2 p1, two residual blocks of ReLU, conv3, BatchNorm, ReLU, conv1,
+BatchNorm between). The paper says 416 channels and 19,199,491 parameters; that count is the one of 512
+channels, 416 have 12,724,195: both are offered (``width``). Both counts hold for eight BatchNorms, 512 codes
+as trainable parameters, and biases throughout; they say nothing of where the eight stand. Here: one after
+each convolution and each residual block of the encoder, one inside each of its blocks, one between the
+decoder's blocks and one between its transposed convolutions. The codebook is the `VectorQuantize` of
+vector-quantize-pytorch (MIT), learnt by gradient as in the source (codebook term + 0.25 commitment), started
+by k-means on the first batch; entries that hardly any place chose of late are replaced by places of the
+batch. Leaves out sampling of new images.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, Literal
+
+import torch
+from jaxtyping import Float, Int64
+from pydantic import Field, field_validator
+from torch import Generator, Tensor, nn
+from torch.nn.functional import binary_cross_entropy_with_logits, mse_loss, one_hot
+
+from derender.baselines.model import (
+    ADAM,
+    BaselineSettings,
+    Features,
+    Images,
+    LoopModel,
+    LossInputs,
+    optional,
+)
+from derender.networks.decoders import MapDecoder
+from derender.networks.encoders import Encoder, NetworkSettings
+from derender.settings import Settings
+from derender.training.config import LoopSettings, OptimiserSettings
+
+Grid = Float[Tensor, "n d gh gw"]
+"""One vector for each of the places of a grid."""
+
+
+class AutoencoderSettings(BaselineSettings):
+    """Sizes as in `NetworkSettings`; the defaults are the geometry net's."""
+
+    width: int = Field(default=64, ge=4, multiple_of=4)
+    code_size: int = Field(default=256, ge=1)
+
+    @field_validator("image_size")
+    @classmethod
+    def _as_ours(cls, value: int) -> int:
+        return NetworkSettings(image_size=value).image_size
+
+    def encoder(self, code_size: int | None = None) -> Encoder:
+        """A geometry encoder of this size."""
+        return Encoder(self.network, self.width, code_size or self.code_size, normalised=True)
+
+    @property
+    def network(self) -> NetworkSettings:
+        """The same sizes as our own networks take them."""
+        return NetworkSettings(image_size=self.image_size, width=self.width, code_size=self.code_size)
+
+
+class AutoencoderConfig(LoopSettings):
+    """One training run of a plain autoencoder."""
+
+    baseline: Literal["ae"] = "ae"
+    model: AutoencoderSettings = AutoencoderSettings()
+    optimiser: OptimiserSettings = ADAM
+
+
+class Autoencoder(LoopModel):
+    """Image to code to image. Feature: ``code``, as our own codes the output of a ReLU."""
+
+    name, settings_type, config_type = "ae", AutoencoderSettings, AutoencoderConfig
+    features = ("code",)
+    settings: AutoencoderSettings
+
+    def __init__(self, settings: AutoencoderSettings):
+        super().__init__(settings)
+        self.encoder = settings.encoder()
+        self.decoder = MapDecoder(settings.network, 3)
+
+    def reconstruct(self, images: Images) -> Images:
+        """Images through the code, in 0..1."""
+        return self.decoder(self.encoder(images)).float().tanh() / 2 + 0.5
+
+    def describe(self, images: Images) -> Features:
+        return {"code": self.encoder(images)}
+
+    def shown(self, images: Images, config: Any) -> dict[str, Images]:
+        return {"input": images, "reconstruction": self.reconstruct(images)}
+
+    def losses(self, images: Images, run: LossInputs) -> dict[str, Tensor]:
+        """Mean squared error in 0..1, and beside it L1."""
+        with run.precision():
+            again = self.reconstruct(images)
+        return {"reconstruction": mse_loss(again, images), "l1": (again.detach() - images).abs().mean()}
+
+
+class BetaObjective(Settings):
+    """The weight of the divergence from the prior; 1 is an ordinary VAE."""
+
+    beta: float = Field(default=4.0, ge=0)
+
+
+class BetaVaeConfig(AutoencoderConfig):
+    """One training run of a beta-VAE."""
+
+    baseline: Literal["beta-vae"] = "beta-vae"  # pyright: ignore[reportIncompatibleVariableOverride]
+    objective: BetaObjective = BetaObjective()
+
+
+class BetaVae(LoopModel):
+    """Image to a normal posterior over codes to an image. Feature: ``mean``, the posterior's mean."""
+
+    name, settings_type, config_type = "beta-vae", AutoencoderSettings, BetaVaeConfig
+    features = ("mean",)
+    settings: AutoencoderSettings
+
+    def __init__(self, settings: AutoencoderSettings):
+        super().__init__(settings)
+        self.encoder = settings.encoder(2 * settings.code_size)
+        self.encoder.to_code = nn.Sequential(self.encoder.to_code[0])  # no ReLU: a mean has both signs
+        self.decoder = MapDecoder(settings.network, 3)
+
+    def posterior(self, images: Images) -> tuple[Float[Tensor, "n code"], Float[Tensor, "n code"]]:
+        """Mean and log variance of every number of the code."""
+        mean, log_variance = self.encoder(images).float().chunk(2, dim=1)
+        return mean, log_variance.clamp(-20, 10)
+
+    def describe(self, images: Images) -> Features:
+        return {"mean": self.posterior(images)[0]}
+
+    def shown(self, images: Images, config: Any) -> dict[str, Images]:
+        again = self.decoder(self.posterior(images)[0]).float().sigmoid()
+        return {"input": images, "reconstruction": again}
+
+    def losses(self, images: Images, run: LossInputs) -> dict[str, Tensor]:
+        """Bernoulli likelihood and weighted divergence, both per colour value; beside them L1, ``active``.
+
+        ``active`` counts the numbers of the code whose divergence, averaged over the batch, is above 0.01
+        nats. The code is sampled in training and is the mean otherwise.
+        """
+        with run.precision():
+            mean, log_variance = self.posterior(images)
+        code = mean
+        if self.training:
+            noise = torch.randn(mean.shape, generator=run.generator).to(mean)
+            code = mean + noise * (0.5 * log_variance).exp()
+        with run.precision():
+            logits = self.decoder(code).float()  # log odds of every colour value
+        divergence = 0.5 * (mean.square() + log_variance.exp() - 1 - log_variance)  # from N(0, 1), in nats
+        return {
+            "reconstruction": binary_cross_entropy_with_logits(logits, images),
+            "kl": run.config.objective.beta * divergence.sum(dim=1).mean() / images[0].numel(),
+            "l1": (logits.detach().sigmoid() - images).abs().mean(),
+            "active": (divergence.detach().mean(dim=0) > 0.01).float().sum(),
+        }
+
+
+class VqvaeSettings(BaselineSettings):
+    """Sizes: channels (D) and entries of the codebook (K). Images are any multiple of 4 pixels wide."""
+
+    image_size: int = Field(default=64, ge=8, multiple_of=4)
+    width: int = Field(default=512, ge=1)
+    codes: int = Field(default=512, ge=2)
+    dead_below: float = Field(default=1.0, ge=0)  # places a batch, averaged; 0: entries are never replaced
+
+
+class VqvaeObjective(Settings):
+    """Weight of the commitment term; the source finds 0.1 to 2 to do alike."""
+
+    commitment: float = Field(default=0.25, ge=0)
+
+
+class VqvaeConfig(LoopSettings):
+    """One training run of a VQ-VAE; the learning rate is that of the paper's text."""
+
+    baseline: Literal["vqvae"] = "vqvae"
+    model: VqvaeSettings = VqvaeSettings()
+    objective: VqvaeObjective = VqvaeObjective()
+    optimiser: OptimiserSettings = ADAM
+
+
+class Vqvae(LoopModel):
+    """Encoder, codebook, decoder.
+
+    Features: ``pooled`` (D numbers: the mean entry over all places), ``map`` (the entries of all places,
+    flattened: what the paper compares with, 106,496 numbers at 64x64 and 416 channels; its 416x25x25 are
+    those of 100x100 images), ``histogram`` (K numbers: the share of places at each entry).
+    """
+
+    name, settings_type, config_type = "vqvae", VqvaeSettings, VqvaeConfig
+    features = ("pooled", "map", "histogram")
+    not_judged = ("codebook", "commitment")
+    settings: VqvaeSettings
+
+    def __init__(self, settings: VqvaeSettings):
+        super().__init__(settings)
+        width = settings.width
+        halves = (4, 2, 1)  # kernel, stride, padding
+        self.encoder = nn.Sequential(
+            *(nn.Conv2d(3, width, *halves), nn.BatchNorm2d(width), nn.ReLU()),
+            *(nn.Conv2d(width, width, *halves), nn.BatchNorm2d(width), nn.ReLU()),
+            *(Residual(width, normalised=True), nn.BatchNorm2d(width)),
+            *(Residual(width, normalised=True), nn.BatchNorm2d(width)),
+        )
+        self.codebook = optional("vector_quantize_pytorch", "the baseline vqvae").VectorQuantize(
+            dim=width, codebook_size=settings.codes, accept_image_fmap=True, learnable_codebook=True,
+            ema_update=False, rotation_trick=False, kmeans_init=True, commitment_weight=0.0,
+            threshold_ema_dead_code=settings.dead_below,
+        )  # fmt: skip
+        self.decoder = nn.Sequential(
+            *(Residual(width, normalised=False), nn.BatchNorm2d(width), Residual(width, normalised=False)),
+            *(nn.ConvTranspose2d(width, width, *halves), nn.BatchNorm2d(width), nn.ReLU()),
+            nn.ConvTranspose2d(width, 3, *halves),
+        )
+
+    def encode(self, images: Images) -> Grid:
+        """Images in 0..1 to a grid of a quarter of their side, not yet quantised."""
+        return self.encoder(images * 2 - 1)
+
+    def quantise(self, grid: Grid) -> tuple[Grid, Grid, Int64[Tensor, "n gh gw"]]:
+        """The nearest entry for every place, and its number.
+
+        Gradients of the first pass straight through to the input, those of the second reach the codebook.
+        """
+        through, indices, _ = self.codebook(grid.float(), freeze_codebook=True)
+        return through, self.codebook.get_codes_from_indices(indices), indices
+
+    def decode(self, grid: Grid) -> Images:
+        """Images, about 0..1 but not clipped."""
+        return self.decoder(grid).float() / 2 + 0.5
+
+    def describe(self, images: Images) -> Features:
+        _, entries, indices = self.quantise(self.encode(images))
+        share = one_hot(indices.flatten(1), self.settings.codes).float().mean(dim=1)
+        return {"pooled": entries.mean(dim=(2, 3)), "map": entries.flatten(1), "histogram": share}
+
+    def shown(self, images: Images, config: Any) -> dict[str, Images]:
+        again = self.decode(self.quantise(self.encode(images))[0]).clamp(0, 1)
+        return {"input": images, "reconstruction": again}
+
+    def losses(self, images: Images, run: LossInputs) -> dict[str, Tensor]:
+        """Squared error in -1..1, codebook and commitment terms; beside them L1 in 0..1 and ``codes_used``.
+
+        ``codes_used`` is exp(entropy) of the entries chosen in this batch: from 1 (one entry for all) to K.
+        """
+        with run.precision():
+            grid = self.encode(images).float()
+        with _seeded(run.generator, grid.device):  # k-means, at the very first batch
+            through, entries, indices = self.quantise(grid)
+        with run.precision():
+            again = self.decode(through)
+        share = one_hot(indices.flatten(), self.settings.codes).float().mean(dim=0)
+        terms = {
+            "reconstruction": mse_loss(2 * again, 2 * images),
+            "codebook": mse_loss(entries, grid.detach()),
+            "commitment": run.config.objective.commitment * mse_loss(grid, entries.detach()),
+            "l1": (again.detach().clamp(0, 1) - images).abs().mean(),
+            "codes_used": torch.special.entr(share).sum().exp(),
+        }
+        if self.training:  # count which entries were chosen, replace those that hardly ever are
+            with _seeded(run.generator, grid.device):
+                self.codebook.update_indices(grid.detach().float(), indices)
+        return terms
+
+
+class Residual(nn.Module):
+    """x + conv1(ReLU(norm(conv3(ReLU(x)))))."""
+
+    def __init__(self, width: int, *, normalised: bool):
+        super().__init__()
+        norm = [nn.BatchNorm2d(width)] if normalised else []
+        self.layers = nn.Sequential(
+            nn.ReLU(), nn.Conv2d(width, width, 3, padding=1), *norm, nn.ReLU(), nn.Conv2d(width, width, 1)
+        )
+
+    def forward(self, grid: Grid) -> Grid:
+        return grid + self.layers(grid)
+
+
+@contextmanager
+def _seeded(generator: Generator, device: torch.device) -> Iterator[None]:
+    """torch's global generators, which the library draws from, as a function of ours; put back afterwards."""
+    seed = int(torch.randint(2**62, (), generator=generator))
+    with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
+        torch.manual_seed(seed)
+        yield
