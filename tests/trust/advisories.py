@@ -7,8 +7,8 @@ is asked of a network, so it knows of no advisory that is younger than its list.
 """
 
 import tomllib
-from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -21,22 +21,60 @@ from packaging.version import Version
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "advisories.md"
 LIST = Path(__file__).with_name("advisories.yaml")
+PAGE_HEAD = """\
+# Security advisories of what derender needs
+
+Looked up on {day} for {packages} packages: those of `constraints.txt` (tested) and of
+`constraints-lowest.txt`, and the lower bounds of `pyproject.toml`. {searches} searches over
+records of CVE, OSV, GHSA and PyPA and reports about them, up to November 2026, and a copy
+of PyPA's advisory database that ends in early 2024. No live database was asked (`pip-audit` found
+none that answered): run `pip-audit -r constraints.txt` where there is a network. Empty rows say
+that nothing was found, not that there is nothing. This page is written by
+`python tests/trust/advisories.py` from `tests/trust/advisories.yaml`; a test holds that list
+against the versions.
+
+## Tested versions that an advisory reaches
+
+{tested}
+
+## Lowest versions that an advisory reaches, while the tested one is free of it
+
+{lowest}
+
+## No longer allowed
+
+Advisories of versions that were allowed before; lower bounds stand above them now.
+
+{passed}
+
+## Every package
+
+| package | tested | lowest | PyPA's records to 2024 | searches | newest advisory seen | note |
+| --- | --- | --- | ---: | ---: | --- | --- |
+"""
 
 
 @dataclass(frozen=True)
 class Advisory:
-    """One flaw: where it was seen, and the versions that have it."""
+    """One flaw; fields as in advisories.yaml."""
 
     id: str
-    aliases: tuple[str, ...]
     affected: tuple[SpecifierSet, ...]
     fixed: str | None
     severity: str | None
     summary: str
     source: str
+    aliases: tuple[str, ...] = ()
 
     def reaches(self, version: Version) -> bool:
         return any(version in those for those in self.affected)
+
+    def row(self, package: str) -> str:
+        """A line of the page."""
+        graded = f" ({self.severity})" if self.severity else ""
+        affected = "; ".join(", ".join(sorted(map(str, those))) for those in self.affected)
+        fixed, summary = self.fixed or "not known", self.summary.replace("|", "/")
+        return f"| {package} | [{self.id}]({self.source}){graded} | {affected} | {fixed} | {summary} |"
 
 
 @dataclass(frozen=True)
@@ -47,52 +85,53 @@ class Looked:
     records: int
     searches: int
     newest: str | None
-    note: str
-    answer: str
-    advisories: tuple[Advisory, ...]
+    note: str = ""
+    answer: str = ""
+    advisories: tuple[Advisory, ...] = ()
 
     def reaching(self, version: Version) -> tuple[Advisory, ...]:
         return tuple(one for one in self.advisories if one.reaches(version))
 
 
+def advisory(row: dict[str, Any]) -> Advisory:
+    return Advisory(
+        **{**row, "affected": tuple(SpecifierSet(text, prereleases=True) for text in row["affected"])}
+    )
+
+
 def looked_up(file: Path = LIST) -> tuple[str, dict[str, Looked]]:
     """The day, and what was found by package."""
     tree = yaml.safe_load(file.read_text())
-    return str(tree["looked_up"]), {row["package"]: _looked(row) for row in tree["packages"]}
+    rows = [
+        {**row, "advisories": tuple(map(advisory, row.get("advisories", ())))} for row in tree["packages"]
+    ]
+    return str(tree["looked_up"]), {row["package"]: Looked(**row) for row in rows}
 
 
 def pins(file: Path) -> dict[str, Version]:
     """Versions by package."""
-    lines = [
-        line.partition("==") for line in file.read_text().splitlines() if "==" in line and line[0] != "#"
-    ]
-    return {canonicalize_name(name): Version(version) for name, _, version in lines}
+    lines = [line.partition("==") for line in file.read_text().splitlines() if line[:1] != "#"]
+    return {canonicalize_name(name): Version(version) for name, mark, version in lines if mark}
 
 
 def lower_bounds() -> dict[str, Version]:
     """The lowest versions that pyproject.toml allows of what it names."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    texts = [*project["dependencies"]]
-    texts += [text for wanted in project["optional-dependencies"].values() for text in wanted]
-    found = {}
-    for wanted in map(Requirement, texts):
-        least = [Version(one.version) for one in wanted.specifier if one.operator in (">=", "==")]
-        found[canonicalize_name(wanted.name)] = max(least)
-    return found
+    texts = [*project["dependencies"], *chain(*project["optional-dependencies"].values())]
+    return {
+        canonicalize_name(wanted.name): max(
+            Version(one.version) for one in wanted.specifier if one.operator in (">=", "==")
+        )
+        for wanted in map(Requirement, texts)
+    }
 
 
 def versions() -> dict[str, dict[str, Version]]:
     """Which versions of every package are judged: the tested ones and the lowest ones."""
     tested, lowest = pins(ROOT / "constraints.txt"), pins(ROOT / "constraints-lowest.txt")
-    bounds = lower_bounds()
-    return {
-        name: {
-            kind: those[name]
-            for kind, those in (("tested", tested), ("lowest", bounds), ("lowest set", lowest))
-            if name in those
-        }
-        for name in sorted({*tested, *lowest, *bounds})
-    }
+    kinds = {"tested": tested, "lowest": lower_bounds(), "lowest set": lowest}
+    names = sorted({name for those in kinds.values() for name in those})
+    return {name: {kind: those[name] for kind, those in kinds.items() if name in those} for name in names}
 
 
 def page() -> str:
@@ -100,99 +139,34 @@ def page() -> str:
     day, found = looked_up()
     judged = versions()
     reached = {
-        name: {kind: found[name].reaching(version) for kind, version in those.items()}
-        for name, those in judged.items()
+        name: {kind for kind in judged[name] if found[name].reaching(judged[name][kind])} for name in judged
     }
-    searches = sum(found[name].searches for name in judged)
-    pinned = [name for name, kinds in reached.items() if kinds.get("tested")]
-    allowed = [name for name, kinds in reached.items() if any(kinds.values()) and name not in pinned]
-    passed = [name for name in judged if found[name].advisories and name not in (*pinned, *allowed)]
+    tested = [name for name in judged if "tested" in reached[name]]
+    lowest = [name for name in judged if reached[name] and name not in tested]
+    passed = [name for name in judged if found[name].advisories and not reached[name]]
+
+    def table(names: list[str], kind: str) -> str:
+        """The advisories that reach these packages, and below them why the versions stay."""
+        lines = ["| package | advisory | affected | fixed in | what |", "| --- | --- | --- | --- | --- |"]
+        for name in names:
+            version = judged[name].get(kind)
+            rows = found[name].advisories if version is None else found[name].reaching(version)
+            lines += [one.row(name) for one in rows]
+        return "\n".join(
+            lines + [line for name in names if kind for line in ("", f"{name}: {found[name].answer}")]
+        )
+
     lines = [
-        "# Security advisories of what derender needs",
-        "",
-        f"Looked up on {day} for {len(judged)} packages: those of `constraints.txt` (tested) and of",
-        f"`constraints-lowest.txt`, and the lower bounds of `pyproject.toml`. {searches} searches over",
-        "records of CVE, OSV, GHSA and PyPA and reports about them, up to November 2026, and a copy",
-        "of PyPA's advisory database that ends in early 2024. No live database was asked (`pip-audit` found",
-        "none that answered): run `pip-audit -r constraints.txt` where there is a network. Empty rows say",
-        "that nothing was found, not that there is nothing. This page is written by",
-        "`python tests/trust/advisories.py` from `tests/trust/advisories.yaml`; a test holds that list",
-        "against the versions.",
-        "",
-        "## Tested versions that an advisory reaches",
-        "",
-        *_table(pinned, found, "tested", judged),
-        "",
-        "## Lowest versions that an advisory reaches, while the tested one is free of it",
-        "",
-        *_table(allowed, found, "lowest", judged),
-        "",
-        "## No longer allowed",
-        "",
-        "Advisories of versions that were allowed before; lower bounds stand above them now.",
-        "",
-        *_rows(passed, found, judged),
-        "",
-        "## Every package",
-        "",
-        "| package | tested | lowest | PyPA's records to 2024 | searches | newest advisory seen | note |",
-        "| --- | --- | --- | ---: | ---: | --- | --- |",
+        f"| {name} | {those.get('tested', '')} | {those.get('lowest', those.get('lowest set', ''))} | "
+        f"{found[name].records or ''} | {found[name].searches} | {found[name].newest or ''} | "
+        f"{found[name].note} |\n"
+        for name, those in judged.items()
     ]
-    for name, those in judged.items():
-        one = found[name]
-        least = those.get("lowest", those.get("lowest set", ""))
-        lines.append(
-            f"| {name} | {those.get('tested', '')} | {least} | {one.records or ''} | {one.searches} | "
-            f"{one.newest or ''} | {one.note} |"
-        )
-    return "\n".join([*lines, ""])
-
-
-def _looked(row: dict[str, Any]) -> Looked:
-    advisories = [
-        Advisory(
-            id=one["id"],
-            aliases=tuple(one["aliases"]),
-            affected=tuple(SpecifierSet(text, prereleases=True) for text in one["affected"]),
-            fixed=one["fixed"],
-            severity=one["severity"],
-            summary=one["summary"],
-            source=one["source"],
-        )
-        for one in row.get("advisories", ())
-    ]
-    plain = {key: row[key] for key in ("package", "records", "searches", "newest")}
-    return Looked(
-        **plain, note=row.get("note", ""), answer=row.get("answer", ""), advisories=tuple(advisories)
-    )
-
-
-def _table(
-    names: Sequence[str], found: dict[str, Looked], kind: str, judged: dict[str, dict[str, Version]]
-) -> list[str]:
-    """Rows of the advisories that reach these packages, and below them why the versions stay."""
-    lines = _rows(names, found, judged, kind)
-    return lines + [line for name in names for line in ("", f"{name}: {found[name].answer}")]
-
-
-def _rows(
-    names: Sequence[str],
-    found: dict[str, Looked],
-    judged: dict[str, dict[str, Version]],
-    kind: str | None = None,
-) -> list[str]:
-    lines = ["| package | advisory | affected | fixed in | what |", "| --- | --- | --- | --- | --- |"]
-    for name in names:
-        one = found[name]
-        version = judged[name].get(kind or "")
-        for advisory in one.advisories if version is None else one.reaching(version):
-            affected = "; ".join(", ".join(sorted(map(str, those))) for those in advisory.affected)
-            graded = f" ({advisory.severity})" if advisory.severity else ""
-            lines.append(
-                f"| {name} | [{advisory.id}]({advisory.source}){graded} | {affected} | "
-                f"{advisory.fixed or 'not known'} | {advisory.summary.replace('|', '/')} |"
-            )
-    return lines
+    head = PAGE_HEAD.format(
+        day=day, packages=len(judged), searches=sum(found[name].searches for name in judged),
+        tested=table(tested, "tested"), lowest=table(lowest, "lowest"), passed=table(passed, ""),
+    )  # fmt: skip
+    return head + "".join(lines)
 
 
 if __name__ == "__main__":

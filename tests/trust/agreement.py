@@ -5,15 +5,14 @@
 float32 with the numba kernels is what the others are held against: float32 with the plain torch kernels
 (other sums, same definition), networks in bfloat16, and networks through torch.compile: traced only
 (``aot_eager``), and as compiled machine code (``inductor``) where a C++ compiler is found. The same weights,
-images and perturbations go into each; a training is chaotic, so what must agree stands in ``BOUNDS``.
+images and perturbations go into each; a training is chaotic, so what must agree stands in ``WAYS``.
 """
 
 import argparse
 import os
 import shutil
 import sys
-from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
 
@@ -39,47 +38,31 @@ class Way:
 
     Attributes:
         name: of the way.
+        first, end: how far, relative, the L1 may be of the first step and of the mean of the last tenth.
         backend: of the renderer.
-        precision: a context for the networks.
+        bf16: whether networks compute in bfloat16.
         compiled: the backend of torch.compile for every encoder and decoder, "" for none.
     """
 
     name: str
+    first: float = 1e-5
+    end: float = 0.02
     backend: str = "numba"
-    precision: Callable[[], AbstractContextManager] = nullcontext
+    bf16: bool = False
     compiled: str = ""
 
 
 FLOAT32 = Way("float32, numba")
 WAYS = (
     Way("float32, reference", backend="reference"),
-    Way("bf16, numba", precision=partial(torch.autocast, "cpu", torch.bfloat16)),
+    Way("bf16, numba", 0.02, 0.10, bf16=True),
     Way("float32, compiled", compiled="aot_eager"),
     Way("float32, machine code", compiled="inductor"),
 )
-BOUNDS = {
-    "float32, reference": (1e-5, 0.02),
-    "bf16, numba": (0.02, 0.10),
-    "float32, compiled": (1e-5, 0.02),
-    "float32, machine code": (1e-5, 0.02),
-}
-"""How far the L1 may be, relative to float32: that of the first step, and the mean of the last tenth."""
 
 
-@dataclass(frozen=True)
-class Course:
-    """The L1 of every step."""
-
-    l1: Tensor
-
-    @property
-    def end(self) -> float:
-        """Mean L1 of the last tenth."""
-        return float(self.l1[-max(1, len(self.l1) // 10) :].mean())
-
-
-def course(way: Way, steps: int, seed: int = 0) -> Course:
-    """Train for some steps."""
+def course(way: Way, steps: int, seed: int = 0) -> Tensor:
+    """Train for some steps; the L1 of each."""
     pictures = torch.from_numpy(faces.generate(PICTURES, image_size=SIZE, seed=seed).images).float() / 255
     model = Derenderer.from_preset("small", seed=seed, image_size=SIZE, width=8, light_width=4, code_size=32)
     model.renderer = partial(render_scene, backend=way.backend)
@@ -87,41 +70,44 @@ def course(way: Way, steps: int, seed: int = 0) -> Course:
         torch._dynamo.reset()
         torch._dynamo.config.recompile_limit = PROGRAMS  # pyright: ignore[reportAttributeAccessIssue]
         for net in model.nets.values():
-            for part in ("encoder", "decoder"):
-                if hasattr(net, part):
-                    setattr(net, part, torch.compile(getattr(net, part), backend=way.compiled))
+            for part in {"encoder", "decoder"} & dict(net.named_children()).keys():
+                setattr(net, part, torch.compile(getattr(net, part), backend=way.compiled))
     optimiser = torch.optim.Adam(model.parameters(), lr=3e-4)
+    precision = partial(torch.autocast, "cpu", torch.bfloat16) if way.bf16 else nullcontext
     l1 = []
     for step in range(steps):
         rows = torch.randperm(PICTURES, generator=torch.Generator().manual_seed(step))[:BATCH]
         noise = random_stream(seed, "perturb", step)
-        result = training_step(model, pictures[rows], OBJECTIVE, None, noise, way.precision)
+        result = training_step(model, pictures[rows], OBJECTIVE, None, noise, precision)
         optimiser.zero_grad(set_to_none=True)
         result.total.backward()
         optimiser.step()
         l1.append(result.terms["l1"])
-    return Course(torch.stack(l1).double())
+    return torch.stack(l1).double()
 
 
-def drift(found: Course, expected: Course) -> tuple[float, float, float]:
+def last_tenth(l1: Tensor) -> float:
+    return float(l1[-max(1, len(l1) // 10) :].mean())
+
+
+def drift(found: Tensor, expected: Tensor) -> tuple[float, float, float]:
     """Relative differences of the L1: in the first step, the largest, of the mean of the last tenth."""
-    apart = (found.l1 - expected.l1).abs() / expected.l1
-    return float(apart[0]), float(apart.max()), abs(found.end - expected.end) / expected.end
+    apart, end = (found - expected).abs() / expected, last_tenth(expected)
+    return float(apart[0]), float(apart.max()), abs(last_tenth(found) - end) / end
 
 
-def compiler() -> str:
-    """The C++ compiler that torch.compile would call, "" where there is none."""
-    return next(filter(None, map(shutil.which, (os.environ.get("CXX", ""), "g++", "clang++"))), "")
+def compiler() -> str | None:
+    """The C++ compiler that torch.compile would call."""
+    return next(filter(None, map(shutil.which, (os.environ.get("CXX", ""), "g++", "clang++"))), None)
 
 
 def run(given: argparse.Namespace) -> int:
     """The script."""
     expected = course(FLOAT32, given.steps)
     print(
-        f"{given.steps} steps of {BATCH} images of {SIZE} x {SIZE}; L1 {expected.l1[0]:.4f} at first, ",
-        end="",
+        f"{given.steps} steps of {BATCH} images of {SIZE} x {SIZE}; L1 {expected[0]:.4f} at first, ", end=""
     )
-    print(f"{expected.end:.4f} in the last tenth with {FLOAT32.name}")
+    print(f"{last_tenth(expected):.4f} in the last tenth with {FLOAT32.name}")
     print("| way | L1 of the first step | largest of all | mean of the last tenth | within |")
     print("| --- | ---: | ---: | ---: | --- |", flush=True)
     failed = 0
@@ -130,12 +116,10 @@ def run(given: argparse.Namespace) -> int:
             print(f"| {way.name} | left out: no C++ compiler found | | | |", flush=True)
             continue
         first, largest, end = drift(course(way, given.steps), expected)
-        within = first <= BOUNDS[way.name][0] and end <= BOUNDS[way.name][1]
+        within = first <= way.first and end <= way.end
         failed += not within
-        print(
-            f"| {way.name} | {first:.1e} | {largest:.1e} | {end:.1e} | {'yes' if within else 'NO'} |",
-            flush=True,
-        )
+        cells = (f"{value:.1e}" for value in (first, largest, end))
+        print(f"| {way.name} | {' | '.join(cells)} | {'yes' if within else 'NO'} |", flush=True)
     return 1 if failed else 0
 
 

@@ -2,7 +2,6 @@
 
 import importlib.util
 import os
-import signal
 import sys
 import time
 import traceback
@@ -10,12 +9,10 @@ from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
-HERE = Path(__file__).parent
-
 
 def script(name: str) -> ModuleType:
     """A script of this folder as a module."""
-    spec = importlib.util.spec_from_file_location(Path(name).stem, HERE / f"{name}.py")
+    spec = importlib.util.spec_from_file_location(Path(name).stem, Path(__file__).parent / f"{name}.py")
     assert spec is not None and spec.loader is not None
     module = sys.modules[Path(name).stem] = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
@@ -27,13 +24,13 @@ def start(work: Callable[[], int], log: Path, *, failed: int = 1) -> int:
 
     An exception ends it with its traceback in the log and the exit code ``failed``. Gives its number.
     """
-    log.write_text("")
+    stream = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
     child = os.fork()
     if child:
+        os.close(stream)
         return child
     code = failed
     try:
-        stream = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
         os.dup2(stream, 1)
         os.dup2(stream, 2)
         code = int(work())
@@ -45,18 +42,13 @@ def start(work: Callable[[], int], log: Path, *, failed: int = 1) -> int:
         os._exit(code)
 
 
-def waited(child: int, seconds: float, stop: Callable[[], bool] = lambda: False) -> int | None:
-    """Wait for a child's end, so many seconds, or ``stop``; its exit code, or None while it runs."""
+def waited(child: int, seconds: float) -> int | str | None:
+    """Wait for a child so many seconds: its exit code, "stopped" if it has stopped, None if it still runs."""
     until = time.monotonic() + seconds
-    while time.monotonic() < until and not stop():
-        done, status = os.waitpid(child, os.WNOHANG)
+    while True:
+        done, status = os.waitpid(child, os.WNOHANG | os.WUNTRACED)
         if done:
-            return os.waitstatus_to_exitcode(status)
+            return "stopped" if os.WIFSTOPPED(status) else os.waitstatus_to_exitcode(status)
+        if time.monotonic() >= until:
+            return None
         time.sleep(0.002)
-    return None
-
-
-def ended(child: int, group: bool = False) -> None:
-    """End a child, or the group that it leads, by force."""
-    (os.killpg if group else os.kill)(child, signal.SIGKILL)
-    os.waitpid(child, 0)

@@ -10,8 +10,8 @@ has a process of its own, whose end by a signal is a finding, too. Inputs that w
 """
 
 import argparse
-import json
 import os
+import pickle
 import re
 import sys
 import tempfile
@@ -23,11 +23,12 @@ except ImportError as error:
     raise SystemExit("atheris is not installed: pip install atheris") from error
 
 with atheris.instrument_imports(include=["derender", "yaml"], enable_loader_override=False):
-    from fuzzing.found import Found, limit_memory, quiet
+    from fuzz import Found, limited_and_quiet
     from fuzzing.targets import Target, targets
 
 LONGEST = 1 << 14
 REACHED = re.compile(r"#(\d+)\s+\w+\s+cov: (\d+) ft: (\d+)")
+NOTED = ("inputs", "accepted", "slowest", "findings", "times")
 
 
 def search(target: Target, seconds: int, seed: int, corpus: Path, notes: Path) -> int:
@@ -38,49 +39,28 @@ def search(target: Target, seconds: int, seed: int, corpus: Path, notes: Path) -
     log = os.open(notes / "log", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
     for stream in (1, 2):
         os.dup2(log, stream)
-    found = Found()
+    found = Found(target)
 
     def one(content: bytes) -> None:
         kinds = len(found.findings)
         (notes / "input").write_bytes(content)
-        found.feed(target, target.given(content))
-        if found.inputs % 200 == 0 or len(found.findings) > kinds:
-            told = [found.inputs, found.accepted, found.slowest, found.findings]
-            (notes / "found.json").write_text(json.dumps(told))
+        found.feed(target.given(content))
+        if found.inputs % 200 == 1 or len(found.findings) > kinds:
+            (notes / "found").write_bytes(pickle.dumps({name: getattr(found, name) for name in NOTED}))
 
     asked = {"max_total_time": seconds, "seed": seed + 1, "max_len": LONGEST, "timeout": 300}
     asked |= {"rss_limit_mb": 0, "artifact_prefix": f"{notes}/"}
     asked["only_ascii"] = int(all(whole.isascii() for whole in target.wholes))
-    options = [f"-{name}={value}" for name, value in asked.items()]
-    atheris.Setup([sys.argv[0], *options, str(corpus)], one)
+    atheris.Setup([sys.argv[0], *(f"-{name}={value}" for name, value in asked.items()), str(corpus)], one)
     atheris.Fuzz()
     os._exit(1)  # it does not come back
 
 
-def tell(target: Target, code: int, notes: Path) -> int:
-    """Say what came of it; gives the number of findings."""
-    log = (notes / "log").read_text(errors="replace")
-    inputs, accepted, slowest, findings = json.loads((notes / "found.json").read_text())
-    seen = [tuple(map(int, numbers)) for numbers in REACHED.findall(log)] or [(0, 0, 0)]
-    if code != 0:
-        last = (notes / "input").read_bytes()
-        findings[f"ended with code {code}"] = f"{log[-1500:]} <- {last!r:.2000}"
-    print(
-        f"{target.name}: {max(inputs, seen[-1][0]):,} inputs, {accepted:,} read, {seen[-1][1]} places and "
-        f"{seen[-1][2]} features reached ({seen[0][2]} at first), {len(findings)} findings, "
-        f"slowest {slowest:.2f} s",
-        flush=True,
-    )
-    for kind, example in findings.items():
-        print(f"  {kind}: {example}", flush=True)
-    return len(findings)
-
-
 def run(given: argparse.Namespace) -> int:
     """The script."""
-    limit_memory()
+    limited_and_quiet()
     findings = 0
-    with tempfile.TemporaryDirectory() as place, quiet():
+    with tempfile.TemporaryDirectory() as place:
         for target in targets(Path(place)):
             if not target.wholes or not any(part in target.name for part in given.only.split(",")):
                 continue
@@ -90,7 +70,15 @@ def run(given: argparse.Namespace) -> int:
                 folder.mkdir(parents=True, exist_ok=True)
             for number, whole in enumerate(target.wholes):
                 (corpus / f"whole{number}").write_bytes(whole)
-            findings += tell(target, search(target, given.seconds, given.seed, corpus, notes), notes)
+            code = search(target, given.seconds, given.seed, corpus, notes)
+            found, log = Found(target), (notes / "log").read_text(errors="replace")
+            vars(found).update(pickle.loads((notes / "found").read_bytes()))
+            if code:
+                found.keep(f"ended with code {code}", log[-1500:], (notes / "input").read_bytes())
+            seen = [tuple(map(int, numbers)) for numbers in REACHED.findall(log)] or [(0, 0, 0)]
+            found.inputs = max(found.inputs, seen[-1][0])
+            places = f"; {seen[-1][1]} places and {seen[-1][2]} features reached ({seen[0][2]} at first)"
+            findings += found.tell(places)
     return 1 if findings else 0
 
 

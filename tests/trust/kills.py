@@ -3,162 +3,273 @@
     python tests/trust/kills.py --kills 30 --seed 0
 
 Each attempt is a process of its own that runs one command as a user would. It is ended by SIGKILL, SIGTERM,
-Ctrl-C, a full disk or an exception, at a moment drawn at random: half of the moments anywhere in the command,
-half just when a file is being written. A comparison writes faster than one can look: it stops itself in the
-midst of a file drawn at random, and is ended there. What lies on disk is checked after each, and the command
-is given again until it comes through; the result must then be that of an undisturbed run, bit for bit. The
-disk is a small tmpfs, filled up, where one may be mounted (root); elsewhere a limit on the size of files.
+Ctrl-C, a full disk or an exception, at a moment drawn at random. Half of the signals are aimed: the process
+stops itself in the midst of writing a file drawn at random, and is ended there. What lies on disk is checked
+after each, and the command is given again until it comes through; the result must then be that of an
+undisturbed run, bit for bit. The disk is a small tmpfs, filled up, where one may be mounted (root); elsewhere
+a limit on the size of files.
 """
 
 import argparse
+import ctypes
+import importlib
+import os
 import random
+import resource
 import shutil
+import signal
+import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from apart import waited
-from killing.attempts import INJECTED, Place, attempt, preload, run_child, small_disk
-from killing.commands import (
-    Command,
-    compare_command,
-    embed_command,
-    made_pictures,
-    made_table,
-    train_command,
-)
+from apart import start, waited
+from killing.commands import Command, compare_command, embed_command, train_command
 
+from derender.cli import main
 from derender.features import embedding as embedding_module
 
-CAUSES = ("SIGKILL", "SIGTERM", "Ctrl-C", "full disk", "exception")
-CAME_THROUGH = 0
-ENDINGS = {
-    "SIGKILL": (-9,),
-    "SIGTERM": (-15, 130),
-    "Ctrl-C": (130,),
-    "full disk": (2,),
-    "exception": (INJECTED, 2),
-}
+SIGNALS = {"SIGKILL": signal.SIGKILL, "SIGTERM": signal.SIGTERM, "Ctrl-C": signal.SIGINT}
+CAUSES = (*SIGNALS, "full disk", "exception")
+CAME_THROUGH, INJECTED = 0, 86
+ENDINGS = {"SIGKILL": (-9,), "SIGTERM": (-15, 130), "Ctrl-C": (130,), "full disk": (2,)}
+ENDINGS["exception"] = (INJECTED, 2)
 """Exit codes of an attempt that was ended by each cause; 0 if it came through before or in spite of it."""
+
+PRELOADED = {"derender", "torch", "lightning_fabric", "tensorboard"}
+PRELOADED |= {"matplotlib", "sklearn", "scipy", "numba"}
+DISK_MEGABYTES = 200
+
+
+class Injected(Exception):
+    """Raised at a random moment."""
+
+
+class Writes:
+    """Counts files and folders that are begun under another name, and stops the process in the midst of one.
+
+    ``hold`` is the number of the one to stop in, and after how many calls; at the latest at its renaming.
+    """
+
+    def __init__(self, hold: tuple[int, int] | None):
+        self.begun, self.calls, self.hold, self.midst = 0, 0, hold, False
+
+    def seen(self, event: str, _: object) -> None:
+        """Hears of every file that is touched."""
+        if event in ("tempfile.mkstemp", "tempfile.mkdtemp"):
+            self.begun += 1
+            if self.hold is not None and self.begun == self.hold[0]:
+                self.midst = True
+                sys.setprofile(self.called)
+        elif event == "os.rename" and self.midst:
+            self.stop()
+
+    def called(self, frame: object, event: str, _: object) -> None:
+        """Hears of every call within the writing."""
+        self.calls += event in ("call", "c_call")
+        if self.midst and self.hold is not None and self.calls >= self.hold[1]:
+            self.stop()
+
+    def stop(self) -> None:
+        self.midst = False
+        sys.setprofile(None)
+        os.kill(os.getpid(), signal.SIGSTOP)
 
 
 @dataclass
-class Figures:
-    """What happened.
+class Trial:
+    """One command, where it is killed, and what happened.
 
     Attributes:
+        disk: the folder that may be a small disk of its own; ``mounted`` says whether it is one.
+        log: what the command said last; not on that disk.
+        numbers: draws causes' moments.
+        seconds, bytes, writes: how long the command takes undisturbed, what it leaves and writes.
         kills: by cause, of attempts that were ended before they came through.
         writing: how many of them while a file was being written.
-        rounds: how many times a command was brought to its end.
+        rounds: how many times the command was brought to its end.
         survived: how many of these gave the undisturbed result.
         faults: sentences on what went wrong.
     """
 
+    command: Command
+    disk: Path
+    mounted: bool
+    log: Path
+    numbers: random.Random
+    seconds: float = 0.0
+    bytes: int = 0
+    writes: int = 0
     kills: Counter[str] = field(default_factory=Counter)
     writing: int = 0
     rounds: int = 0
     survived: int = 0
     faults: list[str] = field(default_factory=list)
 
+    def child(
+        self,
+        folder: Path,
+        *,
+        limit: int | None = None,
+        raise_after: float | None = None,
+        hold: tuple[int, int] | None = None,
+        record: bool = False,
+    ) -> int:
+        """Start the command in a process of its own; gives its number. Can record writes and modules."""
 
-def undisturbed(command: Command, folder: Path, place: Place) -> dict[str, bytes]:
-    """The result of a run nobody disturbs; notes how long it takes and what it leaves."""
-    folder.mkdir(parents=True)
-    began = time.monotonic()
-    record = place.log.with_suffix(".modules")
-    code = waited(run_child(command.arguments(folder), place.log, record=record), 900)
-    if code != CAME_THROUGH:
-        raise RuntimeError(f"{command.name} does not come through undisturbed:\n{place.log.read_text()}")
-    place.seconds = time.monotonic() - began
-    place.writes = int(record.read_text().splitlines()[0])
-    place.bytes = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
-    return command.result(folder)
+        def work() -> int:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+            signal.signal(signal.SIGTERM, signal.SIG_DFL)
+            if limit is not None:
+                signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+                resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+            if raise_after is not None:
+                thread = ctypes.c_ulong(threading.main_thread().ident or 0)
+                inject = ctypes.pythonapi.PyThreadState_SetAsyncExc
+                timer = threading.Timer(raise_after, inject, (thread, ctypes.py_object(Injected)))
+                timer.daemon = True
+                timer.start()
+            writes = Writes(hold)
+            sys.addaudithook(writes.seen)
+            try:
+                code = main(self.command.arguments(folder))
+            except Injected:
+                return INJECTED
+            if record:
+                self.log.with_suffix(".record").write_text("\n".join((str(writes.begun), *sys.modules)))
+            return code
 
+        return start(work, self.log)
 
-def kill(command: Command, kills: int, seed: int, *, mount: bool, megabytes: int = 200) -> Figures:
-    """Kill a command so many times in all, from as many beginnings as that takes."""
-    figures, numbers = Figures(), random.Random(seed)
-    with small_disk(megabytes, mount) as (disk, mounted), tempfile.TemporaryDirectory() as beside:
-        place = Place(disk, mounted, Path(beside) / "log", numbers)
-        undisturbed(command, disk / "first", place)
-        preload(place.log.with_suffix(".modules"))
-        wanted = undisturbed(command, disk / "whole", place)
-        for name in ("first", "whole"):
-            shutil.rmtree(disk / name)
-        while sum(figures.kills.values()) < kills:
-            folder = disk / f"round{figures.rounds}"
+    def undisturbed(self, folder: Path) -> dict[str, bytes]:
+        """The result of an undisturbed run; notes time and bytes it takes, and imports what it did.
+
+        Later processes begin with those modules, and are killed at work.
+        """
+        folder.mkdir()
+        began = time.monotonic()
+        if waited(self.child(folder, record=True), 900) != CAME_THROUGH:
+            raise RuntimeError(f"{self.command.name} does not come through:\n{self.log.read_text()}")
+        self.seconds = time.monotonic() - began
+        self.bytes = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+        writes, *modules = self.log.with_suffix(".record").read_text().splitlines()
+        self.writes = int(writes)
+        for name in modules:
+            if name.split(".")[0] in PRELOADED:
+                importlib.import_module(name)
+        result = self.command.result(folder)
+        shutil.rmtree(folder)
+        return result
+
+    def attempt(self, folder: Path, cause: str) -> int:
+        """Run the command once and end it by this cause; gives the exit code."""
+        draw, filler = self.numbers, self.disk / "filler"
+        moment, how = draw.uniform(0, self.seconds), {}
+        if cause == "full disk" and self.mounted:
+            room = shutil.disk_usage(self.disk).free - draw.randrange(self.bytes)
+            with filler.open("wb") as stream:
+                os.posix_fallocate(stream.fileno(), 0, max(1, room))
+        elif cause == "full disk":
+            how["limit"] = draw.randrange(1, 60_000)
+        elif cause == "exception":
+            how["raise_after"] = moment
+        elif cause in SIGNALS and draw.random() < 0.5:
+            how["hold"] = draw.randint(1, self.writes), round(10 ** draw.uniform(0.5, 3))
+        child = self.child(folder, **how)
+        code = waited(child, moment if cause in SIGNALS and not how else 600)
+        if code in (None, "stopped") and cause in SIGNALS:
+            self.writing += code == "stopped"
+            os.kill(child, SIGNALS[cause])
+            os.kill(child, signal.SIGCONT)
+            code = waited(child, 600)
+        filler.unlink(missing_ok=True)
+        if not isinstance(code, int):
+            os.kill(child, signal.SIGKILL)
+            raise TimeoutError(f"{self.command.name} did not end within 10 minutes of {cause}")
+        return code
+
+    def check(self, folder: Path, cause: str, code: int) -> None:
+        """After a kill: an ending as promised, no traceback, and nothing half-written on disk."""
+        said = self.log.read_text(errors="replace")
+        if code not in ENDINGS.get(cause, ()) or "Traceback" in said:
+            self.faults.append(f"{self.command.name} ended by {cause} with exit code {code}: {said[-1500:]}")
+        try:
+            self.command.sound(folder)
+        except (ValueError, OSError) as problem:
+            self.faults.append(f"after {cause} {self.command.name} left something half-written: {problem}")
+
+    def kill(self, kills: int) -> None:
+        """Kill the command so many times in all, from as many beginnings as that takes."""
+        self.undisturbed(self.disk / "first")
+        wanted = self.undisturbed(self.disk / "whole")
+        while (done := self.kills.total()) < kills:
+            folder, code = self.disk / f"round{self.rounds}", -1
             folder.mkdir()
-            figures.rounds += 1
-            code = -1
-            while code != CAME_THROUGH:
-                done = sum(figures.kills.values())
-                cause = CAUSES[done % len(CAUSES)] if done < kills else "nothing"
-                began = time.monotonic()
-                code, writing = attempt(command, folder, place, cause)
+            self.rounds += 1
+            while code != CAME_THROUGH and done <= kills:
+                cause, began = CAUSES[done % len(CAUSES)] if done < kills else "nothing", time.monotonic()
+                code = self.attempt(folder, cause)
                 if code == CAME_THROUGH:  # it takes no longer than that: draw earlier moments
-                    place.seconds = min(place.seconds, time.monotonic() - began)
+                    self.seconds = min(self.seconds, time.monotonic() - began)
                     continue
-                figures.kills[cause] += 1
-                figures.writing += writing
-                check(command, folder, place, cause, code, figures)
-                if cause == "nothing":
-                    break
-            if code == CAME_THROUGH and command.result(folder) == wanted:
-                figures.survived += 1
+                self.kills[cause] += 1
+                done += 1
+                self.check(folder, cause, code)
+            if code == CAME_THROUGH and self.command.result(folder) == wanted:
+                self.survived += 1
             else:
-                figures.faults.append(f"round {figures.rounds} of {command.name} ended otherwise")
+                self.faults.append(f"round {self.rounds} of {self.command.name} ended otherwise")
             shutil.rmtree(folder)
-            tell(command.name, figures)
-    return figures
+            self.tell()
+
+    def tell(self) -> None:
+        by_cause = ", ".join(f"{cause} {count}" for cause, count in sorted(self.kills.items()))
+        print(
+            f"{self.command.name}: {self.kills.total()} kills ({by_cause}), {self.writing} while writing; "
+            f"{self.survived} of {self.rounds} runs ended bit-identical to the undisturbed one; "
+            f"{len(self.faults)} faults",
+            flush=True,
+        )
 
 
-def check(command: Command, folder: Path, place: Place, cause: str, code: int, figures: Figures) -> None:
-    """After a kill: an ending as promised, no traceback, and nothing half-written on disk."""
-    said = place.log.read_text(errors="replace")
-    if code not in ENDINGS.get(cause, ()):
-        figures.faults.append(f"{command.name} ended by {cause} with exit code {code}: {said[-600:]}")
-    if "Traceback" in said:
-        figures.faults.append(f"{command.name} ended by {cause} with a traceback: {said[-1500:]}")
-    try:
-        command.sound(folder)
-    except (ValueError, OSError) as problem:
-        figures.faults.append(f"after {cause} {command.name} left something half-written: {problem}")
-
-
-def tell(name: str, figures: Figures) -> None:
-    by_cause = ", ".join(f"{cause} {count}" for cause, count in sorted(figures.kills.items()))
-    print(
-        f"{name}: {sum(figures.kills.values())} kills ({by_cause}), {figures.writing} while writing; "
-        f"{figures.survived} of {figures.rounds} runs ended bit-identical to the undisturbed one; "
-        f"{len(figures.faults)} faults",
-        flush=True,
-    )
+@contextmanager
+def small_disk(mount: bool) -> Iterator[tuple[Path, bool]]:
+    """A folder, on a small file system of its own where one may be mounted, and whether it is."""
+    with tempfile.TemporaryDirectory(prefix="derender-kills-") as folder:
+        command = ["mount", "-t", "tmpfs", "-o", f"size={DISK_MEGABYTES}m", "none", folder]
+        allowed = mount and sys.platform == "linux" and os.geteuid() == 0
+        mounted = allowed and subprocess.run(command, capture_output=True).returncode == 0
+        try:
+            yield Path(folder), mounted
+        finally:
+            if mounted:
+                subprocess.run(["umount", "-l", folder], check=False)
 
 
 def run(given: argparse.Namespace) -> int:
     """The script."""
     embedding_module.PART_ROWS = 8
-    faults = 0
-    with tempfile.TemporaryDirectory() as place:
-        data = made_pictures(Path(place) / "pictures")
+    faults = []
+    with tempfile.TemporaryDirectory() as folder:
+        place = Path(folder)
         commands = {
-            "train": lambda: train_command(data, given.images),
-            "embed": lambda: embed_command(given.model, made_pictures(Path(place) / "more", given.pictures)),
-            "compare": lambda: compare_command(
-                [
-                    made_table(Path(place) / f"{name}.parquet", seed)
-                    for seed, name in enumerate(("one", "two"))
-                ]
-            ),
+            "train": lambda: train_command(place, given.images),
+            "embed": lambda: embed_command(place, given.model, given.pictures),
+            "compare": lambda: compare_command(place),
         }
         for name in given.what.split(","):
-            figures = kill(commands[name](), given.kills, given.seed, mount=not given.no_mount)
-            faults += len(figures.faults)
-            for fault in figures.faults:
-                print(f"  {fault}", flush=True)
+            with small_disk(not given.no_mount) as (disk, mounted):
+                trial = Trial(commands[name](), disk, mounted, place / "log", random.Random(given.seed))
+                trial.kill(given.kills)
+            faults += trial.faults
+    for fault in faults:
+        print(f"  {fault}")
     return 1 if faults else 0
 
 

@@ -6,64 +6,48 @@ Read from what is installed (importlib.metadata): the packages that pyproject.to
 need in turn. Nothing is asked of a network.
 """
 
-import re
 import tomllib
 from collections.abc import Iterable
-from dataclasses import dataclass
 from importlib.metadata import Distribution, PackageNotFoundError, distribution
 from pathlib import Path
 
 from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "licences.md"
-NAMED = {
-    "BSD License": "BSD",
-    "MIT License": "MIT",
-    "Apache Software License": "Apache-2.0",
-    "Python Software Foundation License": "PSF-2.0",
-}
+NAMED = {"BSD License": "BSD", "MIT License": "MIT", "Apache Software License": "Apache-2.0"}
+NAMED["Python Software Foundation License"] = "PSF-2.0"
+PAGE_HEAD = """\
+# Licences of what derender needs
 
+derender itself is under the MIT licence (`LICENSE`). This page is written by
+`python tests/trust/licences.py` from the metadata of the packages that are installed; the versions
+are those of `constraints.txt`. None of these packages is part of derender's own files.
 
-@dataclass(frozen=True)
-class Package:
-    """One row: name, version, licence and home page."""
-
-    name: str
-    version: str
-    licence: str
-    home: str
-
-
-def plain(name: str) -> str:
-    """The name as indices write it."""
-    return re.sub(r"[-_.]+", "-", name).lower()
+Two packages bring programs or libraries with a licence of their own: the wheel of imageio-ffmpeg
+holds an ffmpeg program under the GNU General Public License (`ffmpeg -L` tells its version), which
+derender starts to write MP4 films; and the torch package for NVIDIA GPUs brings NVIDIA's libraries
+under NVIDIA's terms.
+"""
 
 
 def needed(requirements: Iterable[str]) -> dict[str, Distribution | None]:
     """The packages that requirements name and those that these need, by name; None: not installed here."""
     found: dict[str, Distribution | None] = {}
-    waiting = [Requirement(text) for text in requirements]
+    waiting = [(Requirement(text), ("",)) for text in requirements]
     while waiting:
-        wanted = waiting.pop()
-        if wanted.marker is not None and not any(
-            wanted.marker.evaluate({"extra": extra}) for extra in ("", *wanted.extras)
-        ):
-            continue
-        name = plain(wanted.name)
-        if name in found and not wanted.extras:
+        wanted, extras = waiting.pop()
+        name = canonicalize_name(wanted.name)
+        applies = wanted.marker is None or any(wanted.marker.evaluate({"extra": one}) for one in extras)
+        if not applies or (name in found and not wanted.extras):
             continue
         try:
             found[name] = distribution(name)
         except PackageNotFoundError:
             found[name] = None
             continue
-        for text in found[name].requires or ():
-            below = Requirement(text)
-            if below.marker is None or any(below.marker.evaluate({"extra": e}) for e in ("", *wanted.extras)):
-                below.marker = None
-                if plain(below.name) not in found:
-                    waiting.append(below)
+        waiting += [(Requirement(text), ("", *wanted.extras)) for text in found[name].requires or ()]
     return found
 
 
@@ -72,41 +56,32 @@ def licence_of(package: Distribution) -> str:
     about = package.metadata
     if about.get("License-Expression"):
         return about["License-Expression"]
-    classified = [
-        line.rsplit(" :: ", 1)[-1] for line in about.get_all("Classifier") or () if line.startswith("License")
-    ]
+    lines = [one for one in about.get_all("Classifier") or () if one.startswith("License")]
+    classified = [one.rsplit(" :: ", 1)[-1] for one in lines]
     classified = [NAMED.get(one, one) for one in classified if one != "OSI Approved"]
-    if classified:
-        return ", ".join(dict.fromkeys(classified))
-    stated = (about.get("License") or "").strip().splitlines()
-    return stated[0][:60] if stated else "not stated"
+    stated = (about.get("License") or "not stated").strip().splitlines()
+    return ", ".join(dict.fromkeys(classified)) or stated[0][:60]
 
 
 def home_of(package: Distribution) -> str:
     about = package.metadata
-    links = dict(one.split(", ", 1) for one in about.get_all("Project-URL") or () if ", " in one)
-    kinds = {name.lower(): link for name, link in links.items()}
-    stated = about.get("Home-page")
-    for kind in ("homepage", "home", "source", "repository", "source code", "github"):
-        stated = stated if stated and stated != "UNKNOWN" else kinds.get(kind)
-    return stated or ""
+    pairs = (one.partition(", ") for one in about.get_all("Project-URL") or ())
+    links = {kind.lower(): link for kind, _, link in pairs}
+    kinds = ("homepage", "home", "source", "repository", "source code", "github")
+    stated = [about.get("Home-page"), *(links.get(kind) for kind in kinds)]
+    return next((one for one in stated if one and one != "UNKNOWN"), "")
 
 
-def rows(found: dict[str, Distribution | None]) -> list[Package]:
-    return [
-        Package(name, "", "not installed where this page was made", "")
-        if package is None
-        else Package(name, package.version.partition("+")[0], licence_of(package), home_of(package))
-        for name, package in sorted(found.items())
-    ]
-
-
-def table(packages: list[Package]) -> list[str]:
+def table(found: dict[str, Distribution | None]) -> str:
     lines = ["| package | version | licence |", "| --- | --- | --- |"]
-    for one in packages:
-        shown = f"[{one.name}]({one.home})" if one.home.startswith("http") else one.name
-        lines.append(f"| {shown} | {one.version} | {one.licence.replace('|', '/')} |")
-    return lines
+    for name, package in sorted(found.items()):
+        if package is None:
+            lines.append(f"| {name} |  | not installed where this page was made |")
+            continue
+        home, licence = home_of(package), licence_of(package).replace("|", "/")
+        shown = f"[{name}]({home})" if home.startswith("http") else name
+        lines.append(f"| {shown} | {package.version.partition('+')[0]} | {licence} |")
+    return "\n".join(lines)
 
 
 def page() -> str:
@@ -116,36 +91,16 @@ def page() -> str:
     base = needed(project["dependencies"])
     extras = needed(text for wanted in project["optional-dependencies"].values() for text in wanted)
     development = needed(document["dependency-groups"]["dev"])
-    only_extras = {name: one for name, one in extras.items() if name not in base}
-    only_development = {
-        name: one for name, one in development.items() if name not in base and name not in extras
+    parts = {
+        "Always needed, with what that needs in turn": base,
+        "Needed by an extra (`pip install 'derender[view]'` and others)": {
+            name: one for name, one in extras.items() if name not in base
+        },
+        "For development only": {
+            name: one for name, one in development.items() if name not in {**base, **extras}
+        },
     }
-    lines = [
-        "# Licences of what derender needs",
-        "",
-        "derender itself is under the MIT licence (`LICENSE`). This page is written by",
-        "`python tests/trust/licences.py` from the metadata of the packages that are installed; the versions",
-        "are those of `constraints.txt`. None of these packages is part of derender's own files.",
-        "",
-        "Two packages bring programs or libraries with a licence of their own: the wheel of imageio-ffmpeg",
-        "holds an ffmpeg program under the GNU General Public License (`ffmpeg -L` tells its version), which",
-        "derender starts to write MP4 films; and the torch package for NVIDIA GPUs brings NVIDIA's libraries",
-        "under NVIDIA's terms.",
-        "",
-        "## Always needed, with what that needs in turn",
-        "",
-        *table(rows(base)),
-        "",
-        "## Needed by an extra (`pip install 'derender[view]'` and others)",
-        "",
-        *table(rows(only_extras)),
-        "",
-        "## For development only",
-        "",
-        *table(rows(only_development)),
-        "",
-    ]
-    return "\n".join(lines)
+    return PAGE_HEAD + "".join(f"\n## {title}\n\n{table(found)}\n" for title, found in parts.items())
 
 
 if __name__ == "__main__":

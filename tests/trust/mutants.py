@@ -20,27 +20,27 @@ try:
     from cosmic_ray.mutating import mutate_code  # pyright: ignore[reportMissingImports]
     from cosmic_ray.operators.provider import OperatorProvider  # pyright: ignore[reportMissingImports]
 except ImportError:
-    raise SystemExit(
-        "mutants are made by cosmic-ray, which is not installed: pip install cosmic-ray"
-    ) from None
+    raise SystemExit("mutants are made by cosmic-ray: pip install cosmic-ray") from None
 
 ROOT = Path(__file__).resolve().parents[2]
 SOURCE = ROOT / "src" / "derender"
-OPERATORS = (
-    *(f"ReplaceBinaryOperator_{pair}" for pair in ("Add_Sub", "Sub_Add", "Mul_Div", "Div_Mul", "Pow_Mul")),
-    *(
-        f"ReplaceBinaryOperator_{pair}"
-        for pair in ("FloorDiv_Mul", "Mod_FloorDiv", "BitAnd_BitOr", "BitOr_BitAnd")
-    ),
-    *(f"ReplaceBinaryOperator_{pair}" for pair in ("LShift_RShift", "RShift_LShift", "BitXor_BitAnd")),
-    *(f"ReplaceComparisonOperator_{pair}" for pair in ("Eq_NotEq", "NotEq_Eq", "Is_IsNot", "IsNot_Is")),
-    *(f"ReplaceComparisonOperator_{pair}" for pair in ("Lt_LtE", "Lt_Gt", "LtE_Lt", "LtE_GtE")),
-    *(f"ReplaceComparisonOperator_{pair}" for pair in ("Gt_GtE", "Gt_Lt", "GtE_Gt", "GtE_LtE")),
-    *(f"ReplaceUnaryOperator_Delete_{sign}" for sign in ("USub", "Invert", "Not")),
-    *("AddNot", "ReplaceTrueWithFalse", "ReplaceFalseWithTrue", "ReplaceAndWithOr", "ReplaceOrWithAnd"),
-    *("ReplaceBreakWithContinue", "ReplaceContinueWithBreak", "ExceptionReplacer", "NumberReplacer"),
-    *("RemoveDecorator", "ZeroIterationForLoop"),
-)
+REPLACED = {
+    "ReplaceBinaryOperator": "Add_Sub Sub_Add Mul_Div Div_Mul Pow_Mul FloorDiv_Mul Mod_FloorDiv BitAnd_BitOr "
+    "BitOr_BitAnd LShift_RShift RShift_LShift BitXor_BitAnd",
+    "ReplaceComparisonOperator": "Eq_NotEq NotEq_Eq Is_IsNot IsNot_Is Lt_LtE Lt_Gt LtE_Lt LtE_GtE "
+    "Gt_GtE Gt_Lt GtE_Gt GtE_LtE",
+    "ReplaceUnaryOperator": "Delete_USub Delete_Invert Delete_Not",
+}
+OPERATORS = [f"{kind}_{pair}" for kind, pairs in REPLACED.items() for pair in pairs.split()]
+OPERATORS += [
+    "AddNot",
+    "ReplaceTrueWithFalse",
+    "ReplaceFalseWithTrue",
+    "ReplaceAndWithOr",
+    "ReplaceOrWithAnd",
+]
+OPERATORS += ["ReplaceBreakWithContinue", "ReplaceContinueWithBreak", "ExceptionReplacer", "NumberReplacer"]
+OPERATORS += ["RemoveDecorator", "ZeroIterationForLoop"]
 ONLY_SPEED_OR_TYPES = ("@kernel", "@no_type_check", "@cache", "@lru_cache")
 
 
@@ -71,11 +71,14 @@ class Mutant:
 def mutants_of(file: str) -> list[Mutant]:
     """Every mutant of a file, in its order, each changed text once."""
     text = (SOURCE / file).read_text()
-    found, at = [], 0
+    old, found, at = text.splitlines(), [], 0
     for piece in (node.get_code() for node in get_ast(text).children):  # functions, classes, statements
-        for where, line, changed in changes(piece):
-            new = text[:at] + changed + text[at + len(piece) :]
-            found.append(described(file, where, text[:at].count("\n") + line, text, new))
+        for where, number, changed in changes(piece):
+            whole, line = text[:at] + changed + text[at + len(piece) :], text[:at].count("\n") + number
+            new = whole.splitlines()
+            after = " ".join(new[line - 1].split()) if len(old) == len(new) else "(removed)"
+            after = re.sub(r"(?<=[([]) +", "", after)
+            found.append(Mutant(file, where, line, old[line - 1].strip(), after, whole))
         at += len(piece)
     return sorted(found, key=lambda mutant: (mutant.line, mutant.after))
 
@@ -83,35 +86,32 @@ def mutants_of(file: str) -> list[Mutant]:
 def changes(text: str) -> Iterator[tuple[str, int, str]]:
     """Function, line and changed text of every mutant of a piece of Python."""
     nodes = list(ast_nodes(get_ast(text)))
-    skipped = [*filter(left_out, nodes), *(note for node in nodes for note in annotations(node))]
+    skipped = [part for node in nodes for part in left_out(node)]
     seen = {parsed(text)}
     for name in OPERATORS:
-        operator, occurrence = OperatorProvider()[name](), -1
-        for node in nodes:
-            for start, end in operator.mutation_positions(node):
-                occurrence += 1
-                if any(skip.start_pos <= start and end <= skip.end_pos for skip in skipped):
-                    continue
-                changed = mutate_code(text, operator, occurrence)
-                tree = parsed(changed)
-                if tree is not None and tree not in seen and "not not" not in changed:
-                    seen.add(tree)
-                    function = node if node.type == "funcdef" else node.search_ancestor("funcdef")
-                    yield function.name.value if function is not None else "", start[0], changed
+        operator = OperatorProvider()[name]()
+        places = [(node, place) for node in nodes for place in operator.mutation_positions(node)]
+        for occurrence, (node, (start, end)) in enumerate(places):
+            if any(skip.start_pos <= start and end <= skip.end_pos for skip in skipped):
+                continue
+            changed = mutate_code(text, operator, occurrence)
+            tree = parsed(changed)
+            if tree is not None and tree not in seen and "not not" not in changed:
+                seen.add(tree)
+                function = node if node.type == "funcdef" else node.search_ancestor("funcdef")
+                yield function.name.value if function is not None else "", start[0], changed
 
 
-def annotations(node: Any) -> Iterator[Any]:
-    if node.type == "annassign":
+def left_out(node: Any) -> Iterator[Any]:
+    """What of a node is not changed: the node itself, or its annotation."""
+    bare_star = node.type == "operator" and node.value == "*" and node.parent.type == "parameters"
+    speed = node.type == "decorator" and node.get_code().strip().startswith(ONLY_SPEED_OR_TYPES)
+    if node.type == "fstring" or bare_star or speed:
+        yield node
+    elif node.type == "annassign":
         yield node.children[1]
     elif node.type in ("param", "funcdef") and node.annotation is not None:
         yield node.annotation
-
-
-def left_out(node: Any) -> bool:
-    if node.type == "decorator":
-        return node.get_code().strip().startswith(ONLY_SPEED_OR_TYPES)
-    bare_star = node.type == "operator" and node.value == "*" and node.parent.type == "parameters"
-    return node.type == "fstring" or bare_star
 
 
 def parsed(text: str | None) -> str | None:
@@ -120,12 +120,6 @@ def parsed(text: str | None) -> str | None:
         return None if text is None else ast.dump(ast.parse(text))
     except SyntaxError:
         return None
-
-
-def described(file: str, where: str, line: int, text: str, changed: str) -> Mutant:
-    old, new = text.splitlines(), changed.splitlines()
-    after = " ".join(new[line - 1].split()) if len(old) == len(new) else "(removed)"
-    return Mutant(file, where, line, old[line - 1].strip(), re.sub(r"(?<=[([]) +", "", after), changed)
 
 
 def drawn(mutants: dict[str, list[Mutant]], sample: int, seed: int) -> list[Mutant]:

@@ -1,13 +1,12 @@
 """Trains, embeds and serves at once, for an hour, and tells whether anything grows.
 
-    python tests/trust/soak.py --minutes 60 --clients 20 --json soak.json --png soak.png
+    python tests/trust/soak.py --minutes 60 --clients 20 --json soak.json
 
 One ``derender train`` that checkpoints and validates often, one process that embeds again and again by the
 Python API (soaking/embedding.py), ``derender embed`` as a command once a minute, and ``derender view`` under
 many clients (soaking/clients.py), all on generated images in a temporary folder. Memory, descriptors,
-threads, children and files are sampled (soaking/measure.py) and have to be flat after the first quarter
-(soaking/flat.py). Then all are told to end, and nothing may be left but a run that can be resumed, which it
-is. Linux only.
+threads, children and files are sampled and have to be flat after the first quarter (soaking/measure.py). Then
+all are told to end, and nothing may be left but a run that can be resumed, which it is. Linux only.
 """
 
 import argparse
@@ -20,164 +19,111 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections import Counter, defaultdict
+from dataclasses import asdict
 from pathlib import Path
 
-from soaking.clients import Answers, Nuisance, Visitor, encoded
-from soaking.flat import BOUNDS, Series, Verdict, draw, markdown, verdict
-from soaking.measure import files_below, measured, of_group
-
-from derender.cli.console import progress_bar
+from soaking.clients import Answers, Visitor, encoded, nuisance
+from soaking.measure import BOUNDS, Verdict, files_below, markdown, measured, of_group, verdict
 
 MODEL = "rendered-faces-64"
 PICTURES, UPLOADS, BATCH = 600, 40, 16
-TRAINING = (
-    "optimiser.learning_rate=1e-5",
-    f"batch_size={BATCH}",
-    "validate_every=400",
-    "checkpoint_every=400",
-    "sample_every=4000",
-    "patience=1000000",
-    "self_features_steps=20",
-    "whitening.pictures=16",
-)
+TRAINING = ("optimiser.learning_rate=1e-5", f"batch_size={BATCH}", "patience=1000000")
+TRAINING += ("validate_every=400", "checkpoint_every=400", "sample_every=4000")
+TRAINING += ("self_features_steps=20", "whitening.pictures=16")
 START_SECONDS, PATIENCE_SECONDS = 600.0, 180.0
-COMMAND_EVERY_SECONDS = 45.0
-NUISANCE_SECONDS = 3.0
+COMMAND_EVERY_SECONDS, NUISANCE_SECONDS = 45.0, 3.0
 SHORT_MINUTES = 15
-PANELS = {
-    "private memory, MB": ("private_mb", "peak_mb"),
-    "descriptors": ("descriptors",),
-    "threads": ("threads",),
-    "answers per second": ("per_second",),
-    "longest wait, s": ("longest_s",),
-}
-
-
-@dataclass
-class Watched:
-    """A process with its log."""
-
-    name: str
-    process: subprocess.Popen[bytes]
-    log: Path
-
-    @property
-    def end_of_log(self) -> str:
-        return self.log.read_text(errors="replace")[-800:]
+LASTING = {"view": (signal.SIGINT, 0), "embed, one process": (signal.SIGTERM, 0)}
+LASTING["train"] = (signal.SIGTERM, 130)
+"""Processes that run all the time: the signal that ends each, and the exit code that is due."""
 
 
 class Soak:
     """Everything that runs, and what was measured.
 
     Attributes:
-        series: by process and quantity.
+        series: pairs of seconds and value, by process and quantity.
         faults: sentences on what went wrong.
-        lasting: processes that run all the time.
-        passing: processes that somebody waits for.
+        running: processes that have not ended, by name; each leads a group of its own.
+        counts: of what was done meanwhile.
     """
 
     def __init__(self, folder: Path, minutes: float, clients: int, pause_seconds: float):
         self.folder, self.seconds = folder, 60 * minutes
         self.clients, self.pause_seconds = clients, pause_seconds
-        self.series: dict[str, dict[str, Series]] = {}
+        self.series: dict[str, dict[str, list[tuple[float, float]]]] = defaultdict(lambda: defaultdict(list))
         self.faults: list[str] = []
-        self.lasting: list[Watched] = []
-        self.passing: list[Watched] = []
+        self.running: dict[str, subprocess.Popen[bytes]] = {}
+        self.counts: Counter[str] = Counter()
         self.answers, self.stop = Answers(), threading.Event()
-        self.commands = self.passes = self.images = self.validations = 0
-        self.began = self.sampled = time.monotonic()
+        self.began = time.monotonic()
         self.places = {name: folder / name for name in ("tmp", "cache", "tables", "run")}
         for name in ("tmp", "cache", "tables", "logs"):
             (folder / name).mkdir()
 
-    def start(self, name: str, arguments: Sequence[str]) -> Watched:
+    def log(self, name: str) -> Path:
+        return self.folder / "logs" / f"{name}.txt"
+
+    def said(self, name: str) -> str:
+        return self.log(name).read_text(errors="replace")[-800:]
+
+    def start(self, name: str, *arguments: str) -> subprocess.Popen[bytes]:
         """A process in a group of its own, with one thread for arithmetic and its own temporary folder."""
-        own = self.places["tmp"] / name.replace(", ", "-")
+        own = self.places["tmp"] / name
         own.mkdir(exist_ok=True)
         one = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
         places = {"TMPDIR": str(own), "DERENDER_CACHE": str(self.places["cache"])}
-        log = self.folder / "logs" / f"{own.name}.txt"
-        with log.open("wb") as stream:
-            process = subprocess.Popen(
-                [sys.executable, *arguments],
-                stdin=subprocess.DEVNULL,
-                stdout=stream,
-                stderr=stream,
-                env={**os.environ, **one, **places},
-                process_group=0,
-            )
-        return Watched(name, process, log)
+        with self.log(name).open("wb") as stream:
+            self.running[name] = subprocess.Popen(
+                [sys.executable, *arguments], stdin=subprocess.DEVNULL, stdout=stream, stderr=stream,
+                env={**os.environ, **one, **places}, process_group=0,
+            )  # fmt: skip
+        return self.running[name]
 
     def run(self, name: str, *arguments: str) -> float:
         """A command to its end; gives its largest memory in MB, or raises with what it said."""
-        watched = self.start(name, ["-m", "derender", *arguments])
-        self.passing.append(watched)
-        _, status, used = os.wait4(watched.process.pid, 0)
-        code = watched.process.returncode = os.waitstatus_to_exitcode(status)
-        left = of_group(watched.process.pid)
-        self.passing.remove(watched)
+        process = self.start(name, "-m", "derender", *arguments)
+        _, status, used = os.wait4(process.pid, 0)
+        code = process.returncode = os.waitstatus_to_exitcode(status)
+        left = of_group(process.pid)
         if code or left:
-            raise RuntimeError(
-                f"{name} ended with {code} and left {len(left)} processes: {watched.end_of_log}"
-            )
+            raise RuntimeError(f"{name} ended with {code}, left {len(left)} processes: {self.said(name)}")
+        del self.running[name]
         return used.ru_maxrss / 1024
 
     def embedding(self, out: str) -> tuple[str, ...]:
-        table, data = self.places["tables"] / out, self.folder / "data"
-        return (
-            "embed",
-            "--model",
-            MODEL,
-            "--data",
-            str(data),
-            "--out",
-            str(table),
-            "--device",
-            "cpu",
-            "--force",
-        )
+        given = ("embed", "--model", MODEL, "--data", str(self.folder / "data"), "--device", "cpu", "--force")
+        return (*given, "--out", str(self.places["tables"] / out))
 
     def training(self, images: int) -> tuple[str, ...]:
-        settings = [text for setting in (*TRAINING, f"images={images}") for text in ("--set", setting)]
+        settings = [f"--set={setting}" for setting in (*TRAINING, f"images={images}")]
         given = ("train", "--data", str(self.folder / "data"), "--out", str(self.places["run"]))
         return (*given, "--preset", "small", "--start-from", MODEL, "--device", "cpu", *settings)
 
     def begin(self) -> int:
         """Make images and a table, start everything; gives the viewer's port."""
-        data, said = self.folder / "data", self.folder / "viewer.json"
+        data, told = self.folder / "data", self.folder / "viewer.json"
         self.run("synth", "synth", "faces", "--out", str(data), "--count", str(PICTURES), "--no-truth")
         shutil.make_archive(str(data), "zip", data)
         self.run("embed", *self.embedding("shown.parquet"))
         view = ("view", "--model", MODEL, "--features", str(self.places["tables"] / "shown.parquet"))
         again = (str(Path(__file__).parent / "soaking" / "embedding.py"), str(self.folder), MODEL)
-        checkpoint = self.places["run"] / "checkpoints" / "previous"
-        for name, arguments, sign in (
-            ("view", ("-m", "derender", *view, "--device", "cpu", "--json", str(said)), said),
-            ("embed, one process", again, self.folder / "passes.txt"),
-            ("train", ("-m", "derender", *self.training(10**9)), checkpoint),
-        ):
-            self.lasting.append(self.start(name, arguments))
-            self.wait_for(sign, name)
-        return int(json.loads(said.read_text())["port"])
-
-    def wait_for(self, sign: Path, name: str) -> None:
-        """Until a process has written what shows that it works."""
-        until = time.monotonic() + START_SECONDS
-        while not sign.exists():
-            self.check_alive()
-            if self.faults or time.monotonic() > until:
-                raise RuntimeError(f"{name} does not start: {self.faults or self.lasting[-1].end_of_log}")
-            time.sleep(0.2)
-
-    def check_alive(self) -> None:
-        """A process that ended by itself is a fault, told once."""
-        for watched in list(self.lasting):
-            if watched.process.poll() is not None:
-                code = watched.process.returncode
-                self.faults.append(f"{watched.name} ended by itself with {code}: {watched.end_of_log}")
-                self.lasting.remove(watched)
+        signs = {
+            "view": (("-m", "derender", *view, "--device", "cpu", "--json", str(told)), told),
+            "embed, one process": (again, self.folder / "passes.txt"),
+            "train": (
+                ("-m", "derender", *self.training(10**9)),
+                self.places["run"] / "checkpoints" / "previous",
+            ),
+        }
+        for name, (arguments, sign) in signs.items():
+            process, until = self.start(name, *arguments), time.monotonic() + START_SECONDS
+            while not sign.exists():
+                if process.poll() is not None or time.monotonic() > until:
+                    raise RuntimeError(f"{name} does not start: {self.said(name)}")
+                time.sleep(0.2)
+        return int(json.loads(told.read_text())["port"])
 
     def embed_by_command(self) -> None:
         """``derender embed`` again and again, each in a process of its own."""
@@ -188,80 +134,72 @@ class Soak:
                 if not self.stop.is_set():
                     self.faults.append(str(problem))
                 return
-            if not self.stop.is_set():
-                self.note("embed, by command", peak_mb=peak)
-                self.commands += 1
+            self.note("embed, by command", peak_mb=peak)
+            self.counts["embedded by command"] += 1
 
     def note(self, name: str, **values: float) -> None:
-        now = time.monotonic() - self.began
         for quantity, value in values.items():
-            series = self.series.setdefault(name, {}).setdefault(quantity, Series())
-            series.seconds.append(now)
-            series.values.append(value)
+            self.series[name][quantity].append((time.monotonic() - self.began, value))
 
     def load(self, every_seconds: float) -> None:
         """Keep all under load for the time asked, and sample."""
         port = self.begin()
         uploads = encoded(sorted((self.folder / "data" / "images").iterdir())[:UPLOADS])
-        threads: list[threading.Thread] = [
-            Visitor(port, number, uploads, PICTURES, self.pause_seconds, self.answers, self.stop)
+        works = [
+            Visitor(port, number, uploads, PICTURES, self.pause_seconds, self.answers, self.stop).run
             for number in range(self.clients)
         ]
-        threads.append(Nuisance(port, NUISANCE_SECONDS, self.answers, self.stop))
-        threads.append(threading.Thread(target=self.embed_by_command, name="embed by command", daemon=True))
-        self.began = self.sampled = time.monotonic()
+        works.append(lambda: nuisance(port, NUISANCE_SECONDS, self.answers, self.stop))
+        works.append(self.embed_by_command)
+        threads = [threading.Thread(target=work, daemon=True) for work in works]
+        self.began = time.monotonic()
         for thread in threads:
             thread.start()
         try:
-            with progress_bar("soaking", "s") as report:
-                while (now := time.monotonic() - self.began) < self.seconds:
-                    if not self.stop.wait(every_seconds):
-                        self.sample(every_seconds)
-                    failed = sum(self.answers.failures.values())
-                    report(int(now), int(self.seconds), f"{self.answers.count:,} answers, {failed} failed")
+            while time.monotonic() - self.began < self.seconds:
+                if not self.stop.wait(every_seconds):
+                    self.sample(every_seconds)
         finally:
             self.stop.set()
         for thread in threads:
             thread.join(PATIENCE_SECONDS)
             if thread.is_alive():
-                self.faults.append(f"a thread of the load hangs: {thread.name}")
+                self.faults.append("a thread of the load hangs")
 
     def sample(self, over_seconds: float) -> None:
-        self.check_alive()
-        for watched in self.lasting:
-            self.note(watched.name, **measured(watched.process.pid))
+        for name in LASTING.keys() & self.running.keys():
+            process = self.running[name]
+            if process.poll() is None:
+                self.note(name, **measured(process.pid))
+            else:
+                self.faults.append(f"{name} ended by itself with {process.returncode}: {self.said(name)}")
+                del self.running[name]
         for name, place in self.places.items():
             self.note(f"files in {name}/", files=float(len(files_below(place, without="samples"))))
-        count, longest = self.answers.since_last()
-        passed, self.sampled = time.monotonic() - self.sampled, time.monotonic()
-        self.note("clients", per_second=count / passed, longest_s=longest)
-        if not count:
+        waits = [wait for _, wait in self.answers.waits[self.counts["answers"] :]]
+        self.counts["answers"] += len(waits)
+        self.note("clients", per_second=len(waits) / over_seconds, longest_s=max(waits, default=0.0))
+        if not waits:
             self.faults.append(f"no answer for {over_seconds:.0f} s")
 
     def end(self) -> None:
         """Ctrl-C or SIGTERM for each, then look what is left, and go on with the run."""
-        due = {
-            "view": (signal.SIGINT, 0),
-            "train": (signal.SIGTERM, 130),
-            "embed, one process": (signal.SIGTERM, 0),
-        }
-        for watched in list(self.lasting):
-            number, wanted = due[watched.name]
-            watched.process.send_signal(number)
+        for name in LASTING.keys() & self.running.keys():
+            process, (number, due) = self.running[name], LASTING[name]
+            process.send_signal(number)
             try:
-                code = watched.process.wait(PATIENCE_SECONDS)
+                code = process.wait(PATIENCE_SECONDS)
             except subprocess.TimeoutExpired:
-                self.faults.append(f"{watched.name} still runs {PATIENCE_SECONDS:.0f} s after {number.name}")
+                self.faults.append(f"{name} still runs {PATIENCE_SECONDS:.0f} s after {number.name}")
                 continue
-            left = of_group(watched.process.pid)
-            if code != wanted or left or "Traceback" in watched.end_of_log:
+            left = of_group(process.pid)
+            if code != due or left or "Traceback" in self.said(name):
                 how = f"ended by {number.name} with {code} and left {len(left)} processes"
-                self.faults.append(f"{watched.name} {how}: {watched.end_of_log}")
-            self.lasting.remove(watched)
+                self.faults.append(f"{name} {how}: {self.said(name)}")
+            del self.running[name]
         temporary = [
             str(entry)
-            for own in self.places["tmp"].iterdir()
-            for entry in own.iterdir()
+            for entry in self.places["tmp"].glob("*/*")
             if not entry.name.startswith("torchinductor_") or any(entry.iterdir())  # PyTorch makes it, empty
         ]
         found = [f"/{name}" for place in self.places.values() for name in files_below(place)]
@@ -269,67 +207,42 @@ class Soak:
         for what, names in (("temporary", temporary), ("unfinished", unfinished)):
             if names:
                 self.faults.append(f"{len(names)} {what} files or folders are left: {', '.join(names[:5])}")
-        counted = self.folder / "passes.txt"
-        self.passes = int(counted.read_text()) if counted.exists() else 0
+        self.counts["passes in one process"] = int((self.folder / "passes.txt").read_text())
         try:
             state = self.places["run"] / "checkpoints" / "last" / "state.json"
-            self.images = json.loads(state.read_text())["state"]["images"]
-            metrics = (self.places["run"] / "metrics.jsonl").read_text().splitlines()
-            self.validations = sum(json.loads(line)["kind"] == "validation" for line in metrics)
-            self.run("resume", *self.training(self.images + 10 * BATCH), "--resume")
+            self.counts["images trained on"] = json.loads(state.read_text())["state"]["images"]
+            metrics = (self.places["run"] / "metrics.jsonl").read_text()
+            self.counts["validations"] = metrics.count('"kind": "validation"')
+            images = self.counts["images trained on"] + 10 * BATCH
+            self.run("resume", *self.training(images), "--resume")
         except (OSError, LookupError, RuntimeError) as problem:
             self.faults.append(f"the run cannot be resumed: {problem}")
 
     def kill(self) -> None:
-        """End by force what still runs, and wait for it."""
+        """End by force what still runs."""
         self.stop.set()
-        for watched in [*self.lasting, *self.passing]:
-            until = time.monotonic() + 10
-            while (numbers := of_group(watched.process.pid)) and time.monotonic() < until:
-                for number in numbers:
-                    os.kill(number, signal.SIGKILL)
-                time.sleep(0.1)
+        for process in self.running.values():
+            for number in of_group(process.pid):
+                os.kill(number, signal.SIGKILL)
+
+    def judged(self) -> dict[str, dict[str, Verdict]]:
+        """The verdict on every quantity that has a bound; what grows or failed becomes a fault."""
+        found: dict[str, dict[str, Verdict]] = defaultdict(dict)
+        for name, quantities in self.series.items():
+            for quantity in (one for one in BOUNDS if one in quantities):
+                try:
+                    one = found[name][quantity] = verdict(quantities[quantity], BOUNDS[quantity])
+                except ValueError as problem:
+                    if self.seconds >= 60 * SHORT_MINUTES:
+                        self.faults.append(f"{name}, {quantity}: {problem}")
+                    continue
+                if one.grows:
+                    self.faults.append(f"{name}: {quantity} grows from {one.before:,.1f} to {one.after:,.1f}")
+        self.faults += [f"a client's {kind} failed: {why}" for kind, why in self.answers.failures[:20]]
+        return found
 
 
-def judge(soak: Soak) -> dict[str, dict[str, Verdict]]:
-    """The verdict on every quantity that has a bound; what grows or failed becomes a fault."""
-    found: dict[str, dict[str, Verdict]] = {}
-    for name, quantities in soak.series.items():
-        for quantity in BOUNDS.keys() & quantities.keys():
-            try:
-                one = verdict(quantities[quantity], BOUNDS[quantity])
-            except ValueError as problem:
-                if soak.seconds >= 60 * SHORT_MINUTES:
-                    soak.faults.append(f"{name}, {quantity}: {problem}")
-                continue
-            found.setdefault(name, {})[quantity] = one
-            if one.grows:
-                soak.faults.append(f"{name}: {quantity} grows from {one.before:,.1f} to {one.after:,.1f}")
-    soak.faults += [f"{count} x {kind} failed" for kind, count in soak.answers.failures.items()]
-    return {name: {key: found[name][key] for key in BOUNDS if key in found[name]} for name in found}
-
-
-def told(soak: Soak, verdicts: dict[str, dict[str, Verdict]]) -> str:
-    """All of it as Markdown."""
-    held = ", ".join(f"{count} {kind}" for kind, count in sorted(soak.answers.held.items()))
-    lines = [
-        markdown(verdicts),
-        "",
-        soak.answers.markdown(),
-        "",
-        f"{soak.images:,} images trained on with {soak.validations} validations; {soak.commands} times "
-        f"embedded by command, {soak.passes:,} passes in one process. Odd lines ended: {held or 'none'}.",
-        "",
-        *(f"FAULT: {fault}" for fault in soak.faults),
-        *(f"FAULT of a client: {sentence}" for sentence in soak.answers.said),
-        f"{len(soak.faults)} faults",
-    ]
-    if soak.seconds < 60 * SHORT_MINUTES:
-        lines.append(f"{soak.seconds / 60:g} minutes prove little: slow leaks and late growth need an hour.")
-    return "\n".join(lines)
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
+def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -338,12 +251,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--pause", type=float, default=2.0, help="mean seconds between a client's requests")
     parser.add_argument("--every", type=float, default=10.0, help="seconds between samples")
     parser.add_argument("--json", type=Path, help="file for all samples and verdicts")
-    parser.add_argument("--png", type=Path, help="file for the curves")
-    asked = parser.parse_args(arguments)
-    if not Path("/proc/self/smaps_rollup").exists():
-        parser.error("memory is read from /proc/PID/smaps_rollup: run this on Linux")
-    if asked.minutes < 0.5 or asked.clients < 1 or asked.pause <= 0 or asked.every <= 0:
-        parser.error("--minutes must be 0.5 or more, --clients 1 or more, --pause and --every above 0")
+    asked = parser.parse_args()
     for number in (signal.SIGINT, signal.SIGTERM):  # a shell has SIGINT ignored in the background
         signal.signal(number, signal.default_int_handler)
     with tempfile.TemporaryDirectory(prefix="derender-soak-") as folder:
@@ -356,29 +264,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return 130
         finally:
             soak.kill()
-    verdicts = judge(soak)
-    print(told(soak, verdicts))
+    verdicts = soak.judged()
+    print(markdown(verdicts), soak.answers.markdown(), sep="\n\n", end="\n\n")
+    print(", ".join(f"{count:,} {what}" for what, count in soak.counts.items()))
+    print("odd connections that were ended:", dict(Counter(soak.answers.ended)))
+    print(*(f"FAULT: {fault}" for fault in soak.faults), f"{len(soak.faults)} faults", sep="\n")
+    if asked.minutes < SHORT_MINUTES:
+        print(f"{asked.minutes:g} minutes prove little: slow leaks and late growth need an hour.")
     if asked.json is not None:
+        told = {name: {key: asdict(one) for key, one in row.items()} for name, row in verdicts.items()}
         facts = {
-            "minutes": asked.minutes,
-            "clients": asked.clients,
-            "faults": soak.faults,
-            "images": soak.images,
-            "validations": soak.validations,
-            "commands": soak.commands,
-            "passes": soak.passes,
-            "verdicts": {
-                name: {key: asdict(one) for key, one in row.items()} for name, row in verdicts.items()
-            },
-            "answers": soak.answers.rows(),
-            "ended_connections": soak.answers.held,
-            "samples": {
-                name: {key: asdict(one) for key, one in row.items()} for name, row in soak.series.items()
-            },
-        }
+            "minutes": asked.minutes, "clients": asked.clients, "faults": soak.faults, "counts": soak.counts,
+            "verdicts": told,
+            "answers": soak.answers.rows(), "ended_connections": Counter(soak.answers.ended),
+            "samples": soak.series,
+        }  # fmt: skip
         asked.json.write_text(json.dumps(facts, indent=1) + "\n")
-    if asked.png is not None:
-        draw(soak.series, PANELS, asked.png)
     return 1 if soak.faults else 0
 
 

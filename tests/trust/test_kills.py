@@ -14,13 +14,8 @@ import torch
 from derender.model import Derenderer
 from derender.storage import atomic
 from derender.storage.atomic import CHECKSUMS, Damaged, DamageNoticed, atomic_folder, check_seal, seal
-from derender.training.checkpoint import (
-    DamagedCheckpoint,
-    TrainState,
-    load_checkpoint,
-    resume_from,
-    save_checkpoint,
-)
+from derender.training import checkpoint
+from derender.training.checkpoint import DamagedCheckpoint, TrainState, load_checkpoint, resume_from
 
 ROOT = Path(__file__).resolve().parents[2]
 STEPS = ("open", "os.", "shutil.", "tempfile.")
@@ -28,21 +23,18 @@ STEPS = ("open", "os.", "shutil.", "tempfile.")
 
 
 class Net:
-    """A layer and its optimiser, moved a step further with every call."""
+    """A layer and its optimiser, moved a step further with every save."""
 
     def __init__(self):
         self.model = torch.nn.Linear(3, 2)
         self.optimiser = torch.optim.Adam(self.model.parameters())
 
-    def step(self) -> None:
+    def save(self, run: Path, images: int) -> None:
         self.optimiser.zero_grad()
         self.model(torch.ones(1, 3)).sum().backward()
         self.optimiser.step()
-
-    def save(self, run: Path, images: int) -> None:
-        self.step()
         state = TrainState(images=images)
-        save_checkpoint(run / "last", self.model, self.optimiser, state, previous=run / "previous")
+        checkpoint.save_checkpoint(run / "last", self.model, self.optimiser, state, previous=run / "previous")
 
     def resumed(self, run: Path) -> tuple[int, str | None]:
         state, note = resume_from(run / "last", run / "previous", self.model, self.optimiser)
@@ -154,59 +146,52 @@ def test_a_missing_last_checkpoint_falls_back_too(net, run):
 
 
 def test_a_checkpoint_of_another_model_is_no_damage(run):
+    other = torch.nn.Linear(4, 2)
     with pytest.raises(ValueError, match=r"last is of another model \(.*shape"):
-        other = torch.nn.Linear(4, 2)
         resume_from(run / "last", run / "previous", other, torch.optim.Adam(other.parameters()))
 
 
 def test_a_checkpoint_from_the_future_says_so(net, run):
-    state = (run / "last" / "state.json").read_text().replace('"format": 1', '"format": 9')
-    (run / "last" / "state.json").write_text(state)
-    seal_again(run / "last")
+    state = run / "last" / "state.json"
+    state.write_text(state.read_text().replace('"format": 1', '"format": 9'))
+    (run / "last" / CHECKSUMS).unlink()
+    seal(run / "last")
     with pytest.raises(ValueError, match="made in format 9, this version reads up to 1: update derender"):
         net.resumed(run)
 
 
-def seal_again(folder: Path) -> None:
-    (folder / CHECKSUMS).unlink()
-    seal(folder)
-
-
 def test_checkpoints_of_earlier_versions_have_no_seal_and_are_read(net, run):
     (run / "last" / CHECKSUMS).unlink()
-    state = (run / "last" / "state.json").read_text().replace('"format": 1, ', "")
-    (run / "last" / "state.json").write_text(state)
+    state = run / "last" / "state.json"
+    state.write_text(state.read_text().replace('"format": 1, ', ""))
     assert net.resumed(run) == (16, None)
 
 
 def test_a_checkpoint_that_reads_back_otherwise_is_not_taken(net, run, monkeypatch):
-    def writes_nonsense(tensors, file):
-        real({name: value * 2 for name, value in tensors.items()}, file)
+    write = checkpoint.save_file
 
-    from derender.training import checkpoint
+    def doubled(tensors, file) -> None:
+        write({name: value * 2 for name, value in tensors.items()}, file)
 
-    real = checkpoint.save_file
-    monkeypatch.setattr(checkpoint, "save_file", writes_nonsense)
-    with pytest.raises(
-        OSError, match="reads back other than it was written: check the disk; the old one is kept"
-    ):
+    monkeypatch.setattr(checkpoint, "save_file", doubled)
+    with pytest.raises(OSError, match="reads back other than it was written: check the disk; the old one is"):
         net.save(run, 24)
-    monkeypatch.undo()
     assert net.resumed(run) == (16, None)
     assert sorted(entry.name for entry in run.iterdir()) == ["last", "previous"]
 
 
-def test_a_seal_names_what_has_changed(tmp_path):
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [(b"bab", "^b has changed since it was written: its checksum differs"), (b"bb", "2 of 3 bytes")],
+)
+def test_a_seal_names_what_has_changed(tmp_path, content, message):
     with atomic_folder(tmp_path / "sealed") as folder:
         (folder / "a").write_bytes(b"aaa")
         (folder / "b").write_bytes(b"bbb")
         seal(folder)
     check_seal(tmp_path / "sealed")
-    (tmp_path / "sealed" / "b").write_bytes(b"bab")
-    with pytest.raises(Damaged, match=r"^b has changed since it was written: its checksum differs"):
-        check_seal(tmp_path / "sealed")
-    (tmp_path / "sealed" / "b").write_bytes(b"bb")
-    with pytest.raises(Damaged, match="2 of 3 bytes"):
+    (tmp_path / "sealed" / "b").write_bytes(content)
+    with pytest.raises(Damaged, match=message):
         check_seal(tmp_path / "sealed")
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from safetensors.torch import save_file
+from safetensors.torch import save
 
 import derender
 from derender.baselines import load_baseline
@@ -28,20 +28,16 @@ SOURCES = sorted(PACKAGE.rglob("*.py"))
 
 NEVER = {
     *(
-        "pickle.load",
-        "pickle.loads",
-        "pickle.dumps",
-        "pickle.Unpickler",
-        "marshal.load",
-        "marshal.loads",
-        "shelve.open",
-        "joblib.load",
+        f"{name}.{call}"
+        for name in ("pickle", "marshal", "dill", "cloudpickle")
+        for call in ("load", "loads")
     ),
-    *("dill.load", "dill.loads", "cloudpickle.load", "cloudpickle.loads", "pandas.read_pickle"),
+    *("pickle.dumps", "pickle.Unpickler", "shelve.open", "joblib.load", "pandas.read_pickle"),
     *("yaml.load", "yaml.full_load", "yaml.unsafe_load", "yaml.load_all", "jsonpickle.decode"),
     *("eval", "exec", "compile", "__import__", "os.system", "os.popen", "runpy.run_path"),
     *("shutil.unpack_archive", "torch.hub.load", "torch.jit.load"),
 }
+NEVER_FROM = {"pickle", "marshal", "shelve", "dill", "joblib"}
 NEVER_METHODS = {"extract", "extractall", "read_pickle", "full_load", "unsafe_load"}
 BETWEEN_OWN_PROCESSES = {"features/blocks.py": {"pickle.loads", "pickle.dumps"}}
 """What our actors hand back through Ray, which sends pickles between its processes anyhow; never a file."""
@@ -49,45 +45,23 @@ BETWEEN_OWN_PROCESSES = {"features/blocks.py": {"pickle.loads", "pickle.dumps"}}
 NEEDED = {"torch.load": ("weights_only", True), "np.load": ("allow_pickle", False)}
 
 
-def dotted(node: ast.expr) -> str:
-    parts: list[str] = []
-    while isinstance(node, ast.Attribute):
-        parts.append(node.attr)
-        node = node.value
-    return (
-        ".".join(reversed([*parts, node.id]))
-        if isinstance(node, ast.Name)
-        else f"?.{parts[0] if parts else ''}"
-    )
-
-
 def dangers(tree: ast.AST) -> list[str]:
     """Calls that can run what a file says, with their lines."""
     found = []
     for node in ast.walk(tree):
-        if isinstance(node, ast.ImportFrom) and node.module in (
-            "pickle",
-            "marshal",
-            "shelve",
-            "dill",
-            "joblib",
-        ):
+        if isinstance(node, ast.ImportFrom) and node.module in NEVER_FROM:
             found.append(f"{node.lineno}: from {node.module} import")
         if not isinstance(node, ast.Call):
             continue
-        name = dotted(node.func)
+        name = ast.unparse(node.func)
         given = {word.arg: word.value.value for word in node.keywords if isinstance(word.value, ast.Constant)}
-        method = node.func.attr if isinstance(node.func, ast.Attribute) else ""
-        if name in NEVER or method in NEVER_METHODS:
+        needed = NEEDED.get(name)
+        if name.endswith("from_pretrained") and "library" in name:
+            needed = ("use_safetensors", True)
+        if name in NEVER or name.rpartition(".")[2] in NEVER_METHODS:
             found.append(f"{node.lineno}: {name}")
-        elif name in NEEDED and given.get(NEEDED[name][0]) is not NEEDED[name][1]:
-            found.append(f"{node.lineno}: {name} without {NEEDED[name][0]}={NEEDED[name][1]}")
-        elif (
-            name.endswith("from_pretrained")
-            and "library" in name
-            and given.get("use_safetensors") is not True
-        ):
-            found.append(f"{node.lineno}: {name} without use_safetensors=True")
+        elif needed is not None and given.get(needed[0]) is not needed[1]:
+            found.append(f"{node.lineno}: {name} without {needed[0]}={needed[1]}")
         elif given.get("shell") or given.get("trust_remote_code") or given.get("allow_pickle"):
             found.append(f"{node.lineno}: {name} with shell, trust_remote_code or allow_pickle")
     return found
@@ -107,16 +81,14 @@ def test_no_source_has_a_call_that_runs_what_a_file_says():
 @pytest.mark.parametrize(
     "source",
     [
-        "pickle.load(f)",
-        "from pickle import loads",
-        "torch.load(f)",
-        "torch.load(f, weights_only=False)",
-        "np.load(f)",
-        "np.load(f, allow_pickle=True)",
-        "yaml.load(f, Loader)",
-        "archive.extractall(folder)",
-        "eval(text)",
-        "subprocess.run(text, shell=True)",
+        *("pickle.load(f)", "from pickle import loads", "yaml.load(f, Loader)", "eval(text)"),
+        *(
+            "torch.load(f)",
+            "torch.load(f, weights_only=False)",
+            "np.load(f)",
+            "np.load(f, allow_pickle=True)",
+        ),
+        *("archive.extractall(folder)", "subprocess.run(text, shell=True)"),
         "library.Net.from_pretrained(source)",
     ],
 )
@@ -161,28 +133,57 @@ def test_weights_that_are_pickles_run_nothing(canary, tmp_path):
         _read_weights(tmp_path / "vgg16.npz")
 
 
-def test_model_folders_with_pickles_in_them_run_nothing(canary, tmp_path):
-    model = derender.Derenderer.from_preset("small", seed=0, image_size=32, width=8, light_width=4)
-    folder = model.save(tmp_path / "model")
+@pytest.fixture
+def folder(tmp_path) -> Path:
+    """A tiny model, saved."""
+    model = derender.Derenderer.from_preset("small", seed=0, image_size=32, width=4, light_width=4)
+    return model.save(tmp_path / "model")
+
+
+def refused_as_damaged(folder: Path, name: str, content: bytes) -> None:
+    """A model with one file exchanged, which is put back."""
+    file = folder / name
+    whole = file.read_bytes() if file.exists() else None
+    file.write_bytes(content)
+    with pytest.raises(ValueError, match="damaged"):
+        derender.load(folder)
+    file.unlink() if whole is None else file.write_bytes(whole)
+
+
+def test_model_folders_with_pickles_in_them_run_nothing(canary, folder):
     pickled = pickle.dumps(Bomb(canary))
     (folder / "pytorch_model.bin").write_bytes(pickled)
     assert derender.load(folder).image_size == 32
     for name in ("model.safetensors", "whitening.safetensors", "config.json"):
-        whole = (folder / name).read_bytes() if (folder / name).exists() else None
-        (folder / name).write_bytes(pickled)
-        with pytest.raises(ValueError, match="damaged"):
-            derender.load(folder)
-        (folder / name).unlink() if whole is None else (folder / name).write_bytes(whole)
+        refused_as_damaged(folder, name, pickled)
     with pytest.raises(ValueError, match="is a pickle, which can run code"):
         load_baseline(folder / "pytorch_model.bin")
+
+
+def test_safetensors_with_other_sizes_than_they_say_are_refused(folder):
+    content = (folder / "model.safetensors").read_bytes()
+    for changed in (
+        (1 << 62).to_bytes(8, "little") + content[8:],
+        save({"nets.geometry.encoder.weight": torch.zeros(3)}),
+    ):
+        refused_as_damaged(folder, "model.safetensors", changed)
+
+
+def test_a_configuration_that_claims_a_giant_takes_no_memory(folder):
+    config = json.loads((folder / "config.json").read_text())
+    network = dict(config["settings"]["network"])
+    for name, size in (("width", 1 << 16), ("code_size", 1 << 40), ("light_width", 1 << 20)):
+        config["settings"]["network"] = {**network, name: size}
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        refused_as_damaged(folder, "config.json", json.dumps(config).encode())
+        assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200_000  # kB
 
 
 def test_tables_and_caches_with_pickles_in_them_run_nothing(canary, tmp_path):
     (tmp_path / "F.parquet").write_bytes(pickle.dumps(Bomb(canary)))
     with pytest.raises(ValueError, match="not a readable parquet file"):
         FeatureTable.read(tmp_path / "F.parquet")
-    bomb = np.array([Bomb(canary)], object)
-    memory = Memory(tmp_path)
+    bomb, memory = np.array([Bomb(canary)], object), Memory(tmp_path)
     memory.recall("kind", {"a": 1}, lambda: {"found": np.zeros(2)})
     (file,) = tmp_path.glob("kind-*.npz")
     np.savez(file, found=bomb)
@@ -199,30 +200,3 @@ def test_configurations_run_nothing(canary, tmp_path):
         read_config_tree(tmp_path)
     with pytest.raises(ValueError, match="cannot read the value"):
         resolve("small", [f"preset={told}"])
-
-
-def test_safetensors_with_other_sizes_than_they_say_are_refused(tmp_path):
-    model = derender.Derenderer.from_preset("small", seed=0, image_size=32, width=8, light_width=4)
-    folder = model.save(tmp_path / "model")
-    content = bytearray((folder / "model.safetensors").read_bytes())
-    content[:8] = (1 << 62).to_bytes(8, "little")
-    (folder / "model.safetensors").write_bytes(content)
-    with pytest.raises(ValueError, match="damaged"):
-        derender.load(folder)
-    save_file({"nets.geometry.encoder.weight": torch.zeros(3)}, folder / "model.safetensors")
-    with pytest.raises(ValueError, match="damaged"):
-        derender.load(folder)
-
-
-def test_a_configuration_that_claims_a_giant_takes_no_memory(tmp_path):
-    model = derender.Derenderer.from_preset("small", seed=0, image_size=32, width=8, light_width=4)
-    folder = model.save(tmp_path / "model")
-    config = json.loads((folder / "config.json").read_text())
-    for name, size in (("width", 1 << 16), ("code_size", 1 << 40), ("light_width", 1 << 20)):
-        changed = {**config["settings"]["network"], name: size}
-        told = {**config, "settings": {**config["settings"], "network": changed}}
-        (folder / "config.json").write_text(json.dumps(told))
-        before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        with pytest.raises(ValueError, match="is damaged"):
-            derender.load(folder)
-        assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200_000  # kB

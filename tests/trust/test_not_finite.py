@@ -1,6 +1,7 @@
 """NaN and infinity put into every stage in turn: each is caught, and what is said names the stage."""
 
 from collections.abc import Callable
+from functools import partial
 from math import inf, isnan, nan
 
 import numpy as np
@@ -16,8 +17,6 @@ from derender.objectives import self_features
 from derender.objectives.self_features import SelfFeatures, SelfTraining
 from derender.postprocess import Features
 from derender.postprocess.whitening import Projection, Whitening
-from derender.render import Rendering
-from derender.scene import Scene
 from derender.scene.perturb import PerturbSettings
 from derender.training import resolve, train
 from derender.training.config import ObjectiveSettings, WhiteningSettings
@@ -30,6 +29,7 @@ from derender.training.watch import Finding, FiniteWatch, Watcher, broken_gradie
 
 SIZE = 32
 MIDDLE = SIZE // 2
+CONFIDENCES = tuple(Confidence.__dataclass_fields__)
 NETS = {"geometry": "depth", "albedo": "albedo", "light": "light", "camera": "camera"}
 
 
@@ -63,6 +63,34 @@ def spoil(module: nn.Module, bad: float, call: int | None = None) -> None:
     module.register_forward_hook(hook)
 
 
+def spoil_net(name: str, part: str, model: Derenderer, bad: float, call: int | None = None) -> None:
+    spoil(getattr(model.nets[name], part), bad, call)
+
+
+def spoil_field(values: object, name: str, bad: float) -> object:
+    """A dataclass of maps, one of them spoiled."""
+    return type(values)(**{**vars(values), name: spoiled(getattr(values, name), bad)})
+
+
+def spoil_confidence(name: str, model: Derenderer, bad: float) -> None:
+    model.nets["confidence"].register_forward_hook(lambda _, __, output: spoil_field(output, name, bad))
+
+
+def spoil_rendering(name: str, model: Derenderer, bad: float) -> None:
+    plain = model.renderer
+    model.renderer = lambda scene, fov_deg: spoil_field(plain(scene, fov_deg), name, bad)
+
+
+STAGES = {
+    **{f"the code of {name}": partial(spoil_net, name, "encoder") for name in NETS},
+    **{f"the predicted {said}": partial(spoil_net, name, "decoder") for name, said in NETS.items()},
+    **{f"the {name} confidence": partial(spoil_confidence, name) for name in CONFIDENCES},
+    **{f"the rendered {name}": partial(spoil_rendering, name) for name in ("image", "depth", "mask")},
+    "the loss term 'loocc'": partial(spoil_net, "albedo", "encoder", call=2),  # of perturbed renderings
+}
+"""What the watcher has to name, and who spoils it."""
+
+
 def what_is_said(model: Derenderer, images: Tensor, perceptual: nn.Module | None = None) -> str:
     """What the watcher of a training says of one step; it has to end the run."""
     objective = ObjectiveSettings(loocc="light+camera", perceptual="self" if perceptual else "none")
@@ -81,49 +109,13 @@ def test_a_sound_step_raises_nothing(model, images):
 
 
 @pytest.mark.parametrize("bad", [nan, inf, -inf])
-@pytest.mark.parametrize("factor", NETS)
-def test_each_encoder(model, images, factor, bad):
-    spoil(model.nets[factor].encoder, bad)
-    assert f"the first value that is not finite is the code of {factor}" in what_is_said(model, images)
-
-
-@pytest.mark.parametrize("bad", [nan, inf, -inf])
-@pytest.mark.parametrize("factor", NETS)
-def test_each_decoder(model, images, factor, bad):
-    spoil(model.nets[factor].decoder, bad)
-    if factor != "albedo" or isnan(bad):
-        assert f"is the predicted {NETS[factor]}" in what_is_said(model, images)
+@pytest.mark.parametrize("stage", STAGES)
+def test_each_stage_is_named(model, images, stage, bad):
+    STAGES[stage](model, bad)
+    if stage != "the predicted albedo" or isnan(bad):
+        assert f"the first value that is not finite is {stage}" in what_is_said(model, images)
     else:  # a squashed infinity is a number: black or white
-        albedo = model.decompose(images).albedo
-        assert albedo[0, 0, MIDDLE, MIDDLE] == (1 if bad > 0 else 0)
-
-
-@pytest.mark.parametrize("bad", [nan, inf])
-@pytest.mark.parametrize("name", list(Confidence.__dataclass_fields__))
-def test_the_confidence_net(model, images, name, bad):
-    def hook(_: nn.Module, __: object, output: Confidence) -> Confidence:
-        maps = dict(vars(output))
-        maps[name] = maps[name].clone()
-        maps[name][0, 0, 3, 3] = bad
-        return Confidence(**maps)
-
-    model.nets["confidence"].register_forward_hook(hook)
-    assert f"is the {name} confidence" in what_is_said(model, images)
-
-
-@pytest.mark.parametrize("bad", [nan, inf])
-@pytest.mark.parametrize("name", ["image", "depth", "mask"])
-def test_the_rendering(model, images, name, bad):
-    plain = model.renderer
-
-    def renderer(scene: Scene, fov_deg: float) -> Rendering:
-        found = dict(vars(plain(scene, fov_deg)))
-        found[name] = found[name].clone()
-        found[name][(0, 0, MIDDLE, MIDDLE) if name == "image" else (0, MIDDLE, MIDDLE)] = bad
-        return Rendering(**found)
-
-    model.renderer = renderer
-    assert f"is the rendered {name}" in what_is_said(model, images)
+        assert model.decompose(images).albedo[0, 0, MIDDLE, MIDDLE] == (1 if bad > 0 else 0)
 
 
 @pytest.mark.parametrize("bad", [nan, inf])
@@ -133,12 +125,6 @@ def test_perceptual_features(model, images, bad):
         lambda _, __, output: torch.full_like(output, bad) if output.requires_grad else output
     )
     assert "is the loss term 'perceptual'" in what_is_said(model, images, features)
-
-
-@pytest.mark.parametrize("bad", [nan, inf])
-def test_loocc(model, images, bad):
-    spoil(model.nets["albedo"].encoder, bad, call=2)  # of the perturbed renderings
-    assert "is the loss term 'loocc'" in what_is_said(model, images)
 
 
 def test_a_depth_that_is_no_number_leaves_the_loss_finite_and_is_seen_all_the_same(model, images):

@@ -20,33 +20,27 @@ from derender.training.config import setting_names
 
 def mutated(wholes: list[bytes], number: int) -> bytes:
     """One of some whole files, changed in a few places: bits, bytes, runs, numbers, pieces cut or doubled."""
-    numbers = random.Random(number)
-    content = bytearray(numbers.choice(wholes))
-    for _ in range(numbers.choice((1, 1, 1, 2, 3, 8))):
+    draw = random.Random(number)
+    content = bytearray(draw.choice(wholes))
+    for _ in range(draw.choice((1, 1, 1, 2, 3, 8))):
         if not content:
             break
-        at = numbers.randrange(len(content))
-        match numbers.randrange(8):
-            case 0:
-                content[at] ^= 1 << numbers.randrange(8)
-            case 1:
-                content[at] = numbers.randrange(256)
-            case 2:
-                del content[at:]
-            case 3:
-                del content[at : at + numbers.randrange(1, 64)]
-            case 4:
-                content[at:at] = content[at : at + numbers.randrange(1, 64)]
-            case 5:
-                size = numbers.choice((2, 4, 8))
-                value = numbers.choice(
-                    (0, 1, (1 << 8 * size) - 1, 1 << (8 * size - 1), (1 << 8 * size - 1) - 1)
-                )
-                content[at : at + size] = value.to_bytes(size, numbers.choice(("little", "big")))
-            case 6:
-                content[at : at + 16] = bytes(len(content[at : at + 16]))
-            case 7:
-                content[at : at + 4] = numbers.randbytes(4)
+        at, run, size = draw.randrange(len(content)), draw.randrange(1, 64), draw.choice((2, 4, 8))
+        all_bits = (1 << 8 * size) - 1
+        value = draw.choice((0, 1, all_bits, all_bits // 2, all_bits // 2 + 1))
+        length, new = draw.choice(
+            (
+                (1, bytes([content[at] ^ 1 << draw.randrange(8)])),
+                (1, draw.randbytes(1)),
+                (4, draw.randbytes(4)),
+                (len(content), b""),
+                (run, b""),
+                (0, bytes(content[at : at + run])),
+                (size, value.to_bytes(size, draw.choice(("little", "big")))),
+                (16, bytes(len(content[at : at + 16]))),
+            )
+        )
+        content[at : at + length] = new
     return bytes(content)
 
 
@@ -58,18 +52,12 @@ def encoded_pictures() -> list[bytes]:
     """A small image in every format that is read."""
     noise = np.random.default_rng(0).integers(0, 256, (9, 11, 3), dtype=np.uint8)
     picture, deep = Image.fromarray(noise), Image.fromarray(noise[..., 0].astype(np.uint16) * 257)
+    plain = [(form, picture) for form in ("JPEG", "PNG", "WEBP", "BMP", "GIF", "TIFF", "PPM")]
     found = []
-    for form, one in (
-        *((form, picture) for form in ("JPEG", "PNG", "WEBP", "BMP", "GIF", "TIFF", "PPM")),
-        ("PNG", deep),
-        ("TIFF", deep),
-    ):
+    for form, one in (*plain, ("PNG", deep), ("TIFF", deep)):
         stream = io.BytesIO()
-        one.save(
-            stream,
-            format=form,
-            **({"save_all": True, "append_images": [picture.rotate(90)]} if form == "GIF" else {}),
-        )
+        more = {"save_all": True, "append_images": [picture.rotate(90)]} if form == "GIF" else {}
+        one.save(stream, format=form, **more)
         found.append(stream.getvalue())
     return found
 
@@ -77,9 +65,9 @@ def encoded_pictures() -> list[bytes]:
 def packed(kind: int) -> bytes:
     """A zip of three images and a list."""
     stream = io.BytesIO()
+    members = {f"class {row % 2}/{row}.png": one for row, one in enumerate(encoded_pictures()[:3])}
+    members["labels.csv"] = b"file,age\nclass 0/0.png,3\nclass 1/1.png,4\n"
     with zipfile.ZipFile(stream, "w", kind) as archive:
-        members = {f"class {row % 2}/{row}.png": one for row, one in enumerate(encoded_pictures()[:3])}
-        members["labels.csv"] = b"file,age\nclass 0/0.png,3\nclass 1/1.png,4\n"
         for name, content in members.items():
             member = zipfile.ZipInfo(name)  # of 1980, whenever it is made
             member.external_attr = 0o600 << 16
@@ -99,48 +87,34 @@ def tarred() -> bytes:
     return stream.getvalue()
 
 
-LAUGHS = (
-    "[&a [x,x,x,x,x,x,x,x], "
-    + ", ".join(f"&{b} [{', '.join(['*' + a] * 8)}]" for a, b in zip("abcdefghi", "bcdefghij", strict=True))
-    + "]"
-)
+EIGHTFOLD = [f"&{b} [{', '.join(['*' + a] * 8)}]" for a, b in zip("abcdefghi", "bcdefghij", strict=True)]
+LAUGHS = f"[&a [x,x,x,x,x,x,x,x], {', '.join(EIGHTFOLD)}]"
 """A line of YAML that stands for a billion words."""
 
+ENDS = st.none() | st.booleans() | st.integers() | st.floats()
 PLAIN = st.recursive(
-    st.none()
-    | st.booleans()
-    | st.integers()
-    | st.floats()
-    | st.text(max_size=8)
-    | st.binary(max_size=3).map(repr),
+    ENDS | st.text(max_size=8) | st.binary(max_size=3).map(repr),
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=6), inner, max_size=3),
     max_leaves=6,
 )
 WORDS = st.sampled_from(
     [
-        "1e400",
-        "-0",
-        ".inf",
-        ".nan",
-        "0x7fffffffffffffffffff",
-        "1_000",
-        "2026-01-01",
-        "!!python/none",
-        "&a [*a]",
-        "*a",
-        "<<: 3",
-        "{",
-        "[[",
-        "'",
-        "\0",
-        "~",
-        "yes",
-        "1:30",
-        "!!binary aGk=",
-        "1e9999999",
-        "[" * 2000,
-        "- " * 500,
-        LAUGHS,
+        *("1e400", "-0", ".inf", ".nan", "0x7fffffffffffffffffff", "1_000", "1e9999999", "1:30"),
+        *(
+            "!!python/none",
+            "!!binary aGk=",
+            "&a [*a]",
+            "*a",
+            "<<: 3",
+            "{",
+            "[[",
+            "'",
+            "\0",
+            "~",
+            "yes",
+            "1:30",
+        ),
+        *("[" * 500, "- " * 500, LAUGHS),  # reading takes the square of the depth
     ]
 )
 
@@ -149,48 +123,33 @@ def json_text(whole: Any) -> st.SearchStrategy[str]:
     """A JSON document with one value, key or piece of text changed."""
 
     def change(number: int, value: Any) -> str:
-        numbers = random.Random(number)
+        draw = random.Random(number)
         tree = json.loads(json.dumps(whole))
         node, parent, key = tree, None, None
-        while isinstance(node, dict | list) and node and (parent is None or numbers.random() < 0.7):
-            parent, key = node, numbers.choice(list(node) if isinstance(node, dict) else range(len(node)))
+        while isinstance(node, dict | list) and node and (parent is None or draw.random() < 0.7):
+            parent, key = node, draw.choice(list(node) if isinstance(node, dict) else range(len(node)))
             node = node[key]
-        if parent is None or numbers.random() < 0.05:
+        if parent is None or draw.random() < 0.05:
             return json.dumps(value)
-        if numbers.random() < 0.15:
+        if draw.random() < 0.15:
             del parent[key]
         else:
             parent[key] = value
         text = json.dumps(tree)
-        return (
-            text
-            if numbers.random() < 0.7
-            else mutated([text.encode()], number).decode("utf-8", "surrogateescape")
-        )
+        broken = mutated([text.encode()], number).decode("utf-8", "surrogateescape")
+        return text if draw.random() < 0.7 else broken
 
     return st.builds(change, st.integers(0, 2**62), PLAIN)
 
 
 def overrides() -> st.SearchStrategy[list[str]]:
-    """Settings as ``--set`` takes them."""
-    key = (
-        st.sampled_from(setting_names())
-        | st.sampled_from(setting_names())
-        | st.sampled_from(setting_names())
-        | st.sampled_from(["model", "objective", "optimiser", "", ".", "a.b.c", "betas.0"])
-        | st.text(max_size=12)
-    )
-    small = st.sampled_from(
-        ["0", "1", "2", "0.5", "1e-4", "true", "false", "none", "light", "[0.8, 0.1, 0.1]"]
-    )
-    value = (
-        small
-        | small
-        | WORDS
-        | PLAIN.map(lambda tree: yaml.safe_dump(tree, default_flow_style=True, width=10**6).strip())
-        | st.text(max_size=20)
-    )
-    one = st.builds(
-        lambda name, text, mark: f"{name}{mark}{text}", key, value, st.sampled_from(["=", "=", "=", "", "=="])
-    )
+    """Settings as ``--set`` takes them; three names of four are known, half of the values small."""
+    known = st.sampled_from(setting_names())
+    parts = st.sampled_from(["model", "objective", "optimiser", "", ".", "a.b.c", "betas.0"])
+    small = st.sampled_from(["0", "1", "2", "0.5", "1e-4", "true", "none", "light", "[0.8, 0.1, 0.1]"])
+    tree = PLAIN.map(lambda one: yaml.safe_dump(one, default_flow_style=True, width=10**6).strip())
+    key = known | known | known | parts | st.text(max_size=12)
+    value = small | small | WORDS | tree | st.text(max_size=20)
+    mark = st.sampled_from(["=", "=", "=", "", "=="])
+    one = st.builds(lambda name, text, between: f"{name}{between}{text}", key, value, mark)
     return st.lists(one, min_size=1, max_size=3)

@@ -3,7 +3,6 @@
 import io
 import json
 import os
-import warnings
 import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -13,23 +12,15 @@ from typing import Any
 
 import numpy as np
 import torch
-from fuzzing.inputs import (
-    WORDS,
-    bytes_like,
-    encoded_pictures,
-    json_text,
-    overrides,
-    packed,
-    tarred,
-)
+from fuzzing.inputs import WORDS, bytes_like, encoded_pictures, json_text, overrides, packed, tarred
 from hypothesis import strategies as st
 
 import derender
 from derender.data import checked_footer, decode, open_source, quiet_pillow, read_images
-from derender.data.cache import cache_file, read_cache
+from derender.data.cache import read_cache
 from derender.evaluation.memory import Memory
 from derender.features import FeatureTable
-from derender.storage.atomic import CHECKSUMS, DamageNoticed
+from derender.storage.atomic import CHECKSUMS
 from derender.training import resolve
 from derender.training.checkpoint import TrainState, load_checkpoint, save_checkpoint
 from derender.training.config import config_from_tree, to_yaml
@@ -39,6 +30,7 @@ from derender.training.watch import Watcher
 REFUSALS = (ValueError, OSError)
 TEXT = partial(str, encoding="utf-8", errors="surrogateescape")
 TINY = ("image_size=32", "width=4", "light_width=4")
+CONFIG = resolve("small", TINY)
 
 
 @dataclass(frozen=True)
@@ -52,6 +44,7 @@ class Target:
         read: gives one to the reader.
         wholes: good files, as bytes, for a search that starts from them; none where it is not fed bytes.
         given: makes an input of bytes.
+        made_again: whether the reader makes a damaged file again instead of refusing it.
     """
 
     name: str
@@ -60,130 +53,124 @@ class Target:
     read: Callable[[Any], object]
     wholes: Sequence[bytes] = ()
     given: Callable[[bytes], Any] = bytes
+    made_again: bool = False
+
+
+def bytes_target(
+    name: str, share: float, file: Path, read: Callable[[], object], *wholes: bytes, **more: bool
+) -> Target:
+    """A reader of one file, which is fed changed copies of whole ones."""
+
+    def written_and_read(content: bytes) -> None:
+        file.write_bytes(content)
+        read()
+
+    return Target(name, share, bytes_like(*wholes), written_and_read, wholes, **more)
 
 
 def targets(place: Path) -> Iterator[Target]:
     """Every reader, with whole files to start from."""
-    numbers = np.random.default_rng(0)
-    config = resolve("small", TINY)
-    tree = config.model_dump(mode="json")
+    yield from configurations(place)
+    yield from tables(place)
+    yield from models(place)
+    yield checkpoint_target(place)
+    yield from images(place)
+    yield from kept_results(place)
 
-    def config_text(text: str) -> None:
-        (place / "config.yaml").write_text(text, errors="surrogateescape")
+
+def configurations(place: Path) -> Iterator[Target]:
+    file, whole = place / "config.yaml", to_yaml(CONFIG).encode()
+
+    def read(text: str) -> None:
+        file.write_text(text, errors="surrogateescape")
         config_from_tree(read_config_tree(place))
 
-    documents = (
-        json_text(tree)
-        | bytes_like(to_yaml(config).encode()).map(lambda content: content.decode("utf-8", "surrogateescape"))
-        | WORDS.map(lambda word: f"preset: {word}\n")
-    )
-    yield Target("config (YAML)", 0.02, documents, config_text, [to_yaml(config).encode()], TEXT)
+    documents = json_text(CONFIG.model_dump(mode="json")) | bytes_like(whole).map(TEXT)
+    documents |= WORDS.map(lambda word: f"preset: {word}\n")
+    yield Target("config (YAML)", 0.02, documents, read, [whole], TEXT)
+    chosen = ["\0".join(TINY).encode(), b"optimiser.betas=[0.9, 0.99]\0objective.perceptual=none"]
     yield Target(
-        "config (--set)",
-        0.28,
-        overrides(),
-        lambda chosen: resolve("small", chosen),
-        ["\0".join(TINY).encode(), b"optimiser.betas=[0.9, 0.99]\0objective.perceptual=none"],
+        "config (--set)", 0.28, overrides(), partial(resolve, "small"), chosen,
         lambda content: TEXT(content).split("\0"),
-    )
+    )  # fmt: skip
 
-    table = place / "F.parquet"
-    FeatureTable(
-        ("a", "b", "c"),
-        {"geometry": numbers.normal(size=(3, 4)), "light": numbers.normal(size=(3, 2))},
-        {"age": np.array([1.0, 2, 3]), "name": np.array(["x", "y", "z"])},
-        {"data": "here"},
-    ).write(table)
 
-    def table_bytes(content: bytes) -> None:
-        table.write_bytes(content)
-        FeatureTable.read(table)
+def tables(place: Path) -> Iterator[Target]:
+    draw, file = np.random.default_rng(0), place / "F.parquet"
+    factors = {"geometry": draw.normal(size=(3, 4)), "light": draw.normal(size=(3, 2))}
+    labels = {"age": np.array([1.0, 2, 3]), "name": np.array(["x", "y", "z"])}
+    whole = FeatureTable(("a", "b", "c"), factors, labels, {"data": "here"}).write(file).read_bytes()
+    yield bytes_target("FeatureTable (parquet)", 0.25, file, lambda: FeatureTable.read(file), whole)
+    footer = whole[-8 - int.from_bytes(whole[-8:-4], "little") : -8]
 
-    written = table.read_bytes()
-    yield Target("FeatureTable (parquet)", 0.25, bytes_like(written), table_bytes, [written])
-    footer = written[-8 - int.from_bytes(written[-8:-4], "little") : -8]
+    def read(content: bytes) -> None:
+        end = content + len(content).to_bytes(4, "little") + b"PAR1"
+        file_like = whole[: -8 - len(footer)] + end
+        checked_footer(io.BytesIO(file_like), len(file_like))
 
-    def footer_bytes(content: bytes) -> None:
-        whole = b"".join((written[: -8 - len(footer)], content, len(content).to_bytes(4, "little"), b"PAR1"))
-        checked_footer(io.BytesIO(whole), len(whole))
+    yield Target("footer (parquet)", 0.02, bytes_like(footer), read, [footer])
 
-    yield Target("footer (parquet)", 0.02, bytes_like(footer), footer_bytes, [footer])
 
-    model = derender.Derenderer.seeded(config.model, 0)
-    folder = model.save(place / "model")
-    described, weights = (
-        json.loads((folder / "config.json").read_text()),
-        (folder / "model.safetensors").read_bytes(),
-    )
+def models(place: Path) -> Iterator[Target]:
+    folder = derender.Derenderer.seeded(CONFIG.model, 0).save(place / "model")
+    described, weights = (folder / "config.json").read_bytes(), (folder / "model.safetensors").read_bytes()
 
-    def model_config(text: str) -> None:
-        (folder / "config.json").write_text(text, errors="surrogateescape")
-        (folder / "model.safetensors").write_bytes(weights)
-        derender.load(folder)
-
-    def model_weights(content: bytes) -> None:
-        (folder / "config.json").write_text(json.dumps(described))
+    def read(config: bytes, content: bytes) -> None:
+        (folder / "config.json").write_bytes(config)
         (folder / "model.safetensors").write_bytes(content)
         derender.load(folder)
 
+    yield Target(
+        "model (JSON)", 0.03, json_text(json.loads(described)),
+        lambda text: read(text.encode(errors="surrogateescape"), weights), [described], TEXT,
+    )  # fmt: skip
     header = weights[: 8 + int.from_bytes(weights[:8], "little")]
-    yield Target(
-        "model (JSON)", 0.03, json_text(described), model_config, [json.dumps(described).encode()], TEXT
-    )
-    yield Target(
-        "model (safetensors)",
-        0.01,
-        bytes_like(header).map(lambda head: head + weights[len(header) :]) | bytes_like(weights),
-        model_weights,
-        [header],
-        lambda head: head + weights[len(header) :],
-    )
 
+    def with_header(head: bytes) -> bytes:
+        return head + weights[len(header) :]
+
+    inputs = bytes_like(header).map(with_header) | bytes_like(weights)
+    yield Target("model (safetensors)", 0.01, inputs, partial(read, described), [header], with_header)
+
+
+def checkpoint_target(place: Path) -> Target:
     torch.manual_seed(0)
-    net = torch.nn.Linear(3, 2)
+    net, kept = torch.nn.Linear(3, 2), place / "last"
     optimiser = torch.optim.Adam(net.parameters(), fused=True)
     net(torch.ones(1, 3)).sum().backward()
     optimiser.step()
-    kept = place / "last"
     save_checkpoint(kept, net, optimiser, TrainState(images=8))
-    files = {file.name: file.read_bytes() for file in kept.iterdir()}
+    files = {file.name: file.read_bytes() for file in sorted(kept.iterdir())}
+    names = list(files)
 
-    def checkpoint(change: tuple[str, bytes, bool]) -> None:
+    def read(change: tuple[str, bytes, bool]) -> None:
         name, content, sealed = change
-        for other, whole in files.items():
+        for other, whole in {**files, name: content}.items():
             (kept / other).write_bytes(whole)
-        (kept / name).write_bytes(content)
         if not sealed:  # as earlier versions wrote them
             (kept / CHECKSUMS).unlink()
             state = (kept / "state.json").read_bytes()
             (kept / "state.json").write_bytes(state.replace(b'"format": 1, ', b""))
         state = load_checkpoint(kept, net, optimiser)
-        Watcher.remembering(config.model.ranges, config.batch_size, state.watcher)
+        Watcher.remembering(CONFIG.model.ranges, CONFIG.batch_size, state.watcher)
         optimiser.step()  # with what was read
 
-    change = st.sampled_from(sorted(files)).flatmap(
-        lambda name: st.tuples(st.just(name), bytes_like(files[name]), st.booleans())
-    )
-    names = sorted(files)
-
-    def of_a_checkpoint(content: bytes) -> tuple[str, bytes, bool]:
+    def of_bytes(content: bytes) -> tuple[str, bytes, bool]:
         """The first byte chooses a file, which stands without a checksum that would end the search."""
         name = names[content[0] % len(names)] if content else names[0]
         return name, content[1:], name == CHECKSUMS
 
-    yield Target(
-        "checkpoint",
-        0.04,
-        change,
-        checkpoint,
-        [bytes([number]) + files[name] for number, name in enumerate(names)],
-        of_a_checkpoint,
+    change = st.sampled_from(names).flatmap(
+        lambda name: st.tuples(st.just(name), bytes_like(files[name]), st.booleans())
     )
+    wholes = [bytes([number]) + files[name] for number, name in enumerate(names)]
+    return Target("checkpoint", 0.04, change, read, wholes, of_bytes)
 
-    archive = place / "a.zip"
 
-    def zip_bytes(content: bytes) -> None:
-        archive.write_bytes(content)
+def images(place: Path) -> Iterator[Target]:
+    archive, shard = place / "a.zip", place / "s.tar"
+
+    def read_members() -> None:
         with open_source(archive) as source:
             for file in source.files:
                 try:
@@ -193,21 +180,11 @@ def targets(place: Path) -> Iterator[Target]:
 
     kinds = (zipfile.ZIP_DEFLATED, zipfile.ZIP_STORED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA)
     zips = [packed(kind) for kind in kinds]
-    yield Target("zip", 0.14, bytes_like(*zips), zip_bytes, zips)
-
-    def data_set(content: bytes) -> None:
-        archive.write_bytes(content)
-        read_images(archive, 8, workers=1)
-
-    yield Target("data set in a zip", 0.005, bytes_like(zips[0]), data_set, zips[:1])
-
-    shard = place / "s.tar"
-
-    def shard_bytes(content: bytes) -> None:
-        shard.write_bytes(content)
-        read_images(shard, 8, workers=1, cache=place / "cache")
-
-    yield Target("data set in a tar shard", 0.005, bytes_like(tarred()), shard_bytes, [tarred()])
+    yield bytes_target("zip", 0.14, archive, read_members, *zips)
+    whole = partial(read_images, archive, 8, workers=1)
+    yield bytes_target("data set in a zip", 0.005, archive, whole, zips[0])
+    whole = partial(read_images, shard, 8, workers=1, cache=place / "cache")
+    yield bytes_target("data set in a tar shard", 0.005, shard, whole, tarred())
 
     def picture(content: bytes) -> None:
         with quiet_pillow():
@@ -215,39 +192,28 @@ def targets(place: Path) -> Iterator[Target]:
 
     yield Target("picture", 0.16, bytes_like(*encoded_pictures()), picture)
 
+
+def kept_results(place: Path) -> Iterator[Target]:
     memory = Memory(place / "memory")
     memory.recall("kind", {"a": 1}, lambda: {"found": np.arange(6.0)})
-    (remembered,) = (place / "memory").iterdir()
+    (file,) = (place / "memory").iterdir()
 
-    def memory_bytes(content: bytes) -> None:
-        remembered.write_bytes(content)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DamageNoticed)
-            assert memory.recall("kind", {"a": 1}, lambda: {"found": np.zeros(2)})
+    def recall() -> None:
+        assert memory.recall("kind", {"a": 1}, lambda: {"found": np.zeros(2)})
 
-    kept_results = remembered.read_bytes()
-    yield Target("remembered results (npz)", 0.02, bytes_like(kept_results), memory_bytes, [kept_results])
-
-    pictures = place / "pictures"
-    pictures.mkdir()
+    yield bytes_target("remembered results (npz)", 0.02, file, recall, file.read_bytes(), made_again=True)
+    folder = place / "pictures"
+    folder.mkdir()
     for number, content in enumerate(encoded_pictures()[:2]):
-        (pictures / f"{number}.png").write_bytes(content)
-        os.utime(pictures / f"{number}.png", (0, 0))
-    read_images(pictures, 8, cache=place / "rows", workers=1)
+        (folder / f"{number}.png").write_bytes(content)
+        os.utime(folder / f"{number}.png", (0, 0))
+    read_images(folder, 8, cache=place / "rows", workers=1)
     (rows,) = (place / "rows").iterdir()
-    assert cache_file(place / "rows", "pictures", ("x",)).parent == rows.parent
 
-    def rows_bytes(content: bytes) -> None:
-        rows.write_bytes(content)
+    def read_rows() -> None:
         read_cache(rows, "fingerprint", 8)
-        read_images(pictures, 8, cache=place / "rows", workers=1)
+        read_images(folder, 8, cache=place / "rows", workers=1)
 
-    cached = rows.read_bytes()
-    yield Target("decoded images (cache)", 0.005, bytes_like(cached), rows_bytes, [cached])
-
-    def metrics(content: bytes) -> None:
-        (place / "metrics.jsonl").write_bytes(content)
-        read_metrics(place)
-
+    yield bytes_target("decoded images (cache)", 0.005, rows, read_rows, rows.read_bytes(), made_again=True)
     lines = b'{"kind": "train", "images": 8, "l1": 0.1}\n{"kind": "validation", "images": 8}\n'
-    yield Target("metrics of a run", 0.015, bytes_like(lines), metrics, [lines])
+    yield bytes_target("metrics of a run", 0.015, place / "metrics.jsonl", lambda: read_metrics(place), lines)

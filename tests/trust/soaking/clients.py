@@ -2,7 +2,7 @@
 
 Each client opens images (uploads, examples, rows of the table), drags light and camera, swaps factors, asks
 for neighbours, saves, and sometimes goes away without taking its answer. What comes back is looked at: kind,
-content, and whether it belongs to the question. Leaves out who runs the server (../soak.py).
+content, and whether it belongs to the question.
 """
 
 import http.client
@@ -29,329 +29,244 @@ ENDED_WITHIN_SECONDS = 50.0
 """Later than any of the server's own limits for heads, bodies and answers that nobody takes."""
 
 PNG, GLB = b"\x89PNG\r\n\x1a\n", b"glTF"
-FACTORS = ("geometry", "albedo", "light", "camera")
-EXPORTS = ("picture", "panel", "mesh", "archive", "settings")
 MAPS = {"input", "reconstruction", "view", "depth", "normals", "albedo", "shading"}
+Check = Callable[[bytes], bool]
 
 
 @dataclass
 class Answers:
-    """What all clients got, safe to use from several threads.
+    """What all clients got; lists are safe to append to from several threads.
 
     Attributes:
-        waits: seconds from question to whole answer, by kind of request.
-        failures: by kind.
-        said: the first sentences on what went wrong.
-        held: odd connections that the server ended in time, by kind.
+        waits: kind of request, and seconds to its whole answer.
+        failures: kind, and what went wrong.
+        ended: kinds of odd connections that the server ended in time.
     """
 
-    waits: dict[str, list[float]] = field(default_factory=dict)
-    failures: Counter[str] = field(default_factory=Counter)
-    said: list[str] = field(default_factory=list)
-    held: Counter[str] = field(default_factory=Counter)
-    lock: threading.Lock = field(default_factory=threading.Lock)
-    _count_before: int = 0
-    _longest: float = 0.0
-
-    def got(self, kind: str, seconds: float) -> None:
-        with self.lock:
-            self.waits.setdefault(kind, []).append(seconds)
-            self._longest = max(self._longest, seconds)
-
-    def ended(self, kind: str) -> None:
-        with self.lock:
-            self.held[kind] += 1
-
-    def since_last(self) -> tuple[int, float]:
-        """How many answers there were since this was last asked, and the longest wait for one."""
-        count = self.count
-        with self.lock:
-            found = count - self._count_before, self._longest
-            self._count_before, self._longest = count, 0.0
-        return found
-
-    def failed(self, kind: str, why: str) -> None:
-        with self.lock:
-            self.failures[kind] += 1
-            if len(self.said) < 20:
-                self.said.append(f"{kind}: {why}")
-
-    @property
-    def count(self) -> int:
-        with self.lock:
-            return sum(map(len, self.waits.values()))
+    waits: list[tuple[str, float]] = field(default_factory=list)
+    failures: list[tuple[str, str]] = field(default_factory=list)
+    ended: list[str] = field(default_factory=list)
 
     def rows(self) -> list[dict[str, Any]]:
         """Per kind and for all: how many, failures, and waits in milliseconds."""
-        with self.lock:
-            waits = {kind: list(found) for kind, found in self.waits.items()}
-        kinds = sorted(set(waits) | set(self.failures))
-        every = [wait for found in waits.values() for wait in found]
-        table = [(kind, waits.get(kind, []), self.failures[kind]) for kind in kinds]
-        table.append(("all", every, sum(self.failures.values())))
-        return [
-            {
-                "request": kind,
-                "answers": len(found),
-                "failed": failed,
-                **{
-                    f"p{share}_ms": 1000 * float(np.percentile(found or [0], share)) for share in (50, 95, 99)
-                },
-                "longest_ms": 1000 * max(found, default=0.0),
-            }
-            for kind, found, failed in table
-        ]
+        failed = Counter(kind for kind, _ in self.failures)
+        rows = []
+        for kind in [*sorted({kind for kind, _ in self.waits} | failed.keys()), "all"]:
+            waits = [1000 * wait for name, wait in list(self.waits) if kind in (name, "all")] or [0.0]
+            shares = {f"p{share}_ms": float(np.percentile(waits, share)) for share in (50, 95, 99)}
+            count = sum(kind in (name, "all") for name, _ in self.waits)
+            lost = failed.total() if kind == "all" else failed[kind]
+            shares["longest_ms"] = max(waits)
+            rows.append({"request": kind, "answers": count, "failed": lost, **shares})
+        return rows
 
     def markdown(self) -> str:
         lines = ["| request | answers | failed | median ms | 95 % | 99 % | longest |"]
         lines.append("| --- |" + " ---: |" * 6)
-        for row in self.rows():
-            waits = " | ".join(f"{row[key]:,.0f}" for key in ("p50_ms", "p95_ms", "p99_ms", "longest_ms"))
-            lines.append(f"| {row['request']} | {row['answers']:,} | {row['failed']} | {waits} |")
+        for kind, *numbers in (row.values() for row in self.rows()):
+            lines.append(f"| {kind} | {' | '.join(f'{number:,.0f}' for number in numbers)} |")
         return "\n".join(lines)
 
 
 class Unfit(Exception):
-    """An answer that is not what was asked for."""
+    """An answer that is not what was asked for, or the end of the load."""
 
 
-class Visitor(threading.Thread):
+@dataclass
+class Visitor:
     """Somebody at the page: one session after another until told to stop.
 
-    Args:
+    Attributes:
         port: of the viewer on this machine.
         number: tells visitors apart, and seeds what they do.
         uploads: encoded images.
         rows: in the viewer's table.
         pause_seconds: mean time between two requests.
         answers: where waits are noted.
-        stop: ends the thread.
+        stop: ends it.
     """
 
-    def __init__(
-        self,
-        port: int,
-        number: int,
-        uploads: Sequence[bytes],
-        rows: int,
-        pause_seconds: float,
-        answers: Answers,
-        stop: threading.Event,
-    ):
-        super().__init__(name=f"visitor {number}", daemon=True)
-        self.port, self.uploads, self.rows = port, uploads, rows
-        self.pause_seconds, self.answers, self.stop = pause_seconds, answers, stop
-        self.draw = random.Random(number)
-        self.line: http.client.HTTPConnection | None = None
+    port: int
+    number: int
+    uploads: Sequence[bytes]
+    rows: int
+    pause_seconds: float
+    answers: Answers
+    stop: threading.Event
+    line: http.client.HTTPConnection | None = None
+
+    def __post_init__(self) -> None:
+        self.draw = random.Random(self.number)
 
     def run(self) -> None:
         while not self.stop.is_set():
             with suppress(Unfit):
                 self.session()
             self.leave()
-        self.leave()
 
     def leave(self) -> None:
         if self.line is not None:
             self.line.close()
-            self.line = None
+        self.line = None
 
     def session(self) -> None:
         """Load the page, open an image or two, and play."""
         for path in ("/", "/view.css", "/view.js", "/surface.js"):
-            self.ask("page", path, check=lambda body: len(body) > 100, method="GET")
-        about = json.loads(
-            self.ask("about", "/api/about", check=lambda body: b"examples" in body, method="GET")
-        )
-        examples = len(about["examples"])
-        first, second = self.opened(examples), None
+            self.ask("page", path, fits=lambda body: len(body) > 100, method="GET")
+        about = self.ask("about", "/api/about", fits=lambda body: b"examples" in body, method="GET")
+        examples = len(json.loads(about)["examples"])
+        first, swaps = self.opened(examples), {}
         for _ in range(self.draw.randrange(10, 40)):
-            if self.stop.is_set():
-                return
-            chance = self.draw.random()
-            question = self.question(first, second)
-            if chance < 0.70:
-                self.drag(question)
-            elif chance < 0.78:
-                self.ask(
-                    "factors", "/api/factors", question, check=lambda body: set(json.loads(body)) == MAPS
-                )
-            elif chance < 0.86:
-                more = {"factor": self.draw.choice(FACTORS), "k": 12}
-                self.ask("neighbours", "/api/neighbours", {**question, **more}, check=_neighbours)
-            elif chance < 0.92:
-                name = self.draw.choice(EXPORTS)
-                self.ask(name, f"/api/{name}", question, check=_export(name, question))
-            elif chance < 0.95:
-                second = self.opened(examples)
-            elif chance < 0.97:
-                self.ask("refused", "/api/pictures", b"no picture", check=None, status=415)
-            else:
-                self.abandon(question)
+            question = self.question(first, swaps)
+            weights = {"drag": 70, "factors": 8, "neighbours": 8, "save": 6, "open": 3, "refused": 2, "go": 3}
+            match self.draw.choices(list(weights), list(weights.values()))[0]:
+                case "drag":
+                    self.drag(question)
+                case "factors":
+                    self.ask("factors", "/api/factors", question, lambda body: set(json.loads(body)) == MAPS)
+                case "neighbours":
+                    asked = {"factor": self.draw.choice(("geometry", "albedo", "light", "camera")), "k": 12}
+                    self.ask("neighbours", "/api/neighbours", {**question, **asked}, nearest_first)
+                case "save":
+                    name = self.draw.choice(("picture", "panel", "mesh", "archive", "settings"))
+                    self.ask(name, f"/api/{name}", question, export(name, question))
+                case "open":
+                    swaps = {self.draw.choice(("geometry", "albedo")): self.opened(examples)}
+                case "refused":
+                    self.ask("refused", "/api/pictures", b"no picture", status=415)
+                case "go":
+                    self.abandon(question)
 
-    def opened(self, examples: int) -> dict[str, Any]:
-        """What the viewer says of an image from one of the three sources."""
+    def opened(self, examples: int) -> str:
+        """The viewer's name of an image from one of the three sources."""
         source = self.draw.choice(("upload", "upload", "example", "row"))
         path, body = {
             "upload": ("/api/pictures", self.draw.choice(self.uploads)),
             "example": (f"/api/examples/{self.draw.randrange(examples)}", {}),
             "row": (f"/api/rows/{self.draw.randrange(self.rows)}", {}),
         }[source]
-        return json.loads(
-            self.ask(source, path, body, check=lambda found: len(json.loads(found)["picture"]) == 22)
-        )
+        told = self.ask(source, path, body, lambda found: len(json.loads(found)["picture"]) == 22)
+        return json.loads(told)["picture"]
 
-    def question(self, first: dict[str, Any], second: dict[str, Any] | None) -> dict[str, Any]:
+    def question(self, picture: str, swaps: dict[str, str]) -> dict[str, Any]:
         """What the page sends: the image under some light and view, perhaps with another's factor."""
         draw = self.draw.uniform
-        light = {
-            "ambient": draw(0, 1),
-            "diffuse": draw(0, 1),
-            "pitch_deg": draw(-80, 80),
-            "yaw_deg": draw(-80, 80),
-        }
-        camera = {
-            "rotation_deg": [draw(-40, 40) for _ in range(3)],
-            "translation": [draw(-0.1, 0.1) for _ in range(3)],
-        }
-        swaps = {} if second is None else {self.draw.choice(("geometry", "albedo")): second["picture"]}
-        return {"picture": first["picture"], "swaps": swaps, "light": light, "camera": camera}
+        light = {"ambient": draw(0, 1), "diffuse": draw(0, 1)}
+        light |= {"pitch_deg": draw(-80, 80), "yaw_deg": draw(-80, 80)}
+        turned, moved = [draw(-40, 40) for _ in range(3)], [draw(-0.1, 0.1) for _ in range(3)]
+        camera = {"rotation_deg": turned, "translation": moved}
+        return {"picture": picture, "swaps": swaps, "light": light, "camera": camera}
 
     def drag(self, question: dict[str, Any]) -> None:
         """One step of a slider, at the model's size or larger."""
         size = self.draw.choices((None, 128, 256), (90, 8, 2))[0]
         kind = "view" if size is None else f"view at {size}"
-        self.ask(kind, "/api/view", {**question, "size": size}, check=lambda body: body.startswith(PNG))
+        self.ask(kind, "/api/view", {**question, "size": size}, lambda body: body.startswith(PNG))
 
     def abandon(self, question: dict[str, Any]) -> None:
         """Ask for something heavy and go away before it comes."""
         body = json.dumps(question).encode()
         with socket.create_connection(("127.0.0.1", self.port), TIMEOUT_SECONDS) as line:
-            line.sendall(_head(self.port, "POST", "/api/archive", f"Content-Length: {len(body)}\r\n") + body)
+            line.sendall(head(self.port, "POST", "/api/archive", len(body)) + body)
             self.stop.wait(self.draw.uniform(0, 0.3))
-        self.answers.ended("abandoned")
-        self.leave()
+        self.answers.ended.append("abandoned")
 
     def ask(
         self,
         kind: str,
         path: str,
         body: object = None,
+        fits: Check = lambda _: True,
         *,
-        check: Callable[[bytes], bool] | None,
         method: str = "POST",
         status: int = 200,
     ) -> bytes:
         """One request on the kept connection; notes the wait, or raises ``Unfit`` and notes why."""
         if self.stop.wait(self.draw.expovariate(1 / self.pause_seconds)):
-            raise Unfit("it is over")
+            raise Unfit
         content = body if isinstance(body, bytes) or body is None else json.dumps(body).encode()
-        headers = (
-            {} if method == "GET" else {"X-Derender-Page": "1", "Origin": f"http://127.0.0.1:{self.port}"}
-        )
         began = time.monotonic()
         try:
-            found, answer = self._exchange(method, path, content, headers)
+            found, answer = self.exchange(method, path, content)
         except (OSError, http.client.HTTPException) as problem:
-            waited = f"{type(problem).__name__} {problem} after {time.monotonic() - began:.1f} s"
-            if self.stop.is_set():  # the server may be gone already
-                raise Unfit from problem
-            self.answers.failed(kind, waited)
+            if not self.stop.is_set():  # else the server may be gone already
+                self.answers.failures.append((kind, f"{type(problem).__name__} {problem}"))
             raise Unfit from problem
-        waited = time.monotonic() - began
-        fits = found == status
-        try:
-            fits = fits and (check is None or check(answer))
-        except (ValueError, LookupError, zipfile.BadZipFile):
-            fits = False
-        if not fits:
-            self.answers.failed(kind, f"status {found} after {waited:.1f} s: {answer[:200]!r}")
+        waited, well = time.monotonic() - began, False
+        with suppress(ValueError, LookupError, zipfile.BadZipFile):
+            well = found == status and fits(answer)
+        if not well:
+            self.answers.failures.append((kind, f"status {found} after {waited:.1f} s: {answer[:200]!r}"))
             raise Unfit
-        self.answers.got(kind, waited)
+        self.answers.waits.append((kind, waited))
         return answer
 
-    def _exchange(
-        self, method: str, path: str, content: bytes | None, headers: dict[str, str]
-    ) -> tuple[int, bytes]:
+    def exchange(self, method: str, path: str, content: bytes | None) -> tuple[int, bytes]:
         """As browsers do: on the open connection, or on a new one where the server has ended that."""
+        headers = {"X-Derender-Page": "1", "Origin": f"http://127.0.0.1:{self.port}"}
         kept = self.line is not None
-        if self.line is None:
-            self.line = http.client.HTTPConnection("127.0.0.1", self.port, timeout=TIMEOUT_SECONDS)
+        self.line = self.line or http.client.HTTPConnection("127.0.0.1", self.port, timeout=TIMEOUT_SECONDS)
         try:
-            self.line.request(method, path, content, headers)
+            self.line.request(method, path, content, headers if method == "POST" else {})
             answer = self.line.getresponse()
             return answer.status, answer.read()
         except (http.client.RemoteDisconnected, BrokenPipeError, ConnectionResetError):
             self.leave()
             if not kept:
                 raise
-            return self._exchange(method, path, content, headers)
+            return self.exchange(method, path, content)
         except BaseException:
             self.leave()
             raise
 
 
-class Nuisance(threading.Thread):
-    """Opens connections as no browser would, and looks whether the server ends them in time."""
-
-    def __init__(self, port: int, pause_seconds: float, answers: Answers, stop: threading.Event):
-        super().__init__(name="nuisance", daemon=True)
-        self.port, self.pause_seconds, self.answers, self.stop = port, pause_seconds, answers, stop
-        self.draw = random.Random(-1)
-        self.held: list[tuple[float, str, socket.socket]] = []
-
-    def run(self) -> None:
-        while not self.stop.wait(self.draw.expovariate(1 / self.pause_seconds)):
-            try:
-                self.open(
-                    self.draw.choice(
-                        ("half a head", "slow body", "answers not taken", "silence", "reset", "noise")
-                    )
-                )
-            except OSError as problem:
-                self.answers.failed("half-open", f"cannot connect: {problem}")
-            while self.held and time.monotonic() - self.held[0][0] > ENDED_WITHIN_SECONDS:
-                self.look(*self.held.pop(0)[1:])
-        for _, _, line in self.held:
-            line.close()
-
-    def open(self, kind: str) -> None:
-        line = socket.socket()
-        if kind == "answers not taken":
-            line.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+def nuisance(port: int, pause_seconds: float, answers: Answers, stop: threading.Event) -> None:
+    """Open connections as no browser would, and look whether the server ends them in time."""
+    draw, held = random.Random(-1), []
+    sent = {
+        "half a head": head(port, "GET", "/")[:-10],
+        "slow body": head(port, "POST", "/api/pictures", 1_000_000) + bytes(1000),
+        "answers not taken": head(port, "GET", "/view.js") * 40,
+        "silence": b"",
+        "noise": draw.randbytes(300) + b"\r\n\r\n",
+        "reset": head(port, "GET", "/api/about"),
+    }
+    while not stop.wait(draw.expovariate(1 / pause_seconds)):
+        kind, line = draw.choice(list(sent)), socket.socket()
         line.settimeout(5)
-        line.connect(("127.0.0.1", self.port))
-        if kind == "half a head":
-            line.sendall(_head(self.port, "GET", "/")[:-10])
-        elif kind == "slow body":
-            line.sendall(
-                _head(self.port, "POST", "/api/pictures", "Content-Length: 1000000\r\n") + bytes(1000)
-            )
-        elif kind == "answers not taken":
-            line.sendall(_head(self.port, "GET", "/view.js") * 40)
-        elif kind == "noise":
-            line.sendall(self.draw.randbytes(300) + b"\r\n\r\n")
-        elif kind == "reset":
-            line.sendall(_head(self.port, "GET", "/api/about"))
-            line.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
-            line.close()
-            self.answers.ended(kind)
-            return
-        self.held.append((time.monotonic(), kind, line))
+        try:
+            if kind == "answers not taken":
+                line.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+            line.connect(("127.0.0.1", port))
+            line.sendall(sent[kind])
+            if kind == "reset":
+                line.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+                line.close()
+                answers.ended.append(kind)
+            else:
+                held.append((time.monotonic(), kind, line))
+        except OSError as problem:
+            answers.failures.append(("half-open", f"cannot connect: {problem}"))
+        while held and time.monotonic() - held[0][0] > ENDED_WITHIN_SECONDS:
+            look(*held.pop(0)[1:], answers)
+    for _, _, line in held:
+        line.close()
 
-    def look(self, kind: str, line: socket.socket) -> None:
-        """Whether the server has ended a connection: after what it had sent comes an end."""
-        line.settimeout(1)
+
+def look(kind: str, line: socket.socket, answers: Answers) -> None:
+    """Whether the server has ended a connection: after what it had sent comes an end, or a reset."""
+    line.settimeout(1)
+    with line:
         try:
             while line.recv(1 << 20):
                 pass
-            self.answers.ended(kind)
         except TimeoutError:
-            self.answers.failed("half-open", f"{kind} is still open after {ENDED_WITHIN_SECONDS:.0f} s")
-        except OSError:  # reset: ended, too
-            self.answers.ended(kind)
-        finally:
-            line.close()
+            text = f"{kind} is still open after {ENDED_WITHIN_SECONDS:.0f} s"
+            answers.failures.append(("half-open", text))
+            return
+        except OSError:
+            pass
+    answers.ended.append(kind)
 
 
 def encoded(files: Sequence[Path]) -> list[bytes]:
@@ -360,24 +275,24 @@ def encoded(files: Sequence[Path]) -> list[bytes]:
     for number, file in enumerate(files):
         stream, side = io.BytesIO(), (64, 300, 1200)[number % 3]
         with Image.open(file) as picture:
-            picture.resize((side, side * 3 // 4)).save(
-                stream, format=("JPEG", "PNG", "WEBP", "TIFF")[number % 4]
-            )
+            resized = picture.resize((side, side * 3 // 4))
+        resized.save(stream, format=("JPEG", "PNG", "WEBP", "TIFF")[number % 4])
         found.append(stream.getvalue())
     return found
 
 
-def _head(port: int, method: str, path: str, more: str = "") -> bytes:
+def head(port: int, method: str, path: str, length: int | None = None) -> bytes:
+    more = "" if length is None else f"Content-Length: {length}\r\n"
     return f"{method} {path} HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\nX-Derender-Page: 1\r\n{more}\r\n".encode()
 
 
-def _neighbours(body: bytes) -> bool:
+def nearest_first(body: bytes) -> bool:
     rows = json.loads(body)["rows"]
     distances = [row["distance"] for row in rows]
     return len(rows) == 12 and distances == sorted(distances) and all(row["image"] for row in rows)
 
 
-def _export(name: str, question: dict[str, Any]) -> Callable[[bytes], bool]:
+def export(name: str, question: dict[str, Any]) -> Check:
     """Whether bytes are what was asked for; settings show that they belong to this question."""
     if name == "settings":
         return lambda body: json.loads(body)["light"] == question["light"]

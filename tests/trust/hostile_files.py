@@ -11,15 +11,10 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageCms
 
-NAMES = [
-    "ÄÖ ß 日本.png",
-    "two\nlines.png",
-    "quote\"'.png",
-    "tab\there.png",
-    "-rf.png",
-    "a" * 240 + ".png",
-    "<script>.png",
-]
+NAMES = ("ÄÖ ß 日本.png", "two\nlines.png", "quote\"'.png", "tab\there.png", "-rf.png", "a" * 240 + ".png")
+NAMES += ("<script>.png",)
+UNSAFE = ("../outside.png", "/absolute.png", "a/../../outside.png", "C:/windows.png", "..\\back.png")
+PNG_HEAD = b"\x89PNG\r\n\x1a\n"
 
 
 @dataclass(frozen=True)
@@ -37,13 +32,13 @@ class Hostile:
     unreadable: tuple[str, ...]
 
 
-def smooth(size: tuple[int, int] = (48, 40), seed: int = 0) -> Image.Image:
+def smooth(seed: int, size: tuple[int, int] = (48, 40)) -> Image.Image:
     """An image that differs with the seed."""
     small = np.random.default_rng(seed).integers(0, 256, (5, 5, 3), dtype=np.uint8)
     return Image.fromarray(small).resize(size)
 
 
-def encoded(picture: Image.Image, form: str, **options: object) -> bytes:
+def encoded(picture: Image.Image, form: str = "PNG", **options: object) -> bytes:
     stream = io.BytesIO()
     picture.save(stream, format=form, **options)
     return stream.getvalue()
@@ -56,15 +51,13 @@ def png_chunk(kind: bytes, content: bytes) -> bytes:
 def png_that_says(width: int, height: int) -> bytes:
     """A small PNG file that claims this size; its data would unpack to 10 MB of zeros."""
     head = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    data = zlib.compress(bytes(10_000_000), 9)
-    return (
-        b"\x89PNG\r\n\x1a\n" + png_chunk(b"IHDR", head) + png_chunk(b"IDAT", data) + png_chunk(b"IEND", b"")
-    )
+    chunks = {b"IHDR": head, b"IDAT": zlib.compress(bytes(10_000_000), 9), b"IEND": b""}
+    return PNG_HEAD + b"".join(png_chunk(kind, content) for kind, content in chunks.items())
 
 
 def png_with_endless_text() -> bytes:
     """A whole PNG whose compressed comment unpacks to 100 MB."""
-    whole = encoded(smooth(seed=90), "PNG")
+    whole = encoded(smooth(90))
     text = png_chunk(b"zTXt", b"Comment\0\0" + zlib.compress(bytes(100_000_000), 9))
     return whole[:33] + text + whole[33:]
 
@@ -80,34 +73,34 @@ def odd_pictures() -> dict[str, bytes]:
     rotated = Image.Exif()
     rotated[0x0112] = 6
     damaged_exif = b"Exif\0\0II*\0\xff\xff\xff\xff" + bytes(20)
-    frames = [smooth(seed=number) for number in range(10, 14)]
+    frames = [smooth(number) for number in range(10, 14)]
     animated = {"save_all": True, "append_images": frames[1:]}
     profile = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
     deep = np.random.default_rng(1).integers(0, 65536, (30, 30)).astype(np.uint16)
     found = {
-        "plain.jpg": encoded(smooth(seed=1), "JPEG"),
-        "jpeg named.png": encoded(smooth(seed=2), "JPEG"),
-        "png named.jpg": encoded(smooth(seed=3), "PNG"),
+        "plain.jpg": encoded(smooth(1), "JPEG"),
+        "jpeg named.png": encoded(smooth(2), "JPEG"),
+        "png named.jpg": encoded(smooth(3)),
         "animated.gif": encoded(frames[0], "GIF", **animated),
-        "animated.webp": encoded(smooth(seed=15), "WEBP", **animated),
-        "animated.png": encoded(smooth(seed=16), "PNG", **animated),
-        "cmyk.jpg": encoded(smooth(seed=17).convert("CMYK"), "JPEG"),
-        "grey.bmp": encoded(smooth(seed=18).convert("L"), "BMP"),
-        "bilevel.tif": encoded(smooth(seed=19).convert("1"), "TIFF"),
-        "deep.png": encoded(Image.fromarray(deep), "PNG"),
+        "animated.webp": encoded(smooth(15), "WEBP", **animated),
+        "animated.png": encoded(smooth(16), **animated),
+        "cmyk.jpg": encoded(smooth(17).convert("CMYK"), "JPEG"),
+        "grey.bmp": encoded(smooth(18).convert("L"), "BMP"),
+        "bilevel.tif": encoded(smooth(19).convert("1"), "TIFF"),
+        "deep.png": encoded(Image.fromarray(deep)),
         "deep.tif": encoded(Image.fromarray(deep // 2), "TIFF"),
         "float.tif": float_tiff(0.25),
-        "rotated.jpg": encoded(smooth(seed=20), "JPEG", exif=rotated),
-        "damaged exif.jpg": encoded(smooth(seed=21), "JPEG", exif=damaged_exif),
-        "profile.png": encoded(smooth(seed=22), "PNG", icc_profile=profile),
-        "damaged profile.png": encoded(smooth(seed=23), "PNG", icc_profile=b"nonsense"),
-        "palette.gif": encoded(smooth(seed=24).convert("P"), "GIF", transparency=3),
-        "transparent.png": encoded(smooth(seed=25).convert("RGBA"), "PNG"),
-        "one pixel.png": encoded(smooth((1, 1), 26), "PNG"),
-        "wide.png": encoded(smooth((30_000, 10), 27), "PNG"),
-        "tall.jpg": encoded(smooth((10, 30_000), 28), "JPEG"),
+        "rotated.jpg": encoded(smooth(20), "JPEG", exif=rotated),
+        "damaged exif.jpg": encoded(smooth(21), "JPEG", exif=damaged_exif),
+        "profile.png": encoded(smooth(22), icc_profile=profile),
+        "damaged profile.png": encoded(smooth(23), icc_profile=b"nonsense"),
+        "palette.gif": encoded(smooth(24).convert("P"), "GIF", transparency=3),
+        "transparent.png": encoded(smooth(25).convert("RGBA")),
+        "one pixel.png": encoded(smooth(26, (1, 1))),
+        "wide.png": encoded(smooth(27, (30_000, 10))),
+        "tall.jpg": encoded(smooth(28, (10, 30_000)), "JPEG"),
     }
-    return {**found, **{name: encoded(smooth(seed=40 + row), "PNG") for row, name in enumerate(NAMES)}}
+    return {**found, **{name: encoded(smooth(40 + row)) for row, name in enumerate(NAMES)}}
 
 
 def broken_pictures(steps: int = 16) -> dict[str, bytes]:
@@ -127,11 +120,11 @@ def broken_pictures(steps: int = 16) -> dict[str, bytes]:
         "endless text.png": png_with_endless_text(),
     }
     whole = {
-        "jpg": encoded(smooth((300, 200), 60), "JPEG", quality=95),
-        "png": encoded(smooth((90, 70), 61), "PNG"),
-        "bmp": encoded(smooth((30, 20), 62), "BMP"),
-        "tif": encoded(smooth((60, 40), 63), "TIFF"),
-        "webp": encoded(smooth((90, 70), 64), "WEBP"),
+        "jpg": encoded(smooth(60, (300, 200)), "JPEG", quality=95),
+        "png": encoded(smooth(61, (90, 70))),
+        "bmp": encoded(smooth(62, (30, 20)), "BMP"),
+        "tif": encoded(smooth(63, (60, 40)), "TIFF"),
+        "webp": encoded(smooth(64, (90, 70)), "WEBP"),
     }
     for kind, content in whole.items():
         for step in range(1, steps):
@@ -152,60 +145,32 @@ def write_hostile(folder: Path, steps: int = 16) -> Hostile:
     os.mkfifo(folder / "pipe.png")
     special = ["to itself.png", "to nowhere.png", "pipe.png"]
     if os.geteuid():  # root may read anything
-        (folder / "closed.png").write_bytes(encoded(smooth(seed=70), "PNG"))
+        (folder / "closed.png").write_bytes(encoded(smooth(70)))
         (folder / "closed.png").chmod(0)
         special.append("closed.png")
-    (folder / os.fsdecode(b"not utf8 \xff.png")).write_bytes(encoded(smooth(seed=71), "PNG"))
+    (folder / os.fsdecode(b"not utf8 \xff.png")).write_bytes(encoded(smooth(71)))
     return Hostile(folder, (*odd, "not utf8 \\xff.png"), (*broken, *special))
 
 
 def write_hostile_zip(file: Path) -> Path:
     """A zip with unsafe names, a symbolic link, an encrypted member and one that claims a terabyte."""
     file.parent.mkdir(parents=True, exist_ok=True)
-    picture = encoded(smooth(seed=80), "PNG")
+    link = zipfile.ZipInfo("link.png")
+    link.create_system, link.external_attr = 3, 0o120777 << 16
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
         for number in range(4):
-            archive.writestr(f"good/{number}.png", encoded(smooth(seed=81 + number), "PNG"))
-        for name in (
-            "../outside.png",
-            "/absolute.png",
-            "a/../../outside.png",
-            "C:/windows.png",
-            "..\\back.png",
-        ):
-            archive.writestr(name, picture)
-        link = zipfile.ZipInfo("link.png")
-        link.create_system, link.external_attr = 3, 0o120777 << 16
+            archive.writestr(f"good/{number}.png", encoded(smooth(81 + number)))
+        for name in (*UNSAFE, "encrypted.png", "huge.png"):
+            archive.writestr(name, encoded(smooth(80)))
         archive.writestr(link, "/etc/passwd")
-        archive.writestr("encrypted.png", picture)
-        archive.writestr("huge.png", picture)
     content = bytearray(file.read_bytes())
-    for name, change in (
-        ("encrypted.png", lambda at: content.__setitem__(at + 8, content[at + 8] | 1)),
-        (
-            "huge.png",
-            lambda at: content.__setitem__(slice(at + 24, at + 28), struct.pack("<I", (1 << 32) - 2)),
-        ),
-    ):
-        at = content.rfind(b"PK\x01\x02", 0, content.rfind(name.encode()))
-        change(at)
+    encrypted, huge = (
+        content.rfind(b"PK\x01\x02", 0, content.rfind(name)) for name in (b"encrypted.png", b"huge.png")
+    )
+    content[encrypted + 8] |= 1
+    content[huge + 24 : huge + 28] = struct.pack("<I", (1 << 32) - 2)
     file.write_bytes(content)
     return file
-
-
-def labelled(folder: Path, hostile: Hostile) -> tuple[Path, int]:
-    """The same files in two classes, with 12 plain images each; and how many of them cannot be read."""
-    for number, name in enumerate(("a", "b")):
-        (folder / name).mkdir(parents=True)
-        for row in range(12):
-            (folder / name / f"plain {row}.png").write_bytes(
-                encoded(smooth(seed=500 + 2 * row + number), "PNG")
-            )
-        for file in (*hostile.readable, *hostile.unreadable):
-            source = hostile.folder / file
-            if source.is_file() and len(file) < 200:
-                (folder / name / file).write_bytes(source.read_bytes())
-    return folder, 2 * sum((hostile.folder / file).is_file() for file in hostile.unreadable)
 
 
 def named_in(said: str, names: tuple[str, ...]) -> list[str]:
