@@ -50,7 +50,7 @@ class Matrix:
 
 def card_matrices(card: DisentanglementCard) -> list[Matrix]:
     """The matrices of a disentanglement card, means over seeds, the model's own."""
-    names, first = card.features, card.model_scores[0]
+    names, first = card.features, card.rows["model"][0]
     apart, identity = "best: 0 off the diagonal", "row exchanged, column moved; best: identity"
     shown = [
         ("pearson.per_dimension", "mean |Pearson|", apart, names),
@@ -68,8 +68,7 @@ def card_matrices(card: DisentanglementCard) -> list[Matrix]:
     whole = "best: white outside the blocks"
     found = [Matrix("|Pearson| of all dimensions", card.correlations, names, names, card.dimensions, whole)]
     for path, title, note, columns in shown:
-        mean = np.mean([scores.get(path) for scores in card.model_scores], axis=0)
-        found.append(Matrix(title, mean, names, columns, note=note))
+        found.append(Matrix(title, card.mean(path), names, columns, note=note))
     return found
 
 

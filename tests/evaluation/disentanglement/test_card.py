@@ -4,13 +4,8 @@ import numpy as np
 import pytest
 from tests.evaluation.disentanglement.conftest import card
 
-from derender.data import ImageSet
-from derender.evaluation.disentanglement.card import (
-    disentangle,
-    random_blocks,
-    random_pixels,
-    shuffled_rows,
-)
+from derender.data import PictureSet
+from derender.evaluation.disentanglement.card import dealt, disentangle, shuffled_rows
 from derender.model import Derenderer
 from derender.presets import MODEL_PRESETS
 
@@ -75,16 +70,11 @@ def test_controls_are_what_they_say():
     for name, values in features.items():
         assert sorted(map(tuple, shuffled[name])) == sorted(map(tuple, values))
     assert not np.array_equal(shuffled["a"][:, 0] / 2, shuffled["b"][:, 0])
-    images = np.arange(2 * 3 * 2 * 2, dtype=np.uint8).reshape(2, 3, 2, 2)
-    blocks = random_pixels(images, {"a": 5, "b": 3}, 0)
-    assert blocks["a"].shape == (2, 5) and blocks["b"].shape == (2, 3)
-    drawn = np.concatenate([blocks["a"][0], blocks["b"][0]]) * 255
-    assert len(np.unique(drawn.round())) == 8 and drawn.max() < 12
-    assert sum(values.shape[1] for values in random_pixels(images, {"a": 256, "b": 256}, 0).values()) == 12
-    components = np.arange(10.0).reshape(2, 5)
-    parts = random_blocks(components, ["a", "b"], 0)
-    assert [values.shape for values in parts.values()] == [(2, 3), (2, 2)]
-    assert sorted(np.concatenate([values[0] for values in parts.values()])) == [0, 1, 2, 3, 4]
+    values = np.arange(24).reshape(2, 12)
+    one, two = dealt(values, [5, 3], 0)
+    assert one.shape == (2, 5) and two.shape == (2, 3)
+    assert len({*one[0], *two[0]}) == 8 and np.array_equal(one[1], one[0] + 12)
+    assert [part.shape[1] for part in dealt(values, [256, 256], 0)] == [6, 6]
 
 
 def test_rows_are_means_with_the_spread_over_seeds_below():

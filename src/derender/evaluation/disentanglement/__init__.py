@@ -13,26 +13,12 @@ from derender.evaluation.disentanglement.ground_truth import (
     ground_truth_scores,
     importance,
     mutual_information,
-    true_factors,
 )
 from derender.evaluation.disentanglement.similarity import correlation_matrix, linear_cka, pearson, similarity
 from derender.evaluation.disentanglement.swap import SwapScores, diagonal_over_rest, swap_test
 
 __all__ = [
-    "DisentanglementCard",
-    "FeatureScores",
-    "SwapScores",
-    "TrueFactor",
-    "correlation_matrix",
-    "dci",
-    "diagonal_over_rest",
-    "disentangle",
-    "ground_truth_scores",
-    "importance",
-    "linear_cka",
-    "mutual_information",
-    "pearson",
-    "similarity",
-    "swap_test",
-    "true_factors",
-]
+    "DisentanglementCard", "FeatureScores", "SwapScores", "TrueFactor", "correlation_matrix", "dci",
+    "diagonal_over_rest", "disentangle", "ground_truth_scores", "importance", "linear_cka",
+    "mutual_information", "pearson", "similarity", "swap_test",
+]  # fmt: skip

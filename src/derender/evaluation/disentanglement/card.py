@@ -7,9 +7,9 @@ model and the untrained one have it. Without true factors among the labels that 
 answer has no features; it is the chance of every class.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
-from functools import cache
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,6 @@ from derender.evaluation.bootstrap import LEVEL
 from derender.evaluation.disentanglement.ground_truth import (
     GroundTruthScores,
     ground_truth_scores,
-    left_out,
     true_factors,
 )
 from derender.evaluation.disentanglement.similarity import (
@@ -33,34 +32,31 @@ from derender.evaluation.disentanglement.similarity import (
 )
 from derender.evaluation.disentanglement.swap import SwapScores, swap_test
 from derender.evaluation.memory import Memory
-from derender.evaluation.score_table import Column, Interval, Row, Scores, ScoreTable, interval_column
+from derender.evaluation.score_table import Cell, Column, Interval, Row, Scores, ScoreTable, interval_column
 from derender.features import embed_images, model_fingerprint
 from derender.features.table import check_finite
-from derender.inputs import as_images, as_model
+from derender.inputs import Progress, as_images, as_model
 
-MODEL, UNTRAINED, SHUFFLED, PIXELS = "model", "untrained encoder", "shuffled rows", "random pixels"
-COMPONENTS = "PCA"
+MODEL = "model"
 MIN_IMAGES = 20
 
 _SWAP = Column("swap", "high", 2, "move of the exchanged feature over the others'; chance 1")
 _DECODED = Column("decoded", "high", 2, "the same of decoded depth, albedo, light and camera")
+_MIG = Column("MIG", "high", note="mutual information gap")
 _SUMMARY = {  # by attribute of ``FeatureScores``
     "pearson.mean_per_image": Column(
-        "PCC image", note="Pearson between two vectors of an image, -1 to 1, best 0"
+        "PCC image", note="Pearson between two vectors of an image, -1..1, best 0"
     ),
-    "pearson.mean_per_dimension": Column(
-        "PCC dim", note="mean |Pearson| of dimensions over images, 0 to 1, best 0"
-    ),
+    "pearson.mean_per_dimension": Column("PCC dim", note="mean |Pearson| of dimensions over images, best 0"),
     "similarity.mean_cka_unbiased": Column(
-        "CKA", note="linear, unbiased; about 0 for independent features, 1 for equal ones"
+        "CKA", note="linear, unbiased; about 0 if independent, 1 if equal"
     ),
-    "similarity.mean_cross_r2": Column(
-        "cross R2", note="held-out variance of a feature explained by another; best 0"
-    ),
+    "similarity.mean_cross_r2": Column("cross R2", note="held-out variance explained by another; best 0"),
     "swap.ratio": _SWAP,
+    "interval.0": interval_column(_SWAP, "images"),
     "swap.ratio_parameters": _DECODED,
+    "interval.1": interval_column(_DECODED, "images"),
 }
-_MIG = Column("MIG", "high", note="mutual information gap")
 _WHOLE = {
     "truth.by_feature.disentanglement": Column("D", note="a feature holds one factor, best 1"),
     "truth.by_feature.completeness": Column("C", note="one feature holds a factor, best 1"),
@@ -122,121 +118,91 @@ class DisentanglementCard:
     dimensions: tuple[int, ...]
     n_pictures: int
 
-    @property
-    def model_scores(self) -> Sequence[FeatureScores]:
-        """The model's own results, one per seed."""
-        return next(iter(self.rows.values()))
+    def mean(self, path: str, row: str = MODEL) -> Any:
+        """Mean over seeds of a score or matrix by its path in ``FeatureScores``; None if it is missing."""
+        found = [scores.get(path) for scores in self.rows[row]]
+        return None if found[0] is None else np.mean(found, axis=0)
 
     def numbers(self) -> dict[str, Any]:
         """Every score of every row and seed for JSON; no matrix of all dimensions, no resamples."""
 
         def plain(scores: FeatureScores) -> dict[str, Any]:
-            parts = {field.name: getattr(scores, field.name) for field in fields(scores)}
-            if scores.swap is not None:
-                names = (field.name for field in fields(scores.swap) if field.name != "resampled")
-                ends = dict(
-                    zip(("ratio_95", "ratio_parameters_95"), swap_interval([scores.swap]), strict=True)
-                )
-                parts["swap"] = {**{name: getattr(scores.swap, name) for name in names}, **ends}
-            return parts
+            if scores.swap is None:
+                return vars(scores)
+            swap = {name: value for name, value in vars(scores.swap).items() if name != "resampled"}
+            ends = zip(("ratio_95", "ratio_parameters_95"), swap_intervals([scores.swap]), strict=True)
+            return {**vars(scores), "swap": {**swap, **dict(ends)}}
 
         return {name: [plain(scores) for scores in results] for name, results in self.rows.items()}
 
     def tables(self) -> list[ScoreTable]:
         """The summary, the swap test's matrices, and where true factors are known the scores against them."""
-        truth = self.model_scores[0].truth
-        found = [self._summary(), *self._swap_tables()]
+        truth, count = self.rows[MODEL][0].truth, len(self.rows[MODEL])
+        seeds = "1 seed" if count == 1 else f"{count} seeds"
+        caption = (
+            f"Disentanglement: {', '.join(self.features)} of {self.n_pictures:,} images, mean over "
+            f"{seeds} of all pairs; low correlation alone proves nothing, read it with the swap test"
+        )
+        found = [self._means(caption, _SUMMARY), *self._swap_tables()]
         if truth is None:
             return found
         caption = (
-            f"Whole features against {len(truth.factors)} true factors, best 1, mean over {self._seeds}; "
+            f"Whole features against {len(truth.factors)} true factors, best 1, mean over {seeds}; "
             "where I is near 0, D and C are accidents"
         )
         found.append(self._means(caption, _WHOLE))
         if truth.by_dimension is not None:
-            caption = f"Single dimensions, as published, mean over {self._seeds}"
-            found.append(self._means(caption, _DIMENSIONS))
-        return [*found, self._factor_table(truth)]
-
-    @property
-    def _seeds(self) -> str:
-        count = len(self.model_scores)
-        return "1 seed" if count == 1 else f"{count} seeds"
+            found.append(self._means(f"Single dimensions, as published, mean over {seeds}", _DIMENSIONS))
+        together = {name: f"all, {name.split()[0]}" for name in self.rows} | {MODEL: "all"}
+        cells = [
+            *self.mean("truth.score"),
+            *(self.mean("truth.together", name) for name in together),
+            truth.chance,
+        ]
+        caption = "True factors from features, held out: R2 of light and camera, accuracy of classes; best 1"
+        columns = [Column(head, None, 2) for head in (*self.features, *together.values(), "chance")]
+        rows = [Row(*row) for row in zip(truth.factors, np.stack(cells, axis=1).tolist(), strict=True)]
+        return [*found, ScoreTable(caption, "true factor", columns, rows)]
 
     def _means(self, caption: str, columns: Mapping[str, Column]) -> ScoreTable:
         """A row of means for each set of features; with several seeds, standard deviations below."""
         rows = []
         for name, results in self.rows.items():
-            values = [
-                [one for scores in results if (one := scores.get(path)) is not None] for path in columns
-            ]
-            means = [float(np.mean(column)) if column else None for column in values]
+            tests = [one.swap for one in results if one.swap is not None]
+            ends = swap_intervals(tests) if tests else (None, None)
+            means: list[Cell] = []
+            deviations: list[Cell] = []
+            for path in columns:
+                interval = path.startswith("interval")
+                values = [] if interval else [v for one in results if (v := one.get(path)) is not None]
+                means.append(ends[int(path[-1])] if interval else float(np.mean(values)) if values else None)
+                deviations.append(f"{np.std(values, ddof=1):.3f}" if len(values) > 1 else None)
             rows.append(Row(name, means, name != MODEL))
             if len(results) > 1:
-                deviations = [f"{np.std(v, ddof=1):.3f}" if len(v) > 1 else None for v in values]
                 rows.append(Row(f"  ± {len(results)} seeds", deviations, True))
         return ScoreTable(caption, "features", list(columns.values()), rows)
 
-    def _summary(self) -> ScoreTable:
-        """Correlation, similarity and the swap test with its intervals, means over seeds."""
-        caption = (
-            f"Disentanglement: {', '.join(self.features)} of {self.n_pictures:,} images, mean over "
-            f"{self._seeds} of all pairs; low correlation alone proves nothing, read it with the swap test"
-        )
-        table = self._means(caption, _SUMMARY)
-        ends = [interval_column(column, "images") for column in (_SWAP, _DECODED)]
-        rows = []
-        for row in table.rows:
-            tests = [scores.swap for scores in self.rows.get(row.name, ()) if scores.swap is not None]
-            both = [Interval(*one) for one in swap_interval(tests)] if tests else [None, None]
-            cells = [*row.cells[:5], both[0], row.cells[5], both[1]]
-            rows.append(Row(row.name, cells, row.control))
-        columns = [*table.columns[:5], ends[0], _DECODED, ends[1]]
-        return ScoreTable(caption, table.first, columns, rows)
-
     def _swap_tables(self) -> list[ScoreTable]:
         """How far features, and decoded parameters, moved when one factor was exchanged."""
-        tests = [scores.swap for scores in self.model_scores if scores.swap is not None]
-        if not tests:
+        if self.mean("swap.moved") is None:
             return []
-
-        def mean(name: str) -> np.ndarray:
-            return np.mean([getattr(test, name) for test in tests], axis=0)
-
         columns = [Column(name, None, 2) for name in self.features]
         ends = (
             Column("picture", None, 2, "move of the pixels"),
             Column("left", None, 2, "remaining distance from the exchanged feature to the donor's, best 0"),
         )
-        cells = np.column_stack((mean("moved"), mean("moved_pixels"), mean("arrived"))).tolist()
-        rows = [Row(name, row) for name, row in zip(self.features, cells, strict=True)]
-        loss = [*mean("unexchanged").tolist(), None, None]
+        cells = np.column_stack([self.mean(f"swap.{name}") for name in ("moved", "moved_pixels", "arrived")])
+        rows = [Row(*row) for row in zip(self.features, cells.tolist(), strict=True)]
+        loss = [*self.mean("swap.unexchanged").tolist(), None, None]
         rows.append(Row("nothing", loss, True, "from an image to its own rendering"))
         caption = (
             "Swap test, features: 1 is the distance of two images; best 1 for the one exchanged, 0 elsewhere"
         )
-        decoded = zip(self.features, mean("moved_parameters").tolist(), strict=True)
+        decoded = zip(self.features, self.mean("swap.moved_parameters").tolist(), strict=True)
         return [
             ScoreTable(caption, "exchanged", [*columns, *ends], rows),
             ScoreTable("Swap test, decoded parameters", "exchanged", columns, [Row(*one) for one in decoded]),
         ]
-
-    def _factor_table(self, truth: GroundTruthScores) -> ScoreTable:
-        """A row for each true factor: how well each feature predicts it, all together, and the controls."""
-
-        def mean(row: str, name: str) -> np.ndarray:
-            return np.mean([getattr(one.truth, name) for one in self.rows[row]], axis=0)
-
-        first, *controls = self.rows
-        cells = [*mean(first, "score"), *(mean(name, "together") for name in self.rows), truth.chance]
-        heads = [*self.features, "all", *(f"all, {name.split()[0]}" for name in controls), "chance"]
-        rows = zip(truth.factors, np.stack(cells, axis=1).tolist(), strict=True)
-        return ScoreTable(
-            "True factors from features, held out: R2 of light and camera, accuracy of classes; best 1",
-            "true factor",
-            [Column(head, None, 2) for head in heads],
-            [Row(*row) for row in rows],
-        )
 
 
 def disentangle(
@@ -248,7 +214,7 @@ def disentangle(
     swap_images: int = 256,
     batch_size: int = 64,
     memory: Memory | None = None,
-    progress: Callable[[int, int], object] | None = None,
+    progress: Progress | None = None,
 ) -> Scores:
     """Does each feature hold its own factor? Correlation, CKA, the swap test; on rendered data DCI, MIG, SAP.
 
@@ -267,104 +233,84 @@ def disentangle(
     Returns:
         The tables; ``result`` is the ``DisentanglementCard``.
     """
-    model = as_model(model)
-    pictures = as_images(images, model.image_size)
-    card = _card(model, pictures, seeds, dimensions, swap_images, batch_size, memory or Memory(), progress)
-    tables, unused = card.tables(), left_out(pictures.labels)
-    places = {column.name: place for place, column in enumerate(tables[0].columns)}
-    names = {_SWAP.name: "swap test", _DECODED.name: "swap test, decoded"}
-    notes = [f"{name}: {tables[0].verdict(places[column])}" for column, name in names.items()]
-    notes += [f"left out of the true factors: {name} ({why})" for name, why in unused.items()]
-    values = {
-        "pictures": card.n_pictures,
-        "features": dict(zip(card.features, card.dimensions, strict=True)),
-        "seeds": list(seeds),
-        "left_out": unused,
-        "rows": card.numbers(),
-    }
-    return Scores(tables, values, notes, result=card)
-
-
-def _card(
-    model: Any,
-    pictures: ImageSet,
-    seeds: Sequence[int],
-    dimensions: str | None,
-    swap_images: int,
-    batch_size: int,
-    kept: Memory,
-    progress: Callable[[int, int], object] | None,
-) -> DisentanglementCard:
-    count = pictures.require(MIN_IMAGES, "the disentanglement card").images.shape[0]
+    model, kept = as_model(model), memory or Memory()
+    images = as_images(images, model.image_size).require(MIN_IMAGES, "the disentanglement card")
     if not seeds:
         raise ValueError("the card needs at least one seed")
-    factors = true_factors(pictures.labels)
+    pixels, (factors, unused) = images.images, true_factors(images.labels)
     inputs = {
-        "weights": model_fingerprint(model),
-        "settings": model.settings.model_dump(mode="json"),
-        "images": pictures.images,
-        **{f"factor {factor.name}": factor.values for factor in factors},
-    }
+        "weights": model_fingerprint(model), "settings": model.settings.model_dump(mode="json"),
+        "images": pixels, **{f"factor {factor.name}": factor.values for factor in factors},
+    }  # fmt: skip
 
     @cache
     def features() -> dict[str, np.ndarray]:
-        found = embed_images(model, pictures.images, batch_size=batch_size)
-        check_finite(found, pictures.files)
+        found = embed_images(model, pixels, batch_size=batch_size)
+        check_finite(found, images.files)
         return found
 
-    @cache
-    def components() -> np.ndarray:
-        return pca_features(pictures, components=max(len(sizes), min(64, count // 4))).concatenate()
-
-    def whole() -> dict[str, np.ndarray]:
+    def correlations() -> dict[str, np.ndarray]:
         lengths = np.array([values.shape[1] for values in features().values()])
         names = np.array(list(features()))
         return {"names": names, "sizes": lengths, "correlations": correlation_matrix(features())}
 
-    found = kept.recall("card-correlations", inputs, whole)
-    sizes = dict(zip(found["names"].tolist(), found["sizes"].tolist(), strict=True))
+    whole = kept.recall("card-correlations", inputs, correlations)
+    sizes = dict(zip(whole["names"].tolist(), whole["sizes"].tolist(), strict=True))
 
-    def scored(blocks: Mapping[str, np.ndarray], seed: int, net: Any = None) -> FeatureScores:
-        swap, truth = None, None
+    @cache
+    def components() -> np.ndarray:
+        return pca_features(images, components=max(len(sizes), min(64, len(images) // 4))).concatenate()
+
+    def made(row: str, seed: int) -> FeatureScores:
+        swap, truth, net = None, None, {MODEL: model}.get(row)
+        if row == "untrained encoder":
+            net = untrained_twin(model, seed)
+            blocks = embed_images(net, pixels, batch_size=batch_size)
+        elif row == "random pixels":
+            drawn = dealt(pixels.reshape(len(pixels), -1), list(sizes.values()), seed)
+            blocks = {name: part.astype(np.float32) / 255 for name, part in zip(sizes, drawn, strict=True)}
+        elif row == "PCA":
+            equal = [len(part) for part in np.array_split(components()[0], len(sizes))]
+            blocks = dict(zip(sizes, dealt(components(), equal, seed), strict=True))
+        else:
+            blocks = features() if net is model else shuffled_rows(features(), seed)
         if net is not None:
-            chosen = np.sort(np.random.default_rng(seed).permutation(count)[:swap_images])
-            swap = swap_test(net, pictures.images[chosen], seed=seed, batch_size=batch_size)
+            chosen = np.sort(np.random.default_rng(seed).permutation(len(pixels))[:swap_images])
+            swap = swap_test(net, pixels[chosen], seed=seed, batch_size=batch_size)
         if len(factors) >= 2:
             truth = ground_truth_scores(blocks, factors, dimensions=dimensions, seed=seed)
         return FeatureScores(pearson(blocks), similarity(blocks, seed=seed), truth, swap)
 
-    def untrained(seed: int) -> FeatureScores:
-        twin = untrained_twin(model, seed)
-        return scored(embed_images(twin, pictures.images, batch_size=batch_size), seed, twin)
-
-    made: dict[str, Callable[[int], FeatureScores]] = {
-        MODEL: lambda seed: scored(features(), seed, model),
-        UNTRAINED: untrained,
-        SHUFFLED: lambda seed: scored(shuffled_rows(features(), seed), seed),
-        PIXELS: lambda seed: scored(random_pixels(pictures.images, sizes, seed), seed),
-        COMPONENTS: lambda seed: scored(random_blocks(components(), list(sizes), seed), seed),
-    }
-    rows: dict[str, list[FeatureScores]] = {name: [] for name in made}
+    names = (MODEL, "untrained encoder", "shuffled rows", "random pixels", "PCA")
+    rows: dict[str, list[FeatureScores]] = {name: [] for name in names}
     for seed in seeds:
-        for name, make in made.items():
+        for name, found in rows.items():
             keys = {"row": name, "seed": seed, "dimensions": dimensions, "swap_pictures": swap_images}
-            one = kept.recall_value(
-                "card", {**inputs, **keys}, FeatureScores, lambda make=make, seed=seed: make(seed)
+            found.append(
+                kept.recall_value("card", {**inputs, **keys}, FeatureScores, partial(made, name, seed))
             )
-            rows[name].append(one)
             if progress is not None:
                 progress(sum(map(len, rows.values())), len(seeds) * len(rows))
-    return DisentanglementCard(tuple(sizes), rows, found["correlations"], tuple(sizes.values()), count)
+    card = DisentanglementCard(tuple(sizes), rows, whole["correlations"], tuple(sizes.values()), len(images))
+    tables, places = card.tables(), list(_SUMMARY.values())
+    notes = [f"swap test: {tables[0].verdict(places.index(_SWAP))}"]
+    notes += [f"swap test, decoded: {tables[0].verdict(places.index(_DECODED))}"]
+    notes += [f"left out of the true factors: {name} ({why})" for name, why in unused.items()]
+    values = {
+        "pictures": len(images), "features": sizes, "seeds": list(seeds), "left_out": unused,
+        "rows": card.numbers(),
+    }  # fmt: skip
+    return Scores(tables, values, notes, result=card)
 
 
-def swap_interval(tests: Sequence[SwapScores]) -> tuple[tuple[float, float], tuple[float, float]]:
+def swap_intervals(tests: Sequence[SwapScores]) -> tuple[Interval, Interval]:
     """The 95 % intervals of the mean over seeds of the swap test's ratio, of features and of decoded
     parameters; NaN where a ratio is NaN or infinite."""
-    resampled = np.mean([test.resampled for test in tests], axis=0)
-    if not len(resampled) or not np.isfinite(resampled).all():
-        return (np.nan, np.nan), (np.nan, np.nan)
-    low, high = np.quantile(resampled, [(1 - LEVEL) / 2, (1 + LEVEL) / 2], axis=0)
-    return (float(low[0]), float(high[0])), (float(low[1]), float(high[1]))
+    drawn = np.mean([test.resampled for test in tests], axis=0)
+    ends = np.full((2, 2), np.nan)
+    if len(drawn) and np.isfinite(drawn).all():
+        ends = np.quantile(drawn, [(1 - LEVEL) / 2, (1 + LEVEL) / 2], axis=0)
+    return Interval(*ends[:, 0].tolist()), Interval(*ends[:, 1].tolist())
 
 
 def shuffled_rows(features: Mapping[str, np.ndarray], seed: int) -> dict[str, np.ndarray]:
@@ -373,21 +319,12 @@ def shuffled_rows(features: Mapping[str, np.ndarray], seed: int) -> dict[str, np
     return {name: values[generator.permutation(len(values))] for name, values in features.items()}
 
 
-def random_pixels(images: np.ndarray, sizes: Mapping[str, int], seed: int) -> dict[str, np.ndarray]:
-    """For each name, that many pixel values in 0..1 of uint8 images (N, 3, H, W), none of them twice.
+def dealt(values: np.ndarray, sizes: Sequence[int], seed: int) -> list[np.ndarray]:
+    """For each size, that many random columns of (N, D) values, none of them twice.
 
-    Blocks shrink in proportion where the images have fewer values than requested.
+    Blocks shrink in proportion where there are fewer columns than requested.
     """
-    flat = images.reshape(len(images), -1)
-    share = min(1.0, flat.shape[1] / sum(sizes.values()))
-    ends = np.cumsum([max(1, int(size * share)) for size in sizes.values()])
-    chosen = np.split(np.random.default_rng(seed).permutation(flat.shape[1])[: ends[-1]], ends[:-1])
-    return {
-        name: flat[:, pixels].astype(np.float32) / 255 for name, pixels in zip(sizes, chosen, strict=True)
-    }
-
-
-def random_blocks(components: np.ndarray, names: Sequence[str], seed: int) -> dict[str, np.ndarray]:
-    """(N, D) principal components split at random into one block for each name, of D / names each."""
-    chosen = np.array_split(np.random.default_rng(seed).permutation(components.shape[1]), len(names))
-    return {name: components[:, columns] for name, columns in zip(names, chosen, strict=True)}
+    share = min(1.0, values.shape[1] / sum(sizes))
+    ends = np.cumsum([max(1, int(size * share)) for size in sizes])
+    chosen = np.random.default_rng(seed).permutation(values.shape[1])[: ends[-1]]
+    return [values[:, columns] for columns in np.split(chosen, ends[:-1])]

@@ -18,13 +18,13 @@ factor; ``placed`` does. True factors are the labels of a rendered set: numbers 
 names become classes (identity, expression, kind of car).
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from derender.evaluation.disentanglement.similarity import finite, held_out, r_squared
+from derender.evaluation.disentanglement.similarity import held_out, side_by_side
 from derender.features import missing
 
 BINS = 20
@@ -32,19 +32,19 @@ METHODS = ("lasso", "trees")
 LASSO_PENALTIES = (0.5, 0.2, 0.1)  # a warm path to the last; as shares of the smallest one without a weight
 TOLERANCE = 1e-2  # of the duality gap, in units of the target's power
 
-_SHAPE = ("geometry", "albedo")
+_LIGHT, _CAMERA, _SHAPE = ("light",), ("camera",), ("geometry", "albedo")
 _KNOWN = {  # label: (name in tables, features that it belongs to)
-    "ambient": ("ambient", ("light",)),
-    "diffuse": ("diffuse", ("light",)),
-    "light_pitch_rad": ("light pitch", ("light",)),
-    "light_yaw_rad": ("light yaw", ("light",)),
-    "camera_x_rad": ("camera pitch", ("camera",)),
-    "camera_y_rad": ("camera yaw", ("camera",)),
-    "camera_z_rad": ("camera roll", ("camera",)),
-    "camera_tx": ("shift x", ("camera",)),
-    "camera_ty": ("shift y", ("camera",)),
-    "elevation_rad": ("elevation", ("camera",)),
-    "azimuth_rad": ("azimuth", ("camera",)),
+    "ambient": ("ambient", _LIGHT),
+    "diffuse": ("diffuse", _LIGHT),
+    "light_pitch_rad": ("light pitch", _LIGHT),
+    "light_yaw_rad": ("light yaw", _LIGHT),
+    "camera_x_rad": ("camera pitch", _CAMERA),
+    "camera_y_rad": ("camera yaw", _CAMERA),
+    "camera_z_rad": ("camera roll", _CAMERA),
+    "camera_tx": ("shift x", _CAMERA),
+    "camera_ty": ("shift y", _CAMERA),
+    "elevation_rad": ("elevation", _CAMERA),
+    "azimuth_rad": ("azimuth", _CAMERA),
     "identity": ("identity", _SHAPE),
     "expression": ("expression", _SHAPE),
     "class": ("class", _SHAPE),
@@ -67,11 +67,10 @@ class TrueFactor:
     is_class: bool
     belongs_to: tuple[str, ...] = ()
 
+    @property
     def targets(self) -> np.ndarray:
         """Targets of a regression: (N, 1) numbers, or (N, classes) zeros and ones."""
-        if not self.is_class:
-            return self.values[:, None].astype(np.float64)
-        return np.eye(int(self.values.max()) + 1)[self.values]
+        return np.eye(int(self.values.max()) + 1)[self.values] if self.is_class else self.values[:, None]
 
     @property
     def largest_share(self) -> float:
@@ -104,14 +103,11 @@ class GroundTruthScores:
 
     Attributes:
         features, factors: names of the rows and columns.
-        score: (F, K) held-out R2 of numbers, at most 1 and negative where the fit does harm; accuracy of
-            classes, 0..1. Best 1.
+        score: (F, K) held-out R2 of numbers (negative where the fit does harm), accuracy of classes; best 1.
         together: (K,) the same of all features side by side.
         chance: (K,) of a constant answer: 0 for numbers, the largest class's share for classes.
-        by_feature: scores of whole features.
-        by_dimension: scores of single dimensions; None where they were not requested.
-        grouped_dci: disentanglement and completeness of the dimensions' importances added up by feature: DCI
-            as published, at the level of features; None where ``by_dimension`` is.
+        by_feature, by_dimension: scores of whole features, and where requested of single dimensions.
+        grouped_dci: disentanglement and completeness of the dimensions' importances added up by feature.
         placed: share of the factors that the right feature predicts best, 0..1, best 1; NaN where none of
             the features has a factor of its own.
     """
@@ -127,104 +123,89 @@ class GroundTruthScores:
     placed: float
 
 
-def true_factors(labels: Mapping[str, np.ndarray]) -> list[TrueFactor]:
-    """The labels that are factors of a rendered scene, in a fixed order; empty for real images.
+def true_factors(labels: Mapping[str, np.ndarray]) -> tuple[list[TrueFactor], dict[str, str]]:
+    """The labels that are factors of a rendered scene, in a fixed order, and by name why others are left out.
 
     A column is left out when a value is missing or all are the same, and a class column also when it has more
     classes than a fifth of the rows: such classes are names of single images. A set without a column of light
     or camera is not a rendered one and has none.
     """
-    found = [one for one in _read_known(labels).values() if isinstance(one, TrueFactor)]
-    return found if any(not factor.is_class for factor in found) else []
-
-
-def left_out(labels: Mapping[str, np.ndarray]) -> dict[str, str]:
-    """The factors of a rendered scene that are among the labels and left out by ``true_factors``, and why."""
-    if not true_factors(labels):
-        return {}
-    return {name: one for name, one in _read_known(labels).items() if isinstance(one, str)}
+    read = {_KNOWN[name][0]: _read(labels[name], *_KNOWN[name]) for name in _KNOWN if name in labels}
+    factors = [one for one in read.values() if isinstance(one, TrueFactor)]
+    if all(factor.is_class for factor in factors):
+        return [], {}
+    return factors, {name: why for name, why in read.items() if isinstance(why, str)}
 
 
 def ground_truth_scores(
     blocks: Mapping[str, np.ndarray],
-    factors: list[TrueFactor],
+    factors: Sequence[TrueFactor],
     *,
     dimensions: str | None = None,
     folds: int = 5,
     seed: int = 0,
 ) -> GroundTruthScores:
-    """All scores of features by name, each (N, D), against true factors of the same N images.
+    """All scores of features by name, each (N, D), against two true factors or more of the same N images.
 
     Args:
         blocks: features.
         factors: at least two.
         dimensions: method of the importances of single dimensions ("lasso", fast, or "trees", slow); None
             leaves the scores by dimension out.
-        folds: of the predictions.
-        seed: of the random folds, and of the trees.
+        folds, seed: of the predictions; the seed is also that of the trees.
     """
-    if len(factors) < 2 or len(blocks) < 2:
-        raise ValueError(f"needs two features and two true factors, got {len(blocks)} and {len(factors)}")
-    blocks = {name: finite(values, f"feature {name!r}") for name, values in blocks.items()}
+    blocks = side_by_side(blocks)
     names, everything = tuple(blocks), np.concatenate(list(blocks.values()), axis=1)
     found = [_predicted(x, factors, folds, seed) for x in (*blocks.values(), everything)]
-    raw = np.array([[score for score, _, _ in row] for row in found])
-    gain = np.array([[gain for _, gain, _ in row] for row in found])
+    score, gain = (np.array([[one[part] for one in row] for row in found]) for part in (0, 1))
     share, informativeness = gain[:-1], float(gain[-1].mean())
-    gaps = [
-        _information_gap(np.stack([row[k][2] for row in found[:-1]], axis=1), factor)
-        for k, factor in enumerate(factors)
-    ]
+    bins = [np.stack([row[k][2] for row in found[:-1]], axis=1) for k in range(len(factors))]
+    mig = float(np.mean([_information_gap(each, factor) for each, factor in zip(bins, factors, strict=True)]))
     owned = [k for k, factor in enumerate(factors) if set(factor.belongs_to) & set(names)]
     right = [share[:, k].max() > 0 and names[share[:, k].argmax()] in factors[k].belongs_to for k in owned]
-    by_dimension, grouped = None, None
+    by_dimension = grouped = None
     if dimensions is not None:
-        weights = importance(everything, factors, dimensions, seed=seed)
-        bins = binned(everything)
+        weights, each = importance(everything, factors, dimensions, seed=seed), binned(everything)
+        single = np.stack([_explained(everything, factor) for factor in factors], axis=1)
         by_dimension = ModularityScores(
             *dci(weights),
             informativeness,
-            mig=float(np.mean([_information_gap(bins, factor) for factor in factors])),
-            sap=float(np.mean(_gap(np.stack([_single(everything, factor) for factor in factors], axis=1)))),
+            float(np.mean([_information_gap(each, factor) for factor in factors])),
+            float(np.mean(_gap(single))),
         )
         starts = np.cumsum([0, *(values.shape[1] for values in blocks.values())])[:-1]
         grouped = dci(np.add.reduceat(weights, starts, axis=0))
     return GroundTruthScores(
         names,
         tuple(factor.name for factor in factors),
-        score=raw[:-1],
-        together=raw[-1],
-        chance=np.array([factor.largest_share for factor in factors]),
-        by_feature=ModularityScores(
-            *dci(share), informativeness, mig=float(np.mean(gaps)), sap=float(np.mean(_gap(share)))
-        ),
-        by_dimension=by_dimension,
-        grouped_dci=grouped,
-        placed=sum(right) / len(owned) if owned else float("nan"),
+        score[:-1],
+        score[-1],
+        np.array([factor.largest_share for factor in factors]),
+        ModularityScores(*dci(share), informativeness, mig, float(np.mean(_gap(share)))),
+        by_dimension,
+        grouped,
+        sum(right) / len(owned) if owned else float("nan"),
     )
 
 
-def importance(codes: np.ndarray, factors: list[TrueFactor], method: str, *, seed: int = 0) -> np.ndarray:
+def importance(codes: np.ndarray, factors: Sequence[TrueFactor], method: str, *, seed: int = 0) -> np.ndarray:
     """(D, K) importance of each dimension of (N, D) codes for each of K factors; each column adds to 1.
 
     Absolute weights of a lasso on standardised codes (Eastwood and Williams; a class is regressed as one
-    lasso for each class, the weights added up), or importances of gradient boosted trees (Locatello et al.).
-    A column is 0 throughout where no dimension helps. ``seed`` matters to trees only. The lasso's penalty is
-    a fixed share of the largest useful one, so scaling codes or factors changes nothing; a rotation does.
+    lasso for each class, the weights added up), or importances of gradient boosted trees (Locatello et al.),
+    which ``seed`` belongs to. A column is 0 where no dimension helps. The lasso's penalty is a fixed share of
+    the largest useful one, so scaling codes or factors changes nothing; a rotation does.
     """
     if method not in METHODS:
         raise ValueError(f"unknown method {method!r}: choose lasso or trees")
-    codes = np.asarray(codes, np.float64)
     deviation = codes.std(axis=0)
     alive = deviation > 1e-9 * np.abs(codes).max(axis=0, initial=0)
     standard = (codes[:, alive] - codes[:, alive].mean(axis=0)) / deviation[alive]
     found = np.zeros((codes.shape[1], len(factors)))
     for column, factor in enumerate(factors if alive.any() else []):
-        found[alive, column] = (
-            _lasso(standard, factor) if method == "lasso" else _trees(standard, factor, seed)
-        )
-    total = found.sum(axis=0)
-    return found / np.where(total > 0, total, 1)
+        weights = _lasso(standard, factor) if method == "lasso" else _trees(standard, factor, seed)
+        found[alive, column] = weights / (weights.sum() or 1)
+    return found
 
 
 def dci(weights: np.ndarray) -> tuple[float, float]:
@@ -233,12 +214,13 @@ def dci(weights: np.ndarray) -> tuple[float, float]:
     One minus the entropy, in units of the largest possible, of each row (column), weighted by the row's
     (column's) share of all importance. No importance at all scores 0 in both.
     """
-    weights = np.asarray(weights, np.float64)
-    if weights.ndim != 2 or min(weights.shape) < 2 or not (np.isfinite(weights) & (weights >= 0)).all():
-        raise ValueError(
-            f"DCI needs importances of 0 and up, two rows and columns or more, got shape {weights.shape}"
-        )
-    return (_concentration(weights), _concentration(weights.T)) if weights.sum() > 0 else (0.0, 0.0)
+    scores = []
+    for each in (weights, weights.T):
+        total = each.sum(axis=1, keepdims=True)
+        share = each / np.where(total > 0, total, 1)
+        entropy = -(share * np.log(np.where(share > 0, share, 1))).sum(axis=1) / np.log(each.shape[1])
+        scores.append(float(((1 - entropy) * total[:, 0]).sum() / (total.sum() or 1)))
+    return scores[0], scores[1]
 
 
 def mutual_information(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -257,42 +239,38 @@ def binned(values: np.ndarray, bins: int = BINS) -> np.ndarray:
     return np.clip(((values - low) / width * bins).astype(np.int64), 0, bins - 1)
 
 
-def _read_known(labels: Mapping[str, np.ndarray]) -> dict[str, TrueFactor | str]:
-    """By name in tables, the factor that a label holds, or the reason why it is left out."""
-    return {_KNOWN[label][0]: _read(labels[label], *_KNOWN[label]) for label in _KNOWN if label in labels}
-
-
 def _read(column: np.ndarray, name: str, features: tuple[str, ...]) -> TrueFactor | str:
+    """The factor that a label holds, or the reason why it is left out."""
     if absent := int(missing(column).sum()):
         return f"{absent:,} of {len(column):,} values are missing"
-    values = np.asarray(column)
-    if values.dtype.kind == "f":
-        if np.ptp(values) > 1e-9:
-            return TrueFactor(name, values.astype(np.float64), False, features)
-        return "one value for all images"
-    classes = np.unique(values.astype(str), return_inverse=True)[1]
+    if column.dtype.kind == "f":
+        varies = np.ptp(column) > 1e-9
+        values = column.astype(np.float64)
+        return TrueFactor(name, values, False, features) if varies else "one value for all images"
+    classes = np.unique(column.astype(str), return_inverse=True)[1]
     count = int(classes.max()) + 1
-    if 2 <= count <= len(values) / 5:
+    if 2 <= count <= len(column) / 5:
         return TrueFactor(name, classes, True, features)
-    return "one class only" if count < 2 else f"{count:,} classes of {len(values):,} images"
+    return "one class only" if count < 2 else f"{count:,} classes of {len(column):,} images"
 
 
 def _predicted(
-    x: np.ndarray, factors: list[TrueFactor], folds: int, seed: int
+    x: np.ndarray, factors: Sequence[TrueFactor], folds: int, seed: int
 ) -> list[tuple[float, float, np.ndarray]]:
     """For each factor: score, score above chance in 0..1, and the (N,) binned prediction from one feature."""
-    targets = [factor.targets() for factor in factors]
-    answers = held_out(x, np.concatenate(targets, axis=1), folds=folds, seed=seed)
-    ends = np.cumsum([target.shape[1] for target in targets])
+    every = np.concatenate([factor.targets for factor in factors], axis=1)
+    ends = np.cumsum([factor.targets.shape[1] for factor in factors])[:-1]
+    answers = np.split(held_out(x, every, folds=folds, seed=seed), ends, axis=2)
     found = []
-    for factor, target, predicted in zip(factors, targets, np.split(answers, ends[:-1], axis=1), strict=True):
+    for factor, (answer, constant) in zip(factors, answers, strict=True):
         if factor.is_class:
-            answer, largest = predicted.argmax(axis=1), factor.largest_share
-            accuracy = float((answer == factor.values).mean())
-            found.append((accuracy, max(0.0, (accuracy - largest) / (1 - largest)), answer))
+            bins, largest = answer.argmax(axis=1), factor.largest_share
+            score = float((bins == factor.values).mean())
         else:
-            share = float(np.asarray(r_squared(predicted, target, folds=folds, seed=seed))[0])
-            found.append((share, max(0.0, share), binned(predicted)[:, 0]))
+            bins, largest = binned(answer)[:, 0], 0.0
+            left, total = (np.square(each - factor.targets).sum() for each in (answer, constant))
+            score = float(1 - left / total)
+        found.append((score, max(0.0, (score - largest) / (1 - largest)), bins))
     return found
 
 
@@ -301,10 +279,8 @@ def _lasso(codes: np.ndarray, factor: TrueFactor) -> np.ndarray:
     from sklearn.linear_model import lasso_path
 
     how: dict[str, Any] = {"alphas": LASSO_PENALTIES, "tol": TOLERANCE, "max_iter": 5000}
-    targets = factor.targets()
-    targets = targets - targets.mean(axis=0)
     gram, weights = codes.T @ codes, np.zeros(codes.shape[1])
-    for target in targets.T:
+    for target in (factor.targets - factor.targets.mean(axis=0)).T:
         along = codes.T @ target
         largest = np.abs(along).max() / len(codes)
         if largest > 0:
@@ -320,19 +296,15 @@ def _trees(codes: np.ndarray, factor: TrueFactor, seed: int) -> np.ndarray:
     return np.asarray(kind(random_state=seed).fit(codes, factor.values).feature_importances_)
 
 
-def _single(codes: np.ndarray, factor: TrueFactor) -> np.ndarray:
+def _explained(codes: np.ndarray, factor: TrueFactor) -> np.ndarray:
     """(D,) share of a dimension's variance that goes with the factor: squared correlation with a number, with
     classes the squared correlation ratio (SAP as published has an SVM's accuracy there).
     """
-    centred = codes - codes.mean(axis=0)
+    centred, targets = codes - codes.mean(axis=0), factor.targets
+    if not factor.is_class:
+        targets = targets - targets.mean()
+    explained = (np.square(targets.T @ centred) / np.square(targets).sum(axis=0)[:, None]).sum(axis=0)
     total = np.square(centred).sum(axis=0)
-    targets = factor.targets()
-    if factor.is_class:
-        sums, sizes = targets.T @ centred, targets.sum(axis=0)
-        explained = (np.square(sums) / np.maximum(sizes, 1)[:, None]).sum(axis=0)
-    else:
-        true = targets[:, 0] - targets.mean()
-        explained = np.square(true @ centred) / np.square(true).sum()
     alive = total > 1e-18 * np.square(codes).sum(axis=0)
     return np.divide(explained, total, out=np.zeros_like(total), where=alive)
 
@@ -348,10 +320,3 @@ def _gap(scores: np.ndarray) -> np.ndarray:
     """Best minus second best of each column of (D, K)."""
     ordered = np.sort(scores, axis=0)
     return ordered[-1] - ordered[-2]
-
-
-def _concentration(weights: np.ndarray) -> float:
-    total = weights.sum(axis=1, keepdims=True)
-    share = weights / np.where(total > 0, total, 1)
-    entropy = -(share * np.log(np.where(share > 0, share, 1))).sum(axis=1) / np.log(weights.shape[1])
-    return float(((1 - entropy) * total[:, 0]).sum() / total.sum())

@@ -1,28 +1,23 @@
 """How much two features share: Pearson's correlation, linear CKA and cross-prediction. All are best at 0.
 
-Sources. Pearson: Klinghoffer et al., ECCV 2022, Sec. 5: "Pearson's correlation coefficient between each
-combination of the four learned physical features", 0.26 to 0.28 without LOOCC and 0.18 with it. The paper
-does not define over which values it is taken, so both readings are here. For features A and B of N images,
-a_i and b_i being the vectors of image i and a_p, b_q single dimensions over the N images:
+Pearson: Klinghoffer et al., ECCV 2022, Sec. 5. The paper does not define over which values it is taken, so
+both readings are here. With a_i, b_i the vectors of image i in features A and B of N images, and a_p, b_q
+single dimensions over the images:
 
-    per image       r(A, B) = 1/N sum_i corr(a_i, b_i), signed; needs vectors of one length and depends on the
+    per image       mean over i of corr(a_i, b_i), signed; needs vectors of one length and depends on the
                     order of the dimensions, which has no meaning in a learned code
-    per dimension   r(A, B) = mean over all pairs (p, q) of |corr(a_p, b_q)|; shuffled rows score not 0 but
-                    about sqrt(2 / (pi (N - 1)))
+    per dimension   mean over p and q of |corr(a_p, b_q)|; shuffled rows score about sqrt(2 / (pi (N - 1)))
 
-CKA: Kornblith et al., ICML 2019; unbiased with the HSIC estimator of Song et al., JMLR 2012, as in Nguyen et
-al., ICLR 2021. The biased form is far from 0 for independent features when there are more dimensions than a
-small fraction of the rows (two features of 256 normal numbers on 800 images: 0.24). Cross-prediction: ridge
-regression from one feature to another, scored on images it was not fitted on. Within each fold, every target
-gets the penalty with the smallest leave-one-out error (Allen's PRESS, in closed form). Penalties are
-relative to the mean squared singular value and no dimension is rescaled, so predictions do not change with
-the scale of a feature, the order of its dimensions or a rotation.
+CKA: Kornblith et al., ICML 2019; unbiased with the HSIC estimator of Song et al., JMLR 2012. The biased form
+is far from 0 for independent features of many dimensions. Cross-prediction: ridge regression from one feature
+to another, held out; within each fold every target gets the penalty with the smallest leave-one-out error
+(Allen's PRESS). It does not change with the scale, the order or a rotation of the dimensions.
 
 No low number proves disentanglement: an untrained encoder has about 0.07 per dimension. Read them beside the
 swap test (swap.py). Leaves out kernels other than the linear one and non-linear predictors.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,12 +30,10 @@ class PearsonScores:
     """Correlations between F features.
 
     Attributes:
-        per_image: (F, F) mean over images of the correlation between two vectors, -1..1, best 0; NaN where
-            the two have different lengths. The diagonal is 1.
-        per_dimension: (F, F) mean absolute correlation over pairs of dimensions, 0..1, best 0; on the
-            diagonal between different dimensions of one feature.
-        mean_per_image, mean_per_dimension: over the pairs of different features: the two candidates for the
-            paper's number.
+        per_image: (F, F) mean correlation of an image's two vectors, -1..1; NaN for different lengths.
+        per_dimension: (F, F) mean |correlation| over pairs of dimensions, 0..1; on the diagonal between
+            different dimensions of one feature.
+        mean_per_image, mean_per_dimension: over the pairs of different features; best 0.
         n_dead: by feature, dimensions that are the same in every image; left out.
     """
 
@@ -53,14 +46,13 @@ class PearsonScores:
 
 @dataclass(frozen=True)
 class SimilarityScores:
-    """Similarity of F features; all best at 0 between different features.
+    """Similarity of F features.
 
     Attributes:
-        cka_biased: (F, F) 0..1, 1 on the diagonal.
-        cka_unbiased: (F, F) about 0 for independent features (it may fall a little below), 1 on the diagonal.
+        cka_biased, cka_unbiased: (F, F) 0..1 (unbiased, a little below 0 too), 1 on the diagonal.
         cross_r2: (F, F) held-out share of the variance of the feature in the column that the feature in the
             row explains, at most 1; below 0 where the fit does harm.
-        mean_cka_biased, mean_cka_unbiased, mean_cross_r2: over the pairs of different features.
+        mean_cka_biased, mean_cka_unbiased, mean_cross_r2: over the pairs of different features; best 0.
     """
 
     cka_biased: np.ndarray
@@ -71,96 +63,72 @@ class SimilarityScores:
     mean_cross_r2: float
 
 
-def pearson(factors: Mapping[str, np.ndarray]) -> PearsonScores:
-    """Both readings for features by name, each (N, D) with the same N of 3 or more."""
-    blocks = _same_rows(factors)
-    unit = [_standardised(values) for values in blocks.values()]
-    alive = [values.any(axis=0) for values in unit]
+def pearson(features: Mapping[str, np.ndarray]) -> PearsonScores:
+    """Both readings for features by name, each (N, D) with the same N of 4 or more."""
+    blocks = side_by_side(features)
+    vectors = [_standardised(values.T) for values in blocks.values()]
+    every, ends = correlation_matrix(features), np.cumsum([len(each) for each in vectors])[:-1]
     image, dimension = np.full((2, len(blocks), len(blocks)), np.nan)
-    for i, a in enumerate(blocks.values()):
-        for j, b in enumerate(blocks.values()):
+    for i, row in enumerate(np.split(every, ends)):
+        for j, block in enumerate(np.split(row, ends, axis=1)):
+            dimension[i, j] = _mean(block[~np.eye(len(block), dtype=bool)] if i == j else block)
+            a, b = vectors[i], vectors[j]
             if a.shape == b.shape:
-                image[i, j] = _mean(per_image(a, b))
-            r = np.abs(unit[i][:, alive[i]].T @ unit[j][:, alive[j]])
-            dimension[i, j] = _mean(r[~np.eye(len(r), dtype=bool)] if i == j else r)
-    dead = {name: int((~columns).sum()) for name, columns in zip(blocks, alive, strict=True)}
-    return PearsonScores(image, dimension, _mean(image, pairs=True), _mean(dimension, pairs=True), dead)
+                image[i, j] = _mean(np.where(a.any(axis=0) & b.any(axis=0), (a * b).sum(axis=0), np.nan))
+    dead = [int(part.sum()) for part in np.split(np.isnan(every.diagonal()), ends)]
+    means = _mean_of_pairs(image), _mean_of_pairs(dimension)
+    return PearsonScores(image, dimension, *means, dict(zip(blocks, dead, strict=True)))
 
 
-def per_image(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(N,) correlation between the two vectors (N, D) of each image, -1..1; NaN where one is constant."""
-    if a.shape != b.shape:
-        raise ValueError(f"the per-image reading needs vectors of one length, got {a.shape} and {b.shape}")
-    a, b = (_standardised(np.asarray(values, np.float64).T) for values in (a, b))
-    return np.where(a.any(axis=0) & b.any(axis=0), (a * b).sum(axis=0), np.nan)
-
-
-def correlation_matrix(factors: Mapping[str, np.ndarray]) -> np.ndarray:
-    """|correlation| between all dimensions of all features over images, (sum of D, sum of D), 0..1.
-
-    The per-dimension reading averages it; dead dimensions have NaN.
-    """
-    values = _standardised(np.concatenate(list(_same_rows(factors).values()), axis=1))
-    alive = np.asarray(values.any(axis=0))
+def correlation_matrix(features: Mapping[str, np.ndarray]) -> np.ndarray:
+    """|correlation| between all dimensions of all features, (sum of D, sum of D), 0..1; NaN for dead ones."""
+    values = _standardised(np.concatenate(list(side_by_side(features).values()), axis=1))
+    alive = values.any(axis=0)
     return np.where(alive[:, None] & alive, np.abs(values.T @ values), np.nan)
 
 
+def similarity(features: Mapping[str, np.ndarray], *, folds: int = 5, seed: int = 0) -> SimilarityScores:
+    """Both forms of CKA, and cross-prediction in random folds, between features by name, each (N, D)."""
+    blocks = list(side_by_side(features).values())
+    biased, unbiased, cross = np.full((3, len(blocks), len(blocks)), np.nan)
+    every, ends = np.concatenate(blocks, axis=1), np.cumsum([values.shape[1] for values in blocks])[:-1]
+    for i, a in enumerate(blocks):
+        squares = np.square(every - held_out(a, every, folds=folds, seed=seed)).sum(axis=1)
+        left, total = (np.split(each, ends) for each in squares)
+        for j, b in enumerate(blocks):
+            cross[i, j] = 1 - left[j].sum() / (total[j].sum() or np.nan)
+            if j <= i:
+                biased[i, j] = biased[j, i] = linear_cka(a, b, unbiased=False)
+                unbiased[i, j] = unbiased[j, i] = linear_cka(a, b, unbiased=True)
+    return SimilarityScores(biased, unbiased, cross, *map(_mean_of_pairs, (biased, unbiased, cross)))
+
+
 def linear_cka(x: np.ndarray, y: np.ndarray, *, unbiased: bool) -> float:
-    """Linear CKA of two features (N, D) and (N, E); 1 for features equal up to rotation and scale.
+    """Linear CKA of features (N, D) and (N, E) of the same 4 images or more.
 
-    Args:
-        x, y: features of the same N images, N of 4 or more.
-        unbiased: whether independent features score 0 on average.
-
-    Returns NaN where one of the two is the same in every image.
+    1 for features equal up to rotation and scale; independent ones score 0 on average if ``unbiased``. NaN
+    where one of the two is the same in every image.
     """
-    x, y = (_centred(finite(values, "a feature")) for values in (x, y))
-    if len(x) != len(y) or len(x) < 4:
-        raise ValueError(f"CKA needs features of the same 4 rows or more, got {len(x)} and {len(y)} rows")
-    hsic = _unbiased_hsic if unbiased else _biased_hsic
+    x, y = _centred(x), _centred(y)
+    hsic = _unbiased_hsic if unbiased else lambda x, y: float(np.square(x.T @ y).sum())
     own = hsic(x, x) * hsic(y, y)
     return float(hsic(x, y) / np.sqrt(own)) if own > 0 else float("nan")
 
 
-def similarity(factors: Mapping[str, np.ndarray], *, folds: int = 5, seed: int = 0) -> SimilarityScores:
-    """Both forms of CKA and cross-prediction between features by name, each (N, D).
-
-    Args:
-        factors: features.
-        folds: of the cross-prediction.
-        seed: of the random folds.
-    """
-    blocks = [finite(values, f"feature {name!r}") for name, values in factors.items()]
-    biased, unbiased, cross = np.full((3, len(blocks), len(blocks)), np.nan)
-    everything = np.concatenate(blocks, axis=1)
-    ends = np.cumsum([values.shape[1] for values in blocks])
-    for i, a in enumerate(blocks):
-        predicted = held_out(a, everything, folds=folds, seed=seed)
-        for j, b in enumerate(blocks):
-            if j <= i:
-                biased[i, j] = biased[j, i] = linear_cka(a, b, unbiased=False)
-                unbiased[i, j] = unbiased[j, i] = linear_cka(a, b, unbiased=True)
-            part = slice(ends[j] - b.shape[1], ends[j])
-            cross[i, j] = r_squared(predicted[:, part], b, folds=folds, seed=seed, pooled=True)
-    means = (_mean(matrix, pairs=True) for matrix in (biased, unbiased, cross))
-    return SimilarityScores(biased, unbiased, cross, *means)
-
-
 def held_out(x: np.ndarray, y: np.ndarray, *, folds: int = 5, seed: int = 0) -> np.ndarray:
-    """Ridge predictions of (N, T) targets from (N, D) features, each row by a fit without it: (N, T).
+    """Predictions of (N, T) targets, each row by a fit without it: (2, N, T).
 
-    Args:
-        x: features; constant ones predict the mean of the other folds.
-        y: targets.
-        folds: number of random parts.
-        seed: of the random folds.
+    Those of a ridge regression from (N, D) features, and the means that a fit without features predicts: the
+    reference of R2, which a constant feature reaches exactly. ``seed`` deals the rows into ``folds``.
     """
-    x, y = finite(x, "the features"), finite(y, "the targets")
-    if len(x) != len(y):
-        raise ValueError(f"{len(x)} rows of features but {len(y)} rows of targets: give one target per row")
-    predicted = np.empty_like(y)
-    for train, test in _folds(len(x), folds, seed):
-        predicted[test] = fit_predict(x[train], y[train], x[test])
+    if not 2 <= folds <= len(x) // 2:
+        raise ValueError(f"{len(x)} rows cannot be dealt into {folds} folds: use 2 to {len(x) // 2}")
+    predicted = np.empty((2, *y.shape))
+    for test in np.array_split(np.random.default_rng(seed).permutation(len(x)), folds):
+        train = np.ones(len(x), bool)
+        train[test] = False
+        predicted[0, test] = fit_predict(x[train], y[train], x[test])
+        predicted[1, test] = y[train].mean(axis=0)
     return predicted
 
 
@@ -174,13 +142,11 @@ def fit_predict(
     """
     x_mean, y_mean = x.mean(axis=0), y.mean(axis=0)
     u, power, back = _decomposed(x - x_mean)
-    if len(power) == 0:
-        return np.tile(y_mean, (len(x_new), 1))
     centred = y - y_mean
     projected = u.T @ centred
     square, full = np.square(u), np.square(centred).sum(axis=0)
     best, chosen = np.full(y.shape[1], np.inf), np.zeros_like(projected)
-    for penalty in penalties:
+    for penalty in penalties if len(power) else ():
         shrink = (power / (power + penalty * power.mean()))[:, None]
         leverage = square @ shrink + 1 / len(x)
         left = centred - u @ (shrink * projected)
@@ -191,53 +157,27 @@ def fit_predict(
     return y_mean + (x_new - x_mean) @ (back @ chosen)
 
 
-def r_squared(
-    predicted: np.ndarray, y: np.ndarray, *, folds: int = 5, seed: int = 0, pooled: bool = False
-) -> np.ndarray | float:
-    """Share of the variance that held-out predictions explain; at most 1, best 1, about 0 for chance.
-
-    The reference is the mean of the folds that each prediction was fitted on, so that a constant gives 0; a
-    fit that does harm is negative.
-
-    Args:
-        predicted: (N, T) from ``held_out`` with the same ``folds`` and ``seed``.
-        y: (N, T).
-        folds, seed: as given to ``held_out``.
-        pooled: one number for all targets together, weighted by their variance; else (T,).
-    """
-    reference = np.empty_like(y, dtype=np.float64)
-    for train, test in _folds(len(y), folds, seed):
-        reference[test] = y[train].mean(axis=0)
-    left, total = (np.square(values - y).sum(axis=0) for values in (predicted, reference))
-    if pooled:
-        left, total = left.sum(), total.sum()
-    share = 1 - left / np.where(total > 0, total, np.nan)
-    return float(share) if pooled else share
-
-
-def finite(values: np.ndarray, what: str) -> np.ndarray:
-    """The rows as float64, or an error that counts the rows with NaN or infinity."""
-    values = np.asarray(values, np.float64)
-    bad = int((~np.isfinite(values.reshape(len(values), -1)).all(axis=1)).sum()) if len(values) else 0
-    if bad:
-        raise ValueError(f"{what}: {bad} of {len(values)} rows are not finite: drop them or check the model")
-    return values
-
-
-def _folds(n_rows: int, folds: int, seed: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """(N,) bool training rows and the numbers of the tested rows; sizes of folds differ by one at most."""
-    if not 2 <= folds <= n_rows // 2:
-        raise ValueError(f"{n_rows} rows cannot be dealt into {folds} folds: use 2 to {n_rows // 2}")
-    for test in np.array_split(np.random.default_rng(seed).permutation(n_rows), folds):
-        train = np.ones(n_rows, bool)
-        train[test] = False
-        yield train, test
+def side_by_side(features: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Features as float64; ValueError unless there are two or more, of the same 4 rows or more, finite."""
+    blocks = {name: np.asarray(values, np.float64) for name, values in features.items()}
+    lengths = sorted({len(values) for values in blocks.values()})
+    if len(blocks) < 2 or len(lengths) != 1 or lengths[0] < 4:
+        raise ValueError(
+            f"scores between features need two or more of one number of rows, 4 or more; got {len(blocks)} "
+            f"features of {lengths} rows"
+        )
+    for name, values in blocks.items():
+        if bad := int((~np.isfinite(values)).any(axis=1).sum()):
+            raise ValueError(
+                f"feature {name!r}: {bad} of {len(values)} rows are not finite: drop them or check the model"
+            )
+    return blocks
 
 
 def _decomposed(x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Left singular vectors (N, R), squared singular values (R,), and (D, R) from coefficients of the former
-    to weights of the dimensions, of centred features. From the smaller Gram matrix, which is several times as
-    fast as the decomposition of x; directions with less than 1e-11 of the strongest's power are dropped.
+    to weights of the dimensions, of centred features. From the smaller Gram matrix, several times as fast as
+    the decomposition of x; directions with less than 1e-11 of the strongest's power are dropped.
     """
     wide = x.shape[1] > len(x)
     power, vectors = np.linalg.eigh(x @ x.T if wide else x.T @ x)
@@ -247,16 +187,6 @@ def _decomposed(x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         return vectors, power, x.T @ (vectors / power)
     root = np.sqrt(power)
     return x @ (vectors / root), power, vectors / root
-
-
-def _same_rows(factors: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    blocks = {name: finite(values, f"feature {name!r}") for name, values in factors.items()}
-    lengths = {len(values) for values in blocks.values()}
-    if len(blocks) < 2:
-        raise ValueError("a correlation between features needs two features or more")
-    if len(lengths) != 1 or min(lengths) < 3:
-        raise ValueError(f"features must have one number of rows, 3 or more; there are {sorted(lengths)}")
-    return blocks
 
 
 def _centred(values: np.ndarray) -> np.ndarray:
@@ -273,11 +203,6 @@ def _standardised(values: np.ndarray) -> np.ndarray:
     return centred / np.where(length > 0, length, 1)
 
 
-def _biased_hsic(x: np.ndarray, y: np.ndarray) -> float:
-    """HSIC of linear kernels up to a factor that depends on N only."""
-    return float(np.square(x.T @ y).sum())
-
-
 def _unbiased_hsic(x: np.ndarray, y: np.ndarray) -> float:
     """Song et al.'s estimator without the N x N kernels K and L, whose diagonals it sets to 0."""
     n = len(x)
@@ -288,8 +213,11 @@ def _unbiased_hsic(x: np.ndarray, y: np.ndarray) -> float:
     return float(corrected / (n * (n - 3)))
 
 
-def _mean(values: np.ndarray, *, pairs: bool = False) -> float:
-    """Mean of all that is not NaN, with ``pairs`` off the diagonal; NaN where nothing is."""
-    chosen = values[~np.eye(len(values), dtype=bool)] if pairs else values
-    defined = chosen[~np.isnan(chosen)]
+def _mean(values: np.ndarray) -> float:
+    """Mean of all that is not NaN; NaN where nothing is."""
+    defined = values[~np.isnan(values)]
     return float(defined.mean()) if defined.size else float("nan")
+
+
+def _mean_of_pairs(matrix: np.ndarray) -> float:
+    return _mean(matrix[~np.eye(len(matrix), dtype=bool)])

@@ -10,13 +10,11 @@ donor p(i), a random derangement:
 so 0 means that feature j stayed and 1 that it moved as far as two different images are apart. Best: the
 identity matrix. Both ends of a difference are renderings, so the loss of reconstruction does not count; it is
 reported by itself as ``unexchanged``. |.| is the Euclidean distance. The same is done with the decoded
-parameters (angles in radians beside intensities and scene units, as the scene holds them) and with the
-pixels. Pixels that no surface covers are filled with the mean colour of the input image's edge, by the rule
-of training (training/step.py). Leaves out whether a swapped image looks right.
+parameters and with the pixels. Pixels that no surface covers are filled as in training (training/step.py).
+Leaves out whether a swapped image looks right.
 """
 
-import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -26,25 +24,21 @@ from torch import Tensor
 
 from derender.data import as_float
 from derender.evaluation.bootstrap import RESAMPLES, resamples
-from derender.features import Progress
+from derender.features import Progress, evaluating
 from derender.scene import Scene
 from derender.scene.perturb import derangement
 from derender.training.step import fill_uncovered
 
-Distances = Mapping[str, np.ndarray]
-"""By "feature NAME", "parameter NAME" and "pixels", (N,) Euclidean distances."""
-
 
 @dataclass(frozen=True)
 class SwapScores:
-    """How far features moved, in units of the mean distance between an image and its donor; NaN where that
+    """How far F features moved, in units of the mean distance between an image and its donor; NaN where that
     is 0 (a feature or parameter that is the same for every image).
 
     Attributes:
         factors: names, in the order of rows and columns.
-        moved: (F, F) features; row: the factor exchanged, column: the feature that moved. Best 1 on the
-            diagonal, 0 elsewhere.
-        moved_parameters: (F, F) the same of decoded depth, albedo, light and camera.
+        moved, moved_parameters: (F, F) features, and decoded depth, albedo, light and camera; row: the factor
+            exchanged, column: what moved. Best 1 on the diagonal, 0 elsewhere.
         moved_pixels: (F,) how far the image itself moved when this factor was exchanged.
         arrived: (F,) remaining distance from the exchanged feature to the donor's, best 0.
         unexchanged: (F,) how far features move from an image to its own rendering, best 0.
@@ -74,7 +68,7 @@ def swap_test(
     batch_size: int = 64,
     progress: Progress | None = None,
 ) -> SwapScores:
-    """The swap test on uint8 images (N, 3, H, W), N of 2 or more.
+    """The swap test on uint8 images (N, 3, H, W), N of 2 or more, at the size of the model.
 
     Args:
         model: a ``Derenderer``; stays as it was.
@@ -85,125 +79,72 @@ def swap_test(
     """
     if len(images) < 2:
         raise ValueError(f"the swap test needs two images or more, got {len(images)}")
-    parameters = {factor.name: factor.parameter for factor in model.factors}
-    donor = derangement(len(images), torch.Generator().manual_seed(seed))
-    total, done = len(images) * (len(parameters) + 1), 0
+    names, count = [factor.name for factor in model.factors], len(images)
+    parameters = [factor.parameter for factor in model.factors]
+    donor = derangement(count, torch.Generator().manual_seed(seed))
 
-    def report(count: int) -> None:
-        nonlocal done
-        done += count
-        if progress is not None:
-            progress(done, total)
+    def encoded(scenes: Scene | None = None, done: int = 0) -> dict[str, Tensor]:
+        """Features, decoded parameters and pixels of the renderings of scenes, or of the images."""
+        parts = []
+        for start in range(0, count, batch_size):
+            rows = slice(start, start + batch_size)
+            pixels = as_float(images[rows]).to(model.device)
+            if scenes is not None:
+                found = model.render(scenes[rows].to(model.device))
+                pixels = fill_uncovered(found.image.float(), found.mask.float(), pixels)
+                if progress is not None:
+                    progress(done * count + min(start + batch_size, count), (len(names) + 1) * count)
+            activations = model.activations(pixels)
+            features, decoded = model.features_from(activations), model.decode(model.codes(activations))
+            part = {f"parameter {name}": each for name, each in decoded.parameters.items()}
+            part |= {"pixels": pixels, **{f"feature {name}": features[name] for name in names}}
+            parts.append({key: each.float().cpu() for key, each in part.items()})
+        return {key: torch.cat([part[key] for part in parts]) for key in parts[0]}
 
-    was_training = model.training
-    model.eval()
-    try:
-        with torch.inference_mode():
-            scenes, inputs = _decompose(model, images, batch_size)
-            plain = _encode_renderings(model, scenes, images, parameters, batch_size, report)
-            apart = _distances(plain, {key: value[donor] for key, value in plain.items()})
-            moves: list[Distances] = []
-            left = []
-            for name, parameter in parameters.items():
-                exchanged = scenes.with_parameters(**{parameter: scenes.parameters[parameter][donor]})
-                again = _encode_renderings(model, exchanged, images, parameters, batch_size, report)
-                moves.append(_distances(again, plain))
-                own = f"feature {name}"
-                left.append(_distances({own: again[own]}, {own: plain[own][donor]}))
-            loss = _distances({key: plain[key] for key in inputs}, inputs)
-    finally:
-        model.train(was_training)
-    unit = {key: float(each.mean()) or math.nan for key, each in apart.items()}
+    with evaluating(model):
+        inputs = encoded()
+        scene = {key[10:]: each for key, each in inputs.items() if key.startswith("parameter ")}
+        plain, swapped = encoded(Scene.from_parameters(scene)), []
+        for done, name in enumerate(parameters, 1):
+            swapped.append(encoded(Scene.from_parameters({**scene, name: scene[name][donor]}), done))
+    donors = {key: each[donor] for key, each in plain.items()}
+    apart = _distances(plain, donors)
+    unit = {key: each.mean() or np.nan for key, each in apart.items()}
+    moves, left = ([_distances(each, other) for each in swapped] for other in (plain, donors))
+    weights = np.concatenate(list(resamples(count, RESAMPLES))).astype(np.float64)
 
-    def matrix(keys: Sequence[str]) -> np.ndarray:
-        return np.array([[float(row[key].mean()) / unit[key] for key in keys] for row in moves])
+    def matrix(kind: str, of: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
+        """(F, F) mean moves, and the ratio of its diagonal on resamples."""
+        keys = [f"{kind} {name}" for name in of]
+        each = np.array([[row[key] for key in keys] for row in moves])
+        between = np.stack([apart[key] for key in keys])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            drawn = diagonal_over_rest((each @ weights.T) / (between @ weights.T))
+        return each.mean(axis=2) / np.array([unit[key] for key in keys]), drawn
 
-    def resampled(keys: Sequence[str]) -> np.ndarray:
-        return _resampled(np.array([[row[key] for row in moves] for key in keys]), [apart[k] for k in keys])
-
-    features, decoded = ([f"{kind} {name}" for name in parameters] for kind in ("feature", "parameter"))
-    moved, moved_parameters = matrix(features), matrix(decoded)
+    (moved, drawn), (decoded, drawn_decoded) = matrix("feature", names), matrix("parameter", parameters)
+    loss, own = _distances(plain, inputs), [f"feature {name}" for name in names]
     return SwapScores(
-        factors=tuple(parameters),
-        moved=moved,
-        moved_parameters=moved_parameters,
-        moved_pixels=matrix(["pixels"])[:, 0],
-        arrived=np.array([float(row[key].mean()) / unit[key] for row in left for key in row]),
-        unexchanged=np.array([float(loss[key].mean()) / unit[key] for key in features]),
-        ratio=diagonal_over_rest(moved),
-        ratio_parameters=diagonal_over_rest(moved_parameters),
-        n_pictures=len(images),
-        resampled=np.stack([resampled(features), resampled(decoded)], axis=1),
+        tuple(names),
+        moved,
+        decoded,
+        np.array([row["pixels"].mean() / unit["pixels"] for row in moves]),
+        np.array([row[key].mean() / unit[key] for row, key in zip(left, own, strict=True)]),
+        np.array([loss[key].mean() / unit[key] for key in own]),
+        float(diagonal_over_rest(moved)),
+        float(diagonal_over_rest(decoded)),
+        count,
+        np.stack([drawn, drawn_decoded], axis=1),
     )
 
 
-def diagonal_over_rest(moved: np.ndarray) -> float:
-    """Mean of the diagonal over mean of the other cells of a square matrix; infinite where these are 0, NaN
-    where a cell is NaN.
+def diagonal_over_rest(moved: np.ndarray) -> np.ndarray | np.floating:
+    """Mean of the diagonal over mean of the other cells of (F, F, ...) matrices; infinite where these are 0,
+    NaN where all or any are NaN.
     """
     own = np.eye(len(moved), dtype=bool)
-    rest = moved[~own].mean()
-    if rest == 0:
-        return float("inf") if moved[own].mean() > 0 else float("nan")
-    return float(moved[own].mean() / rest)
-
-
-def _resampled(moves: np.ndarray, apart: Sequence[np.ndarray]) -> np.ndarray:
-    """(B,) mean of the diagonal over mean of the rest on resamples of the images.
-
-    Args:
-        moves: (columns, rows, N) how far each image's feature moved.
-        apart: for every column, (N,) how far each image is from its donor.
-    """
-    weights = np.concatenate(list(resamples(len(apart[0]), RESAMPLES))).astype(np.float64)
-    between = np.stack([weights @ each for each in apart])  # (columns, B)
-    moved = np.stack([[weights @ each for each in column] for column in moves])  # (columns, rows, B)
-    own = np.eye(len(apart), dtype=bool)
     with np.errstate(divide="ignore", invalid="ignore"):
-        share = moved / between[:, None]
-        return share[own].mean(axis=0) / share[~own].mean(axis=0)
-
-
-def _decompose(model: Any, images: np.ndarray, batch_size: int) -> tuple[Scene, dict[str, Tensor]]:
-    """Scenes of images and the features they were decoded from (as "feature NAME"), on the CPU."""
-    scenes, features = [], []
-    for start in range(0, len(images), batch_size):
-        activations = model.activations(as_float(images[start : start + batch_size]).to(model.device))
-        scenes.append(model.decode(model.codes(activations)).to("cpu").parameters)
-        found = model.features_from(activations)
-        features.append({f"feature {name}": value.float().cpu() for name, value in found.items()})
-    return Scene.from_parameters(_joined(scenes)), _joined(features)
-
-
-def _encode_renderings(
-    model: Any,
-    scenes: Scene,
-    images: np.ndarray,
-    parameters: Mapping[str, str],
-    batch_size: int,
-    report: Callable[[int], object],
-) -> dict[str, Tensor]:
-    """Features, decoded parameters and pixels of the renderings of scenes, by the keys of ``Distances``."""
-    parts: list[dict[str, Tensor]] = []
-    for start in range(0, len(scenes), batch_size):
-        rows = slice(start, start + batch_size)
-        rendering = model.render(scenes[rows].to(model.device))
-        inputs = as_float(images[rows]).to(model.device)
-        rendered = fill_uncovered(rendering.image.float(), rendering.mask.float(), inputs)
-        activations = model.activations(rendered)
-        decoded, features = (
-            model.decode(model.codes(activations)).parameters,
-            model.features_from(activations),
-        )
-        part = {f"feature {name}": features[name] for name in parameters}
-        part |= {f"parameter {name}": decoded[parameter] for name, parameter in parameters.items()}
-        parts.append({key: value.float().cpu() for key, value in (part | {"pixels": rendered}).items()})
-        report(len(rendered))
-    return _joined(parts)
-
-
-def _joined(parts: Sequence[Mapping[str, Tensor]]) -> dict[str, Tensor]:
-    return {key: torch.cat([part[key] for part in parts]) for key in parts[0]}
+        return np.divide(moved[own].mean(axis=0), moved[~own].mean(axis=0))
 
 
 def _distances(a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> dict[str, np.ndarray]:
