@@ -1,9 +1,12 @@
 """Means over images: intervals, lower is better where it is, missing images left out; tables and verdicts."""
 
+from types import SimpleNamespace
+from typing import ClassVar
+
 import numpy as np
 import pytest
 
-from derender.evaluation.image_scores import image_rows, image_table, image_verdicts
+from derender.evaluation.image_scores import ImageResult, image_rows, image_verdicts
 from derender.evaluation.score_table import Column
 
 ERROR = np.random.default_rng(0).normal(1.0, 0.2, 400)
@@ -35,25 +38,30 @@ def test_images_without_a_score_are_left_out():
     found = rows[0].scores["e"]
     assert found.value == pytest.approx(ERROR[1::2].mean()) and found.low < found.value < found.high
     assert np.isnan(rows[0].scores["n"].value) and not rows[0].versus["n"].above
-    with pytest.raises(ValueError, match=r"scores of the same images, got \[3, 400\]"):
-        image_rows({"a": {"e": ERROR}, "b": {"e": ERROR[:3]}}, ONE)
+
+
+class Both(ImageResult):
+    columns: ClassVar = {"side": (Column("SIDE x 100", "low"), 100.0), "mad": (Column("MAD", "low", 1), 1.0)}
+    notes: ClassVar = {"plane": "flat"}
+    caption, coverage = "{} images", Column("coverage")
+
+    def named(self):
+        side = np.array([0.01, 0.02, 0.03])
+        return {
+            "model": SimpleNamespace(side_each=side, mad_each=1000 * side, coverage=0.9),
+            "plane": SimpleNamespace(side_each=2 * side, mad_each=500 * side, coverage=1),
+        }
 
 
 def test_tables_are_in_the_units_of_their_columns():
-    columns = {"side": (Column("SIDE x 100", "low"), 100.0), "mad": (Column("MAD", "low", 1), 1.0)}
-    side = np.array([0.01, 0.02, 0.03])
-    each = {"model": {"side": side, "mad": 1000 * side}, "plane": {"side": side * 2, "mad": 500 * side}}
-    rows = image_rows(each, columns)
-    table = image_table(
-        "c", rows, columns, more={Column("coverage"): {"model": 0.9}}, notes={"plane": "flat"}
-    )
+    rows = Both().rows()
+    table = Both().table(rows)
     assert [column.name for column in table.columns] == ["SIDE x 100", "95 %", "MAD", "95 %", "coverage"]
     texts = [text for text, _ in table.texts(table.rows[0])]
-    assert texts == ["2.000", "1.000-3.000", "20.0", "10.0-30.0", "0.900"]
-    assert table.rows[1].control and table.rows[1].cells[-1] is None and table.rows[1].note == "flat"
-    plain = image_table("c", rows, columns, intervals=False)
-    assert plain.rows[1].cells == pytest.approx([4.0, 10.0])
-    side_words, mad_words = image_verdicts(rows[0], columns)
+    assert texts == ["2.000", "1.000-3.000", "20.0", "10.0-30.0", "0.900"] and table.caption == "3 images"
+    assert table.rows[1].control and table.rows[1].note == "flat"
+    assert Both().table().rows[1].cells == pytest.approx([4.0, 10.0, 1])
+    side_words, mad_words = image_verdicts(rows[0], Both.columns)
     assert side_words.startswith(
         "SIDE x 100: 2.000, better than the strongest control (plane), by +2.000, 95 %"
     )

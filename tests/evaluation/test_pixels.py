@@ -5,7 +5,7 @@ import pytest
 import torch
 from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
 
-from derender.evaluation import evaluate_reconstruction, mean_picture, reconstruction_scores
+from derender.evaluation import evaluate_reconstruction, mean_image, reconstruction_scores
 from derender.evaluation.pixels import AT_A_TIME, WINDOW, component_count, from_components, masked_ssim
 
 
@@ -63,12 +63,10 @@ def test_the_mean_picture_is_scored_in_the_same_masks():
     assert result.model.coverage == result.mean_picture.coverage == 0.5
 
 
-def test_the_mean_of_many_images_is_exact_and_of_none_an_error():
+def test_the_mean_of_many_images_is_exact():
     images = np.full((2500, 3, 2, 2), 255, np.uint8)
     images[:625] = 0
-    np.testing.assert_allclose(mean_picture(images), 0.75)
-    with pytest.raises(ValueError, match="no images"):
-        mean_picture(images[:0])
+    np.testing.assert_allclose(mean_image(images), 0.75)
 
 
 def test_components_copy_what_lies_in_their_span():
@@ -147,5 +145,4 @@ def test_masks_too_small_for_a_window_have_no_score():
     assert found.isnan().tolist() == [True, False]
     scores = reconstruction_scores(prediction, target, mask)
     assert scores.ssim == pytest.approx(found[1].item()) and scores.n_empty == 0
-    with pytest.raises(ValueError, match=r"11 pixels or more each way, got \(8, 8\)"):
-        masked_ssim(prediction[..., :8, :8], target[..., :8, :8], mask[..., :8, :8])
+    assert masked_ssim(prediction[..., :8, :8], target[..., :8, :8], mask[..., 16:, 16:24]).isnan().all()

@@ -25,7 +25,7 @@ from derender.evaluation import (
     evaluate_factors,
     evaluate_geometry,
     evaluate_reconstruction,
-    mean_picture,
+    mean_image,
 )
 from derender.features import embed_pictures
 from derender.model import Derenderer, load
@@ -190,7 +190,7 @@ def run_demo(
     factors = evaluate_factors(model, truth)
     bundled_geometry = evaluate_geometry(bundled, truth) if size == bundled.image_size else None
     report(STAGES[3], 1, 4, "reconstruction")
-    reconstruction = evaluate_reconstruction(model, unseen.images, mean=mean_picture(seen.images))
+    reconstruction = evaluate_reconstruction(model, unseen.images, mean=mean_image(seen.images))
     report(STAGES[3], 2, 4, "features")
     table = embed_pictures(model, unseen)
     components = min(64, len(seen) // 4)

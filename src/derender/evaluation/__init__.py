@@ -41,7 +41,7 @@ from derender.evaluation.pixels import (
     ReconstructionResult,
     ReconstructionScores,
     evaluate_reconstruction,
-    mean_picture,
+    mean_image,
     reconstruction_scores,
 )
 from derender.evaluation.robust.protocol import robustness
@@ -98,7 +98,7 @@ __all__ = [
     "linear",
     "linear_scores",
     "majority_answers",
-    "mean_picture",
+    "mean_image",
     "probe",
     "reconstruction",
     "reconstruction_scores",

@@ -5,17 +5,15 @@ where predicted and true mask overlap, eroded by one pixel (the rim is where ras
 the standard deviation of log predicted minus log true depth, so a global scale costs nothing; MAD is the
 mean angle between normals. Each image is scored by itself and the images are averaged.
 
-The erosion takes away a pixel when one of its four neighbours is outside, beyond the border counting as
-outside: what stays are exactly the pixels whose central differences lie inside the mask. On synface64's
-test_gt with the stored normals the average depth then scores SIDE 1.51e-2 and MAD 22.4 degrees, a plane
-2.28e-2 and 38.9. Eroding with all eight neighbours, as a 3x3 pooling does, gives 1.48e-2, 22.4 and 2.25e-2,
-38.7. Normals taken from true depth instead of the stored ones raise MAD to 22.9 and 40.0.
+The erosion takes away a pixel when one of its four neighbours is outside: what stays are exactly the pixels
+whose central differences lie inside the mask. On synface64's test_gt with the stored normals the average
+depth then scores SIDE 1.51e-2 and MAD 22.4 degrees, a plane 2.28e-2 and 38.9.
 Leaves out errors of light, camera and albedo (evaluation/factors.py).
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -23,19 +21,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from derender.data import GroundTruth
-from derender.evaluation.bootstrap import RESAMPLES, ScoredRow
-from derender.evaluation.image_scores import Columns, image_rows, image_table
-from derender.evaluation.score_table import Column, ScoreTable
+from derender.evaluation.image_scores import Columns, ImageResult
+from derender.evaluation.score_table import Column
 from derender.features import Progress, map_batches
+from derender.features.extract import check_size
 from derender.scene.normals import normals_from_depth
-
-GEOMETRY: Columns = {
-    "side": (Column("SIDE x 100", "low", note="scale-invariant depth error times 100, best 0"), 100.0),
-    "mad_deg": (Column("MAD", "low", 1, "mean angle between normals in degrees, best 0"), 1.0),
-}
-COVERAGE = Column(
-    "coverage", None, note="share of the true object that the prediction covers; errors count only there"
-)
 
 
 @dataclass(frozen=True)
@@ -45,8 +35,8 @@ class GeometryScores:
     Attributes:
         side: scale-invariant depth error, 0 and up, best 0. Papers print it times 100.
         mad_deg: mean angle between normals in degrees, 0..180, best 0.
-        coverage: share of the eroded true mask that the prediction covers, 0..1, best 1: errors are measured
-            only there, so a prediction without the hard part must be visible.
+        coverage: share of the eroded true mask that the prediction covers, 0..1, best 1: errors count only
+            there, so a prediction without the hard part must be visible.
         n_empty: images where prediction and truth share no pixel; left out of the two means.
         side_each, mad_deg_each: (N,) per image, NaN where there is nothing to compare.
     """
@@ -60,7 +50,7 @@ class GeometryScores:
 
 
 @dataclass(frozen=True)
-class GeometryResult:
+class GeometryResult(ImageResult):
     """A model's errors beside its controls, all on the same images.
 
     Attributes:
@@ -70,33 +60,28 @@ class GeometryResult:
         untrained: of the same architecture with fresh weights; None without one.
     """
 
+    columns: ClassVar[Columns] = {
+        "side": (Column("SIDE x 100", "low", note="scale-invariant depth error times 100, best 0"), 100.0),
+        "mad_deg": (Column("MAD", "low", 1, "mean angle between normals in degrees, best 0"), 1.0),
+    }
+    caption = "Geometry on {:,} images with exact depth"
+    coverage = Column(
+        "coverage", None, note="share of the true object that the prediction covers; errors count only there"
+    )
+    notes: ClassVar[Mapping[str, str]] = {
+        "average depth": "the mean true depth map, the same for every image",
+        "untrained model": "same networks, fresh weights",
+    }
+
     model: GeometryScores
     average_depth: GeometryScores
     plane: GeometryScores
     untrained: GeometryScores | None = None
 
-    def _named(self) -> dict[str, GeometryScores]:
+    def named(self) -> dict[str, GeometryScores]:
+        """Scores by row."""
         named = {"model": self.model, "average depth": self.average_depth, "plane": self.plane}
         return named if self.untrained is None else {**named, "untrained model": self.untrained}
-
-    def rows(self, resample_count: int = RESAMPLES) -> tuple[ScoredRow, ...]:
-        """The model, then its controls, ``side`` and ``mad_deg`` with intervals; lower is better."""
-        each = {name: {"side": s.side_each, "mad_deg": s.mad_deg_each} for name, s in self._named().items()}
-        return image_rows(each, GEOMETRY, resample_count=resample_count)
-
-    def table(self, rows: Sequence[ScoredRow] | None = None) -> ScoreTable:
-        """Depth and normal errors beside the controls; with ``rows``, their intervals too."""
-        return image_table(
-            f"Geometry on {len(self.model.side_each):,} images with exact depth",
-            rows or self.rows(1),
-            GEOMETRY,
-            intervals=rows is not None,
-            more={COVERAGE: {name: scores.coverage for name, scores in self._named().items()}},
-            notes={
-                "average depth": "the mean true depth map, the same for every image",
-                "untrained model": "same networks, fresh weights",
-            },
-        )
 
 
 def erode(mask: Bool[Tensor, "n h w"]) -> Bool[Tensor, "n h w"]:
@@ -130,30 +115,28 @@ def geometry_scores(
         normal_true: true normals where they are known better than from depth (rendered ones); camera frame,
             inward.
     """
-    inside = erode(mask_true)
-    valid = erode(mask_true & mask_pred)
+    inside, valid = erode(mask_true), erode(mask_true & mask_pred)
     if not inside.any():
         raise ValueError("the true masks are empty after taking one pixel off: nothing to compare")
+    if not valid.any():
+        raise ValueError("prediction and truth share no pixel in any image: check the camera or the masks")
     for name, depth in (("predicted", depth_pred), ("true", depth_true)):
         if not bool((torch.isfinite(depth[valid]) & (depth[valid] > 0)).all()):
             raise ValueError(f"{name} depth must be positive and finite inside its mask")
-    depth_pred, depth_true = depth_pred.double(), depth_true.double()
-    pixels = valid.sum(dim=(1, 2))
-    difference = _where(valid, _log(depth_pred, valid) - _log(depth_true, valid))
-    centred = _where(valid, difference - (difference.sum(dim=(1, 2)) / pixels)[:, None, None])
-    side = (centred.square().sum(dim=(1, 2)) / pixels).sqrt()
-    normal_pred = normals_from_depth(_filled(depth_pred, mask_pred), fov_deg)
-    if normal_true is None:
-        normal_true = normals_from_depth(_filled(depth_true, mask_true), fov_deg)
-    mad = _where(valid, angle_deg(normal_pred, normal_true.double())).sum(dim=(1, 2)) / pixels
-    empty = pixels == 0
-    if bool(empty.all()):
-        raise ValueError("prediction and truth share no pixel in any image: check the camera or the masks")
+
+    def mean(values: Tensor) -> Tensor:
+        return torch.where(valid, values, torch.nan).nanmean(dim=(1, 2))
+
+    predicted, true = depth_pred.double(), depth_true.double()
+    difference = predicted.log() - true.log()
+    side = mean((difference - mean(difference)[:, None, None]).square()).sqrt()
+    normal = normals_from_depth(true, fov_deg) if normal_true is None else normal_true.double()
+    mad = mean(angle_deg(normals_from_depth(predicted, fov_deg), normal))
     return GeometryScores(
-        side=side[~empty].mean().item(),
-        mad_deg=mad[~empty].mean().item(),
+        side=side.nanmean().item(),
+        mad_deg=mad.nanmean().item(),
         coverage=(valid.sum() / inside.sum()).item(),
-        n_empty=int(empty.sum()),
+        n_empty=int(side.isnan().sum()),
         side_each=side.numpy(force=True),
         mad_deg_each=mad.numpy(force=True),
     )
@@ -161,19 +144,8 @@ def geometry_scores(
 
 def average_depth(depth: Float[Tensor, "n h w"], mask: Bool[Tensor, "n h w"]) -> Float[Tensor, "h w"]:
     """Mean depth of every pixel over the images whose object covers it; the farthest mean where none."""
-    count = mask.sum(dim=0)
-    mean = _where(mask, depth.double()).sum(dim=0) / count
-    return torch.where(count > 0, mean, mean[count > 0].max()).to(depth.dtype)
-
-
-def geometry_controls(truth: GroundTruth, fov_deg: float) -> tuple[GeometryScores, GeometryScores]:
-    """Scores of the average depth map over these images and of a plane at depth 1."""
-    depth, mask, normal = _truth(truth)
-    everywhere = torch.ones_like(mask)
-    average = average_depth(depth, mask).expand_as(depth)
-    plane = torch.ones_like(depth)
-    first, second = (geometry_scores(d, everywhere, depth, mask, fov_deg, normal) for d in (average, plane))
-    return first, second
+    mean = torch.where(mask, depth.double(), torch.nan).nanmean(dim=0)
+    return mean.nan_to_num(mean[mask.any(dim=0)].max().item()).to(depth.dtype)
 
 
 def predicted_depth(
@@ -186,7 +158,8 @@ def predicted_depth(
         return rendering.depth.cpu(), rendering.mask.cpu() > 0.5
 
     parts = map_batches(see, model, images, batch_size=batch_size, progress=progress)
-    return torch.cat([depth for depth, _ in parts]), torch.cat([mask for _, mask in parts])
+    depth, mask = map(torch.cat, zip(*parts, strict=True))
+    return depth, mask
 
 
 def evaluate_geometry(
@@ -206,37 +179,21 @@ def evaluate_geometry(
         untrained: the same architecture with fresh weights, for the control.
         progress: called with (images done, images in all) after every batch of ``model``.
     """
-    size = truth.images.shape[-1]
-    if size != model.image_size:
-        raise ValueError(
-            f"the ground truth is {size} pixels wide, the model takes {model.image_size}: use its size"
-        )
-    depth, mask, normal = _truth(truth)
+    check_size(model, truth.images)
+    depth, mask = torch.as_tensor(truth.depth), torch.as_tensor(truth.mask) > 0
+    normal = None
+    if truth.normal is not None:
+        normal = torch.nn.functional.normalize(torch.as_tensor(truth.normal), dim=-1)
 
-    def score(any_model: Any, report: Progress | None) -> GeometryScores:
-        prediction = predicted_depth(any_model, truth.images, batch_size=batch_size, progress=report)
-        return geometry_scores(*prediction, depth, mask, model.fov_deg, normal)
+    def score(predicted: Tensor, covered: Tensor) -> GeometryScores:
+        return geometry_scores(predicted, covered, depth, mask, model.fov_deg, normal)
 
-    average, plane = geometry_controls(truth, model.fov_deg)
-    fresh = None if untrained is None else score(untrained, None)
-    return GeometryResult(score(model, progress), average, plane, fresh)
-
-
-def _truth(truth: GroundTruth) -> tuple[Tensor, Tensor, Tensor | None]:
-    normal = (
-        None if truth.normal is None else torch.nn.functional.normalize(torch.as_tensor(truth.normal), dim=-1)
+    everywhere, fresh = torch.ones_like(mask), None
+    if untrained is not None:
+        fresh = score(*predicted_depth(untrained, truth.images, batch_size=batch_size))
+    return GeometryResult(
+        score(*predicted_depth(model, truth.images, batch_size=batch_size, progress=progress)),
+        score(average_depth(depth, mask).expand_as(depth), everywhere),
+        score(torch.ones_like(depth), everywhere),
+        fresh,
     )
-    return torch.as_tensor(truth.depth), torch.as_tensor(truth.mask) > 0, normal
-
-
-def _where(mask: Tensor, values: Tensor) -> Tensor:
-    return torch.where(mask, values, torch.zeros_like(values))
-
-
-def _filled(depth: Tensor, mask: Tensor) -> Tensor:
-    """Depth with a harmless 1 outside the mask; no scored pixel depends on it."""
-    return torch.where(mask, depth, torch.ones_like(depth))
-
-
-def _log(depth: Tensor, mask: Tensor) -> Tensor:
-    return _filled(depth, mask).log()

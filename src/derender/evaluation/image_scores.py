@@ -7,21 +7,63 @@ covered) is left out of its row's means; a single image has no interval.
 
 from collections.abc import Mapping, Sequence
 from math import isfinite
+from typing import Any, ClassVar
 
 import numpy as np
 
-from derender.evaluation.bootstrap import (
-    RESAMPLES,
-    Estimate,
-    ScoredRow,
-    estimate,
-    resamples,
-    with_verdicts,
-)
+from derender.evaluation.bootstrap import RESAMPLES, Estimate, ScoredRow, estimate, resamples, with_verdicts
 from derender.evaluation.score_table import Cell, Column, Row, ScoreTable, interval_column, interval_of
 
 Columns = Mapping[str, tuple[Column, float]]
 """By score, its column and the factor from the score to the unit of the column."""
+
+
+class ImageResult:
+    """A model's scores beside its controls, all on the same images.
+
+    Attributes:
+        columns: of the scores.
+        caption: of the table, with a place for the number of images.
+        coverage: the column of ``coverage``, where rows have that.
+        notes: on rows, by their name.
+    """
+
+    columns: ClassVar[Columns]
+    caption: ClassVar[str]
+    coverage: ClassVar[Column | None] = None
+    notes: ClassVar[Mapping[str, str]] = {}
+
+    def named(self) -> Mapping[str, Any]:
+        """The model, then its controls, by row: objects with (N,) of each score as ``SCORE_each``."""
+        return {}
+
+    def each(self) -> dict[str, dict[str, np.ndarray]]:
+        """Every score of every image, (N,), by row."""
+        return {
+            row: {score: getattr(one, f"{score}_each") for score in self.columns}
+            for row, one in self.named().items()
+        }
+
+    def rows(self, resample_count: int = RESAMPLES) -> tuple[ScoredRow, ...]:
+        """The model, then its controls, with intervals."""
+        return image_rows(self.each(), self.columns, resample_count=resample_count)
+
+    def table(self, rows: Sequence[ScoredRow] | None = None) -> ScoreTable:
+        """The scores in the units of the columns; with ``rows``, their intervals too."""
+        heads: list[Column] = []
+        for column, _ in self.columns.values():
+            heads += [column] if rows is None else [column, interval_column(column, "images")]
+        heads += [] if self.coverage is None else [self.coverage]
+        made = []
+        for row in rows or self.rows(1):
+            cells: list[Cell] = []
+            for score, (_, scale) in self.columns.items():
+                cells.append(scale * row.scores[score].value)
+                cells += [] if rows is None else [interval_of(row, score, scale)]
+            cells += [] if self.coverage is None else [self.named()[row.name].coverage]
+            made.append(Row(row.name, cells, row.control, self.notes.get(row.name, "")))
+        count = len(next(iter(self.each()["model"].values())))
+        return ScoreTable(self.caption.format(count), "prediction", heads, made)
 
 
 def image_rows(
@@ -34,59 +76,17 @@ def image_rows(
     """A row for each name, in their order; all but the first are controls.
 
     Args:
-        scores: by row, every score's (N,) values of the images, NaN where there is none.
+        scores: by row, every score's (N,) values of the same images, NaN where there is none.
         columns: of the scores; they hold which end is better.
-        resample_count: bootstrap resamples of the images.
-        seed: of the resamples.
-
-    Raises:
-        ValueError: rows of different length.
+        resample_count, seed: bootstrap resamples of the images.
     """
-    lengths = {len(values) for each in scores.values() for values in each.values()}
-    if len(lengths) != 1:
-        raise ValueError(f"all rows must be scores of the same images, got {sorted(lengths)} of them")
-    weights = np.concatenate(list(resamples(lengths.pop(), resample_count, seed)))
+    count = max(len(values) for each in scores.values() for values in each.values())
+    weights = np.concatenate(list(resamples(count, resample_count, seed)))
     rows = [
         ScoredRow(name, at > 0, 1, {score: _estimate(values, weights) for score, values in each.items()})
         for at, (name, each) in enumerate(scores.items())
     ]
-    return with_verdicts(
-        rows, lower=[score for score, (column, _) in columns.items() if column.best == "low"]
-    )
-
-
-def image_table(
-    caption: str,
-    rows: Sequence[ScoredRow],
-    columns: Columns,
-    *,
-    intervals: bool = True,
-    more: Mapping[Column, Mapping[str, float]] | None = None,
-    notes: Mapping[str, str] | None = None,
-) -> ScoreTable:
-    """The rows in the units of the columns.
-
-    Args:
-        caption: of the table.
-        rows: of ``image_rows``.
-        columns: in the order of display.
-        intervals: whether a column of 95 % intervals follows each score.
-        more: further columns, by name of the row.
-        notes: on rows, by their name.
-    """
-    heads: list[Column] = []
-    for column, _ in columns.values():
-        heads += [column, interval_column(column, "images")] if intervals else [column]
-
-    def cells(row: ScoredRow) -> list[Cell]:
-        found: list[Cell] = []
-        for score, (_, scale) in columns.items():
-            found.append(scale * row.scores[score].value)
-            found += [interval_of(row, score, scale)] if intervals else []
-        return [*found, *(values.get(row.name) for values in (more or {}).values())]
-
-    made = [Row(row.name, cells(row), row.control, (notes or {}).get(row.name, "")) for row in rows]
-    return ScoreTable(caption, "prediction", [*heads, *(more or {})], made)
+    return with_verdicts(rows, lower=[name for name, (column, _) in columns.items() if column.best == "low"])
 
 
 def image_verdicts(row: ScoredRow, columns: Columns) -> list[str]:

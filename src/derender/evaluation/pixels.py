@@ -11,30 +11,23 @@ own, without the same five pixels at the border of the image. Leaves out several
 similarities.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from derender.evaluation.bootstrap import RESAMPLES, ScoredRow
-from derender.evaluation.image_scores import Columns, image_rows, image_table
-from derender.evaluation.score_table import Column, ScoreTable
+from derender.evaluation.image_scores import Columns, ImageResult
+from derender.evaluation.score_table import Column
 from derender.features import Progress, map_batches
 
 COMPONENTS = 64
 WINDOW = 11
 SIGMA = 1.5
 AT_A_TIME = 32  # images: convolutions with windows this large take memory
-RECONSTRUCTION: Columns = {
-    "l1": (Column("L1", "low", 4, "mean absolute difference inside the mask, 0 to 1, best 0"), 1.0),
-    "psnr_db": (Column("PSNR", "high", 2, "peak signal-to-noise ratio in decibels"), 1.0),
-    "ssim": (Column("SSIM", "high", note="structural similarity of windows inside the mask, at most 1"), 1.0),
-}
-COVERAGE = Column("coverage", None, note="share of all pixels inside the mask")
 
 
 @dataclass(frozen=True)
@@ -43,8 +36,7 @@ class ReconstructionScores:
 
     Attributes:
         l1: mean absolute difference, 0..1, best 0.
-        psnr_db: peak signal-to-noise ratio in decibels, 0 and up, more is better; infinite for a perfect
-            copy.
+        psnr_db: peak signal-to-noise ratio in decibels, 0 and up, more is better; infinite for a copy.
         coverage: share of all pixels inside the mask, 0..1.
         n_empty: images with an empty mask, left out of the means.
         l1_each, psnr_db_each: (N,) per image, NaN where the mask is empty.
@@ -64,7 +56,7 @@ class ReconstructionScores:
 
 
 @dataclass(frozen=True)
-class ReconstructionResult:
+class ReconstructionResult(ImageResult):
     """A model's reconstructions beside its controls.
 
     Attributes:
@@ -75,61 +67,49 @@ class ReconstructionResult:
         n_components: how many principal components.
     """
 
+    columns: ClassVar[Columns] = {
+        "l1": (Column("L1", "low", 4, "mean absolute difference inside the mask, 0 to 1, best 0"), 1.0),
+        "psnr_db": (Column("PSNR", "high", 2, "peak signal-to-noise ratio in decibels"), 1.0),
+        "ssim": (Column("SSIM", "high", note="structural similarity inside the mask, at most 1"), 1.0),
+    }
+    caption = "Reconstruction of {:,} images"
+    coverage = Column("coverage", None, note="share of all pixels inside the mask")
+    notes: ClassVar[Mapping[str, str]] = {
+        "untrained model": "same networks, fresh weights, inside its own mask"
+    }
+
     model: ReconstructionScores
     mean_picture: ReconstructionScores
     components: ReconstructionScores | None = None
     untrained: ReconstructionScores | None = None
     n_components: int = 0
 
-    def _named(self) -> dict[str, ReconstructionScores]:
+    def named(self) -> dict[str, ReconstructionScores]:
+        """Scores by row."""
         named = {
             "model": self.model, "mean image": self.mean_picture,
             f"PCA ({self.n_components})": self.components, "untrained model": self.untrained,
         }  # fmt: skip
         return {name: scores for name, scores in named.items() if scores is not None}
 
-    def rows(self, resample_count: int = RESAMPLES) -> tuple[ScoredRow, ...]:
-        """The model, then its controls, L1, PSNR and SSIM with intervals."""
-        each = {
-            name: dict(zip(RECONSTRUCTION, (s.l1_each, s.psnr_db_each, s.ssim_each), strict=True))
-            for name, s in self._named().items()
-        }
-        return image_rows(each, RECONSTRUCTION, resample_count=resample_count)
-
-    def table(self, rows: Sequence[ScoredRow] | None = None) -> ScoreTable:
-        """Errors of the reconstructions beside the controls; with ``rows``, their intervals too."""
-        return image_table(
-            f"Reconstruction of {len(self.model.l1_each):,} images",
-            rows or self.rows(1),
-            RECONSTRUCTION,
-            intervals=rows is not None,
-            more={COVERAGE: {name: scores.coverage for name, scores in self._named().items()}},
-            notes={"untrained model": "same networks, fresh weights, inside its own mask"},
-        )
-
 
 def reconstruction_scores(
-    prediction: Float[Tensor, "n 3 h w"],
-    target: Float[Tensor, "n 3 h w"],
-    mask: Float[Tensor, "n h w"],
+    prediction: Float[Tensor, "n 3 h w"], target: Float[Tensor, "n 3 h w"], mask: Float[Tensor, "n h w"]
 ) -> ReconstructionScores:
     """Masked L1, PSNR and SSIM of images in 0..1, averaged over pixels, channels, then images."""
     weight = mask[:, None].double().expand_as(target)
     total = weight.sum(dim=(1, 2, 3))
+    if not bool(total.any()):
+        raise ValueError("every mask is empty: the model renders nothing into the image")
     difference = torch.where(weight > 0, prediction.double() - target.double(), 0.0)
     l1 = (weight * difference.abs()).sum(dim=(1, 2, 3)) / total
     psnr = -10 * ((weight * difference.square()).sum(dim=(1, 2, 3)) / total).log10()
-    empty = total == 0
-    if bool(empty.all()):
-        raise ValueError("every mask is empty: the model renders nothing into the image")
-    ssim = torch.full_like(l1, torch.nan)
-    if min(target.shape[-2:]) >= WINDOW:
-        ssim = masked_ssim(prediction, target, mask)
+    ssim = masked_ssim(prediction, target, mask)
     return ReconstructionScores(
-        l1=l1[~empty].mean().item(),
-        psnr_db=psnr[~empty].mean().item(),
+        l1=l1.nanmean().item(),
+        psnr_db=psnr.nanmean().item(),
         coverage=mask.double().mean().item(),
-        n_empty=int(empty.sum()),
+        n_empty=int((total == 0).sum()),
         l1_each=l1.numpy(force=True),
         psnr_db_each=psnr.numpy(force=True),
         ssim=ssim.nanmean().item(),
@@ -137,10 +117,8 @@ def reconstruction_scores(
     )
 
 
-def mean_picture(images: np.ndarray) -> Float[Tensor, "3 h w"]:
+def mean_image(images: np.ndarray) -> Float[Tensor, "3 h w"]:
     """The mean of uint8 images (N, 3, H, W), in 0..1; reads a memory map a part at a time."""
-    if len(images) == 0:
-        raise ValueError("no images to average")
     total = np.zeros(images.shape[1:])
     for start in range(0, len(images), 1024):
         total += images[start : start + 1024].sum(axis=0, dtype=np.float64)
@@ -170,27 +148,26 @@ def evaluate_reconstruction(
         batch_size: images at a time; changes speed and memory only.
         progress: called with (images done, images in all) after every batch.
     """
-    mean = mean_picture(images) if mean is None else mean
 
-    def rendered(any_model: Any, report: Progress | None) -> tuple[Tensor, Tensor, Tensor]:
+    def rendered(net: Any, report: Progress | None = None) -> tuple[Tensor, ...]:
         def render(batch: Tensor) -> tuple[Tensor, ...]:
-            rendering = any_model.reconstruct(batch)
+            rendering = net.reconstruct(batch)
             return rendering.image.float().cpu(), batch.cpu(), rendering.mask.float().cpu()
 
-        parts = map_batches(render, any_model, images, batch_size=batch_size, progress=report)
-        image, target, mask = (torch.cat(values) for values in zip(*parts, strict=True))
-        return image, target, mask
+        parts = map_batches(render, net, images, batch_size=batch_size, progress=report)
+        return tuple(map(torch.cat, zip(*parts, strict=True)))
 
     image, target, mask = rendered(model, progress)
-    known = None
+    mean, known, count = mean_image(images) if mean is None else mean, None, 0
     if components_of is not None:
+        count = component_count(len(components_of))
         known = reconstruction_scores(from_components(images, components_of), target, mask)
     return ReconstructionResult(
         reconstruction_scores(image, target, mask),
         reconstruction_scores(mean.expand_as(target), target, mask),
         known,
-        None if untrained is None else reconstruction_scores(*rendered(untrained, None)),
-        0 if components_of is None else component_count(len(components_of)),
+        None if untrained is None else reconstruction_scores(*rendered(untrained)),
+        count,
     )
 
 
@@ -200,17 +177,13 @@ def component_count(images: int) -> int:
 
 
 def from_components(images: np.ndarray, fitted: np.ndarray) -> Float[Tensor, "n 3 h w"]:
-    """uint8 images (N, 3, H, W) from their principal components alone, in 0..1.
-
-    Args:
-        images: to show.
-        fitted: (M, 3, H, W) uint8 that give the components.
-    """
+    """uint8 images (N, 3, H, W) from the principal components of (M, 3, H, W) others alone, in 0..1."""
     from sklearn.decomposition import PCA
 
-    pca = PCA(component_count(len(fitted)), random_state=0).fit(_flat(fitted))
-    again = pca.inverse_transform(pca.transform(_flat(images)))
-    return torch.from_numpy(again.astype(np.float32)).clamp(0, 1).reshape(images.shape)
+    known, flat = (np.asarray(one, np.float32).reshape(len(one), -1) / 255 for one in (fitted, images))
+    pca = PCA(component_count(len(fitted)), random_state=0).fit(known)
+    again = pca.inverse_transform(pca.transform(flat)).astype(np.float32)
+    return torch.from_numpy(again).clamp(0, 1).reshape(images.shape)
 
 
 def masked_ssim(
@@ -224,26 +197,17 @@ def masked_ssim(
     from torchmetrics.functional.image import structural_similarity_index_measure
 
     if min(target.shape[-2:]) < WINDOW:
-        raise ValueError(
-            f"SSIM needs images of {WINDOW} pixels or more each way, got {tuple(target.shape[-2:])}"
-        )
+        return torch.full((len(target),), torch.nan, dtype=torch.float64)
     found = []
-    for part in zip(*(values.split(AT_A_TIME) for values in (prediction, target, mask)), strict=True):
-        covered = part[2] > 0
+    for shown, true, covered in zip(
+        *(v.split(AT_A_TIME) for v in (prediction, target, mask > 0)), strict=True
+    ):
         hole = torch.nn.functional.pad((~covered).float(), (WINDOW // 2,) * 4, value=1.0)
         inside = torch.nn.functional.max_pool2d(hole[:, None], WINDOW, stride=1)[:, 0] == 0  # window centres
+        one, other = (torch.where(covered[:, None], values.float(), 0.0) for values in (shown, true))
         _, similarity = structural_similarity_index_measure(
-            torch.where(covered[:, None], part[0].float(), 0.0),
-            torch.where(covered[:, None], part[1].float(), 0.0),
-            data_range=1.0,
-            sigma=SIGMA,
-            reduction="none",
-            return_full_image=True,
+            one, other, data_range=1.0, sigma=SIGMA, reduction="none", return_full_image=True
         )
         total = torch.where(inside, torch.as_tensor(similarity).mean(dim=1), 0.0).sum(dim=(1, 2))
         found.append(total.double() / inside.sum(dim=(1, 2)))
     return torch.cat(found)
-
-
-def _flat(images: np.ndarray) -> np.ndarray:
-    return np.asarray(images, np.float32).reshape(len(images), -1) / 255

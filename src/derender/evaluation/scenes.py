@@ -4,34 +4,32 @@ Every score is beside constant answers and the same networks untrained. With ``f
 not the untrained one's, are optimised against their images first.
 """
 
+import copy
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
-from torch import Tensor
 
 from derender.baselines.controls import untrained_twin
 from derender.data import GroundTruth, ImageSet, read_ground_truth
 from derender.evaluation.bootstrap import RESAMPLES
-from derender.evaluation.depth import GEOMETRY, GeometryResult, evaluate_geometry
-from derender.evaluation.factors import FACTORS, FactorResult, evaluate_factors
-from derender.evaluation.image_scores import image_verdicts
+from derender.evaluation.depth import GeometryResult, evaluate_geometry
+from derender.evaluation.factors import FactorResult, evaluate_factors
+from derender.evaluation.image_scores import ImageResult, image_verdicts
 from derender.evaluation.memory import Memory
-from derender.evaluation.pixels import (
-    RECONSTRUCTION,
-    ReconstructionResult,
-    evaluate_reconstruction,
-    mean_picture,
-)
+from derender.evaluation.pixels import ReconstructionResult, evaluate_reconstruction, mean_image
 from derender.evaluation.score_table import Scores
 from derender.features import Progress, model_fingerprint
 from derender.inputs import as_images, as_model, require_fitting
 from derender.model import Derenderer
-from derender.render import Rendering
-from derender.scene import Scene
 
 COMPONENT_IMAGES = 2_000
+_KINDS: Mapping[str, type[ImageResult]] = {
+    "geometry": GeometryResult, "factors": FactorResult, "reconstruction": ReconstructionResult,
+}  # fmt: skip
 
 
 def geometry(
@@ -64,37 +62,20 @@ def geometry(
     exact = truth if isinstance(truth, GroundTruth) else read_ground_truth(truth, image_size=model.image_size)
     names = ("images", "depth", "mask", "normal", "albedo", "light", "camera")
     known = {name: getattr(exact, name) for name in names if getattr(exact, name) is not None}
-    inputs = {**_facts(model), **known, "seed": seed, "fitted": fit_steps or 0}
-    scored, twin, kept = _optimised(model, fit_steps), untrained_twin(model, seed), memory or Memory()
-    found = kept.recall_value(
-        "geometry", inputs, GeometryResult,
-        lambda: evaluate_geometry(scored, exact, batch_size=batch_size, untrained=twin, progress=progress),
-    )  # fmt: skip
-    rows = {"geometry": found.rows(resample_count)}
-    tables, notes = [found.table(rows["geometry"])], image_verdicts(rows["geometry"][0], GEOMETRY)
-    values: dict[str, Any] = {"pictures": len(exact), "geometry": found}
+    scored = _optimised(model, fit_steps)
+    how: dict[str, Any] = {"batch_size": batch_size, "untrained": untrained_twin(model, seed)}
+    again = partial(evaluate_reconstruction, scored, exact.images, components_of=exact.images, **how)
+    protocols: dict[str, Callable[[], Any]] = {
+        "geometry": partial(evaluate_geometry, scored, exact, progress=progress, **how)
+    }
     if {"albedo", "light", "camera"} <= set(known):
-        factors, fresh = (
-            kept.recall_value(
-                f"factors-{name}", inputs, FactorResult,
-                lambda one=one: evaluate_factors(one, exact, batch_size=batch_size),
-            )
-            for name, one in (("model", scored), ("untrained", twin))
-        )  # fmt: skip
-        rows["factors"] = factors.rows(fresh, resample_count)
-        tables.append(factors.table(fresh, rows["factors"]))
-        notes += image_verdicts(rows["factors"][0], FACTORS)
-        values |= {"factors": factors, "factors_untrained": fresh}
-    again = kept.recall_value(
-        "reconstruction", inputs, ReconstructionResult,
-        lambda: evaluate_reconstruction(
-            scored, exact.images, components_of=exact.images, untrained=twin, batch_size=batch_size
-        ),
-    )  # fmt: skip
-    rows["reconstruction"] = again.rows(resample_count)
-    tables.append(again.table(rows["reconstruction"]))
-    intervals = {name: {row.name: row.numbers() for row in scored} for name, scored in rows.items()}
-    return Scores(tables, {**values, "reconstruction": again, "intervals": intervals}, notes, result=found)
+        protocols["factors"] = partial(evaluate_factors, scored, exact, **how)
+    inputs = {**known, "seed": seed, "fitted": fit_steps or 0}
+    found = _scored(model, {**protocols, "reconstruction": again}, inputs, resample_count, memory)
+    if isinstance(factors := found.values.get("factors"), FactorResult):
+        parts = {"factors": replace(factors, untrained=None), "factors_untrained": factors.untrained}
+        found = replace(found, values={**found.values, **parts})
+    return found
 
 
 def reconstruction(
@@ -120,51 +101,45 @@ def reconstruction(
         fit_steps, resample_count, seed, batch_size, memory, progress: as of ``geometry``.
     """
     model = as_model(model)
-    pictures = as_images(images, model.image_size)
-    known = (training_images or pictures).images
+    images = as_images(images, model.image_size)
+    known = (training_images or images).images
     chosen = known[np.linspace(0, len(known) - 1, min(len(known), COMPONENT_IMAGES)).astype(int)]
-    inputs = {
-        **_facts(model), "images": pictures.images, "fitted": known, "seed": seed, "fit_steps": fit_steps or 0
-    }  # fmt: skip
-    scored = _optimised(model, fit_steps)
-    found = (memory or Memory()).recall_value(
-        "reconstruction", inputs, ReconstructionResult,
-        lambda: evaluate_reconstruction(
-            scored, pictures.images, mean=mean_picture(known), components_of=chosen,
+
+    def make() -> ReconstructionResult:
+        return evaluate_reconstruction(
+            _optimised(model, fit_steps), images.images, mean=mean_image(known), components_of=chosen,
             untrained=untrained_twin(model, seed), batch_size=batch_size, progress=progress,
-        ),
-    )  # fmt: skip
-    rows = found.rows(resample_count)
-    values = {
-        "pictures": len(pictures),
-        "reconstruction": found,
-        "intervals": {row.name: row.numbers() for row in rows},
-    }
-    return Scores([found.table(rows)], values, image_verdicts(rows[0], RECONSTRUCTION), result=found)
+        )  # fmt: skip
+
+    inputs = {"images": images.images, "fitted": known, "seed": seed, "fit_steps": fit_steps or 0}
+    found = _scored(model, {"reconstruction": make}, inputs, resample_count, memory)
+    return replace(found, values={**found.values, "intervals": found.values["intervals"]["reconstruction"]})
 
 
-def _facts(model: Derenderer) -> dict[str, Any]:
-    """Everything that a model's renderings depend on."""
-    return {"weights": model_fingerprint(model), "model": model.settings.model_dump(mode="json")}
+def _scored(
+    model: Derenderer,
+    protocols: Mapping[str, Callable[[], Any]],
+    inputs: Mapping[str, Any],
+    resample_count: int,
+    memory: Memory | None,
+) -> Scores:
+    """What the protocols give by name, from the cache if the same model and inputs gave it before."""
+    settings, kept = model.settings.model_dump(mode="json"), memory or Memory()
+    inputs = {"weights": model_fingerprint(model), "model": settings, **inputs}
+    found = {name: kept.recall_value(name, inputs, _KINDS[name], make) for name, make in protocols.items()}
+    rows = {name: one.rows(resample_count) for name, one in found.items()}
+    notes = [note for name, one in found.items() for note in image_verdicts(rows[name][0], one.columns)]
+    intervals = {name: {row.name: row.numbers() for row in scored} for name, scored in rows.items()}
+    values = {"pictures": len(inputs["images"]), **found, "intervals": intervals}
+    tables = [one.table(rows[name]) for name, one in found.items()]
+    return Scores(tables, values, notes, result=next(iter(found.values())))
 
 
-def _optimised(model: Derenderer, steps: int | None) -> "Derenderer | _Optimised":
+def _optimised(model: Derenderer, steps: int | None) -> Derenderer:
     """The model, or with steps one whose scenes are optimised per image."""
     if not steps:
         return model
     require_fitting(model)
-    return _Optimised(model, steps)
-
-
-class _Optimised:
-    def __init__(self, model: Derenderer, steps: int):
-        self.model, self.steps = model, steps
-
-    def decompose(self, images: Float[Tensor, "n 3 h w"]) -> Scene:
-        return self.model.fit_scenes(images, self.steps).scene
-
-    def reconstruct(self, images: Float[Tensor, "n 3 h w"]) -> Rendering:
-        return self.model.render(self.decompose(images))
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self.model, name)
+    fitted = copy.copy(model)
+    fitted.decompose = lambda images: model.fit_scenes(images, steps).scene
+    return fitted

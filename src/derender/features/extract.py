@@ -108,17 +108,16 @@ def embed_pictures(
         origin: further facts for the table, such as the model's path and preset; they win over those found
             here.
     """
-    check_size(model, pictures)
+    check_size(model, pictures.images)
     factors = embed_images(model, pictures.images, batch_size=batch_size, progress=progress)
     facts = {**model_facts(model, pictures.source, pictures.layout), **(origin or {})}
     return FeatureTable(pictures.files, factors, table_labels(pictures), facts)
 
 
-def check_size(model: Any, pictures: ImageSet) -> None:
-    """Images of another size than the model's are an error."""
-    size = model.image_size
-    if tuple(pictures.images.shape[-2:]) != (size, size):
-        height, width = pictures.images.shape[-2:]
+def check_size(model: Any, images: np.ndarray) -> None:
+    """Images (N, 3, H, W) of another size than the model's are an error."""
+    size, (height, width) = model.image_size, images.shape[-2:]
+    if (height, width) != (size, size):
         raise ValueError(
             f"the images are {height}x{width}, the model takes {size}x{size}: "
             f"read them with image_size={size}"

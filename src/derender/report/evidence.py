@@ -19,7 +19,7 @@ from derender.baselines import read_any_config
 from derender.baselines.controls import untrained_features
 from derender.data import GroundTruth, ImageSet, as_float, read_ground_truth, split_indices
 from derender.data.doctor import EXAMINED_PX, doctor
-from derender.evaluation import evaluate_factors, evaluate_geometry, evaluate_reconstruction, mean_picture
+from derender.evaluation import evaluate_factors, evaluate_geometry, evaluate_reconstruction, mean_image
 from derender.evaluation.disentanglement import disentangle
 from derender.evaluation.linear_task import choose_rows
 from derender.features import embed_pictures
@@ -194,7 +194,7 @@ def looping_films(
 def _scores(subject: Subject) -> Values:
     """Reconstruction beside the mean image and, on rendered data, geometry beside its controls."""
     sample = _sample(subject.held_out.require(1, "a score"), SCORED)
-    again = evaluate_reconstruction(subject.model, sample.images, mean=mean_picture(subject.images.images))
+    again = evaluate_reconstruction(subject.model, sample.images, mean=mean_image(subject.images.images))
     tables, truth = [], subject.truth
     if truth is not None:
         tables.append(evaluate_geometry(subject.model, truth).table())

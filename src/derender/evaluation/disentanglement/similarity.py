@@ -83,7 +83,7 @@ def pearson(features: Mapping[str, np.ndarray]) -> PearsonScores:
 def correlation_matrix(features: Mapping[str, np.ndarray]) -> np.ndarray:
     """|correlation| between all dimensions of all features, (sum of D, sum of D), 0..1; NaN for dead ones."""
     values = _standardised(np.concatenate(list(side_by_side(features).values()), axis=1))
-    alive = values.any(axis=0)
+    alive = np.asarray(values.any(axis=0))
     return np.where(alive[:, None] & alive, np.abs(values.T @ values), np.nan)
 
 

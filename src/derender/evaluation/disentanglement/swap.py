@@ -113,7 +113,7 @@ def swap_test(
     moves, left = ([_distances(each, other) for each in swapped] for other in (plain, donors))
     weights = np.concatenate(list(resamples(count, RESAMPLES))).astype(np.float64)
 
-    def matrix(kind: str, of: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
+    def matrix(kind: str, of: Sequence[str]) -> tuple[np.ndarray, Any]:
         """(F, F) mean moves, and the ratio of its diagonal on resamples."""
         keys = [f"{kind} {name}" for name in of]
         each = np.array([[row[key] for key in keys] for row in moves])
