@@ -183,5 +183,5 @@ def test_bad_input_is_named(data, model):
     large = replace(
         data, images=np.zeros((40, 3, 64, 64), np.uint8), masks=data.masks.repeat(2, axis=1).repeat(2, axis=2)
     )
-    with pytest.raises(ValueError, match="64 pixels wide, the model takes 32"):
+    with pytest.raises(ValueError, match="the images are 64x64, the model takes 32x32"):
         segment(model, large, variants=["geometry"])

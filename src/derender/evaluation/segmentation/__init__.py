@@ -16,13 +16,6 @@ from derender.evaluation.segmentation.data import SegmentationData, divide
 from derender.evaluation.segmentation.nets import VARIANTS, SegmentSettings
 
 __all__ = [
-    "VARIANTS",
-    "SegmentSettings",
-    "SegmentationComparison",
-    "SegmentationData",
-    "class_iou",
-    "count_pixels",
-    "divide",
-    "resampled_scores",
-    "segment",
-]
+    "VARIANTS", "SegmentSettings", "SegmentationComparison", "SegmentationData", "class_iou", "count_pixels",
+    "divide", "resampled_scores", "segment",
+]  # fmt: skip

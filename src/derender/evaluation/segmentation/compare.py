@@ -33,6 +33,7 @@ from derender.evaluation.segmentation.nets import (
     train_segmenter,
 )
 from derender.features import model_fingerprint
+from derender.features.extract import check_size
 from derender.inputs import as_model
 
 SHOWN = 8
@@ -97,67 +98,59 @@ class SegmentationComparison:
     def numbers(self) -> dict[str, Any]:
         """Everything but images, for JSON."""
         data = self.data
+
+        def by_class(values: np.ndarray) -> dict[str, float]:
+            return dict(zip(data.classes, values.tolist(), strict=True))
+
         rows = {
             row.scored.name: {
                 **row.scored.numbers(),
                 "trainable": row.trainable,
-                "class_iou": dict(zip(data.classes, row.class_iou.tolist(), strict=True)),
+                "class_iou": by_class(row.class_iou),
                 "losses": row.losses.tolist(),
             }
             for row in self.rows
         }
-        shares = {
-            part: dict(zip(data.classes, data.shares(chosen).tolist(), strict=True))
-            for part, chosen in (("train_share", data.train), ("test_share", data.test))
-        }
-        sizes = {"n_train": len(data.train), "n_test": len(data.test), "split": data.split}
-        settings = self.settings.model_dump()
-        return {**sizes, "seeds": self.seeds, "settings": settings, **shares, "rows": rows}
+        return {
+            "n_train": len(data.train), "n_test": len(data.test), "split": data.split, "seeds": self.seeds,
+            "settings": self.settings.model_dump(), "train_share": by_class(data.shares(data.train)),
+            "test_share": by_class(data.shares(data.test)), "rows": rows,
+        }  # fmt: skip
 
     def tables(self) -> list[ScoreTable]:
-        """Scores, verdicts, classes, and the paper's rows."""
-        scored, trainable = [row.scored for row in self.rows], {r.scored.name: r.trainable for r in self.rows}
+        """Scores, verdicts, the IoU of every class, and the paper's rows."""
+        data, scored = self.data, [row.scored for row in self.rows]
+        share, count = data.shares(data.test), len(self.seeds)
+        caption = (
+            f"segmentation: {len(data.train):,} images learned, {len(data.test):,} tested (by {data.split}), "
+            f"{(share > 0).sum()} of {len(data.classes)} classes tested, {self.settings.epochs} epochs, "
+            f"{count} seed{'s' if count > 1 else ''}"
+        )
+        trainable = {row.scored.name: row.trainable for row in self.rows}
         learn: Mapping[Column, Callable[[ScoredRow], Cell]] = {
             Column("learn", note="number of trained weights"): lambda row: trainable[row.name] or None
         }
-        tables = [scored_table(self._caption(), "net", scored, COLUMNS, more=learn)]
+        tables = [scored_table(caption, "net", scored, COLUMNS, more=learn)]
         if any(row.versus for row in scored):
             tables.append(verdict_table(scored, COLUMNS, "above the strongest control?"))
-        return [*tables, self._class_table(), self._beside_the_paper()]
-
-    def _caption(self) -> str:
-        data = self.data
-        seen = int((data.shares(data.test) > 0).sum())
-        seeds = "1 seed" if len(self.seeds) == 1 else f"{len(self.seeds)} seeds"
-        return (
-            f"segmentation: {len(data.train):,} images learned, {len(data.test):,} tested (by {data.split}), "
-            f"{seen} of {len(data.classes)} classes tested, {self.settings.epochs} epochs, {seeds}"
-        )
-
-    def _class_table(self) -> ScoreTable:
-        """A row for each class, most frequent first: its share of the tested pixels, and each IoU."""
         nets = [row for row in self.rows if row.trainable]
         columns = [Column(row.scored.name, None, note="IoU, 0 to 1") for row in nets]
-        share = self.data.shares(self.data.test)
-        rows = [
-            Row(self.data.classes[at], (float(share[at]), *(float(row.class_iou[at]) for row in nets)))
+        classes = [
+            Row(data.classes[at], (float(share[at]), *(float(row.class_iou[at]) for row in nets)))
             for at in np.argsort(-share, kind="stable").tolist()
         ]
-        shown = (Column("share", note="of the tested pixels"), *columns)
-        return ScoreTable("intersection over union of every class", "class", shown, rows)
-
-    def _beside_the_paper(self) -> ScoreTable:
-        """These networks and controls over the paper's rows; the last column has the differing data."""
+        heads = (Column("share", note="of the tested pixels"), *columns)
+        tables.append(ScoreTable("intersection over union of every class", "class", heads, classes))
         rows = [
             Row(one.name, (*(one.scores[name].value for name in COLUMNS), self.differs), one.control)
-            for one in (row.scored for row in self.rows)
+            for one in scored
         ]
         rows += [
             Row(f"paper: {one.method}", (*(one.scores[n] for n in COLUMNS), one.dataset), note="paper")
             for one in SEGMENTATION.paper
         ]
-        columns = (*COLUMNS.values(), Column("data"))
-        return ScoreTable("segmentation, beside the paper's Table 3", "net", columns, rows)
+        heads = (*COLUMNS.values(), Column("data"))
+        return [*tables, ScoreTable("segmentation, beside the paper's Table 3", "net", heads, rows)]
 
 
 def segment(
@@ -196,74 +189,72 @@ def segment(
     Raises:
         ValueError: the model has no U-Net encoders, or images of another size.
     """
-    model = as_model(model)
-    chosen = chosen_variants(model, variants)
+    model, report = as_model(model), progress or (lambda *_: None)
+    chosen, notes = chosen_variants(model, variants), []
     if not len(seeds):
         raise ValueError("a comparison needs at least one seed")
-    notes = []
     if not isinstance(data, SegmentationData):
-
-        def reading(done: int, total: int) -> None:
-            if progress is not None:
-                progress(done, total, "reading")
-
-        read = read_masks(data, model.image_size, masks=masks, dataset=dataset, limit=limit, progress=reading)
+        read = read_masks(
+            data, model.image_size, masks=masks, dataset=dataset, limit=limit,
+            progress=lambda done, total: report(done, total, "reading"),
+        )  # fmt: skip
         notes.append(read[0].describe())
         data = divide(*read, test_fraction=test_fraction, split_seed=seeds[0], labelled=labelled)
+    check_size(model, data.images)
     settings, memory = settings or SegmentSettings(), memory or Memory()
     settings = settings.model_copy(update={"batch_size": settings.batch_for(len(data.train))})
-    side = data.images.shape[-1]
-    if side != model.image_size:
-        raise ValueError(
-            f"the images are {side} pixels wide, the model takes {model.image_size}: "
-            f"read them with read_masks(..., {model.image_size})"
-        )
     shown = data.test[np.linspace(0, len(data.test) - 1, min(SHOWN, len(data.test))).astype(int)]
     content = content_hash({name: getattr(data, name) for name in ("images", "masks", "train", "test")})
-    weights = np.concatenate(list(resamples(len(data.test), resample_count)))
+    same = {"data": content, "classes": len(data.classes)}
     each = settings.epochs * len(data.train)
-    total, done, rows = each * len(chosen) * len(seeds), 0, []
+    total, done = each * len(chosen) * len(seeds), 0
+
+    def counted(answers: np.ndarray) -> dict[str, np.ndarray]:
+        counts = count_pixels(answers, data.masks[data.test], len(data.classes))
+        return {"counts": counts.astype(np.int32), "shown": answers[np.searchsorted(data.test, shown)]}
+
+    def trained(net: Any, seed: int, run: str) -> dict[str, np.ndarray]:
+        def step(seen: int, loss: float) -> None:
+            report(done + seen, total, f"{run}, seed {seed}, loss {loss:.2f}")
+
+        losses = train_segmenter(net, data, seed, settings, step)
+        return {**counted(answer(net, data.images[data.test])), "losses": np.array(losses)}
+
+    rows: list[tuple[str, bool, list[dict[str, np.ndarray]], int]] = []
     for name, variant in chosen.items():
         runs, trainable = [], 0
         for seed in seeds:
             net = build_variant(model, variant, data, seed)
             trainable = sum(p.numel() for p in net.parameters() if p.requires_grad)
             inputs = {
-                "start": model_fingerprint(net), "frozen": variant.frozen, "data": content, "seed": seed,
-                "settings": settings.model_dump(mode="json"), "classes": len(data.classes),
-                "statistics": net.kept_statistics, "decoder": variant.decoder,
+                "start": model_fingerprint(net), "frozen": variant.frozen, "seed": seed, **same,
+                "settings": settings.model_dump(mode="json"), "statistics": net.kept_statistics,
+                "decoder": variant.decoder,
             }  # fmt: skip
-
-            def make(net: Any = net, seed: int = seed, before: int = done, run: str = f"{name}, seed {seed}"):
-                def step(seen: int, loss: float) -> None:
-                    if progress is not None:
-                        progress(before + seen, total, f"{run}, loss {loss:.2f}")
-
-                losses = train_segmenter(net, data, seed, settings, step)
-                answers = answer(net, data.images[data.test])
-                return {**_counted(answers, data, shown), "losses": np.array(losses)}
-
-            runs.append(memory.recall(f"segment-{name}", inputs, make))
+            runs.append(memory.recall(f"segment-{name}", inputs, partial(trained, net, seed, name)))
             done += each
-            if progress is not None:
-                progress(done, total, name)
+            report(done, total, name)
         rows.append((variant.title, not variant.pretrained, runs, trainable))
     apart = Memory(memory.folder)  # controls are cached as well, but are no runs
     for title, control in CONTROLS.items():
         runs = []
         for seed in seeds if title == "pixel colour" else seeds[:1]:
-            inputs = {"data": content, "seed": seed, "classes": len(data.classes), "control": title}
-            made = partial(lambda control, seed: _counted(control(data, seed), data, shown), control, seed)
-            runs.append(apart.recall("segment-control", inputs, made))
+            made = partial(lambda control, seed: counted(control(data, seed)), control, seed)
+            runs.append(apart.recall("segment-control", {**same, "seed": seed, "control": title}, made))
         rows.append((title, True, runs, 0))
+    weights = np.concatenate(list(resamples(len(data.test), resample_count)))
     scored = with_verdicts([_scored(title, control, runs, weights) for title, control, runs, _ in rows])
-    found = SegmentationComparison(
-        tuple(_row(one, runs, trainable) for one, (_, _, runs, trainable) in zip(scored, rows, strict=True)),
-        data,
-        tuple(seeds),
-        settings,
-        shown,
-    )
+    made_rows = [
+        SegmentationRow(
+            one,
+            np.mean([class_iou(run["counts"]) for run in runs], axis=0),
+            trainable,
+            np.array([run["losses"] for run in runs if "losses" in run]),
+            runs[0]["shown"],
+        )
+        for one, (_, _, runs, trainable) in zip(scored, rows, strict=True)
+    ]
+    found = SegmentationComparison(tuple(made_rows), data, tuple(seeds), settings, shown)
     return Scores(found.tables(), {"data": data.source, **found.numbers()}, notes, result=found)
 
 
@@ -274,8 +265,6 @@ def count_pixels(answers: np.ndarray, masks: np.ndarray, n_classes: int) -> np.n
         answers, masks: (N, H, W) class numbers below ``n_classes``.
         n_classes: C, two or more.
     """
-    if answers.shape != masks.shape or not len(masks):
-        raise ValueError(f"answers {answers.shape} and masks {masks.shape} must be alike, and one or more")
     cell = n_classes * np.arange(len(masks))[:, None, None]
     kinds = ((cell + masks)[answers == masks], cell + answers, cell + masks)
     counts = [np.bincount(kind.ravel(), minlength=n_classes * len(masks)) for kind in kinds]
@@ -309,12 +298,6 @@ def best_classes(counts: np.ndarray, number: int = TOP) -> np.ndarray:
     return order[: min(number, int(np.isfinite(iou).sum()))]
 
 
-def _counted(answers: np.ndarray, data: SegmentationData, shown: np.ndarray) -> dict[str, np.ndarray]:
-    """The cached part of a run's answers for the tested images."""
-    counts = count_pixels(answers, data.masks[data.test], len(data.classes))
-    return {"counts": counts.astype(np.int32), "shown": answers[np.searchsorted(data.test, shown)]}
-
-
 def _scored(
     title: str, control: bool, runs: Sequence[Mapping[str, np.ndarray]], weights: np.ndarray
 ) -> ScoredRow:
@@ -322,12 +305,6 @@ def _scored(
     resampled = np.mean([resampled_scores(run["counts"], weights) for run in runs], axis=0)
     scores = {score: estimate(plain[:, at].tolist(), resampled[:, at]) for at, score in enumerate(COLUMNS)}
     return ScoredRow(title, control, len(runs), scores)
-
-
-def _row(scored: ScoredRow, runs: Sequence[Mapping[str, np.ndarray]], trainable: int) -> SegmentationRow:
-    iou = np.mean([class_iou(run["counts"]) for run in runs], axis=0)
-    losses = np.array([run["losses"] for run in runs if "losses" in run])
-    return SegmentationRow(scored, iou, trainable, losses, runs[0]["shown"])
 
 
 def _iou(counts: np.ndarray) -> np.ndarray:

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Int64, UInt8
 
-from derender.data import ImageSet, split_indices
+from derender.data import PictureSet, split_indices
+from derender.evaluation.pixels import component_count
 
 TEST_FRACTION = 0.2
 COLOUR_PIXELS = 20_000
-COMPONENTS = 64
 COMPONENT_IMAGES = 2_000
 _CHUNK = 512
 
@@ -49,7 +49,7 @@ class SegmentationData:
 
 
 def divide(
-    pictures: ImageSet,
+    images: PictureSet,
     masks: UInt8[np.ndarray, "n s s"],
     classes: Sequence[str],
     *,
@@ -74,18 +74,17 @@ def divide(
     """
     if not 0 < test_fraction < 1:
         raise ValueError(f"the tested share must lie between 0 and 1, got {test_fraction}")
-    partition = pictures.partition
-    if partition is not None and (partition == "test").any():
-        test, train = np.flatnonzero(partition == "test"), np.flatnonzero(partition == "train")
-        train = train if len(train) else np.flatnonzero(partition != "test")
+    owners = images.partition
+    if owners is not None and (owners == "test").any():
+        test = np.flatnonzero(owners == "test")
+        train = np.flatnonzero(owners == "train" if (owners == "train").any() else owners != "test")
         rule = "the data's own partition"
     else:
-        split = split_indices(pictures.files, (1 - test_fraction, 0.0, test_fraction), seed=split_seed)
-        train, test = split.train, split.test
-        rule = f"a hash of the files' names, seed {split_seed}"
+        split = split_indices(images.files, (1 - test_fraction, 0.0, test_fraction), seed=split_seed)
+        train, test, rule = split.train, split.test, f"a hash of the files' names, seed {split_seed}"
     if len(train) < 2 or not len(test):
         raise ValueError(
-            f"{pictures.source} leaves {len(train)} images to learn from and {len(test)} to test on: "
+            f"{images.source} leaves {len(train)} images to learn from and {len(test)} to test on: "
             "bring more images, or another test_fraction"
         )
     if labelled is not None:
@@ -97,42 +96,45 @@ def divide(
     seen = np.unique(masks[train])
     if len(seen) < 2:
         raise ValueError(
-            f"the {len(train):,} masks to learn from in {pictures.source} show one class only "
+            f"the {len(train):,} masks to learn from in {images.source} show one class only "
             f"({classes[int(seen[0])]}): segmentation needs two or more"
         )
     return SegmentationData(
-        pictures.images, masks, tuple(classes), train, test, rule, pictures.source, pictures.layout
+        images.images, masks, tuple(classes), train, test, rule, images.source, images.layout
     )
 
 
 def most_frequent(data: SegmentationData, seed: int = 0) -> np.ndarray:
     """(T, S, S): always the class with the most training pixels."""
-    return np.full(data.masks[data.test].shape, np.uint8(data.shares(data.train).argmax()), np.uint8)
+    return np.full(data.masks[data.test].shape, data.shares(data.train).argmax(), np.uint8)
 
 
 def most_frequent_at_place(data: SegmentationData, seed: int = 0) -> np.ndarray:
     """(T, S, S): the class that most training masks have at this place; of two even ones the lower."""
     learned = data.masks[data.train]
     counts = np.stack([(learned == number).sum(axis=0) for number in range(len(data.classes))])
-    best = counts.argmax(axis=0).astype(np.uint8)
-    return np.broadcast_to(best, data.masks[data.test].shape).copy()
+    return np.tile(counts.argmax(axis=0).astype(np.uint8), (len(data.test), 1, 1))
 
 
 def by_colour(data: SegmentationData, seed: int = 0) -> np.ndarray:
     """(T, S, S): logistic regression from a pixel's red, green and blue alone, on 20,000 training pixels."""
     from sklearn.linear_model import LogisticRegression
 
-    pixels_each, shape = data.masks[0].size, data.masks[data.test].shape
-    pool = len(data.train) * pixels_each
+    def colours(rows: np.ndarray) -> np.ndarray:
+        """Every pixel of some images, (pixels, 3) in -2..2, where the regression's penalty is mild."""
+        return np.moveaxis(data.images[rows], 1, -1).reshape(-1, 3).astype(np.float64) / 63.75 - 2
+
+    masks = data.masks.reshape(len(data.masks), -1)
+    pool = masks[data.train].size
     drawn = np.random.default_rng(seed).choice(pool, min(COLOUR_PIXELS, pool), replace=False)
-    rows, places = data.train[drawn // pixels_each], drawn % pixels_each
-    flat = data.images.reshape(len(data.images), 3, pixels_each)
-    classes = data.masks.reshape(len(data.masks), pixels_each)[rows, places]
+    rows, places = data.train[drawn // masks.shape[1]], drawn % masks.shape[1]
+    flat, classes = data.images.reshape(len(masks), 3, -1), masks[rows, places]
     if len(np.unique(classes)) == 1:
-        return np.full(shape, classes[0], np.uint8)
-    regression = LogisticRegression(max_iter=1_000).fit(_scaled(flat[rows, :, places]), classes)
-    answers = [regression.predict(_scaled(flat[row].T)) for row in data.test.tolist()]
-    return np.stack(answers).reshape(shape).astype(np.uint8)
+        return np.full(data.masks[data.test].shape, classes[0], np.uint8)
+    regression = LogisticRegression(max_iter=1_000)
+    regression.fit(flat[rows, :, places].astype(np.float64) / 63.75 - 2, classes)
+    answers = [regression.predict(colours(row)) for row in data.test[:, None]]
+    return np.stack(answers).reshape(data.masks[data.test].shape).astype(np.uint8)
 
 
 def by_components(data: SegmentationData, seed: int = 0) -> np.ndarray:
@@ -143,26 +145,24 @@ def by_components(data: SegmentationData, seed: int = 0) -> np.ndarray:
     """
     from sklearn.decomposition import PCA
 
-    learned = data.masks[data.train].reshape(len(data.train), -1)
-    places = np.linspace(0, len(data.train) - 1, min(len(data.train), COMPONENT_IMAGES)).astype(int)
-    count = max(1, min(COMPONENTS, len(data.train) // 4))
-    pca = PCA(count, random_state=seed).fit(_flat(data, data.train[places]))
+    def flat(rows: np.ndarray) -> np.ndarray:
+        return data.images[rows].reshape(len(rows), -1).astype(np.float32) / 255
 
     def described(rows: np.ndarray) -> np.ndarray:
         parts = np.array_split(rows, max(1, len(rows) // _CHUNK))
-        found = np.concatenate([pca.transform(_flat(data, part)) for part in parts])
-        return np.column_stack((np.ones(len(rows)), found))
+        return np.column_stack(
+            (np.ones(len(rows)), np.concatenate([pca.transform(flat(part)) for part in parts]))
+        )
 
-    tested = described(data.test)
-    solver = np.linalg.pinv(described(data.train))  # (1 + components, training images)
+    places = np.linspace(0, len(data.train) - 1, min(len(data.train), COMPONENT_IMAGES)).astype(int)
+    pca = PCA(component_count(len(data.train)), random_state=seed).fit(flat(data.train[places]))
+    learned = data.masks[data.train].reshape(len(data.train), -1)
+    solver, tested = np.linalg.pinv(described(data.train)), described(data.test)
     best = np.zeros((len(data.test), learned.shape[1]), np.uint8)
     most = np.full(best.shape, -np.inf)
     for number in np.unique(learned).tolist():
-        weights = sum(
-            solver[:, start : start + _CHUNK] @ (learned[start : start + _CHUNK] == number)
-            for start in range(0, len(learned), _CHUNK)
-        )
-        favour = tested @ np.asarray(weights)
+        parts = (slice(start, start + _CHUNK) for start in range(0, len(learned), _CHUNK))
+        favour = tested @ np.sum([solver[:, part] @ (learned[part] == number) for part in parts], axis=0)
         better = favour > most + 1e-9
         best[better], most[better] = number, favour[better]
     return best.reshape(len(best), *data.masks.shape[1:])
@@ -175,13 +175,3 @@ CONTROLS: Mapping[str, Callable[[SegmentationData, int], np.ndarray]] = {
     "most frequent class": most_frequent,
 }
 """By row name."""
-
-
-def _flat(data: SegmentationData, rows: np.ndarray) -> np.ndarray:
-    """Images as rows of numbers in 0..1."""
-    return data.images[rows].reshape(len(rows), -1).astype(np.float32) / 255
-
-
-def _scaled(colours: np.ndarray) -> np.ndarray:
-    """Bytes as numbers in -2..2, where the regression's penalty is mild."""
-    return colours.astype(np.float64) / 63.75 - 2

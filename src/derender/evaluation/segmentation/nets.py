@@ -1,14 +1,12 @@
 """The networks that are compared, how they are trained, and their answers.
 
 Source: Klinghoffer et al., ECCV 2022, Sec. 4.7 and Table 3: Adam 2e-4 with betas 0.5 and 0.999, 20 epochs.
-Neither the loss nor the batch size is stated: cross-entropy, every pixel alike, and 64, that of the paper's
-other trainings, or fewer where there are few images: in 20 epochs of 80 steps no network learns an eye. The
-paper's only control is one encoder from fresh weights, while its best row joins two; this table adds two
-fresh encoders, trained and frozen. A pre-trained encoder keeps its BatchNorm statistics while its weights
-learn, since few labelled images make small batches with unreliable statistics; a fresh one has none to keep.
-A fresh encoder that is frozen gets those of the training images. The paper's decoder is always fresh; one
-network begins with the decoder that was distilled beside the encoders, and keeps statistics at its finest
-levels only. Leaves out augmentation, class weights and early stopping: the last weights are scored.
+Neither the loss nor the batch size is stated: cross-entropy, every pixel alike, and 64, or fewer where there
+are few images. The paper's only control is one encoder from fresh weights, while its best row joins two; this
+table adds two fresh encoders, trained and frozen. A pre-trained encoder keeps its BatchNorm statistics while
+its weights learn, since small batches have unreliable ones; a fresh encoder that is frozen gets those of the
+training images. The paper's decoder is always fresh; one network begins with the decoder that was distilled
+beside the encoders. Leaves out augmentation, class weights and early stopping: the last weights are scored.
 """
 
 import copy
@@ -22,6 +20,7 @@ import torch
 from pydantic import Field
 from torch import nn
 from torch.nn.functional import cross_entropy
+from torch.optim.swa_utils import update_bn
 
 from derender.data import as_float, suggestion
 from derender.evaluation.segmentation.data import SegmentationData
@@ -33,9 +32,6 @@ from derender.training.process import freed_memory_kept
 LARGEST_BATCH, SMALLEST_BATCH, STEPS_AN_EPOCH = 64, 2, 320
 STATISTICS_IMAGES = 512
 
-StepProgress = Callable[[int, float], object]
-"""Called with (images seen, loss) after every step."""
-
 
 @dataclass(frozen=True)
 class Variant:
@@ -45,10 +41,8 @@ class Variant:
         title: in tables.
         factors: whose encoders, joined in this order.
         pretrained: whether with the model's weights; otherwise fresh ones of the same shape.
-        frozen: whether only the decoder learns; otherwise pre-trained encoders learn with their BatchNorm
-            statistics kept.
-        decoder: whether the decoder, too, begins with the model's weights (all but its last layer); otherwise
-            it is fresh.
+        frozen: whether only the decoder learns.
+        decoder: whether the decoder, too, begins with the model's weights (all but its last layer).
     """
 
     title: str
@@ -60,14 +54,14 @@ class Variant:
 
 _ONE, _BOTH = ("geometry",), ("geometry", "albedo")
 VARIANTS: Mapping[str, Variant] = {
-    "joint-whole": Variant("joint, decoder too", _BOTH, pretrained=True, frozen=False, decoder=True),
-    "joint": Variant("joint encoders", _BOTH, pretrained=True, frozen=False),
-    "geometry": Variant("geometry encoder", _ONE, pretrained=True, frozen=False),
-    "albedo": Variant("albedo encoder", ("albedo",), pretrained=True, frozen=False),
-    "joint-frozen": Variant("joint encoders, frozen", _BOTH, pretrained=True, frozen=True),
-    "random": Variant("random start", _ONE, pretrained=False, frozen=False),
-    "joint-random": Variant("random start, joint", _BOTH, pretrained=False, frozen=False),
-    "joint-random-frozen": Variant("random, joint, frozen", _BOTH, pretrained=False, frozen=True),
+    "joint-whole": Variant("joint, decoder too", _BOTH, True, False, decoder=True),
+    "joint": Variant("joint encoders", _BOTH, True, False),
+    "geometry": Variant("geometry encoder", _ONE, True, False),
+    "albedo": Variant("albedo encoder", ("albedo",), True, False),
+    "joint-frozen": Variant("joint encoders, frozen", _BOTH, True, True),
+    "random": Variant("random start", _ONE, False, False),
+    "joint-random": Variant("random start, joint", _BOTH, False, False),
+    "joint-random-frozen": Variant("random, joint, frozen", _BOTH, False, True),
 }
 """By name on the command line."""
 
@@ -136,8 +130,10 @@ def build_variant(model: Any, variant: Variant, data: SegmentationData, seed: in
             decoder=model.unet_decoder if variant.decoder else None,
         ).to(model.device)
     if variant.frozen and not variant.pretrained:
+        rows = data.train[:STATISTICS_IMAGES]
+        parts = np.array_split(rows, max(1, len(rows) // LARGEST_BATCH))
         for encoder in encoders:
-            _set_statistics(encoder, data)
+            update_bn((as_float(data.images[part]) for part in parts), encoder, model.device)
     return net
 
 
@@ -146,9 +142,12 @@ def train_segmenter(
     data: SegmentationData,
     seed: int,
     settings: SegmentSettings,
-    progress: StepProgress | None = None,
+    progress: Callable[[int, float], object] | None = None,
 ) -> list[float]:
-    """Train in place on the training rows; the mean loss of each epoch. The seed orders the images."""
+    """Train in place on the training rows; the mean loss of each epoch.
+
+    The seed orders the images; ``progress`` is called with (images seen, loss) after every step.
+    """
     device = next(net.parameters()).device
     net.to(memory_format=torch.channels_last).train()  # pyright: ignore[reportCallIssue]
     learning = [parameter for parameter in net.parameters() if parameter.requires_grad]
@@ -183,21 +182,3 @@ def answer(net: SegmentationNet, images: np.ndarray, batch_size: int = 128) -> n
     parts = (images[start : start + batch_size] for start in range(0, len(images), batch_size))
     logits = (net(as_float(part).to(device)) for part in parts)
     return np.concatenate([one.argmax(dim=1).to(torch.uint8).cpu().numpy() for one in logits])
-
-
-@torch.no_grad()
-def _set_statistics(encoder: nn.Module, data: SegmentationData) -> None:
-    """Set every BatchNorm to the mean statistics of batches of training images."""
-    norms = [module for module in encoder.modules() if isinstance(module, nn.BatchNorm2d)]
-    usual = [norm.momentum for norm in norms]
-    for norm in norms:
-        norm.reset_running_stats()
-        norm.momentum = None  # a plain mean over batches
-    encoder.train()
-    device = next(encoder.parameters()).device
-    rows = data.train[:STATISTICS_IMAGES]
-    for part in np.array_split(rows, max(1, len(rows) // LARGEST_BATCH)):
-        encoder.spatial(as_float(data.images[part]).to(device))  # type: ignore[operator]
-    encoder.eval()
-    for norm, momentum in zip(norms, usual, strict=True):
-        norm.momentum = momentum
