@@ -1,9 +1,8 @@
 """Each row's nearest other row by cosine, in bounded memory: exactly, or by cells for very many rows.
 
-Distances are made in square tiles with one matrix product each: memory is a copy of the rows and 8 MB.
-Equally near rows: the first counts. Above ``EXACT_ROWS`` rows a row is compared with those of its own cell
-    and of the ``NEAR_CELLS`` nearest ones, in float32, so that work grows with the rows and not with their
-    square.
+Distances are made in blocks with one matrix product each, in a copy of the rows and 64 MB. Equally near rows:
+the first counts. Above ``EXACT_ROWS`` rows a row is compared with those of its own cell and of the
+``NEAR_CELLS`` nearest ones, in float32, so that work grows with the rows and not with their square.
 
 ``cells`` puts near rows together: centres come from a few rounds of k-means (Lloyd 1982) over a sample;
 every row goes to its nearest centre; cells that came out too large are divided again. Approximate by
@@ -22,6 +21,7 @@ from derender.data import usable_cores
 
 T = TypeVar("T")
 TILE = 1_024
+NUMBERS_AT_ONCE = 1 << 23
 
 EXACT_ROWS = 100_000
 """Up to so many rows all pairs are looked at."""
@@ -61,48 +61,39 @@ def unit_rows(points: np.ndarray) -> np.ndarray:
 def nearest_rows(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """For each of (N, D) rows the nearest other row, (N,) integers, and its cosine distance, (N,), 0..2.
 
-    Above ``EXACT_ROWS`` rows some
-    are not the nearest: docs/scale.md says how many.
+    Above ``EXACT_ROWS`` rows some are not the nearest: docs/scale.md says how many.
     """
     points = unit_rows(points)
-    if len(points) > EXACT_ROWS:
-        return _nearest_in_cells(points.astype(np.float32, copy=False))
     nearest, distance = np.zeros(len(points), np.int64), np.full(len(points), np.inf)
-    for start in range(0, len(points), TILE):
-        rows = slice(start, start + TILE)
-        for left in range(0, len(points), TILE):
-            block = 1 - points[rows] @ points[left : left + TILE].T
-            if left == start:
-                np.fill_diagonal(block, np.inf)
-            at = block.argmin(axis=1)
-            found = block[np.arange(len(block)), at]
-            better = found < distance[rows]
-            nearest[rows] = np.where(better, at + left, nearest[rows])
-            distance[rows] = np.where(better, found, distance[rows])
-    return nearest, distance
 
+    def look(rows: np.ndarray, others: np.ndarray | slice, own: np.ndarray) -> None:
+        """Find the nearest of some others, in which the rows themselves stand at ``own``."""
+        candidates = points[others]
+        at_once = max(1, NUMBERS_AT_ONCE // len(candidates))
+        for start in range(0, len(rows), at_once):
+            part = rows[start : start + at_once]
+            block = 1 - points[part] @ candidates.T
+            block[np.arange(len(part)), own[start : start + at_once]] = np.inf
+            nearest[part] = block.argmin(axis=1)
+            distance[part] = block[np.arange(len(part)), nearest[part]]
 
-def _nearest_in_cells(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """``nearest_rows`` of unit rows, compared with those of near cells only."""
+    if len(points) <= EXACT_ROWS:
+        look(np.arange(len(points)), slice(None), np.arange(len(points)))
+        return nearest, distance
+    points = points.astype(np.float32, copy=False)
     groups = members(cells(points, CELL_ROWS))
     centres = np.stack([points[rows].mean(axis=0) for rows in groups])
     square = (centres**2).sum(axis=1)
     apart = square[:, None] + square - 2 * centres @ centres.T
     np.fill_diagonal(apart, -np.inf)  # its own cell comes first
     near = np.argsort(apart, axis=1, kind="stable")[:, : NEAR_CELLS + 1]
-    nearest, distance = np.zeros(len(points), np.int64), np.full(len(points), np.inf)
 
-    def look(cell: int) -> None:
-        rows, others = groups[cell], np.sort(np.concatenate([groups[one] for one in near[cell]]))
-        candidates = points[others]
-        for start in range(0, len(rows), TILE):
-            part = rows[start : start + TILE]
-            block = 1 - points[part] @ candidates.T
-            block[np.arange(len(part)), np.searchsorted(others, part)] = np.inf
-            at = block.argmin(axis=1)
-            nearest[part], distance[part] = others[at], block[np.arange(len(part)), at]
+    def look_around(cell: int) -> None:
+        others = np.sort(np.concatenate([groups[one] for one in near[cell]]))
+        look(groups[cell], others, np.searchsorted(others, groups[cell]))
+        nearest[groups[cell]] = others[nearest[groups[cell]]]
 
-    for _ in of_each(look, groups):
+    for _ in of_each(look_around, groups):
         pass
     return nearest, distance
 

@@ -34,13 +34,7 @@ AGREEMENT = 1e-4
 
 @dataclass(frozen=True)
 class SpeedPair:
-    """Two ways of the same work, or two kinds of work on the same images.
-
-    Attributes:
-        what: ours against theirs.
-        unit, count: how many of what each call does.
-        ours, theirs: the work.
-    """
+    """Ours against theirs: what is compared, how many of which unit each call does, and the two calls."""
 
     what: str
     unit: str
@@ -84,19 +78,16 @@ def rasteriser(quick: bool) -> SpeedPair:
     depth = 1 + 0.01 * torch.rand(count, 64, 64, generator=generator)
     albedo = torch.rand(count, 3, 64, 64, generator=generator)
     light = torch.tensor([0.4, 0.6, 0.1, -0.2]).repeat(count, 1)
-    camera = torch.zeros(count, 6)
-    camera[:, 1] = 0.2
+    camera = torch.tensor([0, 0.2, 0, 0, 0, 0]).repeat(count, 1)
 
     def work(backend: str) -> tuple[Tensor, Tensor]:
         surface = depth.clone().requires_grad_()
         image = render(surface, albedo, light, camera, fov_deg=10.0, backend=backend).image
-        image.square().mean().backward()
-        assert surface.grad is not None
-        return image.detach(), surface.grad
+        return image.detach(), torch.autograd.grad(image.square().mean(), surface)[0]
 
-    require_agreement("rasterisers", zip(work("numba"), work("reference"), strict=True))
-    what = "rendering with gradient, 64 px: numba / plain torch"
-    return SpeedPair(what, "images", count, partial(work, "numba"), partial(work, "reference"))
+    ours, theirs = partial(work, "numba"), partial(work, "reference")
+    require_agreement("rasterisers", zip(ours(), theirs(), strict=True))
+    return SpeedPair("rendering with gradient, 64 px: numba / plain torch", "images", count, ours, theirs)
 
 
 def embedding(quick: bool) -> SpeedPair:
@@ -116,13 +107,17 @@ def clustering(quick: bool) -> SpeedPair:
     count = 500 if quick else 3_000
     features = np.random.default_rng(0).normal(size=(count, 128)).astype(np.float32)
     features[: count // 2] += 1
-    peer = AgglomerativeClustering(n_clusters=8, linkage="ward")
-    same = adjusted_rand_score(peer.fit_predict(features), cut(ward_tree(features), 8))
+
+    def ours() -> np.ndarray:
+        return cut(ward_tree(features), 8)
+
+    theirs = partial(AgglomerativeClustering(n_clusters=8, linkage="ward").fit_predict, features)
+    same = adjusted_rand_score(theirs(), ours())
     if same < 1:
         raise ValueError(f"the two clusterings differ (adjusted Rand index {same:.4f}): nothing was measured")
-    what = f"Ward clustering of {count:,} rows: derender / scikit-learn"
-    ours, theirs = (lambda: cut(ward_tree(features), 8)), partial(peer.fit_predict, features)
-    return SpeedPair(what, "rows", count, ours, theirs)
+    return SpeedPair(
+        f"Ward clustering of {count:,} rows: derender / scikit-learn", "rows", count, ours, theirs
+    )
 
 
 def waiting_share(quick: bool) -> dict[str, float]:
@@ -140,13 +135,22 @@ def waiting_share(quick: bool) -> dict[str, float]:
         unaided = sum(_seconds(partial(batches.read, position)) for position in range(steps))
         reader = Reader(batches)
         step(reader.at(0))
-        before, began = reader.waited_s, time.perf_counter()
-        for position in range(1, steps):
-            step(reader.at(position))
-        took, waited = time.perf_counter() - began, reader.waited_s - before
+        before = reader.waited_s
+        took = sum(_seconds(lambda at=at: step(reader.at(at))) for at in range(1, steps))
+        waited = reader.waited_s - before
         reader.close()
         del images, batches, reader  # the file stays mapped as long as one of them lives
     return {"seconds": took, "share": waited / took, "share_unaided": unaided / (took + unaided)}
+
+
+def require_agreement(what: str, pairs: Iterable[tuple[Any, Any]]) -> None:
+    """Two results that differ by more than 1e-4 of the largest value are an error."""
+    for ours, theirs in pairs:
+        apart = float((ours - theirs).abs().max()) / max(float(theirs.abs().max()), 1e-12)
+        if not apart <= AGREEMENT:
+            raise ValueError(
+                f"the two {what} differ by {apart:.1e} of the largest value: nothing was measured"
+            )
 
 
 def _training() -> tuple[Any, Callable[[Any], None]]:
@@ -160,16 +164,6 @@ def _training() -> tuple[Any, Callable[[Any], None]]:
         model.zero_grad(set_to_none=True)
 
     return model, step
-
-
-def require_agreement(what: str, pairs: Iterable[tuple[Any, Any]]) -> None:
-    """Two results that differ by more than 1e-4 of the largest value are an error."""
-    for ours, theirs in pairs:
-        apart = float((ours - theirs).abs().max()) / max(float(theirs.abs().max()), 1e-12)
-        if not apart <= AGREEMENT:
-            raise ValueError(
-                f"the two {what} differ by {apart:.1e} of the largest value: nothing was measured"
-            )
 
 
 def _seconds(work: Callable[[], Any]) -> float:

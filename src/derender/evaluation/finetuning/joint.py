@@ -24,7 +24,7 @@ from derender.evaluation.linear_probes import head_loss, probabilities
 from derender.evaluation.linear_task import Task, task_of
 from derender.model import Derenderer, load
 from derender.objectives.perceptual_features import PerceptualFeatures
-from derender.storage.atomic import atomic_file, atomic_folder
+from derender.storage.atomic import atomic_file, new_folder
 from derender.storage.tensors import read_tensors, write_tensors
 from derender.training.config import FinetuneConfig
 from derender.training.derender_task import DerenderTask, perceptual_of
@@ -82,15 +82,12 @@ class FinetunedModel(nn.Module):
 
     def save(self, folder: str | Path, *, overwrite: bool = False) -> Path:
         """Write a folder that `derender.load` takes, the head beside the model; complete or not at all."""
-        folder = Path(folder)
-        if folder.exists() and not overwrite:
-            raise FileExistsError(f"{folder} exists already: choose another folder or pass overwrite=True")
         about = {"factors": self.head.factors, "kind": self.head.kind, "names": self.head.names}
-        with atomic_folder(folder) as temporary:
+        with new_folder(folder, overwrite=overwrite) as temporary:
             self.model.save(temporary, overwrite=True)
             write_tensors(self.head.state_dict(), temporary / HEAD_FILE)
             (temporary / HEAD_CONFIG_FILE).write_text(json.dumps(about, indent=1))
-        return folder
+        return Path(folder)
 
 
 def load_finetuned(source: str | Path, *, device: str | torch.device = "cpu") -> FinetunedModel:
@@ -129,38 +126,32 @@ class JointLabels:
     split: Split
 
 
-def target_of(pictures: ImageSet, config: FinetuneConfig) -> JointLabels:
-    """The labels that the configuration names, -1 where training must not see them.
+def target_of(images: PictureSet, config: FinetuneConfig) -> JointLabels:
+    """The labels that a configuration names, from an image set.
 
     Raises:
-        ValueError: no or unknown labels, a single class, fewer labelled images than requested, or unknown
-            factors.
+        ValueError: no label, unknown ones, one class, or fewer labelled images than requested.
     """
     target = config.target
     if not target.labels:
-        known = ", ".join(pictures.labels) or "no labels"
+        known = ", ".join(images.labels) or "no labels"
         raise ValueError(f"name a label to learn; the images have {known}")
-    asked = task_of({name: pictures.label(name) for name in target.labels})
-    split = split_indices(pictures.files, config.split, seed=config.seed)
+    named = ", ".join(target.labels)
+    asked = task_of({name: images.label(name) for name in target.labels})
+    split = split_indices(images.files, config.split, seed=config.seed)
     labelled = split.train[asked.known[split.train]]
     if target.labelled is not None:
         if target.labelled > len(labelled):
             raise ValueError(
                 f"{target.labelled:,} labelled images were requested, the training part has "
-                f"{len(labelled):,} with {', '.join(target.labels)}: set labelled={len(labelled)} or fewer"
+                f"{len(labelled):,} with {named}: set labelled={len(labelled)} or fewer"
             )
         labelled = np.random.default_rng(config.seed).permutation(labelled)[: target.labelled]
-    if len(labelled) < 2 or not (asked.targets[labelled] == 1).any():
-        raise ValueError(
-            f"the training part has {len(labelled)} images with {', '.join(target.labels)} to learn from: "
-            "bring more labelled images"
-        )
     known = asked.targets[labelled]
-    varied = (known == 1).any(axis=0) & ((known == 0).any(axis=0))
-    if not varied.any():
+    if not ((known == 1).any(axis=0) & (known == 0).any(axis=0)).any():
         raise ValueError(
-            f"the {len(labelled)} labelled images to learn from have one class of "
-            f"{', '.join(target.labels)} only: use more of them, or another seed"
+            f"the {len(labelled)} labelled images to learn from have one class of {named} only: use more of "
+            "them, or another seed"
         )
     visible = np.full_like(asked.targets, -1)
     for rows in (labelled, split.validation):
@@ -201,14 +192,12 @@ class FinetuneTask(TrainingTask):
 
     def build(self) -> FinetunedModel:
         """The model to start from with a fresh head, the same for the same seed."""
-        target, config = self.config.target, self.config
-        model = (
-            Derenderer.seeded(config.model, config.seed) if self.start is None else copy.deepcopy(self.start)
-        )
-        width = config.model.network.code_size * len(target.factors)
+        factors, config, asked = self.config.target.factors, self.config, self.target.asked
+        model = copy.deepcopy(self.start) or Derenderer.seeded(config.model, config.seed)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(config.seed)
-            head = TargetHead(target.factors, width, self.target.asked.kind, self.target.asked.names)
+            width = config.model.network.code_size * len(factors)
+            head = TargetHead(factors, width, asked.kind, asked.names)
         return FinetunedModel(model.cpu(), head).requires_grad_(True).train()
 
     def step_module(
@@ -216,12 +205,16 @@ class FinetuneTask(TrainingTask):
     ) -> "FinetuneStep":
         """The step, with all labels, and with the perceptual features of the run that it starts from."""
         assert isinstance(model, FinetunedModel)
-        perceptual = None
-        if self.config.target.rendering_weight > 0:
-            _bring_perceptual(self.config, run.perceptual)
-            perceptual = perceptual_of(self.config, run, images, progress)
+        config, perceptual = self.config, None
+        if config.target.rendering_weight > 0:
+            if config.start is not None and config.objective.perceptual == "self":
+                there = RunFolder(Path(config.start)).perceptual  # its sigmas belong to them
+                if there.is_file() and not run.perceptual.exists():
+                    with atomic_file(run.perceptual) as temporary:
+                        shutil.copyfile(there, temporary)
+            perceptual = perceptual_of(config, run, images, progress)
         labels = torch.from_numpy(self.target.visible).float().to(images.device)
-        return FinetuneStep(model, self.config, labels, perceptual)
+        return FinetuneStep(model, config, labels, perceptual)
 
     def watch(self, memory: dict[str, Any]) -> Watch:
         """The collapse detector; where nothing is rendered, a watcher of the loss."""
@@ -266,13 +259,11 @@ class FinetuneStep(nn.Module):
                 self.model.model, images, config.objective, self.perceptual, generator, precision, own
             )
             codes = result.codes
-        terms = {
-            name: value if name == "l1" else target.rendering_weight * value
-            for name, value in result.terms.items()
-        }
+        weight = target.rendering_weight
+        terms = {name: value if name == "l1" else weight * value for name, value in result.terms.items()}
         labels = self.labels[rows.to(self.labels.device)]
         loss = target.weight * target_loss(head(codes), labels, head.kind)
-        total = target.rendering_weight * result.total + loss
+        total = weight * result.total + loss
         return total, Held(replace(result, total=total, terms={**terms, "target": loss.detach()}))
 
 
@@ -286,13 +277,3 @@ def target_loss(logits: Float[Tensor, "n a"], targets: Float[Tensor, "n a"], kin
     known = (targets >= 0).any(dim=1)
     each = -(logits.log_softmax(dim=1) * targets.clamp(min=0)).sum(dim=1)
     return (each * known).sum() / known.sum().clamp(min=1)
-
-
-def _bring_perceptual(config: FinetuneConfig, file: Path) -> None:
-    """Copy self-trained perceptual features from the run it starts from: its sigmas belong to them."""
-    if config.start is None or config.objective.perceptual != "self" or file.exists():
-        return
-    there = RunFolder(Path(config.start)).perceptual
-    if there.is_file():
-        with atomic_file(file) as temporary:
-            shutil.copyfile(there, temporary)

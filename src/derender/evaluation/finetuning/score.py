@@ -5,10 +5,11 @@ on frozen features (the paper's, and penalised logistic regression) learn from t
 does the regression on features of an untrained encoder, on principal components and on pixels.
 """
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+import torch
 
 from derender.baselines.controls import pca_features, pixel_features, untrained_twin
 from derender.data import ImageSet
@@ -17,11 +18,12 @@ from derender.evaluation.finetuning.joint import FinetunedModel, FinetuneTask
 from derender.evaluation.linear_probing import LINEAR_COLUMNS, compare_linear
 from derender.evaluation.linear_task import Rows, Task
 from derender.evaluation.memory import Memory
+from derender.evaluation.pixels import component_count
 from derender.evaluation.score_table import ScoreTable, scored_table
 from derender.features import embed_images, map_batches, model_fingerprint
 from derender.inputs import Progress
 
-JOINT, LOGISTIC, PAPER_HEAD, MAJORITY = "fine-tuned", "frozen, logistic", "frozen, paper's head", "majority"
+BOTH = ("accuracy", "balanced_accuracy")
 
 
 @dataclass(frozen=True)
@@ -48,12 +50,8 @@ class FinetuneScores:
 
     def numbers(self) -> dict[str, Any]:
         """Everything as JSON takes it."""
-        versus = {
-            name: {part: getattr(one, part) for part in ("rival", "value", "low", "high", "above")}
-            for name, one in self.versus.items()
-        }
-        sizes = {name: getattr(self, name) for name in ("kind", "names", "n_train", "n_test", "n_unlabelled")}
-        return {**sizes, "rows": {row.name: row.numbers() for row in self.rows}, "versus": versus}
+        versus = {name: asdict(one) for name, one in self.versus.items()}
+        return {**vars(self), "rows": {row.name: row.numbers() for row in self.rows}, "versus": versus}
 
     def table(self, began: str) -> ScoreTable:
         """A row each; ``began`` names the model whose frozen features the heads take."""
@@ -65,9 +63,8 @@ class FinetuneScores:
         )
         if self.n_unlabelled:
             caption += f"; {self.n_unlabelled:,} images without label never asked"
-        both = ("accuracy", "balanced_accuracy")
         return scored_table(
-            caption, "trained on labels", self.rows, LINEAR_COLUMNS, intervals=both, deviations=()
+            caption, "trained on labels", self.rows, LINEAR_COLUMNS, intervals=BOTH, deviations=()
         )
 
 
@@ -84,7 +81,7 @@ def score_finetuned(
     Raises:
         ValueError: no tested image has a label.
     """
-    target = task.target
+    target, seed, kept = task.target, task.config.seed, memory or Memory()
     test = target.split.test[target.asked.known[target.split.test]]
     train = target.split.train[(target.visible[target.split.train] >= 0).any(axis=1)]
     if len(test) < 2:
@@ -92,73 +89,64 @@ def score_finetuned(
             f"the test part has {len(test)} images with a label, two are needed to score: "
             "bring more images, or set a larger test share in split="
         )
-    memory, rows = memory or Memory(), np.concatenate([train, test])
 
     def answered() -> dict[str, np.ndarray]:
-        parts = map_batches(
-            lambda batch: tuned.predict(batch).cpu().numpy(), tuned, task.images[test], batch_size=256
-        )
-        return {"answers": np.concatenate(parts)}
+        parts = map_batches(tuned.predict, tuned, task.images[test], batch_size=256)
+        return {"answers": torch.cat(parts).cpu().numpy()}
 
     inputs = {"weights": model_fingerprint(tuned), "kind": target.asked.kind, "images": task.images[test]}
-    answers = memory.recall("finetuned-answers", inputs, answered)["answers"]
+    answers = kept.recall("finetuned-answers", inputs, answered)["answers"]
     start = (task.start if task.start is not None else task.build().model).to(tuned.device)
-    frozen = _codes(start, task, rows, memory)
-    asked = Task(target.asked.kind, target.asked.names, target.asked.targets[rows])
-    count, seed = len(train), task.config.seed
-    who = Rows(np.arange(count, len(rows)), {count: np.arange(count)[None]})
-    found = compare_linear(
-        {LOGISTIC: [frozen]},
-        asked,
-        who,
-        (seed,),
-        heads=("logistic", "linear"),
-        finetuned={JOINT: {count: answers[None]}},
-        resample_count=resample_count,
-        memory=memory,
-        progress=progress,
-    )
-    by_head = {part.head: part.rows for part in found.parts}
-    controls = _controls(start, task, rows, memory)
-    known = compare_linear(
-        {name: [values] for name, values in controls.items()},
-        asked, who, (seed,), heads=("logistic",), resample_count=resample_count, memory=memory,
-    ).parts[0].rows  # fmt: skip
-    joint, majority = by_head["fine-tuned"]
-    heads = [
-        ScoredRow(name, True, 1, by_head[head][0].scores)
-        for name, head in ((LOGISTIC, "logistic"), (PAPER_HEAD, "linear"))
+    features = _features(start, task, np.concatenate([train, test]), kept)
+    count, runs = len(train), {name: [values] for name, values in features.items()}
+    rows = Rows(np.arange(count, count + len(test)), {count: np.arange(count)[None]})
+    asked = Task(target.asked.kind, target.asked.names, target.asked.targets[np.concatenate([train, test])])
+    how: dict[str, Any] = {"resample_count": resample_count, "memory": kept}
+    tuned_answers = {"fine-tuned": {count: answers[None]}}
+    logistic, joint = compare_linear(
+        runs, asked, rows, (seed,), heads=("logistic",), finetuned=tuned_answers, progress=progress, **how
+    ).parts
+    paper = compare_linear({"frozen": runs["frozen"]}, asked, rows, (seed,), heads=("linear",), **how).parts[
+        0
     ]
-    ours = ScoredRow(JOINT, False, 1, joint.scores)
-    quiet = [ScoredRow(f"{row.name}, logistic", True, 1, row.scores) for row in known[: len(controls)]]
-    others = (*heads, *quiet, ScoredRow(MAJORITY, True, 1, majority.scores))
-    versus = {
-        name: difference(ours.scores[name], {row.name: row.scores[name] for row in others})
-        for name in ("accuracy", "balanced_accuracy")
-    }
-    unlabelled = int((~target.asked.known).sum())
-    return FinetuneScores((ours, *others), versus, asked.kind, asked.names, count, len(test), unlabelled)
+    ours, majority = joint.rows
+    frozen, *controls = logistic.rows[: len(features)]
+    named = {"frozen, logistic": frozen, "frozen, paper's head": paper.rows[0]}
+    named |= {f"{row.name}, logistic": row for row in controls} | {"majority": majority}
+    others = {name: row.scores for name, row in named.items()}
+    rivals = {score: {name: scores[score] for name, scores in others.items()} for score in BOTH}
+    controls = (ScoredRow(name, True, 1, scores) for name, scores in others.items())
+    return FinetuneScores(
+        (ScoredRow("fine-tuned", False, 1, ours.scores), *controls),
+        {score: difference(ours.scores[score], rivals[score]) for score in BOTH},
+        asked.kind,
+        asked.names,
+        count,
+        len(test),
+        int((~target.asked.known).sum()),
+    )
 
 
-def _codes(model: Any, task: FinetuneTask, rows: np.ndarray, memory: Memory) -> np.ndarray:
-    """(R, D) features of some rows of the task's images, those that the head reads side by side."""
-    inputs = {"weights": model_fingerprint(model), "images": task.images[rows]}
-    codes = memory.recall("embedding", inputs, lambda: embed_images(model, task.images[rows]))
-    return np.concatenate([codes[name] for name in task.config.target.factors], axis=1)
+def _features(start: Any, task: FinetuneTask, rows: np.ndarray, kept: Memory) -> dict[str, np.ndarray]:
+    """(R, D) of some of the task's images: codes that training began with, and three that learned nothing."""
 
+    def codes(model: Any) -> np.ndarray:
+        inputs = {"weights": model_fingerprint(model), "images": task.images[rows]}
+        found = kept.recall("embedding", inputs, lambda: embed_images(model, task.images[rows]))
+        return np.concatenate([found[name] for name in task.config.target.factors], axis=1)
 
-def _controls(start: Any, task: FinetuneTask, rows: np.ndarray, memory: Memory) -> dict[str, np.ndarray]:
-    """(R, D) features that learned nothing, of some rows of the task's images."""
-    twin, train = untrained_twin(start, task.config.seed), task.target.split.train
-    shown, fitted = (ImageSet(task.images[some], tuple(map(str, some.tolist()))) for some in (rows, train))
-    components = max(1, min(64, len(fitted) // 4))
-    pca = memory.recall(
-        "pca",
-        {"images": shown.images, "components": components, "fit_on": fitted.images},
-        lambda: dict(pca_features(shown, components=components, fit_on=fitted).factors),
-    )["pca"]
+    shown, fitted = (
+        PictureSet(task.images[some], tuple(map(str, some.tolist())))
+        for some in (rows, task.target.split.train)
+    )
+    components = component_count(len(fitted))
+    inputs = {"images": shown.images, "components": components, "fit_on": fitted.images}
+    pca = kept.recall(
+        "pca", inputs, lambda: dict(pca_features(shown, components=components, fit_on=fitted).factors)
+    )
     return {
-        "untrained encoder": _codes(twin, task, rows, memory),
-        f"PCA ({components})": pca,
+        "frozen": codes(start),
+        "untrained encoder": codes(untrained_twin(start, task.config.seed)),
+        f"PCA ({components})": pca["pca"],
         "pixels": pixel_features(shown).concatenate(),
     }
