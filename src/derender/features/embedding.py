@@ -195,7 +195,7 @@ def _plan(
     net: Any, images: Stream | ImageSet, facts: Mapping[str, Any], reading: object, batch_size: int
 ) -> dict[str, Any]:
     """Everything that a resumed run must have in common with the one before."""
-    if isinstance(images, PictureSet):
+    if isinstance(images, ImageSet):
         check_size(net, images.images)
         labels = {name: column.tolist() for name, column in images.labels.items()}
         content: object = (images.files, labels, sample_checksum(images.images))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from tests.evaluation.disentanglement.conftest import card
 
-from derender.data import PictureSet
+from derender.data import ImageSet
 from derender.evaluation.disentanglement.card import dealt, disentangle, shuffled_rows
 from derender.model import Derenderer
 from derender.presets import MODEL_PRESETS

@@ -126,7 +126,7 @@ class JointLabels:
     split: Split
 
 
-def target_of(images: PictureSet, config: FinetuneConfig) -> JointLabels:
+def target_of(images: ImageSet, config: FinetuneConfig) -> JointLabels:
     """The labels that a configuration names, from an image set.
 
     Raises:

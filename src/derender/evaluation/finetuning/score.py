@@ -136,7 +136,7 @@ def _features(start: Any, task: FinetuneTask, rows: np.ndarray, kept: Memory) ->
         return np.concatenate([found[name] for name in task.config.target.factors], axis=1)
 
     shown, fitted = (
-        PictureSet(task.images[some], tuple(map(str, some.tolist())))
+        ImageSet(task.images[some], tuple(map(str, some.tolist())))
         for some in (rows, task.target.split.train)
     )
     components = component_count(len(fitted))

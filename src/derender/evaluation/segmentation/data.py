@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Int64, UInt8
 
-from derender.data import PictureSet, split_indices
+from derender.data import ImageSet, split_indices
 from derender.evaluation.pixels import component_count
 
 TEST_FRACTION = 0.2
@@ -49,7 +49,7 @@ class SegmentationData:
 
 
 def divide(
-    images: PictureSet,
+    images: ImageSet,
     masks: UInt8[np.ndarray, "n s s"],
     classes: Sequence[str],
     *,
