@@ -4,6 +4,7 @@ One file per group of commands; ``main`` turns bad input into exit code 2 and on
 Nothing heavy is imported before a command runs, so that help appears at once.
 """
 
+import errno
 import os
 import sys
 from collections.abc import Sequence
@@ -66,12 +67,12 @@ def _options(
     pass
 
 
-for group in (
-    demo, doctor, train, whiten, refine, unet, pack, embed, evaluate, explain, finetune, importing, compare,
-    report,
-    decompose, relight, rotate, swap, mesh, search, view, synth, bench,
+for one in (
+    demo.demo, doctor.doctor, train.train, whiten.whiten, refine.refine, unet.unet, pack.pack, embed.embed,
+    evaluate, explain.explain, finetune.finetune, importing.import_checkpoint, compare, report.report,
+    decompose, relight, rotate, swap, mesh, search.search, view, synth, bench.bench,
 ):  # fmt: skip
-    group.register(app)
+    one.register(app)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -92,12 +93,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except (KeyboardInterrupt, typer.Abort) as error:
-        _complain(_flat(str(error)) or "stopped by Ctrl-C; nothing half-written was kept")
+        _complain(str(error) or "stopped by Ctrl-C; nothing half-written was kept")
         return 130
     except (ValueError, OSError) as error:
         if os.environ.get("DERENDER_TRACEBACK"):
             raise
-        _complain(_one_line(error))
+        message = str(error) or type(error).__name__
+        if isinstance(error, OSError) and error.errno is not None and error.strerror:
+            where = f"{error.filename}: " if error.filename is not None else ""
+            hint = "; free some space and run the command again" if error.errno == errno.ENOSPC else ""
+            message = f"{where}{error.strerror.lower()}{hint}"
+        _complain(message)
         return 2
     except Exception as error:
         describe = getattr(error, "format_message", None)  # bad words; typer has several kinds
@@ -105,11 +111,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             if not _speaks_of_errors():
                 return 1
             raise
-        command = getattr(getattr(error, "ctx", None), "command_path", "derender")
-        message = describe().strip()
-        if not message:  # no command given: help has been shown
-            return 2
-        _complain(f"{message.rstrip('.')} (see {command} --help)")
+        if message := describe().strip():  # none where no command was given: help has been shown
+            command = getattr(getattr(error, "ctx", None), "command_path", "derender")
+            _complain(f"{message.rstrip('.')} (see {command} --help)")
         return 2
 
 
@@ -123,18 +127,6 @@ def _speaks_of_errors() -> bool:
 
 
 def _complain(message: str) -> None:
-    if _speaks_of_errors():
-        sys.stderr.write(f"derender: {visible(message)}\n")
-
-
-def _one_line(error: ValueError | OSError) -> str:
     """What, where and what to do, on one line."""
-    if isinstance(error, OSError) and error.errno is not None and error.strerror:
-        where = f"{error.filename}: " if error.filename is not None else ""
-        hint = "; free some space and run the command again" if error.errno == 28 else ""
-        return _flat(f"{where}{error.strerror.lower()}{hint}")
-    return _flat(str(error)) or type(error).__name__
-
-
-def _flat(text: str) -> str:
-    return " ".join(text.split())
+    if _speaks_of_errors():
+        sys.stderr.write(f"derender: {visible(' '.join(message.split()))}\n")

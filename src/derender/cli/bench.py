@@ -6,12 +6,10 @@ import typer
 
 from derender.cli import options
 from derender.cli.console import progress_bar, result, write_json
+from derender.cli.gathered import command
 
 
-def register(app: typer.Typer) -> None:
-    app.command("bench", epilog="Example: derender bench --quick --json speed.json")(bench)
-
-
+@command("bench", "bench --quick --json speed.json")
 def bench(
     quick: Annotated[bool, typer.Option("--quick", help="Smaller sizes and one round: a minute.")] = False,
     json_file: options.Json = None,
@@ -25,11 +23,7 @@ def bench(
         speeds = f"{row['ours_per_second']:,.1f} against {row['theirs_per_second']:,.1f} {row['unit']}/s"
         spread = f"rounds {row['least']:.2f}..{row['most']:.2f}"
         result(f"{row['what']}: {row['ratio']:.2f}x ({speeds}; {spread})", json_file)
-    waiting = measured["waiting"]
-    result(
-        f"training, preset small, images in a mapped file: {waiting['share']:.2%} of "
-        f"{waiting['seconds']:.1f} s spent waiting for data "
-        f"({waiting['share_unaided']:.2%} without reading ahead)",
-        json_file,
-    )
+    share, seconds, unaided = (measured["waiting"][key] for key in ("share", "seconds", "share_unaided"))
+    spent = f"{share:.2%} of {seconds:.1f} s spent waiting for data ({unaided:.2%} without reading ahead)"
+    result(f"training, preset small, images in a mapped file: {spent}", json_file)
     write_json(json_file, measured)

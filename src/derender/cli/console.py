@@ -4,9 +4,7 @@ Results go to standard output, everything else to standard error, so that a pipe
 Leaves out what any single command does.
 """
 
-import dataclasses
 import json
-import math
 import os
 import sys
 import time
@@ -48,8 +46,13 @@ def is_main_process() -> bool:
 
 def notice(text: str) -> None:
     """One note for the person at the terminal."""
+    result(text, "-")
+
+
+def result(text: str, json_file: str | None) -> None:
+    """One line of result; it makes way on standard output where the JSON goes there."""
     if is_main_process():
-        Console(stderr=True, highlight=False, soft_wrap=True, markup=False).print(visible(text))
+        Console(stderr=json_file == "-", highlight=False, soft_wrap=True, markup=False).print(visible(text))
 
 
 def visible(text: str, kept: str = "\n") -> str:
@@ -57,13 +60,13 @@ def visible(text: str, kept: str = "\n") -> str:
     return "".join(char if char in kept or char.isprintable() else repr(char)[1:-1] for char in text)
 
 
-def report_images(pictures: "ImageSet") -> None:
+def report_images(images: "ImageSet") -> None:
     """What was read, and the first of what was left out by name."""
-    notice(pictures.describe())
-    for row in pictures.skipped[:NAMED]:
+    notice(images.describe())
+    for row in images.skipped[:NAMED]:
         notice(f"skipped {visible(row.file, '')}: {row.reason}")
-    if len(pictures.skipped) > NAMED:
-        notice(f"and {len(pictures.skipped) - NAMED:,} more (derender doctor --json FILE names all)")
+    if len(images.skipped) > NAMED:
+        notice(f"and {len(images.skipped) - NAMED:,} more (derender doctor --json FILE names all)")
 
 
 @contextmanager
@@ -83,65 +86,43 @@ def damage_as_notices() -> Iterator[None]:
         yield
 
 
-def result(text: str, json_file: str | None) -> None:
-    """One line of result; it makes way on standard output where the JSON goes there."""
-    if is_main_process():
-        Console(stderr=json_file == "-", highlight=False, soft_wrap=True, markup=False).print(visible(text))
-
-
 @contextmanager
 def progress_bar(description: str, unit: str = "images") -> Iterator[Callable[..., None]]:
     """A progress bar on standard error: call the given function with (done, total) and, if any, a note.
 
     Where standard error is no terminal, a plain line appears every half minute instead.
     """
-    console = Console(stderr=True)
-    if not console.is_terminal or not is_main_process():
-        yield _plain_lines(description, unit)
-        return
-    columns = (
-        SpinnerColumn(),
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        TaskProgressColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[unit]}", markup=False),
-        TimeRemainingColumn(compact=True),
-        TextColumn("{task.fields[note]}", style="dim", markup=False),
-    )
-    with Progress(*columns, console=console) as progress:
-        task = progress.add_task(description, total=None, unit=unit, note="")
+    console, last = Console(stderr=True), time.monotonic()
 
-        def report(done: int, total: int, note: str = "", **fields: str) -> None:
-            progress.update(task, completed=done, total=total, note=note, **fields)  # pyright: ignore[reportArgumentType]
-
-        yield report
-
-
-def _plain_lines(description: str, unit: str) -> Callable[..., None]:
-    last = time.monotonic()
-
-    def report(
-        done: int, total: int, note: str = "", description: str = description, unit: str = unit
-    ) -> None:
+    def say(done: int, total: int, note: str = "", description: str = description, unit: str = unit) -> None:
         nonlocal last
         if time.monotonic() - last >= PLAIN_LINE_EVERY_SECONDS:
             last = time.monotonic()
             notice(f"{description}: {done:,} of {total:,} {unit} {note}".rstrip())
 
-    return report
+    if not console.is_terminal or not is_main_process():
+        yield say
+        return
+    columns = (
+        SpinnerColumn(), TextColumn("{task.description}", markup=False), BarColumn(), TaskProgressColumn(),
+        MofNCompleteColumn(), TextColumn("{task.fields[unit]}", markup=False),
+        TimeRemainingColumn(compact=True), TextColumn("{task.fields[note]}", style="dim", markup=False),
+    )  # fmt: skip
+    with Progress(*columns, console=console) as progress:
+        task = progress.add_task(description, total=None, unit=unit, note="")
+
+        def report(done: int, total: int, note: str = "", **fields: Any) -> None:
+            progress.update(task, completed=done, total=total, note=note, **fields)
+
+        yield report
 
 
 def show_scores(scores: "ScoreTable", json_file: str | None) -> None:
     """A table of scores where results go: controls dim, the best of each column bold."""
     table = Table(
-        title=scores.caption,
-        title_justify="left",
-        title_style="none",
-        box=None,
-        pad_edge=False,
+        title=scores.caption, title_justify="left", title_style="none", box=None, pad_edge=False,
         padding=(0, 3, 0, 0),
-    )
+    )  # fmt: skip
     table.add_column(scores.first, header_style="dim")
     for column in scores.columns:
         table.add_column(column.head, justify="right", no_wrap=True, header_style="dim")
@@ -170,19 +151,14 @@ def write_json(target: str | None, values: Mapping[str, Any]) -> None:
 
 def plain(value: Any) -> Any:
     """Dataclasses, arrays, tensors and paths as what JSON can hold; NaN and infinity become null."""
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
-    if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
-    if isinstance(value, Path):
-        return str(value)
-    if callable(listed := getattr(value, "tolist", None)):
-        return plain(listed())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
+    from pydantic_core import to_jsonable_python
+
+    def listed(one: Any) -> Any:
+        if isinstance(one, Mapping):
+            return dict(one)
+        return one.tolist() if hasattr(one, "tolist") else list(one)
+
+    return to_jsonable_python(value, inf_nan_mode="null", fallback=listed)
 
 
 def refuse_existing_file(path: Path, force: bool) -> None:

@@ -1,6 +1,7 @@
 """`derender demo`: the whole story on built-in data, ending with the name of one report."""
 
 import time
+from itertools import count
 from pathlib import Path
 from typing import Annotated
 
@@ -8,40 +9,37 @@ import typer
 
 from derender.cli import options
 from derender.cli.console import duration, notice, progress_bar, result, show_scores, write_json
+from derender.cli.gathered import command
+
+Out = Annotated[
+    Path | None, typer.Option("--out", "-o", help="New folder for everything it makes.", metavar="DIR")
+]
+QUICK_HELP = "About one minute: to see that it runs, not how good it is."
 
 
-def register(app: typer.Typer) -> None:
-    app.command("demo", epilog="Example: derender demo --quick")(demo)
-
-
+@command("demo", "demo --quick")
 def demo(
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="New folder for everything it makes.", metavar="DIR")
-    ] = None,
-    quick: Annotated[
-        bool, typer.Option("--quick", help="About one minute: to see that it runs, not how good it is.")
-    ] = False,
+    out: Out = None,
+    quick: Annotated[bool, typer.Option("--quick", help=QUICK_HELP)] = False,
     seed: options.Seed = 0,
     json_file: options.Json = None,
 ) -> None:
     """Generate faces, train on them without labels, score unseen ones, write one page. Offline."""
     began = time.monotonic()
-    notice("taking faces apart, learned from scratch on this machine" + (" (quick)" if quick else ""))
+    notice("decomposing faces, learned from scratch on this machine" + (" (quick)" if quick else ""))
     from derender.demo import FULL, QUICK, demo_page, run_demo
     from derender.demo.page import score_tables
     from derender.training.process import TrainingInterrupted
 
-    folder = out or _free_folder(Path("derender-demo"))
+    names = (f"derender-demo{f'-{number}' if number > 1 else ''}" for number in count(1))
+    folder = out or next(Path(name) for name in names if not Path(name).exists())
     try:
         with progress_bar("starting", "") as report:
-
-            def show(stage: str, done: int, total: int, note: str) -> None:
-                report(done, total, note, description=stage)
-
-            told = run_demo(folder, QUICK if quick else FULL, seed=seed, report=show)
-            show("writing the report", 0, 1, "")
+            told = run_demo(
+                folder, QUICK if quick else FULL, seed=seed,
+                report=lambda stage, done, total, note: report(done, total, note, description=stage),
+            )  # fmt: skip
             page = demo_page(told).write(folder / "report.html")
-            show("writing the report", 1, 1, "")
     except TrainingInterrupted as stop:
         raise KeyboardInterrupt(
             f"stopped; run derender demo again to start over ({folder} can be deleted)"
@@ -54,16 +52,5 @@ def demo(
         notice(f"{finding.sign}: {finding.text}; {finding.advice}")
     notice(f"done in {duration(time.monotonic() - began)}; the model is in {told.trained.folder}")
     result(f"report {page}", json_file)
-    write_json(
-        json_file,
-        {"report": page, "run": told.trained, "seconds": told.seconds}
-        | {name: table.values() for name, table in tables.items()},
-    )
-
-
-def _free_folder(wanted: Path) -> Path:
-    """The folder itself, or with the first number behind it that is not taken."""
-    folder, number = wanted, 2
-    while folder.exists():
-        folder, number = wanted.with_name(f"{wanted.name}-{number}"), number + 1
-    return folder
+    values = {name: table.values() for name, table in tables.items()}
+    write_json(json_file, {"report": page, "run": told.trained, "seconds": told.seconds, **values})

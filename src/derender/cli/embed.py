@@ -9,7 +9,7 @@ import typer
 from derender.baselines import BASELINES
 from derender.cli import options
 from derender.cli.console import NAMED, notice, progress_bar, refuse_existing_file, visible
-from derender.cli.gathered import gathered
+from derender.cli.gathered import command
 
 NAMES = ", ".join(BASELINES)
 Out = Annotated[Path, typer.Option("--out", "-o", help="The table to write.", metavar="FILE.parquet")]
@@ -34,12 +34,7 @@ class BaselineOptions:
     seed: Annotated[int, _option("Seed of pca, noise and untrained.", min=0)] = 0
 
 
-def register(app: typer.Typer) -> None:
-    example = "derender embed photos/ --model runs/faces --out features.parquet"
-    app.command("embed", epilog=f"Example: {example}")(embed)
-
-
-@gathered
+@command("embed", "embed photos/ --model runs/faces --out features.parquet")
 def embed(
     images: options.PartOfImages, out: Out, baselines: BaselineOptions, output: options.Output,
     model: Model = None, batch_size: options.BatchSize = 256, fit_steps: options.FitSteps = None,
@@ -62,16 +57,15 @@ def embed(
         raise ValueError("--workers belongs to --engine ray: leave it out, every core is used")
     how = {"batch_size": batch_size, "engine": engine, "workers": workers, "fresh": output.force}
     with progress_bar("embedding") as report:
+        how |= {"device": device, "progress": report}
         if name is None:
-            how |= {**images.how, "fit_steps": fit_steps, "device": device}
-            done = derender.embed_to_file(images.address, source, out, **how, progress=report)
+            how |= {**images.how, "fit_steps": fit_steps}
+            done = derender.embed_to_file(images.address, source, out, **how)
         else:
-            chosen = baselines.features and [part.strip() for part in baselines.features.split(",")]
-            how |= {name: getattr(baselines, name) for name in ("image_size", "components", "seed")}
-            done = derender.baselines.embed_baseline(
-                name, images.address, out, source, features=chosen, device=device, reading=images.how,
-                progress=report, **how,
-            )  # fmt: skip
+            how["features"] = baselines.features and [part.strip() for part in baselines.features.split(",")]
+            how |= {option: getattr(baselines, option) for option in ("image_size", "components", "seed")}
+            call = derender.baselines.embed_baseline
+            done = call(name, images.address, out, source, reading=images.how, **how)
     named = (f"skipped {visible(row.file, '')}: {row.reason}" for row in done.examples[:NAMED])
     notice("\n".join([done.describe(), *named]))
     sizes = ", ".join(f"{factor} {size}" for factor, size in done.factors.items())

@@ -8,45 +8,32 @@ import typer
 
 from derender.cli import options, scoring
 from derender.cli.console import notice, progress_bar, refuse_existing, report_images, result
-from derender.cli.gathered import gathered
+from derender.cli.gathered import command
 
-Labels = Annotated[
-    list[str] | None, typer.Option("--label", "-l", help="Label column; several if each has two values.")
-]
+LABEL = "Label column; several if each has two values."
+Labels = Annotated[list[str] | None, typer.Option("--label", "-l", help=LABEL)]
 Attributes = Annotated[bool, typer.Option("--attributes", help="Every yes/no label.")]
 Bins = Annotated[int | None, typer.Option(min=2, help="Cut a column of numbers into N classes.", metavar="N")]
 MinCount = Annotated[int, typer.Option(min=2, help="Leave out classes of fewer images.", metavar="N")]
-Out = Annotated[
-    Path | None,
-    typer.Option("--out", "-o", help="Folder for page, chart, sheets of maps and probe.", metavar="DIR"),
-]
+OUT = "Folder for page, chart, sheets of maps and probe."
+Out = Annotated[Path | None, typer.Option("--out", "-o", help=OUT, metavar="DIR")]
 Seeds = Annotated[int, typer.Option(min=1, help="Number of probes to average over.", metavar="N")]
-Count = Annotated[
-    int | None, typer.Option(min=2, help="Number of images to learn from; default: 2 of 5.", metavar="N")
-]
+COUNT = "Number of images to learn from; default: 2 of 5."
+Count = Annotated[int | None, typer.Option(min=2, help=COUNT, metavar="N")]
 Groups = Annotated[str | None, typer.Option(help="Label whose rows stay together, such as identity.")]
 Head = Annotated[str, typer.Option(help="logistic, or linear: the paper's head.")]
 Target = Annotated[str, typer.Option("--output", help="Attributed output: logit or probability.")]
 Start = Annotated[str, typer.Option(help="Start of the path: zero (the paper's) or mean.")]
-Sheets = Annotated[
-    int, typer.Option(min=0, help="Number of labels to draw maps for, best first.", metavar="N")
-]
+SHEETS = "Number of labels to draw maps for, best first."
+Sheets = Annotated[int, typer.Option(min=0, help=SHEETS, metavar="N")]
 Rows = Annotated[int, typer.Option(min=2, help="Number of images on a sheet.", metavar="N")]
-Clusters = Annotated[
-    int | None, typer.Option(min=2, help="Also explain the distance between N clusters.", metavar="N")
-]
-Pair = Annotated[
-    tuple[str, str] | None,
-    typer.Option("--pair", help="Also explain the distance of these two images.", metavar="FILE FILE"),
-]
+CLUSTERS = "Also explain the distance between N clusters."
+Clusters = Annotated[int | None, typer.Option(min=2, help=CLUSTERS, metavar="N")]
+PAIR = "Also explain the distance of these two images."
+Pair = Annotated[tuple[str, str] | None, typer.Option("--pair", help=PAIR, metavar="FILE FILE")]
 
 
-def register(app: typer.Typer) -> None:
-    example = "derender explain celeba.zip --model runs/faces --attributes --out why/"
-    app.command("explain", epilog=f"Example: {example}")(explain)
-
-
-@gathered
+@command("explain", "explain celeba.zip --model runs/faces --attributes --out why/")
 def explain(
     model: options.TrainedModel, images: options.PartOfImages, published: scoring.Published,
     label: Labels = None, attributes: Attributes = False, bins: Bins = None, min_count: MinCount = 2,

@@ -6,31 +6,19 @@ from typing import Annotated
 import typer
 
 from derender.cli.console import notice
-from derender.cli.gathered import gathered
+from derender.cli.gathered import command
 from derender.cli.options import OutModel, Output, Settings
 
 PRESETS = ("faces", "cats", "cars")
-
+PRESET = f"Kind of object it was trained on: {', '.join(PRESETS)}."
 Checkpoint = Annotated[Path, typer.Argument(help="The .pth file that unsup3d wrote.", metavar="CHECKPOINT")]
-Preset = Annotated[
-    str, typer.Option("--preset", help=f"Kind of object it was trained on: {', '.join(PRESETS)}.")
-]
 
 
-def register(app: typer.Typer) -> None:
-    app.command("import", epilog="Example: derender import unsup3d.pth --preset faces --out imported/")(
-        import_checkpoint
-    )
-
-
-@gathered
+@command("import", "import unsup3d.pth --preset faces --out imported/")
 def import_checkpoint(
-    checkpoint: Checkpoint,
-    out: OutModel,
-    output: Output,
-    preset: Preset = "faces",
-    settings: Settings = None,
-) -> None:
+    checkpoint: Checkpoint, out: OutModel, output: Output,
+    preset: Annotated[str, typer.Option("--preset", help=PRESET)] = "faces", settings: Settings = None,
+) -> None:  # fmt: skip
     """Write a derender model with the weights of an unsup3d checkpoint. Nothing in the file is run.
 
     With --set the ranges of its training are given where they differ, as translation_z=0.1 or fov_deg=10.

@@ -29,12 +29,6 @@ Images = Annotated[
     ),
 ]  # fmt: skip
 DataAlias = Annotated[str | None, typer.Option("--data", "-d", hidden=True, metavar="IMAGES")]
-Data = Annotated[
-    str,
-    typer.Option(
-        "--data", "-d", help="Folder, zip, .tar shards or Hugging Face id; ::PART for a part.", metavar="PATH"
-    ),
-]
 Dataset = Annotated[
     str, typer.Option("--dataset", help="Layout of the images, if it is not recognised.", metavar="NAME")
 ]

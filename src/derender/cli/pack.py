@@ -5,20 +5,14 @@ from typing import Annotated
 import typer
 
 from derender.cli.console import notice, progress_bar
-from derender.cli.gathered import gathered
+from derender.cli.gathered import command
 from derender.cli.options import OutModel, Output, PartOfImages, TrainedModel
 
-Maps = Annotated[
-    str,
-    typer.Option("--maps", help="Storage of the large maps of features: bytes or float16.", metavar="KIND"),
-]
+MAPS = "Storage of the large maps of features: bytes or float16."
+Maps = Annotated[str, typer.Option("--maps", help=MAPS, metavar="KIND")]
 
 
-def register(app: typer.Typer) -> None:
-    app.command("pack", epilog="Example: derender pack photos/ --model runs/mine --out mine")(pack)
-
-
-@gathered
+@command("pack", "pack photos/ --model runs/mine --out mine")
 def pack(
     images: PartOfImages, model: TrainedModel, out: OutModel, output: Output, maps: Maps = "bytes"
 ) -> None:
@@ -31,8 +25,7 @@ def pack(
     from derender.storage.packing import pack_model
 
     output.refuse_existing(out)
-    original = model.open()
-    chosen = None
+    original, chosen = model.open(), None
     if images.optional_address is not None:
         chosen = images.read(original.image_size, model=model.model, at_least=2)
     packed = pack_model(model.model, out, maps=maps, overwrite=output.force)
@@ -41,10 +34,9 @@ def pack(
     notice(f"{sizes['after'] / 1e6:,.2f} MB, before {sizes['before'] / 1e6:,.2f} MB")
     values = {"model": packed.folder, "bytes": sizes}
     if chosen is not None:
+        copy = as_model(packed.folder, device=model.device)
         with progress_bar("comparing") as report:
-            cost = copy_cost(
-                original, as_model(packed.folder, device=model.device), chosen.images, progress=report
-            )
+            cost = copy_cost(original, copy, chosen.images, progress=report)
         moved = ", ".join(f"{name} {share:.2%}" for name, share in cost.moved.items())
         notice(f"features moved, as a share of the distance between two images: {moved}")
         notice(f"reconstruction L1 {cost.l1:.5f}, before {cost.l1_before:.5f}")

@@ -2,31 +2,20 @@
 
 from typing import Annotated
 
-import typer
-
-from derender.cli.console import notice, progress_bar, report_images
-from derender.cli.gathered import gathered
+from derender.cli.console import notice
+from derender.cli.copies import changes, copied
+from derender.cli.gathered import command
 from derender.cli.options import OutModel, Output, PartOfImages, Seed, TrainedModel
 
-Changes = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--set", metavar="KEY=VALUE",
-        help="images (how many are seen), batch_size, learning_rate, fitted (images), fit_steps, worst, "
-        "rendered, exchanged, picture_weight, reframed (share shown in other crops, as reframe.farther=1.9), "
-        "strange; the size of perturbations, as perturb.light_deg; for features those of derender whiten.",
-    ),
-]  # fmt: skip
+SETTINGS = (
+    "images (how many are seen), batch_size, learning_rate, fitted (images), fit_steps, worst, rendered, "
+    "exchanged, picture_weight, reframed (share shown in other crops, as reframe.farther=1.9), strange; the "
+    "size of perturbations, as perturb.light_deg; for features those of derender whiten."
+)
+Changes = Annotated[list[str] | None, changes(SETTINGS)]
 
 
-def register(app: typer.Typer) -> None:
-    app.command(
-        "refine",
-        epilog="Example: derender refine photos/ --model runs/mine --part train --out refined",
-    )(refine)
-
-
-@gathered
+@command("refine", "refine photos/ --model runs/mine --part train --out refined")
 def refine(
     images: PartOfImages, model: TrainedModel, out: OutModel, output: Output, settings: Changes = None,
     seed: Seed = 0,
@@ -39,20 +28,12 @@ def refine(
     """
     from derender import learn
 
-    output.refuse_existing(out)
-    with progress_bar("refining") as report:
-        made = learn.refine(
-            model.model, images.address, out=out, settings=settings or (), seed=seed, device=model.device,
-            overwrite=output.force, **images.how, on_images=report_images, progress=report,
-        )  # fmt: skip
-    errors = made.scores["errors"]
+    scores = copied(learn.refine, "refining", images, model, out, output, settings, seed=seed)
+    errors = scores["errors"]
     notice(
-        f"{made.scores['held_out']} held-out images: reconstructed with an error of {errors['now']:.4f}, "
-        f"before {errors['before']:.4f}, fitted {errors['fitted']:.4f}"
+        f"{scores['held_out']} held-out images: reconstructed with an error of {errors['now']:.4f}, before "
+        f"{errors['before']:.4f}, fitted {errors['fitted']:.4f}"
     )
-    for name, gap in made.scores["gaps"].items():
-        notice(
-            f"{name}: {gap['now']:.2f} mean deviations away from fitted scenes, before {gap['before']:.2f}"
-        )
-    output.result(f"model {made.folder}")
-    output.write(made.values())
+    for name, gap in scores["gaps"].items():
+        away = f"{gap['now']:.2f} mean deviations away from fitted scenes"
+        notice(f"{name}: {away}, before {gap['before']:.2f}")

@@ -7,62 +7,45 @@ import typer
 
 from derender.cli import options
 from derender.cli.console import notice, progress_bar, refuse_existing_file
-from derender.cli.gathered import gathered
+from derender.cli.gathered import command
 from derender.cli.options import Output
 
 Run = Annotated[Path, typer.Argument(help="Folder made by derender train.", metavar="RUN")]
-Truth = Annotated[
-    str | None,
-    typer.Option("--truth", help="Rendered images with exact depth, to score geometry.", metavar="PATH"),
-]
-Labels = Annotated[
-    list[str] | None,
-    typer.Option("--label", "-l", help="Label to explain by factors. By default the first suitable one."),
-]
-OutPage = Annotated[
-    Path | None,
-    typer.Option("--out", "-o", help="By default RUN/report.html, made anew.", metavar="FILE"),
-]
+TRUTH = "Rendered images with exact depth, to score geometry."
+Truth = Annotated[str | None, typer.Option("--truth", help=TRUTH, metavar="PATH")]
+LABEL = "Label to explain by factors. By default the first suitable one."
+Labels = Annotated[list[str] | None, typer.Option("--label", "-l", help=LABEL)]
+OUT = "By default RUN/report.html, made anew."
+OutPage = Annotated[Path | None, typer.Option("--out", "-o", help=OUT, metavar="FILE")]
 
 
-def register(app: typer.Typer) -> None:
-    app.command("report", epilog="Example: derender report runs/faces photos/ --out faces.html")(report)
-
-
-@gathered
+@command("report", "report runs/faces photos/ --out faces.html")
 def report(
-    run: Run,
-    images: options.DataOptions,
-    output: Output,
-    truth: Truth = None,
-    label: Labels = None,
-    out: OutPage = None,
-    device: options.Device = "auto",
-) -> None:
+    run: Run, images: options.DataOptions, output: Output, truth: Truth = None, label: Labels = None,
+    out: OutPage = None, device: options.Device = "auto",
+) -> None:  # fmt: skip
     """Make the page of a run again, from its folder; with images also films, scores and explanations.
 
     The page holds images of the data: share it as you would the data itself.
     """
-    from derender.report.evidence import run_evidence
+    from derender.report.evidence import Evidence, run_evidence
     from derender.report.run import run_page
 
     if not (run / "config.yaml").is_file():
         raise FileNotFoundError(f"no run in {run} (no config.yaml): give a folder made by derender train")
     if out is not None:
         refuse_existing_file(out, output.force)
-    evidence, data = None, images.optional_address
+    evidence, data = Evidence(), images.optional_address
     if data is not None:
+        how = {"truth": truth, "labels": label or (), "device": device, **images.how}
         with progress_bar("gathering", "parts") as progress:
-            evidence = run_evidence(
-                run, data, truth=truth, labels=label or (), device=device, progress=progress, **images.how
-            )
+            evidence = run_evidence(run, data, progress=progress, **how)
     elif truth is not None or label:
         raise ValueError("--truth and --label need images to report on")
     else:
         notice("add images for decompositions, films, scores, the disentanglement card and explanations")
     page = run_page(run, evidence).write(out or run / "report.html")
-    failed = [] if evidence is None else list(evidence.failed)
-    for reason in failed:
+    for reason in evidence.failed:
         notice(f"not on the page: {reason}")
     output.result(f"report {page}")
-    output.write({"report": page, "failed": failed})
+    output.write({"report": page, "failed": evidence.failed})

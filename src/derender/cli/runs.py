@@ -1,12 +1,13 @@
 """Options and notices of the commands that train into a run folder: train and finetune."""
 
-from collections.abc import Callable
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from derender.cli.console import duration, notice, report_images
+from derender.cli.console import duration, notice, progress_bar, report_images, result, write_json
 
 if TYPE_CHECKING:
     from derender.data import ImageSet
@@ -26,25 +27,33 @@ PHASES = {
 }
 
 
-def show_progress(report: Callable[..., None]) -> "Callable[[Progress], None]":
-    """A run's progress on a progress bar."""
+def dry_run_shown(config: Any, json_file: str | None) -> None:
+    """Show all settings of a run."""
+    from derender.training.config import to_yaml
+
+    result(to_yaml(config).rstrip(), json_file)
+    write_json(json_file, config.model_dump(mode="json"))
+
+
+@contextmanager
+def run_progress() -> Iterator[dict[str, Any]]:
+    """A progress bar for a run, as keywords of the library call; what was read is noted, with its terms."""
 
     def show(progress: "Progress") -> None:
         speed = ""
         if progress.phase == "train":
             waiting = f"{progress.waiting:.1%} waiting for data"
-            speed = f"{progress.images_per_second:.0f} pictures/s, {waiting}"
+            speed = f"{progress.images_per_second:.0f} images/s, {waiting}"
         description, unit = PHASES[progress.phase]
         report(progress.done, progress.total, speed, description=description, unit=unit)
 
-    return show
+    def note(images: "ImageSet") -> None:
+        report_images(images)
+        if images.terms:
+            notice(f"on its owners' terms: {images.terms}")
 
-
-def report_read(images: "ImageSet") -> None:
-    """Note what was read, and on which terms."""
-    report_images(images)
-    if images.terms:
-        notice(f"on its owners' terms: {images.terms}")
+    with progress_bar("reading") as report:
+        yield {"on_images": note, "progress": show}
 
 
 def report_run(run: "TrainResult") -> None:

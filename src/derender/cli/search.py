@@ -7,7 +7,7 @@ import typer
 
 from derender.cli import options
 from derender.cli.console import notice, progress_bar, refuse_existing_file, show_scores, visible
-from derender.cli.gathered import gathered
+from derender.cli.gathered import command
 
 LABELS_SHOWN = 4
 Table = Annotated[str, typer.Option("--features", "-f", help="A table of derender embed.", metavar="FILE")]
@@ -18,17 +18,11 @@ Metric = Annotated[str, typer.Option(help="Distance: cosine or euclidean.", meta
 Copies = Annotated[bool, typer.Option("--copies", help="Find the image itself too, and copies of it.")]
 Maker = Annotated[str | None, typer.Option("--model", "-m", help="Model of the table.", metavar="MODEL")]
 Sheet = Annotated[Path | None, typer.Option("--out", "-o", help="Also draw the result.", metavar="FILE.png")]
-Images = Annotated[
-    str | None, typer.Option("--data", "-d", help="New address of the table's images.", metavar="IMAGES")
-]
+ADDRESS = "New address of the table's images."
+Images = Annotated[str | None, typer.Option("--data", "-d", help=ADDRESS, metavar="IMAGES")]
 
 
-def register(app: typer.Typer) -> None:
-    example = "derender search --features F.parquet --like a.jpg --model runs/faces --factor geometry"
-    app.command("search", epilog=f"Example: {example}")(search)
-
-
-@gathered
+@command("search", "search --features F.parquet --like a.jpg --model runs/faces --factor geometry")
 def search(
     features: Table, like: Like, output: options.Output, factor: Factor = "geometry", k: Count = 12,
     metric: Metric = "cosine", copies: Copies = False, model: Maker = None, out: Sheet = None,
@@ -42,44 +36,39 @@ def search(
     import derender
     from derender.evaluation.score_table import Column, Row, ScoreTable
     from derender.report.search_sheet import search_sheet
-    from derender.storage.atomic import atomic_file
 
-    found = derender.search(
-        features, like, factor, k, metric=metric, model=model, copies=copies, device=device
-    )
+    how = {"metric": metric, "model": model, "copies": copies, "device": device}
+    found = derender.search(features, like, factor, k, **how)
+    files, away = found.table.files, dict(zip(found.rows, found.distances, strict=True))
     shown = [name for name in found.table.labels if name != "partition"][:LABELS_SHOWN]
     columns = (Column("distance", digits=4), *(Column(visible(name, "")) for name in shown))
-    rows = [
-        Row(visible(found.table.files[row], ""), (away, *(visible(str(labels[name]), "") for name in shown)))
-        for row, away in zip(found.rows, found.distances, strict=True)
-        for labels in [found.labels(row)]
-    ]
+    rows = []
+    for row, distance in away.items():
+        labels = found.labels(row)
+        texts = (visible(str(labels[name]), "") for name in shown)
+        rows.append(Row(visible(files[row], ""), (distance, *texts)))
     caption = f"nearest to {like} by {factor}, {metric} distance, in {features} ({len(found.table):,} rows)"
     show_scores(ScoreTable(visible(caption, ""), "file", columns, rows), output.json_file)
     if found.unchecked:
         notice(f"{features} does not record which model made it: cannot check that it was {model}")
     if len(rows) < k:
         notice(f"the table has no more than {len(rows):,} {'rows' if copies else 'other rows'}")
-    others = [] if copies else [found.table.files[r] for r in found.same_image if r != found.own_row]
+    others = [] if copies else [files[row] for row in found.same_image if row != found.own_row]
     if others:
         more = f" and {len(others) - 1:,} more" if len(others) > 1 else ""
         notice(f"left out as the very same image: {others[0]}{more} (--copies finds it)")
     if out is not None:
-        with progress_bar("finding images") as report, atomic_file(out) as temporary:
-            sheet, missing = search_sheet(found, data, dataset=dataset, progress=report)
-            sheet.save(temporary, format="PNG")
-        notice(
-            "\n".join(
-                [*(f"left out of the sheet: {name} cannot be read" for name in missing), f"drawn in {out}"]
-            )
-        )
+        with progress_bar("finding images") as report:
+            for name in search_sheet(found, out, data, dataset=dataset, progress=report):
+                notice(f"left out of the sheet: {name} cannot be read")
+        notice(f"drawn in {out}")
     output.write(
         {
             "like": like, "factor": factor, "metric": metric, "table": features, "out": out,
-            "same_picture": [found.table.files[row] for row in found.same_image],
+            "same_picture": [files[row] for row in found.same_image],
             "found": [
-                {"row": row, "file": found.table.files[row], "distance": away, "labels": found.labels(row)}
-                for row, away in zip(found.rows, found.distances, strict=True)
+                {"row": row, "file": files[row], "distance": distance, "labels": found.labels(row)}
+                for row, distance in away.items()
             ],
         }
     )  # fmt: skip

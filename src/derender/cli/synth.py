@@ -8,7 +8,7 @@ from typer import Option, Typer
 
 from derender.cli import options
 from derender.cli.console import progress_bar, result, write_json
-from derender.cli.gathered import gathered
+from derender.cli.gathered import command
 
 
 @dataclass(frozen=True)
@@ -40,14 +40,7 @@ class Request:
         write_json(self.json_file, {"out": self.out, **facts, "settings": settings.model_dump(mode="json")})
 
 
-def register(app: Typer) -> None:
-    group = Typer(help="Generate images of known geometry, albedo, light and camera.", no_args_is_help=True)
-    group.command("faces", epilog="Example: derender synth faces --out made/ --count 500 --light wide")(faces)
-    group.command("cars", epilog="Example: derender synth cars --out made/ --classes police,jeep")(cars)
-    app.add_typer(group, name="synth")
-
-
-@gathered
+@command("faces", "synth faces --out made/ --count 500 --light wide")
 def faces(
     request: Request,
     identities: Annotated[int | None, Option(min=1, help="Number of people; default: 8 images each.")] = None,
@@ -68,7 +61,7 @@ def faces(
     request.generate(partial(faces.generate, model=model), count, "identities", FaceSettings, names, **own)
 
 
-@gathered
+@command("cars", "synth cars --out made/ --classes police,jeep")
 def cars(
     request: Request,
     classes: Annotated[str, Option(metavar="A,B", help="Only these classes; default: all twelve.")] = "",
@@ -78,3 +71,10 @@ def cars(
 
     names = [f"classes=[{classes}]"] if classes else []
     request.generate(cars.generate, request.count or 1000, "models", CarSettings, names)
+
+
+def register(app: Typer) -> None:
+    group = Typer(help="Generate images of known geometry, albedo, light and camera.", no_args_is_help=True)
+    for kind in (faces, cars):
+        kind.register(group)
+    app.add_typer(group, name="synth")

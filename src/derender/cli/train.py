@@ -4,54 +4,34 @@ from typing import Annotated
 
 import typer
 
-from derender.cli.console import is_main_process, progress_bar, result, write_json
-from derender.cli.gathered import gathered
+from derender.cli.console import is_main_process, result, write_json
+from derender.cli.gathered import command
 from derender.cli.options import DataOptions, Device, Json, Settings
-from derender.cli.runs import DryRun, OutRun, Resume, report_read, report_run, show_progress
+from derender.cli.runs import DryRun, OutRun, Resume, dry_run_shown, report_run, run_progress
 
-Network = Annotated[
-    str | None,
-    typer.Option(
-        "--model", metavar="NAME",
-        help="Instead of derender: vqvae, simclr, ae, beta-vae, resnet18, stylegan2, e4e or ris.",
-    ),
-]  # fmt: skip
-Preset = Annotated[
-    str | None, typer.Option("--preset", help="faces (the default), cars, cats, paper, or small for a CPU.")
-]
-StartFrom = Annotated[
-    str | None,
-    typer.Option(
-        "--start-from", metavar="MODEL",
-        help="Begin with a trained model's weights: a run folder, a bundled name or a Hub id.",
-    ),
-]  # fmt: skip
-Loocc = Annotated[
-    str | None, typer.Option("--loocc", help="Contrast over none, light, light+camera or all factors.")
-]
-Generator = Annotated[
-    str | None, typer.Option("--generator", metavar="RUN", help="stylegan2 run of e4e, or its published .pt.")
-]
-ConfigFile = Annotated[
-    str | None,
-    typer.Option("--config", metavar="FILE", help="Settings in YAML, such as a run's; options come after."),
-]
+MODEL = "Instead of derender: vqvae, simclr, ae, beta-vae, resnet18, stylegan2, e4e or ris."
+Network = Annotated[str | None, typer.Option("--model", metavar="NAME", help=MODEL)]
+PRESET = "faces (the default), cars, cats, paper, or small for a CPU."
+Preset = Annotated[str | None, typer.Option("--preset", help=PRESET)]
+START_FROM = "Begin with a trained model's weights: a run folder, a bundled name or a Hub id."
+StartFrom = Annotated[str | None, typer.Option("--start-from", metavar="MODEL", help=START_FROM)]
+LOOCC = "Contrast over none, light, light+camera or all factors."
+Loocc = Annotated[str | None, typer.Option("--loocc", help=LOOCC)]
+GENERATOR = "stylegan2 run of e4e, or its published .pt."
+Generator = Annotated[str | None, typer.Option("--generator", metavar="RUN", help=GENERATOR)]
+CONFIG = "Settings in YAML, such as a run's; options come after."
+ConfigFile = Annotated[str | None, typer.Option("--config", metavar="FILE", help=CONFIG)]
 
 
-def register(app: typer.Typer) -> None:
-    app.command("train", epilog="Example: derender train photos/ --preset faces --out runs/faces")(train)
-
-
-@gathered
+@command("train", "train photos/ --preset faces --out runs/faces")
 def train(
     images: DataOptions, out: OutRun, model: Network = None, preset: Preset = None,
-    start_from: StartFrom = None, loocc: Loocc = None, generator: Generator = None,
-    config: ConfigFile = None, settings: Settings = None, resume: Resume = False,
-    dry_run: DryRun = False, device: Device = "auto", json_file: Json = None,
+    start_from: StartFrom = None, loocc: Loocc = None, generator: Generator = None, config: ConfigFile = None,
+    settings: Settings = None, resume: Resume = False, dry_run: DryRun = False, device: Device = "auto",
+    json_file: Json = None,
 ) -> None:  # fmt: skip
     """Learn to decompose images from a folder of unlabelled images of one kind of object."""
     from derender import learn
-    from derender.training.config import to_yaml
 
     changes = [*(settings or ()), *([] if generator is None else [f"generator={generator}"])]
     chosen = learn.run_settings(
@@ -59,14 +39,12 @@ def train(
         resume=resume,
     )  # fmt: skip
     if dry_run:
-        result(to_yaml(chosen).rstrip(), json_file)
-        write_json(json_file, chosen.model_dump(mode="json"))
+        dry_run_shown(chosen, json_file)
         return
-    with progress_bar("reading") as report:
+    with run_progress() as how:
         run = learn.train(
-            images.address, out=out, config=chosen, resume=resume, **images.how, device=device,
-            on_images=report_read, progress=show_progress(report),
-        )  # fmt: skip
+            images.address, out=out, config=chosen, resume=resume, device=device, **images.how, **how
+        )
     if is_main_process():
         report_run(run)
         result(f"model {run.folder}", json_file)

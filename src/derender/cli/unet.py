@@ -2,27 +2,19 @@
 
 from typing import Annotated
 
-import typer
-
-from derender.cli.console import notice, progress_bar, report_images
-from derender.cli.gathered import gathered
+from derender.cli.console import notice
+from derender.cli.copies import changes, copied
+from derender.cli.gathered import command
 from derender.cli.options import OutModel, Output, PartOfImages, Seed, TrainedModel
 
-Changes = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--set", metavar="KEY=VALUE",
-        help="images (how many are seen), batch_size, learning_rate, weight_decay, code_weight, unet_width, "
-        "precision (32-true or bf16-mixed).",
-    ),
-]  # fmt: skip
+SETTINGS = (
+    "images (how many are seen), batch_size, learning_rate, weight_decay, code_weight, unet_width, precision "
+    "(32-true or bf16-mixed)."
+)
+Changes = Annotated[list[str] | None, changes(SETTINGS)]
 
 
-def register(app: typer.Typer) -> None:
-    app.command("unet", epilog="Example: derender unet photos/ --model faces-64 --out faces-unet")(unet)
-
-
-@gathered
+@command("unet", "unet photos/ --model faces-64 --out faces-unet")
 def unet(
     images: PartOfImages, model: TrainedModel, out: OutModel, output: Output, settings: Changes = None,
     seed: Seed = 0,
@@ -34,17 +26,10 @@ def unet(
     """
     from derender import learn
 
-    output.refuse_existing(out)
-    with progress_bar("distilling") as report:
-        made = learn.unet(
-            model.model, images.address, out=out, settings=settings or (), seed=seed, device=model.device,
-            overwrite=output.force, **images.how, on_images=report_images, progress=report,
-        )  # fmt: skip
-    errors = made.scores["errors"]
+    scores = copied(learn.unet, "distilling", images, model, out, output, settings, seed=seed)
+    errors = scores["errors"]
     notice(
         f"mean errors against {model.model}: place {errors['place']:.2f} pixels, depth {errors['depth']:.1%} "
         f"of its range, albedo {errors['albedo']:.3f}; reconstruction {errors['reconstruction']:.4f}, before "
         f"{errors['reconstruction before']:.4f}"
     )
-    output.result(f"model {made.folder}")
-    output.write(made.values())

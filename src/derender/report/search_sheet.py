@@ -4,11 +4,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 
 from derender.data import Unreadable, decode, open_images, quiet_pillow, read_picture
 from derender.features.neighbours import Found
 from derender.report.colours import pictures
+from derender.report.page import png_bytes, write_whole
 from derender.report.panel import GridLayout, contact_sheet
 
 CELL = 160
@@ -16,12 +16,18 @@ Progress = Callable[[int, int], object]
 
 
 def search_sheet(
-    found: Found, images: str | None = None, *, dataset: str = "auto", progress: Progress | None = None
-) -> tuple[Image.Image, list[str]]:
-    """The sheet, and the names of images that cannot be read and are left out of it.
+    found: Found,
+    out: Path,
+    images: str | None = None,
+    *,
+    dataset: str = "auto",
+    progress: Progress | None = None,
+) -> list[str]:
+    """Write the sheet as PNG; gives the names of images that cannot be read and are left out of it.
 
     Args:
         found: of `derender.search`.
+        out: the file.
         images: the address of the table's images; by default the one that the table records.
         dataset: layout of the images, or "auto".
         progress: called with (images read, all).
@@ -41,7 +47,8 @@ def search_sheet(
     names, drawn = [caption for caption, _ in shown], pictures(np.stack([image for _, image in shown]))
     title, layout = f"nearest by {found.factor}", GridLayout(cell=CELL)
     sheet = contact_sheet(drawn, names, across=7, title=title, layout=layout)
-    return sheet, [file for file in captions if file not in read]
+    write_whole(out, png_bytes(sheet))
+    return [file for file in captions if file not in read]
 
 
 def _read(
