@@ -9,7 +9,7 @@ from derender.cli import options, scoring
 from derender.cli.console import progress_bar
 from derender.cli.evaluate.segment import Masks
 from derender.cli.gathered import gathered
-from derender.cli.plan.command import Planned, by_plan
+from derender.cli.plan import Planned, by_plan
 
 if TYPE_CHECKING:
     from derender.evaluation import Scores
