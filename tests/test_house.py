@@ -18,7 +18,7 @@ TESTS = sorted((ROOT / "tests").rglob("*.py"))
 BUDGET = {  # lines, files
     "data": (10_100, 53),
     "evaluation": (8_130, 45),
-    "report": (4_460, 31),
+    "report": (4_480, 31),
     "cli": (3_540, 43),
     "training": (3_800, 16),
     "baselines": (2_870, 11),
