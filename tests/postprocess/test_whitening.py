@@ -26,12 +26,12 @@ def planted(seed: int = 0) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
 
 def test_directions_of_lighting_shrink_and_discriminative_ones_are_kept():
     codes, told, lit = planted()
-    found = fit_projection(Scatter.of(codes), directions=3, shrinkage=1e-6)
+    found = fit_projection(Scatter().add(codes), directions=3, shrinkage=1e-6)
     kept = (told @ found.map).norm(dim=1)
     left = (lit @ found.map).norm(dim=1)
     assert (kept > 10).all()  # 1 of identity counts 20 times the 0.05 that views move there
     assert (left < 0.2).all()
-    every = fit_projection(Scatter.of(codes), directions=SIZE, shrinkage=1e-6).ratios
+    every = fit_projection(Scatter().add(codes), directions=SIZE, shrinkage=1e-6).ratios
     assert len(every) == SIZE
     assert every[:3].min() > 100 > 1 > every[3:].max()
     torch.testing.assert_close(found.ratios, every[:3])
@@ -39,7 +39,7 @@ def test_directions_of_lighting_shrink_and_discriminative_ones_are_kept():
 
 def test_renderings_of_one_picture_differ_by_one_in_every_kept_direction():
     codes, _, _ = planted()
-    found = fit_projection(Scatter.of(codes), directions=5, shrinkage=0.0)
+    found = fit_projection(Scatter().add(codes), directions=5, shrinkage=0.0)
     features = (codes - found.mean) @ found.map
     within = (features - features.mean(dim=0)).flatten(0, 1)
     covariance = within.T @ within / (IMAGES * (VIEWS - 1))
@@ -53,7 +53,7 @@ def test_at_evenness_one_pictures_differ_alike_in_every_kept_direction():
     codes, _, _ = planted()
     readings = codes.double()
     for evenness in (0.0, 0.5, 1.0):
-        found = fit_projection(Scatter.of(codes), 5, 0.0, evenness=evenness)
+        found = fit_projection(Scatter().add(codes), 5, 0.0, evenness=evenness)
         features = (readings - found.mean) @ found.map.double()
         within = (features - features.mean(dim=0)).flatten(0, 1)
         total = within.T @ within / (IMAGES * (VIEWS - 1)) + torch.cov(features.mean(0).T, correction=0)
@@ -66,7 +66,7 @@ def test_an_affine_change_of_the_codes_changes_no_distance():
     codes, _, _ = planted()
     change = torch.randn(SIZE, SIZE, generator=torch.Generator().manual_seed(3)).double()
     changed = (codes.double() @ change + 7).float()
-    one, two = (fit_projection(Scatter.of(c.double()), 4, 0.0) for c in (codes, changed))
+    one, two = (fit_projection(Scatter().add(c.double()), 4, 0.0) for c in (codes, changed))
     distances = [torch.pdist((c[0, :50] - f.mean) @ f.map) for c, f in ((codes, one), (changed, two))]
     assert torch.allclose(*distances, rtol=2e-2)
 
@@ -75,7 +75,7 @@ def test_activations_longer_than_the_code_give_features_of_its_size_and_distingu
     told, _, _ = planted(0)
     code, _, lit = planted(1)
     code = code - code @ lit.T @ lit  # the code itself is distinguished by other images' axes
-    found = fit_projection(Scatter.of(torch.cat([code, told], dim=2)), 6, 1e-6, size=SIZE)
+    found = fit_projection(Scatter().add(torch.cat([code, told], dim=2)), 6, 1e-6, size=SIZE)
     assert found.map.shape == (2 * SIZE, SIZE)
     features = (torch.cat([code, told], dim=2) - found.mean) @ found.map
     assert torch.linalg.matrix_rank(features.flatten(0, 1), rtol=1e-4) == 6
@@ -89,7 +89,7 @@ def test_features_stand_in_the_place_of_the_code_that_they_are_nearest_to():
         [1.0, 2.0, 3.0, 4.0]
     )
     codes = codes.mean(dim=0) + 0.1 * torch.randn(3, 200, 4, generator=torch.Generator().manual_seed(1))
-    found = fit_projection(Scatter.of(codes), 4, 0.0)
+    found = fit_projection(Scatter().add(codes), 4, 0.0)
     features = ((codes - found.mean) @ found.map).flatten(0, 1)
     together = torch.corrcoef(torch.cat([codes.flatten(0, 1), features], dim=1).T)[:4, 4:]
     assert (together.diagonal() > 0.95).all()
@@ -97,14 +97,14 @@ def test_features_stand_in_the_place_of_the_code_that_they_are_nearest_to():
 
 
 def test_codes_where_activations_are_needed_are_refused():
-    whitening = Whitening({"geometry": fit_projection(Scatter.of(planted()[0]), 3, 0.1)})
+    whitening = Whitening({"geometry": fit_projection(Scatter().add(planted()[0]), 3, 0.1)})
     with pytest.raises(ValueError, match="features of geometry are made of 12 numbers, got 7"):
         whitening({"geometry": torch.zeros(2, 7)})
 
 
 def test_codes_that_never_move_are_survived():
     codes = torch.zeros(3, 10, 4)
-    found = fit_projection(Scatter.of(codes), 2, 0.1)
+    found = fit_projection(Scatter().add(codes), 2, 0.1)
     assert torch.isfinite(found.map).all()
     assert ((codes - found.mean) @ found.map).abs().max() == 0
 
@@ -112,12 +112,12 @@ def test_codes_that_never_move_are_survived():
 @pytest.mark.parametrize("shape", [(1, 10, 4), (3, 1, 4)])
 def test_one_view_or_one_image_is_refused(shape):
     with pytest.raises(ValueError, match="at least 2 views of 2 images"):
-        fit_projection(Scatter.of(torch.zeros(shape)), 2, 0.1)
+        fit_projection(Scatter().add(torch.zeros(shape)), 2, 0.1)
 
 
 def test_maps_are_read_as_they_were_written_and_leave_other_factors_alone(tmp_path):
     codes, _, _ = planted()
-    whitening = Whitening({"geometry": fit_projection(Scatter.of(codes), 3, 0.1)})
+    whitening = Whitening({"geometry": fit_projection(Scatter().add(codes), 3, 0.1)})
     whitening.save(tmp_path / "whitening.safetensors")
     again = Whitening.load(tmp_path / "whitening.safetensors")
     given = {"geometry": codes[0], "light": codes[1]}
@@ -137,7 +137,7 @@ def test_maps_that_do_not_fit_are_refused(tmp_path):
 
 def test_sums_over_batches_are_those_of_all_at_once():
     codes = planted()[0]
-    whole, parts = Scatter.of(codes), Scatter()
+    whole, parts = Scatter().add(codes), Scatter()
     for batch in codes.split(37, dim=1):
         parts.add(batch)
     apart = codes.double() - codes.double().mean(dim=0)
@@ -150,7 +150,7 @@ def test_sums_over_batches_are_those_of_all_at_once():
 
 def test_mirrored_maps_take_the_mean_of_both_readings():
     codes = planted()[0]
-    found = fit_projection(Scatter.of(codes), 3, 0.1)
+    found = fit_projection(Scatter().add(codes), 3, 0.1)
     plain, both = Whitening({"geometry": found}), Whitening({"geometry": found}, mirrored=["geometry"])
     own, mirror = codes[0], codes[1]
     expected = (plain({"geometry": own})["geometry"] + plain({"geometry": mirror})["geometry"]) / 2
@@ -162,7 +162,7 @@ def test_mirrored_maps_take_the_mean_of_both_readings():
 
 def test_of_several_maps_each_is_read_again_as_it_was_written(tmp_path):
     codes = planted()[0]
-    maps = {name: fit_projection(Scatter.of(codes), 3, 0.1) for name in ("geometry", "light")}
+    maps = {name: fit_projection(Scatter().add(codes), 3, 0.1) for name in ("geometry", "light")}
     for mirrored in (["geometry"], ["geometry", "light"], []):
         written = Whitening(maps, mirrored=mirrored)
         written.save(tmp_path / "whitening.safetensors")
@@ -176,7 +176,7 @@ def test_of_several_maps_each_is_read_again_as_it_was_written(tmp_path):
 
 
 def test_directions_count_by_how_much_of_them_is_the_pictures_own():
-    spread = Scatter.of(planted()[0])
+    spread = Scatter().add(planted()[0])
     plain, weighted = fit_projection(spread, 3, 0.1), fit_projection(spread, 3, 0.1, power=2)
     before, after = ((found.map.T @ spread.between.float() @ found.map) for found in (plain, weighted))
     own = plain.ratios / (1 + plain.ratios)

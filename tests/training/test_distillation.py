@@ -14,8 +14,8 @@ from derender.training.distillation import (
     RefineConfig,
     RefiningSettings,
     SceneUnit,
-    _examples,
-    _fit,
+    examples,
+    fit_scenes,
     refine,
 )
 
@@ -101,10 +101,10 @@ def test_features_are_made_as_the_settings_say(model, images):
 
 def test_renderings_come_with_the_scene_they_show(model, images):
     pictures = images[:16].float() / 255
-    fitted = _fit(model, images[:16], 2, None)
+    fitted = fit_scenes(model, images[:16], 2, print)
     meant = fitted.scene(model.fitting.maps)
     half = changed(rendered=0.5, exchanged=0.5)
-    shown, scene = _examples(model, pictures, meant, half, torch.Generator().manual_seed(0))
+    shown, scene = examples(model, pictures, meant, half, torch.Generator().manual_seed(0))
     assert shown.shape == pictures.shape and len(scene) == 16
     made: Rendering = model.render(scene[:8])
     seen = made.mask.bool()[:, None].expand_as(made.image)
@@ -127,8 +127,8 @@ def framed(**refining) -> RefineConfig:
 
 def test_pictures_in_other_frames_come_with_the_camera_that_sees_them_so(model, images):
     pictures = images[:16].float() / 255
-    meant = _fit(model, images[:16], 2, None).scene(model.fitting.maps)
-    shown, scene = _examples(model, pictures, meant, framed(rendered=0), torch.Generator().manual_seed(0))
+    meant = fit_scenes(model, images[:16], 2, print).scene(model.fitting.maps)
+    shown, scene = examples(model, pictures, meant, framed(rendered=0), torch.Generator().manual_seed(0))
     away = scene.camera[:, 5] - meant.camera[:, 5]
     moved = away.abs() > 1e-6
     assert 3 < moved.sum() < 13
@@ -155,7 +155,7 @@ def test_a_copy_taught_so_steps_back_from_smaller_faces(model, images):
 
 
 def test_the_unit_is_the_spread_of_fitted_scenes(model, images):
-    meant = _fit(model, images[:16], 2, None).scene(model.fitting.maps)
+    meant = fit_scenes(model, images[:16], 2, print).scene(model.fitting.maps)
     unit = SceneUnit(model, meant)
     mean = meant.map(lambda value: value.mean(dim=0, keepdim=True).expand_as(value))
     gaps = unit.gaps(mean, meant)

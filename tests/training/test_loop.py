@@ -296,7 +296,7 @@ def test_a_checkpoint_that_cannot_be_written_leaves_the_old_one_whole(pictures, 
     def disk_full(*args, **kwargs):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("derender.training.checkpoint.save_file", disk_full)
+    monkeypatch.setattr("derender.training.checkpoint.save", disk_full)
     with pytest.raises(OSError, match="No space left"):
         train(resolve("small", [*TINY, "images=64"]), pictures, tmp_path / "run", resume=True)
     monkeypatch.undo()

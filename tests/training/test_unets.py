@@ -13,9 +13,9 @@ from derender.scene.ranges import SceneRanges
 from derender.training.unets import (
     PixelTargets,
     UNetSettings,
-    _augmented,
-    _masked_error,
+    augmented,
     distil_unets,
+    masked_error,
     pixel_targets,
 )
 
@@ -91,7 +91,7 @@ def test_pictures_and_what_is_said_of_them_move_together(model, images):
     line = torch.linspace(-1, 1, 32).expand(8, 32, 32)
     maps = {"geometry": torch.stack([line, line.mT, line * 0], dim=1), "albedo": pictures.clone()}
     said = PixelTargets(maps, torch.ones(8, 32, 32), {})
-    shown, moved, mask = _augmented(pictures, said, 2, torch.Generator().manual_seed(0))
+    shown, moved, mask = augmented(pictures, said, 2, torch.Generator().manual_seed(0))
     torch.testing.assert_close(shown[:2], pictures[:2], atol=1e-5, rtol=0)
     torch.testing.assert_close(moved["geometry"][:2], maps["geometry"][:2], atol=1e-5, rtol=0)
     assert not torch.allclose(shown[2:], pictures[2:], atol=0.1)
@@ -136,7 +136,7 @@ def test_it_learns_what_the_model_says():
     pictures = images.float() / 255
     said = pixel_targets(model, pictures)
     maps = torch.cat([*said.maps.values()], dim=1)
-    ours, none = (_masked_error(said_jointly(one.model, images), maps, said.mask) for one in (taught, hardly))
+    ours, none = (masked_error(said_jointly(one.model, images), maps, said.mask) for one in (taught, hardly))
     assert ours < 0.85 * none, "the decoder over both learns it, too"
     theirs, ours, none = (one.encode(pictures)["albedo"] for one in (model, taught.model, hardly.model))
     assert (ours - theirs).square().mean() < 0.97 * (none - theirs).square().mean()
@@ -174,7 +174,7 @@ def test_only_covered_pixels_count():
     told, truth = torch.zeros(1, 2, 2, 2), torch.ones(1, 2, 2, 2)
     truth[..., 0] = 5
     mask = torch.tensor([[[0.0, 1.0], [0.0, 1.0]]])
-    assert float(_masked_error(told, truth, mask)) == 1
+    assert float(masked_error(told, truth, mask)) == 1
 
 
 def test_what_cannot_be_taught_is_named(model, images):

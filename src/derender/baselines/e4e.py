@@ -263,7 +263,7 @@ class E4e(LoopModel):
             "l1": (again.detach().clamp(0, 1) - images).abs().mean(),
         }
         if run.aid is not None:
-            distance = mse_loss(run.aid(again), run.aid.target(images))
+            distance = mse_loss(run.aid(again), run.aid(images))
             terms["perceptual"] = objective.perceptual_weight * distance
         return terms
 

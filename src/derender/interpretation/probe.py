@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import torch
 from safetensors import SafetensorError
-from safetensors.numpy import load_file, save_file
+from safetensors.numpy import load_file, save
 from scipy.special import expit, softmax
 
 from derender.data import suggestion
@@ -26,7 +26,6 @@ from derender.evaluation.linear_probes import PAPER_HEAD, HeadSettings, head_los
 from derender.evaluation.linear_task import Task, task_of
 from derender.features import missing
 from derender.storage.atomic import atomic_folder
-from derender.storage.tensors import disk_errors
 
 HEADS = ("logistic", "linear")
 PENALTIES = (1e-1, 1.0, 1e1)
@@ -206,8 +205,7 @@ class Probe:
         facts: dict[str, Any] = {"format": FORMAT, "kind": self.kind, "names": list(self.names)}
         facts |= {"sizes": [[name, size] for name, size in self.sizes.items()], "head": self.head}
         with atomic_folder(folder) as temporary:
-            with disk_errors(temporary / WEIGHTS_FILE):
-                save_file({"weight": self.weight, "bias": self.bias}, temporary / WEIGHTS_FILE)
+            (temporary / WEIGHTS_FILE).write_bytes(save({"weight": self.weight, "bias": self.bias}))
             (temporary / CONFIG_FILE).write_text(json.dumps(facts, indent=1))
         return folder
 

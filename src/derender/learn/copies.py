@@ -11,10 +11,7 @@ from derender.data import ImageSet, split_indices
 from derender.inputs import as_images, as_model, copy_split
 from derender.learn.runs import Changes, OnImages, texts_of
 from derender.model import Derenderer
-from derender.training.config import (
-    FeatureSettings,
-    with_changes,
-)
+from derender.training.config import FeatureSettings, with_changes
 from derender.training.distillation import RefineConfig
 from derender.training.distillation import refine as distil
 from derender.training.features import make_features, recentre
@@ -79,12 +76,11 @@ def whiten(
     if mean_only and settings:
         raise ValueError("with mean_only nothing else is estimated: leave out settings")
     work = _Copying(model, images, Path(out), 2, **how)
-    pixels = torch.from_numpy(work.images.images)
     if mean_only:
-        whitening = recentre(work.model, pixels, progress=work.progress)
+        whitening = recentre(work.model, work.pixels, progress=work.progress)
         made = work.model.with_features(replace(work.model.features, whitening=whitening))
     else:
-        made = make_features(work.model, pixels, features, seed=seed, progress=work.progress)
+        made = make_features(work.model, work.pixels, features, seed=seed, progress=work.progress)
     assert made.whitening is not None
     ratios = {name: made.whitening.get_buffer(f"{name}_ratios").tolist() for name in made.whitening.names}
     return work.saved(made, {"between_over_within": ratios})
@@ -102,15 +98,8 @@ def refine(
     """A copy of a model that predicts at once the scenes that test-time optimisation finds slowly.
 
     Scenes are fitted to these images once, without labels; then the encoders learn to predict them. Every
-    tenth image is held out: errors are measured on those.
-
-    Args:
-        model: trained, with a fitting (`whiten` makes one), or where it is.
-        images: an image set at the model's size, or its address.
-        out: folder of the copy.
-        settings: changes of `RefineConfig`, as ``{"refining.images": 100_000}``.
-        seed: of every random choice.
-        how: ``part``, ``dataset``, ``limit``, ``device``, ``overwrite``, ``on_images`` and ``progress``.
+    tenth image is held out: errors are measured on those. Arguments are those of `whiten`, for a model with
+    a fitting (`whiten` makes one); settings are changes of `RefineConfig`, as ``{"refining.images": 9000}``.
 
     Returns:
         The copy; "held_out" is the number of held-out images, "errors" and "gaps" are those of `Refined`.
@@ -119,9 +108,8 @@ def refine(
     work = _Copying(model, images, Path(out), 10, **how)
     work.model.features.required_fitting(str(work.model.source or "this model"))
     split = split_indices(work.images.files, (0.9, 0.1, 0.0), seed=seed)
-    pixels = torch.from_numpy(work.images.images)
-    held_out = pixels[split.validation]
-    refined = distil(work.model, pixels[split.train], held_out, config, seed=seed, progress=work.progress)
+    training, held_out = work.pixels[split.train], work.pixels[split.validation]
+    refined = distil(work.model, training, held_out, config, seed=seed, progress=work.progress)
     scores = {"held_out": len(held_out), "errors": refined.errors, "gaps": refined.gaps}
     made = work.saved(refined.model, scores, split=work.part == "train")
     store_errors(made.folder, held_out)
@@ -139,22 +127,14 @@ def unet(
 ) -> ModelCopy:
     """A copy of a model with U-Net encoders, which learn its scenes pixel by pixel; for segmentation.
 
-    Args:
-        model: trained, or where it is.
-        images: an image set at the model's size, or its address.
-        out: folder of the copy.
-        settings: changes of `UNetSettings`, as ``{"images": 50_000}``.
-        seed: of every random choice.
-        how: ``part``, ``dataset``, ``limit``, ``device``, ``overwrite``, ``on_images`` and ``progress``.
+    Arguments are those of `whiten`; settings are changes of `UNetSettings`, as ``{"images": 50_000}``.
 
     Returns:
         The copy; "errors" are those of `DistilledUNets`.
     """
     config = with_changes(UNetSettings(), texts_of(settings))
     work = _Copying(model, images, Path(out), 2, **how)
-    made = distil_unets(
-        work.model, torch.from_numpy(work.images.images), config, seed=seed, progress=work.progress
-    )
+    made = distil_unets(work.model, work.pixels, config, seed=seed, progress=work.progress)
     return work.saved(made.model, {"errors": made.errors}, split=work.part == "train")
 
 
@@ -169,12 +149,11 @@ class _Copying:
         at_least: int,
         *,
         part: str = "all",
-        dataset: str = "auto",
-        limit: int | None = None,
         device: str = "auto",
         overwrite: bool = False,
         on_images: OnImages | None = None,
         progress: CopyProgress | None = None,
+        **reading: Any,
     ):
         if out.exists() and not overwrite:
             raise FileExistsError(f"{out} exists already: choose another folder or pass overwrite=True")
@@ -182,9 +161,9 @@ class _Copying:
         self.model = as_model(model, device=device)
         self.source = self.model.source if isinstance(model, Derenderer) else model
         self.images = as_images(
-            images, self.model.image_size, dataset=dataset, limit=limit, part=part, model=self.source,
-            at_least=at_least,
-        )  # fmt: skip
+            images, self.model.image_size, part=part, model=self.source, at_least=at_least, **reading
+        )
+        self.pixels = torch.from_numpy(self.images.images)
         if on_images is not None:
             on_images(self.images)
 

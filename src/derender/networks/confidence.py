@@ -9,8 +9,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
-from derender.networks.decoders import NarrowConv2d
-from derender.networks.encoders import Encoder, NetworkSettings, norm_relu
+from derender.networks.decoders import NarrowConv2d, doubling
+from derender.networks.encoders import Encoder, NetworkSettings
 
 
 @dataclass(frozen=True)
@@ -35,22 +35,17 @@ class ConfidenceNet(nn.Module):
 
     def __init__(self, settings: NetworkSettings):
         super().__init__()
-        width = settings.width
-        self.encoder = Encoder(settings, width, settings.confidence_code_size, normalised=True)
-        upsampling: list[nn.Module] = [
-            nn.ConvTranspose2d(settings.confidence_code_size, 8 * width, 4, bias=False)
-        ]
-        upsampling.append(nn.ReLU())
+        width, code = settings.width, settings.confidence_code_size
+        self.encoder = Encoder(settings, width, code, normalised=True)
         previous = 8 * width
+        upsampling: list[nn.Module] = [nn.ConvTranspose2d(code, previous, 4, bias=False), nn.ReLU()]
         for stage in range(settings.stages - 2):
             channels = max(4 * width // 2**stage, 2 * width)
-            upsampling += [*_upsample(previous, channels)]
+            upsampling += doubling(previous, channels)
             previous = channels
         self.trunk = nn.Sequential(*upsampling)
         self.photometric_head = nn.Sequential(
-            *_upsample(previous, width),
-            *_upsample(width, width),
-            NarrowConv2d(width, 2),
+            *doubling(previous, width), *doubling(width, width), NarrowConv2d(width, 2)
         )
         self.perceptual_head = nn.Conv2d(previous, 2, 3, padding=1, bias=False)
 
@@ -59,10 +54,3 @@ class ConfidenceNet(nn.Module):
         photometric = softplus(self.photometric_head(trunk).float())
         perceptual = softplus(self.perceptual_head(trunk).float())
         return Confidence(photometric[:, :1], photometric[:, 1:], perceptual[:, :1], perceptual[:, 1:])
-
-
-def _upsample(channels_in: int, channels_out: int) -> list[nn.Module]:
-    return [
-        nn.ConvTranspose2d(channels_in, channels_out, 4, stride=2, padding=1, bias=False),
-        norm_relu(channels_out),
-    ]

@@ -22,26 +22,14 @@ class MapDecoder(nn.Module):
     def __init__(self, settings: NetworkSettings, channels: int):
         super().__init__()
         widths = stage_widths(settings.width, settings.stages)[::-1]
-        layers: list[nn.Module] = [
-            nn.ConvTranspose2d(settings.code_size, widths[0], 4, bias=False),
-            nn.ReLU(),
-            nn.Conv2d(widths[0], widths[0], 3, padding=1, bias=False),
-            nn.ReLU(),
-        ]
+        layers: list[nn.Module] = [nn.ConvTranspose2d(settings.code_size, widths[0], 4, bias=False)]
+        layers += [nn.ReLU(), nn.Conv2d(widths[0], widths[0], 3, padding=1, bias=False), nn.ReLU()]
         for previous, width in pairwise(widths):
-            layers += [
-                nn.ConvTranspose2d(previous, width, 4, stride=2, padding=1, bias=False),
-                norm_relu(width),
-                nn.Conv2d(width, width, 3, padding=1, bias=False),
-                norm_relu(width),
-            ]
+            layers += doubling(previous, width)
+            layers += [nn.Conv2d(width, width, 3, padding=1, bias=False), norm_relu(width)]
         last = widths[-1]
-        layers += [
-            UpsampledConv2d(last, last),
-            norm_relu(last),
-            nn.Conv2d(last, last, 5, padding=2, bias=False),
-            norm_relu(last),
-        ]
+        layers += [UpsampledConv2d(last, last), norm_relu(last)]
+        layers += [nn.Conv2d(last, last, 5, padding=2, bias=False), norm_relu(last)]
         self.layers = nn.Sequential(*layers)
         self.last = NarrowConv2d(last, channels)
 
@@ -60,6 +48,12 @@ class VectorDecoder(nn.Module):
         return self.linear(code).tanh()
 
 
+def doubling(channels_in: int, channels_out: int) -> list[nn.Module]:
+    """A transposed convolution to twice the size, normalised and rectified."""
+    upsample = nn.ConvTranspose2d(channels_in, channels_out, 4, stride=2, padding=1, bias=False)
+    return [upsample, norm_relu(channels_out)]
+
+
 class UpsampledConv2d(nn.Conv2d):
     """Nearest-neighbour doubling, then a 3x3 convolution, done as one transposed convolution.
 
@@ -70,9 +64,9 @@ class UpsampledConv2d(nn.Conv2d):
         super().__init__(channels_in, channels_out, 3, padding=1, bias=False)
 
     def forward(self, input: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c2 h2 w2"]:
-        doubling = self.weight.new_ones(1, 1, 2, 2)
+        square = self.weight.new_ones(1, 1, 2, 2)
         flipped = self.weight.flip(2, 3).flatten(0, 1)[:, None]
-        kernel = functional.conv2d(flipped, doubling, padding=1)[:, 0].unflatten(0, self.weight.shape[:2])
+        kernel = functional.conv2d(flipped, square, padding=1)[:, 0].unflatten(0, self.weight.shape[:2])
         return functional.conv_transpose2d(input, kernel.transpose(0, 1), stride=2, padding=1)
 
 

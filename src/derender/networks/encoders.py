@@ -23,9 +23,8 @@ MAX_PLACES = 2048  # numbers of the last spatial map among the activations
 class NetworkSettings(Settings):
     """Sizes of the networks; the defaults are the paper's.
 
-    The geometry and albedo nets start at ``width`` channels and double to 8x that; light and camera
-    start at ``light_width``. ``unet_width`` counts only where ``encoder`` is "unet"; ``unet_decoder`` adds a
-    decoder over the U-Nets of geometry and albedo, which ``derender unet`` trains.
+    Geometry and albedo start at ``width`` channels, light and camera at ``light_width``, and double to 8x
+    that. ``unet_decoder`` adds a decoder over the U-Nets of geometry and albedo (``derender unet``).
     """
 
     image_size: int = 64
@@ -80,10 +79,7 @@ def activations(
 
 
 class Encoder(nn.Module):
-    """Strided convolutions to a code of 1x1 pixels.
-
-    ``spatial`` gives the last features that still have a place in the image, for attribution.
-    """
+    """Strided convolutions to a code of 1x1 pixels; ``spatial`` gives the features before the code."""
 
     def __init__(self, settings: NetworkSettings, width: int, code_size: int, *, normalised: bool):
         super().__init__()
@@ -92,10 +88,9 @@ class Encoder(nn.Module):
         previous = 3
         for stage, channels in enumerate(widths):
             layers.append(nn.Conv2d(previous, channels, 4, stride=2, padding=1, bias=False))
-            if normalised and stage < settings.stages - 1:
-                layers.append(norm_relu(channels, slope=0.2))
-            else:
-                layers.append(nn.LeakyReLU(0.2) if normalised else nn.ReLU())
+            rectifier = nn.LeakyReLU(0.2) if normalised else nn.ReLU()
+            last = stage == settings.stages - 1
+            layers.append(norm_relu(channels, slope=0.2) if normalised and not last else rectifier)
             previous = channels
         self.convolutions = nn.Sequential(*layers)
         self.to_code = nn.Sequential(nn.Conv2d(previous, code_size, 4, bias=False), nn.ReLU())
@@ -109,10 +104,7 @@ class Encoder(nn.Module):
 
 
 class UNetEncoder(nn.Module):
-    """The contracting half of a U-Net, with a code read from its 4x4 centre.
-
-    ``skips`` gives the features at every resolution, finest first, for a segmentation decoder.
-    """
+    """The contracting half of a U-Net, with a code read from its 4x4 centre."""
 
     def __init__(self, settings: NetworkSettings, code_size: int):
         super().__init__()
@@ -123,11 +115,10 @@ class UNetEncoder(nn.Module):
         )
         self.pool = nn.MaxPool2d(2)
         self.to_code = nn.Sequential(nn.Conv2d(widths[-1], code_size, 4, bias=False), nn.ReLU())
-        self.code_size = code_size
-        self.widths = widths
+        self.code_size, self.widths = code_size, widths
 
     def skips(self, images: Float[Tensor, "n 3 h w"]) -> list[Tensor]:
-        """Features after each level, from full resolution down to 4x4."""
+        """Features after each level, from full resolution down to 4x4, for a segmentation decoder."""
         features, found = images * 2 - 1, []
         for level, block in enumerate(self.levels):
             features = block(features if level == 0 else self.pool(features))

@@ -16,7 +16,7 @@ from torch.nn.functional import pad
 
 from derender.networks.decoders import MapDecoder, VectorDecoder
 from derender.networks.encoders import Encoder, NetworkSettings, UNetEncoder, activations
-from derender.scene.camera import shared_tensor
+from derender.scene.camera import focal_px, shared_tensor
 from derender.scene.perturb import PerturbSettings, exchange, perturb_camera, perturb_light
 from derender.scene.ranges import SceneRanges
 
@@ -26,8 +26,7 @@ class FactorNet(nn.Module):
 
     def __init__(self, encoder: nn.Module, decoder: nn.Module):
         super().__init__()
-        self.encoder = encoder
-        self.decoder = decoder
+        self.encoder, self.decoder = encoder, decoder
         self.code_size: int = encoder.code_size  # type: ignore[assignment]
 
     def encode(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n code"]:
@@ -72,13 +71,15 @@ def depth_from_raw(raw: Float[Tensor, "n 1 h w"], ranges: SceneRanges) -> Float[
     """Centre each map, squash it into the depth range and hold both side borders at the border depth."""
     raw = raw.float()
     centred = (raw - raw.mean(dim=(1, 2, 3), keepdim=True)).squeeze(1)
+    height, width = centred.shape[-2:]
+    half, middle = (ranges.depth_max - ranges.depth_min) / 2, (ranges.depth_max + ranges.depth_min) / 2
     if ranges.level_depth:
         centred = level(centred)
     if ranges.lean_deg:
-        centred = centred + leaning_back(centred.shape[-2:], ranges, centred.device)
-    middle, half = (ranges.depth_max + ranges.depth_min) / 2, (ranges.depth_max - ranges.depth_min) / 2
+        up = ((height - 1) / 2 - torch.arange(height, device=raw.device)) / focal_px(width, ranges.fov_deg)
+        centred = centred + math.tan(math.radians(ranges.lean_deg)) * up[:, None] / half
     depth = middle + half * centred.tanh()
-    columns = ranges.border_columns(depth.shape[-1])
+    columns = ranges.border_columns(width)
     if columns == 0:
         return depth
     return pad(depth[..., columns:-columns], (columns, columns), value=ranges.border_depth)
@@ -96,17 +97,6 @@ def level(values: Float[Tensor, "n h w"]) -> Float[Tensor, "n h w"]:
     return values - slope[:, None, None] * down
 
 
-def leaning_back(
-    size: tuple[int, int] | torch.Size, ranges: SceneRanges, device: torch.device | str = "cpu"
-) -> Float[Tensor, "h 1"]:
-    """What is added before the tanh so that a flat map leans back by ``lean_deg`` degrees in its middle."""
-    height, width = size
-    focal = (width - 1) / 2 / math.tan(math.radians(ranges.fov_deg) / 2)
-    up = ((height - 1) / 2 - torch.arange(height, device=device)) / focal
-    half = (ranges.depth_max - ranges.depth_min) / 2
-    return math.tan(math.radians(ranges.lean_deg)) * up[:, None] / half
-
-
 def albedo_from_raw(raw: Float[Tensor, "n 3 h w"], ranges: SceneRanges) -> Float[Tensor, "n 3 h w"]:
     """Reflectance in 0..1."""
     return raw.float().tanh() / 2 + 0.5
@@ -115,10 +105,8 @@ def albedo_from_raw(raw: Float[Tensor, "n 3 h w"], ranges: SceneRanges) -> Float
 def light_from_raw(raw: Float[Tensor, "n 4"], ranges: SceneRanges) -> Float[Tensor, "n 4"]:
     """Ambient, diffuse, pitch, yaw from numbers in -1..1; the last two are slopes: angles are arctangents."""
     raw = raw.float()
-    intensity = [
-        low + (high - low) * (raw[:, i] / 2 + 0.5)
-        for i, (low, high) in enumerate((ranges.ambient, ranges.diffuse))
-    ]
+    ends = enumerate((ranges.ambient, ranges.diffuse))
+    intensity = [low + (high - low) * (raw[:, i] / 2 + 0.5) for i, (low, high) in ends]
     pitch, yaw = (raw[:, 2:] * ranges.light_slope).atan().unbind(1)
     return torch.stack([*intensity, pitch, yaw], dim=1)
 
@@ -142,11 +130,10 @@ def map_net(channels: int, initial_scale: float = 1.0) -> Callable[[NetworkSetti
     """
 
     def build(settings: NetworkSettings) -> FactorNet:
-        encoder = (
-            UNetEncoder(settings, settings.code_size)
-            if settings.encoder == "unet"
-            else Encoder(settings, settings.width, settings.code_size, normalised=True)
-        )
+        if settings.encoder == "unet":
+            encoder = UNetEncoder(settings, settings.code_size)
+        else:
+            encoder = Encoder(settings, settings.width, settings.code_size, normalised=True)
         decoder = MapDecoder(settings, channels)
         with torch.no_grad():
             decoder.last.weight.mul_(initial_scale)
@@ -165,11 +152,9 @@ def vector_net(numbers: int) -> Callable[[NetworkSettings], FactorNet]:
     return build
 
 
-GEOMETRY = Factor(
-    "geometry", "depth", map_net(1, initial_scale=0.1), depth_from_raw, mirrored=True, perturb=exchange
+FACTORS = (
+    Factor("geometry", "depth", map_net(1, 0.1), depth_from_raw, mirrored=True, perturb=exchange),
+    Factor("albedo", "albedo", map_net(3), albedo_from_raw, mirrored=True, perturb=exchange),
+    Factor("light", "light", vector_net(4), light_from_raw, mirrored=False, perturb=perturb_light),
+    Factor("camera", "camera", vector_net(6), camera_from_raw, mirrored=False, perturb=perturb_camera),
 )
-ALBEDO = Factor("albedo", "albedo", map_net(3), albedo_from_raw, mirrored=True, perturb=exchange)
-LIGHT = Factor("light", "light", vector_net(4), light_from_raw, mirrored=False, perturb=perturb_light)
-CAMERA = Factor("camera", "camera", vector_net(6), camera_from_raw, mirrored=False, perturb=perturb_camera)
-
-FACTORS = (GEOMETRY, ALBEDO, LIGHT, CAMERA)

@@ -1,15 +1,13 @@
 """The expanding half of a U-Net, over the skip features of one encoder or of several side by side.
 
-Source: Ronneberger et al., MICCAI 2015 (transposed convolution, skip features joined, two 3x3 convolutions),
-with the widths of the encoders (encoders.py); Klinghoffer et al., ECCV 2022, Sec. 4.7 joins two encoders by
-stacking their features at each skip. The features of the centre are joined in the same way, so that each
-encoder's centre enters once. Leaves out cropping: convolutions are padded.
+Source: Ronneberger et al., MICCAI 2015, with the widths of the encoders (encoders.py); Klinghoffer et al.,
+ECCV 2022, Sec. 4.7 joins two encoders by stacking their features at each skip, and here at the centre, too.
+Leaves out cropping: convolutions are padded.
 """
 
 import copy
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
-from typing import cast
 
 import torch
 from jaxtyping import Float
@@ -47,20 +45,11 @@ class UNetDecoder(nn.Module):
             features = convolve(torch.cat([skip, up(features)], dim=1))
         return self.to_outputs(features)
 
-    def with_outputs(self, outputs: int) -> "UNetDecoder":
-        """A copy that ends in a fresh layer of so many outputs and learns."""
-        decoder = copy.deepcopy(self).requires_grad_(True)
-        decoder.to_outputs = nn.Conv2d(
-            self.to_outputs.in_channels, outputs, 1, device=self.to_outputs.weight.device
-        )
-        return decoder
-
 
 def pixel_decoder(settings: NetworkSettings) -> UNetDecoder:
     """The decoder over the U-Nets of geometry and albedo that a model may have; rendering never asks it."""
-    return UNetDecoder(
-        unet_widths(settings), len(PIXEL_CHANNELS), sum(PIXEL_CHANNELS.values())
-    ).requires_grad_(False)
+    outputs = sum(PIXEL_CHANNELS.values())
+    return UNetDecoder(unet_widths(settings), len(PIXEL_CHANNELS), outputs).requires_grad_(False)
 
 
 class SegmentationNet(nn.Module):
@@ -95,22 +84,23 @@ class SegmentationNet(nn.Module):
         self.encoders = nn.ModuleList(encoders).requires_grad_(not frozen)
         for encoder in encoders:
             encoder.to_code.requires_grad_(False)  # the code takes no part here
-        fresh = decoder is None
-        self.decoder = (
-            UNetDecoder(widths.pop(), len(encoders), outputs) if fresh else decoder.with_outputs(outputs)
-        )
-        self.frozen, self.kept_statistics = frozen, frozen or kept_statistics
-        self.fresh_decoder = fresh
+        if decoder is None:
+            self.decoder = UNetDecoder(widths.pop(), len(encoders), outputs)
+        else:
+            self.decoder = copy.deepcopy(decoder).requires_grad_(True)
+            last = decoder.to_outputs
+            self.decoder.to_outputs = nn.Conv2d(last.in_channels, outputs, 1, device=last.weight.device)
+        self.frozen = frozen
+        self._fixed: list[nn.Module] = []  # parts whose BatchNorm keeps its statistics
+        if frozen or kept_statistics:
+            finest = [encoder.levels[:LEVELS_KEPT] for encoder in encoders]
+            self._fixed += [self.encoders] if frozen or decoder is None else finest
+            self._fixed += [] if decoder is None else [self.decoder.convolve[-LEVELS_KEPT:]]
 
     def train(self, mode: bool = True) -> "SegmentationNet":
         super().train(mode)
-        if self.kept_statistics and (self.frozen or self.fresh_decoder):
-            self.encoders.eval()
-        elif self.kept_statistics:
-            for encoder in cast(Iterable[UNetEncoder], self.encoders):
-                encoder.levels[:LEVELS_KEPT].eval()
-        if self.kept_statistics and not self.fresh_decoder:
-            self.decoder.convolve[-LEVELS_KEPT:].eval()
+        for part in self._fixed:
+            part.eval()
         return self
 
     def forward(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n outputs h w"]:

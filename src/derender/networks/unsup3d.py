@@ -2,11 +2,10 @@
 
 The networks are the same (the paper's appendix), their tensors have other names. So they are matched by
 net (``netD`` depth, ``netA`` albedo, ``netL`` light, ``netV`` view, ``netC`` confidence) and, within one, by
-order: the n-th tensor of the file becomes the n-th of the network, and every shape is compared. Two things
-are converted: 1x1 convolutions become linear layers, and light comes as (ambient, diffuse, x, y) where
-derender has pitch, y, first. The file is a pickle, read with torch's reader for weights: objects of kinds it
-does not know become empty ones, no code is imported or run. Leaves out optimisers, and the ranges, which no
-file holds.
+order, and every shape is compared. Two things are converted: 1x1 convolutions become linear layers, and light
+comes as (ambient, diffuse, x, y) where derender has pitch, y, first. The file is a pickle, read with torch's
+reader for weights: objects of kinds it does not know become empty ones, no code is imported or run. Leaves
+out optimisers, and the ranges, which no file holds.
 """
 
 import pickle
@@ -68,10 +67,13 @@ def read_checkpoint(file: str | Path) -> tuple[NetworkSettings, dict[str, Tensor
         holds = ", ".join(sorted(map(str, content))[:8]) or "nothing"
         raise ValueError(f"{file} is no checkpoint of unsup3d: it has no {missing[0]} (it holds {holds})")
     settings = _sizes(theirs, file)
+    with torch.device("meta"):  # without memory
+        ours: dict[str, nn.Module] = {factor.name: factor.build(settings) for factor in FACTORS}
+        ours["confidence"] = ConfidenceNet(settings)
     weights: dict[str, Tensor] = {}
-    for net, module in _modules(settings).items():
+    for net, name in NETS.items():
         if theirs[net]:
-            weights |= _renamed(theirs[net], module, net, file)
+            weights |= _renamed(theirs[net], ours[name], net, file)
     key = next(name for name in reversed(weights) if name.startswith("nets.light."))
     weights[key] = weights[key][LIGHT_ROWS]
     return settings, weights
@@ -105,23 +107,18 @@ def _loaded(file: Path) -> Any:
 def _tensors(content: Mapping[Any, Any], net: str) -> dict[str, Tensor]:
     """The tensors of one net in their order, whether it is an entry of its own or a prefix."""
     entry = content.get(net)
-    if isinstance(entry, Mapping):
-        return {str(name): value for name, value in entry.items() if isinstance(value, Tensor)}
-    start = f"{net}."
-    return {
-        str(name).removeprefix(start): value
-        for name, value in content.items()
-        if str(name).startswith(start) and isinstance(value, Tensor)
-    }
+    if not isinstance(entry, Mapping):
+        entry = {name: value for name, value in content.items() if str(name).startswith(f"{net}.")}
+    return {str(name): value for name, value in entry.items() if isinstance(value, Tensor)}
 
 
 def _sizes(theirs: Mapping[str, Mapping[str, Tensor]], file: Path) -> NetworkSettings:
     """Read off the first and last convolutions of depth and light."""
     shapes = {net: [tuple(value.shape) for value in tensors.values()] for net, tensors in theirs.items()}
-    depth, light = shapes["netD"], shapes["netL"]
+    light = shapes["netL"]
     try:
-        sizes = {
-            "width": depth[0][0],
+        sizes: dict[str, Any] = {
+            "width": shapes["netD"][0][0],
             "light_width": light[0][0],
             "code_size": light[-1][1],
             "image_size": 4 * 2 ** (len(light) - 2),
@@ -139,21 +136,12 @@ def _sizes(theirs: Mapping[str, Mapping[str, Tensor]], file: Path) -> NetworkSet
         ) from error
 
 
-def _modules(settings: NetworkSettings) -> dict[str, nn.Module]:
-    """derender's networks without memory, by unsup3d's names."""
-    with torch.device("meta"):
-        ours: dict[str, nn.Module] = {factor.name: factor.build(settings) for factor in FACTORS}
-        ours["confidence"] = ConfidenceNet(settings)
-    return {net: ours[name] for net, name in NETS.items()}
-
-
 def _renamed(theirs: Mapping[str, Tensor], module: nn.Module, net: str, file: Path) -> dict[str, Tensor]:
     """The n-th tensor of the file under the name of the network's n-th."""
     found: dict[str, Tensor] = {}
-    expected = list(module.state_dict().items())
-    for (name, value), (ours, like) in zip(theirs.items(), expected, strict=False):
-        fits = value.shape == like.shape or value.shape == (*like.shape, 1, 1)
-        if not fits:
+    expected = module.state_dict()
+    for (name, value), (ours, like) in zip(theirs.items(), expected.items(), strict=False):
+        if value.shape not in (like.shape, (*like.shape, 1, 1)):
             raise ValueError(
                 f"{file}: {net} has {name} of shape {tuple(value.shape)} where {tuple(like.shape)} is "
                 f"expected (derender's {ours}): this is another architecture"

@@ -1,22 +1,15 @@
 """What the networks are trained for: explain the image (reconstruction, perceptual), keep factors apart."""
 
 from derender.objectives.loocc import loocc_loss, nt_xent
-from derender.objectives.perceptual import PERCEPTUAL_KINDS, PerceptualKind, build_perceptual, perceptual_loss
+from derender.objectives.perceptual import PERCEPTUAL_KINDS, build_perceptual, perceptual_loss
 from derender.objectives.perceptual_features import PerceptualFeatures, Vgg16Features, load_vgg16
 from derender.objectives.reconstruction import depth_smoothness, masked_l1, photometric_loss
-from derender.objectives.self_features import (
-    SelfFeatures,
-    SelfTraining,
-    load_self_features,
-    train_self_features,
-)
+from derender.objectives.self_features import SelfFeatures, load_self_features, train_self_features
 
 __all__ = [
     "PERCEPTUAL_KINDS",
     "PerceptualFeatures",
-    "PerceptualKind",
     "SelfFeatures",
-    "SelfTraining",
     "Vgg16Features",
     "build_perceptual",
     "depth_smoothness",

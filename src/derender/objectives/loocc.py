@@ -1,13 +1,11 @@
 """Leave-one-out, cycle contrastive loss (LOOCC): what was not perturbed must be recognised again.
 
-Source: the paper, section 3.2; NT-Xent from SimCLR (Chen et al. 2020): cosine similarity, temperature 0.5,
-two views of each of N images, each view against the 2N - 1 others. Three choices that the paper leaves open:
+Source: the paper, section 3.2; NT-Xent from SimCLR (Chen et al. 2020). Choices that the paper leaves open:
 
-- The perturbed factor is drawn per image. An image is absent from the contrast of its perturbed factor
-  altogether: neither anchor, positive nor negative, as the paper's denominator also runs over unchanged
-  features only. Its two codes of that factor are free to differ as far as the perturbation moves them.
-- Every contrasted (image, factor) counts the same: the loss is the mean over all of them. In expectation this
-  is the mean over the unperturbed factors when one factor is drawn for the whole batch.
+- The perturbed factor is drawn per image, which is absent from the contrast of that factor altogether:
+  neither anchor, positive nor negative.
+- The loss is the mean over all contrasted (image, factor). In expectation this is the mean over the
+  unperturbed factors when one factor is drawn for the whole batch.
 - A factor that fewer than two images kept has nothing to contrast and is dropped from the mean.
 
 Leaves out the perturbation (scene/perturb.py) and the encoding of the new rendering.
@@ -32,9 +30,8 @@ def nt_xent(a: Float[Tensor, "n d"], b: Float[Tensor, "n d"], temperature: float
     At least 0; log(2N - 1) when every code is the same. A code of zeros has no direction: similarity 0, no
     gradient.
     """
-    _check_pairs("codes", a, b)
-    every_row = torch.ones(len(a), dtype=torch.bool, device=a.device)
-    return _anchor_losses(a, b, every_row, temperature).mean()
+    everything = torch.ones(len(a), dtype=torch.bool, device=a.device)
+    return _anchor_losses("codes", a, b, everything, temperature).mean()
 
 
 def loocc_loss(
@@ -58,52 +55,43 @@ def loocc_loss(
         allowed = f"-1..{len(names) - 1} ({', '.join(names)})"
         raise ValueError(f"perturbed must lie in {allowed}, got {perturbed.tolist()}")
     totals, counts = [], []
-    for index, name in enumerate(names):
-        _check_pairs(name, features[name], features_again[name])
-        kept = (perturbed != index).to(features[name].device)
+    for index, (name, codes) in enumerate(features.items()):
+        kept = (perturbed != index).to(codes.device)
         enough = kept.sum() >= 2
-        totals.append(
-            _anchor_losses(features[name], features_again[name], kept, temperature).sum() / 2 * enough
-        )
+        losses = _anchor_losses(name, codes, features_again[name], kept, temperature)
+        totals.append(losses.sum() / 2 * enough)
         counts.append(kept.sum() * enough)
     return torch.stack(totals).sum() / torch.stack(counts).sum().clamp(min=1)
 
 
 def _anchor_losses(
-    a: Tensor, b: Tensor, kept: Bool[Tensor, " n"], temperature: float
+    what: str, a: Tensor, b: Tensor, kept: Bool[Tensor, " n"], temperature: float
 ) -> Float[Tensor, " twice_n"]:
     """The loss of each of the 2N views among the kept ones; 0 for views of images that are not kept."""
+    if a.shape != b.shape:
+        raise ValueError(f"{what}: both encodings need one shape, got {tuple(a.shape)} and {tuple(b.shape)}")
+    if len(a) < 2:
+        raise ValueError(f"{what}: a contrastive loss needs at least 2 images in a batch, got {len(a)}")
     if not temperature > 0:
         raise ValueError(f"the temperature must be positive, got {temperature}")
     with torch.autocast(a.device.type, enabled=False):
         codes = _directions(torch.cat([at_least_float32(a), at_least_float32(b)]))
-        count = len(codes)
-        views = torch.arange(count, device=codes.device)
+        views = torch.arange(len(codes), device=codes.device)
         kept = torch.cat([kept, kept])
-        similarity = codes @ codes.T / temperature
         candidates = kept & (views != views.unsqueeze(1))
-        logits = similarity.masked_fill(~candidates, float("-inf"))
+        logits = (codes @ codes.T / temperature).masked_fill(~candidates, float("-inf"))
         logits = torch.where(kept.unsqueeze(1), logits, 0.0)
-        positive = (views + count // 2) % count
-        losses = functional.cross_entropy(logits, positive, reduction="none")
-        return torch.where(kept, losses, 0.0)
+        positive = (views + len(a)) % len(codes)
+        return torch.where(kept, functional.cross_entropy(logits, positive, reduction="none"), 0.0)
 
 
 def _directions(codes: Float[Tensor, "n d"]) -> Float[Tensor, "n d"]:
     """Unit vectors, safe for any magnitude: each code is first divided by its largest entry.
 
-    The divisor is taken as a constant; a direction does not depend on the length, so the gradient is still
-    exact. NaN stays NaN: it must not pass for a code without a direction.
+    The divisor is a constant: a direction does not depend on the length, so the gradient is exact. NaN stays
+    NaN: it must not pass for a code without a direction.
     """
     largest = codes.detach().abs().amax(dim=1, keepdim=True)
     has_direction = ~(largest <= _NO_DIRECTION)
     codes = torch.where(has_direction, codes, 0.0) / torch.where(has_direction, largest, 1.0)
-    length = torch.where(has_direction, codes, 1.0).norm(dim=1, keepdim=True)
-    return codes / length
-
-
-def _check_pairs(what: str, a: Tensor, b: Tensor) -> None:
-    if a.shape != b.shape:
-        raise ValueError(f"{what}: both encodings need one shape, got {tuple(a.shape)} and {tuple(b.shape)}")
-    if len(a) < 2:
-        raise ValueError(f"{what}: a contrastive loss needs at least 2 images in a batch, got {len(a)}")
+    return codes / torch.where(has_direction, codes, 1.0).norm(dim=1, keepdim=True)

@@ -1,12 +1,11 @@
 """The perceptual loss, and the one place that makes the features it compares.
 
 Source: unsup3d (Wu et al., CVPR 2020), Eq. 7: a Gaussian of the feature difference, with a confidence per
-feature location. Leaves out the features themselves (vgg.py, self_features.py).
+feature location.
 """
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float, UInt8
@@ -17,8 +16,7 @@ from derender.objectives.perceptual_features import CALIBRATION_IMAGES, Perceptu
 from derender.objectives.reconstruction import at_least_float32, bounded_sigma, masked_mean
 from derender.objectives.self_features import train_self_features
 
-PerceptualKind = Literal["vgg16", "self", "none"]
-PERCEPTUAL_KINDS: tuple[PerceptualKind, ...] = ("vgg16", "self", "none")
+PERCEPTUAL_KINDS = ("vgg16", "self", "none")
 
 
 def perceptual_loss(
@@ -30,30 +28,27 @@ def perceptual_loss(
     """``|df|^2 / (2 sigma^2) + log sigma`` with |df|^2 averaged over channels, weighted by the mask's share.
 
     The mask is average-pooled to the features' resolution. Without sigma it is the plain mean of |df|^2 (not
-    half of it), as in unsup3d's code; 0 is best there. Best sigma is |df|; ``bounded_sigma`` keeps it
-    from 0.
+    half of it), as in unsup3d's code; 0 is best there. Best sigma is |df|.
     """
-    height, width = prediction.shape[-2:]
-    weight = functional.adaptive_avg_pool2d(
-        mask if mask.is_floating_point() else mask.float(), (height, width)
-    )
-    weight = at_least_float32(weight)
-    kept = weight > 0
+    height, width = size = prediction.shape[-2], prediction.shape[-1]
+    pooled = functional.adaptive_avg_pool2d(mask if mask.is_floating_point() else mask.float(), size)
+    weight = at_least_float32(pooled)
+    kept = (weight > 0).unsqueeze(1)
     difference = at_least_float32(prediction) - at_least_float32(target)
-    squared = torch.where(kept.unsqueeze(1), difference, 0.0).square().mean(dim=1)
+    squared = torch.where(kept, difference, 0.0).square().mean(dim=1)
     if sigma is None:
         return masked_mean(squared, weight)
-    if sigma.shape[-2:] != (height, width):
+    if sigma.shape[-2:] != size:
         raise ValueError(
             f"the perceptual sigma must have the features' resolution {height} x {width}, got shape "
             f"{tuple(sigma.shape)}; let the confidence net put out that size"
         )
-    deviation = bounded_sigma(torch.where(kept.unsqueeze(1), sigma, 1.0))[:, 0]
+    deviation = bounded_sigma(torch.where(kept, sigma, 1.0))[:, 0]
     return masked_mean(squared / (2 * deviation.square()) + deviation.log(), weight)
 
 
 def build_perceptual(
-    kind: PerceptualKind,
+    kind: str,
     images: UInt8[Tensor, "n 3 h w"] | None = None,
     *,
     weights: Path | str | None = None,
@@ -62,25 +57,18 @@ def build_perceptual(
     progress: Callable[[int, int, float], None] | None = None,
     device: torch.device | str = "cpu",
 ) -> PerceptualFeatures | None:
-    """Frozen, calibrated features of one kind; None for ``none``.
+    """Frozen, calibrated features of one of ``PERCEPTUAL_KINDS``; None for ``none``.
 
-    ``images`` are training images: ``self`` learns from them, and both kinds are calibrated on the first
-    256. Without images ``vgg16`` keeps scale 1. ``weights`` is VGG16's file; None looks in torch hub's
-    cache.
+    ``images`` are training images: ``self`` learns from them, and both kinds are calibrated on 256 of them.
+    Without images ``vgg16`` keeps scale 1. ``weights`` is VGG16's file; None looks in torch hub's cache.
     """
-    match kind:
-        case "none":
-            return None
-        case "vgg16":
-            features = load_vgg16(weights).to(device)
-            if images is not None:
-                features.calibrate_(images[:CALIBRATION_IMAGES].to(device).float() / 255)
-            return features
-        case "self":
-            if images is None:
-                raise ValueError(
-                    "perceptual features 'self' are learned from the training images: give images"
-                )
-            return train_self_features(images, seed=seed, steps=steps, progress=progress, device=device)
-        case _:
-            raise ValueError(f"unknown perceptual features {kind!r}: choose {', '.join(PERCEPTUAL_KINDS)}")
+    if kind == "none":
+        return None
+    if kind == "vgg16":
+        features = load_vgg16(weights).to(device)
+        if images is not None:
+            features.calibrate_(images[:CALIBRATION_IMAGES].to(device).float() / 255)
+        return features
+    if images is None:
+        raise ValueError("perceptual features 'self' are learned from the training images: give images")
+    return train_self_features(images, seed=seed, steps=steps, progress=progress, device=device)

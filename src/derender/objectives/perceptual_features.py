@@ -2,9 +2,8 @@
 
 An extractor normalises images in 0..1, runs ``features``, and divides by one number measured on a calibration
 batch, so that confidence terms mean the same whichever weights are used. Source of VGG16: Simonyan &
-Zisserman 2015 (configuration D); layer choice of unsup3d (Wu et al., CVPR 2020). Layer numbers and key names
-(``features.0.weight`` ...) are torchvision's. Leaves out the loss (perceptual.py), self-supervised features
-(self_features.py), everything after relu3_3, and downloading.
+Zisserman 2015 (configuration D); layer choice of unsup3d (Wu et al., CVPR 2020). Names of weights are
+torchvision's. Leaves out self-supervised features (self_features.py) and downloading.
 """
 
 import pickle
@@ -19,28 +18,17 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
-from derender.storage.tensors import refuse_old_torch
+from derender.storage.tensors import check_fit, refuse_old_torch
 
 CALIBRATION_IMAGES = 256
-IMAGENET_MEAN = (0.485, 0.456, 0.406)
-IMAGENET_STD = (0.229, 0.224, 0.225)
 WHERE_TO_GET_IT = (
     "save https://download.pytorch.org/models/vgg16-397923af.pth (torchvision's ImageNet weights, 528 MB) "
     "in torch hub's cache, or anywhere and give its path"
 )
 # what the readers raise on bytes that are not theirs, the last three from torch.load's restricted unpickler
 _DAMAGED = (
-    zipfile.BadZipFile,
-    zlib.error,
-    SafetensorError,
-    pickle.UnpicklingError,
-    RuntimeError,
-    EOFError,
-    OSError,
-    ValueError,
-    LookupError,
-    AttributeError,
-    TypeError,
+    *(zipfile.BadZipFile, zlib.error, SafetensorError, pickle.UnpicklingError, RuntimeError, EOFError),
+    *(OSError, ValueError, LookupError, AttributeError, TypeError),
 )
 _WIDTHS = (64, 64, "pool", 128, 128, "pool", 256, 256, 256)
 
@@ -75,16 +63,11 @@ class PerceptualFeatures(nn.Module):
         return self.features((images - self.image_mean) / self.image_std) * self.scale
 
     @torch.no_grad()
-    def target(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n c fh fw"]:
-        """The same without gradient, for the images that a rendering is compared with."""
-        return self(images)
-
-    @torch.no_grad()
     def calibrate_(self, images: Float[Tensor, "n 3 h w"]) -> "PerceptualFeatures":
         """Set the scale so that on these images the features' standard deviation about channel means is 1.
 
-        It is pooled over channels (one number for all), so relations between channels stay, and two unrelated
-        locations differ by a mean square of about 2. A few hundred images are enough.
+        It is pooled over channels (one number for all), so relations between channels stay. A few hundred
+        images are enough.
         """
         self.scale.fill_(1.0)
         count = 0
@@ -111,9 +94,7 @@ class PerceptualFeatures(nn.Module):
 class Vgg16Features(PerceptualFeatures):
     """relu3_3 of VGG16: 256 channels at a quarter of the resolution."""
 
-    kind = "vgg16"
-    stride = 4
-    channels = 256
+    kind, stride, channels = "vgg16", 4, 256
 
     def __init__(self):
         layers: list[nn.Module] = []
@@ -124,7 +105,7 @@ class Vgg16Features(PerceptualFeatures):
             else:
                 layers += [nn.Conv2d(channels, width, 3, padding=1), nn.ReLU(inplace=True)]
                 channels = width
-        super().__init__(nn.Sequential(*layers), IMAGENET_MEAN, IMAGENET_STD)
+        super().__init__(nn.Sequential(*layers), (0.485, 0.456, 0.406), (0.229, 0.224, 0.225))  # ImageNet's
 
 
 def load_vgg16(path: Path | str | None = None) -> Vgg16Features:
@@ -132,34 +113,27 @@ def load_vgg16(path: Path | str | None = None) -> Vgg16Features:
 
     Keys beyond relu3_3 are ignored. A ``.pth`` is read with ``weights_only=True``, so it cannot run code.
     """
-    path = _cached_weights() if path is None else Path(path).expanduser()
+    if path is None:
+        folder = Path(torch.hub.get_dir()) / "checkpoints"
+        cached = sorted(folder.glob("vgg16-*.pth"))
+        if not cached:
+            raise ValueError(f"no vgg16-*.pth in torch hub's cache {folder}: {WHERE_TO_GET_IT}")
+        path = cached[0]
+    path = Path(path).expanduser()
     if not path.is_file():
         raise ValueError(f"no VGG16 weights at {path}: {WHERE_TO_GET_IT}")
     found = _read_weights(path)
-    if not isinstance(found, dict):
-        raise ValueError(
-            f"{path} holds no named weights, so it is not torchvision's VGG16: {WHERE_TO_GET_IT}"
-        )
     net = Vgg16Features()
-    expected = {name: value for name, value in net.state_dict().items() if name.startswith("features.")}
-    for name, value in expected.items():
-        if name not in found:
-            raise ValueError(f"{path} has no {name!r}, so it is not torchvision's VGG16: {WHERE_TO_GET_IT}")
-        if found[name].shape != value.shape:
-            raise ValueError(
-                f"{name} in {path} has shape {tuple(found[name].shape)}, VGG16 needs {tuple(value.shape)}: "
-                f"{WHERE_TO_GET_IT}"
-            )
-    net.load_state_dict({**net.state_dict(), **{name: found[name].float() for name in expected}})
+    expected = net.features.state_dict(prefix="features.")
+    try:
+        if not isinstance(found, dict):
+            raise ValueError("it holds no named weights")
+        named = {name: value for name, value in found.items() if name in expected}
+        check_fit(named, expected)
+    except ValueError as problem:
+        raise ValueError(f"{path} is not torchvision's VGG16 ({problem}): {WHERE_TO_GET_IT}") from problem
+    net.load_state_dict({**net.state_dict(), **{name: value.float() for name, value in named.items()}})
     return net
-
-
-def _cached_weights() -> Path:
-    folder = Path(torch.hub.get_dir()) / "checkpoints"
-    candidates = sorted(folder.glob("vgg16-*.pth"))
-    if not candidates:
-        raise ValueError(f"no vgg16-*.pth in torch hub's cache {folder}: {WHERE_TO_GET_IT}")
-    return candidates[0]
 
 
 def _read_weights(path: Path) -> object:

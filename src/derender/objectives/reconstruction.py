@@ -23,16 +23,15 @@ def photometric_loss(
 ) -> Float[Tensor, ""]:
     """Negative log-likelihood of a Laplace distribution around the prediction, averaged over the mask.
 
-    ``sqrt(2) |dI| / sigma + log sigma`` with |dI| averaged over the channels; best sigma is sqrt(2) |dI|.
-    Without sigma it is the plain masked L1. Unbounded below in principle; ``bounded_sigma`` makes log(1e-3) =
-    -6.9 the least. Images may be 0..1 or -1..1: the range only shifts the loss by a constant once sigma has
-    adapted.
+    ``sqrt(2) |dI| / sigma + log sigma`` with |dI| averaged over the channels; best sigma is sqrt(2) |dI|, and
+    log(1e-3) = -6.9 the least value. Without sigma it is the plain masked L1.
     """
+    kept = (mask > 0).unsqueeze(1)
+    difference = at_least_float32(prediction) - at_least_float32(target)
+    error = torch.where(kept, difference, 0.0).abs().mean(dim=1)
     if sigma is None:
-        return masked_l1(prediction, target, mask)
-    kept = mask > 0
-    scale = bounded_sigma(torch.where(kept.unsqueeze(1), sigma, 1.0))[:, 0]
-    error = _channel_error(prediction, target, kept)
+        return masked_mean(error, mask)
+    scale = bounded_sigma(torch.where(kept, sigma, 1.0))[:, 0]
     return masked_mean(math.sqrt(2) * error / scale + scale.log(), mask)
 
 
@@ -42,18 +41,27 @@ def masked_l1(
     mask: Float[Tensor, "n h w"] | Bool[Tensor, "n h w"],
 ) -> Float[Tensor, ""]:
     """Mean absolute difference over channels and over the pixels that the mask keeps; 0 is best."""
-    return masked_mean(_channel_error(prediction, target, mask > 0), mask)
+    return photometric_loss(prediction, target, mask, None)
 
 
 def depth_smoothness(
-    depth: Float[Tensor, "n h w"], depth_range: float = 0.2, border: int = 0
+    depth: Float[Tensor, "n h w"], depth_range: float = 0.2, border: int = 0, order: int = 1
 ) -> Float[Tensor, ""]:
     """Mean |step| to the next row plus mean |step| to the next column, in depth ranges; 0 is flat.
 
     ``border`` columns at each side are left out: the presets clamp two of them, a step that is no part of the
     surface. The paper of unsup3d names the term without a formula; the definition is that of its code.
     """
-    return _mean_differences(depth, 1, depth_range, border, "smoothness")
+    if depth_range <= 0:
+        raise ValueError(f"depth_range must be above 0, got {depth_range}; give farthest minus nearest depth")
+    depth = at_least_float32(depth[:, :, border : depth.shape[2] - border])
+    if min(depth.shape[1:]) <= order:
+        raise ValueError(
+            f"depth {'smoothness' if order == 1 else 'curvature'} needs {order + 1} rows and {order + 1} "
+            f"columns inside the border, got {tuple(depth.shape)}"
+        )
+    rows, columns = (depth.diff(n=order, dim=axis).abs().mean() for axis in (1, 2))
+    return (rows + columns) / depth_range
 
 
 def depth_curvature(
@@ -62,25 +70,9 @@ def depth_curvature(
     """Mean |second difference| down the columns plus along the rows, in depth ranges; 0 for every plane.
 
     Depth noise of a thousandth turns normals by tens of degrees, and stripes can pass for matt skin; this
-    term removes both and leaves slopes alone, which ``depth_smoothness`` flattens. ``border`` as there.
-    No published source.
+    term removes both and leaves slopes alone. ``border`` as in ``depth_smoothness``. No published source.
     """
-    return _mean_differences(depth, 2, depth_range, border, "curvature")
-
-
-def _mean_differences(
-    depth: Float[Tensor, "n h w"], order: int, depth_range: float, border: int, name: str
-) -> Float[Tensor, ""]:
-    if depth_range <= 0:
-        raise ValueError(f"depth_range must be above 0, got {depth_range}; give farthest minus nearest depth")
-    depth = at_least_float32(depth[:, :, border : depth.shape[2] - border])
-    if min(depth.shape[1:]) <= order:
-        raise ValueError(
-            f"depth {name} needs {order + 1} rows and {order + 1} columns inside the border, got "
-            f"{tuple(depth.shape)}"
-        )
-    rows, columns = (depth.diff(n=order, dim=axis).abs().mean() for axis in (1, 2))
-    return (rows + columns) / depth_range
+    return depth_smoothness(depth, depth_range, border, order=2)
 
 
 def masked_mean(
@@ -96,9 +88,8 @@ def masked_mean(
 def bounded_sigma(sigma: Float[Tensor, "*shape"], floor: float = SIGMA_FLOOR) -> Float[Tensor, "*shape"]:
     """``sqrt(sigma^2 + floor^2)``: sigma itself to 1e-4 relative from 0.07 up, never below the floor.
 
-    A softplus can reach 0, where both the loss and its gradient have no bound. The floor of 1e-3 is a quarter
-    of an 8-bit grey level, and unlike a clamp it leaves a gradient by which a sigma that fell too low
-    recovers.
+    A softplus can reach 0, where both the loss and its gradient have no bound. Unlike a clamp this leaves a
+    gradient by which a sigma that fell too low recovers.
     """
     sigma = at_least_float32(sigma)
     return (sigma.square() + floor**2).sqrt()
@@ -107,9 +98,3 @@ def bounded_sigma(sigma: Float[Tensor, "*shape"], floor: float = SIGMA_FLOOR) ->
 def at_least_float32(value: Tensor) -> Tensor:
     """Half precision becomes float32; float32 and float64 stay as they are."""
     return value.float() if value.dtype in (torch.bfloat16, torch.float16) else value
-
-
-def _channel_error(prediction: Tensor, target: Tensor, kept: Tensor) -> Tensor:
-    """|prediction - target| averaged over channels, 0 outside the mask whatever stands there."""
-    difference = at_least_float32(prediction) - at_least_float32(target)
-    return torch.where(kept.unsqueeze(1), difference, 0.0).abs().mean(dim=1)

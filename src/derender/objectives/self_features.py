@@ -5,14 +5,13 @@ with average instead of maximum pooling, so that the gradient reaches every pixe
 of unsup3d (Wu et al., CVPR 2020, table 2) finds self-supervised features as good as VGG's.
 
 Training is dense contrastive learning: SimCLR's objective (Chen et al. 2020) at feature locations, as in
-DenseCL (Wang et al. 2021), with exact correspondences. Each image is cropped twice at corners that differ by
-whole feature strides, and each crop gets its own brightness, contrast, colour and noise. Locations that show
-the same point of the same image are positives; every other sampled location is a negative (NT-Xent). Leaves
-out a momentum encoder and a queue: a batch holds thousands of locations already.
+DenseCL (Wang et al. 2021). Each image is cropped twice at corners that differ by whole feature strides, and
+each crop gets its own brightness, contrast, colour and noise. Locations that show the same point of the same
+image are positives; every other sampled location is a negative (NT-Xent).
 """
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -31,8 +30,7 @@ DEFAULT_STEPS = 600
 class SelfFeatures(PerceptualFeatures):
     """Convolutions, ReLUs and average pooling: ``widths[-1]`` channels at a quarter of the resolution."""
 
-    kind = "self"
-    stride = 4
+    kind, stride = "self", 4
 
     def __init__(self, widths: tuple[int, int, int] = DEFAULT_WIDTHS):
         super().__init__(trunk(widths, normalised=False), (0.5, 0.5, 0.5), (0.25, 0.25, 0.25))
@@ -41,8 +39,7 @@ class SelfFeatures(PerceptualFeatures):
 
     def save(self, path: Path | str) -> None:
         """Write weights, scale and widths to one safetensors file."""
-        about = {"kind": self.kind, "widths": json.dumps(self.widths)}
-        write_tensors(self.state_dict(), path, about)
+        write_tensors(self.state_dict(), path, {"kind": self.kind, "widths": json.dumps(self.widths)})
 
 
 def load_self_features(path: Path | str) -> SelfFeatures:
@@ -69,19 +66,13 @@ def trunk(widths: tuple[int, int, int], normalised: bool) -> nn.Sequential:
         raise ValueError(f"the self-trained features need three positive widths, got {widths}")
     full, half, quarter = widths
     layers: list[nn.Module] = []
-    for channels_in, channels_out, pool in (
-        (3, full, True),
-        (full, half, False),
-        (half, half, True),
-        (half, quarter, False),
-        (quarter, quarter, False),
-    ):
-        layers.append(nn.Conv2d(channels_in, channels_out, 3, padding=1, bias=not normalised))
-        if normalised:
-            layers.append(nn.BatchNorm2d(channels_out))
+    previous = 3
+    for channels, pool in ((full, True), (half, False), (half, True), (quarter, False), (quarter, False)):
+        layers.append(nn.Conv2d(previous, channels, 3, padding=1, bias=not normalised))
+        layers += [nn.BatchNorm2d(channels)] if normalised else []
         layers.append(nn.ReLU(inplace=True))
-        if pool:
-            layers.append(nn.AvgPool2d(2))
+        layers += [nn.AvgPool2d(2)] if pool else []
+        previous = channels
     return nn.Sequential(*layers)
 
 
@@ -89,14 +80,15 @@ def trunk(widths: tuple[int, int, int], normalised: bool) -> nn.Sequential:
 def without_normalisation(normalised: nn.Sequential, widths: tuple[int, int, int]) -> nn.Sequential:
     """What the trained layers compute in evaluation mode, every BatchNorm folded into its convolution."""
     folded = trunk(widths, normalised=False)
-    plain = [layer for layer in folded if isinstance(layer, nn.Conv2d)]
-    convolutions = [layer for layer in normalised if isinstance(layer, nn.Conv2d)]
-    norms = [layer for layer in normalised if isinstance(layer, nn.BatchNorm2d)]
-    for target, convolution, norm in zip(plain, convolutions, norms, strict=True):
-        assert norm.running_var is not None and norm.running_mean is not None and target.bias is not None
-        gain = norm.weight / (norm.running_var + norm.eps).sqrt()
-        target.weight.copy_(convolution.weight * gain.view(-1, 1, 1, 1))
-        target.bias.copy_(norm.bias - norm.running_mean * gain)
+    layers = [layer for layer in normalised if not isinstance(layer, nn.BatchNorm2d)]
+    norms = (layer for layer in normalised if isinstance(layer, nn.BatchNorm2d))
+    for target, convolution in zip(folded, layers, strict=True):
+        if isinstance(target, nn.Conv2d) and isinstance(convolution, nn.Conv2d):
+            norm = next(norms)
+            assert norm.running_var is not None and norm.running_mean is not None and target.bias is not None
+            gain = norm.weight / (norm.running_var + norm.eps).sqrt()
+            target.weight.copy_(convolution.weight * gain.view(-1, 1, 1, 1))
+            target.bias.copy_(norm.bias - norm.running_mean * gain)
     return folded
 
 
@@ -145,28 +137,32 @@ def train_self_features(
     if steps < 1:
         raise ValueError(f"training perceptual features needs at least 1 step, got {steps}")
     generator = Generator().manual_seed(seed)
-    net = SelfFeatures(settings.widths).to(device)
-    layers, head = (module.to(device).train() for module in _initialised(settings, generator))
-    parameters = [*layers.parameters(), *head.parameters()]
-    optimiser = torch.optim.AdamW(parameters, settings.learning_rate, weight_decay=settings.weight_decay)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(
-        optimiser, settings.learning_rate, total_steps=steps + 1, pct_start=0.2, cycle_momentum=False
+    net, width = SelfFeatures(settings.widths).to(device), settings.widths[-1]
+    head = nn.Sequential(
+        nn.Conv2d(width, 2 * width, 1), nn.ReLU(), nn.Conv2d(2 * width, settings.projection, 1)
     )
-    batch = min(settings.batch, len(images))
-    order = endless_order(len(images), generator)
-    for step in range(steps):
-        rows = torch.tensor([next(order) for _ in range(batch)])
+    layers = trunk(settings.widths, normalised=True)
+    for module in [*layers, *head]:
+        if isinstance(module, nn.Conv2d):
+            nn.init.kaiming_normal_(module.weight, nonlinearity="relu", generator=generator)
+            if module.bias is not None:
+                nn.init.zeros_(module.bias)
+    learner = nn.Sequential(layers, head).to(device).train()
+    optimiser = torch.optim.AdamW(
+        learner.parameters(), settings.learning_rate, weight_decay=settings.weight_decay
+    )
+
+    def loss(rows: Int64[Tensor, " b"]) -> Tensor:
         crops = images[rows].to(device).float() / 255
         pair = two_views(crops, settings.crop, SelfFeatures.stride, settings.places, generator)
         views = (torch.cat([pair.first, pair.second]) - net.image_mean) / net.image_std
-        first, second = head(layers(views.contiguous(memory_format=torch.channels_last))).chunk(2)
-        loss = nt_xent(_at(first, pair.first_places), _at(second, pair.second_places), settings.temperature)
-        optimiser.zero_grad(set_to_none=True)
-        loss.backward()
-        optimiser.step()
-        schedule.step()
+        first, second = learner(views.contiguous(memory_format=torch.channels_last)).chunk(2)
+        return nt_xent(_at(first, pair.first_places), _at(second, pair.second_places), settings.temperature)
+
+    batch = min(settings.batch, len(images))
+    for step, value in one_cycle(optimiser, loss, len(images), batch, steps, generator, warm_up=0.2):
         if progress is not None:
-            progress(step + 1, steps, loss.item())
+            progress(step, steps, value.item())
     if not all(bool(value.isfinite().all()) for value in layers.state_dict().values()):
         raise ValueError(
             f"learning perceptual features ended in weights that are NaN or infinite after {steps} steps: "
@@ -176,6 +172,40 @@ def train_self_features(
     rows = torch.randperm(len(images), generator=generator)[:CALIBRATION_IMAGES]
     net.calibrate_(images[rows].to(device).float() / 255)
     return net
+
+
+def one_cycle(
+    optimiser: torch.optim.Optimizer,
+    loss: Callable[[Int64[Tensor, " b"]], Float[Tensor, ""]],
+    count: int,
+    batch: int,
+    steps: int,
+    generator: Generator,
+    *,
+    warm_up: float,
+    clipped: Sequence[nn.Module] = (),
+) -> Iterator[tuple[int, Float[Tensor, ""]]]:
+    """Minimise a loss of rows of ``count`` images, drawn epoch by epoch, with one cycle of the rate.
+
+    Gives the number of steps done and the loss after each. The optimiser's own rate is the peak, reached
+    after the share ``warm_up`` of the steps; gradients of each of ``clipped`` are clipped to norm 1.
+    """
+    schedule = torch.optim.lr_scheduler.OneCycleLR(
+        optimiser, optimiser.defaults["lr"], total_steps=steps + 1, pct_start=warm_up, cycle_momentum=False
+    )
+    order: list[int] = []
+    for step in range(1, steps + 1):
+        while len(order) < batch:
+            order += torch.randperm(count, generator=generator).tolist()
+        rows, order = order[:batch], order[batch:]
+        value = loss(torch.tensor(rows))
+        optimiser.zero_grad(set_to_none=True)
+        value.backward()
+        for part in clipped:
+            nn.utils.clip_grad_norm_(part.parameters(), 1.0)
+        optimiser.step()
+        schedule.step()
+        yield step, value.detach()
 
 
 @dataclass(frozen=True)
@@ -195,44 +225,43 @@ class ViewPair:
 
 
 def two_views(
-    pictures: Float[Tensor, "n 3 h w"], crop: int, stride: int, places: int, generator: Generator
+    images: Float[Tensor, "n 3 h w"], crop: int, stride: int, places: int, generator: Generator
 ) -> ViewPair:
     """Crop each image twice, mirror both crops alike, augment each by itself.
 
     Crops lie inside the image, take at most three quarters of its side, and are up to a quarter of the crop
     apart, by whole strides: feature locations correspond exactly. The first is placed to the pixel.
     """
-    n, _, height, width = pictures.shape
+    n, _, height, width = images.shape
     crop = min(crop, 3 * min(height, width) // 4) // stride * stride
     if crop < 2 * stride:
         raise ValueError(
             f"images of {height} x {width} are too small to learn features of stride {stride} from"
         )
     cells = crop // stride
-    reach = max(1, cells // 4)
-    corners = torch.stack(
-        [_crop_corners(n, side - crop, stride, reach, generator) for side in (height, width)], dim=2
-    )
-    first_corner, second_corner = corners
+    reach = torch.tensor(max(1, cells // 4))
+    corners = []
+    for slack in (height - crop, width - crop):
+        first = torch.randint(slack + 1, (n,), generator=generator)
+        lowest = -torch.minimum(first // stride, reach)
+        highest = torch.minimum((slack - first) // stride, reach)
+        steps = lowest + (torch.rand(n, generator=generator) * (highest - lowest + 1)).long()
+        corners.append(torch.stack([first, first + steps * stride]))
+    first_corner, second_corner = torch.stack(corners, dim=2)
     offset = (second_corner - first_corner) // stride
-    lowest = offset.clamp(min=0)
-    extent = cells - offset.abs()
     drawn = torch.rand((n, places, 2), generator=generator)
-    first_cell = lowest.unsqueeze(1) + (drawn * extent.unsqueeze(1)).long()
+    extent = cells - offset.abs()
+    first_cell = offset.clamp(min=0).unsqueeze(1) + (drawn * extent.unsqueeze(1)).long()
     second_cell = first_cell - offset.unsqueeze(1)
     mirrored = torch.rand((n, 1), generator=generator) < 0.5
 
     def flat(cell: Tensor) -> Tensor:
         column = torch.where(mirrored, cells - 1 - cell[..., 1], cell[..., 1])
-        return (cell[..., 0] * cells + column).to(pictures.device)
+        return (cell[..., 0] * cells + column).to(images.device)
 
     def view(corner: Tensor) -> Tensor:
-        cut = torch.stack(
-            [
-                picture[:, y : y + crop, x : x + crop]
-                for picture, (y, x) in zip(pictures, corner.tolist(), strict=True)
-            ]
-        )
+        placed = zip(images, corner.tolist(), strict=True)
+        cut = torch.stack([image[:, y : y + crop, x : x + crop] for image, (y, x) in placed])
         mirror = mirrored.view(-1, 1, 1, 1).to(cut.device)
         return photometric_augmentation(torch.where(mirror, cut.flip(3), cut), generator)
 
@@ -244,54 +273,19 @@ def photometric_augmentation(
 ) -> Float[Tensor, "n 3 h w"]:
     """Brightness, contrast, a colour cast and noise, drawn for each image; the result stays in 0..1.
 
-    There is no blur: features that ignore it would not miss the detail that a blurred rendering lacks
-    (measured on synface64, relative to another identity's distance: blur of 1 pixel 0.034 without and 0.018
-    with it).
+    There is no blur: features that ignore it would not miss the detail that a blurred rendering lacks.
     """
 
-    def draw(*shape: int) -> Tensor:
-        return torch.rand(shape, generator=generator).to(images)
+    def draw(channels: int = 1) -> Tensor:
+        return torch.rand(len(images), channels, 1, 1, generator=generator).to(images)
 
-    n = len(images)
     mean = images.mean(dim=(1, 2, 3), keepdim=True)
-    contrast = 0.7 + 0.6 * draw(n, 1, 1, 1)
-    gain = 0.7 + 0.6 * draw(n, 1, 1, 1)
-    cast = 0.9 + 0.2 * draw(n, 3, 1, 1)
+    contrast, gain, cast = 0.7 + 0.6 * draw(), 0.7 + 0.6 * draw(), 0.9 + 0.2 * draw(3)
     changed = ((images - mean) * contrast + mean) * gain * cast
     noise = torch.randn(images.shape, generator=generator).to(images)
-    return (changed + noise * 0.03 * draw(n, 1, 1, 1)).clamp(0, 1)
-
-
-def _crop_corners(n: int, slack: int, stride: int, reach: int, generator: Generator) -> Int64[Tensor, "2 n"]:
-    """First and second corner along one axis: the first uniform, the second whole strides away."""
-    first = torch.randint(slack + 1, (n,), generator=generator)
-    lowest = -torch.minimum(first // stride, torch.tensor(reach))
-    highest = torch.minimum((slack - first) // stride, torch.tensor(reach))
-    steps = lowest + (torch.rand(n, generator=generator) * (highest - lowest + 1)).long()
-    return torch.stack([first, first + steps * stride])
+    return (changed + noise * 0.03 * draw()).clamp(0, 1)
 
 
 def _at(codes: Float[Tensor, "n c h w"], places: Int64[Tensor, "n p"]) -> Float[Tensor, "np c"]:
     codes = codes.flatten(2)
     return codes.gather(2, places.unsqueeze(1).expand(-1, codes.shape[1], -1)).transpose(1, 2).flatten(0, 1)
-
-
-def endless_order(count: int, generator: Generator) -> Iterator[int]:
-    """Row numbers, each epoch a new permutation."""
-    while True:
-        yield from torch.randperm(count, generator=generator).tolist()
-
-
-def _initialised(settings: SelfTraining, generator: Generator) -> tuple[nn.Sequential, nn.Sequential]:
-    """Trunk and projection head, their weights drawn from the generator (He normal)."""
-    width = settings.widths[-1]
-    head = nn.Sequential(
-        nn.Conv2d(width, 2 * width, 1), nn.ReLU(), nn.Conv2d(2 * width, settings.projection, 1)
-    )
-    layers = trunk(settings.widths, normalised=True)
-    for module in [*layers, *head]:
-        if isinstance(module, nn.Conv2d):
-            nn.init.kaiming_normal_(module.weight, nonlinearity="relu", generator=generator)
-            if module.bias is not None:
-                nn.init.zeros_(module.bias)
-    return layers, head

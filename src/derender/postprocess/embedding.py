@@ -15,8 +15,7 @@ from torch import Tensor, nn
 from derender.data import check_images, refuse_not_finite
 from derender.networks import Factor
 from derender.postprocess.features import Features
-from derender.postprocess.fitting import STEPS, Fitted, Fitting, coordinates_of
-from derender.postprocess.whitening import Whitening
+from derender.postprocess.fitting import STEPS, Fitted, coordinates_of
 from derender.render import Rendering
 from derender.scene import Scene
 
@@ -38,8 +37,7 @@ class EmbeddingModel(nn.Module):
     def __init__(self, features: Features | None):
         super().__init__()
         features = features or Features()
-        self.whitening: Whitening | None = features.whitening
-        self.fitting: Fitting | None = features.fitting
+        self.whitening, self.fitting = features.whitening, features.fitting
 
     @property
     @abstractmethod
@@ -98,11 +96,8 @@ class EmbeddingModel(nn.Module):
 
     def codes(self, activations: Mapping[str, Float[Tensor, "n _"]]) -> dict[str, Float[Tensor, "n code"]]:
         """The codes that activations begin with: ``encode`` of the same images."""
-        return {
-            factor.name: activations[factor.name][:, : self.nets[factor.name].code_size]  # type: ignore[misc]
-            for factor in self.factors
-            if factor.name in activations
-        }
+        names = [factor.name for factor in self.factors if factor.name in activations]
+        return {name: activations[name][:, : self.nets[name].code_size] for name in names}  # type: ignore[misc]
 
     def features_from(
         self, activations: Mapping[str, Float[Tensor, "n _"]]

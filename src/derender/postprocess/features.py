@@ -41,11 +41,7 @@ class Features:
     def __call__(
         self, codes: Mapping[str, Float[Tensor, "n code"]], activations: Mapping[str, Float[Tensor, "n _"]]
     ) -> dict[str, Float[Tensor, "n _"]]:
-        """Features by factor.
-
-        Args:
-            codes: encoder outputs, by factor.
-            activations: what `Derenderer.activations` gives for the same images.
+        """Features by factor, of encoder outputs and of what `Derenderer.activations` gives for the same.
 
         Raises:
             ValueError: there are codes where a feature needs all activations.

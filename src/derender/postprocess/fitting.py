@@ -2,8 +2,8 @@
 
 Analysis by synthesis. Geometry and albedo move within a morphable model of the trained model's predictions on
 its training images (morphable.py), light and camera freely, so that the rendering comes near the image; the
-further a coordinate is from its mean, the more it costs. Encoders know the lighting and viewpoints of their
-training; the renderer holds in any. Leaves out the parameters of further factors, which stay as predicted.
+further a coordinate is from its mean, the more it costs. Leaves out the parameters of further factors, which
+stay as predicted.
 """
 
 import json
@@ -51,9 +51,7 @@ class FittingSettings(Settings):
 
     examples: int = Field(default=2_000, ge=0)  # training images whose maps the morphable model is made of
     coordinates: int = Field(default=64, ge=1)  # of geometry, and of albedo
-    steps: int = Field(
-        default=0, ge=0, le=10_000
-    )  # of every image when features are made; 0: feed-forward only
+    steps: int = Field(default=0, ge=0, le=10_000)  # of every image for its features; 0: feed-forward only
     prior: float = Field(default=0.1, ge=0)  # how much unusual coordinates cost
     tolerance: float = Field(default=0.15, gt=0)  # error of a pixel beyond which it hardly counts more
     weight: float = Field(default=1.0, ge=0)  # length of fitted coordinates beside feed-forward features
@@ -92,23 +90,23 @@ class Fitting(nn.Module):
 
     def __init__(self, maps: MorphableMaps, settings: FittingSettings, length: float = 1.0):
         super().__init__()
-        self.maps = maps
+        self.maps, self.settings = maps, settings
         self.register_buffer("length", torch.tensor(float(length)), persistent=False)
-        self.settings = settings
         numbers = torch.tensor([settings.steps, settings.prior, settings.tolerance], dtype=torch.float64)
         self.register_buffer("told", numbers, persistent=False)  # the name is part of a model's fingerprint
 
     def with_steps(self, steps: int) -> "Fitting":
         """The same, with the same maps, that makes so many steps; 0: features are feed-forward only."""
         settings = FittingSettings.model_validate(self.settings.model_dump() | {"steps": steps})
-        return Fitting(self.maps, settings, float(self.get_buffer("length"))).to(
-            self.get_buffer("length").device
-        )
+        length = self.get_buffer("length")
+        return Fitting(self.maps, settings, float(length)).to(length.device)
 
     def features(self, coordinates: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
         """Coordinates in the unit of the feed-forward features beside them."""
         return coordinates * self.get_buffer("length")
 
+    @torch.inference_mode(False)
+    @torch.enable_grad()
     def fit(
         self,
         images: Float[Tensor, "n 3 h w"],
@@ -127,13 +125,7 @@ class Fitting(nn.Module):
         steps = self.settings.steps if steps is None else steps
         if steps < 1:
             raise ValueError(f"fitting needs 1 step or more, got {steps}")
-        with torch.inference_mode(False), torch.enable_grad():
-            own = scene.map(lambda value: value.detach().clone())
-            return self._fitted(images.detach().clone(), own, render, steps)
-
-    def _fitted(
-        self, images: Tensor, scene: Scene, render: Callable[[Scene], Rendering], steps: int
-    ) -> Fitted:
+        images, scene = images.detach().clone(), scene.map(lambda value: value.detach().clone())
         coordinates = {
             factor: self.maps.coordinates(parameter, scene.parameters[parameter].float()).clamp(
                 -_START_LIMIT, _START_LIMIT
@@ -143,25 +135,28 @@ class Fitting(nn.Module):
         light, (rotation, translation) = scene.light.float(), scene.camera.float().split(3, dim=1)
         moved = [*coordinates.values(), light, rotation, translation]
         rates = [_COORDINATE_RATE] * len(coordinates) + [_LIGHT_RATE, _ROTATION_RATE, _TRANSLATION_RATE]
-        for value in moved:
-            value.requires_grad_()
-        optimiser = torch.optim.Adam(
-            [{"params": [value], "lr": rate} for value, rate in zip(moved, rates, strict=True)],
-            betas=(0.9, 0.95),
-        )
+        groups = [
+            {"params": [value.requires_grad_()], "lr": rate} for value, rate in zip(moved, rates, strict=True)
+        ]
+        optimiser = torch.optim.Adam(groups, betas=(0.9, 0.95))
 
         def rendered() -> tuple[Scene, Tensor]:
+            """The present scenes and the error of each."""
             depth, albedo = (self.maps.maps(PARAMETERS[name], value) for name, value in coordinates.items())
             camera = torch.cat([rotation, translation], dim=1)
-            moved_scene = Scene(depth, albedo.clamp(0, 1), light, camera, scene.extra)
-            return moved_scene, self._error(images, render(moved_scene))
+            present = Scene(depth, albedo.clamp(0, 1), light, camera, scene.extra)
+            rendering = render(present)
+            apart = (rendering.image - images).abs().mean(dim=1)
+            beyond = (apart - self.settings.tolerance).clamp(min=0)
+            limited, covered = (apart - (1 - _BEYOND) * beyond).flatten(1), rendering.mask.flatten(1)
+            return present, (limited * covered).sum(dim=1) / covered.sum(dim=1).clamp(min=1)
 
-        before = None
+        before = torch.empty(0)
         for step in range(steps):
             for group, rate in zip(optimiser.param_groups, rates, strict=True):
                 group["lr"] = rate * (_LATE_RATE if step >= _LATE * steps else 1.0)
-            error = rendered()[1]
-            before = error.detach() if before is None else before
+            _, error = rendered()
+            before = error.detach() if step == 0 else before
             usual = torch.stack([value.square().mean(dim=1) for value in coordinates.values()]).sum(dim=0)
             optimiser.zero_grad(set_to_none=True)
             (error / _NOISE + self.settings.prior * usual).sum().backward()
@@ -173,18 +168,8 @@ class Fitting(nn.Module):
                 translation.clamp_(-_TRANSLATION_LIMIT, _TRANSLATION_LIMIT)
         with torch.no_grad():
             fitted, after = rendered()
-        assert before is not None
-        return Fitted(
-            fitted.detach(), {name: value.detach() for name, value in coordinates.items()}, before, after
-        )
-
-    def _error(self, images: Tensor, rendering: Rendering) -> Float[Tensor, " n"]:
-        apart = (rendering.image - images).abs().mean(dim=1)
-        beyond = (apart - self.settings.tolerance).clamp(min=0)
-        covered = rendering.mask.flatten(1)
-        return ((apart - (1 - _BEYOND) * beyond).flatten(1) * covered).sum(dim=1) / covered.sum(dim=1).clamp(
-            min=1
-        )
+        found = {name: value.detach() for name, value in coordinates.items()}
+        return Fitted(fitted.detach(), found, before, after)
 
     def tensors(self) -> dict[str, Tensor]:
         """All tensors that ``save`` writes, by name."""

@@ -2,9 +2,8 @@
 
 A morphable model (Blanz and Vetter, SIGGRAPH 1999) whose examples are no scans: they are a trained model's
 predictions on unlabelled images, each averaged with its mirror image, for the object is symmetric and the
-lighting need not be. A coordinate of 1 is one standard deviation of them. Making maps of coordinates is two
-products of matrices, where decoders take a hundred times as long. Leaves out differences
-between the sides, and everything a decoder can predict that is far from the mean.
+lighting need not be. A coordinate of 1 is one standard deviation of them. Leaves out differences between the
+sides, and everything a decoder can predict that is far from the mean.
 """
 
 from collections.abc import Mapping
@@ -12,8 +11,6 @@ from collections.abc import Mapping
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-
-_MEAN, _AXES = "_mean", "_axes"
 
 
 class MorphableMaps(nn.Module):
@@ -33,8 +30,8 @@ class MorphableMaps(nn.Module):
                     f"{name}: axes of {tuple(axes[name].shape[1:])} beside a mean of "
                     f"{tuple(means[name].shape)}"
                 )
-            self.register_buffer(f"{name}{_MEAN}", means[name].float(), persistent=False)
-            self.register_buffer(f"{name}{_AXES}", axes[name].float(), persistent=False)
+            self.register_buffer(f"{name}_mean", means[name].float(), persistent=False)
+            self.register_buffer(f"{name}_axes", axes[name].float(), persistent=False)
 
     @classmethod
     def of(cls, examples: Mapping[str, Float[Tensor, "n ..."]], coordinates: int) -> "MorphableMaps":
@@ -60,16 +57,16 @@ class MorphableMaps(nn.Module):
 
     def size(self, name: str) -> int:
         """How many coordinates a name has."""
-        return len(self.get_buffer(f"{name}{_AXES}"))
+        return len(self.get_buffer(f"{name}_axes"))
 
     def maps(self, name: str, coordinates: Float[Tensor, "n k"]) -> Float[Tensor, "n ..."]:
         """The maps that coordinates stand for."""
-        mean, axes = self.get_buffer(f"{name}{_MEAN}"), self.get_buffer(f"{name}{_AXES}")
+        mean, axes = self.get_buffer(f"{name}_mean"), self.get_buffer(f"{name}_axes")
         return mean + (coordinates @ axes.flatten(1)).unflatten(1, mean.shape)
 
     def coordinates(self, name: str, maps: Float[Tensor, "n ..."]) -> Float[Tensor, "n k"]:
         """Of the nearest map the model has; an axis without length has coordinate 0."""
-        mean, axes = self.get_buffer(f"{name}{_MEAN}"), self.get_buffer(f"{name}{_AXES}").flatten(1)
+        mean, axes = self.get_buffer(f"{name}_mean"), self.get_buffer(f"{name}_axes").flatten(1)
         squared = axes.square().sum(dim=1)
         found = (maps - mean).flatten(1) @ axes.T
         return torch.where(squared > 0, found / squared.clamp(min=torch.finfo(squared.dtype).tiny), 0.0)
@@ -83,10 +80,8 @@ def _principal(centred: Float[Tensor, "n d"], count: int) -> tuple[Float[Tensor,
     count = min(count, rows, columns)
     wide = columns > rows
     gram = (centred @ centred.T if wide else centred.T @ centred).double().cpu().numpy()
-    largest = [len(gram) - count, len(gram) - 1]
-    variances, vectors = (
-        torch.from_numpy(found.copy()).flip(-1) for found in eigh(gram, subset_by_index=largest)
-    )
+    found = eigh(gram, subset_by_index=[len(gram) - count, len(gram) - 1])
+    variances, vectors = (torch.from_numpy(part.copy()).flip(-1) for part in found)
     directions = vectors.T.to(centred)
     if wide:
         directions = directions @ centred

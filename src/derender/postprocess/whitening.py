@@ -20,6 +20,7 @@ from derender.storage.tensors import read_tensors, write_tensors
 _MIRRORED = "reads_mirror_image"  # in a file: maps take images with their mirror images
 _ALONE = "_alone"  # after a factor's name, beside the former: this one takes images alone
 _NEVER_SINGULAR = 1e-9  # share of the mean variance that is added at least: Cholesky's root must exist
+_TINY = torch.finfo(torch.float32).tiny
 
 
 @dataclass(frozen=True)
@@ -48,15 +49,8 @@ class Scatter:
         self.views = self.count = 0
         self._within = self._centres = self._centre = torch.zeros((), dtype=torch.float64)
 
-    @classmethod
-    def of(cls, activations: Float[Tensor, "views n input"]) -> "Scatter":
-        """Of activations that are all there."""
-        scatter = cls()
-        scatter.add(activations)
-        return scatter
-
-    def add(self, activations: Float[Tensor, "views n input"]) -> None:
-        """More images, each with as many views as those before."""
+    def add(self, activations: Float[Tensor, "views n input"]) -> "Scatter":
+        """More images, each with as many views as those before; gives the scatter itself."""
         self.views = len(activations)
         self.count += activations.shape[1]
         centres = activations.double().mean(dim=0)
@@ -64,6 +58,7 @@ class Scatter:
         self._within = self._within + (apart.T @ apart).double()
         self._centres = self._centres + centres.T @ centres
         self._centre = self._centre + centres.sum(dim=0)
+        return self
 
     @property
     def mean(self) -> Float[Tensor, " input"]:
@@ -108,6 +103,8 @@ def fit_projection(
     Raises:
         ValueError: fewer than two views or images.
     """
+    from scipy.linalg import eigh  # only the kept directions: torch would find all, three times as slow
+
     if scatter.views < 2 or scatter.count < 2:
         raise ValueError(
             f"whitening needs at least 2 views of 2 images, got {scatter.views} of {scatter.count}"
@@ -115,11 +112,13 @@ def fit_projection(
     mean, within, between = scatter.mean, scatter.within, scatter.between
     width = len(mean)
     size = size or width
-    floor = within.diagonal().mean().clamp(min=torch.finfo(torch.float32).tiny)
+    floor = within.diagonal().mean().clamp(min=_TINY)
     within = within + max(shrinkage, _NEVER_SINGULAR) * floor * torch.eye(width).to(within)
-    ratios, kept = _most_discriminative(between, within, min(directions, size, width))
+    largest = [width - min(directions, size, width), width - 1]
+    found = eigh(between.cpu().numpy(), within.cpu().numpy(), subset_by_index=largest)
+    ratios, kept = (torch.from_numpy(part.copy()).to(within).flip(-1) for part in found)
     kept = kept * (2 / (1 + ratios)) ** (evenness / 2)  # 1 within and as much between are the 2
-    positive = ratios.clamp(min=torch.finfo(torch.float32).tiny)
+    positive = ratios.clamp(min=_TINY)
     kept = kept * (positive / (1 + positive)) ** power
     left, _, right = torch.linalg.svd(kept.T @ (within + between)[:, :size], full_matrices=False)
     return Projection(mean.float(), (kept @ left @ right).float(), ratios.float())
@@ -167,12 +166,9 @@ class Whitening(nn.Module):
 
     def with_means(self, means: Mapping[str, Float[Tensor, " input"]]) -> "Whitening":
         """The same maps about other means of ``inputs``, by name; distances stay as they are."""
-        projections = {
-            name: Projection(
-                means[name].float(), self.get_buffer(f"{name}_map"), self.get_buffer(f"{name}_ratios")
-            )
-            for name in self.names
-        }
+        maps, ratios = ([self.get_buffer(f"{n}_{part}") for n in self.names] for part in ("map", "ratios"))
+        rows = zip(self.names, maps, ratios, strict=True)
+        projections = {name: Projection(means[name].float(), own, ratio) for name, own, ratio in rows}
         return Whitening(projections, mirrored=self.mirrored)
 
     def tensors(self) -> dict[str, Tensor]:
@@ -205,14 +201,3 @@ class Whitening(nn.Module):
             projections[name] = Projection(mean, chart, ratios)
         alone = {name for name in projections if f"{name}{_ALONE}" in tensors or _MIRRORED not in tensors}
         return cls(projections, mirrored=projections.keys() - alone)
-
-
-def _most_discriminative(between: Tensor, within: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """The largest ratios of two covariances and their directions (input, count), of variance 1 within."""
-    from scipy.linalg import eigh  # only the kept directions: torch would find all, three times as slow
-
-    width = len(within)
-    ratios, directions = eigh(
-        between.cpu().numpy(), within.cpu().numpy(), subset_by_index=[width - count, width - 1]
-    )
-    return tuple(torch.from_numpy(found.copy()).to(within).flip(-1) for found in (ratios, directions))  # type: ignore[return-value]

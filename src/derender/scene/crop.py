@@ -1,9 +1,8 @@
 """Images in other crops, as a camera nearer, farther, beside the middle or rolled would have taken them.
 
-A model learns the crop of its training images, and other images have other crops. Unlike lighting and
-viewpoint, another crop of an image needs no rendering: its pixels are known, and so is its camera. Crops are
-(n, 2, 3) affine maps: where each crop's points lie in the image, in coordinates from -1 to 1 across and down.
-Leaves out the search for the crop that suits a model (crop_search.py).
+Unlike lighting and viewpoint, another crop of an image needs no rendering: its pixels are known, and so is
+its camera. Crops are (n, 2, 3) affine maps: where each crop's points lie in the image, in coordinates from -1
+to 1 across and down. Leaves out the search for the crop that suits a model (crop_search.py).
 """
 
 import math
@@ -79,16 +78,10 @@ def other_surroundings(images: Float[Tensor, "n 3 h w"], generator: Generator) -
 
 
 def crop_scene(scene: Scene, crops: Float[Tensor, "n 2 3"], fov_deg: float) -> Scene:
-    """The scenes of cropped images: only the camera changes.
+    """The scenes of images in crops that are similarities, as `random_crops` makes them: cameras change.
 
-    A larger crop is a camera farther away, a crop beside the middle one beside the object, a rolled one a
-    camera rolled about its axis. Exact at the distance of the object's middle; with a field of view of 10
-    degrees the rest is off by less than a pixel.
-
-    Args:
-        scene: n of them; further factors stay as they are.
-        crops: similarities, as `random_crops` makes them.
-        fov_deg: horizontal field of view of the images.
+    Exact at the distance of the object's middle; with a field of view of 10 degrees the rest is off by less
+    than a pixel.
     """
     width = scene.depth.shape[-1]
     crops, focal = crops.to(scene.camera), focal_px(width, fov_deg) * 2 / width
@@ -96,16 +89,9 @@ def crop_scene(scene: Scene, crops: Float[Tensor, "n 2 3"], fov_deg: float) -> S
     scale, roll = torch.hypot(cosine, sine), torch.atan2(sine, cosine)
     distance = 1 + scene.camera[:, 5]
     x, y = (scene.camera[:, 3:5] - crops[:, :, 2] * distance[:, None] / focal).unbind(dim=1)
-    moved = torch.stack(
-        [
-            *scene.camera[:, :2].unbind(dim=1),
-            scene.camera[:, 2] - roll,
-            (cosine * x + sine * y) / scale,
-            (cosine * y - sine * x) / scale,
-            scale * distance - 1,
-        ],
-        dim=1,
-    )
+    pitch, yaw, rolled = scene.camera[:, :3].unbind(dim=1)
+    across, down = (cosine * x + sine * y) / scale, (cosine * y - sine * x) / scale
+    moved = torch.stack([pitch, yaw, rolled - roll, across, down, scale * distance - 1], dim=1)
     return scene.with_parameters(camera=moved)
 
 
@@ -114,9 +100,7 @@ def ranges_for_crops(ranges: SceneRanges, width: int, settings: CropSettings) ->
     focal = focal_px(width, ranges.fov_deg) * 2 / width
     away = max(settings.farther - 1, 1 - 1 / settings.nearer) / _REACH
     aside = math.sqrt(2) * settings.shift * settings.farther / focal / _REACH
+    needed = {"translation_xy": aside, "translation_z": away}
     return ranges.model_copy(
-        update={
-            "translation_xy": max(ranges.translation_xy, aside),
-            "translation_z": max(ranges.translation_z, away),
-        }
+        update={name: max(getattr(ranges, name), value) for name, value in needed.items()}
     )

@@ -1,10 +1,9 @@
 """The square crop of an image that a model reconstructs best.
 
-A model learns the crop of its training images: where the object lies and how much of the image it fills. In
-another crop it mistakes one part for another, eyes on cheeks. Crops on a grid are reconstructed and compared
-by their squared error over the crop's own variance, both inside the mask, so that smooth crops gain nothing.
-Needs neither labels nor a detector. Leaves out rolled images, objects that fill less than half of the image's
-side, and crops that reach beyond it.
+A model learns the crop of its training images; in another crop it mistakes one part for another, eyes on
+cheeks. Crops on a grid are reconstructed and compared by their squared error over the crop's own variance,
+both inside the mask, so that smooth crops gain nothing. Needs neither labels nor a detector. Leaves out
+rolled images, objects that fill less than half of the image's side, and crops that reach beyond it.
 """
 
 from collections.abc import Sequence
@@ -77,16 +76,15 @@ def candidate_crops() -> list[Crop]:
     """The grid of the search: the whole image first, then smaller crops, none beyond the image."""
     crops = [WHOLE]
     for side in SIDES:
-        across, down = (_centres(min(far, 1 - side)) for far in (FARTHEST_ACROSS, FARTHEST_DOWN))
+        across, down = (
+            [round(STEP * step, 6) for step in range(-steps, steps + 1)]
+            for steps in (int(min(far, 1 - side) / STEP + 1e-6) for far in (FARTHEST_ACROSS, FARTHEST_DOWN))
+        )
         crops += [Crop(side, x, y) for y in down for x in across]
     return crops
 
 
-def _centres(far: float) -> list[float]:
-    steps = int(far / STEP + 1e-6)
-    return [round(STEP * step, 6) for step in range(-steps, steps + 1)]
-
-
+@torch.inference_mode()
 def crop_errors(
     model: Any, images: UInt8[Tensor, "n 3 r r"], crops: Sequence[Crop], batch_size: int = 64
 ) -> Float[np.ndarray, "crops n"]:
@@ -99,30 +97,25 @@ def crop_errors(
         batch_size: crops rendered at a time; changes speed and memory only.
     """
     columns = []
-    with torch.inference_mode():
-        for few in images.split(max(1, batch_size // len(crops))):
-            parts = torch.cat([crop.cut(few, model.image_size) for crop in crops])
-            errors = torch.cat([_unexplained(model, batch) for batch in parts.split(batch_size)])
-            columns.append(errors.view(len(crops), len(few)))
+    for few in images.split(max(1, batch_size // len(crops))):
+        errors = []
+        for batch in torch.cat([crop.cut(few, model.image_size) for crop in crops]).split(batch_size):
+            target = batch.to(model.device)
+            rendering = model.reconstruct(target)
+            mask = rendering.mask.unsqueeze(1)
+            covered = mask.sum(dim=(1, 2, 3))
+            mean = (target * mask).sum(dim=(2, 3), keepdim=True) / covered.clamp(min=1).view(-1, 1, 1, 1)
+            error = ((rendering.image - target).square() * mask).sum(dim=(1, 2, 3))
+            variance = ((target - mean).square() * mask).sum(dim=(1, 2, 3))
+            share = error / torch.maximum(variance, _LEAST_VARIANCE * covered).clamp(min=1e-12)
+            errors.append(torch.where(covered > 0, share, torch.inf).cpu())
+        columns.append(torch.cat(errors).view(len(crops), len(few)))
     return torch.cat(columns, dim=1).numpy()
-
-
-def _unexplained(model: Any, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, " n"]:
-    target = images.to(model.device)
-    rendering = model.reconstruct(target)
-    mask = rendering.mask.unsqueeze(1)
-    covered = mask.sum(dim=(1, 2, 3))
-    mean = (target * mask).sum(dim=(2, 3), keepdim=True) / covered.clamp(min=1).view(-1, 1, 1, 1)
-    error = ((rendering.image - target).square() * mask).sum(dim=(1, 2, 3))
-    variance = ((target - mean).square() * mask).sum(dim=(1, 2, 3))
-    share = error / torch.maximum(variance, _LEAST_VARIANCE * covered).clamp(min=1e-12)
-    return torch.where(covered > 0, share, torch.inf).cpu()
 
 
 def best_crops(model: Any, images: UInt8[Tensor, "n 3 r r"]) -> list[Crop]:
     """The crop of each image that the model reconstructs best; the whole where none is clearly better."""
     crops = candidate_crops()
     errors = crop_errors(model, images, crops)
-    best = errors.argmin(axis=0)
     clearly = errors.min(axis=0) < GAIN * errors[0]
-    return [crops[at] if better else WHOLE for at, better in zip(best, clearly, strict=True)]
+    return [crops[at] if better else WHOLE for at, better in zip(errors.argmin(axis=0), clearly, strict=True)]

@@ -1,12 +1,10 @@
 """The same scenes on a finer grid: smooth depth, sharp albedo, light and camera as they are.
 
-Depth becomes a uniform cubic B-spline whose control points are the depth map: twice differentiable, never
-outside the values it is made of, and its slope at the old pixels is the central difference that
-``normals_from_depth`` takes there, so that a model is seen with the normals it was trained with. Albedo is
-interpolated by the Catmull-Rom spline, which keeps every pixel's value, and clipped to 0..1. Source: de Boor,
-A Practical Guide to Splines; Catmull and Rom, 1974; one matrix product per axis. Outermost pixel centres stay
-where they are, as the field of view does. Leaves out maps of further factors and detail that the coarse maps
-never had.
+Depth becomes a uniform cubic B-spline whose control points are the depth map: its slope at the old pixels is
+the central difference that ``normals_from_depth`` takes there, so that a model is seen with the normals it
+was trained with. Albedo is interpolated by the Catmull-Rom spline, which keeps every pixel's value, and
+clipped to 0..1. Source: de Boor, A Practical Guide to Splines; Catmull and Rom, 1974. Outermost pixel centres
+stay where they are, as the field of view does. Leaves out maps of further factors.
 """
 
 from typing import Literal
@@ -53,13 +51,12 @@ def cubic_weights(
     t = place - left
     if kind == "smooth":
         blend = ((1 - t) ** 3, 3 * t**3 - 6 * t**2 + 4, -3 * t**3 + 3 * t**2 + 3 * t + 1, t**3)
-        blend = [weight / 6 for weight in blend]
     else:
         blend = (-(t**3) + 2 * t**2 - t, 3 * t**3 - 5 * t**2 + 2, -3 * t**3 + 4 * t**2 + t, t**3 - t**2)
-        blend = [weight / 2 for weight in blend]
+    total = 6 if kind == "smooth" else 2
     padded = place.new_zeros(len(place), count + 2)  # one value more at each end
     for offset, weight in enumerate(blend):
-        padded[torch.arange(len(place)), left + offset] += weight
+        padded[torch.arange(len(place)), left + offset] += weight / total
     weights = padded[:, 1:-1].clone()
     weights[:, :2] += padded[:, :1] * place.new_tensor([2.0, -1.0])
     weights[:, -2:] += padded[:, -1:] * place.new_tensor([-1.0, 2.0])

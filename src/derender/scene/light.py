@@ -12,10 +12,7 @@ from torch.nn.functional import normalize
 
 
 def light_direction(light: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3"]:
-    """Unit direction in which the light travels, along (tan yaw, tan pitch, 1).
-
-    Written with sines and cosines, so that it stays continuous at 90 degrees and beyond (light from behind).
-    """
+    """Unit direction in which the light travels, along (tan yaw, tan pitch, 1); continuous at 90 degrees."""
     sin_pitch, sin_yaw = light[:, 2:].sin().unbind(-1)
     cos_pitch, cos_yaw = light[:, 2:].cos().unbind(-1)
     direction = (sin_yaw * cos_pitch, sin_pitch * cos_yaw, cos_yaw * cos_pitch)
@@ -25,10 +22,7 @@ def light_direction(light: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3"]:
 def lambert_shading(
     normal: Float[Tensor, "n h w 3"], light: Float[Tensor, "n 4"]
 ) -> Float[Tensor, "n 1 h w"]:
-    """Shading = ambient + diffuse * max(0, n.l), with inward unit normals in the frame of the light.
-
-    Values start at 0 and are not clipped at 1.
-    """
+    """Ambient + diffuse * max(0, n.l), not clipped at 1; inward unit normals in the frame of the light."""
     x, y, z = light_direction(light)[:, :, None, None].unbind(1)
     cosine = normal[..., 0] * x + normal[..., 1] * y + normal[..., 2] * z
     ambient, diffuse = light[:, 0, None, None], light[:, 1, None, None]

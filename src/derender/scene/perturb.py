@@ -2,11 +2,10 @@
 
 Source: the paper, section 4 (LOOCC): uniform additive perturbations of light (ambient and diffuse +-0.5,
 pitch and yaw +-45 degrees) and camera (pitch +-22.5, yaw +-45 degrees). The paper leaves open what happens
-at the bounds. Here the perturbation is uniform over those values in its range that keep the result physical
-(the law that rejecting and drawing again would give, from one draw): intensities stay in their bounds, light
-within 45 degrees, camera within 60, and nothing piles up at a bound. Geometry and albedo, which have no such
-range, are exchanged between images. Which factor changes, and by which of these functions, is declared in a
-factor's row (networks/factors.py). Leaves out rendering and encoding the new scene.
+at the bounds. Here the perturbation is uniform over those values in its range that keep the result physical:
+intensities in their bounds, light within 45 degrees, camera within 60, and nothing piles up at a bound.
+Geometry and albedo, which have no such range, are exchanged between images. Which factor changes, and by
+which of these functions, is declared in a factor's row (networks/factors.py).
 """
 
 import math
@@ -70,8 +69,7 @@ def exchange(
 ) -> Shaped[Tensor, "n ..."]:
     """Give every row the value of another row (a derangement), for factors without a range of change.
 
-    What it gives is in range because another scene had it, so ``settings`` and ``ranges`` are not consulted;
-    they are there because every perturbation is called alike.
+    ``settings`` and ``ranges`` are not consulted: they are there because every perturbation is called alike.
     """
     return value[derangement(len(value), generator).to(value.device)]
 
@@ -101,10 +99,9 @@ def _uniform_about(
     bounds: Sequence[tuple[float, float]],
     generator: Generator,
 ) -> Float[Tensor, "n k"]:
-    """Uniform over the part of [value - change, value + change] inside the bounds.
+    """Uniform over the part of [value - change, value + change] inside the bounds, with gradient to value.
 
-    A value outside the bounds is first brought to the nearest one. The result keeps its gradient to the
-    value.
+    A value outside the bounds is first brought to the nearest one.
     """
     low, high = constant(tuple(bounds), value).unbind(dim=1)
     half_width = constant(tuple(changes), value)

@@ -53,7 +53,7 @@ class Scene:
         return Scene.from_parameters({**self.parameters, **changed})
 
     def map(self, function: Callable[[Tensor], Tensor]) -> "Scene":
-        """Apply one function to every parameter (move to a device, detach, select rows)."""
+        """Apply one function to every parameter."""
         return Scene.from_parameters({name: function(value) for name, value in self.parameters.items()})
 
     def to(self, device) -> "Scene":

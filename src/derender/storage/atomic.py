@@ -1,8 +1,8 @@
 """Files and folders that appear complete or not at all, and folders with checksums of their files.
 
-Both are written under another name beside their place and moved there at the end. A run that is killed, or a
-disk that is full, leaves what was there before. A sealed folder holds a checksum of each of its files, which
-shows a later reader a changed bit; it is no protection against an attacker.
+Both are written under another name beside their place and moved there at the end: a kill or a full disk
+leaves the previous content. A sealed folder holds a checksum of each of its files, which shows a later reader
+a changed bit; it is no protection against an attacker.
 """
 
 import ctypes
@@ -16,9 +16,9 @@ from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 
-LONGEST_PREFIX = 80  # of a name's characters, so that the temporary name is no longer than file systems allow
 CHECKSUMS = "checksums.json"
 
+_LONGEST_PREFIX = 80  # of a name's characters, so that temporary names are no longer than file systems allow
 _PIECE_BYTES = 1 << 20
 _THIS_FOLDER, _EXCHANGE = -100, 2  # AT_FDCWD and RENAME_EXCHANGE of Linux
 
@@ -28,7 +28,7 @@ class Damaged(ValueError):
 
 
 class DamageNoticed(UserWarning):
-    """Something damaged was passed over, and the work goes on from what was there before it."""
+    """Something damaged was passed over, and the work goes on from an earlier state."""
 
 
 @contextmanager
@@ -57,34 +57,36 @@ def atomic_file(path: Path, *, durable: bool = False) -> Iterator[Path]:
 def atomic_folder(folder: Path, *, previous: Path | None = None) -> Iterator[Path]:
     """Give a temporary folder to fill; it takes the place of ``folder`` if nothing is raised.
 
-    The two are exchanged in one step where the system can (Linux); elsewhere the old one is moved aside
-    first, and a kill between the two moves leaves it there.
-
-    Args:
-        folder: what is replaced.
-        previous: what becomes of the old folder, which is deleted otherwise.
+    The old folder becomes ``previous``, or is deleted without it. The two are exchanged in one step where the
+    system can (Linux); elsewhere the old one is moved first, and a kill between the moves leaves it there.
     """
     folder.parent.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(prefix=_prefix(folder), dir=folder.parent))
+    aside = temporary.with_name(f"{temporary.name}-old") if previous is None else previous
     try:
         yield temporary
         temporary.chmod(0o755)
         sealed = (temporary / CHECKSUMS).exists()
         if not folder.exists():
             temporary.rename(folder)
-        elif previous is None:
-            _exchange(temporary, folder)
+        elif _exchanged(temporary, folder):
+            if previous is not None and not _exchanged(temporary, previous):
+                temporary.rename(previous)
         else:
-            _make_way(previous, folder, temporary)
+            shutil.rmtree(aside, ignore_errors=True)
+            folder.rename(aside)
+            temporary.rename(folder)
         if sealed:
             _to_disk(folder.parent)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+    if previous is None:
+        shutil.rmtree(aside, ignore_errors=True)
 
 
 @contextmanager
 def new_folder(folder: str | Path, *, overwrite: bool = False) -> Iterator[Path]:
-    """`atomic_folder` for a folder that must not exist yet, unless ``overwrite`` says that it may."""
+    """`atomic_folder` for a folder that must not exist yet, unless ``overwrite`` allows it."""
     folder = Path(folder)
     if folder.exists() and not overwrite:
         raise FileExistsError(f"{folder} exists already: choose another folder or pass overwrite=True")
@@ -95,12 +97,11 @@ def new_folder(folder: str | Path, *, overwrite: bool = False) -> Iterator[Path]
 def remove_abandoned(path: Path) -> None:
     """Delete what processes killed while writing this file or folder left; no process may be writing it."""
     for entry in path.parent.iterdir() if path.parent.is_dir() else ():
-        if not entry.name.startswith(_prefix(path)):
-            continue
-        if entry.is_dir():
-            shutil.rmtree(entry, ignore_errors=True)
-        else:
-            entry.unlink(missing_ok=True)
+        if entry.name.startswith(_prefix(path)):
+            if entry.is_dir():
+                shutil.rmtree(entry, ignore_errors=True)
+            else:
+                entry.unlink(missing_ok=True)
 
 
 def seal(folder: Path) -> None:
@@ -134,18 +135,18 @@ def check_seal(folder: Path) -> None:
             raise Damaged(f"{name} has changed since it was written: {how}")
 
 
-def _prefix(path: Path) -> str:
-    return f".{path.name[:LONGEST_PREFIX]}-"
-
-
 def measured(file: Path) -> tuple[int, int]:
-    """Size in bytes and CRC-32 of a file, read back piece by piece."""
+    """Size in bytes and CRC-32 of a file."""
     size = checksum = 0
     with file.open("rb") as stream:
         while piece := stream.read(_PIECE_BYTES):
             size += len(piece)
             checksum = zlib.crc32(piece, checksum)
     return size, checksum
+
+
+def _prefix(path: Path) -> str:
+    return f".{path.name[:_LONGEST_PREFIX]}-"
 
 
 def _to_disk(path: Path) -> None:
@@ -160,46 +161,18 @@ def _to_disk(path: Path) -> None:
         os.close(handle)
 
 
-def _make_way(previous: Path, folder: Path, temporary: Path) -> None:
-    """``temporary`` becomes ``folder``, that becomes ``previous``; one of the latter two is always there."""
-    if _exchanged(temporary, folder):
-        if previous.exists():
-            _exchange(temporary, previous)
-        else:
-            temporary.rename(previous)
-        return
-    shutil.rmtree(previous, ignore_errors=True)
-    folder.rename(previous)
-    temporary.rename(folder)
-
-
-def _exchange(one: Path, other: Path) -> None:
-    """Two folders take each other's place: in one step where that can be, else in three."""
-    if _exchanged(one, other):
-        return
-    aside = Path(tempfile.mkdtemp(prefix=_prefix(other), dir=other.parent))
-    other.rename(aside / other.name)
-    one.rename(other)
-    (aside / other.name).rename(one)
-    aside.rmdir()
-
-
 def _exchanged(one: Path, other: Path) -> bool:
-    """Whether the system could exchange the two in one step."""
+    """Whether the system could let the two take each other's place in one step."""
     rename = _system_exchange()
-    return (
-        rename is not None
-        and rename(_THIS_FOLDER, os.fsencode(one), _THIS_FOLDER, os.fsencode(other), _EXCHANGE) == 0
-    )
+    if rename is None:
+        return False
+    return rename(_THIS_FOLDER, os.fsencode(one), _THIS_FOLDER, os.fsencode(other), _EXCHANGE) == 0
 
 
 @cache
-def _system_exchange() -> Callable[[int, bytes, int, bytes, int], int] | None:
+def _system_exchange() -> Callable[..., int] | None:
     """Linux's renameat2, where the C library has it."""
     try:
-        function = ctypes.CDLL(None, use_errno=True).renameat2
+        return ctypes.CDLL(None).renameat2
     except (OSError, AttributeError, TypeError):
         return None
-    function.argtypes = (ctypes.c_int, ctypes.c_char_p, ctypes.c_int, ctypes.c_char_p, ctypes.c_uint)
-    function.restype = ctypes.c_int
-    return function

@@ -15,15 +15,17 @@ from torch import Tensor, nn
 
 from derender.storage import hub
 from derender.storage.atomic import atomic_file
-from derender.storage.tensors import read_tensors, write_tensors
+from derender.storage.tensors import check_fit, read_tensors, write_tensors
 
 Net = TypeVar("Net", bound=nn.Module)
 
 FORMAT = SPLIT_FORMAT = 1
 WEIGHTS_FILE, CONFIG_FILE = "model.safetensors", "config.json"
-WHITENING_FILE, FITTING_FILE = "whitening.safetensors", "fitting.safetensors"  # a model may lack them
-ERRORS_FILE = "held_out_errors.json"  # written and read by training/held_out_errors.py; a model may lack it
-SPLIT_FILE, CARD_FILE = "split.json", "README.md"  # a model may lack them
+# A model may lack any of these; training/held_out_errors.py writes and reads the third.
+WHITENING_FILE, FITTING_FILE = "whitening.safetensors", "fitting.safetensors"
+ERRORS_FILE, SPLIT_FILE, CARD_FILE = "held_out_errors.json", "split.json", "README.md"
+TENSOR_FILES = (WEIGHTS_FILE, WHITENING_FILE, FITTING_FILE)
+TEXT_FILES = (CARD_FILE, ERRORS_FILE, SPLIT_FILE)
 PRETRAINED = Path(__file__).parents[1] / "pretrained"
 
 
@@ -50,8 +52,7 @@ def model_folder(source: str | Path) -> Path:
     if source in bundled_models():
         return PRETRAINED / source
     if isinstance(source, str) and source.count("/") == 1 and not source.startswith((".", "/", "~")):
-        weights = (CONFIG_FILE, WEIGHTS_FILE, WHITENING_FILE, FITTING_FILE)
-        return hub.download(source, (*weights, ERRORS_FILE, SPLIT_FILE, CARD_FILE))
+        return hub.download(source, (CONFIG_FILE, *TENSOR_FILES, *TEXT_FILES))
     raise FileNotFoundError(
         f"no model at {source}: give a run folder, a saved folder, a Hub id 'owner/name', or one of those "
         f"that come with derender ({', '.join(bundled_models())})"
@@ -63,13 +64,13 @@ def texts_beside(folder: Path | None, tensors: Mapping[str, Tensor]) -> dict[str
     if folder is None or not (folder / WEIGHTS_FILE).is_file():
         return {}
     stored: dict[str, Tensor] = {}
-    for name in (WEIGHTS_FILE, WHITENING_FILE, FITTING_FILE):
+    for name in TENSOR_FILES:
         stored |= read_tensors(folder / name) if (folder / name).is_file() else {}
     if stored.keys() != tensors.keys() or any(
         not torch.equal(stored[name].to(value), value) for name, value in tensors.items()
     ):
         return {}
-    files = (folder / name for name in (CARD_FILE, ERRORS_FILE, SPLIT_FILE))
+    files = (folder / name for name in TEXT_FILES)
     return {file.name: file.read_text(encoding="utf-8") for file in files if file.is_file()}
 
 
@@ -79,13 +80,12 @@ def read_config(folder: Path, factors: Sequence[str] | None = None) -> dict[str,
     Raises:
         ValueError: it is damaged, of a newer version, of a baseline, or of other ``factors``.
     """
+    damaged = f"{folder / CONFIG_FILE} is damaged: copy or train the model again"
     try:
         config = json.loads((folder / CONFIG_FILE).read_text())
-        version, complete = config["format"], isinstance(config.get("settings"), dict)
-        names = config.get("factors")
-        complete = complete and isinstance(names, list) and all(isinstance(name, str) for name in names)
+        version, names = config["format"], config.get("factors")
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
-        raise ValueError(f"{folder / CONFIG_FILE} is damaged: copy or train the model again") from error
+        raise ValueError(damaged) from error
     if "baseline" in config:
         name = config["baseline"]
         raise ValueError(
@@ -96,11 +96,12 @@ def read_config(folder: Path, factors: Sequence[str] | None = None) -> dict[str,
         raise ValueError(
             f"{folder} was saved in format {version}, this version reads up to {FORMAT}: update derender"
         )
-    if not complete:
-        raise ValueError(f"{folder / CONFIG_FILE} is damaged: copy or train the model again")
-    if factors is not None and config["factors"] != list(factors):
+    named = isinstance(names, list) and all(isinstance(name, str) for name in names)
+    if not named or not isinstance(config.get("settings"), dict):
+        raise ValueError(damaged)
+    if factors is not None and names != list(factors):
         raise ValueError(
-            f"{folder} holds factors {', '.join(config['factors'])}, asked for {', '.join(factors)}: "
+            f"{folder} holds factors {', '.join(names)}, asked for {', '.join(factors)}: "
             "pass its rows as factors="
         )
     return config
@@ -123,11 +124,7 @@ def read_weights(folder: Path, build: Callable[[], Net]) -> Net:
     """
     weights = read_tensors(folder / WEIGHTS_FILE)
     with torch.device("meta"):  # sizes are compared before memory is taken for what the file only claims
-        expected = build().state_dict()
-    for name in sorted({*weights, *expected}):
-        shapes = [tuple(side[name].shape) if name in side else "nothing" for side in (weights, expected)]
-        if shapes[0] != shapes[1]:
-            raise ValueError(f"{name}: {shapes[0]} in {WEIGHTS_FILE}, {shapes[1]} by {CONFIG_FILE}")
+        check_fit(weights, build().state_dict())
     network = build()
     network.load_state_dict(weights)
     return network
@@ -177,10 +174,8 @@ def read_split(folder: Path) -> SplitRecord | None:
     try:
         values = json.loads(file.read_text())
         train, validation, test = (float(share) for share in values["shares"])
-        sound = values["format"] == SPLIT_FORMAT and abs(train + validation + test - 1) < 1e-6
-        found = SplitRecord((train, validation, test), int(values["seed"])) if sound else None
-    except (UnicodeDecodeError, KeyError, TypeError, ValueError):
-        found = None
-    if found is None:
-        raise ValueError(f"{file} is damaged or of a newer version: take the model again, or update derender")
-    return found
+        if values["format"] == SPLIT_FORMAT and abs(train + validation + test - 1) < 1e-6:
+            return SplitRecord((train, validation, test), int(values["seed"]))
+    except (KeyError, TypeError, ValueError):
+        pass
+    raise ValueError(f"{file} is damaged or of a newer version: take the model again, or update derender")

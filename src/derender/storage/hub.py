@@ -1,6 +1,6 @@
 """Models from and to the Hugging Face Hub; the one place that talks to it.
 
-What goes there is a folder of safetensors and JSON. Leaves out what is in it (``derender.model``, ``card``).
+What goes there is a folder of safetensors and JSON, which ``derender.model`` and ``sharing`` write.
 """
 
 from collections.abc import Sequence
@@ -15,11 +15,11 @@ def download(repository: str, names: Sequence[str]) -> Path:
         FileNotFoundError: the Hub gave nothing under that id, or cannot be reached and nothing is cached.
     """
     from huggingface_hub import snapshot_download
-    from huggingface_hub.errors import HfHubHTTPError, HFValidationError, LocalEntryNotFoundError
+    from huggingface_hub.errors import HfHubHTTPError, HFValidationError
 
     try:
         return Path(snapshot_download(repository, allow_patterns=list(names)))
-    except (HfHubHTTPError, HFValidationError, LocalEntryNotFoundError, OSError) as error:
+    except (HfHubHTTPError, HFValidationError, OSError) as error:
         raise FileNotFoundError(
             f"no folder {repository} here, and the Hub gave nothing under that id ({type(error).__name__}): "
             "check the path or the id, and the network"
@@ -43,10 +43,9 @@ def upload(folder: Path, repository: str, *, private: bool, token: str | None) -
     except HFValidationError as error:
         raise ValueError(f"{repository!r} is no name on the Hub: give OWNER/NAME") from error
     except (HfHubHTTPError, LocalTokenNotFoundError) as error:
-        message = " ".join(str(error).split())
         raise PermissionError(
-            f"the Hub refuses {repository} ({message}): log in with 'hf auth login' or pass token=, with the "
-            "right to write there"
+            f"the Hub refuses {repository} ({' '.join(str(error).split())}): log in with 'hf auth login' or "
+            "pass token=, with the right to write there"
         ) from error
     except Exception as error:  # what a broken connection raises changes with the client's HTTP library
         raise ConnectionError(
@@ -57,7 +56,7 @@ def upload(folder: Path, repository: str, *, private: bool, token: str | None) -
 
 
 def client(token: str | None) -> Any:
-    """What speaks to the Hub."""
+    """The client of the Hub's interface."""
     from huggingface_hub import HfApi
 
     return HfApi(token=token)

@@ -1,12 +1,10 @@
 """A saved model in fewer bytes: weights in half precision, large maps in bytes with a unit for each slice.
 
-Written are the files of `saved.py`, which every version that knows bytes reads. Leaves out what rounding
-costs; evaluation/copies.py measures it.
+Leaves out what rounding costs; evaluation/copies.py measures it.
 """
 
 import re
 import shutil
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,13 +12,10 @@ from torch import Tensor
 
 from derender.storage.atomic import new_folder
 from derender.storage.folder import (
-    CARD_FILE,
     CONFIG_FILE,
-    ERRORS_FILE,
-    FITTING_FILE,
-    SPLIT_FILE,
+    TENSOR_FILES,
+    TEXT_FILES,
     WEIGHTS_FILE,
-    WHITENING_FILE,
     model_folder,
     read_config,
 )
@@ -30,7 +25,6 @@ KINDS = ("bytes", "float16")
 """How the large maps of whitening and fitting are kept; weights are kept in float16 by both."""
 
 _LARGE = re.compile(r"\w+_map|maps\.\w+_axes")
-_TEXTS = (CARD_FILE, ERRORS_FILE, SPLIT_FILE)
 
 
 @dataclass(frozen=True)
@@ -69,33 +63,24 @@ def pack_model(
     read_config(own)
     before, after = {}, {}
     with new_folder(folder, overwrite=overwrite) as temporary:
-        for name in (WEIGHTS_FILE, WHITENING_FILE, FITTING_FILE):
-            if not (own / name).is_file():
+        for file in TENSOR_FILES:
+            if not (own / file).is_file():
                 continue
-            tensors, metadata = read_described(own / name)
-            small = _halved(tensors) if name == WEIGHTS_FILE else _maps_packed(tensors, maps)
-            write_tensors(small, temporary / name, metadata)
-            before[name], after[name] = ((place / name).stat().st_size for place in (own, temporary))
-        for name in (CONFIG_FILE, *_TEXTS):
-            if (own / name).is_file():
-                shutil.copyfile(own / name, temporary / name)
+            tensors, metadata = read_described(own / file)
+            small = dict(tensors)
+            for name, value in tensors.items():
+                if file == WEIGHTS_FILE:
+                    small[name] = _half(name, value) if value.is_floating_point() else value
+                elif _LARGE.fullmatch(name) and maps == "bytes":
+                    small[name], small[name + UNIT] = packed(value.float(), along=0)
+                elif _LARGE.fullmatch(name):
+                    small[name] = _half(name, value)
+            write_tensors(small, temporary / file, metadata)
+            before[file], after[file] = ((place / file).stat().st_size for place in (own, temporary))
+        for file in (CONFIG_FILE, *TEXT_FILES):
+            if (own / file).is_file():
+                shutil.copyfile(own / file, temporary / file)
     return Packed(folder, before, after)
-
-
-def _halved(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    return {
-        name: _half(name, value) if value.is_floating_point() else value for name, value in tensors.items()
-    }
-
-
-def _maps_packed(tensors: Mapping[str, Tensor], kind: str) -> dict[str, Tensor]:
-    small = dict(tensors)
-    for name in filter(_LARGE.fullmatch, tensors):
-        if kind == "bytes":
-            small[name], small[name + UNIT] = packed(tensors[name].float(), along=0)
-        else:
-            small[name] = _half(name, tensors[name])
-    return small
 
 
 def _half(name: str, value: Tensor) -> Tensor:

@@ -1,8 +1,7 @@
 """Saving and sharing a model: beside its weights a card, held-out errors and its split; the way to the Hub.
 
-The card is the README.md that states what a model is, what made it and what it may be used for; what is
-unknown is "not stated". Leaves out the files of the model itself, which the class that inherits `Shareable`
-writes.
+The card is the README.md that states what a model is, what made it and what it may be used for. Leaves out
+the files of the model itself, which the class that inherits `Shareable` writes.
 """
 
 import json
@@ -16,8 +15,6 @@ from torch import Tensor
 from derender.storage import hub
 from derender.storage.atomic import new_folder
 from derender.storage.folder import CARD_FILE, ERRORS_FILE, SPLIT_FILE, texts_beside
-
-NOT_STATED = "not stated"
 
 
 class Shareable:
@@ -63,7 +60,7 @@ class Shareable:
         ``card``, or is made of ``data`` (what it was trained on), ``licence`` and ``scores``.
         """
         beside = texts_beside(self.source, self.tensors())
-        stated = {"data": data, "licence": licence, "scores": scores}
+        stated = {"Trained on": data, "Scores": scores, "Licence": licence}
         card = card or self._card(beside, Path(folder).name, stated)
         with new_folder(folder, overwrite=overwrite) as temporary:
             self.write(temporary)
@@ -95,7 +92,8 @@ class Shareable:
                 "this model has no card: state what it was trained on and what it may be used for, "
                 "push_to_hub(..., data=..., licence=...), or pass card="
             )
-        card = card or self._card(beside, repository, {"data": data, "licence": licence, "scores": scores})
+        stated = {"Trained on": data, "Scores": scores, "Licence": licence}
+        card = card or self._card(beside, repository, stated)
         with TemporaryDirectory() as place:
             folder = self.save_pretrained(Path(place) / "model", card=card, licence=licence)
             return hub.upload(folder, repository, private=private, token=token)
@@ -104,42 +102,15 @@ class Shareable:
         """The card that lies beside the weights, unless something else is stated about them."""
         if CARD_FILE in beside and not any(stated.values()):
             return beside[CARD_FILE]
-        return model_card(title, self.description(), **stated, held_out=beside.get(ERRORS_FILE))
-
-
-def model_card(
-    title: str,
-    description: str,
-    *,
-    data: str | None = None,
-    licence: str | None = None,
-    scores: str | None = None,
-    held_out: str | None = None,
-) -> str:
-    """The card of one model as Markdown.
-
-    Args:
-        title: the model's name.
-        description: one sentence: what the model does, its sizes and ranges.
-        data: what it was trained on.
-        licence: what it may be used for.
-        scores: measured results.
-        held_out: its reconstruction errors (JSON), whose median and 99th percentile are stated.
-    """
-    measured = [text for text in (scores, _held_out(held_out)) if text]
-    parts = {
-        "Trained on": data,
-        "Scores": " ".join(measured),
-        "Licence": licence,
-    }
-    return "\n\n".join(
-        [
+        measured = [stated["Scores"], _errors_in_words(beside.get(ERRORS_FILE, ""))]
+        parts = {**stated, "Scores": " ".join(filter(None, measured))}
+        paragraphs = [
             f"# {title}",
-            description,
+            self.description(),
             f'```python\nimport derender\n\nmodel = derender.load("{title}")\n```',
-            *(f"**{name}**: {text or NOT_STATED}" for name, text in parts.items()),
+            *(f"**{name}**: {text or 'not stated'}" for name, text in parts.items()),
         ]
-    ) + "\n"  # fmt: skip
+        return "\n\n".join(paragraphs) + "\n"
 
 
 def with_metadata(card: str, licence: str | None = None) -> str:
@@ -147,18 +118,13 @@ def with_metadata(card: str, licence: str | None = None) -> str:
     if card.startswith("---"):
         return card
     tags = "library_name: derender\ntags: [inverse-rendering, disentanglement]\n"
-    named = f"license: {json.dumps(licence.lower())}\n" if licence and _is_short_name(licence) else ""
-    return f"---\n{tags}{named}---\n\n{card}"
+    if licence and len(licence) <= 32 and " " not in licence:  # a short name, such as MIT, and no sentence
+        tags += f"license: {json.dumps(licence.lower())}\n"
+    return f"---\n{tags}---\n\n{card}"
 
 
-def _is_short_name(licence: str) -> bool:
-    """Whether this is a licence's short name, such as MIT, and no sentence."""
-    return len(licence) <= 32 and " " not in licence
-
-
-def _held_out(errors: str | None) -> str:
-    if errors is None:
-        return ""
+def _errors_in_words(errors: str) -> str:
+    """Median and 99th percentile of held-out errors (JSON); empty where there are none."""
     try:
         stored = json.loads(errors)
         quantiles, count = [float(value) for value in stored["quantiles"]], int(stored["pictures"])

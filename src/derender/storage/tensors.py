@@ -1,21 +1,18 @@
 """Named tensors in a safetensors file that carries its own checksum; and which pickles of weights are safe.
 
 The CRC-32 of names, kinds, shapes and values is in the file's metadata, so that a changed bit is an error and
-not another model. Files made elsewhere carry none and are read as they are. Published networks exist only as
-pickles (.pth): torch's restricted reader makes tensors and plain values and runs no code, but before PyTorch
-2.10 a crafted file could corrupt memory through it (CVE-2026-24747). derender never writes a pickle.
+not another model; files made elsewhere have none. Published networks exist only as pickles (.pth): torch's
+restricted reader runs no code, but before PyTorch 2.10 a crafted file could corrupt memory through it
+(CVE-2026-24747). derender never writes a pickle.
 """
 
-import os
-import re
 import zlib
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor
 
 CHECKSUM = "crc32"
@@ -29,21 +26,7 @@ def write_tensors(
 ) -> None:
     """Write tensors, on whatever device, with their checksum; ``metadata`` is kept beside it."""
     plain = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
-    with disk_errors(file):
-        save_file(plain, file, metadata={**(metadata or {}), CHECKSUM: checksum(plain)})
-    Path(file).chmod(0o644)  # safetensors makes files that only their owner can read
-
-
-@contextmanager
-def disk_errors(file: str | Path) -> Iterator[None]:
-    """Turn what safetensors raises when a disk is full or a folder is closed into the system's own error."""
-    try:
-        yield
-    except SafetensorError as error:
-        number = re.search(r"os error (\d+)", str(error))
-        if number is None:
-            raise
-        raise OSError(int(number[1]), os.strerror(int(number[1])), str(file)) from error
+    Path(file).write_bytes(save(plain, {**(metadata or {}), CHECKSUM: checksum(plain)}))
 
 
 def read_tensors(file: str | Path) -> dict[str, Tensor]:
@@ -66,7 +49,29 @@ def read_described(file: str | Path) -> tuple[dict[str, Tensor], dict[str, str]]
         raise ValueError(f"{Path(file).name} is cut off or no safetensors file ({error})") from error
     if metadata.get(CHECKSUM, checksum(tensors)) != checksum(tensors):
         raise ValueError(f"{Path(file).name} has changed since it was written: its checksum differs")
-    return _unpacked(tensors), metadata
+    plain = {name: value for name, value in tensors.items() if not name.endswith(UNIT)}
+    for unit_name in tensors.keys() - plain.keys():
+        name, unit = unit_name.removesuffix(UNIT), tensors[unit_name]
+        value = plain.get(name)
+        if value is None or value.dtype != torch.int8 or value.ndim != unit.ndim:
+            raise ValueError(f"{unit_name} is the unit of no tensor in the file")
+        if any(one not in (1, size) for one, size in zip(unit.shape, value.shape, strict=True)):
+            raise ValueError(f"{unit_name} does not fit: {tuple(unit.shape)} beside {tuple(value.shape)}")
+        plain[name] = value.float() * unit.float()
+    return plain, metadata
+
+
+def check_fit(weights: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> None:
+    """Raise ValueError where a weight is missing, has another shape or is not expected; names the first."""
+    for name, value in expected.items():
+        if name not in weights:
+            raise ValueError(f"it has no {name!r}, which this architecture needs")
+        if weights[name].shape != value.shape:
+            there, here = tuple(weights[name].shape), tuple(value.shape)
+            raise ValueError(f"{name!r} has shape {there} there and {here} in this architecture")
+    for name in weights:
+        if name not in expected:
+            raise ValueError(f"it has {name!r}, which this architecture lacks")
 
 
 def packed(value: Tensor, along: int) -> tuple[Tensor, Tensor]:
@@ -74,20 +79,6 @@ def packed(value: Tensor, along: int) -> tuple[Tensor, Tensor]:
     others = [axis for axis in range(value.ndim) if axis != along]
     unit = value.abs().amax(dim=others, keepdim=True).clamp(min=torch.finfo(torch.float32).tiny) / 127
     return (value / unit).round().to(torch.int8), unit.float()
-
-
-def _unpacked(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    plain = {name: value for name, value in tensors.items() if not name.endswith(UNIT)}
-    for name, unit in tensors.items():
-        if not name.endswith(UNIT):
-            continue
-        value = plain.get(name.removesuffix(UNIT))
-        if value is None or value.dtype != torch.int8 or value.ndim != unit.ndim:
-            raise ValueError(f"{name} is the unit of no tensor in the file")
-        if any(one not in (1, size) for one, size in zip(unit.shape, value.shape, strict=True)):
-            raise ValueError(f"{name} does not fit: {tuple(unit.shape)} beside {tuple(value.shape)}")
-        plain[name.removesuffix(UNIT)] = value.float() * unit.float()
-    return plain
 
 
 def checksum(tensors: Mapping[str, Tensor]) -> str:
@@ -101,7 +92,7 @@ def checksum(tensors: Mapping[str, Tensor]) -> str:
 
 
 def reads_safely() -> bool:
-    """Whether the installed PyTorch is new enough."""
+    """Whether the installed PyTorch is new enough to read pickles of weights."""
     return torch.__version__ >= SAFE_SINCE
 
 

@@ -86,14 +86,14 @@ class Batches:
         return torch.from_numpy(np.take(self.images.numpy(), chosen, axis=0))
 
     def ready(
-        self, pictures: UInt8[Tensor, "b 3 h w"], position: int, ranks: Ranks = ALONE
+        self, images: UInt8[Tensor, "b 3 h w"], position: int, ranks: Ranks = ALONE
     ) -> Float[Tensor, "b 3 h w"]:
         """What ``read`` gave for this position as float32 in 0..1, some images mirrored or cropped anew."""
-        batch = pictures.float() / 255
+        batch = images.float() / 255
         if self.horizontal_flips:
             flip = torch.rand(self.batch_size, generator=random_stream(self.seed, "flip", position)) < 0.5
-            flip = ranks.own(flip)
-            batch = torch.where(flip.to(batch.device)[:, None, None, None], batch.flip(-1), batch)
+            flip = ranks.own(flip).to(batch.device)[:, None, None, None]
+            batch = torch.where(flip, batch.flip(-1), batch)
         if self.reframed:
             generator = random_stream(self.seed, "frame", position)
             crops = random_crops(self.batch_size, generator, self.reframe, self.reframed)
@@ -110,17 +110,13 @@ def batches_of(
     """Batches of these rows: on the device, or left in the file where they lie mapped and train on a CPU."""
     stay = isinstance(images, np.memmap) and device.type == "cpu"
     lying = torch.from_numpy(images if stay else np.ascontiguousarray(images[rows])).to(device)
-    kept = rows if stay else None
-    return Batches(
-        lying, config.batch_size, config.seed, config.horizontal_flips, kept, config.reframed, config.reframe
-    )
+    how = config.batch_size, config.seed, config.horizontal_flips
+    return Batches(lying, *how, rows if stay else None, config.reframed, config.reframe)
 
 
 def some_of(images: UInt8[np.ndarray, "n 3 h w"], rows: Int64[np.ndarray, " k"]) -> np.ndarray:
     """These images; of a mapped set at most ``SAMPLED``, evenly spread: (m, 3, H, W) in memory."""
-    if isinstance(images, np.memmap):
-        return _spread(images, rows)
-    return np.ascontiguousarray(images[rows])
+    return _spread(images, rows) if isinstance(images, np.memmap) else np.ascontiguousarray(images[rows])
 
 
 def _spread(images: np.ndarray, rows: np.ndarray) -> np.ndarray:
@@ -140,26 +136,21 @@ class Reader:
 
     def __init__(self, batches: Batches, ranks: Ranks = ALONE):
         self.batches, self.ranks, self.waited_s = batches, ranks, 0.0
-        on_cpu = batches.images.device.type == "cpu"
-        self._thread = ThreadPoolExecutor(1, thread_name_prefix="batch") if on_cpu else None
-        self._next: tuple[int, Future[Tensor]] | None = None
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="batch")
+        self._next: dict[int, Future[Tensor]] = {}
 
     def at(self, position: int) -> Float[Tensor, "b 3 h w"]:
         """What ``Batches.at`` gives; asked for in order it is there already."""
-        began = time.perf_counter()
-        if self._next is not None and self._next[0] == position:
-            pictures = self._next[1].result()
-        else:
-            pictures = self.batches.read(position, self.ranks)
+        began, ahead = time.perf_counter(), self._next.pop(position, None)
+        images = self.batches.read(position, self.ranks) if ahead is None else ahead.result()
         self.waited_s += time.perf_counter() - began
-        if self._thread is not None:
-            self._next = position + 1, self._thread.submit(self.batches.read, position + 1, self.ranks)
-        return self.batches.ready(pictures, position, self.ranks)
+        if self.batches.images.device.type == "cpu":
+            self._next = {position + 1: self._thread.submit(self.batches.read, position + 1, self.ranks)}
+        return self.batches.ready(images, position, self.ranks)
 
     def close(self) -> None:
         """End the thread."""
-        if self._thread is not None:
-            self._thread.shutdown(cancel_futures=True)
+        self._thread.shutdown(cancel_futures=True)
 
 
 @lru_cache(maxsize=2)

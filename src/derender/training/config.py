@@ -7,6 +7,7 @@ Source: the paper, Sec. 4 and its published settings; where the two differ (lear
 import json
 import math
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from reprlib import Repr
 from typing import Any, Literal, TypeVar
 
@@ -166,31 +167,28 @@ _SHORT = Repr()
 _SHORT.maxstring = _SHORT.maxother = 200  # a few lines of YAML can stand for gigabytes of text
 
 
-def _preset(name: str, **changes: Any) -> TrainConfig:
-    return TrainConfig(preset=name, model=MODEL_PRESETS[name], **changes)
-
-
+_PRESET_CHANGES: dict[str, dict[str, Any]] = {
+    "paper": {
+        "objective": {"perceptual": "vgg16", "curvature_weight": 0.0},
+        "whitening": {"pictures": 0},
+    },
+    "faces": {},
+    "cats": {},
+    "cars": {
+        "batch_size": 256,
+        "objective": {
+            "flip_weight": 1.0, "confidence": False, "perceptual_weight": 0.01, "smoothness_weight": 0.1,
+        },
+    },
+    "small": {
+        "batch_size": 16,
+        "images": 250_000,
+        "optimiser": {"learning_rate": 3e-4, "warmup_images": 4_000, "final_rate": 0.05},
+    },
+}  # fmt: skip
 PRESETS: dict[str, TrainConfig] = {
-    "paper": _preset(
-        "paper",
-        objective=ObjectiveSettings(perceptual="vgg16", curvature_weight=0.0),
-        whitening=WhiteningSettings(pictures=0),
-    ),
-    "faces": _preset("faces"),
-    "cats": _preset("cats"),
-    "cars": _preset(
-        "cars",
-        batch_size=256,
-        objective=ObjectiveSettings(
-            flip_weight=1.0, confidence=False, perceptual_weight=0.01, smoothness_weight=0.1
-        ),
-    ),
-    "small": _preset(
-        "small",
-        batch_size=16,
-        images=250_000,
-        optimiser=OptimiserSettings(learning_rate=3e-4, warmup_images=4_000, final_rate=0.05),
-    ),
+    name: TrainConfig.model_validate({"preset": name, "model": MODEL_PRESETS[name], **changes})
+    for name, changes in _PRESET_CHANGES.items()
 }
 
 
@@ -206,19 +204,18 @@ def resolve(preset: str, overrides: Iterable[str] = (), **explicit: Any) -> Trai
         ValueError: unknown preset or key (names the nearest), or a value that does not fit.
         FileNotFoundError: there is no model to start from.
     """
-    overrides = list(overrides)
-    config = with_changes(named_preset(preset, PRESETS), overrides, **explicit)
+    overrides, row = list(overrides), named_preset(preset, PRESETS)
+    config = with_changes(row, overrides, **explicit)
     if config.start_from is None:
         return config
     model = load(config.start_from).settings
     model = model.model_copy(update={"network": model.network.model_copy(update={"unet_decoder": False})})
-    row = named_preset(preset, PRESETS).model_copy(update={"model": model})
-    return with_changes(row, overrides, **explicit)
+    return with_changes(row.model_copy(update={"model": model}), overrides, **explicit)
 
 
 def with_changes(config: Config, overrides: Iterable[str] = (), **explicit: Any) -> Config:
     """The same kind of configuration with changes as in ``resolve``."""
-    tree = config.model_dump(mode="json")
+    leaves = _leaves(config.model_dump(mode="json"))
     changes: list[tuple[str, Any]] = []
     for override in overrides:
         key, equals, text = override.partition("=")
@@ -227,7 +224,14 @@ def with_changes(config: Config, overrides: Iterable[str] = (), **explicit: Any)
         changes.append((key.strip(), _read_value(text)))
     changes += [(key.replace("__", "."), value) for key, value in explicit.items() if value is not None]
     for key, value in changes:
-        _assign(tree, _full_key(key, tree), value)
+        leaves[_full_key(key, leaves)] = value
+    tree: dict[str, Any] = {}
+    for key, value in leaves.items():
+        *parents, last = key.split(".")
+        part = tree
+        for parent in parents:
+            part = part.setdefault(parent, {})
+        part[last] = value
     return config_from_tree(tree, type(config))
 
 
@@ -265,13 +269,10 @@ def without_removed(tree: dict[str, Any]) -> dict[str, Any]:
         ValueError: one has a value that this version cannot honour.
     """
     for key, neutral in REMOVED.items():
-        *parents, last = key.split(".")
-        part: Any = tree
-        for parent in parents:
-            part = part.get(parent) if isinstance(part, dict) else None
-        if not isinstance(part, dict) or last not in part:
-            continue
-        if (value := part.pop(last)) != neutral and neutral is not ...:
+        parent, last = key.split(".")
+        part = tree.get(parent)
+        value = part.pop(last, neutral) if isinstance(part, dict) else neutral
+        if value != neutral and neutral is not ...:
             raise ValueError(
                 f"setting {key!r} no longer exists: it can be {neutral}, not {_SHORT.repr(value)}; use an "
                 "earlier version of derender"
@@ -287,25 +288,19 @@ def _leaves(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return leaves
 
 
-def _full_key(key: str, tree: Mapping[str, Any]) -> str:
-    names = list(_leaves(tree))
+def _full_key(key: str, names: Iterable[str]) -> str:
+    """The dotted name that a key stands for."""
     if key in names:
         return key
-    ending = [name for name in names if name.rsplit(".", 1)[-1] == key or name.endswith(f".{key}")]
+    ending = [name for name in names if f".{name}".endswith(f".{key}")]
     if len(ending) == 1:
         return ending[0]
     if ending:
         raise ValueError(f"{key!r} could mean {' or '.join(ending)}: write it in full")
-    short = {name.rsplit(".", 1)[-1]: name for name in names}
-    guess = suggestion(key, names) or suggestion(key.rsplit(".", 1)[-1], short)
+    guess = suggestion(key, names) or suggestion(
+        key.rsplit(".", 1)[-1], [name.rsplit(".", 1)[-1] for name in names]
+    )
     raise ValueError(f"unknown setting {key!r}{guess}: 'derender train --dry-run' lists all of them")
-
-
-def _assign(tree: dict[str, Any], key: str, value: Any) -> None:
-    *parents, last = key.split(".")
-    for parent in parents:
-        tree = tree[parent]
-    tree[last] = value
 
 
 def _read_value(text: str) -> Any:
@@ -317,8 +312,6 @@ def _read_value(text: str) -> Any:
             f"cannot read the value {text!r}: write a number, a word, true, false or [a, b]"
         ) from error
     if isinstance(value, str):
-        try:
+        with suppress(ValueError):
             return float(value)
-        except ValueError:
-            return value
     return value

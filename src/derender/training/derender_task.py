@@ -22,8 +22,9 @@ from derender.training.batches import some_of
 from derender.training.checkpoint import fit_weights
 from derender.training.config import TrainConfig
 from derender.training.distributed import ALONE, Ranks, this_rank_writes
-from derender.training.features import complete_model
-from derender.training.loop import MAX_VALIDATION_IMAGES, NOT_RECONSTRUCTION, SampleSheet, train_task
+from derender.training.features import make_features
+from derender.training.held_out_errors import store_errors
+from derender.training.loop import MAX_VALIDATION_IMAGES, NOT_RECONSTRUCTION, train_task
 from derender.training.process import deterministic_algorithms
 from derender.training.run_folder import RunFolder
 from derender.training.step import own_share, training_step
@@ -33,13 +34,13 @@ from derender.training.watch import Watcher
 
 def train(
     config: TrainConfig,
-    pictures: ImageSet,
+    images: ImageSet,
     out: str | Path,
     *,
     resume: bool = False,
-    sample_sheet: SampleSheet | None = None,
     progress: Callable[[Progress], None] | None = None,
     accelerator: str = "auto",
+    **how: Any,
 ) -> TrainResult:
     """Train a model on images and estimate its features; all files lie in the folder ``out``.
 
@@ -47,33 +48,34 @@ def train(
         config: see `derender.training.config.resolve`.
         images: at the model's image size.
         out: a new folder, or with ``resume`` the folder of an unfinished run.
-        sample_sheet: draws a sheet for a few held-out images from time to time.
+        resume: go on with the run in ``out``.
         progress: called after every step.
         accelerator: "auto", "cpu" or "cuda".
+        how: ``sample_sheet``, which draws a sheet for a few held-out images from time to time.
 
     Raises:
         FileExistsError: ``out`` is not empty and ``resume`` was not requested.
         ValueError: images and configuration do not fit, or the run to resume has other settings.
         TrainingInterrupted: Ctrl-C or SIGTERM; the run can be resumed.
     """
-    report = progress or (lambda _: None)
-    task = DerenderTask(config, begins=not (resume and RunFolder(Path(out)).resumable))
-    how = {"resume": resume, "sample_sheet": sample_sheet, "accelerator": accelerator}
-    result = train_task(task, pictures, out, progress=report, **how)
-    if this_rank_writes() and result.stopped != "collapse":
-        split = split_indices(pictures.files, config.split, seed=config.seed)
-        held_out = pictures.images[split.validation[:MAX_VALIDATION_IMAGES]]
-        on_gpu = accelerator != "cpu" and torch.cuda.is_available()
-        with deterministic_algorithms(config.deterministic):
-            complete_model(
-                RunFolder(result.folder).model,
-                torch.from_numpy(some_of(pictures.images, split.train)),
-                torch.from_numpy(np.ascontiguousarray(held_out)),
-                config.features,
-                seed=config.seed,
-                device="cuda" if on_gpu else "cpu",
-                progress=lambda done, total: report(Progress("features", done, total)),
-            )
+    report, folder = progress or (lambda _: None), RunFolder(Path(out))
+    task = DerenderTask(config, begins=not (resume and folder.resumable))
+    result = train_task(task, images, out, resume=resume, progress=report, accelerator=accelerator, **how)
+    if not this_rank_writes() or result.stopped == "collapse":
+        return result
+    split = split_indices(images.files, config.split, seed=config.seed)
+    on_gpu = accelerator != "cpu" and torch.cuda.is_available()
+    with deterministic_algorithms(config.deterministic):
+        model = make_features(
+            load(folder.model, device="cuda" if on_gpu else "cpu"),
+            torch.from_numpy(some_of(images.images, split.train)),
+            config.features,
+            seed=config.seed,
+            progress=lambda done, total: report(Progress("features", done, total)),
+        )
+        model.features.save(folder.model)
+        held_out = images.images[split.validation[:MAX_VALIDATION_IMAGES]]
+        store_errors(folder.model, torch.from_numpy(np.ascontiguousarray(held_out)))
     return result
 
 
@@ -111,8 +113,7 @@ class DerenderTask(TrainingTask):
             FileNotFoundError: there is no model to start from.
             ValueError: its weights do not fit this one's settings; names the first.
         """
-        model = Derenderer.seeded(self.config.model, self.config.seed)
-        start = self.config.start_from
+        model, start = Derenderer.seeded(self.config.model, self.config.seed), self.config.start_from
         if start is not None and self.begins:
             try:
                 weights = load(start).state_dict()
@@ -159,17 +160,10 @@ class DerenderStep(nn.Module):
         done: float | None = None,
         rows: Tensor | None = None,
     ) -> tuple[Tensor, Held]:
-        objective = self.config.objective
+        objective, chunks = self.config.objective, self.config.accumulate
+        own, ranks = (1.0, ALONE) if done is None else (own_share(objective, done), self.ranks)
         result = training_step(
-            self.model,
-            images,
-            objective,
-            self.perceptual,
-            generator,
-            precision,
-            1.0 if done is None else own_share(objective, done),
-            ALONE if done is None else self.ranks,
-            self.config.accumulate,
+            self.model, images, objective, self.perceptual, generator, precision, own, ranks, chunks
         )
         return result.total, Held(result)
 

@@ -5,25 +5,23 @@ as long. Here scenes are fitted to the training images once, and a copy of the m
 predict them: from the images, and from renderings of the fitted scenes under other light, from other
 viewpoints and with another's geometry, whose scenes are known exactly. The student's scenes are also asked to
 reconstruct the images. Images in other crops (``reframed``) teach the position of the camera, which rendering
-alone does not: a decoder draws a small object sooner than a camera learns to step back. Needs no labels.
-Leaves out models with further factors, and the confidence net, which stays.
+alone does not. Needs no labels. Leaves out models with further factors, and the confidence net, which stays.
 """
 
 import math
-from collections.abc import Callable, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int64, UInt8
+from jaxtyping import Bool, Float, UInt8
 from pydantic import Field
 from torch import Generator, Tensor, nn
 
 from derender.data import as_float
 from derender.model import Derenderer
 from derender.objectives.reconstruction import masked_l1
-from derender.objectives.self_features import endless_order
+from derender.objectives.self_features import one_cycle
 from derender.postprocess.fitting import PARAMETERS, STEPS
 from derender.postprocess.morphable import MorphableMaps
 from derender.scene import Scene
@@ -58,6 +56,19 @@ class StudentSettings(Settings):
     images: int = Field(default=160_000, ge=1)
     batch_size: int = Field(default=64, ge=2)
     learning_rate: float = Field(default=4e-4, gt=0)
+
+    def plan(self, count: int) -> tuple[int, int]:
+        """Images of a batch and number of batches, out of ``count`` images."""
+        batch = min(self.batch_size, count)
+        return batch, math.ceil(self.images / batch)
+
+    def check(self, student: nn.Module, what: str) -> None:
+        """Weights that are NaN or infinite are an error."""
+        if not all(bool(value.isfinite().all()) for value in student.state_dict().values()):
+            raise ValueError(
+                f"{what} ended in weights that are NaN or infinite after {self.images:,} images: "
+                "give another seed or a lower learning_rate"
+            )
 
 
 class RefiningSettings(StudentSettings):
@@ -129,8 +140,12 @@ def refine(
         ValueError: a model that cannot fit scenes or has further factors; too few images, or images of
             another size; weights that are NaN or infinite in the end.
     """
-    config = config or RefineConfig()
-    settings, maps = config.refining, _maps_of(model)
+    config, report = config or RefineConfig(), progress or (lambda *_: None)
+    settings = config.refining
+    further = [factor.name for factor in model.factors if factor.name not in FACTORS]
+    if further:
+        raise ValueError(f"the model has {further[0]} beside the paper's factors: it cannot be refined")
+    maps = model.features.required_fitting().maps
     if len(images) < 2 or not len(held_out) or images.shape[-1] != model.image_size:
         raise ValueError(
             f"refining needs 2 images or more of {model.image_size} pixels and one held out, got "
@@ -138,7 +153,7 @@ def refine(
         )
     generator = Generator().manual_seed(seed)
     rows = torch.randperm(len(images), generator=generator)[: settings.fitted]
-    fitted = _fit(model, images[rows], settings.fit_steps, progress)
+    fitted = fit_scenes(model, images[rows], settings.fit_steps, report)
     clear = fitted.clear(settings.worst).cpu()
     if not clear.any():
         raise ValueError("fitting finds no scene of any image: the model's training went wrong")
@@ -147,59 +162,12 @@ def refine(
     if settings.reframed:
         ranges = ranges_for_crops(student.settings.ranges, student.image_size, config.reframe)
         student.settings = student.settings.model_copy(update={"ranges": ranges})
-    _learn(student, images[rows[clear]], maps, fitted.rows(clear), config, generator, progress)
-    check_weights(student, "refining", settings)
+    _learn(student, images[rows[clear]], maps, fitted.rows(clear), config, generator, report)
+    settings.check(student, "refining")
     fitting = config.fitting.model_copy(update={"coordinates": maps.size("depth")})
     features = config.model_copy(update={"fitting": fitting})
     student = make_features(student, images, features, seed=seed, progress=progress, maps=maps)
-    return Refined(student, *_compared(model, student, maps, held_out[:MEASURED_IMAGES], settings.fit_steps))
-
-
-def train_student(
-    parts: Sequence[nn.Module],
-    optimiser: torch.optim.Optimizer,
-    settings: StudentSettings,
-    count: int,
-    loss: Callable[[Int64[Tensor, " b"]], Float[Tensor, ""]],
-    generator: Generator,
-    progress: Progress | None,
-    *,
-    warm_up: float,
-    clip: float = math.inf,
-) -> None:
-    """Minimise a loss of random rows of ``count`` images, with one cycle of the learning rate.
-
-    ``warm_up`` is the share of the steps until the rate peaks; gradients of each of the ``parts`` are clipped
-    to the norm ``clip``. Afterwards the parts are in evaluation mode, without gradients.
-    """
-    batch = min(settings.batch_size, count)
-    steps = math.ceil(settings.images / batch)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(
-        optimiser, settings.learning_rate, total_steps=steps + 1, pct_start=warm_up, cycle_momentum=False
-    )
-    order = endless_order(count, generator)
-    for step in range(steps):
-        value = loss(torch.tensor([next(order) for _ in range(batch)]))
-        optimiser.zero_grad(set_to_none=True)
-        value.backward()
-        if clip < math.inf:
-            for part in parts:
-                nn.utils.clip_grad_norm_(part.parameters(), clip)
-        optimiser.step()
-        schedule.step()
-        if progress is not None:
-            progress(min((step + 1) * batch, settings.images), settings.images)
-    for part in parts:
-        part.eval().requires_grad_(False)
-
-
-def check_weights(student: nn.Module, what: str, settings: StudentSettings) -> None:
-    """Weights that are NaN or infinite are an error."""
-    if not all(bool(value.isfinite().all()) for value in student.state_dict().values()):
-        raise ValueError(
-            f"{what} ended in weights that are NaN or infinite after {settings.images:,} images: "
-            "give another seed or a lower learning_rate"
-        )
+    return Refined(student, *_compared(model, student, held_out[:MEASURED_IMAGES], settings.fit_steps))
 
 
 class FittedScenes(NamedTuple):
@@ -226,23 +194,16 @@ class FittedScenes(NamedTuple):
         return Scene(depth, albedo.clamp(0, 1), self.light, self.camera)
 
 
-def _maps_of(model: Derenderer) -> MorphableMaps:
-    further = [factor.name for factor in model.factors if factor.name not in FACTORS]
-    if further:
-        raise ValueError(f"the model has {further[0]} beside the paper's factors: it cannot be refined")
-    return model.features.required_fitting().maps
-
-
-def _fit(
-    model: Derenderer, images: UInt8[Tensor, "n 3 h w"], steps: int, progress: Progress | None
+def fit_scenes(
+    model: Derenderer, images: UInt8[Tensor, "n 3 h w"], steps: int, report: Progress
 ) -> FittedScenes:
+    """Scenes fitted to all images, batch by batch."""
     parts = []
     for start in range(0, len(images), _FIT_BATCH):
         found = model.fit_scenes(as_float(images[start : start + _FIT_BATCH]).to(model.device), steps)
         own = found.coordinates
         parts.append((own["geometry"], own["albedo"], found.scene.light, found.scene.camera, found.after))
-        if progress is not None:
-            progress(min(start + _FIT_BATCH, len(images)), len(images))
+        report(min(start + _FIT_BATCH, len(images)), len(images))
     return FittedScenes(*(torch.cat(part) for part in zip(*parts, strict=True)))
 
 
@@ -253,7 +214,7 @@ def _learn(
     fitted: FittedScenes,
     config: RefineConfig,
     generator: Generator,
-    progress: Progress | None,
+    report: Progress,
 ) -> None:
     """Train the student's networks of the four factors in place."""
     settings = config.refining
@@ -266,7 +227,7 @@ def _learn(
 
     def loss(rows: Tensor) -> Tensor:
         shown = as_float(images[rows]).to(student.device)
-        shown, target = _examples(student, shown, fitted.rows(rows).scene(maps), config, generator)
+        shown, target = examples(student, shown, fitted.rows(rows).scene(maps), config, generator)
         predicted = student.decompose(shown)
         total = unit.distance(predicted, target)
         photographs = slice(round(len(rows) * settings.rendered), None)  # renderings have exact scenes
@@ -276,12 +237,14 @@ def _learn(
             total = total + settings.picture_weight * error / _NOISE
         return total
 
-    train_student([learning], optimiser, settings, len(images), loss, generator, progress, warm_up=0.05)
+    batch, steps = settings.plan(len(images))
+    for step, _ in one_cycle(optimiser, loss, len(images), batch, steps, generator, warm_up=0.05):
+        report(min(step * batch, settings.images), settings.images)
     student.requires_grad_(False).eval()
 
 
 @torch.no_grad()
-def _examples(
+def examples(
     model: Derenderer,
     images: Float[Tensor, "n 3 h w"],
     fitted: Scene,
@@ -299,18 +262,17 @@ def _examples(
         light=perturb_light(fitted.light, generator, config.perturb, ranges),
         camera=perturb_camera(fitted.camera, generator, config.perturb, ranges),
     )[:rendered]
-    shown, scene = images[rendered:], fitted[rendered:]
+    shown, scene = images, fitted
     if rendered:
         made = model.render(otherwise)
         filled = fill_uncovered(made.image, made.mask, images[:rendered])
-        shown, scene = torch.cat([filled.clamp(0, 1), shown]), concatenate([otherwise, scene])
+        shown = torch.cat([filled.clamp(0, 1), images[rendered:]])
+        scene = concatenate([otherwise, fitted[rendered:]])
     mirrored = torch.rand(len(shown), generator=generator) < 0.5
     mirrored[:rendered] = False  # their light and view are any already
-    twin = seen_in_mirror(scene)
-    shown = _where(mirrored, shown.flip(-1), shown)
-    scene = scene.with_parameters(
-        **{name: _where(mirrored, twin.parameters[name], value) for name, value in scene.parameters.items()}
-    )
+    twin = seen_in_mirror(scene).parameters
+    both = {name: _where(mirrored, twin[name], value) for name, value in scene.parameters.items()}
+    shown, scene = _where(mirrored, shown.flip(-1), shown), Scene.from_parameters(both)
     return _cropped(shown, scene, model, config, generator)
 
 
@@ -342,36 +304,33 @@ class SceneUnit:
     Numbers that the model cannot change (a translation whose range is 0) do not count.
     """
 
+    @torch.no_grad()
     def __init__(self, model: Derenderer, fitted: Scene):
-        with torch.no_grad():
-            self.able = {
-                name: _changeable(model, name, fitted.parameters[name]) for name in ("light", "camera")
-            }
-            self.deviation = {name: _mean_deviation(value) for name, value in fitted.parameters.items()}
-            self.slope = _mean_deviation(_slopes(fitted.depth)).mean()
+        self.able: dict[str, Bool[Tensor, " k"]] = {}
+        for factor in model.factors:
+            if not factor.mirrored:
+                value = fitted.parameters[factor.parameter][:1]
+                ends = (torch.full_like(value, end) for end in (-1.0, 1.0))
+                least, most = (factor.to_parameter(end, model.settings.ranges) for end in ends)
+                self.able[factor.parameter] = (least != most)[0]
+        self.deviation = {name: _mean_deviation(value) for name, value in fitted.parameters.items()}
+        self.slope = _mean_deviation(_slopes(fitted.depth)).mean()
 
     def gaps(self, predicted: Scene, target: Scene) -> dict[str, Tensor]:
         """By parameter of a scene, mean absolute difference in this unit."""
-        apart = {
-            name: (value - target.parameters[name]).abs() for name, value in predicted.parameters.items()
-        }
-        gaps = {name: apart[name].mean() / self.deviation[name].mean() for name in PARAMETERS.values()}
-        for name, able in self.able.items():
-            gaps[name] = (apart[name] / self.deviation[name])[:, able].mean()
+        gaps = {}
+        for name, value in predicted.parameters.items():
+            apart, deviation = (value - target.parameters[name]).abs(), self.deviation[name]
+            if name in self.able:
+                gaps[name] = (apart / deviation)[:, self.able[name]].mean()
+            else:
+                gaps[name] = apart.mean() / deviation.mean()
         return gaps
 
     def distance(self, predicted: Scene, target: Scene) -> Float[Tensor, ""]:
         """The sum of the gaps, and that of the slopes of depth, which make the shading."""
         slopes = (_slopes(predicted.depth) - _slopes(target.depth)).abs().mean() / self.slope
         return torch.stack([*self.gaps(predicted, target).values(), slopes]).sum()
-
-
-def _changeable(model: Derenderer, name: str, values: Float[Tensor, "n k"]) -> Bool[Tensor, " k"]:
-    """Which numbers of a factor the model's ranges let it change."""
-    (factor,) = (factor for factor in model.factors if factor.name == name)
-    ends = (torch.full_like(values[:1], end) for end in (-1.0, 1.0))
-    least, most = (factor.to_parameter(end, model.settings.ranges) for end in ends)
-    return (least != most)[0]
 
 
 def _slopes(depth: Float[Tensor, "n h w"]) -> Float[Tensor, "n d"]:
@@ -385,7 +344,7 @@ def _mean_deviation(value: Float[Tensor, "n ..."]) -> Tensor:
 
 @torch.no_grad()
 def _compared(
-    model: Derenderer, student: Derenderer, maps: MorphableMaps, images: UInt8[Tensor, "n 3 h w"], steps: int
+    model: Derenderer, student: Derenderer, images: UInt8[Tensor, "n 3 h w"], steps: int
 ) -> tuple[dict[str, float], dict[str, dict[str, float]]]:
     """Errors and gaps of ``Refined``."""
     shown = as_float(images).to(model.device)

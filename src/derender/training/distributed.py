@@ -1,16 +1,15 @@
 """Training on several devices: each has its rows of a batch, and values of all rows are exchanged.
 
 Each rank (one process, one device) takes its rows of every batch. What couples the images of a batch goes
-through `Ranks`, with gradient where one is due, so that losses and gradients are those of one process with
-the whole batch: a rank's loss is its share of the whole, such that the mean over ranks is the loss of the
-batch, and DDP averages gradients accordingly. Processes are started by torchrun; their traffic is
-torch.distributed's, through Lightning Fabric's DDP strategy. Leaves out splitting a model over devices.
+through `Ranks`, with gradient where one is due: a rank's loss is its share of the whole, such that the mean
+over ranks is the loss of the batch, and DDP averages gradients accordingly. Processes are started by
+torchrun and joined by Lightning Fabric. Leaves out splitting a model over devices.
 """
 
 import logging
 import os
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -22,27 +21,6 @@ import torch
 from jaxtyping import Shaped
 from torch import Tensor, distributed
 from torch.autograd.function import once_differentiable
-from torch.nn.parallel import DistributedDataParallel
-
-
-@contextmanager
-def _version_alone(package: str) -> Iterator[None]:
-    """Within the block a package that is not imported yet is there with its version and nothing else."""
-    if package in sys.modules:
-        yield
-        return
-    placeholder = ModuleType(package)
-    placeholder.__dict__["__version__"] = version(package)
-    sys.modules[package] = placeholder
-    try:
-        yield
-    finally:
-        sys.modules.pop(package)
-
-
-with _version_alone("torchmetrics"):  # Fabric reads its version: two of the six seconds of its import
-    from lightning_fabric import Fabric
-    from lightning_fabric.strategies.ddp import DDPStrategy
 
 
 @dataclass(frozen=True)
@@ -79,7 +57,8 @@ class Ranks:
         """The rows of all ranks in order; the gradient of every rank's loss flows back to the owner."""
         if self.count == 1:
             return piece
-        gathered: Any = _Gather.apply(piece.float() if piece.dtype in _HALF else piece, self)
+        half = piece.dtype in (torch.bfloat16, torch.float16)
+        gathered: Any = _Gather.apply(piece.float() if half else piece, self)
         return gathered
 
     def part_of_mean(self, weight: Tensor) -> Tensor:
@@ -96,37 +75,27 @@ class Ranks:
 
     def mean(self, values: Mapping[str, float]) -> dict[str, float]:
         """Means over the ranks, by name; all have the same names."""
-        if self.count == 1:
-            return dict(values)
-        names = sorted(values)
-        summed = self._reduced([values[name] for name in names], distributed.ReduceOp.SUM)
-        means = dict(zip(names, summed, strict=True))
-        return {name: means[name] / self.count for name in values}
+        return {name: value / self.count for name, value in self.sum(values).items()}
 
     def sum(self, values: Mapping[str, float]) -> dict[str, float]:
         """Sums over the ranks, by name; one that has nothing to add gives no names."""
-        if self.count == 1:
-            return dict(values)
-        gathered: list[Any] = [None] * self.count
-        distributed.all_gather_object(gathered, dict(values))
-        names = dict.fromkeys(name for one in gathered for name in one)
-        return {name: sum(one.get(name, 0.0) for one in gathered) for name in names}
+        everyone = self._everyone(dict(values))
+        names = dict.fromkeys(name for one in everyone for name in one)
+        return {name: sum(one.get(name, 0.0) for one in everyone) for name in names}
 
     def largest(self, *values: float) -> list[float]:
         """Of each number the largest that any rank has."""
-        return self._reduced(values, distributed.ReduceOp.MAX)
+        return [max(column) for column in zip(*self._everyone(values), strict=True)]
 
-    def _reduced(self, values: Sequence[float], operation: Any) -> list[float]:
-        if self.count == 1:
-            return list(values)
-        device = "cuda" if distributed.get_backend() == "nccl" else "cpu"
-        tensor = torch.tensor(list(values), dtype=torch.float64, device=device)
-        distributed.all_reduce(tensor, operation)
-        return tensor.tolist()
+    def _everyone(self, value: Any) -> list[Any]:
+        """The values of all ranks in order."""
+        found: list[Any] = [value] * self.count
+        if self.count > 1:
+            distributed.all_gather_object(found, value)
+        return found
 
 
 ALONE = Ranks()
-_HALF = (torch.bfloat16, torch.float16)
 
 
 class _Gather(torch.autograd.Function):
@@ -152,47 +121,43 @@ def started_together() -> int:
     return int(os.environ.get("WORLD_SIZE", "1")) if "LOCAL_WORLD_SIZE" in os.environ else 1
 
 
-def open_fabric(accelerator: str, *, every_parameter_learns: bool = False) -> Fabric:
-    """One device; under torchrun one for each of its processes, joined when this returns.
+def open_fabric(accelerator: str, *, every_parameter_learns: bool = False) -> Any:
+    """A Lightning Fabric of one device; under torchrun of one for each process, joined when this returns.
 
     Args:
         accelerator: "auto", "cpu" or "cuda".
         every_parameter_learns: in every step, which saves DDP a search.
-
-    Raises:
-        ValueError: nodes with different numbers of processes.
     """
+    stub = ModuleType("torchmetrics")  # Fabric reads its version alone: two of the four seconds of its import
+    stub.__dict__["__version__"] = version("torchmetrics")
+    stands_in = sys.modules.setdefault("torchmetrics", stub) is stub
+    from lightning_fabric import Fabric
+    from lightning_fabric.strategies.ddp import DDPStrategy
+
+    if stands_in:
+        del sys.modules["torchmetrics"]
     world = started_together()
     if world == 1:
         return Fabric(accelerator=accelerator, devices=1)
-    local = int(os.environ["LOCAL_WORLD_SIZE"])
-    if world % local:
-        raise ValueError(
-            f"{world} processes, {local} of them on this machine: start the same number on every machine "
-            "(torchrun --nproc-per-node)"
-        )
-    known = signature(DistributedDataParallel.__init__).parameters
+    known = signature(torch.nn.parallel.DistributedDataParallel.__init__).parameters
     buffers = "forward_sync_buffers" if "forward_sync_buffers" in known else "broadcast_buffers"
     options: dict[str, Any] = {"find_unused_parameters": not every_parameter_learns, buffers: False}
-    strategy = DDPStrategy(**options)
-    fabric = Fabric(accelerator=accelerator, devices=local, num_nodes=world // local, strategy=strategy)
-    logger = logging.getLogger("lightning_fabric")  # quiet while processes find each other
-    before = logger.level
-    logger.setLevel(logging.WARNING)
-    try:
-        fabric.launch()
-    finally:
-        logger.setLevel(before)
+    local = int(os.environ["LOCAL_WORLD_SIZE"])
+    logging.getLogger("lightning_fabric").setLevel(logging.WARNING)  # quiet while processes find each other
+    fabric = Fabric(
+        accelerator=accelerator, devices=local, num_nodes=world // local, strategy=DDPStrategy(**options)
+    )
+    fabric.launch()
     return fabric
 
 
-def ranks_of(fabric: Fabric) -> Ranks:
+def ranks_of(fabric: Any) -> Ranks:
     """Where this process stands among those of a fabric."""
     return Ranks(fabric.global_rank, fabric.world_size)
 
 
 @contextmanager
-def first_then_others(fabric: Fabric, *, local: bool = False) -> Iterator[None]:
+def first_then_others(fabric: Any, *, local: bool = False) -> Iterator[None]:
     """The first rank (``local``: of each machine) runs the block before the others do."""
     if fabric.world_size == 1:
         yield
@@ -210,8 +175,7 @@ def first_to_fail() -> bool:
         return True
     if not distributed.is_initialized():
         return os.environ.get("RANK", "0") == "0"  # before they know of each other all fail alike
-    store = distributed.distributed_c10d._get_default_store()
-    return store.add("derender/failed", 1) == 1
+    return distributed.distributed_c10d._get_default_store().add("derender/failed", 1) == 1
 
 
 def leave() -> None:

@@ -2,10 +2,9 @@
 
 Whitening: how other factors move a model's activations, measured on its own renderings. For geometry and
 albedo every image is decomposed, rendered with other values of all its vector factors (light and camera), and
-encoded again, several times; mirror images count as views, too, for the object is symmetric. This is LOOCC's
-perturbation, of all vector factors at once, used after training instead of during it. For each vector factor
-everything but that factor is changed: maps are another image's. Leaves out changing one map beside the other,
-which brought nothing (docs/log.md).
+encoded again, several times; mirror images count as views, too, for the object is symmetric. For each vector
+factor everything but that factor is changed: maps are another image's. Leaves out changing one map beside the
+other, which brought nothing (docs/log.md).
 
 Fitting: a morphable model of the depths and albedos that the model predicts. The optimisation itself happens
 when a model is used (postprocess/fitting.py).
@@ -13,14 +12,13 @@ when a model is used (postprocess/fitting.py).
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from pathlib import Path
 
 import torch
 from jaxtyping import Float, Int64, Shaped
 from torch import Generator, Tensor
 
 from derender.data import as_float
-from derender.model import Derenderer, load
+from derender.model import Derenderer
 from derender.networks import Factor
 from derender.postprocess import Features
 from derender.postprocess.fitting import PARAMETERS, Fitting, FittingSettings
@@ -29,7 +27,6 @@ from derender.postprocess.whitening import Scatter, Whitening, fit_projection
 from derender.scene import Scene
 from derender.scene.perturb import PerturbSettings
 from derender.training.config import FeatureSettings, WhiteningSettings
-from derender.training.held_out_errors import store_errors
 from derender.training.step import fill_uncovered
 
 BATCH_SIZE = 128
@@ -39,22 +36,6 @@ Describe = Callable[[Float[Tensor, "n 3 h w"]], Mapping[str, Float[Tensor, "n _"
 """Activations by name of images in 0..1: the code, then the rest."""
 Progress = Callable[[int, int], object]
 """Called with (images done, images in all)."""
-
-
-def complete_model(
-    folder: Path,
-    images: Shaped[Tensor, "n 3 h w"],
-    held_out: Shaped[Tensor, "m 3 h w"],
-    settings: FeatureSettings,
-    *,
-    seed: int = 0,
-    device: str | torch.device = "cpu",
-    progress: Progress | None = None,
-) -> None:
-    """Add features, estimated on training images, and errors of held-out images to a saved model."""
-    model = make_features(load(folder, device=device), images, settings, seed=seed, progress=progress)
-    model.features.save(folder)
-    store_errors(folder, held_out)
 
 
 def make_features(
@@ -99,6 +80,7 @@ def make_features(
     return model
 
 
+@torch.no_grad()
 def fit_whitening(
     model: Derenderer,
     images: Shaped[Tensor, "n 3 h w"],
@@ -133,20 +115,17 @@ def fit_whitening(
         raise ValueError("whitening needs at least 2 images, got 0")
     model = model.without_features()
     encode = describe or (model.activations if settings.spatial else model.encode)
-    moving = [factor for factor in model.factors if not factor.mirrored]
-    vectors = moving if describe is None and settings.vectors else []
+    maps, vectors = ([f for f in model.factors if f.mirrored is which] for which in (True, False))
     mirrored: dict[str, Scatter] = {}
     alone: dict[str, Scatter] = {}
-    with _evaluating(model), torch.no_grad():
+    with _evaluating(model):
         for start, batch in _batches(model, images, rows, progress):
             scene = model.decompose(batch)
-            shown = _renderings(model, scene, batch, moving, perturb, generator, settings.views)
+            shown = _renderings(model, scene, batch, vectors, perturb, generator, settings.views)
             views = [encode(one) for one in shown]
             if settings.mirrored:
                 views += [encode(one.flip(-1)) for one in shown]
-            names = tuple(views[0])
-            if describe is None:
-                names = tuple(factor.name for factor in model.factors if factor.mirrored)
+            names = tuple(views[0]) if describe is not None else tuple(factor.name for factor in maps)
             for view in views:  # the images first: of a broken rendering every activation is broken
                 _check_finite(
                     "whitening", {f"the activations of {name}": view[name] for name in names}, start
@@ -154,22 +133,22 @@ def fit_whitening(
             for name in names:
                 joined = torch.stack([view[name].float() for view in views])
                 mirrored.setdefault(name, Scatter()).add(joined)
-            for factor in vectors if len(batch) > 1 else ():  # maps are exchanged within the batch
+            exchangeable = len(batch) > 1 and describe is None and settings.vectors
+            for factor in vectors if exchangeable else ():  # maps are exchanged within the batch
                 rest = [other for other in model.factors if other.name != factor.name]
                 shown = _renderings(model, scene, batch, rest, perturb, others, settings.views)
                 codes = [model.nets[factor.name].encode(one).float() for one in shown]  # type: ignore[operator]
                 alone.setdefault(factor.name, Scatter()).add(torch.stack(codes))
     if describe is None:
         size = size or model.settings.network.code_size
-    contrasts = {
+    projections = {
         name: fit_projection(scatter, settings.directions, settings.shrinkage, size, settings.evenness)
         for name, scatter in mirrored.items()
     }
-    contrasts |= {
-        name: fit_projection(scatter, len(scatter.mean), settings.shrinkage, power=settings.vector_power)
-        for name, scatter in alone.items()
-    }
-    return Whitening(contrasts, mirrored=mirrored if settings.mirrored else ()).to(model.device)
+    for name, scatter in alone.items():
+        kept, power = len(scatter.mean), settings.vector_power
+        projections[name] = fit_projection(scatter, kept, settings.shrinkage, power=power)
+    return Whitening(projections, mirrored=mirrored if settings.mirrored else ()).to(model.device)
 
 
 @torch.no_grad()
@@ -196,6 +175,7 @@ def recentre(
     return whitening.with_means(means).to(model.device)
 
 
+@torch.no_grad()
 def make_fitting(
     model: Derenderer,
     images: Shaped[Tensor, "n 3 h w"],
@@ -228,38 +208,28 @@ def make_fitting(
     model = model.with_features(Features(model.whitening))
     examples: dict[str, list[Tensor]] = {parameter: [] for parameter in PARAMETERS.values()}
     squares = torch.zeros((), dtype=torch.float64)
-    with _evaluating(model), torch.no_grad():
+    with _evaluating(model):
         for start, batch in _batches(model, images, rows, progress):
             scene, features = model.decompose(batch), model.embed(batch)
             _check_finite("fitting", {name: scene.parameters[name] for name in examples}, start)
-            if maps is None:
-                for name, parts in examples.items():
-                    parts.append(scene.parameters[name].float().cpu())
+            for name, parts in examples.items() if maps is None else ():
+                parts.append(scene.parameters[name].float().cpu())
             squares += sum(features[name].double().square().sum().cpu() for name in PARAMETERS)
     if maps is None:
         joined = {name: torch.cat(parts) for name, parts in examples.items()}
         maps = MorphableMaps.of(joined, settings.coordinates)
     fitting = Fitting(maps, settings).to(model.device)
-    # feed-forward every coordinate varies by 1
+    # squared length of coordinates, all factors together: feed-forward every one varies by 1
     own = float(sum(maps.size(parameter) for parameter in PARAMETERS.values()))
     if settings.steps:
-        own = _fitted_length(model, fitting, images, rows[:LENGTH_IMAGES])
-    features_length = float(squares / len(rows))
-    fitting.get_buffer("length").fill_(settings.weight * (features_length / own) ** 0.5 if own else 0.0)
+        total, few = 0.0, rows[:LENGTH_IMAGES]
+        for _, batch in _batches(model, images, few, None):
+            fitted = fitting.fit(batch, model.decompose(batch), model.render).coordinates
+            total += sum(float(value.double().square().sum()) for value in fitted.values())
+        own = total / len(few)
+    length = (float(squares / len(rows)) / own) ** 0.5 if own else 0.0
+    fitting.get_buffer("length").fill_(settings.weight * length)
     return fitting
-
-
-def _fitted_length(
-    model: Derenderer, fitting: Fitting, images: Shaped[Tensor, "n 3 h w"], rows: Int64[Tensor, " k"]
-) -> float:
-    """Squared length of the images' fitted coordinates, all factors together, the mean over images."""
-    total = 0.0
-    for _, batch in _batches(model, images, rows, None):
-        with torch.no_grad():
-            scene = model.decompose(batch)
-        fitted = fitting.fit(batch, scene, model.render, fitting.settings.steps)
-        total += sum(float(value.double().square().sum()) for value in fitted.coordinates.values())
-    return total / len(rows)
 
 
 def _renderings(

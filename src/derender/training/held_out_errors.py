@@ -22,7 +22,6 @@ from derender.settings import Settings
 from derender.storage.atomic import atomic_file
 from derender.storage.folder import ERRORS_FILE
 
-FORMAT = 1
 QUANTILES = 101
 FEWEST = 20
 """Of fewer images nothing is saved: their largest error says little."""
@@ -40,7 +39,7 @@ class HeldOutErrors:
 
     Attributes:
         quantiles: (101,) the masked L1 (0..1) that 0, 1, ... 100 % of the images do not exceed.
-        images: how many there were.
+        pictures: how many there were.
     """
 
     quantiles: Float[np.ndarray, " 101"]
@@ -48,7 +47,7 @@ class HeldOutErrors:
 
 
 class _ErrorsFile(Settings):
-    format: Literal[1] = FORMAT
+    format: Literal[1] = 1
     measure: str = "mean absolute difference inside the mask, 0..1"
     pictures: int = Field(ge=0)
     quantiles: list[Annotated[float, Field(ge=0)]] = Field(min_length=QUANTILES, max_length=QUANTILES)
@@ -90,7 +89,11 @@ def masked_l1(rendering: Any, target: Float[Tensor, "n 3 h w"]) -> Float[Tensor,
 
 
 def errors_of(model: Any, images: Images, batch_size: int = 64) -> HeldOutErrors:
-    """The quantiles for images the model was not trained on."""
+    """The quantiles for images the model was not trained on.
+
+    Raises:
+        ValueError: fewer than 20 images, or a model that renders nothing or NaN.
+    """
     if len(images) < FEWEST:
         raise ValueError(f"quantiles of errors need {FEWEST} images or more, got {len(images)}")
     errors = reconstruction_errors(model, images, batch_size)

@@ -5,27 +5,31 @@ optimiser and counters to go on where it stopped.
 """
 
 import time
+import warnings
 from collections import defaultdict
 from collections.abc import Callable
 from contextlib import nullcontext
-from functools import partial
 from math import isfinite
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Int64, UInt8
 from PIL import Image
-from torch import Tensor, nn
+from torch import Tensor
 from torch.utils.tensorboard.writer import SummaryWriter
 
 from derender.data import ImageSet, split_indices
-from derender.storage.atomic import atomic_file
-from derender.training.batches import Batches, Reader, batches_of, random_stream
-from derender.training.checkpoint import ModelOfRun, TrainState, resume_from, save_checkpoint
-from derender.training.config import LoopSettings
-from derender.training.distributed import ALONE, Ranks, first_then_others, open_fabric, ranks_of
+from derender.storage.atomic import DamageNoticed, atomic_file
+from derender.training.batches import Reader, batches_of, random_stream
+from derender.training.checkpoint import (
+    DamagedCheckpoint,
+    TrainState,
+    load_checkpoint,
+    resume_from,
+    save_checkpoint,
+)
+from derender.training.distributed import first_then_others, open_fabric, ranks_of
 from derender.training.process import (
     TrainingInterrupted,
     deterministic_algorithms,
@@ -41,12 +45,10 @@ from derender.training.run_folder import (
     start_run,
 )
 from derender.training.task import (
-    Precision,
     Progress,
     StepLosses,
     TrainingTask,
     TrainResult,
-    Watch,
     compute_step,
     network_precision,
 )
@@ -65,7 +67,7 @@ SampleSheet = Callable[[Any, Tensor], Image.Image]
 
 def train_task(
     task: TrainingTask,
-    pictures: ImageSet,
+    images: ImageSet,
     out: str | Path,
     *,
     resume: bool = False,
@@ -74,45 +76,12 @@ def train_task(
     accelerator: str = "auto",
 ) -> TrainResult:
     """Train any task; arguments, files and errors are those of `derender.training.train`."""
-    config, out, report = task.config, Path(out), progress or (lambda _: None)
-    pictures.require(10)
-    with deterministic_algorithms(config.deterministic):
-        fabric = open_fabric(accelerator, every_parameter_learns=task.every_parameter_learns)
-        ranks = ranks_of(fabric)
-        if ranks.count > 1:
-            task = task.shared(ranks)
-        split = split_indices(pictures.files, config.split, seed=config.seed)
-        batches = batches_of(pictures.images, split.train, config, fabric.device)
-        task.check()
-        if not ranks.first:
-            folder = RunFolder(out)
-        elif resume:
-            folder = reopen_run(out, config)
-        else:
-            device = f"{ranks.count} x {fabric.device.type}" if ranks.count > 1 else str(fabric.device)
-            folder = start_run(out, config, describe_data(pictures, split), device)
-        model = task.build().to(fabric.device)
-        if config.channels_last:
-            model = model.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
-        with first_then_others(fabric):
-            step = task.step_module(
-                model, folder, batches.sample(), lambda *counts: report(Progress("perceptual", *counts))
-            )
-        how = config.optimiser.model_dump(include={"betas", "weight_decay"})
-        optimiser = torch.optim.Adam(model.parameters(), config.optimiser.learning_rate, **how, fused=True)
-        train_rows = torch.from_numpy(split.train)
-        module, wrapped = fabric.setup(step, optimiser)
-        run = _Run(task, folder, fabric, ranks, module, wrapped, batches, train_rows)
-        note = None
-        if resume:
-            run.state, note = resume_from(folder.last, folder.previous, model, optimiser)
-        for group in optimiser.param_groups:
-            group.update(how)
-        held_rows = split.validation[:MAX_VALIDATION_IMAGES]
-        held_out = torch.from_numpy(np.ascontiguousarray(pictures.images[held_rows]))
-        run.begin(fabric.to_device(held_out), torch.from_numpy(held_rows), sample_sheet, note)
-        with freed_memory_kept() if fabric.device.type == "cpu" else nullcontext():
-            return run.go_on(report)
+    images.require(10)
+    with deterministic_algorithms(task.config.deterministic):
+        report = progress or (lambda _: None)
+        run = _Run(task, images, Path(out), resume, sample_sheet, report, accelerator)
+        with freed_memory_kept() if run.fabric.device.type == "cpu" else nullcontext():
+            return run.go_on()
 
 
 class _Run:
@@ -121,48 +90,116 @@ class _Run:
     def __init__(
         self,
         task: TrainingTask,
-        folder: RunFolder,
-        fabric: Any,
-        ranks: Ranks,
-        module: nn.Module,
-        optimiser: torch.optim.Optimizer,
-        batches: Batches,
-        train_rows: Tensor,
+        images: ImageSet,
+        out: Path,
+        resume: bool,
+        sample_sheet: SampleSheet | None,
+        report: Callable[[Progress], None],
+        accelerator: str,
     ):
-        self.task, self.folder, self.fabric, self.ranks = task, folder, fabric, ranks
-        self.module, self.optimiser, self.config = module, optimiser, task.config
-        self.model: nn.Module = module.model  # type: ignore[assignment]
-        self.precision = network_precision(self.config.precision, fabric.device)
-        self.reader, self.train_rows = Reader(batches, ranks), train_rows
-        self.saved = ModelOfRun(folder, self.model, self.config.keep)
-        self.state = TrainState()
+        config = self.config = task.config
+        self.report, self.sample_sheet = report, sample_sheet
+        fabric = self.fabric = open_fabric(accelerator, every_parameter_learns=task.every_parameter_learns)
+        ranks = self.ranks = ranks_of(fabric)
+        self.task = task = task.shared(ranks) if ranks.count > 1 else task
+        split = split_indices(images.files, config.split, seed=config.seed)
+        batches = batches_of(images.images, split.train, config, fabric.device)
+        self.reader, self.train_rows = Reader(batches, ranks), torch.from_numpy(split.train)
+        task.check()
+        self.folder = RunFolder(out)
+        if ranks.first and resume:
+            reopen_run(out, config)
+        elif ranks.first:
+            device = f"{ranks.count} x {fabric.device.type}" if ranks.count > 1 else str(fabric.device)
+            start_run(out, config, describe_data(images, split), device)
+        self.model: Any = task.build().to(fabric.device)
+        if config.channels_last:
+            self.model.to(memory_format=torch.channels_last)
+
+        def prepared(done: int, total: int) -> None:
+            report(Progress("perceptual", done, total))
+
+        with first_then_others(fabric):
+            step = task.step_module(self.model, self.folder, batches.sample(), prepared)
+        how = config.optimiser.model_dump(include={"betas", "weight_decay"})
+        rate = config.optimiser.learning_rate
+        self.optimiser = torch.optim.Adam(self.model.parameters(), rate, **how, fused=True)
+        self.module = fabric.setup_module(step)
+        self.precision = network_precision(config.precision, fabric.device)
+        held_out = split.validation[:MAX_VALIDATION_IMAGES]
+        self.held_rows = torch.from_numpy(held_out)
+        self.held_out = torch.from_numpy(np.ascontiguousarray(images.images[held_out])).to(fabric.device)
+        self.state, note = TrainState(), None
+        if resume:
+            self.state, note = resume_from(self.folder.last, self.folder.previous, self.model, self.optimiser)
+        self.fell_back = note is not None  # the damaged checkpoint is not to become the previous one
+        self.watcher = task.watch(self.state.watcher) if config.watch else None
         self.validation: dict[str, float] = {}
         self.findings: tuple[Finding, ...] = ()
+        self.model_images: int | None = None
         self.writer: SummaryWriter | None = None
-        self.watcher: Watch | None = None
-
-    def begin(
-        self, held_out: Tensor, held_rows: Tensor, sample_sheet: SampleSheet | None, note: str | None
-    ) -> None:
-        """Set what depends on the state that the run begins or resumes with.
-
-        A ``note`` on a damaged checkpoint is logged: that checkpoint is not to become the previous one.
-        """
-        self.held_out, self.held_rows = held_out, held_rows
-        self.sample_sheet, self.fell_back = sample_sheet, note is not None
-        if self.config.watch:
-            self.watcher = self.task.watch(self.state.watcher)
-        if self.ranks.first:
+        if ranks.first:
             drop_metrics_after(self.folder, self.state.images)
             if note is not None:
                 append_metrics(self.folder, {"kind": "note", "images": self.state.images, "text": note})
-            self.writer = SummaryWriter(str(self.folder.path / "tensorboard"), purge_step=self.state.images)
+            self.writer = SummaryWriter(str(out / "tensorboard"), purge_step=self.state.images)
 
-    def close(self) -> None:
-        """Finish all writing."""
-        self.reader.close()
-        if self.writer is not None:
-            self.writer.close()
+    def go_on(self) -> TrainResult:
+        """Train from where the run stands until something ends it."""
+        config, state = self.config, self.state
+        began, images_before, seconds_before = time.perf_counter(), state.images, state.seconds
+        stopped, steps = self.why_stop(), 0
+        with stop_on_signal() as signals:
+            while stopped is None:
+                before = state.images
+                result = self.step()
+                steps += 1
+                elapsed = time.perf_counter() - began
+                state.seconds, speed = seconds_before + elapsed, (state.images - images_before) / elapsed
+                waiting, terms = self.reader.waited_s / elapsed, None
+                if steps % LOG_EVERY_STEPS == 1:
+                    terms = self.ranks.mean({name: value.item() for name, value in result.terms.items()})
+                    self.log("train", {**terms, "images_per_second": speed, "waiting": waiting})
+                self.report(Progress("train", state.images, config.images, speed, terms, waiting))
+
+                elapsed, interrupted = self.ranks.largest(elapsed, signals.is_set())
+                state.seconds = seconds_before + elapsed
+                stopped = self.why_stop()
+                if stopped == "collapse":
+                    break
+                healthy = self.watcher is None or not self.watcher.uneasy
+                span, ended = (before, state.images), stopped is not None
+                if healthy and kept(*span, config.validate_every, ended=ended):
+                    self.validate()
+                    stopped = self.why_stop() or stopped
+                    if stopped == "collapse":
+                        break
+                if passed(*span, config.sample_every, ended=ended):
+                    self.draw()
+                if interrupted or (healthy and kept(*span, config.checkpoint_every, ended=ended)):
+                    self.checkpoint()
+                if interrupted and stopped is None:
+                    self.close()
+                    raise TrainingInterrupted(
+                        f"stopped after {state.images:,} images and saved; the same with --resume goes on"
+                    )
+        if stopped == "collapse":
+            self.log("collapse", {finding.sign: finding.text for finding in self.findings})
+        elif self.ranks.first:
+            self.leave_model()
+        self.close()
+        took = max(time.perf_counter() - began, 1e-9)
+        return TrainResult(
+            folder=self.folder.path,
+            images=state.images,
+            seconds=state.seconds,
+            images_per_second=(state.images - images_before) / took,
+            validation=self.validation,
+            stopped=stopped or "images",
+            findings=self.findings,
+            waiting=self.reader.waited_s / took,
+            model_images=self.model_images,
+        )
 
     def step(self) -> StepLosses:
         """One batch: losses, gradients, update, watcher."""
@@ -171,8 +208,8 @@ class _Run:
         for group in self.optimiser.param_groups:
             group["lr"] = config.optimiser.rate(state.images, config.images)
         noise = random_stream(config.seed, "perturb", position)
-        done = state.images / config.images
         rows = self.train_rows[self.reader.batches.order(position, self.ranks)]
+        done = state.images / config.images
         result = compute_step(self.module, self.reader.at(position), noise, self.precision, done, rows)
         self.fabric.backward(result.total)
         broken = broken_gradient(self.model)
@@ -186,14 +223,22 @@ class _Run:
             self.findings = (*self.findings, not_finite(broken))
         return result
 
+    def why_stop(self) -> str | None:
+        """The reason that ends the run now, if there is one."""
+        config, state = self.config, self.state
+        if any(finding.fatal for finding in self.findings):
+            return "collapse"
+        if state.images >= config.images:
+            return "images"
+        if config.minutes is not None and state.seconds >= 60 * config.minutes:
+            return "minutes"
+        return "patience" if state.validations_since_best >= config.patience else None
+
     def validate(self) -> None:
         """Score held-out images; keep the weights if they are the best so far."""
         if not len(self.held_out):
             return
-        outside, state = self.task.outside_loss, self.state
-        self.validation = validate(
-            self.module, self.held_out, self.held_rows, self.config, self.precision, outside, self.ranks
-        )
+        state, self.validation = self.state, self.held_out_losses()
         loss = self.validation["loss"]
         self.log("validation", self.validation)
         if not isfinite(loss):
@@ -205,7 +250,33 @@ class _Run:
         state.best_loss, state.validations_since_best = loss, 0
         if self.ranks.first:
             save_checkpoint(self.folder.best, self.model, self.optimiser, state)
-            self.saved.at_best(state.images)
+            if self.config.keep == "best":
+                self.save_model(state.images)
+
+    @torch.no_grad()
+    def held_out_losses(self) -> dict[str, float]:
+        """Mean losses over held-out images; "loss" is the sum of all that the task judges by.
+
+        Of several ranks each judges some of the batches, as one process would all of them.
+        """
+        sums: dict[str, float] = defaultdict(float)
+        count, size = 0, self.config.batch_size
+        self.module.eval()
+        for position, (batch, rows) in enumerate(
+            zip(self.held_out.split(size), self.held_rows.split(size), strict=True)
+        ):
+            if len(batch) < 2 and count:
+                break
+            count += len(batch)
+            if position % self.ranks.count != self.ranks.rank:
+                continue
+            noise = random_stream(self.config.seed, "perturb", position)
+            result = compute_step(self.module, batch.float() / 255, noise, self.precision, rows=rows)
+            for name, value in result.terms.items():
+                sums[name] += value.item() * len(batch)
+        self.module.train()
+        means = {name: value / max(count, 1) for name, value in self.ranks.sum(sums).items()}
+        return {"loss": sum(means[name] for name in means if name not in self.task.outside_loss), **means}
 
     def draw(self) -> None:
         """Write a sheet of decomposed held-out images."""
@@ -219,129 +290,53 @@ class _Run:
             sheet.save(temporary, format="PNG")
 
     def checkpoint(self) -> None:
-        """Write everything a resumed run needs."""
+        """Write everything a resumed run needs; the first one of all leaves a model in any case."""
         if not self.ranks.first:
             return
         self.state.watcher = self.watcher.memory() if self.watcher is not None else {}
         previous = None if self.fell_back else self.folder.previous
         save_checkpoint(self.folder.last, self.model, self.optimiser, self.state, previous=previous)
         self.fell_back = False
-        self.saved.at_checkpoint(self.state.images)
+        if self.config.keep == "last" or not self.folder.model.exists():
+            self.save_model(self.state.images)
+
+    def leave_model(self) -> None:
+        """Make sure that a run that ends leaves the weights its settings name: on resuming they may differ.
+
+        Where no images were held out, those are of its end.
+        """
+        if self.config.keep == "last" or self.state.best_loss is None:
+            if self.model_images != self.state.images:
+                self.save_model(self.state.images)
+        elif self.model_images is None:
+            try:
+                best = load_checkpoint(self.folder.best, self.model, None)
+            except (DamagedCheckpoint, FileNotFoundError):
+                note = f"{self.folder.best} is damaged or missing: {self.folder.model} stays as it is"
+                warnings.warn(note, DamageNoticed, stacklevel=2)
+            else:
+                self.save_model(best.images)
+
+    def save_model(self, images: int) -> None:
+        """Save the model, whose weights have seen so many images."""
+        self.model.save(self.folder.model, overwrite=True)
+        self.model_images = images
 
     def log(self, kind: str, values: dict[str, Any]) -> None:
         """Add a line to metrics.jsonl, and its numbers to TensorBoard."""
-        state = self.state
         if self.writer is None:
             return
-        append_metrics(
-            self.folder, {"kind": kind, "images": state.images, "seconds": round(state.seconds, 2), **values}
-        )
+        images, seconds = self.state.images, round(self.state.seconds, 2)
+        append_metrics(self.folder, {"kind": kind, "images": images, "seconds": seconds, **values})
         for name, value in values.items():
             if isinstance(value, float):
-                self.writer.add_scalar(f"{kind}/{name}", value, state.images)
+                self.writer.add_scalar(f"{kind}/{name}", value, images)
 
-    def why_stop(self) -> str | None:
-        """The reason that ends the run now, if there is one."""
-        config, state = self.config, self.state
-        if any(finding.fatal for finding in self.findings):
-            return "collapse"
-        if state.images >= config.images:
-            return "images"
-        if config.minutes is not None and state.seconds >= 60 * config.minutes:
-            return "minutes"
-        return "patience" if state.validations_since_best >= config.patience else None
-
-    def go_on(self, report: Callable[[Progress], None]) -> TrainResult:
-        """Train from where the run stands until something ends it."""
-        config, state = self.config, self.state
-        began, images_before, seconds_before = time.perf_counter(), state.images, state.seconds
-        stopped, steps = self.why_stop(), 0
-        with stop_on_signal() as signals:
-            while stopped is None:
-                before = state.images
-                result = self.step()
-                steps += 1
-                elapsed = time.perf_counter() - began
-                state.seconds, speed = seconds_before + elapsed, (state.images - images_before) / elapsed
-                waiting = self.reader.waited_s / elapsed
-                terms = None
-                if steps % LOG_EVERY_STEPS == 1:
-                    terms = self.ranks.mean({name: value.item() for name, value in result.terms.items()})
-                    self.log("train", {**terms, "images_per_second": speed, "waiting": waiting})
-                report(Progress("train", state.images, config.images, speed, terms, waiting))
-
-                elapsed, stop_requested = self.ranks.largest(elapsed, signals.requested)
-                state.seconds = seconds_before + elapsed
-                stopped = self.why_stop()
-                if stopped == "collapse":
-                    break
-                healthy = self.watcher is None or not self.watcher.uneasy
-                due = partial(passed, before, state.images, ended=stopped is not None)
-                keep = partial(kept, before, state.images, ended=stopped is not None)
-                if keep(config.validate_every) and healthy:
-                    self.validate()
-                    stopped = self.why_stop() or stopped
-                    if stopped == "collapse":
-                        break
-                if due(config.sample_every):
-                    self.draw()
-                if (keep(config.checkpoint_every) and healthy) or stop_requested:
-                    self.checkpoint()
-                if stop_requested and stopped is None:
-                    self.close()
-                    raise TrainingInterrupted(
-                        f"stopped after {state.images:,} images and saved; the same with --resume goes on"
-                    )
-        if stopped == "collapse":
-            self.log("collapse", {finding.sign: finding.text for finding in self.findings})
-        elif self.ranks.first:
-            self.saved.at_end(state)
-        self.close()
-        took = max(time.perf_counter() - began, 1e-9)
-        return TrainResult(
-            self.folder.path,
-            state.images,
-            state.seconds,
-            (state.images - images_before) / took,
-            self.validation,
-            stopped or "images",
-            self.findings,
-            self.reader.waited_s / took,
-            self.saved.images,
-        )
-
-
-@torch.no_grad()
-def validate(
-    module: nn.Module,
-    held_out: UInt8[Tensor, "n 3 h w"],
-    held_rows: Int64[Tensor, " n"],
-    config: LoopSettings,
-    precision: Precision,
-    outside_loss: tuple[str, ...] = NOT_RECONSTRUCTION,
-    ranks: Ranks = ALONE,
-) -> dict[str, float]:
-    """Mean losses over held-out images; "loss" is the sum of all but those ``outside_loss``.
-
-    Of several ``ranks`` each judges some of the batches, as one process would all of them.
-    """
-    module.eval()
-    sums: dict[str, float] = defaultdict(float)
-    count = 0
-    batches = zip(held_out.split(config.batch_size), held_rows.split(config.batch_size), strict=True)
-    for position, (batch, rows) in enumerate(batches):
-        if len(batch) < 2 and count:
-            break
-        count += len(batch)
-        if position % ranks.count != ranks.rank:
-            continue
-        noise = random_stream(config.seed, "perturb", position)
-        result = compute_step(module, batch.float() / 255, noise, precision, rows=rows)
-        for name, value in result.terms.items():
-            sums[name] += value.item() * len(batch)
-    module.train()
-    means = {name: value / max(count, 1) for name, value in ranks.sum(sums).items()}
-    return {"loss": sum(value for name, value in means.items() if name not in outside_loss), **means}
+    def close(self) -> None:
+        """Finish all writing."""
+        self.reader.close()
+        if self.writer is not None:
+            self.writer.close()
 
 
 def passed(before: int, now: int, interval: int, *, ended: bool) -> bool:

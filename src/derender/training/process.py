@@ -7,7 +7,6 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 
 import torch
 
@@ -20,34 +19,24 @@ class TrainingInterrupted(KeyboardInterrupt):
     """Ctrl-C or SIGTERM during training; the run was saved first and can be resumed."""
 
 
-@dataclass
-class StopRequest:
-    """Whether a signal has requested a stop."""
-
-    requested: bool = False
-
-
 @contextmanager
-def stop_on_signal() -> Iterator[StopRequest]:
-    """Turn the first Ctrl-C or SIGTERM into a request; a second one ends the program at once.
+def stop_on_signal() -> Iterator[threading.Event]:
+    """Turn the first Ctrl-C or SIGTERM into an event; a second one ends the program at once.
 
-    Outside the main thread signals cannot be caught, and the request never comes.
+    Outside the main thread signals cannot be caught, and the event never comes.
     """
-    request = StopRequest()
-    if threading.current_thread() is not threading.main_thread():
-        yield request
-        return
-    previous = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    stop = threading.Event()
 
     def note(number: int, frame: object) -> None:
-        if request.requested:
+        if stop.is_set():
             raise KeyboardInterrupt
-        request.requested = True
+        stop.set()
 
-    for number in previous:
-        signal.signal(number, note)
+    main = threading.current_thread() is threading.main_thread()
+    signals = (signal.SIGINT, signal.SIGTERM) if main else ()
+    previous = {number: signal.signal(number, note) for number in signals}
     try:
-        yield request
+        yield stop
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
@@ -71,9 +60,8 @@ def deterministic_algorithms(deterministic: bool) -> Iterator[None]:
 def freed_memory_kept() -> Iterator[bool]:
     """Have glibc reuse freed memory instead of returning it; gives whether it could be configured so.
 
-    glibc returns every freed large block, and the system fills it with zeros, page by page, when it is needed
-    again: up to a third of a training step on a CPU. Until the end of the block the process keeps its highest
-    need. Leaves other allocators, and memory of other devices, as they are.
+    glibc returns every freed large block, and the system fills it with zeros when it is needed again: up to a
+    third of a training step on a CPU. Other allocators, and memory of other devices, stay as they are.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform.startswith("linux") else None
     if mallopt is None:

@@ -7,6 +7,7 @@ tensorboard/.
 import json
 import platform
 import subprocess
+from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from reprlib import Repr
@@ -28,7 +29,6 @@ _MAY_CHANGE_ON_RESUME = (
     "accumulate",
     "optimiser",  # a run that the watcher stopped goes on with a smaller rate
 )
-_SHORT = Repr()
 _BEGUN = ("environment.json", ".environment.json-", ".config.yaml-")  # there before config.yaml
 _REPORTED_PACKAGES = ("derender", "torch", "numpy", "numba", "lightning-fabric", "safetensors", "pillow")
 
@@ -39,9 +39,8 @@ class RunFolder:
     def __init__(self, path: Path):
         self.path = path
         self.config, self.metrics = path / "config.yaml", path / "metrics.jsonl"
-        self.last, self.previous, self.best = (
-            path / "checkpoints" / name for name in ("last", "previous", "best")
-        )
+        checkpoints = path / "checkpoints"
+        self.last, self.previous, self.best = (checkpoints / name for name in ("last", "previous", "best"))
         self.samples, self.model = path / "samples", path / "model"
         self.perceptual = path / "perceptual.safetensors"
 
@@ -93,14 +92,12 @@ def reopen_run(path: Path, config: Settings) -> RunFolder:
     if not run.config.is_file():
         raise FileNotFoundError(f"no run to resume in {path} (no config.yaml): train without --resume first")
     stored = read_config(path, type(config)).model_dump(mode="json")
-    asked = config.model_dump(mode="json")
-    different = [key for key in asked if key not in _MAY_CHANGE_ON_RESUME and asked[key] != stored[key]]
-    if different:
-        key = different[0]
-        raise ValueError(
-            f"{path} was trained with another {key} ({stored[key]}, now {asked[key]}): "
-            "resume with the same settings, or start a new run in another folder"
-        )
+    for key, asked in config.model_dump(mode="json").items():
+        if key not in _MAY_CHANGE_ON_RESUME and asked != stored[key]:
+            raise ValueError(
+                f"{path} was trained with another {key} ({stored[key]}, now {asked}): "
+                "resume with the same settings, or start a new run in another folder"
+            )
     for written in (run.last, run.best, run.model, run.config, run.metrics, run.perceptual):
         remove_abandoned(written)
     write_text(run.config, f"format: {FORMAT}\n{to_yaml(config)}")
@@ -128,8 +125,9 @@ def read_config_tree(path: Path) -> dict[str, Any]:
     Raises:
         ValueError: it is damaged, or of a newer version.
     """
-    file = path / "config.yaml"
-    return _settings_tree(file, f"{file} is damaged: restore it, or start a new run in another folder")
+    return _settings_tree(
+        path / "config.yaml", "{} is damaged: restore it, or start a new run in another folder"
+    )
 
 
 def read_settings(file: Path) -> dict[str, Any]:
@@ -142,21 +140,19 @@ def read_settings(file: Path) -> dict[str, Any]:
     file = file / "config.yaml" if file.is_dir() else file
     if not file.is_file():
         raise FileNotFoundError(f"no settings in {file}: give a YAML file, such as a run's config.yaml")
-    return _settings_tree(file, f"{file} holds no settings: write YAML, one key: value a line")
+    return _settings_tree(file, "{} holds no settings: write YAML, one key: value a line")
 
 
 def _settings_tree(file: Path, otherwise: str) -> dict[str, Any]:
     try:
         tree = yaml.safe_load(file.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise ValueError(otherwise) from error
-    if not isinstance(tree, dict):
-        raise ValueError(otherwise)
-    version = tree.pop("format", FORMAT)
-    if not isinstance(version, int) or version > FORMAT:
+        found = tree.pop("format", FORMAT)
+    except (yaml.YAMLError, ValueError, RecursionError, AttributeError, TypeError) as error:
+        raise ValueError(otherwise.format(file)) from error
+    if not isinstance(found, int) or found > FORMAT:
+        shown = Repr().repr(found)
         raise ValueError(
-            f"{file} was written in format {_SHORT.repr(version)}, this version reads up to {FORMAT}: "
-            "update derender"
+            f"{file} was written in format {shown}, this version reads up to {FORMAT}: update derender"
         )
     return without_removed(tree)
 
@@ -188,32 +184,34 @@ def drop_metrics_after(run: RunFolder, images: int) -> None:
 def environment(device: str) -> dict[str, Any]:
     """Versions, machine and commit, to repeat the run."""
     command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "HEAD"]
-    try:
-        commit = subprocess.run(
-            command, capture_output=True, text=True, timeout=5, check=False
-        ).stdout.strip()
-    except (OSError, subprocess.TimeoutExpired):
-        commit = ""
+    packages: dict[str, str | None] = dict.fromkeys(_REPORTED_PACKAGES)
+    for package in packages:
+        with suppress(PackageNotFoundError):
+            packages[package] = version(package)
+    commit = ""
+    with suppress(OSError, subprocess.TimeoutExpired):
+        done = subprocess.run(command, capture_output=True, text=True, timeout=5, check=False)
+        commit = done.stdout.strip()
     return {
         "python": platform.python_version(),
         "platform": platform.platform(terse=True),
         "processor_threads": torch.get_num_threads(),
         "device": device,
-        "packages": {name: _version(name) for name in _REPORTED_PACKAGES},
+        "packages": packages,
         "commit": commit or None,
     }
 
 
-def describe_data(pictures: ImageSet, split: Split) -> dict[str, Any]:
+def describe_data(images: ImageSet, split: Split) -> dict[str, Any]:
     """The data of a run, for its environment.json."""
     return {
-        "layout": pictures.layout,
-        "pictures": len(pictures),
+        "layout": images.layout,
+        "pictures": len(images),
         "train": len(split.train),
         "validation": len(split.validation),
         "test": len(split.test),
-        "skipped": len(pictures.skipped),
-        "duplicates": len(pictures.duplicates),
+        "skipped": len(images.skipped),
+        "duplicates": len(images.duplicates),
     }
 
 
@@ -221,10 +219,3 @@ def write_text(path: Path, text: str) -> None:
     """Write a file whole or not at all."""
     with atomic_file(path) as temporary:
         temporary.write_text(text)
-
-
-def _version(package: str) -> str | None:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return None

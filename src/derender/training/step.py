@@ -50,12 +50,14 @@ class StepResult(StepLosses):
 
     def stages(self) -> list[tuple[str, Tensor]]:
         """The output of every stage of the step by name, in the order in which they work."""
-        stages = [(f"the code of {name}", code) for name, code in self.codes.items()]
-        stages += [(f"the predicted {name}", value) for name, value in self.scene.parameters.items()]
-        if self.confidence is not None:
-            stages += [(f"the {name} confidence", value) for name, value in vars(self.confidence).items()]
-        stages += [(f"the rendered {name}", value) for name, value in vars(self.rendering).items()]
-        return stages + [(f"the loss term {name!r}", value) for name, value in self.terms.items()]
+        named = {
+            "the code of {}": self.codes,
+            "the predicted {}": self.scene.parameters,
+            "the {} confidence": {} if self.confidence is None else vars(self.confidence),
+            "the rendered {}": vars(self.rendering),
+            "the loss term {!r}": self.terms,
+        }
+        return [(stage.format(name), value) for stage, row in named.items() for name, value in row.items()]
 
 
 def training_step(
@@ -90,29 +92,30 @@ def training_step(
         scene = Scene.from_parameters(
             in_chunks(lambda rows: dict(model.decode(dict(rows)).parameters), shared, chunks)
         )
-        confidence = None
+        sigmas: dict[str, Tensor] = {}
         if objective.confidence:
-            maps = in_chunks(lambda rows: vars(model.confidence(rows["images"])), {"images": images}, chunks)
-            confidence = Confidence(**maps)
+            seen = {"images": images}
+            sigmas = in_chunks(lambda rows: vars(model.confidence(rows["images"])), seen, chunks)
     scenes = [scene, model.mirror(scene)]
     left_out = None
     if objective.loocc != "none":
         perturbed, left_out = perturb_one_factor(model, scene, objective, generator, ranks)
         scenes.append(perturbed)
-    rendering = _rendered(model, concatenate(scenes), chunks)
-
-    covered = rendering.mask[:count] * rendering.mask[count : 2 * count]
-    straight, twin = rendering.image[:count], rendering.image[count : 2 * count]
+    rendered = in_chunks(
+        lambda rows: vars(model.render(Scene.from_parameters(rows))), concatenate(scenes).parameters, chunks
+    )
+    image, mask = rendered["image"], rendered["mask"]
+    straight, twin = image[:count], image[count : 2 * count]
+    covered = mask[:count] * mask[count : 2 * count]
     part = ranks.part_of_mean(covered)
+    flipped = photometric_loss(twin, images, covered, sigmas.get("photometric_flip"))
     terms = {
-        "photometric": part * photometric_loss(straight, images, covered, _sigma(confidence, "photometric")),
-        "photometric_flip": part
-        * objective.flip_weight
-        * photometric_loss(twin, images, covered, _sigma(confidence, "photometric_flip")),
+        "photometric": part * photometric_loss(straight, images, covered, sigmas.get("photometric")),
+        "photometric_flip": part * objective.flip_weight * flipped,
     }
     if perceptual is not None and objective.perceptual_weight > 0:
-        columns = {"straight": straight, "twin": twin, "images": images, "covered": covered}
-        straight_term, twin_term = _perceptual_terms(perceptual, columns, confidence, precision, chunks)
+        columns = {"straight": straight, "twin": twin, "images": images, "covered": covered, **sigmas}
+        straight_term, twin_term = _perceptual_terms(perceptual, columns, precision, chunks)
         terms["perceptual"] = part * objective.perceptual_weight * straight_term
         terms["perceptual_flip"] = part * objective.perceptual_weight * objective.flip_weight * twin_term
     ranges = model.settings.ranges
@@ -122,9 +125,9 @@ def training_step(
     if objective.curvature_weight > 0:
         terms["curvature"] = objective.curvature_weight * depth_curvature(scene.depth, *inside)
     if left_out is not None:
-        seen = fill_uncovered(rendering.image[2 * count :], rendering.mask[2 * count :], images)
+        seen = {"seen": fill_uncovered(image[2 * count :], mask[2 * count :], images)}
         with precision():
-            again = in_chunks(lambda rows: model.encode(rows["seen"]), {"seen": seen}, chunks)
+            again = in_chunks(lambda rows: model.encode(rows["seen"]), seen, chunks)
         contrast = loocc_loss(
             {name: ranks.gather(code) for name, code in codes.items()},
             {name: ranks.gather(code) for name, code in again.items()},
@@ -138,8 +141,8 @@ def training_step(
     total = torch.stack(list(terms.values())).sum()
     reported = {name: term.detach() for name, term in terms.items()}
     reported["l1"] = part * masked_l1(straight, images, covered).detach()
-    shown = Rendering(image=straight, depth=rendering.depth[:count], mask=rendering.mask[:count])
-    return StepResult(total, reported, scene, shown, codes, confidence)
+    shown = Rendering(image=straight, depth=rendered["depth"][:count], mask=mask[:count])
+    return StepResult(total, reported, scene, shown, codes, Confidence(**sigmas) if sigmas else None)
 
 
 def perturb_one_factor(
@@ -163,11 +166,9 @@ def perturb_one_factor(
     for index, factor in zip(indices, factors, strict=True):
         assert factor.perturb is not None
         value = scene.parameters[factor.parameter]
-        drawn = ranks.own(
-            factor.perturb(ranks.gather(value), generator, objective.perturb, model.settings.ranges)
-        )
+        drawn = factor.perturb(ranks.gather(value), generator, objective.perturb, model.settings.ranges)
         rows = (chosen == index).view(-1, *[1] * (value.ndim - 1))
-        changed[factor.parameter] = torch.where(rows, drawn, value)
+        changed[factor.parameter] = torch.where(rows, ranks.own(drawn), value)
     return scene.with_parameters(**changed), chosen
 
 
@@ -186,8 +187,7 @@ def fill_uncovered(
     Left black, they would show an encoder how far the camera was turned, which no real image does.
     """
     edge = torch.cat([images[..., 0], images[..., -1], images[:, :, 0]], dim=-1)
-    colour = edge.mean(dim=-1)[:, :, None, None]
-    return torch.where(mask[:, None] > 0, rendered, colour)
+    return torch.where(mask[:, None] > 0, rendered, edge.mean(dim=-1)[:, :, None, None])
 
 
 def cycle_loss(
@@ -199,17 +199,16 @@ def cycle_loss(
     """How far light and camera, predicted from a rendering, are from those it was rendered with; best 0.
 
     Mean absolute difference (radians, intensities, scene units) over the vector factors that were perturbed,
-    with the rendered scene as a fixed target: renderings come with exact labels, so they can teach what an
-    image alone leaves open (pitch above all, which shifted albedo explains nearly as well).
+    with the rendered scene as a fixed target: its labels are exact, so they can teach what an image alone
+    leaves open (pitch above all, which shifted albedo explains nearly as well).
     """
-    differences = []
+    total = rendered.depth.new_zeros(())
     for factor in _contrasted(model, objective):
-        if factor.mirrored:
-            continue
-        raw = model.nets[factor.name].decode(codes_again[factor.name].float())  # type: ignore[operator]
-        predicted = factor.to_parameter(raw, model.settings.ranges)
-        differences.append((predicted - rendered.parameters[factor.parameter].detach()).abs().mean())
-    return torch.stack(differences).sum() if differences else rendered.depth.new_zeros(())
+        if not factor.mirrored:
+            raw = model.nets[factor.name].decode(codes_again[factor.name].float())  # type: ignore[operator]
+            predicted = factor.to_parameter(raw, model.settings.ranges)
+            total = total + (predicted - rendered.parameters[factor.parameter].detach()).abs().mean()
+    return total
 
 
 def concatenate(scenes: list[Scene]) -> Scene:
@@ -242,9 +241,8 @@ def own_share(objective: ObjectiveSettings, done: float) -> float:
     """The template start: an image's share in its own maps after this share of the run, 0 (all shared) to 1.
 
     An image's pose can be explained by its camera, or by a geometry and an albedo that have moved: nothing in
-    the reconstruction prefers the camera (for left and right the flipped twin does, for up and down nothing).
-    While all images share the same maps only camera and light can explain how they differ, so both are
-    learnt. Then each image's own code is let in gradually.
+    the reconstruction prefers the camera. While all images share the same maps only camera and light can
+    explain how they differ, so both are learnt. Then each image's own code is let in gradually.
     """
     if done < objective.template_share:
         return 0.0
@@ -260,46 +258,26 @@ def share_codes(
 
     ``own`` = 1 leaves all as they are.
     """
-    if own >= 1:
-        return dict(codes)
-    means = {name: ranks.gather(codes[name]).mean(dim=0, keepdim=True) for name in codes if name in names}
-    return {
-        name: torch.lerp(means[name].to(code.dtype).expand_as(code), code, own) if name in names else code
-        for name, code in codes.items()
-    }
-
-
-def _sigma(confidence: Confidence | None, name: str) -> Tensor | None:
-    return None if confidence is None else getattr(confidence, name)
-
-
-def _rendered(model: Derenderer, scene: Scene, chunks: int) -> Rendering:
-    if chunks == 1:
-        return model.render(scene)
-    return Rendering(
-        **in_chunks(lambda rows: vars(model.render(Scene.from_parameters(rows))), scene.parameters, chunks)
-    )
+    shared = dict(codes)
+    for name, code in codes.items() if own < 1 else ():
+        if name in names:
+            mean = ranks.gather(code).mean(dim=0, keepdim=True).to(code.dtype)
+            shared[name] = torch.lerp(mean.expand_as(code), code, own)
+    return shared
 
 
 def _perceptual_terms(
-    perceptual: PerceptualFeatures,
-    columns: Columns,
-    confidence: Confidence | None,
-    precision: Precision,
-    chunks: int,
+    perceptual: PerceptualFeatures, columns: Columns, precision: Precision, chunks: int
 ) -> Float[Tensor, "2"]:
     """The terms of the reconstruction and of its twin; in chunks each counts as its covered pixels.
 
-    ``columns`` are straight, twin and images (n, 3, h, w), and covered (n, h, w); pixels that nothing covers
-    show the image itself.
+    ``columns`` are straight, twin and images (n, 3, h, w), covered (n, h, w) and the sigmas there are; pixels
+    that nothing covers show the image itself.
     """
     if chunks > 1:
-        columns = {**columns, **({} if confidence is None else vars(confidence))}
 
         def weighted(rows: Columns) -> dict[str, Tensor]:
-            sigma = confidence and Confidence(**{name: rows[name] for name in vars(confidence)})
-            terms = _perceptual_terms(perceptual, rows, sigma, precision, 1)
-            return {"sums": (terms * rows["covered"].sum())[None]}
+            return {"sums": (_perceptual_terms(perceptual, rows, precision, 1) * rows["covered"].sum())[None]}
 
         sums = in_chunks(weighted, columns, chunks)["sums"].sum(dim=0)
         return sums / columns["covered"].sum().clamp(min=1)
@@ -307,10 +285,8 @@ def _perceptual_terms(
     hole = covered[:, None] == 0
     filled = torch.cat([torch.where(hole, images, columns[name]) for name in ("straight", "twin")])
     with precision():
-        with torch.no_grad():
-            target = perceptual(images)
-        predicted = perceptual(filled)
-    halves = predicted[: len(images)], predicted[len(images) :]
-    sigmas = _sigma(confidence, "perceptual"), _sigma(confidence, "perceptual_flip")
-    terms = zip(halves, sigmas, strict=True)
-    return torch.stack([perceptual_loss(half, target, covered, sigma) for half, sigma in terms])
+        target, predicted = perceptual(images), perceptual(filled)
+    halves = {"perceptual": predicted[: len(images)], "perceptual_flip": predicted[len(images) :]}
+    return torch.stack(
+        [perceptual_loss(half, target, covered, columns.get(name)) for name, half in halves.items()]
+    )

@@ -4,6 +4,7 @@ The loop decides on batches, learning rate, checkpoints and when to stop; everyt
 `Derenderer` is one task (derender_task.py), the trained baselines are others.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
@@ -53,15 +54,19 @@ class Watch(Protocol):
     def memory(self) -> dict[str, Any]: ...
 
 
-class TrainingTask:
-    """What the loop needs to know of what it trains; the base class of all tasks."""
+class TrainingTask(ABC):
+    """What the loop needs to know of what it trains; the base class of all tasks.
+
+    Attributes:
+        config: a `LoopSettings`.
+        outside_loss: names of terms that held-out images are not judged by.
+        every_parameter_learns: whether every parameter gets a gradient in every step, which saves DDP a
+            search.
+    """
 
     config: Any
-    """A `LoopSettings`."""
     outside_loss: Any = ()
-    """Names of terms that held-out images are not judged by."""
     every_parameter_learns = False
-    """Whether every parameter gets a gradient in every step, which saves DDP a search."""
 
     def shared(self, ranks: Ranks) -> "TrainingTask":
         """The same task as one of several ranks that share every batch.
@@ -71,13 +76,15 @@ class TrainingTask:
         """
         raise ValueError("this is trained on one device: start it without torchrun")
 
+    @abstractmethod
     def check(self) -> None:
         """Raise what is missing, before a run folder is made."""
 
+    @abstractmethod
     def build(self) -> nn.Module:
         """The untrained model, the same for the same seed; its ``save(folder, overwrite=)`` writes it."""
-        raise NotImplementedError
 
+    @abstractmethod
     def step_module(
         self, model: nn.Module, run: RunFolder, images: UInt8[Tensor, "n 3 h w"], progress: PhaseProgress
     ) -> nn.Module:
@@ -85,11 +92,10 @@ class TrainingTask:
 
         ``images`` are all training images, on the device.
         """
-        raise NotImplementedError
 
-    def watch(self, memory: dict[str, Any]) -> Watch | None:
-        """A watcher that goes on from ``memory``, or None."""
-        return None
+    @abstractmethod
+    def watch(self, memory: dict[str, Any]) -> Watch:
+        """A watcher that goes on from ``memory``."""
 
 
 def compute_step(

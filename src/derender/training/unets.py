@@ -5,8 +5,8 @@ through a code of 1x1 pixels. A trained model knows more of every pixel that its
 place on the object, its depth, and the object's colour there. The geometry encoder learns the first two, the
 albedo encoder the last, each through the expanding half of a U-Net that is thrown away; a decoder over both,
 which is kept, learns all of it from their features without changing them. Images and targets are zoomed,
-moved and mirrored together. Both also learn the model's own codes of images as they are, so that the copy
-decomposes images, too. Needs no labels. Leaves out light and camera, whose encoders stay.
+moved and mirrored together. Both also learn the model's own codes of images as they are. Needs no labels.
+Leaves out light and camera, whose encoders stay.
 """
 
 from dataclasses import dataclass
@@ -22,8 +22,9 @@ from derender.data import as_float
 from derender.model import Derenderer
 from derender.networks.encoders import UNetEncoder
 from derender.networks.unet import PIXEL_CHANNELS, UNetDecoder
+from derender.objectives.self_features import one_cycle
 from derender.render.renderer import warp
-from derender.training.distillation import MEASURED_IMAGES, StudentSettings, check_weights, train_student
+from derender.training.distillation import MEASURED_IMAGES, StudentSettings
 from derender.training.features import Progress
 
 ZOOM = (0.7, 1.25)
@@ -106,22 +107,18 @@ def distil_unets(
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         student = _with_unets(model, settings.unet_width)
-        heads = nn.ModuleDict(
-            {
-                name: UNetDecoder(_encoder(student, name).widths, 1, count)
-                for name, count in PIXEL_CHANNELS.items()
-            }
-        ).to(model.device)
+        widths = {name: encoder.widths for name, encoder in _encoders(student).items()}
+        decoders = {name: UNetDecoder(widths[name], 1, count) for name, count in PIXEL_CHANNELS.items()}
+        heads = nn.ModuleDict(decoders).to(model.device)
     _learn(model, student, heads, images, settings, Generator().manual_seed(seed), progress)
-    check_weights(student, "the U-Nets' training", settings)
+    settings.check(student, "the U-Nets' training")
     return DistilledUNets(student, _errors(model, student, heads, images[:MEASURED_IMAGES]))
 
 
 def _with_unets(model: Derenderer, width: int) -> Derenderer:
     """The model with fresh U-Net encoders of geometry and albedo and a decoder, all else as it was."""
-    network = model.settings.network.model_copy(
-        update={"encoder": "unet", "unet_width": width, "unet_decoder": True}
-    )
+    changes = {"encoder": "unet", "unet_width": width, "unet_decoder": True}
+    network = model.settings.network.model_copy(update=changes)
     settings = model.settings.model_copy(update={"network": network})
     student = Derenderer(settings, model.factors, model.renderer)
     fresh = ("unet_decoder.", *(f"nets.{name}.encoder." for name in PIXEL_CHANNELS))
@@ -130,10 +127,10 @@ def _with_unets(model: Derenderer, width: int) -> Derenderer:
     return student.to(model.device).requires_grad_(False)
 
 
-def _encoder(model: Derenderer, name: str) -> UNetEncoder:
-    encoder = model.nets[name].encoder
-    assert isinstance(encoder, UNetEncoder)
-    return encoder
+def _encoders(model: Derenderer) -> dict[str, UNetEncoder]:
+    """The U-Nets of geometry and albedo."""
+    encoders = {name: model.nets[name].encoder for name in PIXEL_CHANNELS}
+    return {name: encoder for name, encoder in encoders.items() if isinstance(encoder, UNetEncoder)}
 
 
 def _learn(
@@ -146,9 +143,9 @@ def _learn(
     progress: Progress | None,
 ) -> None:
     """Train the student's encoders and decoder and the heads in place."""
-    joint = student.unet_decoder
+    joint, encoders = student.unet_decoder, _encoders(student)
     assert joint is not None
-    alone = nn.ModuleList([*(_encoder(student, name) for name in PIXEL_CHANNELS), heads])
+    alone = nn.ModuleList([*encoders.values(), heads])
     learning = nn.ModuleList([alone, joint])
     learning.requires_grad_(True).train().to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
     optimiser = torch.optim.AdamW(
@@ -163,25 +160,29 @@ def _learn(
         shown = as_float(images[rows]).to(model.device)
         targets = pixel_targets(model, shown)
         straight = len(rows) // 2  # these stay as they are: codes are of whole images
-        shown, maps, mask = _augmented(shown, targets, straight, generator)
+        shown, maps, mask = augmented(shown, targets, straight, generator)
         shown = shown.contiguous(memory_format=torch.channels_last)
         with torch.autocast(model.device.type, torch.bfloat16, enabled=settings.precision == "bf16-mixed"):
-            skips = {name: _encoder(student, name).skips(shown) for name in PIXEL_CHANNELS}
+            skips = {name: encoder.skips(shown) for name, encoder in encoders.items()}
             own = {name: heads[name](levels) for name, levels in skips.items()}
-            codes = {name: _encoder(student, name).to_code(levels[-1]) for name, levels in skips.items()}
+            codes = {name: encoder.to_code(skips[name][-1]) for name, encoder in encoders.items()}
             joined = joint([torch.cat(level, dim=1).detach() for level in zip(*skips.values(), strict=True)])
         total = shown.new_zeros(())
         pieces = joined.float().split([*PIXEL_CHANNELS.values()], dim=1)
         for name, piece in zip(PIXEL_CHANNELS, pieces, strict=True):
-            total = total + _masked_error(own[name].float(), maps[name], mask)
-            total = total + _masked_error(piece, maps[name], mask)
+            total = total + masked_error(own[name].float(), maps[name], mask)
+            total = total + masked_error(piece, maps[name], mask)
             difference = codes[name].flatten(1)[:straight].float() - targets.codes[name][:straight]
             total = total + settings.code_weight * (difference / scale[name]).square().mean()
         return total
 
-    train_student(  # each part is clipped by itself: encoders learn as if there were no decoder over both
-        [alone, joint], optimiser, settings, len(images), loss, generator, progress, warm_up=0.1, clip=1.0
-    )
+    batch, steps = settings.plan(len(images))
+    parts = [alone, joint]  # each is clipped by itself: encoders learn as if there were no decoder over both
+    cycle = one_cycle(optimiser, loss, len(images), batch, steps, generator, warm_up=0.1, clipped=parts)
+    for step, _ in cycle:
+        if progress is not None:
+            progress(min(step * batch, settings.images), settings.images)
+    learning.eval().requires_grad_(False)
     student.eval()
 
 
@@ -201,7 +202,7 @@ def pixel_targets(model: Derenderer, images: Float[Tensor, "n 3 h w"]) -> PixelT
     return PixelTargets({"geometry": geometry, "albedo": seen.image[:, 2:]}, seen.mask, codes)
 
 
-def _augmented(
+def augmented(
     images: Float[Tensor, "n 3 h w"], targets: PixelTargets, straight: int, generator: Generator
 ) -> tuple[Tensor, dict[str, Tensor], Tensor]:
     """Images, maps and mask, all but the first ``straight`` zoomed, moved, mirrored and lit otherwise."""
@@ -227,7 +228,7 @@ def _augmented(
     return shown, moved, (mask[:, 0] > 0.99).float()
 
 
-def _masked_error(
+def masked_error(
     predicted: Float[Tensor, "n c h w"], target: Float[Tensor, "n c h w"], mask: Float[Tensor, "n h w"]
 ) -> Float[Tensor, ""]:
     """Mean absolute error over channels and the pixels that the mask keeps."""
@@ -241,14 +242,14 @@ def _errors(
     """The errors of ``DistilledUNets``."""
     shown = as_float(images).to(model.device)
     targets = pixel_targets(model, shown)
-    own = {name: heads[name](_encoder(student, name).skips(shown)) for name in PIXEL_CHANNELS}
+    own = {name: heads[name](encoder.skips(shown)) for name, encoder in _encoders(student).items()}
     geometry, place = targets.maps["geometry"], (model.image_size - 1) / 2
     errors = {
-        "place": place * float(_masked_error(own["geometry"][:, :2], geometry[:, :2], targets.mask)),
-        "depth": float(_masked_error(own["geometry"][:, 2:], geometry[:, 2:], targets.mask)) / 2,
-        "albedo": float(_masked_error(own["albedo"], targets.maps["albedo"], targets.mask)),
+        "place": place * float(masked_error(own["geometry"][:, :2], geometry[:, :2], targets.mask)),
+        "depth": float(masked_error(own["geometry"][:, 2:], geometry[:, 2:], targets.mask)) / 2,
+        "albedo": float(masked_error(own["albedo"], targets.maps["albedo"], targets.mask)),
     }
     for title, one in (("reconstruction", student), ("reconstruction before", model)):
         seen = one.reconstruct(shown)
-        errors[title] = float(_masked_error(seen.image.clamp(0, 1), shown, seen.mask))
+        errors[title] = float(masked_error(seen.image.clamp(0, 1), shown, seen.mask))
     return errors

@@ -1,22 +1,21 @@
 """Detects a training that fails while its loss still falls, and explains it in plain words.
 
-Unsupervised geometry can fail in ways that reconstruction does not show: depth that is flat, hollow, torn
-into stripes or stuck at its bounds, every camera at its limit, albedo that equals the image. Each sign below
-is a number measured on training batches, smoothed, and compared with a limit; a sign that stays on for a
-while is a finding. The limits were set on healthy and collapsed runs (docs/log.md), the times on runs with
-batches of 16: networks recover by updates, so larger batches get as many updates, not as many images.
+Unsupervised geometry can fail in ways that reconstruction does not show. Each sign below is a number measured
+on training batches, smoothed, and compared with a limit; a sign that stays on for a while is a finding. The
+limits were set on healthy and collapsed runs (docs/log.md), the times on runs with batches of 16: networks
+recover by updates, so larger batches get as many updates, not as many images.
 
 NaN and infinity are looked for at every stage: a NaN need not reach the loss, because a depth of NaN covers
-no pixel, and a pixel that nothing covers does not count. Leaves out images, which are bytes.
+no pixel, and a pixel that nothing covers does not count.
 """
 
+import copy
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import torch
-from jaxtyping import Float
 from torch import Tensor, nn
 
 from derender.scene import Scene
@@ -157,15 +156,20 @@ class Watcher:
     Args:
         ranges: bounds of the scene.
         batch_size: images in every update.
+        averages: measurements by name, smoothed.
+        on_since: images seen when a sign came on.
+        last_images: images seen at the latest look.
+        ranks: those that share a batch; all see the same.
+        uneasy: whether the latest batch or the averages show a fatal sign: no state to keep.
     """
 
     ranges: SceneRanges
     batch_size: int
     averages: dict[str, float] = field(default_factory=dict)
-    on_since: dict[str, int] = field(default_factory=dict)  # images seen when a sign came on
+    on_since: dict[str, int] = field(default_factory=dict)
     last_images: int = 0
-    ranks: Ranks = ALONE  # those that share a batch; all see the same
-    uneasy: bool = False  # whether the latest batch or the averages show a fatal sign: no state to keep
+    ranks: Ranks = ALONE
+    uneasy: bool = False
 
     @classmethod
     def remembering(
@@ -191,11 +195,8 @@ class Watcher:
 
     def memory(self) -> dict[str, Any]:
         """The state that a resumed run needs."""
-        return {
-            "averages": dict(self.averages),
-            "on_since": dict(self.on_since),
-            "last_images": self.last_images,
-        }
+        kept = {"averages": self.averages, "on_since": self.on_since, "last_images": self.last_images}
+        return copy.deepcopy(kept)
 
     def look(self, images: int, result: Any) -> tuple[Finding, ...]:
         """The problems of a step's result (a `training.step.StepResult`); usually none."""
@@ -217,23 +218,19 @@ class Watcher:
             return (Finding("non-finite loss", text, f"{SLOWER}; with bf16, try 32-true", True),)
         longer = max(1.0, self.batch_size / USUAL_BATCH)
         share = min(1.0, (images - self.last_images) / (longer * MEMORY_IMAGES))
-        self.last_images = images
+        self.last_images, self.uneasy = images, False
         latest = self.ranks.mean(measure(scene, self.ranges))
+        findings = []
         for name, value in latest.items():
             before = self.averages.get(name, value)
             self.averages[name] = before + share * (value - before)
-        findings = []
-        self.uneasy = False
         for sign in SIGNS:
             value = self.averages[sign.measure]
             shown = sign.is_on(value) or sign.is_on(latest[sign.measure])
-            if sign.fatal and shown and images >= longer * sign.usual_images:
-                self.uneasy = True
+            self.uneasy |= sign.fatal and shown and images >= longer * sign.usual_images
             if images < longer * sign.grace_images or not sign.is_on(value):
                 self.on_since.pop(sign.name, None)
-                continue
-            since = self.on_since.setdefault(sign.name, images)
-            if images - since >= longer * PERSISTENCE_IMAGES:
+            elif images - self.on_since.setdefault(sign.name, images) >= longer * PERSISTENCE_IMAGES:
                 findings.append(Finding(sign.name, sign.text.format(value=value), sign.advice, sign.fatal))
         return tuple(findings)
 
@@ -247,40 +244,28 @@ def measure(scene: Scene, ranges: SceneRanges) -> dict[str, float]:
     the rim lies behind the middle, over the range; negative is hollow. shading_contrast: standard deviation
     of the shading in an image over its mean.
     """
-    depth = _inside(scene.depth, ranges)
+    columns = ranges.border_columns(scene.depth.shape[-1])
+    depth = scene.depth[..., columns:-columns] if columns else scene.depth
     low, high = ranges.depth_min, ranges.depth_max
     half, middle = (high - low) / 2, (high + low) / 2
     spread = depth.std(dim=(1, 2))
     steps = (depth.diff(dim=2).abs().mean(dim=(1, 2)) + depth.diff(dim=1).abs().mean(dim=(1, 2))) / 2
-    rotation = scene.camera[:, :2].abs() / math.radians(ranges.rotation_deg)
-    light = scene.light[:, 2:].abs() / math.radians(ranges.light_deg)
-    shading = _shading(scene, ranges)
-    values = {
-        "depth_at_bound": ((depth - middle).abs() > 0.97 * half).float().mean(),
-        "depth_spread": (spread / (high - low)).mean(),
-        "depth_roughness": (steps / spread.clamp(min=1e-6)).mean(),
-        "bulge": _bulge(depth).mean() / (high - low),
-        "view_at_bound": (rotation > 0.95).any(dim=1).float().mean(),
-        "light_at_bound": (light > 0.95).any(dim=1).float().mean(),
-        "shading_contrast": (shading.std(dim=(1, 2)) / shading.mean(dim=(1, 2)).clamp(min=1e-6)).mean(),
-    }
-    return {name: float(value) for name, value in values.items()}
-
-
-def _inside(depth: Float[Tensor, "n h w"], ranges: SceneRanges) -> Float[Tensor, "n h w_inside"]:
-    columns = ranges.border_columns(depth.shape[-1])
-    return depth[..., columns:-columns] if columns else depth
-
-
-def _bulge(depth: Float[Tensor, "n h w"]) -> Float[Tensor, " n"]:
-    """Mean depth of the outer ring minus mean depth of the middle."""
     height, width = depth.shape[1:]
     y = torch.linspace(-1, 1, height, device=depth.device)[:, None]
     x = torch.linspace(-1, 1, width, device=depth.device)[None]
     radius = (x.square() + y.square()).sqrt()
     ring, core = (radius > 0.7) & (radius < 1.0), radius < 0.4
-    return depth[:, ring].mean(dim=1) - depth[:, core].mean(dim=1)
-
-
-def _shading(scene: Scene, ranges: SceneRanges) -> Float[Tensor, "n h w"]:
-    return lambert_shading(normals_from_depth(scene.depth, ranges.fov_deg), scene.light).squeeze(1)
+    bulge = depth[:, ring].mean(dim=1) - depth[:, core].mean(dim=1)
+    rotation = scene.camera[:, :2].abs() / math.radians(ranges.rotation_deg)
+    light = scene.light[:, 2:].abs() / math.radians(ranges.light_deg)
+    shading = lambert_shading(normals_from_depth(scene.depth, ranges.fov_deg), scene.light).squeeze(1)
+    values = {
+        "depth_at_bound": ((depth - middle).abs() > 0.97 * half).float().mean(),
+        "depth_spread": (spread / (high - low)).mean(),
+        "depth_roughness": (steps / spread.clamp(min=1e-6)).mean(),
+        "bulge": bulge.mean() / (high - low),
+        "view_at_bound": (rotation > 0.95).any(dim=1).float().mean(),
+        "light_at_bound": (light > 0.95).any(dim=1).float().mean(),
+        "shading_contrast": (shading.std(dim=(1, 2)) / shading.mean(dim=(1, 2)).clamp(min=1e-6)).mean(),
+    }
+    return {name: float(value) for name, value in values.items()}

@@ -32,9 +32,6 @@ class NormReLU(nn.Module):
         norm_relu = fast if suits_fast(values, self.weight) else reference
         return norm_relu(values, self.weight, self.bias, self.groups, self.slope, EPSILON)
 
-    def extra_repr(self) -> str:
-        return f"{len(self.weight)}, groups={self.groups}, slope={self.slope}"
-
 
 def reference(
     values: Tensor, weight: Tensor, bias: Tensor, groups: int, slope: float, epsilon: float
@@ -69,24 +66,13 @@ def _forward(
     from derender.render.numba_threads import array, over_images
 
     result, statistics = torch.empty_like(values), values.new_empty((len(values), groups, 2))
-    over_images(
-        numba_kernels.forward,
-        len(values),
-        _rows(values),
-        array(weight),
-        array(bias),
-        slope,
-        epsilon,
-        _rows(result),
-        array(statistics),
-    )
+    given = _rows(values), array(weight), array(bias), slope, epsilon
+    over_images(numba_kernels.forward, len(values), *given, _rows(result), array(statistics))
     return result, statistics
 
 
 @_forward.register_fake
-def _(
-    values: Tensor, weight: Tensor, bias: Tensor, groups: int, slope: float, epsilon: float
-) -> tuple[Tensor, Tensor]:
+def _(values: Tensor, weight: Tensor, bias: Tensor, groups: int, slope: float, epsilon: float):
     return torch.empty_like(values), values.new_empty((len(values), groups, 2))
 
 
@@ -100,26 +86,14 @@ def _backward(
     grad = grad.contiguous(memory_format=torch.channels_last)
     grad_values = torch.empty_like(values)
     each = values.new_empty((2, len(values), values.shape[1]))  # per image, summed below in one order
-    over_images(
-        numba_kernels.backward,
-        len(values),
-        _rows(grad),
-        _rows(values),
-        array(weight),
-        array(bias),
-        array(statistics),
-        slope,
-        _rows(grad_values),
-        array(each),
-    )
+    given = _rows(grad), _rows(values), array(weight), array(bias), array(statistics), slope
+    over_images(numba_kernels.backward, len(values), *given, _rows(grad_values), array(each))
     grad_weight, grad_bias = each.sum(dim=1)
     return grad_values, grad_weight.clone(), grad_bias.clone()
 
 
 @_backward.register_fake
-def _(
-    grad: Tensor, values: Tensor, weight: Tensor, bias: Tensor, statistics: Tensor, slope: float
-) -> tuple[Tensor, Tensor, Tensor]:
+def _(grad: Tensor, values: Tensor, weight: Tensor, bias: Tensor, statistics: Tensor, slope: float):
     return torch.empty_like(values), torch.empty_like(weight), torch.empty_like(bias)
 
 
