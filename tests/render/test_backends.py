@@ -15,8 +15,8 @@ from tests.tolerances import assert_agrees
 from torch import Tensor
 
 from derender.render import available_backends, chosen_backend
+from derender.render.backends import INSTALLED
 from derender.render.rasterize import CHOOSE, reference
-from derender.render.triton_launch import triton_installed
 from derender.render.warping import FORWARD, sample
 from derender.scene.camera import focal_px, motion, to_camera, unproject
 
@@ -35,31 +35,21 @@ def nan_filled_memory():
     torch.use_deterministic_algorithms(was)
 
 
-def gradients_with(
-    cotangents: torch.Generator, outputs: tuple[Tensor, ...], inputs: list[Tensor]
-) -> tuple[Tensor, ...]:
-    weights = [torch.randn(value.shape, generator=cotangents, dtype=value.dtype) for value in outputs]
-    return torch.autograd.grad(outputs, inputs, weights)
-
-
-def assert_agrees_with_reference(fast_backend: str, values: tuple[Tensor, ...]) -> None:
-    """Outputs and the gradient of each of render's four inputs."""
-    kept = {}
+def assert_agrees_with_reference(fast_backend: str, values: tuple[Tensor, ...], function=render) -> None:
+    """Outputs, and the gradient of each input."""
+    kept = []
     for backend in ("reference", fast_backend):
         inputs = [value.clone().requires_grad_() for value in values]
-        before = [value.detach().clone() for value in inputs]
-        result = render(*inputs, FOV_DEG, backend)
-        cotangents = torch.Generator().manual_seed(1)
-        gradients = gradients_with(cotangents, (result.image, result.depth), inputs)
-        kept[backend] = {"image": result.image, "depth": result.depth, "mask": result.mask}
-        names = ("depth", "albedo", "light", "camera")
-        kept[backend] |= {f"d/d {name}": gradient for name, gradient in zip(names, gradients, strict=True)}
+        result, cotangents = function(*inputs, FOV_DEG, backend), torch.Generator().manual_seed(1)
+        outputs = (result.image, result.depth)
+        weights = [torch.randn(value.shape, generator=cotangents, dtype=value.dtype) for value in outputs]
+        kept.append((*outputs, *torch.autograd.grad(outputs, inputs, weights), result.mask))
         assert not result.mask.requires_grad
-        for value, original in zip(inputs, before, strict=True):
+        for value, original in zip(inputs, values, strict=True):
             assert torch.equal(value, original), "inputs must not be written to"
-    assert torch.equal(kept[fast_backend]["mask"], kept["reference"]["mask"])
-    for name, expected in kept["reference"].items():
-        assert_agrees(kept[fast_backend][name], expected, name)
+    assert torch.equal(kept[0][-1], kept[1][-1])
+    for number, (expected, actual) in enumerate(zip(*kept, strict=True)):
+        assert_agrees(actual, expected, f"output or gradient {number}")
 
 
 @fast
@@ -129,15 +119,7 @@ def test_reference_gives_the_same_in_small_portions(generator, monkeypatch):
 def test_warping_agrees_for_any_number_of_channels(backend, channels, dtype, generator, nan_filled_memory):
     depth, _, _, pose = scene(2, 5, 8, generator, dtype)
     image = torch.randn(2, channels, 5, 8, generator=generator, dtype=dtype)
-    kept = []
-    for name in ("reference", backend):
-        inputs = [value.clone().requires_grad_() for value in (image, depth, pose)]
-        seen = warp(*inputs, FOV_DEG, name)
-        outputs = (seen.image, seen.depth)
-        kept.append((*outputs, *gradients_with(torch.Generator().manual_seed(1), outputs, inputs)))
-    names = ("image", "depth", "d/d image", "d/d depth", "d/d camera")
-    for name, expected, actual in zip(names, *kept, strict=True):
-        assert_agrees(actual, expected, name)
+    assert_agrees_with_reference(backend, (image, depth, pose), warp)
 
 
 def test_sampling_is_exact_on_bilinear_images_and_at_pixels(generator):
@@ -270,15 +252,14 @@ def test_importing_the_renderer_does_not_import_its_compilers():
 
 
 def test_what_can_be_imported_counts_as_installed():
-    assert ("numba" in available_backends()) == (importlib.util.find_spec("numba") is not None)
-    assert triton_installed() == (importlib.util.find_spec("triton") is not None)
+    assert {name: importlib.util.find_spec(name) is not None for name in ("numba", "triton")} == INSTALLED
+    assert ("numba" in available_backends()) == INSTALLED["numba"]
 
 
 def test_auto_takes_the_fastest_that_is_installed(monkeypatch):
-    package = sys.modules["derender.render.backends"]
     for installed, on_cpu, on_cuda in ((True, "numba", "triton"), (False, "reference", "reference")):
-        monkeypatch.setattr(package, "_numba_installed", lambda installed=installed: installed)
-        monkeypatch.setattr(package, "triton_installed", lambda installed=installed: installed)
+        for name in INSTALLED:
+            monkeypatch.setitem(INSTALLED, name, installed)
         assert chosen_backend("cpu") == chosen_backend(torch.device("cpu"), "auto") == on_cpu
         assert chosen_backend("cuda:0") == on_cuda
         assert chosen_backend("mps") == "reference"
@@ -298,8 +279,8 @@ def test_auto_takes_the_fastest_that_is_installed(monkeypatch):
     ],
 )
 def test_impossible_backends_are_errors(device, backend, message, monkeypatch):
-    package = sys.modules["derender.render.backends"]
-    for name, value in (("_numba_installed", True), ("triton_installed", True), ("interpreted", False)):
-        monkeypatch.setattr(package, name, lambda value=value: value)
+    for name in INSTALLED:
+        monkeypatch.setitem(INSTALLED, name, True)
+    monkeypatch.delenv("TRITON_INTERPRET", raising=False)
     with pytest.raises(ValueError, match=message):
         chosen_backend(device, backend)

@@ -6,14 +6,7 @@ import torch
 from derender.render import render, shade, warp
 from derender.render.rasterize import rasterize
 
-
-def good() -> dict[str, torch.Tensor]:
-    return {
-        "depth": torch.ones(2, 6, 5),
-        "albedo": torch.ones(2, 3, 6, 5),
-        "light": torch.zeros(2, 4),
-        "camera": torch.zeros(2, 6),
-    }
+GOOD = {"depth": (2, 6, 5), "albedo": (2, 3, 6, 5), "light": (2, 4), "camera": (2, 6)}
 
 
 @pytest.mark.parametrize(
@@ -32,37 +25,29 @@ def good() -> dict[str, torch.Tensor]:
     ],
 )
 def test_wrong_shapes(name, shape, message):
-    inputs = good()
-    inputs[name] = torch.ones(shape)
-    if name == "depth" and len(shape) == 3:
-        inputs["albedo"] = torch.ones(2, 3, *shape[1:])
     with pytest.raises(ValueError, match=message):
-        render(**inputs)
+        render(**{key: torch.ones(size) for key, size in (GOOD | {name: shape}).items()})
 
 
-@pytest.mark.parametrize("name", ["depth", "albedo", "light", "camera"])
+@pytest.mark.parametrize("name", GOOD)
 def test_integers_and_mixed_precision(name):
-    inputs = good()
-    inputs[name] = inputs[name].long()
+    inputs = {key: torch.ones(size) for key, size in GOOD.items()}
     with pytest.raises(ValueError, match=rf"{name} must be floating point, got torch.int64"):
-        render(**inputs)
-    inputs[name] = inputs[name].double()
+        render(**inputs | {name: inputs[name].long()})
     with pytest.raises(ValueError, match=r"must all have one dtype, got .*float64"):
-        render(**inputs)
+        render(**inputs | {name: inputs[name].double()})
 
 
-@pytest.mark.parametrize("fov_deg", [0.0, 180.0, -5.0])
-def test_field_of_view(fov_deg):
-    with pytest.raises(ValueError, match="fov_deg must lie between 0 and 180"):
-        render(**good(), fov_deg=fov_deg)
-
-
-def test_backend_name():
-    with pytest.raises(ValueError, match="unknown render backend 'gpu'"):
-        render(**good(), backend="gpu")
-
-
-def test_parts_refuse_too():
+def test_settings_and_parts():
+    inputs = [torch.ones(size) for size in GOOD.values()]
+    for how, message in (
+        ({"fov_deg": 0.0}, "fov_deg must lie between 0 and 180"),
+        ({"fov_deg": 180.0}, "fov_deg must lie between 0 and 180"),
+        ({"fov_deg": -5.0}, "fov_deg must lie between 0 and 180"),
+        ({"backend": "gpu"}, "unknown render backend 'gpu'"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            render(*inputs, **how)
     with pytest.raises(ValueError, match="image must have shape"):
         warp(torch.ones(2, 3, 4, 4), torch.ones(2, 6, 5), torch.zeros(2, 6))
     with pytest.raises(ValueError, match="light must have shape"):

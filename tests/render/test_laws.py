@@ -168,35 +168,21 @@ def test_roll_turns_the_picture_clockwise(backend):
     assert float((image * v).sum() / image.sum()) == pytest.approx(0, abs=0.1)
 
 
-def test_light_stays_with_the_canonical_frame(backend, generator):
-    depth, albedo, light, _ = scene(1, 16, 16, generator, torch.float64)
-    turned = render(depth, albedo, light, camera(ry=0.3), FOV_DEG, backend)
-    again = warp(shade(depth, albedo, light, FOV_DEG, backend), depth, camera(ry=0.3), FOV_DEG, backend)
-    assert_agrees(turned.image, again.image)
-
-
-def test_values_above_one_are_not_clipped(backend):
-    plane = torch.ones(1, 5, 5)
-    light = torch.tensor([[0.9, 0.8, 0.0, 0.0]])
-    image = render(plane, torch.ones(1, 3, 5, 5), light, torch.zeros(1, 6), FOV_DEG, backend).image
-    assert_agrees(image, torch.full((1, 3, 5, 5), 1.7))
-
-
-def test_render_scene_is_render(backend, generator):
-    values = scene(2, 9, 7, generator)
-    one, other = render(*values, FOV_DEG, backend), render_scene(Scene(*values), FOV_DEG, backend)
-    for name in ("image", "depth", "mask"):
-        assert torch.equal(getattr(one, name), getattr(other, name))
-
-
-def test_the_field_of_view_is_ten_degrees_where_none_is_given(backend, generator):
-    depth, albedo, light, pose = values = scene(1, 6, 7, generator)
-    expected = render(*values, 10.0, backend).image
-    assert torch.equal(render(*values, backend=backend).image, expected)
-    assert torch.equal(render_scene(Scene(*values), backend=backend).image, expected)
+def test_defaults_parts_and_scenes_are_the_same_rendering(backend, generator):
+    """Ten degrees where no field of view is given; nothing is clipped at 1."""
+    depth, albedo, light, pose = values = scene(2, 9, 7, generator)
+    light[:, :2] = torch.tensor([0.9, 0.8])
+    expected = render(*values, 10.0, backend)
+    assert expected.image.max() > 1
     canonical = shade(depth, albedo, light, backend=backend)
-    assert torch.equal(warp(canonical, depth, pose, backend=backend).image, expected)
-    assert not torch.equal(render(*values, 11.0, backend).image, expected)
+    for other in (
+        render(*values, backend=backend),
+        render_scene(Scene(*values), FOV_DEG, backend),
+        render_scene(Scene(*values), backend=backend),
+        warp(canonical, depth, pose, backend=backend),
+    ):
+        assert all(torch.equal(getattr(other, name), getattr(expected, name)) for name in vars(other))
+    assert not torch.equal(render(*values, 11.0, backend).image, expected.image)
     assert not torch.equal(shade(depth, albedo, light, 11.0, backend), canonical)
 
 

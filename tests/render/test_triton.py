@@ -16,6 +16,7 @@ from tests.render.scenes import FOV_DEG, scene
 from tests.tolerances import assert_agrees
 
 from derender.render import available_backends, triton_launch
+from derender.render.backends import INSTALLED
 from derender.render.triton_launch import (
     ADD,
     ADD_INTEGERS,
@@ -23,7 +24,6 @@ from derender.render.triton_launch import (
     float64_bits,
     interpreted,
     scattered_sums,
-    triton_installed,
 )
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -37,7 +37,7 @@ INTERPRETED = (
 )
 
 
-@pytest.mark.skipif(not triton_installed(), reason="triton is not installed")
+@pytest.mark.skipif(not INSTALLED["triton"], reason="triton is not installed")
 @pytest.mark.skipif("triton" in available_backends(), reason="Triton runs in this very process")
 def test_kernels_agree_with_the_definition_in_the_interpreter():
     tests = [f"tests/render/{name}" for name in INTERPRETED]
@@ -50,7 +50,7 @@ def test_kernels_agree_with_the_definition_in_the_interpreter():
     assert f"{len(INTERPRETED)} passed" in call.stdout
 
 
-@pytest.mark.skipif(not (triton_installed() and interpreted()), reason="needs TRITON_INTERPRET=1")
+@pytest.mark.skipif(not (INSTALLED["triton"] and interpreted()), reason="needs TRITON_INTERPRET=1")
 def test_several_programs_for_an_image_change_nothing(monkeypatch, generator):
     """In the interpreter one program has room for a whole small image; on a GPU many share it."""
     monkeypatch.setattr(triton_launch, "INTERPRETED_BLOCK", 16)
@@ -64,36 +64,38 @@ def test_several_programs_for_an_image_change_nothing(monkeypatch, generator):
         assert_agrees(actual, expected)
 
 
-@pytest.mark.skipif("triton" not in available_backends(), reason="needs a GPU, or TRITON_INTERPRET=1")
-def test_gradients_repeat_bit_for_bit_where_asked_for(generator):
-    values = scene(2, 33, 40, generator)
-
-    def gradients() -> tuple[torch.Tensor, ...]:
-        inputs = [value.clone().requires_grad_() for value in values]
-        return torch.autograd.grad(render(*inputs, FOV_DEG, "triton").image.square().sum(), inputs)
-
+@pytest.fixture
+def deterministic():
     torch.use_deterministic_algorithms(True)
-    try:
-        one, other = gradients(), gradients()
-    finally:
-        torch.use_deterministic_algorithms(False)
+    yield
+    torch.use_deterministic_algorithms(False)
+
+
+def gradients_of(values, backend: str, columns: int) -> tuple[torch.Tensor, ...]:
+    """Of a loss on the left columns of the image."""
+    inputs = [value.clone().requires_grad_() for value in values]
+    seen = render(*inputs, FOV_DEG, backend).image[..., :columns]
+    return torch.autograd.grad(seen.square().sum(), inputs)
+
+
+@pytest.mark.skipif("triton" not in available_backends(), reason="needs a GPU, or TRITON_INTERPRET=1")
+def test_gradients_repeat_bit_for_bit_where_asked_for(generator, deterministic):
+    values = scene(2, 33, 40, generator)
+    one, other = (gradients_of(values, "triton", 40) for _ in range(2))
     assert all(torch.equal(first, second) for first, second in zip(one, other, strict=True))
 
 
 @pytest.mark.skipif("triton" not in available_backends(), reason="needs a GPU, or TRITON_INTERPRET=1")
 def test_where_nothing_is_added_repeatable_gradients_are_nothing(generator):
-    values, kept = scene(1, 6, 9, generator), []
-    for backend in ("reference", "triton"):
-        inputs = [value.clone().requires_grad_() for value in values]
-        torch.use_deterministic_algorithms(backend == "triton")
-        try:
-            seen = render(*inputs, FOV_DEG, backend).image[..., :3]  # the rest of the pixels ask for nothing
-            kept.append(torch.autograd.grad(seen.square().sum(), inputs)[:2])
-        finally:
-            torch.use_deterministic_algorithms(False)
-    for expected, actual in zip(*kept, strict=True):
-        assert (expected == 0).any()
-        assert (actual[expected == 0] == 0).all()
+    values = scene(1, 6, 9, generator)
+    right = gradients_of(values, "reference", 3)[:2]
+    torch.use_deterministic_algorithms(True)
+    try:
+        found = gradients_of(values, "triton", 3)[:2]
+    finally:
+        torch.use_deterministic_algorithms(False)
+    for expected, actual in zip(right, found, strict=True):
+        assert (expected == 0).any() and (actual[expected == 0] == 0).all()
         assert_agrees(actual, expected)
 
 
@@ -116,33 +118,24 @@ def adding(values: torch.Tensor, order: torch.Tensor):
 
 @pytest.mark.parametrize("shape", [(3,), (3, 2, 2)])
 @pytest.mark.parametrize("scale", [1.0, 1e-200, 1e200])
-def test_integer_sums_have_no_order_and_lose_nothing_that_counts(scale, shape, generator):
+def test_integer_sums_have_no_order_and_lose_nothing_that_counts(scale, shape, generator, deterministic):
     values = torch.randn(3, 4, 5, generator=generator, dtype=torch.float64) * scale
     values[0] = 0
     values[2] *= 1e-9  # each image by a unit of its own
     orders = [torch.randperm(20, generator=generator) for _ in range(2)]
-    torch.use_deterministic_algorithms(True)
-    try:
-        one, other = (
-            scattered_sums(adding(values, order), values, [shape], [torch.float64])[0] for order in orders
-        )
-    finally:
-        torch.use_deterministic_algorithms(False)
-    assert torch.equal(one, other)
-    assert (one[0] == 0).all()
+    one, other = (
+        scattered_sums(adding(values, order), values, [shape], [torch.float64])[0] for order in orders
+    )
+    assert torch.equal(one, other) and (one[0] == 0).all()
+    torch.use_deterministic_algorithms(False)
     expected = scattered_sums(adding(values, orders[0]), values, [shape], [torch.float64])[0]
     for sums, right, summands in zip(one, expected, values, strict=True):
         assert torch.allclose(sums, right, rtol=0, atol=1e-15 * 20 * float(summands.abs().max()))
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
-def test_a_summand_that_is_not_finite_spoils_its_own_image_alone(bad):
+def test_a_summand_that_is_not_finite_spoils_its_own_image_alone(bad, deterministic):
     values = torch.ones(2, 2, 2)
     values[1, 0, 1] = bad
-    torch.use_deterministic_algorithms(True)
-    try:
-        sums = scattered_sums(adding(values, torch.arange(4)), values, [(2,)], [torch.float32])[0]
-    finally:
-        torch.use_deterministic_algorithms(False)
-    assert sums[0] == 4
-    assert sums[1].isnan()
+    sums = scattered_sums(adding(values, torch.arange(4)), values, [(2,)], [torch.float32])[0]
+    assert sums[0] == 4 and sums[1].isnan()

@@ -1,22 +1,32 @@
-"""Which implementation of an operation runs: plain torch (the definition), Numba (CPU) or Triton (CUDA).
+"""Implementations of an operation: plain torch (the definition), Numba (CPU) or Triton (CUDA), one signature.
 
-All three share one signature. Triton also runs on the CPU in its interpreter, slowly, for tests.
+Which one runs, and the last two as torch operators with an analytic derivative. An operator's inputs are
+tensors, images first, and a focal length in pixels. Of its outputs, the first few are differentiable and
+those of integers are kept for the derivative, which takes gradients, inputs, kept outputs and focal length.
+Triton also runs on the CPU in its interpreter, slowly, for tests.
 """
 
+import importlib
 import importlib.util
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
+from torch import Tensor
 
-from derender.render.triton_launch import interpreted, triton_installed
+from derender.render.triton_launch import interpreted
 
-BACKENDS = ("auto", "reference", "numba", "triton")
-_NUMBA = importlib.util.find_spec("numba") is not None  # here, as torch 2.6 cannot trace it
+Operation = Callable[..., Any]
+WORKS_ON = {"numba": "cpu", "triton": "cuda"}
+INSTALLED = {name: importlib.util.find_spec(name) is not None for name in WORKS_ON}
+"""Found at import, as torch 2.6 cannot trace it."""
+BACKENDS = ("auto", "reference", *WORKS_ON)
 
 
 def available_backends() -> tuple[str, ...]:
     """Names that ``backend=`` accepts on this machine, besides ``auto``; ``triton`` for its GPU."""
-    triton = triton_installed() and (torch.cuda.is_available() or interpreted())
-    return ("reference", *["numba"] * _numba_installed(), *["triton"] * triton)
+    runs = {"numba": True, "triton": torch.cuda.is_available() or interpreted()}
+    return ("reference", *(name for name in WORKS_ON if INSTALLED[name] and runs[name]))
 
 
 def chosen_backend(device: torch.device | str, backend: str = "auto") -> str:
@@ -25,24 +35,88 @@ def chosen_backend(device: torch.device | str, backend: str = "auto") -> str:
     if backend not in BACKENDS:
         raise ValueError(f"unknown render backend {backend!r}; choose one of {', '.join(BACKENDS)}")
     if backend == "auto":
-        best = {"cpu": "numba", "cuda": "triton"}.get(kind, "reference")
-        missing = not (_numba_installed() if best == "numba" else triton_installed())
-        return "reference" if missing else best
+        return next(
+            (name for name, works in WORKS_ON.items() if works == kind and INSTALLED[name]), "reference"
+        )
     if backend == "reference":
         return backend
-    if not (_numba_installed() if backend == "numba" else triton_installed()):
+    if not INSTALLED[backend]:
         raise ValueError(
             f"the {backend} render backend needs the package {backend}; install it or use 'reference'"
         )
-    if backend == "numba" and kind != "cpu":
-        raise ValueError(f"the numba render backend works on the CPU, the tensors are on {kind}; use 'auto'")
-    if backend == "triton" and kind != "cuda" and not interpreted():
+    if kind != WORKS_ON[backend] and not (backend == "triton" and interpreted()):
+        where = "the CPU" if backend == "numba" else "a CUDA device"
+        slowly = ", or set TRITON_INTERPRET=1 before Python starts to try it on the CPU, slowly"
         raise ValueError(
-            f"the triton render backend works on a CUDA device, the tensors are on {kind}; use 'auto', or "
-            "set TRITON_INTERPRET=1 before Python starts to try it on the CPU, slowly"
+            f"the {backend} render backend works on {where}, the tensors are on {kind}; use 'auto'"
+            + slowly * (backend == "triton")
         )
     return backend
 
 
-def _numba_installed() -> bool:
-    return _NUMBA
+def operators(
+    name: str, package: str, inputs: Sequence[str], room: Operation, differentiable: int, triton: Operation,
+    triton_backward: Operation,
+) -> dict[str, Operation]:  # fmt: skip
+    """By backend the operator ``derender::{name}_{backend}``.
+
+    Numba's kernels are ``forward`` and ``backward`` in package/numba_kernels.py: each takes the arrays of the
+    operator's tensors, the focal length, those of the results, and a range of images. ``room`` makes empty
+    outputs for input tensors. Fast kernels are imported, and compiled, on the first call.
+    """
+    outputs = room(*(torch.empty((1, 1, 2, 2), device="meta") for _ in inputs))
+    kept = [f"kept_{number}" for number, value in enumerate(outputs) if not value.is_floating_point()]
+    grads = [f"grad_{number}" for number in range(differentiable)]
+
+    def gradients(*values: Tensor) -> tuple[Tensor, ...]:
+        return tuple(value.new_empty(value.shape) for value in values[differentiable:][: len(inputs)])
+
+    def in_numba(direction: str, room: Operation) -> Operation:
+        def run(*values: Any) -> Any:
+            from derender.render.numba_threads import array, over_images
+
+            kernel = getattr(importlib.import_module(f"derender.render.{package}.numba_kernels"), direction)
+            *tensors, focal_px = values
+            results = room(*tensors)
+            over_images(kernel, len(tensors[0]), *map(array, tensors), focal_px, *map(array, results))
+            return _one_or_all(results)
+
+        return run
+
+    def registered(
+        backend: str, devices: str | Sequence[str], run: Operation, run_backward: Operation
+    ) -> Operation:
+        def made(
+            suffix: str, tensors: Sequence[str], results: int, function: Operation, room: Operation
+        ) -> Any:
+            several = ", ".join(["Tensor"] * results)
+            schema = f"({', '.join(f'Tensor {one}' for one in tensors)}, float focal_px) -> "
+            operator = torch.library.custom_op(
+                f"derender::{name}_{backend}{suffix}", function, mutates_args=(), device_types=devices,
+                schema=schema + (several if results == 1 else f"({several})"),
+            )  # fmt: skip
+            operator.register_fake(lambda *values: _one_or_all(room(*values[:-1])))
+            return operator
+
+        def keep(ctx: Any, inputs: tuple, output: Any) -> None:
+            *values, ctx.focal_px = inputs
+            results = (output,) if isinstance(output, Tensor) else output
+            ctx.mark_non_differentiable(*results[differentiable:])
+            ctx.save_for_backward(*values, *(value for value in results if not value.is_floating_point()))
+
+        def differentiate(ctx: Any, *given: Tensor) -> tuple[Tensor | None, ...]:
+            return *derivative(*given[:differentiable], *ctx.saved_tensors, ctx.focal_px), None
+
+        operator = made("", inputs, len(outputs), run, room)
+        derivative = made("_backward", [*grads, *inputs, *kept], len(inputs), run_backward, gradients)
+        operator.register_autograd(differentiate, setup_context=keep)
+        return operator
+
+    return {
+        "numba": registered("numba", "cpu", in_numba("forward", room), in_numba("backward", gradients)),
+        "triton": registered("triton", ("cuda", "cpu"), triton, triton_backward),
+    }
+
+
+def _one_or_all(values: Sequence[Tensor]) -> Any:
+    return values[0] if len(values) == 1 else values

@@ -52,12 +52,7 @@ def shade(
     depth: Tensor, albedo: Tensor, light: Tensor, fov_deg: float = 10.0, backend: str = "auto"
 ) -> Float[Tensor, "n 3 h w"]:
     """The canonical image: albedo times shading, before any camera. Shade once, warp to many cameras."""
-    count, height, width = _map_size(depth)
-    depth, albedo, light = _checked(
-        depth=(depth, (count, height, width)),
-        albedo=(albedo, (count, 3, height, width)),
-        light=(light, (count, 4)),
-    )
+    depth, albedo, light = _checked(depth, albedo=(albedo, 3), light=(light, 4))
     with torch.autocast(depth.device.type, enabled=False):
         return shading.shade(depth, albedo, light, fov_deg, backend)
 
@@ -66,40 +61,35 @@ def warp(
     image: Tensor, depth: Tensor, camera: Tensor, fov_deg: float = 10.0, backend: str = "auto"
 ) -> Rendering:
     """Show a canonical image (N, C, H, W), painted on the surface ``depth``, to another camera."""
-    count, height, width = _map_size(depth)
     channels = image.shape[1] if image.dim() == 4 else 3
-    image, depth, camera = _checked(
-        image=(image, (count, channels, height, width)),
-        depth=(depth, (count, height, width)),
-        camera=(camera, (count, 6)),
-    )
+    depth, image, camera = _checked(depth, image=(image, channels), camera=(camera, 6))
     with torch.autocast(depth.device.type, enabled=False):
         return Rendering(*warping.warp(image, depth, camera, fov_deg, backend))
 
 
-def _map_size(depth: Tensor) -> tuple[int, int, int]:
+def _checked(depth: Tensor, **others: tuple[Tensor, int]) -> list[Tensor]:
+    """The tensors in float32 or float64, or an error that names the one that does not fit ``depth``.
+
+    Light and camera have so many numbers, the others so many maps.
+    """
     if depth.dim() != 3:
         raise ValueError(f"render: depth must have shape (N, H, W), got {tuple(depth.shape)}")
-    count, height, width = depth.shape
-    if height < 2 or width < 2:
-        raise ValueError(f"render: depth maps need at least 2x2 pixels, got {height}x{width}")
-    return count, height, width
-
-
-def _checked(**inputs: tuple[Tensor, tuple[int, ...]]) -> list[Tensor]:
-    """The tensors in float32 or float64, or an error that names the one that does not fit."""
-    values = []
-    for name, (value, shape) in inputs.items():
+    count, *size = depth.shape
+    if min(size) < 2:
+        raise ValueError(f"render: depth maps need at least 2x2 pixels, got {size[0]}x{size[1]}")
+    values = {"depth": depth} | {name: value for name, (value, _) in others.items()}
+    for name, value in values.items():
         if not value.is_floating_point():
             raise ValueError(f"render: {name} must be floating point, got {value.dtype}; use .float()")
+        vector = name in ("light", "camera")
+        shape = (count, *(() if name == "depth" else others[name][1:]), *(() if vector else size))
         if tuple(value.shape) != shape:
             raise ValueError(f"render: {name} must have shape {shape} to fit depth, got {tuple(value.shape)}")
-        values.append(value.float() if value.dtype in (torch.float16, torch.bfloat16) else value)
-    for what, kinds in (
-        ("dtype", [value.dtype for value in values]),
-        ("device", [value.device for value in values]),
-    ):
+        if value.dtype in (torch.float16, torch.bfloat16):
+            values[name] = value.float()
+    for what in ("dtype", "device"):
+        kinds = [getattr(value, what) for value in values.values()]
         if any(kind != kinds[0] for kind in kinds):
-            found = ", ".join(f"{name} {kind}" for name, kind in zip(inputs, kinds, strict=True))
+            found = ", ".join(f"{name} {kind}" for name, kind in zip(values, kinds, strict=True))
             raise ValueError(f"render: inputs must all have one {what}, got {found}")
-    return values
+    return list(values.values())

@@ -3,16 +3,10 @@
 Every kernel works on ``per_image`` lanes of each image (its pixels, vertices or triangles), in blocks that
 never straddle two images, so that sums over a block belong to one image. Kernels run without fused
 multiply-add: which triangle a pixel shows is decided by float64 arithmetic that must round like the
-definition's. With TRITON_INTERPRET=1 in the environment, set before Triton is imported, the same kernels run
-on the CPU, slowly, for tests.
-
-`scattered_sums` are sums that many lanes add to: in floating point, or, with
-``torch.use_deterministic_algorithms(True)``, as integers, which have no order, so that gradients repeat bit
-for bit. Their unit is set per image by its largest summand and the number of summands, which leaves at least
-44 bits below that summand at 512x512. A summand that is not finite makes its image's sums NaN.
+definition's. With TRITON_INTERPRET=1 in the environment, set before Triton is imported, they run on the CPU,
+slowly, for tests.
 """
 
-import importlib.util
 import os
 import struct
 from collections.abc import Callable, Sequence
@@ -38,24 +32,18 @@ SMALLEST_SUMMAND = 1e-280
 
 Run = Callable[[int, Tensor, Tensor, Sequence[Tensor]], None]
 
-_TRITON = importlib.util.find_spec("triton") is not None  # here, as torch 2.6 cannot trace it
-
-
-def triton_installed() -> bool:
-    return _TRITON
-
 
 def interpreted() -> bool:
     """Whether kernels run in Triton's interpreter, on the CPU."""
     return os.environ.get("TRITON_INTERPRET") == "1"
 
 
-def block_of(lanes_per_program: int) -> int:
-    return INTERPRETED_BLOCK if interpreted() else lanes_per_program
+def block_of(lanes: int) -> int:
+    return INTERPRETED_BLOCK if interpreted() else lanes
 
 
-def programs_per_image(per_image: int, lanes_per_program: int) -> int:
-    return -(-per_image // block_of(lanes_per_program))
+def programs_per_image(per_image: int, lanes: int = PIXELS_PER_PROGRAM) -> int:
+    return -(-per_image // block_of(lanes))
 
 
 def float64_bits(value: float) -> int:
@@ -75,27 +63,25 @@ def launch(
     programs = len(images) * programs_per_image(per_image, lanes)
     if programs == 0:
         return
+    constants |= {"BLOCK": block_of(lanes), "num_warps": max(1, lanes // 32), "enable_fp_fusion": False}
     with torch.cuda.device(images.device) if images.is_cuda else nullcontext():
-        kernel[(programs,)](
-            *arguments,
-            BLOCK=block_of(lanes),
-            num_warps=max(1, lanes // 32),
-            enable_fp_fusion=False,
-            **constants,
-        )
+        kernel[(programs,)](*arguments, **constants)
 
 
 def scattered_sums(
     run: Run, like: Tensor, shapes: Sequence[tuple[int, ...]], dtypes: Sequence[torch.dtype]
 ) -> list[Tensor]:
-    """Sums of these shapes (images first) and dtypes on ``like``'s device.
+    """Sums, of these shapes (images first) and dtypes, that many lanes add to, on ``like``'s device.
 
-    ``run(mode, units, largest, targets)`` launches the kernel: it adds to ``targets``, in ``units`` (float64,
-    one per image and target) where mode is ADD_INTEGERS; or raises ``largest`` (bits of float64) for MEASURE.
+    They are made in floating point, or, with ``torch.use_deterministic_algorithms(True)``, as integers, which
+    have no order, so that gradients repeat bit for bit. Their unit is set per image by its largest summand
+    and the number of summands, which leaves at least 44 bits below that summand at 512x512. A summand that is
+    not finite makes its image's sums NaN. ``run(mode, units, largest, targets)`` launches the kernel: it adds
+    to ``targets``, in ``units`` (float64, one per image and target) where mode is ADD_INTEGERS; or raises
+    ``largest`` (bits of float64) for MEASURE.
     """
-    size = len(like), len(shapes)
-    largest = torch.zeros(size, dtype=torch.int64, device=like.device)
-    units = torch.ones(size, dtype=torch.float64, device=like.device)
+    largest = torch.zeros((len(like), len(shapes)), dtype=torch.int64, device=like.device)
+    units = torch.ones_like(largest, dtype=torch.float64)
     if not torch.are_deterministic_algorithms_enabled():
         sums = [
             torch.zeros(shape, dtype=dtype, device=like.device)
@@ -104,14 +90,11 @@ def scattered_sums(
         run(ADD, units, largest, sums)
         return sums
     run(MEASURE, units, largest, [largest] * len(shapes))
-    most = largest.view(torch.float64)
-    pixels = like.shape[-2] * like.shape[-1]
+    most, pixels = largest.view(torch.float64), like.shape[-2] * like.shape[-1]
     units = torch.where(most > SMALLEST_SUMMAND, LARGEST_SUM / (pixels * most.clamp(min=SMALLEST_SUMMAND)), 0)
     whole = [torch.zeros(shape, dtype=torch.int64, device=like.device) for shape in shapes]
     run(ADD_INTEGERS, units, largest, whole)
-    sizes = torch.where(
-        units > 0, 1 / torch.where(units > 0, units, 1), most * 0
-    )  # NaN if most is not finite
+    sizes = torch.where(units > 0, 1 / units, most * 0)  # NaN if most is not finite
     return [
         (value * size.view(-1, *[1] * (value.dim() - 1))).to(dtype)
         for value, size, dtype in zip(whole, sizes.unbind(1), dtypes, strict=True)

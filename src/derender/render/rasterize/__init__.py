@@ -12,6 +12,7 @@ With the winner fixed, uv and depth are differentiable functions of its vertices
 ray meets the triangle's plane. Nothing flows at occlusion edges. Rendering does both in one pass (warping).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -19,7 +20,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from derender.render.backends import chosen_backend
-from derender.render.rasterize.reference import intersect, project, visible_triangles
+from derender.render.rasterize.reference import NO_TRIANGLE, intersect, project, visible_triangles
 from derender.render.triton_launch import TRIANGLES_PER_PROGRAM, launch
 
 
@@ -61,30 +62,28 @@ def choose_numba(screen: Tensor) -> Tensor:
     return triangle
 
 
-def choose_triton(screen: Tensor) -> Tensor:
-    """The same on a CUDA device."""
-    triangle = mark_triangles(tuple(screen.unbind()))
-    return torch.where(triangle == torch.iinfo(torch.int32).max, -1, triangle)
-
-
-def mark_triangles(screen: tuple[Tensor, ...]) -> Tensor:
-    """`choose_triton` on u, v and inverse depth, with the largest int32 where there is no triangle.
+def mark_triangles(screen: Sequence[Tensor]) -> Tensor:
+    """The same on a CUDA device, from u, v and inverse depth; NO_TRIANGLE where there is none.
 
     The kernel that reads this map next replaces the mark.
     """
     from derender.render.rasterize import triton_kernels
 
     _, height, width = screen[0].shape
-    nearest_bits = torch.zeros_like(screen[0], dtype=torch.int64)
-    nearest = nearest_bits.view(torch.float64)
-    first = torch.full_like(screen[0], torch.iinfo(torch.int32).max, dtype=torch.int32)
+    nearest = torch.zeros_like(screen[0])
+    first = torch.full_like(nearest, NO_TRIANGLE, dtype=torch.int32)
     for second in (False, True):
         launch(
             triton_kernels.choose, first, 2 * (height - 1) * (width - 1),
-            *screen, nearest_bits, nearest, first, height, width,
+            *screen, nearest.view(torch.int64), nearest, first, height, width,
             lanes=TRIANGLES_PER_PROGRAM, SECOND=second,
         )  # fmt: skip
     return first
+
+
+def choose_triton(screen: Tensor) -> Tensor:
+    triangle = mark_triangles(screen.unbind())
+    return torch.where(triangle == NO_TRIANGLE, -1, triangle)
 
 
 CHOOSE = {"reference": visible_triangles, "numba": choose_numba, "triton": choose_triton}

@@ -26,6 +26,9 @@ EDGE_TOLERANCE = 1e-4
 TIE_TOLERANCE = 1e-6
 """Inverse depths this close (relative) count as equal; the triangle with the lowest index wins."""
 
+NO_TRIANGLE = torch.iinfo(torch.int32).max
+"""Above every index, where none has been found yet."""
+
 PAIRS_AT_ONCE = 1 << 20
 
 
@@ -62,19 +65,17 @@ def _visible_triangle(u: Tensor, v: Tensor, inverse_z: Tensor) -> Tensor:
     corners = triangle_corners(height, width, u.device)
     u, v, inverse_z = (value.ravel()[corners] for value in (u, v, inverse_z))
     area = (u[:, 1] - u[:, 0]) * (v[:, 2] - v[:, 0]) - (u[:, 2] - u[:, 0]) * (v[:, 1] - v[:, 0])
-    kept = (inverse_z != 0).all(-1) & (area.abs() > MIN_TWICE_AREA_PX2)
-    kept = kept.nonzero()[:, 0]
+    kept = ((inverse_z != 0).all(-1) & (area.abs() > MIN_TWICE_AREA_PX2)).nonzero()[:, 0]
     u, v, inverse_z, area = u[kept], v[kept], inverse_z[kept], area[kept]
 
     nearest = u.new_zeros(height * width)
     for _, pixel, inverse_depth in _covered(u, v, inverse_z, area, height, width):
         nearest.scatter_reduce_(0, pixel, inverse_depth, "amax")
-    none = torch.iinfo(torch.long).max
-    first = torch.full((height * width,), none, device=u.device)
+    first = torch.full((height * width,), NO_TRIANGLE, device=u.device)
     for chosen, pixel, inverse_depth in _covered(u, v, inverse_z, area, height, width):
         tied = inverse_depth >= nearest[pixel] * (1 - TIE_TOLERANCE)
         first.scatter_reduce_(0, pixel[tied], kept[chosen[tied]], "amin")
-    return torch.where(first == none, -1, first).view(height, width)
+    return torch.where(first == NO_TRIANGLE, -1, first).view(height, width)
 
 
 def _covered(
@@ -92,16 +93,13 @@ def _covered(
         within = pair - torch.where(triangle > 0, ends[triangle - 1], 0)
         pixel_u = first_u[triangle] + within % columns[triangle]
         pixel_v = first_v[triangle] + within // columns[triangle]
-        (u0, u1, u2), (v0, v1, v2) = u[triangle].unbind(-1), v[triangle].unbind(-1)
-        u0, u1, u2 = u0 - pixel_u, u1 - pixel_u, u2 - pixel_u
-        v0, v1, v2 = v0 - pixel_v, v1 - pixel_v, v2 - pixel_v
-        scale = 1 / area[triangle]
-        weight0, weight1 = (u1 * v2 - u2 * v1) * scale, (u2 * v0 - u0 * v2) * scale
-        weight2 = (u0 * v1 - u1 * v0) * scale
-        inverse_z0, inverse_z1, inverse_z2 = inverse_z[triangle].unbind(-1)
-        inverse_depth = weight0 * inverse_z0 + weight1 * inverse_z1 + weight2 * inverse_z2
-        inside = (weight0 >= -EDGE_TOLERANCE) & (weight1 >= -EDGE_TOLERANCE) & (weight2 >= -EDGE_TOLERANCE)
-        inside &= inverse_depth > 0
+        du, dv = u[triangle] - pixel_u[:, None], v[triangle] - pixel_v[:, None]
+        weight = (du.roll(-1, 1) * dv.roll(-2, 1) - du.roll(-2, 1) * dv.roll(-1, 1)) * (
+            1 / area[triangle, None]
+        )
+        first, second, third = (weight * inverse_z[triangle]).unbind(-1)
+        inverse_depth = first + second + third  # in this order, as in the fast versions
+        inside = (weight >= -EDGE_TOLERANCE).all(-1) & (inverse_depth > 0)
         yield triangle[inside], (pixel_v * width + pixel_u)[inside], inverse_depth[inside]
 
 

@@ -21,7 +21,7 @@ MAX_COORDINATE_PX = tl.constexpr(rule.MAX_COORDINATE_PX)
 EDGE_TOLERANCE = tl.constexpr(rule.EDGE_TOLERANCE)
 REACH = tl.constexpr(3 * rule.EDGE_TOLERANCE)
 TIED = tl.constexpr(1 - rule.TIE_TOLERANCE)
-NO_TRIANGLE = tl.constexpr(2**31 - 1)
+NO_TRIANGLE = tl.constexpr(rule.NO_TRIANGLE)
 
 
 @triton.jit

@@ -15,22 +15,22 @@ from derender.render.numba_threads import kernel
 @no_type_check
 def row_slopes(depth, i, along_u, along_v):
     """Write row i's relative slopes along both axes, as ``scene/normals.py`` defines them."""
-    height, width = depth.shape
-    row = depth[i]
+    width, row = depth.shape[1], depth[i]
     for j in range(1, width - 1):
         along_u[j] = (row[j + 1] - row[j - 1]) / (row[j + 1] + row[j - 1])
     along_u[0] = (row[1] - row[0]) / row[1]
     along_u[width - 1] = (row[width - 1] - row[width - 2]) / row[width - 2]
-    above, below = depth[max(i - 1, 0)], depth[min(i + 1, height - 1)]
-    if i == 0:
-        for j in range(width):
-            along_v[j] = (below[j] - above[j]) / below[j]
-    elif i == height - 1:
-        for j in range(width):
-            along_v[j] = (below[j] - above[j]) / above[j]
-    else:
-        for j in range(width):
-            along_v[j] = (below[j] - above[j]) / (below[j] + above[j])
+    above, below, count_above, count_below = neighbours(depth, i)
+    for j in range(width):
+        along_v[j] = (below[j] - above[j]) / (below[j] * count_below + above[j] * count_above)
+
+
+@kernel
+@no_type_check
+def neighbours(rows, i):
+    """The rows above and below row i, itself at the border, and which of them its slope's divisor counts."""
+    last, one, none = len(rows) - 1, rows.dtype.type(1), rows.dtype.type(0)
+    return rows[max(i - 1, 0)], rows[min(i + 1, last)], one if i > 0 else none, one if i < last else none
 
 
 @kernel
@@ -106,8 +106,7 @@ def backward(grad, depth, albedo, lamp, focal, grad_depth, grad_albedo, grad_lam
             row, out = depth[n, i], grad_depth[n, i]
             for j in range(1, width - 1):
                 total = row[j + 1] + row[j - 1]
-                share = two * along_u[j] / (total * total)
-                along_u[j] = share
+                along_u[j] = two * along_u[j] / (total * total)
             for j in range(1, width - 1):
                 out[j + 1] += along_u[j] * row[j - 1]
             for j in range(1, width - 1):
@@ -117,22 +116,13 @@ def backward(grad, depth, albedo, lamp, focal, grad_depth, grad_albedo, grad_lam
             out[1] += along_u[0] * row[0] / (row[1] * row[1])
             out[last] += along_u[last] / row[last - 1]
             out[last - 1] -= along_u[last] * row[last] / (row[last - 1] * row[last - 1])
-            above, below = depth[n, max(i - 1, 0)], depth[n, min(i + 1, height - 1)]
-            out_above, out_below = grad_depth[n, max(i - 1, 0)], grad_depth[n, min(i + 1, height - 1)]
-            if i == 0:
-                for j in range(width):
-                    out_above[j] -= along_v[j] / below[j]
-                    out_below[j] += along_v[j] * above[j] / (below[j] * below[j])
-            elif i == height - 1:
-                for j in range(width):
-                    out_below[j] += along_v[j] / above[j]
-                    out_above[j] -= along_v[j] * below[j] / (above[j] * above[j])
-            else:
-                for j in range(width):
-                    total = below[j] + above[j]
-                    share = two * along_v[j] / (total * total)
-                    out_below[j] += share * above[j]
-                    out_above[j] -= share * below[j]
+            above, below, count_above, count_below = neighbours(depth[n], i)
+            out_above, out_below, _, _ = neighbours(grad_depth[n], i)
+            for j in range(width):
+                total = below[j] * count_below + above[j] * count_above
+                share = (count_above + count_below) * along_v[j] / (total * total)
+                out_below[j] += share * above[j]
+                out_above[j] -= share * below[j]
         for k in range(5):
             total = 0.0
             for j in range(width):

@@ -53,24 +53,17 @@ def spread(grad_image, place, gradient, across, down, width, seen, unit, MODE: t
 
 @triton.jit
 @no_type_check
-def turned_ray(rotation, n, i, j, focal, height, width):
-    """The ray (x, y, 1) of pixel (i, j), and the same ray turned by image n's rotation."""
-    x = (j - (width - 1) * 0.5).to(tl.float64) / focal
-    y = (i - (height - 1) * 0.5).to(tl.float64) / focal
-    r = rotation + n * 9
-    turned_x = tl.load(r) * x + tl.load(r + 1) * y + tl.load(r + 2)
-    turned_y = tl.load(r + 3) * x + tl.load(r + 4) * y + tl.load(r + 5)
-    turned_z = tl.load(r + 6) * x + tl.load(r + 7) * y + tl.load(r + 8)
-    return x, y, turned_x, turned_y, turned_z
-
-
-@triton.jit
-@no_type_check
-def moved(distance, turned_x, turned_y, turned_z, offset, n):
-    """A surface point in the camera's frame."""
-    x = distance * turned_x + tl.load(offset + n * 3)
-    y = distance * turned_y + tl.load(offset + n * 3 + 1)
-    return x, y, distance * turned_z + tl.load(offset + n * 3 + 2)
+def surface(depth, rotation, offset, n, i, j, focal, height, width, live):
+    """Vertex (i, j) of image n: its depth, its ray (x, y, 1), the ray turned, the point for the camera."""
+    distance = tl.load(depth + n * height * width + i * width + j, mask=live, other=0).to(tl.float64)
+    ray_x = (j - (width - 1) * 0.5).to(tl.float64) / focal
+    ray_y = (i - (height - 1) * 0.5).to(tl.float64) / focal
+    r, t = rotation + n * 9, offset + n * 3
+    turned_x = tl.load(r) * ray_x + tl.load(r + 1) * ray_y + tl.load(r + 2)
+    turned_y = tl.load(r + 3) * ray_x + tl.load(r + 4) * ray_y + tl.load(r + 5)
+    turned_z = tl.load(r + 6) * ray_x + tl.load(r + 7) * ray_y + tl.load(r + 8)
+    x, y = distance * turned_x + tl.load(t), distance * turned_y + tl.load(t + 1)
+    return distance, ray_x, ray_y, turned_x, turned_y, turned_z, x, y, distance * turned_z + tl.load(t + 2)
 
 
 @triton.jit
@@ -79,11 +72,9 @@ def project_depth(
     depth, rotation, offset, us, vs, inverse_zs, focal_bits, height, width, BLOCK: tl.constexpr
 ):
     n, pixel, live = lanes(height * width, BLOCK)
-    place, focal = n * height * width + pixel, float64(focal_bits)
-    distance = tl.load(depth + place, mask=live, other=0).to(tl.float64)
-    _, _, tx, ty, tz = turned_ray(rotation, n, pixel // width, pixel % width, focal, height, width)
-    x, y, z = moved(distance, tx, ty, tz, offset, n)
-    project(x, y, z, focal, place, live, us, vs, inverse_zs, height, width)
+    i, j, focal = pixel // width, pixel % width, float64(focal_bits)
+    _, _, _, _, _, _, x, y, z = surface(depth, rotation, offset, n, i, j, focal, height, width, live)
+    project(x, y, z, focal, n * height * width + pixel, live, us, vs, inverse_zs, height, width)
 
 
 @triton.jit
@@ -98,15 +89,9 @@ def show(
     index = tl.load(triangle + base + pixel, mask=live, other=NO_TRIANGLE)
     seen = index != NO_TRIANGLE
     i0, j0, i1, j1, i2, j2 = corners(tl.where(seen, index, 0), width)
-    d0 = tl.load(depth + base + i0 * width + j0, mask=seen, other=0).to(tl.float64)
-    d1 = tl.load(depth + base + i1 * width + j1, mask=seen, other=0).to(tl.float64)
-    d2 = tl.load(depth + base + i2 * width + j2, mask=seen, other=0).to(tl.float64)
-    _, _, tx, ty, tz = turned_ray(rotation, n, i0, j0, focal, height, width)
-    x0, y0, z0 = moved(d0, tx, ty, tz, offset, n)
-    _, _, tx, ty, tz = turned_ray(rotation, n, i1, j1, focal, height, width)
-    x1, y1, z1 = moved(d1, tx, ty, tz, offset, n)
-    _, _, tx, ty, tz = turned_ray(rotation, n, i2, j2, focal, height, width)
-    x2, y2, z2 = moved(d2, tx, ty, tz, offset, n)
+    _, _, _, _, _, _, x0, y0, z0 = surface(depth, rotation, offset, n, i0, j0, focal, height, width, seen)
+    _, _, _, _, _, _, x1, y1, z1 = surface(depth, rotation, offset, n, i1, j1, focal, height, width, seen)
+    _, _, _, _, _, _, x2, y2, z2 = surface(depth, rotation, offset, n, i2, j2, focal, height, width, seen)
     ray_x = (pixel % width - (width - 1) * 0.5).to(tl.float64) / focal
     ray_y = (pixel // width - (height - 1) * 0.5).to(tl.float64) / focal
     b0, b1, b2, _, _, _, _, _, _, _ = meet(ray_x, ray_y, x0, y0, z0, x1, y1, z1, x2, y2, z2, seen)
@@ -140,16 +125,12 @@ def show_backward(
     index = tl.load(triangle + base + pixel, mask=live, other=-1)
     seen = index >= 0
     i0, j0, i1, j1, i2, j2 = corners(tl.where(seen, index, 0), width)
-    place0, place1, place2 = base + i0 * width + j0, base + i1 * width + j1, base + i2 * width + j2
-    d0 = tl.load(depth + place0, mask=seen, other=0).to(tl.float64)
-    d1 = tl.load(depth + place1, mask=seen, other=0).to(tl.float64)
-    d2 = tl.load(depth + place2, mask=seen, other=0).to(tl.float64)
-    rx0, ry0, tx0, ty0, tz0 = turned_ray(rotation, n, i0, j0, focal, height, width)
-    x0, y0, z0 = moved(d0, tx0, ty0, tz0, offset, n)
-    rx1, ry1, tx1, ty1, tz1 = turned_ray(rotation, n, i1, j1, focal, height, width)
-    x1, y1, z1 = moved(d1, tx1, ty1, tz1, offset, n)
-    rx2, ry2, tx2, ty2, tz2 = turned_ray(rotation, n, i2, j2, focal, height, width)
-    x2, y2, z2 = moved(d2, tx2, ty2, tz2, offset, n)
+    at0 = surface(depth, rotation, offset, n, i0, j0, focal, height, width, seen)
+    at1 = surface(depth, rotation, offset, n, i1, j1, focal, height, width, seen)
+    at2 = surface(depth, rotation, offset, n, i2, j2, focal, height, width, seen)
+    d0, rx0, ry0, tx0, ty0, tz0, x0, y0, z0 = at0
+    d1, rx1, ry1, tx1, ty1, tz1, x1, y1, z1 = at1
+    d2, rx2, ry2, tx2, ty2, tz2, x2, y2, z2 = at2
     ray_x = (pixel % width - (width - 1) * 0.5).to(tl.float64) / focal
     ray_y = (pixel // width - (height - 1) * 0.5).to(tl.float64) / focal
     b0, b1, b2, scale, x0, y0, x1, y1, x2, y2 = meet(ray_x, ray_y, x0, y0, z0, x1, y1, z1, x2, y2, z2, seen)
@@ -190,9 +171,9 @@ def show_backward(
         most = tl.maximum(tl.maximum(magnitude(gd0, seen), magnitude(gd1, seen)), magnitude(gd2, seen))
         note_largest(largest + n * 2 + 1, most)
     else:
-        accumulate(grad_depth + place0, gd0, seen, depth_unit, MODE)
-        accumulate(grad_depth + place1, gd1, seen, depth_unit, MODE)
-        accumulate(grad_depth + place2, gd2, seen, depth_unit, MODE)
+        accumulate(grad_depth + base + i0 * width + j0, gd0, seen, depth_unit, MODE)
+        accumulate(grad_depth + base + i1 * width + j1, gd1, seen, depth_unit, MODE)
+        accumulate(grad_depth + base + i2 * width + j2, gd2, seen, depth_unit, MODE)
         part = grad_motion + tl.program_id(0).to(tl.int64) * 12
         sum_motion(part, gx0, gx1, gx2, d0, d1, d2, rx0, ry0, rx1, ry1, rx2, ry2, seen)
         sum_motion(part + 4, gy0, gy1, gy2, d0, d1, d2, rx0, ry0, rx1, ry1, rx2, ry2, seen)
