@@ -137,7 +137,7 @@ def test_pictures_are_cut_by_the_list(wild, encoded):
             [HEADER, *SIZED[:2], "000003.jpg,30,20,30,20"],
             r"line 4: the box from \(30, 20\) to \(60, 40\) lies outside 000003\.jpg, which is 40 x 34",
         ),
-        ([HEADER], "has no rows"),
+        ([HEADER], r"has no row for 000001\.jpg"),
     ],
 )
 def test_a_list_that_cannot_be_right_is_refused(wild, lines, message):

@@ -1,121 +1,151 @@
-"""Very large folders: the listing that is remembered is the one a walk finds, and any change is seen."""
+"""Very large folders and zips: what is remembered is what a look finds, and any change is seen."""
 
 import os
+import zipfile
 from pathlib import Path
 
 import pytest
 
-from derender.data import cache_folder, folder_source, list_images, opening
-from derender.data.folder_source import FolderSource
+import derender
+from derender.data import cache_folder, folder_source, list_images, opening, zip_source
+
+NAMES = [f"{kind}/ä{row:02d}.png" for kind in ("cat", "dog") for row in range(20)]
+KINDS = pytest.mark.parametrize("kind", ["folder", "zip"])
 
 
 @pytest.fixture
-def walks(monkeypatch, tmp_path) -> list[str]:
-    """Folders of 30 files count as very large, in a cache of our own; which folders were walked."""
+def looks(monkeypatch, tmp_path) -> list[int]:
+    """Sources of 30 files count as very large, in a cache of our own; every time one was listed anew."""
     monkeypatch.setattr("derender.data.listing.REMEMBERED_FROM", 30)
     monkeypatch.setattr(folder_source, "_SETTLED_NS", -(10**12))
     monkeypatch.setenv("DERENDER_CACHE", str(tmp_path / "cache"))
-    walked, real = [], folder_source.list_files
-    monkeypatch.setattr(folder_source, "list_files", lambda root: walked.append(root) or real(root))
-    return walked
+    counted: list[int] = []
+    for module, name in ((folder_source, "list_files"), (zip_source, "members_of")):
+        real = getattr(module, name)
+        monkeypatch.setattr(module, name, lambda *of, real=real: counted.append(1) or real(*of))
+    return counted
 
 
 @pytest.fixture
-def folder(tree, walks) -> Path:
-    root = tree(
-        [f"{kind}/ä{row:02d}.png" for kind in ("cat", "dog") for row in range(20)]
-        + ["notes.csv", "cat/x.tmp"]
-    )
-    (root / "loop").symlink_to(root)
-    (root / "gone.png").symlink_to(root / "nowhere")
-    (root / os.fsdecode(b"raw\xff.png")).write_bytes(b"x")
-    return root
+def large(tree, looks):
+    """``large("folder")`` or ``large("zip")``: forty images, and what is no image."""
+
+    def make(kind: str) -> Path:
+        if kind == "zip":
+            return tree([*NAMES, "notes.csv", "../out.png", "a\\b.txt"], zipped=True)
+        root = tree([*NAMES, "notes.csv", "cat/x.tmp"])
+        (root / "loop").symlink_to(root)
+        (root / "gone.png").symlink_to(root / "nowhere")
+        (root / os.fsdecode(b"cat/raw\xff.png")).write_bytes(b"x")
+        return root
+
+    return make
 
 
-def known(source: FolderSource) -> tuple[object, ...]:
-    stamps = source.stamps(source.files).tolist()
-    source.remember()
-    return source.files, source.skipped, stamps
+def known(path: Path, **options: str) -> tuple[object, ...]:
+    """Everything there is to know of a source, its files' bytes included."""
+    with list_images(path, **options) as found:
+        files = found.files
+        stamps = files.stamps(files.files).tolist()
+        assert files.stamps(files.images).tolist() == [stamps[files.row_of(file)] for file in files.images]
+        contents = [files.read(file) for file in files.files]
+        return found.layout, files.files, files.skipped, stamps, contents, found.identity()
 
 
-def test_what_is_remembered_is_what_a_walk_finds(folder, walks):
-    first = known(FolderSource(folder))
-    assert walks == [str(folder)] and len(list(cache_folder().glob("*.listing"))) == 1
-    again = FolderSource(folder)
-    assert known(again) == first and len(walks) == 1
-    assert again.read("raw\\xff.png") == b"x"
-    status = (folder / "cat" / "ä03.png").stat()
-    assert again.stamps(["cat/ä03.png"]).tolist() == [[status.st_size, status.st_mtime_ns]]
-    assert [row.file for row in again.skipped] == ["gone.png"]
-
-
-def test_the_layout_is_recognised_once(folder, walks, monkeypatch):
-    (folder / os.fsdecode(b"raw\xff.png")).unlink()
-    asked, real = [], opening.recognise
+@KINDS
+def test_what_is_remembered_is_what_a_look_finds(large, looks, kind, monkeypatch):
+    path, asked, real = large(kind), [], opening.recognise
     monkeypatch.setattr(opening, "recognise", lambda source: asked.append(1) or real(source))
-    for _ in range(2):
-        with list_images(folder) as found:
-            assert found.layout == "classes"
-    assert len(asked) == 1 and len(walks) == 1
+    assert known(path, dataset="folder")[0] == "folder" and not asked
+    first = known(path)
+    assert known(path) == first and first[0] == "classes"
+    assert len(looks) == len(asked) == len(list(cache_folder().glob("*.listing"))) == 1
+    assert ("a/b.txt" in first[1]) if kind == "zip" else ("cat/raw\\xff.png" in first[1])
+    assert [row.file for row in first[2]] == ["../out.png" if kind == "zip" else "gone.png"]
 
 
-def add(folder: Path) -> None:
-    (folder / "cat" / "new.png").write_bytes(b"x")
+def in_folder(folder: Path, change: str) -> None:
+    if change == "add":
+        (folder / "cat" / "new.png").write_bytes(b"x")
+    elif change == "remove":
+        (folder / "dog" / "ä07.png").unlink()
+    elif change == "rename":
+        (folder / "dog" / "ä07.png").rename(folder / "dog" / "b.png")
+    elif change == "new folder":
+        (folder / "bird").mkdir()
+    elif change == "write over a table":
+        (folder / "notes.csv").write_text("other words")
+    else:
+        for file in (folder / "cat").glob("*.png"):
+            file.write_bytes(b"other bytes")
 
 
-def remove(folder: Path) -> None:
-    (folder / "dog" / "ä07.png").unlink()
+def in_zip(path: Path, change: str) -> None:
+    with zipfile.ZipFile(path) as archive:
+        contents = {name: archive.read(name) for name in archive.namelist()}
+    if change == "add":
+        contents["cat/new.png"] = b"x"
+    elif change == "remove":
+        del contents[NAMES[0]]
+    elif change == "rename":
+        contents["dog/b.png"] = contents.pop("dog/ä07.png")
+    else:  # the same size, name and place
+        contents["notes.csv"] = contents["notes.csv"][::-1]
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, content in contents.items():
+            archive.writestr(name, content)
 
 
-def rename(folder: Path) -> None:
-    (folder / "dog" / "ä07.png").rename(folder / "dog" / "b.png")
+CHANGES = ("add", "remove", "rename", "new folder", "write over a table", "write over many")
 
 
-def new_folder(folder: Path) -> None:
-    (folder / "bird").mkdir()
+@pytest.mark.parametrize(
+    ("kind", "change"),
+    [("folder", change) for change in CHANGES] + [("zip", change) for change in (*CHANGES[:3], CHANGES[4])],
+)
+def test_a_change_is_seen(large, looks, kind, change):
+    path = large(kind)
+    before = known(path)
+    (in_folder if kind == "folder" else in_zip)(path, change)
+    after = known(path)
+    assert len(looks) == 2 and (after != before or change == "new folder")
+    for listing in cache_folder().glob("*.listing"):
+        listing.unlink()
+    assert known(path) == after
 
 
-def write_over_a_table(folder: Path) -> None:
-    (folder / "notes.csv").write_text("other words")
+@KINDS
+@pytest.mark.parametrize("damage", ["empty", "junk", "cut", "one bit", "version"])
+def test_a_damaged_listing_or_one_of_another_version_is_made_again(large, looks, kind, damage, monkeypatch):
+    path = large(kind)
+    first = known(path)
+    (listing,) = cache_folder().glob("*.listing")
+    whole = listing.read_bytes()
+    changed = bytearray(whole)
+    changed[len(changed) // 2] ^= 1
+    contents = {"empty": b"", "junk": b"junk", "cut": whole[:-100], "one bit": bytes(changed)}
+    listing.write_bytes(contents.get(damage, whole))
+    if damage == "version":
+        monkeypatch.setattr(derender, "__version__", "0.0.0")
+    assert known(path) == first and len(looks) == 2
+    assert known(path) == first and len(looks) == 2
 
 
-def write_over_many(folder: Path) -> None:
-    for file in (folder / "cat").glob("*.png"):
-        file.write_bytes(b"other bytes")
-
-
-@pytest.mark.parametrize("change", [add, remove, rename, new_folder, write_over_a_table, write_over_many])
-def test_a_change_is_seen(folder, walks, change):
-    known(FolderSource(folder))
-    change(folder)
-    after = known(FolderSource(folder))
-    assert len(walks) == 2
-    for kept in cache_folder().glob("*.listing"):
-        kept.unlink()
-    assert known(FolderSource(folder)) == after
-
-
-@pytest.mark.parametrize("damage", [b"", b"junk", None])
-def test_a_damaged_listing_is_made_again(folder, walks, damage):
-    first = known(FolderSource(folder))
-    (kept,) = cache_folder().glob("*.listing")
-    kept.write_bytes(kept.read_bytes()[:-100] if damage is None else damage)
-    assert known(FolderSource(folder)) == first and len(walks) == 2
-    assert known(FolderSource(folder)) == first and len(walks) == 2
-
-
-def test_what_changed_a_moment_ago_is_not_trusted(folder, walks, monkeypatch):
+def test_what_changed_a_moment_ago_is_not_trusted(large, looks, monkeypatch):
     monkeypatch.setattr(folder_source, "_SETTLED_NS", 10**10)
-    known(FolderSource(folder))
-    FolderSource(folder)
-    assert len(walks) == 2
+    path = large("folder")
+    assert known(path) == known(path) and len(looks) == 2
 
 
-def test_small_folders_and_a_cache_that_cannot_be_written(folder, walks, monkeypatch, tmp_path):
+@KINDS
+def test_small_sources_and_a_cache_that_cannot_be_written(large, kind, monkeypatch, tmp_path):
+    path = large(kind)
     monkeypatch.setattr("derender.data.listing.REMEMBERED_FROM", 100)
-    known(FolderSource(folder))
+    known(path)
     assert not cache_folder().exists()
     monkeypatch.setattr("derender.data.listing.REMEMBERED_FROM", 30)
     (tmp_path / "file").write_text("in the way")
     monkeypatch.setenv("DERENDER_CACHE", str(tmp_path / "file"))
-    assert known(FolderSource(folder)) and known(FolderSource(folder))
+    assert known(path) == known(path)
+    with opening.open_source(path) as source, pytest.raises(ValueError, match=r"zzz is not in"):
+        source.stamps(["zzz"])

@@ -8,7 +8,7 @@ from PIL import Image
 from tests.data.conftest import noise
 
 from derender.data import MASK_CLASSES, list_images, read_masks
-from derender.data.layouts.celebamask import CELEBAMASK
+from derender.data.layouts.celeba import CELEBAMASK
 
 MAPPING = (
     "idx orig_idx         orig_file\n"
@@ -146,7 +146,7 @@ def test_official_parts_and_attributes(tree, published):
     assert found.images.labels["Bald"].tolist() == [0, 1, -1]
     assert [file[-5:] for file in read_masks(source, 8, subset="test").images.files] == ["2.jpg"]
     assert len(read_masks(f"{source}::train", 8).masks) == 2
-    with pytest.raises(ValueError, match="no subset 'validation'; there are test, train"):
+    with pytest.raises(ValueError, match="no part 'validation': its parts are test, train"):
         read_masks(source, 8, subset="validation")
 
 

@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from derender.data import read_ground_truth, read_images
-from derender.data.layouts.depth_pairs import DEPTH_RANGE
+from derender.data.maps import DEPTH_RANGE
 
 SIZE = 12
 
@@ -54,7 +54,7 @@ def test_subsets_limits_and_names_that_do_not_differ(pairs):
     path = pairs(names=("a", "a"))
     assert len(read_ground_truth(f"{path}::train")) == 2
     assert len(read_ground_truth(path, "test", limit=1)) == 1
-    with pytest.raises(ValueError, match="it has no subset 'val'; there are 'test', 'train'"):
+    with pytest.raises(ValueError, match="no part 'val': its parts are test, train"):
         read_ground_truth(path, "val")
 
 

@@ -117,7 +117,7 @@ def test_damaged_member_says_so(tree):
     path = tree({"a.bin": b"x" * 100}, zipped=True)
     raw = path.read_bytes()
     path.write_bytes(raw.replace(b"x" * 100, b"x" * 99 + b"y"))
-    with open_source(path) as source, pytest.raises(ValueError, match="cannot be unpacked: Bad CRC"):
+    with open_source(path) as source, pytest.raises(ValueError, match="cannot be unpacked: Bad size or CRC"):
         source.read("a.bin")
 
 

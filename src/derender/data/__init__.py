@@ -4,15 +4,15 @@ opening       from what the user wrote to a stream of images: open_images
 source, folder_source, zip_source   named files; listing: what is remembered of very large ones
 layouts/      how data sets lie: recognised, and read into a table of files and labels
 stream        images one after another; shards (WebDataset), huggingface
-decode        one image; decoding: a stream, on every core
-image_set   a stream collected into an array: read_images; cache: large sets in a memory map
-masks, ground_truth   images with masks, with exact maps
+image         decode one; decoding: a stream, on every core
+image_set     a stream collected into an array: read_images; cache: large sets in a memory map
+maps          images with masks, with exact depth, normals and albedo
 splits        which rows are for training, validation, test
 parquet       a parquet footer, checked before it is believed
-names         which names count, and suggestions for unknown ones
+doctor/       whether a set of images suits the method
 """
 
-from derender.data.cache import sample_checksum
+from derender.data.cache import cache_folder, sample_checksum
 from derender.data.decoding import (
     Decoded,
     Progress,
@@ -23,7 +23,6 @@ from derender.data.decoding import (
     estimated_total,
     usable_cores,
 )
-from derender.data.ground_truth import GroundTruth, read_ground_truth
 from derender.data.image import READER_VERSION, Unreadable, decode, quiet_pillow, read_image
 from derender.data.image_set import (
     Duplicate,
@@ -34,15 +33,13 @@ from derender.data.image_set import (
     refuse_not_finite,
 )
 from derender.data.layouts import LAYOUTS
-from derender.data.layouts.celebamask import MASK_CLASSES
-from derender.data.listing import cache_folder
-from derender.data.masks import MaskedImages, read_masks
-from derender.data.names import is_image, suggestion
+from derender.data.layouts.celeba import MASK_CLASSES
+from derender.data.maps import GroundTruth, MaskedImages, read_ground_truth, read_masks
 from derender.data.opening import ListedStream, list_images, open_images, open_source, parse_source
 from derender.data.parquet import check_lists, checked_footer
-from derender.data.source import Skipped, nearest_sibling
+from derender.data.source import Skipped, is_image, nearest_sibling, suggestion
 from derender.data.splits import Split, split_indices
-from derender.data.stream import Kinds, Sample, Stream, Value, ValueKind, column_of
+from derender.data.stream import Kinds, Sample, Stream, Value, column_of
 
 PictureSet = ImageSet  # the names of before, while callers change
 read_pictures = read_images
@@ -50,50 +47,11 @@ read_picture = read_image
 check_pictures = check_images
 
 __all__ = [
-    "LAYOUTS",
-    "MASK_CLASSES",
-    "READER_VERSION",
-    "Decoded",
-    "Duplicate",
-    "GroundTruth",
-    "ImageSet",
-    "Kinds",
-    "ListedStream",
-    "MaskedImages",
-    "Progress",
-    "Sample",
-    "SeenPixels",
-    "Skipped",
-    "Split",
-    "Stream",
-    "Unreadable",
-    "Value",
-    "ValueKind",
-    "ahead",
-    "as_float",
-    "cache_folder",
-    "check_images",
-    "check_lists",
-    "checked_footer",
-    "column_of",
-    "decode",
-    "decode_samples",
-    "decoded",
-    "estimated_total",
-    "is_image",
-    "list_images",
-    "nearest_sibling",
-    "open_images",
-    "open_source",
-    "parse_source",
-    "quiet_pillow",
-    "read_ground_truth",
-    "read_image",
-    "read_images",
-    "read_masks",
-    "refuse_not_finite",
-    "sample_checksum",
-    "split_indices",
-    "suggestion",
-    "usable_cores",
-]
+    "LAYOUTS", "MASK_CLASSES", "READER_VERSION", "Decoded", "Duplicate", "GroundTruth", "ImageSet", "Kinds",
+    "ListedStream", "MaskedImages", "Progress", "Sample", "SeenPixels", "Skipped", "Split", "Stream",
+    "Unreadable", "Value", "ahead", "as_float", "cache_folder", "check_images", "check_lists",
+    "checked_footer", "column_of", "decode", "decode_samples", "decoded", "estimated_total", "is_image",
+    "list_images", "nearest_sibling", "open_images", "open_source", "parse_source", "quiet_pillow",
+    "read_ground_truth", "read_image", "read_images", "read_masks", "refuse_not_finite", "sample_checksum",
+    "split_indices", "suggestion", "usable_cores",
+]  # fmt: skip

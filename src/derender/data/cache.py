@@ -1,30 +1,43 @@
-"""Decoded images of a large data set in one file that is mapped into memory.
+"""Decoded images of a large data set in one file that is mapped into memory; the folder of such files.
 
 The file is the rows themselves, appended as they are decoded, then a JSON note (what they were made from,
-which files they are, labels that came with them), then the note's length and a mark. It is written under
-another name and moved into place when complete, so a reader never sees half of one. It counts only if the
-note's fingerprint is that of the source as it is now, its length is right, and a sample of its rows has the
-recorded checksum; otherwise it is made again. One file per source and setting: a new version takes the old
-one's place.
+which files they are, labels that came with them), then the note's length and a mark. It is moved into place
+when complete, so a reader never sees half of one. It counts only if the note's fingerprint is that of the
+source as it is now, its length is right, and a sample of its rows has the recorded checksum; otherwise it is
+made again. One file per source and setting: a new version takes the old one's place.
 """
 
 import hashlib
 import json
 import os
-import tempfile
+import sys
 import time
 import zlib
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
 
+from derender.storage.atomic import atomic_file
+
 _MARK = b"derender pictures 2\n"
 _SAMPLED_ROWS = 64
 _ABANDONED_SECONDS = 86_400
+
+
+def cache_folder() -> Path:
+    """``$DERENDER_CACHE``, or derender's folder in the place this system has for caches."""
+    if "DERENDER_CACHE" in os.environ:
+        return Path(os.environ["DERENDER_CACHE"])
+    if sys.platform == "darwin":
+        base = Path.home() / "Library" / "Caches"
+    elif sys.platform == "win32":
+        base = Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData" / "Local"))
+    else:
+        base = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
+    return base / "derender"
 
 
 def cache_file(folder: Path, name: str, key: tuple[object, ...]) -> Path:
@@ -58,65 +71,52 @@ def read_cache(
     return (images, content) if sample_checksum(images) == checksum else None
 
 
-class CacheWriter:
-    """Rows being appended to a draft; ``finish`` puts it in place."""
+def write_cache(
+    file: Path,
+    fingerprint: str,
+    image_size: int,
+    fill: Callable[[Callable[[np.ndarray], None]], dict[str, Any]],
+) -> None:
+    """Make the file anew; one that cannot be written is an OSError that says what to do.
 
-    def __init__(self, file: Path, stream: IO[bytes], image_size: int):
-        self._file = file
-        self._stream = stream
-        self._size = image_size
-
-    def append(self, rows: UInt8[np.ndarray, "n 3 s s"]) -> None:
-        """Write some rows behind those that are there."""
-        try:
-            self._stream.write(np.ascontiguousarray(rows).data)
-        except OSError as problem:
-            raise _no_room(self._file, self._stream.tell(), problem) from problem
-
-    def finish(self, fingerprint: str, content: dict[str, Any]) -> None:
-        """Append the note and move the file into place; ``content["files"]`` names the rows."""
-        try:
-            self._stream.flush()
-            shape = (len(content["files"]), 3, self._size, self._size)
-            rows = np.memmap(self._stream.name, np.uint8, mode="r", shape=shape)
-            note = {"fingerprint": fingerprint, "checksum": sample_checksum(rows), "content": content}
-            encoded = json.dumps(note).encode()
-            self._stream.write(encoded + len(encoded).to_bytes(8, "little") + _MARK)
-            self._stream.flush()
-            os.fsync(self._stream.fileno())
-            Path(self._stream.name).replace(self._file)
-        except OSError as problem:
-            raise _no_room(self._file, self._stream.tell(), problem) from problem
-
-
-@contextmanager
-def new_cache(file: Path, image_size: int) -> Iterator[CacheWriter]:
-    """A draft beside ``file`` that rows are appended to; what is not finished is deleted."""
-    draft = None
+    Args:
+        file: where.
+        fingerprint: of what the rows are made from.
+        image_size: side of the images in pixels.
+        fill: calls the function it is given with rows, (n, 3, S, S) uint8, any number of times, and returns
+            what is known of them; its "files" name the rows.
+    """
+    written, storing = 0, True
     try:
-        try:
-            file.parent.mkdir(parents=True, exist_ok=True)
-            for other in file.parent.glob(f".{file.name}.*"):  # of a process that was killed
-                if other.stat().st_mtime < time.time() - _ABANDONED_SECONDS:
-                    other.unlink(missing_ok=True)
-            handle, name = tempfile.mkstemp(prefix=f".{file.name}.", dir=file.parent)
-            draft = Path(name)
-            os.close(handle)
-        except OSError as problem:
-            raise _no_room(file, 0, problem) from problem
-        with draft.open("ab") as stream:
-            yield CacheWriter(file, stream, image_size)
-    finally:
-        if draft is not None:
-            draft.unlink(missing_ok=True)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        for other in file.parent.glob(f".{file.name}-*"):  # of a process that was killed
+            if other.stat().st_mtime < time.time() - _ABANDONED_SECONDS:
+                other.unlink(missing_ok=True)
+        with atomic_file(file, durable=True) as draft, draft.open("wb") as stream:
 
+            def append(rows: np.ndarray) -> None:
+                nonlocal written, storing
+                storing = True
+                stream.write(np.ascontiguousarray(rows).data)
+                written, storing = written + rows.nbytes, False
 
-def _no_room(file: Path, needed: int, problem: OSError) -> OSError:
-    return OSError(
-        f"cannot keep {needed / 1e9:.3g} GB of decoded images in {file.parent} "
-        f"({problem.strerror or problem}); "
-        "set DERENDER_CACHE to a folder on another disk, or ask for smaller images"
-    )
+            storing = False
+            content = fill(append)
+            storing = True
+            stream.flush()
+            shape = (len(content["files"]), 3, image_size, image_size)
+            checksum = sample_checksum(np.memmap(draft, np.uint8, mode="r", shape=shape))
+            note = {"fingerprint": fingerprint, "checksum": checksum, "content": content}
+            encoded = json.dumps(note).encode()
+            stream.write(encoded + len(encoded).to_bytes(8, "little") + _MARK)
+    except OSError as problem:
+        if not storing:  # the images could not be read
+            raise
+        raise OSError(
+            f"cannot keep {written / 1e9:.3g} GB of decoded images in {file.parent} "
+            f"({problem.strerror or problem}); "
+            "set DERENDER_CACHE to a folder on another disk, or ask for smaller images"
+        ) from problem
 
 
 def sample_checksum(rows: np.ndarray) -> int:

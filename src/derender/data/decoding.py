@@ -63,12 +63,7 @@ def usable_cores() -> int:
 
 
 def decoded(
-    stream: Stream,
-    image_size: int,
-    *,
-    fit: str = "crop",
-    start: int = 0,
-    workers: int | None = None,
+    stream: Stream, image_size: int, *, fit: str = "crop", start: int = 0, workers: int | None = None
 ) -> Iterator[Decoded]:
     """Decode a stream from sample ``start`` on, up to its limit. Wrap in ``quiet_pillow``."""
     cores = workers or usable_cores()
@@ -108,8 +103,6 @@ def _decode_one(target: np.ndarray, sample: Sample, fit: str) -> bytes | Unreada
         if not encoded:
             return Unreadable("empty file")
         target[:] = decode(encoded, target.shape[-1], fit, sample.box)
-    except Unreadable as problem:
-        return problem
     except ValueError as problem:
         return Unreadable(str(problem))
     except OSError as problem:
@@ -156,36 +149,28 @@ class SeenPixels:
     def __init__(self) -> None:
         self._runs: list[tuple[np.ndarray, np.ndarray]] = []
 
-    def __len__(self) -> int:
-        return sum(len(digests) for digests, _ in self._runs)
-
     def first(self, digests: Sequence[bytes], rows: Sequence[int]) -> Int64[np.ndarray, " n"]:
-        """For each digest the row that had it first, itself if new; new ones are remembered.
+        """For each digest (16 bytes) the row that had it first, itself if new; new ones are remembered.
 
-        Args:
-            digests: sixteen bytes each.
-            rows: the numbers of these images, in order.
+        ``rows`` are the numbers of these images, in order.
         """
-        keys = np.array(digests, dtype=f"S{DIGEST_BYTES}")
-        numbers = np.array(rows, dtype=np.int64)
-        if not len(keys):
-            return numbers
-        unique, position, inverse = np.unique(keys, return_index=True, return_inverse=True)
-        found = numbers[position]
-        known = np.zeros(len(unique), bool)
+        keys, position, inverse = np.unique(
+            np.array(digests, f"S{DIGEST_BYTES}"), return_index=True, return_inverse=True
+        )
+        found = np.array(rows, np.int64)[position]
+        new = np.ones(len(keys), bool)
         for run_keys, run_rows in self._runs:
-            place = np.minimum(np.searchsorted(run_keys, unique), len(run_keys) - 1)
-            hit = run_keys[place] == unique
+            place = np.minimum(np.searchsorted(run_keys, keys), len(run_keys) - 1)
+            hit = run_keys[place] == keys
             found[hit] = run_rows[place[hit]]
-            known |= hit
-        if not known.all():
-            self._add(unique[~known], found[~known])
-        return found[inverse.reshape(-1)]
+            new &= ~hit
+        if new.any():
+            self._add(keys[new], found[new])
+        return found[inverse]
 
     def _add(self, keys: np.ndarray, rows: np.ndarray) -> None:
         while self._runs and len(self._runs[-1][0]) < 2 * len(keys):
-            more_keys, more_rows = self._runs.pop()
-            keys, rows = np.concatenate([more_keys, keys]), np.concatenate([more_rows, rows])
+            keys, rows = (np.concatenate(pair) for pair in zip(self._runs.pop(), (keys, rows), strict=True))
             order = np.argsort(keys, kind="stable")
             keys, rows = keys[order], rows[order]
         self._runs.append((keys, rows))

@@ -13,15 +13,11 @@ from collections.abc import Iterator
 from contextlib import suppress
 from functools import partial
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from derender.data.layouts.layout import PARTITION_NAMES
-from derender.data.names import printable, suggestion
-from derender.data.source import read_bounded, stamps_of
+from derender.data.source import printable, read_bounded, stamps_of, suggestion
 from derender.data.stream import Sample, Stream, label_name, unreadable
-
-if TYPE_CHECKING:
-    from datasets import IterableDataset
 
 _ANSWER_SECONDS = 10.0
 _LABEL_KINDS = ("string", "large_string", "int", "uint", "float", "bool")
@@ -51,34 +47,45 @@ class HuggingFaceStream(Stream):
         config: str | None = None,
         revision: str | None = None,
     ):
+        try:
+            import datasets
+        except ImportError as problem:
+            raise ValueError(
+                f"reading {source} as a Hugging Face data set needs the package datasets: "
+                "pip install 'derender[huggingface]'"
+            ) from problem
         self.source = source
         self._where = place
-        self.options = (split, column, config)
-        self.revision = revision if isinstance(place, Path) else _commit(place, revision, source)
-        splits = _load(source, place, config, self.revision)
+        self._options = (split, column, config)
+        self._revision = revision if isinstance(place, Path) else _commit(place, revision)
+        splits = _load(source, place, config, self._revision)
         names = _chosen(list(splits), split, source)
-        self.column, self._labels = _columns(splits[names[0]], column, source)
-        self.splits = {name: _raw(splits[name], [self.column, *self._labels], self.column) for name in names}
+        self._column, self._labels = _columns(splits[names[0]], column, source)
         self._counts = {name: _count(splits[name]) for name in names}
+        self._splits: dict[str, Any] = {}
+        for name in names:  # these columns only, images as encoded bytes
+            rows = splits[name].select_columns([self._column, *self._labels])
+            rows = rows.cast_column(self._column, datasets.Image(decode=False))
+            streamed = isinstance(rows, datasets.IterableDataset)
+            self._splits[name] = rows if streamed else rows.to_iterable_dataset()
 
     def identity(self) -> object:
         place = self._where
         if not isinstance(place, Path):
-            return place, self.revision, self.options
+            return place, self._revision, self._options
         files = [place] if place.is_file() else sorted(path for path in place.rglob("*") if path.is_file())
-        return self.options, [str(file.resolve()) for file in files], stamps_of(files).tolist()
+        return self._options, [str(file.resolve()) for file in files], stamps_of(files).tolist()
 
     @property
     def place(self) -> str:
-        return super().place if isinstance(self._where, Path) else f"{self._where} {self.options}"
+        return super().place if isinstance(self._where, Path) else f"{self._where} {self._options}"
 
     def samples(self, start: int = 0) -> Iterator[Sample]:
-        known = list(self._counts.values())
-        total = None if None in known else sum(count for count in known if count is not None)
+        known = [count for count in self._counts.values() if count is not None]
+        total = sum(known) if len(known) == len(self._counts) else 0
         before = 0
-        for name, rows in self.splits.items():
-            count = self._counts[name]
-            first = 0 if count is None else min(count, max(0, start - before))
+        for name, rows in self._splits.items():
+            first = min(self._counts[name] or 0, max(0, start - before))
             row = first - 1
             for row, values in enumerate(rows.skip(first) if first else rows, first):
                 if before + row >= start:
@@ -86,39 +93,26 @@ class HuggingFaceStream(Stream):
             before += row + 1
 
     def _sample(self, split: str, row: int, values: dict[str, Any], share: float | None) -> Sample:
-        image = values[self.column] or {}
+        image = values[self._column] or {}
         content, path = image.get("bytes"), image.get("path")
         name = f"{split}/{row:08d}"
         if path:
             name += f"-{printable(PurePosixPath(path.replace(os.sep, '/')).name)}"
         if content is not None:
             read = partial(bytes, content)
-        elif path:
-            read = partial(_read_path, path, self._where)
         else:
-            read = unreadable("no image in this row")
-        labels = {label_name(column): values[column] for column in self._labels}
+            read = partial(_read_path, path, self._where) if path else unreadable("no image in this row")
+        labels = {}
         for column, feature in self._labels.items():
-            names, value = getattr(feature, "names", None), values[column]
+            value, names = values[column], getattr(feature, "names", None)
             if names is not None and value is not None:
-                labels[label_name(column)] = names[value] if 0 <= value < len(names) else None
+                value = names[value] if 0 <= value < len(names) else None
+            labels[label_name(column)] = value
         return Sample(name, read, share, labels, PARTITION_NAMES.get(split.lower(), ""))
 
 
-def _library(source: str) -> Any:
-    try:
-        import datasets
-    except ImportError as problem:
-        raise ValueError(
-            f"reading {source} as a Hugging Face data set needs the package datasets: "
-            "pip install 'derender[huggingface]'"
-        ) from problem
-    return datasets
-
-
-def _commit(identifier: str, revision: str | None, source: str) -> str:
+def _commit(identifier: str, revision: str | None) -> str:
     """The commit that an id stands for now; asked for first because the library itself retries for long."""
-    _library(source)
     from huggingface_hub import HfApi, errors
 
     refusals = {
@@ -128,28 +122,24 @@ def _commit(identifier: str, revision: str | None, source: str) -> str:
         "(or it is private): check the id, or log in",
         errors.HFValidationError: f"{identifier!r} is no id of a Hugging Face data set",
     }
+    transport: type[Exception] = OSError  # what the Hub's client raises without a network has changed twice
+    for module in ("httpx", "httpx2"):
+        with suppress(ImportError):
+            transport = importlib.import_module(module).HTTPError
     try:
         info = HfApi().dataset_info(identifier, revision=revision, timeout=_ANSWER_SECONDS)
-    except (*refusals, errors.HfHubHTTPError, OSError, RuntimeError, _transport_error()) as problem:
+    except (*refusals, errors.HfHubHTTPError, OSError, RuntimeError, transport) as problem:
         why = type(problem).__name__
         failed = f"the Hugging Face Hub cannot be asked for {identifier} ({why}): check the network"
-        raise ValueError(
-            next((text for kind, text in refusals.items() if isinstance(problem, kind)), failed)
-        ) from problem
+        told = (text for kind, text in refusals.items() if isinstance(problem, kind))
+        raise ValueError(next(told, failed)) from problem
     return info.sha or "main"
 
 
-def _transport_error() -> type[Exception]:
-    """What the Hub's client raises where there is no network; it changed its transport more than once."""
-    for name in ("httpx2", "httpx"):
-        with suppress(ImportError):
-            return importlib.import_module(name).HTTPError
-    return OSError  # that of requests is one
-
-
 def _load(source: str, place: str | Path, config: str | None, revision: str | None) -> dict[str, Any]:
-    """Every split as an iterable data set that has read nothing yet."""
-    datasets = _library(source)
+    """Every split as a data set that has read nothing yet."""
+    datasets: Any = importlib.import_module("datasets")
+
     try:
         if isinstance(place, Path) and is_saved(place):
             saved = datasets.load_from_disk(str(place))
@@ -176,10 +166,10 @@ def _chosen(splits: list[str], split: str | None, source: str) -> list[str]:
 
 def _columns(rows: Any, column: str | None, source: str) -> tuple[str, dict[str, Any]]:
     """The image column, and the columns that are labels with their types."""
-    datasets = _library(source)
-    features = rows.features
-    if features is None:  # some forms tell only when rows are read
-        features = rows._resolve_features().features or {}
+    import datasets
+
+    # some forms tell their columns only when rows are read
+    features = rows.features if rows.features is not None else rows._resolve_features().features or {}
     images = [name for name, feature in features.items() if isinstance(feature, datasets.Image)]
     if not images:
         kinds = {name: getattr(one, "dtype", None) or type(one).__name__ for name, one in features.items()}
@@ -194,20 +184,12 @@ def _columns(rows: Any, column: str | None, source: str) -> tuple[str, dict[str,
     if column is not None and column not in images:
         hint = suggestion(column, images)
         raise ValueError(f"{source} has no column of images {column!r}{hint}; there is {', '.join(images)}")
-    labels = {
-        name: feature
-        for name, feature in features.items()
-        if isinstance(feature, datasets.ClassLabel)
-        or (isinstance(feature, datasets.Value) and feature.dtype.startswith(_LABEL_KINDS))
-    }
-    return column or images[0], labels
 
+    def is_label(feature: Any) -> bool:
+        plain = isinstance(feature, datasets.Value) and feature.dtype.startswith(_LABEL_KINDS)
+        return plain or isinstance(feature, datasets.ClassLabel)
 
-def _raw(rows: Any, columns: list[str], image: str) -> "IterableDataset":
-    """The rows with these columns only, images as encoded bytes."""
-    datasets = _library("")
-    chosen = rows.select_columns(columns).cast_column(image, datasets.Image(decode=False))
-    return chosen if isinstance(chosen, datasets.IterableDataset) else chosen.to_iterable_dataset()
+    return column or images[0], {name: one for name, one in features.items() if is_label(one)}
 
 
 def _count(rows: Any) -> int | None:
@@ -215,7 +197,7 @@ def _count(rows: Any) -> int | None:
     if hasattr(rows, "num_rows"):
         return rows.num_rows
     split = (rows.info.splits or {}).get(str(rows.split)) if rows.split is not None else None
-    return split.num_examples if split is not None and split.num_examples else None
+    return (split.num_examples or None) if split is not None else None
 
 
 def _read_path(path: str, place: str | Path) -> bytes:

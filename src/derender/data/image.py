@@ -16,16 +16,16 @@ import threading
 import warnings
 import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float32, UInt8
 from PIL import Image
+from PIL.Image import Resampling, Transpose
 
-from derender.data.names import suggestion
-from derender.data.source import Source, read_bounded
+from derender.data.source import Source, read_bounded, suggestion
 
 READER_VERSION = 1
 """Goes up whenever the same file would decode to other pixels, so that cached images are made again."""
@@ -42,31 +42,15 @@ _one_large_image_at_a_time = threading.Lock()
 _FORMATS = ("JPEG", "PNG", "WEBP", "BMP", "GIF", "TIFF", "PPM", "AVIF")
 _BACKGROUND = (255, 255, 255)
 _ORIENTATION_TAG = 0x0112
-_UPRIGHT = {
-    2: Image.Transpose.FLIP_LEFT_RIGHT,
-    3: Image.Transpose.ROTATE_180,
-    4: Image.Transpose.FLIP_TOP_BOTTOM,
-    5: Image.Transpose.TRANSPOSE,
-    6: Image.Transpose.ROTATE_270,
-    7: Image.Transpose.TRANSVERSE,
-    8: Image.Transpose.ROTATE_90,
-}
+_UPRIGHT = (  # by orientation, from 2 on
+    *(Transpose.FLIP_LEFT_RIGHT, Transpose.ROTATE_180, Transpose.FLIP_TOP_BOTTOM, Transpose.TRANSPOSE),
+    *(Transpose.ROTATE_270, Transpose.TRANSVERSE, Transpose.ROTATE_90),
+)
 
 # What Pillow and the libraries under it raise on damaged or hostile files (found by feeding them such files).
 DECODER_ERRORS = (
-    OSError,
-    ValueError,
-    SyntaxError,
-    EOFError,
-    LookupError,
-    TypeError,
-    AttributeError,
-    ArithmeticError,
-    MemoryError,
-    RuntimeError,
-    struct.error,
-    zlib.error,
-    Image.DecompressionBombError,
+    *(OSError, ValueError, SyntaxError, EOFError, LookupError, TypeError, AttributeError, ArithmeticError),
+    *(MemoryError, RuntimeError, struct.error, zlib.error, Image.DecompressionBombError),
 )
 
 
@@ -75,16 +59,16 @@ class Unreadable(ValueError):
 
 
 def read_image(
-    picture: str | Path | bytes, image_size: int, *, fit: str = "crop"
+    image: str | Path | bytes, image_size: int, *, fit: str = "crop"
 ) -> UInt8[np.ndarray, "3 s s"]:
     """Read one image, from a file or from its encoded bytes, as RGB of ``image_size`` x ``image_size``.
 
     A file that does not exist raises FileNotFoundError; one that is no usable image raises ``Unreadable``.
     """
     check_fit(fit)
-    name = "the given bytes" if isinstance(picture, bytes) else str(picture)
+    name = "the given bytes" if isinstance(image, bytes) else str(image)
     try:
-        encoded = picture if isinstance(picture, bytes) else read_bounded(Path(picture))
+        encoded = image if isinstance(image, bytes) else read_bounded(Path(image))
         with quiet_pillow():
             return decode(encoded, image_size, fit)
     except ValueError as problem:
@@ -113,12 +97,12 @@ def decode(
             if width * height > pixel_limit:
                 raise Unreadable(f"{width} x {height} is more than {pixel_limit // 10**6} million pixels")
             _reduce_while_decoding(opened, image_size, fit, box)
-            if box is not None:
-                box = box * (opened.size[0] / width)
-            if opened.size[0] * opened.size[1] > _LARGE_PIXELS:
-                with _one_large_image_at_a_time:
-                    return _finish(opened, image_size, fit, box)
-            return _finish(opened, image_size, fit, box)
+            large = opened.width * opened.height > _LARGE_PIXELS
+            with _one_large_image_at_a_time if large else nullcontext():
+                image = upright(_as_rgb(opened), opened)
+                if box is not None:
+                    image = _cut(image, box * (opened.width / width))
+                return np.ascontiguousarray(np.asarray(fit_square(image, image_size, fit)).transpose(2, 0, 1))
     except Unreadable:
         raise
     except Image.UnidentifiedImageError as problem:
@@ -152,41 +136,34 @@ def _reduce_while_decoding(
     kept = long if fit == "pad" else short
     if opened.format in ("JPEG", "MPO") and kept >= 4 * image_size:
         scale = 2 * image_size / kept
-        opened.draft(None, (int(opened.size[0] * scale), int(opened.size[1] * scale)))
+        opened.draft(None, (int(opened.width * scale), int(opened.height * scale)))
 
 
-def _finish(
-    opened: Image.Image, image_size: int, fit: str, box: Float32[np.ndarray, "4"] | None
-) -> UInt8[np.ndarray, "3 s s"]:
-    picture = upright(_as_rgb(opened), opened)
-    if box is not None:
-        picture = _cut(picture, box)
-    return np.ascontiguousarray(np.asarray(fit_square(picture, image_size, fit)).transpose(2, 0, 1))
-
-
-def _cut(picture: Image.Image, box: Float32[np.ndarray, "4"]) -> Image.Image:
+def _cut(image: Image.Image, box: Float32[np.ndarray, "4"]) -> Image.Image:
     """The part in the box, to the nearest pixel; a square box stays square."""
     sides = np.maximum(1, np.round(box[2:] - box[:2])).astype(int)
-    sides = np.minimum(sides, min(picture.size)) if sides[0] == sides[1] else np.minimum(sides, picture.size)
-    left, top = np.clip(np.round((box[:2] + box[2:] - sides) / 2).astype(int), 0, picture.size - sides)
-    return picture.crop((int(left), int(top), int(left + sides[0]), int(top + sides[1])))
+    sides = np.minimum(sides, min(image.size) if sides[0] == sides[1] else image.size)
+    left, top = np.clip(np.round((box[:2] + box[2:] - sides) / 2).astype(int), 0, image.size - sides)
+    return image.crop((int(left), int(top), int(left + sides[0]), int(top + sides[1])))
 
 
-def upright(picture: Image.Image, opened: Image.Image) -> Image.Image:
+def upright(image: Image.Image, opened: Image.Image) -> Image.Image:
     """Turn the image as the EXIF orientation of the ``opened`` file says; damaged EXIF counts as none."""
     if opened.format == "JPEG" and "exif" not in opened.info and "xmp" not in opened.info:
-        return picture
+        return image
     try:
-        orientation = opened.getexif().get(_ORIENTATION_TAG, 1)
+        orientation = opened.getexif().get(_ORIENTATION_TAG)
     except DECODER_ERRORS:
-        return picture
-    turn = _UPRIGHT.get(orientation) if isinstance(orientation, int) else None
-    return picture if turn is None else picture.transpose(turn)
+        return image
+    if not isinstance(orientation, int) or not 2 <= orientation <= 8:
+        return image
+    return image.transpose(_UPRIGHT[orientation - 2])
 
 
-def upright_size(opened: Image.Image) -> tuple[int, int]:
-    """Width and height of an opened file, turned as its EXIF orientation says; nothing is decoded."""
-    return upright(Image.new("1", opened.size), opened).size
+def upright_size(encoded: bytes) -> tuple[int, int]:
+    """Width and height, turned as the EXIF orientation says; nothing is decoded. Raises DECODER_ERRORS."""
+    with Image.open(io.BytesIO(encoded)) as opened:
+        return upright(Image.new("1", opened.size), opened).size
 
 
 def opened_image(source: Source, file: str) -> Image.Image:
@@ -199,23 +176,19 @@ def opened_image(source: Source, file: str) -> Image.Image:
         raise ValueError(f"{file} in {source.path} cannot be read: {problem}") from problem
 
 
-def _as_rgb(picture: Image.Image) -> Image.Image:
+def _as_rgb(image: Image.Image) -> Image.Image:
     """Any of Pillow's modes as 8-bit RGB."""
-    if picture.mode == "RGB" and "transparency" not in picture.info:
-        picture.load()
-        return picture
-    if picture.mode == "F" or picture.mode.startswith("I"):
-        return _from_high_depth(picture).convert("RGB")
-    if picture.mode in ("RGBA", "RGBa", "LA", "La", "PA") or "transparency" in picture.info:
-        layered = picture.convert("RGBA")
-        background = Image.new("RGBA", layered.size, (*_BACKGROUND, 255))
-        return Image.alpha_composite(background, layered).convert("RGB")
-    return picture.convert("RGB")
+    if image.mode == "F" or image.mode.startswith("I"):
+        image = _from_high_depth(image)
+    if image.mode in ("RGBA", "RGBa", "LA", "La", "PA") or "transparency" in image.info:
+        layered = image.convert("RGBA")
+        image = Image.alpha_composite(Image.new("RGBA", layered.size, (*_BACKGROUND, 255)), layered)
+    return image.convert("RGB")
 
 
-def _from_high_depth(picture: Image.Image) -> Image.Image:
+def _from_high_depth(image: Image.Image) -> Image.Image:
     """Grey images of 16 bits (white is 65535) or of floats (white is 1) as 8-bit grey."""
-    values = np.asarray(picture)
+    values = np.asarray(image)
     if values.dtype.kind == "f":
         if not (np.isfinite(values).all() and values.min() >= 0 and values.max() <= 1):
             raise Unreadable("floating-point image with values outside 0..1")
@@ -226,26 +199,25 @@ def _from_high_depth(picture: Image.Image) -> Image.Image:
 
 
 def fit_square(
-    picture: Image.Image,
+    image: Image.Image,
     image_size: int,
     fit: str,
-    resample: Image.Resampling = Image.Resampling.LANCZOS,
+    resample: Resampling = Resampling.LANCZOS,
     background: int | tuple[int, ...] = _BACKGROUND,
 ) -> Image.Image:
     """Crop, pad or squeeze to a square of the wanted size; maps of classes take NEAREST and a class."""
-    size = (image_size, image_size)
-    if picture.size == size:
-        return picture
-    width, height = picture.size
+    size, (width, height) = (image_size, image_size), image.size
+    if image.size == size:
+        return image
     if fit == "pad":
         scale = image_size / max(width, height)
         inner = (max(1, round(width * scale)), max(1, round(height * scale)))
-        square = Image.new(picture.mode, size, background)
-        resized = picture.resize(inner, resample, reducing_gap=3.0)
+        square = Image.new(image.mode, size, background)
+        resized = image.resize(inner, resample, reducing_gap=3.0)
         square.paste(resized, ((image_size - inner[0]) // 2, (image_size - inner[1]) // 2))
         return square
     if fit == "crop" and width != height:
         side = min(width, height)
         left, top = (width - side) // 2, (height - side) // 2
-        picture = picture.crop((left, top, left + side, top + side))
-    return picture.resize(size, resample, reducing_gap=3.0)
+        image = image.crop((left, top, left + side, top + side))
+    return image.resize(size, resample, reducing_gap=3.0)

@@ -18,14 +18,12 @@ import torch
 from jaxtyping import Float, Shaped, UInt8
 from torch import Tensor
 
-from derender.data.cache import cache_file, new_cache, read_cache
+from derender.data.cache import cache_file, cache_folder, read_cache, write_cache
 from derender.data.decoding import Decoded, Progress, SeenPixels, ahead, decoded, estimated_total
 from derender.data.image import READER_VERSION, Unreadable, check_fit, quiet_pillow
 from derender.data.layouts.layout import Labels, count_unknown, text_column
-from derender.data.listing import cache_folder
-from derender.data.names import suggestion
 from derender.data.opening import open_images
-from derender.data.source import Skipped
+from derender.data.source import Skipped, suggestion
 from derender.data.stream import Kinds, Stream, Value, column_of
 
 MEMORY_LIMIT_BYTES = 2 << 30
@@ -67,11 +65,9 @@ class ImageSet:
     terms: str = ""
 
     def __post_init__(self) -> None:
-        columns = {"files": self.files, **self.labels}
-        if self.partition is not None:
-            columns["partition"] = self.partition
+        columns = {"files": self.files, "partition": self.partition, **self.labels}
         for name, column in columns.items():
-            if len(column) != len(self.images):
+            if column is not None and len(column) != len(self.images):
                 raise ValueError(f"{len(self.images)} images, but {len(column)} values in {name!r}")
 
     def __len__(self) -> int:
@@ -119,15 +115,13 @@ class ImageSet:
         if self.skipped:
             parts.append(f"{len(self.skipped):,} skipped")
         if self.duplicates:
-            kept = set(self.files)
-            verb = "kept" if all(row.file in kept for row in self.duplicates) else "dropped"
+            verb = "kept" if {row.file for row in self.duplicates} <= set(self.files) else "dropped"
             parts.append(f"{len(self.duplicates):,} identical copies {verb}")
         unknown = {name: count_unknown(column) for name, column in self.labels.items()}
         partly = [f"{name} unknown for {count:,}" for name, count in unknown.items() if count]
-        parts += (
-            partly if len(partly) <= 3 else [*partly[:2], f"{len(partly) - 2} more labels in part unknown"]
-        )
-        return ", ".join(parts)
+        if len(partly) > 3:
+            partly[2:] = [f"{len(partly) - 2} more labels in part unknown"]
+        return ", ".join([*parts, *partly])
 
 
 def read_images(
@@ -167,15 +161,44 @@ def read_images(
         raise ValueError(f"limit must be 1 or more, got {limit}")
     check_fit(fit)
     with open_images(source, dataset=dataset, subset=subset, limit=limit) as stream:
-        reading = _Reading(stream, image_size, fit, keep_duplicates, workers, progress)
+
+        def fill(append: Callable[[np.ndarray], object]) -> dict[str, Any]:
+            """Decode everything and append the rows; what is known of them, as JSON has it."""
+            found = _Found(keep_duplicates)
+            chunks = decoded(stream, image_size, fit=fit, workers=workers)
+            with quiet_pillow(), ahead(chunks) as ready:
+                for chunk in ready:
+                    append(chunk.images[found.add(chunk)])
+                    if progress is not None:
+                        done = chunk.start + len(chunk)
+                        progress(done, estimated_total(done, chunk.share, stream.limit))
+            if not found.files:
+                raise _nothing_readable(stream, found.skipped)
+            return found.content()
+
         count = None if stream.table is None else len(stream.table.files)
         if cache is None and count is not None and count * 3 * image_size**2 <= memory_limit_bytes:
-            rows = _RowsInMemory(np.empty((count, 3, image_size, image_size), np.uint8))
-            content = reading.into(rows.append)
-            images = rows.images[: rows.count]
-        else:
-            images, content = reading.through(cache_folder() if cache is None else Path(cache), limit)
-        return _joined(stream, images, content)
+            images, filled = np.empty((count, 3, image_size, image_size), np.uint8), 0
+
+            def append(rows: np.ndarray) -> None:
+                nonlocal filled
+                images[filled : filled + len(rows)] = rows
+                filled += len(rows)
+
+            content = fill(append)
+            return _joined(stream, images[:filled], content)
+        settings = (READER_VERSION, stream.layout, image_size, fit, keep_duplicates, limit)
+        made_of = repr((settings, PIL.__version__, stream.identity()))
+        fingerprint = hashlib.sha256(made_of.encode()).hexdigest()
+        name = re.sub(r"[^\w.-]+", "-", stream.source.rpartition("/")[2])
+        file = cache_file(cache_folder() if cache is None else Path(cache), name, (stream.place, settings))
+        if (cached := read_cache(file, fingerprint, image_size)) is None:
+            write_cache(file, fingerprint, image_size, fill)
+            if (cached := read_cache(file, fingerprint, image_size)) is None:
+                raise OSError(f"decoded images could not be read back from {file}; check the disk")
+        if progress is not None:
+            progress(len(cached[0]), len(cached[0]))
+        return _joined(stream, *cached)
 
 
 def as_float(images: UInt8[np.ndarray, "*n 3 h w"] | UInt8[Tensor, "*n 3 h w"]) -> Float[Tensor, "*n 3 h w"]:
@@ -204,71 +227,13 @@ def refuse_not_finite(images: Tensor) -> None:
 
 
 @dataclass
-class _RowsInMemory:
-    """An array of known length that is filled from its beginning."""
-
-    images: UInt8[np.ndarray, "n 3 s s"]
-    count: int = 0
-
-    def append(self, rows: np.ndarray) -> None:
-        self.images[self.count : self.count + len(rows)] = rows
-        self.count += len(rows)
-
-
-@dataclass(frozen=True)
-class _Reading:
-    """A stream, and how to decode it."""
-
-    stream: Stream
-    image_size: int
-    fit: str
-    keep_duplicates: bool
-    workers: int | None
-    progress: Progress | None
-
-    def into(self, append: Callable[[np.ndarray], object]) -> dict[str, Any]:
-        """Decode everything and ``append`` the rows; what is known of them, as JSON has it."""
-        found = _Found(self.keep_duplicates)
-        chunks = decoded(self.stream, self.image_size, fit=self.fit, workers=self.workers)
-        with quiet_pillow(), ahead(chunks) as ready:
-            for chunk in ready:
-                append(chunk.images[found.add(chunk)])
-                if self.progress is not None:
-                    done = chunk.start + len(chunk)
-                    self.progress(done, estimated_total(done, chunk.share, self.stream.limit))
-        if not found.files:
-            raise nothing_readable(self.stream, found.skipped)
-        return found.content()
-
-    def through(self, folder: Path, limit: int | None) -> tuple[np.ndarray, dict[str, Any]]:
-        """Rows and content from the cache file if it is good, else decoded into a new one."""
-        stream = self.stream
-        settings = (READER_VERSION, stream.layout, self.image_size, self.fit, self.keep_duplicates, limit)
-        made_of = repr((settings, PIL.__version__, stream.identity()))
-        fingerprint = hashlib.sha256(made_of.encode()).hexdigest()
-        name = re.sub(r"[^\w.-]+", "-", stream.source.rpartition("/")[2])
-        file = cache_file(folder, name, (stream.place, settings))
-        cached = read_cache(file, fingerprint, self.image_size)
-        if cached is None:
-            with new_cache(file, self.image_size) as writer:
-                content = self.into(writer.append)
-                writer.finish(fingerprint, content)
-            cached = read_cache(file, fingerprint, self.image_size)
-            if cached is None:
-                raise OSError(f"decoded images could not be read back from {file}; check the disk")
-        if self.progress is not None:
-            self.progress(len(cached[0]), len(cached[0]))
-        return cached
-
-
-@dataclass
 class _Found:
     """What is known after each chunk: names, labels and partitions of the rows, and what is left out."""
 
     keep_duplicates: bool
     files: list[str] = field(default_factory=list)
     skipped: list[Skipped] = field(default_factory=list)
-    copies: list[tuple[str, int]] = field(default_factory=list)
+    copies: list[Duplicate] = field(default_factory=list)
     columns: dict[str, list[Value]] = field(default_factory=dict)
     partitions: list[str] = field(default_factory=list)
     kinds: Kinds = field(default_factory=Kinds)
@@ -277,42 +242,39 @@ class _Found:
 
     def add(self, chunk: Decoded) -> list[int]:
         """Note a chunk; which of its rows are to be kept."""
-        good = {row: one for row, one in enumerate(chunk.outcomes) if not isinstance(one, Unreadable)}
+        outcomes = list(zip(chunk.files, chunk.outcomes, strict=True))
+        self.skipped += [Skipped(file, str(one)) for file, one in outcomes if isinstance(one, Unreadable)]
+        good = {row: one for row, (_, one) in enumerate(outcomes) if not isinstance(one, Unreadable)}
         numbers = range(len(self.readable), len(self.readable) + len(good))
+        self.readable += [chunk.files[row] for row in good]
         first = self.seen.first(list(good.values()), numbers).tolist()
         kept = []
         for row, number, earlier in zip(good, numbers, first, strict=True):
-            self.readable.append(chunk.files[row])
             if earlier != number:
-                self.copies.append((chunk.files[row], earlier))
+                self.copies.append(Duplicate(chunk.files[row], self.readable[earlier]))
             if earlier == number or self.keep_duplicates:
                 kept.append(row)
-                self._label(chunk.labels[row])
+                self.kinds.see(chunk.labels[row])
+                for name in chunk.labels[row]:
+                    self.columns.setdefault(name, [None] * len(self.files))
+                for name, column in self.columns.items():
+                    column.append(chunk.labels[row].get(name))
                 self.files.append(chunk.files[row])
                 self.partitions.append(chunk.partitions[row])
-        outcomes = zip(chunk.files, chunk.outcomes, strict=True)
-        self.skipped += [Skipped(file, str(one)) for file, one in outcomes if isinstance(one, Unreadable)]
         return kept
-
-    def _label(self, labels: Mapping[str, Value]) -> None:
-        self.kinds.see(labels)
-        for name in labels:
-            self.columns.setdefault(name, [None] * len(self.files))
-        for name, column in self.columns.items():
-            column.append(labels.get(name))
 
     def content(self) -> dict[str, Any]:
         """Everything, as JSON has it."""
         return {
             "files": self.files,
-            "skipped": [asdict(row) for row in self.skipped],
-            "duplicates": [{"file": file, "first": self.readable[first]} for file, first in self.copies],
+            "skipped": list(map(asdict, self.skipped)),
+            "duplicates": list(map(asdict, self.copies)),
             "labels": {name: [self.kinds[name], column] for name, column in self.columns.items()},
             "partition": self.partitions if any(self.partitions) else None,
         }
 
 
-def nothing_readable(stream: Stream, skipped: list[Skipped]) -> ValueError:
+def _nothing_readable(stream: Stream, skipped: list[Skipped]) -> ValueError:
     """The error for a stream without a usable image."""
     where = f"{stream.source} ({stream.layout})"
     if not skipped:
@@ -325,10 +287,9 @@ def _joined(stream: Stream, images: np.ndarray, content: Mapping[str, Any]) -> I
     """The rows with their labels: those of the stream's table, or those that came with each."""
     files, partition = tuple(content["files"]), content["partition"]
     if stream.table is None:
-        columns = content["labels"].items()
         labels = {
             name: column_of(name, ({name: value} for value in values), kind)
-            for name, (kind, values) in columns
+            for name, (kind, values) in content["labels"].items()
         }
         partition = None if partition is None else text_column(partition)
     else:

@@ -1,18 +1,17 @@
 """What a very large folder or zip holds, remembered in the cache folder between starts.
 
-The file is a checksum and, behind it, an archive of numpy arrays: names, numbers and a note. It can be made
+The file is a checksum and, behind it, an archive of numpy arrays: numbers, a note and names. It can be made
 again, so one that is missing, damaged or of another version is as good as none, and a full disk is no error.
 """
 
 import hashlib
 import io
 import json
-import os
-import sys
 from abc import abstractmethod
 from bisect import bisect_left
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -21,28 +20,14 @@ import numpy as np
 from jaxtyping import Int64
 
 import derender
-from derender.data.names import printable
-from derender.data.source import Skipped, Source
+from derender.data.cache import cache_folder
+from derender.data.source import Skipped, Source, printable
 from derender.storage.atomic import atomic_file
 
 REMEMBERED_FROM = 50_000
 """Folders and zips with this many files or more are remembered."""
 
-_DAMAGED = (OSError, ValueError, LookupError, TypeError, AttributeError)
 _DIGEST_BYTES = 32
-
-
-def cache_folder() -> Path:
-    """``$DERENDER_CACHE``, or derender's folder in the place this system has for caches."""
-    if "DERENDER_CACHE" in os.environ:
-        return Path(os.environ["DERENDER_CACHE"])
-    if sys.platform == "darwin":
-        base = Path.home() / "Library" / "Caches"
-    elif sys.platform == "win32":
-        base = Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData" / "Local"))
-    else:
-        base = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
-    return base / "derender"
 
 
 @dataclass(frozen=True)
@@ -50,53 +35,46 @@ class Listing:
     """Files, and what is known of them.
 
     Attributes:
-        files: their names as the system or archive has them, sorted by their printable form.
-        numbers: (N, k) whole numbers, a row for each file; (N, 0) before they are looked up.
-        faults: what is no usable file: its name, and why.
+        files: their names as the system or archive has them, sorted by their shown form.
+        numbers: a row of whole numbers for each file.
+        faults: names of what is no usable file, and why.
         proof: what must still be so for the listing to hold.
         layout: the layout that was recognised, "" for none.
     """
 
     files: tuple[str, ...]
     numbers: Int64[np.ndarray, "n k"]
-    faults: tuple[tuple[str, str], ...]
-    proof: dict[str, Any] = field(default_factory=dict)
+    faults: Sequence[Sequence[str]]
+    proof: Mapping[str, Any]
     layout: str = ""
 
     def write(self, file: Path) -> None:
         """Write the listing to a file; one that cannot be written is only slower next time."""
-        note = {"version": derender.__version__, "proof": self.proof}
-        note |= {"faults": self.faults, "layout": self.layout}
-        names = "\0".join(self.files).encode("utf-8", "surrogateescape")
-        texts = {"note": json.dumps(note).encode(), "names": names}
+        facts = {"faults": self.faults, "proof": self.proof, "layout": self.layout}
+        texts = json.dumps({"version": derender.__version__, **facts}), "\0".join(self.files)
+        as_bytes = [np.frombuffer(text.encode("utf-8", "surrogateescape"), np.uint8) for text in texts]
         buffer = io.BytesIO()
-        arrays = {name: np.frombuffer(text, np.uint8) for name, text in texts.items()}
-        np.savez(buffer, numbers=self.numbers, **arrays)  # pyright: ignore[reportArgumentType]
-        content = buffer.getbuffer()
-        try:
-            with atomic_file(file) as temporary, temporary.open("wb") as stream:
-                stream.write(_checksum(content))
-                stream.write(content)
-        except OSError:
-            return
+        np.savez(buffer, self.numbers, *as_bytes)
+        with suppress(OSError), atomic_file(file) as temporary, temporary.open("wb") as stream:
+            stream.write(_checksum(buffer.getbuffer()))
+            stream.write(buffer.getbuffer())
 
 
 def read_listing(file: Path) -> Listing | None:
     """What was written, or None where there is none, it is damaged, or another version wrote it."""
     try:
-        with file.open("rb") as stream:
-            checksum, content = stream.read(_DIGEST_BYTES), stream.read()
-        if _checksum(content) != checksum:
+        content = memoryview(file.read_bytes())
+        if _checksum(content[_DIGEST_BYTES:]) != content[:_DIGEST_BYTES]:
             return None
-        with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
-            note = json.loads(arrays["note"].tobytes())
-            joined = arrays["names"].tobytes().decode("utf-8", "surrogateescape")
-            numbers = arrays["numbers"]
-        names, faults = tuple(joined.split("\0")), tuple((name, why) for name, why in note["faults"])
-        if note["version"] != derender.__version__ or len(numbers) != len(names):
+        with np.load(io.BytesIO(content[_DIGEST_BYTES:]), allow_pickle=False) as arrays:
+            numbers, note, names = (arrays[name] for name in arrays.files)
+        facts = json.loads(note.tobytes())
+        if facts.pop("version") != derender.__version__:
             return None
-        return Listing(names, numbers, faults, note["proof"], note["layout"])
-    except _DAMAGED:
+        return Listing(
+            tuple(names.tobytes().decode("utf-8", "surrogateescape").split("\0")), numbers, **facts
+        )
+    except (OSError, ValueError, LookupError, TypeError):
         return None
 
 
@@ -105,7 +83,14 @@ def _checksum(content: bytes | memoryview) -> bytes:
 
 
 class ListedSource(Source):
-    """A source whose files are listed, by itself or by what was remembered of it."""
+    """A source whose files are listed, by itself or by what was remembered of it.
+
+    Attributes:
+        listing: the files, a row of numbers each.
+        stamped: the two columns of these numbers that change with a file's content.
+    """
+
+    stamped: tuple[int, int] = (0, 1)
 
     def __init__(self, path: Path):
         self.path = path
@@ -116,7 +101,7 @@ class ListedSource(Source):
         self._remembered = known is not None and self._holds(known)
         self.listing = known if known is not None and self._remembered else self._listed()
         self.recognised = self.listing.layout
-        self.files = tuple(map(printable, self.listing.files))
+        self.files = tuple(map(self.shown, self.listing.files))
         faults = [Skipped(printable(file), reason) for file, reason in self.listing.faults]
         self.skipped = tuple(sorted(faults, key=lambda row: row.file))
 
@@ -128,16 +113,22 @@ class ListedSource(Source):
     def _holds(self, known: Listing) -> bool:
         """Whether a remembered listing still tells what is there."""
 
+    @staticmethod
+    def shown(name: str) -> str:
+        """How a name is told and stored."""
+        return printable(name)
+
     @cached_property
-    def numbers(self) -> Int64[np.ndarray, "n k"]:
-        """A row for every file."""
-        return self.listing.numbers
+    def renamed(self) -> dict[str, str]:
+        """The files that are not called as they are shown, by shown name."""
+        pairs = zip(self.files, self.listing.files, strict=True)
+        return {shown: name for shown, name in pairs if shown is not name and shown != name}
 
     def remember(self) -> None:
         if len(self.files) < REMEMBERED_FROM:
             return
         if not self._remembered or self.listing.layout != self.recognised:
-            self.listing = replace(self.listing, numbers=self.numbers, layout=self.recognised)
+            self.listing = replace(self.listing, layout=self.recognised)
             self.listing.write(self._file)
             self._remembered = True
 
@@ -148,6 +139,6 @@ class ListedSource(Source):
             raise ValueError(f"{file} is not in {self.path}")
         return row
 
-    def rows_of(self, files: Sequence[str]) -> list[int] | slice:
-        """The places of files in ``files``."""
-        return slice(None) if files == self.files else [self.row_of(file) for file in files]
+    def stamps(self, files: Sequence[str]) -> Int64[np.ndarray, "n 2"]:
+        rows = slice(None) if files == self.files else [self.row_of(file) for file in files]
+        return self.listing.numbers[rows][:, self.stamped]

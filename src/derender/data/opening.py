@@ -10,8 +10,10 @@ path.
 import hashlib
 import os
 import re
+import zipfile
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import suppress
 from functools import partial
 from itertools import islice
 from pathlib import Path, PurePosixPath
@@ -23,12 +25,19 @@ from derender.data.folder_source import FolderSource
 from derender.data.huggingface import HuggingFaceStream, is_saved
 from derender.data.layouts import layout_named, recognise
 from derender.data.layouts.layout import Layout, Table
-from derender.data.layouts.tables import TableSource, holds_paths, is_table
-from derender.data.names import SUFFIXES, is_hidden, is_image, suggestion
-from derender.data.shards import SHARD_SUFFIXES, ShardStream, find_shards, part_of_shards
-from derender.data.source import FileSource, Source, nearest_sibling
+from derender.data.layouts.tables import TABLE_SUFFIXES, TableSource, holds_paths
+from derender.data.shards import SHARD_SUFFIXES, ShardStream, find_shards
+from derender.data.source import (
+    SUFFIXES,
+    FileSource,
+    Source,
+    is_hidden,
+    is_image,
+    nearest_sibling,
+    suggestion,
+)
 from derender.data.stream import Sample, Stream
-from derender.data.zip_source import ZipSource, is_zip
+from derender.data.zip_source import ZipSource
 
 STREAMED = ("webdataset", "huggingface")
 """The layouts that are read from front to back, by the names one can ask for them."""
@@ -89,17 +98,29 @@ def open_images(
         subset: the part, if it is not in ``source``.
         limit: at most so many images: evenly spaced where it is known what there is, else the first.
     """
-    if dataset in ("auto", *STREAMED):
-        place, options, part = _parsed(str(source))
-        path = Path(place).expanduser()
-        kind = dataset if dataset != "auto" else _kind_of(path, place)
-        if kind is not None:
-            part = _only_part(source, part, subset)
-            open_kind = _open_shards if kind == "webdataset" else _open_hugging_face
-            stream = open_kind(str(source), place, path, options, part)
-            stream.limit = limit
-            return stream
-    return list_images(source, dataset=dataset, subset=subset, limit=limit)
+    place, part, options = parse_source(source)
+    path = Path(place).expanduser()
+    kind = _kind_of(path, place) if dataset == "auto" else dataset
+    if kind not in STREAMED:
+        return list_images(source, dataset=dataset, subset=subset, limit=limit)
+    part = _only_part(source, part, subset)
+    if kind == "webdataset":
+        if set(options) - {"column"}:
+            raise ValueError(f"{source}: shards take ?column=NAME only")
+        stream = ShardStream(str(source), find_shards(path, str(source), part), options.get("column"))
+    elif path.exists():
+        stream = HuggingFaceStream(str(source), path, split=part, **options)
+    elif _IDENTIFIER.fullmatch(place):
+        try:
+            stream = HuggingFaceStream(str(source), place, split=part, **options)
+        except ValueError as problem:
+            raise ValueError(
+                f"{place} does not exist here{nearest_sibling(path)}; and {problem}"
+            ) from problem
+    else:
+        raise ValueError(f"{place!r} is no folder here and no id of a Hugging Face data set (OWNER/NAME)")
+    stream.limit = limit
+    return stream
 
 
 def list_images(
@@ -110,10 +131,12 @@ def list_images(
     No image at all is an error that says what is there instead. The arguments are those of ``open_images``.
     """
     layout = None if dataset == "auto" else layout_named(dataset)
-    path, part = parse_source(source)
+    place, part, options = parse_source(source)
     subset = _only_part(source, part, subset)
-    files = open_source(path)
+    files = open_source(Path(place).expanduser())
     try:
+        if options:
+            raise ValueError(f"{source}: ?{next(iter(options))}= is for shards and Hugging Face data sets")
         layout = layout or (layout_named(files.recognised) if files.recognised else recognise(files))
         if dataset == "auto":
             files.recognised = layout.name
@@ -135,26 +158,37 @@ def open_source(path: Path) -> Source:
         raise ValueError(f"{path} does not exist{nearest_sibling(path)}")
     if path.is_dir():
         return FolderSource(path)
-    if is_table(path):
+    if path.is_file() and path.name.lower().endswith(TABLE_SUFFIXES):
         return TableSource(path)
-    if path.suffix.lower() in SUFFIXES:
+    if is_image(path.name):
         return FileSource(path)
-    if path.is_file() and (path.suffix.lower() == ".zip" or is_zip(path)):
+    if path.is_file() and (path.suffix.lower() == ".zip" or zipfile.is_zipfile(path)):
         return ZipSource(path)
     raise ValueError(
         f"{path} is no folder, zip or image ({' '.join(SUFFIXES)}); unpack other archives into a folder"
     )
 
 
-def parse_source(source: str | Path) -> tuple[Path, str | None]:
-    """Split ``PATH::SUBSET`` into its two parts; a path that exists as written is taken as it is."""
-    path = Path(source).expanduser()
-    left, separator, right = str(path).rpartition("::")
-    if not separator or path.exists():
-        return path, None
-    if not left or not right:
-        raise ValueError(f"{source!s} should read PATH::SUBSET, with both parts")
-    return Path(left), right
+def parse_source(source: str | Path) -> tuple[str, str | None, dict[str, str]]:
+    """Place, part and options of ``PLACE?column=NAME::PART``; a path that exists as written is all place."""
+    text = str(source)
+    if Path(text).expanduser().exists():
+        return text, None, {}
+    left, separator, part = text.rpartition("::")
+    if not separator:
+        left, part = text, ""
+    elif not left or not part:
+        raise ValueError(f"{text} should read PATH::SUBSET, with both parts")
+    place, _, query = left.partition("?")
+    if not query or Path(left).expanduser().exists():
+        return left, part or None, {}
+    options = dict(parse_qsl(query, keep_blank_values=True))
+    for name in options:
+        if name not in _OPTIONS:
+            raise ValueError(
+                f"{text}: unknown option {name!r}{suggestion(name, _OPTIONS)} (known: {', '.join(_OPTIONS)})"
+            )
+    return place, part or None, options
 
 
 def _only_part(source: str | Path, part: str | None, subset: str | None) -> str | None:
@@ -174,63 +208,17 @@ def _nothing_found(files: Source) -> str:
     return f"no images found in {files.path}: looked for {' '.join(SUFFIXES)}; found {found}{hint}"
 
 
-def _open_shards(
-    source: str, place: str, path: Path, options: dict[str, str], part: str | None
-) -> ShardStream:
-    if set(options) - {"column"}:
-        raise ValueError(f"{source}: shards take ?column=NAME only")
-    shards = find_shards(path, source)
-    if part is not None:
-        shards = part_of_shards(shards, part, place)
-    return ShardStream(source, shards, options.get("column"))
-
-
-def _open_hugging_face(
-    source: str, place: str, path: Path, options: dict[str, str], part: str | None
-) -> HuggingFaceStream:
-    if path.exists():
-        return HuggingFaceStream(source, path, split=part, **options)
-    if not _IDENTIFIER.fullmatch(place):
-        raise ValueError(f"{place!r} is no folder here and no id of a Hugging Face data set (OWNER/NAME)")
-    try:
-        return HuggingFaceStream(source, place, split=part, **options)
-    except ValueError as problem:
-        raise ValueError(f"{place} does not exist here{nearest_sibling(path)}; and {problem}") from problem
-
-
-def _parsed(text: str) -> tuple[str, dict[str, str], str | None]:
-    """Place, options and part of ``PLACE?column=NAME::PART``; a path that exists is all place."""
-    if Path(text).expanduser().exists():
-        return text, {}, None
-    left, separator, part = text.rpartition("::")
-    if not separator:
-        left, part = text, ""
-    place, question, query = left.partition("?")
-    if not question or (Path(left).expanduser().exists()):
-        return left, {}, part if separator else None
-    options = dict(parse_qsl(query, keep_blank_values=True))
-    for name in options:
-        if name not in _OPTIONS:
-            raise ValueError(
-                f"{text}: unknown option {name!r}{suggestion(name, _OPTIONS)} (known: {', '.join(_OPTIONS)})"
-            )
-    return place, options, part if separator else None
-
-
 def _kind_of(path: Path, written: str) -> str | None:
     """One of ``STREAMED`` by a place's name as written, or a folder's by the first files in it; or None."""
+    name = path.name.lower()
     if path.is_dir():
         return "huggingface" if is_saved(path) else _kind_of_folder(path)
-    if path.exists():
-        name = path.name.lower()
-        if name.endswith(SHARD_SUFFIXES):
-            return "webdataset"
-        return "huggingface" if name.endswith(".parquet") and not holds_paths(path) else None
-    if "{" in str(path) and str(path).endswith(SHARD_SUFFIXES):
+    if name.endswith(SHARD_SUFFIXES) and (path.exists() or "{" in str(path)):
         return "webdataset"
-    known = (".zip", ".parquet", ".csv", *SHARD_SUFFIXES)
-    could_be_one = _IDENTIFIER.fullmatch(written) and not is_image(written)
-    return "huggingface" if could_be_one and not written.lower().endswith(known) else None
+    if path.exists():
+        return "huggingface" if name.endswith(".parquet") and not holds_paths(path) else None
+    a_file = name.endswith((".zip", *TABLE_SUFFIXES, *SHARD_SUFFIXES, *SUFFIXES))
+    return "huggingface" if _IDENTIFIER.fullmatch(written) and not a_file else None
 
 
 def _kind_of_folder(folder: Path) -> str | None:
@@ -250,12 +238,12 @@ def _names(folder: Path) -> Iterator[str]:
     """Names of the files below a folder, its own first, no more of them looked up than are taken."""
     waiting = [str(folder)]
     while waiting:
-        try:
-            with os.scandir(waiting.pop(0)) as entries:
-                for entry in entries:
-                    if entry.is_dir(follow_symlinks=False):
-                        waiting += [] if is_hidden(entry.name) else [entry.path]
-                    else:
-                        yield entry.name
-        except OSError:  # whoever reads the folder says what is wrong with it
-            continue
+        with (
+            suppress(OSError),
+            os.scandir(waiting.pop(0)) as entries,
+        ):  # reading it says what is wrong with it
+            for entry in entries:
+                if not entry.is_dir(follow_symlinks=False):
+                    yield entry.name
+                elif not is_hidden(entry.name):
+                    waiting.append(entry.path)

@@ -19,12 +19,11 @@ import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
-from itertools import islice, product
+from itertools import accumulate, islice, product
 from pathlib import Path
 
 from derender.data.layouts.layout import PARTITION_NAMES
-from derender.data.names import is_hidden, is_image, printable
-from derender.data.source import FILE_LIMIT_BYTES, stamps_of
+from derender.data.source import FILE_LIMIT_BYTES, is_hidden, is_image, printable, stamps_of
 from derender.data.stream import Sample, Stream, Value, label_name, unreadable
 
 SHARD_SUFFIXES = (".tar", ".tar.gz", ".tgz", ".tar.bz2", ".tar.xz")
@@ -34,8 +33,22 @@ _LABELS = ("json", "cls")
 _BLOCK = 512
 _DAMAGE = (tarfile.TarError, OSError, EOFError, zlib.error, lzma.LZMAError, ValueError, OverflowError)
 _PACKINGS = {b"\x1f\x8b": gzip.open, b"BZh": bz2.open, b"\xfd7zXZ": lzma.open}
-_RANGE = re.compile(r"(\d+)\.\.(\d+)")
 _MOST_SHARDS = 1_000_000
+
+
+@dataclass
+class _Group:
+    """One sample's members while they are read: contents by ending (None: passed over), and what is wrong."""
+
+    key: str = ""
+    content: dict[str, bytes | None] = field(default_factory=dict)
+    fault: str = ""
+    read_bytes: int = 0
+
+    @property
+    def images(self) -> list[str]:
+        """The endings of its images."""
+        return [ending for ending, one in self.content.items() if one is not None and ending not in _LABELS]
 
 
 class ShardStream(Stream):
@@ -58,19 +71,15 @@ class ShardStream(Stream):
         return self.column, [str(shard.resolve()) for shard in self.shards], stamps_of(self.shards).tolist()
 
     def samples(self, start: int = 0) -> Iterator[Sample]:
-        sizes = [shard.stat().st_size for shard in self.shards]
-        total = max(1, sum(sizes))
+        ends = [0, *accumulate(stamps_of(self.shards)[:, 0].tolist())]
+        every = (
+            self._sample(shard, group, (before + group.read_bytes) / max(1, ends[-1]))
+            for shard, before in zip(self.shards, ends, strict=False)
+            for group in self._groups(shard)
+        )
+        return islice(every, start, None)
 
-        def all_of_them() -> Iterator[Sample]:
-            before = 0
-            for shard, size in zip(self.shards, sizes, strict=True):
-                for group in self._groups(shard):
-                    yield self._sample(shard, group, (before + group.read_bytes) / total)
-                before += size
-
-        yield from islice(all_of_them(), start, None)
-
-    def _groups(self, shard: Path) -> Iterator["_Group"]:
+    def _groups(self, shard: Path) -> Iterator[_Group]:
         """Members that belong together, in order; the last group may be the shard's damage."""
         group: _Group | None = None
         try:
@@ -81,32 +90,30 @@ class ShardStream(Stream):
             ):
                 while (member := tar.next()) is not None:
                     tar.members = []  # pyright: ignore[reportAttributeAccessIssue]  (it would keep them all)
-                    name = printable(member.name)
-                    folder, slash, base = name.rpartition("/")
+                    folder, slash, base = printable(member.name).rpartition("/")
                     if not member.isreg() or member.issparse() or is_hidden(base):
                         continue
                     stem, _, ending = base.partition(".")  # "a/0001", "seg.png" for a/0001.seg.png
                     key, ending = f"{folder}{slash}{stem}", ending.lower()
-                    if group is None or key != group.key or ending in group.endings:
+                    if group is None or key != group.key or ending in group.content:
                         if group is not None:
                             yield group
                         group = _Group(key)
-                    group.endings.append(ending)
+                    group.content[ending] = None
                     group.read_bytes = raw.tell()
                     self._take(group, ending, tar, member)
                 stream.seek(tar.offset)
                 if stream.read(_BLOCK) != bytes(_BLOCK):
                     raise tarfile.ReadError("no end mark")
         except _DAMAGE as problem:
-            if group is not None and any(ending not in _LABELS for ending in group.content):
+            if group is not None and group.images:
                 yield group
             why = str(problem) or type(problem).__name__
-            yield _Group("", fault=f"damaged or cut short, what comes before counts ({why})")
-            return
+            group = _Group(fault=f"damaged or cut short, what comes before counts ({why})")
         if group is not None:
             yield group
 
-    def _take(self, group: "_Group", ending: str, tar: tarfile.TarFile, member: tarfile.TarInfo) -> None:
+    def _take(self, group: _Group, ending: str, tar: tarfile.TarFile, member: tarfile.TarInfo) -> None:
         """Read a member if it is needed: an image, the one that was asked for, or labels."""
         needed = is_image(f"x.{ending}") if self.column is None else ending == self.column
         if not needed and ending not in _LABELS:
@@ -121,38 +128,27 @@ class ShardStream(Stream):
             raise tarfile.ReadError("unexpected end of data")
         group.content[ending] = content
 
-    def _sample(self, shard: Path, group: "_Group", share: float) -> Sample:
+    def _sample(self, shard: Path, group: _Group, share: float) -> Sample:
         name = printable(shard.name) + (f"/{group.key}" if group.key else "")
-        refused = partial(Sample, name, share=share, partition=_partition(shard))
-        if group.fault:
-            return refused(unreadable(group.fault))
-        images = [ending for ending in group.content if ending not in _LABELS]
-        if len(images) > 1:
+        images, fault = group.images, group.fault
+        if len(images) > 1 and not fault:
             left, separator, right = self.source.partition("::")
             raise ValueError(
                 f"{self.source}: the sample {group.key!r} in {shard.name} has several images "
                 f"({', '.join(images)}); name one: '{left}?column={images[0]}{separator}{right}'"
             )
-        if not images:
+        if not images and not fault:
             missing = "no image" if self.column is None else f"no {self.column!r}"
-            return refused(unreadable(f"{missing} in this sample (it has {', '.join(group.endings)})"))
-        read, labels = partial(bytes, group.content[images[0]]), {}
+            fault = f"{missing} in this sample (it has {', '.join(group.content)})"
+        partition = next(filter(None, (PARTITION_NAMES.get(one.lower()) for one in _series(shard))), "")
+        if fault:
+            return Sample(name, unreadable(fault), share, partition=partition)
+        read, labels = partial(bytes, group.content[images[0]] or b""), {}
         try:
             labels = _labels(group.content)
         except ValueError as problem:
             read = unreadable(str(problem))
-        return Sample(f"{name}.{images[0]}", read, share, labels, _partition(shard))
-
-
-@dataclass
-class _Group:
-    """One sample's members while they are read."""
-
-    key: str
-    endings: list[str] = field(default_factory=list)
-    content: dict[str, bytes] = field(default_factory=dict)
-    fault: str = ""
-    read_bytes: int = 0
+        return Sample(f"{name}.{images[0]}", read, share, labels, partition)
 
 
 def _unpacked(raw: io.BufferedIOBase) -> io.BufferedIOBase:
@@ -163,33 +159,37 @@ def _unpacked(raw: io.BufferedIOBase) -> io.BufferedIOBase:
     return raw if opener is None else opener(raw)
 
 
-def find_shards(path: Path, source: str) -> list[Path]:
-    """The shards below a folder, sorted by path; a shard itself; or those of a pattern with braces."""
+def find_shards(path: Path, source: str, part: str | None = None) -> list[Path]:
+    """The shards below a folder, sorted by path; a shard itself; or those of a pattern with braces.
+
+    Of a part ``train`` are those called train-000.tar, and those in a folder of that name.
+    """
     if path.is_dir():
         found = (one for one in path.rglob("*") if one.name.endswith(SHARD_SUFFIXES) and one.is_file())
         if not (shards := sorted(found)):
             raise ValueError(f"{path} holds no shards ({' '.join(SHARD_SUFFIXES)})")
-        return shards
-    if path.exists():
-        return [path]
-    shards = [Path(name) for name in expand_braces(str(path))]
+    else:
+        shards = [path] if path.exists() else [Path(name) for name in expand_braces(str(path))]
     absent = [shard for shard in shards if not shard.is_file()]
     if absent:
         missing = f"{len(absent):,} of the {len(shards):,} shards of {source} do not exist"
         raise ValueError(f"{missing}; the first is {absent[0]}")
-    return shards
+    chosen = [shard for shard in shards if part is None or part in _series(shard)]
+    if not chosen:
+        known = sorted({name for shard in shards for name in _series(shard)})
+        raise ValueError(f"{path} has no shards of a part {part!r}; there are {', '.join(known)}")
+    return chosen
 
 
 def expand_braces(pattern: str) -> Iterator[str]:
     """``a-{00..02}.tar`` to its three names, ``{x,y}`` to two; numbers keep the width they are written in."""
     pieces = re.split(r"\{([^{}]*)\}", pattern)
     choices = [[piece] if place % 2 == 0 else _choices(piece, pattern) for place, piece in enumerate(pieces)]
-    for chosen in product(*choices):
-        yield "".join(chosen)
+    return map("".join, product(*choices))
 
 
 def _choices(inner: str, pattern: str) -> list[str]:
-    numbers = _RANGE.fullmatch(inner)
+    numbers = re.fullmatch(r"(\d+)\.\.(\d+)", inner)
     if numbers is None:
         if "," in inner:
             return inner.split(",")
@@ -201,40 +201,25 @@ def _choices(inner: str, pattern: str) -> list[str]:
     return [f"{number:0{width}d}" for number in range(first, last + 1)]
 
 
-def part_of_shards(shards: list[Path], part: str, source: str) -> list[Path]:
-    """The shards of one part: ``train`` means train-000.tar, or what lies in a folder ``train``."""
-    chosen = [shard for shard in shards if part in _series(shard)]
-    if not chosen:
-        known = sorted({name for shard in shards for name in _series(shard)})
-        raise ValueError(f"{source} has no shards of a part {part!r}; there are {', '.join(known)}")
-    return chosen
-
-
 def _series(shard: Path) -> tuple[str, str]:
     """A shard's name without its number, "train" for train-000012.tar; and that of its folder."""
-    stem = shard.name[: shard.name.index(".tar")] if ".tar" in shard.name else shard.stem
+    stem = shard.name.partition(".tar")[0].removesuffix(".tgz")
     return re.sub(r"[-_.]?\d+(?:[-_]of[-_]\d+)?$", "", stem), shard.parent.name
 
 
-def _partition(shard: Path) -> str:
-    names = (name.lower() for name in _series(shard))
-    return next((PARTITION_NAMES[name] for name in names if name in PARTITION_NAMES), "")
-
-
-def _labels(content: Mapping[str, bytes]) -> dict[str, Value]:
+def _labels(content: Mapping[str, bytes | None]) -> dict[str, Value]:
     labels: dict[str, Value] = {}
-    if "json" in content:
+    if (text := content.get("json")) is not None:
         try:
-            values = json.loads(content["json"])
+            values = json.loads(text)
         except (ValueError, RecursionError) as problem:
             raise ValueError(f"its .json cannot be read ({problem})") from problem
         if not isinstance(values, dict):
             raise ValueError(f"its .json holds a {type(values).__name__}, expected an object")
-        plain = {name: value for name, value in values.items() if isinstance(value, Value)}
-        labels = {label_name(name): value for name, value in plain.items()}
-    if "cls" in content:
+        labels = {label_name(name): value for name, value in values.items() if isinstance(value, Value)}
+    if (text := content.get("cls")) is not None:
         try:
-            labels["class"] = content["cls"].decode("utf-8").strip()
+            labels["class"] = text.decode("utf-8").strip()
         except UnicodeDecodeError as problem:
             raise ValueError("its .cls is not UTF-8 text") from problem
     return labels

@@ -1,4 +1,4 @@
-"""Named files that are read by name: what every folder, zip, table and single image has in common.
+"""Named files that are read by name: the interface of folders, zips, tables and single images.
 
 Names are posix paths relative to the source, sorted. Nothing is ever extracted, so that no name in an archive
 can write anywhere. Nested archives are not opened.
@@ -6,15 +6,20 @@ can write anywhere. Nested archives are not opened.
 
 import stat
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from difflib import get_close_matches
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Int64
 
-from derender.data.names import is_image, printable, suggestion
+SUFFIXES = (
+    *(".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".webp", ".avif", ".bmp", ".gif"),
+    *(".tif", ".tiff", ".ppm", ".pgm", ".pnm"),
+)
+"""File names that end in one of these are taken for images."""
 
 FILE_LIMIT_BYTES = 512 << 20
 """No single file larger than this is read: a bound on memory, and on what a zip bomb can unpack to."""
@@ -34,7 +39,7 @@ class Source(ABC):
     Attributes:
         path: the folder or file that the user named.
         files: every regular file, as sorted posix paths relative to the source.
-        skipped: files that cannot even be opened (unsafe names, broken links, no permission, encrypted).
+        skipped: files that cannot be opened (unsafe names, broken links, no permission, encrypted).
         recognised: the layout that it was recognised as, "" until then.
     """
 
@@ -89,22 +94,26 @@ class Source(ABC):
 
 
 class FileSource(Source):
-    """One image."""
+    """Files beside one another on disk; a single image is the usual case."""
 
     def __init__(self, path: Path):
         self.path = path
         self.files = (printable(path.name),)
 
+    def on_disk(self, file: str) -> Path:
+        """Where a file lies."""
+        return self.path
+
     def read(self, file: str) -> bytes:
-        return read_bounded(self.path)
+        return read_bounded(self.on_disk(file))
 
     def stamps(self, files: Sequence[str]) -> Int64[np.ndarray, "n 2"]:
-        return stamps_of([self.path] * len(files))
+        return stamps_of(map(self.on_disk, files))
 
 
-def stamps_of(paths: Sequence[Path]) -> Int64[np.ndarray, "n 2"]:
+def stamps_of(paths: Iterable[Path]) -> Int64[np.ndarray, "n 2"]:
     """Size and time of change in nanoseconds of files on disk."""
-    found = (path.stat() for path in paths)
+    found = [path.stat() for path in paths]
     return np.array([(one.st_size, one.st_mtime_ns) for one in found], np.int64).reshape(-1, 2)
 
 
@@ -113,14 +122,41 @@ def read_bounded(path: Path) -> bytes:
     status = path.stat()
     if not stat.S_ISREG(status.st_mode):  # a pipe may never end, a device never does
         raise ValueError("not a regular file")
-    size = status.st_size
-    if size > FILE_LIMIT_BYTES:
-        raise ValueError(f"file of {size >> 20:,} MiB is larger than {FILE_LIMIT_BYTES >> 20:,} MiB")
+    if status.st_size > FILE_LIMIT_BYTES:
+        raise ValueError(
+            f"file of {status.st_size >> 20:,} MiB is larger than {FILE_LIMIT_BYTES >> 20:,} MiB"
+        )
     with path.open("rb") as stream:
-        content = stream.read(size + 1)
-    if len(content) > size:
+        content = stream.read(status.st_size + 1)
+    if len(content) > status.st_size:
         raise ValueError("the file grew while it was read")
     return content
+
+
+def is_image(file: str) -> bool:
+    """Whether the name has an image's suffix."""
+    return file.lower().endswith(SUFFIXES)
+
+
+def is_hidden(name: str) -> bool:
+    """Whether a file or folder of this name is left out."""
+    return name.startswith(".") or name == "__MACOSX"
+
+
+def printable(name: str) -> str:
+    """The name with bytes that are not UTF-8 as backslash escapes, so that it can be stored anywhere."""
+    try:
+        name.encode()
+    except UnicodeEncodeError:
+        return name.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
+    return name
+
+
+def suggestion(name: str, known: Iterable[str]) -> str:
+    """``"; did you mean 'x'?"`` for the closest known name, or an empty string when nothing is close."""
+    by_lower = {candidate.lower(): candidate for candidate in known}
+    close = get_close_matches(name.lower(), by_lower, n=1, cutoff=0.5)
+    return f"; did you mean {by_lower[close[0]]!r}?" if close else ""
 
 
 def nearest_sibling(path: Path) -> str:
@@ -132,6 +168,5 @@ def nearest_sibling(path: Path) -> str:
         entries = sorted(parent.iterdir())
     except OSError:
         return ""
-    suffixes = (".zip", ".tar")
-    readable = [one for one in entries if is_image(one.name) or one.suffix in suffixes or one.is_dir()]
-    return suggestion(path.name, [one.name for one in readable])
+    known = (*SUFFIXES, ".zip", ".tar")
+    return suggestion(path.name, [one.name for one in entries if one.is_dir() or one.name.endswith(known)])

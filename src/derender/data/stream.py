@@ -1,9 +1,8 @@
 """Images one after another, in a fixed order, named and not yet decoded, with the labels they bring."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from enum import StrEnum
 from pathlib import Path
 from typing import TypeVar
 
@@ -58,6 +57,11 @@ class Stream(ABC):
     passed_over: tuple[Skipped, ...] = ()
     limit: int | None = None
 
+    @property
+    def table(self) -> Table | None:
+        """Names and labels of every sample where they are known beforehand; None: each brings its own."""
+        return None
+
     @abstractmethod
     def samples(self, start: int = 0) -> Iterator[Sample]:
         """The samples from number ``start`` on; of one that cannot be read, ``read`` raises."""
@@ -65,11 +69,6 @@ class Stream(ABC):
     @abstractmethod
     def identity(self) -> object:
         """Something whose ``repr`` changes when the content does (sizes, times, a revision)."""
-
-    @property
-    def table(self) -> Table | None:
-        """Names and labels of every sample where they are known beforehand; None: each brings its own."""
-        return None
 
     @property
     def place(self) -> str:
@@ -100,16 +99,8 @@ def label_name(name: str) -> str:
     return "original_file" if name == "file" else name
 
 
-class ValueKind(StrEnum):
-    """What a column of labels holds."""
-
-    TEXT = "text"
-    NUMBER = "number"
-    FLAG = "flag"
-
-
-class Kinds(dict[str, ValueKind | None]):
-    """The kind of each column so far; None while only unknown values were seen.
+class Kinds(dict[str, str | None]):
+    """What each column of labels holds so far: "text", "number", "flag", or None while all is unknown.
 
     A column of several kinds is text, and so are whole numbers that float32 cannot hold (above 2^24:
     identifiers, as a rule).
@@ -118,29 +109,26 @@ class Kinds(dict[str, ValueKind | None]):
     def see(self, labels: Mapping[str, Value]) -> None:
         """Take one image's labels into account."""
         for name, value in labels.items():
-            self.join(name, _kind(value))
+            if isinstance(value, bool | None):
+                kind = None if value is None else "flag"
+            else:
+                small = isinstance(value, float) or (
+                    isinstance(value, int) and abs(value) <= _EXACT_IN_FLOAT32
+                )
+                kind = "number" if small else "text"
+            self.join(name, kind)
 
-    def join(self, name: str, kind: ValueKind | None) -> None:
+    def join(self, name: str, kind: str | None) -> None:
         """Take a kind into account that a column has elsewhere."""
         known = self.get(name)
-        self[name] = kind if known is None else known if kind in (None, known) else ValueKind.TEXT
+        self[name] = kind if known is None else known if kind in (None, known) else "text"
 
 
-def column_of(name: str, rows: Iterable[Mapping[str, Value]], kind: ValueKind | str | None) -> np.ndarray:
+def column_of(name: str, rows: Iterable[Mapping[str, Value]], kind: str | None) -> np.ndarray:
     """One column of labels of a given kind; unknown values are "", NaN or -1."""
-    values: Sequence[Value] = [row.get(name) for row in rows]
-    if kind == ValueKind.NUMBER:
+    values = [row.get(name) for row in rows]
+    if kind == "number":
         return number_column(np.nan if value is None else float(value) for value in values)
-    if kind == ValueKind.FLAG:
+    if kind == "flag":
         return np.array([-1 if value is None else int(value) for value in values], np.int8)
     return text_column("" if value is None else str(value) for value in values)
-
-
-def _kind(value: Value) -> ValueKind | None:
-    if value is None:
-        return None
-    if isinstance(value, bool):
-        return ValueKind.FLAG
-    if isinstance(value, int):
-        return ValueKind.NUMBER if abs(value) <= _EXACT_IN_FLOAT32 else ValueKind.TEXT
-    return ValueKind.NUMBER if isinstance(value, float) else ValueKind.TEXT

@@ -19,7 +19,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from derender.data import Kinds, SeenPixels, Skipped, ValueKind, column_of
+from derender.data import Kinds, SeenPixels, Skipped, column_of
 from derender.features.blocks import TableRows
 from derender.features.parquet import Columns, factor_column
 from derender.storage.atomic import Damaged, DamageNoticed, atomic_file, measured
@@ -68,7 +68,7 @@ class Progressed:
         self.partitioned |= note["partitioned"]
         self.examples = (self.examples + examples)[:LISTED_SKIPPED]
         for name, kind in note["kinds"].items():
-            self.kinds.join(name, None if kind is None else ValueKind(kind))
+            self.kinds.join(name, kind)
 
 
 class Parts:

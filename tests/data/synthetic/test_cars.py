@@ -6,8 +6,8 @@ import torch
 from scipy.ndimage import binary_erosion
 from scipy.spatial import cKDTree
 
-from derender.data.ground_truth import read_ground_truth
 from derender.data.image_set import read_images
+from derender.data.maps import read_ground_truth
 from derender.data.synthetic import CAR_LIGHTS, CAR_VIEWS, CarSettings, CarViewSettings, cars, write
 from derender.data.synthetic.cars import about_x, class_of, euler_angles, view_rotation
 from derender.data.synthetic.settings import CLASSES

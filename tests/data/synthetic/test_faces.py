@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy.ndimage import binary_erosion
 
-from derender.data.layouts.celebamask import MASK_CLASSES
+from derender.data.layouts.celeba import MASK_CLASSES
 from derender.data.synthetic import LIGHTS, VIEWS, FaceSettings, LightSettings, ViewSettings, faces
 from derender.data.synthetic.synthetic_set import SyntheticSet
 from derender.render import render

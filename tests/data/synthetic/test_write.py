@@ -8,8 +8,7 @@ import pytest
 from PIL import Image
 
 from derender.data import read_images
-from derender.data.ground_truth import read_ground_truth
-from derender.data.masks import read_masks
+from derender.data.maps import read_ground_truth, read_masks
 from derender.data.synthetic import FaceSettings, faces, write, write_tracks
 from derender.data.synthetic.write import encode_png
 

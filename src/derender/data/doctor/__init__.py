@@ -32,8 +32,8 @@ from derender.data.doctor.pixels import (
 )
 from derender.data.doctor.structure import Halves, JackknifeEstimate, SymmetryAxis, jackknife
 from derender.data.image_set import ImageSet, read_images
-from derender.data.names import is_image
 from derender.data.opening import ListedStream, open_images
+from derender.data.source import is_image
 
 __all__ = [
     "CHECKS",

@@ -1,46 +1,74 @@
-"""How data sets lie: the list of layouts, most particular first, a row each in the file that reads them.
+"""How data sets lie: the list of layouts, most particular first, a row each; and anybody's own folders.
 
-A table that somebody laid beside images comes first: it says what they are.
+A table that somebody laid beside images comes first: it says what they are. Of folders, one named train, val
+or test (and the like) is read as a partition, not as a class. What a folder means is worked out once for all
+of its images, of which there may be millions.
 """
 
-from derender.data.layouts.cars import SHAPENET_CARS
-from derender.data.layouts.celeba import CELEBA
-from derender.data.layouts.celebamask import CELEBAMASK
-from derender.data.layouts.depth_pairs import DEPTH_PAIRS
-from derender.data.layouts.faces import LFW, RAFDB, UTKFACE
-from derender.data.layouts.folders import CLASSES, FOLDER
-from derender.data.layouts.layout import Layout
-from derender.data.layouts.rendered import SYNCAR, SYNFACE
-from derender.data.layouts.tables import TABLE
-from derender.data.layouts.tracks import FACE_TRACKS, SYNFACE_TRACKS
-from derender.data.names import suggestion
-from derender.data.source import Source
+from collections.abc import Callable
+from functools import cache
 
-LAYOUTS: tuple[Layout, ...] = (
-    TABLE,
-    SYNCAR,
-    SYNFACE,
-    SYNFACE_TRACKS,
-    DEPTH_PAIRS,
-    RAFDB,
-    CELEBAMASK,
-    CELEBA,
-    UTKFACE,
-    LFW,
-    SHAPENET_CARS,
-    FACE_TRACKS,
-    CLASSES,
-    FOLDER,
+from derender.data.layouts.cars import SHAPENET_CARS
+from derender.data.layouts.celeba import CELEBA, CELEBAMASK
+from derender.data.layouts.faces import FACE_TRACKS, LFW, RAFDB, UTKFACE
+from derender.data.layouts.layout import (
+    PARTITION_NAMES,
+    Layout,
+    Table,
+    parent_name,
+    partition_by_folder,
+    partition_column,
+    text_column,
+)
+from derender.data.layouts.rendered import DEPTH_PAIRS, SYNCAR, SYNFACE, SYNFACE_TRACKS
+from derender.data.layouts.tables import TABLE
+from derender.data.source import Source, suggestion
+
+
+def _class(file: str) -> str:
+    """The name of the folder that a file lies in, unless that is a partition's."""
+    name = parent_name(file)
+    return "" if name.lower() in PARTITION_NAMES else name
+
+
+def _by_folder(files: tuple[str, ...], meaning: Callable[[str], str]) -> list[str]:
+    """The meaning of the folder of each file."""
+    known = cache(lambda folder: meaning(f"{folder}/"))
+    return [known(file.rpartition("/")[0]) for file in files]
+
+
+def _is_classes(source: Source) -> bool:
+    """Every image lies in a class folder, all at one depth, and there are two classes or more."""
+    folders = {file.rpartition("/")[0] for file in source.images}
+    classes = {_class(f"{folder}/") for folder in folders}
+    return len({folder.count("/") for folder in folders}) == 1 and len(classes) >= 2 and "" not in classes
+
+
+def _load_folder(source: Source) -> Table:
+    return Table(source.images, partition=partition_column(_by_folder(source.images, partition_by_folder)))
+
+
+def _load_classes(source: Source) -> Table:
+    labels = {"class": text_column(_by_folder(source.images, _class))}
+    return Table(source.images, labels, _load_folder(source).partition)
+
+
+CLASSES = Layout("classes", "one folder per class", _is_classes, _load_classes)
+FOLDER = Layout("folder", "images in any arrangement", lambda source: True, _load_folder)
+
+LAYOUTS = (
+    *(TABLE, SYNCAR, SYNFACE, SYNFACE_TRACKS, DEPTH_PAIRS, RAFDB, CELEBAMASK, CELEBA, UTKFACE, LFW),
+    *(SHAPENET_CARS, FACE_TRACKS, CLASSES, FOLDER),
 )
 
 
 def layout_named(name: str) -> Layout:
     """The layout of that name; an unknown name is an error with a suggestion."""
-    for layout in LAYOUTS:
-        if layout.name == name.lower():
-            return layout
-    known = [layout.name for layout in LAYOUTS]
-    raise ValueError(f"unknown data set {name!r}{suggestion(name, known)} (known: auto, {', '.join(known)})")
+    by_name = {layout.name: layout for layout in LAYOUTS}
+    if name.lower() not in by_name:
+        known = f"(known: auto, {', '.join(by_name)})"
+        raise ValueError(f"unknown data set {name!r}{suggestion(name, by_name)} {known}")
+    return by_name[name.lower()]
 
 
 def recognise(source: Source) -> Layout:

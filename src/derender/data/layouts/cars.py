@@ -13,20 +13,17 @@ words in name, tags and wnlemmas, in this order; "" for other cars. The paper's 
 among its words here.
 """
 
-import io
 import re
 
 import numpy as np
-from PIL import Image
 
-from derender.data.image import DECODER_ERRORS
+from derender.data.image import DECODER_ERRORS, upright_size
 from derender.data.layouts.layout import (
     MOSTLY,
     Labels,
     Layout,
     Table,
     header_of,
-    part_of,
     partition_by_folder,
     partition_column,
     read_csv,
@@ -35,7 +32,6 @@ from derender.data.layouts.layout import (
 from derender.data.source import Source
 
 HOME = "https://github.com/elliottwu/unsup3d"
-TABLE_HOME = "https://shapenet.org"
 
 CAR_CLASSES = {
     "police": ("police", "patrol car", "squad car", "prowl car"),
@@ -54,13 +50,19 @@ _MAPS = {"depth", "mask", "normal", "albedo"}  # folders of maps beside images, 
 _TABLES = (f"{_CARS}.csv", "metadata.csv", "all.csv")
 
 
+def _table_of(source: Source) -> str | None:
+    """ShapeNet's table, recognised by its columns, or None."""
+    candidates = [file for name in _TABLES if (file := source.named(name)) is not None]
+    return next((file for file in candidates if "fullId" in header_of(source, file)), None)
+
+
 def _is_cars(source: Source) -> bool:
     files = source.images
     ours = _table_of(source) is not None or any(_CARS in file.split("/") for file in files[:1])
     return ours and bool(files) and sum(1 for file in files if _ID.search(file)) >= MOSTLY * len(files)
 
 
-def _read_cars(source: Source, subset: str | None) -> Table:
+def _load_cars(source: Source) -> Table:
     files = tuple(file for file in source.images if not _MAPS & set(file.split("/")[:-1]))
     models = [found[0] if (found := _ID.search(file)) else "" for file in files]
     partition = partition_column(map(partition_by_folder, files))
@@ -71,49 +73,34 @@ def _read_cars(source: Source, subset: str | None) -> Table:
             f"way of {HOME}"
         )
     labels: Labels = {"model": text_column(models)} if any(models) else {}
-    table = _table_of(source)
-    if table is not None:
-        labels |= _names(source, table, models)
-    read = Table(files, labels, partition, _boxes(source, files) if files else None)
-    return part_of(read, source, subset, "a folder train, val or test")
-
-
-def _boxes(source: Source, files: tuple[str, ...]) -> np.ndarray | None:
-    """The published crop for every image if the first one has the published size."""
-    try:
-        with Image.open(io.BytesIO(source.read(files[0]))) as image:
-            size = image.size
+    if (table := _table_of(source)) is not None:
+        known = {
+            row["fullId"].rpartition(".")[2]: (
+                row["name"],
+                car_class(row["name"], row["tags"], row["wnlemmas"]),
+            )
+            for row in read_csv(source, table, ("fullId", "wnlemmas", "name", "tags"))
+        }
+        if not known.keys() & set(models):
+            raise ValueError(
+                f"{table} in {source.path} names none of the models there; ShapeNet's owners publish "
+                f"the table of cars ({_CARS}) at https://shapenet.org"
+            )
+        found = [known.get(model, ("", "")) for model in models]
+        labels["name"], labels["class"] = map(text_column, zip(*found, strict=True))
+    try:  # the published crop for every image if the first one has the published size
+        published = bool(files) and upright_size(source.read(files[0])) == _PUBLISHED_SIZE
     except DECODER_ERRORS:
-        return None
-    return np.tile(np.array(_CROP, np.float32), (len(files), 1)) if size == _PUBLISHED_SIZE else None
-
-
-def _table_of(source: Source) -> str | None:
-    """ShapeNet's table, recognised by its columns, or None."""
-    candidates = [file for name in _TABLES if (file := source.named(name)) is not None]
-    return next((file for file in candidates if "fullId" in header_of(source, file)), None)
-
-
-def _names(source: Source, table: str, models: list[str]) -> Labels:
-    rows = read_csv(source, table, ("fullId", "wnlemmas", "name", "tags"))
-    known = {
-        row["fullId"].rpartition(".")[2]: (row["name"], car_class(row["name"], row["tags"], row["wnlemmas"]))
-        for row in rows
-    }
-    if not known.keys() & set(models):
-        raise ValueError(
-            f"{table} in {source.path} names none of the models there; ShapeNet's owners publish "
-            f"the table of cars (02958343) at {TABLE_HOME}"
-        )
-    found = [known.get(model, ("", "")) for model in models]
-    return {"name": text_column(name for name, _ in found), "class": text_column(kind for _, kind in found)}
+        published = False
+    boxes = np.tile(np.array(_CROP, np.float32), (len(files), 1)) if published else None
+    return Table(files, labels, partition, boxes)
 
 
 def car_class(*texts: str) -> str:
     """The class of a car whose name, tags and the like are these: a key of ``CAR_CLASSES``, or ""."""
     text = " , ".join(texts).lower().replace("_", " ")
     for kind, words in CAR_CLASSES.items():
-        if any(re.search(rf"\b{word}s?\b", text) for word in words):
+        if re.search(rf"\b({'|'.join(words)})s?\b", text):
             return kind
     return ""
 
@@ -121,8 +108,9 @@ def car_class(*texts: str) -> str:
 SHAPENET_CARS = Layout(
     "shapenet_cars",
     "ShapeNet cars, rendered: train, val and test, model ids in the names",
-    HOME,
     _is_cars,
-    _read_cars,
-    "models: ShapeNet's terms, non-commercial research and education only",
+    _load_cars,
+    home=HOME,
+    terms="models: ShapeNet's terms, non-commercial research and education only",
+    split_from="a folder train, val or test",
 )

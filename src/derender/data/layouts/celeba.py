@@ -1,4 +1,4 @@
-"""CelebA: 202,599 faces of 10,177 people with 40 attributes, aligned or in the wild.
+"""CelebA: 202,599 faces of 10,177 people with 40 attributes, aligned or in the wild; and CelebAMask-HQ.
 
 Lists are read as the owners publish them (``list_attr_celeba.txt``: a count, the columns, a row for each
 image; ``identity_CelebA.txt`` and ``list_eval_partition.txt``: rows only) and as their CSV copies. Only
@@ -6,71 +6,96 @@ the attributes must be there. Aligned images (``img_align_celeba``, 178 x 218) a
 in the wild (``img_celeba``, any size) show a scene with a face in it, so each gets a square box about its
 face:
 
-- from a list of the user's own (boxes.py), those boxes as they are;
+- from a list of the user's own, ``boxes.csv`` (or ``.txt``), those boxes as they are: a first line
+  ``file,left,top,width,height`` or ``file,left,top,right,bottom``, then a row for each image;
 - else from ``list_landmarks_celeba.txt``, the box of CelebA-HQ without its rotation (Karras et al.,
   Progressive Growing of GANs, 2018, appendix C): with the eyes' middle E, their distance e, the middle of
   the mouth's corners M and m = |E - M|, the side is max(4 e, 3.6 m) and the middle E + 0.1 (E - M);
 - else from ``list_bbox_celeba.txt``, the square about the middle of the owners' box whose side is the
   box's longer one.
 
-unsup3d was trained on its own crops of the images in the wild. It publishes those boxes as a list, and
-not the rule behind them (github.com/elliottwu/unsup3d, issue 30): without that list in the folder the boxes
-resemble its crops and are not the same.
+unsup3d was trained on its own crops of the images in the wild. It publishes those boxes as a list,
+``celeba_crop_bbox.txt``, and not the rule behind them (github.com/elliottwu/unsup3d, issue 30). How its rows
+are laid out is written nowhere that we found: without a first line of names they are taken for a name, left,
+top, width and height.
+
+CelebAMask-HQ: 30,000 faces, each with a mask of 19 classes, as published (``CelebA-HQ-img/0.jpg`` and for
+every part of a face ``CelebAMask-HQ-mask-anno/0/00000_skin.png``) or merged (``images/0.jpg`` and
+``masks/0.png`` of class numbers). ``CelebA-HQ-to-CelebA-mapping.txt`` says which image of CelebA each one
+was, and so its official partition. The owners' own script compares that table's count from zero with
+CelebA's numbers, which start at one; here an image is in the part in which CelebA has it, which moves an
+image at each border at most.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import PurePosixPath
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float32
 
-from derender.data.layouts.boxes import BOX_LISTS, read_box_list
-from derender.data.layouts.layout import Labels, Layout, Table, base_name, part_of, text_column
-from derender.data.source import Source
+from derender.data.image import DECODER_ERRORS, upright_size
+from derender.data.layouts.layout import (
+    MOSTLY,
+    Labels,
+    Layout,
+    Table,
+    base_name,
+    parent_name,
+    read_list,
+    stem_of,
+    text_column,
+)
+from derender.data.source import Source, suggestion
 
-HOME = "https://mmlab.ie.cuhk.edu.hk/projects/CelebA.html"
-PARTITIONS = {"0": "train", "1": "validation", "2": "test"}
+CELEBA_HOME = "https://mmlab.ie.cuhk.edu.hk/projects/CelebA.html"
+MASK_HOME = "https://github.com/switchablenorms/CelebAMask-HQ"
 
+MASK_CLASSES = (
+    *("background", "skin", "nose", "eye_g", "l_eye", "r_eye", "l_brow", "r_brow", "l_ear", "r_ear"),
+    *("mouth", "u_lip", "l_lip", "hair", "hat", "ear_r", "neck_l", "neck", "cloth"),
+)
+"""The owners' names in their order, which is the class number: eye_g are glasses, ear_r earrings, neck_l a
+necklace."""
+
+BOX_LISTS = ("boxes.csv", "boxes.txt", "celeba_crop_bbox.txt", "celeba_crop_bbox.csv")
+
+_PARTITIONS = {"0": "train", "1": "validation", "2": "test"}
+_FIRST_NUMBERS = {"test": 182_638, "validation": 162_771, "train": 1}  # the parts are runs of image numbers
 _EYES_AND_MOUTH = (
     *("lefteye_x", "lefteye_y", "righteye_x", "righteye_y"),
     *("leftmouth_x", "leftmouth_y", "rightmouth_x", "rightmouth_y"),
 )
 _BOX = ("x_1", "y_1", "width", "height")
+_SIZED, _SIDES = ("left", "top", "width", "height"), ("left", "top", "right", "bottom")
+_MOST_OPENED = 1000
+_MAPPING = "CelebA-HQ-to-CelebA-mapping.txt"
 
 
-@dataclass(frozen=True)
-class OwnersList:
-    """One of the owners' lists.
+class _OwnersList(NamedTuple):
+    """A list's file and place, the names of its values (none where it has no such line), rows by image."""
 
-    Attributes:
-        file: its name in the source, and where that is, for messages.
-        columns: what the values of a row are; empty where the list does not say.
-        rows: the values by image name.
-    """
-
-    file: str
-    columns: tuple[str, ...]
-    rows: dict[str, list[str]]
+    where: str
+    columns: Sequence[str]
+    rows: Mapping[str, Sequence[str]]
 
     def numbers(self, columns: Sequence[str], names: Sequence[str]) -> Float32[np.ndarray, "n c"]:
         """These columns for the images of these names, NaN for one without a row."""
         missing = [column for column in columns if column not in self.columns]
         if missing:
             known = ", ".join(self.columns) or "unnamed"
-            raise ValueError(f"{self.file} has no column {missing[0]!r}; its columns are {known}")
+            raise ValueError(f"{self.where} has no column {missing[0]!r}; its columns are {known}")
         places = [self.columns.index(column) for column in columns]
         unknown = ["nan"] * len(self.columns)
         try:
             rows = [[float(self.rows.get(name, unknown)[place]) for place in places] for name in names]
         except ValueError as problem:
-            raise ValueError(f"{self.file} holds something that is no number ({problem})") from problem
+            raise ValueError(f"{self.where} holds something that is no number ({problem})") from problem
         return np.array(rows, np.float32).reshape(len(names), len(columns))
 
 
-def read_owners_list(
+def _owners_list(
     source: Source, stem: str, codes: Sequence[str] = (), meaning: str = ""
-) -> OwnersList | None:
+) -> _OwnersList | None:
     """The list of that name, as the original text or as a CSV copy, or None when neither is there.
 
     A row of another length than the others or with another value than the ``codes``, and a list with fewer
@@ -91,7 +116,7 @@ def read_owners_list(
         columns = columns[1:]
     rows = {}
     for number, line in enumerate(lines[head:], head + 1):
-        name, *values = line.split(comma) if line else [""]
+        name, *values = line.split(comma) or [""]
         if line and (len(values) != (len(columns) or 1) or (codes and not set(values) <= set(codes))):
             expected = f"a name and {len(columns) or 1} values{meaning}"
             raise ValueError(f"{where}, line {number}: expected {expected}, got {line[:80]!r}")
@@ -102,12 +127,12 @@ def read_owners_list(
             f"{where} is cut short: its first line says {int(lines[0]):,} rows and it has "
             f"{len(rows):,}; copy it again, or correct that line"
         )
-    return OwnersList(where, tuple(columns), rows)
+    return _OwnersList(where, columns, rows)
 
 
-def attributes_of(source: Source, stem: str, names: Sequence[str]) -> Labels | None:
+def _attributes(source: Source, stem: str, names: Sequence[str]) -> Labels | None:
     """Every attribute as 1 yes, 0 no, -1 unknown (no row) for these images; None without the list."""
-    listed = read_owners_list(source, stem, ("-1", "0", "1"), " of -1 or 1")
+    listed = _owners_list(source, stem, ("-1", "0", "1"), " of -1 or 1")
     if listed is None:
         return None
     rows = {name: np.array([value == "1" for value in row], np.int8) for name, row in listed.rows.items()}
@@ -116,88 +141,225 @@ def attributes_of(source: Source, stem: str, names: Sequence[str]) -> Labels | N
     return {column: values[:, place].copy() for place, column in enumerate(listed.columns)}
 
 
-def partition_of(source: Source, names: Sequence[str]) -> np.ndarray | None:
+def _partition(source: Source, names: Sequence[str]) -> np.ndarray | None:
     """The official part of each image of CelebA, "" where it has no row; None without the list."""
     meaning = " of 0 (train), 1 (validation) or 2 (test)"
-    listed = read_owners_list(source, "list_eval_partition", tuple(PARTITIONS), meaning)
+    listed = _owners_list(source, "list_eval_partition", tuple(_PARTITIONS), meaning)
     if listed is None:
         return None
-    return text_column(PARTITIONS[listed.rows[name][0]] if name in listed.rows else "" for name in names)
-
-
-def _read_celeba(source: Source, subset: str | None) -> Table:
-    """Attributes, and identity and the official partition where their lists are there; boxes in the wild."""
-    if not _is_celeba(source):
-        raise ValueError(f"{source.path} has no list_attr_celeba.txt; CelebA's owners publish it at {HOME}")
-    files, in_the_wild = _images(source)
-    names = [base_name(file) for file in files]
-    labels = attributes_of(source, "list_attr_celeba", names) or {}
-    identities = read_owners_list(source, "identity_CelebA")
-    if identities is not None:
-        labels["identity"] = text_column(identities.rows.get(name, [""])[0] for name in names)
-    boxes = _face_boxes(source, files, names) if in_the_wild else None
-    table = Table(files, labels, partition_of(source, names), boxes)
-    return part_of(table, source, subset, "list_eval_partition.txt")
+    return text_column(_PARTITIONS[listed.rows[name][0]] if name in listed.rows else "" for name in names)
 
 
 def _is_celeba(source: Source) -> bool:
     return source.named("list_attr_celeba.txt", "list_attr_celeba.csv") is not None
 
 
-def _images(source: Source) -> tuple[tuple[str, ...], bool]:
-    """Aligned images if there are any, else those in the wild, else all; and whether they are wild."""
-    for folder in ("img_align_celeba", "img_celeba"):
-        files = tuple(file for file in source.images if folder in PurePosixPath(file).parts[:-1])
-        if files:
-            return files, folder == "img_celeba"
+def _load_celeba(source: Source) -> Table:
+    """Attributes, and identity and the official partition where their lists are there; boxes in the wild."""
+    if not _is_celeba(source):
+        raise ValueError(
+            f"{source.path} has no list_attr_celeba.txt; CelebA's owners publish it at {CELEBA_HOME}"
+        )
     if not source.images:
         raise ValueError(
             f"{source.path} has CelebA's list of attributes and no images: expected img_align_celeba or "
-            f"img_celeba, unpacked; CelebA's owners publish both at {HOME}"
+            f"img_celeba, unpacked; CelebA's owners publish both at {CELEBA_HOME}"
         )
-    return source.images, False
+    aligned, wild = (
+        tuple(file for file in source.images if folder in file.split("/")[:-1])
+        for folder in ("img_align_celeba", "img_celeba")
+    )
+    files = aligned or wild or source.images
+    names = [base_name(file) for file in files]
+    labels = _attributes(source, "list_attr_celeba", names) or {}
+    identities = _owners_list(source, "identity_CelebA")
+    if identities is not None:
+        labels["identity"] = text_column(identities.rows.get(name, [""])[0] for name in names)
+    boxes = _face_boxes(source, files, names) if wild and not aligned else None
+    return Table(files, labels, _partition(source, names), boxes)
 
 
 def _face_boxes(source: Source, files: Sequence[str], names: Sequence[str]) -> Float32[np.ndarray, "n 4"]:
     """A box about each face in the wild (left, top, right, bottom); NaN for an image without a row."""
-    own = read_box_list(source, files)
+    own = source.named(*BOX_LISTS)
     if own is not None:
-        return own
-    landmarks = read_owners_list(source, "list_landmarks_celeba")
+        return _own_boxes(source, own, files, names)
+    landmarks = _owners_list(source, "list_landmarks_celeba")
+    boxes = _owners_list(source, "list_bbox_celeba") if landmarks is None else None
     if landmarks is not None:
-        return _square_of_landmarks(landmarks.numbers(_EYES_AND_MOUTH, names))
-    boxes = read_owners_list(source, "list_bbox_celeba")
-    if boxes is not None:
+        points = landmarks.numbers(_EYES_AND_MOUTH, names).reshape(-1, 4, 2)
+        eyes, mouth = points[:, :2].mean(axis=1), points[:, 2:].mean(axis=1)
+        apart = np.linalg.norm(points[:, 1] - points[:, 0], axis=1)
+        down = np.linalg.norm(eyes - mouth, axis=1)
+        middle, side = eyes + 0.1 * (eyes - mouth), np.maximum(4 * apart, 3.6 * down)
+    elif boxes is not None:
         box = boxes.numbers(_BOX, names)
-        return _square(box[:, :2] + box[:, 2:] / 2, box[:, 2:].max(axis=1))
-    raise ValueError(
-        f"{source.path} holds CelebA's images in the wild (img_celeba), which are cropped to their "
-        f"face, but neither list_landmarks_celeba.txt nor list_bbox_celeba.txt; the owners publish both "
-        f"at {HOME}. A list of your own may stand in for them: {BOX_LISTS[0]}, with rows of "
-        f"file,left,top,width,height"
-    )
-
-
-def _square_of_landmarks(points: Float32[np.ndarray, "n 8"]) -> Float32[np.ndarray, "n 4"]:
-    left_eye, right_eye, left_mouth, right_mouth = (points[:, at : at + 2] for at in (0, 2, 4, 6))
-    eyes, mouth = (left_eye + right_eye) / 2, (left_mouth + right_mouth) / 2
-    apart = np.linalg.norm(right_eye - left_eye, axis=1)
-    down = np.linalg.norm(eyes - mouth, axis=1)
-    return _square(eyes + 0.1 * (eyes - mouth), np.maximum(4 * apart, 3.6 * down))
-
-
-def _square(
-    middle: Float32[np.ndarray, "n 2"], side: Float32[np.ndarray, " n"]
-) -> Float32[np.ndarray, "n 4"]:
+        middle, side = box[:, :2] + box[:, 2:] / 2, box[:, 2:].max(axis=1)
+    else:
+        raise ValueError(
+            f"{source.path} holds CelebA's images in the wild (img_celeba), which are cropped to their "
+            f"face, but neither list_landmarks_celeba.txt nor list_bbox_celeba.txt; the owners publish both "
+            f"at {CELEBA_HOME}. A list of your own may stand in for them: {BOX_LISTS[0]}, with rows of "
+            f"file,left,top,width,height"
+        )
     half = side[:, None] / 2
     return np.concatenate([middle - half, middle + half], axis=1).astype(np.float32)
+
+
+def _own_boxes(
+    source: Source, file: str, images: Sequence[str], names: Sequence[str]
+) -> Float32[np.ndarray, "n 4"]:
+    """The boxes of a list that the user made for exactly these images.
+
+    A row that is none, a second row of an image, an image without a row, or a box of which less than half
+    lies in its image (looked up in at most 1,000 images, evenly spaced) is an error.
+    """
+    where = f"{file} in {source.path}"
+    boxes: dict[str, tuple[int, tuple[float, ...]]] = {}
+    columns, started = _SIZED, False
+    for number, line in enumerate(map(str.strip, source.read_text(file).splitlines()), 1):
+        if not line or (not started and line.isdecimal()):
+            continue
+        name, *cells = [cell.strip() for cell in line.split(",")] if "," in line else line.rsplit(None, 4)
+        name, values = base_name(name.replace("\\", "/")), [_number(cell) for cell in cells]
+        if not started and not np.isfinite(values).any():
+            found = tuple(cell.lower() for cell in cells)
+            columns = _SIZED if found == _BOX else found
+            if columns not in (_SIZED, _SIDES):
+                known = " or ".join(",".join(("file", *one)) for one in (_SIZED, _SIDES))
+                there = ", ".join(cells) or "of no name"
+                raise ValueError(f"{where}, line {number}: expected {known}, got columns {there}")
+        else:
+            expected = f"an image's name and {', '.join(columns)}"
+            if len(values) != 4 or not np.isfinite(values).all():
+                raise ValueError(f"{where}, line {number}: expected {expected}, got {line!r}")
+            if columns == _SIZED:
+                values[2:] = values[0] + values[2], values[1] + values[3]
+            if values[2] <= values[0] or values[3] <= values[1]:
+                raise ValueError(
+                    f"{where}, line {number}: the box has no area; expected {expected}, got {line!r}"
+                )
+            if name in boxes:
+                raise ValueError(f"{where}, line {number}: a second row for {name}; keep one of them")
+            boxes[name] = number, tuple(values)
+        started = True
+    missing = [name for name in names if name not in boxes]
+    if missing:
+        close = suggestion(missing[0], boxes) if len(boxes) < _MOST_OPENED else ""
+        raise ValueError(
+            f"{where} has no row for {missing[0]} ({len(missing):,} of {len(names):,} images have none"
+            f"{close}); add the rows, or move these images or the list out of the folder"
+        )
+    for row in map(int, np.unique(np.linspace(0, len(names) - 1, _MOST_OPENED).astype(int))):
+        number, (left, top, right, bottom) = boxes[names[row]]
+        try:
+            width, height = upright_size(source.read(images[row]))
+        except DECODER_ERRORS:  # an unreadable image is listed elsewhere
+            continue
+        across, down = min(right, width) - max(left, 0), min(bottom, height) - max(top, 0)
+        if max(0.0, across) * max(0.0, down) < 0.5 * (right - left) * (bottom - top):
+            raise ValueError(
+                f"{where}, line {number}: the box from ({left:g}, {top:g}) to ({right:g}, {bottom:g}) lies "
+                f"outside {names[row]}, which is {width} x {height} pixels; say in the first line "
+                f"whether boxes are file,{','.join(_SIZED)} or file,{','.join(_SIDES)}"
+            )
+    return np.array([boxes[name][1] for name in names], np.float32)
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return np.nan
+
+
+def parts_of(source: Source) -> dict[str, dict[int, str]]:
+    """The files of every mask in parts, by class number, under the mask's name (FOLDER/NUMBER_*.png)."""
+    numbers = {name: number for number, name in enumerate(MASK_CLASSES) if number}
+    found: dict[str, dict[int, str]] = {}
+    for file in source.files:
+        if file.endswith(".png"):
+            folder, _, name = file.rpartition("/")
+            digits, _, part = name.removesuffix(".png").partition("_")
+            if part in numbers and digits.isdecimal():
+                found.setdefault(f"{folder}/{digits}_*.png", {})[numbers[part]] = file
+    return found
+
+
+def _mask_images(source: Source) -> tuple[str, ...]:
+    found = [
+        [file for file in source.images if parent_name(file) == name] for name in ("CelebA-HQ-img", "images")
+    ]
+    return tuple(found[0] or found[1])
+
+
+def _mask_names(source: Source, images: Sequence[str]) -> list[str]:
+    """The mask of each image, "" where there is none: a file, or FOLDER/NUMBER_*.png for one in parts."""
+    merged = {file for file in source.files if file.endswith(".png") and parent_name(file) == "masks"}
+    in_parts = {int(base_name(name).removesuffix("_*.png")): name for name in parts_of(source)}
+    names = []
+    for file in images:
+        stem, folders = stem_of(file), file.split("/")[:-2]
+        number = int(stem) if stem.isdecimal() and stem.isascii() else -1
+        beside = "/".join([*folders, "masks", f"{stem}.png"])
+        names.append(beside if beside in merged else in_parts.get(number, ""))
+    return names
+
+
+def _is_celebamask(source: Source) -> bool:
+    files = _mask_images(source)
+    return bool(files) and sum(map(bool, _mask_names(source, files))) >= MOSTLY * len(files)
+
+
+def _load_celebamask(source: Source) -> Table:
+    """The label ``mask`` names each mask ("" for none); attributes and parts where their lists are there."""
+    files = _mask_images(source)
+    if not files:
+        raise ValueError(
+            f"{source.path} has no images of CelebAMask-HQ: expected CelebA-HQ-img/0.jpg, or images/0.jpg; "
+            f"the owners publish the set at {MASK_HOME}"
+        )
+    masks = _mask_names(source, files)
+    if not any(masks):
+        raise ValueError(
+            f"{source.path} has images and none of their masks: expected "
+            f"CelebAMask-HQ-mask-anno/0/00000_skin.png, or masks/0.png beside images/0.jpg; "
+            f"the owners publish them at {MASK_HOME}"
+        )
+    names = [base_name(file) for file in files]
+    attributes, partition = _attributes(source, "CelebAMask-HQ-attribute-anno", names), None
+    mapping = source.named(_MAPPING)
+    if mapping is not None:
+        expected, header = "idx orig_idx orig_file, as in 0 119613 119614.jpg", r"idx\s+orig_idx\s+orig_file"
+        rows = read_list(source, mapping, r"(\d+)\s+\S+\s+(\d+(?:\.\w+)?)", expected, header)
+        origins = {f"{int(number)}.jpg": origin for _, (number, origin) in rows}
+        in_celeba = [origins.get(name, "") for name in names]
+        attributes = attributes or _attributes(source, "list_attr_celeba", in_celeba)
+        partition = _partition(source, in_celeba)
+        if partition is None:  # by number, which is the same
+            numbers = [int(stem_of(name)) if name else 0 for name in in_celeba]
+            partition = text_column(
+                next((part for part, first in _FIRST_NUMBERS.items() if number >= first), "")
+                for number in numbers
+            )
+    return Table(files, {"mask": text_column(masks), **(attributes or {})}, partition)
 
 
 CELEBA = Layout(
     "celeba",
     "CelebA: faces with 40 attributes",
-    HOME,
     _is_celeba,
-    _read_celeba,
-    "non-commercial research only",
+    _load_celeba,
+    home=CELEBA_HOME,
+    terms="non-commercial research only",
+    split_from="list_eval_partition.txt",
+)
+CELEBAMASK = Layout(
+    "celebamask",
+    "CelebAMask-HQ: faces with masks of their parts",
+    _is_celebamask,
+    _load_celebamask,
+    home=MASK_HOME,
+    terms="non-commercial research and education only",
+    split_from=_MAPPING,
 )

@@ -1,4 +1,4 @@
-"""Real faces: UTKFace, Labeled Faces in the Wild, and RAF-DB.
+"""Real faces: UTKFace, Labeled Faces in the Wild, RAF-DB, and faces followed through a video.
 
 UTKFace: ``[age]_[gender]_[race]_[date].jpg.chip.jpg``. Its owners give no split; the paper's 80/10/10 is
 made by data/splits.py. LFW: ``First_Last/First_Last_0001.jpg``; where the lists of its view 1
@@ -9,32 +9,40 @@ RAF-DB, the basic set: ``basic/Image/aligned/train_00001_aligned.jpg`` (100 x 10
 ``basic/EmoLabel/list_patition_label.txt``, spelt so, with a line ``train_00001.jpg 5`` for each image; the
 name says the part (12,271 train, 3,068 test). The images before alignment and the compound emotions are not
 read.
+
+Tracks have two forms: ``NAME.ids`` as published for The Big Bang Theory and Buffy (episodes bbt_s01e01..06
+and buffy_s05e01..06; github.com/makarandtapaswi/BallClustering_ICCV2019, after Baeuml et al., CVPR 2013): a
+line ``CVHCI_TRACKLABELS_V1``, then a track's number and a name a line. The frames cannot be published; cut
+them from the video into ``NAME/NUMBER/FRAME.jpg``, leading zeros as you like. ``NAME/`` may be left out
+where there is one list only. Or, without a list, ``IDENTITY/TRACK/FRAME.jpg`` as in YouTube Faces, where
+tracks and frames are numbered. Every track of a list is read, background people (unknown_...) too; the paper
+used 568 tracks of six people of buffy_s05e02 and 644 of five of bbt_s01e01. There is no official split.
 """
 
 import re
-from pathlib import PurePosixPath
 
 import numpy as np
 
 from derender.data.layouts.layout import (
-    MOSTLY,
+    PARTITION_NAMES,
+    Labels,
     Layout,
     Table,
     base_name,
-    images_of,
+    mostly,
     number_column,
     parent_name,
-    part_of,
     read_csv,
     read_list,
+    stem_of,
     text_column,
 )
+from derender.data.layouts.rendered import track_labels
 from derender.data.source import Source
 
 # In a few published names the race is missing, in one the gender.
 _UTK_NAME = re.compile(r"(?P<age>\d{1,3})_(?P<gender>\d?)_(?:(?P<race>\d)_)?\d{8,}")
-_UTK_GENDERS = ("male", "female")
-_UTK_RACES = ("white", "black", "asian", "indian", "other")
+_UTK_CODES = {"gender": ("male", "female"), "race": ("white", "black", "asian", "indian", "other")}
 _UTK_OLDEST = 116
 _UTK_HOME = "https://susanqq.github.io/UTKFace/"
 
@@ -47,74 +55,55 @@ _RAF_HOME = "http://www.whdeng.cn/raf/model1.html"
 EMOTIONS = ("surprise", "fear", "disgust", "happiness", "sadness", "anger", "neutral")
 """In the owners' order: 1 is surprise, 7 neutral."""
 
+_TRACKS_HOME = "https://github.com/makarandtapaswi/BallClustering_ICCV2019"
+_TRACKS_HEADER = "CVHCI_TRACKLABELS_V1"
+_NUMBERED = re.compile(
+    r"(?:.*/)?(?P<identity>[^/]+)/(?P<track>(?:track[_-]?)?\d+)/(?:frame[_-]?)?\d[\d._-]*\.\w+"
+)
+_NESTED = re.compile(r"(?:.*/)?(?P<identity>[^/]+)/(?P<track>[^/]+)/[^/]+")
 
-def _share(files: list[str] | tuple[str, ...], pattern: re.Pattern[str]) -> float:
-    return sum(1 for file in files if pattern.match(file)) / len(files) if files else 0.0
 
-
-def _is_utkface(source: Source) -> bool:
-    return _share([base_name(file) for file in source.images], _UTK_NAME) >= MOSTLY
-
-
-def _read_utkface(source: Source, subset: str | None) -> Table:
+def _load_utkface(source: Source) -> Table:
     """Age, gender and race from the names; values outside the published codes count as unknown."""
-    files = images_of(source, subset)
-    ages, genders, races = [], [], []
-    for file in files:
-        found = _UTK_NAME.match(base_name(file))
-        age = float(found["age"]) if found else np.nan
-        ages.append(age if age <= _UTK_OLDEST else np.nan)
-        genders.append(_coded(found["gender"] if found else None, _UTK_GENDERS))
-        races.append(_coded(found["race"] if found else None, _UTK_RACES))
-    if files and np.isnan(ages).all():
+    found = [_UTK_NAME.match(base_name(file)) for file in source.images]
+    if source.images and not any(found):
         raise ValueError(
             f"no image in {source.path} is named as in UTKFace ([age]_[gender]_[race]_[date].jpg): "
-            f"the first is {files[0]!r}; the owners publish the set at {_UTK_HOME}"
+            f"the first is {source.images[0]!r}; the owners publish the set at {_UTK_HOME}"
         )
-    return Table(
-        files, {"age": number_column(ages), "gender": text_column(genders), "race": text_column(races)}
-    )
+    ages = [float(one["age"]) if one else np.nan for one in found]
+    labels = {"age": number_column(age if age <= _UTK_OLDEST else np.nan for age in ages)}
+    for column, names in _UTK_CODES.items():
+        by_code = dict(zip("01234", names, strict=False))
+        labels[column] = text_column(by_code.get(one[column] or "", "") if one else "" for one in found)
+    return Table(source.images, labels)
 
 
-def _coded(code: str | None, names: tuple[str, ...]) -> str:
-    return names[int(code)] if code and int(code) < len(names) else ""
-
-
-def _read_lfw(source: Source, subset: str | None) -> Table:
+def _load_lfw(source: Source) -> Table:
     """Identity from the folder; emotion from ``emotions.csv`` (file, emotion) where there is one."""
-    partition = _lfw_partition(source)
-    files = images_of(source, None if partition else subset)
+    files = source.images
     lonely = next((file for file in files if "/" not in file), None)
     if lonely is not None:
         raise ValueError(
             f"LFW has one folder per person, but {lonely} in {source.path} lies in none; "
             f"the owners publish the set at {_LFW_HOME}"
         )
-    people = [parent_name(file) for file in files]
-    labels = {"identity": text_column(people)}
-    emotions = source.named("emotions.csv")
-    if emotions is not None:
-        by_name = {row["file"]: row["emotion"] for row in read_csv(source, emotions, ("file", "emotion"))}
-        labels["emotion"] = text_column(by_name.get(base_name(file), "") for file in files)
-    if not partition:
-        return Table(files, labels)
-    table = Table(files, labels, text_column(partition.get(person, "") for person in people))
-    return part_of(table, source, subset, "peopleDevTrain.txt")
-
-
-def _lfw_partition(source: Source) -> dict[str, str]:
-    """The part of each person in the lists of view 1; empty without them."""
-    partition: dict[str, str] = {}
+    part_of_person: dict[str, str] = {}
     for name, part in _LFW_PARTS.items():
-        file = source.named(name)
-        if file is not None:
+        if (file := source.named(name)) is not None:
             expected = "the number of people, then a name and a number of images a line"
             rows = read_list(source, file, r"(.+?)\s+\d+", expected, header=r"\d+")
             count = int(source.read_text(file).split("\n", 1)[0])
             if len(rows) != count:
                 raise ValueError(f"{file} in {source.path} is cut short: {len(rows)} people of {count}")
-            partition |= {person: part for _, (person,) in rows}
-    return partition
+            part_of_person |= {person: part for _, (person,) in rows}
+    people = [parent_name(file) for file in files]
+    labels = {"identity": text_column(people)}
+    if (emotions := source.named("emotions.csv")) is not None:
+        by_name = {row["file"]: row["emotion"] for row in read_csv(source, emotions, ("file", "emotion"))}
+        labels["emotion"] = text_column(by_name.get(base_name(file), "") for file in files)
+    partition = text_column(part_of_person.get(person, "") for person in people) if part_of_person else None
+    return Table(files, labels, partition)
 
 
 def _raf_list(source: Source) -> str | None:
@@ -123,7 +112,8 @@ def _raf_list(source: Source) -> str | None:
     return min(found, key=lambda file: (file.count("/"), file), default=None)
 
 
-def _read_rafdb(source: Source, subset: str | None) -> Table:
+def _load_rafdb(source: Source) -> Table:
+    """Emotions from the owners' list, the part from an image's name."""
     file = _raf_list(source)
     if file is None:
         raise ValueError(
@@ -132,46 +122,120 @@ def _read_rafdb(source: Source, subset: str | None) -> Table:
         )
     expected = f"an image and an emotion from 1 ({EMOTIONS[0]}) to {len(EMOTIONS)} ({EMOTIONS[-1]})"
     rows = read_list(source, file, rf"(\S.*) ([1-{len(EMOTIONS)}])", expected)
-    emotions = {PurePosixPath(name.strip()).stem: EMOTIONS[int(code) - 1] for _, (name, code) in rows}
-    files = tuple(name for name in source.images if PurePosixPath(name).stem.endswith("_aligned"))
+    emotions = {stem_of(name.strip()): EMOTIONS[int(code) - 1] for _, (name, code) in rows}
+    files = tuple(name for name in source.images if stem_of(name).endswith("_aligned"))
     if not files:
         raise ValueError(
             f"{source.path} has RAF-DB's list of emotions and no aligned images: expected "
             f"Image/aligned/train_00001_aligned.jpg; unpack aligned.zip into a folder of its name"
         )
-    names = [PurePosixPath(name).stem.removesuffix("_aligned") for name in files]
+    names = [stem_of(name).removesuffix("_aligned") for name in files]
     if not emotions.keys() & set(names):
         raise ValueError(f"{file} in {source.path} names none of its images; the first is {files[0]!r}")
     parts = (name.partition("_")[0] for name in names)
-    table = Table(
+    return Table(
         files,
         {"emotion": text_column(emotions.get(name, "") for name in names)},
         text_column(part if part in ("train", "test") else "" for part in parts),
     )
-    return part_of(table, source, subset, "a name such as test_0001_aligned.jpg")
+
+
+def _is_tracks(source: Source) -> bool:
+    """A list of tracks, or numbered frames in numbered tracks throughout, of two people or more."""
+    if _track_lists(source):
+        return bool(source.images)
+    people: set[str] = set()
+    for file in source.images:
+        match = _NUMBERED.fullmatch(file)
+        if match is None:
+            return False
+        people.add(match["identity"])
+    return len(people - PARTITION_NAMES.keys()) > 1
+
+
+def _track_lists(source: Source) -> dict[str, str]:
+    """Each list's file by its name (the episode)."""
+    found = {stem_of(file): file for file in reversed(source.files) if file.endswith(".ids")}
+    return dict(sorted(found.items()))
+
+
+def _load_tracks(source: Source) -> Table:
+    """Identity, track (unique in the whole set) and frame, by lists or by folders."""
+    files, lists = source.images, _track_lists(source)
+    if lists:
+        return Table(files, _listed_tracks(source, lists))
+    matches = [_NESTED.fullmatch(file) for file in files]
+    if None in matches:
+        raise ValueError(
+            f"{source.path}: {files[matches.index(None)]} does not lie in IDENTITY/TRACK/, and there is "
+            f"no list of tracks NAME.ids (those of Buffy and The Big Bang Theory are published "
+            f"at {_TRACKS_HOME})"
+        )
+    return Table(files, track_labels(files, [match for match in matches if match]))
+
+
+def _listed_tracks(source: Source, lists: dict[str, str]) -> Labels:
+    expected = f"a first line {_TRACKS_HEADER}, then a track's number and a name a line, as at {_TRACKS_HOME}"
+    people: dict[tuple[str, int], str] = {}
+    for episode, file in lists.items():
+        for line, (number, name) in read_list(source, file, r"(\d+) +(.+)", expected, _TRACKS_HEADER):
+            if people.setdefault((episode, int(number)), name) != name:
+                raise ValueError(f"{file} in {source.path}, line {line}: track {int(number)} has two names")
+    rows = []
+    for file in source.images:
+        folders = file.split("/")[:-1]
+        episode = next((name for name in lists if name in folders), "")
+        if len(lists) == 1:
+            (episode,) = lists
+        number = folders[-1] if folders else ""
+        if episode and number.isdecimal() and number.isascii():
+            track = int(number)
+            rows.append((people.get((episode, track), ""), f"{episode}/{track}", episode))
+        else:
+            rows.append(("", "", episode))
+    if rows and not any(identity for identity, *_ in rows):
+        name, first = next(iter(lists.items()))
+        raise ValueError(
+            f"none of the images in {source.path} lies in the folder of a track that {first} lists "
+            f"(the first is {source.images[0]!r}): expected {name}/NUMBER/FRAME.jpg; the owners "
+            f"publish numbers and names, not images ({_TRACKS_HOME})"
+        )
+    columns = dict(
+        zip(("identity", "track", "episode"), map(text_column, zip(*rows, strict=True)), strict=True)
+    )
+    return {**columns, "frame": text_column(map(stem_of, source.images))}
 
 
 UTKFACE = Layout(
     "utkface",
     "UTKFace: faces with age, gender and race in their names",
-    _UTK_HOME,
-    _is_utkface,
-    _read_utkface,
-    "non-commercial research only",
+    lambda source: mostly(_UTK_NAME, [base_name(file) for file in source.images]),
+    _load_utkface,
+    home=_UTK_HOME,
+    terms="non-commercial research only",
 )
 LFW = Layout(
     "lfw",
     "Labeled Faces in the Wild: one folder per person",
-    _LFW_HOME,
-    lambda source: _share(source.images, _LFW_NAME) >= MOSTLY,
-    _read_lfw,
-    "no licence stated; news photographs, collected for research",
+    lambda source: mostly(_LFW_NAME, source.images),
+    _load_lfw,
+    home=_LFW_HOME,
+    terms="no licence stated; news photographs, collected for research",
+    split_from="peopleDevTrain.txt",
 )
 RAFDB = Layout(
     "rafdb",
     "RAF-DB: faces with one of seven emotions",
-    _RAF_HOME,
     lambda source: _raf_list(source) is not None,
-    _read_rafdb,
-    "non-commercial research only, on request",
+    _load_rafdb,
+    home=_RAF_HOME,
+    terms="non-commercial research only, on request",
+)
+FACE_TRACKS = Layout(
+    "face_tracks",
+    "face tracks: NAME.ids and NAME/TRACK/FRAME (Buffy, Big Bang Theory), or IDENTITY/TRACK/FRAME",
+    _is_tracks,
+    _load_tracks,
+    home=_TRACKS_HOME,
+    terms="lists for research; frames are the broadcasters', to be cut from one's own copy",
 )

@@ -9,7 +9,6 @@ import io
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import PurePosixPath
 
 import numpy as np
 from jaxtyping import Float32
@@ -66,18 +65,49 @@ class Layout:
     Attributes:
         name: what the user writes to ask for this layout.
         title: what it is, in a few words.
-        home: where the owners publish it; "" for layouts without owners.
         recognise: whether a source looks like it, from the names of its files (and a header line).
-        read: the table of one subset; None asks for the default. An error names the file that is missing.
+        load: every image with its labels. An error names the file that is missing.
+        home: where the owners publish it; "" for layouts without owners.
         terms: on what terms the owners give it, in a few words; "" for layouts without owners.
+        split_from: the file that gives the official split, for messages.
+        default_parts: the first of these that is there is read unless a part is asked for; () for all images.
     """
 
     name: str
     title: str
-    home: str
     recognise: Callable[[Source], bool]
-    read: Callable[[Source, str | None], Table]
+    load: Callable[[Source], Table]
+    home: str = ""
     terms: str = ""
+    split_from: str = ""
+    default_parts: Sequence[str] = ()
+
+    def read(
+        self, source: Source, subset: str | None = None, default_parts: Sequence[str] | None = None
+    ) -> Table:
+        """The images of one part: of the official split, else those in a folder of that name at any depth."""
+        table = self.load(source)
+        known = set() if table.partition is None else {*table.partition.tolist()}
+        parts = sorted(known - {""})
+        defaults = self.default_parts if default_parts is None else default_parts
+        if subset is None and defaults and len(known) > 1:
+            subset = next((part for part in defaults if part in known), None)
+            if subset is None:
+                raise ValueError(f"{source.path}: name one of its parts; there are {', '.join(parts)}")
+        if subset is None:
+            return table
+        part = subset if subset in parts else PARTITION_NAMES.get(subset.lower())
+        if part in parts:
+            return table.select(np.flatnonzero(table.partition == part))
+        inside = [row for row, file in enumerate(table.files) if f"/{subset.strip('/')}/" in f"/{file}"]
+        if not inside:
+            lacking = f"none ({self.split_from} is missing)" if self.split_from else "none"
+            folders = sorted({file.partition("/")[0] for file in table.files if "/" in file})
+            raise ValueError(
+                f"{source.path} has no part {subset!r}: its parts are {', '.join(parts) or lacking}, "
+                f"its folders {', '.join(folders[:8]) or 'none'}"
+            )
+        return table.select(np.array(inside))
 
 
 def base_name(file: str) -> str:
@@ -85,31 +115,19 @@ def base_name(file: str) -> str:
     return file.rpartition("/")[2]
 
 
+def stem_of(file: str) -> str:
+    """A file's name without its folders and its suffix."""
+    return base_name(file).rsplit(".", 1)[0]
+
+
 def parent_name(file: str) -> str:
     """The name of the folder that a file lies in, "" at the top."""
     return file.rpartition("/")[0].rpartition("/")[2]
 
 
-def images_of(source: Source, subset: str | None = None) -> tuple[str, ...]:
-    """Every image of the source, or those in a folder ``subset`` at any depth."""
-    if subset is None:
-        return source.images
-    inside = tuple(file for file in source.images if f"/{subset.strip('/')}/" in f"/{file}")
-    if not inside:
-        folders = sorted({PurePosixPath(file).parts[0] for file in source.images if "/" in file})
-        known = f"its folders are {', '.join(folders[:8])}" if folders else "it has no folders with images"
-        raise ValueError(f"{source.path} has no images in a folder {subset!r}; {known}")
-    return inside
-
-
-def all_match(
-    source: Source, files: Sequence[str], pattern: re.Pattern[str], error: str
-) -> list[re.Match[str]]:
-    """The match of every file's whole name; one that has none is named before ``error``."""
-    matches = [pattern.fullmatch(file) for file in files]
-    if None in matches:
-        raise ValueError(f"{source.path}: {files[matches.index(None)]} {error}")
-    return [match for match in matches if match is not None]
+def mostly(pattern: re.Pattern[str], names: Sequence[str]) -> bool:
+    """Whether nearly all of the names, and at least one, begin with the pattern."""
+    return bool(names) and sum(1 for name in names if pattern.match(name)) >= MOSTLY * len(names)
 
 
 def partition_by_folder(file: str) -> str:
@@ -122,30 +140,6 @@ def partition_column(values: Iterable[str]) -> np.ndarray | None:
     """A column of partitions, or None where all are unknown."""
     column = text_column(values)
     return column if (column != "").any() else None
-
-
-def part_of(table: Table, source: Source, subset: str | None, needed: str) -> Table:
-    """The rows of one part of the official split, or all; ``needed`` is the file that gives the split."""
-    if subset is None:
-        return table
-    if table.partition is None:
-        raise ValueError(f"{source.path} has no official split, so no subset {subset!r}: {needed} is missing")
-    rows = np.flatnonzero(table.partition == PARTITION_NAMES.get(subset.lower(), ""))
-    if not len(rows) or subset.lower() not in PARTITION_NAMES:
-        known = sorted(set(table.partition.tolist()) - {""})
-        raise ValueError(f"{source.path} has no subset {subset!r}; there are {', '.join(known) or 'none'}")
-    return table.select(rows)
-
-
-def one_of(source: Source, subset: str | None, default: str, names: Iterable[str]) -> str:
-    """The subset that was asked for, else the default or the only one; none of that is an error."""
-    known = list(names)
-    if subset is None:
-        subset = default if default in known else known[0] if len(known) == 1 else None
-    if subset not in known:
-        problem = "name one of its subsets" if subset is None else f"it has no subset {subset!r}"
-        raise ValueError(f"{source.path}: {problem}; there are {', '.join(map(repr, known))}")
-    return subset
 
 
 def count_unknown(column: np.ndarray) -> int:
@@ -201,14 +195,12 @@ def read_list(
     A line that does not fit, or a first line that does not fit the pattern ``header``, is an error that says
     what was ``expected``.
     """
-    rows, pattern = [], re.compile(row)
-    for number, line in enumerate(source.read_text(file).splitlines() or [""], 1):
+    rows = []
+    for number, line in enumerate(map(str.strip, source.read_text(file).splitlines() or [""]), 1):
         is_header = number == 1 and header is not None
-        match = re.fullmatch(header or "", line.strip()) if is_header else pattern.fullmatch(line.strip())
-        if match is None and (line.strip() or is_header):
-            raise ValueError(
-                f"{file} in {source.path}, line {number}: expected {expected}, got {line.strip()!r}"
-            )
+        match = re.fullmatch(header if number == 1 and header is not None else row, line)
+        if match is None and (line or is_header):
+            raise ValueError(f"{file} in {source.path}, line {number}: expected {expected}, got {line!r}")
         if match is not None and not is_header:
             rows.append((number, match.groups()))
     return rows

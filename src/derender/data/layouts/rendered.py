@@ -1,123 +1,190 @@
-"""Rendered collections, whose params.csv gives the exact factors of every image: synface and syncar.
+"""Rendered collections: with a params.csv that gives the exact factors of every image, or with depth maps.
 
-Angles become radians here. Light and camera columns are in the canonical frame (docs/conventions.md). The
-maps of depth, normals, albedo and mask are read by data/ground_truth.py.
+synface and syncar: folders with ``images`` beside a ``params.csv``. Tracks: ``tracks/IDENTITY/TRACK/FRAME``.
+Angles become radians here; light and camera are in the canonical frame (docs/conventions.md). Images with
+depth maps in folders side by side, as unsup3d's synthetic faces lie:
+
+    SET/image/NAME.png          the image; SET is train, val or test, or nothing
+    SET/depth/NAME.png          its depth map, NAME the same or with "image" replaced by "depth"
+
+All maps are read by data/maps.py.
 """
 
 import math
-from collections.abc import Sequence
-from pathlib import PurePosixPath
+import re
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from derender.data.layouts.layout import (
+    PARTITION_NAMES,
     Labels,
     Layout,
     Table,
     header_of,
     number_column,
-    one_of,
     parent_name,
+    partition_column,
     read_csv,
+    stem_of,
     text_column,
 )
 from derender.data.source import Source
 
-# column in params.csv: (label, factor to our unit)
-_NUMBERS = {
-    "strength": ("strength", 1.0),
-    "age": ("age", 1.0),
-    "skin_tone": ("skin_tone", 1.0),
-    "ambient": ("ambient", 1.0),
-    "diffuse": ("diffuse", 1.0),
-    "light_pitch": ("light_pitch_rad", math.pi / 180),
-    "light_yaw": ("light_yaw_rad", math.pi / 180),
-    "pitch": ("camera_x_rad", math.pi / 180),
-    "yaw": ("camera_y_rad", math.pi / 180),
-    "roll": ("camera_z_rad", math.pi / 180),
-    "tx": ("camera_tx", 1.0),
-    "ty": ("camera_ty", 1.0),
-    "elev": ("elevation_rad", math.pi / 180),
-    "azim": ("azimuth_rad", math.pi / 180),
+LIGHT = ("ambient", "diffuse", "light_pitch_rad", "light_yaw_rad")
+CAMERA = ("camera_x_rad", "camera_y_rad", "camera_z_rad", "camera_tx", "camera_ty")
+
+# by column of params.csv, what it is called here
+_NUMBERS = {name: name for name in ("strength", "age", "skin_tone", "ambient", "diffuse")}
+_NUMBERS |= {"tx": "camera_tx", "ty": "camera_ty"}
+_DEGREES = {
+    "light_pitch": "light_pitch_rad",
+    "light_yaw": "light_yaw_rad",
+    "pitch": "camera_x_rad",
+    "yaw": "camera_y_rad",
+    "roll": "camera_z_rad",
+    "elev": "elevation_rad",
+    "azim": "azimuth_rad",
 }
 _TEXTS = (
     *("identity", "expression", "class", "model", "track", "frame", "light_kind"),
     *("hair", "hair_colour", "beard", "style"),
 )
-LIGHT = ("ambient", "diffuse", "light_pitch_rad", "light_yaw_rad")
-CAMERA = ("camera_x_rad", "camera_y_rad", "camera_z_rad", "camera_tx", "camera_ty")
+_TRACK = re.compile(r"(?:.*/)?tracks/(?P<identity>[^/]+)/(?P<track>[^/]+)/[^/]+\.\w+")
 
 
-def subsets_of(source: Source) -> dict[str, str]:
-    """Folder of each params.csv that has an images folder beside it, by the folder's name ("" at the top)."""
+def rendered_folders(source: Source) -> list[str]:
+    """The folders (with a final slash, or "") that hold a params.csv and images beside it."""
     if source.named("params.csv") is None:
-        return {}
-    tables = [PurePosixPath(file) for file in source.files if f"/{file}".endswith("/params.csv")]
-    depicted = {PurePosixPath(file).parent.parent for file in source.files if parent_name(file) == "images"}
-    folders = [table.parent for table in tables if table.parent in depicted]
-    return {folder.name: "" if str(folder) == "." else f"{folder}/" for folder in folders}
+        return []
+    depicted = {file.rpartition("/")[0].removesuffix("images") for file in _images_in(source, "images")}
+    tables = (file for file in source.files if f"/{file}".endswith("/params.csv"))
+    return [folder for table in tables if (folder := table.removesuffix("params.csv")) in depicted]
 
 
-def subset_folder(source: Source, subset: str | None, default: str = "train") -> str:
-    """The folder (with a final slash, or "") of a subset: the one named, the default or the only one."""
-    subsets = subsets_of(source)
-    if not subsets:
+def pairs_of(source: Source) -> dict[str, str]:
+    """Image to depth map, for every image in a folder ``image`` with a map in the folder beside it."""
+    images = _images_in(source, "image")
+    known, found = set(source.files) if images else set(), {}
+    for file in images:
+        stem, folder = stem_of(file), file.rpartition("/")[0].removesuffix("image")
+        names = (f"{folder}depth/{name}.png" for name in (stem.replace("image", "depth"), stem))
+        if (name := next((name for name in names if name in known), None)) is not None:
+            found[file] = name
+    return found
+
+
+def track_labels(files: Sequence[str], matches: Sequence[re.Match[str]]) -> Labels:
+    """Identity, track (unique in the whole set) and frame, of files and the matches of a pattern for them."""
+    return {
+        "identity": text_column(match["identity"] for match in matches),
+        "track": text_column(f"{match['identity']}/{match['track']}" for match in matches),
+        "frame": text_column(map(stem_of, files)),
+    }
+
+
+def _images_in(source: Source, folder: str) -> list[str]:
+    """The images in folders of that name."""
+    return [file for file in source.images if parent_name(file) == folder]
+
+
+def _parameters(source: Source, folders: Sequence[str], files: Sequence[str]) -> Labels:
+    """The known columns of the params.csv in these folders for some images, in our units."""
+    by_file: dict[str, Mapping[str, str]] = {}
+    for folder in folders:
+        rows = read_csv(source, f"{folder}params.csv", ("file",))
+        by_file |= {folder + row["file"]: row for row in rows}
+        inside = [file for file in files if file.startswith(folder)]
+        if inside and not any(file in by_file for file in inside):
+            raise ValueError(f"{folder}params.csv in {source.path} names none of the images beside it")
+    columns = dict.fromkeys(name for row in by_file.values() for name in row)
+    rows = [by_file.get(file, {}) for file in files]
+    labels = {name: text_column(row.get(name, "") for row in rows) for name in _TEXTS if name in columns}
+    for name, label in (_NUMBERS | _DEGREES).items():
+        if name in columns:
+            try:
+                values = np.array([float(row.get(name) or "nan") for row in rows])
+            except ValueError as problem:
+                raise ValueError(
+                    f"params.csv in {source.path}: column {name!r} holds something that is no number "
+                    f"({problem})"
+                ) from problem
+            labels[label] = number_column(values * (math.pi / 180 if name in _DEGREES else 1.0))
+    return labels
+
+
+def _load_rendered(source: Source) -> Table:
+    """The images beside every params.csv; their masks of parts, if they have such, as the label ``mask``."""
+    folders = rendered_folders(source)
+    if not folders:
         raise ValueError(
             f"{source.path} has no params.csv with an images folder beside it, as rendered sets have"
         )
-    return subsets[one_of(source, subset, default, subsets)]
-
-
-def parameters_of(source: Source, table: str, files: Sequence[str]) -> tuple[Labels, int]:
-    """The known columns of a params.csv for some images, in our units; and how many have a row there."""
-    folder = table.removesuffix("params.csv")
-    by_file = {folder + row["file"]: row for row in read_csv(source, table, ("file",))}
-    columns = next(iter(by_file.values()), {})
-    rows = [by_file.get(file) or dict.fromkeys(columns, "") for file in files]
-    labels: Labels = {name: text_column(row[name] for row in rows) for name in _TEXTS if name in columns}
-    for name, (label, factor) in _NUMBERS.items():
-        if name in columns:
-            try:
-                values = np.array([float(row[name] or "nan") for row in rows])
-            except ValueError as problem:
-                raise ValueError(
-                    f"{table} in {source.path}: column {name!r} holds something that is no number ({problem})"
-                ) from problem
-            labels[label] = number_column(values * factor)
-    return labels, sum(file in by_file for file in files)
-
-
-def _read_rendered(source: Source, subset: str | None) -> Table:
-    folder = subset_folder(source, subset)
-    table = f"{folder}params.csv"
-    files = tuple(file for file in source.images if file.startswith(f"{folder}images/"))
-    labels, known = parameters_of(source, table, files)
-    if files and not known:
-        raise ValueError(f"{table} in {source.path} names none of the images in {folder}images")
-    masks = [f"{folder}masks/{PurePosixPath(file).stem}.png" for file in files]
-    if masks and set(masks) <= set(source.files):
-        labels["mask"] = text_column(masks)  # numbers of parts, for read_masks
-    name = parent_name(table)
-    return Table(files, labels, text_column([name] * len(files)) if name else None)
+    beside = tuple(f"{folder}images/" for folder in folders)
+    files = tuple(file for file in source.images if file.startswith(beside))
+    labels = _parameters(source, folders, files)
+    known = set(source.files)
+    masks = [f"{file.rpartition('images/')[0]}masks/{stem_of(file)}.png" for file in files]
+    if any(mask in known for mask in masks):
+        labels["mask"] = text_column(mask if mask in known else "" for mask in masks)
+    return Table(files, labels, partition_column(parent_name(file.rpartition("/")[0]) for file in files))
 
 
 def _columns(source: Source) -> list[str]:
-    """The columns of the first subset's params.csv, none without any subset."""
-    folder = next(iter(subsets_of(source).values()), None)
-    return [] if folder is None else header_of(source, f"{folder}params.csv")
+    """The columns of the first params.csv, none without any."""
+    folders = rendered_folders(source)
+    return header_of(source, f"{folders[0]}params.csv") if folders else []
+
+
+def _load_tracks(source: Source) -> Table:
+    """Identity and track from the folders, everything else from params.csv where it is there."""
+    matches = [_TRACK.fullmatch(file) for file in source.images]
+    if None in matches:
+        stray = source.images[matches.index(None)]
+        raise ValueError(f"{source.path}: {stray} does not lie in tracks/IDENTITY/TRACK/")
+    table = source.named("params.csv")
+    labels = {} if table is None else _parameters(source, [table.removesuffix("params.csv")], source.images)
+    return Table(source.images, labels | track_labels(source.images, [one for one in matches if one]))
+
+
+def _is_paired(source: Source) -> bool:
+    """Every image in a folder ``image`` has its depth map, and there is at least one."""
+    images = _images_in(source, "image")
+    return bool(images) and len(pairs_of(source)) == len(images)
+
+
+def _load_pairs(source: Source) -> Table:
+    """The images without their maps, with the owners' split where the folders give one."""
+    files = tuple(pairs_of(source))
+    around = (parent_name(file.rpartition("/")[0]).lower() for file in files)
+    return Table(files, partition=partition_column(PARTITION_NAMES.get(name, "") for name in around))
 
 
 SYNCAR = Layout(
     "syncar",
     "rendered cars with exact factors",
-    "",
     lambda source: "class" in _columns(source),
-    _read_rendered,
+    _load_rendered,
+    default_parts=("train",),
 )
 SYNFACE = Layout(
     "synface",
     "rendered faces with exact factors",
-    "",
     lambda source: "file" in (columns := _columns(source)) and "class" not in columns,
-    _read_rendered,
+    _load_rendered,
+    default_parts=("train",),
+)
+SYNFACE_TRACKS = Layout(
+    "synface_tracks",
+    "rendered tracks: tracks/IDENTITY/TRACK/FRAME",
+    lambda source: bool(source.images) and all(map(_TRACK.fullmatch, source.images)),
+    _load_tracks,
+)
+DEPTH_PAIRS = Layout(
+    "depth_pairs",
+    "images and depth maps: image/NAME.png, depth/NAME.png",
+    _is_paired,
+    _load_pairs,
+    home="https://github.com/elliottwu/unsup3d",
+    terms="see its owners' page",
 )

@@ -12,30 +12,27 @@ label:
 - anything else is text. Empty cells are unknown.
 """
 
-import csv
 import io
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
-from jaxtyping import Int64
 
 from derender.data.layouts.layout import (
     PARTITION_NAMES,
     Layout,
     Table,
-    images_of,
+    header_of,
     number_column,
-    part_of,
     read_csv,
+    stem_of,
     text_column,
 )
-from derender.data.names import is_image
 from derender.data.parquet import check_lists, checked_footer
-from derender.data.source import Skipped, Source, read_bounded, stamps_of
+from derender.data.source import FileSource, Skipped, Source, is_image
 
 TABLE_SUFFIXES = (".csv", ".parquet")
 PATH_COLUMNS = ("file", "path", "image", "file_name", "filename")
@@ -44,38 +41,25 @@ _NAMES = ("data.csv", "data.parquet", "metadata.csv", "metadata.parquet")
 _UNSAFE = re.compile(r"^[/\\]|^[A-Za-z]:|(^|[/\\])\.\.([/\\]|$)")  # absolute, or out of the folder
 _YES, _NO = ("true", "yes", "1"), ("false", "no", "0")
 
-Cells = tuple[list[str], Sequence[Mapping[str, str]]]
-"""The columns' names and the rows of a table, every cell as text ("" for none)."""
 
-
-class TableSource(Source):
+class TableSource(FileSource):
     """The images that a table on disk names, and the table itself."""
 
     def __init__(self, path: Path):
-        self.path = path
+        super().__init__(path)
         self.table = path.name
-        self._folder = path.parent
-        self.files = (self.table,)
         _, paths, _ = _columns(self, self.table)
         there = {file for file in paths if is_image(file) and self._is_file(file)}
         self.files = tuple(sorted({self.table, *there}))
 
+    def on_disk(self, file: str) -> Path:
+        return self.path.parent / file
+
     def _is_file(self, file: str) -> bool:
         try:
-            return (self._folder / file).is_file()
+            return self.on_disk(file).is_file()
         except (OSError, ValueError):
             return False
-
-    def read(self, file: str) -> bytes:
-        return read_bounded(self._folder / file)
-
-    def stamps(self, files: Sequence[str]) -> Int64[np.ndarray, "n 2"]:
-        return stamps_of([self._folder / file for file in files])
-
-
-def is_table(path: Path) -> bool:
-    """Whether a path names a table rather than a folder, a zip or an image."""
-    return path.suffix.lower() in TABLE_SUFFIXES and path.is_file()
 
 
 def holds_paths(path: Path) -> bool:
@@ -96,18 +80,16 @@ def _table_of(source: Source) -> str | None:
 
 def _is_listed(source: Source) -> bool:
     """Whether there is a table with a column of paths: a metadata.csv may be about something else."""
-    if isinstance(source, TableSource):
-        return True
     file = _table_of(source)
-    if file is None or not source.images:
-        return False
+    if isinstance(source, TableSource) or file is None or not source.images:
+        return isinstance(source, TableSource)
     try:
-        return bool(set(_cells(source, file)[0]) & set(PATH_COLUMNS))
+        return bool({*PATH_COLUMNS} & {*_cells(source, file)})
     except ValueError:
-        return PurePosixPath(file).stem == "data"
+        return stem_of(file) == "data"
 
 
-def _read_listed(source: Source, subset: str | None) -> Table:
+def _load_listed(source: Source) -> Table:
     """The rows whose image is there; those whose image is not are listed as skipped."""
     file = _table_of(source)
     if file is None:
@@ -126,16 +108,11 @@ def _read_listed(source: Source, subset: str | None) -> Table:
     partition, labels = None, {}
     for name, values in columns.items():
         values = [values[row] for row in rows]
-        parts = {value.lower() for value in values}
-        if name.lower() in ("split", "partition") and parts <= {*PARTITION_NAMES, ""}:
+        if name.lower() in ("split", "partition") and {*map(str.lower, values)} <= {*PARTITION_NAMES, ""}:
             partition = text_column(PARTITION_NAMES.get(value.lower(), "") for value in values)
         else:
             labels[name] = label_column(values)
-    table = Table(tuple(paths[row] for row in rows), labels, partition, skipped=skipped)
-    if subset is not None and (partition is None or subset.lower() not in PARTITION_NAMES):
-        inside = set(images_of(source, subset))
-        return table.select(np.array([row for row, path in enumerate(table.files) if path in inside], int))
-    return part_of(table, source, subset, f"a column split in {file}")
+    return Table(tuple(paths[row] for row in rows), labels, partition, skipped=skipped)
 
 
 def label_column(values: Sequence[str]) -> np.ndarray:
@@ -144,7 +121,7 @@ def label_column(values: Sequence[str]) -> np.ndarray:
     known = set(cells) - {""}
     if known and known <= {*_YES, *_NO}:
         return np.array([1 if cell in _YES else 0 if cell in _NO else -1 for cell in cells], np.int8)
-    if known and all(_is_number(cell) for cell in known):
+    if known and all(map(_is_number, known)):
         return number_column(float(cell or "nan") for cell in cells)
     return text_column(value.strip() for value in values)
 
@@ -161,38 +138,33 @@ def _is_number(value: str) -> bool:
 
 def _columns(source: Source, file: str) -> tuple[str, list[str], dict[str, list[str]]]:
     """The name of the column of paths, the paths relative to the source, and the other columns."""
-    header, rows = _cells(source, file)
-    column = next((name for known in PATH_COLUMNS for name in header if name.lower() == known), None)
+    cells = _cells(source, file)
+    column = next((name for known in PATH_COLUMNS for name in cells if name.lower() == known), None)
     if column is None:
         raise ValueError(
             f"{file} in {source.path} has no column of paths ({', '.join(PATH_COLUMNS)}); "
-            f"its columns are {', '.join(header)}"
+            f"its columns are {', '.join(cells)}"
         )
     folder = str(PurePosixPath(file).parent)
     paths: dict[str, None] = {}
-    for number, row in enumerate(rows, 1):
-        path = str(PurePosixPath(folder, row[column].replace("\\", "/")))
-        if not row[column] or _UNSAFE.search(row[column]):
+    for number, written in enumerate(cells.pop(column), 1):
+        path = str(PurePosixPath(folder, written.replace("\\", "/")))
+        if not written or _UNSAFE.search(written):
             raise ValueError(
                 f"{file} in {source.path}, row {number}: expected a path relative to the table and below it, "
-                f"got {row[column]!r}"
+                f"got {written!r}"
             )
         if path in paths:
             raise ValueError(f"{file} in {source.path}, row {number}: {path!r} is there twice")
         paths[path] = None
-    others = [name for name in header if name and name != column]
-    return column, list(paths), {name: [row[name] for row in rows] for name in others}
+    return column, list(paths), {name: values for name, values in cells.items() if name}
 
 
-def _cells(source: Source, file: str) -> Cells:
-    if file.lower().endswith(".parquet"):
-        return _parquet_cells(source, file)
-    if rows := read_csv(source, file):
-        return list(rows[0]), rows
-    return next(csv.reader(io.StringIO(source.read_text(file))), []), []
-
-
-def _parquet_cells(source: Source, file: str) -> Cells:
+def _cells(source: Source, file: str) -> dict[str, list[str]]:
+    """The columns of a table, every cell as text ("" for none)."""
+    if not file.lower().endswith(".parquet"):
+        rows = read_csv(source, file)
+        return {name: [row[name] for row in rows] for name in (rows[0] if rows else header_of(source, file))}
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -211,8 +183,7 @@ def _parquet_cells(source: Source, file: str) -> Cells:
             f"column {nested[0]!r} of {file} in {source.path} holds {table.schema.field(nested[0]).type}; "
             f"expected paths, numbers and text (images kept inside a table are not read)"
         )
-    cells = {name: [_text(cell) for cell in table[name].to_pylist()] for name in table.column_names}
-    return list(cells), [dict(zip(cells, row, strict=True)) for row in zip(*cells.values(), strict=True)]
+    return {name: list(map(_text, table[name].to_pylist())) for name in table.column_names}
 
 
 def _not_cells(schema: Any) -> list[str]:
@@ -226,4 +197,10 @@ def _text(cell: object) -> str:
     return "" if cell is None or (isinstance(cell, float) and math.isnan(cell)) else str(cell)
 
 
-TABLE = Layout("table", "a table of paths and labels (CSV or Parquet)", "", _is_listed, _read_listed)
+TABLE = Layout(
+    "table",
+    "a table of paths and labels (CSV or Parquet)",
+    _is_listed,
+    _load_listed,
+    split_from="a column split in the table",
+)

@@ -117,7 +117,7 @@ class Gallery:
 def _listed(place: str, dataset: str) -> ListedStream:
     if not place:
         raise ValueError("the table does not record the place of its images: name it with --data")
-    if not parse_source(place)[0].exists():
+    if not Path(parse_source(place)[0]).expanduser().exists():
         raise ValueError(f"{place} is not here: name the place of the images with --data")
     stream = open_images(place, dataset=dataset)
     if isinstance(stream, ListedStream):

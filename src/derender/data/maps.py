@@ -1,0 +1,362 @@
+"""Images with a map of every pixel: masks of classes, and the exact depth, normals and albedo of a rendering.
+
+Masks lie in the data set itself (CelebAMask-HQ, rendered sets), or in another folder or zip beside images
+of any layout: one of class numbers for each, named alike. They are only ever resized to the nearest value,
+after the same crop as their image's. A mask in parts is merged as CelebAMask-HQ's owners do it (their
+g_mask.py): the parts are laid over one another in the order of the classes, so that a later class hides an
+earlier one. Leaves out colours as classes, and a number for pixels without a class.
+
+Exact maps are in the camera frame of their image, as docs/conventions.md defines it. With a params.csv depth
+is stored as z = 0.8 + value / 65535 * 0.4, normals as (n + 1) / 2 * 255, albedo as 0..255, and value 0 is
+background. Depth maps alone (unsup3d's synthetic faces) are grey: a value, as a share v of the largest (255
+or 65,535), is nearness, z = 1.1 - 0.2 v, so that the nearest surface that the model can predict is white, and
+0 is background. The set's own words do not say this, and the archive could not be had to check it: look at
+the average depth first, for which unsup3d gives SIDE 1.990e-2 and MAD 23.26 degrees.
+"""
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float32, UInt8
+from PIL import Image
+
+from derender.data.decoding import Progress, usable_cores
+from derender.data.image import fit_square, opened_image, quiet_pillow, upright_size
+from derender.data.image_set import ImageSet, read_images
+from derender.data.layouts.celeba import MASK_CLASSES, parts_of
+from derender.data.layouts.layout import Labels, Table, stem_of
+from derender.data.layouts.rendered import CAMERA, DEPTH_PAIRS, LIGHT, SYNFACE, pairs_of, rendered_folders
+from derender.data.opening import list_images, open_source, parse_source
+from derender.data.source import Source
+
+CLASSES_FILE = "classes.txt"
+MOST_CLASSES = 255  # 255 itself marks pixels without a class in many sets
+DEPTH_RANGE = (0.9, 1.1)
+
+
+class MaskedImages(NamedTuple):
+    """What ``read_masks`` returns.
+
+    Attributes:
+        images: the images with their labels and partition.
+        masks: (N, S, S) the class number of every pixel, a row for each image.
+        classes: the name of every class number.
+    """
+
+    images: ImageSet
+    masks: UInt8[np.ndarray, "n s s"]
+    classes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class GroundTruth:
+    """N rendered images with everything that made them.
+
+    Attributes:
+        images: (N, 3, H, W) RGB.
+        depth: (N, H, W) z in the camera frame; 0 where there is background.
+        normal: (N, H, W, 3) inward unit normals in the camera frame, zero in the background; or None.
+        albedo: (N, 3, H, W) in 0..1, zero in the background; or None.
+        mask: (N, H, W) true on the object.
+        light: (N, 4) ambient, diffuse, pitch, yaw (radians, canonical frame); or None.
+        camera: (N, 6) rotation about x, y, z (radians), translation along x, y, z (z is 0); or None.
+        files: the images' names, relative to the source.
+        labels: the other columns (identity, expression, class, ...).
+    """
+
+    images: UInt8[np.ndarray, "n 3 h w"]
+    depth: Float32[np.ndarray, "n h w"]
+    normal: Float32[np.ndarray, "n h w 3"] | None
+    albedo: Float32[np.ndarray, "n 3 h w"] | None
+    mask: Bool[np.ndarray, "n h w"]
+    light: Float32[np.ndarray, "n 4"] | None
+    camera: Float32[np.ndarray, "n 6"] | None
+    files: tuple[str, ...]
+    labels: Labels
+
+    def __len__(self) -> int:
+        return len(self.files)
+
+
+def read_masks(
+    source: str | Path,
+    image_size: int,
+    *,
+    masks: str | Path | None = None,
+    dataset: str = "auto",
+    subset: str | None = None,
+    fit: str = "crop",
+    workers: int | None = None,
+    progress: Progress | None = None,
+    **reading: Any,
+) -> MaskedImages:
+    """Read every image of a folder or zip with its mask, both at ``image_size`` x ``image_size``.
+
+    The other options are those of ``read_images``; ``progress`` counts the images and then, from the start,
+    the masks. A data set without masks is an error, and so is a mask that does not fit its image: one that is
+    missing, is no image of one channel, or holds a number that is no class.
+
+    Args:
+        masks: a folder or zip with a mask for every image: that of ``a/b.jpg`` is ``a/b.png``, or the only
+            ``b.png`` there is. A file ``classes.txt`` among them, or beside their folder as `derender synth`
+            writes it, names the classes, one a line, the first being number 0; else they are called
+            after their numbers. None takes the data set's own masks, with CelebAMask-HQ's classes and the
+            aspect ratio of their images.
+    """
+    own = masks is None
+    listed = list_images(source, dataset=dataset, subset=subset) if own else None
+    files = listed.files if listed is not None else open_source(Path(masks or "").expanduser())
+    classes = len(MASK_CLASSES) if own else MOST_CLASSES
+    named = f"0 ({MASK_CLASSES[0]}) to {classes - 1} ({MASK_CLASSES[-1]})"
+    limits = named if own else f"0 to {classes - 1}: give pixels without a class a class of their own"
+    with files:
+        if listed is not None:
+            _require_all(files, listed.layout, listed.table)
+        how = {"dataset": dataset, "subset": subset, "fit": fit, "workers": workers, "progress": progress}
+        images = read_images(source, image_size, **how, **reading)
+        names = images.label("mask").tolist() if own else _named_alike(files, images.files)
+        parts = parts_of(files) if own else {}
+        found = np.empty((len(images), image_size, image_size), np.uint8)
+
+        def load(row: int) -> None:
+            name = names[row]
+            mask = _merged(files, parts[name]) if name in parts else _numbers(files, name, classes, limits)
+            if own:
+                width, height = upright_size(files.read(images.files[row]))
+                rows, columns = mask.shape
+                if abs(columns * height - rows * width) > width + height:
+                    raise ValueError(
+                        f"{name} in {files.path} is {columns} x {rows} and its image {images.files[row]} "
+                        f"{width} x {height}: a mask has the aspect ratio of its image"
+                    )
+            square = fit_square(Image.fromarray(mask), image_size, fit, Image.Resampling.NEAREST, 0)
+            found[row] = np.asarray(square)
+
+        pool = ThreadPoolExecutor(workers or usable_cores())
+        try:
+            with quiet_pillow():
+                for done, _ in enumerate(pool.map(load, range(len(images))), 1):
+                    if progress is not None:
+                        progress(done, len(images))
+        finally:
+            pool.shutdown(cancel_futures=True)
+        return MaskedImages(images, found, MASK_CLASSES if own else _class_names(files, found, names))
+
+
+def read_ground_truth(
+    source: str | Path, subset: str | None = None, *, limit: int | None = None, image_size: int | None = None
+) -> GroundTruth:
+    """Read the images of a rendered set that have a depth map.
+
+    Args:
+        source: a folder or zip in synface64's format or with folders ``image`` and ``depth``, or
+            ``PATH::SUBSET``.
+        subset: "test_gt" or "test" by default, or the only subset there is.
+        limit: only the first so many.
+        image_size: side to bring images and maps to, where the set is images beside depth maps alone; a
+            set in synface64's format is read at the size it was rendered in.
+    """
+    place, named, _ = parse_source(source)
+    with open_source(Path(place).expanduser()) as opened:
+        pairs = {} if rendered_folders(opened) else pairs_of(opened)
+        layout = DEPTH_PAIRS if pairs else SYNFACE
+        table = layout.read(opened, subset or named, default_parts=("test_gt", "test", "train"))
+        if pairs:
+            return _read_pairs(opened, {file: pairs[file] for file in table.files[:limit]}, image_size)
+        return _read_maps(opened, table, limit)
+
+
+def _require_all(files: Source, layout: str, table: Table) -> None:
+    """Every image has a mask, or an error says how many have none."""
+    if "mask" not in table.labels:
+        raise ValueError(
+            f"{files.path} holds no masks (it was read as {layout}): expected images/NAME.jpg with "
+            f"masks/NAME.png, or CelebA-HQ-img with CelebAMask-HQ-mask-anno"
+        )
+    bare = [file for file, mask in zip(table.files, table.labels["mask"], strict=True) if not mask]
+    if bare:
+        raise ValueError(
+            f"{len(bare):,} of {len(table.files):,} images in {files.path} have no mask, the first is "
+            f"{bare[0]!r}; add the masks or take these images out"
+        )
+
+
+def _numbers(source: Source, file: str, classes: int, limits: str) -> UInt8[np.ndarray, "h w"]:
+    """A mask that holds class numbers; a palette's colours do not matter."""
+    values = np.asarray(opened_image(source, file))
+    if values.ndim > 2:
+        raise ValueError(
+            f"{file} in {source.path} has {values.shape[2]} channels; a mask has one, of class numbers"
+        )
+    if values.min() < 0 or values.max() >= classes:
+        wrong = int(values.min() if values.min() < 0 else values.max())
+        raise ValueError(f"{file} in {source.path} holds the number {wrong}; classes are {limits}")
+    return values.astype(np.uint8)
+
+
+def _merged(source: Source, files: dict[int, str]) -> UInt8[np.ndarray, "h w"]:
+    """The parts of one face, at least one, over one another, in the order of their class numbers."""
+    parts = {number: np.asarray(opened_image(source, files[number]).convert("L")) for number in sorted(files)}
+    merged = np.zeros(next(iter(parts.values())).shape, np.uint8)
+    for number, part in parts.items():
+        if part.shape != merged.shape:
+            size = f"{part.shape[1]} x {part.shape[0]}"
+            raise ValueError(f"{files[number]} in {source.path} is {size}, other parts of the face are not")
+        merged[part > 0] = number
+    return merged
+
+
+def _named_alike(source: Source, images: tuple[str, ...]) -> list[str]:
+    """The mask of every image by its path, else by its name where that is the only one."""
+    by_path = {file.removesuffix(".png"): file for file in source.files if file.endswith(".png")}
+    by_stem: dict[str, list[str]] = {}
+    for file in by_path.values():
+        by_stem.setdefault(stem_of(file), []).append(file)
+    names = []
+    for image in images:
+        alike = by_stem.get(stem_of(image), [])
+        names.append(by_path.get(image.rpartition(".")[0]) or (alike[0] if len(alike) == 1 else ""))
+    if bare := [image for image, name in zip(images, names, strict=True) if not name]:
+        raise ValueError(
+            f"{len(bare):,} of {len(images):,} images have no mask in {source.path}, the first is "
+            f"{bare[0]!r}: expected {PurePosixPath(bare[0]).with_suffix('.png')} there"
+        )
+    return names
+
+
+def _class_names(source: Source, masks: UInt8[np.ndarray, "n s s"], files: list[str]) -> tuple[str, ...]:
+    largest = masks.max(axis=(1, 2))
+    listed, beside = source.named(CLASSES_FILE), source.path.parent / CLASSES_FILE
+    if listed is not None:
+        text = source.read_text(listed)
+    elif source.path.is_dir() and beside.is_file():
+        listed, text = str(beside), beside.read_text(encoding="utf-8", errors="replace")
+    else:
+        return tuple(f"class {number}" for number in range(int(largest.max()) + 1))
+    names = tuple(line.strip() for line in text.splitlines() if line.strip())
+    if int(largest.max()) >= len(names):
+        file = files[int(largest.argmax())]
+        raise ValueError(
+            f"{file} in {source.path} holds the number {int(largest.max())}; {listed} names "
+            f"{len(names)} classes"
+        )
+    return names
+
+
+def _read_maps(source: Source, table: Table, limit: int | None) -> GroundTruth:
+    """The images of a set in synface64's format, in the order of their names."""
+    known = set(source.files)
+
+    def map_names(kind: str, files: tuple[str, ...]) -> list[str]:
+        return [f"{file.rpartition('images/')[0]}{kind}/{stem_of(file)}.png" for file in files]
+
+    with_depth = [row for row, name in enumerate(map_names("depth", table.files)) if name in known][:limit]
+    if not with_depth:
+        expected = "; ".join(map_names("depth", table.files[:1]))
+        raise ValueError(f"{source.path} has no depth maps for its images (expected {expected})")
+    table = table.select(np.array(with_depth))
+    missing = [name for name in (*LIGHT, *CAMERA) if name not in table.labels]
+    if missing:
+        raise ValueError(f"the params.csv in {source.path} lacks the column for {missing[0]!r}")
+
+    def maps(kind: str, *modes: str) -> np.ndarray | None:
+        """The maps of a kind as they are stored, all of one mode and size, or None where there is none."""
+        names = map_names(kind, table.files) if kind else table.files
+        arrays = []
+        if known.isdisjoint(names):
+            return None
+        for name in names:
+            if name not in known:
+                raise ValueError(f"{source.path} has no {name}, which other images have")
+            opened = opened_image(source, name)
+            array = np.asarray(opened)
+            if opened.mode not in modes or (arrays and array.shape != arrays[0].shape):
+                raise ValueError(
+                    f"{name} in {source.path} is {opened.mode} {array.shape}; "
+                    f"expected {modes[0]}, and all of one size"
+                )
+            arrays.append(array)
+        return np.stack(arrays)
+
+    code, mask, images = maps("depth", "I;16", "I"), maps("mask", "L"), maps("", "RGB")
+    normal, albedo = maps("normal", "RGB"), maps("albedo", "RGB")
+    if code is None or mask is None or images is None:
+        raise ValueError(f"{source.path} has no masks for its depth maps")
+    if images.shape[:3] != mask.shape:
+        raise ValueError(f"images in {source.path} are {images.shape[1:3]}, their maps {mask.shape[1:]}")
+    mask = mask > 127
+    if normal is not None:
+        normal = normal.astype(np.float32) / 255 * 2 - 1
+        normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)
+        normal *= mask[..., None]
+    camera = np.stack([table.labels[name] for name in CAMERA], axis=1)
+    return GroundTruth(
+        images=_channels_first(images),
+        depth=np.where(code > 0, 0.8 + code / 65535 * 0.4, 0).astype(np.float32),
+        normal=normal,
+        albedo=None if albedo is None else _channels_first(albedo).astype(np.float32) / 255,
+        mask=mask,
+        light=np.stack([table.labels[name] for name in LIGHT], axis=1),
+        camera=np.pad(camera, ((0, 0), (0, 1))),
+        files=table.files,
+        labels={name: one for name, one in table.labels.items() if name not in (*LIGHT, *CAMERA, "mask")},
+    )
+
+
+def _read_pairs(source: Source, pairs: dict[str, str], image_size: int | None) -> GroundTruth:
+    """Images beside depth maps: neither normals nor albedo, light and camera are known."""
+    images, depths, masks = [], [], []
+    for file, map_file in pairs.items():
+        depth, mask = _read_depth(source, map_file, image_size)
+        image = opened_image(source, file).convert("RGB")
+        if image.width != image.height:
+            raise ValueError(f"{file} in {source.path} is {image.size}: images with depth must be square")
+        if image_size is not None:
+            image = image.resize((image_size, image_size), Image.Resampling.BOX)
+        if not (image.height, image.width) == depth.shape == (depths or [depth])[0].shape:
+            raise ValueError(
+                f"{file} in {source.path} is {image.size}, its map {map_file} {depth.shape[::-1]}: both "
+                "must have one size, the same in the whole set; or give image_size"
+            )
+        images.append(np.asarray(image))
+        depths.append(depth)
+        masks.append(mask)
+    nothing = dict.fromkeys(("normal", "albedo", "light", "camera"))
+    exact = {"depth": np.stack(depths), "mask": np.stack(masks)}
+    return GroundTruth(_channels_first(np.stack(images)), **exact, **nothing, files=tuple(pairs), labels={})
+
+
+def _read_depth(
+    source: Source, file: str, size: int | None
+) -> tuple[Float32[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
+    """One depth map, z with 0 for background, and where the object is; at ``size`` if given.
+
+    Maps are shrunk by area, over the object's pixels alone; a pixel is on the object where more than half of
+    it is.
+    """
+    opened = opened_image(source, file)
+    mode, code = opened.mode, np.asarray(opened)
+    if mode == "RGB" and (code == code[..., :1]).all():
+        code = code[..., 0]
+    if code.ndim != 2 or mode not in ("L", "RGB", "I;16", "I"):
+        raise ValueError(
+            f"{file} in {source.path} is {mode} {code.shape}; a depth map is a grey PNG of 8 or 16 bits"
+        )
+    (near, far), mask = DEPTH_RANGE, code > 0
+    nearness = code / (255 if code.dtype == np.uint8 else 65_535)
+    depth = np.where(mask, far - (far - near) * nearness, 0).astype(np.float32)
+    if size is None or depth.shape == (size, size):
+        return depth, mask
+    by_area, share = (
+        np.asarray(Image.fromarray(one.astype(np.float32)).resize((size, size), Image.Resampling.BOX))
+        for one in (depth, mask)
+    )
+    small = share > 0.5
+    return np.where(small, by_area / np.where(small, share, 1), 0).astype(np.float32), small
+
+
+def _channels_first(code: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(code.transpose(0, 3, 1, 2))
