@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from derender.data.masks import MASK_CLASSES
 from PIL import Image
 
 from derender import FeatureTable
@@ -20,7 +21,6 @@ from derender.baselines.ris import (
 )
 from derender.baselines.stylegan2_generator import Generator, GeneratorSettings, style_layers
 from derender.data import read_images
-from derender.data.masks import MASK_CLASSES
 from derender.features.neighbours import nearest
 
 PARTS = ("hair", "skin", "nose", "mouth")  # of the planted generator: quarters of the width, left to right

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from derender.data import Unreadable, decode, open_images, quiet_pillow, read_picture
+from derender.data import Unreadable, decode, open_images, quiet_pillow, read_image
 from derender.features.neighbours import Found
 from derender.report.colours import pictures
 from derender.report.page import png_bytes, write_whole
@@ -42,7 +42,7 @@ def search_sheet(
     for row, distance in zip(found.rows, found.distances, strict=True):
         captions.setdefault(found.table.files[row], f"{distance:.3f}")
     read = _read(list(captions), address, dataset, progress)
-    shown = [] if found.own_row is not None else [("query", read_picture(Path(found.like), CELL))]
+    shown = [] if found.own_row is not None else [("query", read_image(Path(found.like), CELL))]
     shown += [(caption, read[file]) for file, caption in captions.items() if file in read]
     names, drawn = [caption for caption, _ in shown], pictures(np.stack([image for _, image in shown]))
     title, layout = f"nearest by {found.factor}", GridLayout(cell=CELL)
