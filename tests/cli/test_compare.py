@@ -212,7 +212,7 @@ def test_bad_input_is_one_line(tables, model, people, refused, tmp_path):
     assert "unknown table 'identities'; did you mean 'identity'" in refused(
         "compare", "--table", "identities"
     )
-    assert "give --features NAME=FILE" in refused("compare", "--table", "identity")
+    assert "give features, or models and images" in refused("compare", "--table", "identity")
     assert "needs images to embed" in refused("compare", "--table", "identity", "-m", model)
     assert "needs labels (class)" in refused("compare", "--table", "cars", "-f", f"good={good}")
     assert "should read NAME=PATH" in refused("compare", "--table", "cars", "-f", f"={good}")

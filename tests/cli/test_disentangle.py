@@ -75,7 +75,7 @@ def test_bad_words(model, rendered, tmp_path, capsys):
     taken = tmp_path / "taken.png"
     taken.write_bytes(b"mine")
     assert "--force" in refused("--out", taken) and taken.read_bytes() == b"mine"
-    assert "choose lasso, trees or none" in refused("--dimensions", "forest")
+    assert "is not one of 'lasso', 'trees', 'none'" in refused("--dimensions", "forest")
     assert "needs 20 images or more" in refused("--limit", "5")
 
 

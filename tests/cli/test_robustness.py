@@ -100,6 +100,6 @@ def test_bad_words(model, rendered, tmp_path, capsys):
     taken = tmp_path / "taken.svg"
     taken.write_text("mine")
     assert "--force" in refused("--out", taken) and taken.read_text() == "mine"
-    assert "choose accuracy or balanced" in refused("--score", "f1")
+    assert "is not one of 'accuracy', 'balanced'" in refused("--score", "f1")
     assert "two models have the name 'a'" in refused("-m", f"a={model}", "-m", f"a={model}")
     assert "unknown head 'svm'" in refused("--head", "svm")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from derender import Derenderer
+from derender import Derenderer, FeatureTable
 from derender.cli import main
 from derender.data import MASK_CLASSES
 
@@ -91,9 +91,11 @@ def test_the_papers_table_beside_the_papers_numbers(parts, tmp_path, capsys, ref
     assert typeset.read_text().count(r"\begin{table}") == 4
     assert main([str(word) for word in [*words, 1]]) == 0
     assert "0 results computed, 5 found" in capsys.readouterr().err
-    feature = ("compare", "--table", "segmentation", "-f", "a=f.parquet", "-d", parts)
+    features = FeatureTable(("a",), {"geometry": np.ones((1, 2))}).write(tmp_path / "f.parquet")
+    feature = ("compare", "--table", "segmentation", "-f", f"a={features}", "-d", parts)
     assert "features do not do" in refused(*feature)
-    assert "--masks goes with" in refused("compare", "--table", "cars", "-f", "a=f.parquet", "--masks", parts)
+    cars = ("compare", "--table", "cars", "-f", f"a={features}", "--masks", parts)
+    assert "masks go with the table of segmentation, not with cars" in refused(*cars)
     assert "no U-Net encoder" in refused(*words[:4], f"plain={model(tmp_path, 'conv')}", *words[5:], 1)
 
 

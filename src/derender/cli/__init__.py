@@ -69,8 +69,8 @@ def _options(
 
 for one in (
     demo.demo, doctor.doctor, train.train, whiten.whiten, refine.refine, unet.unet, pack.pack, embed.embed,
-    evaluate, explain.explain, finetune.finetune, importing.import_checkpoint, compare, report.report,
-    decompose, relight, rotate, swap, mesh, search.search, view, synth, bench.bench,
+    evaluate, explain.explain, finetune.finetune, importing.import_checkpoint, compare.compare,
+    report.report, decompose, relight, rotate, swap, mesh, search.search, view, synth, bench.bench,
 ):  # fmt: skip
     one.register(app)
 

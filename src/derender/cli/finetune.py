@@ -47,6 +47,7 @@ def finetune(
     its split is scored beside the majority and beside heads on the frozen features that training began with.
     """
     from derender import learn
+    from derender.evaluation import Scores
     from derender.evaluation.memory import memory_in
 
     published.check()
@@ -64,4 +65,4 @@ def finetune(
     result(f"report {out / 'report.html'}", published.json_file)
     values = {"run": made.run, "report": out / "report.html", "scores": made.scores.numbers()}
     table = made.scores.table(made.start or "fresh weights")
-    published.show([table], values, [*notes, scoring.remembered(memory)])
+    published.publish(Scores([table], values, notes), memory)

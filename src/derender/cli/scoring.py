@@ -1,65 +1,40 @@
 """Option groups of the commands that score features, and where their tables go (gathered.py)."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from derender.cli import options
-from derender.cli.console import notice, show_scores, write_json
+from derender.cli.console import notice, refuse_existing_file, show_scores, write_json
 
 if TYPE_CHECKING:
     from derender.evaluation.feature_rows import FeatureSource
     from derender.evaluation.memory import Memory
-    from derender.evaluation.score_table import Scores, ScoreTable
+    from derender.evaluation.score_table import Scores
 
-Method = Annotated[Literal["ward", "finch", "k-means"], typer.Option("--method", help="Clustering method.")]
-Label = Annotated[
-    list[str] | None, typer.Option("--label", "-l", help="Label column; repeated: mean over yes/no labels.")
-]
-Attributes = Annotated[bool, typer.Option("--attributes", help="Score by every yes/no label.")]
-Features = Annotated[
-    str | None, typer.Option("--features", "-f", help="Table made by derender embed.", metavar="FILE.parquet")
-]
-AModel = Annotated[
-    str | None,
-    typer.Option("--model", "-m", help=f"Instead of --features, with IMAGES. {options.MODELS}"),
-]
-Factors = Annotated[str, typer.Option("--factors", help="Features to use, with commas between, or all.")]
-MinCount = Annotated[
-    int, typer.Option("--min-count", min=1, metavar="N", help="Leave out classes of fewer rows.")
-]
-MaxCount = Annotated[
-    int | None, typer.Option("--max-count", min=1, metavar="N", help="Use at most N rows of a class.")
-]
-WhitenOn = Annotated[
-    str | None,
-    typer.Option(
-        "--whiten-on", metavar="PATH",
-        help="Also score the codes without whitening, and controls whitened by the model's renderings of "
-        "these images (best those of its training).",
-    ),
-]  # fmt: skip
-UntrainedSeeds = Annotated[
-    int, typer.Option("--untrained-seeds", min=1, metavar="N", help="Number of untrained encoders averaged.")
-]
-Resamples = Annotated[
-    int, typer.Option("--resamples", min=2, metavar="N", help="Number of bootstrap resamples of the rows.")
+number = partial(typer.Option, min=1, metavar="N")
+"""An option that takes a whole number, 1 or more."""
+share = partial(typer.Option, min=0.01, max=0.99)
+target = partial(typer.Option, metavar="FILE")
+
+Method = Annotated[Literal["ward", "finch", "k-means"], typer.Option(help="Clustering method.")]
+Factors = Annotated[str, typer.Option(help="Features to use, with commas between, or all.")]
+Counts = Annotated[str, typer.Option(help="Numbers of labelled rows to learn from, with commas between.")]
+UntrainedSeeds = Annotated[int, number(help="Number of untrained encoders averaged.")]
+Resamples = Annotated[int, number(min=2, help="Number of bootstrap resamples of the rows.")]
+Groups = Annotated[
+    str | None, typer.Option(help="Label whose rows stay on one side of the split, as identity.")
 ]
 Cache = Annotated[
+    str | None, typer.Option(metavar="DIR", help="Folder of cached results, or none; default: the user's.")
+]
+Masks = Annotated[
     str | None,
-    typer.Option("--cache", help="Folder of cached results, or none; default: the user's.", metavar="DIR"),
-]
-Markdown = Annotated[
-    str | None, typer.Option("--markdown", help="Also write the tables as Markdown.", metavar="FILE")
-]
-Latex = Annotated[
-    str | None, typer.Option("--latex", help="Also write the tables as LaTeX (booktabs).", metavar="FILE")
-]
-Html = Annotated[
-    str | None, typer.Option("--html", help="Also write the tables and charts as one page.", metavar="FILE")
+    typer.Option(metavar="PATH", help="Folder or zip of masks named as the images, if they lie apart."),
 ]
 
 
@@ -67,20 +42,36 @@ Html = Annotated[
 class Labels:
     """The labels of a score, and the rows that carry them."""
 
-    label: Label = None
-    attributes: Attributes = False
-    min_count: MinCount = 1
-    max_count: MaxCount = None
+    label: Annotated[
+        list[str] | None,
+        typer.Option("--label", "-l", help="Label column; repeated: mean over yes/no labels."),
+    ] = None
+    attributes: Annotated[bool, typer.Option("--attributes", help="Score by every yes/no label.")] = False
+    min_count: Annotated[int, number(help="Leave out classes of fewer rows.")] = 1
+    max_count: Annotated[int | None, number(help="Use at most N rows of a class.")] = None
 
 
 @dataclass(frozen=True)
 class ScoredSubject:
     """The features that are scored: one table or one model."""
 
-    features: Features = None
-    model: AModel = None
+    features: Annotated[
+        str | None,
+        typer.Option("--features", "-f", metavar="FILE.parquet", help="Table made by derender embed."),
+    ] = None
+    model: Annotated[
+        str | None,
+        typer.Option("--model", "-m", help=f"Instead of --features, with IMAGES. {options.MODELS}"),
+    ] = None
     factors: Factors = "geometry,albedo"
-    whiten_on: WhitenOn = None
+    whiten_on: Annotated[
+        str | None,
+        typer.Option(
+            metavar="PATH",
+            help="Also score the codes without whitening, and controls whitened by the model's renderings of "
+            "these images (best those of its training).",
+        ),
+    ] = None
 
     def source(self, images: str | None) -> "FeatureSource":
         """The table or the model."""
@@ -94,6 +85,11 @@ class ScoredSubject:
             raise ValueError("--model needs IMAGES to embed")
         return self.model
 
+    @property
+    def how(self) -> dict[str, Any]:
+        """Keywords of library calls."""
+        return {"factors": names_of(self.factors), "whiten_on": self.whiten_on}
+
 
 @dataclass(frozen=True)
 class Computed:
@@ -104,66 +100,61 @@ class Computed:
     device: options.Device = "auto"
     cache: Cache = None
 
-    def from_seed(self, count: int) -> range:
-        """So many seeds, from ``seed`` on."""
-        return range(self.seed, self.seed + count)
-
 
 @dataclass(frozen=True)
 class Published:
     """Where tables go besides the terminal."""
 
     json_file: options.Json = None
-    markdown: Markdown = None
-    latex: Latex = None
-    html: Html = None
+    markdown: Annotated[str | None, target(help="Also write the tables as Markdown.")] = None
+    latex: Annotated[str | None, target(help="Also write the tables as LaTeX (booktabs).")] = None
+    html: Annotated[str | None, target(help="Also write the tables and charts as one page.")] = None
     force: options.Force = False
 
-    def check(self) -> None:
-        """Refuse to write over tables, and into folders, before anything is computed."""
-        for target in (self.markdown, self.latex, self.html, self.json_file):
-            if target is None or target == "-":
+    def check(self, out: Path | None = None, forms: Sequence[str] = ()) -> None:
+        """Refuse, before anything is computed, to write over tables and drawings, and into folders."""
+        if out is not None:
+            if out.suffix.lower() not in forms:
+                raise ValueError(f"--out {out} must end in {', '.join(forms)}: the kind of drawing")
+            refuse_existing_file(out, self.force)
+        for file in (self.markdown, self.latex, self.html, self.json_file):
+            if file is None or file == "-":
                 continue
-            if Path(target).is_dir():
-                raise ValueError(f"{target} is a folder: name a file to write")
-            if Path(target).exists() and not self.force and target != self.json_file:
-                raise ValueError(
-                    f"{target} exists already: choose another name, or add --force to replace it"
-                )
+            if Path(file).is_dir():
+                raise ValueError(f"{file} is a folder: name a file to write")
+            if Path(file).exists() and not self.force and file != self.json_file:
+                raise ValueError(f"{file} exists already: choose another name, or add --force to replace it")
 
-    def publish(self, scores: "Scores") -> None:
-        """Show tables and notes, and write every form that was requested."""
+    def publish(
+        self, scores: "Scores", memory: "Memory | None" = None, what: str = "results", **values: Any
+    ) -> None:
+        """Show tables and notes, and write every form that was requested; ``values`` are further numbers."""
         from derender.storage.atomic import atomic_file
 
+        values, notes = {**scores.values, **values}, list(scores.notes)
+        if memory is not None:
+            notes.append(memory.summary(what))
         for table in scores.tables:
             show_scores(table, self.json_file)
-        for note in scores.notes:
+        for note in notes:
             notice(note)
-        write_json(self.json_file, scores.values)
-        for target, form in ((self.markdown, scores.to_markdown), (self.latex, scores.to_latex)):
-            if target is not None:
-                with atomic_file(Path(target)) as temporary:
+        write_json(self.json_file, values)
+        for file, form in ((self.markdown, scores.to_markdown), (self.latex, scores.to_latex)):
+            if file is not None:
+                with atomic_file(Path(file)) as temporary:
                     temporary.write_text(form(), encoding="utf-8")
         if self.html is not None:
             from derender.report.comparison import comparison_page
 
-            facts = {name: one for name, one in scores.values.items() if isinstance(one, str | int | float)}
-            lead = ". ".join(scores.notes)
-            page = comparison_page("Scores beside their controls", scores.tables, lead=lead, facts=facts)
+            facts = {name: one for name, one in values.items() if isinstance(one, str | int | float)}
+            lead, title = ". ".join(notes), "Scores beside their controls"
+            page = comparison_page(title, scores.tables, lead=lead, facts=facts)
             notice(f"page {page.write(self.html)}")
-
-    def show(
-        self, tables: "Sequence[ScoreTable]", values: Mapping[str, Any], notes: Iterable[str] = ()
-    ) -> None:
-        """See ``publish``."""
-        from derender.evaluation.score_table import Scores
-
-        self.publish(Scores(tables, values, list(notes)))
 
 
 def names_of(text: str) -> tuple[str, ...] | None:
     """``geometry,albedo`` as names; None for ``all``."""
-    return None if text == "all" else tuple(name.strip() for name in text.split(","))
+    return None if text == "all" else tuple(name.strip() for name in text.split(",") if name.strip())
 
 
 def numbers_of(text: str, option: str) -> tuple[int, ...]:
@@ -187,6 +178,9 @@ def named_paths(values: Sequence[str], option: str) -> dict[str, list[str]]:
     return found
 
 
-def remembered(memory: "Memory", what: str = "results") -> str:
-    """See ``Memory.summary``."""
-    return memory.summary(what)
+def single_paths(values: Sequence[str], option: str) -> dict[str, str]:
+    """The same where each name is given once."""
+    found = named_paths(values, option)
+    if twice := [name for name, paths in found.items() if len(paths) > 1]:
+        raise ValueError(f"two models have the name {twice[0]!r}: give each its own")
+    return {name: path for name, (path,) in found.items()}

@@ -263,7 +263,7 @@ def check_lengths(features: Mapping[str, Sequence[np.ndarray]], n_rows: int) -> 
 def check_rows(rows: Sequence[FeatureRow]) -> None:
     """All tables are of the same images, names are unique, runs of one row are of one kind of model."""
     if not rows:
-        raise ValueError("a comparison needs at least one feature table")
+        raise ValueError("a comparison needs at least one feature table: give features, or models and images")
     names = [row.name for row in rows]
     if twice := [name for name in names if names.count(name) > 1]:
         raise ValueError(f"two rows have the name {twice[0]!r}: give each its own")

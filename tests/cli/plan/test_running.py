@@ -185,8 +185,8 @@ def test_what_does_not_go_together_is_one_line(plan, tmp_path, capsys):
     assert [file.name for file in (tmp_path / "mine").iterdir()] == ["letter.txt"]
     assert "is a file" in refused("--plan", plan, "--out", plan)
     assert "--plan needs --out" in refused("--plan", plan)
-    assert "--plan says what is compared" in refused("--plan", plan, "--table", "identity")
-    assert "--plan says what is compared" in refused("--plan", plan, "--seeds", "2")
+    assert "beside --plan go --out" in refused("--plan", plan, "--table", "identity")
+    assert "beside --plan go --out" in refused("--plan", plan, "--seeds", "2")
     assert "go with --plan FILE" in refused("--table", "identity", "--workers", "2")
     assert "give --table NAME" in refused()
     assert "no plan at" in refused("--plan", tmp_path / "none.yaml", "--out", tmp_path / "o")

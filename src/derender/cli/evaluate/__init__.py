@@ -1,25 +1,33 @@
 """`derender evaluate`: one protocol a command, each beside its controls.
 
-One file per protocol; a new one gets a ``register`` of its own and a place in ``PROTOCOLS``.
+One file per protocol: a function of its name, which takes a place in ``EXAMPLES``.
 """
 
 import typer
 
-from derender.cli.evaluate import cluster, disentangle, geometry, linear, reconstruction, robustness, segment
+from derender.cli.evaluate.cluster import cluster
+from derender.cli.evaluate.disentangle import disentangle
+from derender.cli.evaluate.geometry import geometry
+from derender.cli.evaluate.linear import linear
+from derender.cli.evaluate.reconstruction import reconstruction
+from derender.cli.evaluate.robustness import robustness
+from derender.cli.evaluate.segment import segment
+from derender.cli.gathered import command
 
-PROTOCOLS = (
-    cluster,
-    linear,
-    segment,
-    disentangle,
-    geometry,
-    reconstruction,
-    robustness,
-)
+EXAMPLES = {
+    cluster: "lfw.zip --model faces-64 --label identity",
+    linear: "celeba.zip --model faces-64 --attributes",
+    segment: "CelebAMask-HQ/ --model runs/unet --out segmented/",
+    disentangle: "made/ --model runs/faces --out card.png",
+    geometry: "made/::test_gt --model runs/faces",
+    reconstruction: "photos/ --model runs/faces --part test",
+    robustness: "--model runs/faces --out curves.svg",
+}
 
 
 def register(app: typer.Typer) -> None:
     group = typer.Typer(help="Score features or a model, beside controls.", no_args_is_help=True)
-    for protocol in PROTOCOLS:
-        protocol.register(group)
+    for protocol, words in EXAMPLES.items():
+        name = protocol.__name__
+        command(name, f"evaluate {name} {words}")(protocol).register(group)
     app.add_typer(group, name="evaluate")

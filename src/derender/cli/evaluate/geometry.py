@@ -1,20 +1,9 @@
 """`derender evaluate geometry`: is the geometry the true one?"""
 
-import typer
-
 from derender.cli import options, scoring
 from derender.cli.console import progress_bar
-from derender.cli.gathered import gathered
 
 
-def register(group: typer.Typer) -> None:
-    group.command(
-        "geometry",
-        epilog="Example: derender evaluate geometry made/::test_gt --model runs/faces",
-    )(geometry)
-
-
-@gathered
 def geometry(
     images: options.DataOptions,
     trained: options.TrainedModel,
@@ -41,4 +30,4 @@ def geometry(
             model, truth, fit_steps=fit_steps, resample_count=resamples, seed=seed, batch_size=batch_size,
             memory=memory, progress=report,
         )  # fmt: skip
-    published.show(scores.tables, scores.values, [*scores.notes, scoring.remembered(memory)])
+    published.publish(scores, memory)

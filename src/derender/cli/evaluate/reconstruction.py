@@ -7,32 +7,21 @@ import typer
 
 from derender.cli import options, scoring
 from derender.cli.console import notice, progress_bar
-from derender.cli.gathered import gathered
-
-Store = Annotated[
-    bool,
-    typer.Option(
-        "--store",
-        help="Store the errors with the model, to detect out-of-distribution images: use unseen images.",
-    ),
-]
 
 
-def register(group: typer.Typer) -> None:
-    group.command(
-        "reconstruction",
-        epilog="Example: derender evaluate reconstruction photos/ --model runs/faces --part test",
-    )(reconstruction)
-
-
-@gathered
 def reconstruction(
     images: options.PartOfImages,
     trained: options.TrainedModel,
     published: scoring.Published,
     batch_size: options.BatchSize = 64,
     fit_steps: options.FitSteps = None,
-    store: Store = False,
+    store: Annotated[
+        bool,
+        typer.Option(
+            "--store",
+            help="Store the errors with the model, to detect out-of-distribution images: use unseen images.",
+        ),
+    ] = False,
     resamples: scoring.Resamples = 1_000,
     seed: options.Seed = 0,
     cache: scoring.Cache = None,
@@ -57,8 +46,7 @@ def reconstruction(
             model, chosen, training_images=learned, fit_steps=fit_steps, resample_count=resamples, seed=seed,
             batch_size=batch_size, memory=memory, progress=report,
         )  # fmt: skip
-    values = {**scores.values, "part": images.part}
-    published.show(scores.tables, values, [*scores.notes, scoring.remembered(memory)])
+    published.publish(scores, memory, part=images.part)
     if store:
         file = write_errors(model_folder(trained.model), errors_of(model, chosen.images, batch_size))
         notice(f"errors of {len(chosen):,} images stored in {file}")

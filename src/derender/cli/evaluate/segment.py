@@ -7,62 +7,29 @@ import typer
 
 from derender.cli import options, scoring
 from derender.cli.console import progress_bar, result
-from derender.cli.gathered import gathered
-
-Masks = Annotated[
-    str | None,
-    typer.Option(
-        "--masks",
-        help="Folder or zip of masks named as the images, if they lie apart.",
-        metavar="PATH",
-    ),
-]
-Variants = Annotated[
-    str | None,
-    typer.Option("--variants", help="Networks to train, the subject first, with commas; default: all."),
-]
-Epochs = Annotated[int, typer.Option("--epochs", min=1, metavar="N", help="Epochs of every network.")]
-Seeds = Annotated[int, typer.Option("--seeds", min=1, metavar="N", help="Runs of every network.")]
-BatchSize = Annotated[
-    int | None,
-    typer.Option("--batch-size", min=2, metavar="N", help="Images a step; default: 64, fewer of few images."),
-]
-TestFraction = Annotated[
-    float,
-    typer.Option("--test-fraction", min=0.01, max=0.99, help="Tested share of data without a partition."),
-]
-Labelled = Annotated[
-    int | None,
-    typer.Option("--labelled", min=2, metavar="N", help="Number of training images."),
-]
-Out = Annotated[
-    Path | None,
-    typer.Option("--out", "-o", help="Folder for runs (to continue) and overlays.", metavar="DIR"),
-]
 
 
-def register(group: typer.Typer) -> None:
-    group.command(
-        "segment",
-        epilog="Example: derender evaluate segment CelebAMask-HQ/ --model runs/unet --out segmented/",
-    )(segment)
-
-
-@gathered
 def segment(
     images: options.DataOptions,
     trained: options.TrainedModel,
     published: scoring.Published,
-    masks: Masks = None,
-    variants: Variants = None,
-    epochs: Epochs = 20,
-    seeds: Seeds = 3,
-    batch_size: BatchSize = None,
-    test_fraction: TestFraction = 0.2,
-    labelled: Labelled = None,
+    masks: scoring.Masks = None,
+    variants: Annotated[
+        str, typer.Option(help="Networks to train, the subject first, with commas; default: all.")
+    ] = "all",
+    epochs: Annotated[int, scoring.number(help="Epochs of every network.")] = 20,
+    seeds: Annotated[int, scoring.number(help="Runs of every network.")] = 3,
+    batch_size: Annotated[
+        int | None, scoring.number(min=2, help="Images a step; default: 64, fewer of few images.")
+    ] = None,
+    test_fraction: Annotated[float, scoring.share(help="Tested share of data without a partition.")] = 0.2,
+    labelled: Annotated[int | None, scoring.number(min=2, help="Number of training images.")] = None,
     resamples: scoring.Resamples = 1_000,
     seed: options.Seed = 0,
-    out: Out = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", metavar="DIR", help="Folder for runs (to continue) and overlays."),
+    ] = None,
 ) -> None:
     """Do pre-trained U-Net encoders help segmentation? mIoU, mIoU of the ten best classes, pixel accuracy.
 
@@ -76,16 +43,15 @@ def segment(
     from derender.evaluation.segmentation import SegmentSettings
 
     memory = memory_in(None if out is None else str(out / "runs"))
-    names = None if variants is None else [name.strip() for name in variants.split(",") if name.strip()]
     with progress_bar("training") as report:
         scores = evaluation.segment(
             trained.open(), images.address, **images.how, masks=masks, test_fraction=test_fraction,
-            labelled=labelled, variants=names, seeds=range(seed, seed + seeds), resample_count=resamples,
-            settings=SegmentSettings(epochs=epochs, batch_size=batch_size), memory=memory, progress=report,
+            labelled=labelled, variants=scoring.names_of(variants), seeds=range(seed, seed + seeds),
+            resample_count=resamples, settings=SegmentSettings(epochs=epochs, batch_size=batch_size),
+            memory=memory, progress=report,
         )  # fmt: skip
     if out is not None:
         from derender.report.segmentation import write_overlays
 
         result(f"overlays {write_overlays(scores.result, out)}", published.json_file)
-    values = {"model": trained.model, **scores.values}
-    published.show(scores.tables, values, [*scores.notes, scoring.remembered(memory, "runs")])
+    published.publish(scores, memory, "runs", model=trained.model)
