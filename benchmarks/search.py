@@ -21,7 +21,7 @@ from machine import describe_machine
 from sklearn.neighbors import NearestNeighbors
 
 from derender.features import FeatureTable
-from derender.features.neighbours import nearest, same_picture
+from derender.features.neighbours import nearest, same_image
 
 FACTORS = ("geometry", "albedo", "light", "camera")
 FOUND = 12
@@ -72,7 +72,7 @@ def in_memory(table: FeatureTable, rounds: int) -> dict[str, dict[str, float]]:
     """One query and 64, by either distance, and looking for the image itself."""
     rows = table.factors["geometry"]
     codes = {name: values[7] for name, values in table.factors.items()}
-    taken = {"same_picture": best_of(rounds, lambda: same_picture(table, codes))}
+    taken = {"same_image": best_of(rounds, lambda: same_image(table, codes))}
     for metric in ("cosine", "euclidean"):
         for count in (1, 64):
             taken[f"{metric}_{count}"] = best_of(

@@ -294,7 +294,7 @@ def test_a_full_disk_is_one_line(run, faces, tmp_path, monkeypatch, refused):
     def full(*_, **__):
         raise OSError(28, "No space left on device", "f.parquet")
 
-    monkeypatch.setattr("derender.features.embedding.write_row_groups", full)
+    monkeypatch.setattr("derender.features.embedding.write_columns", full)
     line = refused("embed", "-m", run, "-d", faces, "--out", tmp_path / "f.parquet")
     assert line == "derender: f.parquet: no space left on device; free some space and run the command again"
 

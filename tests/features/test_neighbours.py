@@ -5,7 +5,7 @@ import pytest
 from sklearn.neighbors import NearestNeighbors
 
 from derender.features import FeatureTable, neighbours
-from derender.features.neighbours import nearest, same_picture
+from derender.features.neighbours import nearest, same_image
 
 
 @pytest.fixture
@@ -19,7 +19,6 @@ def table() -> FeatureTable:
 @pytest.mark.parametrize("factor", ["geometry", "light"])
 def test_same_as_scikit_learn(table, factor, metric, monkeypatch):
     monkeypatch.setattr(neighbours, "BLOCK_ROWS", 64)
-    monkeypatch.setattr(neighbours, "NUMBERS_AT_ONCE", 1000)
     rows = table.factors[factor].astype(np.float64)
     query = rows[:7] + 0.1
     found = nearest(table, query, factor, 9, metric=metric)
@@ -56,15 +55,15 @@ def test_equal_rows_come_in_order_and_zero_rows_are_apart():
     assert nearest(table, np.array([2.0, 0]), "f", 99).rows.tolist() == [[1, 2, 4, 0, 3]]
 
 
-def test_the_same_picture_is_alike_in_every_factor(table, monkeypatch):
+def test_the_same_image_is_alike_in_every_factor(table, monkeypatch):
     monkeypatch.setattr(neighbours, "BLOCK_ROWS", 64)
     for rows in table.factors.values():
         rows[250] = rows[17] * (1 + 1e-6)  # a copy, rounded otherwise
     table.factors["light"][33] = table.factors["light"][17]  # another face in the same light
     codes = {name: rows[17] for name, rows in table.factors.items()}
-    assert same_picture(table, codes).tolist() == [17, 250]
-    assert same_picture(table, {"light": codes["light"]}).tolist() == [17, 33, 250]
-    assert same_picture(table, {"albedo": codes["light"]}).tolist() == []
+    assert same_image(table, codes).tolist() == [17, 250]
+    assert same_image(table, {"light": codes["light"]}).tolist() == [17, 33, 250]
+    assert same_image(table, {"albedo": codes["light"]}).tolist() == []
 
 
 @pytest.mark.parametrize(
@@ -90,6 +89,6 @@ def test_a_fitted_picture_is_itself_though_rounding_grew_on_its_way():
     names = ("a", "b", "c", "d")
     read = FeatureTable(names, {"geometry": geometry, "light": light})
     fitted = FeatureTable(names, {"geometry": geometry, "light": light}, {}, {"fit_steps": 60})
-    assert same_picture(read, again).tolist() == []
-    assert same_picture(fitted, again).tolist() == [2]
-    assert same_picture(fitted, {**again, "light": light[2] * 1.1}).tolist() == []  # light is read as ever
+    assert same_image(read, again).tolist() == []
+    assert same_image(fitted, again).tolist() == [2]
+    assert same_image(fitted, {**again, "light": light[2] * 1.1}).tolist() == []  # light is read as ever

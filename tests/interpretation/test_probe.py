@@ -70,8 +70,6 @@ def test_a_probe_comes_back_from_its_folder(features, labels, tmp_path):
         load_probe(tmp_path / "probe")
     with pytest.raises(ValueError, match="needs 5 numbers of factor 'light', the features have 2"):
         probe.logits({**features, "light": features["light"][:, :2]})
-    with pytest.raises(ValueError, match="did you mean 'smiling'"):
-        probe.number("Smilin")
 
 
 def test_classes_are_the_lead_over_the_mean(features, labels):

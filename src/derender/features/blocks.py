@@ -1,90 +1,35 @@
-"""A stream in blocks of consecutive images: decoded, embedded, in order, no copies; here or on a cluster.
+"""A stream in blocks of consecutive images: decoded and embedded, in order; here or on a cluster.
 
 In this process a pool decodes ahead of the model. With Ray Data, blocks go to a pool of actors that each open
-the stream themselves; only features, names, labels and digests of pixels travel. Copies are dropped where the
-blocks meet, so rows, order and numbers are the same bit for bit either way.
+the stream themselves; only features, names, labels and digests of pixels travel. Rows, order and numbers are
+the same bit for bit either way.
 """
 
 import logging
 import pickle
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import islice
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Int64
 
-from derender.data import (
-    Decoded,
-    ImageSet,
-    Sample,
-    SeenPixels,
-    Skipped,
-    Stream,
-    Unreadable,
-    Value,
-    ahead,
-    decode_samples,
-    decoded,
-    quiet_pillow,
-)
+from derender.data import Decoded, ImageSet, Sample, Stream, ahead, decode_samples, decoded, quiet_pillow
 from derender.features.extract import as_batch, evaluating, factor_codes
 
 OpenStream = Callable[[], AbstractContextManager[Stream]]
 """Opens the stream anew, in whatever process."""
+Block = tuple[Decoded, Mapping[str, np.ndarray]]
+"""Consecutive samples without their pixels, and the features by factor of those that could be read."""
 
 
-@dataclass(frozen=True)
-class TableRows:
-    """The rows of a table that a block becomes, but for their features.
-
-    Attributes:
-        files: names.
-        positions: the number of each in the stream or set.
-        digests: 16 bytes of each one's pixels; b"" for a set.
-        labels: of each, where the stream brings them.
-        partitions: of each, where the stream brings them, or "".
-        following: the number of the first sample after the block.
-        skipped: unreadable ones among them.
-        copies: how many identical copies are among them.
-    """
-
-    files: tuple[str, ...]
-    positions: Int64[np.ndarray, " n"]
-    digests: tuple[bytes, ...]
-    labels: tuple[Mapping[str, Value], ...]
-    partitions: tuple[str, ...]
-    following: int
-    skipped: tuple[Skipped, ...] = ()
-    copies: int = 0
-
-
-Computed = tuple[TableRows, Mapping[str, np.ndarray], float | None]
-"""Rows of a table, their features by factor (none without rows), and the share of the stream read."""
-
-
-@dataclass(frozen=True)
-class Block:
-    """Consecutive samples, computed.
-
-    Attributes:
-        decoded: names, labels and digests; without pixels.
-        codes: features by factor of those that could be read.
-    """
-
-    decoded: Decoded
-    codes: Mapping[str, np.ndarray]
-
-
-def computed_block(model: Any, chunk: Decoded) -> Block:
+def embedded_block(model: Any, chunk: Decoded) -> Block:
     """The features of decoded samples; the model is in evaluation mode."""
     good = [row for row, outcome in enumerate(chunk.outcomes) if isinstance(outcome, bytes)]
-    images = chunk.images if len(good) == len(chunk) else chunk.images[good]
-    codes = factor_codes(model, as_batch(images, model.device)) if good else {}
-    return Block(replace(chunk, images=chunk.images[:0]), codes)
+    codes = factor_codes(model, as_batch(chunk.images[good], model.device)) if good else {}
+    return replace(chunk, images=chunk.images[:0]), codes
 
 
 @contextmanager
@@ -104,7 +49,7 @@ def local_blocks(
         else:
             pixels = decoded(source, model.image_size, fit=fit, start=start, workers=workers)
             chunks = stack.enter_context(ahead(_regrouped(pixels, batch_size), 2))
-        yield (computed_block(model, chunk) for chunk in chunks)
+        yield (embedded_block(model, chunk) for chunk in chunks)
 
 
 def _of_set(images: ImageSet, start: int, size: int) -> Iterator[Decoded]:
@@ -116,68 +61,16 @@ def _of_set(images: ImageSet, start: int, size: int) -> Iterator[Decoded]:
 
 def _regrouped(chunks: Iterable[Decoded], size: int) -> Iterator[Decoded]:
     """The same samples, ``size`` at a time."""
-    waiting: list[Decoded] = []
-    for chunk in chunks:
-        waiting.append(chunk)
-        while sum(map(len, waiting)) >= size:
-            whole = _joined(waiting)
-            yield _part(whole, 0, size)
-            waiting = [_part(whole, size, len(whole))] if len(whole) > size else []
-    if waiting:
-        yield _joined(waiting)
-
-
-def _joined(chunks: list[Decoded]) -> Decoded:
-    if len(chunks) == 1:
-        return chunks[0]
-    joined = {
-        name: sum((getattr(chunk, name) for chunk in chunks), ())
-        for name in ("files", "outcomes", "labels", "partitions")
-    }
-    images = np.concatenate([chunk.images for chunk in chunks])
-    return replace(chunks[-1], start=chunks[0].start, images=images, **joined)
-
-
-def _part(chunk: Decoded, first: int, last: int) -> Decoded:
-    cut = {
-        name: getattr(chunk, name)[first:last]
-        for name in ("files", "images", "outcomes", "labels", "partitions")
-    }
-    return replace(chunk, start=chunk.start + first, **cut)
-
-
-def in_order(blocks: Iterable[Block], seen: SeenPixels, keep_duplicates: bool = False) -> Iterator[Computed]:
-    """Blocks in the order of the stream as rows of the table; copies are dropped, unless they are kept.
-
-    ``seen`` holds the pixels of the images before, and grows.
-    """
-    for block in blocks:
-        chunk = block.decoded
-        good = [row for row, outcome in enumerate(chunk.outcomes) if isinstance(outcome, bytes)]
-        digests = [outcome for outcome in chunk.outcomes if isinstance(outcome, bytes)]
-        positions = np.array([chunk.start + row for row in good], np.int64)
-        first = np.ones(len(good), bool)
-        if digests and digests[0]:  # copies are dropped from a set when it is read
-            first = seen.first(digests, positions.tolist()) == positions
-        kept = np.flatnonzero(first | keep_duplicates)
-        chosen = [good[row] for row in kept]
-        skipped = [
-            Skipped(chunk.files[row], str(outcome))
-            for row, outcome in enumerate(chunk.outcomes)
-            if isinstance(outcome, Unreadable)
-        ]
-        rows = TableRows(
-            tuple(chunk.files[row] for row in chosen),
-            positions[kept],
-            tuple(digests[row] for row in kept),
-            tuple(chunk.labels[row] for row in chosen),
-            tuple(chunk.partitions[row] for row in chosen),
-            chunk.start + len(chunk),
-            tuple(skipped),
-            int((~first).sum()),
+    rows = (
+        (chunk.start + row, one[0], one[1], one[2], one[3], one[4], chunk.share)
+        for chunk in chunks
+        for row, one in enumerate(
+            zip(chunk.files, chunk.images, chunk.outcomes, chunk.labels, chunk.partitions, strict=True)
         )
-        codes = {name: values[kept] for name, values in block.codes.items()} if len(kept) else {}
-        yield rows, codes, chunk.share
+    )
+    while group := list(islice(rows, size)):
+        numbers, files, images, outcomes, labels, partitions, shares = zip(*group, strict=True)
+        yield Decoded(numbers[0], files, np.stack(images), outcomes, labels, partitions, shares[-1])
 
 
 class BlockEmbedder:
@@ -202,10 +95,6 @@ class BlockEmbedder:
         self.samples: Iterator[Sample] = iter(())
         self.at: int | None = None
 
-    def close(self) -> None:
-        """Release the open stream."""
-        self.opened.close()
-
     def embed(self, start: int) -> Block:
         """The block of samples from number ``start`` on."""
         if self.at is None or start < self.at:
@@ -215,7 +104,11 @@ class BlockEmbedder:
         samples = list(islice(self.samples, passed, passed + size))
         self.at = start + len(samples)
         with quiet_pillow(), evaluating(self.model):
-            return computed_block(self.model, decode_samples(start, samples, self.model.image_size, self.fit))
+            return embedded_block(self.model, decode_samples(start, samples, self.model.image_size, self.fit))
+
+    def __call__(self, numbers: dict[str, Any]) -> dict[str, list[bytes]]:
+        """As Ray Data calls it: the first samples of blocks in, pickled blocks out."""
+        return {"block": [pickle.dumps(self.embed(int(start))) for start in numbers["start"]]}
 
 
 @contextmanager
@@ -246,15 +139,13 @@ def ray_blocks(
             "engine 'ray' needs Ray: pip install 'derender[ray]', or use engine 'local'"
         ) from error
     left = None if stream.limit is None else max(0, stream.limit - start)
-    numbers = -(-sum(1 for _ in islice(stream.samples(start), left)) // batch_size)
+    end = start + sum(1 for _ in islice(stream.samples(start), left))
+    starts = [{"start": first} for first in range(start, end, batch_size)]
 
     def blocks() -> Iterator[Block]:
-        if not numbers:
-            return
-        turns = [{"number": number} for number in range(numbers)]
-        made = ray.data.from_items(turns, override_num_blocks=numbers).map_batches(
-            _Actor,
-            fn_constructor_args=(model, open_stream, batch_size, fit, start),
+        made = ray.data.from_items(starts, override_num_blocks=len(starts)).map_batches(
+            BlockEmbedder,
+            fn_constructor_args=(model, open_stream, batch_size, fit, 1),
             batch_size=1,
             compute=ray.data.ActorPoolStrategy(size=workers),
             num_cpus=1,
@@ -270,20 +161,8 @@ def ray_blocks(
     before = context.execution_options.preserve_order, context.enable_progress_bars
     context.execution_options.preserve_order, context.enable_progress_bars = True, False
     try:
-        yield blocks()
+        yield blocks() if starts else iter(())
     finally:
         context.execution_options.preserve_order, context.enable_progress_bars = before
         if started:
             ray.shutdown()
-
-
-class _Actor:
-    """A `BlockEmbedder` as Ray Data calls it: block numbers in, pickled blocks out."""
-
-    def __init__(self, model: Any, open_stream: OpenStream, size: int, fit: str, start: int):
-        self.embedder = BlockEmbedder(model, open_stream, size, fit, threads=1)
-        self.size, self.start = size, start
-
-    def __call__(self, numbers: dict[str, Any]) -> dict[str, list[bytes]]:
-        blocks = [self.embedder.embed(self.start + self.size * int(number)) for number in numbers["number"]]
-        return {"block": [pickle.dumps(block) for block in blocks]}

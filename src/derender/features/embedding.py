@@ -6,15 +6,14 @@ run that was stopped goes on from them, and gives the same table, bit for bit: i
 """
 
 import hashlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 import PIL
 import torch
 
@@ -28,11 +27,11 @@ from derender.data import (
     sample_checksum,
     suggestion,
 )
-from derender.features.blocks import TableRows, in_order, local_blocks, ray_blocks
+from derender.features.blocks import local_blocks, ray_blocks
 from derender.features.extract import check_size, embed_pictures, model_facts, table_labels
-from derender.features.parquet import Columns, write_row_groups
-from derender.features.parts import Parts
-from derender.features.table import FeatureTable, check_finite, check_names
+from derender.features.parquet import Columns, write_columns
+from derender.features.parts import Parts, Rows, rows_of
+from derender.features.table import FeatureTable, check_names
 from derender.inputs import Progress, as_images, as_model
 
 PART_ROWS = 4096
@@ -210,14 +209,38 @@ def _plan(
 def _compute(
     parts: Parts, blocks: Any, keep_duplicates: bool, limit: int | None, progress: Progress | None
 ) -> None:
-    """Write the parts that are missing. An error removes the folder if nothing was written."""
+    """Write the parts that are missing, in a thread, one at a time; no folder stays without a part.
+
+    Ctrl-C writes the rows that wait; any other error drops them.
+    """
+    waiting: list[Rows] = []
+    written: list[Future[None]] = []
+
+    def write() -> None:
+        for future in written:
+            future.result()
+        written[:] = [pool.submit(parts.write, waiting.copy())]
+        waiting.clear()
+
     try:
-        with blocks as made, _writing(parts) as add:
-            for rows, codes, share in in_order(made, parts.seen(), keep_duplicates):
-                check_finite(codes, rows.files)
-                add(rows, codes)
-                if progress is not None:
-                    progress(rows.following, estimated_total(rows.following, share, limit))
+        with blocks as made, ThreadPoolExecutor(1, thread_name_prefix="write") as pool:
+            seen = parts.seen()
+            try:
+                for block in made:
+                    waiting.append(rows_of(block, seen, keep_duplicates))
+                    if sum(len(table) for table, _ in waiting) >= PART_ROWS:
+                        write()
+                    if progress is not None:
+                        done = block[0].start + len(block[0])
+                        progress(done, estimated_total(done, block[0].share, limit))
+            except KeyboardInterrupt:
+                if waiting:
+                    write()
+                raise
+            if waiting:
+                write()
+            for future in written:
+                future.result()
     except Exception:
         parts.remove_if_empty()
         raise
@@ -232,74 +255,38 @@ def _compute(
         progress(parts.so_far.following, parts.so_far.following)
 
 
-@contextmanager
-def _writing(parts: Parts) -> Iterator[Callable[[TableRows, Mapping[str, np.ndarray]], None]]:
-    """Take the rows of batches and write them as parts in a thread of its own, one part at a time.
-
-    Ctrl-C writes the rows that wait; any other error drops them.
-    """
-    waiting: list[tuple[TableRows, Mapping[str, np.ndarray]]] = []
-    written: list[Future[None]] = []
-
-    def write() -> None:
-        for future in written:
-            future.result()
-        written.clear()
-        rows = [rows for rows, _ in waiting]
-        codes = [codes for _, codes in waiting if codes]
-        waiting.clear()
-        written.append(pool.submit(parts.write, rows, codes))
-
-    def add(rows: TableRows, codes: Mapping[str, np.ndarray]) -> None:
-        waiting.append((rows, codes))
-        if sum(len(one.files) for one, _ in waiting) >= PART_ROWS:
-            write()
-
-    with ThreadPoolExecutor(1, thread_name_prefix="write") as pool:
-        try:
-            yield add
-        except KeyboardInterrupt:
-            if waiting:
-                write()
-            raise
-        if waiting:
-            write()
-        for future in written:
-            future.result()
-
-
 def _finish(
     parts: Parts, path: Path, images: Stream | ImageSet, facts: dict[str, Any], resumed: int
 ) -> Embedded:
     """Put the parts together, then delete them."""
-    so_far = parts.so_far
+    so_far, factors, labels = parts.so_far, {}, []
     if not so_far.rows:
         parts.remove()
-        first = so_far.examples[0] if so_far.skipped else None
-        more = f"; the first is {first.file!r}: {first.reason}" if first else ""
+        more = f"; the first is {so_far.examples[0][0]!r}: {so_far.examples[0][1]}" if so_far.skipped else ""
         raise ValueError(f"no image in {images.source} ({images.layout}) can be read{more}")
-    factors: dict[str, int] = {}
-    labels: list[str] = []
-    known = _known_labels(images)
+    source = images if isinstance(images, ImageSet) else images.table
+    known = None if source is None else table_labels(source)
 
     def groups() -> Iterator[Columns]:
-        for columns in parts.columns(facts, known):
-            factors.update({name: values.shape[1] for name, values in columns.factors.items()})
-            labels[:] = columns.labels
-            check_names(columns.factors, columns.labels)
-            yield columns
+        for group in parts.columns(facts, known):
+            check_names(group.factors, group.labels)
+            factors.update({name: values.shape[1] for name, values in group.factors.items()})
+            labels[:] = group.labels
+            yield group
 
-    rows = write_row_groups(path, groups())
+    write_columns(path, groups())
     parts.remove()
     passed_over = () if isinstance(images, ImageSet) else images.passed_over
-    skipped, examples = so_far.skipped + len(passed_over), (*passed_over, *so_far.examples)
-    counts = (skipped, examples, so_far.copies, resumed)
-    return Embedded(path, rows, factors, tuple(labels), facts, *counts, images.source, images.layout)
-
-
-def _known_labels(images: Stream | ImageSet) -> Callable[[np.ndarray], dict[str, np.ndarray]] | None:
-    """Labels by position where they are known without reading images."""
-    if not isinstance(images, ImageSet) and images.table is None:
-        return None
-    columns = table_labels(images if isinstance(images, ImageSet) else images.table)
-    return lambda positions: {name: column[positions] for name, column in columns.items()}
+    return Embedded(
+        path,
+        so_far.rows,
+        factors,
+        tuple(labels),
+        facts,
+        so_far.skipped + len(passed_over),
+        (*passed_over, *(Skipped(*row) for row in so_far.examples)),
+        so_far.copies,
+        resumed,
+        images.source,
+        images.layout,
+    )

@@ -1,17 +1,18 @@
 """Nearest images by one factor: the same shape under any lighting, the same lighting on any shape.
 
-Exact: every row is compared, in blocks, with one matrix product each, in float64. Distances: cosine is
-1 - cosine, 0..2 (a row of zeros is at distance 1 from all); euclidean is not squared. Equally near rows come
-in the table's order. Leaves out approximate indices, which pay from some ten million rows on.
+Exact: every row is compared, in blocks, in float64. Distances: cosine is 1 - cosine, 0..2 (a row of zeros is
+at distance 1 from all); euclidean is not squared. Equally near rows come in the table's order. Leaves out
+approximate indices, which pay from some ten million rows on.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float64, Int64
+from scipy.spatial.distance import cdist
 
 from derender.data import nearest_sibling, read_image, suggestion
 from derender.features.extract import embed_images, model_fingerprint
@@ -21,9 +22,7 @@ from derender.postprocess.fitting import PARAMETERS
 
 METRICS = ("cosine", "euclidean")
 BLOCK_ROWS = 4096
-NUMBERS_AT_ONCE = 1 << 23
-"""So many distances are held at a time (64 MB)."""
-SAME_PICTURE = 1e-3
+SAME_IMAGE = 1e-3
 """Largest relative difference, in every factor, of one image embedded twice (batches and devices round)."""
 SAME_FITTED = 0.3
 """The same of scenes optimised per image: after sixty steps 0.12 (measured); others are 0.6 away."""
@@ -104,35 +103,33 @@ def search(
         ValueError: no such row, factor or metric, or the table was made by another model.
         FileNotFoundError: no such image.
     """
-    name = str(table) if isinstance(table, str | Path) else "the table"
+    name, like = str(table) if isinstance(table, str | Path) else "the table", str(like)
     rows = table if isinstance(table, FeatureTable) else FeatureTable.read(table, only=factor)
-    own_row, unchecked = rows.files.index(str(like)) if str(like) in rows.files else None, False
-    if own_row is not None and (model is None or not Path(like).is_file()):
+    own_row, is_file = rows.files.index(like) if like in rows.files else None, Path(like).is_file()
+    if own_row is not None and (model is None or not is_file):
         codes: dict[str, np.ndarray] = {key: values[own_row] for key, values in rows.factors.items()}
+        unchecked = False
     elif model is None:
-        known = rows.files if len(rows) <= 2_000 else ()
-        hint = (
-            "; to search with an image, add a model" if Path(like).is_file() else suggestion(str(like), known)
-        )
-        raise ValueError(f"{name} has no row {str(like)!r}{hint}; its first is {rows.files[0]!r}")
+        hint = "; to search with an image, add a model"
+        if not is_file:
+            hint = suggestion(like, rows.files if len(rows) <= 2_000 else ())
+        raise ValueError(f"{name} has no row {like!r}{hint}; its first is {rows.files[0]!r}")
+    elif not is_file:
+        raise FileNotFoundError(f"{like} is no image file{nearest_sibling(Path(like))}")
     else:
-        if not Path(like).is_file():
-            raise FileNotFoundError(f"{like} is no image file{nearest_sibling(Path(like))}")
         net, own_row = maker_of(rows, model, name, device=device), None
         unchecked = rows.origin.get("weights") is None
         image = read_image(Path(like), net.image_size)
         codes = {key: values[0] for key, values in embed_images(net, image[None]).items()}
         if factor not in codes:
             raise ValueError(f"{model} makes no {factor!r}; it makes {', '.join(codes)}")
-    itself = same_picture(rows, codes).tolist()
+    itself = same_image(rows, codes).tolist()
     hidden = [] if copies else itself
     if len(hidden) == len(rows):
         raise ValueError(f"{name} has no row but {like} itself: include copies to find that")
     near = nearest(rows, codes[factor], factor, k, metric=metric, exclude=hidden)
-    return Found(
-        rows, str(like), factor, metric, near.rows[0].tolist(), near.distances[0].tolist(), own_row, itself,
-        unchecked,
-    )  # fmt: skip
+    found = near.rows[0].tolist(), near.distances[0].tolist()
+    return Found(rows, like, factor, metric, *found, own_row, itself, unchecked)
 
 
 def maker_of(table: FeatureTable, model: Any, name: str = "the table", *, device: str = "auto") -> Any:
@@ -156,7 +153,7 @@ def nearest(
     factor: str,
     k: int = 12,
     *,
-    metric: str = "cosine",
+    metric: Literal["cosine", "euclidean"] | str = "cosine",
     exclude: Sequence[int] = (),
 ) -> Neighbours:
     """The ``k`` rows of a table nearest to each query by one factor.
@@ -178,9 +175,9 @@ def nearest(
         raise ValueError(
             f"unknown metric {metric!r}{suggestion(metric, METRICS)}; there is {', '.join(METRICS)}"
         )
-    if query.ndim != 2 or query.shape[1] != rows.shape[1]:
+    if query.shape[1] != rows.shape[1]:
         raise ValueError(
-            f"{factor} has {rows.shape[1]} numbers in this table, the query {query.shape[-1]}: "
+            f"{factor} has {rows.shape[1]} numbers in this table, the query {query.shape[1]}: "
             "it was made by another model"
         )
     if not np.isfinite(query).all():
@@ -191,20 +188,17 @@ def nearest(
     count = min(k, len(rows) - len(hidden))
     if count < 1:
         raise ValueError(f"there is no row to find: the table has {len(rows)}, {len(hidden)} are left out")
-    found = np.empty((len(query), count), np.int64)
-    distances = np.empty((len(query), count), np.float64)
-    at_once = max(1, NUMBERS_AT_ONCE // len(rows))
-    for start in range(0, len(query), at_once):
-        part = slice(start, start + at_once)
-        block = _distances(query[part], rows, metric)
-        block[:, hidden] = np.inf
-        for number, row in enumerate(block, start):
-            found[number] = _smallest(row, count)
-            distances[number] = row[found[number]]
+    found, distances = np.empty((len(query), count), np.int64), np.empty((len(query), count))
+    for number, one in enumerate(query):
+        away = _distances(one, rows, metric)
+        away[hidden] = np.inf
+        places = np.flatnonzero(away <= np.partition(away, count - 1)[count - 1])
+        found[number] = places[np.argsort(away[places], kind="stable")][:count]
+        distances[number] = away[found[number]]
     return Neighbours(found, distances)
 
 
-def same_picture(table: FeatureTable, codes: Mapping[str, np.ndarray]) -> Int64[np.ndarray, " m"]:
+def same_image(table: FeatureTable, codes: Mapping[str, np.ndarray]) -> Int64[np.ndarray, " m"]:
     """Rows of an image itself, or copies of it under other names: alike in every factor they share.
 
     Args:
@@ -215,43 +209,19 @@ def same_picture(table: FeatureTable, codes: Mapping[str, np.ndarray]) -> Int64[
         rows in the table's order, none where image and table share no factor.
     """
     shared = [name for name in codes if name in table.factors]
-    rows = np.arange(len(table) if shared else 0)
     fitted = PARAMETERS if table.origin.get("fit_steps") else ()
+    rows: Any = slice(len(table) if shared else 0)
     for name in shared:
-        limit = SAME_FITTED if name in fitted else SAME_PICTURE
-        query = np.asarray(codes[name], dtype=np.float64)
-        near = np.empty(len(rows), bool)
-        for start in range(0, len(rows), BLOCK_ROWS):
-            part = slice(start, start + BLOCK_ROWS)
-            away = np.linalg.norm(table.factors[name][rows[part]] - query, axis=1)
-            near[part] = away <= limit * np.linalg.norm(query)
-        rows = rows[near]
-    return rows.astype(np.int64)
+        away = _distances(codes[name], table.factors[name][rows], "euclidean")
+        limit = SAME_FITTED if name in fitted else SAME_IMAGE
+        rows = np.arange(len(table))[rows][away <= limit * np.linalg.norm(codes[name].astype(np.float64))]
+    return np.arange(len(table))[rows]
 
 
-def _distances(query: np.ndarray, rows: np.ndarray, metric: str) -> np.ndarray:
-    """(Q, N) distances."""
-    result = np.empty((len(query), len(rows)))
-    middle = query.mean(axis=0)  # close to the query, so that squares do not cancel
-    lengths = np.linalg.norm(query, axis=1)
+def _distances(query: np.ndarray, rows: np.ndarray, metric: Any) -> Float64[np.ndarray, " n"]:
+    """From one feature (D,) to each of (N, D) rows."""
+    away = np.empty(len(rows))
     for start in range(0, len(rows), BLOCK_ROWS):
         part = slice(start, start + BLOCK_ROWS)
-        block = rows[part].astype(np.float64)
-        if metric == "euclidean":
-            block -= middle
-            shifted = query - middle
-            square = np.einsum("nd,nd->n", block, block) + np.einsum("qd,qd->q", shifted, shifted)[:, None]
-            result[:, part] = np.sqrt(np.maximum(square - 2 * shifted @ block.T, 0))
-        else:
-            scale = lengths[:, None] * np.sqrt(np.einsum("nd,nd->n", block, block))
-            product = query @ block.T
-            cosine = np.divide(product, scale, out=np.zeros_like(product), where=scale > 0)
-            result[:, part] = 1 - cosine.clip(-1, 1)
-    return result
-
-
-def _smallest(values: np.ndarray, count: int) -> np.ndarray:
-    """Places of the ``count`` smallest values in rising order; of equal values the first."""
-    limit = np.partition(values, count - 1)[count - 1]
-    places = np.flatnonzero(values <= limit)
-    return places[np.argsort(values[places], kind="stable")][:count]
+        away[part] = cdist(query[None], rows[part], metric)[0]
+    return np.nan_to_num(away.clip(0), nan=1.0)  # the cosine of zeros

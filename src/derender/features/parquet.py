@@ -6,7 +6,8 @@ our metadata the list columns are factors and all others labels.
 """
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -32,58 +33,45 @@ class Columns:
     origin: Mapping[str, Any]
 
 
-def write_columns(path: Path, content: Columns) -> None:
-    """Write a parquet file; at ``path`` stands the old file or the whole new one, never half of it."""
+def write_columns(path: Path, groups: Iterable[Columns]) -> None:
+    """Write a table that need never be whole in memory, each of ``groups`` as a row group.
+
+    All groups have the same factors, labels and origin. At ``path`` stands the old file or the whole new one,
+    never half of it.
+    """
     if path.is_dir():
         raise ValueError(f"{path} is a folder: name a file to write, such as {path / 'features.parquet'}")
-    with atomic_file(path, durable=True) as temporary:
-        pq.write_table(as_arrow(content), temporary, write_page_checksum=True)
-
-
-def write_row_groups(path: Path, groups: Iterable[Columns]) -> int:
-    """Write a table that is never whole in memory, each of ``groups`` as a row group; gives its rows.
-
-    All groups have the same factors, labels and origin. What stands at ``path`` in the end is as with
-    ``write_columns``: the file reads the same.
-    """
-    rows, writer = 0, None
+    writer = None
     with atomic_file(path, durable=True) as temporary:
         try:
             for group in groups:
                 table = as_arrow(group)
+                repeating: Any = list(group.labels)  # a dictionary of features or names helps nothing
                 writer = writer or pq.ParquetWriter(
-                    temporary, table.schema, use_dictionary=_repeating(group), write_page_checksum=True
+                    temporary, table.schema, use_dictionary=repeating, write_page_checksum=True
                 )
                 writer.write_table(table.cast(writer.schema))
-                rows += len(table)
                 del table
                 pa.default_memory_pool().release_unused()
         finally:
             if writer is not None:
                 writer.close()
-        if not rows:
-            raise ValueError(f"there are no rows to write to {path}")
-    return rows
-
-
-def _repeating(content: Columns) -> Any:  # a list of names, which pyarrow's stubs do not know of
-    """The columns in which values repeat; features and names would only fill a dictionary in vain."""
-    return list(content.labels)
 
 
 def as_arrow(content: Columns) -> pa.Table:
     """The columns as they stand in the file, with what describes them."""
     columns: dict[str, pa.Array] = {"file": pa.array(content.files, pa.string())}
-    for name, values in content.factors.items():
-        columns[name] = factor_column(values)
+    columns |= {name: factor_column(values) for name, values in content.factors.items()}
     for name, values in content.labels.items():
-        columns[name] = _label_column(name, values)
-    described = {
-        "format": FORMAT,
-        "factors": list(content.factors),
-        "labels": list(content.labels),
-        "origin": dict(content.origin),
-    }
+        plain = values.tolist() if values.dtype.kind in "UO" else values
+        try:
+            columns[name] = pa.array(plain, from_pandas=True)
+        except pa.ArrowException as error:
+            raise ValueError(
+                f"label {name!r} mixes kinds of values that no column holds ({error})"
+            ) from error
+    names = {"factors": list(content.factors), "labels": list(content.labels)}
+    described = {"format": FORMAT, **names, "origin": dict(content.origin)}
     metadata = {METADATA_KEY: json.dumps(described, ensure_ascii=False).encode()}
     return pa.table(columns).replace_schema_metadata(metadata)
 
@@ -98,49 +86,50 @@ def read_columns(path: Path, only: str | None = None) -> Columns:
     """Read a feature table's file, ours or a similar one made elsewhere: all its factors, or ``only`` one."""
     if not path.is_file():
         raise FileNotFoundError(f"no feature table at {path}: make one with 'derender embed --out {path}'")
-    try:
+    with _readable(path):
         size = path.stat().st_size
         with path.open("rb") as file:
             footer = checked_footer(file, size)
         opened = pq.ParquetFile(path, page_checksum_verification=True)
-        check_lists(footer, opened.schema_arrow, size)
-    except (pa.ArrowException, OSError) as error:
-        raise ValueError(f"{path} is not a readable parquet file: make it with 'derender embed'") from error
-    except ValueError as error:
-        raise ValueError(f"{path} is damaged ({error}): make it again with 'derender embed'") from error
-    try:
-        names = _factor_names(opened.schema_arrow, path)
-        if only is not None and only not in names:
-            there = ", ".join(names) or "none"
-            raise ValueError(f"unknown factor {only!r}{suggestion(only, names)}; there is {there}")
-        left_out = () if only is None else [name for name in names if name != only]
-        table = opened.read([name for name in opened.schema_arrow.names if name not in left_out])
-    except (pa.ArrowException, OSError) as error:
-        raise ValueError(f"{path} is not a readable parquet file: make it with 'derender embed'") from error
-    if "file" not in table.column_names:
-        found = ", ".join(table.column_names) or "no columns"
-        raise ValueError(f"{path} has no column 'file' (it has {found}): add one with the images' names")
-    described = _described(table.schema.metadata, path)
+        schema = opened.schema_arrow
+        check_lists(footer, schema, size)
+    described = _described(schema.metadata, path)
+    lists = [name for name in schema.names if name != "file" and _is_list(schema.field(name).type)]
+    names = described.get("factors", lists)
+    if only is not None and only not in names:
+        there = ", ".join(names) or "none"
+        raise ValueError(f"unknown factor {only!r}{suggestion(only, names)}; there is {there}")
+    factors = names if only is None else [only]
+    with _readable(path):
+        table = opened.read([name for name in schema.names if name not in names or name in factors])
     others = [name for name in table.column_names if name != "file"]
-    factors = [name for name in names if name not in left_out]
+    if len(others) == len(table.column_names):
+        raise ValueError(
+            f"{path} has no column 'file' (it has {', '.join(others) or 'no columns'}): add one with the "
+            "images' names"
+        )
     labels = described.get("labels", [name for name in others if name not in factors])
     if not factors:
         raise ValueError(f"{path} has no column of lists, so no features: make it with 'derender embed'")
-    absent = [name for name in (*factors, *labels) if name not in others]
-    if absent:
-        raise ValueError(f"{path} lacks the column {absent[0]!r} that its metadata names: make it again")
+    for name in (*factors, *labels):
+        if name not in others:
+            raise ValueError(f"{path} lacks the column {name!r} that its metadata names: make it again")
     return Columns(
         [str(file) for file in table.column("file").to_pylist()],
-        {name: _factor(table.column(name), name, path) for name in factors},
+        {name: factor_values(table.column(name), name, path) for name in factors},
         {name: _label(table.column(name)) for name in labels},
         described.get("origin", {}),
     )
 
 
-def _factor_names(schema: pa.Schema, path: Path) -> Sequence[str]:
-    """What the metadata calls factors; without ours, the columns of lists."""
-    lists = [name for name in schema.names if name != "file" and _is_list(schema.field(name).type)]
-    return _described(schema.metadata, path).get("factors", lists)
+@contextmanager
+def _readable(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except (pa.ArrowException, OSError) as error:
+        raise ValueError(f"{path} is not a readable parquet file: make it with 'derender embed'") from error
+    except ValueError as error:
+        raise ValueError(f"{path} is damaged ({error}): make it again with 'derender embed'") from error
 
 
 def _described(metadata: Mapping[bytes, bytes] | None, path: Path) -> dict[str, Any]:
@@ -161,7 +150,8 @@ def _is_list(kind: pa.DataType) -> bool:
     return pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind)
 
 
-def _factor(column: pa.ChunkedArray, name: str, path: Path) -> np.ndarray:
+def factor_values(column: pa.ChunkedArray, name: str, path: Path) -> np.ndarray:
+    """A column of equally long lists of numbers as (N, D) float32."""
     where = f"{path}: factor {name!r}"
     if not _is_list(column.type):
         raise ValueError(f"{where} is a column of {column.type}, expected a list of numbers in each row")
@@ -181,21 +171,12 @@ def _factor(column: pa.ChunkedArray, name: str, path: Path) -> np.ndarray:
     return flat.reshape(len(column), widths[0] if widths else 1)
 
 
-def _label_column(name: str, values: np.ndarray) -> pa.Array:
-    try:
-        return pa.array(values.tolist() if values.dtype.kind in "UO" else values, from_pandas=True)
-    except pa.ArrowException as error:
-        raise ValueError(f"label {name!r} mixes kinds of values that no column holds ({error})") from error
-
-
 def _label(column: pa.ChunkedArray) -> np.ndarray:
     """Numbers and texts as their own kinds; what is missing is NaN among floats, None elsewhere."""
-    kind = column.type
-    if pa.types.is_floating(kind):
+    kind, whole = column.type, column.null_count == 0
+    if pa.types.is_floating(kind) or (whole and (pa.types.is_integer(kind) or pa.types.is_boolean(kind))):
         return column.to_numpy()
-    if column.null_count == 0 and (pa.types.is_integer(kind) or pa.types.is_boolean(kind)):
-        return column.to_numpy()
-    if column.null_count == 0 and (pa.types.is_string(kind) or pa.types.is_large_string(kind)):
+    if whole and (pa.types.is_string(kind) or pa.types.is_large_string(kind)):
         return np.array(column.to_pylist(), dtype=str)
     values = np.empty(len(column), dtype=object)
     values[:] = column.to_pylist()

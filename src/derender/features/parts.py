@@ -10,7 +10,7 @@ import json
 import re
 import shutil
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,9 +19,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from derender.data import Kinds, SeenPixels, Skipped, column_of
-from derender.features.blocks import TableRows
-from derender.features.parquet import Columns, factor_column
+from derender.data import Kinds, SeenPixels, Unreadable, column_of
+from derender.features.blocks import Block
+from derender.features.parquet import Columns, factor_column, factor_values
+from derender.features.table import check_finite
 from derender.storage.atomic import Damaged, DamageNoticed, atomic_file, measured
 
 PLAN = "plan.json"
@@ -30,12 +31,10 @@ LISTED_SKIPPED = 20
 
 _KEY = b"derender part"
 _NAME = re.compile(r"part-(\d{6})(?:-([0-9a-f]{8}))?\.parquet")  # earlier versions wrote no checksum
-_BEGUN = (
-    PLAN,
-    f".{PLAN}",
-    "writing.parquet",
-    ".writing.parquet",
-)  # left by a run killed before its first part
+_BEGUN = (PLAN, f".{PLAN}", "writing.parquet", ".writing.parquet")  # of a run killed before its first part
+
+Rows = tuple[pa.Table, Mapping[str, Any]]
+"""Rows of an unfinished table, and what `Progressed` counts of them."""
 
 
 @dataclass
@@ -45,7 +44,8 @@ class Progressed:
     Attributes:
         following: the number of the first image that is in no part.
         rows: rows in all parts.
-        skipped: unreadable images so far; the first few by name in ``examples``.
+        skipped: unreadable images so far; the first few by name and reason in ``examples``.
+        examples: of skipped images.
         copies: identical copies so far.
         kinds: of labels that came with the stream.
         partitioned: whether any row knows its partition.
@@ -54,21 +54,61 @@ class Progressed:
     following: int = 0
     rows: int = 0
     skipped: int = 0
-    examples: list[Skipped] = field(default_factory=list)
     copies: int = 0
-    kinds: Kinds = field(default_factory=Kinds)
     partitioned: bool = False
+    examples: list[Sequence[str]] = field(default_factory=list)
+    kinds: Kinds = field(default_factory=Kinds)
 
     def join(self, note: Mapping[str, Any]) -> None:
-        """Take the note of one more part into account."""
-        examples = [Skipped(*row) for row in note["examples"]]
+        """Take the note of further rows into account."""
         self.following = note["following"]
         for name in ("rows", "skipped", "copies"):
             setattr(self, name, getattr(self, name) + note[name])
         self.partitioned |= note["partitioned"]
-        self.examples = (self.examples + examples)[:LISTED_SKIPPED]
+        self.examples = (self.examples + note["examples"])[:LISTED_SKIPPED]
         for name, kind in note["kinds"].items():
             self.kinds.join(name, kind)
+
+
+def rows_of(block: Block, seen: SeenPixels, keep_duplicates: bool = False) -> Rows:
+    """The rows of a block in the order of the stream; copies are dropped, unless they are kept.
+
+    ``seen`` holds the pixels of the images before, and grows. A feature that is not finite is an error.
+    """
+    chunk, codes = block
+    good = np.flatnonzero([isinstance(outcome, bytes) for outcome in chunk.outcomes])
+    digests = [outcome for outcome in chunk.outcomes if isinstance(outcome, bytes)]
+    positions, first = chunk.start + good, np.ones(len(good), bool)
+    if digests and digests[0]:  # copies are dropped from a set when it is read
+        first = seen.first(digests, positions.tolist()) == positions
+    kept = np.flatnonzero(first | keep_duplicates)
+    rows, kinds = good[kept].tolist(), Kinds()
+    files, labels = [chunk.files[row] for row in rows], [chunk.labels[row] for row in rows]
+    for one in labels:
+        kinds.see(one)
+    found = {name: values[kept] for name, values in codes.items()} if rows else {}
+    check_finite(found, files)
+    partitions = [chunk.partitions[row] for row in rows]
+    skipped = [
+        (file, str(outcome))
+        for file, outcome in zip(chunk.files, chunk.outcomes, strict=True)
+        if isinstance(outcome, Unreadable)
+    ]
+    note = {
+        "following": chunk.start + len(chunk), "rows": len(rows), "skipped": len(skipped),
+        "examples": skipped[:LISTED_SKIPPED], "copies": int((~first).sum()), "kinds": kinds,
+        "partitioned": any(partitions),
+    }  # fmt: skip
+    texts = [json.dumps(dict(one), ensure_ascii=False) if one else "" for one in labels]
+    columns = {
+        "file": pa.array(files, pa.string()),
+        "position": pa.array(positions[kept], pa.int64()),
+        "digest": pa.array([digests[row] for row in kept], pa.binary()),
+        "partition": pa.array(partitions, pa.string()),
+        "labels": pa.array(texts, pa.string()),
+        **{f"factor {name}": factor_column(values) for name, values in found.items()},
+    }
+    return pa.table(columns), note
 
 
 class Parts:
@@ -132,59 +172,48 @@ class Parts:
             seen.first(table["digest"].to_pylist(), table["position"].to_pylist())
         return seen
 
-    def write(self, batches: list[TableRows], factors: list[Mapping[str, np.ndarray]]) -> None:
-        """Add a part: the rows of batches in order, and the features of each by factor, (n, D)."""
-        kinds = Kinds()
-        for labels in (labels for batch in batches for labels in batch.labels):
-            kinds.see(labels)
-        skipped = [row for batch in batches for row in batch.skipped]
-        note = {
-            "following": batches[-1].following,
-            "skipped": len(skipped),
-            "examples": [[row.file, row.reason] for row in skipped[:LISTED_SKIPPED]],
-            "copies": sum(batch.copies for batch in batches),
-            "kinds": kinds,
-            "partitioned": any(any(batch.partitions) for batch in batches),
-            "rows": sum(len(batch.files) for batch in batches),
-        }
-        columns: dict[str, pa.Array] = {
-            "file": pa.array([file for batch in batches for file in batch.files], pa.string()),
-            "position": pa.array(np.concatenate([batch.positions for batch in batches])),
-            "digest": pa.array([digest for batch in batches for digest in batch.digests], pa.binary()),
-            "partition": pa.array([one for batch in batches for one in batch.partitions], pa.string()),
-            "labels": pa.array([_packed(one) for batch in batches for one in batch.labels], pa.string()),
-        }
-        for name in factors[0] if factors else ():
-            columns[f"factor {name}"] = factor_column(np.concatenate([codes[name] for codes in factors]))
-        table = pa.table(columns).replace_schema_metadata({_KEY: json.dumps(note).encode()})
+    def write(self, blocks: Sequence[Rows]) -> None:
+        """Add a part: the rows of blocks in order."""
+        note = Progressed()
+        for _, one in blocks:
+            note.join(one)
+        table = pa.concat_tables([table for table, _ in blocks if len(table)] or [blocks[0][0]])
+        table = table.replace_schema_metadata({_KEY: json.dumps(vars(note)).encode()})
         with atomic_file(self.folder / "writing.parquet", durable=True) as temporary:
             pq.write_table(table, temporary, use_dictionary=False)
             name = f"part-{len(self.files):06d}-{measured(temporary)[1]:08x}.parquet"
         self.files.append((self.folder / "writing.parquet").rename(self.folder / name))
-        del table, columns
+        del table
         pa.default_memory_pool().release_unused()
-        self.so_far.join(note)
+        self.so_far.join(vars(note))
 
-    def columns(
-        self, origin: Mapping[str, Any], known: Callable[[np.ndarray], dict[str, np.ndarray]] | None
-    ) -> Iterator[Columns]:
+    def columns(self, origin: Mapping[str, Any], known: Mapping[str, np.ndarray] | None) -> Iterator[Columns]:
         """The finished table, part by part.
 
         Args:
             origin: where it comes from.
-            known: labels by the rows' positions, where they were known beforehand; None: the stream's.
+            known: labels of all images, where they were known beforehand; None: the stream's.
         """
-        for table in map(pq.read_table, self.files):
+        for file in self.files:
+            table = pq.read_table(file)
             if not len(table):
                 continue
-            factors = {}
-            for name in table.column_names:
-                if name.startswith("factor "):
-                    values = table[name].combine_chunks()
-                    width = values.type.list_size
-                    factors[name.removeprefix("factor ")] = values.flatten().to_numpy().reshape(-1, width)
-            labels = self._labels(table) if known is None else known(table["position"].to_numpy())
+            factors = {
+                name.removeprefix("factor "): factor_values(table[name], name, file)
+                for name in table.column_names
+                if name.startswith("factor ")
+            }
+            places = table["position"].to_numpy()
+            labels = {name: column[places] for name, column in (known or {}).items()}
+            labels = self._labels(table) if known is None else labels
             yield Columns(table["file"].to_pylist(), factors, labels, origin)
+
+    def _labels(self, table: pa.Table) -> dict[str, np.ndarray]:
+        rows = [json.loads(text) if text else {} for text in table["labels"].to_pylist()]
+        labels = {name: column_of(name, rows, kind) for name, kind in self.so_far.kinds.items()}
+        if not self.so_far.partitioned:
+            return labels
+        return {"partition": np.array(table["partition"].to_pylist(), np.str_), **labels}
 
     def remove(self) -> None:
         """Delete the folder."""
@@ -195,17 +224,6 @@ class Parts:
         if not self.files:
             self.remove()
         return not self.files
-
-    def _labels(self, table: pa.Table) -> dict[str, np.ndarray]:
-        rows = [json.loads(text) if text else {} for text in table["labels"].to_pylist()]
-        labels = {}
-        if self.so_far.partitioned:
-            labels["partition"] = np.array(table["partition"].to_pylist(), np.str_)
-        return {**labels, **{name: column_of(name, rows, kind) for name, kind in self.so_far.kinds.items()}}
-
-
-def _packed(labels: Mapping[str, Any]) -> str:
-    return json.dumps(dict(labels), ensure_ascii=False) if labels else ""
 
 
 def _checked_note(file: Path, number: int) -> dict[str, Any]:

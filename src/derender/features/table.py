@@ -61,18 +61,20 @@ class FeatureTable:
         if not factors:
             raise ValueError("a feature table needs at least one factor")
         check_names(factors, labels)
-        for name, values in labels.items():
-            self._check_shape("label", name, values, 1)
-        for name, values in factors.items():
-            self._check_shape("factor", name, values, 2)
+        for kind, columns, shape in (
+            ("label", labels, "one value"),
+            ("factor", factors, "at least one number"),
+        ):
+            for name, values in columns.items():
+                if values.ndim != (1 if kind == "label" else 2) or 0 in values.shape[1:]:
+                    raise ValueError(
+                        f"{kind} {name!r} must have {shape} in each row, got shape {values.shape}"
+                    )
+                if len(values) != len(self):
+                    raise ValueError(
+                        f"{kind} {name!r} has {len(values)} rows, but there are {len(self)} files"
+                    )
         check_finite(factors, self.files)
-
-    def _check_shape(self, kind: str, name: str, values: np.ndarray, dimensions: int) -> None:
-        if values.ndim != dimensions or 0 in values.shape[1:]:
-            expected = "one value" if dimensions == 1 else "at least one number"
-            raise ValueError(f"{kind} {name!r} must have {expected} in each row, got shape {values.shape}")
-        if len(values) != len(self.files):
-            raise ValueError(f"{kind} {name!r} has {len(values)} rows, but there are {len(self.files)} files")
 
     def __len__(self) -> int:
         return len(self.files)
@@ -112,16 +114,20 @@ class FeatureTable:
         number = {key: position for position, key in enumerate(dict.fromkeys(keys))}
         group = np.array([number[key] for key in keys], dtype=np.int64)
         first = np.unique(group, return_index=True)[1]
+        total = {name: np.zeros((len(number), values.shape[1])) for name, values in table.factors.items()}
+        for name, values in table.factors.items():
+            np.add.at(total[name], group, values)
+        sizes = np.bincount(group, minlength=len(number))[:, None]
         return type(self)(
             tuple("/".join(map(str, key)) for key in number),
-            {name: _group_mean(values, group, len(number)) for name, values in table.factors.items()},
+            {name: values / sizes for name, values in total.items()},
             {name: v[first] for name, v in table.labels.items() if _equal(v[first][group], v)},
             {**self.origin, "mean_by": list(labels)},
         )
 
     def write(self, path: str | Path) -> Path:
         """Write parquet; at ``path`` stands the old file or the whole new one, never half of it."""
-        write_columns(Path(path), Columns(self.files, self.factors, self.labels, self.origin))
+        write_columns(Path(path), [Columns(self.files, self.factors, self.labels, self.origin)])
         return Path(path)
 
     @classmethod
@@ -153,12 +159,6 @@ def check_finite(factors: Mapping[str, np.ndarray], files: Sequence[str]) -> Non
                 f"factor {name!r} is not finite in {int((~finite).sum())} of {len(values)} rows, first in "
                 f"{files[int(np.argmin(finite))]}: drop these rows, or check the model that made them"
             )
-
-
-def _group_mean(values: np.ndarray, group: np.ndarray, count: int) -> np.ndarray:
-    total = np.zeros((count, values.shape[1]))
-    np.add.at(total, group, values)
-    return total / np.bincount(group, minlength=count)[:, None]
 
 
 def _equal(a: np.ndarray, b: np.ndarray) -> bool:

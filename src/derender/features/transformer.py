@@ -35,10 +35,7 @@ class DisentangledFeatures(TransformerMixin, BaseEstimator):
         batch_size: int = 256,
         device: str | None = None,
     ):
-        self.model = model
-        self.factors = factors
-        self.batch_size = batch_size
-        self.device = device
+        self.model, self.factors, self.batch_size, self.device = model, factors, batch_size, device
 
     def fit(self, X: Any = None, y: Any = None) -> "DisentangledFeatures":
         """Load the model and check the factors' names; images and labels are not looked at."""
@@ -48,7 +45,7 @@ class DisentangledFeatures(TransformerMixin, BaseEstimator):
     def transform(self, X: Any) -> np.ndarray:
         """(N, sum of D) float32."""
         model = self._loaded()
-        codes = embed_images(model, as_pictures(X, model.image_size), batch_size=self.batch_size)
+        codes = embed_images(model, as_pixels(X, model.image_size), batch_size=self.batch_size)
         return np.concatenate([codes[name] for name in self._chosen(codes)], axis=1)
 
     def get_feature_names_out(self, input_features: Any = None) -> np.ndarray:
@@ -95,13 +92,19 @@ class DisentangledFeatures(TransformerMixin, BaseEstimator):
         return tags
 
 
-def as_pictures(X: Any, image_size: int) -> np.ndarray:
+def as_pixels(X: Any, image_size: int) -> np.ndarray:
     """Images in any of the forms DisentangledFeatures takes, as (N, 3, S, S), uint8 or float32 in 0..1."""
     if isinstance(X, (str, os.PathLike)):
         raise ValueError(f"expected several images, got the one path {str(X)!r}: give a list of paths")
     array = X.detach().cpu().numpy() if isinstance(X, torch.Tensor) else np.asarray(X)
     if array.size and array.dtype.kind in "UO":
-        return np.stack([_from_path(item, image_size) for item in array.reshape(-1).tolist()])
+        paths = array.reshape(-1).tolist()
+        for item in paths:
+            if not isinstance(item, (str, os.PathLike)):
+                raise ValueError(
+                    f"expected paths of images, got {type(item).__name__}: give paths or an array"
+                )
+        return np.stack([read_image(Path(item), image_size) for item in paths])
     if array.ndim == 4 and array.shape[1] != 3 and array.shape[3] == 3:
         array = np.moveaxis(array, 3, 1)
     if array.ndim != 4 or array.shape[1:] != (3, image_size, image_size):
@@ -116,9 +119,3 @@ def as_pictures(X: Any, image_size: int) -> np.ndarray:
     if not np.isfinite(array).all() or array.min(initial=0) < 0 or array.max(initial=0) > 1:
         raise ValueError("images given as floats must lie in 0..1 without NaN: divide by 255, or pass uint8")
     return np.ascontiguousarray(array, np.float32)
-
-
-def _from_path(item: Any, image_size: int) -> np.ndarray:
-    if not isinstance(item, (str, os.PathLike)):
-        raise ValueError(f"expected paths of images, got {type(item).__name__}: give paths or an array")
-    return read_image(Path(item), image_size)

@@ -2,21 +2,18 @@
 
 Shares: integrated gradients of a probe (Sundararajan et al., ICML 2017), computed by captum. A factor's
 share is that of Klinghoffer et al. (ECCV 2022, caption of the Grad-CAM figure): the sum of |IG| over its
-dimensions, over the sum of all. The path from the baseline b to the feature z is straight, so IG of a
-linear logit is weight times (z - b) exactly; the probability's IG is proportional to it for yes/no labels,
-and the share of an image the same. A zero baseline counts a feature that is large in every image, whether
-or not it distinguishes images; the mean as baseline does not.
+dimensions, over the sum of all. A zero baseline counts a feature that is large in every image, whether or not
+it distinguishes images; the mean as baseline does not.
 
 Maps: Grad-CAM (Selvaraju et al., ICCV 2017) at the encoder's last spatial convolution, the paper's choice;
 HiResCAM (Draelos and Carin, 2020, arXiv 2011.08891), which multiplies gradient and activation place by
 place; integrated gradients of the pixels through the whole encoder. The answer is the probe's logit by way
-of ONE factor while the others are held. Grad-CAM averages the gradient over places, and these encoders
-weigh every place of the last activations by itself: it can light up where the answer does not look, which
-HiResCAM cannot. Maps are 4 x 4 at the activations: upsampled they show a region, not an outline.
+of one factor while the others are held. Grad-CAM averages the gradient over places: it can light up where the
+answer does not look, which HiResCAM cannot. Maps are 4 x 4 at the activations: a region, not an outline.
 
 Sanity check of maps: Adebayo et al., Sanity Checks for Saliency Maps, NeurIPS 2018. A map that stays the
 same when the encoder's weights are drawn anew shows the image, not the model: do not trust it. One that
-stays with shuffled labels shows the encoder's interest, whatever the question. ``another picture`` measures
+stays with shuffled labels shows the encoder's interest, whatever the question. ``another image`` measures
 how much of a map is the same for every image. The verdict goes by Spearman's rank correlation over the
 places of the map; SSIM is that of the maps at the image's size, each divided by its largest value.
 """
@@ -202,8 +199,8 @@ def pixel_attribution(
 ) -> tuple[Float[Tensor, "n h w"], Float[Tensor, " n"]]:
     """|IG| of the pixels from a grey image, summed over colours, and the relative completeness error."""
 
-    def answer(pictures: Tensor, own: Tensor | None = None) -> Tensor:
-        active = model.factor_activations(factor, pictures)
+    def answer(pixels: Tensor, own: Tensor | None = None) -> Tensor:
+        active = model.factor_activations(factor, pixels)
         return score(model.features_from({factor: active})[factor], own)
 
     grey = torch.full_like(images[:1], GREY)
@@ -279,22 +276,22 @@ def sanity_check(
     """
     if len(images) < 2:
         raise ValueError(f"a sanity check compares maps of 2 images or more, got {len(images)}")
-    twins = [untrained_twin(model, seed) for seed in seeds]
-    found = []
+    twins, found = [untrained_twin(model, seed) for seed in seeds], []
     for method in methods:
         for factor in probe.factors:
-            own = saliency(method, model, images, factor, probe, targets)
+
+            def maps(net: Any, asked: Probe, method: str = method, factor: str = factor) -> Tensor:
+                return saliency(method, net, images, factor, asked, targets)
+
+            own = maps(model, probe)
             others = {
-                "random weights": [saliency(method, twin, images, factor, probe, targets) for twin in twins],
-                "shuffled labels": []
-                if shuffled is None
-                else [saliency(method, model, images, factor, shuffled, targets)],
+                "random weights": [maps(twin, probe) for twin in twins],
+                "shuffled labels": [] if shuffled is None else [maps(model, shuffled)],
                 "another image": [own.roll(1, dims=0)],
             }
-            size = images.shape[-1]
-            found += [
-                similarity(method, factor, name, own, maps, size) for name, maps in others.items() if maps
-            ]
+            for changed, them in others.items():
+                if them:
+                    found.append(similarity(method, factor, changed, own, them, images.shape[-1]))
     return found
 
 
@@ -307,15 +304,8 @@ def similarity(
     known = np.isfinite(ranks)
     if not known.any():
         return Similarity(method, factor, changed, float("nan"), float("nan"), float("nan"), 1.0)
-    return Similarity(
-        method,
-        factor,
-        changed,
-        float(ranks[known].mean()),
-        float(ssim[known].mean()),
-        float(ranks[known].std()),
-        float(1 - known.mean()),
-    )
+    means = float(ranks[known].mean()), float(ssim[known].mean()), float(ranks[known].std())
+    return Similarity(method, factor, changed, *means, float(1 - known.mean()))
 
 
 def spearman(first: Tensor, second: Tensor) -> np.ndarray:

@@ -212,24 +212,26 @@ def explain_labels(
     ((count, train),) = split.train.items()
     if len(train) != len(seeds):
         raise ValueError(f"{len(seeds)} seeds need as many choices of rows, got {len(train)}")
-    measured: dict[str, list[_Measured]] = {"model": [], "shuffled labels": [], "untrained encoder": []}
-    total, done = 2 * len(seeds) + min(len(untrained), len(seeds)), 0
+    fitted: dict[str, list[Probe]] = {"model": [], "shuffled labels": [], "untrained encoder": []}
+    measured: dict[str, list[tuple[np.ndarray, ...]]] = {name: [] for name in fitted}
+    total = 2 * len(seeds) + min(len(untrained), len(seeds))
     for place, (seed, rows) in enumerate(zip(seeds, train, strict=True)):
         tried = [("model", features, task), ("shuffled labels", features, shuffled(task, rows, seed))]
-        if place < len(untrained):
-            tried.append(("untrained encoder", untrained[place], task))
+        tried += [("untrained encoder", values, task) for values in untrained[place : place + 1]]
         for name, values, asked in tried:
             probe = fit_probe(values, asked, rows, head=head, seed=seed, settings=settings)
             start = None if baseline == "zero" else probe.columns(values)[rows].mean(axis=0)
-            measured[name].append(_measure(probe, values, task, split.test, start, output, steps, seed))
-            done += 1
+            z, targets = probe.columns(values)[split.test], task.targets[split.test]
+            parts = _shares(probe, z, targets, start, output, steps)
+            fitted[name].append(probe)
+            measured[name].append((*parts, *scores(probe, z, targets, seed)))
             if progress is not None:
-                progress(done, total)
-    rows_of = [_row(name, name != "model", runs) for name, runs in measured.items() if runs]
-    first = measured["model"][0].probe
+                progress(sum(map(len, measured.values())), total)
+    first = fitted["model"][0]
     return Explanation(
-        task.kind, task.names, first.factors, tuple(rows_of), first, measured["shuffled labels"][0].probe,
-        count, len(split.test), head, output, baseline,
+        task.kind, task.names, first.factors,
+        tuple(_row(name, runs) for name, runs in measured.items() if runs), first,
+        fitted["shuffled labels"][0], count, len(split.test), head, output, baseline,
     )  # fmt: skip
 
 
@@ -240,35 +242,21 @@ def shuffled(task: Task, rows: np.ndarray, seed: int) -> Task:
     return replace(task, targets=targets)
 
 
-@dataclass(frozen=True, eq=False)
-class _Measured:
-    """One probe: per image (T, A, F) shares (NaN where not asked), AUC and its drop, error and scale."""
-
-    probe: Probe
-    shares: np.ndarray
-    auc: np.ndarray
-    drop: np.ndarray
-    error: float
-    scale: float
-
-
-def _measure(
-    probe: Probe, features: Features, task: Task, test: np.ndarray,
-    start: np.ndarray | None, output: str, steps: int | None, seed: int,
-) -> _Measured:  # fmt: skip
-    z, targets = probe.columns(features)[test], task.targets[test]
-    shares = np.full((len(test), len(task.names), len(probe.sizes)), np.nan)
-    error = scale = 0.0
-    for answer in range(len(task.names)):
-        asked = targets[:, answer] >= 0 if task.kind == "labels" else targets[:, answer] == 1
+def _shares(
+    probe: Probe, z: np.ndarray, targets: np.ndarray, start: np.ndarray | None, output: str, steps: int | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Per image (T, A, F) shares, NaN where not asked; and (2,) the largest completeness error and change."""
+    shares = np.full((*targets.shape, len(probe.sizes)), np.nan)
+    error, scale = np.zeros((2, 1))
+    for answer in range(targets.shape[1]):
+        asked = targets[:, answer] >= (0 if probe.kind == "labels" else 1)
         found, delta = integrated_gradients(
             probe, z[asked], answer, baseline=start, output=output, steps=steps
         )
         shares[asked, answer] = factor_shares(found, probe)
-        error = max(error, float(np.abs(delta).max(initial=0)))
-        scale = max(scale, float(np.abs(found.sum(axis=1) - delta).max(initial=0)))
-    auc, drop = scores(probe, z, targets, seed)
-    return _Measured(probe, shares, auc, drop, error, scale)
+        error = np.append(error, np.abs(delta))
+        scale = np.append(scale, np.abs(found.sum(axis=1) - delta))
+    return shares, np.array([error.max(), scale.max()])
 
 
 def scores(probe: Probe, z: np.ndarray, targets: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -286,8 +274,7 @@ def _auc(targets: np.ndarray, logits: np.ndarray, kind: str) -> np.ndarray:
     """NaN where the test rows have one value only."""
     found = np.full(targets.shape[1], np.nan)
     if kind == "classes":  # a class's lead over the best of the others: what decides the answer
-        top = np.sort(logits, axis=1)
-        best, second = top[:, -1:], top[:, -2:-1]
+        second, best = np.sort(logits, axis=1)[:, -2:, None].transpose(1, 0, 2)
         logits = logits - np.where(logits == best, second, best)
     for answer, (truth, value) in enumerate(zip(targets.T, logits.T, strict=True)):
         rows = truth >= 0
@@ -296,41 +283,28 @@ def _auc(targets: np.ndarray, logits: np.ndarray, kind: str) -> np.ndarray:
     return found
 
 
-def _row(name: str, control: bool, runs: Sequence[_Measured]) -> ShareRow:
-    every = np.stack([run.shares for run in runs])  # (S, T, A, F)
-    per_seed = np.stack([_mean(run.shares) for run in runs])
-    low, high = _interval(_mean(every))
-    scale = max(run.scale for run in runs)
-    return ShareRow(
-        name,
-        control,
-        per_seed,
-        low,
-        high,
-        np.stack([run.auc for run in runs]),
-        np.stack([run.drop for run in runs]),
-        max(run.error for run in runs) / scale if scale > 0 else 0.0,
-    )
+def _row(name: str, runs: Sequence[tuple[np.ndarray, ...]]) -> ShareRow:
+    shares, largest, auc, drop = map(np.stack, zip(*runs, strict=True))  # shares: (S, T, A, F)
+    ends, (error, scale) = _interval(_mean(shares)), largest.max(axis=0)
+    error = float(error / scale) if scale > 0 else 0.0
+    per_seed = np.stack([_mean(each) for each in shares])
+    return ShareRow(name, name != "model", per_seed, ends[0], ends[1], auc, drop, error)
 
 
-def _mean(shares: np.ndarray) -> np.ndarray:
+def _mean(values: np.ndarray) -> np.ndarray:
     """Mean over the first axis of what is no NaN; NaN where nothing is."""
-    known = np.isfinite(shares)
-    count = known.sum(axis=0)
-    total = np.where(known, shares, 0).sum(axis=0)
+    known = np.isfinite(values)
+    count, total = known.sum(axis=0), np.where(known, values, 0).sum(axis=0)
     return np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0)
 
 
-def _interval(shares: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(T, A, F) as the ends of the 95 % interval of the mean over images, (A, F) each."""
+def _interval(shares: np.ndarray) -> np.ndarray:
+    """(T, A, F) as the ends of the 95 % interval of the mean over images, (2, A, F)."""
     known = np.isfinite(shares).reshape(len(shares), -1).astype(np.float32)
     values = np.where(np.isfinite(shares), shares, 0).reshape(len(shares), -1).astype(np.float32)
-    means = []
-    for weights in resamples(len(shares), BOOTSTRAP):
-        count = weights @ known
-        means.append(np.divide(weights @ values, count, out=np.full(count.shape, np.nan), where=count > 0))
-    drawn = np.concatenate(means)
-    ends = np.full((2, drawn.shape[1]), np.nan)
-    some = np.isfinite(drawn).any(axis=0)
+    weights = np.concatenate(list(resamples(len(shares), BOOTSTRAP)))
+    count = weights @ known
+    drawn = np.divide(weights @ values, count, out=np.full(count.shape, np.nan), where=count > 0)
+    ends, some = np.full((2, drawn.shape[1]), np.nan), np.isfinite(drawn).any(axis=0)
     ends[:, some] = np.nanquantile(drawn[:, some], [(1 - LEVEL) / 2, (1 + LEVEL) / 2], axis=0)
-    return ends[0].reshape(shares.shape[1:]), ends[1].reshape(shares.shape[1:])
+    return ends.reshape(2, *shares.shape[1:])

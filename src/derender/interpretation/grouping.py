@@ -71,30 +71,33 @@ def cluster_shares(
     Args:
         features: by factor, (N, D_f).
         clusters: (N,) names or numbers; two or more different ones.
-        permutations: of the rows, for the chance level.
-        seed: of these.
+        permutations, seed: of the rows, for the chance level.
     """
-    clusters = np.asarray(clusters)
     names = np.unique(clusters)
     if len(names) < 2:
         raise ValueError(
             f"a cluster needs others to compare with: {len(clusters)} rows form {len(names)} cluster"
         )
-    member = clusters[:, None] == names  # (N, C)
+    member, count = np.asarray(clusters)[:, None] == names, len(clusters)  # (N, C)
+    sizes = member.sum(axis=0)
     centred = [np.asarray(v, np.float64) - np.asarray(v, np.float64).mean(axis=0) for v in features.values()]
     total = np.array([(values**2).sum() for values in centred])
-    between = _between(centred, member)
-    generator = np.random.default_rng(seed)
-    shuffled = [_between(centred, generator.permutation(member)) for _ in range(permutations)]
-    sizes = member.sum(axis=0)
-    weight = (sizes * (len(clusters) - sizes) / len(clusters))[:, None]
-    distance = between / weight
+
+    def between(member: np.ndarray) -> np.ndarray:
+        """Sum of squares between each cluster and the rest, by factor: (C, F)."""
+        means = [member.T.astype(np.float64) @ values / sizes[:, None] for values in centred]
+        apart = np.stack([(values**2).sum(axis=1) for values in means], axis=1)  # |mean of the cluster|^2
+        return apart * (sizes * count / (count - sizes))[:, None]
+
+    generator, found = np.random.default_rng(seed), between(member)
+    shuffled = [between(generator.permutation(member)) for _ in range(permutations)]
+    distance = found / (sizes * (count - sizes) / count)[:, None]
     return ClusterShares(
-        tuple(str(name) for name in names),
+        tuple(map(str, names)),
         tuple(features),
         sizes,
         _over(distance, distance.sum(axis=1, keepdims=True)),
-        _over(between, total),
+        _over(found, total),
         _over(np.mean(shuffled, axis=0), total),
     )
 
@@ -107,35 +110,28 @@ def pair_parts(
     Args:
         features: by factor, (N, D_f).
         first, second: row numbers.
-        pairs: random pairs of rows that they are compared with.
-        seed: of these.
+        pairs, seed: random pairs of rows that they are compared with.
     """
     rows = [np.asarray(values, np.float64) for values in features.values()]
-    distance = np.array([((v[first] - v[second]) ** 2).sum() for v in rows])
+    generator, count = np.random.default_rng(seed), len(rows[0])
+    one = generator.integers(count, size=pairs)
+    other = (one + generator.integers(1, max(count, 2), size=pairs)) % count
+
+    def apart(one: Sequence[int] | np.ndarray, other: Sequence[int] | np.ndarray) -> np.ndarray:
+        return np.stack([((v[one] - v[other]) ** 2).sum(axis=1) for v in rows])  # (F, pairs)
+
+    distance = apart([first], [second])
     inner = np.array([v[first] @ v[second] for v in rows])
-    lengths = [np.array([np.linalg.norm(v[row]) for v in rows]) for row in (first, second)]
-    whole = np.linalg.norm(lengths[0]) * np.linalg.norm(lengths[1])
-    generator = np.random.default_rng(seed)
-    one = generator.integers(len(rows[0]), size=pairs)
-    other = (one + generator.integers(1, max(len(rows[0]), 2), size=pairs)) % len(rows[0])
-    usual = np.stack([((v[one] - v[other]) ** 2).sum(axis=1) for v in rows])
-    own = np.prod(lengths, axis=0)
+    lengths = np.array([np.linalg.norm(v[[first, second]], axis=1) for v in rows])  # (F, 2)
+    own, whole = lengths.prod(axis=1), np.linalg.norm(lengths, axis=0).prod()
     return PairParts(
         tuple(features),
-        distance,
-        _over(distance, float(distance.sum())),
-        _over(inner, float(whole)),
+        distance[:, 0],
+        _over(distance[:, 0], distance.sum()),
+        _over(inner, whole),
         np.divide(inner, own, out=np.full(len(rows), np.nan), where=own > 0),
-        (usual > distance[:, None]).mean(axis=1),
+        (apart(one, other) > distance).mean(axis=1),
     )
-
-
-def _between(centred: Sequence[np.ndarray], member: np.ndarray) -> np.ndarray:
-    """Sum of squares between each cluster and the rest, by factor: (C, F); rows are centred."""
-    count, sizes = len(member), member.sum(axis=0)
-    mean = [member.T.astype(np.float64) @ values / sizes[:, None] for values in centred]
-    apart = np.stack([(values**2).sum(axis=1) for values in mean], axis=1)  # |mean of the cluster|^2
-    return apart * (sizes * count / (count - sizes))[:, None]
 
 
 def _over(part: np.ndarray, whole: np.ndarray | float) -> np.ndarray:

@@ -12,7 +12,6 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -25,7 +24,7 @@ from derender.evaluation.linear_logistic import axes_of, fit_logistic, solve_log
 from derender.evaluation.linear_probes import PAPER_HEAD, HeadSettings, head_loss
 from derender.evaluation.linear_task import Task, task_of
 from derender.features import missing
-from derender.storage.atomic import atomic_folder
+from derender.storage.atomic import new_folder
 
 HEADS = ("logistic", "linear")
 PENALTIES = (1e-1, 1.0, 1e1)
@@ -61,30 +60,36 @@ def question(
         raise ValueError(
             f"{source} has no labels, and an explanation needs an answer to explain: add a table"
         )
+    columns, known = {}, {}
     for name in names:
         if name not in labels:
             raise ValueError(
                 f"{source} has no label {name!r}{suggestion(name, labels)}; there is {', '.join(labels)}"
             )
-    columns = {name: without_rare(in_bins(np.asarray(labels[name]), bins), min_count) for name in names}
-    for name, values in columns.items():
-        known = values[~missing(values)]
-        if len(known) < FEWEST_IMAGES:
+        columns[name] = without_rare(in_bins(np.asarray(labels[name]), bins), min_count)
+        known[name] = columns[name][~missing(columns[name])].tolist()
+        if len(known[name]) < FEWEST_IMAGES:
             raise ValueError(
-                f"label {name!r} of {source} is known for {len(known)} images, and an explanation needs "
-                f"{FEWEST_IMAGES} or more: add images or choose another label"
+                f"label {name!r} of {source} is known for {len(known[name])} images, and an explanation "
+                f"needs {FEWEST_IMAGES} or more: add images or choose another label"
             )
-        if len(set(known.tolist())) < 2:
-            others = [other for other in labels if other != name and _classes(labels[other]) > 1]
-            close = suggestion(name, others)
+        if len(set(known[name])) < 2:
+            others = [
+                other
+                for other, values in labels.items()
+                if other != name and len(set(np.asarray(values)[~missing(values)].tolist())) > 1
+            ]
             raise ValueError(
-                f"every labelled image of {source} has {name} {known[0]}, so there is nothing to "
-                f"distinguish{close}; labels with two classes or more: {', '.join(others) or 'none'}"
+                f"every labelled image of {source} has {name} {known[name][0]}, so there is nothing to "
+                f"distinguish{suggestion(name, others)}; labels with two classes or more: "
+                f"{', '.join(others) or 'none'}"
             )
     task = task_of(columns)
     if task.kind == "classes":
         return task
-    return replace(task, names=tuple(_yes_of(name, values) for name, values in columns.items()))
+    words = (name for name, values in columns.items() if values.dtype.kind not in "bi")
+    yes = {name: f"{name}: {max(set(known[name]))}" for name in words}  # what a yes means
+    return replace(task, names=tuple(yes.get(name, name) for name in columns))
 
 
 def in_bins(values: np.ndarray, bins: int | None = None) -> np.ndarray:
@@ -92,8 +97,7 @@ def in_bins(values: np.ndarray, bins: int | None = None) -> np.ndarray:
     kind = values.dtype.kind
     if kind not in "iuf" or values.dtype == np.int8 or (kind != "f" and bins is None):
         return values
-    known = ~missing(values)
-    count = BINS if bins is None else bins
+    known, count = ~missing(values), BINS if bins is None else bins
     if count < 2:
         raise ValueError(f"numbers are cut into 2 bins or more, got {count}")
     if len(np.unique(values[known])) <= count:
@@ -114,18 +118,6 @@ def without_rare(values: np.ndarray, min_count: int) -> np.ndarray:
     kept = values.astype(object)
     kept[rare | ~known] = None
     return kept
-
-
-def _yes_of(name: str, values: np.ndarray) -> str:
-    """A column of two values by what a yes means: its name, or name and value where the values are words."""
-    if np.asarray(values).dtype.kind in "bi":
-        return name
-    return f"{name}: {max(set(values[~missing(values)].tolist()))}"
-
-
-def _classes(values: np.ndarray) -> int:
-    values = np.asarray(values)
-    return len(set(values[~missing(values)].tolist()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,9 +156,7 @@ class Probe:
     def slices(self) -> dict[str, slice]:
         """Where each factor's columns lie."""
         ends = np.cumsum(list(self.sizes.values())).tolist()
-        return {
-            name: slice(end - size, end) for (name, size), end in zip(self.sizes.items(), ends, strict=True)
-        }
+        return {name: slice(end - self.sizes[name], end) for name, end in zip(self.sizes, ends, strict=True)}
 
     def columns(self, features: Mapping[str, np.ndarray]) -> np.ndarray:
         """The features of its factors side by side, (N, D)."""
@@ -188,26 +178,14 @@ class Probe:
         logits = self.logits(features)
         return softmax(logits, axis=1) if self.kind == "classes" else expit(logits)
 
-    def number(self, name: str) -> int:
-        """The place of a label or class; an unknown name is an error that names the nearest."""
-        if name not in self.names:
-            raise ValueError(
-                f"the probe has no answer {name!r}{suggestion(name, self.names)}; "
-                f"it has {', '.join(self.names)}"
-            )
-        return self.names.index(name)
-
     def save(self, folder: str | Path, *, overwrite: bool = False) -> Path:
         """Write weights and what they mean to ``folder``; complete or not at all."""
-        folder = Path(folder)
-        if folder.exists() and not overwrite:
-            raise FileExistsError(f"{folder} exists already: choose another folder or pass overwrite=True")
-        facts: dict[str, Any] = {"format": FORMAT, "kind": self.kind, "names": list(self.names)}
-        facts |= {"sizes": [[name, size] for name, size in self.sizes.items()], "head": self.head}
-        with atomic_folder(folder) as temporary:
+        facts = {"format": FORMAT, "kind": self.kind, "names": self.names, "head": self.head}
+        facts["sizes"] = list(self.sizes.items())
+        with new_folder(folder, overwrite=overwrite) as temporary:
             (temporary / WEIGHTS_FILE).write_bytes(save({"weight": self.weight, "bias": self.bias}))
             (temporary / CONFIG_FILE).write_text(json.dumps(facts, indent=1))
-        return folder
+        return Path(folder)
 
 
 def load_probe(folder: str | Path) -> Probe:
@@ -257,43 +235,42 @@ def fit_probe(
     if head not in HEADS:
         raise ValueError(f"unknown head {head!r}{suggestion(head, HEADS)}; there is {', '.join(HEADS)}")
     sizes = {name: values.shape[1] for name, values in features.items()}
-    x = np.concatenate(list(features.values()), axis=1)[rows]
-    fitted = _logistic(x, task, rows, seed) if head == "logistic" else _paper(x, task, rows, seed, settings)
-    weight, bias = fitted
+    x, y = np.concatenate(list(features.values()), axis=1)[rows], task.targets[rows]
+    weight, bias = (
+        _logistic(x, y, task.kind, seed) if head == "logistic" else _paper(x, y, task.kind, seed, settings)
+    )
     if task.kind == "classes":
         weight, bias = weight - weight.mean(axis=0), bias - bias.mean()
     return Probe(task.kind, task.names, sizes, weight.astype(np.float32), bias.astype(np.float32), head)
 
 
-def _logistic(x: np.ndarray, task: Task, rows: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    targets = task.targets[rows]
+def _logistic(x: np.ndarray, targets: np.ndarray, kind: str, seed: int) -> tuple[np.ndarray, np.ndarray]:
     folds = min(FOLDS, len(x))
-    _, chosen = fit_logistic(x, targets, x[:1], kind=task.kind, penalties=PENALTIES, folds=folds, seed=seed)
+    _, chosen = fit_logistic(x, targets, x[:1], kind=kind, penalties=PENALTIES, folds=folds, seed=seed)
     axes, distinct = axes_of(x), np.unique(chosen)
     every = np.ones((len(x), len(distinct)), bool)
-    found = solve_logistic(axes.apply(x), targets.astype(np.float64), every, distinct, task.kind)
+    found = solve_logistic(axes.apply(x), targets.astype(np.float64), every, distinct, kind)
     own, answers = np.searchsorted(distinct, chosen), np.arange(targets.shape[1])
-    picked = found[:, own, answers] if task.kind == "labels" else found[:, own[0]]  # (R + 1, A)
+    picked = found[:, own, answers] if kind == "labels" else found[:, own[0]]  # (R + 1, A)
     weight = (axes.rotation @ picked[:-1]) / axes.scale[:, None]
     return weight.T, picked[-1] - axes.mean @ weight
 
 
 def _paper(
-    x: np.ndarray, task: Task, rows: np.ndarray, seed: int, settings: HeadSettings
+    x: np.ndarray, y: np.ndarray, kind: str, seed: int, settings: HeadSettings
 ) -> tuple[np.ndarray, np.ndarray]:
     """The head of ``train_heads`` for one seed, with its weights."""
     generator = torch.Generator().manual_seed(seed)
     inputs = torch.from_numpy(np.ascontiguousarray(x, np.float32))
-    targets = torch.from_numpy(task.targets[rows].astype(np.float32))
-    reach = inputs.shape[1] ** 0.5
+    targets = torch.from_numpy(y.astype(np.float32))
     weight, bias = (
-        ((torch.rand(shape, generator=generator) * 2 - 1) / reach).requires_grad_()
-        for shape in ((inputs.shape[1], targets.shape[1]), (1, targets.shape[1]))
+        ((torch.rand(rows, y.shape[1], generator=generator) * 2 - 1) / x.shape[1] ** 0.5).requires_grad_()
+        for rows in (x.shape[1], 1)
     )
     optimiser = torch.optim.Adam([weight, bias], lr=settings.learning_rate)
     for _ in range(settings.epochs):
         for batch in torch.randperm(len(inputs), generator=generator).split(settings.batch_size):
-            loss = head_loss((inputs[batch] @ weight + bias)[None], targets[batch][None], task.kind).sum()
+            loss = head_loss((inputs[batch] @ weight + bias)[None], targets[batch][None], kind).sum()
             optimiser.zero_grad(set_to_none=True)
             loss.backward()
             optimiser.step()

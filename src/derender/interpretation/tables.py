@@ -37,22 +37,22 @@ class ShareRow:
 
     def numbers(self, names: Sequence[str], factors: Sequence[str]) -> dict[str, Any]:
         """As JSON takes it, by label and factor."""
-
-        def one(answer: int) -> dict[str, Any]:
-            parts = {
-                factor: {
-                    "share": self.shares[:, answer, place].mean(),
-                    "low": self.low[answer, place],
-                    "high": self.high[answer, place],
-                    "spread": self.shares[:, answer, place].std(ddof=1) if len(self.shares) > 1 else None,
-                    "drop": self.drop[:, answer, place].mean(),
-                }
-                for place, factor in enumerate(factors)
+        spread = self.shares.std(axis=0, ddof=1) if len(self.shares) > 1 else np.full(self.low.shape, None)
+        parts = {
+            "share": self.shares.mean(axis=0), "low": self.low, "high": self.high, "spread": spread,
+            "drop": self.drop.mean(axis=0),
+        }  # fmt: skip
+        answers = {
+            name: {
+                "auc": self.auc[:, answer].mean(),
+                "factors": {
+                    factor: {part: values[answer, place] for part, values in parts.items()}
+                    for place, factor in enumerate(factors)
+                },
             }
-            return {"auc": self.auc[:, answer].mean(), "factors": parts}
-
-        by_name = {name: one(answer) for answer, name in enumerate(names)}
-        return {"control": self.control, "completeness_error": self.error, "answers": by_name}
+            for answer, name in enumerate(names)
+        }
+        return {"control": self.control, "completeness_error": self.error, "answers": answers}
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,8 +83,7 @@ class Explanation:
 
     def numbers(self) -> dict[str, Any]:
         """Everything as JSON takes it."""
-        facts = {name: getattr(self, name) for name in ("kind", "names", "factors", "n_train", "n_test")}
-        facts |= {name: getattr(self, name) for name in ("head", "output", "baseline")}
+        facts = {name: value for name, value in vars(self).items() if name not in ("probe", "shuffled")}
         return {**facts, "rows": {row.name: row.numbers(self.names, self.factors) for row in self.rows}}
 
 
@@ -97,15 +96,18 @@ def share_table(found: Explanation) -> ScoreTable:
     for factor in found.factors:
         column = Column(factor, note="share of the sum of |integrated gradients|, 0 to 1")
         columns += [column, interval_column(column, "images")]
-    model, *controls = found.rows
-    rows = [_mean_row(f"mean of {len(found.names)}", model)] if len(found.names) > 1 else []
-    for answer, name in enumerate(found.names):
+    model = found.rows[0]
+
+    def one(answer: int) -> list[Cell]:
         cells: list[Cell] = []
-        for place in range(len(found.factors)):
-            ends = model.low[answer, place], model.high[answer, place]
-            cells += [_number(model.shares[:, answer, place]), Interval(*map(float, ends))]
-        rows.append(Row(name, (*cells, _number(model.auc[:, answer]))))
-    rows += [_mean_row(row.name, row) for row in controls]
+        for place, share in enumerate(_means(model.shares[:, [answer]])):
+            cells += [share, Interval(float(model.low[answer, place]), float(model.high[answer, place]))]
+        return [*cells, *_means(model.auc[:, [answer], None])]
+
+    def whole(row: ShareRow) -> list[Cell]:
+        shares = [cell for share in _means(row.shares) for cell in (share, None)]
+        return [*shares, *_means(row.auc[..., None])]
+
     what = "yes/no labels" if found.kind == "labels" else "classes, each on its own images"
     seeds = len(model.shares)
     caption = (
@@ -113,19 +115,23 @@ def share_table(found: Explanation) -> ScoreTable:
         f"{found.n_test:,} held out, {seeds} seed{'s' if seeds > 1 else ''}, {len(found.names)} {what}; "
         f"{found.output} from a {found.baseline} baseline, completeness error {model.error:.1e}"
     )
-    return ScoreTable(caption, "label" if found.kind == "labels" else "class", (*columns, AUC), rows)
+    return _answers(found, caption, [*columns, AUC], one, whole)
 
 
 def drop_table(found: Explanation) -> ScoreTable:
     """AUC lost when one factor's features are exchanged between the held-out images."""
-    columns = tuple(Column(factor, note="AUC lost without this factor") for factor in found.factors)
-    model, *controls = found.rows
-    many = len(found.names) > 1
-    rows = [Row(f"mean of {len(found.names)}", _over_all(model.drop))] if many else []
-    for answer, name in enumerate(found.names):
-        rows.append(Row(name, tuple(_number(part) for part in model.drop[:, answer].T)))
-    rows += [Row(row.name, _over_all(row.drop), True) for row in controls]
+    columns = [Column(factor, note="AUC lost without this factor") for factor in found.factors]
     caption = "AUC lost when one factor's features are exchanged between images: a check without gradients"
+    drop = found.rows[0].drop
+    return _answers(found, caption, columns, lambda at: _means(drop[:, [at]]), lambda row: _means(row.drop))
+
+
+def _answers(found: Explanation, caption: str, columns: Sequence[Column], one: Any, whole: Any) -> ScoreTable:
+    """A row of ``one`` answer each, their mean first, the ``whole`` controls last."""
+    model, *controls = found.rows
+    rows = [Row(f"mean of {len(found.names)}", whole(model))] if len(found.names) > 1 else []
+    rows += [Row(name, one(answer)) for answer, name in enumerate(found.names)]
+    rows += [Row(row.name, whole(row), True) for row in controls]
     return ScoreTable(caption, "label" if found.kind == "labels" else "class", columns, rows)
 
 
@@ -143,10 +149,9 @@ def share_verdicts(found: Explanation) -> list[str]:
 
 def sanity_table(rows: Sequence[Similarity]) -> ScoreTable:
     """Similarity of maps when weights, labels or the image change; fresh weights first."""
+    fresh_note = f"Spearman with maps of fresh weights; {UNCHANGED} or more: not trusted"
     columns = (
-        Column(
-            "new weights", "low", 2, f"Spearman with maps of fresh weights; {UNCHANGED} or more: not trusted"
-        ),
+        Column("new weights", "low", 2, fresh_note),
         Column("its SSIM", "low", 2, "structural similarity of the same maps"),
         Column("shuffled labels", "low", 2, "Spearman with maps of a probe of shuffled labels"),
         Column("other image", None, 2, "Spearman with the map of another image"),
@@ -156,14 +161,14 @@ def sanity_table(rows: Sequence[Similarity]) -> ScoreTable:
     found = {(row.method, row.factor, row.changed): row for row in rows}
     lines = []
     for method, factor in dict.fromkeys((row.method, row.factor) for row in rows):
-        fresh = found[method, factor, "random weights"]
-        labels, other = (found.get((method, factor, name)) for name in ("shuffled labels", "another image"))
+        fresh, labels, other = (
+            found.get((method, factor, changed))
+            for changed in ("random weights", "shuffled labels", "another image")
+        )
+        assert fresh is not None
         word = {True: "yes", False: "no", None: "-"}[fresh.trusted]
-        cells: tuple[Cell, ...] = (
-            fresh.spearman, fresh.ssim, labels and labels.spearman, other and other.spearman,
-            fresh.empty, word,
-        )  # fmt: skip
-        lines.append(Row(f"{method}, {factor}", cells))
+        cells = (fresh.spearman, fresh.ssim, labels and labels.spearman, other and other.spearman)
+        lines.append(Row(f"{method}, {factor}", (*cells, fresh.empty, word)))
     return ScoreTable("Do maps change with the learned weights? Similarity, -1 to 1", "map", columns, lines)
 
 
@@ -180,23 +185,21 @@ def unasked(rows: Sequence[Similarity]) -> list[str]:
 
 def cluster_share_table(found: ClusterShares) -> ScoreTable:
     """Parts of the distance of each cluster from the rest, and between-variance beside chance."""
-    columns: list[Column] = [Column("images")]
-    for factor in found.factors:
-        columns += [
-            Column(factor, note="share of the squared distance to the mean of all other images, 0 to 1"),
-            Column(
-                "ratio", note="share of this factor's variance between cluster and rest; in brackets chance"
-            ),
-        ]
+    share = "share of the squared distance to the mean of all other images, 0 to 1"
+    ratio = Column(
+        "ratio", note="share of this factor's variance between cluster and rest; in brackets chance"
+    )
+    columns = [column for factor in found.factors for column in (Column(factor, note=share), ratio)]
     rows = []
-    for cluster, name in enumerate(found.names):
-        cells: list[Cell] = [int(found.sizes[cluster])]
-        for place in range(len(found.factors)):
-            ratio, chance = found.ratio[cluster, place], found.chance[cluster, place]
-            cells += [float(found.share[cluster, place]), f"{ratio:.3f} ({chance:.3f})"]
+    for name, size, *parts in zip(
+        found.names, found.sizes, found.share, found.ratio, found.chance, strict=True
+    ):
+        cells: list[Cell] = [int(size)]
+        for own, between, chance in zip(*parts, strict=True):
+            cells += [float(own), f"{between:.3f} ({chance:.3f})"]
         rows.append(Row(f"cluster {name}", cells))
     caption = "Each cluster against the rest: parts of the squared distance, ratios of variances (by chance)"
-    return ScoreTable(caption, "cluster", columns, rows)
+    return ScoreTable(caption, "cluster", [Column("images"), *columns], rows)
 
 
 def pair_table(found: PairParts, names: tuple[str, str]) -> ScoreTable:
@@ -214,19 +217,7 @@ def pair_table(found: PairParts, names: tuple[str, str]) -> ScoreTable:
     return ScoreTable(caption, "factor", columns, (*rows, whole))
 
 
-def _mean_row(name: str, row: ShareRow) -> Row:
-    cells: list[Cell] = []
-    for share in _over_all(row.shares):
-        cells += [share, None]
-    auc = row.auc[np.isfinite(row.auc)]
-    return Row(name, (*cells, float(auc.mean()) if len(auc) else None), row.control)
-
-
-def _over_all(values: np.ndarray) -> tuple[Cell, ...]:
-    """(S, A, F) as the mean for each factor."""
-    return tuple(_number(part) for part in values.reshape(-1, values.shape[-1]).T)
-
-
-def _number(values: np.ndarray) -> float | None:
-    known = values[np.isfinite(values)]
-    return float(known.mean()) if len(known) else None
+def _means(values: np.ndarray) -> list[float | None]:
+    """(S, A, F) as the mean of what is finite for each factor."""
+    known = [part[np.isfinite(part)] for part in values.reshape(-1, values.shape[-1]).T]
+    return [float(part.mean()) if len(part) else None for part in known]

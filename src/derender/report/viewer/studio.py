@@ -27,7 +27,7 @@ from derender import __version__
 from derender.data import as_float
 from derender.evaluation.out_of_distribution import OUTLIER_PERCENTILE, percentile_of
 from derender.features import FeatureTable, named
-from derender.features.neighbours import nearest, same_picture
+from derender.features.neighbours import nearest, same_image
 from derender.model import Derenderer
 from derender.report import colours
 from derender.report.mesh import model_mesh
@@ -251,7 +251,7 @@ class Studio:
         features = self.shelf.get(other).features
         try:
             feature = named(features, question.factor, "factor")
-            itself = same_picture(self.table, features)
+            itself = same_image(self.table, features)
             found = nearest(self.table, feature, question.factor, question.k, exclude=itself.tolist())
         except ValueError as problem:
             raise Refused(422, str(problem)) from problem
