@@ -12,7 +12,7 @@ from tests.data.doctor import made
 from derender.data import Duplicate, Skipped, open_source, read_images
 from derender.data.doctor import CHECKS, doctor, measure_originals
 from derender.data.doctor.findings import CheckFinding, judged, verdict_of
-from derender.data.doctor.structure import JackknifeEstimate
+from derender.data.doctor.measures import JackknifeEstimate
 
 
 def levels(examination) -> dict[str, str]:

@@ -4,15 +4,17 @@ import numpy as np
 import pytest
 from tests.data.doctor import made
 
-from derender.data.doctor.pixels import measure_pixels, near_copy_groups, shrunk
-from derender.data.doctor.structure import (
+from derender.data.doctor.measures import (
     agreement,
     edge_cells,
     frame_filled,
     jackknife,
     light_variety,
     likeness,
+    measure_pixels,
     mirrored,
+    near_copy_groups,
+    shrunk,
     side_light,
     split_in_two,
     structure_of,

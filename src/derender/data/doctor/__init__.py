@@ -1,7 +1,6 @@
 """Whether a set of images suits the method, before anyone trains: ``doctor``.
 
-pixels (sizes, brightness, colour, near copies) and structure (what images share, in what they vary) measure;
-findings makes sentences and a verdict of it, and has every threshold.
+measures has what is measured; findings makes sentences and a verdict of it, and has every threshold.
 """
 
 from collections.abc import Callable, Mapping
@@ -12,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int64
 
-from derender.data.doctor import structure
+from derender.data.doctor import measures
 from derender.data.doctor.findings import (
     CHECKS,
     Check,
@@ -22,29 +21,22 @@ from derender.data.doctor.findings import (
     percent,
     verdict_of,
 )
-from derender.data.doctor.pixels import (
+from derender.data.doctor.measures import (
+    JackknifeEstimate,
     Originals,
     Pixels,
+    SymmetryAxis,
+    evenly,
+    jackknife,
     measure_originals,
-    measure_pixels,
-    near_copy_groups,
-    shrunk,
 )
-from derender.data.doctor.structure import Halves, JackknifeEstimate, SymmetryAxis, jackknife
 from derender.data.image_set import ImageSet, read_images
 from derender.data.opening import ListedStream, open_images
 from derender.data.source import is_image
 
 __all__ = [
-    "CHECKS",
-    "Check",
-    "CheckFinding",
-    "Examination",
-    "Verdict",
-    "doctor",
-    "measure_originals",
-    "percent",
-]
+    "CHECKS", "Check", "CheckFinding", "Examination", "Verdict", "doctor", "measure_originals", "percent",
+]  # fmt: skip
 
 EXAMINED_PX = 64
 """Side at which images are read for an examination."""
@@ -52,7 +44,7 @@ EXAMINED_PX = 64
 COMPARED = 4_000
 """Most distinct images that are compared with one another, evenly spaced."""
 
-FEWEST_COMPARED = 2 * structure.GROUPS
+FEWEST_COMPARED = 2 * measures.GROUPS
 """With fewer distinct images nothing can be said about what they share."""
 
 ODD_LIKENESS = 0.15
@@ -64,20 +56,18 @@ SHOWN = 8
 
 @dataclass(frozen=True)
 class Shared:
-    """What distinct images share, and in what they vary (structure.py).
+    """What distinct images share, and in what they vary.
 
     Attributes:
         rows: which images were compared.
         values: agreement, symmetry, fill, view, light, odd, and kinship where it can be judged.
         axis: where the mean image of edges is symmetric.
-        halves: the two most different groups, or None.
         orders: pairs of names for the two ends of an order of the compared images, and what orders them.
     """
 
     rows: Int64[np.ndarray, " k"]
     values: Mapping[str, JackknifeEstimate]
     axis: SymmetryAxis
-    halves: Halves | None
     orders: Mapping[tuple[str, str], Float[np.ndarray, " k"]]
 
 
@@ -110,13 +100,15 @@ class Examination:
     @property
     def mean(self) -> Float[np.ndarray, "3 s s"] | None:
         """The compared images' mean, 0..1, or None where too few were compared."""
-        rows = None if self.shared is None else self.shared.rows
-        return None if rows is None else self.images.images[rows].mean(axis=0, dtype=np.float64) / 255
+        if self.shared is None:
+            return None
+        return self.images.images[self.shared.rows].mean(axis=0, dtype=np.float64) / 255
 
     def as_json(self) -> dict[str, Any]:
         """What ``derender doctor --json`` writes."""
         files, shared = self.images.files, self.shared
         compared = {} if shared is None else {**shared.values, "axis": shared.axis}
+        kinship = compared.pop("kinship", None)
         copies = [(row, first) for row, first in enumerate(self.group) if row != first]
         return {
             "source": self.images.source,
@@ -132,8 +124,8 @@ class Examination:
             "blank": round(self.values["blank"].value * len(files)),
             "originals": self.originals,
             "compared": 0 if shared is None else len(shared.rows),
-            "measures": {name: one for name, one in compared.items() if name != "kinship"} or None,
-            "kinship": compared.get("kinship"),
+            "measures": compared or None,
+            "kinship": kinship,
             "unreadable": self.images.skipped,
             "copies": [{"file": files[row], "first": files[first]} for row, first in copies],
         }
@@ -167,79 +159,72 @@ def doctor(
         with open_images(source, dataset=dataset) as stream:
             if isinstance(stream, ListedStream):
                 originals = measure_originals(stream.files, images.files, EXAMINED_PX)
-    if len(images) == 0:
+    count, unreadable = len(images), len(images.skipped)
+    if count == 0:
         raise ValueError(f"there is no image to examine in {images.source}")
-    pixels = measure_pixels(images.images, progress)
-    group = near_copy_groups(pixels.tiny)
-    shared = _compare(images, pixels, np.unique(group), np.random.default_rng(seed))
-    values = {**_counts(images, pixels, group, originals), **({} if shared is None else shared.values)}
-    kept = set(images.files)
+    pixels = measures.measure_pixels(images.images, progress)
+    group = measures.near_copy_groups(pixels.tiny)
+    distinct = np.unique(group)
+    shared = _compare(images, distinct[~pixels.blank[distinct]], np.random.default_rng(seed))
+    copies, kept = count - len(distinct), set(images.files)
     identical = sum(row.file in kept for row in images.duplicates)
-    copies, details = len(images) - len(np.unique(group)), {}
+    shares = {
+        "distinct": len(distinct),
+        "copies": 1 - len(distinct) / count,
+        "unreadable": unreadable / (unreadable + count),
+        "clipped": pixels.clipped.mean(),
+        "blank": pixels.blank.mean(),
+        "grey": pixels.colourless.mean(),
+    }
+    details = {}
     if copies:
         nearly = copies - identical
-        details["copies"] = f"{copies:,} of {len(images):,}: {identical:,} to the pixel, {nearly:,} nearly"
+        details["copies"] = f"{copies:,} of {count:,}: {identical:,} to the pixel, {nearly:,} nearly"
     if originals is not None:
+        shares |= {"small": originals.smaller, "oblong": originals.oblong}
         details["small"] = f"short sides: {originals.median_short:,} pixels in the median"
+    values = {name: JackknifeEstimate(float(value)) for name, value in shares.items()}
+    values |= {} if shared is None else shared.values
     findings = findings_of(values, details, None if shared is None else shared.axis)
     examples = _examples(pixels, group, shared)
     verdict = verdict_of(findings)
     return Examination(images, verdict, findings, values, group, identical, originals, shared, examples)
 
 
-def _counts(
-    images: ImageSet, pixels: Pixels, group: np.ndarray, originals: Originals | None
-) -> dict[str, JackknifeEstimate]:
-    """What needs no comparison of what different images show."""
-    count, unreadable, distinct = len(images), len(images.skipped), len(np.unique(group))
-    values: dict[str, float] = {
-        "distinct": distinct,
-        "copies": 1 - distinct / count,
-        "unreadable": unreadable / (unreadable + count),
-        "clipped": (pixels.dark + pixels.bright).mean(),
-        "blank": pixels.blank.mean(),
-        "grey": pixels.colourless.mean(),
-    }
-    if originals is not None:
-        values |= {"small": originals.smaller, "oblong": originals.oblong}
-    return {name: JackknifeEstimate(float(value)) for name, value in values.items()}
-
-
 def _compare(
-    images: ImageSet, pixels: Pixels, distinct: np.ndarray, generator: np.random.Generator
+    images: ImageSet, rows: Int64[np.ndarray, " n"], generator: np.random.Generator
 ) -> Shared | None:
-    rows = distinct[~pixels.blank[distinct]]
+    """Compare distinct images; None of too few."""
     if len(rows) < FEWEST_COMPARED:
         return None
-    rows = _evenly(rows, COMPARED)
-    parts = np.array_split(rows, -(-len(rows) // 256))
-    grey = np.concatenate([shrunk(images.images[part]) for part in parts])
-    edges, sides, count = (
-        structure.structure_of(structure.edge_cells(grey)),
-        structure.side_light(grey),
-        len(rows),
-    )
-    alike = structure.likeness(edges)
+    rows = rows[evenly(len(rows), COMPARED)]
+    count, parts = len(rows), np.array_split(rows, -(-len(rows) // 256))
+    grey = np.concatenate([measures.shrunk(images.images[part]) for part in parts])
+    edges, sides = measures.structure_of(measures.edge_cells(grey)), measures.side_light(grey)
+    alike = measures.likeness(edges)
     odd = float((alike < ODD_LIKENESS).mean())
-    values = {
-        "agreement": jackknife(lambda kept: structure.agreement(edges[kept]), count),
-        "symmetry": jackknife(lambda kept: structure.symmetry(edges[kept]), count),
-        "fill": jackknife(lambda kept: structure.frame_filled(edges[kept]), count),
-        "view": jackknife(lambda kept: structure.view_variety(edges[kept]), count),
-        "light": jackknife(lambda kept: structure.light_variety(sides[kept]), count),
-        "odd": JackknifeEstimate(odd, float(np.sqrt(odd * (1 - odd) / count))),
+    of_edges = {
+        "agreement": measures.agreement,
+        "symmetry": measures.symmetry,
+        "fill": measures.frame_filled,
+        "view": measures.view_variety,
     }
+    values = {
+        name: jackknife(lambda kept, measure=measure: measure(edges[kept]), count)
+        for name, measure in of_edges.items()
+    }
+    values["light"] = jackknife(lambda kept: measures.light_variety(sides[kept]), count)
+    values["odd"] = JackknifeEstimate(odd, float(np.sqrt(odd * (1 - odd) / count)))
     orders = {
         ("least typical", "most typical"): alike,
-        ("nearest their mirror image", "farthest from it"): structure.own_mirror_distance(edges),
+        ("nearest their mirror image", "farthest from it"): measures.own_mirror_distance(edges),
         ("brightest on the right", "brightest on the left"): sides.mean(axis=1),
     }
-    halves = structure.split_in_two(edges, generator)
-    if halves is not None:
-        values["kinship"] = halves.kinship
-        if halves.kinship.value < (CHECKS["kinship"].objects or 0):
-            orders["one group", "the other group"] = halves.margin
-    return Shared(rows, values, structure.symmetry_axis(grey), halves, orders)
+    if (halves := measures.split_in_two(edges, generator)) is not None:
+        values["kinship"], margin = halves
+        if values["kinship"].value < (CHECKS["kinship"].objects or 0):
+            orders["one group", "the other group"] = margin
+    return Shared(rows, values, measures.symmetry_axis(grey), orders)
 
 
 def _examples(pixels: Pixels, group: np.ndarray, shared: Shared | None) -> dict[str, tuple[int, ...]]:
@@ -247,20 +232,20 @@ def _examples(pixels: Pixels, group: np.ndarray, shared: Shared | None) -> dict[
     examples: dict[str, np.ndarray] = {}
     copies = np.flatnonzero(group != np.arange(len(group)))
     if len(copies):
-        some = _evenly(copies, SHOWN // 2)
+        some = copies[evenly(len(copies), SHOWN // 2)]
         examples["copies, in pairs"] = np.stack([group[some], some], axis=1).ravel()
-    if (blank := np.flatnonzero(pixels.blank)).size:
-        examples["empty"] = _evenly(blank, SHOWN)
+
+    def spread(title: str, rows: np.ndarray) -> None:
+        examples[title] = rows[evenly(len(rows), SHOWN)]
+
+    if pixels.blank.any():
+        spread("empty", np.flatnonzero(pixels.blank))
     if shared is None:
-        examples["all distinct"] = _evenly(np.unique(group), SHOWN)
+        spread("all distinct", np.unique(group))
     elif shared.values["agreement"].value < (CHECKS["agreement"].objects or 0):
-        examples["evenly through the set"] = _evenly(shared.rows, SHOWN)
+        spread("evenly through the set", shared.rows)
     else:
         for (low, high), values in shared.orders.items():
             order = shared.rows[np.argsort(values)]
             examples |= {low: order[:SHOWN], high: order[::-1][:SHOWN]}
     return {name: tuple(map(int, rows)) for name, rows in examples.items()}
-
-
-def _evenly(rows: np.ndarray, count: int) -> np.ndarray:
-    return rows[np.unique(np.linspace(0, len(rows) - 1, count).astype(int))]

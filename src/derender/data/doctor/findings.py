@@ -1,14 +1,15 @@
 """From measures to sentences and a verdict: one finding for each thing that was looked at.
 
 Every threshold stands in ``CHECKS``. Limits were chosen on one half of the material of docs/doctor.md and
-checked on the other; those marked (*) are conventions: nothing was measured to set them.
+checked on the other; those of distinct, unreadable, small and clipped are conventions: nothing was measured
+to set them.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from derender.data.doctor.structure import JackknifeEstimate, SymmetryAxis
+from derender.data.doctor.measures import JackknifeEstimate, SymmetryAxis
 
 Level = Literal["good", "note", "trouble", "objection", "open"]
 """``trouble``: will struggle; ``objection``: does not suit; ``open``: cannot be judged on this set."""
@@ -20,7 +21,7 @@ AXIS_SYMMETRIC = 0.7
 """Both sides about an axis correlate by this much where it is one."""
 
 NOTE_SHARE = 0.1
-"""Of images that are small, oblong, grey or clipped, a share above this is worth a note (*)."""
+"""Of images that are small, oblong, grey or clipped, a share above this is worth a note, by convention."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,7 @@ class CheckFinding:
 class Verdict:
     """``suits``, ``will struggle`` or ``does not suit``, with the reasons, worst first."""
 
-    word: Literal["suits", "will struggle", "does not suit"]
+    word: str
     because: tuple[str, ...] = ()
 
     @property
@@ -59,11 +60,10 @@ class Verdict:
 
 def verdict_of(findings: Sequence[CheckFinding]) -> Verdict:
     """The worst level decides; all objections, or else all troubles, are the reasons."""
-    objections = tuple(finding.short for finding in findings if finding.level == "objection")
-    troubles = tuple(finding.short for finding in findings if finding.level == "trouble")
-    if objections:
-        return Verdict("does not suit", objections)
-    return Verdict("will struggle", troubles) if troubles else Verdict("suits")
+    for level, word in (("objection", "does not suit"), ("trouble", "will struggle")):
+        if reasons := tuple(finding.short for finding in findings if finding.level == level):
+            return Verdict(word, reasons)
+    return Verdict("suits")
 
 
 @dataclass(frozen=True)
@@ -108,20 +108,17 @@ CHECKS = {
     "unreadable": Check(
         *("files", "unreadable", "share of all files; less is better", None, 0.2),
         *("every file can be read", "{number} of the files cannot be read"),
-        "They are left out; the list of unreadable files says why.",
-        0,
+        *("They are left out; the list of unreadable files says why.", 0),
     ),
     "small": Check(
         *("sizes", "small", "share of files below the examined size; less is better", None, 0.5),
         *("no file is too small", "{number} of the files are smaller than the examined size"),
-        "Small images are enlarged, which blurs them: find larger ones.",
-        NOTE_SHARE,
+        *("Small images are enlarged, which blurs them: find larger ones.", NOTE_SHARE),
     ),
     "oblong": Check(
         *("shapes", "oblong", "share of files far from square; less is better", None, None),
         *("every file is about square", "{number} of the files are far from square, cropped to their middle"),
-        "Look whether the thing is still in the image, and crop around it if not.",
-        NOTE_SHARE,
+        *("Look whether the thing is still in the image, and crop around it if not.", NOTE_SHARE),
     ),
     "clipped": Check(
         *("brightness", "clipped", "mean share of black or white pixels; less is better", None, 0.3),
@@ -132,8 +129,7 @@ CHECKS = {
     "blank": Check(
         *("empty images", "empty", "share of images of one brightness; less is better", None, None),
         *("no image is empty", "{number} of the images show one brightness only"),
-        "Delete empty images.",
-        0,
+        *("Delete empty images.", 0),
     ),
     "grey": Check(
         *("colour", "grey", "share of images without colour", None, None),
@@ -143,10 +139,8 @@ CHECKS = {
     ),
     "agreement": Check(
         *("alignment", "agreement", "mean cosine between the edges of two images; 0: unrelated", 0.1, 0.18),
-        *(
-            "the images show the same thing at the same place",
-            "the images have too little in common at the same place",
-        ),
+        "the images show the same thing at the same place",
+        "the images have too little in common at the same place",
         "Take images of one kind of thing, and crop them all alike: the same points at the same place.",
     ),
     "kinship": Check(
@@ -157,8 +151,7 @@ CHECKS = {
     "odd": Check(
         *("out-of-distribution", "unlike the others", "share of images; less is better", None, 0.05),
         *("no image is unlike the others", "{number} of the images are unlike the others"),
-        "Look at the least typical ones and delete what does not belong.",
-        0.05,
+        *("Look at the least typical ones and delete what does not belong.", 0.05),
     ),
     "symmetry": Check(
         *("symmetry", "symmetry", "agreement with other mirror images over agreement; best 1", 0.6, 0.85),
@@ -181,26 +174,25 @@ CHECKS = {
         "Add images lit from the left and from the right: shading shows how the surface bends.",
     ),
 }
-"""By the names of the measures. Those of distinct, unreadable, small and clipped are conventions."""
+"""By the names of the measures."""
 
 
 def judged(value: JackknifeEstimate, check: Check) -> tuple[Level, bool]:
     """The level of a value, and whether two standard errors either way keep it there.
 
-    An objection needs certainty: a value below ``objects`` by less than two errors is only trouble.
+    An objection needs certainty: a value past ``objects`` by less than two errors is only trouble.
     """
-    low, high = value.value - 2 * value.error, value.value + 2 * value.error
-    objects, struggles = check.objects, check.struggles
-    if check.noted is not None:
-        if struggles is not None and value.value > struggles:
-            return "trouble", low > struggles
-        return ("note" if value.value > check.noted else "good"), struggles is None or high <= struggles
-    if objects is not None and value.value < objects:
-        return ("objection", True) if high < objects else ("trouble", False)
-    if struggles is not None and value.value < struggles:
-        return "trouble", high < struggles and (objects is None or low >= objects)
+    sign = 1 if check.noted is None else -1  # so that more is better
+    limits = (None if limit is None else sign * limit for limit in (check.objects, check.struggles))
+    (objects, struggles), middle, margin = limits, sign * value.value, 2 * value.error
+    if objects is not None and middle < objects:
+        return ("objection", True) if middle + margin < objects else ("trouble", False)
+    if struggles is not None and middle < struggles:
+        certain = middle + margin < struggles and (objects is None or middle - margin >= objects)
+        return "trouble", certain
     least = struggles if struggles is not None else objects
-    return "good", least is None or low >= least
+    noted = check.noted is not None and value.value > check.noted
+    return "note" if noted else "good", least is None or middle - margin >= least
 
 
 def finding_of(name: str, value: JackknifeEstimate, detail: str = "") -> CheckFinding:
@@ -208,17 +200,16 @@ def finding_of(name: str, value: JackknifeEstimate, detail: str = "") -> CheckFi
     check = CHECKS[name]
     level, certain = judged(value, check)
     is_share = check.noted is not None
-    number = percent(value.value) if is_share else f"{value.value:,.3g}"
-    if value.value >= 1000:
-        number = f"{value.value:,.0f}"
+    number = (
+        percent(value.value) if is_share else format(value.value, ",.0f" if value.value >= 1000 else ",.3g")
+    )
     clause = check.good if (value.value == 0 if is_share else level == "good") else check.bad
     clause = clause.format(number=number)
     measured = [] if "{number}" in check.bad else [f"{check.label} {number}"]
     if value.error:
         measured.append(f"± {percent(2 * value.error) if is_share else format(2 * value.error, '.2g')}")
-    brackets = "; ".join(
-        part for part in (" ".join(measured), "" if certain else "too few images to be sure", detail) if part
-    )
+    details = (" ".join(measured), "" if certain else "too few images to be sure", detail)
+    brackets = "; ".join(filter(None, details))
     text = f"{clause[:1].upper()}{clause[1:]}{f' ({brackets})' if brackets else ''}."
     if level == "good":
         return CheckFinding(check.name, level, text, value=value)
@@ -240,19 +231,22 @@ def findings_of(
     if "kinship" not in found:
         found["kinship"] = CheckFinding("kinds", "open", "No two groups are large enough to compare.")
     off = found["symmetry"].level != "good" and axis.correlation > AXIS_SYMMETRIC
-    name, old = ("symmetry", found["symmetry"]) if off else ("fill", found["fill"])
-    if abs(axis.offset) >= AXIS_OFFSET and (off or old.level == "good"):
+    name = "symmetry" if off else "fill"
+    if abs(axis.offset) >= AXIS_OFFSET and (off or found[name].level == "good"):
         side = "right" if axis.offset > 0 else "left"
         where = f"Their axis of symmetry lies {percent(abs(axis.offset))} of the width {side} of the middle."
-        advice = f"Crop further to the {side}, so that the axis is in the middle."
-        short, level = "the axis of symmetry is off the middle", old.level if off else "trouble"
-        found[name] = replace(old, level=level, text=f"{old.text} {where}", advice=advice, short=short)
+        found[name] = replace(
+            found[name],
+            level=found[name].level if off else "trouble",
+            text=f"{found[name].text} {where}",
+            advice=f"Crop further to the {side}, so that the axis is in the middle.",
+            short="the axis of symmetry is off the middle",
+        )
     if found["light"].level == "objection":  # where both are missing, nothing is left to learn a shape from
         view = values["view"]
-        if view.value + 2 * view.error < (CHECKS["view"].struggles or 0):
-            found["view"] = replace(found["view"], level="objection")
-        else:
-            found["light"] = replace(found["light"], level="trouble")
+        missing = view.value + 2 * view.error < (CHECKS["view"].struggles or 0)
+        name, level = ("view", "objection") if missing else ("light", "trouble")
+        found[name] = replace(found[name], level=level)
     return tuple(found.values())
 
 
