@@ -8,12 +8,7 @@ import torch
 from derender.model import Derenderer
 from derender.objectives.reconstruction import masked_l1, photometric_loss
 from derender.training.config import ObjectiveSettings
-from derender.training.step import (
-    cycle_loss,
-    fill_uncovered,
-    perturb_one_factor,
-    training_step,
-)
+from derender.training.step import cycle_loss, fill_uncovered, perturb_one_factor, training_step
 
 PLAIN = ObjectiveSettings(perceptual="none", curvature_weight=0.0)
 

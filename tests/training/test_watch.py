@@ -158,13 +158,7 @@ SOONER = 5
 
 
 @pytest.mark.parametrize(
-    "memory",
-    [
-        {"averages": {"bulge": "0"}},
-        {"on_since": [3]},
-        {"last_images": None},
-        {"uneasy_since": 3},
-    ],
+    "memory", [{"averages": {"bulge": "0"}}, {"on_since": [3]}, {"last_images": None}, {"uneasy_since": 3}]
 )
 def test_a_memory_that_no_watcher_gave_is_refused(memory):
     with pytest.raises(ValueError, match="does not hold what the collapse detector remembers"):

@@ -20,13 +20,7 @@ from derender.evaluation.memory import Memory
 from derender.inputs import as_images, as_model, device_named
 from derender.learn.runs import Changes, OnImages, texts_of
 from derender.report.run import decomposition_sheet, run_page
-from derender.training.config import (
-    PRESETS,
-    FinetuneConfig,
-    TrainConfig,
-    resolve,
-    with_changes,
-)
+from derender.training.config import PRESETS, FinetuneConfig, TrainConfig, resolve, with_changes
 from derender.training.loop import train_task
 from derender.training.run_folder import refuse_taken
 from derender.training.task import Progress, TrainResult

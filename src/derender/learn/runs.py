@@ -10,11 +10,7 @@ from derender.inputs import as_images, device_named
 from derender.report.evidence import Evidence, look_at_data
 from derender.report.run import baseline_sheet, decomposition_sheet, run_page
 from derender.training import derender_task
-from derender.training.config import (
-    TrainConfig,
-    as_overrides,
-    resolve,
-)
+from derender.training.config import TrainConfig, as_overrides, resolve
 from derender.training.distributed import first_then_others, leave, open_fabric, this_rank_writes
 from derender.training.run_folder import read_settings, refuse_taken
 from derender.training.task import Progress, TrainResult

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from derender.networks.encoders import NetworkSettings, norm_relu, stage_widths
+from derender.networks.encoders import NetworkSettings, NormReLU, stage_widths
 
 
 class MapDecoder(nn.Module):
@@ -26,10 +26,10 @@ class MapDecoder(nn.Module):
         layers += [nn.ReLU(), nn.Conv2d(widths[0], widths[0], 3, padding=1, bias=False), nn.ReLU()]
         for previous, width in pairwise(widths):
             layers += doubling(previous, width)
-            layers += [nn.Conv2d(width, width, 3, padding=1, bias=False), norm_relu(width)]
+            layers += [nn.Conv2d(width, width, 3, padding=1, bias=False), NormReLU(width)]
         last = widths[-1]
-        layers += [UpsampledConv2d(last, last), norm_relu(last)]
-        layers += [nn.Conv2d(last, last, 5, padding=2, bias=False), norm_relu(last)]
+        layers += [UpsampledConv2d(last, last), NormReLU(last)]
+        layers += [nn.Conv2d(last, last, 5, padding=2, bias=False), NormReLU(last)]
         self.layers = nn.Sequential(*layers)
         self.last = NarrowConv2d(last, channels)
 
@@ -51,7 +51,7 @@ class VectorDecoder(nn.Module):
 def doubling(channels_in: int, channels_out: int) -> list[nn.Module]:
     """A transposed convolution to twice the size, normalised and rectified."""
     upsample = nn.ConvTranspose2d(channels_in, channels_out, 4, stride=2, padding=1, bias=False)
-    return [upsample, norm_relu(channels_out)]
+    return [upsample, NormReLU(channels_out)]
 
 
 class UpsampledConv2d(nn.Conv2d):

@@ -10,14 +10,16 @@ import torch
 from jaxtyping import Float
 from pydantic import Field, field_validator
 from torch import Tensor, nn
-from torch.nn.functional import adaptive_avg_pool2d
+from torch.nn.functional import adaptive_avg_pool2d, leaky_relu
 
-from derender.networks.norm_relu import NormReLU
 from derender.settings import Settings
 
 IMAGE_SIZES = (32, 64, 128, 256)
-CHANNELS_PER_GROUP = 4
 MAX_PLACES = 2048  # numbers of the last spatial map among the activations
+
+Images = Float[Tensor, "n 3 h w"]
+Code = Float[Tensor, "n code"]
+Spatial = Float[Tensor, "n channels y x"]
 
 
 class NetworkSettings(Settings):
@@ -38,7 +40,7 @@ class NetworkSettings(Settings):
 
     @field_validator("image_size")
     @classmethod
-    def _power_of_two(cls, value: int) -> int:
+    def _one_of(cls, value: int) -> int:
         if value not in IMAGE_SIZES:
             raise ValueError(f"image_size must be one of {', '.join(map(str, IMAGE_SIZES))}, got {value}")
         return value
@@ -59,14 +61,19 @@ def unet_widths(settings: NetworkSettings) -> list[int]:
     return [settings.unet_width * 2**level for level in range(settings.stages + 1)]
 
 
-def norm_relu(channels: int, slope: float = 0.0) -> NormReLU:
-    """GroupNorm with four channels a group (16, 32, 64 groups for 64, 128, 256 channels) and a rectifier."""
-    return NormReLU(channels, channels // CHANNELS_PER_GROUP, slope)
+class NormReLU(nn.GroupNorm):
+    """Group normalisation (Wu & He 2018), four channels a group; then keep ``slope`` of negative values."""
+
+    def __init__(self, channels: int, slope: float = 0.0):
+        super().__init__(channels // 4, channels)
+        self.slope = slope
+
+    def forward(self, input: Spatial) -> Spatial:
+        normalised = super().forward(input)
+        return leaky_relu(normalised, self.slope) if self.slope else normalised.relu()
 
 
-def activations(
-    code: Float[Tensor, "n code"], spatial: Float[Tensor, "n channels y x"]
-) -> Float[Tensor, "n _"]:
+def activations(code: Code, spatial: Spatial) -> Float[Tensor, "n _"]:
     """Encoder activations, one row per image: the code, then the last spatial map.
 
     The map is averaged over 2x2 locations, then over all, where it holds more than 2,048 numbers.
@@ -79,27 +86,25 @@ def activations(
 
 
 class Encoder(nn.Module):
-    """Strided convolutions to a code of 1x1 pixels; ``spatial`` gives the features before the code."""
+    """Strided convolutions to a code of 1x1 pixels; ``spatial`` gives the 4x4 features before the code."""
 
     def __init__(self, settings: NetworkSettings, width: int, code_size: int, *, normalised: bool):
         super().__init__()
         widths = stage_widths(width, settings.stages)
         layers: list[nn.Module] = []
-        previous = 3
-        for stage, channels in enumerate(widths):
+        for stage, (previous, channels) in enumerate(zip([3, *widths], widths, strict=False)):
             layers.append(nn.Conv2d(previous, channels, 4, stride=2, padding=1, bias=False))
             rectifier = nn.LeakyReLU(0.2) if normalised else nn.ReLU()
             last = stage == settings.stages - 1
-            layers.append(norm_relu(channels, slope=0.2) if normalised and not last else rectifier)
-            previous = channels
+            layers.append(NormReLU(channels, slope=0.2) if normalised and not last else rectifier)
         self.convolutions = nn.Sequential(*layers)
-        self.to_code = nn.Sequential(nn.Conv2d(previous, code_size, 4, bias=False), nn.ReLU())
+        self.to_code = nn.Sequential(nn.Conv2d(widths[-1], code_size, 4, bias=False), nn.ReLU())
         self.code_size = code_size
 
-    def spatial(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n channels 4 4"]:
+    def spatial(self, images: Images) -> Spatial:
         return self.convolutions(images * 2 - 1)
 
-    def forward(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n code"]:
+    def forward(self, images: Images) -> Code:
         return self.to_code(self.spatial(images)).flatten(1)
 
 
@@ -109,15 +114,13 @@ class UNetEncoder(nn.Module):
     def __init__(self, settings: NetworkSettings, code_size: int):
         super().__init__()
         widths = unet_widths(settings)
-        self.levels = nn.ModuleList(
-            double_convolution(previous, channels)
-            for previous, channels in zip([3, *widths], widths, strict=False)
-        )
+        pairs = zip([3, *widths], widths, strict=False)
+        self.levels = nn.ModuleList(double_convolution(previous, channels) for previous, channels in pairs)
         self.pool = nn.MaxPool2d(2)
         self.to_code = nn.Sequential(nn.Conv2d(widths[-1], code_size, 4, bias=False), nn.ReLU())
         self.code_size, self.widths = code_size, widths
 
-    def skips(self, images: Float[Tensor, "n 3 h w"]) -> list[Tensor]:
+    def skips(self, images: Images) -> list[Tensor]:
         """Features after each level, from full resolution down to 4x4, for a segmentation decoder."""
         features, found = images * 2 - 1, []
         for level, block in enumerate(self.levels):
@@ -125,10 +128,10 @@ class UNetEncoder(nn.Module):
             found.append(features)
         return found
 
-    def spatial(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n channels 4 4"]:
+    def spatial(self, images: Images) -> Spatial:
         return self.skips(images)[-1]
 
-    def forward(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n code"]:
+    def forward(self, images: Images) -> Code:
         return self.to_code(self.spatial(images)).flatten(1)
 
 
@@ -136,9 +139,6 @@ def double_convolution(channels_in: int, channels_out: int) -> nn.Sequential:
     """Twice a 3x3 convolution, BatchNorm and ReLU: a level of a U-Net."""
     layers: list[nn.Module] = []
     for previous in (channels_in, channels_out):
-        layers += [
-            nn.Conv2d(previous, channels_out, 3, padding=1, bias=False),
-            nn.BatchNorm2d(channels_out),
-            nn.ReLU(),
-        ]
+        layers.append(nn.Conv2d(previous, channels_out, 3, padding=1, bias=False))
+        layers += [nn.BatchNorm2d(channels_out), nn.ReLU()]
     return nn.Sequential(*layers)

@@ -15,34 +15,33 @@ from torch import Generator, Tensor, nn
 from torch.nn.functional import pad
 
 from derender.networks.decoders import MapDecoder, VectorDecoder
-from derender.networks.encoders import Encoder, NetworkSettings, UNetEncoder, activations
+from derender.networks.encoders import Code, Encoder, Images, NetworkSettings, UNetEncoder, activations
 from derender.scene.camera import focal_px, shared_tensor
 from derender.scene.perturb import PerturbSettings, exchange, perturb_camera, perturb_light
 from derender.scene.ranges import SceneRanges
 
 
 class FactorNet(nn.Module):
-    """Encoder and decoder of one factor."""
+    """Encoder and decoder of one factor; images are in 0..1."""
 
-    def __init__(self, encoder: nn.Module, decoder: nn.Module):
+    def __init__(self, encoder: Encoder | UNetEncoder, decoder: nn.Module):
         super().__init__()
-        self.encoder, self.decoder = encoder, decoder
-        self.code_size: int = encoder.code_size  # type: ignore[assignment]
+        self.encoder, self.decoder, self.code_size = encoder, decoder, encoder.code_size
 
-    def encode(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n code"]:
-        """The factor's feature, one row per image (images in 0..1)."""
+    def encode(self, images: Images) -> Code:
+        """The factor's feature, one row per image."""
         return self.encoder(images)
 
-    def activations(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n _"]:
-        """The code, followed by the encoder's last spatial map (images in 0..1)."""
-        spatial = self.encoder.spatial(images)  # type: ignore[operator]
-        return activations(self.encoder.to_code(spatial).flatten(1), spatial)  # type: ignore[operator]
+    def activations(self, images: Images) -> Float[Tensor, "n _"]:
+        """The code, followed by the encoder's last spatial map."""
+        spatial = self.encoder.spatial(images)
+        return activations(self.encoder.to_code(spatial).flatten(1), spatial)
 
-    def decode(self, code: Float[Tensor, "n code"]) -> Tensor:
+    def decode(self, code: Code) -> Tensor:
         """The factor's raw value, before its range is applied."""
         return self.decoder(code)
 
-    def forward(self, images: Float[Tensor, "n 3 h w"]) -> Tensor:
+    def forward(self, images: Images) -> Tensor:
         return self.decode(self.encode(images))
 
 

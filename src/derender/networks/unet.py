@@ -59,11 +59,10 @@ class SegmentationNet(nn.Module):
         encoders: of one width; their features are joined in this order.
         outputs: classes.
         frozen: encoders never change: weights take no gradient, and statistics are kept.
-        kept_statistics: the encoders' BatchNorm uses and keeps the statistics it came with, in training too:
-            a batch of two images gives poor estimates.
-        decoder: one that has learnt over these encoders, of which all but the last layer is taken; where
-            statistics are kept, its two finest levels and the encoders' keep theirs, while coarser ones,
-            which have most to learn anew, take each batch's. Without it the decoder is fresh.
+        kept_statistics: the encoders' BatchNorm keeps the statistics it came with in training, too; beside a
+            ``decoder`` that of the two finest levels of either.
+        decoder: one that has learnt over these encoders, of which all but the last layer is taken. Without
+            it the decoder is fresh.
     """
 
     def __init__(

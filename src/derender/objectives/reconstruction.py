@@ -76,8 +76,7 @@ def depth_curvature(
 
 
 def masked_mean(
-    value: Float[Tensor, "n h w"],
-    weight: Float[Tensor, "n h w"] | Bool[Tensor, "n h w"],
+    value: Float[Tensor, "n h w"], weight: Float[Tensor, "n h w"] | Bool[Tensor, "n h w"]
 ) -> Float[Tensor, ""]:
     """Weighted mean over the whole batch; exactly 0, with zero gradient, where every weight is 0."""
     weight = weight.to(value.dtype)

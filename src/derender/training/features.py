@@ -255,10 +255,7 @@ def _renderings(
 
 
 def _batches(
-    model: Derenderer,
-    images: Shaped[Tensor, "n 3 h w"],
-    rows: Int64[Tensor, " k"],
-    progress: Progress | None,
+    model: Derenderer, images: Shaped[Tensor, "n 3 h w"], rows: Int64[Tensor, " k"], progress: Progress | None
 ) -> Iterator[tuple[int, Float[Tensor, "b 3 h w"]]]:
     """These rows of the images in batches, in 0..1 on the model's device, each with its place."""
     for start in range(0, len(rows), BATCH_SIZE):

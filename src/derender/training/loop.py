@@ -65,21 +65,11 @@ SampleSheet = Callable[[Any, Tensor], Image.Image]
 """Draws a model's output for a few images."""
 
 
-def train_task(
-    task: TrainingTask,
-    images: ImageSet,
-    out: str | Path,
-    *,
-    resume: bool = False,
-    sample_sheet: SampleSheet | None = None,
-    progress: Callable[[Progress], None] | None = None,
-    accelerator: str = "auto",
-) -> TrainResult:
+def train_task(task: TrainingTask, images: ImageSet, out: str | Path, **how: Any) -> TrainResult:
     """Train any task; arguments, files and errors are those of `derender.training.train`."""
     images.require(10)
     with deterministic_algorithms(task.config.deterministic):
-        report = progress or (lambda _: None)
-        run = _Run(task, images, Path(out), resume, sample_sheet, report, accelerator)
+        run = _Run(task, images, Path(out), **how)
         with freed_memory_kept() if run.fabric.device.type == "cpu" else nullcontext():
             return run.go_on()
 
@@ -92,13 +82,14 @@ class _Run:
         task: TrainingTask,
         images: ImageSet,
         out: Path,
-        resume: bool,
-        sample_sheet: SampleSheet | None,
-        report: Callable[[Progress], None],
-        accelerator: str,
+        *,
+        resume: bool = False,
+        sample_sheet: SampleSheet | None = None,
+        progress: Callable[[Progress], None] | None = None,
+        accelerator: str = "auto",
     ):
         config = self.config = task.config
-        self.report, self.sample_sheet = report, sample_sheet
+        self.report, self.sample_sheet = progress or (lambda _: None), sample_sheet
         fabric = self.fabric = open_fabric(accelerator, every_parameter_learns=task.every_parameter_learns)
         ranks = self.ranks = ranks_of(fabric)
         self.task = task = task.shared(ranks) if ranks.count > 1 else task
@@ -117,7 +108,7 @@ class _Run:
             self.model.to(memory_format=torch.channels_last)
 
         def prepared(done: int, total: int) -> None:
-            report(Progress("perceptual", done, total))
+            self.report(Progress("perceptual", done, total))
 
         with first_then_others(fabric):
             step = task.step_module(self.model, self.folder, batches.sample(), prepared)

@@ -51,25 +51,17 @@ class RunFolder:
 
 
 def start_run(path: Path, config: Settings, data: dict[str, Any], device: str) -> RunFolder:
-    """Make a new run folder; one that holds anything already is never touched.
-
-    Raises:
-        FileExistsError: the folder is not empty.
-    """
+    """Make a new run folder; one that holds anything already is never touched: a FileExistsError."""
     refuse_taken(path)
     run = RunFolder(path)
     run.samples.mkdir(parents=True, exist_ok=True)
-    write_text(path / "environment.json", json.dumps({**environment(device), "data": data}, indent=1))
-    write_text(run.config, f"format: {FORMAT}\n{to_yaml(config)}")
+    _write(path / "environment.json", json.dumps({**environment(device), "data": data}, indent=1))
+    _write(run.config, f"format: {FORMAT}\n{to_yaml(config)}")
     return run
 
 
 def refuse_taken(path: Path) -> None:
-    """Refuse a place for a new run that holds anything but the traces of a run that hardly began.
-
-    Raises:
-        FileExistsError: the folder is not empty.
-    """
+    """FileExistsError where a folder holds anything but the traces of a run that hardly began."""
     if not path.exists():
         return
     for entry in path.iterdir() if path.is_dir() else [path]:
@@ -100,7 +92,7 @@ def reopen_run(path: Path, config: Settings) -> RunFolder:
             )
     for written in (run.last, run.best, run.model, run.config, run.metrics, run.perceptual):
         remove_abandoned(written)
-    write_text(run.config, f"format: {FORMAT}\n{to_yaml(config)}")
+    _write(run.config, f"format: {FORMAT}\n{to_yaml(config)}")
     return run
 
 
@@ -120,35 +112,28 @@ def read_config(path: Path, kind: type[Any] = TrainConfig) -> Any:
 
 
 def read_config_tree(path: Path) -> dict[str, Any]:
-    """The configuration of a run as plain values, whatever it trained.
-
-    Raises:
-        ValueError: it is damaged, or of a newer version.
-    """
-    return _settings_tree(
-        path / "config.yaml", "{} is damaged: restore it, or start a new run in another folder"
-    )
+    """The configuration of a run as plain values, whatever it trained; errors as of `read_settings`."""
+    advice = "is damaged: restore it, or start a new run in another folder"
+    return read_settings(path / "config.yaml", advice)
 
 
-def read_settings(file: Path) -> dict[str, Any]:
+def read_settings(
+    file: Path, otherwise: str = "holds no settings: write YAML, one key: value a line"
+) -> dict[str, Any]:
     """The settings in a YAML file or a run folder, as plain values.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: it holds no settings, or is of a newer version.
+        ValueError: it holds no settings (``otherwise``), or is of a newer version.
     """
     file = file / "config.yaml" if file.is_dir() else file
     if not file.is_file():
         raise FileNotFoundError(f"no settings in {file}: give a YAML file, such as a run's config.yaml")
-    return _settings_tree(file, "{} holds no settings: write YAML, one key: value a line")
-
-
-def _settings_tree(file: Path, otherwise: str) -> dict[str, Any]:
     try:
         tree = yaml.safe_load(file.read_text(encoding="utf-8"))
         found = tree.pop("format", FORMAT)
     except (yaml.YAMLError, ValueError, RecursionError, AttributeError, TypeError) as error:
-        raise ValueError(otherwise.format(file)) from error
+        raise ValueError(f"{file} {otherwise}") from error
     if not isinstance(found, int) or found > FORMAT:
         shown = Repr().repr(found)
         raise ValueError(
@@ -178,7 +163,7 @@ def read_metrics(path: Path) -> list[dict[str, Any]]:
 def drop_metrics_after(run: RunFolder, images: int) -> None:
     """Drop rows written after a checkpoint, so that a resumed run writes them once."""
     kept = [row for row in read_metrics(run.path) if row.get("images", 0) <= images]
-    write_text(run.metrics, "".join(json.dumps(row) + "\n" for row in kept))
+    _write(run.metrics, "".join(json.dumps(row) + "\n" for row in kept))
 
 
 def environment(device: str) -> dict[str, Any]:
@@ -204,18 +189,11 @@ def environment(device: str) -> dict[str, Any]:
 
 def describe_data(images: ImageSet, split: Split) -> dict[str, Any]:
     """The data of a run, for its environment.json."""
-    return {
-        "layout": images.layout,
-        "pictures": len(images),
-        "train": len(split.train),
-        "validation": len(split.validation),
-        "test": len(split.test),
-        "skipped": len(images.skipped),
-        "duplicates": len(images.duplicates),
-    }
+    counts: dict[str, Any] = {"pictures": images, "train": split.train, "validation": split.validation}
+    counts |= {"test": split.test, "skipped": images.skipped, "duplicates": images.duplicates}
+    return {"layout": images.layout, **{name: len(values) for name, values in counts.items()}}
 
 
-def write_text(path: Path, text: str) -> None:
-    """Write a file whole or not at all."""
+def _write(path: Path, text: str) -> None:
     with atomic_file(path) as temporary:
         temporary.write_text(text)

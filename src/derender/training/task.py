@@ -10,7 +10,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int64, UInt8
@@ -18,7 +18,7 @@ from torch import Generator, Tensor, nn
 
 from derender.training.distributed import Ranks
 from derender.training.run_folder import RunFolder
-from derender.training.watch import Finding
+from derender.training.watch import Finding, FiniteWatch
 
 PhaseProgress = Callable[[int, int], None]
 """Called with (done, total) while a task prepares itself."""
@@ -39,19 +39,6 @@ class Held:
 
     def __init__(self, result: StepLosses):
         self.result = result
-
-
-@runtime_checkable
-class Watch(Protocol):
-    """Looks at every step and names problems; remembers, so that a resumed run goes on watching."""
-
-    @property
-    def uneasy(self) -> bool:
-        """Whether the present state is no good checkpoint."""
-        ...
-
-    def look(self, images: int, result: Any) -> tuple[Finding, ...]: ...
-    def memory(self) -> dict[str, Any]: ...
 
 
 class TrainingTask(ABC):
@@ -88,13 +75,13 @@ class TrainingTask(ABC):
     def step_module(
         self, model: nn.Module, run: RunFolder, images: UInt8[Tensor, "n 3 h w"], progress: PhaseProgress
     ) -> nn.Module:
-        """A module that `compute_step` can call and that returns (total, Held); its ``model`` is the model.
+        """A module for `compute_step` that returns (total, Held), given all training images, on the device.
 
-        ``images`` are all training images, on the device.
+        Its ``model`` is the model.
         """
 
     @abstractmethod
-    def watch(self, memory: dict[str, Any]) -> Watch:
+    def watch(self, memory: dict[str, Any]) -> FiniteWatch:
         """A watcher that goes on from ``memory``."""
 
 
@@ -117,9 +104,7 @@ def compute_step(
 
 def network_precision(precision: str, device: torch.device) -> Precision:
     """A context in which networks run in that precision; geometry and losses are computed outside it."""
-    if precision == "32-true":
-        return nullcontext
-    return partial(torch.autocast, device.type, torch.bfloat16)
+    return nullcontext if precision == "32-true" else partial(torch.autocast, device.type, torch.bfloat16)
 
 
 @dataclass(frozen=True)
@@ -127,12 +112,11 @@ class Progress:
     """Where a run stands, for a progress bar.
 
     Attributes:
-        phase: "perceptual" while perceptual features are learnt, then "train", then "features" while
-            whitening and fitting are estimated.
+        phase: "perceptual" while perceptual features are learnt, "train", then "features".
         done, total: steps of the first phase, images of the others.
         images_per_second: since the run was started or resumed.
         terms: the latest losses by name.
-        waiting: share of the time, since the run was started or resumed, spent waiting for images, 0..1.
+        waiting: share of the time, since then, spent waiting for images, 0..1.
     """
 
     phase: str

@@ -129,29 +129,32 @@ def not_finite(what: str) -> Finding:
 
 @dataclass
 class FiniteWatch:
-    """Looks for a loss that is not finite: the watcher of what has no scene."""
+    """Looks at every step for a loss that is not finite: the watcher of what has no scene.
+
+    Attributes:
+        uneasy: whether the present state is no good checkpoint.
+    """
 
     uneasy: bool = field(default=False, init=False)
 
     def look(self, images: int, result: Any) -> tuple[Finding, ...]:
-        """A fatal finding once the loss is not finite."""
+        """The problems of a step's result (`StepLosses`) after so many images; usually none."""
         loss = result.total.item()
         if math.isfinite(loss):
             return ()
         broken = first_not_finite(result.terms.items())
         first = "" if broken is None else f"; the first term that is not finite is {broken!r}"
-        return (
-            Finding("non-finite loss", f"the loss is {loss}{first}", "use a smaller learning_rate", True),
-        )
+        text, advice = f"the loss is {loss}{first}", "use a smaller learning_rate"
+        return (Finding("non-finite loss", text, advice, True),)
 
     def memory(self) -> dict[str, Any]:
-        """Nothing: a finite loss leaves nothing to remember."""
+        """The state that a resumed run needs to go on watching: here none."""
         return {}
 
 
 @dataclass
-class Watcher:
-    """Looks at training batches and remembers its measurements.
+class Watcher(FiniteWatch):
+    """The collapse detector: looks at training batches and remembers its measurements.
 
     Args:
         ranges: bounds of the scene.
@@ -160,7 +163,6 @@ class Watcher:
         on_since: images seen when a sign came on.
         last_images: images seen at the latest look.
         ranks: those that share a batch; all see the same.
-        uneasy: whether the latest batch or the averages show a fatal sign: no state to keep.
     """
 
     ranges: SceneRanges
@@ -169,7 +171,6 @@ class Watcher:
     on_since: dict[str, int] = field(default_factory=dict)
     last_images: int = 0
     ranks: Ranks = ALONE
-    uneasy: bool = False
 
     @classmethod
     def remembering(
@@ -194,12 +195,10 @@ class Watcher:
         )
 
     def memory(self) -> dict[str, Any]:
-        """The state that a resumed run needs."""
         kept = {"averages": self.averages, "on_since": self.on_since, "last_images": self.last_images}
         return copy.deepcopy(kept)
 
     def look(self, images: int, result: Any) -> tuple[Finding, ...]:
-        """The problems of a step's result (a `training.step.StepResult`); usually none."""
         broken = first_not_finite(result.stages())
         shared = self.ranks.mean({"loss": result.total.item(), "broken": float(broken is not None)})
         if shared["broken"] and broken is None:

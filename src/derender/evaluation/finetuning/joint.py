@@ -31,7 +31,7 @@ from derender.training.derender_task import DerenderTask, perceptual_of
 from derender.training.loop import NOT_RECONSTRUCTION
 from derender.training.run_folder import RunFolder
 from derender.training.step import own_share, training_step
-from derender.training.task import Held, PhaseProgress, Precision, StepLosses, TrainingTask, Watch
+from derender.training.task import Held, PhaseProgress, Precision, StepLosses, TrainingTask
 from derender.training.watch import FiniteWatch, Watcher
 
 HEAD_FILE, HEAD_CONFIG_FILE = "head.safetensors", "head.json"
@@ -216,7 +216,7 @@ class FinetuneTask(TrainingTask):
         labels = torch.from_numpy(self.target.visible).float().to(images.device)
         return FinetuneStep(model, config, labels, perceptual)
 
-    def watch(self, memory: dict[str, Any]) -> Watch:
+    def watch(self, memory: dict[str, Any]) -> FiniteWatch:
         """The collapse detector; where nothing is rendered, a watcher of the loss."""
         if self.config.target.rendering_weight == 0:
             return FiniteWatch()
