@@ -27,10 +27,8 @@ class ModelCopy:
     """A model made of another one.
 
     Attributes:
-        folder: where it was saved; `derender.load` takes it.
-        model: ready for use.
-        images: how many it was made with.
-        scores: measurements by name.
+        folder, model: where it was saved, for `derender.load`; the model, ready for use.
+        images, scores: how many images it was made with; measurements by name.
     """
 
     folder: Path

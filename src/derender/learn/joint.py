@@ -28,13 +28,7 @@ from derender.training.task import Progress, TrainResult
 
 @dataclass(frozen=True)
 class Finetuned:
-    """A joint training with labels.
-
-    Attributes:
-        run: how it ended.
-        scores: of the test part of its split.
-        start: the model that it began with; None for fresh weights.
-    """
+    """A joint training with labels: how it ended, scores of its split's test part, the model it began with."""
 
     run: TrainResult
     scores: FinetuneScores

@@ -17,11 +17,7 @@ from derender.networks.encoders import Encoder, NetworkSettings
 class Confidence:
     """Standard deviations, positive, of the reconstruction and of its flipped twin.
 
-    Attributes:
-        photometric: sigma for the reconstruction's colours, (N, 1, H, W).
-        photometric_flip: the same for the flipped twin.
-        perceptual: sigma for the reconstruction's perceptual features, (N, 1, H/4, W/4).
-        perceptual_flip: the same for the flipped twin.
+    ``photometric`` are of colours, (N, 1, H, W), ``perceptual`` of perceptual features, (N, 1, H/4, W/4).
     """
 
     photometric: Float[Tensor, "n 1 h w"]

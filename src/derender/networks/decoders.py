@@ -1,9 +1,8 @@
 """Code to map or to numbers.
 
-Source: unsup3d's networks as pinned in the paper's appendix. No convolution has a bias; outputs are raw
-(the factor's row in factors.py gives them range and meaning). `UpsampledConv2d` and `NarrowConv2d` do less
-work than the plain layers for the same result, to rounding, and the same weights: a convolution is linear in
-its kernel, so kernels can be combined or shifted before they meet the image.
+Source: unsup3d's networks as pinned in the paper's appendix. No convolution has a bias; outputs are raw.
+`UpsampledConv2d` and `NarrowConv2d` do less work than the plain layers for the same result, to rounding: a
+convolution is linear in its kernel, so kernels can be combined or shifted before they meet the image.
 """
 
 from itertools import pairwise
@@ -55,10 +54,7 @@ def doubling(channels_in: int, channels_out: int) -> list[nn.Module]:
 
 
 class UpsampledConv2d(nn.Conv2d):
-    """Nearest-neighbour doubling, then a 3x3 convolution, done as one transposed convolution.
-
-    Of the 3x3 values under the kernel only 2x2 differ: 4 multiplications instead of 9.
-    """
+    """Nearest-neighbour doubling and a 3x3 convolution as one transposed convolution: 4 products, not 9."""
 
     def __init__(self, channels_in: int, channels_out: int):
         super().__init__(channels_in, channels_out, 3, padding=1, bias=False)
@@ -73,9 +69,8 @@ class UpsampledConv2d(nn.Conv2d):
 class NarrowConv2d(nn.Conv2d):
     """A 5x5 convolution to very few channels, done for a block of neighbouring pixels at a time.
 
-    Processors work on 16 channels or more at once, so one to three of them leave most lanes empty. The pixels
-    of a block become channels: one convolution with the kernel shifted to each of them, then put in their
-    places. Height and width must be multiples of the block (4 for one channel, else 2).
+    The pixels of a block become channels, of which processors work on many at once. Height and width are
+    multiples of the block (4 for one channel, else 2).
     """
 
     def __init__(self, channels_in: int, channels_out: int):

@@ -1,8 +1,4 @@
-"""The factors that an image is decomposed into: one declared row each.
-
-Training, features and evaluation go through these rows only, so that a fifth factor (the strength of a
-highlight, say) is a new row and a renderer that uses it, and nothing else changes.
-"""
+"""The factors that an image is decomposed into: one declared row each, so that a fifth is a new row."""
 
 import math
 from collections.abc import Callable

@@ -1,8 +1,8 @@
 """The expanding half of a U-Net, over the skip features of one encoder or of several side by side.
 
-Source: Ronneberger et al., MICCAI 2015, with the widths of the encoders (encoders.py); Klinghoffer et al.,
-ECCV 2022, Sec. 4.7 joins two encoders by stacking their features at each skip, and here at the centre, too.
-Leaves out cropping: convolutions are padded.
+Source: Ronneberger et al., MICCAI 2015; Klinghoffer et al., ECCV 2022, Sec. 4.7 joins two encoders by
+stacking
+their features at each skip, and here at the centre, too. Leaves out cropping: convolutions are padded.
 """
 
 import copy
@@ -24,10 +24,7 @@ LEVELS_KEPT = 2
 
 
 class UNetDecoder(nn.Module):
-    """Features at every resolution, finest first, joined over all encoders, to one value a class and pixel.
-
-    The decoder keeps the widths of a single encoder, however many are joined.
-    """
+    """Features at every resolution, finest first, of all encoders, to one value a class and pixel."""
 
     def __init__(self, widths: Sequence[int], encoders: int, outputs: int):
         super().__init__()

@@ -1,11 +1,10 @@
 """The weights in a checkpoint of unsup3d (Wu et al., CVPR 2020), as those of our networks.
 
-The networks are the same (the paper's appendix), their tensors have other names. So they are matched by
-net (``netD`` depth, ``netA`` albedo, ``netL`` light, ``netV`` view, ``netC`` confidence) and, within one, by
-order, and every shape is compared. Two things are converted: 1x1 convolutions become linear layers, and light
-comes as (ambient, diffuse, x, y) where derender has pitch, y, first. The file is a pickle, read with torch's
-reader for weights: objects of kinds it does not know become empty ones, no code is imported or run. Leaves
-out optimisers, and the ranges, which no file holds.
+Tensors are matched by net (``netD`` depth, ``netA`` albedo, ``netL`` light, ``netV`` view, ``netC``
+confidence)
+and order, and every shape is compared. 1x1 convolutions become linear layers, and light comes as (ambient,
+diffuse, x, y) where derender has pitch, y, first. The file is a pickle, read with torch's reader for weights:
+other objects become empty ones, no code is run. Leaves out the ranges, which no file holds.
 """
 
 import pickle
@@ -49,9 +48,7 @@ class Empty:
 def read_checkpoint(file: str | Path) -> tuple[NetworkSettings, dict[str, Tensor]]:
     """Sizes of the networks, and their tensors by the names that a `Derenderer`'s state has.
 
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: it cannot be read, or is no such checkpoint; the first tensor that differs is named.
+    No file is a FileNotFoundError; one that is no such checkpoint is a ValueError, which names what differs.
     """
     file = Path(file)
     if not file.exists():

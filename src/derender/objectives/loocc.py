@@ -1,14 +1,10 @@
 """Leave-one-out, cycle contrastive loss (LOOCC): what was not perturbed must be recognised again.
 
-Source: the paper, section 3.2; NT-Xent from SimCLR (Chen et al. 2020). Choices that the paper leaves open:
-
-- The perturbed factor is drawn per image, which is absent from the contrast of that factor altogether:
-  neither anchor, positive nor negative.
-- The loss is the mean over all contrasted (image, factor). In expectation this is the mean over the
-  unperturbed factors when one factor is drawn for the whole batch.
-- A factor that fewer than two images kept has nothing to contrast and is dropped from the mean.
-
-Leaves out the perturbation (scene/perturb.py) and the encoding of the new rendering.
+Source: the paper, section 3.2; NT-Xent from SimCLR (Chen et al. 2020). Left open there: the perturbed factor
+is
+drawn per image, which is absent from the contrast of that factor altogether; the loss is the mean over all
+contrasted (image, factor); a factor that fewer than two images kept is dropped. Leaves out the perturbation
+(scene/perturb.py) and the encoding of the new rendering.
 """
 
 from collections.abc import Mapping
@@ -86,10 +82,9 @@ def _anchor_losses(
 
 
 def _directions(codes: Float[Tensor, "n d"]) -> Float[Tensor, "n d"]:
-    """Unit vectors, safe for any magnitude: each code is first divided by its largest entry.
+    """Unit vectors, safe for any magnitude: each code is first divided by its largest entry, a constant.
 
-    The divisor is a constant: a direction does not depend on the length, so the gradient is exact. NaN stays
-    NaN: it must not pass for a code without a direction.
+    NaN stays NaN: it must not pass for a code without a direction.
     """
     largest = codes.detach().abs().amax(dim=1, keepdim=True)
     has_direction = ~(largest <= _NO_DIRECTION)

@@ -1,9 +1,8 @@
 """Frozen perceptual features: what every extractor shares, and VGG16 up to relu3_3 from weights on disk.
 
-An extractor normalises images in 0..1, runs ``features``, and divides by one number measured on a calibration
-batch, so that confidence terms mean the same whichever weights are used. Source of VGG16: Simonyan &
-Zisserman 2015 (configuration D); layer choice of unsup3d (Wu et al., CVPR 2020). Names of weights are
-torchvision's. Leaves out self-supervised features (self_features.py) and downloading.
+Features are divided by one number measured on a calibration batch, so that confidence terms mean the same
+whichever weights are used. Source of VGG16: Simonyan & Zisserman 2015 (configuration D); layer choice of
+unsup3d (Wu et al., CVPR 2020). Leaves out self-supervised features (self_features.py) and downloading.
 """
 
 import pickle
@@ -36,10 +35,7 @@ _WIDTHS = (64, 64, "pool", 128, 128, "pool", 256, 256, 256)
 class PerceptualFeatures(nn.Module):
     """A frozen net from images in 0..1 to feature maps; always in evaluation mode, never trained further.
 
-    Attributes:
-        kind: the name under which ``build_perceptual`` makes it.
-        stride: pixels per feature location.
-        channels: channels of the feature map.
+    ``kind`` is its name in ``build_perceptual``, ``stride`` the pixels per feature location.
     """
 
     kind: str
@@ -64,10 +60,9 @@ class PerceptualFeatures(nn.Module):
 
     @torch.no_grad()
     def calibrate_(self, images: Float[Tensor, "n 3 h w"]) -> "PerceptualFeatures":
-        """Set the scale so that on these images the features' standard deviation about channel means is 1.
+        """Make the standard deviation of features about their channel means 1 on these few hundred images.
 
-        It is pooled over channels (one number for all), so relations between channels stay. A few hundred
-        images are enough.
+        It is pooled over channels (one number for all), so relations between channels stay.
         """
         self.scale.fill_(1.0)
         count = 0

@@ -1,9 +1,7 @@
 """How well a rendering explains the image: photometric, plain L1 and depth smoothness losses.
 
-Source: unsup3d (Wu et al., CVPR 2020), Eq. 3, and its public training code for what the paper leaves out:
-the average runs over every pixel of the batch that the mask keeps, and smoothness is the mean absolute
-FIRST difference of depth along rows plus that along columns, in units of the depth range.
-Leaves out the flipped twin and the weights of the terms: the caller adds those.
+Source: unsup3d (Wu et al., CVPR 2020), Eq. 3, and its public training code for what the paper leaves out: the
+average runs over every pixel of the batch that the mask keeps.
 """
 
 import math
@@ -49,8 +47,7 @@ def depth_smoothness(
 ) -> Float[Tensor, ""]:
     """Mean |step| to the next row plus mean |step| to the next column, in depth ranges; 0 is flat.
 
-    ``border`` columns at each side are left out: the presets clamp two of them, a step that is no part of the
-    surface. The paper of unsup3d names the term without a formula; the definition is that of its code.
+    Source: unsup3d's code. ``border`` columns at each side, which the presets clamp, are left out.
     """
     if depth_range <= 0:
         raise ValueError(f"depth_range must be above 0, got {depth_range}; give farthest minus nearest depth")
@@ -69,8 +66,7 @@ def depth_curvature(
 ) -> Float[Tensor, ""]:
     """Mean |second difference| down the columns plus along the rows, in depth ranges; 0 for every plane.
 
-    Depth noise of a thousandth turns normals by tens of degrees, and stripes can pass for matt skin; this
-    term removes both and leaves slopes alone. ``border`` as in ``depth_smoothness``. No published source.
+    Removes depth noise, which turns normals by tens of degrees, and stripes. No published source.
     """
     return depth_smoothness(depth, depth_range, border, order=2)
 
@@ -85,10 +81,8 @@ def masked_mean(
 
 
 def bounded_sigma(sigma: Float[Tensor, "*shape"], floor: float = SIGMA_FLOOR) -> Float[Tensor, "*shape"]:
-    """``sqrt(sigma^2 + floor^2)``: sigma itself to 1e-4 relative from 0.07 up, never below the floor.
-
-    A softplus can reach 0, where both the loss and its gradient have no bound. Unlike a clamp this leaves a
-    gradient by which a sigma that fell too low recovers.
+    """``sqrt(sigma^2 + floor^2)``: never below the floor, where a softplus could reach 0, and with a
+    gradient.
     """
     sigma = at_least_float32(sigma)
     return (sigma.square() + floor**2).sqrt()

@@ -1,13 +1,9 @@
 """Perceptual features learned without labels from the training images: a small frozen net, and its training.
 
-The stage layout is VGG16's up to relu3_3 (stride 1, 2, 4) at about a twenty-fifth of the multiplications,
-with average instead of maximum pooling, so that the gradient reaches every pixel evenly. Source: the ablation
-of unsup3d (Wu et al., CVPR 2020, table 2) finds self-supervised features as good as VGG's.
-
-Training is dense contrastive learning: SimCLR's objective (Chen et al. 2020) at feature locations, as in
-DenseCL (Wang et al. 2021). Each image is cropped twice at corners that differ by whole feature strides, and
-each crop gets its own brightness, contrast, colour and noise. Locations that show the same point of the same
-image are positives; every other sampled location is a negative (NT-Xent).
+The stage layout is VGG16's up to relu3_3 at a twenty-fifth of the multiplications, with average pooling, so
+that the gradient reaches every pixel evenly. Self-supervised features do as well as VGG's in the ablation of
+unsup3d (Wu et al., CVPR 2020, table 2). Training is dense contrastive learning: SimCLR's objective (Chen et
+al. 2020) at feature locations, as in DenseCL (Wang et al. 2021), between two crops of each image.
 """
 
 import json
@@ -98,12 +94,10 @@ class SelfTraining:
 
     Attributes:
         widths: channels at full, half and quarter resolution.
-        batch: images a step.
-        places: locations sampled in each image; a step contrasts 2 * batch * places of them.
+        batch, places: images a step, and locations sampled in each: 2 * batch * places are contrasted.
         crop: side of the views in pixels, at most three quarters of the image.
         projection: width of the head that is thrown away afterwards.
-        temperature: of NT-Xent.
-        learning_rate, weight_decay: AdamW's; the rate is the peak of a one-cycle schedule.
+        temperature, learning_rate, weight_decay: of NT-Xent; AdamW's, the rate at its peak.
     """
 
     widths: tuple[int, int, int] = DEFAULT_WIDTHS
@@ -210,12 +204,9 @@ def one_cycle(
 
 @dataclass(frozen=True)
 class ViewPair:
-    """Two augmented crops of each image and where they show the same points.
+    """Two augmented crops (N, 3, crop, crop) of each image, 0..1, and where they show the same points.
 
-    Attributes:
-        first, second: (N, 3, crop, crop) views, 0..1.
-        first_places, second_places: (N, P) flat index into each view's feature map; entry p is one point of
-        the image.
+    Entry p of ``first_places`` and ``second_places`` is one point, as a flat index into either's feature map.
     """
 
     first: Float[Tensor, "n 3 c c"]
@@ -229,8 +220,8 @@ def two_views(
 ) -> ViewPair:
     """Crop each image twice, mirror both crops alike, augment each by itself.
 
-    Crops lie inside the image, take at most three quarters of its side, and are up to a quarter of the crop
-    apart, by whole strides: feature locations correspond exactly. The first is placed to the pixel.
+    Crops take at most three quarters of the image's side and are up to a quarter of the crop apart, by whole
+    strides: feature locations correspond exactly.
     """
     n, _, height, width = images.shape
     crop = min(crop, 3 * min(height, width) // 4) // stride * stride

@@ -1,7 +1,4 @@
-"""A model's features: encoder activations, and what `Features` makes of them; scenes fitted per image.
-
-Leaves out the encoders, the decoders and the renderer, which the class that inherits `EmbeddingModel` has.
-"""
+"""A model's features: encoder activations, and what `Features` makes of them; scenes fitted per image."""
 
 import copy
 from abc import abstractmethod
@@ -23,13 +20,7 @@ Model = TypeVar("Model", bound="EmbeddingModel")
 
 
 class EmbeddingModel(nn.Module):
-    """Images to features.
-
-    Attributes:
-        factors: the declared rows.
-        nets: by factor name, a `FactorNet`.
-        whitening, fitting: the parts of ``features``; exchange them by ``with_features``.
-    """
+    """Images to features; ``features`` (whitening, fitting) are exchanged by ``with_features``."""
 
     factors: tuple[Factor, ...]
     nets: nn.ModuleDict
@@ -78,8 +69,8 @@ class EmbeddingModel(nn.Module):
     def activations(self, images: Float[Tensor, "n 3 h w"]) -> dict[str, Float[Tensor, "n _"]]:
         """Encoder activations of images in 0..1, by factor: the code, then the last spatial map.
 
-        Where ``features`` needs them, those of the mirror image follow, and coordinates of the fitted scene
-        come under keys of their own (`coordinates_of`).
+        Where ``features`` needs them, the mirror image's follow, and the fitted scene's under
+        `coordinates_of`.
         """
         check_images(images, self.image_size)
         found = {factor.name: self.factor_activations(factor.name, images) for factor in self.factors}
@@ -102,21 +93,15 @@ class EmbeddingModel(nn.Module):
     def features_from(
         self, activations: Mapping[str, Float[Tensor, "n _"]]
     ) -> dict[str, Float[Tensor, "n _"]]:
-        """``embed`` of the images that these activations belong to.
-
-        Raises:
-            ValueError: there are codes where a feature needs all activations.
-        """
+        """``embed`` of the images that these activations belong to; codes alone are a ValueError."""
         return self.features(self.codes(activations), activations)
 
     def fit_scenes(self, images: Float[Tensor, "n 3 h w"], steps: int = STEPS) -> Fitted:
         """Scenes optimised per image, images in 0..1: from ``decompose`` on, downhill through the renderer.
 
-        Slower than ``decompose`` by a hundred times, with a smaller error, also under lighting and viewpoints
-        that the encoders were not trained on.
-
-        Raises:
-            ValueError: the model has no fitting (``derender whiten`` makes one).
+        A hundred times as slow as ``decompose``, with a smaller error, also under other lighting and
+        viewpoints. A
+        model without a fitting (``derender whiten`` makes one) is a ValueError.
         """
         refuse_not_finite(images)
         fitting = self.features.required_fitting()

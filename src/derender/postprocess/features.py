@@ -1,8 +1,4 @@
-"""How features are made of encoder activations: one frozen value, with which a model is loaded or not.
-
-Without it a feature is the encoder output (the code). Whitening replaces it; coordinates of scenes fitted per
-image follow where the fitting makes steps. Leaves out how either is made of training images (training/).
-"""
+"""How features are made of encoder activations: one frozen value, with which a model is loaded or not."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -19,11 +15,12 @@ from derender.storage.folder import FITTING_FILE, WHITENING_FILE
 
 @dataclass(frozen=True)
 class Features:
-    """Post-processing of encoder activations.
+    """Post-processing of encoder activations; without it a feature is the encoder output (the code).
 
     Attributes:
         whitening: maps activations of some factors to their features; None leaves the codes.
-        fitting: fits scenes to images at test time; None cannot. With 0 steps features do without.
+        fitting: fits scenes to images, whose coordinates follow; None cannot. With 0 steps features do
+        without.
     """
 
     whitening: Whitening | None = None
@@ -41,11 +38,7 @@ class Features:
     def __call__(
         self, codes: Mapping[str, Float[Tensor, "n code"]], activations: Mapping[str, Float[Tensor, "n _"]]
     ) -> dict[str, Float[Tensor, "n _"]]:
-        """Features by factor, of encoder outputs and of what `Derenderer.activations` gives for the same.
-
-        Raises:
-            ValueError: there are codes where a feature needs all activations.
-        """
+        """Features by factor, of encoder outputs and activations; codes alone may be a ValueError."""
         features = {**codes, **(self.whitening(activations) if self.whitening is not None else {})}
         if self.fitting is not None:
             for name in [name for name in features if coordinates_of(name) in activations]:
@@ -81,11 +74,7 @@ class Features:
 
     @classmethod
     def load(cls, folder: Path, image_size: int) -> "Features":
-        """Read the parts that a saved model's folder holds.
-
-        Raises:
-            ValueError: a file is damaged, or fits maps of another size than the model's images.
-        """
+        """Read the parts in a saved model's folder; damage or maps of another size are a ValueError."""
         whitening, fitting = folder / WHITENING_FILE, folder / FITTING_FILE
         return cls(
             Whitening.load(whitening) if whitening.is_file() else None,

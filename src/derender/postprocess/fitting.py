@@ -1,9 +1,8 @@
 """Test-time optimisation: scenes fitted per image, from the encoders' prediction down through the renderer.
 
-Analysis by synthesis. Geometry and albedo move within a morphable model of the trained model's predictions on
-its training images (morphable.py), light and camera freely, so that the rendering comes near the image; the
-further a coordinate is from its mean, the more it costs. Leaves out the parameters of further factors, which
-stay as predicted.
+Geometry and albedo move within a morphable model of the trained model's predictions (morphable.py), light and
+camera freely, so that the rendering comes near the image; coordinates far from their mean cost more. Leaves
+out the parameters of further factors, which stay as predicted.
 """
 
 import json
@@ -80,13 +79,7 @@ class Fitted:
 
 
 class Fitting(nn.Module):
-    """Fits scenes to images: a morphable model, settings, and the length of features made of coordinates.
-
-    Args:
-        maps: of depth and albedo.
-        settings: how.
-        length: what a coordinate is multiplied by in a feature.
-    """
+    """Fits scenes to images by ``maps`` of depth and albedo; a coordinate times ``length`` is a feature's."""
 
     def __init__(self, maps: MorphableMaps, settings: FittingSettings, length: float = 1.0):
         super().__init__()
@@ -114,14 +107,7 @@ class Fitting(nn.Module):
         render: Callable[[Scene], Rendering],
         steps: int | None = None,
     ) -> Fitted:
-        """Fit scenes to images, each by itself.
-
-        Args:
-            images: in 0..1.
-            scene: where to begin, at the images' size.
-            render: gives images of scenes, with gradients.
-            steps: of Adam; by default the settings'.
-        """
+        """Fit scenes to images in 0..1, each by itself, from a scene on, by so many steps of Adam."""
         steps = self.settings.steps if steps is None else steps
         if steps < 1:
             raise ValueError(f"fitting needs 1 step or more, got {steps}")
@@ -182,12 +168,7 @@ class Fitting(nn.Module):
 
     @classmethod
     def load(cls, file: Path, image_size: int | None = None) -> "Fitting":
-        """Read what ``save`` wrote.
-
-        Raises:
-            ValueError: it is damaged, tensors are missing or do not fit each other, or maps have another side
-                than ``image_size``.
-        """
+        """Read what ``save`` wrote; damage, or maps of another side than ``image_size``, is a ValueError."""
         tensors, metadata = read_described(file)
         try:
             settings = FittingSettings.model_validate(json.loads(metadata["settings"]))

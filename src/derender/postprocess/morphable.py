@@ -1,9 +1,7 @@
 """Geometry and albedo as a linear model: a mean map, and the directions in which a model's own maps vary.
 
-A morphable model (Blanz and Vetter, SIGGRAPH 1999) whose examples are no scans: they are a trained model's
-predictions on unlabelled images, each averaged with its mirror image, for the object is symmetric and the
-lighting need not be. A coordinate of 1 is one standard deviation of them. Leaves out differences between the
-sides, and everything a decoder can predict that is far from the mean.
+A morphable model (Blanz and Vetter, SIGGRAPH 1999) whose examples are a trained model's predictions, each
+averaged with its mirror image, for the object is symmetric. A coordinate of 1 is one standard deviation.
 """
 
 from collections.abc import Mapping
@@ -14,12 +12,7 @@ from torch import Tensor, nn
 
 
 class MorphableMaps(nn.Module):
-    """Coordinates to maps and back, by name.
-
-    Args:
-        means: by name, a map of any shape.
-        axes: by name, (coordinates, *shape of the map): what a coordinate of 1 adds; at right angles.
-    """
+    """Coordinates to maps and back, by name: a mean, and what a coordinate of 1 of each axis adds to it."""
 
     def __init__(self, means: Mapping[str, Tensor], axes: Mapping[str, Tensor]):
         super().__init__()
@@ -35,14 +28,9 @@ class MorphableMaps(nn.Module):
 
     @classmethod
     def of(cls, examples: Mapping[str, Float[Tensor, "n ..."]], coordinates: int) -> "MorphableMaps":
-        """The directions in which examples vary most, at most as many as differ; same maps, same model.
+        """The directions in which maps vary most, by name, at most as many as differ; same maps, same model.
 
-        Args:
-            examples: by name, maps; what their mirror images (along the last axis) share with them counts.
-            coordinates: of each name.
-
-        Raises:
-            ValueError: fewer than two examples.
+        What the mirror images (along the last axis) share with them counts. Fewer than two are a ValueError.
         """
         means, axes = {}, {}
         for name, maps in examples.items():

@@ -1,9 +1,8 @@
 """Encoder activations to features: linear discriminant analysis (LDA) without labels.
 
-The classes are images; the members of a class are renderings of its scene with this factor left as it is and
-the others changed. Within-class covariance normalisation divides each direction by how much renderings of one
-image differ in it. The most discriminative directions are kept and made more even, so that a few do not drown
-the others. Leaves out how the renderings are made (training/features.py).
+The classes are images; the members of a class are renderings of its scene with the other factors changed.
+Within-class covariance normalisation divides each direction by how much renderings of one image differ in it;
+the most discriminative directions are kept and made more even (training/features.py renders).
 """
 
 from collections.abc import Collection, Mapping
@@ -25,12 +24,9 @@ _TINY = torch.finfo(torch.float32).tiny
 
 @dataclass(frozen=True)
 class Projection:
-    """An affine map of one factor's activations.
+    """An affine map of one factor's activations: ``mean`` is subtracted, ``map`` multiplied from the right.
 
-    Attributes:
-        mean: what is subtracted first.
-        map: multiplied from the right; its rank is the number of directions kept.
-        ratios: of every kept direction, largest first: variance between images over variance within them.
+    ``ratios`` of every direction kept, largest first: variance between images over variance within them.
     """
 
     mean: Float[Tensor, " input"]
@@ -86,22 +82,16 @@ def fit_projection(
 ) -> Projection:
     """The map that makes the mean within-class variance 1 in every kept direction, or evens out the total.
 
-    Features are rotated so that each is as near as can be to the number of the code in its place, which
-    changes no distance.
+    Features are rotated so that each is as near as can be to the number of the code in its place.
 
     Args:
-        scatter: of activations in which the code comes first.
+        scatter: of activations in which the code comes first; fewer than two views or images: a ValueError.
         directions: how many are kept, those with the largest ratio between over within; at most ``size``.
-        shrinkage: how much of the mean within-class variance is added to every direction's, so that a
-            direction that hardly moved in these images does not count as one that never moves.
+        shrinkage: share of the mean within-class variance that is added to every direction's.
         size: of the code, and of the features; by default that of the activations.
-        evenness: 0..1. At 0 a direction in which images differ more counts for more; at 1 all count alike:
-            like one whose variances between and within classes are equal.
-        power: of each direction's repeatability, between / (between + within), by which it is weighted: the
-            expected class mean, at 1 the posterior mean. At 0 kept directions are weighted alike.
-
-    Raises:
-        ValueError: fewer than two views or images.
+        evenness: 0..1. At 0 a direction in which images differ more counts for more; at 1 all count alike.
+        power: of each direction's repeatability, between / (between + within), by which it is weighted: at 1
+            the posterior mean. At 0 kept directions are weighted alike.
     """
     from scipy.linalg import eigh  # only the kept directions: torch would find all, three times as slow
 
@@ -127,8 +117,9 @@ def fit_projection(
 class Whitening(nn.Module):
     """The projections of some factors, applied to activations by name; gives those factors' features alone.
 
-    A projection of fewer rows than there are activations takes the first of them: the code. Projections of
-    names in ``mirrored`` take the mean over an image and its mirror image, whose activations follow.
+    A projection takes the first of the activations, as many as it has rows. Those of names in ``mirrored``
+    take
+    the mean over an image and its mirror image, whose activations follow.
     """
 
     def __init__(self, projections: Mapping[str, Projection], *, mirrored: Collection[str] = ()):
@@ -182,11 +173,7 @@ class Whitening(nn.Module):
 
     @classmethod
     def load(cls, file: Path) -> "Whitening":
-        """Read what ``save`` wrote.
-
-        Raises:
-            ValueError: it is damaged, or tensors are missing or do not fit each other.
-        """
+        """Read what ``save`` wrote; damage, or tensors that are missing or do not fit, is a ValueError."""
         tensors = read_tensors(file)
         projections = {}
         for name in [key.removesuffix("_map") for key in tensors if key.endswith("_map")]:

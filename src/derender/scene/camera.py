@@ -98,9 +98,6 @@ def constant(values: Any, like: Tensor) -> Tensor:
 
 @lru_cache(maxsize=256)
 def shared_tensor(values: Any, device: torch.device, dtype: torch.dtype) -> Tensor:
-    """The tensor of these numbers that every caller shares.
-
-    Making one anew copies it from the host, which waits for the device and cannot be part of a CUDA graph.
-    """
+    """The tensor of these numbers that every caller shares: making it anew would wait for the device."""
     with torch.inference_mode(False):  # else it could serve no gradient later
         return torch.tensor(values, device=device, dtype=dtype)

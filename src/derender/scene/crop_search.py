@@ -1,9 +1,9 @@
 """The square crop of an image that a model reconstructs best.
 
-A model learns the crop of its training images; in another crop it mistakes one part for another, eyes on
-cheeks. Crops on a grid are reconstructed and compared by their squared error over the crop's own variance,
-both inside the mask, so that smooth crops gain nothing. Needs neither labels nor a detector. Leaves out
-rolled images, objects that fill less than half of the image's side, and crops that reach beyond it.
+A model learns the crop of its training images; in another one it mistakes eyes for cheeks. Crops on a grid
+are
+compared by the squared error of their reconstruction over their own variance, inside the mask, so that smooth
+crops gain nothing. Leaves out rolled images, small objects, and crops that reach beyond the image.
 """
 
 from collections.abc import Sequence
@@ -30,12 +30,7 @@ _LEAST_VARIANCE = 1e-4
 
 @dataclass(frozen=True)
 class Crop:
-    """A square part of a square image.
-
-    Attributes:
-        side: its side over the image's, up to 1.
-        across, down: its centre, -1 (left, top) to 1; within ``1 - side`` of 0.
-    """
+    """A square part of a square image: its side over the image's, and its centre, -1 (left, top) to 1."""
 
     side: float = 1.0
     across: float = 0.0
@@ -90,11 +85,7 @@ def crop_errors(
 ) -> Float[np.ndarray, "crops n"]:
     """Squared error of each crop's reconstruction over its variance: best 0; inf where nothing is rendered.
 
-    Args:
-        model: with ``reconstruct``, ``device`` and ``image_size``, in evaluation mode.
-        images: square, best of ``SEARCH_SCALE`` times the model's size or more.
-        crops: candidates.
-        batch_size: crops rendered at a time; changes speed and memory only.
+    ``model`` has ``reconstruct``, ``device`` and ``image_size``; images are best ``SEARCH_SCALE`` times that.
     """
     columns = []
     for few in images.split(max(1, batch_size // len(crops))):

@@ -1,10 +1,8 @@
 """The same scenes on a finer grid: smooth depth, sharp albedo, light and camera as they are.
 
-Depth becomes a uniform cubic B-spline whose control points are the depth map: its slope at the old pixels is
-the central difference that ``normals_from_depth`` takes there, so that a model is seen with the normals it
-was trained with. Albedo is interpolated by the Catmull-Rom spline, which keeps every pixel's value, and
-clipped to 0..1. Source: de Boor, A Practical Guide to Splines; Catmull and Rom, 1974. Outermost pixel centres
-stay where they are, as the field of view does. Leaves out maps of further factors.
+Depth becomes a uniform cubic B-spline of the depth map: its slope at the old pixels is that of
+``normals_from_depth``. Albedo is interpolated by the Catmull-Rom spline, which keeps every pixel's value.
+Source: de Boor, A Practical Guide to Splines; Catmull and Rom, 1974. Leaves out maps of further factors.
 """
 
 from typing import Literal
@@ -19,10 +17,7 @@ SMALLEST_MAP = 4
 
 
 def at_size(scene: Scene, size: int) -> Scene:
-    """Scenes with depth and albedo of ``size`` x ``size``; no smaller than they are.
-
-    A scene that has that size already is returned as it is. Gradients reach depth and albedo.
-    """
+    """Scenes with depth and albedo of ``size`` x ``size``, no smaller than they are, with gradient to both."""
     height, width = scene.depth.shape[-2:]
     if height != width:
         raise ValueError(f"only square scenes can be enlarged, got {height}x{width}: cut or pad them first")

@@ -1,8 +1,7 @@
 """Surface normals of a depth map.
 
-The normal is the cross product of the differences of the unprojected points along u and v (central inside,
-one-sided at the border), worked out by hand for the pinhole camera so that only maps of one channel are
-touched. Exact on planes at every angle. Depth must be positive. Leaves out smoothing.
+The cross product of the differences of the unprojected points along u and v (central inside, one-sided at the
+border), worked out by hand. Exact on planes at every angle. Depth must be positive. Leaves out smoothing.
 """
 
 import torch

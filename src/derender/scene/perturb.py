@@ -1,11 +1,9 @@
 """Physical augmentation: change one factor of a scene by a random, physically possible amount.
 
 Source: the paper, section 4 (LOOCC): uniform additive perturbations of light (ambient and diffuse +-0.5,
-pitch and yaw +-45 degrees) and camera (pitch +-22.5, yaw +-45 degrees). The paper leaves open what happens
-at the bounds. Here the perturbation is uniform over those values in its range that keep the result physical:
-intensities in their bounds, light within 45 degrees, camera within 60, and nothing piles up at a bound.
-Geometry and albedo, which have no such range, are exchanged between images. Which factor changes, and by
-which of these functions, is declared in a factor's row (networks/factors.py).
+pitch and yaw +-45 degrees) and camera (pitch +-22.5, yaw +-45 degrees); here uniform over those values that
+keep the result in its bounds, so that nothing piles up there. Geometry and albedo are exchanged between
+images. Which factor changes, and how, is declared in its row (networks/factors.py).
 """
 
 import math
@@ -67,10 +65,7 @@ def exchange(
     settings: PerturbSettings = DEFAULT_CHANGES,
     ranges: SceneRanges = DEFAULT_RANGES,
 ) -> Shaped[Tensor, "n ..."]:
-    """Give every row the value of another row (a derangement), for factors without a range of change.
-
-    ``settings`` and ``ranges`` are not consulted: they are there because every perturbation is called alike.
-    """
+    """Give every row another row's value, for factors without a range; the last two are not consulted."""
     return value[derangement(len(value), generator).to(value.device)]
 
 

@@ -1,8 +1,8 @@
 """Files and folders that appear complete or not at all, and folders with checksums of their files.
 
 Both are written under another name beside their place and moved there at the end: a kill or a full disk
-leaves the previous content. A sealed folder holds a checksum of each of its files, which shows a later reader
-a changed bit; it is no protection against an attacker.
+leaves
+the previous content. The checksums of a sealed folder show a changed bit; they protect from no attacker.
 """
 
 import ctypes
@@ -35,7 +35,7 @@ class DamageNoticed(UserWarning):
 def atomic_file(path: Path, *, durable: bool = False) -> Iterator[Path]:
     """Give a temporary path to write to; it takes the place of ``path`` if nothing is raised.
 
-    With ``durable`` the disk has the content before the name: losing power cannot leave an empty file.
+    ``durable`` has the disk keep the content before the name.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(prefix=_prefix(path), dir=path.parent)
@@ -55,10 +55,11 @@ def atomic_file(path: Path, *, durable: bool = False) -> Iterator[Path]:
 
 @contextmanager
 def atomic_folder(folder: Path, *, previous: Path | None = None) -> Iterator[Path]:
-    """Give a temporary folder to fill; it takes the place of ``folder`` if nothing is raised.
+    """Give a temporary folder to fill; it takes the place of ``folder``, if nothing is raised.
 
-    The old folder becomes ``previous``, or is deleted without it. The two are exchanged in one step where the
-    system can (Linux); elsewhere the old one is moved first, and a kill between the moves leaves it there.
+    The old one becomes ``previous``, or is deleted. They are exchanged in one step where the system can
+    (Linux);
+    elsewhere the old one is moved first.
     """
     folder.parent.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(prefix=_prefix(folder), dir=folder.parent))
@@ -113,11 +114,7 @@ def seal(folder: Path) -> None:
 
 
 def check_seal(folder: Path) -> None:
-    """Compare the files with what was noted.
-
-    Raises:
-        Damaged: one is missing or differs, or the note is; names the first.
-    """
+    """Compare the files with what was noted; `Damaged` names the first that is missing or differs."""
     try:
         noted = json.loads((folder / CHECKSUMS).read_bytes())["crc32"]
         rows = [(str(name), (int(size), int(checksum))) for name, (size, checksum) in noted.items()]

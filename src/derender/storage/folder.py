@@ -35,11 +35,7 @@ def bundled_models() -> tuple[str, ...]:
 
 
 def model_folder(source: str | Path) -> Path:
-    """The folder that ``load`` reads for this source.
-
-    Raises:
-        FileNotFoundError: nothing is there.
-    """
+    """The folder that ``load`` reads for this source; a FileNotFoundError where nothing is there."""
     folder = Path(source)
     for candidate in (folder, folder / "model"):
         if (candidate / CONFIG_FILE).is_file() and (candidate / WEIGHTS_FILE).is_file():
@@ -77,8 +73,7 @@ def texts_beside(folder: Path | None, tensors: Mapping[str, Tensor]) -> dict[str
 def read_config(folder: Path, factors: Sequence[str] | None = None) -> dict[str, Any]:
     """``config.json`` of a saved model: its ``factors`` and ``settings``.
 
-    Raises:
-        ValueError: it is damaged, of a newer version, of a baseline, or of other ``factors``.
+    A ValueError: it is damaged, of a newer version, of a baseline, or of other ``factors``.
     """
     damaged = f"{folder / CONFIG_FILE} is damaged: copy or train the model again"
     try:
@@ -117,11 +112,7 @@ def write_model(
 
 
 def read_weights(folder: Path, build: Callable[[], Net]) -> Net:
-    """The network that ``build`` makes, with the weights of a saved folder.
-
-    Raises:
-        ValueError: the file is damaged, or a name or shape differs; names the first.
-    """
+    """The network that ``build`` makes, with the weights of a saved folder; damage is a ValueError."""
     weights = read_tensors(folder / WEIGHTS_FILE)
     with torch.device("meta"):  # sizes are compared before memory is taken for what the file only claims
         check_fit(weights, build().state_dict())
@@ -143,13 +134,9 @@ def naming_damage(folder: Path) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class SplitRecord:
-    """Which images a saved model was not trained on: the split of the run it comes from.
+    """Which images a model was not trained on: its run's shares of training, validation, test, and seed.
 
-    Parts are drawn from files' names (``data.splits``), so shares and a seed define it.
-
-    Attributes:
-        shares: of training, validation and test, which sum to 1.
-        seed: that they were drawn with.
+    Parts are drawn from files' names (``data.splits``), so that these define them.
     """
 
     shares: tuple[float, float, float]
@@ -163,11 +150,7 @@ def write_split(folder: Path, split: SplitRecord) -> None:
 
 
 def read_split(folder: Path) -> SplitRecord | None:
-    """The split recorded with the model in ``folder``; None where there is none.
-
-    Raises:
-        ValueError: the file is damaged or of a newer version.
-    """
+    """The split recorded with the model in ``folder``; None without, a ValueError where it is damaged."""
     file = folder / SPLIT_FILE
     if not file.is_file():
         return None

@@ -1,7 +1,4 @@
-"""Models from and to the Hugging Face Hub; the one place that talks to it.
-
-What goes there is a folder of safetensors and JSON, which ``derender.model`` and ``sharing`` write.
-"""
+"""Models from and to the Hugging Face Hub; the one place that talks to it."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,8 +8,7 @@ from typing import Any
 def download(repository: str, names: Sequence[str]) -> Path:
     """Those of the named files that a repository has, downloaded and cached; gives their folder.
 
-    Raises:
-        FileNotFoundError: the Hub gave nothing under that id, or cannot be reached and nothing is cached.
+    A FileNotFoundError: the Hub gave nothing under that id, or cannot be reached and nothing is cached.
     """
     from huggingface_hub import snapshot_download
     from huggingface_hub.errors import HfHubHTTPError, HFValidationError
@@ -29,10 +25,8 @@ def download(repository: str, names: Sequence[str]) -> Path:
 def upload(folder: Path, repository: str, *, private: bool, token: str | None) -> str:
     """Put a folder's files into a repository, which is made where there is none; gives its address.
 
-    Raises:
-        ValueError: that is no name of a repository.
-        PermissionError: the Hub refuses.
-        ConnectionError: it cannot be reached.
+    A ValueError: that is no name; a PermissionError: the Hub refuses; a ConnectionError: it cannot be
+    reached.
     """
     from huggingface_hub.errors import HfHubHTTPError, HFValidationError, LocalTokenNotFoundError
 

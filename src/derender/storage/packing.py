@@ -1,7 +1,4 @@
-"""A saved model in fewer bytes: weights in half precision, large maps in bytes with a unit for each slice.
-
-Leaves out what rounding costs; evaluation/copies.py measures it.
-"""
+"""A saved model in fewer bytes: weights in half precision, large maps in bytes with a unit for each slice."""
 
 import re
 import shutil
@@ -29,12 +26,7 @@ _LARGE = re.compile(r"\w+_map|maps\.\w+_axes")
 
 @dataclass(frozen=True)
 class Packed:
-    """What was written.
-
-    Attributes:
-        folder: where.
-        before, after: bytes of the tensors' files, by file.
-    """
+    """What was written: the folder, and the bytes of the tensors' files by file, before and after."""
 
     folder: Path
     before: dict[str, int]
@@ -48,12 +40,10 @@ def pack_model(
 
     Args:
         source: what `derender.load` takes.
-        folder: to write.
+        folder, overwrite: to write; whether it may exist, else a FileExistsError.
         maps: "bytes", a 127th of the largest number of each slice apart, or "float16".
-        overwrite: replace what is there.
 
     Raises:
-        FileExistsError: something is there.
         FileNotFoundError: no model is at ``source``.
         ValueError: it is damaged, or a weight is no number of half precision.
     """

@@ -1,7 +1,6 @@
 """Saving and sharing a model: beside its weights a card, held-out errors and its split; the way to the Hub.
 
-The card is the README.md that states what a model is, what made it and what it may be used for. Leaves out
-the files of the model itself, which the class that inherits `Shareable` writes.
+The card is the README.md that states what a model is, what made it and what it may be used for.
 """
 
 import json
@@ -18,11 +17,7 @@ from derender.storage.folder import CARD_FILE, ERRORS_FILE, SPLIT_FILE, texts_be
 
 
 class Shareable:
-    """Saving, for a model that can write its own files.
-
-    Attributes:
-        source: the folder its weights were loaded from.
-    """
+    """Saving, for a model that can write its own files; ``source`` is the folder its weights come from."""
 
     source: Path | None = None
 

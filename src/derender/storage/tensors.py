@@ -30,12 +30,7 @@ def write_tensors(
 
 
 def read_tensors(file: str | Path) -> dict[str, Tensor]:
-    """The tensors of a safetensors file, on the CPU.
-
-    Raises:
-        ValueError: it is damaged or no such file.
-        OSError: it is missing or cannot be opened.
-    """
+    """The tensors of a safetensors file, on the CPU; damage is a ValueError, no file an OSError."""
     return read_described(file)[0]
 
 

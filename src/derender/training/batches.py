@@ -34,11 +34,9 @@ class Batches:
     """Batches of a training set that lies on the device as bytes, or in a file that is mapped into memory.
 
     Attributes:
-        images: (N, 3, H, W) uint8.
+        images: (N, 3, H, W) uint8; ``rows`` of them (None: all) are the training set.
         batch_size: images in every batch; at most as many as there are.
-        seed: of the order and the flips.
-        horizontal_flips: whether each image is mirrored with probability one half.
-        rows: the rows of images that are the training set; None: all. Saves a copy of them.
+        seed, horizontal_flips: of the order and the flips; each image is mirrored with probability one half.
         reframed, reframe: the share of images that are shown in another crop, and how far it is moved.
     """
 
@@ -65,9 +63,8 @@ class Batches:
         return self.images if self.rows is None else torch.from_numpy(_spread(self.images.numpy(), self.rows))
 
     def at(self, position: int, ranks: Ranks = ALONE) -> Float[Tensor, "b 3 h w"]:
-        """The batch at a position of the run, counted in batches from 0, as float32 in 0..1.
-
-        Of several ``ranks`` each gets its own rows of the batch that one process would get.
+        """The batch at a position of the run, counted from 0, in 0..1; of several ``ranks`` each gets its
+        rows.
         """
         return self.ready(self.read(position, ranks), position, ranks)
 
@@ -126,12 +123,9 @@ def _spread(images: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
 
 class Reader:
-    """Takes batches in order; the next one is read in another thread while the present one is computed.
+    """Takes batches in order; on a CPU the next one is read in a thread while the present one is computed.
 
-    On another device than the CPU the images lie there already, and nothing is read ahead.
-
-    Attributes:
-        waited_s: seconds spent waiting for images, of all batches so far.
+    ``waited_s`` are the seconds spent waiting for images, of all batches so far.
     """
 
     def __init__(self, batches: Batches, ranks: Ranks = ALONE):

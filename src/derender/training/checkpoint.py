@@ -1,8 +1,7 @@
 """Checkpoints: weights, optimiser and counters, in files that hold no code.
 
-A checkpoint is a folder. It is written beside the old one, read back, and then takes its place, so that a
-run killed at any moment leaves a whole checkpoint behind; beside the last checkpoint of a run the one before
-it is kept. Every file has a checksum.
+A checkpoint is a folder of files with checksums. It is written beside the old one, read back, and then takes
+its place, so that a run killed at any moment leaves a whole checkpoint behind; the last but one is kept, too.
 """
 
 import json
@@ -34,8 +33,7 @@ class TrainState:
     """Counters of a run; with the weights and the optimiser they determine everything that follows.
 
     Attributes:
-        images: images seen so far, repeats counted.
-        seconds: time spent training.
+        images, seconds: images seen so far, repeats counted, and time spent training.
         best_loss: lowest validation loss so far, None before the first validation.
         validations_since_best: number of validations after that one.
         watcher: state of the collapse detector.
@@ -69,10 +67,7 @@ def save_checkpoint(
     *,
     previous: Path | None = None,
 ) -> None:
-    """Write a checkpoint to ``folder``, which takes the old one's place once it has been read back.
-
-    The old one becomes ``previous`` where that is given, and is deleted otherwise.
-    """
+    """Write a checkpoint, read it back and put it in place of ``folder``; the old one becomes ``previous``."""
     kept = optimiser.state_dict()
     moments = {
         f"{index}.{name}": value
@@ -98,11 +93,9 @@ def resume_from(
 ) -> tuple[TrainState, str | None]:
     """Load the last checkpoint of a run, or the one before it where the last is damaged or gone.
 
-    Gives the counters (of a run that has no checkpoint yet: zeros), and a sentence where it was not the last
-    one, which is warned of, too.
-
-    Raises:
-        ValueError: both are damaged, or they are of another model.
+    Gives the counters (without any checkpoint zeros), and a sentence, warned of, too, where it was not the
+    last.
+    A ValueError: both are damaged, or they are of another model.
     """
     if not last.exists() and not previous.exists():
         return TrainState(), None
@@ -159,11 +152,7 @@ def load_checkpoint(folder: Path, model: nn.Module, optimiser: torch.optim.Optim
 
 
 def fit_weights(module: nn.Module, weights: Mapping[str, Tensor]) -> None:
-    """Load weights by name; all of them, and no others.
-
-    Raises:
-        ValueError: one is missing, has another shape, or is not the module's; names the first.
-    """
+    """Load weights by name; one that is missing, has another shape or is strange is a ValueError."""
     check_fit(weights, module.state_dict())
     module.load_state_dict(dict(weights))
 
@@ -171,7 +160,7 @@ def fit_weights(module: nn.Module, weights: Mapping[str, Tensor]) -> None:
 def _fit_moments(optimiser: torch.optim.Optimizer, moments: Mapping[str, Tensor]) -> None:
     """Give the optimiser a stored state, with the strides of its parameters; how it steps stays its own.
 
-    A state that is not of these parameters is a ValueError: a fused step goes by their size alone.
+    A state of other parameters is a ValueError: a fused step goes by their size alone.
     """
     parameters = [parameter for group in optimiser.param_groups for parameter in group["params"]]
     found: dict[int, dict[str, Tensor]] = {}

@@ -195,10 +195,11 @@ PRESETS: dict[str, TrainConfig] = {
 def resolve(preset: str, overrides: Iterable[str] = (), **explicit: Any) -> TrainConfig:
     """The configuration of a run: a preset, then ``key=value`` overrides, then explicit dotted keys.
 
-    Keys are dotted (``optimiser.learning_rate``); a unique last part may stand alone (``learning_rate``).
-    Values are read as YAML. In ``explicit`` dots are written as double underscores and None means not given.
-    With ``start_from`` the model has that model's settings (without a U-Net decoder) instead of the preset's,
-    before overrides change them.
+    Keys are dotted (``optimiser.learning_rate``); a unique last part may stand alone. Values are read as
+    YAML. In
+    ``explicit`` dots are written as double underscores and None means not given. With ``start_from`` the
+    model
+    has that model's settings (without a U-Net decoder) instead of the preset's, before overrides change them.
 
     Raises:
         ValueError: unknown preset or key (names the nearest), or a value that does not fit.
@@ -263,11 +264,7 @@ def setting_names(kind: type[Settings] = TrainConfig) -> list[str]:
 
 
 def without_removed(tree: dict[str, Any]) -> dict[str, Any]:
-    """Stored settings without those of ``REMOVED``.
-
-    Raises:
-        ValueError: one has a value that this version cannot honour.
-    """
+    """Stored settings without those of ``REMOVED``; a value this version cannot honour is a ValueError."""
     for key, neutral in REMOVED.items():
         parent, last = key.split(".")
         part = tree.get(parent)

@@ -81,10 +81,7 @@ def train(
 
 @dataclass(frozen=True)
 class DerenderTask(TrainingTask):
-    """Train a `Derenderer` as the configuration says.
-
-    ``begins`` is false where a checkpoint gives the weights: then the model to start from is not needed.
-    """
+    """Train a `Derenderer` as configured; ``begins`` is false where a checkpoint gives the weights."""
 
     config: TrainConfig
     begins: bool = True
@@ -109,9 +106,7 @@ class DerenderTask(TrainingTask):
     def build(self) -> Derenderer:
         """The model as the run begins: untrained, or with the weights of ``start_from``.
 
-        Raises:
-            FileNotFoundError: there is no model to start from.
-            ValueError: its weights do not fit this one's settings; names the first.
+        A FileNotFoundError: there is no such model; a ValueError: its weights do not fit, names the first.
         """
         model, start = Derenderer.seeded(self.config.model, self.config.seed), self.config.start_from
         if start is not None and self.begins:
@@ -137,10 +132,7 @@ class DerenderTask(TrainingTask):
 
 
 class DerenderStep(nn.Module):
-    """Model, objective and perceptual features; a batch goes in, the total and the result come out.
-
-    ``ranks`` share the batches of training; held-out images are each judged by one of them.
-    """
+    """Model, objective and perceptual features; held-out images are each judged by one of the ``ranks``."""
 
     def __init__(
         self,
@@ -171,10 +163,7 @@ class DerenderStep(nn.Module):
 def perceptual_of(
     config: TrainConfig, run: RunFolder, images: UInt8[Tensor, "n 3 h w"], progress: PhaseProgress
 ) -> PerceptualFeatures | None:
-    """The perceptual features of a run, the same after a resume; None where they have no weight.
-
-    Self-trained features are read from the run's folder, or learnt once and written there.
-    """
+    """The perceptual features of a run, None without weight; self-trained ones are kept in its folder."""
     objective, file = config.objective, run.perceptual
     if objective.perceptual == "none" or objective.perceptual_weight == 0:
         return None

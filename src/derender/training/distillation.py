@@ -133,8 +133,7 @@ def refine(
         images: its training images, or more of the kind.
         held_out: other images, on which errors are measured.
         config: how, and how features are made afterwards.
-        seed: of every random choice.
-        progress: called once for each part of the work.
+        seed, progress: of every random choice; called once for each part of the work.
 
     Raises:
         ValueError: a model that cannot fit scenes or has further factors; too few images, or images of

@@ -25,12 +25,7 @@ from torch.autograd.function import once_differentiable
 
 @dataclass(frozen=True)
 class Ranks:
-    """This process among those that train together; every method is called by all of them, or by one alone.
-
-    Attributes:
-        rank: the number of this one, from 0.
-        count: how many there are.
-    """
+    """This process, number ``rank`` of ``count`` that train together; all of them call each method."""
 
     rank: int = 0
     count: int = 1
@@ -62,10 +57,7 @@ class Ranks:
         return gathered
 
     def part_of_mean(self, weight: Tensor) -> Tensor:
-        """The share of a mean weighted by ``weight``, taken over this rank's images, in that over all.
-
-        ``mean of (local mean x this)`` over ranks is the weighted mean over all images.
-        """
+        """A factor: the mean over ranks of (local mean x this) is the mean over all images, so weighted."""
         if self.count == 1:
             return torch.ones((), device=weight.device)
         local = weight.detach().float().sum()
@@ -124,9 +116,7 @@ def started_together() -> int:
 def open_fabric(accelerator: str, *, every_parameter_learns: bool = False) -> Any:
     """A Lightning Fabric of one device; under torchrun of one for each process, joined when this returns.
 
-    Args:
-        accelerator: "auto", "cpu" or "cuda".
-        every_parameter_learns: in every step, which saves DDP a search.
+    ``every_parameter_learns`` in every step saves DDP a search.
     """
     stub = ModuleType("torchmetrics")  # Fabric reads its version alone: two of the four seconds of its import
     stub.__dict__["__version__"] = version("torchmetrics")
@@ -167,10 +157,7 @@ def first_then_others(fabric: Any, *, local: bool = False) -> Iterator[None]:
 
 
 def first_to_fail() -> bool:
-    """Whether no other process of this run has failed before; asked once, by one that is about to end.
-
-    The others then end silently: they would only report that the first one has gone.
-    """
+    """Whether no other process of this run has failed before: the others then end silently; asked once."""
     if started_together() == 1 or not distributed.is_available():
         return True
     if not distributed.is_initialized():

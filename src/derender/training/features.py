@@ -53,10 +53,9 @@ def make_features(
 
     Args:
         model: trained.
-        images: its training images, uint8 or float in 0..1.
+        images: its training images, uint8 or float in 0..1; random subsets, drawn with ``seed``, are used.
         settings: how.
-        seed: of the random subset of images.
-        progress: called once for each of the two.
+        seed, progress: of the subsets; called after each batch.
         maps: to fit scenes within, by default estimated here.
 
     Raises:
@@ -92,18 +91,13 @@ def fit_whitening(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> Whitening:
-    """The map from a trained model's activations to its features.
+    """The map from a trained model's activations to its features; arguments as of `make_features`.
 
     Args:
-        model: trained; left as it is.
-        images: its training images, uint8 or float in 0..1; a random subset of the settings' size is used.
-        settings: how many images and views, how many directions are kept.
         perturb: how far light and camera are changed.
         describe: another encoder, all of whose activations of the model's renderings are measured; by default
             the model's own of geometry and albedo.
         size: of the features; by default that of the model's code, or of all activations of ``describe``.
-        seed: of the random subset and of the renderings, which are the same for every encoder.
-        progress: called after each batch.
 
     Raises:
         ValueError: fewer than two images, or activations that are NaN or infinite.
@@ -157,11 +151,8 @@ def recentre(
 ) -> Whitening:
     """The model's own whitening about the mean of these images, uint8 or float in 0..1; the model stays.
 
-    Features of images of another kind than the training images have another mean, on which a penalised or
-    hardly trained head leans; nothing else about them changes.
-
-    Raises:
-        ValueError: the model's features are not whitened.
+    Features of another kind of images have another mean, on which a penalised or hardly trained head leans. A
+    model whose features are not whitened is a ValueError.
     """
     whitening = model.whitening
     if whitening is None:
@@ -187,17 +178,8 @@ def make_fitting(
 ) -> Fitting:
     """The morphable model of a model's predicted maps, and the length of features made of fitted scenes.
 
-    Args:
-        model: trained and, if it is to be, whitened; left as it is.
-        images: its training images, uint8 or float in 0..1; a random subset of the settings' size is used.
-        settings: how many examples and coordinates, and how scenes are fitted later.
-        seed: of the random subset.
-        progress: called after each batch.
-        maps: an existing morphable model; by default one is made.
-
-    Raises:
-        ValueError: fewer than two images, maps that are NaN or infinite, or a model without geometry and
-            albedo.
+    Arguments are those of `make_features`. Fewer than two images, maps that are NaN or infinite, or a model
+    without geometry and albedo are a ValueError.
     """
     missing = sorted(set(PARAMETERS) - {factor.name for factor in model.factors})
     if missing:

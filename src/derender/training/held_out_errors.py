@@ -1,8 +1,7 @@
 """The distance of a model's reconstructions from images it was not trained on, saved with the model.
 
 One number per image, the mean absolute difference inside the mask; of all of them 101 quantiles, in a small
-JSON file of the saved model's folder. Leaves out judging an image by them
-(``evaluation/out_of_distribution.py``).
+JSON file. Leaves out judging an image by them (``evaluation/out_of_distribution.py``).
 """
 
 from dataclasses import dataclass
@@ -35,12 +34,7 @@ class NotFinite(ValueError):
 
 @dataclass(frozen=True)
 class HeldOutErrors:
-    """The reconstruction errors of images a model was validated on.
-
-    Attributes:
-        quantiles: (101,) the masked L1 (0..1) that 0, 1, ... 100 % of the images do not exceed.
-        pictures: how many there were.
-    """
+    """The errors of ``pictures`` images: the masked L1 (0..1) that 0, 1, ... 100 % of them do not exceed."""
 
     quantiles: Float[np.ndarray, " 101"]
     pictures: int
@@ -54,10 +48,9 @@ class _ErrorsFile(Settings):
 
 
 def reconstruction_errors(model: Any, images: Images, batch_size: int = 64) -> Float[np.ndarray, " n"]:
-    """Masked L1 (0..1, best 0) of each image; infinite where the model renders nothing into the image.
+    """Masked L1 (0..1, best 0) of each image; infinite where nothing is rendered into it.
 
-    Raises:
-        NotFinite: a reconstruction is NaN.
+    A NaN among the reconstructions raises `NotFinite`.
     """
     pixels = torch.as_tensor(np.array(images) if isinstance(images, np.ndarray) else images)
     was_training = model.training
@@ -89,11 +82,7 @@ def masked_l1(rendering: Any, target: Float[Tensor, "n 3 h w"]) -> Float[Tensor,
 
 
 def errors_of(model: Any, images: Images, batch_size: int = 64) -> HeldOutErrors:
-    """The quantiles for images the model was not trained on.
-
-    Raises:
-        ValueError: fewer than 20 images, or a model that renders nothing or NaN.
-    """
+    """The quantiles for images it was not trained on; fewer than 20 or no rendering are a ValueError."""
     if len(images) < FEWEST:
         raise ValueError(f"quantiles of errors need {FEWEST} images or more, got {len(images)}")
     errors = reconstruction_errors(model, images, batch_size)
@@ -104,10 +93,7 @@ def errors_of(model: Any, images: Images, batch_size: int = 64) -> HeldOutErrors
 
 
 def store_errors(folder: Path, held_out: UInt8[Tensor, "n 3 h w"]) -> HeldOutErrors | None:
-    """Measure the model saved in ``folder`` on held-out images and save the errors with it.
-
-    Returns None, and saves nothing, for fewer than 20 images and for a model that renders nothing.
-    """
+    """Save the errors of held-out images with the model in ``folder``; None of fewer than 20."""
     try:
         errors = errors_of(load(folder, device=held_out.device), held_out)
     except NotFinite:
@@ -128,11 +114,7 @@ def write_errors(folder: Path, errors: HeldOutErrors) -> Path:
 
 
 def read_errors(folder: Path) -> HeldOutErrors | None:
-    """The errors that were saved with the model in ``folder``; None without any.
-
-    Raises:
-        ValueError: the file is damaged or of a newer version.
-    """
+    """The errors saved with the model in ``folder``, None without any; a damaged file is a ValueError."""
     file = folder / ERRORS_FILE
     if not file.is_file():
         return None

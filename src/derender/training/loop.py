@@ -246,10 +246,7 @@ class _Run:
 
     @torch.no_grad()
     def held_out_losses(self) -> dict[str, float]:
-        """Mean losses over held-out images; "loss" is the sum of all that the task judges by.
-
-        Of several ranks each judges some of the batches, as one process would all of them.
-        """
+        """Mean losses over held-out images, shared by the ranks; "loss" sums those the task judges by."""
         sums: dict[str, float] = defaultdict(float)
         count, size = 0, self.config.batch_size
         self.module.eval()
@@ -292,9 +289,8 @@ class _Run:
             self.save_model(self.state.images)
 
     def leave_model(self) -> None:
-        """Make sure that a run that ends leaves the weights its settings name: on resuming they may differ.
-
-        Where no images were held out, those are of its end.
+        """Make sure that a run that ends leaves the weights its settings name, or without validation its
+        last.
         """
         if self.config.keep == "last" or self.state.best_loss is None:
             if self.model_images != self.state.images:
@@ -338,8 +334,8 @@ def passed(before: int, now: int, interval: int, *, ended: bool) -> bool:
 def kept(before: int, now: int, interval: int, *, ended: bool) -> bool:
     """Whether a state in (before, now] is to be kept: as ``passed``, and at halves of the first interval.
 
-    Those (half, a quarter, ... down to ``FIRST_KEPT_IMAGES``) see to it that a collapse, which happens early
-    if at all, leaves a good state behind whatever the interval.
+    Down to ``FIRST_KEPT_IMAGES``, so that a collapse, which comes early if at all, leaves a good state
+    behind.
     """
     early = interval // 2
     while early >= FIRST_KEPT_IMAGES:

@@ -1,8 +1,4 @@
-"""The files of a run, and the rules under which its folder may be written.
-
-config.yaml, environment.json, metrics.jsonl, samples/, checkpoints/ (last, the previous one, best), model/,
-tensorboard/.
-"""
+"""The files of a run, and the rules under which its folder may be written."""
 
 import json
 import platform
@@ -74,12 +70,7 @@ def refuse_taken(path: Path) -> None:
 
 
 def reopen_run(path: Path, config: Settings) -> RunFolder:
-    """The folder of a run to go on with, after checking that it was made with the same settings.
-
-    Raises:
-        FileNotFoundError: there is no run.
-        ValueError: its settings differ in one that a resumed run must keep.
-    """
+    """The folder of a run to go on with; no run is a FileNotFoundError, other settings are a ValueError."""
     run = RunFolder(path)
     if not run.config.is_file():
         raise FileNotFoundError(f"no run to resume in {path} (no config.yaml): train without --resume first")
@@ -97,11 +88,7 @@ def reopen_run(path: Path, config: Settings) -> RunFolder:
 
 
 def read_config(path: Path, kind: type[Any] = TrainConfig) -> Any:
-    """The configuration of a run, which must be of this kind.
-
-    Raises:
-        ValueError: it is damaged, or the run trained something else.
-    """
+    """The configuration of a run; one that is damaged or not of this kind is a ValueError."""
     tree = read_config_tree(path)
     expected = kind.model_fields.get("baseline")
     trained, name = tree.get("baseline"), None if expected is None else expected.default
@@ -122,9 +109,8 @@ def read_settings(
 ) -> dict[str, Any]:
     """The settings in a YAML file or a run folder, as plain values.
 
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: it holds no settings (``otherwise``), or is of a newer version.
+    A FileNotFoundError: there is none; a ValueError: it holds no settings (``otherwise``), or is of a newer
+    version.
     """
     file = file / "config.yaml" if file.is_dir() else file
     if not file.is_file():

@@ -1,8 +1,8 @@
 """The losses of one training step: decompose, render the scene and its flipped twin, compare; then LOOCC.
 
-Source: unsup3d Sec. 3 (reconstruction), Klinghoffer et al. Sec. 3.2 (LOOCC). Every image is encoded and
-decoded once; the twin reuses the decoded maps, and perturbed scenes are rendered in the same call. Several
-devices may share a batch (distributed.py), and it may be computed in chunks: the losses stay its own.
+Source: unsup3d Sec. 3 (reconstruction), Klinghoffer et al. Sec. 3.2 (LOOCC). The twin reuses the decoded
+maps, and perturbed scenes are rendered in the same call. Several devices may share a batch (distributed.py),
+and it may be computed in chunks: the losses stay its own.
 """
 
 from collections.abc import Callable, Collection, Mapping
@@ -33,12 +33,11 @@ Columns = Mapping[str, Shaped[Tensor, "n ..."]]
 
 @dataclass(frozen=True)
 class StepResult(StepLosses):
-    """Losses of one batch, and the values that the watcher and the sample sheets look at.
+    """Losses of one batch, and the values that the watcher looks at.
 
     Attributes:
         terms: every weighted term of the total by name, and the plain masked L1 ("l1"), detached.
-        scene: the scenes predicted for the batch.
-        rendering: their renderings, without the twins.
+        scene, rendering: the scenes predicted for the batch, and their renderings, without the twins.
         codes: the images' codes by factor, with gradient, for an objective beside this one.
         confidence: the output of the confidence net, where it is used.
     """
@@ -74,15 +73,12 @@ def training_step(
     """Losses for one batch of images in 0..1; networks run under ``precision``, geometry in float32.
 
     Args:
-        model: the model.
+        model, objective: the model; which terms, and their weights.
         images: this rank's rows of the batch.
-        objective: which terms, and their weights.
         perceptual: features to compare, or None.
         generator: of the perturbations; in the same state on every rank.
-        precision: a context for the networks.
         own: each image's share in its maps (`own_share`).
-        ranks: those that share the batch. Every term is then the rank's part: the mean over ranks is the
-            batch's.
+        ranks: those that share the batch; the mean of their terms is the batch's.
         chunks: number of chunks in which networks and renderer work, to save memory.
     """
     count = images.shape[0]
@@ -150,10 +146,9 @@ def perturb_one_factor(
 ) -> tuple[Scene, Int[Tensor, " n"]]:
     """Change one factor of every scene, drawn per image; also which, as an index into ``model.factors``.
 
-    Ranks that share a batch draw for all of it, so that each image gets what one process would give it.
-
-    Raises:
-        ValueError: the model has none of the factors that ``objective.loocc`` names, or cannot perturb one.
+    Ranks draw for all of the batch, as one process would. A ValueError: ``objective.loocc`` names no factor
+    of
+    the model that can be perturbed.
     """
     factors = _contrasted(model, objective)
     if not factors:
@@ -198,9 +193,9 @@ def cycle_loss(
 ) -> Float[Tensor, ""]:
     """How far light and camera, predicted from a rendering, are from those it was rendered with; best 0.
 
-    Mean absolute difference (radians, intensities, scene units) over the vector factors that were perturbed,
-    with the rendered scene as a fixed target: its labels are exact, so they can teach what an image alone
-    leaves open (pitch above all, which shifted albedo explains nearly as well).
+    Mean absolute difference (radians, intensities, scene units) over the perturbed vector factors; the
+    rendered
+    scene is a fixed, exact target for what an image alone leaves open (pitch above all).
     """
     total = rendered.depth.new_zeros(())
     for factor in _contrasted(model, objective):
@@ -221,10 +216,9 @@ def concatenate(scenes: list[Scene]) -> Scene:
 def in_chunks(function: Callable[[Columns], Columns], inputs: Columns, chunks: int) -> dict[str, Tensor]:
     """Apply a function of rows to ``inputs`` in chunks of rows, each computed again in backward.
 
-    The function's output for a row must not depend on other rows, so networks with batch norm are left out.
-    Loss and gradient are those of the whole batch, up to the rounding of sums, for one more forward pass,
-    because whatever couples the rows (LOOCC's negatives, masked means, shared shapes) sees all outputs.
-    Source: gradient caching (Gao et al. 2021), here through torch's activation checkpointing.
+    A row's output must not depend on other rows, as under batch norm. Source: gradient caching (Gao et al.
+    2021),
+    through torch's activation checkpointing: losses and gradients of the batch for one more forward pass.
     """
     if chunks == 1:
         return dict(function(inputs))
@@ -240,9 +234,9 @@ def in_chunks(function: Callable[[Columns], Columns], inputs: Columns, chunks: i
 def own_share(objective: ObjectiveSettings, done: float) -> float:
     """The template start: an image's share in its own maps after this share of the run, 0 (all shared) to 1.
 
-    An image's pose can be explained by its camera, or by a geometry and an albedo that have moved: nothing in
-    the reconstruction prefers the camera. While all images share the same maps only camera and light can
-    explain how they differ, so both are learnt. Then each image's own code is let in gradually.
+    While all images share the same maps only camera and light can explain how they differ, so both are
+    learnt.
+    Then each image's own code is let in gradually.
     """
     if done < objective.template_share:
         return 0.0
@@ -254,10 +248,7 @@ def own_share(objective: ObjectiveSettings, done: float) -> float:
 def share_codes(
     codes: Mapping[str, Float[Tensor, "n _"]], names: Collection[str], own: float, ranks: Ranks = ALONE
 ) -> dict[str, Float[Tensor, "n _"]]:
-    """The codes of the named factors moved to their mean over the batch, which ``ranks`` may share.
-
-    ``own`` = 1 leaves all as they are.
-    """
+    """The codes of the named factors moved to their mean over the batch; ``own`` = 1 leaves them."""
     shared = dict(codes)
     for name, code in codes.items() if own < 1 else ():
         if name in names:
@@ -269,11 +260,7 @@ def share_codes(
 def _perceptual_terms(
     perceptual: PerceptualFeatures, columns: Columns, precision: Precision, chunks: int
 ) -> Float[Tensor, "2"]:
-    """The terms of the reconstruction and of its twin; in chunks each counts as its covered pixels.
-
-    ``columns`` are straight, twin and images (n, 3, h, w), covered (n, h, w) and the sigmas there are; pixels
-    that nothing covers show the image itself.
-    """
+    """The terms of the reconstruction and of its twin, by covered pixels; others show the image itself."""
     if chunks > 1:
 
         def weighted(rows: Columns) -> dict[str, Tensor]:

@@ -47,8 +47,7 @@ class TrainingTask(ABC):
     Attributes:
         config: a `LoopSettings`.
         outside_loss: names of terms that held-out images are not judged by.
-        every_parameter_learns: whether every parameter gets a gradient in every step, which saves DDP a
-            search.
+        every_parameter_learns: gets a gradient in every step, which saves DDP a search.
     """
 
     config: Any
@@ -56,11 +55,7 @@ class TrainingTask(ABC):
     every_parameter_learns = False
 
     def shared(self, ranks: Ranks) -> "TrainingTask":
-        """The same task as one of several ranks that share every batch.
-
-        Raises:
-            ValueError: the batch cannot be shared evenly, or the task needs it whole.
-        """
+        """The same task as one of several ranks; a ValueError where it needs its batch whole."""
         raise ValueError("this is trained on one device: start it without torchrun")
 
     @abstractmethod
@@ -75,9 +70,8 @@ class TrainingTask(ABC):
     def step_module(
         self, model: nn.Module, run: RunFolder, images: UInt8[Tensor, "n 3 h w"], progress: PhaseProgress
     ) -> nn.Module:
-        """A module for `compute_step` that returns (total, Held), given all training images, on the device.
-
-        Its ``model`` is the model.
+        """A module for `compute_step` that returns (total, Held), given all training images; its ``model``
+        learns.
         """
 
     @abstractmethod
@@ -95,8 +89,8 @@ def compute_step(
 ) -> Any:
     """The losses of one batch through a task's step module, wrapped by a strategy or not.
 
-    ``done`` is the share of the run so far, for what changes in its course; None in evaluation. ``rows`` are
-    the images' places in the run's data set, where labels are found.
+    ``done`` is the share of the run so far, None in evaluation; ``rows`` are the images' places in the data
+    set.
     """
     _, held = module(images, generator, precision, done, rows)
     return held.result
@@ -114,9 +108,9 @@ class Progress:
     Attributes:
         phase: "perceptual" while perceptual features are learnt, "train", then "features".
         done, total: steps of the first phase, images of the others.
-        images_per_second: since the run was started or resumed.
+        images_per_second, waiting: since the start or resumption; the latter the share of time, 0..1, for
+        images.
         terms: the latest losses by name.
-        waiting: share of the time, since then, spent waiting for images, 0..1.
     """
 
     phase: str

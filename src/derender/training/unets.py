@@ -70,9 +70,10 @@ class DistilledUNets:
     """A model with U-Net encoders and a decoder over both, and how well the encoders learnt.
 
     Attributes:
-        model: the copy, in evaluation mode and without features of its own (whitening, fitting).
-        errors: mean absolute error of up to 256 of the images as they are: "place" (pixels), "depth" (share
-            of the range), "albedo" (0..1), and "reconstruction" of the copy beside "reconstruction before".
+        model: the copy, in evaluation mode and without whitening or fitting.
+        errors: mean absolute error of up to 256 images: "place" (pixels), "depth" (share of the range),
+        "albedo"
+            (0..1), and "reconstruction" of the copy beside "reconstruction before".
     """
 
     model: Derenderer
@@ -90,11 +91,8 @@ def distil_unets(
     """A copy of a trained model with U-Net encoders of geometry and albedo and a decoder that learnt from it.
 
     The same seed gives the same weights on the same machine and thread count; torch's global random state is
-    neither read nor changed, and the model stays as it is.
-
-    Raises:
-        ValueError: fewer than two images, images of another size, a model that lacks a factor, or weights
-            that are NaN or infinite in the end.
+    neither read nor changed. Fewer than two images, images of another size, a model that lacks a factor, or
+    weights that are NaN or infinite in the end are a ValueError.
     """
     if len(images) < 2 or images.shape[-1] != model.image_size:
         raise ValueError(

@@ -37,10 +37,8 @@ class Finding:
     """A problem of a run.
 
     Attributes:
-        sign: short name.
-        text: the problem in plain words, with the number.
-        advice: what to change.
-        fatal: whether training on is pointless.
+        sign, text: short name; the problem in plain words, with the number.
+        advice, fatal: what to change; whether training on is pointless.
     """
 
     sign: str
@@ -157,12 +155,9 @@ class Watcher(FiniteWatch):
     """The collapse detector: looks at training batches and remembers its measurements.
 
     Args:
-        ranges: bounds of the scene.
-        batch_size: images in every update.
-        averages: measurements by name, smoothed.
-        on_since: images seen when a sign came on.
-        last_images: images seen at the latest look.
-        ranks: those that share a batch; all see the same.
+        ranges, batch_size: bounds of the scene; images in every update.
+        averages, on_since: measurements, smoothed; images seen when a sign came on.
+        last_images, ranks: images seen at the latest look; those that share a batch, and all see the same.
     """
 
     ranges: SceneRanges
@@ -176,11 +171,7 @@ class Watcher(FiniteWatch):
     def remembering(
         cls, ranges: SceneRanges, batch_size: int, memory: Mapping[str, Any], ranks: Ranks = ALONE
     ) -> "Watcher":
-        """A watcher that goes on where ``memory`` was taken; an empty one starts fresh.
-
-        Raises:
-            ValueError: that is no memory of a watcher.
-        """
+        """A watcher that goes on where ``memory`` was taken, or anew; a ValueError of what none gave."""
         try:
             watcher = cls(ranges, batch_size, **memory)
             numbers = [watcher.last_images, *watcher.averages.values(), *watcher.on_since.values()]
@@ -206,10 +197,7 @@ class Watcher(FiniteWatch):
         return self.judge(images, shared["loss"], result.scene, broken)
 
     def judge(self, images: int, loss: float, scene: Scene, broken: str | None = None) -> tuple[Finding, ...]:
-        """The problems after ``images`` images, given the latest batch's loss and scenes; usually none.
-
-        ``broken`` names the first stage whose value is not finite, if there is one.
-        """
+        """The problems, usually none, given the latest batch's loss and scenes; ``broken`` names a stage."""
         if broken is not None or not math.isfinite(loss):
             self.uneasy = True
             first = "" if broken is None else f"; the first value that is not finite is {broken}"
