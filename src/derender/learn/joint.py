@@ -28,7 +28,7 @@ from derender.training.task import Progress, TrainResult
 
 @dataclass(frozen=True)
 class Finetuned:
-    """A joint training with labels: how it ended, scores of its split's test part, the model it began with."""
+    """A joint training with labels: how it ended, scores of its test part, the model it began with."""
 
     run: TrainResult
     scores: FinetuneScores

@@ -17,7 +17,7 @@ SMALLEST_MAP = 4
 
 
 def at_size(scene: Scene, size: int) -> Scene:
-    """Scenes with depth and albedo of ``size`` x ``size``, no smaller than they are, with gradient to both."""
+    """Scenes with depth and albedo of ``size`` x ``size``, no smaller than they are, with gradient."""
     height, width = scene.depth.shape[-2:]
     if height != width:
         raise ValueError(f"only square scenes can be enlarged, got {height}x{width}: cut or pad them first")

@@ -67,7 +67,7 @@ def save_checkpoint(
     *,
     previous: Path | None = None,
 ) -> None:
-    """Write a checkpoint, read it back and put it in place of ``folder``; the old one becomes ``previous``."""
+    """Write a checkpoint, read it back, put it in place of ``folder``; the old one becomes ``previous``."""
     kept = optimiser.state_dict()
     moments = {
         f"{index}.{name}": value
