@@ -59,22 +59,6 @@ def test_the_joint_net_uses_both_centres_once():
         assert (deaf(images) - before).abs().max() > 1e-3
 
 
-def test_swapping_encoders_and_the_weights_that_read_them_changes_nothing():
-    one, two = encoder(0), encoder(1)
-    net = SegmentationNet([one, two], CLASSES).train()
-    swapped = SegmentationNet([two, one], CLASSES).train()
-    swapped.decoder.load_state_dict(net.decoder.state_dict())
-    centre = one.widths[-1]
-    with torch.no_grad():
-        up = swapped.decoder.upsample[0].weight
-        up.copy_(torch.cat([up[centre:], up[:centre]]))
-        for block, width in zip(swapped.decoder.convolve, reversed(one.widths[:-1]), strict=True):
-            first, second, rest = block[0].weight.split([width, width, width], dim=1)
-            block[0].weight.copy_(torch.cat([second, first, rest], dim=1))
-    images = torch.rand(2, 3, 32, 32)
-    assert torch.allclose(net(images), swapped(images), atol=1e-5)
-
-
 def test_frozen_encoders_keep_weights_and_statistics_while_the_decoder_learns():
     net = SegmentationNet([encoder(0)], CLASSES, frozen=True).train()
     free = SegmentationNet([encoder(0)], CLASSES).train()

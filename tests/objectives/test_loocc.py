@@ -49,11 +49,6 @@ def test_closed_forms():
     )
 
 
-def test_gradcheck(generator):
-    a, b = (torch.randn(3, 4, generator=generator, dtype=torch.float64, requires_grad=True) for _ in range(2))
-    assert torch.autograd.gradcheck(nt_xent, (a, b))
-
-
 def test_lengths_do_not_matter_and_order_does_not_matter(generator):
     a, b = (torch.randn(5, 6, generator=generator) for _ in range(2))
     expected = nt_xent(a, b)
@@ -105,19 +100,6 @@ def test_fewer_than_two_images_are_refused(n):
         )
 
 
-def test_nothing_left_out_is_the_mean_of_nt_xent_over_factors(generator):
-    first, again = codes(generator), codes(generator)
-    nothing = torch.full((6,), NOTHING_LEFT_OUT)
-    expected = torch.stack([oracle(first[name], again[name]) for name in FACTORS]).mean()
-    torch.testing.assert_close(loocc_loss(first, again, nothing), expected, **CLOSE)
-
-
-def test_one_factor_left_out_in_the_whole_batch_is_the_mean_over_the_others(generator):
-    first, again = codes(generator), codes(generator)
-    expected = torch.stack([oracle(first[name], again[name]) for name in FACTORS if name != "camera"]).mean()
-    torch.testing.assert_close(loocc_loss(first, again, torch.full((6,), 3)), expected, **CLOSE)
-
-
 def test_choice_per_image_is_the_oracle_on_the_images_that_kept_each_factor(generator):
     first, again = codes(generator), codes(generator)
     perturbed = torch.tensor([2, 3, 2, 2, 0, NOTHING_LEFT_OUT])
@@ -140,35 +122,6 @@ def test_the_perturbed_factor_of_an_image_gets_no_gradient_and_everything_else_d
             assert touched.tolist() == (perturbed != index).tolist(), name
 
 
-def test_the_perturbed_factor_of_an_image_cannot_change_the_loss(generator):
-    first, again = codes(generator), codes(generator)
-    perturbed = torch.tensor([2, 3, 2, 3, 2, 3])
-    before = loocc_loss(first, again, perturbed)
-    for side in (first, again):
-        side["light"][perturbed == 2] = 1e4
-        side["camera"][perturbed == 3] = 0.0
-    torch.testing.assert_close(loocc_loss(first, again, perturbed), before, rtol=0, atol=0)
-
-
-def test_descending_pulls_kept_pairs_together_and_leaves_the_perturbed_pair_alone(generator):
-    first, again = codes(generator, n=4, requires_grad=True), codes(generator, n=4, requires_grad=True)
-    perturbed = torch.tensor([2, 3, 2, 3])
-
-    def similarity(name):
-        return torch.cosine_similarity(first[name], again[name]).detach()
-
-    before = {name: similarity(name) for name in FACTORS}
-    optimiser = torch.optim.SGD([*first.values(), *again.values()], lr=1.0)
-    for _ in range(200):
-        optimiser.zero_grad()
-        loocc_loss(first, again, perturbed).backward()
-        optimiser.step()
-    for index, name in enumerate(FACTORS):
-        left_out = perturbed == index
-        assert torch.equal(similarity(name)[left_out], before[name][left_out])
-        assert (similarity(name)[~left_out] > 0.9).all()
-
-
 def test_a_factor_that_fewer_than_two_images_kept_contributes_nothing(generator):
     first, again = codes(generator, n=2, requires_grad=True), codes(generator, n=2)
     loss = loocc_loss(first, again, torch.tensor([2, 3]))  # light is kept by one image, camera by the other
@@ -184,18 +137,6 @@ def test_when_no_factor_is_left_the_loss_is_zero_with_zero_gradient(generator):
     loss.backward()
     assert loss.item() == 0
     assert torch.equal(light.grad, torch.zeros(2, 5))
-
-
-def test_images_may_come_in_any_order(generator):
-    first, again = codes(generator), codes(generator)
-    perturbed = torch.tensor([2, 3, 2, 3, 0, 1])
-    order = torch.randperm(6, generator=generator)
-    shuffled = loocc_loss(
-        {name: value[order] for name, value in first.items()},
-        {name: again[name][order] for name in reversed(FACTORS)},
-        perturbed[order],
-    )
-    torch.testing.assert_close(shuffled, loocc_loss(first, again, perturbed), **CLOSE)
 
 
 def test_gradcheck_with_factors_left_out(generator):

@@ -141,15 +141,6 @@ def test_training_learns_to_recognise_places_and_to_order_distortions(generator)
     assert after["darker"] < after["shift 2"]
 
 
-def test_calibrated_on_its_own_pictures(generator):
-    images = as_bytes(blobs(20, generator))
-    net = train_self_features(images, seed=0, steps=2, settings=QUICK)
-    found = net(images.float() / 255)
-    spread = (found - found.mean(dim=(0, 2, 3), keepdim=True)).square().mean().sqrt()
-    assert spread.item() == pytest.approx(1, rel=1e-4)
-    assert found.shape == (20, 16, 32 // net.stride, 32 // net.stride) and net.channels == 16
-
-
 def test_at_most_256_pictures_are_calibrated_on(monkeypatch, generator):
     counts = []
     monkeypatch.setattr(SelfFeatures, "calibrate_", lambda net, images: counts.append(len(images)))
@@ -182,17 +173,6 @@ def test_files_that_are_something_else_are_refused(tmp_path):
     )
     with pytest.raises(ValueError, match="does not fit its own widths"):
         load_self_features(tmp_path / "cut.safetensors")
-
-
-def test_bfloat16_autocast_and_channels_last_agree_with_float32(generator):
-    net = train_self_features(as_bytes(blobs(6, generator)), seed=0, steps=1, settings=QUICK)
-    images = torch.rand(2, 3, 16, 16, generator=generator)
-    expected = net(images)
-    lasting = net.to(memory_format=torch.channels_last)
-    torch.testing.assert_close(lasting(images.contiguous(memory_format=torch.channels_last)), expected)
-    with torch.autocast("cpu", dtype=torch.bfloat16):
-        half = net(images)
-    assert (half.float() - expected).abs().max() < 0.03 * expected.abs().max()  # three roundings to 8 bits
 
 
 def test_bad_input_is_named(generator):

@@ -6,7 +6,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from derender.postprocess.fitting import Fitting, FittingSettings, coordinates_of
+from derender.postprocess.fitting import Fitting, FittingSettings
 from derender.postprocess.morphable import MorphableMaps
 from derender.render import render_scene
 from derender.scene import Scene
@@ -92,17 +92,6 @@ def test_each_picture_is_fitted_by_itself(maps, truth, wrong):
         )
 
 
-def test_unusual_coordinates_cost(maps, truth, wrong):
-    pictures = render_scene(truth).image
-    free, held = (
-        Fitting(maps, FittingSettings(steps=40, prior=prior)).fit(pictures, wrong, render_scene)
-        for prior in (0.0, 30.0)
-    )
-    for name in free.coordinates:
-        assert held.coordinates[name].norm() < 0.5 * free.coordinates[name].norm()
-    assert free.after.mean() < held.after.mean()
-
-
 def test_what_was_given_stays_and_no_gradient_is_left(maps, truth, wrong):
     pictures = render_scene(truth).image
     kept = [value.clone() for value in (pictures, *wrong.parameters.values())]
@@ -126,12 +115,6 @@ def test_a_scene_that_is_seen_nowhere_gives_numbers(maps, truth, wrong):
     away = wrong.with_parameters(camera=torch.tensor([[0, 0, 0, 5.0, 0, 0]]).repeat(COUNT, 1))
     found = Fitting(maps, FittingSettings(steps=2)).fit(truth.albedo, away, render_scene)
     assert bool(found.after.isfinite().all()) and bool(found.scene.depth.isfinite().all())
-
-
-def test_features_are_coordinates_of_some_length(maps):
-    fitting = Fitting(maps, FittingSettings(), length=2.5)
-    assert torch.equal(fitting.features(torch.ones(2, 3)), torch.full((2, 3), 2.5))
-    assert coordinates_of("geometry") != "geometry"
 
 
 def test_no_steps_are_refused(maps, truth, wrong):

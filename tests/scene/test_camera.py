@@ -43,15 +43,6 @@ def test_rotation_is_orthonormal_and_right_handed(generator):
     assert_agrees(torch.linalg.det(rotation), torch.ones(50, dtype=torch.float64))
 
 
-@pytest.mark.parametrize("axis", [0, 1, 2])
-def test_turns_about_one_axis_add_up(axis):
-    first, second = torch.zeros(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
-    first[axis], second[axis] = 0.4, -1.3
-    both = rotation_matrix(first) @ rotation_matrix(second)
-    assert_agrees(both, rotation_matrix(first + second))
-    assert_agrees(rotation_matrix(first) @ rotation_matrix(-first), torch.eye(3, dtype=torch.float64))
-
-
 def test_to_canonical_undoes_to_camera(generator):
     points = torch.randn(4, 5, 3, 3, generator=generator, dtype=torch.float64)
     cameras = random_cameras(4, generator)

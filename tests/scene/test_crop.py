@@ -49,12 +49,6 @@ def test_each_number_of_the_camera_moves_as_the_frame_says():
     assert float(camera[3]) == pytest.approx(0, abs=1e-6)
 
 
-def test_the_frame_that_changes_nothing_leaves_the_camera():
-    scene = scenes(torch.tensor([[0.3, 0.2, 0.1, 0.01, -0.01, 0.1]]))
-    whole = torch.tensor([[[1.0, 0, 0], [0, 1.0, 0]]])
-    torch.testing.assert_close(crop_scene(scene, whole, 10.0).camera, scene.camera)
-
-
 def test_ranges_reach_every_camera_that_frames_ask_for():
     narrow = SceneRanges(translation_xy=0.01)
     ranges = ranges_for_crops(narrow, 65, FRAMES)

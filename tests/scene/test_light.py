@@ -31,13 +31,6 @@ def test_direction_is_tan_yaw_tan_pitch_one_normalised(generator):
     assert_agrees(light_direction(torch.cat((torch.zeros_like(angles), angles), -1)), expected)
 
 
-def test_frontal_light_on_a_facing_plane_gives_ambient_plus_diffuse():
-    normal = torch.zeros(1, 4, 5, 3, dtype=torch.float64)
-    normal[..., 2] = 1
-    shading = lambert_shading(normal, light(0.3, 0.9))
-    assert_agrees(shading, torch.full((1, 1, 4, 5), 1.2, dtype=torch.float64))  # not clipped at 1
-
-
 def test_shading_is_the_cosine_between_normal_and_light():
     normal = torch.tensor([0.0, math.sin(0.5), math.cos(0.5)], dtype=torch.float64).expand(1, 2, 2, 3)
     shading = lambert_shading(normal, light(0.1, 0.6, pitch=-0.3))

@@ -66,24 +66,6 @@ def test_at_a_bound_the_change_is_uniform_over_what_is_physical(generator):
     assert uniformity(turned[:, 1], -limit, -limit + QUARTER) < 1.95
 
 
-def test_results_stay_physical_and_close_from_anywhere(generator):
-    light = lights(generator)
-    result = perturb_light(light, generator)
-    assert result[:, :2].min() >= 0 and result[:, :2].max() <= 1
-    assert result[:, 2:].tan().abs().max() <= 1 + 1e-6
-    assert ((result - light).abs() <= torch.tensor([0.5, 0.5, QUARTER, QUARTER]) + 1e-6).all()
-    camera = (torch.rand(MANY, 6, generator=generator) * 2 - 1) * math.radians(60)
-    turned = perturb_camera(camera, generator)
-    assert turned[:, :2].abs().max() <= math.radians(60) + 1e-6
-    assert ((turned - camera)[:, :2].abs() <= torch.tensor([QUARTER / 2, QUARTER]) + 1e-6).all()
-
-
-def test_nothing_piles_up_at_a_bound(generator):
-    result = perturb_light(lights(generator), generator)
-    at_bound = (result[:, 0] < 0.01) | (result[:, 0] > 0.99)
-    assert at_bound.float().mean() < 0.02, "clipping would put an eighth of the mass at each bound"
-
-
 def test_bounds_come_from_the_scene_ranges_and_sizes_from_the_settings(generator):
     cars = SceneRanges(diffuse=(0.5, 1.0), light_deg=20.0, rotation_deg=10.0)
     light = perturb_light(

@@ -29,14 +29,6 @@ def test_an_epoch_shows_every_picture_once_in_a_new_order_each_time():
     assert epochs[0] != epochs[1]
 
 
-def test_a_position_always_gives_the_same_batch():
-    images = numbered(12)
-    one, two = Batches(images, 5, 7, True), Batches(images, 5, 7, True)
-    two.at(0)
-    assert torch.equal(one.at(9), two.at(9))
-    assert not torch.equal(one.at(9), Batches(images, 5, 8, True).at(9))
-
-
 def test_rows_of_a_larger_set_are_batched_as_if_they_were_copied(monkeypatch):
     rows = torch.arange(1, 40, 3).numpy()
     part = Batches(numbered(40), 4, 3, True, rows)
@@ -116,7 +108,3 @@ def test_learning_rate_warms_up_then_falls_along_a_cosine():
     settings = OptimiserSettings(learning_rate=1e-3, warmup_images=100, final_rate=0.1)
     rates = [settings.rate(images, 1100) for images in (0, 49, 99, 100, 600, 1100, 5000)]
     assert rates == pytest.approx([1e-5, 5e-4, 1e-3, 1e-3, 5.5e-4, 1e-4, 1e-4])
-
-
-def test_learning_rate_is_constant_by_default():
-    assert OptimiserSettings().rate(0, 100) == OptimiserSettings().rate(99, 100) == 1e-4

@@ -72,9 +72,3 @@ def test_only_one_chunk_is_held_at_a_time():
         return sum(sizes)
 
     assert kept(4) < kept(1) / 10
-
-
-def test_without_gradient_chunks_are_only_joined():
-    with torch.no_grad():
-        joined = in_chunks(lambda columns: {"y": 2 * columns["x"]}, {"x": torch.arange(5.0)}, 2)
-    assert joined["y"].tolist() == [0, 2, 4, 6, 8]

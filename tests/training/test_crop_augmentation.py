@@ -1,10 +1,9 @@
 """Images in other frames: what moves where, how many, and that features can learn to disregard it."""
 
-import pytest
 import torch
 from torch import Tensor
 
-from derender.scene.crop import CropSettings, crop_images, other_surroundings, random_crops
+from derender.scene.crop import CropSettings, crop_images, random_crops
 from derender.training.batches import Batches
 from derender.training.distributed import Ranks
 
@@ -63,18 +62,6 @@ def test_beyond_the_edge_can_lie_what_is_given():
     assert torch.equal(crop_images(images, whole, around), images)
 
 
-def test_strange_surroundings_are_the_neighbours_in_large_patches():
-    generator = torch.Generator().manual_seed(4)
-    images = torch.rand(3, 3, 32, 32, generator=generator)
-    drawn = [other_surroundings(images, generator) for _ in range(60)]
-    for around in drawn:
-        assert around.shape == images.shape
-        assert torch.allclose(around.mean(dim=(2, 3)), images.roll(1, 0).mean(dim=(2, 3)), atol=0.05)
-    varied = torch.stack([around.std(dim=(2, 3)).mean() for around in drawn])
-    assert varied.min() < 1e-6, "one patch is one colour"
-    assert 0.03 < varied.max() < 0.6 * images.std()
-
-
 def test_the_share_that_is_not_framed_anew_stays_bit_for_bit():
     images = torch.rand(300, 3, 8, 8, generator=torch.Generator().manual_seed(2))
     frames = random_crops(300, torch.Generator().manual_seed(0), CropSettings(), share=0.25)
@@ -90,9 +77,3 @@ def test_batches_are_framed_anew_the_same_way_every_time_and_on_several_devices(
     assert not torch.equal(whole, plain.at(5))
     pieces = torch.cat([framed.at(5, Ranks(rank, 2)) for rank in range(2)])
     assert torch.allclose(pieces, whole, atol=1e-6)
-
-
-@pytest.mark.parametrize("wrong", [{"farther": 0.5}, {"shift": -0.1}, {"roll_deg": 400}])
-def test_impossible_frames_are_refused(wrong):
-    with pytest.raises(ValueError, match=next(iter(wrong))):
-        CropSettings(**wrong)

@@ -59,12 +59,6 @@ def test_what_is_read_comes_nearer_to_what_fitting_finds(refined):
     assert refined.errors["fitted"] < refined.errors["now"] < refined.errors["before"]
 
 
-def test_pictures_are_asked_to_render_again(model, images, refined):
-    asked = refine(model, images, images, changed(picture_weight=3.0), seed=5)
-    assert asked.errors["before"] == refined.errors["before"]
-    assert asked.errors["now"] < 0.97 * refined.errors["now"]
-
-
 def test_the_same_seed_teaches_the_same_and_nothing_else_is_touched(model, images):
     before = {name: value.clone() for name, value in model.state_dict().items()}
     state = torch.random.get_rng_state()
@@ -89,14 +83,6 @@ def test_the_confidence_net_stays_and_the_linear_model_is_the_same(model, refine
         assert torch.equal(value, refined.model.fitting.maps.state_dict()[name])
     features = refined.model.embed(images[:3].float() / 255)
     assert features["geometry"].shape == (3, 256)
-
-
-def test_features_are_made_as_the_settings_say(model, images):
-    fitting = SHORT.fitting.model_copy(update={"steps": 3, "weight": 2.0, "coordinates": 5})
-    own = refine(model, images, images[:2], changed(images=32).model_copy(update={"fitting": fitting})).model
-    assert own.fitting is not None and own.fitting.settings.steps == 3
-    features = own.embed(images[:3].float() / 255)
-    assert features["geometry"].shape == (3, 256), "64 coordinates of the model's own maps, not 5"
 
 
 def test_renderings_come_with_the_scene_they_show(model, images):

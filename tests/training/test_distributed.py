@@ -16,7 +16,7 @@ from PIL import Image
 from derender.data import read_images
 from derender.training import resolve, train
 from derender.training.batches import Batches
-from derender.training.distributed import ALONE, Ranks
+from derender.training.distributed import Ranks
 from derender.training.run_folder import read_metrics
 
 TINY = [
@@ -146,11 +146,3 @@ def test_ranks_have_the_rows_of_the_batch_of_one_process_between_them():
     for position in (0, 3):
         parts = [batches.at(position, Ranks(rank, 3)) for rank in range(3)]
         assert torch.equal(torch.cat(parts), batches.at(position))
-
-
-def test_one_process_alone_needs_nobody():
-    piece = torch.rand(3, 2)
-    assert ALONE.gather(piece) is piece
-    assert ALONE.largest(1.0, 2.0) == [1.0, 2.0]
-    assert ALONE.mean({"a": 0.1}) == {"a": 0.1}
-    assert ALONE.part_of_mean(piece) == 1

@@ -19,11 +19,6 @@ def test_maps_are_shared_and_then_released_along_a_line(done, own):
     assert own_share(OBJECTIVE, done) == pytest.approx(own)
 
 
-def test_without_a_template_every_picture_is_its_own_from_the_start():
-    assert own_share(ObjectiveSettings(), 0) == 1
-    assert own_share(ObjectiveSettings(template_share=0.1), 0.1) == 1
-
-
 def test_only_the_named_codes_move_to_their_mean(generator):
     codes = {name: torch.randn(4, 8, generator=generator) for name in ("geometry", "light")}
     half = share_codes(codes, ["geometry"], 0.5)

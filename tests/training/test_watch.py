@@ -90,17 +90,6 @@ def test_each_failure_is_found_within_20000_images_but_not_at_once(sign):
     assert watch(FAILED_SCENES[sign], 6_000) == []
 
 
-@pytest.mark.parametrize("sign", FAILED_SCENES)
-def test_findings_say_what_is_seen_and_what_to_change(sign):
-    watcher = Watcher(RANGES, BATCH)
-    for seen in range(STEP, 20_001, STEP):
-        findings = watcher.judge(seen, 0.1, FAILED_SCENES[sign])
-    found = next(finding for finding in findings if finding.sign == sign)
-    assert "{" not in found.text
-    assert any(character.isdigit() for character in found.text)
-    assert len(found.advice) > 20
-
-
 def test_large_batches_are_given_as_many_updates_not_as_many_pictures():
     torn = FAILED_SCENES["torn depth"]
     assert "torn depth" in watch(torn, 18_500)
@@ -119,13 +108,6 @@ def test_a_failure_that_passes_is_forgiven():
         findings = watcher.judge(seen, 0.1, healthy_scene())
     assert findings == ()
     assert not watcher.uneasy
-
-
-@pytest.mark.parametrize("loss", [math.nan, math.inf])
-def test_a_loss_that_is_no_number_is_fatal_at_once(loss):
-    (finding,) = Watcher(RANGES, BATCH).judge(16, loss, healthy_scene())
-    assert finding.fatal
-    assert finding.sign == "non-finite loss"
 
 
 def test_a_watcher_goes_on_from_its_memory():
