@@ -19,60 +19,27 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
-_HOME = {
-    "Derenderer": "derender.model",
-    "load": "derender.model",
-    "Scene": "derender.scene",
-    "doctor": "derender.data.doctor",
-    "FeatureTable": "derender.features",
-    "DisentangledFeatures": "derender.features",
-    "train": "derender.learn",
-    "whiten": "derender.learn",
-    "refine": "derender.learn",
-    "unet": "derender.learn",
-    "finetune": "derender.learn",
-    "compare": "derender.evaluation",
-    "embed": "derender.features",
-    "embed_to_file": "derender.features",
-    "search": "derender.features",
-    "explain": "derender.interpretation",
+_NAMES = {
+    "model": ("Derenderer", "load"),
+    "scene": ("Scene",),
+    "data.doctor": ("doctor",),
+    "features": ("FeatureTable", "DisentangledFeatures", "embed", "embed_to_file", "search"),
+    "learn": ("train", "whiten", "refine", "unet", "finetune"),
+    "evaluation": ("compare",),
+    "interpretation": ("explain",),
 }
+_HOME = {name: f"derender.{module}" for module, names in _NAMES.items() for name in names}
 _ALIASES = {"evaluate": "derender.evaluation"}
 _SUBMODULES = [
-    "scene",
-    "render",
-    "data",
-    "networks",
-    "objectives",
-    "model",
-    "training",
-    "features",
-    "baselines",
-    "evaluation",
-    "interpretation",
-    "report",
+    *("scene", "render", "data", "networks", "objectives", "model", "training", "features", "baselines"),
+    *("evaluation", "interpretation", "report"),
 ]
 
 __all__ = [
-    "Derenderer",
-    "DisentangledFeatures",
-    "FeatureTable",
-    "Scene",
-    "__version__",
-    "compare",
-    "doctor",
-    "embed",
-    "embed_to_file",
-    "evaluate",
-    "explain",
-    "finetune",
-    "load",
-    "refine",
-    "search",
-    "train",
-    "unet",
-    "whiten",
-]
+    "Derenderer", "DisentangledFeatures", "FeatureTable", "Scene", "__version__", "compare", "doctor",
+    "embed", "embed_to_file", "evaluate", "explain", "finetune", "load", "refine", "search", "train",
+    "unet", "whiten",
+]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:

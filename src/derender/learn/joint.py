@@ -78,15 +78,11 @@ def finetune_settings(
         values = config.model_dump(mode="json", include=kept)
         start = as_model(model, device="cpu")
         config = FinetuneConfig(**values, model=start.settings, start=str(model))
-    return with_changes(
-        config,
-        texts_of(settings or ()),
-        target__labels=list(dict.fromkeys(labels or ())) or None,
-        target__weight=weight,
-        target__rendering_weight=rendering_weight,
-        target__labelled=labelled,
-        target__factors=None if factors is None else list(factors),
-    )
+    target: dict[str, Any] = {"weight": weight, "rendering_weight": rendering_weight, "labelled": labelled}
+    target |= {"labels": list(dict.fromkeys(labels or ())) or None}
+    target |= {"factors": None if factors is None else list(factors)}
+    changes = {f"target__{name}": value for name, value in target.items()}
+    return with_changes(config, texts_of(settings or ()), **changes)
 
 
 def finetune(
@@ -108,12 +104,8 @@ def finetune(
     Args:
         images: an image set with labels, or its address.
         out: a new run folder, or with ``resume=True`` that of an unfinished run.
-        dataset: the layout's name, or "auto" to recognise it.
-        limit: read at most so many images.
-        device: "auto", "cpu" or "cuda".
+        dataset, limit, device, on_images, progress: as for `train`.
         memory: where scores are cached.
-        on_images: called with the images once they are read.
-        progress: called after every step.
         choices: ``labels`` (names of columns) or ``attributes=True`` (every yes/no label); ``model`` to
             start from or ``preset`` of fresh weights; ``factors`` whose codes the head takes; ``weight`` of
             the labels and ``rendering_weight`` in the total; ``labelled``, the number of training images
@@ -124,8 +116,7 @@ def finetune(
     """
     out, report = Path(out), progress or (lambda _: None)
     resume = bool(choices.get("resume"))
-    config = finetune_settings(out, **choices)
-    accelerator = device_named(device)
+    config, accelerator = finetune_settings(out, **choices), device_named(device)
     if not resume:
         refuse_taken(out)
     start = None if config.start is None else as_model(config.start, device="cpu")
@@ -138,14 +129,9 @@ def finetune(
     if choices.get("attributes"):
         config = with_changes(config, target__labels=_attributes(images))
     task = FinetuneTask(config, images.images, target_of(images, config), start)
+    how = {"resume": resume, "progress": report, "accelerator": accelerator}
     run = train_task(
-        task,
-        images,
-        out,
-        resume=resume,
-        sample_sheet=lambda tuned, few: decomposition_sheet(tuned.model, few),
-        progress=report,
-        accelerator=accelerator,
+        task, images, out, sample_sheet=lambda tuned, few: decomposition_sheet(tuned.model, few), **how
     )
     run_page(out).write(out / "report.html")
     if not (out / "model").is_dir():
@@ -159,11 +145,8 @@ def finetune(
 
 def _attributes(images: ImageSet) -> list[str]:
     """Every yes/no column that has both values."""
-    varied = [
-        name
-        for name, values in images.labels.items()
-        if values.dtype == np.int8 and len(set(values.tolist()) & {0, 1}) == 2
-    ]
+    answers = {name: values for name, values in images.labels.items() if values.dtype == np.int8}
+    varied = [name for name, values in answers.items() if {0, 1} <= set(values.tolist())]
     if not varied:
         raise ValueError(f"{images.source} has no yes/no label: name one in labels")
     return varied

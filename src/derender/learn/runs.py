@@ -32,9 +32,17 @@ def run_settings(
     settings: Changes = (),
     resume: bool = False,
 ) -> Any:
-    """The settings of a training run; arguments as for `train`.
+    """The settings of a training run.
 
-    A run that is resumed without any of them keeps its own.
+    Args:
+        out: the run folder; with ``resume`` and nothing else the run keeps its own settings.
+        model: "derender", or a baseline: vqvae, simclr, ae, beta-vae, resnet18, stylegan2, e4e or ris.
+        preset: faces (the default), cars, cats, paper, or small for a CPU.
+        start_from: a trained model whose weights the run begins with.
+        loocc: contrast over "none", "light", "light+camera" or "all" factors.
+        config: a YAML file of settings, which the other arguments change.
+        settings: changes of single settings, as ``{"batch_size": 32}`` or ``["batch_size=32"]``.
+        resume: go on with the run in ``out``.
     """
     changes = texts_of(settings)
     if config is not None:
@@ -61,12 +69,7 @@ def train(
     images: ImageSet | str | Path,
     *,
     out: str | Path,
-    model: str | None = None,
-    preset: str | None = None,
-    start_from: str | None = None,
-    loocc: str | None = None,
     config: Any = None,
-    settings: Changes = (),
     resume: bool = False,
     dataset: str = "auto",
     limit: int | None = None,
@@ -74,25 +77,20 @@ def train(
     page: bool = True,
     on_images: OnImages | None = None,
     progress: Callable[[Progress], None] | None = None,
+    **choices: Any,
 ) -> TrainResult:
     """Train a model on unlabelled images of one kind of object, into a run folder with a report page.
 
     Args:
         images: an image set at the model's size, or a folder, zip, shards or Hugging Face id.
         out: a new run folder, or with ``resume`` that of an unfinished run.
-        model: "derender", or a baseline: vqvae, simclr, ae, beta-vae, resnet18, stylegan2, e4e or ris.
-        preset: faces (the default), cars, cats, paper, or small for a CPU.
-        start_from: a trained model whose weights the run begins with.
-        loocc: contrast over "none", "light", "light+camera" or "all" factors.
-        config: all settings as `run_settings` gives them, or a YAML file, which the other arguments change.
-        settings: changes of single settings, as ``{"batch_size": 32}`` or ``["batch_size=32"]``.
+        config: all settings as `run_settings` gives them, or a YAML file.
         resume: go on with the run in ``out``; without other arguments with its own settings.
-        dataset: the layout's name, or "auto" to recognise it.
-        limit: read at most so many images.
+        dataset, limit: the layout's name, or "auto" to recognise it; read at most so many images.
         device: "auto", "cpu" or "cuda".
         page: write a report page, for which the data are examined.
-        on_images: called with the images once they are read.
-        progress: called after every step.
+        on_images, progress: called with the images once they are read; called after every step.
+        choices: ``model``, ``preset``, ``start_from``, ``loocc`` and ``settings`` as for `run_settings`.
 
     Raises:
         FileExistsError: ``out`` is not empty and ``resume`` was not requested.
@@ -101,10 +99,9 @@ def train(
     """
     out, report = Path(out), progress or (lambda _: None)
     if config is None or isinstance(config, str | Path):
-        config = run_settings(
-            out, model=model, preset=preset, start_from=start_from, loocc=loocc, config=config,
-            settings=settings, resume=resume,
-        )  # fmt: skip
+        config = run_settings(out, config=config, resume=resume, **choices)
+    elif choices:
+        raise ValueError(f"config holds all settings already: leave out {', '.join(choices)}")
     if resume and not (out / "config.yaml").is_file():
         raise FileNotFoundError(f"no run to resume in {out} (no config.yaml): train without resume first")
     accelerator = device_named(device)
