@@ -23,13 +23,9 @@ NAN = float("nan")
 
 @dataclass(frozen=True)
 class Estimate:
-    """A score with its uncertainty.
+    """A score, the mean over runs, with its 95 % interval (NaN where there is none).
 
-    Attributes:
-        value: on the rows as they are; mean over runs.
-        low, high: the 95 % interval over resamples of the rows; NaN where there is none.
-        deviation: standard deviation over runs (seeds); NaN for a single run.
-        resampled: (B,) the score on each resample.
+    ``deviation`` is the standard deviation over runs (seeds), NaN for one; ``resampled`` the (B,) resamples.
     """
 
     value: float
@@ -41,12 +37,9 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Difference:
-    """A score less that of the strongest control on the same resamples; above 0 is better, whichever end is.
+    """A score less that of the strongest control, ``rival``, on the same resamples, with its 95 % interval.
 
-    Attributes:
-        rival: the strongest control's name.
-        value, low, high: the difference and its 95 % interval.
-        above: whether the whole interval lies above 0; False where there is none.
+    Above 0 is better, whichever end is; ``above`` tells whether the whole interval lies there.
     """
 
     rival: str
@@ -65,14 +58,8 @@ class Difference:
 
 @dataclass(frozen=True)
 class ScoredRow:
-    """One row of a comparison.
-
-    Attributes:
-        name: of the features.
-        control: whether it learned nothing.
-        runs: seeds behind it.
-        scores: by name.
-        versus: by name, against the strongest control; empty for controls.
+    """Scores of one kind of feature by name, and but for controls (which learned nothing) the differences
+    to the strongest control; ``runs`` counts the seeds behind it.
     """
 
     name: str
@@ -103,14 +90,11 @@ def resamples(n_rows: int, count: int = RESAMPLES, seed: int = 0) -> Iterator[np
 
 
 def estimate(runs: Runs, resampled: np.ndarray, *, centred: bool = False, most: float = np.inf) -> Estimate:
-    """The mean over runs with its percentile interval.
+    """The mean over ``runs`` with its percentile interval, from (B,) means over runs on each resample.
 
-    Args:
-        runs: the score of each run.
-        resampled: (B,) the mean over runs on each resample.
-        centred: move the resamples so that their mean is the value. Scores of clusters need it: a row drawn
-            twice agrees with itself, which makes every resample look purer than the rows are.
-        most: the score's largest value, which no moved resample exceeds.
+    ``centred`` moves the resamples so that their mean is the value, and none exceeds ``most``. Scores of
+    clusters need it: a row drawn twice agrees with itself, which makes every resample look purer than the
+    rows are.
     """
     value = float(np.mean(runs))
     if centred:

@@ -15,14 +15,7 @@ from typing import Any
 import numpy as np
 from scipy.sparse import csr_array
 
-from derender.evaluation.bootstrap import (
-    RESAMPLES,
-    ScoredRow,
-    constant,
-    resamples,
-    scored_row,
-    with_verdicts,
-)
+from derender.evaluation.bootstrap import RESAMPLES, ScoredRow, constant, resamples, scored_row, with_verdicts
 from derender.evaluation.clustering_methods import METHODS, approximation, clusterings, finch_hierarchy
 from derender.evaluation.clustering_scores import (
     CLUSTER_COLUMNS,
@@ -103,16 +96,10 @@ def cluster(
 
 @dataclass(frozen=True)
 class ClusterComparison:
-    """Features side by side.
+    """Features in the order given, then ``majority`` and ``chance``.
 
-    Attributes:
-        rows: the features in the order given, then ``majority`` and ``chance``.
-        method: of clustering.
-        labels: by name, the number of classes.
-        n_rows: rows clustered.
-        n_dropped: rows left out because they carry none of the labels.
-        n_missing: single labels that are missing among the rows clustered.
-        per_label: by row and label, the scores of the first run.
+    ``labels`` holds the number of classes by name; ``n_dropped`` rows carry no label and were left out,
+    ``n_missing`` single labels are unknown among the others; ``per_label`` has the scores of each first run.
     """
 
     rows: tuple[ScoredRow, ...]
@@ -154,9 +141,7 @@ def compare_clusterings(
         controls: names of the features that learned nothing.
         method: see ``clusterings``; k-means is fitted with five seeds, each a run of its own.
         n_clusters: by default as many as the label has classes.
-        resample_count: bootstrap resamples of the rows.
-        seed: of the resamples and of k-means.
-        memory: where trees are cached.
+        resample_count, seed, memory: of the rows; of resamples and k-means; cache of the trees.
     """
     if not labels or not features or not all(features.values()):
         raise ValueError("clustering needs at least one label and one array of features in each row")

@@ -43,14 +43,9 @@ def clusterings(
     seed: int = 0,
     memory: Memory | None = None,
 ) -> dict[int, np.ndarray]:
-    """Cluster (N, D) features into each of the numbers in ``counts``: by number, (N,) integers.
+    """Cluster finite (N, D) features into each of the numbers in ``counts``: by number, (N,) integers.
 
-    Args:
-        features: finite.
-        counts: numbers of clusters.
-        method: one of ``METHODS``.
-        seed: for the starts of k-means.
-        memory: where trees are cached.
+    ``method`` is one of ``METHODS``, ``seed`` for the starts of k-means, ``memory`` the cache of the trees.
     """
     memory, wanted = memory or Memory(), sorted(set(counts))
     features = finite_rows(features, "clustering")

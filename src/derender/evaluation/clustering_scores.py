@@ -1,10 +1,10 @@
 """Scores of a clustering against classes, and their chance level.
 
-A score is one function below ``@metric``; its name goes to JSON and its column to tables. All come from the
-table of counts (class by cluster), many tables at a time, so that a thousand resamples cost little more
-than one. Accuracy and F1 are the paper's (Sec. 4.2); NMI, ARI and Hungarian accuracy are those of
-scikit-learn and SciPy. Purity and NMI of random clusters are far from 0, and the purity of one single
-cluster is the majority's share: read no score without its chance level.
+A score is one function below ``@metric``; its name goes to JSON and its column to tables. All come from
+the table of counts (class by cluster), many tables at a time. Accuracy and F1 are the paper's (Sec. 4.2);
+NMI, ARI and Hungarian accuracy are those of scikit-learn and SciPy. Purity and NMI of random clusters are
+far from 0, and the purity of one single cluster is the majority's share: read no score without its chance
+level.
 """
 
 from collections.abc import Callable, Iterable
@@ -96,12 +96,7 @@ def scores_of_counts(counts: np.ndarray) -> np.ndarray:
 
 
 def cluster_scores(labels: np.ndarray, assignment: np.ndarray) -> dict[str, float]:
-    """Score any clustering of labelled rows; names of clusters and classes do not matter.
-
-    Args:
-        labels: (N,) classes, none missing.
-        assignment: (N,) cluster of each row.
-    """
+    """Score any (N,) clustering of rows against their (N,) classes; names do not matter."""
     classes, assignment = encoded(labels), np.asarray(assignment)
     if assignment.shape != classes.shape:
         raise ValueError(f"labels {classes.shape} and assignment {assignment.shape} must be of one length")
@@ -116,12 +111,9 @@ def cluster_scores(labels: np.ndarray, assignment: np.ndarray) -> dict[str, floa
 def chance_scores(
     labels: np.ndarray, clusters: np.ndarray | int, seeds: Iterable[int] = SEEDS
 ) -> dict[str, float]:
-    """Mean scores when rows are dealt to clusters at random.
+    """Mean scores when rows are dealt to clusters at random, once for each seed.
 
-    Args:
-        labels: (N,) classes.
-        clusters: an assignment whose cluster sizes are kept, or a number of clusters of equal size.
-        seeds: one random deal each.
+    ``clusters`` is an assignment whose cluster sizes are kept, or a number of clusters of equal size.
     """
     sizes = np.arange(len(labels)) % clusters if isinstance(clusters, int) else np.asarray(clusters)
     deals = [cluster_scores(labels, np.random.default_rng(seed).permutation(sizes)) for seed in seeds]

@@ -1,13 +1,11 @@
 """Controls that every score of features stands beside, made of the same images under the same protocol.
 
-Without learning: an untrained encoder of the same architecture (several seeds), principal components and the
-pixels themselves; and, to separate whitening from codes, controls whitened by a trained model's renderings.
-
-The whitening (postprocess/whitening.py) learns from renderings of the same scene under other lighting and
-viewpoints. An untrained model's renderings show nothing, so it cannot whiten its own codes. A trained model
-lends its renderings: the same images, lightings and viewpoints, described by an untrained encoder or by
-principal components, and whitened by the same rule. Leaves out whitened pixels: 12,288 directions cannot be
-estimated from 2,000 images, so 256 components are in their place.
+Without learning: an untrained encoder of the same architecture (several seeds), principal components and
+the pixels themselves. To separate whitening from codes there are controls whitened by a trained model's
+renderings: an untrained model's show nothing, so it cannot whiten its own codes
+(postprocess/whitening.py). The model lends its renderings of the same images, lightings and viewpoints,
+described by an untrained encoder or by principal components. Leaves out whitened pixels: 12,288
+directions cannot be estimated from 2,000 images.
 """
 
 import copy
@@ -83,11 +81,8 @@ def control_rows(
 ) -> list[FeatureRow]:
     """The controls of every protocol on features: an untrained encoder, PCA and pixels.
 
-    Args:
-        images: to describe.
-        settings: the architecture of the untrained encoder; without it there is no such row.
-        options: the factors and number of untrained encoders, the cache, the device.
-        fit_on: images that give PCA its components; by default ``images``.
+    Without ``settings``, an architecture, there is no untrained encoder. PCA gets its components from
+    ``fit_on``, by default ``images``.
     """
     rows = []
     if settings is not None:
@@ -172,13 +167,10 @@ def whitened_rows(
 
 @dataclass(frozen=True)
 class Renderings:
-    """A trained model and the images whose renderings whiten the codes of other encoders.
+    """A trained model and (n, 3, S, S) images, best those of its training, whose renderings whiten codes.
 
-    Attributes:
-        model: renders; its own whitening plays no part.
-        images: (n, 3, S, S) images at the model's size, best those of its training.
-        settings: the numbers of images and views, the perturbation, the directions kept.
-        memory: where whitenings are cached.
+    The model's own whitening plays no part. ``settings`` hold the numbers of images and views, the
+    perturbation and the directions kept.
     """
 
     model: Derenderer

@@ -1,10 +1,10 @@
 """How near a copy of a model comes to the model: its features and its renderings of the same images.
 
-Rounding weights moves every feature a little; the unit is how far two of these images are apart. What a
-score makes of that has to be measured with the copy itself (a cut of a tree may depend on one image).
+Rounding weights moves every feature a little; the unit is how far two of these images are apart.
 """
 
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,12 +18,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class CopyCost:
-    """What changed.
-
-    Attributes:
-        moved: by factor, how far an image's feature moved, mean over images, over how far two images'
-            features are apart (root mean square); 0: not at all.
-        l1, l1_before: mean absolute error of the images re-rendered, 0..1, inside each one's mask.
+    """What changed: by factor, how far an image's feature moved (mean over images, over the root mean square
+    distance of two images' features; 0: not at all), and the mean absolute error of the images re-rendered,
+    0..1, inside each one's mask, by the copy and by the model.
     """
 
     moved: dict[str, float]
@@ -48,11 +45,7 @@ def copy_cost(
         raise ValueError(f"the models have other factors: {', '.join(names[0])}; {', '.join(names[1])}")
     passes = []
     for number, one in enumerate((model, copy)):
-
-        def report(done: int, of: int, number: int = number) -> None:
-            if progress is not None:
-                progress(number * of + done, 2 * of)
-
+        report = None if progress is None else partial(_pass, progress, number)
         passes.append(embed_images(one, images, progress=report))
     moved = {}
     for name in names[0]:
@@ -61,3 +54,7 @@ def copy_cost(
         moved[name] = float(np.linalg.norm(own - other, axis=1).mean() / apart) if apart else 0.0
     errors = [evaluate_reconstruction(one, images).model.l1 for one in (copy, model)]
     return CopyCost(moved, *errors)
+
+
+def _pass(progress: Progress, number: int, done: int, of: int) -> None:
+    progress(number * of + done, 2 * of)

@@ -26,13 +26,8 @@ FeatureSource = FeatureTable | ModelSource
 
 @dataclass(frozen=True)
 class FeatureRow:
-    """One kind of feature.
-
-    Attributes:
-        name: shown in the table.
-        tables: one for each run.
-        factors: the features to use, side by side; None means all.
-        control: whether it learned nothing.
+    """One kind of feature: a table for each run, the factors to use side by side (None means all), and
+    whether it is a control, which learned nothing.
     """
 
     name: str
@@ -47,14 +42,9 @@ class FeatureRow:
 
 @dataclass(frozen=True)
 class Prepared:
-    """The input of a protocol: arrays of the same N rows.
+    """Arrays of the same N rows: features by name, (N, D) for each run, and the labels asked, (N,).
 
-    Attributes:
-        features: by name, one (N, D) array for each run.
-        labels: by name, (N,), those that are asked.
-        table: the first row's, with the names of the N rows and all their labels.
-        controls: names of the rows that learned nothing.
-        n_dropped: rows left out before because a label was missing.
+    ``table`` is the first row's, with names and all labels; ``n_dropped`` rows were left out before.
     """
 
     features: dict[str, list[np.ndarray]]
@@ -193,11 +183,9 @@ def prepare(
     """Check that all tables fit together; average, choose rows; labels are those of the first table.
 
     Args:
-        rows: the first one's labels count.
-        labels: columns to score by; an unknown name is an error with a suggestion.
+        rows, labels: of features; the columns to score by.
         mean_by: average the features first over rows that share these labels, as for face tracks.
-        min_count: leave out classes of fewer rows (with a single label only).
-        max_count: keep at most that many rows of a class, the first ones (with a single label only).
+        min_count, max_count: leave out classes of fewer rows; keep the first rows of a class (single labels).
     """
     check_rows(rows)
     first = rows[0].tables[0]

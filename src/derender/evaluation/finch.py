@@ -1,12 +1,12 @@
 """FINCH: a hierarchy of partitions from first neighbours alone; no number of clusters is given.
 
-Source: Sarfraz, Sharma and Stiefelhagen, CVPR 2019 (the paper's appendix uses it), with cosine distance.
-    Every row is linked to its nearest other row; the connected parts are the clusters; their means are the
-    rows of the next level. As in the authors' package `finch-clust`, a level that takes away at most one
-    cluster, or leaves only one, ends the hierarchy. Written anew because that package holds several N x N
-    arrays (1.6 GB each for 20,000 rows) and approximates above; here neighbours are exact in bounded memory
-    up to 100,000 rows, and come from near cells above (neighbours.py). Tests compare the two. Leaves out
-    that package's cut of long links, which has no effect in it (SciPy takes a stored zero for a link).
+Source: Sarfraz, Sharma and Stiefelhagen, CVPR 2019 (the paper's appendix uses it), with cosine
+distance. Every row is linked to its nearest other row; the connected parts are the clusters; their
+means are the rows of the next level. A level that takes away at most one cluster, or leaves only one,
+ends the hierarchy, as in the authors' package `finch-clust`. That package holds several N x N arrays
+(1.6 GB each for 20,000 rows); here neighbours are exact in bounded memory up to 100,000 rows, and
+come from near cells above (neighbours.py). Tests compare the two. Leaves out its cut of long links,
+which has no effect in it.
 """
 
 from dataclasses import dataclass

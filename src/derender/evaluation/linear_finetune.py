@@ -44,10 +44,8 @@ def finetune(
 
     Args:
         model: with ``nets[factor].encode`` and ``device``.
-        images: (N, 3, H, W) uint8.
-        task: targets of the N images.
-        rows: (n,) training rows.
-        tested: (T,) rows to answer for.
+        images, task: (N, 3, H, W) uint8; targets of the N images.
+        rows, tested: (n,) training rows; (T,) rows to answer for.
         factors: whose encoders.
         seed: of the head's start and the order of images.
         settings: of the training.
@@ -96,12 +94,8 @@ def finetuned_answers(
 ) -> dict[str, dict[int, np.ndarray]]:
     """By row name and number of labels, (S, T, A) answers: models, untrained ones, and other controls' heads.
 
-    Args:
-        models: by row name, one for each run; seed s trains run s modulo their number.
-        ready: the rows of features; its controls without an encoder answer by the head alone.
-        task, split, seeds: the targets, the rows of each seed, and the seeds.
-        settings: of the paper's head.
-        options: images, factors (the encoders that are trained), cache and progress.
+    Seed s trains run s of a model modulo their number. Controls of ``ready`` without an encoder answer by the
+    head alone; ``options`` hold the images and the factors whose encoders are trained.
     """
 
     def answers(model: Derenderer, count: int, at: int, what: str) -> np.ndarray:

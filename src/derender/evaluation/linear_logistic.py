@@ -64,13 +64,10 @@ def fit_logistic(
     """Choose C on the training rows alone, fit on all of them, answer for others.
 
     Args:
-        features: (n, D) training rows.
-        targets: (n, A) in -1 (unknown), 0, 1; one-hot for classes.
+        features, targets: (n, D) training rows; (n, A) in -1 (unknown), 0, 1, one-hot for classes.
         tested: (T, D) rows to answer for; C is chosen without them.
         kind: "labels" (a C for each label) or "classes" (one C).
-        penalties: the values of C tried.
-        folds: parts of the training rows.
-        seed: of the folds.
+        penalties, folds, seed: the values of C tried; parts of the training rows, and how they are dealt.
 
     Returns:
         (T, A) probabilities, and the chosen C: (A,) or (1,).
@@ -111,12 +108,10 @@ def solve_logistic(
 
     Args:
         rows: (n, R) centred, with columns orthogonal to each other (from ``axes_of``).
-        targets: (n, A) in -1 (unknown), 0, 1.
+        targets: (n, A) in -1 (unknown), 0, 1, of ``kind`` "labels" or "classes".
         learned: (n, P) bool: the rows that each regression learns from.
         c: (P,) penalties.
-        kind: "labels" or "classes".
-        tolerance: the scaled gradient at which to stop, relative to its start.
-        most_steps: stop there in any case.
+        tolerance: the scaled gradient at which to stop, relative to its start; or after ``most_steps``.
     """
     dtype = rows.dtype
     design = np.column_stack((rows, np.ones(len(rows), dtype)))

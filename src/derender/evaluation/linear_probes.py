@@ -67,13 +67,10 @@ def probe(
 
     Args:
         head: one of ``PROBES``.
-        features: (N, D), finite.
-        task: targets of the N rows.
-        rows: (S, n) training rows.
-        tested: (T,) rows to answer for; they take no part in any choice.
+        features, task: (N, D), finite; targets of the N rows.
+        rows, tested: (S, n) training rows; (T,) rows to answer for, which take no part in any choice.
         seeds: (S,) of starts and folds.
-        settings: of the paper's head.
-        memory: where answers are kept.
+        settings, memory: of the paper's head; cache of the answers.
     """
     named(PROBES, head, "head")
     features = finite_rows(features, "a linear probe").astype(np.float32)
@@ -153,10 +150,8 @@ def train_heads(
     """Train one head for each seed, all in one program, and ask them: (S, T, A) probabilities.
 
     Args:
-        features: (N, D).
-        targets: (N, A) in -1 (unknown, no part in the loss), 0, 1.
-        rows: (S, n) training rows of each seed.
-        tested: (T,) rows to answer for.
+        features, targets: (N, D); (N, A) in -1 (unknown, no part in the loss), 0, 1.
+        rows, tested: (S, n) training rows of each seed; (T,) rows to answer for.
         kind: "labels" or "classes".
         seeds: (S,) for the start and the order of rows.
         settings: of the training.

@@ -17,14 +17,7 @@ from typing import Any
 import numpy as np
 from sklearn.metrics import average_precision_score
 
-from derender.evaluation.bootstrap import (
-    RESAMPLES,
-    ScoredRow,
-    constant,
-    resamples,
-    scored_row,
-    with_verdicts,
-)
+from derender.evaluation.bootstrap import RESAMPLES, ScoredRow, constant, resamples, scored_row, with_verdicts
 from derender.evaluation.controls import subject_and_controls
 from derender.evaluation.feature_rows import (
     FeatureSource,
@@ -125,14 +118,10 @@ class LinearPart:
 
 @dataclass(frozen=True)
 class LinearComparison:
-    """Features side by side.
+    """For every head and number of labels, features side by side; the task's kind and names.
 
-    Attributes:
-        parts: for every head, every number of labels.
-        kind, names: of the task.
-        n_test: rows tested, the same everywhere.
-        n_dropped: rows without any label.
-        seeds: draws of training rows.
+    ``n_test`` rows are tested, the same everywhere; ``n_dropped`` have no label; ``seeds`` drew training
+    rows.
     """
 
     parts: tuple[LinearPart, ...]
@@ -196,15 +185,11 @@ def compare_linear(
     Args:
         features: by name, one (N, D) array for each run of the same thing; seed s uses run s modulo their
             number.
-        task: what is asked.
-        rows: who learns and who is tested.
-        seeds: (S,) those that drew ``rows``.
+        task, rows: what is asked; who learns, drawn by the (S,) ``seeds``, and who is tested.
         controls: names of the features that learned nothing.
-        heads: kinds of probe.
+        heads, settings: kinds of probe; of the paper's head.
         finetuned: by name and number of labels, (S, T, A) answers of fine-tuned models: a further head.
-        settings: of the paper's head.
-        resample_count: bootstrap resamples of the test rows.
-        memory: where answers are kept.
+        resample_count, memory: bootstrap resamples of the test rows; cache of the answers.
         progress: called with (probes done, probes in all).
     """
     check_lengths(features, len(task))
@@ -267,12 +252,9 @@ def linear_part_table(found: LinearComparison, part: LinearPart) -> ScoreTable:
 
 @dataclass(frozen=True)
 class LinearScores:
-    """How right answers are; all 0..1, best 1.
-
-    Attributes:
-        accuracy: share of right answers, at threshold 0.5 for each label, or of the likeliest class.
-        balanced_accuracy: mean of the shares of right answers among the rows of each value or class.
-        average_precision: area under precision over recall, of the value 1 or of each class against the rest.
+    """How right answers are, 0..1, best 1: share of right answers (at threshold 0.5, or of the likeliest
+    class), its mean over the rows of each value or class, and area under precision over recall of each
+    label or class.
     """
 
     accuracy: float
@@ -299,12 +281,8 @@ def linear_scores(targets: np.ndarray, probabilities: np.ndarray, kind: str) -> 
 def count_scores(
     targets: np.ndarray, probabilities: np.ndarray, kind: str, weights: np.ndarray
 ) -> np.ndarray:
-    """Accuracy and balanced accuracy on resamples: (B, 2).
-
-    Args:
-        targets, probabilities: (T, A), see ``linear_scores``.
-        kind: "labels" or "classes".
-        weights: (B, T) how often each row is drawn.
+    """Accuracy and balanced accuracy, (B, 2), of ``linear_scores`` on resamples: (B, T) times each is
+    drawn.
     """
     if targets.shape != probabilities.shape:
         raise ValueError(f"targets {targets.shape} and probabilities {probabilities.shape} must be alike")

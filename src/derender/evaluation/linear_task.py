@@ -17,12 +17,10 @@ from derender.features import missing
 
 @dataclass(frozen=True)
 class Task:
-    """Targets of N rows.
+    """Targets, (N, A) int8 in -1 (unknown), 0, 1, of N rows.
 
-    Attributes:
-        kind: "labels" (yes or no, each apart) or "classes" (one of several).
-        names: of the labels, or of the classes.
-        targets: (N, A) int8 in -1 (unknown), 0, 1; for classes one-hot, and all -1 where unknown.
+    Of kind "labels" (``names``, yes or no, each apart), or "classes" (one of several): one-hot, all -1 where
+    unknown.
     """
 
     kind: str
@@ -44,11 +42,8 @@ class Task:
 
 @dataclass(frozen=True)
 class Rows:
-    """Who learns and who is tested, by row number.
-
-    Attributes:
-        test: (T,) never learned from.
-        train: for each number of labels, (S, number) rows for each of S seeds; smaller sets lie in larger.
+    """Who is tested, (T,) row numbers, and who learns: for each number of labels, (S, number) rows for
+    each of S seeds; smaller sets lie in larger.
     """
 
     test: np.ndarray
@@ -56,12 +51,7 @@ class Rows:
 
 
 def task_of(labels: Mapping[str, np.ndarray]) -> Task:
-    """The task that label columns set.
-
-    Raises:
-        ValueError: one value only, a value that a single row has, or several columns one of which has more
-            than two values.
-    """
+    """The task that label columns set: several of two values each, or one; no value has a single row."""
     if not labels:
         raise ValueError("a linear probe needs at least one label column")
     columns = {name: _column(np.asarray(values), name) for name, values in labels.items()}
@@ -87,15 +77,7 @@ def choose_rows(
     seeds: Sequence[int] = (0, 1, 2, 3, 4),
     **how: Any,
 ) -> Rows:
-    """Test rows and, for every seed, nested training rows.
-
-    Args:
-        task: rows without a label are left out.
-        files: names of the N rows; the split goes by a hash of these.
-        counts: numbers of labelled rows to learn from.
-        seeds: each draws its own training rows.
-        how: test_fraction, partition and groups, see ``divide_rows``.
-    """
+    """Test rows and, for every seed, nested training rows: ``counts`` of those of ``divide_rows``."""
     pool, test = divide_rows(task, files, **how)
     if not len(seeds):
         raise ValueError("a linear probe needs at least one seed")

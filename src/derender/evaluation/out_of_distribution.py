@@ -1,8 +1,7 @@
 """Is an image out-of-distribution for a model? Its reconstruction error among those of held-out images.
 
-The percentile says how much worse an image is reconstructed than the images the model was made for. A high
-one is a sign of another kind of object, another crop or a broken image. A low one proves nothing: a plain
-surface may be easy to render whatever it shows. Leaves out what makes the image unusual.
+A high percentile is a sign of another kind of object, another crop or a broken image. A low one proves
+nothing: a plain surface may be easy to render whatever it shows.
 """
 
 from typing import Any
@@ -17,22 +16,13 @@ OUTLIER_PERCENTILE = 99.0
 
 
 def reconstruction_percentile(
-    model: Any,
-    images: UInt8[np.ndarray, "n 3 h w"],
-    held_out: HeldOutErrors,
-    *,
-    batch_size: int = 64,
+    model: Any, images: UInt8[np.ndarray, "n 3 h w"], held_out: HeldOutErrors, *, batch_size: int = 64
 ) -> Float[np.ndarray, " n"]:
     """Percentage (0..100) of the held-out images that the model reconstructs better than each of these.
 
-    Images like the training data have every percentile equally often; one in a hundred of them lies above
-    99. Between stored quantiles it is interpolated; an image into which the model renders nothing has 100.
-
-    Args:
-        model: with ``reconstruct``, ``device`` and ``image_size``.
-        images: at the model's image size.
-        held_out: stored with the model (``training/held_out_errors.py``).
-        batch_size: images at a time; changes speed and memory only.
+    Images like the training data have every percentile equally often. Between stored quantiles it is
+    interpolated; an image into which the model renders nothing has 100. ``batch_size`` changes speed and
+    memory only; ``held_out`` is stored with the model (``training/held_out_errors.py``).
     """
     return percentile_of(reconstruction_errors(model, images, batch_size), held_out)
 

@@ -1,9 +1,8 @@
 """The paper's tables as data: its numbers (paper_tables.csv), and the questions that they answer.
 
-Source: Klinghoffer et al., ECCV 2022, Tables 1 to 4. A table has parts, one for each question (who is it,
-    which emotion, ...); a part names the label that answers it, the rows that are used, and the paper's
-    lines. Where the data are not the paper's, ``differs`` says so in words. A further table is a further
-    ``TableSpec`` in ``TABLES``; paper_comparison.py makes them.
+Source: Klinghoffer et al., ECCV 2022, Tables 1 to 4. A part of a table is one question: the label that
+answers it, the rows that are used, the paper's lines. Where the data are not the paper's, ``differs``
+says so. A further table is a further ``TableSpec`` in ``TABLES``; paper_comparison.py makes them.
 """
 
 import csv
@@ -20,11 +19,8 @@ ATTRIBUTES = "attributes"
 
 @dataclass(frozen=True)
 class PaperRow:
-    """One line of the paper.
-
-    Attributes:
-        method, dataset: as the paper names them.
-        scores: by the name of our column, 0..1.
+    """One line of the paper: method and data set as it names them, scores (0..1) by the name of our
+    column.
     """
 
     method: str
@@ -46,16 +42,10 @@ def _lines(part: str) -> tuple[PaperRow, ...]:
 
 @dataclass(frozen=True)
 class Part:
-    """One question of a table.
+    """One question of a table: its name, the paper's lines, and what the paper used, in words.
 
-    Attributes:
-        name: of the question.
-        labels: label columns that may answer it, the first one present; ``attributes`` stands for every
-            yes/no column.
-        paper: the paper's lines.
-        layout: the layout of the paper's own data; all others stand in.
-        in_the_paper: what the paper used, in words.
-        size: rows of a class that are used where the label is single; None means all.
+    The first of ``labels`` that is present answers it; ``attributes`` stands for every yes/no column.
+    ``layout`` is the paper's own data, all others stand in; ``size`` rows of each class are used.
     """
 
     name: str
@@ -105,13 +95,8 @@ SEGMENTATION = Part(
 
 @dataclass(frozen=True)
 class TableSpec:
-    """One of the paper's tables, or a part of one.
-
-    Attributes:
-        name: on the command line.
-        number: in the paper.
-        kind: which protocol makes it.
-        parts: its questions.
+    """One of the paper's tables, or a part of one: its name on the command line, its number in the paper,
+    the protocol that makes it, its questions.
     """
 
     name: str

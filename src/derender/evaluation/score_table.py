@@ -29,14 +29,8 @@ LATEX_ARROWS = {"high": r" $\uparrow$", "low": r" $\downarrow$", None: ""}
 
 @dataclass(frozen=True)
 class Column:
-    """One column of numbers.
-
-    Attributes:
-        name: shown in the head.
-        best: which end is better; None where the numbers are no score.
-        digits: after the point.
-        note: range, unit and meaning.
-        of: the score whose interval or standard deviation the column holds.
+    """One column of numbers: its head, the better end (None where the numbers are no score), digits after the
+    point, a note on range, unit and meaning, and the score whose interval or deviation it holds.
     """
 
     name: str
@@ -73,13 +67,9 @@ class Row:
 
 @dataclass(frozen=True)
 class ScoreTable:
-    """Rows of numbers under named columns; the first row is the subject of the table.
+    """Rows of numbers under named columns, one cell for each; the first row is the subject of the table.
 
-    Attributes:
-        caption: the score and the data.
-        first: head of the column of row names.
-        columns: one for each cell of a row.
-        rows: in the order of display.
+    ``caption`` says the score and the data, ``first`` is the head of the column of row names.
     """
 
     caption: str
@@ -197,13 +187,9 @@ class ScoreTable:
 
 @dataclass(frozen=True)
 class Scores:
-    """The result of a protocol.
+    """The result of a protocol: its tables, the main one first, and every number as ``--json`` writes it.
 
-    Attributes:
-        tables: the main table first.
-        values: every number by name, as ``--json`` writes it.
-        notes: sentences on the result.
-        result: the protocol's own value behind the tables, for charts.
+    ``notes`` are sentences on it, ``result`` the protocol's own value behind the tables, for charts.
     """
 
     tables: Sequence[ScoreTable]
@@ -237,15 +223,11 @@ def scored_table(
     deviations: Sequence[str] | None = None,
     more: Mapping[Column, Callable[[ScoredRow], Cell]] | None = None,
 ) -> ScoreTable:
-    """One row for each scored row.
+    """One row for each scored row, one column for each score in ``columns``.
 
-    Args:
-        caption, first: of the table.
-        rows: in the order of display.
-        columns: by score, in the order of display.
-        intervals, deviations: scores followed by their 95 % interval, and by their standard deviation over
-            seeds; by default the first.
-        more: further columns, each with the function that gives its cell.
+    Scores in ``intervals`` are followed by their 95 % interval, those in ``deviations`` by their standard
+    deviation over seeds; by default the first. ``more`` gives further columns, each with a function of
+    the row.
     """
     main = list(columns)[:1]
     shown: dict[Column, Callable[[ScoredRow], Cell]] = {}

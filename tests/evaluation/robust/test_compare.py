@@ -5,8 +5,9 @@ import pytest
 
 from derender.evaluation.linear_task import task_of
 from derender.evaluation.memory import Memory
-from derender.evaluation.robust import Curve, Trial, compare_robustness
+from derender.evaluation.robust import compare_robustness
 from derender.evaluation.robust.compare import area_under
+from derender.evaluation.robust.trial import Curve, Trial
 
 PEOPLE, EACH = 4, 10
 LEVELS = (0.0, 30.0, 60.0)

@@ -11,14 +11,8 @@ from derender import Derenderer
 from derender.data import ImageSet
 from derender.evaluation.linear_task import task_of
 from derender.evaluation.memory import Memory
-from derender.evaluation.robust import (
-    Recipe,
-    checked_levels,
-    chosen_axes,
-    generated_trial,
-    rendered_trial,
-    true_angle_trial,
-)
+from derender.evaluation.robust.sources import Recipe, generated_trial, rendered_trial, true_angle_trial
+from derender.evaluation.robust.trial import checked_levels, chosen_axes
 
 YAW, LIGHT = chosen_axes(["yaw", "light"])
 

@@ -2,7 +2,7 @@
 
 trial     axes of light and camera; training images, and test images at each angle
 sources   trials of generated images, of images re-rendered by a model, and of images with known angles
-compare   probes, curves, intervals, controls
+compare   probes, curves, intervals, controls; protocol: all of it in one call
 """
 
 from derender.evaluation.robust.compare import (
@@ -11,28 +11,5 @@ from derender.evaluation.robust.compare import (
     area_under,
     compare_robustness,
 )
-from derender.evaluation.robust.sources import (
-    KINDS,
-    Recipe,
-    generated_trial,
-    rendered_trial,
-    true_angle_trial,
-)
-from derender.evaluation.robust.trial import AXES, Curve, Trial, checked_levels, chosen_axes
 
-__all__ = [
-    "AXES",
-    "KINDS",
-    "Curve",
-    "CurveResult",
-    "Recipe",
-    "RobustnessComparison",
-    "Trial",
-    "area_under",
-    "checked_levels",
-    "chosen_axes",
-    "compare_robustness",
-    "generated_trial",
-    "rendered_trial",
-    "true_angle_trial",
-]
+__all__ = ["CurveResult", "RobustnessComparison", "area_under", "compare_robustness"]

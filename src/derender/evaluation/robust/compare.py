@@ -32,14 +32,10 @@ _LOST = Column("lost", None, note="ordinary less area; read it beside ordinary, 
 
 @dataclass(frozen=True)
 class CurveResult:
-    """One axis.
+    """One axis: angles in degrees, and the rows tested in ordinary light and view, then at each angle.
 
-    Attributes:
-        name, title: of the axis.
-        levels: (L,) angles in degrees.
-        n_tested: rows tested in ordinary light and view, then at each angle.
-        rows: by score, the features in the order given, then ``majority``; each has the scores ``ordinary``,
-            ``area`` and, for every angle, ``level_name`` of it.
+    ``rows`` holds, by score, the features in the order given, then ``majority``; each has the scores
+    ``ordinary``, ``area`` and, for every angle, ``level_name`` of it.
     """
 
     name: str
@@ -55,16 +51,10 @@ class CurveResult:
 
 @dataclass(frozen=True)
 class RobustnessComparison:
-    """Features side by side.
+    """Features side by side, a curve for each axis.
 
-    Attributes:
-        curves: one for each axis.
-        how: the source of other lights and views.
-        kind, names: of the task.
-        head: of the probe.
-        n_learned: training rows of each probe, by axis.
-        n_dropped: rows without a label.
-        seeds: of the probes.
+    ``how`` is the source of other lights and views; ``kind`` and ``names`` are of the task, ``head`` and
+    ``seeds`` of the probes, ``n_learned`` their training rows by axis; ``n_dropped`` rows have no label.
     """
 
     curves: tuple[CurveResult, ...]
@@ -150,18 +140,11 @@ def compare_robustness(
     Args:
         features: by name, one (M, D) array for each run of the same features, of all images of the trial;
             probe seed s uses run s modulo their number.
-        trial: training and test rows.
-        seeds: (S,) of the training subsets.
+        trial, seeds: training and test rows; (S,) of the training subsets.
         controls: names of the features that learned nothing.
-        head: kind of probe (``linear_probes.PROBES``).
-        settings: of the paper's head.
-        resample_count: bootstrap resamples of the units.
-        seed: of the resamples.
-        memory: cache of the answers.
+        head, settings: kind of probe (``linear_probes.PROBES``); of the paper's head.
+        resample_count, seed, memory: bootstrap resamples of the units; cache of the answers.
         progress: called with (probes done, probes in all).
-
-    Raises:
-        ValueError: features of another number of rows, no seed, no features.
     """
     task = trial.task
     check_lengths(features, len(task))

@@ -8,13 +8,7 @@ import numpy as np
 
 from derender.data import ImageSet
 from derender.evaluation.controls import control_rows
-from derender.evaluation.feature_rows import (
-    FeatureRow,
-    ModelSource,
-    chosen_labels,
-    embedded_table,
-    prepare,
-)
+from derender.evaluation.feature_rows import FeatureRow, ModelSource, chosen_labels, embedded_table, prepare
 from derender.evaluation.linear_probes import PROBES
 from derender.evaluation.linear_task import divide_rows, task_of
 from derender.evaluation.options import Options
@@ -26,11 +20,10 @@ from derender.evaluation.robust.sources import (
     rendered_trial,
     true_angle_trial,
 )
-from derender.evaluation.robust.trial import LEVELS, Axis, Trial, checked_levels, chosen_axes
+from derender.evaluation.robust.trial import LEVELS, checked_levels, chosen_axes
 from derender.evaluation.score_table import Scores, verdict
 from derender.features import FeatureTable, named, table_labels
 from derender.inputs import as_model
-from derender.model import Derenderer
 
 WAYS = (*KINDS, "render", "truth")
 
@@ -99,10 +92,24 @@ def robustness(
         recipe = Recipe(way, name, people, learned, tested, first.image_size, how.seed)
         trial = generated_trial(recipe, turned, levels, memory=how.memory, progress=how.stage("generating"))
     else:
+        read = how.at(first.image_size)
+        columns = FeatureTable(read.files, {"none": np.zeros((len(read), 1))}, table_labels(read))
+        if not names and not attributes:
+            names = [name for name in ("identity", "class") if name in columns.labels][:1]
+        chosen, left_out = chosen_labels(columns, names, attributes, 2)
+        how.notes.extend(left_out)
         sizes = {"min_count": min_count, "max_count": max_count}
-        trial = _trial_of_images(
-            first, way, names, attributes, sizes, groups, test_fraction, turned, levels, how
-        )
+        ready = prepare([FeatureRow("images", (columns,))], chosen, **sizes)
+        side = ready.table.label(groups) if groups else None
+        read, task = how.at(first.image_size, ready.table.files), task_of(ready.labels)
+        if way == "truth":
+            trial = true_angle_trial(read, task, turned)
+        else:
+            parts = divide_rows(task, **ready.split, test_fraction=test_fraction, groups=side)
+            progress = how.stage("re-rendering")
+            trial = rendered_trial(
+                first, read, task, *parts, turned, levels, groups=side, memory=how.memory, progress=progress
+            )
     rows = []
     for name, net in nets.items():
         table = embedded_table(net, trial.pictures, how.memory, how.stage(f"embedding {name}"))
@@ -123,34 +130,3 @@ def robustness(
     address = images.source if isinstance(images, ImageSet) else images
     values = {"pictures": way, "data": None if address is None else str(address), **found.numbers()}
     return Scores(found.tables(score), values, [*notes, how.memory.summary()], result=found)
-
-
-def _trial_of_images(
-    model: Derenderer,
-    way: str,
-    labels: Sequence[str],
-    attributes: bool,
-    sizes: Mapping[str, Any],
-    groups: str | None,
-    test_fraction: float,
-    axes: Sequence[Axis],
-    levels: Sequence[float],
-    options: Options,
-) -> Trial:
-    """The trial of a data set's images: re-rendered, or divided by their true angles."""
-    read = options.at(model.image_size)
-    columns = FeatureTable(read.files, {"none": np.zeros((len(read), 1))}, table_labels(read))
-    if not labels and not attributes:
-        labels = [name for name in ("identity", "class") if name in columns.labels][:1]
-    chosen, left_out = chosen_labels(columns, labels, attributes, 2)
-    options.notes.extend(left_out)
-    ready = prepare([FeatureRow("images", (columns,))], chosen, **sizes)
-    side = ready.table.label(groups) if groups else None
-    images, task = options.at(model.image_size, ready.table.files), task_of(ready.labels)
-    if way == "truth":
-        return true_angle_trial(images, task, axes)
-    learn, test = divide_rows(task, **ready.split, test_fraction=test_fraction, groups=side)
-    return rendered_trial(
-        model, images, task, learn, test, axes, levels, groups=side, memory=options.memory,
-        progress=options.stage("re-rendering"),
-    )  # fmt: skip

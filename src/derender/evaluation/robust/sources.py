@@ -1,20 +1,16 @@
 """Where the images of a trial come from: a generator, a model that re-renders, or labels of the true angles.
 
-generated  Light and view are known because they were set. Face, expression and background depend on seed and
-           index alone, so the same test images are made again at every angle: only the angle changes along a
-           curve. Each is shown from both sides. Probes learn from the generator's usual light and view. For
-           identity, other images of the same people are tested; for any other label, other people.
-rendered   Real images are decomposed by a model and re-rendered in other light and from other sides.
-           Training images are renderings too (each scene in its own light and view), so that no curve starts
-           with the step from photograph to rendering. Angles are the model's own, since those of a photograph
-           are not known. Where its geometry is wrong the renderings are, and the features of the rendering
-           model have an advantage: read it beside generated images. Pixels that no surface covers take the
-           mean colour of the image's edge, by the rule of training.
-true       For tracks of rendered people, and any rendered set, the least rotated half learns. The unit is
-           the track where there are tracks, else the image. Of every class, the less rotated half of its
-           units is ordinary: three of four learn, the fourth is tested as the curve's first point. The other
-           half is tested, in as many portions as requested, by growing angle. Unlike the other trials, each
-           angle shows other images, which may be hard for other reasons.
+generated  Light and view are known because they were set. Face, expression and background depend on seed
+           and index alone: only the angle changes along a curve. Each image is shown from both sides. Probes
+           learn in the generator's usual light and view. For identity other images of the same people are
+           tested, for any other label other people.
+rendered   Real images are decomposed and re-rendered by a model. Training images are renderings too (each
+           scene in its own light and view), so that no curve starts with the step from photograph to
+           rendering. Angles are the model's own, and its features have an advantage: read it beside
+           generated images. Pixels that no surface covers take the mean colour of the image's edge.
+true       The unit is the track where there are tracks, else the image. Of every class, the less rotated
+           half of its units is ordinary: three of four learn, the fourth is tested as the curve's first
+           point. The other half is tested in portions, by growing angle. Each angle shows other images.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -56,16 +52,10 @@ KINDS: Mapping[str, Kind] = {
 
 @dataclass(frozen=True)
 class Recipe:
-    """The generated images.
+    """Generated images of ``people`` faces or cars, ``learned`` and ``tested`` of each.
 
-    Attributes:
-        kind: of ``KINDS``.
-        label: the question: ``identity``, or a label of the generator. Numbers become "above" or "below" the
-            median of the training images.
-        people: how many (or cars); where other people are tested, so many for training and for tests.
-        learned, tested: images of each.
-        image_size: in pixels.
-        seed: of the generator.
+    ``label`` is the question: ``identity``, or a label of the generator, about as many other people. Numbers
+    become "above" or "below" the median of the training images.
     """
 
     kind: str = "faces"
@@ -87,14 +77,9 @@ class Recipe:
     def generate(
         self, part: str, count: int | None = None, axis: Axis | None = None, angle: float = 0.0
     ) -> SyntheticSet:
-        """The training or test images, in usual light and view or at a fixed angle.
-
-        Both parts count people so that numbers agree; indices of images never do, so no seed is shared.
-
-        Args:
-            part: "learned" or "tested".
-            count: only so many of them.
-            axis, angle: the fixed angle, in degrees.
+        """The images of ``part`` "learned" or "tested" (``count`` of them), in usual light and view or at
+        a fixed angle in degrees. Both parts count people so that numbers agree; indices of images never
+        do, so no seed is shared.
         """
         kind, each = KINDS[self.kind], getattr(self, part)
         start = -(-self.people * self.learned // self.tested)  # people before the first one tested
@@ -117,11 +102,7 @@ def generated_trial(
     memory: Memory | None = None,
     progress: Progress | None = None,
 ) -> Trial:
-    """Generate the images, or find them in the cache.
-
-    Raises:
-        ValueError: an unknown label, impossible angles, fewer than two classes.
-    """
+    """Generate the images, or find them in the cache."""
     levels = checked_levels(levels, axes)
     sample = recipe.generate("tested", 1)
     named({"identity": sample.identity, **sample.labels}, recipe.label, f"label of generated {recipe.kind}")
@@ -179,18 +160,10 @@ def rendered_trial(
     memory: Memory | None = None,
     progress: Progress | None = None,
 ) -> Trial:
-    """Re-render the images, or find them in the cache.
+    """Re-render images at the model's size, or find them in the cache.
 
-    Args:
-        model: with ``decompose``, ``render``, ``device``.
-        pictures: at the model's size.
-        task: targets of each image.
-        learn, test: training and test rows.
-        axes, levels: of the rotations (degrees).
-        groups: (N,) labels whose images are resampled together, such as identities; an image without one, and
-            all without groups, by itself.
-        memory: cache of the renderings.
-        progress: called with (images decomposed, images in all).
+    ``learn`` and ``test`` are row numbers, ``levels`` degrees. Images of one of the (N,) ``groups``, such as
+    identities, are resampled together; an image without one, and all without groups, by itself.
     """
     levels = checked_levels(levels, axes)
     asked, rows = all_angles(axes, levels), np.concatenate((learn, test))
@@ -225,17 +198,7 @@ def rendered_trial(
 def true_angle_trial(
     pictures: ImageSet, task: Task, axes: Sequence[Axis], *, portions: int = PORTIONS
 ) -> Trial:
-    """Divide the images along every axis by their true angles.
-
-    Args:
-        pictures: with labels of light or view.
-        task: targets of each image.
-        axes: of the angles.
-        portions: of the more rotated half.
-
-    Raises:
-        ValueError: there is no label of an angle, or there are too few images.
-    """
+    """Divide images along every axis by their true angles, the more rotated half into portions."""
     tracks = pictures.labels.get("track", np.arange(len(pictures)))
     unit = np.unique(tracks, return_inverse=True)[1].astype(np.int64)
     curves = tuple(_curve(axis, axis.true_deg(pictures.labels), unit, task, portions) for axis in axes)

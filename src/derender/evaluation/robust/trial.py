@@ -25,16 +25,11 @@ LEVELS = (0.0, 15.0, 30.0, 45.0, 60.0, 75.0)
 class Axis:
     """One way to turn light or camera.
 
-    Attributes:
-        name: of the option.
-        title: in tables and charts.
-        part: of a generator's settings, "view" or "light".
-        settings: by kind of generated image, the name of the angle's range (degrees) in that part.
-        column: of a scene's camera or light.
-        truth: labels (radians) of the angle; with two, the angle of a light's direction off the front.
-        cleared: the column that is set to 0, so that the angle is the whole angle, ...
-        held: ... and the setting of generated images that is 0 for the same reason.
-        most_deg: the largest angle.
+    ``part`` is that of a generator's settings, "view" or "light"; ``settings`` has, by kind of generated
+    image, the name of the angle's range (degrees) there. ``column`` is that of a scene's camera or light,
+    ``truth`` the labels (radians) of the angle; with two, the angle of a light's direction off the front.
+    Where the angle is to be the whole angle, the column ``cleared`` of a scene and the setting ``held``
+    of generated images are 0.
     """
 
     name: str
@@ -130,14 +125,10 @@ def all_angles(axes: Sequence[Axis], levels: Sequence[float]) -> list[tuple[Axis
 
 @dataclass(frozen=True)
 class Curve:
-    """Tests at growing angles, after learning from the same rows.
+    """Tests at growing angles (degrees), after learning from the rows ``learn`` in ordinary light and view.
 
-    Attributes:
-        name, title: of the axis.
-        learn: (n,) training rows: ordinary light and view.
-        ordinary: (t,) rows tested in ordinary light and view.
-        levels: (L,) angles in degrees, growing.
-        tested: for every level, its rows; none of the training units is among them.
+    ``ordinary`` rows are tested in that light and view, for every level those in ``tested``; no unit is both
+    learned from and tested.
     """
 
     name: str
@@ -155,16 +146,10 @@ class Curve:
 
 @dataclass(frozen=True)
 class Trial:
-    """Everything a probe needs.
+    """Images, for training and tests, the targets of these M rows, and a curve for each axis.
 
-    Attributes:
-        images: (M, 3, S, S) all images, for training and tests.
-        task: targets of the M rows.
-        unit: (M,) the unit of resampling: rows of one unit (the same face at several angles, the images of
-            one person, a track) are drawn together.
-        curves: one for each axis.
-        how: the source of other lights and views, in words.
-        n_dropped: rows left out because they carry no label.
+    Rows of one ``unit`` (the same face at several angles, the images of one person, a track) are resampled
+    together. ``how`` is the source of other lights and views, in words; ``n_dropped`` rows carry no label.
     """
 
     images: UInt8[np.ndarray, "m 3 s s"]
