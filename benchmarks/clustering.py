@@ -7,17 +7,15 @@ how many of the forty trees of the obvious way are really built; fewer are scale
     .venv/bin/python benchmarks/clustering.py --large 50000
 """
 
-import argparse
 import importlib
 import importlib.util
 import json
 import resource
 import sys
 import time
-from pathlib import Path
 
 import numpy as np
-from machine import describe_machine
+from machine import parser, publish
 from scipy.cluster.hierarchy import linkage
 from sklearn.cluster import AgglomerativeClustering
 from sklearn.metrics import adjusted_rand_score
@@ -114,13 +112,12 @@ def large(rows: int, dimensions: int) -> dict[str, float | int]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--rows", type=int, default=6_000)
-    parser.add_argument("--dimensions", type=int, default=512)
-    parser.add_argument("--trees", type=int, default=ATTRIBUTES, help="of the forty that are really built")
-    parser.add_argument("--large", type=int, help="only one tree of so many rows")
-    parser.add_argument("--json", type=Path)
-    options = parser.parse_args()
+    asks = parser(__doc__)
+    asks.add_argument("--rows", type=int, default=6_000)
+    asks.add_argument("--dimensions", type=int, default=512)
+    asks.add_argument("--trees", type=int, default=ATTRIBUTES, help="of the forty that are really built")
+    asks.add_argument("--large", type=int, help="only one tree of so many rows")
+    options = asks.parse_args()
     if options.large:
         results = {"large": large(options.large, options.dimensions)}
     else:
@@ -131,12 +128,8 @@ def main() -> None:
             "one_tree_cpu_s": one_tree(features),
             "forty_attributes": forty_attributes(features, options.trees),
         }
-    results["machine"] = describe_machine()
-    text = json.dumps(results, indent=1)
-    print(text)
-    if options.json:
-        options.json.parent.mkdir(parents=True, exist_ok=True)
-        options.json.write_text(text + "\n")
+    print(json.dumps(results, indent=1))
+    publish(results, options.json)
 
 
 if __name__ == "__main__":

@@ -9,7 +9,6 @@ rectified mixtures is written, and clustered in a process of its own whose secon
     python benchmarks/clustering_million.py --rows 0 --checked 6000          # only how far
 """
 
-import argparse
 import json
 import os
 import resource
@@ -23,7 +22,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from machine import describe_machine
+from machine import parser, publish
 from sklearn.metrics import adjusted_rand_score
 
 from derender.evaluation import neighbours
@@ -125,26 +124,18 @@ def through_the_command(table: Path, method: str, folder: Path) -> dict[str, Any
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--rows", type=int, default=1_000_000, help="of the table; 0 leaves the command out")
-    parser.add_argument("--checked", type=int, nargs="*", default=[6_000], help="rows to compare with exact")
-    parser.add_argument("--methods", nargs="+", default=["ward", "k-means", "finch"])
-    parser.add_argument("--folder", type=Path, help="where the table is put meanwhile (2 KB a row)")
-    parser.add_argument("--json", type=Path, help="also write the numbers, machine and versions here")
-    options = parser.parse_args()
+    asks = parser(__doc__)
+    asks.add_argument("--rows", type=int, default=1_000_000, help="of the table; 0 leaves the command out")
+    asks.add_argument("--checked", type=int, nargs="*", default=[6_000], help="rows to compare with exact")
+    asks.add_argument("--methods", nargs="+", default=["ward", "k-means", "finch"])
+    asks.add_argument("--folder", type=Path, help="where the table is put meanwhile (2 KB a row)")
+    options = asks.parse_args()
     result: dict[str, Any] = {"benchmark": "clustering a million rows", "checked": [], "runs": []}
-
-    def keep() -> None:
-        if options.json is not None:
-            options.json.parent.mkdir(parents=True, exist_ok=True)
-            options.json.write_text(json.dumps({**result, "machine": describe_machine()}, indent=1) + "\n")
 
     for rows in options.checked:
         result["checked"].append(how_far(rows))
         print(json.dumps(result["checked"][-1], indent=1), flush=True)
-        keep()
+        publish(result, options.json)
     if not options.rows:
         return
     with tempfile.TemporaryDirectory(dir=options.folder) as name:
@@ -155,7 +146,7 @@ def main() -> None:
             result["runs"].append(through_the_command(table, method, Path(name)))
             row = result["runs"][-1]
             print(f"{options.rows:,} rows, {method}: {row['seconds']:.0f} s, {row['peak_mb_so_far']:,.0f} MB")
-            keep()
+            publish(result, options.json)
 
 
 if __name__ == "__main__":

@@ -27,7 +27,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from machine import describe_machine
+from machine import parser, publish
 from PIL import Image
 from torch import nn
 from training_step import CONFIG, OurStep
@@ -171,20 +171,17 @@ def in_a_process_of_its_own(count: int) -> dict[str, float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--batch", type=int, default=64, help="images in a training step (default 64)")
-    parser.add_argument("--count", type=int, default=1024, help="images to embed (default 1024)")
-    parser.add_argument("--rounds", type=int, default=3, help="timed rounds after one to warm up (default 3)")
-    parser.add_argument("--threads", type=int, default=os.cpu_count(), help="torch's threads")
-    parser.add_argument(
+    asks = parser(__doc__)
+    asks.add_argument("--batch", type=int, default=64, help="images in a training step (default 64)")
+    asks.add_argument("--count", type=int, default=1024, help="images to embed (default 1024)")
+    asks.add_argument("--rounds", type=int, default=3, help="timed rounds after one to warm up (default 3)")
+    asks.add_argument("--threads", type=int, default=os.cpu_count(), help="torch's threads")
+    asks.add_argument(
         "--memory", type=int, nargs="+", metavar="N", help="measure memory at these sizes instead"
     )
-    parser.add_argument("--cpu", action="store_true", help="count seconds of the processor: a busy machine")
-    parser.add_argument("--one-size", type=int, help=argparse.SUPPRESS)
-    parser.add_argument("--json", type=Path, help="also write the numbers, machine and versions here")
-    options = parser.parse_args()
+    asks.add_argument("--cpu", action="store_true", help="count seconds of the processor: a busy machine")
+    asks.add_argument("--one-size", type=int, help=argparse.SUPPRESS)
+    options = asks.parse_args()
     torch.set_num_threads(options.threads)
     if options.one_size is not None:
         print(json.dumps(measure_memory(options.one_size)))
@@ -208,11 +205,7 @@ def main() -> None:
             "clock": "processor" if options.cpu else "wall",
             "against_training": {way: speed["median"] / base for way, speed in speeds.items()},
         }  # fmt: skip
-    machine = describe_machine()
-    print(", ".join(f"{name} {value}" for name, value in machine.items()))
-    if options.json is not None:
-        options.json.parent.mkdir(parents=True, exist_ok=True)
-        options.json.write_text(json.dumps({**result, "machine": machine}, indent=1) + "\n")
+    publish(result, options.json)
 
 
 if __name__ == "__main__":

@@ -1,15 +1,34 @@
-"""Where and when a number was measured: processor, threads, versions, commit and day."""
+"""Where and when a number was measured: processor, threads, versions, commit and day; and its file."""
 
+import argparse
+import json
 import os
 import platform
 import subprocess
 import time
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import torch
 
 ROOT = Path(__file__).resolve().parents[1]
+
+
+def parser(doc: str | None) -> argparse.ArgumentParser:
+    """The options that every benchmark has."""
+    found = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+    found.add_argument("--json", type=Path, help="also write the numbers, machine and versions here")
+    return found
+
+
+def publish(result: dict[str, Any], file: Path | None) -> None:
+    """Print what machine it was, and write the numbers with it where that is asked for."""
+    machine = describe_machine()
+    print(", ".join(f"{name} {value}" for name, value in machine.items()))
+    if file is not None:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(json.dumps({**result, "machine": machine}, indent=1) + "\n")
 
 
 def describe_machine() -> dict[str, str | int]:

@@ -6,14 +6,11 @@ First checks that both agree in outputs and gradients on the benchmark's own inp
     python benchmarks/rasterize.py --size 64 --batch 64 --json rasterize.json
 """
 
-import argparse
-import json
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 import torch
-from machine import describe_machine
+from machine import parser, publish
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
@@ -70,13 +67,12 @@ def first_call_s() -> float:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--size", type=int, default=64, help="height and width in pixels")
-    parser.add_argument("--batch", type=int, default=64, help="images per call")
-    parser.add_argument("--threads", type=int, default=torch.get_num_threads(), help="CPU threads")
-    parser.add_argument("--repeats", type=int, default=10, help="runs of which the best counts")
-    parser.add_argument("--json", type=Path, help="also write the numbers to this file")
-    arguments = parser.parse_args()
+    asks = parser(__doc__)
+    asks.add_argument("--size", type=int, default=64, help="height and width in pixels")
+    asks.add_argument("--batch", type=int, default=64, help="images per call")
+    asks.add_argument("--threads", type=int, default=torch.get_num_threads(), help="CPU threads")
+    asks.add_argument("--repeats", type=int, default=10, help="runs of which the best counts")
+    arguments = asks.parse_args()
     torch.set_num_threads(arguments.threads)
     compile_s = first_call_s()
 
@@ -128,11 +124,8 @@ def main() -> None:
         ratio = ms["reference"] / ms["numba"]
         rows.append({"part": name, "ms_per_image": ms, "ratio": ratio, "relative_difference": difference})
         print(f"{name:28} {ms['reference']:10.3f} {ms['numba']:8.3f} {ratio:6.1f}x {difference:11.1e}")
-    if arguments.json:
-        settings = {key: value for key, value in vars(arguments).items() if key != "json"}
-        report = {**settings, "first_call_s": compile_s, "rows": rows, "machine": describe_machine()}
-        arguments.json.parent.mkdir(parents=True, exist_ok=True)
-        arguments.json.write_text(json.dumps(report, indent=2) + "\n")
+    settings = {key: value for key, value in vars(arguments).items() if key != "json"}
+    publish({**settings, "first_call_s": compile_s, "rows": rows}, arguments.json)
 
 
 if __name__ == "__main__":

@@ -10,17 +10,14 @@ rounds. Peers that are not installed are named.
     python benchmarks/rasterize_peers.py --sizes 64 256 --json benchmarks/results/rasterize_peers.json
 """
 
-import argparse
 import importlib.util
-import json
 import statistics
 import time
 from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path
 from typing import Any
 
 import torch
-from machine import describe_machine
+from machine import parser, publish
 from peers import PEERS, Ours, Peer
 from rasterize import FOV_DEG, surfaces
 from torch import Tensor
@@ -149,13 +146,12 @@ def show(row: dict[str, Any]) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--sizes", type=int, nargs="+", default=[64, 256], help="pixels")
-    parser.add_argument("--maps", type=int, default=16, help="depth maps in a call")
-    parser.add_argument("--rounds", type=int, default=7, help="timed rounds after one to warm up")
-    parser.add_argument("--threads", type=int, default=torch.get_num_threads(), help="torch's threads")
-    parser.add_argument("--json", type=Path, help="also write the numbers, machine and versions here")
-    options = parser.parse_args()
+    asks = parser(__doc__)
+    asks.add_argument("--sizes", type=int, nargs="+", default=[64, 256], help="pixels")
+    asks.add_argument("--maps", type=int, default=16, help="depth maps in a call")
+    asks.add_argument("--rounds", type=int, default=7, help="timed rounds after one to warm up")
+    asks.add_argument("--threads", type=int, default=torch.get_num_threads(), help="torch's threads")
+    options = asks.parse_args()
     torch.set_num_threads(options.threads)
     versions, missing = installed()
     rows = []
@@ -164,10 +160,8 @@ def main() -> None:
         show(rows[-1])
     missing = [*missing, "PyTorch3D (no wheel)"]
     print(f"not installed: {', '.join(missing)}")
-    if options.json is not None:
-        result = {"benchmark": "rasterise beside peers", "rows": rows, "peers": versions, "missing": missing}
-        options.json.parent.mkdir(parents=True, exist_ok=True)
-        options.json.write_text(json.dumps({**result, "machine": describe_machine()}, indent=1) + "\n")
+    result = {"benchmark": "rasterise beside peers", "rows": rows, "peers": versions, "missing": missing}
+    publish(result, options.json)
 
 
 if __name__ == "__main__":

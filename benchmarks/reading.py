@@ -30,7 +30,7 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
-from machine import describe_machine
+from machine import parser, publish
 from PIL import Image
 
 from derender.data import list_images, open_source, read_images
@@ -186,15 +186,14 @@ def starts(source: Path, cache: Path) -> dict[str, Any]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--files", type=int, default=200_000, help="files in the folder")
-    parser.add_argument("--zip", type=int, default=1_000_000, help="members of the zip")
-    parser.add_argument("--shards", type=int, default=200_000, help="samples in the shards")
-    parser.add_argument("--read", type=int, default=20_000, help="members of the zip to read")
-    parser.add_argument("--place", type=Path, help="make the sets here and leave them; those there are used")
-    parser.add_argument("--start", type=Path, help=argparse.SUPPRESS)
-    parser.add_argument("--json", type=Path, help="also write the numbers, machine and versions here")
-    options = parser.parse_args()
+    asks = parser(__doc__)
+    asks.add_argument("--files", type=int, default=200_000, help="files in the folder")
+    asks.add_argument("--zip", type=int, default=1_000_000, help="members of the zip")
+    asks.add_argument("--shards", type=int, default=200_000, help="samples in the shards")
+    asks.add_argument("--read", type=int, default=20_000, help="members of the zip to read")
+    asks.add_argument("--place", type=Path, help="make the sets here and leave them; those there are used")
+    asks.add_argument("--start", type=Path, help=argparse.SUPPRESS)
+    options = asks.parse_args()
     if options.start is not None:
         known = start_shards if options.start.name == "shards" else start
         print(json.dumps(known(options.start)))
@@ -230,10 +229,7 @@ def main() -> None:
         cpu = ", ".join(f"{one['cpu_s']:.2f}" for one in each)
         print(f"{kind} of {row['files']:,}: first start and later ones {wall} s; processor {cpu} s")
         print(f"  at most {max(one['memory_mb'] for one in each):,.0f} MB in memory")
-    if options.json is not None:
-        options.json.parent.mkdir(parents=True, exist_ok=True)
-        result = {"benchmark": "reading", "starts": results, "machine": describe_machine()}
-        options.json.write_text(json.dumps(result, indent=1) + "\n")
+    publish({"benchmark": "reading", "starts": results}, options.json)
 
 
 if __name__ == "__main__":

@@ -80,19 +80,9 @@ def bench(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
     yield "derender bench: training waits for data", f"{found['waiting']['share']:.2%}"
 
 
-def ray_embedding(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
-    for way, speed in found["pictures_per_second"].items():
-        yield f"embedding, {way}, start included", f"{speed:.0f} pictures/s"
-
-
 def torchrun_resume(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
     for way, apart in found["differences"].items():
         yield f"torchrun: {way}, largest difference from one process", f"{apart:.1e}"
-
-
-def gpu(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
-    for row in found["aims"]:
-        yield f"on the GPU: {row['what']} (aim {row['aim']})", str(row["got"])
 
 
 READERS: dict[str, Reader] = {
@@ -107,9 +97,7 @@ READERS: dict[str, Reader] = {
     ),
     "reading": reading,
     "clustering": clustering,
-    "gpu": gpu,
     "clustering_million": clustering_million,
-    "ray_embedding": ray_embedding,
     "torchrun_resume": torchrun_resume,
     "clustering_how_far": clustering_million,
     "clustering_how_far_50000": clustering_million,

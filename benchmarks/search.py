@@ -7,7 +7,6 @@ Rows are generated: mixtures of 24 hidden numbers and noise, 256 numbers for eac
     .venv/bin/python benchmarks/search.py --rows 1000000 --command
 """
 
-import argparse
 import json
 import os
 import subprocess
@@ -17,7 +16,7 @@ import time
 from pathlib import Path
 
 import numpy as np
-from machine import describe_machine
+from machine import parser, publish
 from sklearn.neighbors import NearestNeighbors
 
 from derender.features import FeatureTable
@@ -101,25 +100,21 @@ def as_command(table: FeatureTable, rounds: int) -> dict[str, dict[str, float]]:
         return taken
 
 
-def main() -> int:
-    words = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    words.add_argument("--rows", type=int, default=100_000)
-    words.add_argument("--dimensions", type=int, default=256)
-    words.add_argument("--rounds", type=int, default=5)
-    words.add_argument("--command", action="store_true", help="also time the command on a file")
-    words.add_argument("--json", type=Path)
-    asked = words.parse_args()
+def main() -> None:
+    asks = parser(__doc__)
+    asks.add_argument("--rows", type=int, default=100_000)
+    asks.add_argument("--dimensions", type=int, default=256)
+    asks.add_argument("--rounds", type=int, default=5)
+    asks.add_argument("--command", action="store_true", help="also time the command on a file")
+    asked = asks.parse_args()
     table = table_of(asked.rows, asked.dimensions)
     agreement(table)
     results = {"rows": asked.rows, "dimensions": asked.dimensions, **in_memory(table, asked.rounds)}
     if asked.command:
         results |= as_command(table, asked.rounds)
-    results = {"machine": describe_machine(), **results}
     print(json.dumps(results, indent=1))
-    if asked.json:
-        asked.json.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
-    return 0
+    publish(results, asked.json)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -13,10 +13,9 @@ import resource
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import torch
-from machine import describe_machine
+from machine import parser, publish
 
 from derender.model import Derenderer
 from derender.objectives import Vgg16Features
@@ -60,14 +59,13 @@ def one_step(preset: str, size: int, batch: int, chunks: int) -> dict[str, float
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--preset", default="paper")
-    parser.add_argument("--sizes", type=int, nargs="+", default=[64, 128, 256], help="pixels")
-    parser.add_argument("--batch", type=int, default=32)
-    parser.add_argument("--chunks", type=int, nargs="+", default=[1, 4, 16])
-    parser.add_argument("--one", type=int, help=argparse.SUPPRESS)
-    parser.add_argument("--json", type=Path, help="also write the numbers, machine and versions here")
-    options = parser.parse_args()
+    asks = parser(__doc__)
+    asks.add_argument("--preset", default="paper")
+    asks.add_argument("--sizes", type=int, nargs="+", default=[64, 128, 256], help="pixels")
+    asks.add_argument("--batch", type=int, default=32)
+    asks.add_argument("--chunks", type=int, nargs="+", default=[1, 4, 16])
+    asks.add_argument("--one", type=int, help=argparse.SUPPRESS)
+    options = asks.parse_args()
     if options.one is not None:
         print(json.dumps(one_step(options.preset, options.sizes[0], options.batch, options.one)))
         return
@@ -84,10 +82,7 @@ def main() -> None:
             apart = max(abs(row[name] / rows[first][name] - 1) for row in rows[first:])
             if apart > allowed:
                 raise SystemExit(f"{size} pixels: {name} differs by {apart:.1e}: the numbers say nothing")
-    if options.json is not None:
-        result = {"benchmark": "step memory", "rows": rows, "machine": describe_machine()}
-        options.json.parent.mkdir(parents=True, exist_ok=True)
-        options.json.write_text(json.dumps(result, indent=1) + "\n")
+    publish({"benchmark": "step memory", "rows": rows}, options.json)
 
 
 if __name__ == "__main__":

@@ -7,7 +7,6 @@ which it was: the mean number of busy processes over the last minute, before and
     .venv/bin/python benchmarks/synthesis.py --rounds 5 --json synthesis.json
 """
 
-import argparse
 import hashlib
 import json
 import os
@@ -18,7 +17,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import torch
-from machine import describe_machine
+from machine import parser, publish
 
 from derender.data.synthetic import SyntheticSet, cars, faces, write
 
@@ -76,14 +75,13 @@ def measure(name: str, count: int, rounds: int, size: int, threads: int) -> dict
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Speed of the generators of faces and cars.")
-    parser.add_argument("--count", type=int, default=1024, help="images in a round")
-    parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--image-size", type=int, default=64)
-    parser.add_argument("--threads", type=int, default=os.cpu_count() or 1)
-    parser.add_argument("--only", choices=list(GENERATORS))
-    parser.add_argument("--json", type=Path)
-    options = parser.parse_args()
+    asks = parser(__doc__)
+    asks.add_argument("--count", type=int, default=1024, help="images in a round")
+    asks.add_argument("--rounds", type=int, default=5)
+    asks.add_argument("--image-size", type=int, default=64)
+    asks.add_argument("--threads", type=int, default=os.cpu_count() or 1)
+    asks.add_argument("--only", choices=list(GENERATORS))
+    options = asks.parse_args()
     load = [os.getloadavg()[0]]
     results: dict[str, object] = {
         name: measure(name, options.count, options.rounds, options.image_size, options.threads)
@@ -92,11 +90,8 @@ def main() -> None:
     }
     load.append(os.getloadavg()[0])
     results |= {"count": options.count, "image_size": options.image_size, "load": load}
-    results["machine"] = describe_machine() | {"threads": options.threads}
-    text = json.dumps(results, indent=1)
-    print(text)
-    if options.json:
-        options.json.write_text(text + "\n")
+    print(json.dumps(results, indent=1))
+    publish(results, options.json)
 
 
 if __name__ == "__main__":

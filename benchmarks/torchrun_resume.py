@@ -7,8 +7,6 @@ was logged must agree. Times are given, start of the processes included; they sa
     python benchmarks/torchrun_resume.py --json benchmarks/results/torchrun_resume.json
 """
 
-import argparse
-import json
 import math
 import os
 import shutil
@@ -17,10 +15,9 @@ import sys
 import tempfile
 import time
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from machine import describe_machine
+from machine import parser, publish
 from PIL import Image
 
 from derender.training.run_folder import read_metrics
@@ -70,12 +67,9 @@ def largest_difference(run: Path, expected: Path) -> float:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument(
-        "--images", type=int, default=64, help="images shown before the resume; as many after"
-    )
-    parser.add_argument("--json", type=Path, help="also write the numbers, machine and versions here")
-    options = parser.parse_args()
+    asks = parser(__doc__)
+    asks.add_argument("--images", type=int, default=64, help="images shown before the resume; as many after")
+    options = asks.parse_args()
     seconds: dict[str, float] = {}
     with tempfile.TemporaryDirectory() as name:
         root = Path(name)
@@ -96,14 +90,8 @@ def main() -> None:
         print(f"{way}: logged numbers differ from those of one process by {difference:.1e} at most")
     for way, taken in seconds.items():
         print(f"{way}: {taken:.1f} s")
-    if options.json is not None:
-        options.json.parent.mkdir(parents=True, exist_ok=True)
-        result: dict[str, Any] = {
-            "benchmark": "torchrun and resume",
-            "differences": apart,
-            "seconds": seconds,
-        }
-        options.json.write_text(json.dumps({**result, "machine": describe_machine()}, indent=1) + "\n")
+    result = {"benchmark": "torchrun and resume", "differences": apart, "seconds": seconds}
+    publish(result, options.json)
     if max(apart.values()) > TOLERANCE:
         raise SystemExit(f"more than {TOLERANCE}: these are not the same run")
 

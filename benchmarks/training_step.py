@@ -9,22 +9,19 @@ weights are random: neither changes the work.
     python benchmarks/training_step.py --rounds 5 --json training_step.json
 """
 
-import argparse
-import json
 import os
 import statistics
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from functools import partial
-from pathlib import Path
 
 import torch
 from literal.networks import Vgg16
 from literal.step import NETS, LiteralStep
-from machine import describe_machine
-from torch import Tensor, nn
+from machine import parser, publish
+from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
 from derender.model import Derenderer
@@ -85,16 +82,11 @@ class Row:
     gflop_per_image: float
 
 
-def in_order(module: nn.Module) -> Iterator[nn.Parameter]:
-    """A network's parameters in the order in which images meet them."""
-    yield from module.parameters()
-
-
 def same_start(literal: LiteralStep, model: Derenderer) -> None:
     """Give derender's networks the literal step's weights, tensor by tensor."""
     with torch.no_grad():
         for name in NETS:
-            pairs = zip(in_order(getattr(literal, name)), in_order(model.nets[name]), strict=True)
+            pairs = zip(getattr(literal, name).parameters(), model.nets[name].parameters(), strict=True)
             for source, target in pairs:
                 target.copy_(source.view(target.shape))
 
@@ -122,7 +114,7 @@ def check_agreement(literal: LiteralStep, ours: OurStep, images: Tensor) -> tupl
     loss_difference = abs(got.item() - expected.item()) / abs(expected.item())
     gradient_difference = 0.0
     for name in NETS:
-        for a, b in zip(in_order(getattr(literal, name)), in_order(ours.model.nets[name]), strict=True):
+        for a, b in zip(getattr(literal, name).parameters(), ours.model.nets[name].parameters(), strict=True):
             assert a.grad is not None and b.grad is not None
             difference = (a.grad.view(b.shape) - b.grad).norm() / a.grad.norm().clamp(min=1e-12)
             gradient_difference = max(gradient_difference, difference.item())
@@ -185,20 +177,15 @@ def table(rows: list[Row]) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--batch", type=int, default=64, help="images in a batch (default 64)")
-    parser.add_argument("--rounds", type=int, default=5, help="timed rounds after one to warm up (default 5)")
-    parser.add_argument(
+    asks = parser(__doc__)
+    asks.add_argument("--batch", type=int, default=64, help="images in a batch (default 64)")
+    asks.add_argument("--rounds", type=int, default=5, help="timed rounds after one to warm up (default 5)")
+    asks.add_argument(
         "--threads", type=int, default=os.cpu_count(), help="torch's threads (default: every core)"
     )
-    parser.add_argument("--no-bf16", action="store_true", help="leave the bfloat16 row out")
-    parser.add_argument(
-        "--check-only", action="store_true", help="compare losses and gradients, time nothing"
-    )
-    parser.add_argument("--json", type=Path, help="also write the numbers, machine and versions here")
-    options = parser.parse_args()
+    asks.add_argument("--no-bf16", action="store_true", help="leave the bfloat16 row out")
+    asks.add_argument("--check-only", action="store_true", help="compare losses and gradients, time nothing")
+    options = asks.parse_args()
 
     torch.set_num_threads(options.threads)
     torch.manual_seed(0)
@@ -213,21 +200,13 @@ def main() -> None:
     if not options.no_bf16:
         steps["derender, bfloat16 networks"] = our_step(literal, "bf16-mixed")
     rows = measure(steps, images, options.rounds)
-    machine = describe_machine()
     print(table(rows))
-    print(", ".join(f"{name} {value}" for name, value in machine.items()))
-    if options.json is not None:
-        result = {
-            "benchmark": "training_step",
-            "batch": options.batch,
-            "rounds": options.rounds,
-            "loss_difference": loss_difference,
-            "gradient_difference": gradient_difference,
-            "rows": [asdict(row) for row in rows],
-            "machine": machine,
-        }
-        options.json.parent.mkdir(parents=True, exist_ok=True)
-        options.json.write_text(json.dumps(result, indent=1) + "\n")
+    result = {
+        "benchmark": "training_step", "batch": options.batch, "rounds": options.rounds,
+        "loss_difference": loss_difference, "gradient_difference": gradient_difference,
+        "rows": [asdict(row) for row in rows],
+    }  # fmt: skip
+    publish(result, options.json)
 
 
 if __name__ == "__main__":

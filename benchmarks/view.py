@@ -7,7 +7,6 @@ Ends by itself after ``--seconds`` for each number of clients.
     .venv/bin/python benchmarks/view.py --clients 1 20 --size 64
 """
 
-import argparse
 import http.client
 import json
 import os
@@ -22,7 +21,7 @@ from pathlib import Path
 from threading import Barrier
 
 import numpy as np
-from machine import describe_machine
+from machine import parser, publish
 
 HEADERS = {"X-Derender-Page": "1"}
 PNG_SIZE = slice(16, 24)  # width and height in a PNG's head
@@ -85,19 +84,14 @@ def memory_mb(process: subprocess.Popen) -> float:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument(
-        "--model", default="rendered-faces-64", help="which model (default rendered-faces-64)"
-    )
-    parser.add_argument(
+    asks = parser(__doc__)
+    asks.add_argument("--model", default="rendered-faces-64", help="which model (default rendered-faces-64)")
+    asks.add_argument(
         "--clients", type=int, nargs="+", default=[1, 20], help="how many at once (default 1 20)"
     )
-    parser.add_argument("--size", type=int, default=64, help="side of the images (default 64)")
-    parser.add_argument("--seconds", type=float, default=10, help="for each number of clients (default 10)")
-    parser.add_argument("--json", type=Path, help="also write the numbers, machine and versions here")
-    options = parser.parse_args()
+    asks.add_argument("--size", type=int, default=64, help="side of the images (default 64)")
+    asks.add_argument("--seconds", type=float, default=10, help="for each number of clients (default 10)")
+    options = asks.parse_args()
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         told = Path(folder) / "told.json"
@@ -137,11 +131,7 @@ def main() -> None:
         finally:
             server.terminate()
             server.wait(30)
-    machine = describe_machine()
-    print(", ".join(f"{name} {value}" for name, value in machine.items()))
-    if options.json is not None:
-        result = {"benchmark": "view", "size": options.size, "rows": rows, "machine": machine}
-        options.json.write_text(json.dumps(result, indent=1) + "\n")
+    publish({"benchmark": "view", "size": options.size, "rows": rows}, options.json)
 
 
 if __name__ == "__main__":

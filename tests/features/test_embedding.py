@@ -85,29 +85,52 @@ def assert_same(path: Path, expected: FeatureTable) -> None:
 
 def in_memory(model, source: str, path: Path, **options) -> FeatureTable:
     """The table of the whole set in memory, once through a file as any table goes."""
-    return FeatureTable.read(
-        embed_pictures(model, read_images(source, 8, **options), batch_size=16).write(path)
-    )
+    images = read_images(source, 8, **options)
+    return FeatureTable.read(embed_pictures(model, images, batch_size=16).write(path))
+
+
+def streamed(model, source: str, path: Path, *, limit: int | None = None, **options):
+    """The table of the set as a stream."""
+    with open_images(source, limit=limit) as stream:
+        return embed_to_file(stream, model, path, **{"batch_size": 16, **options})
+
+
+@pytest.fixture
+def out(tmp_path) -> Path:
+    return tmp_path / "out.parquet"
+
+
+def stop_after(rows: int, how=KeyboardInterrupt):
+    """A report of progress that ends a run once it is beyond so many rows."""
+
+    def stop(done: int, total: int) -> None:
+        if done > rows:
+            raise how
+
+    return stop
 
 
 @pytest.mark.parametrize("keep", [False, True])
-def test_the_table_is_that_of_the_set_in_memory(model, source, tmp_path, keep):
-    expected = in_memory(model, source, tmp_path / "memory.parquet", keep_duplicates=keep)
-    with open_images(source) as stream:
-        done = embed_to_file(
-            stream, model, tmp_path / "out.parquet", batch_size=16, keep_duplicates=keep, workers=2
-        )
-    assert_same(tmp_path / "out.parquet", expected)
+def test_the_table_is_that_of_the_set_in_memory(model, source, tmp_path, out, keep):
+    expected, seen = in_memory(model, source, tmp_path / "m.parquet", keep_duplicates=keep), []
+    model.train()
+    done = streamed(
+        model, source, out, keep_duplicates=keep, workers=2, progress=lambda *state: seen.append(state)
+    )
+    assert model.training
+    assert seen[-1] == (COUNT, COUNT) and all(done <= total for done, total in seen)
+    assert [done for done, _ in seen] == sorted(done for done, _ in seen)
+    assert_same(out, expected)
     assert (done.rows, done.skipped, done.copies, done.resumed) == (len(expected), 6, 4, 0)
     assert done.factors == {"geometry": 3, "albedo": 2} and list(done.labels) == list(expected.labels)
     assert done.examples[0].reason == "not an image in a known format"
-    assert pq.ParquetFile(tmp_path / "out.parquet").num_row_groups == -(-len(expected) // 32)
+    assert pq.ParquetFile(out).num_row_groups == -(-len(expected) // 32)
     assert not (tmp_path / "out.parquet.partial").exists()
 
 
 @pytest.mark.parametrize("keep", [False, True])
-def test_blocks_of_several_workers_make_the_same_table(model, source, tmp_path, keep, monkeypatch):
-    expected = in_memory(model, source, tmp_path / "memory.parquet", keep_duplicates=keep)
+def test_blocks_of_several_workers_make_the_same_table(model, source, tmp_path, out, keep, monkeypatch):
+    expected = in_memory(model, source, tmp_path / "m.parquet", keep_duplicates=keep)
 
     @contextmanager
     def two_workers(net, stream, start, *, open_stream, batch_size, fit, workers):
@@ -121,12 +144,11 @@ def test_blocks_of_several_workers_make_the_same_table(model, source, tmp_path, 
             worker.opened.close()
 
     monkeypatch.setattr(embedding, "ray_blocks", two_workers)
-    path = tmp_path / "out.parquet"
-    done = embed_to_file(source, model, path, batch_size=16, keep_duplicates=keep, engine="ray")
-    assert_same(path, expected)
+    done = embed_to_file(source, model, out, batch_size=16, keep_duplicates=keep, engine="ray")
+    assert_same(out, expected)
     assert (done.rows, done.skipped, done.copies) == (len(expected), 6, 4)
     with pytest.raises(ValueError, match="no engine 'rai'; did you mean 'ray'"):
-        embed_to_file(source, model, path, engine="rai")
+        embed_to_file(source, model, out, engine="rai")
 
 
 @pytest.mark.parametrize("source", ["folder", "shards"], indirect=True)
@@ -134,121 +156,73 @@ def test_blocks_of_several_workers_make_the_same_table(model, source, tmp_path, 
     ("how", "stop_at"),
     [(KeyboardInterrupt, [40]), (KeyboardInterrupt, [0, 60, 60, 100]), (RuntimeError, [10, 90])],
 )
-def test_a_stopped_run_goes_on_to_the_same_table(model, source, tmp_path, stop_at, how, monkeypatch):
+def test_a_stopped_run_goes_on_to_the_same_table(model, source, tmp_path, out, stop_at, how, monkeypatch):
     """Stopped by Ctrl-C (what is computed is kept) or killed (what is written is kept)."""
-    expected = in_memory(model, source, tmp_path / "memory.parquet")
-    out, embedded = tmp_path / "out.parquet", []
+    expected, embedded = in_memory(model, source, tmp_path / "m.parquet"), []
     real = model.embed
     monkeypatch.setattr(model, "embed", lambda images: embedded.append(len(images)) or real(images))
     for stop in stop_at:
-
-        def stop_there(done: int, total: int, stop: int = stop) -> None:
-            if done > stop:
-                raise how
-
-        with open_images(source) as stream, pytest.raises(how) as stopped:
-            embed_to_file(stream, model, out, batch_size=16, progress=stop_there)
+        with pytest.raises(how) as stopped:
+            streamed(model, source, out, progress=stop_after(stop, how))
         assert not out.exists()
         if how is KeyboardInterrupt:
-            parts = list((tmp_path / "out.parquet.partial").glob("part-*"))
+            parts = (tmp_path / "out.parquet.partial").glob("part-*")
             kept = sum(pq.ParquetFile(part).metadata.num_rows for part in parts)
             assert 0 < kept <= sum(embedded) <= kept + 4, "what was computed is kept, but for copies"
             assert f"stopped by Ctrl-C; {kept} rows are kept in" in str(stopped.value)
-    with open_images(source) as stream:
-        done = embed_to_file(stream, model, out, batch_size=16)
+    done = streamed(model, source, out)
     assert_same(out, expected)
     assert done.skipped == 6 and done.copies == 4
     if how is KeyboardInterrupt:
         assert done.resumed > 0 and sum(embedded) == len(expected) + 4, "nothing was computed twice"
-    assert {path.name for path in tmp_path.iterdir()} >= {"out.parquet"}
     assert not (tmp_path / "out.parquet.partial").exists()
 
 
 @pytest.mark.parametrize("source", ["shards"], indirect=True)
-def test_a_set_is_written_as_a_stream_is(model, source, tmp_path):
-    pictures = read_images(source, 8)
-    part = pictures.select(np.arange(len(pictures)) % 2 == 0)
+def test_a_set_is_written_as_a_stream_is(model, source, tmp_path, out):
+    images = read_images(source, 8)
+    part = images.select(np.arange(len(images)) % 2 == 0)
     expected = FeatureTable.read(embed_pictures(model, part, batch_size=16).write(tmp_path / "m.parquet"))
-
-    def stop(done: int, total: int) -> None:
-        assert total == len(part)
-        if done > 30:
-            raise KeyboardInterrupt
-
     with pytest.raises(KeyboardInterrupt, match="the same command goes on"):
-        embed_to_file(part, model, tmp_path / "out.parquet", batch_size=16, progress=stop)
-    assert embed_to_file(part, model, tmp_path / "out.parquet", batch_size=16).resumed == 32
-    assert_same(tmp_path / "out.parquet", expected)
+        embed_to_file(part, model, out, batch_size=16, progress=stop_after(30))
+    assert embed_to_file(part, model, out, batch_size=16).resumed == 32
+    assert_same(out, expected)
 
 
 @pytest.mark.parametrize("source", ["zip"], indirect=True)
-def test_parts_of_another_run_are_an_error_until_told(model, source, tmp_path):
-    out = tmp_path / "out.parquet"
-
-    def stop(done: int, total: int) -> None:
-        raise KeyboardInterrupt
-
-    with open_images(source) as stream, pytest.raises(KeyboardInterrupt):
-        embed_to_file(stream, model, out, batch_size=16, progress=stop)
-    with (
-        open_images(source) as stream,
-        pytest.raises(ValueError, match=r"unfinished table .*\(differs in batch_size\): delete"),
-    ):
-        embed_to_file(stream, model, out, batch_size=8)
+def test_parts_of_another_run_are_an_error_until_told(model, source, tmp_path, out):
+    with pytest.raises(KeyboardInterrupt):
+        streamed(model, source, out, progress=stop_after(0))
+    with pytest.raises(ValueError, match=r"unfinished table .*\(differs in batch_size\): delete"):
+        streamed(model, source, out, batch_size=8)
     model.b[0, 0] += 1
-    with open_images(source) as stream:
-        with pytest.raises(ValueError, match=r"differs in origin.*add --force"):
-            embed_to_file(stream, model, out, batch_size=16)
-        assert embed_to_file(stream, model, out, batch_size=16, fresh=True).resumed == 0
-    assert_same(out, in_memory(model, source, tmp_path / "memory.parquet"))
+    with pytest.raises(ValueError, match=r"differs in origin.*add --force"):
+        streamed(model, source, out)
+    assert streamed(model, source, out, fresh=True).resumed == 0
+    assert_same(out, in_memory(model, source, tmp_path / "m.parquet"))
 
 
 @pytest.mark.parametrize("source", ["folder", "shards"], indirect=True)
-def test_limits(model, source, tmp_path):
-    for limit in (5, 40, 1000):
-        with open_images(source, limit=limit) as stream:
-            embed_to_file(stream, model, tmp_path / "out.parquet", batch_size=16)
-        assert_same(
-            tmp_path / "out.parquet", in_memory(model, source, tmp_path / "memory.parquet", limit=limit)
-        )
+@pytest.mark.parametrize("limit", [5, 40, 1000])
+def test_limits(model, source, tmp_path, out, limit):
+    streamed(model, source, out, limit=limit)
+    assert_same(out, in_memory(model, source, tmp_path / "m.parquet", limit=limit))
 
 
-def test_bad_input_leaves_nothing(model, tmp_path):
-    (tmp_path / "bad").mkdir()
+def test_bad_input_leaves_nothing(model, tmp_path, out):
+    bad = tmp_path / "bad"
+    bad.mkdir()
     for name in ("a.png", "b.png"):
-        (tmp_path / "bad" / name).write_bytes(b"text")
-    out = tmp_path / "out.parquet"
-    with open_images(str(tmp_path / "bad")) as stream:
-        with pytest.raises(
-            ValueError, match=r"no image in .*bad \(folder\) can be read; the first is 'a\.png'"
-        ):
-            embed_to_file(stream, model, out)
-        with pytest.raises(ValueError, match="batch_size must be 1 or more, got 0"):
-            embed_to_file(stream, model, out, batch_size=0)
-    (tmp_path / "bad" / "c.png").write_bytes(png(1))
+        (bad / name).write_bytes(b"text")
+    with pytest.raises(ValueError, match=r"no image in .*bad \(folder\) can be read; the first is 'a\.png'"):
+        streamed(model, str(bad), out)
+    with pytest.raises(ValueError, match="batch_size must be 1 or more, got 0"):
+        streamed(model, str(bad), out, batch_size=0)
+    (bad / "c.png").write_bytes(png(1))
     model.b[:] = np.nan
-    with (
-        open_images(str(tmp_path / "bad")) as stream,
-        pytest.raises(ValueError, match=r"factor 'albedo' is not finite in 1 of 1 rows, first in c\.png"),
-    ):
-        embed_to_file(stream, model, out)
+    with pytest.raises(ValueError, match=r"factor 'albedo' is not finite in 1 of 1 rows, first in c\.png"):
+        streamed(model, str(bad), out)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["bad"]
     (tmp_path / "out.parquet.partial").write_text("in the way")
-    with (
-        open_images(str(tmp_path / "bad")) as stream,
-        pytest.raises(ValueError, match="in the way: delete it"),
-    ):
-        embed_to_file(stream, model, out)
-
-
-@pytest.mark.parametrize("source", ["zip", "shards"], indirect=True)
-def test_the_model_keeps_its_mode_and_progress_ends_at_the_total(model, source, tmp_path):
-    model.train()
-    seen = []
-    with open_images(source) as stream:
-        embed_to_file(
-            stream, model, tmp_path / "o.parquet", batch_size=16, progress=lambda *state: seen.append(state)
-        )
-    assert model.training
-    assert seen[-1] == (COUNT, COUNT) and all(done <= total for done, total in seen)
-    assert [done for done, _ in seen] == sorted(done for done, _ in seen)
+    with pytest.raises(ValueError, match="in the way: delete it"):
+        streamed(model, str(bad), out)

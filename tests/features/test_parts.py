@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from derender.data import ImageSet
-from derender.features import FeatureTable, embed_to_file, embedding
+from derender.features import FeatureTable, embed_pictures, embed_to_file, embedding
 from derender.storage.atomic import DamageNoticed
 
 
@@ -28,10 +28,20 @@ def stopped(model, pictures, tmp_path, monkeypatch):
     return sorted((tmp_path / "F.parquet.partial").glob("part-*"))
 
 
+def same_table(file, wanted: FeatureTable) -> bool:
+    found = FeatureTable.read(file)
+    same = (np.array_equal(found.factors[name], wanted.factors[name]) for name in wanted.factors)
+    return found.files == wanted.files and all(same)
+
+
 def flipped(file) -> None:
     content = bytearray(file.read_bytes())
     content[len(content) // 2] ^= 1
     file.write_bytes(content)
+
+
+def unreadable(file) -> None:
+    file.rename(file.with_name("part-000002.parquet")).write_bytes(b"PAR1")
 
 
 @pytest.mark.parametrize(
@@ -41,10 +51,7 @@ def flipped(file) -> None:
         (lambda file: file.write_bytes(file.read_bytes()[:-1]), "its checksum differs"),
         (lambda file: file.write_bytes(b""), "its checksum differs"),
         (lambda file: file.unlink(), "part 2 is missing"),
-        (
-            lambda file: file.rename(file.with_name("part-000002.parquet")).write_bytes(b"PAR1"),
-            "it cannot be read",
-        ),
+        (unreadable, "it cannot be read"),
     ],
 )
 def test_a_damaged_part_is_made_again_with_those_after_it(model, pictures, stopped, tmp_path, damage, words):
@@ -53,10 +60,7 @@ def test_a_damaged_part_is_made_again_with_those_after_it(model, pictures, stopp
     with pytest.warns(DamageNoticed, match=rf"damaged \({words}\): going on from the 16 rows before it"):
         done = embed_to_file(pictures, model, tmp_path / "F.parquet", batch_size=8)
     assert (done.resumed, done.rows) == (16, 60)
-    whole = embed_to_file(pictures, model, tmp_path / "whole.parquet", batch_size=8)
-    one, other = (FeatureTable.read(tmp_path / name) for name in ("F.parquet", "whole.parquet"))
-    assert one.files == other.files and whole.resumed == 0
-    assert all(np.array_equal(one.factors[name], other.factors[name]) for name in other.factors)
+    assert same_table(tmp_path / "F.parquet", embed_pictures(model, pictures, batch_size=8))
     assert not list(tmp_path.glob("*.partial"))
 
 
@@ -84,9 +88,6 @@ def test_a_changed_byte_in_a_finished_table_is_an_error_and_not_another_number(m
     content[int(at * len(content))] ^= 16
     file.write_bytes(content)
     try:
-        found = FeatureTable.read(file)
+        assert same_table(file, wanted)
     except ValueError as problem:
         assert "not a readable parquet file" in str(problem) or str(file) in str(problem)
-        return
-    assert found.files == wanted.files
-    assert all(np.array_equal(found.factors[name], wanted.factors[name]) for name in wanted.factors)

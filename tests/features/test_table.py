@@ -78,22 +78,13 @@ def test_other_tools_see_plain_columns_and_json(tmp_path):
     assert described["factors"] == ["geometry", "albedo"] and described["origin"]["nested"]["π"] == [1, 2]
 
 
-def test_a_failed_write_leaves_the_old_file_and_no_rest(tmp_path):
+def test_a_failed_write_leaves_the_old_file_and_no_rest(tmp_path, monkeypatch):
     path = make().write(tmp_path / "t.parquet")
     before = path.read_bytes()
-    broken = make(mixed=np.array([1, "a", 2.5, [3], None], dtype=object))
     with pytest.raises(ValueError, match="label 'mixed' mixes kinds"):
-        broken.write(path)
-    unwritable = FeatureTable(("a",), {"f": np.ones((1, 1))}, origin={"x": object()})
+        make(mixed=np.array([1, "a", 2.5, [3], None], dtype=object)).write(path)
     with pytest.raises(TypeError):
-        unwritable.write(path)
-    assert path.read_bytes() == before
-    assert [p.name for p in tmp_path.iterdir()] == ["t.parquet"]
-
-
-def test_a_write_that_dies_half_way_leaves_the_old_file_and_no_rest(tmp_path, monkeypatch):
-    path = make().write(tmp_path / "t.parquet")
-    before = path.read_bytes()
+        FeatureTable(("a",), {"f": np.ones((1, 1))}, origin={"x": object()}).write(path)
 
     def dies(writer, table):
         raise OSError("no space left on device")
@@ -131,8 +122,8 @@ def test_several_row_groups_are_joined_in_order(tmp_path):
         ({"file": ["a", "b"], "f": [[1.0], None]}, "empty in 1 rows"),
         ({"file": ["a"], "f": [["x"]]}, "holds string, expected numbers"),
         (
-            {"file": ["a", "b"], "f": [[1.0], [float("nan")]]},
-            r"t.parquet: factor 'f' is not finite in 1 of 2 rows, first in b",
+            {"file": ["a", "b"], "f": [[1.0], [np.nan]]},
+            "t.parquet: factor 'f' is not finite in 1 of 2 rows, f",
         ),
         ({"file": ["a", "b"], "f": [[1.0, None], [1.0, 2.0]]}, "not finite in 1 of 2 rows"),
     ],
@@ -183,12 +174,7 @@ def test_damaged_metadata_is_refused_in_words(tmp_path, metadata, message):
         ("ab", {"f": np.ones((2, 2))}, {"who": np.ones(3)}, "label 'who' has 3 rows, but there are 2 files"),
         ("ab", {"f": np.ones(2)}, {}, "factor 'f' must have at least one number in each row"),
         ("ab", {"f": np.ones((2, 0))}, {}, "factor 'f' must have at least one number in each row"),
-        (
-            "ab",
-            {"f": np.ones((2, 2))},
-            {"who": np.ones((2, 2))},
-            "label 'who' must have one value in each row",
-        ),
+        ("ab", {"f": np.ones((2, 2))}, {"who": np.ones((2, 2))}, "label 'who' must have one value in each"),
         ("ab", {"f": np.ones((2, 2))}, {"f": np.ones(2)}, "column name 'f' is used twice"),
         ("ab", {"file": np.ones((2, 2))}, {}, "column name 'file' is used twice"),
         ("ab", {"f": np.array([[1.0], [np.inf]])}, {}, "factor 'f' is not finite in 1 of 2 rows, first in b"),
@@ -209,7 +195,7 @@ def test_concatenate_follows_the_order_asked_for_and_names_the_nearest():
     np.testing.assert_array_equal(table.concatenate("albedo"), table.factors["albedo"])
     np.testing.assert_array_equal(table.concatenate(), table.concatenate(("geometry", "albedo")))
     with pytest.raises(
-        ValueError, match="unknown factor 'albdo'; did you mean 'albedo'\\?; there is geometry, albedo"
+        ValueError, match=r"unknown factor 'albdo'; did you mean 'albedo'\?; there is geometry"
     ):
         table.concatenate(("albdo",))
     with pytest.raises(ValueError, match="name at least one factor"):
@@ -250,16 +236,16 @@ def test_mean_by_averages_groups_and_keeps_what_is_constant():
         table.mean_by()
 
 
-def test_missing_knows_every_way_to_be_missing():
-    assert missing(np.array(["", "a"])).tolist() == [True, False]
-    assert missing(np.array([np.nan, 0.0])).tolist() == [True, False]
-    assert missing(np.array([None, np.nan, "", 0, "a"], dtype=object)).tolist() == [
-        True,
-        True,
-        True,
-        False,
-        False,
-    ]
-    assert missing(np.array([-1, 0, 1], np.int8)).tolist() == [True, False, False]
-    assert missing(np.array([-1, 0, 1])).tolist() == [False, False, False]
-    assert missing(np.array([False, True])).tolist() == [False, False]
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        (np.array(["", "a"]), [True, False]),
+        (np.array([np.nan, 0.0]), [True, False]),
+        (np.array([None, np.nan, "", 0, "a"], dtype=object), [True, True, True, False, False]),
+        (np.array([-1, 0, 1], np.int8), [True, False, False]),
+        (np.array([-1, 0, 1]), [False, False, False]),
+        (np.array([False, True]), [False, False]),
+    ],
+)
+def test_missing_knows_every_way_to_be_missing(values, expected):
+    assert missing(values).tolist() == expected

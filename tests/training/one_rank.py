@@ -1,9 +1,10 @@
-"""One of two processes of test_distributed.py: a step on half a batch, compared with the whole one.
+"""One of two processes of test_distributed.py: commands, then a step on half a batch beside the whole one.
 
-Everything runs in float64, where rounding cannot hide a difference. The first process writes what it found.
+The step runs in float64, where rounding cannot hide a difference. The first process writes what it found.
 """
 
 import json
+import os
 import sys
 from functools import partial
 from pathlib import Path
@@ -11,6 +12,7 @@ from pathlib import Path
 import torch
 from torch import distributed
 
+from derender.cli import main as command
 from derender.model import Derenderer
 from derender.objectives import SelfFeatures
 from derender.render import render_scene
@@ -74,8 +76,12 @@ def gathered_rows(ranks: Ranks) -> dict[str, object]:
 
 
 def main() -> None:
-    torch.Tensor.float = torch.Tensor.double
     torch.set_num_threads(1)
+    for words in json.loads(sys.argv[2]):
+        sys.stderr.write(f"\nended with {command(words)}\n")
+        sys.stderr.flush()
+    os.environ["MASTER_PORT"] = sys.argv[3]  # the last command has left its group
+    torch.Tensor.float = torch.Tensor.double
     ranks = ranks_of(open_fabric("cpu"))
     found = {
         "count": ranks.count,

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import socket
 import subprocess
 import sys
@@ -33,15 +34,18 @@ TINY = [
 ]
 
 
-def two_processes(*arguments: str) -> list[tuple[int, str]]:
-    """Run python with these arguments twice, as torchrun would; exit codes and what was said."""
+def free_port() -> str:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+        return str(free.getsockname()[1])
+
+
+def two_processes(*arguments: str) -> list[tuple[int, str]]:
+    """Run python with these arguments twice, as torchrun would; exit codes and what was said."""
     common = {
         **os.environ, "WORLD_SIZE": "2", "LOCAL_WORLD_SIZE": "2", "GROUP_RANK": "0",
         "TORCHELASTIC_RUN_ID": "test",
-        "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "GLOO_SOCKET_IFNAME": "lo",
+        "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": free_port(), "GLOO_SOCKET_IFNAME": "lo",
         "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1",
     }  # fmt: skip
     running = [
@@ -55,7 +59,7 @@ def two_processes(*arguments: str) -> list[tuple[int, str]]:
         for rank in range(2)
     ]
     try:
-        said = [process.communicate(timeout=280)[0] for process in running]
+        said = [process.communicate(timeout=120)[0] for process in running]
     finally:
         for process in running:
             process.kill()
@@ -85,10 +89,28 @@ def folder(tmp_path_factory) -> Path:
     return made
 
 
-def test_two_processes_have_the_losses_and_gradients_of_one_with_the_whole_batch(tmp_path):
-    ended = two_processes(str(Path(__file__).with_name("one_rank.py")), str(tmp_path / "found.json"))
+@pytest.fixture(scope="module")
+def told(folder) -> tuple[dict, list[list[str]], Path]:
+    """Two processes that are refused a training, train, and compare steps.
+
+    Gives what the steps came to; what each process said of each command, its exit code last; and the run.
+    """
+    place = folder.parent / "told"
+    place.mkdir()
+    train_words = ["train", "--data", str(folder), "--preset", "small", "--device", "cpu"]
+    commands = [
+        [*train_words, "--out", str(place / "refused"), *settings("batch_size=7")],
+        [*train_words, "--out", str(place / "run"), *settings("images=32")],
+    ]
+    script = str(Path(__file__).with_name("one_rank.py"))
+    ended = two_processes(script, str(place / "found.json"), json.dumps(commands), free_port())
     assert [code for code, _ in ended] == [0, 0], ended
-    found = json.loads((tmp_path / "found.json").read_text())
+    said = [re.split(r"(?<=\nended with \d)\n", words)[:2] for _, words in ended]
+    return json.loads((place / "found.json").read_text()), said, place
+
+
+def test_two_processes_have_the_losses_and_gradients_of_one_with_the_whole_batch(told):
+    found = told[0]
     assert found["count"] == 2
     assert found["gathered"] == [0, 0, 1, 1]
     assert found["gradient"] == [0, 3, 6, 9]  # both ranks' wishes, once and twice the row's number
@@ -99,26 +121,20 @@ def test_two_processes_have_the_losses_and_gradients_of_one_with_the_whole_batch
 
 
 @pytest.mark.usefixtures("one_thread")
-def test_two_processes_train_one_run_that_one_process_can_go_on_with(folder, tmp_path):
-    run = tmp_path / "shared"
-    command = ["-m", "derender", "train", "--data", str(folder), "--preset", "small", "--device", "cpu"]
-    (code, said), (other_code, silence) = two_processes(
-        *command, "--out", str(run), *settings("images=32")
-    )  # fmt: skip
-    assert (code, other_code) == (0, 0), (said, silence)
-    assert "derender" not in silence
-    assert "pictures" not in silence
+def test_two_processes_train_one_run_that_one_process_can_go_on_with(folder, told, tmp_path):
+    said, silence = (words[1] for words in told[1])
+    assert said.endswith("ended with 0") and silence.endswith("ended with 0")
+    assert "derender" not in silence and "images" not in silence
     assert "stopped by: images" in said
-    environment = json.loads((run / "environment.json").read_text())
-    assert environment["device"] == "2 x cpu"
-    pictures = read_images(str(folder), 32)
-    train(resolve("small", [*TINY, "images=32"]), pictures, tmp_path / "alone", accelerator="cpu")
+    run = told[2] / "run"
+    assert json.loads((run / "environment.json").read_text())["device"] == "2 x cpu"
+    images = read_images(str(folder), 32)
+    train(resolve("small", [*TINY, "images=32"]), images, tmp_path / "alone", accelerator="cpu")
     for place in (run, tmp_path / "alone"):
-        train(resolve("small", [*TINY, "images=48"]), pictures, place, resume=True, accelerator="cpu")
+        train(resolve("small", [*TINY, "images=48"]), images, place, resume=True, accelerator="cpu")
     rows, expected = read_metrics(run), read_metrics(tmp_path / "alone")
-    assert [(row["kind"], row["images"]) for row in rows] == [
-        (row["kind"], row["images"]) for row in expected
-    ]
+    at = [[(row["kind"], row["images"]) for row in some] for some in (rows, expected)]
+    assert at[0] == at[1]
     assert [row["images"] for row in rows if row["kind"] == "validation"] == [16, 32, 48]
     for row, same in zip(rows, expected, strict=True):
         for name in same.keys() - {"kind", "images", "seconds", "images_per_second", "waiting"}:
@@ -126,18 +142,15 @@ def test_two_processes_train_one_run_that_one_process_can_go_on_with(folder, tmp
             assert row[name] == pytest.approx(same[name], rel=1e-3, abs=1e-4), (row["images"], name)
 
 
-def test_what_fails_in_all_processes_is_said_once(folder, tmp_path):
-    ended = two_processes(
-        *("-m", "derender", "train", "--data", str(folder), "--preset", "small", "--device", "cpu"),
-        *("--out", str(tmp_path / "run"), *settings("batch_size=7")),
-    )
-    said = "".join(words for _, words in ended)
-    assert [code for code, _ in ended] == [2, 2], said
+def test_what_fails_in_all_processes_is_said_once(told):
+    each = [words[0] for words in told[1]]
+    said = "\n".join(each)
+    assert all(words.endswith("ended with 2") for words in each), said
     complaints = [line for line in said.splitlines() if line.startswith("derender:")]
     assert len(complaints) == 1, said
     assert "batch_size 7 cannot be shared evenly by 2 processes: set batch_size=6" in complaints[0]
     assert "Traceback" not in said
-    assert not (tmp_path / "run").exists()
+    assert not (told[2] / "refused").exists()
 
 
 def test_ranks_have_the_rows_of_the_batch_of_one_process_between_them():
