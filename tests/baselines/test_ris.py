@@ -3,10 +3,8 @@
 import numpy as np
 import pytest
 import torch
-from derender.data.masks import MASK_CLASSES
 from PIL import Image
 
-from derender import FeatureTable
 from derender.baselines import load_baseline
 from derender.baselines.e4e import E4e, E4eSettings
 from derender.baselines.ris import (
@@ -20,8 +18,7 @@ from derender.baselines.ris import (
     spherical_kmeans,
 )
 from derender.baselines.stylegan2_generator import Generator, GeneratorSettings, style_layers
-from derender.data import read_images
-from derender.features.neighbours import nearest
+from derender.data import MASK_CLASSES, read_images
 
 PARTS = ("hair", "skin", "nose", "mouth")  # of the planted generator: quarters of the width, left to right
 EACH = 4  # channels that paint a part
@@ -180,22 +177,6 @@ def test_taking_a_part_changes_its_place_alone(catalogue, generator):
     own, swapped = model.rebuild(model.styles(images)), model.swapped(images, others, "mouth")
     change = (swapped - own).abs().mean(dim=(0, 1, 2))
     assert change[24:].min() > 0.05 and change[:16].max() == 0  # the filter reaches 7 pixels beyond
-
-
-def test_retrieval_by_part_sees_that_part_alone(catalogue, generator):
-    """Among codes mixed of two images, each part finds the one that it comes from."""
-    model = catalogue
-    net = model.e4e.generator
-    styles = torch.cat(net.styles(torch.randn(6, SIZES.codes, 8, generator=generator)), dim=1)
-    skin = model.row("skin") > 0
-    mixed = styles.clone()
-    mixed[:, skin] = styles.roll(1, dims=0)[:, skin]  # image i has the skin of image i - 1
-    columns = {part: (styles * model.row(part)).numpy() for part in ("hair", "skin")}
-    table = FeatureTable(tuple(f"{n}.png" for n in range(6)), columns, {}, {})
-    for part, shift in (("hair", 0), ("skin", -1)):
-        query = (mixed * model.row(part)).numpy()
-        found = nearest(table, query, part, k=1).rows[:, 0]
-        assert found.tolist() == [(n + shift) % 6 for n in range(6)]
 
 
 def test_a_catalogue_lies_in_a_folder(catalogue, tmp_path):

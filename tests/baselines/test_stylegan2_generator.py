@@ -124,15 +124,12 @@ def test_upfirdn_is_scipys(up, padding, generator):
         torch.testing.assert_close(one, torch.from_numpy(wanted))
 
 
-def test_the_filter_keeps_brightness_and_mirrors(generator):
+def test_the_filter_keeps_brightness():
     assert TAPS.sum() == 1
     flat = torch.full((1, 1, 8, 8), 0.7, dtype=torch.float64)
     twice = upfirdn(flat, 2 * TAPS, up=2, padding=(2, 1))
     assert twice.shape == (1, 1, 16, 16)
     torch.testing.assert_close(twice[..., 2:-2, 2:-2], torch.full((1, 1, 12, 12), 0.7, dtype=torch.float64))
-    images = torch.randn(1, 2, 6, 8, dtype=torch.float64, generator=generator)
-    own, mirrored = (upfirdn(x, TAPS, up=2, padding=(2, 1)) for x in (images, images.flip(-1)))
-    torch.testing.assert_close(mirrored, own.flip(-1))
 
 
 def by_one_kernel_an_image(images, weight, style, demodulate, up):

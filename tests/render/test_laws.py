@@ -146,26 +146,20 @@ def test_step_from_an_angle_and_occlusion_takes_the_nearer_surface(backend, yaw)
     ("view", "shift"),
     [({"ry": 0.3}, (-1, 0)), ({"rx": 0.3}, (0, 1)), ({"tx": 0.02}, (1, 0)), ({"ty": 0.02}, (0, 1))],
 )
-def test_signs_of_the_camera_in_the_picture(backend, view, shift):
+def test_signs_of_the_camera_in_the_image(backend, view, shift):
     """A bright spot at the tip of a bump moves left with yaw, down with pitch (the top comes forward)."""
-    size = 33
-    u, v = (pixel_grid(size, size) - (size - 1) / 2).unbind(-1)
+    u, v = (pixel_grid(33, 33) - 16).unbind(-1)
     depth = (1.0 - 0.05 * (-(u**2 + v**2) / 50).exp())[None]
     spot = (-(u**2 + v**2) / 4).exp()[None, None]
     image = warp(spot, depth, camera(**view), FOV_DEG, backend).image[0, 0]
     moved = [float((image * axis).sum() / image.sum()) for axis in (u, v)]
     for distance, sign in zip(moved, shift, strict=True):
         assert distance * sign > 2 if sign else abs(distance) < 0.5
-
-
-def test_roll_turns_the_picture_clockwise(backend):
-    size = 33
-    u, v = (pixel_grid(size, size) - (size - 1) / 2).unbind(-1)
-    spot_on_top = (-(u**2 + (v + 10) ** 2) / 4).exp()[None, None]
-    plane = torch.ones(1, size, size, dtype=torch.float64)
-    image = warp(spot_on_top, plane, camera(rz=math.pi / 2), FOV_DEG, backend).image[0, 0]
-    assert float((image * u).sum() / image.sum()) == pytest.approx(10, abs=0.1)
-    assert float((image * v).sum() / image.sum()) == pytest.approx(0, abs=0.1)
+    above = (-(u**2 + (v + 10) ** 2) / 4).exp()[None, None]  # roll turns the image clockwise
+    plane = torch.ones(1, 33, 33, dtype=torch.float64)
+    image = warp(above, plane, camera(rz=math.pi / 2), FOV_DEG, backend).image[0, 0]
+    moved = [float((image * axis).sum() / image.sum()) for axis in (u, v)]
+    assert moved == pytest.approx([10, 0], abs=0.1)
 
 
 def test_defaults_parts_and_scenes_are_the_same_rendering(backend, generator):
@@ -264,16 +258,6 @@ def test_cameras_that_turn_the_surface_away_are_survived(backend, view, dtype, g
         assert result.mask.mean() > 0.5  # both faces are seen
     if view.get("tz", 0) in (-2.0, 1e6) or not math.isfinite(sum(view.values())):
         assert (result.mask == 0).all()
-
-
-def test_rough_depth_under_strong_cameras_is_survived(backend, generator):
-    depth = 0.9 + 0.2 * torch.rand(8, 16, 16, generator=generator)
-    _, albedo, light, pose = scene(8, 16, 16, generator, turn_rad=math.pi)
-    inputs = [value.requires_grad_() for value in (depth, albedo, light, pose)]
-    result = render(*inputs, FOV_DEG, backend)
-    assert_empty_where_uncovered(result)
-    for gradient in torch.autograd.grad(result.image.sum() + result.depth.sum(), inputs):
-        assert gradient.isfinite().all()
 
 
 @pytest.mark.parametrize("bad", [0.0, -1.0, math.nan, math.inf, -math.inf])

@@ -26,15 +26,7 @@ from pydantic import Field, field_validator
 from torch import Generator, Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits, mse_loss, one_hot
 
-from derender.baselines.model import (
-    ADAM,
-    BaselineSettings,
-    Features,
-    Images,
-    LoopModel,
-    LossInputs,
-    optional,
-)
+from derender.baselines.model import ADAM, BaselineSettings, Features, Images, LoopModel, LossInputs, optional
 from derender.networks.decoders import MapDecoder
 from derender.networks.encoders import Encoder, NetworkSettings
 from derender.settings import Settings

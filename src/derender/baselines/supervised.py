@@ -15,14 +15,7 @@ from pydantic import Field, field_validator
 from torch import Generator, Tensor
 from torch.nn.functional import cross_entropy
 
-from derender.baselines.model import (
-    BaselineModel,
-    BaselineSettings,
-    Features,
-    Images,
-    ShortRun,
-    optional,
-)
+from derender.baselines.model import BaselineModel, BaselineSettings, Features, Images, ShortRun, optional
 from derender.baselines.simclr import AugmentSettings, augment
 from derender.data import ImageSet, as_float, split_indices
 from derender.features import map_batches, missing

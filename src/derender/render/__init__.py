@@ -6,12 +6,4 @@
 from derender.render.backends import available_backends, chosen_backend
 from derender.render.renderer import Rendering, render, render_scene, shade, warp
 
-__all__ = [
-    "Rendering",
-    "available_backends",
-    "chosen_backend",
-    "render",
-    "render_scene",
-    "shade",
-    "warp",
-]
+__all__ = ["Rendering", "available_backends", "chosen_backend", "render", "render_scene", "shade", "warp"]

@@ -18,12 +18,7 @@ from torch import Tensor
 
 from derender.render.backends import chosen_backend, operators
 from derender.render.rasterize import mark_triangles, rasterize
-from derender.render.triton_launch import (
-    float64_bits,
-    launch,
-    programs_per_image,
-    scattered_sums,
-)
+from derender.render.triton_launch import float64_bits, launch, programs_per_image, scattered_sums
 from derender.scene.camera import focal_px, motion, unproject
 
 
