@@ -71,16 +71,12 @@ def open_baseline(
 
     Args:
         name: of a baseline that has a network.
-        source: its run folder; for e4e or its generator also a published .pt file; for dinov2 an id or a
-            folder of weights (default: facebook/dinov2-small); for untrained the derender model to copy.
+        source: its run folder; for e4e also a published .pt file; for dinov2 an id or a folder of weights
+            (default: facebook/dinov2-small); for untrained the derender model to copy.
         device: "auto", "cpu" or "cuda".
         features: names of the features to compute; by default the baseline's first.
         image_size: side of the input images, where the network does not fix it (dinov2).
         seed: of the fresh weights of untrained.
-
-    Raises:
-        ValueError: unknown name or feature, no source where one is needed, or damaged weights.
-        FileNotFoundError: there is no such source.
     """
     from derender.inputs import device_named
 
@@ -96,15 +92,11 @@ def embed_baseline(
     device: str = "auto", progress: Callable[[int, int], object] | None = None,
     reading: Mapping[str, Any] | None = None, **how: Any,
 ) -> "Embedded":  # fmt: skip
-    """Write the feature table of a baseline or a control; arguments as for ``open_baseline``, and:
+    """Write the feature table of a baseline or a control to the parquet file ``out``.
 
-    Args:
-        images: an address, or an image set.
-        out: the parquet file.
-        components: numbers in pca and noise.
-        progress: called with (images done, images in all).
-        reading: how an address is read: ``dataset``, ``part`` and ``limit``.
-        how: further keywords of `derender.embed_to_file`, for baselines with a network.
+    Arguments are ``open_baseline``'s; ``components``, the numbers in pca and noise; ``reading``, how an
+    address of images is read (``dataset``, ``part``, ``limit``); and for networks others of
+    `derender.embed_to_file`.
     """
     from derender.baselines.controls import control_features
     from derender.features import Embedded, embed_to_file

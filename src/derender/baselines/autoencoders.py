@@ -1,19 +1,13 @@
-"""Autoencoders: plain, beta-VAE and VQ-VAE; each becomes a code and an image again, without any physics.
+"""Autoencoders: plain, beta-VAE and VQ-VAE; each makes a code and an image again, without any physics.
 
 Plain: encoder and map decoder of our albedo net, 12,982,848 parameters, least squares. beta-VAE: the same
 with a normal posterior over the code; source Higgins et al., *beta-VAE* (ICLR 2017), Bernoulli likelihood as
-there, divided by the number of colour values in an image so that both terms have one scale.
-
-VQ-VAE: source van den Oord et al., *Neural Discrete Representation Learning* (2017), in the size that the
-paper compares with (two convolutions k4 s2 p1, two residual blocks of ReLU, conv3, BatchNorm, ReLU, conv1,
-BatchNorm between). The paper says 416 channels and 19,199,491 parameters; that count is the one of 512
-channels, 416 have 12,724,195: both are offered (``width``). Both counts hold for eight BatchNorms, 512 codes
-as trainable parameters, and biases throughout; they say nothing of where the eight stand. Here: one after
-each convolution and each residual block of the encoder, one inside each of its blocks, one between the
-decoder's blocks and one between its transposed convolutions. The codebook is the `VectorQuantize` of
-vector-quantize-pytorch (MIT), learnt by gradient as in the source (codebook term + 0.25 commitment), started
-by k-means on the first batch; entries that hardly any place chose of late are replaced by places of the
-batch. Leaves out sampling of new images.
+there, divided by the number of colour values so that both terms have one scale. VQ-VAE: source van den Oord
+et al., *Neural Discrete Representation Learning* (2017), in the size that the paper compares with, by its two
+readings: 19,199,491 parameters are those of 512 channels, 416 have 12,724,195 (``width``). Both counts hold
+for eight BatchNorms, whose places they do not tell. The codebook, of vector-quantize-pytorch (MIT), is learnt
+by gradient as in the source and started by k-means on the first batch; entries that hardly any place chose of
+late are replaced by places of the batch.
 """
 
 from collections.abc import Iterator
@@ -26,11 +20,18 @@ from pydantic import Field, field_validator
 from torch import Generator, Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits, mse_loss, one_hot
 
-from derender.baselines.model import ADAM, BaselineSettings, Features, Images, LoopModel, LossInputs, optional
+from derender.baselines.model import (
+    BaselineConfig,
+    BaselineSettings,
+    Features,
+    Images,
+    LoopModel,
+    LossInputs,
+    optional,
+)
 from derender.networks.decoders import MapDecoder
 from derender.networks.encoders import Encoder, NetworkSettings
 from derender.settings import Settings
-from derender.training.config import LoopSettings, OptimiserSettings
 
 Grid = Float[Tensor, "n d gh gw"]
 """One vector for each of the places of a grid."""
@@ -57,12 +58,11 @@ class AutoencoderSettings(BaselineSettings):
         return NetworkSettings(image_size=self.image_size, width=self.width, code_size=self.code_size)
 
 
-class AutoencoderConfig(LoopSettings):
+class AutoencoderConfig(BaselineConfig):
     """One training run of a plain autoencoder."""
 
     baseline: Literal["ae"] = "ae"
     model: AutoencoderSettings = AutoencoderSettings()
-    optimiser: OptimiserSettings = ADAM
 
 
 class Autoencoder(LoopModel):
@@ -170,13 +170,12 @@ class VqvaeObjective(Settings):
     commitment: float = Field(default=0.25, ge=0)
 
 
-class VqvaeConfig(LoopSettings):
+class VqvaeConfig(BaselineConfig):
     """One training run of a VQ-VAE; the learning rate is that of the paper's text."""
 
     baseline: Literal["vqvae"] = "vqvae"
     model: VqvaeSettings = VqvaeSettings()
     objective: VqvaeObjective = VqvaeObjective()
-    optimiser: OptimiserSettings = ADAM
 
 
 class Vqvae(LoopModel):

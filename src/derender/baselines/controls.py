@@ -24,28 +24,15 @@ ORIENTATIONS, BLOCK_CELLS = 9, 2
 
 
 def control_features(
-    name: str,
-    images: ImageSet | str | Path,
-    *,
-    image_size: int = 64,
-    dataset: str = "auto",
-    limit: int | None = None,
-    part: str = "all",
-    model: str | Path | None = None,
-    components: int = 64,
-    seed: int = 0,
-    progress: Progress | None = None,
-) -> FeatureTable:
+    name: str, images: ImageSet | str | Path, *, image_size: int = 64, dataset: str = "auto",
+    limit: int | None = None, part: str = "all", model: str | Path | None = None, components: int = 64,
+    seed: int = 0, progress: Progress | None = None,
+) -> FeatureTable:  # fmt: skip
     """The table of a control by its name, pixels, pca, hog or noise, which is also that of its only factor.
 
-    Args:
-        name: of the control.
-        images: an image set, or the address of one.
-        image_size, dataset, limit, part, model: how an address is read, see `derender.inputs.as_images`. The
-            principal components of a part are those of the training part.
-        components: of pca, and dimensions of noise.
-        seed: of the solver of pca, and of noise.
-        progress: called with (images done, images in all), by hog.
+    ``images``, an image set or the address of one, are read as by `derender.inputs.as_images`; the principal
+    components of a part are those of the training part. ``components`` are those of pca, and noise has as
+    many dimensions; ``seed`` is of pca's solver and of noise; hog calls ``progress`` with (images done, all).
     """
     whole = as_images(images, image_size, dataset=dataset, limit=limit)
     chosen = part_of(whole, part, model)
@@ -79,11 +66,7 @@ def pca_features(
 ) -> FeatureTable:
     """Principal components of the pixels, each of variance 1: factor ``pca``.
 
-    Args:
-        images: N images to describe.
-        components: how many.
-        fit_on: images that give the components; by default ``images`` themselves.
-        seed: of the randomised solver.
+    ``fit_on`` gives the components; by default ``images`` themselves. ``seed`` is of the randomised solver.
     """
     source = images if fit_on is None else fit_on
     shape = source.images.shape[1:]
@@ -104,10 +87,7 @@ def pca_features(
 def hog_features(images: ImageSet, *, cell_px: int = 8, progress: Progress | None = None) -> FeatureTable:
     """Histograms of oriented gradients, factor ``hog``; each block of 36 has length 1 at most.
 
-    Args:
-        images: N images to describe.
-        cell_px: side of a cell in pixels; an image has at least two cells a side.
-        progress: called with (images done, images in all).
+    ``cell_px`` is the side of a cell; an image has at least two cells a side.
     """
     height, width = images.images.shape[-2:]
     largest = min(height, width) // BLOCK_CELLS

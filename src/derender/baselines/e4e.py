@@ -15,16 +15,16 @@ mean code. Leaves out the identity loss, which needs a face recogniser.
 from itertools import pairwise
 from math import log2
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import torch
-from jaxtyping import Float, UInt8
-from pydantic import AfterValidator, Field, PositiveInt
+from jaxtyping import UInt8
+from pydantic import Field, PositiveInt
 from torch import Tensor, nn
 from torch.nn.functional import adaptive_avg_pool2d, interpolate, leaky_relu, mse_loss
 
 from derender.baselines.model import (
-    ADAM,
+    BaselineConfig,
     BaselineModel,
     BaselineSettings,
     Features,
@@ -34,21 +34,13 @@ from derender.baselines.model import (
     load_baseline,
 )
 from derender.baselines.stylegan2 import CENTRE_LATENTS, Stylegan
-from derender.baselines.stylegan2_generator import (
-    Codes,
-    EqualLinear,
-    Generator,
-    GeneratorSettings,
-    Maps,
-    power_of_two,
-)
+from derender.baselines.stylegan2_generator import Codes, EqualLinear, Generator, GeneratorSettings, Side
 from derender.objectives.perceptual import build_perceptual
 from derender.objectives.perceptual_features import PerceptualFeatures
 from derender.objectives.self_features import SelfFeatures, load_self_features
 from derender.settings import Settings
 from derender.storage.atomic import atomic_file
 from derender.training.batches import random_stream
-from derender.training.config import LoopSettings, OptimiserSettings
 from derender.training.task import PhaseProgress
 
 FIRST_MIDDLE, FIRST_FINE = 3, 7  # numbers of the codes
@@ -57,7 +49,7 @@ FIRST_MIDDLE, FIRST_FINE = 3, 7  # numbers of the codes
 class EncoderSettings(BaselineSettings):
     """Sizes; the defaults are small. The published encoder has 256, 64, (3, 4, 14, 3) and 16."""
 
-    image_size: Annotated[int, AfterValidator(power_of_two)] = Field(default=64, ge=32)
+    image_size: Side = Field(default=64, ge=32)
     width: int = Field(default=16, ge=1)
     units: tuple[PositiveInt, PositiveInt, PositiveInt, PositiveInt] = (1, 1, 2, 1)
     reduction: int = Field(default=4, ge=1)
@@ -81,14 +73,13 @@ class InversionObjective(Settings):
     self_features_steps: int = Field(default=600, ge=1)
 
 
-class E4eConfig(LoopSettings):
+class E4eConfig(BaselineConfig):
     """One training run of an e4e encoder."""
 
     baseline: Literal["e4e"] = "e4e"
     model: EncoderSettings = EncoderSettings()
     objective: InversionObjective = InversionObjective()
     batch_size: int = Field(default=16, ge=2)
-    optimiser: OptimiserSettings = ADAM
     channels_last: bool = False
 
 
@@ -108,7 +99,7 @@ class Unit(nn.Module):
         self.squeeze = nn.Conv2d(outputs, narrow, 1, bias=False)
         self.excite = nn.Conv2d(narrow, outputs, 1, bias=False)
 
-    def forward(self, maps: Maps) -> Maps:
+    def forward(self, maps: Tensor) -> Tensor:
         passed = self.shortcut_norm(self.shortcut(maps))
         change = self.last_norm(self.second(self.active(self.first(self.norm(maps)))))
         gate = self.excite(self.squeeze(adaptive_avg_pool2d(change, 1)).relu()).sigmoid()
@@ -124,7 +115,7 @@ class Head(nn.Module):
         self.convs = nn.ModuleList(nn.Conv2d(*pair, 3, 2, padding=1) for pair in pairwise(widths))
         self.linear = EqualLinear(outputs, outputs)
 
-    def forward(self, maps: Maps) -> Float[Tensor, "n o"]:
+    def forward(self, maps: Tensor) -> Tensor:
         for conv in self.convs:
             maps = leaky_relu(conv(maps))
         return self.linear(maps.flatten(1))
@@ -190,7 +181,7 @@ class E4e(LoopModel):
 
     @classmethod
     def open(cls, source: str | Path | None, *, image_size: int = 0, seed: int = 0) -> BaselineModel:
-        """The encoder of a run, or a published one (a .pt file); see `registry.open_baseline`."""
+        """The encoder of a run, or a published one (a .pt file); see `open_baseline`."""
         if source is not None and Path(source).suffix.lower() == ".pt":
             from derender.baselines.published import load_published_e4e
 

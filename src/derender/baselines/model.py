@@ -26,25 +26,21 @@ from derender.settings import Settings
 from derender.storage.atomic import atomic_folder
 from derender.storage.tensors import read_tensors, write_tensors
 from derender.training import run_folder
+from derender.training import task as loop
 from derender.training.checkpoint import fit_weights
-from derender.training.config import FinetuneConfig, OptimiserSettings, TrainConfig, with_changes
-from derender.training.loop import train_task
-from derender.training.task import (
-    Held,
-    PhaseProgress,
-    Precision,
-    Progress,
-    StepLosses,
-    TrainingTask,
-    TrainResult,
+from derender.training.config import (
+    FinetuneConfig,
+    LoopSettings,
+    OptimiserSettings,
+    TrainConfig,
+    with_changes,
 )
+from derender.training.loop import train_task
 from derender.training.watch import FiniteWatch
 
 FORMAT = 1
 WEIGHTS_FILE, CONFIG_FILE = "model.safetensors", "config.json"
 PICKLES = (".pth", ".pt", ".ckpt", ".pkl", ".pickle", ".bin")
-ADAM = OptimiserSettings(learning_rate=1e-3, weight_decay=0.0)
-"""The optimiser of most baselines."""
 OUTSIDE_LOSS = ("l1", "codes_used", "active", "found")
 """Numbers that ``losses`` returns beside the losses."""
 Images = Float[Tensor, "n 3 h w"]
@@ -69,6 +65,12 @@ class BaselineSettings(Settings):
     """The settings that every baseline has: the side of its input images, in pixels."""
 
     image_size: int = 64
+
+
+class BaselineConfig(LoopSettings):
+    """Settings of a training run in the common loop."""
+
+    optimiser: OptimiserSettings = OptimiserSettings(learning_rate=1e-3, weight_decay=0.0)
 
 
 class BaselineModel(nn.Module, ABC):
@@ -213,7 +215,7 @@ class LossInputs:
 
     config: Any
     generator: Generator
-    precision: Precision
+    precision: loop.Precision
     aid: Any = None
 
 
@@ -231,7 +233,9 @@ class LoopModel(BaselineModel):
         return cls(config.model)
 
     @staticmethod
-    def prepare(config: Any, images: UInt8[Tensor, "n 3 h w"], file: Path, progress: PhaseProgress) -> Any:
+    def prepare(
+        config: Any, images: UInt8[Tensor, "n 3 h w"], file: Path, progress: loop.PhaseProgress
+    ) -> Any:
         """What the losses need besides the network, from the training images; ``file`` keeps it."""
         return None
 
@@ -252,7 +256,7 @@ class LoopModel(BaselineModel):
         *,
         sample_sheet: SheetOf | None = None,
         **how: Any,
-    ) -> TrainResult:
+    ) -> loop.TrainResult:
         """Train in the common loop; see `train_baseline`."""
         task = BaselineTask(config)
         sheet = None if sample_sheet is None else sample_sheet(task.shown)
@@ -260,19 +264,15 @@ class LoopModel(BaselineModel):
 
 
 @dataclass(frozen=True)
-class BaselineTask(TrainingTask):
+class BaselineTask(loop.TrainingTask):
     """Train a baseline as its configuration says."""
 
     config: Any
 
     @property
-    def network(self) -> type[LoopModel]:
-        return network_type(self.config.baseline)
-
-    @property
     def outside_loss(self) -> tuple[str, ...]:
         """Names of numbers by which held-out images are not judged."""
-        return (*OUTSIDE_LOSS, *self.network.not_judged)
+        return (*OUTSIDE_LOSS, *network_type(self.config.baseline).not_judged)
 
     def check(self) -> None:
         """A missing package or model is an error before a folder is made."""
@@ -282,13 +282,13 @@ class BaselineTask(TrainingTask):
         """The untrained network; torch's global generator is left as it was."""
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.config.seed)
-            return self.network.build(self.config)
+            return network_type(self.config.baseline).build(self.config)
 
     def step_module(
         self, model: nn.Module, run: run_folder.RunFolder, images: UInt8[Tensor, "n 3 h w"],
-        progress: PhaseProgress,
+        progress: loop.PhaseProgress,
     ) -> "BaselineStep":  # fmt: skip
-        aid = self.network.prepare(self.config, images, run.perceptual, progress)
+        aid = network_type(self.config.baseline).prepare(self.config, images, run.perceptual, progress)
         return BaselineStep(model, self.config, aid)
 
     def watch(self, memory: dict[str, Any]) -> FiniteWatch:
@@ -309,12 +309,12 @@ class BaselineStep(nn.Module):
         self.aid = [aid]  # in a list: its weights are not this module's
 
     def forward(
-        self, images: Tensor, generator: Generator, precision: Precision, *_: Any
-    ) -> tuple[Tensor, Held]:
+        self, images: Tensor, generator: Generator, precision: loop.Precision, *_: Any
+    ) -> tuple[Tensor, loop.Held]:
         assert isinstance(self.model, LoopModel)
         terms = self.model.losses(images, LossInputs(self.config, generator, precision, self.aid[0]))
         total = torch.stack([term for name, term in terms.items() if name not in OUTSIDE_LOSS]).sum()
-        return total, Held(StepLosses(total, {name: term.detach() for name, term in terms.items()}))
+        return total, loop.Held(loop.StepLosses(total, {name: term.detach() for name, term in terms.items()}))
 
 
 class ShortRun:
@@ -322,7 +322,7 @@ class ShortRun:
 
     def __init__(
         self, config: Any, images: ImageSet, out: str | Path, *, resume: bool = False,
-        progress: Callable[[Progress], None] | None = None, accelerator: str = "cpu",
+        progress: Callable[[loop.Progress], None] | None = None, accelerator: str = "cpu",
     ):  # fmt: skip
         if resume:
             raise ValueError(
@@ -340,18 +340,18 @@ class ShortRun:
 
     def note(self, done: int, total: int, terms: dict[str, float] | None = None) -> None:
         """Report progress, in images."""
-        self.report(Progress("train", done, total, done / self.seconds, terms))
+        self.report(loop.Progress("train", done, total, done / self.seconds, terms))
 
     def record(self, kind: str, images: int, numbers: dict[str, float]) -> None:
         """A line of metrics.jsonl."""
         row = {"kind": kind, "images": images, "seconds": round(self.seconds, 2), **numbers}
         run_folder.append_metrics(self.folder, row)
 
-    def finish(self, model: BaselineModel, images: int, numbers: dict[str, float]) -> TrainResult:
+    def finish(self, model: BaselineModel, images: int, numbers: dict[str, float]) -> loop.TrainResult:
         """Save the model; ``numbers`` are the last scores by name."""
         seconds = self.seconds
         model.save(self.folder.model)
-        return TrainResult(self.folder.path, images, seconds, images / seconds, numbers, "images", ())
+        return loop.TrainResult(self.folder.path, images, seconds, images / seconds, numbers, "images", ())
 
 
 def baseline_config(name: str, overrides: Sequence[str] = ()) -> Settings:

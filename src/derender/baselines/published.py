@@ -96,9 +96,8 @@ def published_names(ours: Iterable[str], names: Names) -> dict[str, str]:
 def load_published_generator(path: str | Path) -> Generator:
     """The averaged generator (``g_ema``) of a stylegan2-pytorch file, ready to use.
 
-    Raises:
-        FileNotFoundError: there is no such file; says where to get it.
-        ValueError: it is damaged, needs code to be run, or is of another architecture (names the first key).
+    A missing file is an error that says where to get it; one that is damaged, needs code to be run, or is of
+    another architecture is named with its first key that does not fit.
     """
     (weights,) = _parts(path, GENERATOR_FILE, "a generator of stylegan2-pytorch", "g_ema")
     with _architecture_of(path):
@@ -262,16 +261,10 @@ class Dinov2(BaselineModel):
     def open(
         cls, source: str | Path | None = None, *, image_size: int = 64, seed: int = 0, enlarged: int = 224
     ) -> "Dinov2":
-        """The network with its published weights, ready to embed.
+        """The network with its published weights, ready to embed; ``seed`` is ignored.
 
-        Args:
-            source: an id in the Hugging Face cache, or a folder with config.json and model.safetensors.
-            image_size: side of its input images.
-            seed: is ignored.
-            enlarged: side to which it enlarges them.
-
-        Raises:
-            ValueError: there are no weights, or they are a pickle, or of another kind of network.
+        ``source`` is an id in the Hugging Face cache, or a folder with config.json and model.safetensors;
+        weights that are not there, a pickle, or another kind of network are a ValueError.
         """
         settings = Dinov2Settings(image_size=image_size, enlarged=enlarged)
         if source is not None:

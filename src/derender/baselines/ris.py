@@ -28,7 +28,7 @@ from torch.nn.functional import adaptive_avg_pool2d, interpolate, normalize, one
 from derender.baselines.e4e import E4e, E4eSettings
 from derender.baselines.model import BaselineModel, Features, Images, SheetOf, ShortRun
 from derender.baselines.stylegan2_generator import TINY, Codes, Maps, StyleLayer
-from derender.data import ImageSet, read_masks, split_indices, suggestion
+from derender.data import ImageSet, read_masks, split_indices
 from derender.settings import Settings
 from derender.training.batches import random_stream
 from derender.training.loop import SAMPLE_COUNT
@@ -97,9 +97,6 @@ class Ris(BaselineModel):
 
     def row(self, part: str) -> Float[Tensor, " s"]:
         """How much of each style channel belongs to a part, 0..1."""
-        if part not in self.features:
-            known = ", ".join(self.features)
-            raise ValueError(f"no part {part!r}{suggestion(part, self.features)}; there is {known}")
         return self.matrix[self.features.index(part)]
 
     def describe(self, images: Images) -> Features:
@@ -129,12 +126,7 @@ class Ris(BaselineModel):
         cls, config: RisConfig, images: ImageSet, out: str | Path, *, sample_sheet: SheetOf | None = None,
         resume: bool = False, accelerator: str = "cpu", **how: Any,
     ) -> TrainResult:  # fmt: skip
-        """Build a catalogue into a new run folder; see `registry.train_baseline`. No resume.
-
-        Raises:
-            FileExistsError: the folder is not empty.
-            ValueError: no encoder was named, or the images have no masks.
-        """
+        """Build a catalogue into a new run folder; see `train_baseline`. No resume."""
         if config.e4e is None and not resume:
             raise ValueError(
                 "name the encoder whose generator is catalogued, as in --set e4e=RUN (a run of derender "
@@ -161,11 +153,7 @@ class Ris(BaselineModel):
 def masked_rows(
     images: ImageSet, config: RisConfig
 ) -> tuple[Images, Float[Tensor, "n p h w"], tuple[str, ...]]:
-    """The training part's images, a map of 0 and 1 for every part that occurs, and the parts' names.
-
-    Raises:
-        ValueError: some images have no masks.
-    """
+    """The training part's images, a map of 0 and 1 for every part that occurs, and the parts' names."""
     where: dict[str, Any] = {} if config.masks is None else {"masks": config.masks}
     masked = read_masks(images.source, config.image_size, **where)
     row_of = {file: row for row, file in enumerate(masked.images.files)}
@@ -181,23 +169,13 @@ def masked_rows(
 
 
 def build_catalogue(
-    e4e: E4e,
-    images: Images,
-    parts: Float[Tensor, "n p h w"],
-    names: tuple[str, ...],
-    config: RisConfig,
-    *,
+    e4e: E4e, images: Images, parts: Float[Tensor, "n p h w"], names: tuple[str, ...], config: RisConfig, *,
     progress: Callable[[int, int], None] = lambda _done, _total: None,
-) -> Ris:
+) -> Ris:  # fmt: skip
     """Cluster, name and score: a model ready to embed.
 
-    Args:
-        e4e: the inversion and its generator.
-        images: in 0..1 at the encoder's size.
-        parts: 1 where a pixel shows the part and 0 elsewhere.
-        names: of the parts.
-        config: sizes and the seed.
-        progress: called with (images done, all).
+    ``images`` are at the encoder's size, ``parts`` are 1 where a pixel shows the part of that name and 0
+    elsewhere; ``progress`` is called with (images done, all).
     """
     net, total, done = e4e.generator, 2 * config.samples + len(images), 0
 
@@ -227,19 +205,15 @@ def build_catalogue(
     at_side = adaptive_avg_pool2d(parts, side)
     cluster_part = name_clusters(torch.cat(clusters), config.clusters, at_side)
 
-    energy: list[Any] = [0.0] * len(net.layers)
-    area: list[Any] = [0.0] * len(net.layers)
+    energies = []
     for seen in activations(w, net.w_plus):
         shown = cluster_part[nearest_cluster(seen[layer], centres)]
         masks = one_hot(shown, len(names)).movedim(-1, 1).to(w)
-        for number, activation in enumerate(seen):
-            more, places_of = part_energy(activation, masks)
-            energy[number] = energy[number] + more
-            area[number] = area[number] + places_of[:, None].clamp(min=TINY)
-    scores = torch.cat([e / a for e, a in zip(energy, area, strict=True)], dim=1)
-    matrix = part_matrix(
-        scores, net.layers, names, temperature=config.temperature, threshold=config.threshold
-    )
+        energies.append([part_energy(activation, masks) for activation in seen])
+    scores, none = [], torch.zeros(())
+    for each in zip(*energies, strict=True):  # each layer's, batch by batch
+        scores.append(sum((energy for energy, _ in each), none) / sum((area for _, area in each), none))
+    matrix = part_matrix(torch.cat(scores, dim=1), net.layers, names, config.temperature, config.threshold)
     own = {"parts": names, "clusters": config.clusters, "cluster_layer": layer}
     model = Ris(RisSettings(**e4e.settings.model_dump(), **own)).to(images.device)
     model.e4e.load_state_dict(e4e.state_dict())
@@ -255,9 +229,6 @@ def spherical_kmeans(
 
     Initial centres are far from each other (as in k-means++); a cluster that loses all rows gets the row that
     is farthest from its own centre. Ends when no row changes its cluster.
-
-    Raises:
-        ValueError: there are fewer rows than clusters.
     """
     if len(vectors) < clusters:
         raise ValueError(
@@ -290,11 +261,10 @@ def nearest_cluster(activation: Maps, centres: Float[Tensor, "k c"]) -> Int64[Te
 def name_clusters(
     clusters: Int64[Tensor, "n h w"], count: int, parts: Float[Tensor, "n p h w"]
 ) -> Int64[Tensor, " k"]:
-    """The part of each of ``count`` clusters.
+    """The part of each of ``count`` clusters, from ``parts``, their shares of every place.
 
-    ``parts`` are shares of every place. A cluster goes to the part with the largest share * log(share / the
-    part's share of everything), so that small parts are found where they gather. A cluster without places
-    goes to the part that has most.
+    It is that with the largest share * log(share / the part's share of everything), so that small parts are
+    found where they gather, and of a cluster without places the part that has most.
     """
     member, flat = one_hot(clusters, count).flatten(0, 2).to(parts), parts.movedim(1, -1).flatten(0, 2)
     shares = (member.T @ flat) / member.sum(dim=0).clamp(min=1)[:, None]
@@ -305,23 +275,22 @@ def name_clusters(
 
 def part_energy(
     activation: Float[Tensor, "n c h w"], parts: Float[Tensor, "n p h2 w2"]
-) -> tuple[Float[Tensor, "p c"], Float[Tensor, " p"]]:
+) -> tuple[Float[Tensor, "p c"], Float[Tensor, "p 1"]]:
     """Summed squared, instance-normalised activation of every channel over every part, and the parts' areas.
 
-    The first over the second is a part's score: 1 on average over all places. The distance from the channel's
-    mean is squared: a channel that is on in most of the image scores highest where it is off. ``parts`` are
-    shares of every place, at any resolution.
+    The first over the second is a part's score: 1 on average over all places. ``parts`` are shares of every
+    place, at any resolution.
     """
     size = (activation.shape[2], activation.shape[3])
     shrinks = size[0] <= parts.shape[-2]
     at_size = adaptive_avg_pool2d(parts, size) if shrinks else interpolate(parts, size, mode="nearest")
     centred = activation - activation.mean(dim=(2, 3), keepdim=True)
     energy = centred.square() / (centred.square().mean(dim=(2, 3), keepdim=True) + TINY)
-    return torch.einsum("nchw,nphw->pc", energy, at_size), at_size.sum(dim=(0, 2, 3))
+    return torch.einsum("nchw,nphw->pc", energy, at_size), at_size.sum(dim=(0, 2, 3))[:, None].clamp(min=TINY)
 
 
 def part_matrix(
-    scores: Float[Tensor, "p s"], layers: Sequence[StyleLayer], parts: Sequence[str], *,
+    scores: Float[Tensor, "p s"], layers: Sequence[StyleLayer], parts: Sequence[str],
     temperature: float = 0.1, threshold: float = 0.8,
 ) -> Float[Tensor, "p1 s"]:  # fmt: skip
     """How much of each style channel belongs to each part, 0..1; the last row is the pose."""

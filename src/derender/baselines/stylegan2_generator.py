@@ -39,17 +39,20 @@ Noise = Sequence[Tensor] | None
 """One (m, 1, r, r) map for every styled convolution, m = 1 or the number of images; None is no noise."""
 
 
-def power_of_two(side: int) -> int:
-    """A side of images in pixels, from 8 to 1024."""
+def _power_of_two(side: int) -> int:
     if not (8 <= side <= 1024 and side.bit_count() == 1):
         raise ValueError(f"images of 8, 16, 32, ... 1024 pixels are made, not {side}")
     return side
 
 
+Side = Annotated[int, AfterValidator(_power_of_two)]
+"""Of images, in pixels."""
+
+
 class GeneratorSettings(BaselineSettings):
     """Sizes; the defaults are small. The published FFHQ network has 1024, 512, 8, 0.01, 32768 and 512."""
 
-    image_size: Annotated[int, AfterValidator(power_of_two)] = 64
+    image_size: Side = 64
     style_size: int = Field(default=128, ge=1)
     mapping_layers: int = Field(default=8, ge=1)
     mapping_rate: float = Field(default=0.01, gt=0)
@@ -167,21 +170,13 @@ class ToRgb(ModulatedConv):
 
 @dataclass(frozen=True)
 class StyleLayer:
-    """One layer that a style steers.
+    """One layer that a style steers."""
 
-    Attributes:
-        colour: whether it makes colours (ToRGB) or is a styled convolution.
-        index: which of its kind.
-        code: the w of W+ that it takes.
-        resolution: of the activation that the style scales, in pixels.
-        channels: numbers in its style.
-    """
-
-    colour: bool
-    index: int
-    code: int
-    resolution: int
-    channels: int
+    colour: bool  # whether it makes colours (ToRGB) or is a styled convolution
+    index: int  # which of its kind
+    code: int  # the w of W+ that it takes
+    resolution: int  # of the activation that the style scales, in pixels
+    channels: int  # numbers in its style
 
 
 def style_layers(settings: GeneratorSettings) -> tuple[StyleLayer, ...]:
