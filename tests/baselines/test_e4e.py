@@ -4,13 +4,11 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from derender.baselines import baseline_config, load_baseline
+from derender.baselines import baseline_config, load_baseline, train_baseline
 from derender.baselines.e4e import E4e, E4eConfig, E4eSettings, EncoderSettings, open_generator
-from derender.baselines.model import BaselineTask
 from derender.baselines.stylegan2_generator import GeneratorSettings
 from derender.report.run import baseline_sheet
 from derender.training.checkpoint import WEIGHTS_FILE
-from derender.training.loop import train_task
 from derender.training.run_folder import read_metrics
 
 TINY = GeneratorSettings(image_size=32, style_size=6, mapping_layers=2, channel_base=64, channel_max=6)
@@ -34,8 +32,8 @@ def images(generator):
     return torch.rand(2, 3, 32, 32, generator=generator)
 
 
-def task(name: str, images: int, *more: str) -> BaselineTask:
-    return BaselineTask(baseline_config(name, [*COMMON, *OWN[name], *more, f"images={images}"]))
+def config(name: str, images: int, *more: str):
+    return baseline_config(name, [*COMMON, *OWN[name], *more, f"images={images}"])
 
 
 @pytest.fixture(scope="module")
@@ -43,8 +41,8 @@ def runs(blobs, tmp_path_factory):
     """A finished run of a generator and one of its inversion."""
     folder = tmp_path_factory.mktemp("runs")
     for name in OWN:
-        one = task(name, 32, *[f"generator={folder / 'stylegan2'}"] * (name == "e4e"))
-        train_task(one, blobs, folder / name, sample_sheet=baseline_sheet(one.shown))
+        own = config(name, 32, *[f"generator={folder / 'stylegan2'}"] * (name == "e4e"))
+        train_baseline(own, blobs, folder / name, sample_sheet=baseline_sheet)
     torch.use_deterministic_algorithms(False)
     return folder
 
@@ -75,10 +73,10 @@ def test_the_mean_code_is_added(model, images):
 
 
 def test_codes_are_released_one_by_one(model, images, losses):
-    config = baseline_config("e4e", ["first_release=100", "release_every=10"])
+    own = baseline_config("e4e", ["first_release=100", "release_every=10"])
     for seen, released in ((0, 0), (99, 0), (100, 1), (109, 1), (110, 2), (500, 41)):
         model.train().seen.fill_(seen)
-        losses(model, images, config)
+        losses(model, images, own)
         assert model.released == released and model.seen == seen + 2
 
 
@@ -98,8 +96,8 @@ def test_losses_of_what_the_generator_made_from_its_mean_code(model, generator, 
 @pytest.mark.parametrize("name", OWN)
 def test_a_resumed_run_ends_with_the_very_weights_of_an_undisturbed_one(name, runs, blobs, tmp_path):
     own = [f"generator={runs / 'stylegan2'}"] * (name == "e4e")
-    train_task(task(name, 16, *own), blobs, tmp_path / "parts")
-    train_task(task(name, 32, *own), blobs, tmp_path / "parts", resume=True)
+    train_baseline(config(name, 16, *own), blobs, tmp_path / "parts")
+    train_baseline(config(name, 32, *own), blobs, tmp_path / "parts", resume=True)
     whole, parts = (
         load_file(run / "checkpoints" / "last" / WEIGHTS_FILE) for run in (runs / name, tmp_path / "parts")
     )
@@ -132,7 +130,7 @@ def test_a_run_without_a_generator_is_refused_before_a_folder_is_made(runs, blob
         ([f"generator={tmp_path / 'none.pt'}"], r"get stylegan2-ffhq-config-f\.pt"),
     ):
         with pytest.raises((ValueError, FileNotFoundError), match=told):
-            train_task(task("e4e", 32, *more), blobs, tmp_path / "run")
+            train_baseline(config("e4e", 32, *more), blobs, tmp_path / "run")
         assert not (tmp_path / "run").exists()
     with pytest.raises(ValueError, match="8, 16, 32"):
         baseline_config("e4e", ["image_size=48"])

@@ -11,14 +11,12 @@ from PIL import Image
 from safetensors.torch import load_file, save_file
 
 import derender
-from derender.baselines import baseline_config, load_baseline, network_type, read_any_config
-from derender.baselines.model import BaselineTask
+from derender.baselines import baseline_config, load_baseline, network_type, read_any_config, train_baseline
 from derender.features import embed_pictures
 from derender.report.run import baseline_sheet, run_page
 from derender.training import resolve, train
 from derender.training.checkpoint import WEIGHTS_FILE
 from derender.training.config import config_from_tree
-from derender.training.loop import train_task
 from derender.training.run_folder import read_config, read_metrics
 
 COMMON = ["image_size=32", "width=8", "batch_size=8", "checkpoint_every=24", "validate_every=24"]
@@ -26,8 +24,8 @@ COMMON += ["sample_every=48", "deterministic=true"]
 OWN = {"vqvae": ["codes=8"], "simclr": ["code_size=16"], "ae": ["code_size=16"], "beta-vae": ["code_size=16"]}
 
 
-def task(name: str, images: int, *more: str) -> BaselineTask:
-    return BaselineTask(baseline_config(name, [*COMMON, *OWN[name], f"images={images}", *more]))
+def config(name: str, images: int, *more: str):
+    return baseline_config(name, [*COMMON, *OWN[name], f"images={images}", *more])
 
 
 @pytest.fixture(scope="module")
@@ -35,8 +33,7 @@ def runs(blobs, tmp_path_factory):
     """One finished run of each, by name; generators have tests of their own."""
     folder = tmp_path_factory.mktemp("runs")
     for name in OWN:
-        one = task(name, 48)
-        train_task(one, blobs, folder / name, sample_sheet=baseline_sheet(one.shown))
+        train_baseline(config(name, 48), blobs, folder / name, sample_sheet=baseline_sheet)
     torch.use_deterministic_algorithms(False)
     return folder
 
@@ -54,7 +51,7 @@ def weights(run, which: str = "last") -> dict[str, torch.Tensor]:
 @pytest.mark.parametrize("name", OWN)
 def test_a_run_leaves_what_ours_leave_makes_a_table_and_resumes_exactly(name, runs, blobs, tmp_path):
     run = runs / name
-    assert read_any_config(run) == task(name, 48).config
+    assert read_any_config(run) == config(name, 48)
     assert {path.name for path in (run / "checkpoints").iterdir()} == {"last", "previous", "best"}
     assert [row["kind"] for row in read_metrics(run)] == ["train", "validation", "validation"]
     with Image.open(run / "samples" / "000000048.png") as sheet:
@@ -70,26 +67,26 @@ def test_a_run_leaves_what_ours_leave_makes_a_table_and_resumes_exactly(name, ru
     best = weights(run, "best")
     assert all(torch.equal(value, best[key]) for key, value in model.state_dict().items())
 
-    train_task(task(name, 24), blobs, tmp_path / "parts")
-    train_task(task(name, 48), blobs, tmp_path / "parts", resume=True)
+    train_baseline(config(name, 24), blobs, tmp_path / "parts")
+    train_baseline(config(name, 48), blobs, tmp_path / "parts", resume=True)
     whole, parts = weights(run), weights(tmp_path / "parts")
     assert whole.keys() == parts.keys() and all(torch.equal(whole[key], parts[key]) for key in whole)
     with pytest.raises(ValueError, match="was trained with another seed"):
-        train_task(task(name, 72, "seed=3"), blobs, tmp_path / "parts", resume=True)
+        train_baseline(config(name, 72, "seed=3"), blobs, tmp_path / "parts", resume=True)
 
 
 def test_physical_views_train_and_the_renderer_stays_out_of_the_checkpoint(blobs, tmp_path):
     ours = derender.Derenderer.from_preset("small", seed=0, image_size=32, width=8, light_width=4)
-    one = task("simclr", 16, "views=physical", f"physics={ours.save(tmp_path / 'ours')}")
-    train_task(one, blobs, tmp_path / "run", sample_sheet=baseline_sheet(one.shown))
+    own = config("simclr", 16, "views=physical", f"physics={ours.save(tmp_path / 'ours')}")
+    train_baseline(own, blobs, tmp_path / "run", sample_sheet=baseline_sheet)
     assert {key.split(".")[0] for key in weights(tmp_path / "run")} == {"encoder", "head"}
     with pytest.raises(FileNotFoundError, match="no model at"):
-        train_task(task("simclr", 16, "views=physical", "physics=nowhere"), blobs, tmp_path / "no")
+        train_baseline(config("simclr", 16, "views=physical", "physics=nowhere"), blobs, tmp_path / "no")
     assert not (tmp_path / "no").exists()
 
 
 def test_a_loss_that_is_no_number_stops_the_run(blobs, tmp_path):
-    result = train_task(task("ae", 480, "learning_rate=1e30"), blobs, tmp_path / "run")
+    result = train_baseline(config("ae", 480, "learning_rate=1e30"), blobs, tmp_path / "run")
     assert result.stopped == "collapse" and result.images < 480
     assert result.findings[0].fatal and "finite" in result.findings[0].text
 
@@ -104,8 +101,8 @@ def test_a_loss_that_is_no_number_stops_the_run(blobs, tmp_path):
     ],
 )
 def test_another_architecture_names_the_first_key_that_differs(settings, change, message, copy):
-    config = json.loads((copy / "config.json").read_text())
-    (copy / "config.json").write_text(json.dumps({**config, "settings": config["settings"] | settings}))
+    tree = json.loads((copy / "config.json").read_text())
+    (copy / "config.json").write_text(json.dumps({**tree, "settings": tree["settings"] | settings}))
     stored = load_file(copy / "model.safetensors") | change
     save_file({key: v for key, v in stored.items() if v is not None}, copy / "model.safetensors")
     with pytest.raises(ValueError, match=f"another architecture: {message}"):
@@ -117,7 +114,7 @@ def test_a_checkpoint_of_another_architecture_names_the_key(runs, blobs, tmp_pat
     shutil.rmtree(run / "checkpoints" / "last")
     shutil.copytree(runs / "simclr" / "checkpoints" / "last", run / "checkpoints" / "last")
     with pytest.raises(ValueError, match=r"of another model \(it has no 'decoder\.layers\.0\.weight'"):
-        train_task(task("ae", 72), blobs, run, resume=True)
+        train_baseline(config("ae", 72), blobs, run, resume=True)
 
 
 def test_damaged_and_foreign_folders_are_named(runs, copy, tmp_path):
@@ -125,14 +122,14 @@ def test_damaged_and_foreign_folders_are_named(runs, copy, tmp_path):
     file.write_bytes(file.read_bytes()[:-50])
     with pytest.raises(ValueError, match=r"model\.safetensors is damaged"):
         load_baseline(copy)
-    for config, message in (
+    for text, message in (
         ("{", r"config\.json is damaged"),
         ('{"format": 1, "baseline": "ae"}', r"config\.json is damaged"),
         ('{"format": 99, "baseline": "ae", "settings": {}}', "saved in format 99"),
         ('{"format": 1, "settings": {}}', "holds a derender model and no baseline"),
         ('{"format": 1, "baseline": "ae", "settings": {"width": "wide"}}', "setting 'width'"),
     ):
-        (copy / "config.json").write_text(config)
+        (copy / "config.json").write_text(text)
         with pytest.raises(ValueError, match=message):
             load_baseline(copy)
     with pytest.raises(ValueError, match="holds the baseline 'ae', asked for vqvae"):

@@ -11,6 +11,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any, ClassVar
@@ -24,6 +25,7 @@ from derender.baselines import network_type
 from derender.data import ImageSet, split_indices, suggestion
 from derender.settings import Settings
 from derender.storage.atomic import atomic_folder
+from derender.storage.folder import CONFIG_FILE, FORMAT, WEIGHTS_FILE, saved_config
 from derender.storage.tensors import read_tensors, write_tensors
 from derender.training import run_folder
 from derender.training import task as loop
@@ -38,8 +40,6 @@ from derender.training.config import (
 from derender.training.loop import train_task
 from derender.training.watch import FiniteWatch
 
-FORMAT = 1
-WEIGHTS_FILE, CONFIG_FILE = "model.safetensors", "config.json"
 PICKLES = (".pth", ".pt", ".ckpt", ".pkl", ".pickle", ".bin")
 OUTSIDE_LOSS = ("l1", "codes_used", "active", "found")
 """Numbers that ``losses`` returns beside the losses."""
@@ -154,7 +154,9 @@ def load_baseline(source: str | Path, name: str | None = None) -> BaselineModel:
         ValueError: it is a pickle, damaged, of another architecture, another baseline, or none.
     """
     folder = _folder_of(Path(source))
-    config, file = _config_of(folder), folder / WEIGHTS_FILE
+    config, file = saved_config(folder), folder / WEIGHTS_FILE
+    if "baseline" not in config:
+        raise ValueError(f"{folder} holds a derender model and no baseline: leave the baseline's name out")
     stored = str(config["baseline"])
     if name not in (None, stored):
         raise ValueError(f"{folder} holds the baseline {stored!r}, asked for {name}")
@@ -190,23 +192,6 @@ def _folder_of(source: Path) -> Path:
         f"no baseline at {source} (expected {CONFIG_FILE} and {WEIGHTS_FILE} there or in 'model'): "
         "give a run folder made by 'derender train --model NAME'"
     )
-
-
-def _config_of(folder: Path) -> dict[str, Any]:
-    try:
-        config = json.loads((folder / CONFIG_FILE).read_text())
-        version, complete = config["format"], isinstance(config.get("settings"), dict)
-    except (ValueError, LookupError, TypeError, RecursionError):
-        version, complete, config = 0, False, {"baseline": None}
-    if not isinstance(version, int) or version > FORMAT:
-        raise ValueError(
-            f"{folder} was saved in format {version}, this version reads up to {FORMAT}: update derender"
-        )
-    if "baseline" not in config:
-        raise ValueError(f"{folder} holds a derender model and no baseline: leave the baseline's name out")
-    if not complete:
-        raise ValueError(f"{folder / CONFIG_FILE} is damaged: copy or train the model again")
-    return config
 
 
 @dataclass(frozen=True)
@@ -249,18 +234,12 @@ class LoopModel(BaselineModel):
 
     @classmethod
     def train_into(
-        cls,
-        config: Any,
-        images: ImageSet,
-        out: str | Path,
-        *,
-        sample_sheet: SheetOf | None = None,
+        cls, config: Any, images: ImageSet, out: str | Path, *, sample_sheet: SheetOf | None = None,
         **how: Any,
-    ) -> loop.TrainResult:
+    ) -> loop.TrainResult:  # fmt: skip
         """Train in the common loop; see `train_baseline`."""
-        task = BaselineTask(config)
-        sheet = None if sample_sheet is None else sample_sheet(task.shown)
-        return train_task(task, images, out, sample_sheet=sheet, **how)
+        sheet = None if sample_sheet is None else sample_sheet(partial(cls.shown, config=config))
+        return train_task(BaselineTask(config), images, out, sample_sheet=sheet, **how)
 
 
 @dataclass(frozen=True)
@@ -294,10 +273,6 @@ class BaselineTask(loop.TrainingTask):
     def watch(self, memory: dict[str, Any]) -> FiniteWatch:
         """Stops a run whose loss is NaN or infinite."""
         return FiniteWatch()
-
-    def shown(self, model: LoopModel, images: Images) -> dict[str, Tensor]:
-        """Images for a sample sheet, by column."""
-        return model.shown(images, self.config)
 
 
 class BaselineStep(nn.Module):

@@ -70,30 +70,38 @@ def texts_beside(folder: Path | None, tensors: Mapping[str, Tensor]) -> dict[str
     return {file.name: file.read_text(encoding="utf-8") for file in files if file.is_file()}
 
 
+def saved_config(folder: Path) -> dict[str, Any]:
+    """``config.json`` of a saved model or baseline, with its ``settings``; ValueError if damaged or newer."""
+    damaged = f"{folder / CONFIG_FILE} is damaged: copy or train the model again"
+    try:
+        config = json.loads((folder / CONFIG_FILE).read_text())
+        version, settings = config["format"], config.get("settings")
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
+        raise ValueError(damaged) from error
+    if not isinstance(version, int) or version > FORMAT:
+        raise ValueError(
+            f"{folder} was saved in format {version}, this version reads up to {FORMAT}: update derender"
+        )
+    if not isinstance(settings, dict):
+        raise ValueError(damaged)
+    return config
+
+
 def read_config(folder: Path, factors: Sequence[str] | None = None) -> dict[str, Any]:
     """``config.json`` of a saved model: its ``factors`` and ``settings``.
 
     A ValueError: it is damaged, of a newer version, of a baseline, or of other ``factors``.
     """
-    damaged = f"{folder / CONFIG_FILE} is damaged: copy or train the model again"
-    try:
-        config = json.loads((folder / CONFIG_FILE).read_text())
-        version, names = config["format"], config.get("factors")
-    except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
-        raise ValueError(damaged) from error
+    config = saved_config(folder)
     if "baseline" in config:
         name = config["baseline"]
         raise ValueError(
             f"{folder} holds the baseline {name!r}, not our model: add --baseline {name}, or load it with "
             "derender.baselines.load_baseline"
         )
-    if not isinstance(version, int) or version > FORMAT:
-        raise ValueError(
-            f"{folder} was saved in format {version}, this version reads up to {FORMAT}: update derender"
-        )
-    named = isinstance(names, list) and all(isinstance(name, str) for name in names)
-    if not named or not isinstance(config.get("settings"), dict):
-        raise ValueError(damaged)
+    names = config.get("factors")
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise ValueError(f"{folder / CONFIG_FILE} is damaged: copy or train the model again")
     if factors is not None and names != list(factors):
         raise ValueError(
             f"{folder} holds factors {', '.join(names)}, asked for {', '.join(factors)}: "
