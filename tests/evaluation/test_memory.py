@@ -1,12 +1,11 @@
 """Cached results are found by content, and only by the same content; dataclasses come back as they were."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
 
-from derender.evaluation import GeometryResult, GeometryScores
 from derender.evaluation.memory import Memory, content_hash, memory_in, packed, unpacked
 from derender.storage.atomic import DamageNoticed
 
@@ -91,35 +90,19 @@ class Outer:
 
 def outer(value: float = 0.1) -> Outer:
     inner = Inner(np.array([[1.5, np.nan]], np.float32), ("a", "b"), {"a": 3})
-    return Outer(inner, None, (0.25, 1e-17), {"x": float("inf")}, value)
-
-
-def same(one: object, other: object) -> None:
-    assert type(one) is type(other)
-    for field in fields(one):  # pyright: ignore[reportArgumentType]
-        mine, theirs = getattr(one, field.name), getattr(other, field.name)
-        if isinstance(mine, Inner):
-            same(mine, theirs)
-        elif isinstance(mine, np.ndarray):
-            assert mine.dtype == theirs.dtype
-            np.testing.assert_array_equal(mine, theirs)
-        else:
-            assert mine == theirs, field.name
+    return Outer(inner, None, (0.25, 1e-17), {"x": float("inf"), "y": np.float32(0.5)}, np.float64(value))
 
 
 def test_what_was_packed_is_unpacked(tmp_path):
-    same(unpacked(Outer, packed(outer())), outer())
     memory = Memory(tmp_path)
-    same(memory.recall_value("outer", {"k": 1}, Outer, outer), outer())
-    same(memory.recall_value("outer", {"k": 1}, Outer, lambda: outer(0.9)), outer())
+    for again in (unpacked(Outer, packed(outer())), memory.recall_value("outer", {"k": 1}, Outer, outer)):
+        assert repr(again) == repr(outer()).replace("np.float32(0.5)", "0.5").replace(
+            "np.float64(0.1)", "0.1"
+        )
+        assert again.inner.each.dtype == np.float32
+    assert memory.recall_value("outer", {"k": 1}, Outer, lambda: outer(0.9)).value == 0.1
     assert memory.recall_value("outer", {"k": 2}, Outer, lambda: outer(0.9)).value == 0.9
     assert (memory.made, memory.recalled) == (2, 1)
-
-
-def test_numbers_of_numpy_become_numbers():
-    made = Outer(outer().inner, None, None, {"x": np.float32(0.5)}, np.float64(0.1))  # type: ignore[arg-type]
-    found = unpacked(Outer, packed(made))
-    assert found.by_name == {"x": 0.5} and found.value == 0.1 and found.pair is None
 
 
 def test_a_class_with_other_fields_is_another_result(tmp_path):
@@ -131,10 +114,3 @@ def test_a_class_with_other_fields_is_another_result(tmp_path):
     memory.recall_value("x", {}, Inner, lambda: outer().inner)
     found = memory.recall_value("x", {}, Grown, lambda: Grown(np.ones(1), (), {}, 2.0))
     assert found.more == 2.0 and memory.made == 2
-
-
-def test_a_protocols_own_result():
-    scores = GeometryScores(0.1, 20.0, 0.9, 1, np.array([0.1, np.nan]), np.array([20.0, np.nan]))
-    found = unpacked(GeometryResult, packed(GeometryResult(scores, scores, scores)))
-    assert found.untrained is None and found.model.n_empty == 1
-    assert found.plane.side_each == pytest.approx([0.1, np.nan], nan_ok=True)

@@ -20,14 +20,6 @@ def test_known_percentiles():
     assert found == pytest.approx([0, 0, 50, 98.5, 100, 100, 100])
 
 
-def test_pictures_like_the_held_out_ones_have_every_percentile_equally_often():
-    errors = np.random.default_rng(0).gamma(3, 0.01, 4000)
-    held_out = HeldOutErrors(np.quantile(errors[:2000], np.linspace(0, 1, 101)), 2000)
-    found = percentile_of(errors[2000:], held_out)
-    assert np.quantile(found, [0.1, 0.5, 0.9]) == pytest.approx([10, 50, 90], abs=3)
-    assert np.mean(found > OUTLIER_PERCENTILE) == pytest.approx(0.01, abs=0.008)
-
-
 def test_noise_is_odd_to_the_bundled_model_and_says_so_for_every_picture():
     held_out = read_errors(model_folder("rendered-faces-64"))
     assert held_out is not None and held_out.pictures == 800

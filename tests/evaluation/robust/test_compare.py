@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from derender.evaluation.linear_task import task_of
-from derender.evaluation.memory import Memory
 from derender.evaluation.robust import compare_robustness
 from derender.evaluation.robust.compare import area_under
 from derender.evaluation.robust.trial import Curve, Trial
@@ -85,18 +84,6 @@ def test_nothing_that_is_tested_is_learned():
     assert rows_of(found)["noise"].scores["area"].value < 0.5
     with pytest.raises(ValueError, match="40 units would be both learned from and tested"):
         Trial(trial.images, trial.task, trial.unit % 40, trial.curves, "made up")
-
-
-def test_a_table_is_recomputed_from_memory(tmp_path):
-    trial, who, _ = stack()
-    features = {"truth": [np.eye(PEOPLE)[who]], "two runs": [np.eye(PEOPLE)[who], np.ones((len(who), 2))]}
-    first = compare_robustness(features, trial, SEEDS, memory=Memory(tmp_path), resample_count=20)
-    memory = Memory(tmp_path)
-    again = compare_robustness(features, trial, SEEDS, memory=memory, resample_count=20)
-    assert (memory.made, memory.recalled) == (0, 3) and again.numbers() == first.numbers()
-    assert rows_of(first)["two runs"].scores["area"].deviation > 0.1
-    numbers = first.numbers()["curves"]["light"]
-    assert numbers["levels_deg"] == LEVELS and numbers["accuracy"]["truth"]["scores"]["area"]["low"] == 1
 
 
 def test_bad_features_are_refused():
