@@ -38,13 +38,7 @@ from derender.training.task import Progress, TrainResult
 Report = Callable[[str, int, int, str], None]
 """Called with (stage, done, total, note)."""
 
-STAGES = (
-    "generating faces",
-    "learning perceptual features",
-    "training",
-    "scoring unseen faces",
-    "writing the report",
-)
+STAGES = ("generating faces", "learning perceptual features", "training", "scoring unseen faces")
 FACTORS = ("geometry", "albedo")
 BUNDLED = "rendered-faces-64"
 """The bundled model that has seen rendered faces only, as this demo's has."""
@@ -69,29 +63,19 @@ class DemoSettings(Settings):
 
     def training(self, seed: int) -> TrainConfig:
         """The configuration of the demo's training run."""
+        quarter, half = max(1, self.images // 4), max(1, self.images // 2)
+        split = [0.95, 0.05, 0.0]  # the scored images are made apart, of other identities
         return resolve(
-            "small",
-            self.overrides,
-            images=self.images,
-            minutes=self.minutes,
-            validate_every=max(1, self.images // 4),
-            sample_every=max(1, self.images // 4),
-            checkpoint_every=max(1, self.images // 2),
-            split=[0.95, 0.05, 0.0],  # the scored images are made apart, of other identities
-            seed=seed,
-        )
+            "small", self.overrides, images=self.images, minutes=self.minutes, validate_every=quarter,
+            sample_every=quarter, checkpoint_every=half, split=split, seed=seed,
+        )  # fmt: skip
 
 
 FULL = DemoSettings()
 QUICK = DemoSettings(
-    train_pictures=1_500,
-    test_pictures=160,
-    images=3_000,
-    minutes=0.6,
-    shown=6,
-    films=3,
+    train_pictures=1_500, test_pictures=160, images=3_000, minutes=0.6, shown=6, films=3,
     overrides=("warmup_images=500", "objective.self_features_steps=60"),
-)
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -156,9 +140,8 @@ def run_demo(
     def lap(stage: str) -> None:
         """The time since the last lap belongs to ``stage``."""
         nonlocal began
-        now = time.perf_counter()
-        seconds[stage] = seconds.get(stage, 0.0) + now - began
-        began = now
+        seconds[stage] = seconds.get(stage, 0.0) + time.perf_counter() - began
+        began = time.perf_counter()
 
     config = settings.training(seed)
     size = config.model.network.image_size
@@ -168,7 +151,6 @@ def run_demo(
         settings.train_pictures, size, train_seed, lambda done, _: report(STAGES[0], done, total, "")
     )
     unseen, truth = _generated(settings.test_pictures, size, test_seed)
-    report(STAGES[0], total, total, "")
     lap(STAGES[0])
 
     def training_report(progress: Progress) -> None:
@@ -184,7 +166,6 @@ def run_demo(
         reason = "; ".join(finding.text for finding in trained.findings) or trained.stopped
         raise ValueError(f"training collapsed before a model was saved ({reason}): try another --seed")
     model, bundled = load(out / "run", device="cpu"), load(BUNDLED, device="cpu")
-
     report(STAGES[3], 0, 4, "geometry")
     geometry = evaluate_geometry(model, truth, untrained=untrained_twin(model, seed))
     factors = evaluate_factors(model, truth)
@@ -192,22 +173,20 @@ def run_demo(
     report(STAGES[3], 1, 4, "reconstruction")
     reconstruction = evaluate_reconstruction(model, unseen.images, mean=mean_image(seen.images))
     report(STAGES[3], 2, 4, "features")
-    table = embed_pictures(model, unseen)
     components = min(64, len(seen) // 4)
-    tables = {
-        " + ".join(FACTORS): (table, FACTORS),
-        "untrained encoder": (untrained_features(model, unseen, seed=seed), FACTORS),
-        f"PCA ({components})": (pca_features(unseen, components=components, fit_on=seen, seed=seed), None),
-        "pixels": (pixel_features(unseen), None),
+    pca = pca_features(unseen, components=components, fit_on=seen, seed=seed)
+    features = {
+        " + ".join(FACTORS): embed_pictures(model, unseen).concatenate(FACTORS),
+        "untrained encoder": untrained_features(model, unseen, seed=seed).concatenate(FACTORS),
+        f"PCA ({components})": pca.concatenate(None),
+        "pixels": pixel_features(unseen).concatenate(None),
     }
+    own, *controls = features
     report(STAGES[3], 3, 4, "clusters")
-    clustering = compare_clusterings(
-        {name: [rows.concatenate(chosen)] for name, (rows, chosen) in tables.items()},
-        {"identity": truth.labels["identity"]},
-        controls=tuple(tables)[1:],
-    )
+    runs = {name: [values] for name, values in features.items()}
+    clustering = compare_clusterings(runs, {"identity": truth.labels["identity"]}, controls=controls)
     people = len(np.unique(truth.labels["identity"]))
-    clusters = clusterings(table.concatenate(FACTORS), [people])[people]
+    clusters = clusterings(features[own], [people])[people]
     report(STAGES[3], 4, 4, "")
     lap(STAGES[3])
     return DemoResult(
@@ -222,10 +201,8 @@ def _generated(
     """Generated faces as a set of images, and with everything that made them."""
     made = faces.generate(count, size, seed, progress=progress)
     files = tuple(f"face-{row:05d}" for row in range(count))
-    labels = {
-        "identity": np.array([f"id{number:04d}" for number in made.identity]),
-        "expression": np.asarray(made.expression),
-    }
+    people = np.array([f"id{number:04d}" for number in made.identity])
+    labels = {"identity": people, "expression": np.asarray(made.expression)}
     truth = GroundTruth(
         images=made.images, depth=made.depth, normal=made.normal,
         albedo=made.albedo.astype(np.float32) / 255, mask=made.mask, light=made.light,
