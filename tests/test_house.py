@@ -30,11 +30,11 @@ BUDGET = {  # lines, files
     "objectives": (720, 6),
     "postprocess": (650, 6),
     "scene": (710, 10),
-    "demo": (440, 3),
+    "demo": (420, 3),
     "learn": (480, 4),
 }
 TOTAL = (46_100, 288)  # on the way to (32_000, 270)
-TEST_LINES = 30_150  # on the way to 24_000
+TEST_LINES = 29_760  # on the way to 24_000
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80
 SHARED_BY_COMMANDS = {"__init__.py", "console.py", "gathered.py", "options.py", "scoring.py"}

@@ -15,20 +15,12 @@ def folder(tmp_path: Path) -> Path:
     """Twenty-six images of noise, one of them twice, and one that cannot be read."""
     made = tmp_path / "set"
     made.mkdir()
-    for number, picture in enumerate(
-        np.random.default_rng(0).integers(0, 256, (26, 64, 64, 3), dtype=np.uint8)
-    ):
+    noise = np.random.default_rng(0).integers(0, 256, (26, 64, 64, 3), dtype=np.uint8)
+    for number, picture in enumerate(noise):
         Image.fromarray(picture).save(made / f"{number:02}.png")
     (made / "26.png").write_bytes((made / "00.png").read_bytes())
     (made / "27.png").write_bytes(b"no picture")
     return made
-
-
-def refused(capsys, *arguments: object) -> str:
-    assert main([str(argument) for argument in arguments]) == 2
-    last = capsys.readouterr().err.strip().splitlines()[-1]
-    assert last.startswith("derender: ")
-    return last
 
 
 def test_terminal_page_and_json_tell_the_same(folder: Path, tmp_path: Path, capsys):
@@ -47,28 +39,28 @@ def test_terminal_page_and_json_tell_the_same(folder: Path, tmp_path: Path, caps
         assert finding["text"] in html and finding["text"] in said.out
 
 
-def test_what_exists_is_not_replaced_unasked(folder: Path, tmp_path: Path, capsys):
+def test_what_exists_is_not_replaced_unasked(folder: Path, tmp_path: Path, refused):
     page = tmp_path / "doctor.html"
     page.write_text("mine")
-    assert "exists already" in refused(capsys, "doctor", folder, "--out", page)
-    assert "exists already" in refused(capsys, "doctor", folder, "--json", page)
-    assert "is a folder" in refused(capsys, "doctor", folder, "--out", tmp_path)
+    assert "exists already" in refused("doctor", folder, "--out", page)
+    assert "exists already" in refused("doctor", folder, "--json", page)
+    assert "is a folder" in refused("doctor", folder, "--out", tmp_path)
     assert page.read_text() == "mine"
     assert main(["doctor", str(folder), "--out", str(page), "--force"]) == 0
     assert "mine" not in page.read_text()[:10]
 
 
-def test_what_is_no_set_of_pictures_is_refused(folder: Path, tmp_path: Path, capsys):
+def test_what_is_no_set_of_pictures_is_refused(folder: Path, tmp_path: Path, refused):
     empty, broken, text = tmp_path / "empty", tmp_path / "broken", tmp_path / "notes.txt"
     empty.mkdir()
     broken.mkdir()
     (broken / "a.png").write_bytes(b"no picture")
     text.write_text("no image")
-    assert "no images found" in refused(capsys, "doctor", empty)
-    assert "none of the 1 images" in refused(capsys, "doctor", broken)
-    assert "is no folder, zip or image" in refused(capsys, "doctor", text)
-    assert "is one image: a set is examined" in refused(capsys, "doctor", folder / "00.png")
-    assert "does not exist" in refused(capsys, "doctor", tmp_path / "nowhere")
+    assert "no images found" in refused("doctor", empty)
+    assert "none of the 1 images" in refused("doctor", broken)
+    assert "is no folder, zip or image" in refused("doctor", text)
+    assert "is one image: a set is examined" in refused("doctor", folder / "00.png")
+    assert "does not exist" in refused("doctor", tmp_path / "nowhere")
 
 
 def test_a_folder_with_one_picture_gets_a_verdict(tmp_path: Path, capsys):

@@ -8,17 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from tests.cli.conftest import run
 
 from derender import Derenderer, FeatureTable
-from derender.cli import main
 from derender.data import decoding
-
-
-@pytest.fixture(scope="module")
-def model(tmp_path_factory) -> str:
-    """An untrained model of the smallest kind, saved."""
-    folder = tmp_path_factory.mktemp("embed") / "model"
-    return str(Derenderer.from_preset("small", seed=0, image_size=32, width=4, light_width=4).save(folder))
 
 
 @pytest.fixture(autouse=True)
@@ -42,15 +35,15 @@ def shards(folder: Path, count: int = 20) -> str:
     return str(folder / "s-{0..1}.tar")
 
 
-def embed(model: str, data: str, out: Path, *more: str) -> int:
-    return main(["embed", "--model", model, "--data", data, "--out", str(out), "--batch-size", "4", *more])
+def embed(model: Path, data: str, out: Path, *more: object) -> int:
+    return run("embed", "--model", model, "--data", data, "--out", out, "--batch-size", 4, *more)
 
 
-def test_shards_with_a_cut_one_among_them(model, tmp_path, capsys):
+def test_shards_with_a_cut_one_among_them(tiny, tmp_path, capsys):
     data = shards(tmp_path / "set")
     last = tmp_path / "set" / "s-1.tar"
     last.write_bytes(last.read_bytes()[:-12_000])
-    assert embed(model, data, tmp_path / "f.parquet", "--json", str(tmp_path / "told.json")) == 0
+    assert embed(tiny, data, tmp_path / "f.parquet", "--json", tmp_path / "told.json") == 0
     said = capsys.readouterr()
     table = FeatureTable.read(tmp_path / "f.parquet")
     told = json.loads((tmp_path / "told.json").read_text())
@@ -60,9 +53,9 @@ def test_shards_with_a_cut_one_among_them(model, tmp_path, capsys):
     assert "rows in" in said.out
 
 
-def test_ctrl_c_leaves_only_what_the_next_run_goes_on_with(model, tmp_path, capsys, monkeypatch):
+def test_ctrl_c_leaves_only_what_the_next_run_goes_on_with(tiny, tmp_path, capsys, monkeypatch):
     data, out = shards(tmp_path / "set"), tmp_path / "f.parquet"
-    assert embed(model, data, tmp_path / "whole.parquet") == 0
+    assert embed(tiny, data, tmp_path / "whole.parquet") == 0
     real, calls = Derenderer.embed, []
 
     def interrupted(self, images):
@@ -74,18 +67,14 @@ def test_ctrl_c_leaves_only_what_the_next_run_goes_on_with(model, tmp_path, caps
     monkeypatch.setattr(Derenderer, "embed", interrupted)
     before = set(tmp_path.iterdir())
     capsys.readouterr()
-    assert embed(model, data, out) == 130
-    assert (
-        capsys.readouterr()
-        .err.strip()
-        .endswith(f"8 rows are kept in {out}.partial: the same command goes on from there")
-    )
+    assert embed(tiny, data, out) == 130
+    kept = f"8 rows are kept in {out}.partial: the same command goes on from there"
+    assert capsys.readouterr().err.strip().endswith(kept)
     assert set(tmp_path.iterdir()) - before == {tmp_path / "f.parquet.partial"}
-    assert embed(model, data, out, "--limit", "12") == 2
-    assert (
-        "holds an unfinished table that was made otherwise (differs in pictures)" in capsys.readouterr().err
-    )
-    assert embed(model, data, out) == 0
+    assert embed(tiny, data, out, "--limit", "12") == 2
+    otherwise = "holds an unfinished table that was made otherwise (differs in pictures)"
+    assert otherwise in capsys.readouterr().err
+    assert embed(tiny, data, out) == 0
     assert "8 of them from the run before" in capsys.readouterr().err
     assert sum(calls) == 24, "twenty images, and the four that were interrupted"
     whole, resumed = FeatureTable.read(tmp_path / "whole.parquet"), FeatureTable.read(out)
@@ -95,7 +84,7 @@ def test_ctrl_c_leaves_only_what_the_next_run_goes_on_with(model, tmp_path, caps
     assert set(tmp_path.iterdir()) - before == {out}
 
 
-def test_what_cannot_be_read_is_one_line(model, tmp_path, capsys, monkeypatch):
+def test_what_cannot_be_read_is_one_line(tiny, tmp_path, refused, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
     import huggingface_hub
@@ -109,7 +98,5 @@ def test_what_cannot_be_read_is_one_line(model, tmp_path, capsys, monkeypatch):
         ("shards-{000..002}.tar", "3 of the 3 shards of shards-{000..002}.tar do not exist"),
         ("shards-{2..0}.tar", "should count up"),
     ):
-        assert embed(model, data, tmp_path / "f.parquet") == 2
-        *_, last = capsys.readouterr().err.strip().splitlines()
-        assert last.startswith("derender: ") and words in last
+        assert words in refused("embed", "--model", tiny, "--data", data, "--out", tmp_path / "f.parquet")
     assert list(tmp_path.iterdir()) == []

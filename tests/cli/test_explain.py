@@ -7,25 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from tests.cli.conftest import run
 
-from derender.cli import main
 from derender.features import FeatureTable
 from derender.interpretation import load_probe, question
 from derender.interpretation.explanation import split_rows
-from derender.model import Derenderer
-from derender.presets import MODEL_PRESETS
 
 SIZE = 32
-
-
-@pytest.fixture(scope="module")
-def model(tmp_path_factory) -> Path:
-    """An untrained model on disk, for 32 pixels."""
-    settings = MODEL_PRESETS["small"]
-    sizes = {"image_size": SIZE, "width": 4, "light_width": 4, "code_size": 8}
-    network = settings.network.model_copy(update=sizes)
-    made = Derenderer.seeded(settings.model_copy(update={"network": network}), 0)
-    return made.save(tmp_path_factory.mktemp("explain") / "model")
 
 
 @pytest.fixture(scope="module")
@@ -42,27 +30,13 @@ def data(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def why(model, data, tmp_path_factory) -> tuple[Path, dict]:
+def why(tiny, data, tmp_path_factory) -> tuple[Path, dict]:
     """One explanation with everything in it."""
     folder = tmp_path_factory.mktemp("explain")
-    words = [
-        "explain",
-        "-m",
-        model,
-        "-d",
-        data,
-        "-l",
-        "class",
-        "--seeds",
-        "2",
-        "--sheets",
-        "1",
-        "--rows",
-        "2",
-    ]
+    words = ["explain", "-m", tiny, "-d", data, "-l", "class", "--seeds", 2, "--sheets", 1, "--rows", 2]
     words += ["--clusters", "2", "--pair", "dark/00.png", "dark/02.png", "--json", folder / "why.json"]
     words += ["--markdown", folder / "why.md", "--latex", folder / "why.tex"]
-    assert main([str(word) for word in [*words, "--out", folder / "why"]]) == 0
+    assert run(*words, "--out", folder / "why") == 0
     return folder / "why", json.loads((folder / "why.json").read_text())
 
 
@@ -110,25 +84,19 @@ def test_the_numbers_add_up(why):
     assert len(checked) == 3 * 4 * 3
 
 
-def test_bad_words(model, data, why, tmp_path, capsys):
-    def refused(*words) -> str:
-        capsys.readouterr()
-        assert main([str(w) for w in ("explain", "-m", model, "-d", data, *words)]) == 2
-        return capsys.readouterr().err.strip().splitlines()[-1]
-
-    assert "no label 'clas'; did you mean 'class'" in refused("-l", "clas")
-    assert "give either --label NAME" in refused()
-    assert "add --force to replace it" in refused("-l", "class", "--out", why[0])
-    assert "needs 20 or more" in refused("-l", "class", "--limit", "12")
-    assert "no image 'dark/0.png'; did you mean 'dark/" in refused("-l", "class", "--pair", "dark/0.png", "x")
-    assert "unknown head 'lin'" in refused("-l", "class", "--head", "lin")
-    flat = tmp_path / "flat"
-    flat.mkdir()
+def test_bad_words(tiny, data, why, tmp_path, refused):
+    words = ("explain", "-m", tiny, "-d", data)
+    assert "no label 'clas'; did you mean 'class'" in refused(*words, "-l", "clas")
+    assert "give either --label NAME" in refused(*words)
+    words = (*words, "-l", "class")
+    assert "add --force to replace it" in refused(*words, "--out", why[0])
+    assert "needs 20 or more" in refused(*words, "--limit", "12")
+    assert "no image 'dark/0.png'; did you mean 'dark/" in refused(*words, "--pair", "dark/0.png", "x")
+    assert "unknown head 'lin'" in refused(*words, "--head", "lin")
     for place in range(24):
-        Image.fromarray(np.full((SIZE, SIZE, 3), place * 9, np.uint8)).save(flat / f"{place}.png")
-    capsys.readouterr()
-    assert main(["explain", "-m", str(model), "-d", str(flat), "-l", "class"]) == 2
-    assert "has no labels, and an explanation needs" in capsys.readouterr().err
+        Image.fromarray(np.full((SIZE, SIZE, 3), place * 9, np.uint8)).save(tmp_path / f"{place}.png")
+    told = refused("explain", "-m", tiny, "-d", tmp_path, "-l", "class")
+    assert "has no labels, and an explanation needs" in told
 
 
 def test_pictures_that_are_all_their_owners_test_part_are_split_here():

@@ -5,58 +5,29 @@ from pathlib import Path
 
 import pytest
 import yaml
+from tests.cli.conftest import TINY, run, settings
 
 from derender import FeatureTable
-from derender.cli import main
 
-TINY = ["image_size=32", "width=4", "light_width=4", "perceptual=none"]
 STEPS = ["images=16", "batch_size=8"]
 
 
-def settings(*values: str) -> list[str]:
-    return [word for value in values for word in ("--set", value)]
-
-
 @pytest.fixture(scope="module")
-def faces(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("finetune") / "faces"
-    assert main(["synth", "faces", "--out", str(folder), "--count", "40", "--image-size", "32"]) == 0
-    return folder
-
-
-@pytest.fixture(scope="module")
-def run(faces, tmp_path_factory) -> Path:
+def begun(faces, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("finetune") / "run"
-    words = ["train", "--preset", "small", "--data", str(faces), "--out", str(folder)]
-    assert main([*words, *settings(*TINY, *STEPS)]) == 0
+    words = ["train", "--preset", "small", "--data", faces, "--out", folder]
+    assert run(*words, *settings(*TINY, *STEPS)) == 0
     return folder
 
 
-@pytest.fixture
-def refused(capsys):
-    def call(*words: object) -> str:
-        capsys.readouterr()
-        assert main([str(word) for word in words]) == 2
-        return capsys.readouterr().err.strip().splitlines()[-1]
-
-    return call
-
-
-def test_from_a_run_to_features_and_scores(run, faces, tmp_path, capsys, refused):
+def test_from_a_run_to_features_and_scores(begun, faces, tmp_path, capsys, refused):
     out, numbers = tmp_path / "tuned", tmp_path / "numbers.json"
-    words = ["finetune", "-m", run, "-d", faces, "--label", "expression", "--out", out]
-    words += [
-        "--labelled",
-        20,
-        "--weight",
-        2,
-        *settings("images=16", "split=[0.6, 0.2, 0.2]"),
-        "--json",
-        numbers,
-    ]
+    words = ["finetune", "-m", begun, "-d", faces, "--label", "expression", "--out", out]
+    split = settings("images=16", "split=[0.6, 0.2, 0.2]")
+    words += ["--labelled", 20, "--weight", 2, *split, "--json", numbers]
     text, typeset, page = (tmp_path / f"scores.{form}" for form in ("md", "tex", "html"))
     words += ["--markdown", text, "--latex", typeset, "--html", page, "--cache", tmp_path / "cache"]
-    assert main([str(word) for word in words]) == 0
+    assert run(*words) == 0
     shown = capsys.readouterr()
     assert "20 labelled images learned, 8 held out" in " ".join(shown.out.split()) and "against" in shown.err
     told = json.loads(numbers.read_text())["scores"]
@@ -68,47 +39,59 @@ def test_from_a_run_to_features_and_scores(run, faces, tmp_path, capsys, refused
     assert "<table" in page.read_text()
     assert told["kind"] == "classes" and told["n_train"] == 20
     config = yaml.safe_load((out / "config.yaml").read_text())
-    assert config["start"] == str(run) and config["target"]["weight"] == 2
+    assert config["start"] == str(begun) and config["target"]["weight"] == 2
     assert config["batch_size"] == 8 and config["model"]["network"]["width"] == 4
     assert (out / "report.html").is_file()
     table = tmp_path / "t.parquet"
-    assert main(["embed", "-m", str(out), "-d", str(faces), "--part", "test", "--out", str(table)]) == 0
+    assert run("embed", "-m", out, "-d", faces, "--part", "test", "--out", table) == 0
     assert FeatureTable.read(table).factors["geometry"].shape == (8, 256)
     again = ["finetune", "-d", faces, "--out", out, "--resume", "--cache", tmp_path / "cache"]
     capsys.readouterr()
-    assert main([str(word) for word in [*again, "--json", "-"]]) == 0
+    assert run(*again, "--json", "-") == 0
     shown = capsys.readouterr()
     assert "16 images in" in shown.err and "0 results computed, 9 found" in shown.err
     assert json.loads(shown.out)["scores"] == told
     assert "leave out weight" in refused("finetune", "-d", faces, "--out", out, "--resume", "--weight", 3)
     assert "go on with derender finetune --resume" in refused("train", "-d", faces, "--out", out, "--resume")
-    assert "go on with derender train --resume" in refused("finetune", "-d", faces, "--out", run, "--resume")
+    assert "go on with derender train --resume" in refused(
+        "finetune", "-d", faces, "--out", begun, "--resume"
+    )
 
 
 def test_from_fresh_weights_by_labels_alone(faces, tmp_path, capsys):
-    words = ["finetune", "--preset", "small", "-d", faces, "--label", "expression", "--out", tmp_path / "run"]
+    words = [
+        "finetune",
+        "--preset",
+        "small",
+        "-d",
+        faces,
+        "--label",
+        "expression",
+        "--out",
+        tmp_path / "run",
+    ]
     words += ["--rendering-weight", 0, "--factors", "albedo,light", "--cache", "none"]
     words += settings(*TINY, *STEPS)
-    assert main([str(word) for word in words]) == 0
+    assert run(*words) == 0
     assert "frozen features of fresh weights" in " ".join(capsys.readouterr().out.split())
-    assert main([*map(str, words), "--dry-run", "--json", "-"]) == 0
+    assert run(*words, "--dry-run", "--json", "-") == 0
     assert json.loads(capsys.readouterr().out)["target"]["factors"] == ["albedo", "light"]
 
 
-def test_bad_words_are_one_line(run, faces, tmp_path, refused):
+def test_bad_words_are_one_line(begun, faces, tmp_path, refused):
     tune = ("finetune", "-d", faces, "--out", tmp_path / "out")
     assert "give either labels or attributes" in refused(*tune)
     assert "give either labels or attributes" in refused(*tune, "-l", "expression", "--attributes")
     assert "no yes/no label" in refused(*tune, "--attributes", "--preset", "small", *settings(*TINY))
-    assert "give one of them" in refused(*tune, "-m", run, "--preset", "small", "-l", "expression")
-    assert "no label 'expresion'; did you mean 'expression'" in refused(*tune, "-m", run, "-l", "expresion")
+    assert "give one of them" in refused(*tune, "-m", begun, "--preset", "small", "-l", "expression")
+    assert "no label 'expresion'; did you mean 'expression'" in refused(*tune, "-m", begun, "-l", "expresion")
     assert "leave out settings of model.network" in refused(
-        *tune, "-m", run, "-l", "expression", *settings("model.network.width=8")
+        *tune, "-m", begun, "-l", "expression", *settings("model.network.width=8")
     )
-    assert "target.weight" in refused(*tune, "-m", run, "-l", "expression", "--weight", "-1")
+    assert "target.weight" in refused(*tune, "-m", begun, "-l", "expression", "--weight", "-1")
     assert "no run to resume" in refused(*tune, "--resume")
     assert not (tmp_path / "out").exists()
     there = tmp_path / "there"
     there.mkdir()
     (there / "thesis.txt").write_text("mine")
-    assert "is not empty" in refused(*tune[:3], "--out", there, "-l", "expression", "-m", run)
+    assert "is not empty" in refused(*tune[:3], "--out", there, "-l", "expression", "-m", begun)

@@ -6,22 +6,14 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from tests.cli.conftest import run, settings
 
 from derender import FeatureTable
-from derender.cli import main
 from derender.storage.tensors import reads_safely
 
 COMMON = ["batch_size=8", "images=16"]
 GENERATOR = ["image_size=32", "style_size=6", "mapping_layers=2", "channel_base=64", "channel_max=6"]
 ENCODER = ["image_size=32", "width=4", "units=[1,1,1,1]", "perceptual_weight=0"]
-
-
-def run(*words: object) -> int:
-    return main([str(word) for word in words])
-
-
-def settings(*pairs: str) -> list[str]:
-    return [word for pair in pairs for word in ("--set", pair)]
 
 
 @pytest.fixture(scope="module")
@@ -76,12 +68,7 @@ def test_a_generator_its_inversion_and_its_parts(faces, e4e, tmp_path, capsys):
 
 
 @pytest.mark.skipif(not reads_safely(), reason="this PyTorch is not trusted with pickles")
-def test_what_is_missing_or_hostile_is_one_line(faces, e4e, tmp_path, capsys):
-    def refused(*words: object) -> str:
-        capsys.readouterr()
-        assert run(*words) == 2
-        return capsys.readouterr().err.strip().splitlines()[-1]
-
+def test_what_is_missing_or_hostile_is_one_line(faces, e4e, tmp_path, refused):
     embed = ("embed", "-d", faces / "images", "--out", tmp_path / "t.parquet")
     file = tmp_path / "e4e_ffhq_encode.pt"
     told = refused(*embed, "--baseline", "e4e", "--checkpoint", file)

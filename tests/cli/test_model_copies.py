@@ -82,10 +82,10 @@ def test_features_hold_fitted_scenes_where_steps_are_set(folder, tmp_path, capsy
     assert '"geometry": 246' in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("command", ["decompose", "relight", "rotate", "mesh"])
+@pytest.mark.parametrize("command", ["decompose", "rotate"])
 def test_images_are_made_of_fitted_scenes(fits, folder, tmp_path, command):
     given = [command, "-m", str(fits), str(folder / "000.png")]
-    extra = ["--film", "none"] if command in ("relight", "rotate") else []
+    extra = ["--film", "none"] if command == "rotate" else []
     for name, steps in (("plain", []), ("fitted", ["--fit-steps", "12"])):
         assert main([*given, *extra, "-o", str(tmp_path / name), *steps]) == 0
     one, two = (sorted((tmp_path / name / "000").iterdir()) for name in ("plain", "fitted"))
@@ -162,8 +162,5 @@ def test_settings_that_make_no_sense_are_named(folder, tmp_path, capsys, command
     assert not (tmp_path / "mine").exists()
 
 
-@pytest.mark.parametrize("command", ["whiten", "refine", "unet"])
-def test_an_existing_model_is_not_replaced_unasked(folder, tmp_path, capsys, command):
-    (tmp_path / "mine").mkdir()
-    assert run(command, folder, tmp_path / "mine") == 2
-    assert "add --force" in capsys.readouterr().err
+def test_an_existing_model_is_not_replaced_unasked(folder, tmp_path, refused):
+    assert "add --force" in refused("whiten", folder, "-m", KNOWN, "-o", tmp_path)

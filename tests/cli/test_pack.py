@@ -112,17 +112,10 @@ def test_weights_beyond_half_precision_are_refused(tmp_path, value):
     assert not (tmp_path / "p").exists()
 
 
-def test_what_is_there_is_not_replaced_unasked(unpacked, tmp_path, capsys):
-    (tmp_path / "mine").mkdir()
-    assert main(["pack", "-m", str(unpacked), "-o", str(tmp_path / "mine")]) == 2
-    assert "add --force" in capsys.readouterr().err
-    with pytest.raises(FileExistsError):
-        pack_model(unpacked, tmp_path / "mine")
-
-
-def test_unknown_kinds_of_maps_and_one_picture_are_refused(unpacked, pictures, tmp_path, capsys):
-    assert main(["pack", "-m", str(unpacked), "-o", str(tmp_path / "p"), "--maps", "int4"]) == 2
-    assert "choose bytes or float16" in capsys.readouterr().err
+def test_what_cannot_be_packed_is_refused(unpacked, pictures, tmp_path, refused):
+    pack = ("pack", "-m", unpacked, "-o")
+    assert "add --force" in refused(*pack, tmp_path)
+    assert "choose bytes or float16" in refused(*pack, tmp_path / "p", "--maps", "int4")
     assert not (tmp_path / "p").exists()
     model = load(unpacked)
     with pytest.raises(ValueError, match="two images"):

@@ -66,21 +66,11 @@ def test_page_without_data_or_model_says_what_is_missing(run, photos, tmp_path, 
     assert "The data" in html
 
 
-def test_bad_questions(run, photos, tmp_path, capsys):
-    def refused(*arguments: object) -> str:
-        capsys.readouterr()
-        assert main(["report", *map(str, arguments)]) == 2
-        return capsys.readouterr().err.strip().splitlines()[-1]
-
-    assert "no run in" in refused(tmp_path)
-    assert "--truth and --label need images" in refused(run, "--label", "age")
-    assert "has no label 'age'" in refused(run, "--data", photos, "--label", "age")
+def test_bad_questions(run, photos, tmp_path, refused):
+    assert "no run in" in refused("report", tmp_path)
+    assert "--truth and --label need images" in refused("report", run, "--label", "age")
+    assert "has no label 'age'" in refused("report", run, "--data", photos, "--label", "age")
     taken = tmp_path / "taken.html"
     taken.write_text("mine")
-    assert "exists already" in refused(run, "--out", taken)
+    assert "exists already" in refused("report", run, "--out", taken)
     assert taken.read_text() == "mine"
-
-
-def test_help_has_an_example(capsys):
-    assert main(["report", "--help"]) == 0
-    assert "Example: derender report" in " ".join(capsys.readouterr().out.split())

@@ -5,11 +5,9 @@ import json
 
 import numpy as np
 import pytest
+from tests.cli.conftest import run
 
-from derender import Derenderer
-from derender.cli import main
 from derender.data import read_images
-from derender.presets import MODEL_PRESETS
 
 
 @pytest.fixture(scope="module")
@@ -18,7 +16,7 @@ def folder(tmp_path_factory):
 
 
 def made(folder, name: str, *arguments: str) -> list[dict[str, str]]:
-    assert main(["synth", "faces", "--out", str(folder / name), "--image-size", "16", *arguments]) == 0
+    assert run("synth", "faces", "--out", folder / name, "--image-size", 16, *arguments) == 0
     with (folder / name / "params.csv").open() as file:
         return list(csv.DictReader(file))
 
@@ -60,13 +58,8 @@ def test_a_model_of_ones_own(folder):
     lower = np.stack([corner[:-1, 1:], corner[1:, :-1], corner[1:, 1:]], -1).reshape(-1, 3)
     mean = np.stack([x, y, -(x**2) - y**2], -1).reshape(-1, 3)
     components = mean[None] * [0.1, 0.0, 0.0]
-    np.savez(
-        folder / "my.npz",
-        mean=mean,
-        triangles=np.concatenate([upper, lower]),
-        components=components,
-        std=[1.0],
-    )
+    triangles = np.concatenate([upper, lower])
+    np.savez(folder / "my.npz", mean=mean, triangles=triangles, components=components, std=[1.0])
     rows = made(folder, "mine", "--count", "8", "--model", str(folder / "my.npz"))
     assert len(rows) == 8 and "hair" not in rows[0]
     with (folder / "mine" / "identities.csv").open() as file:
@@ -77,7 +70,7 @@ def test_a_model_of_ones_own(folder):
 def car_folder(tmp_path_factory):
     out = tmp_path_factory.mktemp("synth") / "cars"
     arguments = ["--classes", "jeep,police", "--image-size", "32", "--light", "wide", "--json", f"{out}.json"]
-    assert main(["synth", "cars", "--out", str(out), "--count", "12", *arguments]) == 0
+    assert run("synth", "cars", "--out", out, "--count", 12, *arguments) == 0
     return out
 
 
@@ -90,13 +83,9 @@ def test_a_folder_of_cars_holds_what_was_requested(car_folder):
     assert facts["models"] == 3 and facts["settings"]["classes"] == {"jeep": 1.0, "police": 1.0}
 
 
-def test_geometry_is_evaluated_on_cars(car_folder, tmp_path):
-    settings = MODEL_PRESETS["small"]
-    small = settings.network.model_copy(update={"image_size": 32, "width": 4, "light_width": 4})
-    Derenderer(settings.model_copy(update={"network": small})).save(tmp_path / "model")
-    arguments = ["--model", str(tmp_path / "model"), "--json", str(tmp_path / "scores.json")]
-    assert main(["evaluate", "geometry", *arguments, "--data", str(car_folder)]) == 0
-    assert json.loads((tmp_path / "scores.json").read_text())["pictures"] == 12
+def test_geometry_is_evaluated_on_cars(car_folder, tiny, capsys):
+    assert run("evaluate", "geometry", "--model", tiny, "--json", "-", "--data", car_folder) == 0
+    assert json.loads(capsys.readouterr().out)["pictures"] == 12
 
 
 @pytest.mark.parametrize(
@@ -117,7 +106,7 @@ def test_geometry_is_evaluated_on_cars(car_folder, tmp_path):
     ],
 )
 def test_bad_input_is_one_line_and_leaves_nothing(folder, capsys, kind, arguments, message):
-    assert main(["synth", kind, "--out", str(folder / "bad"), *arguments]) == 2
+    assert run("synth", kind, "--out", folder / "bad", *arguments) == 2
     said = capsys.readouterr().err.strip()
     assert message in said and len(said.splitlines()) == 1
     assert not (folder / "bad").exists()

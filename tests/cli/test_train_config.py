@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 import yaml
+from tests.cli.conftest import run
 
-from derender.cli import main
 from derender.cli.plan.settings import read_plan
 from derender.training.config import resolve
 
@@ -18,7 +18,7 @@ def settings(capsys):
     """All settings that `derender train` would run with."""
 
     def said(*arguments: str | Path) -> dict:
-        code = main(["train", "--data", "nowhere", "--out", "nowhere/run", "--dry-run", *map(str, arguments)])
+        code = run("train", "--data", "nowhere", "--out", "nowhere/run", "--dry-run", *arguments)
         found = capsys.readouterr()
         assert code == 0, found.err
         return yaml.safe_load(found.out)
@@ -68,21 +68,13 @@ def test_a_baselines_settings_train_that_baseline(settings, tmp_path):
         ("preset: 3", [], "preset"),
     ],
 )
-def test_what_is_no_settings_is_one_clear_line(tmp_path, capsys, text, more, message):
+def test_what_is_no_settings_is_one_clear_line(tmp_path, refused, text, more, message):
     file = tmp_path / "bad.yaml"
     file.write_text(text)
-    assert (
-        main(["train", "--data", "nowhere", "--out", str(tmp_path / "run"), "--config", str(file), *more])
-        == 2
-    )
-    assert message in capsys.readouterr().err
+    train = ("train", "--data", "nowhere", "--out", tmp_path / "run", "--config")
+    assert message in refused(*train, file, *more)
+    assert f"no settings in {tmp_path / 'gone'}" in refused(*train, tmp_path / "gone")
     assert not (tmp_path / "run").exists()
-
-
-def test_a_file_that_is_not_there_is_named(tmp_path, capsys):
-    gone = tmp_path / "gone.yaml"
-    assert main(["train", "--data", "nowhere", "--out", str(tmp_path / "run"), "--config", str(gone)]) == 2
-    assert f"no settings in {gone}" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", RUNS)

@@ -14,14 +14,8 @@ def question(name: str, **accuracies: float) -> dict:
         return {"control": control, "runs": 1, "scores": scores, "versus": versus}
 
     rows = {name: row(value, name == "pixels") for name, value in accuracies.items()}
-    return {
-        "name": name,
-        "protocol": "cluster",
-        "method": "ward",
-        "labels": {"class": 3},
-        "n_rows": 9,
-        "rows": rows,
-    }
+    how = {"protocol": "cluster", "method": "ward", "labels": {"class": 3}, "n_rows": 9}
+    return {"name": name, **how, "rows": rows}
 
 
 def test_rows_are_methods_then_controls_and_what_failed_keeps_its_place():
@@ -58,32 +52,18 @@ def test_few_labels_show_one_head_and_the_most_labels():
     def part(head: str, labels: int, value: float) -> dict:
         one = {"value": value, "low": NAN, "high": NAN, "spread": NAN}
         scores = dict.fromkeys(("accuracy", "balanced_accuracy", "average_precision"), one)
-        return {
-            "head": head,
-            "labels": labels,
-            "rows": {"ours": {"control": False, "runs": 1, "scores": scores, "versus": {}}},
-        }
+        row = {"control": False, "runs": 1, "scores": scores, "versus": {}}
+        return {"head": head, "labels": labels, "rows": {"ours": row}}
 
     parts = [part(head, labels, 0.5) for head in ("linear", "logistic") for labels in (100, 500)]
-    told = {
-        "name": "celeba",
-        "protocol": "linear",
-        "kind": "labels",
-        "names": ["a", "b"],
-        "n_test": 5,
-        "seeds": [0],
-    }
+    told = {"name": "celeba", "protocol": "linear", "kind": "labels", "names": ["a", "b"]}
+    told |= {"n_test": 5, "seeds": [0]}
     scores = scores_from({**told, "parts": parts}, {}, {})
     assert [(one.head, one.count) for one in scores] == [
-        ("linear", 100),
-        ("linear", 500),
-        ("logistic", 100),
-        ("logistic", 500),
+        *(("linear", 100), ("linear", 500), ("logistic", 100), ("logistic", 500))
     ]
     table = protocol_table(scores, ["ours"])
-    assert [column.name for column in table.columns[:2]] == [
-        "celeba, 100 labels: balanced",
-        "celeba, 500 labels: balanced",
-    ]
+    names = [column.name for column in table.columns[:2]]
+    assert names == ["celeba, 100 labels: balanced", "celeba, 500 labels: balanced"]
     svg, _ = protocol_picture(scores, ["ours"])
     assert "celeba, 500 labels" in svg and "celeba, 100 labels" not in svg

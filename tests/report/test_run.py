@@ -12,16 +12,12 @@ def test_page_of_a_run_shows_curves_samples_settings_and_what_failed(tmp_path):
     run = start_run(tmp_path / "run", resolve("small", ["seed=7"]), {"pictures": 12}, "cpu")
     assert "Nothing was logged yet." in run_page(run.path).html()
     for images in (32, 64, 96):
-        append_metrics(
-            run, {"kind": "train", "images": images, "seconds": 1.0, "l1": 1 / images, "images_per_second": 9}
-        )
-        append_metrics(
-            run, {"kind": "validation", "images": images, "seconds": 1.0, "l1": 2 / images, "loss": -images}
-        )
+        row = {"images": images, "seconds": 1.0, "l1": 1 / images}
+        append_metrics(run, {"kind": "train", **row, "images_per_second": 9})
+        append_metrics(run, {"kind": "validation", **row, "loss": -images})
         Image.new("RGB", (8, 8)).save(run.samples / f"{images:09d}.png")
-    append_metrics(
-        run, {"kind": "collapse", "images": 96, "seconds": 1.0, "flat": "depth is <flat>: lower the rate"}
-    )
+    why = {"flat": "depth is <flat>: lower the rate"}
+    append_metrics(run, {"kind": "collapse", "images": 96, "seconds": 1.0, **why})
     html = run_page(run.path).html()
     assert html.count("<svg") == 2 and "held out" in html
     assert "The watcher stopped this run." in html and "depth is &lt;flat&gt;" in html
@@ -54,8 +50,7 @@ def test_a_damaged_environment_does_not_hide_the_rest(tmp_path):
 
 
 def test_curves_need_two_points_and_leave_out_what_is_no_number():
-    rows = [
-        {"kind": "train", "images": n, "l1": value} for n, value in ((1, 0.5), (2, float("nan")), (3, None))
-    ]
+    logged = ((1, 0.5), (2, float("nan")), (3, None))
+    rows = [{"kind": "train", "images": images, "l1": value} for images, value in logged]
     assert loss_charts(rows) == []
     assert len(loss_charts([*rows, {"kind": "train", "images": 4, "l1": 0.25}])) == 1

@@ -1,11 +1,9 @@
 """What a plan may say, and that everything else is one clear line before anything is trained."""
 
-from pathlib import Path
-
 import pytest
 
 from derender.cli.plan.jobs import jobs_of
-from derender.cli.plan.settings import read_plan
+from derender.cli.plan.settings import Plan, read_plan
 
 GOOD = """
 images: 1000
@@ -27,16 +25,18 @@ score:
 
 
 @pytest.fixture
-def written(tmp_path):
-    def write(text: str, name: str = "plan.yaml") -> Path:
+def read(tmp_path):
+    """The plan in a file of this text."""
+
+    def call(text: str = GOOD, name: str = "plan.yaml") -> Plan:
         (tmp_path / name).write_text(text)
-        return tmp_path / name
+        return read_plan(tmp_path / name)
 
-    return write
+    return call
 
 
-def test_every_training_gets_the_plans_pictures_split_and_seed(written):
-    plan = read_plan(written(GOOD))
+def test_every_training_gets_the_plans_pictures_split_and_seed(read):
+    plan = read()
     ours = plan.configuration("ours", "cars", 1)
     assert (ours.images, ours.seed, ours.precision) == (1000, 1, "bf16-mixed")
     assert (ours.objective.loocc, ours.objective.curvature_weight) == ("light+camera", 2)
@@ -46,8 +46,8 @@ def test_every_training_gets_the_plans_pictures_split_and_seed(written):
     assert vqvae.split == (0.9, 0.05, 0.05)
 
 
-def test_jobs_share_trainings_and_come_after_what_they_need(written):
-    jobs = jobs_of(read_plan(written(GOOD)))
+def test_jobs_share_trainings_and_come_after_what_they_need(read):
+    jobs = jobs_of(read())
     names = [job.name for job in jobs]
     assert len(set(names)) == len(names) == len({job.slug for job in jobs})
     assert sum(job.kind == "train" for job in jobs) == 2 * 2 * 2  # methods, training sets, seeds
@@ -59,18 +59,16 @@ def test_jobs_share_trainings_and_come_after_what_they_need(written):
         assert all(one in jobs[:place] for one in job.after)
 
 
-def test_toml_says_the_same(written):
+def test_toml_says_the_same(read):
     text = """
 methods = ["hog"]
 [score.lfw]
 data = "lfw.zip"
 label = "identity"
 """
-    plan = read_plan(written(text, "plan.toml"))
-    assert plan.score["lfw"].label == ("identity",) and [job.kind for job in jobs_of(plan)] == [
-        "embed",
-        "score",
-    ]
+    plan = read(text, "plan.toml")
+    assert plan.score["lfw"].label == ("identity",)
+    assert [job.kind for job in jobs_of(plan)] == ["embed", "score"]
 
 
 @pytest.mark.parametrize(
@@ -96,8 +94,8 @@ label = "identity"
         ("score:", "score: [", "cannot be read as a plan"),
     ],
 )
-def test_a_mistake_is_one_line(written, old, new, told):
+def test_a_mistake_is_one_line(read, old, new, told):
     assert old in GOOD
     with pytest.raises(ValueError, match=r"plan\.yaml") as error:
-        read_plan(written(GOOD.replace(old, new, 1)))
+        read(GOOD.replace(old, new, 1))
     assert told in str(error.value)
