@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from derender.data.synthetic.mesh_image import fill_triangle
+from derender.data.synthetic.mesh_image import fill_triangles
 
 SIZE = 48
 
@@ -11,8 +11,8 @@ SIZE = 48
 def filled(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     nearest = np.zeros((SIZE, SIZE), np.float32)
     owner = np.full((SIZE, SIZE), -1, np.int32)
-    for number, (a, b, c) in enumerate(triangles.tolist()):
-        fill_triangle(points.astype(np.float32), a, b, c, number, nearest, owner)
+    none = np.zeros(0, np.int32), np.zeros((0, 8), np.float32), np.zeros((1, 2, 3), np.float32)
+    fill_triangles(points.astype(np.float32), triangles.astype(np.int32), *none, nearest, owner)
     return nearest, owner
 
 

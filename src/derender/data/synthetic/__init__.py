@@ -22,22 +22,7 @@ from derender.data.synthetic.synthetic_set import SyntheticSet
 from derender.data.synthetic.write import require_empty, write, write_folder, write_tracks
 
 __all__ = [
-    "CAR_LIGHTS",
-    "CAR_VIEWS",
-    "LIGHTS",
-    "VIEWS",
-    "CarSettings",
-    "CarViewSettings",
-    "FaceSettings",
-    "LightSettings",
-    "MorphableFaces",
-    "SyntheticSet",
-    "ViewSettings",
-    "cars",
-    "faces",
-    "named_settings",
-    "require_empty",
-    "write",
-    "write_folder",
-    "write_tracks",
-]
+    "CAR_LIGHTS", "CAR_VIEWS", "LIGHTS", "VIEWS", "CarSettings", "CarViewSettings", "FaceSettings",
+    "LightSettings", "MorphableFaces", "SyntheticSet", "ViewSettings", "cars", "faces", "named_settings",
+    "require_empty", "write", "write_folder", "write_tracks",
+]  # fmt: skip

@@ -1,39 +1,232 @@
-"""The body of a car as one smooth grid: ten stations along the outline, rounded, times a cross-section.
+"""The geometry of a car: measures, the body as one smooth grid, boxes and wheels, and one mesh of all.
 
-Stations run along the outline seen from the side: 0 lower lip of the front, 1 bumper, 2 nose, 3 cowl, 4
-upper edge of the windscreen, 5 rear end of the roof, 6 lower edge of the rear window, 7 upper edge of the
+Stations run along the body's outline seen from the side: 0 lower lip of the front, 1 bumper, 2 nose, 3 cowl,
+4 upper edge of the windscreen, 5 rear end of the roof, 6 lower edge of the rear window, 7 upper edge of the
 tail, 8 rear bumper, 9 lower lip of the rear. At each station a row of numbers says where the middle of the
 car, its upper edge, its waist (the windows' lower edge, or the shoulder of bonnet and boot) and its sill
 are; between stations the rows are interpolated linearly with rounded corners. Across, the surface goes from
 the middle over the crowned top to the edge, down the glass to the waist, and down the side to the sill. The
-half with x > 0 is mirrored, so the body is exactly symmetric. Points are x to the right, y UP from the
-ground, z to the rear. Wheel arches are holes of the paint. Leaves out the underside."""
+half with x > 0 is mirrored, so the body is exactly symmetric. Wheel arches are holes of the paint.
 
+Points are metres, x right, y UP from the ground, z from the front to the rear; ``join`` turns y down. A
+grid's columns and rows are ordered so that d/dcolumn x d/drow points inwards, as the conventions' normals do.
+Leaves out undersides.
+"""
+
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from derender.data.synthetic.car_mesh import Grid, part_of, smooth_grid
-from derender.data.synthetic.car_traits import CarShape
+from derender.data.synthetic.mesh_image import DECAL_LENGTH, Paint, TriangleMesh, grid_triangles
 
-STATIONS = 10
+PARTS = ("background", "body", "window", "wheel", "light", "trim", "plate")
 ARCH = 1.13  # radius of the wheel arches in wheel radii
 BED_FROM, BED_TO, BED_SIDE = 6.12, 6.93, 0.86
+Colour = tuple[float, float, float]
+Decal = tuple[float, ...]  # the columns of one shape, as in mesh_image
+_LAST = 9  # station
 _ROWS_BETWEEN = (4, 6, 9, 10, 8, 10, 9, 6, 4)  # rows from each station to the next
 _ACROSS = np.array([0.0, 0.22, 0.44, 0.62, 0.76, BED_SIDE, BED_SIDE + 0.02, 0.93, 0.97, 1.0])
 _GLASS = np.array([0.15, 0.38, 0.62, 0.85, 1.0])
 _SIDE = np.array([0.05, 0.13, 0.26, 0.4, 0.55, 0.7, 0.85, 1.0])
-_TOP, _EDGE = len(_ACROSS), len(_ACROSS) + len(_GLASS)
+_ROUND = np.array([0.42, 0.32, 0.16, 0.26, 0.26, 0.16, 0.28, 0.42])  # stations, most of each inner corner
+_DOWN, _FLIP = np.array([1.0, -1.0, 1.0]), np.array([-1.0, 1.0, 1.0])
+_WHEEL_RINGS = np.array([  # distance outwards along the axle in wheel widths, radius in wheel radii
+    (-0.16, 0.0), (-0.16, 0.18), (-0.2, 0.5), (-0.08, 0.66), (0.0, 0.74), (0.0, 0.88), (-0.1, 0.985),
+    (-0.25, 1.0), (-0.75, 1.0), (-1.0, 0.9), (-1.0, 0.0),
+])  # fmt: skip
+_TURN = np.linspace(0.0, 2.0 * np.pi, 25)
 
 
-@dataclass(frozen=True)
-class BodyLines:
+class CarShape(NamedTuple):
+    """One body, in metres. ``*_at`` lies along the car from its front; heights are from the ground."""
+
+    length: float  # of the body without mirrors and what is mounted on it, as width and height
+    width: float
+    height: float
+    sill: float  # height of the body's lower edge
+    front_wheel: float  # where the axles are
+    rear_wheel: float
+    wheel: float  # radius of the wheels
+    nose_at: float  # upper edge of the front face
+    nose: float
+    cowl_at: float  # where bonnet and windscreen meet
+    cowl: float
+    screen_at: float  # upper edge of the windscreen
+    roof_end_at: float  # rear end of the roof, and how much lower it is than the height
+    roof_drop: float
+    deck_at: float  # lower edge of the rear window
+    deck: float
+    tail_at: float  # upper edge of the rear face
+    tail: float
+    bumper: float  # height of the foremost point
+    tumblehome: float  # how much narrower the roof is on each side than the body at the windows' lower edge
+    hood_inset: float  # how much narrower the bonnet's front is on each side than the body
+    bow: float  # how far the front's corners stand back
+    flare: float  # how far the wings stand out around the wheels
+    soft: float  # 0..1, how far the profile's corners are rounded
+    bed: float  # depth of an open bed or cabin behind the deck line; 0 is none
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """What is on one chart: colour and part where no shape lies, shapes (later ones on top); ``folded`` and
+    ``holes`` as in Paint."""
+
+    colour: Colour
+    part: str = "trim"
+    decals: Sequence[Decal] = ()
+    folded: bool = False
+    holes: Sequence[tuple[float, float, float]] = ()
+
+
+class Grid(NamedTuple):
+    """A piece: points (R,C,3) in metres, inward unit normals (R,C,3) in the y-down frame, chart (R,C,2)."""
+
+    points: ndarray
+    normals: ndarray
+    chart: ndarray
+    surface: Surface
+
+    def moved(self, by: Sequence[float]) -> "Grid":
+        return self._replace(points=self.points + np.asarray(by, float))
+
+
+def both(grids: Sequence[Grid]) -> list[Grid]:
+    """The pieces, and those on the other side of x = 0."""
+    mirrored = [
+        Grid(g.points[:, ::-1] * _FLIP, g.normals[:, ::-1] * _FLIP, g.chart[:, ::-1], g.surface)
+        for g in grids
+    ]
+    return [*grids, *mirrored]
+
+
+def join(pieces: Sequence[Grid]) -> TriangleMesh:
+    """One mesh of all pieces, y down from the ground at 0, with the paint of their surfaces."""
+    starts = np.cumsum([0, *(g.points[..., 0].size for g in pieces[:-1])])
+    cells = [grid_triangles(*g.points.shape[:2], (g.points.shape[1] - 1) / 2) for g in pieces]
+    surfaces = list(dict.fromkeys(g.surface for g in pieces))
+    holes, rows = np.zeros((len(surfaces), 2, 3), np.float32), [d for s in surfaces for d in s.decals]
+    for n, surface in enumerate(surfaces):
+        holes[n, : len(surface.holes)] = np.reshape(surface.holes, (-1, 3))
+    vertices, normals, chart = (
+        np.concatenate([each.reshape(-1, each.shape[-1]) for each in arrays])
+        for arrays in zip(*(g[:3] for g in pieces), strict=True)
+    )
+    return TriangleMesh(
+        vertices=(vertices * _DOWN).astype(np.float32),
+        triangles=np.concatenate([c + s for c, s in zip(cells, starts, strict=True)]).astype(np.int32),
+        values=chart.astype(np.float32),
+        number=np.repeat([surfaces.index(g.surface) for g in pieces], [len(c) for c in cells]).astype(
+            np.int32
+        ),
+        normals=normals.astype(np.float32),
+        paint=Paint(
+            colour=np.array([s.colour for s in surfaces], np.float32),
+            part=np.array([PARTS.index(s.part) for s in surfaces], np.int32),
+            folded=np.array([s.folded for s in surfaces]),
+            holes=holes,
+            first=np.cumsum([0, *(len(s.decals) for s in surfaces)]).astype(np.int32),
+            decals=np.array(rows, np.float32).reshape(-1, DECAL_LENGTH),
+        ),
+    )
+
+
+def smooth_grid(points: Float[ndarray, "r c 3"], chart: Float[ndarray, "r c 2"], surface: Surface) -> Grid:
+    """A grid whose normals are area-weighted means of the cells around each vertex."""
+    p = np.moveaxis(points * _DOWN, -1, 0).copy()
+    a, b = p[:, 1:, 1:] - p[:, :-1, :-1], p[:, 1:, :-1] - p[:, :-1, 1:]
+    cells = np.zeros((3, p.shape[1] + 1, p.shape[2] + 1))
+    cells[:, 1:-1, 1:-1] = a[[1, 2, 0]] * b[[2, 0, 1]] - a[[2, 0, 1]] * b[[1, 2, 0]]
+    rows = cells[:, 1:] + cells[:, :-1]
+    normals = rows[..., 1:] + rows[..., :-1]
+    normals /= np.maximum(np.sqrt((normals**2).sum(axis=0)), 1e-12)
+    return Grid(points, np.moveaxis(normals, 0, -1), chart, surface)
+
+
+def _unit(vectors: ndarray) -> ndarray:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
+
+
+def rounded_box(
+    centre: Sequence[float],
+    half: Sequence[float],
+    radius: float,
+    surfaces: Surface | Sequence[Surface],
+    lean_rad: float = 0.0,
+) -> list[Grid]:
+    """A box with rounded edges and no underside; ``lean_rad`` tips its top to the rear.
+
+    ``surfaces``: one for all faces, or those of top (chart x, z), front and rear (x, y) and sides (z, y).
+    """
+    sizes, rim = np.asarray(half, float), _box_faces()
+    core = sizes - min(radius, *half)
+    flat = np.where(np.abs(rim) > 0.4, np.sign(rim) * core, 0.0)
+    outward = _unit(np.where(np.abs(rim) > 0.9, np.sign(rim), 0.0))
+    cos, sin = np.cos(lean_rad), np.sin(lean_rad)
+    turn = np.array([[1, 0, 0], [0, cos, -sin], [0, sin, cos]])
+    points = (flat + (sizes - core).min() * outward) @ turn.T + np.asarray(centre, float)
+    normals = -(outward @ turn.T) * _DOWN
+    top, front, rear, side = [surfaces] * 4 if isinstance(surfaces, Surface) else surfaces
+    faces = ((top, [0, 2]), (front, [0, 1]), (rear, [0, 1]), (side, [2, 1]), (side, [2, 1]))
+    return [Grid(points[i], normals[i], points[i][..., axes], s) for i, (s, axes) in enumerate(faces)]
+
+
+@lru_cache(maxsize=1)
+def _box_faces() -> ndarray:
+    """(5, 4, 4, 3), top, front, rear, right, left: 1 marks the rounded rim of a face, 0.5 its flat inside,
+    with the sign of the side."""
+    a = np.array([-1.0, -0.5, 0.5, 1.0])
+    row, column = np.meshgrid(-a, a, indexing="ij")  # rows run down or forwards, columns to the right
+    one = np.ones_like(row)
+    faces = [(column, one, row), (column, row, -one), (-column, row, one), (one, row, column)]
+    return np.moveaxis(np.array([*faces, (-one, row, -column)]), 1, -1)
+
+
+def wheel(
+    centre: Sequence[float], radius: float, width: float, surface: Surface, backwards: bool = False
+) -> Grid:
+    """A wheel whose outer face looks to the right (+x), or to the rear; ``centre`` is that face's middle. Its
+    chart is in wheel radii."""
+    out, r = _WHEEL_RINGS.T[..., None]
+    up, side = radius * r * np.cos(_TURN), -radius * r * np.sin(_TURN)
+    axle = np.broadcast_to(out * width, up.shape)
+    share = np.where(np.arange(len(r))[:, None] < 8, r, 1.2)
+    chart = np.stack([share * np.cos(_TURN), share * np.sin(_TURN)], axis=-1)
+    local = (-side, up, axle) if backwards else (axle, up, side)
+    grid = smooth_grid(np.stack(local, axis=-1) + np.asarray(centre, float), chart, surface)
+    grid.normals[:, 0] = grid.normals[:, -1] = _unit(grid.normals[:, 0] + grid.normals[:, -1])
+    return grid
+
+
+def wheel_house(
+    inside: float, at: float, shape: CarShape, flank: Float[ndarray, "points 3"], surface: Surface
+) -> Grid:
+    """The hollow of the wheel arch at z = ``at`` on the right: a disc at x = ``inside`` and the wall out to
+    the body's side; nothing reaches below the sill."""
+    radius = ARCH * shape.wheel + 0.01
+    z, y = at - radius * np.sin(_TURN), shape.wheel + radius * np.cos(_TURN)
+    out = np.where(y > shape.sill, half_width(flank, z, y) - 0.01, inside)
+    y = np.maximum(y, shape.sill)
+    rows = [(inside, shape.wheel, at), (inside, y, z), (inside, y, z), (out, y, z)]
+    points = np.stack([np.stack(np.broadcast_arrays(*row, _TURN)[:3], axis=-1) for row in rows])
+    return smooth_grid(points, points[..., [2, 1]], surface)
+
+
+def half_width(flank: Float[ndarray, "points 3"], z: Any, y: Any) -> Any:
+    """The body's half width about those places, from the points of its right side."""
+    away = (flank[:, 2] - np.asarray(z)[..., None]) ** 2 + (flank[:, 1] - np.asarray(y)[..., None]) ** 2
+    return flank[np.argmin(away, axis=-1), 0]
+
+
+class BodyLines(NamedTuple):
     """The lines that paint follows, each (stations, 3): middle, upper edge, waist and sill."""
 
-    stations: Float[ndarray, "t"]
     middle: Float[ndarray, "t 3"]
     edge: Float[ndarray, "t 3"]
     waist: Float[ndarray, "t 3"]
@@ -41,138 +234,111 @@ class BodyLines:
 
 
 def body_lines(shape: CarShape, stations: Float[ndarray, "t"]) -> BodyLines:
-    """The body's lines at these stations (0..9)."""
-    rows = _rounded(_table(shape), _corners(shape), stations)
-    _raise_wings(shape, rows, stations)
-    return BodyLines(stations, *(rows[:, i : i + 3] for i in (0, 3, 6, 9)))
+    """The body's lines at these stations (0..9): linear interpolation of rows whose corners are parabolas,
+    lifted above the wheels of low cars, so that an arch fits below."""
+    table, corners = _table(shape), _ROUND * (0.12 + 0.88 * shape.soft)
+    low = np.minimum(stations.astype(int), _LAST - 1)
+    slope = np.diff(table, axis=0)
+    inside = np.maximum(0.0, corners - np.abs(stations[:, None] - np.arange(1, _LAST)))
+    rows = (
+        table[low]
+        + slope[low] * (stations - low)[:, None]
+        + inside**2 / (4.0 * corners) @ np.diff(slope, axis=0)
+    )
+    shoulder = np.clip((_from_ends(stations) - 1.3) / 0.6, 0.0, 1.0) * (1.0 - _cabin(stations))
+    for wheel_at in (shape.front_wheel, shape.rear_wheel):
+        lack = (1.0 + ARCH) * shape.wheel + 0.07 - rows[:, 7]
+        near = np.exp(-(((rows[:, 8] - wheel_at) / 0.45) ** 2))
+        rows[:, [4, 7]] += (np.maximum(0.0, lack) * near * shoulder)[:, None]
+    return BodyLines(*(rows[:, i : i + 3] for i in (0, 3, 6, 9)))
 
 
-def body_pieces(shape: CarShape, top: int, side: int) -> tuple[list[Grid], Float[ndarray, "points 3"]]:
-    """The body with the numbers of its surfaces, and the points of its right side.
-
-    The top's chart is (share of the half width, station), the sides' (z, y)."""
-    stations = _stations()
-    half = _half(shape, body_lines(shape, stations))
-    left = half[:, :0:-1] * np.array([-1.0, 1.0, 1.0])
-    points = np.concatenate([left, half], axis=1)[::-1]
+def body_pieces(
+    shape: CarShape, top: Surface, side: Surface
+) -> tuple[list[Grid], Float[ndarray, "points 3"]]:
+    """The body, and the points of its right side. Top's chart is (share of the half width, station), side's
+    (z, y)."""
+    between = [i + np.arange(n) / n for i, n in enumerate(_ROWS_BETWEEN)]
+    bed = [BED_FROM, BED_FROM + 0.01, BED_TO, BED_TO + 0.01]
+    stations = np.sort(np.concatenate([*between, [float(_LAST)], bed]))
+    half = _half(shape, stations)
+    points = np.concatenate([half[:, :0:-1] * _FLIP, half], axis=1)[::-1]
     across = np.concatenate([_ACROSS, np.ones(len(_GLASS) + len(_SIDE))])
     share = np.concatenate([-across[:0:-1], across])
-    chart_top = np.stack(np.broadcast_arrays(share[None], stations[::-1, None]), axis=-1)
-    chart_side = points[..., [2, 1]]
-    whole = smooth_grid(points, chart_top, top)
-    middle = half.shape[1] - 1
-    first, last = middle - _TOP + 1, middle + _TOP
-    pieces = [
-        part_of(whole, slice(0, first + 1), chart_side, side),
-        part_of(whole, slice(first, last), chart_top, top),
-        part_of(whole, slice(last - 1, None), chart_side, side),
+    above = np.stack(np.broadcast_arrays(share[None], stations[::-1, None]), axis=-1)
+    whole, middle, beside = smooth_grid(points, above, top), half.shape[1] - 1, points[..., [2, 1]]
+    first, last = middle - len(_ACROSS) + 1, middle + len(_ACROSS)
+    pieces = [  # with the whole's normals, so that neighbours join without a crease
+        Grid(points[:, columns], whole.normals[:, columns], chart[:, columns], surface)
+        for columns, chart, surface in (
+            *((slice(0, first + 1), beside, side), (slice(first, last), above, top)),
+            (slice(last - 1, None), beside, side),
+        )
     ]
     return pieces, points[:, last:].reshape(-1, 3)
-
-
-@lru_cache(maxsize=1)
-def _stations() -> ndarray:
-    parts = [i + np.arange(n) / n for i, n in enumerate(_ROWS_BETWEEN)]
-    bed = [BED_FROM, BED_FROM + 0.01, BED_TO, BED_TO + 0.01]
-    return np.sort(np.concatenate([*parts, [float(STATIONS - 1)], bed]))
 
 
 def _table(s: CarShape) -> Float[ndarray, "stations 12"]:
     """Middle (x = 0), upper edge, waist and sill at each station."""
     w, end = s.width / 2, s.length
     belt, back_belt = s.cowl + 0.02, max(s.cowl + 0.02, s.deck - 0.04)
-    glass, top = w - 0.035, w - 0.035 - s.tumblehome
+    glass, top, bonnet = w - 0.035, w - 0.035 - s.tumblehome, w - 0.07
     cabin = s.deck_at - s.cowl_at
-    bonnet = w - 0.07
+    if s.bed > 0 and s.screen_at - s.cowl_at < 0.2:  # an open top
+        glass, top, belt, back_belt = w - 0.01, w - 0.06, s.cowl - 0.06, s.deck - 0.06
     middle = np.array([
         (0, s.sill, 0.12), (0, s.bumper, 0.0), (0, s.nose, s.nose_at), (0, s.cowl, s.cowl_at),
         (0, s.height, s.screen_at), (0, s.height - s.roof_drop, s.roof_end_at), (0, s.deck, s.deck_at),
         (0, s.tail, s.tail_at), (0, s.bumper + 0.05, end), (0, s.sill + 0.04, end - 0.1),
     ])  # fmt: skip
-    if s.bed > 0 and s.screen_at - s.cowl_at < 0.2:  # an open top
-        glass, top, belt, back_belt = w - 0.01, w - 0.06, s.cowl - 0.06, s.deck - 0.06
-    half = np.array([
+    edge = middle.copy()
+    edge[:, 0] = [
         0.86 * w, 0.90 * w - 0.6 * s.hood_inset, 0.90 * w - s.hood_inset, bonnet - 0.02, top, top - 0.02,
         bonnet, 0.91 * w, 0.92 * w, 0.88 * w,
-    ])  # fmt: skip
-    bow = np.array([0.7, 1.0, 0.9, 0.35, 0.25, -0.12, -0.25, -0.5, -0.55, -0.5]) * s.bow
-    edge = middle.copy()
-    edge[:, 0], edge[:, 2] = half, middle[:, 2] + bow
-    edge[2:8, 1] -= np.array([0.03, 0.045, 0.05, 0.05, 0.03, 0.02])
+    ]  # fmt: skip
+    edge[:, 2] += np.array([0.7, 1.0, 0.9, 0.35, 0.25, -0.12, -0.25, -0.5, -0.55, -0.5]) * s.bow
+    edge[2:8, 1] -= [0.03, 0.045, 0.05, 0.05, 0.03, 0.02]
     waist = edge + np.array([
         (0.04 * w, 0.01, 0.05), (0.06 * w, -0.01, 0.05), (0.06 * w, -0.07, 0.06), (0.05, -0.06, 0.03),
         (0, 0, 0), (0, 0, 0), (0.05, -0.05, 0.0), (0.04 * w, -0.06, -0.04), (0.04 * w, -0.01, -0.05),
         (0.05 * w, 0.01, -0.04),
     ])  # fmt: skip
-    waist[4] = glass, belt, s.cowl_at + 0.42 * cabin
-    waist[5] = glass, back_belt, s.cowl_at + 0.78 * cabin
+    waist[4:6] = (glass, belt, s.cowl_at + 0.42 * cabin), (glass, back_belt, s.cowl_at + 0.78 * cabin)
     below = waist.copy()
-    below[:, 0] = 0.95 * w
-    below[[0, 1, -2, -1], 0] = 0.91 * w, 0.94 * w, 0.94 * w, 0.91 * w
-    below[:, 1] = s.sill
-    below[[0, -1], 1] = waist[[0, -1], 1]
+    below[:, 0] = w * np.array([0.91, 0.94, *[0.95] * 6, 0.94, 0.91])
+    below[1:-1, 1] = s.sill
     below[1:3, 2] += [0.10, 0.16]
     below[7:9, 2] -= [0.16, 0.10]
     return np.concatenate([middle, edge, waist, below], axis=1)
 
 
-def _corners(s: CarShape) -> Float[ndarray, "inner"]:
-    """How far (in stations) each inner corner is rounded on both sides."""
-    return np.array([0.42, 0.32, 0.16, 0.26, 0.26, 0.16, 0.28, 0.42]) * (0.12 + 0.88 * s.soft)
-
-
-def _rounded(table: ndarray, corners: ndarray, t: ndarray) -> ndarray:
-    """Linear interpolation of rows whose corners are parabolas: C1, exact outside the corners' reach."""
-    low = np.minimum(t.astype(int), STATIONS - 2)
-    slope = np.diff(table, axis=0)
-    inside = np.maximum(0.0, corners - np.abs(t[:, None] - np.arange(1, STATIONS - 1)))
-    return table[low] + slope[low] * (t - low)[:, None] + inside**2 / (4.0 * corners) @ np.diff(slope, axis=0)
-
-
-def _half(s: CarShape, lines: BodyLines) -> Float[ndarray, "t c 3"]:
+def _half(s: CarShape, stations: ndarray) -> Float[ndarray, "t c 3"]:
     """The half with x >= 0, from the middle to the sill."""
-    a, cabin = _ACROSS[:, None], _cabin(lines.stations)
+    a, cabin, lines = _ACROSS[:, None], _cabin(stations), body_lines(s, stations)
     across = np.concatenate([a, 0.4 * a**2 + 0.6 * a**8, 0.25 * a**2 + 0.75 * a**4], axis=1)
     top = lines.middle[:, None] + across * (lines.edge - lines.middle)[:, None]
     if s.bed > 0:
-        inside = (lines.stations > BED_FROM) & (lines.stations < BED_TO + 0.005)
+        inside = (stations > BED_FROM) & (stations < BED_TO + 0.005)
         top[inside, : np.searchsorted(_ACROSS, BED_SIDE) + 1, 1] -= s.bed
-    glass = _bulged(lines.edge, lines.waist, _GLASS, 0.9 - 0.75 * cabin)
-    down = lines.waist[:, None] + _SIDE[:, None] * (lines.sill - lines.waist)[:, None]
-    down[..., 0] += 0.035 * (1.0 - np.exp(-_SIDE / 0.06)) * cabin[:, None]
-    from_ends = np.clip(_from_ends(lines.stations) - 0.4, 0.0, 1.0)[:, None]
-    down[..., 0] += 0.05 * np.sin(np.pi * _SIDE) * (1.0 - _SIDE) * from_ends
-    half = np.concatenate([top, glass, down], axis=1)
-    side = half[:, _EDGE:]
-    for wheel in (s.front_wheel, s.rear_wheel):
-        away = np.hypot(side[..., 2] - wheel, side[..., 1] - s.wheel)
-        stands_out = np.exp(-(((away - 1.2 * s.wheel) / 0.16) ** 2)) + 0.6 * np.exp(-((away / 0.7) ** 2))
-        side[..., 0] += s.flare * stands_out * from_ends * np.clip((side[..., 1] - s.sill) / 0.25, 0.0, 1.0)
-    return half
-
-
-def _raise_wings(shape: CarShape, rows: Float[ndarray, "t 12"], stations: Float[ndarray, "t"]) -> None:
-    """Lift upper edge and waist above the wheels of low cars, so that an arch fits below."""
-    shoulder = np.clip((_from_ends(stations) - 1.3) / 0.6, 0.0, 1.0) * (1.0 - _cabin(stations))
-    for wheel in (shape.front_wheel, shape.rear_wheel):
-        waist = rows[:, 6:9]
-        lack = (1.0 + ARCH) * shape.wheel + 0.07 - waist[:, 1]
-        near = np.exp(-(((waist[:, 2] - wheel) / 0.45) ** 2))
-        rows[:, [4, 7]] += (np.maximum(0.0, lack) * near * shoulder)[:, None]
-
-
-def _bulged(edge: ndarray, waist: ndarray, share: ndarray, bulge: ndarray) -> ndarray:
-    """A parabola from edge to waist; ``bulge`` 0 is straight, 1 leaves the edge level and drops at the
-    end."""
+    edge, waist, f = lines.edge, lines.waist, _GLASS[:, None]
     corner = np.stack([waist[:, 0], edge[:, 1], 0.5 * (edge[:, 2] + waist[:, 2])], axis=-1)
-    control = 0.5 * (edge + waist) * (1.0 - bulge[:, None]) + corner * bulge[:, None]
-    f = share[:, None]
-    return (1 - f) ** 2 * edge[:, None] + 2 * f * (1 - f) * control[:, None] + f**2 * waist[:, None]
+    bulge = (0.9 - 0.75 * cabin)[:, None]  # 0 is straight, 1 leaves the edge level and drops at the end
+    control = (0.5 * (edge + waist) * (1.0 - bulge) + corner * bulge)[:, None]
+    glass = (1 - f) ** 2 * edge[:, None] + 2 * f * (1 - f) * control + f**2 * waist[:, None]
+    down = waist[:, None] + _SIDE[:, None] * (lines.sill - waist)[:, None]
+    down[..., 0] += 0.035 * (1.0 - np.exp(-_SIDE / 0.06)) * cabin[:, None]
+    from_ends = np.clip(_from_ends(stations) - 0.4, 0.0, 1.0)[:, None]
+    down[..., 0] += 0.05 * np.sin(np.pi * _SIDE) * (1.0 - _SIDE) * from_ends
+    for wheel_at in (s.front_wheel, s.rear_wheel):
+        away = np.hypot(down[..., 2] - wheel_at, down[..., 1] - s.wheel)
+        stands_out = np.exp(-(((away - 1.2 * s.wheel) / 0.16) ** 2)) + 0.6 * np.exp(-((away / 0.7) ** 2))
+        down[..., 0] += s.flare * stands_out * from_ends * np.clip((down[..., 1] - s.sill) / 0.25, 0.0, 1.0)
+    return np.concatenate([top, glass, down], axis=1)
 
 
 def _from_ends(stations: ndarray) -> ndarray:
     """Stations from the nearer end of the outline."""
-    return np.minimum(stations, STATIONS - 1 - stations)
+    return np.minimum(stations, _LAST - stations)
 
 
 def _cabin(stations: ndarray) -> ndarray:

@@ -1,5 +1,13 @@
 """Procedural cars: class, shape, paint, light and view are drawn, the car is rendered with exact truth.
 
+Twelve classes: seven body styles and five that differ by more than their body (police, ambulance, limousine,
+jeep, sports). Measures are metres and, along the car, distance from the front bumper: a row of ``cars.yaml``
+for each body style (typical outside measures of road cars, rounded) times small independent factors. Paint
+is drawn from short lists of usual colours. Wheels, mirrors, light bars, wings, rails, an ambulance's box, a
+jeep's fittings: everything mounted on the body is a rounded box or a wheel, placed by the body's measures,
+and comes in mirror images or lies across the middle. Leaves out rust, dirt and damage; no existing car is
+drawn.
+
 Each image is a function of the seed and its index alone: asking for more images does not change the first
 ones, nor does the number of threads. Conventions are those of docs/conventions.md and of the rendered
 development set: a car's bounding box is centred on (0, 0, 1). The view is a turntable's: M = Rz(inplane)
@@ -7,45 +15,61 @@ Rx(elevation) Ry(azimuth) takes the upright car, front towards the viewer, to th
 is the car seen from straight ahead and 42.5 degrees above, so the camera's rotation is R = M Rx(42.5)^-1,
 given by its Euler angles."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float32, Float64
+import yaml
+from jaxtyping import Float64
 from numpy import ndarray
 
-from derender.data.synthetic.car_model import build_car
-from derender.data.synthetic.car_traits import CarTraits, draw_traits
-from derender.data.synthetic.decals import PARTS, Paint
-from derender.data.synthetic.mesh_image import TriangleMesh, draw_meshes, shift_room
-from derender.data.synthetic.settings import CarSettings, clipped, either_side, name_at, scaled
-from derender.data.synthetic.synthetic_set import FOV_DEG, Maps, Row, SyntheticSet, draw_background, make_set
+from derender.data.synthetic.car_body import (
+    ARCH,
+    BED_FROM,
+    BED_TO,
+    PARTS,
+    CarShape,
+    Colour,
+    Grid,
+    Surface,
+    body_lines,
+    body_pieces,
+    both,
+    half_width,
+    join,
+    rounded_box,
+    wheel,
+    wheel_house,
+)
+from derender.data.synthetic.car_paint import (
+    BLACK,
+    CHROME,
+    WHITE,
+    CarTraits,
+    ambulance_paint,
+    box,
+    ellipse,
+    side_paint,
+    top_paint,
+    wheel_paint,
+)
+from derender.data.synthetic.mesh_image import TriangleMesh, shift_room
+from derender.data.synthetic.settings import CLASSES, CarSettings, drawn, pick
+from derender.data.synthetic.synthetic_set import FOV_DEG, Row, Shot, SyntheticSet, draw_background, make_set
 
 CANONICAL_ELEVATION_DEG = 42.5
 _GOLDEN = 0.6180339887498949
-
-
-@dataclass(frozen=True)
-class Car:
-    """A model: its mesh in the canonical frame, relative to the object's centre, at its size; its paint."""
-
-    traits: CarTraits
-    mesh: TriangleMesh
-    paint: Paint
-
-
-@dataclass(frozen=True)
-class CarDraw:
-    """One image's draw: angles in degrees, ``rotation`` canonical to camera, the ``shift`` requested."""
-
-    model: int
-    elevation_deg: float
-    azimuth_deg: float
-    inplane_deg: float
-    rotation: Float64[ndarray, "3 3"]
-    shift: Float64[ndarray, "2"]
-    light: Float32[ndarray, "4"]
-    background: Float32[ndarray, "s s 3"]
+_PAINT_WHITE, _PAINT_BLACK, _TYRE = (0.92, 0.92, 0.91), (0.075, 0.075, 0.08), (0.055, 0.055, 0.06)
+_BAR_BLUE, _BAR_RED = (0.05, 0.22, 0.95), (0.95, 0.05, 0.06)
+_ALONG = (
+    *("length", "front_wheel", "rear_wheel", "nose_at", "cowl_at", "screen_at"),
+    *("roof_end_at", "deck_at", "tail_at"),
+)
+_UP = ("height", "nose", "cowl", "deck", "tail", "bumper")
+_PLASTIC = {"suv": 0.6, "van": 0.6, "pickup": 0.6, "jeep": 1.0, "hatchback": 0.15}  # chance of such bumpers
 
 
 def generate(
@@ -59,64 +83,78 @@ def generate(
     """``count`` images, from index ``first`` on; ``progress(done, count)`` is called as they are made.
 
     ``labels`` has ``class``, ``style`` (body style), ``model`` (CLASS/NUMBER) and the turntable's angles in
-    degrees; ``parts`` counts into ``decals.PARTS``; ``identity`` is the model's number."""
+    degrees; ``parts`` counts into ``car_body.PARTS``; ``identity`` is the model's number."""
     settings = settings or CarSettings()
 
-    def work(indices: range, maps: Maps) -> list[tuple[Row, Row]]:
-        draws = [draw_car(seed, index, image_size, settings) for index in indices]
-        models = {number: model_car(seed, number, settings) for number in sorted({d.model for d in draws})}
-        shown = [models[d.model] for d in draws]
-        for n, (draw, car) in enumerate(zip(draws, shown, strict=True)):
-            shift = _shift_inside(car.mesh.vertices, draw.rotation, draw.shift)
-            maps["camera"][n] = *euler_angles(draw.rotation), *shift, 0.0
-            maps["light"][n], maps["identity"][n] = draw.light, draw.model
-        draw_meshes([(car.mesh, car.paint) for car in shown], 0.0, [d.background for d in draws], maps)
-        return [(_labels(d, car.traits), _traits(car.traits)) for d, car in zip(draws, shown, strict=True)]
+    def shots(indices: list[int]) -> Iterator[Shot]:
+        number = settings.first_model + indices[0] // settings.pictures_per_model
+        car = model_car(seed, number, settings)
+        return (draw_car(seed, index, image_size, settings, car, number) for index in indices)
 
-    return make_set(
-        work, lambda: None, count, image_size, seed, first, settings.pictures_per_model, PARTS, progress
-    )
+    return make_set(shots, count, image_size, seed, first, settings.pictures_per_model, PARTS, progress)
+
+
+@dataclass(frozen=True)
+class Car:
+    """A model: its traits (and those that tables name), its mesh in the canonical frame, relative to the
+    object's centre, at its size."""
+
+    traits: CarTraits
+    row: Row
+    mesh: TriangleMesh
 
 
 def model_car(seed: int, number: int, settings: CarSettings | None = None) -> Car:
     """Model ``number`` of a seed, as ``generate`` renders it."""
     settings = settings or CarSettings()
     traits = draw_traits(class_of(seed, number, settings), np.random.default_rng([seed, 5, number]))
-    mesh, paint = build_car(traits)
+    mesh = build_car(traits)
     upright = mesh.vertices.astype(np.float64)
-    low, high = upright.min(axis=0), upright.max(axis=0)
+    low, high = np.array([(axis.min(), axis.max()) for axis in np.ascontiguousarray(upright.T)]).T
     centred = (upright - 0.5 * (low + high)) * (settings.size / np.linalg.norm(high - low))
     turn = about_x(CANONICAL_ELEVATION_DEG).T
     vertices, normals = ((points @ turn).astype(np.float32) for points in (centred, mesh.normals))
-    return Car(traits, mesh._replace(vertices=vertices, normals=normals), paint)
+    row: Row = {name: getattr(traits.shape, name) for name in ("length", "width", "height", "wheel", "soft")}
+    for name in ("paint", "roof", "glass"):
+        names = (f"{name}_{channel}" for channel in ("red", "green", "blue"))
+        row |= dict(zip(names, getattr(traits, name), strict=True))
+    return Car(traits, row, mesh._replace(vertices=vertices, normals=normals))
 
 
 def class_of(seed: int, model: int, settings: CarSettings) -> str:
     """The class of a model. Shares are kept closely by any run of models: a golden-ratio sequence."""
-    start = np.random.default_rng([seed, 4]).random()
-    return name_at(settings.classes, (start + model * _GOLDEN) % 1.0)
+    at = (np.random.default_rng([seed, 4]).random() + model * _GOLDEN) % 1.0
+    return list(settings.classes)[pick([*settings.classes.values()], at)]
 
 
-def draw_car(seed: int, index: int, image_size: int, settings: CarSettings) -> CarDraw:
-    """The draw of image number ``index``, a function of seed and index alone."""
-    generator = np.random.default_rng([seed, 3, index])
-    normal = generator.standard_normal(3)
-    uniform = generator.random(8)
-    view = settings.view
-    elevation, azimuth = scaled(view.elevation_deg, uniform[0]), scaled(view.azimuth_deg, uniform[1])
-    if view.azimuth_beyond_deg > 0:
-        azimuth = either_side(view.azimuth_deg, view.azimuth_beyond_deg, uniform[1])
-    inplane = clipped(view.inplane_sd_deg * normal[0], view.inplane_deg)
+def draw_car(seed: int, index: int, image_size: int, settings: CarSettings, car: Car, number: int) -> Shot:
+    """Image ``index`` of model ``number``: light, view and background."""
+    generator, view = np.random.default_rng([seed, 3, index]), settings.view
+    normal, uniform = generator.standard_normal(3), generator.random(8)
+    elevation = drawn(view.elevation_deg, uniform[0])
+    azimuth = drawn(view.azimuth_deg, uniform[1], view.azimuth_beyond_deg)
+    inplane = min(max(view.inplane_sd_deg * normal[0], view.inplane_deg[0]), view.inplane_deg[1])
     kind = settings.backgrounds[int(uniform[7] * len(settings.backgrounds))]
-    return CarDraw(
-        model=settings.first_model + index // settings.pictures_per_model,
-        elevation_deg=elevation,
-        azimuth_deg=azimuth,
-        inplane_deg=inplane,
-        rotation=view_rotation(elevation, azimuth, inplane) @ about_x(CANONICAL_ELEVATION_DEG).T,
-        shift=np.clip(view.shift_sd * normal[1:], *view.shift),
-        light=settings.light.draw(uniform[2:7], settings.brightest),
-        background=draw_background(kind, generator, image_size),
+    rotation = view_rotation(elevation, azimuth, inplane) @ about_x(CANONICAL_ELEVATION_DEG).T
+    room = np.empty((2, 2))  # so that all vertices stay in the image
+    shift_room(car.mesh.vertices, rotation, np.tan(np.deg2rad(FOV_DEG / 2)), room)
+    (low, high), (least, most) = room, view.shift
+    shift = np.minimum(np.maximum(view.shift_sd * normal[1:], least), most)
+    shift = np.where(low < high, np.minimum(np.maximum(shift, low), high), 0.5 * (low + high))
+    labels: Row = {
+        "class": car.traits.name,
+        "style": car.traits.style,
+        "model": f"{car.traits.name}/{number:05d}",
+    }
+    labels |= {"elev": np.float32(elevation), "azim": np.float32(azimuth), "inplane": np.float32(inplane)}
+    return Shot(
+        car.mesh,
+        draw_background(kind, generator, image_size),
+        settings.light.draw(uniform[2:7], settings.brightest),
+        np.array([*euler_angles(rotation), *shift, 0.0], np.float32),
+        number,
+        labels,
+        car.row,
     )
 
 
@@ -136,28 +174,195 @@ def about_x(angle_deg: float) -> Float64[ndarray, "3 3"]:
 def euler_angles(rotation: Float64[ndarray, "3 3"]) -> Float64[ndarray, "3"]:
     """Angles about x, y, z (radians) of R = Rz Ry Rx."""
     x = np.arctan2(rotation[2, 1], rotation[2, 2])
-    y = np.arcsin(np.clip(-rotation[2, 0], -1.0, 1.0))
+    y = np.arcsin(min(max(-rotation[2, 0], -1.0), 1.0))
     return np.array([x, y, np.arctan2(rotation[1, 0], rotation[0, 0])])
 
 
-def _shift_inside(
-    vertices: Float32[ndarray, "v 3"], rotation: Float64[ndarray, "3 3"], shift: Float64[ndarray, "2"]
-) -> Float64[ndarray, "2"]:
-    """The shift, limited so that the turned vertices stay in the image; one without room is centred."""
-    room = np.empty((2, 2))
-    shift_room(vertices, rotation, np.tan(np.deg2rad(FOV_DEG / 2)), room)
-    low, high = room
-    return np.where(low < high, np.clip(shift, low, high), 0.5 * (low + high))
+@lru_cache(maxsize=1)
+def _numbers() -> dict[str, Any]:
+    return yaml.safe_load(Path(__file__).with_name("cars.yaml").read_text(encoding="utf-8"))
 
 
-def _labels(draw: CarDraw, car: CarTraits) -> Row:
-    row: Row = {"class": car.name, "style": car.style, "model": f"{car.name}/{draw.model:05d}"}
-    angles = {"elev": draw.elevation_deg, "azim": draw.azimuth_deg, "inplane": draw.inplane_deg}
-    return row | {name: np.float32(angle) for name, angle in angles.items()}
+def draw_traits(name: str, generator: np.random.Generator) -> CarTraits:
+    """A model of class ``name``. Draws the same number of random values whatever the class."""
+    uniform, spread = generator.random(24).tolist(), generator.standard_normal(8)
+    style = CLASSES[name][int(uniform[0] * len(CLASSES[name]))]
+    shape = _draw_shape(style, generator, 1.5 + 1.0 * uniform[1] if name == "limousine" else 0.0)
+    livery, palettes = int(uniform[2] * 3), _numbers()["palettes"]
+    palette = np.array(palettes.get(name, palettes["usual"]))
+    tint = np.clip(spread[:3], -2, 2)  # a little lighter or darker, and each channel on its own
+    colour = palette[pick(palette[:, 3], uniform[3]), :3] * (1.0 + 0.10 * tint[0]) * (1.0 + 0.05 * tint)
+    paint: Any = tuple(np.clip(colour, 0.03, 0.95).tolist())
+    if name == "police":
+        paint = (_PAINT_BLACK, _PAINT_WHITE, _PAINT_WHITE)[livery]
+    roof = paint
+    if uniform[4] < {"suv": 0.3, "hatchback": 0.2}.get(name, 0.0):
+        roof = _PAINT_WHITE if sum(paint) < 1.4 else _PAINT_BLACK
+    if uniform[4] < {"sports": 0.25, "coupe": 0.25, "jeep": 0.6}.get(name, 0.0):
+        roof = _PAINT_BLACK if name != "jeep" or uniform[5] < 0.6 else _PAINT_WHITE
+    grey = 0.06 + 0.10 * uniform[6] + (0.08 if sum(paint) < 0.5 else 0.0)
+    bright = 0.25 if uniform[8] < 0.2 else 0.55 + 0.25 * uniform[9]
+    trim = 0.07 + 0.06 * uniform[10]
+    plastic = (trim, trim, trim * 1.05)
+    return CarTraits(
+        name=name,
+        style=style,
+        shape=shape,
+        paint=paint,
+        roof=roof,
+        glass=(grey, grey * (1.05 + 0.2 * uniform[7]), grey * (1.15 + 0.5 * uniform[7])),
+        rim=(bright, bright, bright * 1.02),
+        trim=plastic,
+        bumpers=plastic if uniform[11] < _PLASTIC.get(name, 0.0) else paint,
+        spokes=5 + int(uniform[12] * 4),
+        chances=uniform[13:23],
+        livery=livery,
+    )
 
 
-def _traits(car: CarTraits) -> Row:
-    row: Row = {name: getattr(car.shape, name) for name in ("length", "width", "height", "wheel", "soft")}
-    for name, colour in (("paint", car.paint), ("roof", car.roof), ("glass", car.glass)):
-        row |= {f"{name}_{k}": v for k, v in zip(("red", "green", "blue"), colour, strict=True)}
-    return row
+def _draw_shape(style: str, generator: np.random.Generator, stretch: float) -> CarShape:
+    """A model of that style; ``stretch`` metres are put in behind the front doors (limousines)."""
+    row = CarShape(*_numbers()["measures"][style])
+    normal = np.clip(generator.standard_normal(len(row)), -2.0, 2.0).tolist()
+    factor = {name: 1.0 + 0.03 * z for name, z in zip(CarShape._fields, normal, strict=True)}
+    common = dict.fromkeys(_ALONG, factor["length"]) | dict.fromkeys(
+        _UP, factor["height"]
+    )  # keep their order
+    drawn_row = {name: value * (factor | common)[name] for name, value in row._asdict().items()}
+    between = factor["cowl"] - 1.0  # a longer or shorter bonnet moves the windscreen as a whole
+    drawn_row["cowl_at"] += 1.2 * between
+    drawn_row["screen_at"] += 1.2 * between + 2.0 * row.soft * (factor["screen_at"] - 1.0)
+    if row.roof_end_at < row.deck_at - 0.25 and row.bed == 0.0:
+        drawn_row["roof_end_at"] += 4.0 * row.soft * (factor["roof_end_at"] - 1.0)
+    drawn_row["soft"] = min(1.0, row.soft * (1.0 + 5.0 * (factor["soft"] - 1.0)))
+    drawn_row["bow"] = row.bow * (1.0 + 5.0 * (factor["bow"] - 1.0))
+    drawn_row["nose"] *= factor["nose"]
+    for name in ("length", "rear_wheel", "roof_end_at", "deck_at", "tail_at"):
+        drawn_row[name] += stretch
+    return CarShape(**drawn_row)
+
+
+def build_car(car: CarTraits) -> TriangleMesh:
+    """Mesh in metres (x right, y down, z to the rear; ground at y = 0) with its paint."""
+    s, jeep, black = car.shape, car.name == "jeep", Surface(BLACK)
+    wheels = (s.front_wheel, s.rear_wheel)
+    holes = [] if jeep else [(at, s.wheel, ARCH * s.wheel) for at in wheels]
+    side = Surface(car.paint, "body", side_paint(car), holes=holes)
+    pieces, flank = body_pieces(s, Surface(car.paint, "body", top_paint(car), folded=True), side)
+    tyre = Surface(_TYRE, "wheel", wheel_paint(car))
+    template = wheel((0, s.wheel, 0), s.wheel, 0.28 if jeep else 0.24, tyre)
+    for at in wheels:
+        out, houses = s.width / 2 + 0.15, []
+        if not jeep:
+            z, y = np.meshgrid([-1.1, 0.0, 1.1], [0.8, 1.2])
+            out = half_width(flank, at + z * s.wheel, y * s.wheel).min() - 0.025
+            houses = [wheel_house(out - 0.25, at, s, flank, black)]
+        pieces += both([template.moved((out, 0, at)), *houses])
+    ahead, tall = (0.1, 0.15) if car.style in ("van", "cab") else (0.28, 0.08)
+    mirror = (
+        half_width(flank, s.cowl_at + ahead, s.cowl - 0.05) + 0.09,
+        s.cowl + 0.02 + tall,
+        s.cowl_at + ahead,
+    )
+    pieces += both(
+        rounded_box(mirror, (0.11, tall, 0.05), 0.04, Surface(car.trim if car.plastic else car.paint))
+    )
+    fittings = {"police": _light_bar, "ambulance": _ambulance_box, "sports": _wing, "jeep": _jeep}
+    if car.name in fittings:
+        pieces += fittings[car.name](car)
+    if car.name in ("suv", "estate") and car.chances[9] < 0.7:
+        edge = body_lines(s, np.array([4.1, 4.5, 4.9])).edge
+        centre = (0.93 * edge[:, 0].min(), edge[:, 1].mean() + 0.05, edge[:, 2].mean())
+        rail = Surface(BLACK if car.chances[3] < 0.5 else CHROME)
+        pieces += both(rounded_box(centre, (0.025, 0.03, 0.5 * (edge[-1, 2] - edge[0, 2])), 0.02, rail))
+    return join(pieces)
+
+
+def _light_bar(car: CarTraits) -> list[Grid]:
+    middle, half, top = car.shape.screen_at + 0.42, 0.58, car.shape.height + 0.10
+    left: Colour = _BAR_RED if car.chances[8] < 0.6 else _BAR_BLUE
+    lamps = [box(-half - 0.1, -9, -0.16, 9, left, "light"), box(0.16, -9, half + 0.1, 9, _BAR_BLUE, "light")]
+    glass = Surface((0.85, 0.86, 0.9), "light", lamps)
+    return [
+        *rounded_box((0, top - 0.06, middle), (half, 0.05, 0.13), 0.03, Surface(BLACK)),
+        *rounded_box((0, top + 0.03, middle), (half + 0.04, 0.075, 0.16), 0.05, glass),
+    ]
+
+
+def _ambulance_box(car: CarTraits) -> list[Grid]:
+    s = car.shape
+    low, high, front, rear = s.sill + 0.32, s.height + 0.62, s.screen_at + 0.62, s.length
+    half, tall, long = s.width / 2 + 0.1, 0.5 * (high - low), 0.5 * (rear - front)
+    above, ahead, beside = ambulance_paint(car, low, high, front, rear)
+    walls = [
+        Surface(WHITE, "body", above),
+        Surface(WHITE, "body", ahead, folded=True),
+        Surface(WHITE, "body"),
+    ]
+    lamp = Surface(_BAR_RED if car.livery != 2 and car.chances[8] < 0.5 else _BAR_BLUE, "light")
+    return [
+        *rounded_box(
+            (0, low + tall, 0.5 * (front + rear)),
+            (half, tall, long),
+            0.07,
+            [*walls, Surface(WHITE, "body", beside)],
+        ),
+        *both(rounded_box((half - 0.3, high - 0.02, front + 0.08), (0.24, 0.12, 0.14), 0.05, lamp)),
+        *both(rounded_box((half - 0.3, high - 0.02, rear - 0.12), (0.2, 0.09, 0.1), 0.04, lamp)),
+        *rounded_box((0, s.height + 0.07, s.screen_at + 0.2), (0.55, 0.08, 0.13), 0.05, lamp),
+    ]
+
+
+def _wing(car: CarTraits) -> list[Grid]:
+    s = car.shape
+    half, at = 0.86 * s.width / 2, s.tail_at - 0.1
+    own = Surface(car.paint, "body") if car.chances[6] < 0.55 else Surface(BLACK)
+    if car.chances[5] < 0.25:
+        return rounded_box((0, s.tail + 0.05, s.tail_at - 0.04), (half, 0.04, 0.13), 0.035, own, 0.3)
+    height = s.tail + 0.24 + 0.12 * car.chances[7]
+    stand = (0.025, 0.5 * (height - s.tail) + 0.02, 0.09)
+    return [
+        *both(rounded_box((0.6 * half, 0.5 * (s.tail + height), at), stand, 0.02, own)),
+        *both(rounded_box((half + 0.01, height + 0.03, at), (0.02, 0.1, 0.18), 0.015, own)),
+        *rounded_box((0, height, at), (half, 0.03, 0.17), 0.025, own, 0.12),
+    ]
+
+
+def _jeep(car: CarTraits) -> list[Grid]:
+    s, black = car.shape, Surface(car.trim)
+    inner, outer = 0.55 * s.width / 2, s.width / 2 + 0.16
+    pieces = rounded_box((0, s.bumper - 0.04, -0.06), (0.95 * s.width / 2, 0.11, 0.12), 0.03, black)
+    for at in (s.front_wheel, s.rear_wheel):
+        centre, half = (0.5 * (inner + outer), 2 * s.wheel + 0.08, at), 0.5 * (outer - inner)
+        pieces += both(rounded_box(centre, (half, 0.05, 1.25 * s.wheel), 0.04, black))
+    spare = Surface(_TYRE, "wheel", [*wheel_paint(car), ellipse(0, 0, (0.34, 0.34), BLACK)])
+    if car.style == "jeep_hard" and car.chances[8] < 0.35:  # on its back on the bonnet
+        lying = wheel((0, 0, 0), s.wheel * 0.92, 0.22, spare, backwards=True)
+        middle = (0, 0.5 * (s.nose + s.cowl) + 0.16, 0.55 * (s.nose_at + s.cowl_at))
+        points = (lying.points - lying.points[0, 0])[..., [0, 2, 1]] * (1.0, 1.0, -1.0) + middle
+        pieces.append(lying._replace(points=points, normals=lying.normals[..., [0, 2, 1]] * (1.0, -1.0, 1.0)))
+    else:
+        pieces.append(wheel((0, s.cowl - 0.08, s.length + 0.24), s.wheel * 0.95, 0.24, spare, backwards=True))
+    return pieces + (_open_cabin(car) if car.style == "jeep_open" else [])
+
+
+def _open_cabin(car: CarTraits) -> list[Grid]:
+    s, roll = car.shape, Surface(BLACK)
+    half, x = 0.92 * s.width / 2, 0.78 * s.width / 2
+    frame: Colour = car.paint if car.chances[6] < 0.5 else car.trim
+    pane = box(-0.86 * half, s.cowl + 0.06, 0.86 * half, s.cowl + 0.46, car.glass, "window")
+    plain, glazed = Surface(frame), Surface(frame, "trim", [pane])
+    start, end = body_lines(s, np.array([BED_FROM, BED_TO])).middle[:, 2]
+    bar_at, top = start + 0.5 * (end - start), s.cowl + 0.56
+    seat = Surface((0.36, 0.27, 0.18) if car.chances[4] < 0.5 else (0.13, 0.13, 0.14))
+    screen, walls = (0, s.cowl + 0.26, s.cowl_at + 0.14), (plain, glazed, glazed, plain)
+    post, stay = (0.045, 0.5 * (top - 0.6), 0.045), (x, 0.5 * (top + s.cowl), bar_at + 0.42)
+    return [
+        *rounded_box(screen, (half, 0.28, 0.025), 0.02, walls, 0.22),
+        *both(rounded_box((x, 0.5 * (top + 0.6), bar_at), post, 0.04, roll)),
+        *rounded_box((0, top, bar_at), (x + 0.045, 0.045, 0.045), 0.04, roll),
+        *both(rounded_box(stay, (0.04, 0.4, 0.04), 0.035, roll, -0.8)),
+        *both(rounded_box((0.34, 0.98, bar_at - 0.24), (0.22, 0.36, 0.07), 0.06, seat, 0.2)),
+        *both(rounded_box((0.34, 0.70, bar_at - 0.5), (0.23, 0.09, 0.24), 0.06, seat)),
+        *rounded_box((0, 0.92, end - 0.42), (0.52, 0.3, 0.07), 0.06, seat, 0.2),
+    ]

@@ -3,297 +3,148 @@
 Skin tone with mottling, blush, freckles, lines of age and stubble; lips; brows; hair; beard; clothes. Hair is
 part of the head's surface: it grows above a line around the head, given as a row ``q`` for each angle, and
 lifts the surface by its thickness, with a soft, uneven edge. Eyes and the inside of the mouth change from
-image to image and are painted by ``face_mesh``. Leaves out single strands, plaits, and hair that hangs free
-of the head.
+image to image and are painted over it: lids follow the expression, irises the gaze; the mouth's inside shows
+teeth, dark and tongue as far as the lips have parted. Colours only: no highlights, since albedo holds no
+light. Leaves out single strands, plaits, and hair that hangs free of the head.
 """
 
-from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float32, Int32
 from numpy import ndarray
 from scipy.interpolate import PchipInterpolator
 
 from derender.data import MASK_CLASSES
-from derender.data.synthetic.face_identity import (
-    BEARDS,
-    CURTAIN,
-    HAIR_STYLES,
-    SKIN_FIELDS,
-    FaceIdentity,
-    HairStyle,
-)
+from derender.data.synthetic.face_identity import SKIN_FIELDS, Identity
 from derender.data.synthetic.face_shape import (
+    EYE_P,
+    EYE_Q,
+    MOUTH_BAND,
     MOUTH_Q,
     FaceGrid,
-    bare_head,
-    ear_slant,
-    face_grid,
+    FaceShape,
+    age_lines,
+    ear_angle,
+    face_numbers,
+    face_shape,
+    gauss,
     hill,
     smoothstep,
-    wrinkles,
 )
 
-PART = {name: np.uint8(number) for number, name in enumerate(MASK_CLASSES)}
-_BROW_ROWS = (-27.0, -14.0)
+PART = {name: number for number, name in enumerate(MASK_CLASSES)}
 _FIELD_SEED = 7  # the noise fields are part of the model, the same for everyone; identities mix them
 _HANG = 27.5  # half width at which hair falls past jaw and neck
-_TURNS_DEG = (0.0, 15.0, 30.0, 42.0, 50.0, 57.0, 63.0, 70.0, 78.0, 86.0, 96.0, 104.0, 115.0)
-_BEARD_LINE = np.array([  # where beards begin on the cheek: p, q
-    (0.0, 18.9), (3.0, 19.1), (7.0, 18.6), (10.0, 13.5), (13.0, 11.5), (17.0, 9.5), (21.0, 4.5), (24.0, -1.0),
-    (27.0, 6.0), (31.0, 12.0), (80.0, 12.0),
-])  # fmt: skip
-_LINES = {"fold": 0.30, "forehead_lines": 0.16, "crows_feet": 0.26, "under_eye": 0.16}
+_LASH, _SCLERA, _PINK, _PUPIL, _TOOTH, _DARK, _TONGUE = np.array([
+    (0.10, 0.07, 0.06), (0.86, 0.83, 0.81), (0.74, 0.45, 0.42), (0.02, 0.02, 0.02), (0.87, 0.83, 0.76),
+    (0.15, 0.05, 0.05), (0.60, 0.26, 0.25),
+], np.float32)[..., None, None]  # fmt: skip
+_IRIS_RADIUS, _PUPIL_RADIUS = 2.4, 1.0
 
 
-@dataclass(frozen=True)
-class SkinBasis:
-    """Fixed fields over the domain, between 0 and 1 or zero-mean, and the parts that never move."""
+class HairStyle(NamedTuple):
+    """Face pixels. ``top``, ``front``, ``side``, ``hang``: thickness on the crown, over the forehead's edge,
+    over the ears, and below them; ``curl`` unevenness; ``cover`` opacity; ``fall`` how far a fringe falls;
+    ``end`` the row at which hanging hair ends."""
 
-    mottling: Float[ndarray, "fields rows columns"]
-    strands: Float[ndarray, "rows columns"]
-    curls: Float[ndarray, "rows columns"]
-    freckles: Float[ndarray, "rows columns"]
-    grain: Float[ndarray, "rows columns"]
-    blush: Float[ndarray, "rows columns"]
-    under_eye: Float[ndarray, "rows columns"]
-    lines: dict[str, Float[ndarray, "rows columns"]]
-    lips: Float[ndarray, "rows columns"]
-    beards: dict[str, Float[ndarray, "rows columns"]]
-    nostrils: Float[ndarray, "rows columns"]
-    ear: Float[ndarray, "rows columns"]
-    parts: ndarray
-    is_ear: ndarray
-    reach: ndarray  # (rows, 1) half width of the bare head
+    line: str
+    top: float
+    front: float
+    side: float
+    hang: float
+    curl: float
+    cover: float
+    fall: float
+    end: float
+
+    @property
+    def covers_ears(self) -> bool:
+        return self.side > 1.5
 
 
-@dataclass(frozen=True)
-class Skin:
-    """One person's surface: ``albedo`` (rows, columns, 3) 0..1; ``thickness`` of hair and clothes and how far
+class Skin(NamedTuple):
+    """One person's surface: ``albedo`` (3, rows, columns) 0..1; ``thickness`` of hair and clothes and how far
     hair hangs ``forward`` (rows, columns) in face pixels; ``parts`` as numbers into MASK_CLASSES."""
 
-    albedo: ndarray
-    thickness: ndarray
-    forward: ndarray
+    albedo: Float32[ndarray, "3 rows columns"]
+    thickness: Float32[ndarray, "rows columns"]
+    forward: Float32[ndarray, "rows columns"]
     parts: ndarray
+
+
+def hair_style(who: Identity) -> HairStyle:
+    return HairStyle(*face_numbers()["hair_styles"][who["hair_style"]])
 
 
 @lru_cache(maxsize=4)
-def skin_basis(detail: float = 1.0) -> SkinBasis:
-    grid = face_grid(detail)
-    generator = np.random.default_rng(_FIELD_SEED)
-    q, bump = grid.q, grid.bump
-    freckle_noise = _waves(generator, grid, 60, 1.5, 2.3)
-    cheeks_and_nose = np.maximum(bump(11.0, -2.0, 7.0, 4.5), bump(0.0, -4.0, 4.0, 4.0))
-    lips, is_ear = _lip_mask(np.abs(grid.p), q), _is_ear(grid)
-    basis = SkinBasis(
-        mottling=np.stack([_waves(generator, grid, 10, 9.0, 24.0) for _ in range(SKIN_FIELDS)]),
-        strands=_waves(generator, grid, 40, 1.4, 7.0, along=9.0),
-        curls=_waves(generator, grid, 50, 3.5, 7.0),
-        freckles=smoothstep(1.1, 1.9, freckle_noise) * cheeks_and_nose,
-        grain=_waves(generator, grid, 40, 1.3, 2.6),
-        blush=bump(13.0, 1.0, 5.5, 4.5) + 0.55 * bump(0.0, -1.5, 3.2, 2.6),
-        under_eye=bump(10.8, -9.9, 4.3, 1.5),
-        lines=wrinkles(grid),
-        lips=lips,
-        beards={kind: _beard_amount(grid, kind) * (1.0 - lips) for kind in BEARDS},
-        nostrils=bump(2.4, 3.3, 1.05, 0.6),
-        ear=np.exp(-0.5 * (((np.abs(grid.theta) - 1.44) / 0.06) ** 2 + ((q + 3.0) / 4.0) ** 2)),
-        parts=_fixed_parts(grid, lips, is_ear),
-        is_ear=is_ear,
-        reach=np.abs(bare_head(grid)[..., 0]).max(axis=1, keepdims=True),
-    )
-    return SkinBasis(**{name: _single(value) for name, value in vars(basis).items()})
-
-
-def _single(value: Any) -> Any:
-    """The same in single precision, which is all that colours need."""
-    if isinstance(value, dict):
-        return {name: _single(field) for name, field in value.items()}
-    return value.astype(np.float32) if value.dtype == np.float64 else value
-
-
-def paint_skin(identity: FaceIdentity, detail: float = 1.0) -> Skin:
-    grid, basis = face_grid(detail), skin_basis(detail)
-    albedo = _bare_skin(identity, basis)
-    parts = basis.parts.copy()
-    beard = basis.beards[identity.beard]
-    strands = 1.0 + 0.09 * basis.strands[..., None] + 0.05 * basis.mottling[0][..., None]
-    strand_colour = _rgb(identity.hair) * strands
-    if identity.beard == "stubble":
-        shade = _rgb(0.35 * identity.hair + 0.40 * identity.skin)
-        albedo = _over(albedo, shade, np.clip(0.5 * beard * (1.0 + 0.1 * basis.grain), 0.0, 1.0))
-        thickness = np.zeros(grid.shape)
-    else:
-        rough = np.clip(beard * (1.0 + 0.2 * basis.strands), 0.0, 1.0)
-        albedo = _over(albedo, 0.9 * strand_colour, 0.9 * smoothstep(0.1, 0.8, rough))
-        length = {"full beard": 1.7, "short beard": 0.6}.get(identity.beard, 0.9)
-        thickness = length * smoothstep(0.3, 1.0, rough) * (1.0 + 0.06 * basis.strands)
-    brow = _brow_mask(identity, grid, basis)
-    albedo = _over(albedo, _rgb(0.85 * identity.hair + 0.04), identity.brow_strength * brow)
-    parts[(brow > 0.5) & (grid.p > 0)] = PART["l_brow"]
-    parts[(brow > 0.5) & (grid.p < 0)] = PART["r_brow"]
-    collar = identity.collar + 0.012 * grid.p**2 - 8.0 * smoothstep(0.5, 2.0, np.abs(grid.theta))
-    cloth = smoothstep(-0.4, 0.4, grid.q - collar)
-    albedo = _over(albedo, _rgb(identity.cloth), cloth)
-    parts[cloth > 0.5] = PART["cloth"]
-    thickness = thickness + 1.2 * cloth
-    style = HAIR_STYLES[identity.hair_style]
-    distance = _hair_distance(grid, style, identity)
-    distance = distance + 0.5 * basis.strands + 0.9 * style.curl * basis.curls
-    soft = 0.9 if style.fall > 2.0 or style.covers_ears else 2.2
-    hair = style.cover * smoothstep(-0.8, soft, distance)
-    lift = _hair_thickness(grid, style, identity.hair_volume, distance, basis.reach)
-    lift = lift * (1.0 + style.curl * 0.22 * basis.curls) + 0.03 * basis.strands * np.clip(lift, 0.0, 1.5)
-    if not style.covers_ears:
-        hair, lift = hair * (1.0 - basis.is_ear), lift * (1.0 - basis.is_ear)
-    root = 1.0 - 0.25 * smoothstep(0.0, 3.0, 3.0 - np.abs(distance))[..., None]
-    albedo = _over(albedo, strand_colour * (1.0 + 0.10 * style.curl * basis.curls[..., None]) * root, hair)
-    parts[hair > 0.5] = PART["hair"]
-    return Skin(
-        np.clip(albedo, 0.0, 1.0).astype(np.float32),
-        np.maximum(thickness, lift).astype(np.float32),
-        _hair_forward(grid, style, distance).astype(np.float32),
-        parts,
-    )
-
-
-def _bare_skin(identity: FaceIdentity, basis: SkinBasis) -> ndarray:
-    age, deep = identity.age, max(0.0, identity.age - 0.25)
-    mottling = np.tensordot(_rgb(identity.skin_noise), basis.mottling, 1)
-    tone = 1.0 + (0.022 + 0.016 * age) * mottling / np.sqrt(SKIN_FIELDS) + (0.010 + 0.012 * age) * basis.grain
-    albedo = _rgb(identity.skin) * tone[..., None]
-    redness = (0.4 + 0.6 * (1.0 - identity.melanin)) * identity.blush * basis.blush
-    lines = sum(_LINES[name] * field for name, field in basis.lines.items())
-    for amount, colour in (
-        (redness, (0.01, 0.12, 0.11)),
-        ((0.08 + 0.14 * age) * basis.under_eye, (0.8, 1.0, 0.85)),
-        (0.28 * identity.freckles * basis.freckles, (0.7, 1.0, 1.15)),
-        (0.16 * ear_share(identity) * basis.ear, (0.5, 1.0, 1.0)),
-        (np.clip(deep * lines, 0.0, 0.5), (0.85, 1.0, 1.0)),
-    ):
-        albedo *= 1.0 - amount[..., None] * _rgb(colour)
-    lips = _rgb(identity.lips) * (1.0 + 0.03 * basis.grain[..., None])
-    albedo = _over(albedo, lips, 0.9 * basis.lips)
-    return albedo * (1.0 - 0.6 * basis.nostrils[..., None] * _rgb((0.85, 1.0, 1.0)))
-
-
-def _brow_mask(identity: FaceIdentity, grid: FaceGrid, basis: SkinBasis) -> ndarray:
-    """Brows: an arch that is thickest at a third and tapers outwards, with a hairy edge."""
-    mask = np.zeros(grid.shape, np.float32)
-    rows = slice(*np.searchsorted(grid.q[:, 0], _BROW_ROWS))
-    p, q = np.abs(grid.p[rows]), grid.q[rows]
-    along = np.clip((p - 4.6) / 13.2, 0.0, 1.0)
-    arch = identity.brow_arch * 1.6 * np.sin(np.pi * along**1.25)
-    centre = -19.8 + 0.5 * (1.0 - along) - arch + 1.3 * along**3
-    third = 0.75 + 0.5 * np.sin(np.pi * np.minimum(along * 1.3 + 0.1, 1.0))
-    half = identity.brow_thickness * 1.15 * third * (1.0 - 0.65 * along**1.5)
-    edge = (half - np.abs(q - centre)) / 0.7 + 0.12 * basis.grain[rows]
-    ends = smoothstep(3.9, 6.2, p) * (1.0 - smoothstep(15.8, 18.6, p))
-    mask[rows] = smoothstep(-0.6, 0.8, edge) * ends
-    return mask
-
-
-def ear_share(identity: FaceIdentity) -> float:
-    """Size of the ears relative to the mean, 0 where hair covers them."""
-    return 0.0 if HAIR_STYLES[identity.hair_style].covers_ears else identity.ear_size
-
-
-def _fixed_parts(grid: FaceGrid, lips: ndarray, is_ear: ndarray) -> ndarray:
-    """Skin, nose, ears, lips and neck, left and right being the person's own."""
-    p, q = np.abs(grid.p), grid.q
-    parts = np.full(grid.shape, PART["skin"])
-    width = np.interp(q, [-13.0, -6.0, -2.5, 0.0, 2.5, 4.0], [2.2, 3.4, 5.2, 6.4, 5.8, 3.0])
-    parts[(q > -13.0) & (q < 4.0) & (p < width)] = PART["nose"]
-    parts[is_ear & (grid.p > 0)] = PART["l_ear"]
-    parts[is_ear & (grid.p < 0)] = PART["r_ear"]
-    parts[(q > 32.0) & ~is_ear] = PART["neck"]
-    parts[(lips > 0.5) & (q <= MOUTH_Q)] = PART["u_lip"]
-    parts[(lips > 0.5) & (q > MOUTH_Q)] = PART["l_lip"]
-    return parts
-
-
-def _is_ear(grid: FaceGrid) -> ndarray:
-    """Where face_shape.ear folds an ear out of the head."""
-    away = np.abs(grid.theta) - ear_slant(grid)
-    return (np.abs(grid.q + 5.5) < 7.6) & (away > -0.14) & (away < 0.2)
-
-
-def _lip_mask(p: ndarray, q: ndarray) -> ndarray:
+def skin_fields(detail: float = 1.0) -> dict[str, ndarray]:
+    """Fixed fields over the domain, between 0 and 1 or zero-mean, and the parts that never move."""
+    grid, generator = face_shape(detail).grid, np.random.default_rng(_FIELD_SEED)
+    p, q, bump = np.abs(grid.p), grid.q, grid.bump
+    freckles = _waves(generator, grid, 60, 1.5, 2.3)
     arc = np.clip(1.0 - (p / 9.3) ** 2, 0.0, 1.0)
-    top = MOUTH_Q - 2.9 * arc**0.9 + 0.55 * hill(p, 0.0, 1.3)
-    bottom = MOUTH_Q + 3.6 * np.clip(1.0 - (p / 8.9) ** 2, 0.0, 1.0) ** 0.7
-    return smoothstep(-0.45, 0.45, q - top) * smoothstep(-0.6, 0.6, bottom - q) * smoothstep(0.0, 0.08, arc)
+    upper = MOUTH_Q - 2.9 * arc**0.9 + 0.55 * hill(p, 0.0, 1.3)
+    lower = MOUTH_Q + 3.6 * np.clip(1.0 - (p / 8.9) ** 2, 0.0, 1.0) ** 0.7
+    lips = smoothstep(-0.45, 0.45, q - upper) * smoothstep(-0.6, 0.6, lower - q) * smoothstep(0.0, 0.08, arc)
+    away = ear_angle(grid)
+    is_ear = (np.abs(q + 5.5) < 7.6) & (away > -0.14) & (away < 0.2)  # where an ear folds out of the head
+    lines = {
+        name: np.clip(line / top, 0.0, 1.0)
+        for (name, line), top in zip(age_lines(grid).items(), (0.3, 0.12, 0.16), strict=True)
+    }
+    parts = np.full(p.shape, PART["skin"], np.int32)
+    width = np.interp(q, [-13.0, -6.0, -2.5, 0.0, 2.5, 4.0], [2.2, 3.4, 5.2, 6.4, 5.8, 3.0])
+    for name, where in {  # left and right being the person's own
+        "nose": (q > -13.0) & (q < 4.0) & (p < width),
+        "l_ear": is_ear & (grid.p > 0),
+        "r_ear": is_ear & (grid.p < 0),
+        "neck": (q > 32.0) & ~is_ear,
+        "u_lip": (lips > 0.5) & (q <= MOUTH_Q),
+        "l_lip": (lips > 0.5) & (q > MOUTH_Q),
+    }.items():
+        parts[where] = PART[name]
+    fields = {
+        "mottling": np.stack([_waves(generator, grid, 10, 9.0, 24.0) for _ in range(SKIN_FIELDS)]),
+        "strands": _waves(generator, grid, 40, 1.4, 7.0, along=9.0),
+        "curls": _waves(generator, grid, 50, 3.5, 7.0),
+        "freckles": smoothstep(1.1, 1.9, freckles)
+        * np.maximum(bump(11.0, -2.0, 7.0, 4.5), bump(0.0, -4.0, 4.0, 4.0)),
+        "grain": _waves(generator, grid, 40, 1.3, 2.6),
+        "blush": bump(13.0, 1.0, 5.5, 4.5) + 0.55 * bump(0.0, -1.5, 3.2, 2.6),
+        "under_eye": bump(10.8, -9.9, 4.3, 1.5),
+        "lines": 0.30 * lines["fold"]
+        + 0.16 * lines["forehead_lines"]
+        + 0.26 * lines["crows_feet"]
+        + 0.16 * bump(10.5, -9.2, 4.0, 0.8),
+        "lips": lips,
+        "nostrils": bump(2.4, 3.3, 1.05, 0.6),
+        "ear": gauss(np.abs(grid.theta), 1.44, 0.06) * gauss(q, -3.0, 4.0),
+        **_beards(p, q),
+    }
+    single = {name: field.astype(np.float32) for name, field in fields.items()}
+    return single | {"parts": parts, "is_ear": is_ear}
 
 
-def _hair_distance(grid: FaceGrid, style: HairStyle, identity: FaceIdentity) -> ndarray:
-    """How far a point lies inside the hair (> 0) or outside it, in face pixels."""
-    if style.cover == 0.0:
-        return np.full(grid.shape, -50.0)
-    turn, p = np.rad2deg(grid.theta[0]), grid.p[0]
-    away = np.abs(turn)
-    front = -31.3 + identity.hair_line
-    rows = np.array(style.line)
-    if style.end is not None:
-        rows = np.minimum(rows, style.end - front)
-    limit = front + PchipInterpolator(_TURNS_DEG, rows)(away)
-    recession, parting, wave = identity.hair_recession, identity.hair_parting, identity.hair_wave
-    limit -= 5.5 * recession * hill(away, 30.0, 14.0) + 2.5 * recession * (away < 90)
-    falls = 1.0 - hill(turn - 26.0 * parting, 0.0, 12.0 if style.line is CURTAIN else 20.0)
-    if style.fall > 2.0 and abs(parting) < 0.35:
-        falls = 0.35 + 0.65 * falls
-    limit += style.fall * falls * hill(away, 0.0, 52.0, 6)
-    uneven = np.sin(0.30 * p + 6.3 * wave[1]) + 0.7 * np.sin(0.72 * p + 6.3 * wave[2])
-    limit += (0.15 + 0.55 * wave[0]) * uneven * hill(away, 0.0, 60.0, 6)
-    return (limit - grid.q) / np.sqrt(1.0 + np.gradient(limit, p) ** 2)
-
-
-def _hair_thickness(
-    grid: FaceGrid, style: HairStyle, volume: float, distance: ndarray, reach: ndarray
-) -> ndarray:
-    """How far hair stands off the head, face pixels; ``reach`` (rows, 1) is the bare head's half width, which
-    hanging hair makes up for."""
-    crown = 1.0 - smoothstep(-42.0, -26.0, grid.q)
-    away = smoothstep(np.deg2rad(28.0), np.deg2rad(66.0), np.abs(grid.theta))
-    full = crown * style.top + (1.0 - crown) * (style.front * (1.0 - away) + style.side * away)
-    full *= volume
-    if style.hang > 0.0:
-        full = full + away * np.where(grid.q > -8.0, np.maximum(_HANG - reach, 0.0), 0.0)
-        full = full + style.hang * smoothstep(-4.0, 40.0, grid.q) * away
-    edge = np.where(grid.q > 24.0, 4.0, 1.0 + 1.9 * np.clip(full, 0.3, 4.0))
-    return full * smoothstep(-0.5, edge, distance)
-
-
-def _hair_forward(grid: FaceGrid, style: HairStyle, distance: ndarray) -> ndarray:
-    """How far hanging hair comes forward of the neck, face pixels: it falls from the temples."""
-    if style.hang == 0.0:
-        return np.zeros(grid.shape)
-    beside = smoothstep(np.deg2rad(46.0), np.deg2rad(62.0), np.abs(grid.theta))
-    return 11.0 * beside * smoothstep(26.0, 36.0, grid.q) * smoothstep(-0.5, 4.0, distance)
-
-
-def _beard_amount(grid: FaceGrid, kind: str) -> ndarray:
-    """Where a beard of this kind grows, 0..1; leaves the lips to the caller."""
-    p, q = np.abs(grid.p), grid.q
-    line = PchipInterpolator(*_BEARD_LINE.T)(p)
-    soft = 5.0 if kind == "stubble" else 2.0
-    cheeks = smoothstep(-soft, 1.6 * soft, q - line) * (1.0 - smoothstep(32.0, 37.0, q))
+def _beards(p: ndarray, q: ndarray) -> dict[str, ndarray]:
+    """Where beards grow, 0..1."""
+    line = PchipInterpolator(*np.transpose(face_numbers()["beard_line"]))(p)
     moustache = np.exp(-(((q - 9.6 - 0.030 * p**2) / 2.0) ** 4))
     moustache = moustache * hill(p, 0.0, 10.5, 6) * (1.0 - 0.45 * hill(p, 0.0, 1.2))
     chin = smoothstep(-1.0, 1.5, q - np.maximum(line, 10.0)) * hill(p, 0.0, 9.5, 6)
     chin = chin * (1.0 - smoothstep(31.0, 35.0, q))
-    grown = {"none": np.zeros(grid.shape), "moustache": moustache, "goatee": np.maximum(chin, moustache)}
-    return grown.get(kind, np.maximum(cheeks, moustache))
-
-
-def _rgb(values: Any) -> ndarray:
-    return np.asarray(values, np.float32)
-
-
-def _over(under: ndarray, colour: ndarray, alpha: ndarray) -> ndarray:
-    return under + (colour - under) * alpha[..., None]
+    stubble, short = (
+        np.maximum(smoothstep(-soft, 1.6 * soft, q - line) * (1.0 - smoothstep(32.0, 37.0, q)), moustache)
+        for soft in (5.0, 2.0)
+    )
+    return {
+        "stubble": stubble,
+        "moustache": moustache,
+        "goatee": np.maximum(chin, moustache),
+        "short beard": short,
+        "full beard": short,
+    }
 
 
 def _waves(
@@ -309,7 +160,7 @@ def _waves(
 
     With ``along`` the waves run sideways only, mirrored, and bend slowly over that length, like strands.
     """
-    total = np.zeros(grid.shape)
+    total = np.zeros(grid.p.shape)
     for _ in range(count):
         number = 2.0 * np.pi / generator.uniform(shortest, longest)
         phase, angle = generator.uniform(0, 2 * np.pi, 2)
@@ -319,3 +170,206 @@ def _waves(
             bend = generator.uniform(0.3, 0.9) * np.sin(grid.q / along + angle)
             total += np.cos(number * (np.abs(grid.p) + bend) + phase)
     return total * np.sqrt(2.0 / count)
+
+
+def paint_skin(who: Identity, shape: FaceShape, fields: dict[str, ndarray]) -> Skin:
+    """One person's skin, brows, beard, clothes and hair."""
+    grid, parts, style = shape.grid, fields["parts"].copy(), hair_style(who)
+    albedo, thickness = _bare_skin(who, fields, style), np.zeros(grid.p.shape, np.float32)
+    strands = 1.0 + 0.09 * fields["strands"] + 0.05 * fields["mottling"][0]
+    strand_colour = _rgb(who["hair"]) * strands
+    if who["beard"] == "stubble":
+        alpha = np.clip(
+            0.5 * fields["stubble"] * (1.0 - fields["lips"]) * (1.0 + 0.1 * fields["grain"]), 0.0, 1.0
+        )
+        _over(albedo, _rgb(0.35 * who["hair"] + 0.40 * who["skin"]), alpha)
+    elif who["beard"] != "none":
+        rough = np.clip(
+            fields[who["beard"]] * (1.0 - fields["lips"]) * (1.0 + 0.2 * fields["strands"]), 0.0, 1.0
+        )
+        _over(albedo, 0.9 * strand_colour, 0.9 * smoothstep(0.1, 0.8, rough))
+        length = {"full beard": 1.7, "short beard": 0.6}.get(who["beard"], 0.9)
+        thickness = length * smoothstep(0.3, 1.0, rough) * (1.0 + 0.06 * fields["strands"])
+    brow = _brows(who, grid, fields["grain"])
+    _over(albedo, _rgb(0.85 * who["hair"] + 0.04), who["brow_strength"] * brow)
+    parts[(brow > 0.5) & (grid.p > 0)] = PART["l_brow"]
+    parts[(brow > 0.5) & (grid.p < 0)] = PART["r_brow"]
+    collar = who["collar"] + 0.012 * grid.p**2 - 8.0 * smoothstep(0.5, 2.0, np.abs(grid.theta))
+    cloth = smoothstep(-0.4, 0.4, grid.q - collar)
+    _over(albedo, _rgb(who["cloth"]), cloth)
+    parts[cloth > 0.5] = PART["cloth"]
+    distance = _hair_distance(grid, style, who) + 0.5 * fields["strands"] + 0.9 * style.curl * fields["curls"]
+    hair = style.cover * smoothstep(-0.8, 0.9 if style.fall > 2.0 or style.covers_ears else 2.2, distance)
+    lift, forward = _hair_thickness(shape, style, who["hair_volume"], distance)
+    lift = lift * (1.0 + style.curl * 0.22 * fields["curls"]) + 0.03 * fields["strands"] * np.clip(
+        lift, 0.0, 1.5
+    )
+    if not style.covers_ears:
+        hair, lift = hair * (1.0 - fields["is_ear"]), lift * (1.0 - fields["is_ear"])
+    root = 1.0 - 0.25 * smoothstep(0.0, 3.0, 3.0 - np.abs(distance))
+    _over(albedo, strand_colour * _single((1.0 + 0.10 * style.curl * fields["curls"]) * root), hair)
+    parts[hair > 0.5] = PART["hair"]
+    return Skin(
+        np.clip(albedo, 0.0, 1.0),
+        np.maximum(thickness + 1.2 * cloth, lift).astype(np.float32),
+        forward.astype(np.float32),
+        parts,
+    )
+
+
+def _bare_skin(
+    who: Identity, fields: dict[str, ndarray], style: HairStyle
+) -> Float32[ndarray, "3 rows columns"]:
+    age, grain = who["age"], fields["grain"]
+    mottling = np.tensordot(_single(who["skin_noise"] / np.sqrt(SKIN_FIELDS)), fields["mottling"], 1)
+    tone = 1.0 + (0.022 + 0.016 * age) * mottling + (0.010 + 0.012 * age) * grain
+    albedo = _rgb(who["skin"]) * _single(tone)
+    for amount, field, colour in (
+        ((0.4 + 0.6 * (1.0 - who["melanin"])) * who["blush"], "blush", (0.01, 0.12, 0.11)),
+        (0.08 + 0.14 * age, "under_eye", (0.8, 1.0, 0.85)),
+        (0.28 * who["freckles"], "freckles", (0.7, 1.0, 1.15)),
+        (0.16 * who["ear_size"] * (not style.covers_ears), "ear", (0.5, 1.0, 1.0)),
+        (max(0.0, age - 0.25), "lines", (0.85, 1.0, 1.0)),
+    ):
+        amount = np.minimum(_single(amount) * fields[field], 0.5 if field == "lines" else np.inf)
+        albedo *= 1.0 - amount * _rgb(colour)
+    _over(albedo, _rgb(who["lips"]) * (1.0 + 0.03 * grain), 0.9 * fields["lips"])
+    return albedo * (1.0 - 0.6 * fields["nostrils"] * _rgb((0.85, 1.0, 1.0)))
+
+
+def _brows(who: Identity, grid: FaceGrid, grain: ndarray) -> Float32[ndarray, "rows columns"]:
+    """Brows: an arch that is thickest at a third and tapers outwards, with a hairy edge."""
+    mask = np.zeros(grid.p.shape, np.float32)
+    rows = slice(*np.searchsorted(grid.q[:, 0], (-27.0, -14.0)))
+    p, q = np.abs(grid.p[rows]), grid.q[rows]
+    along = np.clip((p - 4.6) / 13.2, 0.0, 1.0)
+    arch = who["brow_arch"] * 1.6 * np.sin(np.pi * along**1.25)
+    centre = -19.8 + 0.5 * (1.0 - along) - arch + 1.3 * along**3
+    third = 0.75 + 0.5 * np.sin(np.pi * np.minimum(along * 1.3 + 0.1, 1.0))
+    half = who["brow_thickness"] * 1.15 * third * (1.0 - 0.65 * along**1.5)
+    edge = (half - np.abs(q - centre)) / 0.7 + 0.12 * grain[rows]
+    ends = smoothstep(3.9, 6.2, p) * (1.0 - smoothstep(15.8, 18.6, p))
+    mask[rows] = smoothstep(-0.6, 0.8, edge) * ends
+    return mask
+
+
+def _hair_distance(grid: FaceGrid, style: HairStyle, who: Identity) -> Float[ndarray, "rows columns"]:
+    """How far a point lies inside the hair (> 0) or outside it, in face pixels."""
+    if style.cover == 0.0:
+        return np.full(grid.p.shape, -50.0)
+    numbers, turn, p = face_numbers(), np.rad2deg(grid.theta[0]), grid.p[0]
+    away, front, parting = np.abs(turn), -31.3 + who["hair_line"], who["hair_parting"]
+    rows = np.minimum(numbers["hair_lines"][style.line], style.end - front)
+    limit = front + PchipInterpolator(numbers["turns"], rows)(away)
+    limit -= who["hair_recession"] * (5.5 * hill(away, 30.0, 14.0) + 2.5 * (away < 90))
+    falls = 1.0 - hill(turn - 26.0 * parting, 0.0, 12.0 if style.line == "curtain" else 20.0)
+    if style.fall > 2.0 and abs(parting) < 0.35:
+        falls = 0.35 + 0.65 * falls
+    limit += style.fall * falls * hill(away, 0.0, 52.0, 6)
+    size, *phases = who["hair_wave"][:3]
+    uneven = np.sin(0.30 * p + 6.3 * phases[0]) + 0.7 * np.sin(0.72 * p + 6.3 * phases[1])
+    limit += (0.15 + 0.55 * size) * uneven * hill(away, 0.0, 60.0, 6)
+    return (limit - grid.q) / np.sqrt(1.0 + np.gradient(limit, p) ** 2)
+
+
+def _hair_thickness(
+    shape: FaceShape, style: HairStyle, volume: float, distance: ndarray
+) -> tuple[ndarray, ndarray]:
+    """How far hair stands off the head, and how far hanging hair comes forward of the neck (it falls from the
+    temples and makes up for the head's half width), face pixels."""
+    theta, q = np.abs(shape.grid.theta), shape.grid.q
+    crown = 1.0 - smoothstep(-42.0, -26.0, q)
+    away = smoothstep(np.deg2rad(28.0), np.deg2rad(66.0), theta)
+    full = volume * (crown * style.top + (1.0 - crown) * (style.front * (1.0 - away) + style.side * away))
+    forward = np.zeros(q.shape)
+    if style.hang > 0.0:
+        full = full + away * np.where(q > -8.0, np.maximum(_HANG - shape.reach, 0.0), 0.0)
+        full = full + style.hang * smoothstep(-4.0, 40.0, q) * away
+        beside = smoothstep(np.deg2rad(46.0), np.deg2rad(62.0), theta)
+        forward = 11.0 * beside * smoothstep(26.0, 36.0, q) * smoothstep(-0.5, 4.0, distance)
+    edge = np.where(q > 24.0, 4.0, 1.0 + 1.9 * np.clip(full, 0.3, 4.0))
+    return full * smoothstep(-0.5, edge, distance), forward
+
+
+def paint_eyes(
+    albedo: Float32[ndarray, "n 3 rows columns"],
+    parts: Int32[ndarray, "n rows columns"],
+    grid: FaceGrid,
+    who: Identity,
+    lids: Float32[ndarray, "n 2 2"],
+    gaze: Float32[ndarray, "n 2"],
+) -> None:
+    """Paint one person's eyes in place. lids: how wide and how squinted the eye at p < 0 and that at p > 0
+    are; gaze: face pixels."""
+    rows, columns = np.abs(grid.q[:, 0] - EYE_Q) < 7.0, np.abs(np.abs(grid.p[0]) - EYE_P) < 8.0
+    at = np.ix_(rows, columns)
+    colour, p, y = albedo[:, :, *at], _single(grid.p[:1, columns]), _single(grid.q[rows, :1] - EYE_Q)
+    wide, squint = lids[..., (p[0] > 0).astype(int)].transpose(1, 0, 2)[:, :, None]  # (n, 1, columns)
+    right, down = gaze.T[:, :, None, None]
+    up = 2.35 * np.clip(who["eye_opening"] * (1.0 + 0.34 * wide - 0.42 * squint), 0.25, 1.7)
+    low = 1.4 * np.clip(who["eye_opening"] * (1.0 + 0.2 * wide - 0.45 * squint), 0.2, 1.5)
+    outward, length, lashes = np.abs(p) - EYE_P, who["eye_length"], who["lashes"]
+    level, along = y + who["eye_tilt"] * outward, outward / length
+    body = np.maximum(1.0 - along**2, 0.0)
+    below_upper = level + up * body**0.75 * (1.0 - 0.12 * along)  # > 0 below the upper lid's edge
+    above_lower = low * body**0.9 * (1.0 + 0.15 * along) - level
+    fold = who["lid_crease"] * gauss(below_upper, -1.5, 0.42) * hill(along, 0.0, 1.05, 4)
+    lid = gauss(below_upper, -0.9, 0.9) * hill(along, 0.0, 1.1, 4)
+    colour *= ((1.0 - 0.28 * fold) * (1.0 - 0.10 * lid))[:, None]
+    inside = np.where(body > 0.0, np.minimum(below_upper, above_lower) / 0.45 + 0.5, 0.0)
+    distance = np.hypot(p - np.sign(p) * EYE_P - right, level - down + 0.55)
+    shade = (1.0 - 0.28 * np.exp(-np.maximum(below_upper, 0.0) / 0.7)) * (1.0 - 0.12 * np.abs(along))
+    rim = 1.15 - 0.75 * np.clip((distance - _IRIS_RADIUS + 0.7) / 0.55, 0.0, 1.0)
+    ball, iris = shade[:, None] * _SCLERA, rim[:, None] * _rgb(who["iris"])
+    _over(ball, _PINK, 1.6 * (-along - 0.62))
+    _over(iris, _PUPIL, (_PUPIL_RADIUS - distance) / 0.35 + 0.5)
+    _over(ball, iris, (_IRIS_RADIUS - distance) / 0.4 + 0.5)
+    _over(colour, ball, inside)
+    lash = hill(below_upper, -0.15, 0.40 + 0.20 * lashes * (1.0 + 0.6 * along)) * hill(along, 0.0, 1.02, 8)
+    _over(colour, _LASH, 0.95 * lashes * lash)
+    _over(colour, _LASH, 0.28 * lashes * hill(above_lower, -0.1, 0.4) * hill(along, 0.0, 0.95, 8))
+    albedo[:, :, *at] = colour
+    side = np.where(p > 0, PART["l_eye"], PART["r_eye"])
+    parts[:, *at] = np.where(inside > 0.5, side, parts[:, *at])
+
+
+def paint_mouth(
+    albedo: Float32[ndarray, "n 3 rows columns"],
+    parts: Int32[ndarray, "n rows columns"],
+    grid: FaceGrid,
+    who: Identity,
+    gap: Float32[ndarray, "n columns"],
+) -> None:
+    """Paint one person's open mouths in place; ``gap`` is by how much the lips have parted, face pixels."""
+    rows, columns = np.abs(grid.q[:, 0] - MOUTH_Q) < 1.1 * MOUTH_BAND, np.abs(grid.p[0]) < 9.3
+    at = np.ix_(rows, columns)
+    colour, p, gap = albedo[:, :, *at], _single(grid.p[:1, columns]), gap[:, None, columns]
+    across = _single((grid.q[rows, :1] - MOUTH_Q) / MOUTH_BAND)  # -1 upper lip's edge, 1 lower lip's edge
+    lens = np.sqrt(1.0 - (p / 9.3) ** 2)
+    below = 0.5 * (across + 1.0) * gap
+    groove = 1.0 - 0.12 * hill(p - 1.9 * np.round(p / 1.9), 0.0, 0.25)
+    tongue = (2.2 * lens - (gap - below)) * np.clip((gap - 4.0) / 2.0, 0.0, 1.0)
+    shown = (1.0 - 0.5 * (p / 8.0) ** 2) * np.clip((gap - 0.9) / 0.9, 0.0, 1.0)
+    parted = np.clip((gap - 0.8) / 0.7, 0.0, 1.0)
+    cover = (1.08 - np.abs(across)) / 0.25 * np.minimum(lens * 2.5, 1.0) * (0.85 + 0.15 * parted)
+    inside, line = np.empty_like(colour), np.empty_like(colour)
+    inside[:], line[:] = _DARK, _rgb(0.38 * who["lips"])
+    _over(inside, _TONGUE, tongue)
+    _over(inside, groove * _TOOTH, np.minimum((2.7 - below) / 0.4 + 0.5, 1.0) * shown)
+    _over(line, inside, parted)
+    _over(colour, line, cover)
+    albedo[:, :, *at] = colour
+    parts[:, *at] = np.where((cover > 0.5) & (parted > 0.5), PART["mouth"], parts[:, *at])
+
+
+def _single(values: Any) -> ndarray:
+    return np.asarray(values, np.float32)
+
+
+def _rgb(values: Any) -> Float32[ndarray, "3 1 1"]:
+    return _single(values)[:, None, None]
+
+
+def _over(under: Float32[ndarray, "*n 3 rows columns"], colour: ndarray, alpha: ndarray) -> None:
+    """Lay a colour over another, in place; the opacity is cut to 0..1."""
+    under += (colour - under) * _single(np.minimum(np.maximum(alpha, 0.0), 1.0))[..., None, :, :]

@@ -1,40 +1,45 @@
 """Generated faces: identity, expression, light and view are drawn, the face is rendered with exact truth.
 
 Each image is a function of the seed and its index alone: asking for more images does not change the first
-ones, nor does the number of threads. Conventions are those of docs/conventions.md; nose tips of neutral faces
-stand at z = 0.947.
+ones, nor does the number of threads. In a track (settings.tracks) light, background and expression belong to
+the track, while view, gaze and the expression's strength move from one draw to another along its frames.
+Conventions are those of docs/conventions.md; nose tips of neutral faces stand at z = 0.947.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
+from jaxtyping import Float32
 from numpy import ndarray
 
 from derender.data import MASK_CLASSES
-from derender.data.synthetic.decals import paint_table
-from derender.data.synthetic.face_draw import NOSE_TIP_Z as NOSE_TIP_Z
-from derender.data.synthetic.face_draw import FaceDraw, draw_face
-from derender.data.synthetic.face_mesh import ProceduralFaces
-from derender.data.synthetic.mesh_image import TriangleMesh, draw_meshes
-from derender.data.synthetic.morphable import MorphableFaces
-from derender.data.synthetic.settings import FaceSettings
-from derender.data.synthetic.synthetic_set import Maps, Row, SyntheticSet, make_set
+from derender.data.synthetic.face_identity import Identity, draw_identity, identity_columns
+from derender.data.synthetic.face_shape import (
+    ACTIONS,
+    LID_ACTIONS,
+    MOUTH_BAND,
+    MOUTH_Q,
+    FaceShape,
+    face_shape,
+)
+from derender.data.synthetic.face_skin import (
+    Skin,
+    hair_style,
+    paint_eyes,
+    paint_mouth,
+    paint_skin,
+    skin_fields,
+)
+from derender.data.synthetic.mesh_image import TriangleMesh
+from derender.data.synthetic.morphable import NOSE_TIP_Z, MorphableFaces
+from derender.data.synthetic.settings import EXPRESSIONS, FaceSettings, ViewSettings, drawn, pick
+from derender.data.synthetic.synthetic_set import Row, Shot, SyntheticSet, draw_background, make_set
 
-
-@runtime_checkable
-class FaceModel(Protocol):
-    """The methods of a family of faces that ``generate`` calls; only they look into a person."""
-
-    @property
-    def triangles(self) -> ndarray: ...
-
-    def prepare(self) -> None: ...
-    def person(self, seed: int, identity: int, settings: FaceSettings) -> Any: ...
-    def labels(self, person: Any) -> Mapping[str, float | str]: ...
-    def traits(self, person: Any) -> Mapping[str, float | str]: ...
-    def meshes(self, draws: list[FaceDraw], people: dict[int, Any]) -> tuple[ndarray, ndarray, ndarray]: ...
+FACE_PX = float(np.tan(np.deg2rad(5.0)) / 31.5)  # scene units per face pixel at z = 1
+_DOWN_PX = 2.6  # the face sits this much below the middle, so that hair shows
+_DRIFT = np.array([*np.deg2rad([8.0, 18.0, 5.0]), 0.005, 0.005, 0.0])  # how far a head moves within a track
 
 
 def generate(
@@ -51,39 +56,139 @@ def generate(
     ``model`` replaces the built-in faces by those of a morphable model (a file as in ``morphable``).
     """
     settings = settings or FaceSettings()
-    source = _family(model, image_size)
-    no_paint = paint_table([])
+    detail = float(np.clip(np.ceil(image_size / 64 * 2) / 2, 1.0, 3.0))  # of the grid
+    family = ProceduralFaces(face_shape(detail), skin_fields(detail)) if model is None else model
+    family = MorphableFaces.read(family) if isinstance(family, (str, Path)) else family
 
-    def work(indices: range, maps: Maps) -> list[tuple[Row, Row]]:
+    def shots(indices: list[int]) -> Iterator[Shot]:
+        number = settings.first_identity + indices[0] // settings.per_identity
+        person = family.person(seed, number, settings)
         draws = [draw_face(seed, index, image_size, settings) for index in indices]
-        numbers = sorted({d.identity for d in draws})
-        people = {number: source.person(seed, number, settings) for number in numbers}
-        for name in ("light", "camera", "identity"):
-            maps[name][:] = [getattr(d, name) for d in draws]
-        meshes = [
-            TriangleMesh(v, source.triangles, a, p)
-            for v, a, p in zip(*source.meshes(draws, people), strict=True)
-        ]
-        draw_meshes([(mesh, no_paint) for mesh in meshes], 1.0, [d.background for d in draws], maps)
-        rows = {number: (source.labels(who), source.traits(who)) for number, who in people.items()}
-        return [({**_labels(d, settings), **rows[d.identity][0]}, {**rows[d.identity][1]}) for d in draws]
+        meshes = person.meshes([expression for expression, *_ in draws])
+        for mesh, (_, background, light, camera, labels) in zip(meshes, draws, strict=True):
+            yield Shot(mesh, background, light, camera, number, labels | person.labels, person.traits)
 
-    per_identity = settings.per_identity
-    return make_set(
-        work, source.prepare, count, image_size, seed, first, per_identity, MASK_CLASSES, progress
+    return make_set(shots, count, image_size, seed, first, settings.per_identity, MASK_CLASSES, progress)
+
+
+@dataclass(frozen=True)
+class Expression:
+    """What one image's draw does to a face: ``sides`` are weights of each half of ACTIONS and LID_ACTIONS,
+    ``gaze`` is in face pixels."""
+
+    name: str
+    strength: float
+    sides: Float32[ndarray, "actions 2"]
+    gaze: Float32[ndarray, "2"]
+
+
+def draw_face(
+    seed: int, index: int, image_size: int, settings: FaceSettings
+) -> tuple[Expression, ndarray, ndarray, ndarray, Row]:
+    """Expression, background, light, camera and labels of image number ``index``."""
+    track, frame = divmod(index % settings.per_identity, settings.frames) if settings.tracks else (0, 0)
+    along = frame / max(settings.frames - 1, 1)
+    along = along * along * (3.0 - 2.0 * along)  # between two draws, smoothly in time
+    generator = np.random.default_rng([seed, 1, index - frame])  # a track's is that of its first frame
+    normal, uniform = generator.standard_normal((2, 7)), generator.random(8)
+    ends, halves = generator.random((2, 4)), generator.standard_normal((len(ACTIONS) + len(LID_ACTIONS), 2))
+    name = list(settings.expressions)[pick([*settings.expressions.values()], uniform[0])]
+    strengths = [drawn(settings.strength, share) for share in ends[:, 3]]
+    strength = 0.0 if name == "neutral" else strengths[0] + (strengths[1] - strengths[0]) * along
+    weights = np.array([[EXPRESSIONS[name].get(action, 0.0)] for action in (*ACTIONS, *LID_ACTIONS)])
+    sides = strength * weights * (1.0 + settings.asymmetry * halves)
+    sides[len(ACTIONS) :] += 0.5 * settings.asymmetry * halves[len(ACTIONS) :, :1]
+    sides[0] = 0.5 * sum(sides[0])  # a jaw opens as a whole
+    cameras = np.stack([_camera(settings.view, n, u) for n, u in zip(normal, ends, strict=True)])
+    if settings.tracks:
+        cameras[1] = np.clip(cameras[1], cameras[0] - _DRIFT, cameras[0] + _DRIFT)
+    gaze = np.clip(normal[:, 5:], -1.8, 1.8) * settings.gaze_px * np.array([1.0, 0.35])
+    camera, gaze = (start + (end - start) * along for start, end in (cameras, gaze))
+    light = settings.light.draw(uniform[1:6])
+    labels: Row = {"expression": name, "strength": strength}
+    if settings.tracks:
+        kind = "yaw" if abs(light[3]) >= abs(light[2]) else "pitch"
+        labels = {"track": track, "frame": frame, **labels, "light_kind": kind}
+    background = settings.backgrounds[int(uniform[6] * len(settings.backgrounds))]
+    return (
+        Expression(name, strength, sides.astype(np.float32), gaze.astype(np.float32)),
+        draw_background(background, generator, image_size),
+        light,
+        camera.astype(np.float32),
+        labels,
     )
 
 
-def _family(model: MorphableFaces | str | Path | None, image_size: int) -> FaceModel:
-    if model is None:
-        detail = np.ceil(image_size / 64 * 2) / 2  # of the grid
-        return ProceduralFaces(float(np.clip(detail, 1.0, 3.0)))
-    return model if isinstance(model, MorphableFaces) else MorphableFaces.read(model)
+def _camera(view: ViewSettings, normal: ndarray, uniform: ndarray) -> ndarray:
+    ranges = (view.pitch_deg, view.yaw_deg, view.roll_deg, view.shift, view.shift)
+    spreads = (view.pitch_sd_deg, view.yaw_sd_deg, view.roll_sd_deg, view.shift_sd, view.shift_sd)
+    values = [
+        drawn(ends, share) if sd is None else min(max(0.5 * sum(ends) + sd * z, ends[0]), ends[1])
+        for ends, sd, z, share in zip(ranges, spreads, normal, uniform[[0, 1, 2, 0, 1]], strict=False)
+    ]
+    if view.yaw_beyond_deg > 0:
+        values[1] = drawn(view.yaw_deg, uniform[1], view.yaw_beyond_deg)
+    return np.array([*np.deg2rad(values[:3]), *values[3:], 0.0])
 
 
-def _labels(draw: FaceDraw, settings: FaceSettings) -> Row:
-    row: Row = {"expression": draw.expression, "strength": draw.strength}
-    if not settings.tracks:
-        return row
-    kind = "yaw" if abs(draw.light[3]) >= abs(draw.light[2]) else "pitch"
-    return {"track": draw.track, "frame": draw.frame, **row, "light_kind": kind}
+@dataclass(frozen=True)
+class Person:
+    """One identity of the built-in faces: its neutral surface (face pixels), nose tip, and skin."""
+
+    who: Identity
+    shape: FaceShape
+    surface: Float32[ndarray, "rows columns 3"]
+    nose_tip: float
+    skin: Skin
+    traits: Row
+    labels: Row
+
+    def meshes(self, expressions: list[Expression]) -> list[TriangleMesh]:
+        """The face with each expression, in scene units; eyes and mouths are painted as it shows them."""
+        grid, scale, count = self.shape.grid, np.float32(self.who["scale"]), len(expressions)
+        surfaces, albedo, parts = (
+            np.repeat(each[None], count, axis=0) for each in (self.surface, self.skin.albedo, self.skin.parts)
+        )
+        sides = np.stack([expression.sides for expression in expressions])
+        for n, a, side in np.argwhere(sides[:, : len(ACTIONS)]):
+            displacement, box = self.shape.actions[2 * a + side]
+            surfaces[n][box] += sides[n, a, side] * scale * displacement
+        top, bottom = np.searchsorted(grid.q[:, 0], [MOUTH_Q - MOUTH_BAND, MOUTH_Q + MOUTH_BAND])
+        gap = (surfaces[:, bottom, :, 1] - surfaces[:, top - 1, :, 1]) / scale
+        paint_mouth(albedo, parts, grid, self.who, gap)
+        gaze = np.stack([expression.gaze for expression in expressions])
+        paint_eyes(albedo, parts, grid, self.who, sides[:, len(ACTIONS) :], gaze)
+        surfaces += np.array([0.0, _DOWN_PX, -self.nose_tip], np.float32)
+        surfaces *= np.float32(FACE_PX)
+        surfaces[..., 2] += np.float32(NOSE_TIP_Z)
+        surfaces[..., 2] -= 1.0
+        colours = np.ascontiguousarray(albedo.reshape(count, 3, -1).transpose(0, 2, 1))
+        vertices, parts = surfaces.reshape(count, -1, 3), parts.reshape(count, -1)
+        return [TriangleMesh(vertices[n], self.shape.triangles, colours[n], parts[n]) for n in range(count)]
+
+
+@dataclass(frozen=True)
+class ProceduralFaces:
+    """The built-in faces; a user's own morphable model has the same method."""
+
+    shape: FaceShape
+    fields: dict[str, ndarray]
+
+    def person(self, seed: int, identity: int, settings: FaceSettings) -> Person:
+        """One identity; a function of seed, number and the settings' ranges of age and skin tone."""
+        shape, generator = self.shape, np.random.default_rng([seed, 2, identity])
+        who = draw_identity(generator, shape.names, settings.age_years, settings.skin_tone)
+        skin = paint_skin(who, shape, self.fields)
+        surface = shape.mean.copy()
+        for weight, mode in zip(who["shape"].values(), shape.modes, strict=True):
+            surface += np.float32(weight) * mode
+        if not hair_style(who).covers_ears:
+            surface += np.float32(who["ear_size"]) * shape.ear
+        tip = float(surface[..., 2].min()) * who["scale"]
+        surface += skin.thickness[..., None] * shape.outward
+        surface[..., 2] -= skin.forward
+        labels: Row = {"age": round(who["age_years"], 1), "skin_tone": round(who["melanin"], 4)}
+        labels |= {"build": round(who["build"], 4), "hair": who["hair_style"]}
+        labels |= {"hair_colour": who["hair_colour"], "beard": who["beard"]}
+        surface *= np.float32(who["scale"])
+        return Person(who, shape, surface, tip, skin, identity_columns(who), labels)

@@ -23,40 +23,54 @@ import zipfile
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float32, Int32, UInt8
+from jaxtyping import Float32, Int32
 from numpy import ndarray
 
 from derender.data import MASK_CLASSES
-from derender.data.synthetic.face_draw import NOSE_TIP_Z, FaceDraw
 from derender.data.synthetic.face_identity import draw_identity
+from derender.data.synthetic.mesh_image import TriangleMesh
 from derender.data.synthetic.settings import EXPRESSIONS, FaceSettings
+from derender.data.synthetic.synthetic_set import Row
 
+NOSE_TIP_Z = 0.947  # of neutral faces
 _PICTURE_WIDTH = 2.0 * float(np.tan(np.deg2rad(5.0)))  # scene units across the image at z = 1
 _LIMIT = 2.5
 _REQUIRED = ("mean", "triangles", "components", "std")
-Arrays = dict[str, ndarray]
 _DAMAGED = (
     *(OSError, ValueError, AttributeError, LookupError, EOFError, RuntimeError),
     *(zipfile.BadZipFile, zlib.error, struct.error),
 )
-_SKIN = MASK_CLASSES.index("skin")
 
 
 @dataclass(frozen=True)
 class MorphablePerson:
-    """One identity: canonical surface in scene units, albedo, and the coefficients that made them."""
+    """One identity: canonical surface in scene units about (0, 0, 1), albedo, and rows for the tables."""
 
+    family: "MorphableFaces"
     surface: Float32[ndarray, "v 3"]
     albedo: Float32[ndarray, "v 3"]
-    coefficients: Float32[ndarray, "k"]
-    melanin: float
+    labels: Row
+    traits: Row
+
+    def meshes(self, expressions: list[Any]) -> list[TriangleMesh]:
+        """The face with each expression: its ``name`` and ``strength``."""
+        known, still = self.family.expressions, np.zeros(3, np.float32)
+        return [
+            TriangleMesh(
+                self.surface + np.float32(each.strength) * known.get(each.name, still),
+                *(self.family.triangles, self.albedo, self.family.parts),
+            )
+            for each in expressions
+        ]
 
 
 @dataclass(frozen=True)
 class MorphableFaces:
-    """A morphable model in scene units and the project's frame (x right, y down, z away); see the module."""
+    """A morphable model in scene units about (0, 0, 1) and the project's frame (x right, y down, z away); see
+    the module."""
 
     mean: Float32[ndarray, "v 3"]
     triangles: Int32[ndarray, "f 3"]
@@ -65,7 +79,7 @@ class MorphableFaces:
     texture_mean: Float32[ndarray, "v 3"] | None
     texture_components: Float32[ndarray, "t v 3"]
     texture_std: Float32[ndarray, "t"]
-    parts: UInt8[ndarray, "v"]
+    parts: Int32[ndarray, "v"]
     colours: Float32[ndarray, "v 3"]  # NaN where a part has no colour of its own
     expressions: dict[str, Float32[ndarray, "v 3"]]
 
@@ -85,121 +99,85 @@ class MorphableFaces:
         except ValueError as problem:
             raise ValueError(f"{path}: {problem}") from problem
 
-    def prepare(self) -> None:
-        """Nothing is computed lazily."""
-
     def person(self, seed: int, identity: int, settings: FaceSettings) -> MorphablePerson:
         """One identity: coefficients from normals clipped at 2.5 sd."""
         generator = np.random.default_rng([seed, 2, identity])
         normal = np.clip(generator.standard_normal(len(self.std)), -_LIMIT, _LIMIT)
         coefficients = (normal * self.std).astype(np.float32)
         who = draw_identity(generator, (), settings.age_years, settings.skin_tone)
-        surface = self.mean.copy()
-        for weight, component in zip(coefficients, self.components, strict=True):
-            surface += weight * component
-        plain = np.broadcast_to(who.skin.astype(np.float32), self.mean.shape)
-        albedo = (plain if self.texture_mean is None else self.texture_mean).copy()
-        for component, sd in zip(self.texture_components, self.texture_std, strict=True):
-            albedo += np.float32(np.clip(generator.standard_normal(), -_LIMIT, _LIMIT) * sd) * component
-        own = np.isfinite(self.colours).all(axis=1)
-        albedo[own] = self.colours[own]
-        return MorphablePerson(surface, np.clip(albedo, 0.0, 1.0), coefficients, who.melanin)
-
-    def traits(self, person: MorphablePerson) -> dict[str, float | str]:
-        return {f"shape_{k:03d}": float(value) for k, value in enumerate(person.coefficients)}
-
-    def labels(self, person: MorphablePerson) -> dict[str, float | str]:
-        return {} if self.texture_mean is not None else {"skin_tone": round(person.melanin, 4)}
-
-    def meshes(
-        self, draws: list[FaceDraw], people: dict[int, MorphablePerson]
-    ) -> tuple[Float32[ndarray, "n v 3"], Float32[ndarray, "n v 3"], UInt8[ndarray, "n v"]]:
-        """Canonical vertices in scene units, their albedo and their part, one mesh per draw."""
-        vertices = np.stack([people[d.identity].surface for d in draws])
-        for row, draw in zip(vertices, draws, strict=True):
-            if draw.expression in self.expressions:
-                row += np.float32(draw.strength) * self.expressions[draw.expression]
-        albedo = np.stack([people[d.identity].albedo for d in draws])
-        return vertices, albedo, np.stack([self.parts] * len(draws))
+        surface = self.mean + np.tensordot(coefficients, self.components, 1)
+        albedo = self.texture_mean if self.texture_mean is not None else who["skin"].astype(np.float32)
+        normal = np.clip(generator.standard_normal(len(self.texture_std)), -_LIMIT, _LIMIT)
+        weights = (normal * self.texture_std).astype(np.float32)
+        albedo = albedo + np.tensordot(weights, self.texture_components, 1)
+        albedo = np.clip(
+            np.where(np.isfinite(self.colours).all(axis=1, keepdims=True), self.colours, albedo), 0.0, 1.0
+        )
+        labels: Row = {} if self.texture_mean is not None else {"skin_tone": round(who["melanin"], 4)}
+        traits: Row = {f"shape_{k:03d}": float(value) for k, value in enumerate(coefficients)}
+        return MorphablePerson(self, surface, albedo, labels, traits)
 
 
-def _checked(arrays: Arrays) -> MorphableFaces:
+def _checked(arrays: dict[str, ndarray]) -> MorphableFaces:
     for name in _REQUIRED:
         if name not in arrays:
             there = ", ".join(sorted(arrays)) or "none"
             raise ValueError(f"the array {name!r} is missing; there are {there}")
-    mean = _floats(arrays, "mean", (-1, 3))
+
+    def floats(
+        name: str, *shape: int, default: Any = None, holes: bool = False, unit: bool = False
+    ) -> ndarray:
+        """The array or its default, checked; -1 is any size, ``holes`` allows NaN, ``unit`` 0..1 alone."""
+        array = np.asarray(arrays.get(name, default))
+        fits = len(shape) == array.ndim and all(a in (-1, b) for a, b in zip(shape, array.shape, strict=True))
+        if not fits or array.dtype.kind not in "fiu":
+            expected = ", ".join("any" if size < 0 else str(size) for size in shape)
+            raise ValueError(f"{name} must be numbers of shape ({expected}), got {array.dtype} {array.shape}")
+        if not holes and not np.isfinite(array).all():
+            raise ValueError(f"{name} holds values that are not finite")
+        low, high = np.nanmin(array, initial=0.0), np.nanmax(array, initial=0.0)
+        if unit and (low < 0 or high > 1):
+            raise ValueError(f"{name} must lie in 0..1, got {low:.3g}..{high:.3g}")
+        return array.astype(np.float64)
+
+    mean, triangles = floats("mean", -1, 3), np.asarray(arrays["triangles"])
     v = len(mean)
-    triangles = np.asarray(arrays["triangles"])
     if triangles.ndim != 2 or triangles.shape[1] != 3 or triangles.dtype.kind not in "iu":
         raise ValueError(f"triangles must be whole numbers (F, 3), got {triangles.dtype} {triangles.shape}")
     low, high = triangles.min(initial=v), triangles.max(initial=-1)
     if low < 0 or high < 0 or high >= v:
         raise ValueError(f"triangles must number vertices 0..{v - 1}, got {low}..{high}")
-    components = _floats(arrays, "components", (-1, v, 3))
+    components = floats("components", -1, v, 3)
     low, high = mean.min(axis=0), mean.max(axis=0)
     unit = float(arrays["unit"] if "unit" in arrays else (high[0] - low[0]) / 0.9)
     if not unit > 0:
         raise ValueError(f"unit must be above 0, got {unit}")
     scale = np.array([1.0, -1.0, -1.0]) * (_PICTURE_WIDTH / unit)
-    placed = (mean - _floats(arrays, "centre", (3,), 0.5 * (low + high))) * scale
+    placed = (mean - floats("centre", 3, default=0.5 * (low + high))) * scale
     placed[:, 2] += NOSE_TIP_Z - placed[:, 2].min()
-    textured = "texture_mean" in arrays
-    texture = _floats(arrays if textured else {}, "texture_components", (-1, v, 3), np.zeros((0, v, 3)))
-    texture_std = _floats(arrays, "texture_std", (len(texture),)) if len(texture) else np.zeros(0)
-    return MorphableFaces(
-        mean=placed.astype(np.float32),
-        triangles=np.ascontiguousarray(triangles[:, ::-1], np.int32),  # clockwise in the image
-        components=(components * scale).astype(np.float32),
-        std=_floats(arrays, "std", (len(components),)).astype(np.float32),
-        texture_mean=_within(_floats(arrays, "texture_mean", (v, 3)), "texture_mean") if textured else None,
-        texture_components=texture.astype(np.float32),
-        texture_std=texture_std.astype(np.float32),
-        parts=_parts(arrays, v),
-        colours=_within(_floats(arrays, "colours", (v, 3), np.full((v, 3), np.nan), True), "colours"),
-        expressions=_expressions(arrays, v, scale),
-    )
-
-
-def _floats(
-    arrays: Arrays, name: str, shape: tuple[int, ...], default: ndarray | None = None, holes: bool = False
-) -> ndarray:
-    """The array, checked; -1 in ``shape`` is any size, ``holes`` allows NaN."""
-    array = arrays.get(name, default)
-    if array is None:
-        raise ValueError(f"the array {name!r} is missing")
-    array = np.asarray(array)
-    fits = array.ndim == len(shape) and all(
-        size in (-1, got) for size, got in zip(shape, array.shape, strict=True)
-    )
-    if not fits or array.dtype.kind not in "fiu":
-        expected = ", ".join("any" if size < 0 else str(size) for size in shape)
-        raise ValueError(f"{name} must be numbers of shape ({expected}), got {array.dtype} {array.shape}")
-    if not holes and not np.isfinite(array).all():
-        raise ValueError(f"{name} holds values that are not finite")
-    return array.astype(np.float64)
-
-
-def _within(colour: ndarray, name: str) -> Float32[ndarray, "v 3"]:
-    low, high = np.nanmin(colour, initial=0.0), np.nanmax(colour, initial=0.0)
-    if low < 0 or high > 1:
-        raise ValueError(f"{name} must lie in 0..1, got {low:.3g}..{high:.3g}")
-    return colour.astype(np.float32)
-
-
-def _parts(arrays: Arrays, v: int) -> UInt8[ndarray, "v"]:
-    parts, last = _floats(arrays, "parts", (v,), np.full(v, _SKIN)), len(MASK_CLASSES) - 1
+    textured, none = "texture_mean" in arrays, np.zeros((0, v, 3))
+    texture = floats("texture_components", -1, v, 3, default=none) if textured else none
+    parts, last = floats("parts", v, default=np.full(v, MASK_CLASSES.index("skin"))), len(MASK_CLASSES) - 1
     if parts.min() < 1 or parts.max() > last:
         raise ValueError(f"parts must be class numbers 1..{last}, got {parts.min():g}..{parts.max():g}")
-    return parts.astype(np.uint8)
-
-
-def _expressions(arrays: Arrays, v: int, scale: ndarray) -> dict[str, Float32[ndarray, "v 3"]]:
-    fields = _floats(arrays, "expressions", (-1, v, 3), np.zeros((0, v, 3)))
-    names = [str(name) for name in np.asarray(arrays.get("expression_names", ()))] if len(fields) else []
-    if len(names) != len(fields) or not set(names) <= set(EXPRESSIONS):
+    expressions = floats("expressions", -1, v, 3, default=none) * scale
+    names = [str(name) for name in np.asarray(arrays.get("expression_names", ()))] if len(expressions) else []
+    if len(names) != len(expressions) or not set(names) <= set(EXPRESSIONS):
         raise ValueError(
             f"expression_names must give one of {', '.join(EXPRESSIONS)} "
-            f"for each of {len(fields)} expressions, got {names}"
+            f"for each of {len(expressions)} expressions, got {names}"
         )
-    return {name: (shape * scale).astype(np.float32) for name, shape in zip(names, fields, strict=True)}
+    return MorphableFaces(
+        mean=placed.astype(np.float32) - np.array([0, 0, 1], np.float32),
+        triangles=np.ascontiguousarray(triangles[:, ::-1], np.int32),  # clockwise in the image
+        components=(components * scale).astype(np.float32),
+        std=floats("std", len(components)).astype(np.float32),
+        texture_mean=floats("texture_mean", v, 3, unit=True).astype(np.float32) if textured else None,
+        texture_components=texture.astype(np.float32),
+        texture_std=(floats("texture_std", len(texture)) if len(texture) else np.zeros(0)).astype(np.float32),
+        parts=parts.astype(np.int32),
+        colours=floats("colours", v, 3, default=np.full((v, 3), np.nan), holes=True, unit=True).astype(
+            np.float32
+        ),
+        expressions=dict(zip(names, expressions.astype(np.float32), strict=True)),
+    )

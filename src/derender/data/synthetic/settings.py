@@ -6,13 +6,14 @@ it, so the same seed shows the same people in another light. ``LIGHTS``, ``VIEWS
 ``CAR_VIEWS`` name whole sets of them: "wide" is outside what "usual" ever shows.
 """
 
-from collections.abc import Callable, Iterable, Mapping
-from typing import Annotated, Any, TypeVar
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import chain
+from typing import Annotated, Any, ClassVar, TypeVar
 
 import numpy as np
 import yaml
 from numpy import ndarray
-from pydantic import AfterValidator, BeforeValidator, Field, ValidationError
+from pydantic import BeforeValidator, Field, ValidationError, field_validator
 
 from derender.settings import Settings
 
@@ -42,43 +43,19 @@ _OTHER_DEG = 20.0  # with beyond_deg, the angle that is not beyond stays within 
 _YAW_SHARE = 0.6
 
 
-def scaled(ends: Range, share: float) -> float:
-    """The value at that share of a range."""
-    return float(ends[0] + (ends[1] - ends[0]) * share)
-
-
-def clipped(value: float, ends: Range) -> float:
-    """The value of a range that is nearest."""
-    return float(min(max(value, ends[0]), ends[1]))
-
-
-def either_side(ends: Range, beyond: float, share: float) -> float:
-    """Uniform over the two pieces of a range that lie at least ``beyond`` from 0."""
+def drawn(ends: Range, share: float, beyond: float = 0.0) -> float:
+    """The value at that share of a range, or of its two pieces that lie at least ``beyond`` from 0."""
+    if beyond <= 0.0:
+        return float(ends[0] + (ends[1] - ends[0]) * share)
     left, right = max(0.0, -beyond - ends[0]), max(0.0, ends[1] - beyond)
     at = share * (left + right)
     return float(ends[0] + at if at < left else beyond + (at - left))
 
 
-def name_at(shares: Mapping[str, float], at: float) -> str:
-    """The name in whose share of the whole a number of 0..1 falls."""
-    names = list(shares)
-    ends = np.cumsum([shares[name] for name in names])
-    return names[int(np.searchsorted(ends, at * ends[-1], side="right"))]
-
-
-def _known(names: Iterable[str]) -> Callable[[Any, Any], Any]:
-    known = tuple(names)
-
-    def check(values: Iterable[str] | Mapping[str, float], info: Any) -> Any:
-        if not set(values) or not set(values) <= set(known):
-            raise ValueError(
-                f"{info.field_name} must be one or more of {', '.join(known)}; got {tuple(values)}"
-            )
-        if isinstance(values, Mapping) and (min(values.values()) < 0 or sum(values.values()) <= 0):
-            raise ValueError(f"{info.field_name}: shares must be 0 or more and not all 0, got {dict(values)}")
-        return values
-
-    return check
+def pick(weights: Sequence[float] | ndarray, at: float) -> int:
+    """The number in whose share of the whole a number of 0..1 falls."""
+    ends = np.cumsum(weights)
+    return min(int(np.searchsorted(ends, at * ends[-1], side="right")), len(ends) - 1)
 
 
 def _equal_shares(value: object) -> object:
@@ -86,99 +63,107 @@ def _equal_shares(value: object) -> object:
     return dict.fromkeys(value, 1.0) if isinstance(value, (list, tuple)) else value
 
 
-_Backgrounds = Annotated[tuple[str, ...], AfterValidator(_known(BACKGROUNDS))]
-_Shares = Annotated[Mapping[str, float], BeforeValidator(_equal_shares)]
+Shares = Annotated[Mapping[str, float], BeforeValidator(_equal_shares)]
 
 
-def _within(low: float, high: float, where: str = "") -> AfterValidator:
-    """A range within those limits; ``where`` is the dotted place of its settings."""
+class _Checked(Settings):
+    """Settings whose ranges lie within ``limits``, and whose names are among ``known``; ``place`` is the
+    dotted place of the settings. An angle ``X_beyond_deg`` lies within the range ``X_deg`` on both sides."""
 
-    def check(value: Range, info: Any) -> Range:
-        if not low <= value[0] <= value[1] <= high:
-            limits = f"two numbers, low <= high, within {low}..{high}"
-            raise ValueError(f"{where}{info.field_name} must be {limits}; got {value}")
-        return value
+    place: ClassVar[str] = ""
+    limits: ClassVar[Mapping[str, Range]] = {}
+    known: ClassVar[Mapping[str, Iterable[str]]] = {}
 
-    return AfterValidator(check)
-
-
-def _on_both_sides(angle: str) -> AfterValidator:
-    """An angle that, above 0, lies within the range of that name, which stands before it, on both sides."""
-
-    def check(value: float, info: Any) -> float:
-        ends = info.data.get(angle)
+    @field_validator("*")
+    @classmethod
+    def _check(cls, value: Any, info: Any) -> Any:
+        name = str(info.field_name)
+        if name in cls.limits:
+            low, high = cls.limits[name]
+            if not low <= value[0] <= value[1] <= high:
+                limits = f"two numbers, low <= high, within {low}..{high}"
+                raise ValueError(f"{cls.place}{name} must be {limits}; got {value}")
+        ends = info.data.get(name.replace("_beyond", "")) if "_beyond_" in name else None
         if ends is not None and value > 0 and not ends[0] <= -value <= value <= ends[1]:
-            name = f"view.{info.field_name}"
-            raise ValueError(f"{name} must lie within view.{angle} {ends} on both sides, got {value}")
+            within = f"{cls.place}{name.replace('_beyond', '')} {ends}"
+            raise ValueError(f"{cls.place}{name} must lie within {within} on both sides, got {value}")
+        if name in cls.known:
+            if not set(value) or not set(value) <= set(cls.known[name]):
+                names = ", ".join(cls.known[name])
+                raise ValueError(f"{name} must be one or more of {names}; got {tuple(value)}")
+            if isinstance(value, Mapping) and (min(value.values()) < 0 or sum(value.values()) <= 0):
+                raise ValueError(f"{name}: shares must be 0 or more and not all 0, got {dict(value)}")
         return value
 
-    return AfterValidator(check)
 
-
-class LightSettings(Settings):
+class LightSettings(_Checked):
     """Uniform ranges. With ``beyond_deg`` either yaw or pitch (60 : 40) is at least so far off the front, on
     either side, and the other at most 20 degrees."""
 
-    yaw_deg: Annotated[Range, _within(-85, 85, "light.")] = (-45.0, 45.0)
-    pitch_deg: Annotated[Range, _within(-85, 85, "light.")] = (-45.0, 45.0)
+    place = "light."
+    limits: ClassVar = {"yaw_deg": (-85, 85), "pitch_deg": (-85, 85), "ambient": (0, 1), "diffuse": (0, 1)}
+    yaw_deg: Range = (-45.0, 45.0)
+    pitch_deg: Range = (-45.0, 45.0)
     beyond_deg: float = Field(default=0.0, ge=0, lt=85)
-    ambient: Annotated[Range, _within(0, 1, "light.")] = (0.25, 0.7)
-    diffuse: Annotated[Range, _within(0, 1, "light.")] = (0.2, 0.8)
+    ambient: Range = (0.25, 0.7)
+    diffuse: Range = (0.2, 0.8)
 
     def draw(self, uniform: ndarray, brightest: float = np.inf) -> ndarray:
         """Ambient, diffuse, pitch and yaw (radians) from five uniform numbers: one each, and which of the
         angles is beyond. Ambient is limited so that ambient and diffuse together stay below ``brightest``."""
-        diffuse = scaled(self.diffuse, uniform[1])
-        low, high = self.ambient
-        ambient = scaled((low, max(low, min(high, brightest - diffuse))), uniform[0])
-        pitch, yaw = scaled(self.pitch_deg, uniform[2]), scaled(self.yaw_deg, uniform[3])
-        if self.beyond_deg > 0:
-            if uniform[4] < _YAW_SHARE:
-                yaw = either_side(self.yaw_deg, self.beyond_deg, uniform[3])
-                pitch = _OTHER_DEG * (2.0 * uniform[2] - 1.0)
-            else:
-                pitch = either_side(self.pitch_deg, self.beyond_deg, uniform[2])
-                yaw = _OTHER_DEG * (2.0 * uniform[3] - 1.0)
-        return np.array([ambient, diffuse, float(np.deg2rad(pitch)), float(np.deg2rad(yaw))], np.float32)
+        diffuse, (low, high) = drawn(self.diffuse, uniform[1]), self.ambient
+        ambient = drawn((low, max(low, min(high, brightest - diffuse))), uniform[0])
+        pitch = drawn(self.pitch_deg, uniform[2], self.beyond_deg)
+        yaw = drawn(self.yaw_deg, uniform[3], self.beyond_deg)
+        if self.beyond_deg > 0 and uniform[4] < _YAW_SHARE:
+            pitch = _OTHER_DEG * (2.0 * uniform[2] - 1.0)
+        elif self.beyond_deg > 0:
+            yaw = _OTHER_DEG * (2.0 * uniform[3] - 1.0)
+        return np.array([ambient, diffuse, *np.deg2rad([pitch, yaw])], np.float32)
 
 
-class ViewSettings(Settings):
+class ViewSettings(_Checked):
     """Ranges of the camera's angles. A spread (``*_sd_deg``) draws a normal about the middle of the range,
     clipped at its ends; without one (null) the range is uniform. With ``yaw_beyond_deg`` yaw is uniform on
-    either side, from there to the range's ends."""
+    either side, from there to the range's ends. Shifts are scene units, right and down; one pixel of 64 is
+    0.0028."""
 
-    yaw_deg: Annotated[Range, _within(-90.0, 90.0, "view.")] = (-45.0, 45.0)
+    place = "view."
+    limits: ClassVar = {
+        "yaw_deg": (-90.0, 90.0), "pitch_deg": (-60.0, 60.0), "roll_deg": (-180.0, 180.0),
+        "shift": (-0.1, 0.1),
+    }  # fmt: skip
+    yaw_deg: Range = (-45.0, 45.0)
     yaw_sd_deg: float | None = Field(default=18.0, ge=0, le=90)
-    yaw_beyond_deg: Annotated[float, _on_both_sides("yaw_deg")] = Field(default=0.0, ge=0, lt=90)
-    pitch_deg: Annotated[Range, _within(-60.0, 60.0, "view.")] = (-20.0, 20.0)
+    yaw_beyond_deg: float = Field(default=0.0, ge=0, lt=90)
+    pitch_deg: Range = (-20.0, 20.0)
     pitch_sd_deg: float | None = Field(default=8.0, ge=0, le=90)
-    roll_deg: Annotated[Range, _within(-180.0, 180.0, "view.")] = (-12.0, 12.0)
+    roll_deg: Range = (-12.0, 12.0)
     roll_sd_deg: float | None = Field(default=4.0, ge=0, le=90)
-    shift: Annotated[Range, _within(-0.1, 0.1, "view.")] = (
-        -0.008,
-        0.008,
-    )  # scene units, right and down; one pixel of 64 is 0.0028
+    shift: Range = (-0.008, 0.008)
     shift_sd: float | None = Field(default=0.0035, ge=0, le=0.1)
 
 
-class CarViewSettings(Settings):
+class CarViewSettings(_Checked):
     """A turntable seen from above: uniform elevation above the ground and azimuth about the car's vertical
     axis.
 
     Azimuth 0 sees the front; above 0 the front moves to the left of the image. With ``azimuth_beyond_deg``
     azimuth is uniform on either side, from there to the range's ends. The rotation in the image plane is
-    normal, clipped at its range's ends, as are the shifts; a car that a shift would move out of the image is
-    shifted less."""
+    normal, clipped at its range's ends, as are the shifts (scene units, right and down; one pixel of 64 is
+    0.0028); a car that a shift would move out of the image is shifted less."""
 
-    elevation_deg: Annotated[Range, _within(0.0, 90.0, "view.")] = (25.0, 60.0)
-    azimuth_deg: Annotated[Range, _within(-180.0, 180.0, "view.")] = (-30.0, 30.0)
-    azimuth_beyond_deg: Annotated[float, _on_both_sides("azimuth_deg")] = Field(default=0.0, ge=0, lt=180)
-    inplane_deg: Annotated[Range, _within(-180.0, 180.0, "view.")] = (-8.0, 8.0)
+    place = "view."
+    limits: ClassVar = {
+        "elevation_deg": (0.0, 90.0), "azimuth_deg": (-180.0, 180.0), "inplane_deg": (-180.0, 180.0),
+        "shift": (-0.1, 0.1),
+    }  # fmt: skip
+    elevation_deg: Range = (25.0, 60.0)
+    azimuth_deg: Range = (-30.0, 30.0)
+    azimuth_beyond_deg: float = Field(default=0.0, ge=0, lt=180)
+    inplane_deg: Range = (-8.0, 8.0)
     inplane_sd_deg: float = Field(default=3.0, ge=0, le=90)
-    shift: Annotated[Range, _within(-0.1, 0.1, "view.")] = (
-        -0.008,
-        0.008,
-    )  # scene units, right and down; one pixel of 64 is 0.0028
+    shift: Range = (-0.008, 0.008)
     shift_sd: float = Field(default=0.003, ge=0, le=0.1)
 
 
@@ -207,26 +192,28 @@ CAR_VIEWS: Mapping[str, CarViewSettings] = {
 }
 
 
-class FaceSettings(Settings):
+class FaceSettings(_Checked):
     """Every option of generated faces.
 
     With ``tracks`` (per identity) images come as sequences of ``frames``: light and background stay, head
     and expression move smoothly; otherwise an identity has ``pictures_per_identity`` images.
     """
 
+    limits: ClassVar = {"strength": (0.0, 1.5), "age_years": (16.0, 100.0), "skin_tone": (0.0, 1.0)}
+    known: ClassVar = {"expressions": EXPRESSIONS, "backgrounds": BACKGROUNDS}
     light: LightSettings = LightSettings()
     view: ViewSettings = ViewSettings()
     pictures_per_identity: int = Field(default=8, ge=1)
     first_identity: int = Field(default=0, ge=0)  # other people from the same seed
     tracks: int = Field(default=0, ge=0)
     frames: int = Field(default=6, ge=1)
-    expressions: Annotated[_Shares, AfterValidator(_known(EXPRESSIONS))] = dict.fromkeys(EXPRESSIONS, 1.0)
-    strength: Annotated[Range, _within(0.0, 1.5)] = (0.4, 1.05)
+    expressions: Shares = dict.fromkeys(EXPRESSIONS, 1.0)
+    strength: Range = (0.4, 1.05)
     asymmetry: float = Field(default=0.12, ge=0, le=1)  # sd by which the two halves of an expression differ
     gaze_px: float = Field(default=0.6, ge=0, le=3)  # sd of the irises' shift
-    age_years: Annotated[Range, _within(16.0, 100.0)] = (18.0, 80.0)
-    skin_tone: Annotated[Range, _within(0.0, 1.0)] = (0.0, 1.0)  # 0 fair .. 1 dark
-    backgrounds: _Backgrounds = BACKGROUNDS
+    age_years: Range = (18.0, 80.0)
+    skin_tone: Range = (0.0, 1.0)  # 0 fair .. 1 dark
+    backgrounds: tuple[str, ...] = BACKGROUNDS
 
     @property
     def per_identity(self) -> int:
@@ -234,67 +221,52 @@ class FaceSettings(Settings):
         return self.tracks * self.frames or self.pictures_per_identity
 
 
-class CarSettings(Settings):
+class CarSettings(_Checked):
     """Every option of generated cars."""
 
+    known: ClassVar = {"classes": CLASSES, "backgrounds": BACKGROUNDS}
     light: LightSettings = CAR_LIGHTS["usual"]  # in the canonical frame
     brightest: float = Field(default=1.3, ge=0.1, le=2)  # limit of ambient and diffuse together
     view: CarViewSettings = CarViewSettings()
-    classes: Annotated[_Shares, AfterValidator(_known(CLASSES))] = dict.fromkeys(CLASSES, 1.0)
+    classes: Shares = dict.fromkeys(CLASSES, 1.0)
     pictures_per_model: int = Field(default=4, ge=1)  # consecutive images that show one car
     first_model: int = Field(default=0, ge=0)  # other cars from the same seed
     size: float = Field(default=0.198, gt=0.01, le=0.3)  # diagonal of the bounding box; the image: 0.175
-    backgrounds: _Backgrounds = BACKGROUNDS
+    backgrounds: tuple[str, ...] = BACKGROUNDS
 
 
 def named_settings(
     kind: type[Kind], light: str = "usual", view: str = "usual", overrides: Iterable[str] = (), **own: Any
 ) -> Kind:
-    """Settings by the names of their lighting and viewpoints, own values by keyword, then overrides.
+    """Settings by the names of their lighting and viewpoints, own values by keyword, then overrides such as
+    ``light.yaw_deg=[-60,60]``; keys are dotted, values are YAML.
 
     Raises:
-        ValueError: an unknown name, or as ``changed``.
+        ValueError: an unknown name, text that is not key=value, an unknown key (the known ones are listed),
+            or a bad value.
     """
     lights, views = (LIGHTS, VIEWS) if kind is FaceSettings else (CAR_LIGHTS, CAR_VIEWS)
     for option, name, known in (("light", light, lights), ("view", view, views)):
         if name not in known:
             raise ValueError(f"{option} must be one of {', '.join(known)}, got {name!r}")
-    own |= {"light": lights[light], "view": views[view]}
-    return changed(kind.model_validate(own), overrides)
-
-
-def changed(settings: Kind, overrides: Iterable[str]) -> Kind:
-    """The settings with changes such as ``light.yaw_deg=[-60,60]``; keys are dotted, values are YAML.
-
-    Raises:
-        ValueError: text that is not key=value, an unknown key (the known ones are listed), or a bad value.
-    """
-    tree = settings.model_dump(mode="python")
+    tree = kind.model_validate(own | {"light": lights[light], "view": views[view]}).model_dump()
     for override in overrides:
         key, equals, text = override.partition("=")
         if not equals:
             raise ValueError(f"cannot read {override!r}: write key=value, for example light.yaw_deg=[-60,60]")
-        *parents, last = key.strip().split(".")
-        branch: Any = tree
-        for parent in parents:
-            branch = branch.get(parent) if isinstance(branch, dict) else None
+        parent, _, last = (key := key.strip()).rpartition(".")
+        branch = tree.get(parent) if parent else tree
         if not isinstance(branch, dict) or last not in branch:
-            raise ValueError(f"unknown setting {key.strip()!r}; there are {', '.join(_names(tree))}")
+            nested = ([f"{k}.{n}" for n in v] if isinstance(v, dict) else [k] for k, v in tree.items())
+            raise ValueError(f"unknown setting {key!r}; there are {', '.join(chain(*nested))}")
         try:
             branch[last] = yaml.safe_load(text)
         except (yaml.YAMLError, ValueError, RecursionError) as error:
-            raise ValueError(f"cannot read the value {text!r} of {key.strip()}") from error
+            raise ValueError(f"cannot read the value {text!r} of {key}") from error
     try:
-        return type(settings).model_validate(tree)
+        return kind.model_validate(tree)
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"])
         what = first["msg"].removeprefix("Value error, ")
         raise ValueError(what if what.startswith(where) else f"setting {where}: {what}") from error
-
-
-def _names(tree: dict[str, Any], prefix: str = "") -> list[str]:
-    names: list[str] = []
-    for key, value in tree.items():
-        names += _names(value, f"{prefix}{key}.") if isinstance(value, dict) else [prefix + key]
-    return names

@@ -1,28 +1,28 @@
-"""The set of images that generators return, made in batches on threads; and the backgrounds they share.
+"""The set of images that generators return, drawn on threads; and the backgrounds they share.
 
-A batch is a run of consecutive images, whole objects where they fit, and writes into its rows of the result.
-So the threads decide when an image is made and nothing else.
+A generator gives the meshes, light and view of a run of consecutive images that show one object; here they
+are drawn into the rows of the result. So threads decide when an image is made and nothing else.
 """
 
-import itertools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import lru_cache
-from typing import Any
+from itertools import groupby
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float32, Float64, Int64, Shaped, UInt8
 from numpy import ndarray
 
-from derender.scene.camera import rotation_matrix
+from derender.data.synthetic.mesh_image import ImageMaps, TriangleMesh, draw_mesh
+from derender.scene.camera import focal_px, rotation_matrix
 from derender.scene.light import light_direction
 
 FOV_DEG = 10.0
 Row = dict[str, int | float | np.float32 | str]
-Maps = dict[str, ndarray]  # a SyntheticSet's arrays by name
-_BATCH = 16  # images of 64 pixels
+Progress = Callable[[int, int], None]
+_LONGEST_RUN = 16
 _NOISE_CELLS = 5
 
 
@@ -74,6 +74,18 @@ class SyntheticSet:
         return self.labels["strength"]
 
 
+class Shot(NamedTuple):
+    """One image before it is drawn; ``light``, ``camera`` and the rest as in SyntheticSet."""
+
+    mesh: TriangleMesh
+    background: Float32[ndarray, "s s 3"]
+    light: Float32[ndarray, "4"]
+    camera: Float32[ndarray, "6"]
+    identity: int
+    labels: Row
+    traits: Row
+
+
 def camera_rotation_and_light(
     camera: Float32[ndarray, "n 6"], light: Float32[ndarray, "n 4"]
 ) -> tuple[Float64[ndarray, "n 3 3"], Float64[ndarray, "n 3"]]:
@@ -84,20 +96,17 @@ def camera_rotation_and_light(
 
 
 def make_set(
-    work: Callable[[range, Maps], list[tuple[Row, Row]]],
-    prepare: Callable[[], object],
+    shots: Callable[[list[int]], Iterable[Shot]],
     count: int,
     image_size: int,
     seed: int,
     first: int,
     per_object: int,
     part_names: tuple[str, ...],
-    progress: Callable[[int, int], None] | None,
+    progress: Progress | None,
 ) -> SyntheticSet:
-    """The set of ``count`` images from index ``first`` on.
-
-    ``work(indices, maps)`` fills the maps of these images and returns labels and traits of each;
-    ``prepare()`` computes the values they share, before threads ask for them.
+    """The set of ``count`` images from index ``first`` on; ``shots(indices)`` are those of images of one
+    object.
 
     Raises:
         ValueError: a number that no set can have.
@@ -108,49 +117,38 @@ def make_set(
         raise ValueError(f"image_size must be 16..1024 pixels, got {image_size}")
     if seed < 0 or first < 0:
         raise ValueError(f"seed and first must be 0 or more, got seed {seed}, first {first}")
-    prepare()
-    out = _empty(count, image_size)
-    rows: list[tuple[Row, Row]] = []
-
-    def batch(rows: slice) -> list[tuple[Row, Row]]:
-        part = {name: value[rows] for name, value in out.items()}
-        return work(range(first + rows.start, first + rows.stop), part)
-
-    batches = _batches(first, count, per_object, max(1, _BATCH * 64 // image_size))
-    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
-        for made in pool.map(batch, batches):
-            rows += made
-            if progress is not None:
-                progress(len(rows), count)
-    labels, traits = (
-        {name: np.array([row[name] for row in each]) for name in each[0]} for each in zip(*rows, strict=True)
+    plain, coloured = (count, image_size, image_size), (count, 3, image_size, image_size)
+    maps = ImageMaps(
+        *(np.zeros(coloured, np.uint8), np.zeros(plain, np.float32), np.zeros((*plain, 3), np.float32)),
+        *(np.zeros(coloured, np.uint8), np.zeros(plain, bool), np.zeros(plain, np.uint8)),
     )
-    more: dict[str, Any] = {"labels": labels, "identity_traits": traits, "part_names": part_names}
-    return SyntheticSet(**out, **more)
+    focal = np.float32(focal_px(image_size, FOV_DEG))
 
+    def draw(indices: list[int]) -> list[tuple[Any, ...]]:
+        groups = groupby(indices, lambda i: i // per_object)
+        run = [shot for _, group in groups for shot in shots(list(group))]
+        light, camera = np.stack([shot.light for shot in run]), np.stack([shot.camera for shot in run])
+        rotation, direction = camera_rotation_and_light(camera, light)
+        rays = np.hstack([light[:, :2], direction]).astype(np.float32)
+        for n, (index, shot) in enumerate(zip(indices, run, strict=True)):
+            out = ImageMaps(*(each[index - first] for each in maps))
+            turn = rotation[n].astype(np.float32)
+            draw_mesh(shot.mesh, turn, camera[n, 3:], rays[n], shot.background, focal, out)
+        return [shot[2:] for shot in run]  # without meshes
 
-def _batches(first: int, count: int, per_object: int, most: int) -> list[slice]:
-    """Consecutive rows to work on together: whole objects where they fit into ``most`` rows."""
-    whole = max(1, most // per_object) * per_object
-    starts = [0]
-    while starts[-1] < count:
-        in_block = (first + starts[-1]) % whole
-        starts.append(min(starts[-1] + min(whole - in_block, most), count))
-    return [slice(a, b) for a, b in itertools.pairwise(starts)]
-
-
-def _empty(count: int, size: int) -> Maps:
-    return {
-        "images": np.zeros((count, 3, size, size), np.uint8),
-        "depth": np.zeros((count, size, size), np.float32),
-        "normal": np.zeros((count, size, size, 3), np.float32),
-        "albedo": np.zeros((count, 3, size, size), np.uint8),
-        "mask": np.zeros((count, size, size), bool),
-        "parts": np.zeros((count, size, size), np.uint8),
-        "light": np.zeros((count, 4), np.float32),
-        "camera": np.zeros((count, 6), np.float32),
-        "identity": np.zeros(count, np.int64),
-    }
+    whole = per_object * max(1, _LONGEST_RUN // per_object)  # objects where they fit
+    runs = groupby(range(first, first + count), lambda i: (i // whole, i % whole // _LONGEST_RUN))
+    made: list[tuple[Any, ...]] = []
+    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+        for rows in pool.map(draw, [list(indices) for _, indices in runs]):
+            made += rows
+            if progress is not None:
+                progress(len(made), count)
+    light, camera, identity, *tables = zip(*made, strict=True)
+    labels, traits = ({name: np.array([row[name] for row in rows]) for name in rows[0]} for rows in tables)
+    return SyntheticSet(
+        *maps, np.stack(light), np.stack(camera), np.array(identity), labels, traits, part_names
+    )
 
 
 def draw_background(kind: str, generator: np.random.Generator, size: int) -> Float32[ndarray, "s s 3"]:
@@ -160,31 +158,20 @@ def draw_background(kind: str, generator: np.random.Generator, size: int) -> Flo
     """
     grey = generator.random((2, 1), dtype=np.float32)
     strength = np.float32(0.15 + 0.45 * generator.random() ** 2)
-    ends = grey + strength * (generator.random((2, 3), dtype=np.float32) - grey)
+    start, end = grey + strength * (generator.random((2, 3), dtype=np.float32) - grey)
     angle = np.float32(generator.uniform(0.0, 2.0 * np.pi))
     knots = generator.random((_NOISE_CELLS, _NOISE_CELLS, 3), dtype=np.float32)
     if kind == "plain":
-        return np.broadcast_to(ends[0], (size, size, 3)).copy()
+        return np.broadcast_to(start, (size, size, 3)).copy()
     if kind == "gradient":
         across = np.linspace(-1.0, 1.0, size, dtype=np.float32)
         at = 0.5 + 0.5 * (np.cos(angle) * across + np.sin(angle) * across[:, None]) / np.float32(np.sqrt(2.0))
-        return ends[0] + (ends[1] - ends[0]) * at[..., None]
+        return start + (end - start) * at[..., None]
     coloured = np.float32(0.3) * strength * (knots - np.float32(0.5))
-    knots = np.clip(ends[0] + (ends[1] - ends[0]) * knots[..., :1] + coloured, 0.0, 1.0)
-    across = _stretch(knots, size).transpose(1, 0, 2)
-    return np.ascontiguousarray(_stretch(across, size).transpose(1, 0, 2))
-
-
-def _stretch(knots: ndarray, size: int) -> ndarray:
-    """Smooth interpolation of rows of knots to ``size`` rows."""
-    low, part = _between(size)
-    return knots[low] * (1.0 - part) + knots[low + 1] * part
-
-
-@lru_cache(maxsize=4)
-def _between(size: int) -> tuple[ndarray, ndarray]:
-    """The knot before each row, and how far the row is on its way to the next one."""
-    at = np.linspace(0.0, _NOISE_CELLS - 1.0, size, dtype=np.float32)
-    low = np.minimum(at.astype(int), _NOISE_CELLS - 2)
-    part = at - low
-    return low, (part * part * (3.0 - 2.0 * part))[:, None, None].astype(np.float32)
+    knots = np.clip(start + (end - start) * knots[..., :1] + coloured, 0.0, 1.0)
+    at = np.linspace(0.0, _NOISE_CELLS - 1.0, size, dtype=np.float32)[:, None]
+    near = np.maximum(
+        np.float32(1.0) - np.abs(at - np.arange(_NOISE_CELLS, dtype=np.float32)), np.float32(0.0)
+    )
+    share = near * near * (np.float32(3.0) - np.float32(2.0) * near)  # (size, cells)
+    return share @ (share @ knots.reshape(_NOISE_CELLS, -1)).reshape(size, _NOISE_CELLS, 3)

@@ -8,73 +8,42 @@ morphable-model sets has no counterpart here.
 """
 
 import csv
-import errno
-import os
 import struct
 import zlib
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float32, UInt8, UInt16
+from jaxtyping import UInt8, UInt16
 from numpy import ndarray
 from PIL import Image
 
-from derender.data.synthetic.synthetic_set import SyntheticSet, camera_rotation_and_light
+from derender.data.synthetic.synthetic_set import Progress, SyntheticSet, camera_rotation_and_light
 from derender.storage.atomic import atomic_folder
 
 DEPTH_LOW, DEPTH_SPAN = 0.8, 0.4
 _MAPS = ("depth", "normal", "albedo", "mask", "masks")
-_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-_PREDICT_ABOVE, _COMPRESSION = 2, 1
 
 
 def write(
-    synthetic: SyntheticSet,
-    folder: Path | str,
-    truth: bool = True,
-    progress: Callable[[int, int], None] | None = None,
+    synthetic: SyntheticSet, folder: Path | str, truth: bool = True, progress: Progress | None = None
 ) -> Path:
     """Write the set into ``folder`` (made if missing, refused if it holds a set) and return that folder.
 
     ``progress(done, count)`` is called as images are written.
     """
-    folder = _free(folder)
-    for name in ("images", *(_MAPS if truth else ())):
-        (folder / name).mkdir(parents=True, exist_ok=True)
     files = [f"images/{i:06d}.jpg" for i in range(len(synthetic))]
-
-    def save(i: int) -> None:
-        _save_image(synthetic, i, f"{folder}/{files[i]}")
-        if truth:
-            for name, pixels in _encoded(synthetic, i).items():
-                _save_new(f"{folder}/{name}/{i:06d}.png", encode_png(np.ascontiguousarray(pixels)))
-
-    _on_threads(save, len(files), progress)
-    if truth:
-        (folder / "classes.txt").write_text("\n".join(synthetic.part_names) + "\n", encoding="utf-8")
-    return _write_tables(synthetic, folder, files)
+    return _write(synthetic, Path(folder), files, _MAPS if truth else (), progress)
 
 
-def write_tracks(
-    synthetic: SyntheticSet, folder: Path | str, progress: Callable[[int, int], None] | None = None
-) -> Path:
+def write_tracks(synthetic: SyntheticSet, folder: Path | str, progress: Progress | None = None) -> Path:
     """Write a set of tracks into ``folder``, one folder per identity and track; no maps are kept."""
     if "track" not in synthetic.labels:
         raise ValueError("these images are no tracks: generate them with the setting tracks above 0")
-    folder = _free(folder)
-    track, frame = synthetic.labels["track"], synthetic.labels["frame"]
-    files = [
-        f"tracks/id{synthetic.identity[i]:04d}/track_{track[i]:03d}/{frame[i]:03d}.jpg"
-        for i in range(len(synthetic))
-    ]
-    for parent in {(folder / file).parent for file in files}:
-        parent.mkdir(parents=True, exist_ok=True)
-    _on_threads(lambda i: _save_image(synthetic, i, f"{folder}/{files[i]}"), len(files), progress)
-    return _write_tables(synthetic, folder, files)
+    numbers = zip(synthetic.identity, synthetic.labels["track"], synthetic.labels["frame"], strict=True)
+    files = [f"tracks/id{who:04d}/track_{track:03d}/{frame:03d}.jpg" for who, track, frame in numbers]
+    return _write(synthetic, Path(folder), files, (), progress)
 
 
 def require_empty(folder: Path) -> None:
@@ -84,10 +53,7 @@ def require_empty(folder: Path) -> None:
 
 
 def write_folder(
-    synthetic: SyntheticSet,
-    folder: Path,
-    truth: bool = True,
-    progress: Callable[[int, int], None] | None = None,
+    synthetic: SyntheticSet, folder: Path, truth: bool = True, progress: Progress | None = None
 ) -> None:
     """Write images or tracks into a new folder, which appears when it is complete."""
     with atomic_folder(folder) as temporary:
@@ -97,89 +63,70 @@ def write_folder(
             write(synthetic, temporary, truth, progress)
 
 
-def _on_threads(save: Callable[[int], None], count: int, progress: Callable[[int, int], None] | None) -> None:
-    """Save images 0 to ``count`` on as many threads as computing uses."""
-    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
-        for done, _ in enumerate(pool.map(save, range(count)), 1):
-            if progress is not None:
-                progress(done, count)
-
-
-def _free(folder: Path | str) -> Path:
-    folder = Path(folder)
+def _write(
+    synthetic: SyntheticSet, folder: Path, files: list[str], maps: tuple[str, ...], progress: Progress | None
+) -> Path:
     if (folder / "params.csv").exists():
         raise ValueError(f"{folder} already holds a set (params.csv): choose another folder or delete it")
+    for parent in {(folder / file).parent for file in files} | {folder / name for name in maps}:
+        parent.mkdir(parents=True, exist_ok=True)
+
+    def save(i: int) -> None:
+        with (folder / files[i]).open("xb") as file:
+            picture = Image.fromarray(synthetic.images[i].transpose(1, 2, 0))
+            picture.save(file, "JPEG", quality=92, subsampling=0)
+        for name, pixels in _encoded(synthetic, i).items() if maps else ():
+            with open(f"{folder}/{name}/{i:06d}.png", "xb") as file:  # noqa: PTH123 (faster than a Path)
+                file.write(encode_png(pixels))
+
+    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+        for done, _ in enumerate(pool.map(save, range(len(files))), 1):
+            if progress is not None:
+                progress(done, len(files))
+    if maps:
+        (folder / "classes.txt").write_text("\n".join(synthetic.part_names) + "\n", encoding="utf-8")
+    numbers, rows = np.unique(synthetic.identity, return_index=True)
+    traits = {name: _texts(values[rows], 5) for name, values in synthetic.identity_traits.items()}
+    _write_table(folder / "params.csv", {"file": files, **_parameters(synthetic)})
+    _write_table(folder / "identities.csv", {"identity": _texts(numbers), **traits})
     return folder
 
 
-def _save_image(synthetic: SyntheticSet, i: int, path: str) -> None:
-    encoded = BytesIO()
-    Image.fromarray(synthetic.images[i].transpose(1, 2, 0)).save(encoded, "JPEG", quality=92, subsampling=0)
-    _save_new(path, encoded.getvalue())
-
-
-def _save_new(path: str, content: bytes) -> None:
-    """Write a file that is not there yet; for small files several times faster than opening it to replace it.
-
-    Raises:
-        FileExistsError: it is there.
-    """
-    file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0), 0o644)
-    try:
-        if os.write(file, content) != len(content):
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), path)
-    finally:
-        os.close(file)
-
-
 def _encoded(synthetic: SyntheticSet, i: int) -> dict[str, ndarray]:
-    mask = synthetic.mask[i]
+    mask, depth, normal = (
+        synthetic.mask[i],
+        synthetic.depth[i].astype(float),
+        synthetic.normal[i].astype(float),
+    )
+    code = np.clip(np.round((depth - DEPTH_LOW) / DEPTH_SPAN * 65535), 1, 65535)
     return {
-        "depth": encode_depth(synthetic.depth[i]),
-        "normal": encode_normal(synthetic.normal[i]) * mask[..., None],
+        "depth": np.where(depth > 0, code, 0).astype(np.uint16),
+        "normal": np.round((normal + 1.0) / 2.0 * 255).astype(np.uint8) * mask[..., None],
         "albedo": synthetic.albedo[i].transpose(1, 2, 0),
         "mask": mask.astype(np.uint8) * 255,
         "masks": synthetic.parts[i],
     }
 
 
-def _write_tables(synthetic: SyntheticSet, folder: Path, files: list[str]) -> Path:
-    numbers, rows = np.unique(synthetic.identity, return_index=True)
-    traits = {name: _texts(values[rows], 5) for name, values in synthetic.identity_traits.items()}
-    _write_table(folder / "params.csv", _parameters(synthetic, files))
-    _write_table(folder / "identities.csv", {"identity": _texts(numbers), **traits})
-    return folder
-
-
-def encode_depth(depth: Float32[ndarray, "*shape"]) -> UInt16[ndarray, "*shape"]:
-    """16-bit code of z in 0.8..1.2; 0 stays 0 and means background."""
-    code = np.round((depth.astype(np.float64) - DEPTH_LOW) / DEPTH_SPAN * 65535)
-    return np.where(depth > 0, np.clip(code, 1, 65535), 0).astype(np.uint16)
-
-
-def encode_normal(normal: Float32[ndarray, "*shape 3"]) -> UInt8[ndarray, "*shape 3"]:
-    """8-bit code of unit vectors."""
-    return np.round((normal.astype(np.float64) + 1.0) / 2.0 * 255).astype(np.uint8)
-
-
-def _parameters(synthetic: SyntheticSet, files: list[str]) -> dict[str, list[str]]:
+def _parameters(synthetic: SyntheticSet) -> dict[str, list[str]]:
     """The columns of params.csv; ``*_cam`` in the camera's frame, the others in the canonical one."""
     rotation, seen = camera_rotation_and_light(synthetic.camera, synthetic.light)
-    light = np.stack([each.T @ direction for each, direction in zip(rotation, seen, strict=True)])
-    ambient, diffuse, light_pitch, light_yaw = synthetic.light.astype(float).T
+    light = np.einsum("nji,nj->in", rotation, seen)
+    ambient, diffuse, *light_angles = synthetic.light.astype(float).T
+    angles = np.rad2deg(
+        [*light_angles, np.arctan2(seen[:, 1], seen[:, 2]), np.arctan2(seen[:, 0], seen[:, 2])]
+    )
     pitch, yaw, roll, tx, ty, _ = synthetic.camera.astype(float).T
     columns = {
-        "ambient": ambient, "diffuse": diffuse,
-        "light_pitch": np.rad2deg(light_pitch), "light_yaw": np.rad2deg(light_yaw),
-        "lx": light[:, 0], "ly": light[:, 1], "lz": light[:, 2],
-        "light_pitch_cam": np.rad2deg(np.arctan2(seen[:, 1], seen[:, 2])),
-        "light_yaw_cam": np.rad2deg(np.arctan2(seen[:, 0], seen[:, 2])),
+        "ambient": ambient, "diffuse": diffuse, "light_pitch": angles[0], "light_yaw": angles[1],
+        "lx": light[0], "ly": light[1], "lz": light[2],
+        "light_pitch_cam": angles[2], "light_yaw_cam": angles[3],
         "lx_cam": seen[:, 0], "ly_cam": seen[:, 1], "lz_cam": seen[:, 2],
         "pitch": np.rad2deg(pitch), "yaw": np.rad2deg(yaw), "roll": np.rad2deg(roll), "tx": tx, "ty": ty,
     }  # fmt: skip
     labels = {name: _texts(values, 4) for name, values in synthetic.labels.items()}
     numbers = {name: _texts(values, 6) for name, values in columns.items()}
-    return {"file": files, "identity": _texts(synthetic.identity), **labels, **numbers}
+    return {"identity": _texts(synthetic.identity), **labels, **numbers}
 
 
 def _texts(values: ndarray, digits: int = 0) -> list[str]:
@@ -202,16 +149,13 @@ def encode_png(
     every row and builds its chunks in Python; for maps of 64 pixels that is most of the time of saving.
     """
     height, width = pixels.shape[:2]
-    rows = pixels.astype(pixels.dtype.newbyteorder(">"), copy=False).reshape(height, -1).view(np.uint8)
-    lines = np.empty((height, 1 + rows.shape[1]), np.uint8)
-    lines[:, 0] = _PREDICT_ABOVE
-    lines[0, 1:] = rows[0]
-    np.subtract(rows[1:], rows[:-1], out=lines[1:, 1:])
+    rows = np.ascontiguousarray(pixels, pixels.dtype.newbyteorder(">")).reshape(height, -1).view(np.uint8)
+    above = np.vstack([np.zeros((1, rows.shape[1]), np.uint8), rows[:-1]])
+    lines = np.hstack([np.full((height, 1), 2, np.uint8), rows - above])  # 2: from the row above
     kind = 2 if pixels.ndim == 3 else 0  # RGB or grey
     header = struct.pack(">IIBBBBB", width, height, 8 * pixels.dtype.itemsize, kind, 0, 0, 0)
-    data = zlib.compress(lines.tobytes(), _COMPRESSION)
-    return _PNG_SIGNATURE + _chunk(b"IHDR", header) + _chunk(b"IDAT", data) + _chunk(b"IEND", b"")
-
-
-def _chunk(name: bytes, content: bytes) -> bytes:
-    return struct.pack(">I", len(content)) + name + content + struct.pack(">I", zlib.crc32(name + content))
+    chunks = ((b"IHDR", header), (b"IDAT", zlib.compress(lines.tobytes(), 1)), (b"IEND", b""))
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+        for name, data in chunks
+    )
