@@ -56,7 +56,7 @@ from derender.data.synthetic.car_paint import (
     top_paint,
     wheel_paint,
 )
-from derender.data.synthetic.mesh_image import TriangleMesh, shift_room
+from derender.data.synthetic.mesh_image import TriangleMesh
 from derender.data.synthetic.settings import CLASSES, CarSettings, drawn, pick
 from derender.data.synthetic.synthetic_set import FOV_DEG, Row, Shot, SyntheticSet, draw_background, make_set
 
@@ -136,9 +136,10 @@ def draw_car(seed: int, index: int, image_size: int, settings: CarSettings, car:
     inplane = min(max(view.inplane_sd_deg * normal[0], view.inplane_deg[0]), view.inplane_deg[1])
     kind = settings.backgrounds[int(uniform[7] * len(settings.backgrounds))]
     rotation = view_rotation(elevation, azimuth, inplane) @ about_x(CANONICAL_ELEVATION_DEG).T
-    room = np.empty((2, 2))  # so that all vertices stay in the image
-    shift_room(car.mesh.vertices, rotation, np.tan(np.deg2rad(FOV_DEG / 2)), room)
-    (low, high), (least, most) = room, view.shift
+    x, y, z = rotation.astype(np.float32) @ car.mesh.vertices.T
+    reach = np.float32(np.tan(np.deg2rad(FOV_DEG / 2))) * (z + np.float32(1.0))
+    low = np.array([(-reach - x).max(), (-reach - y).max()])  # so that all vertices stay in the image
+    high, (least, most) = np.array([(reach - x).min(), (reach - y).min()]), view.shift
     shift = np.minimum(np.maximum(view.shift_sd * normal[1:], least), most)
     shift = np.where(low < high, np.minimum(np.maximum(shift, low), high), 0.5 * (low + high))
     labels: Row = {

@@ -109,20 +109,6 @@ def draw_mesh(mesh, rotation, translation, light, background, focal_px, out):
 
 @kernel
 @no_type_check
-def shift_room(vertices, rotation, half_width, room):
-    """Least and greatest shifts (2,2), right and down, that keep turned vertices (V,3) in the image, which
-    reaches to ``half_width`` at z = 1."""
-    room[0, :], room[1, :] = -np.inf, np.inf
-    for v in range(vertices.shape[0]):
-        at = _turned(rotation, vertices[v, 0], vertices[v, 1], vertices[v, 2])
-        reach = half_width * (at[2] + 1.0)
-        for k in range(2):
-            room[0, k] = max(room[0, k], -reach - at[k])
-            room[1, k] = min(room[1, k], reach - at[k])
-
-
-@kernel
-@no_type_check
 def _turned(rotation, x, y, z):
     return (
         rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z,
@@ -204,7 +190,11 @@ def fill_triangles(places, triangles, number, more, holes, nearest, owner):
         to_below = ((cw - aw) * abx - (bw - aw) * acx) * scale
         low, high = min(aw, bw, cw), max(aw, bw, cw)
         ab, bc, ca = _edge(ax, ay, bx, by), _edge(bx, by, cx, cy), _edge(cx, cy, ax, ay)
-        pierced = len(number) > 0 and _pierced(more, a, b, c, holes, number[f])
+        pierced = False  # whether a hole is as far along as the triangle
+        for h in range(2 if len(number) else 0):
+            at, reach = holes[number[f], h, 0], holes[number[f], h, 2]
+            p, q, r = more[a, 3] - at, more[b, 3] - at, more[c, 3] - at
+            pierced = pierced or (reach > _ZERO and min(p, q, r) < reach and max(p, q, r) > -reach)
         for v in range(first_row, last_row + 1):
             row = np.float32(v)
             at_ab, at_bc, at_ca = _crossing(ab, row), _crossing(bc, row), _crossing(ca, row)
@@ -232,20 +222,6 @@ def _edge(ax, ay, bx, by):
 @no_type_check
 def _crossing(edge, row):
     return edge[0] + (row - edge[1]) * edge[2]
-
-
-@kernel
-@no_type_check
-def _pierced(more, a, b, c, holes, k):
-    """Whether the bounds of a triangle on its chart meet those of a hole."""
-    meets = False
-    for h in range(2):
-        here = holes[k, h, 2] > _ZERO
-        for i in range(2):
-            p, q, r, reach = more[a, 3 + i], more[b, 3 + i], more[c, 3 + i], holes[k, h, 2]
-            here = here and min(p, q, r) < holes[k, h, i] + reach and max(p, q, r) > holes[k, h, i] - reach
-        meets = meets or here
-    return meets
 
 
 @kernel
