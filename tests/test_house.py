@@ -16,7 +16,7 @@ SOURCES = sorted(PACKAGE.rglob("*.py"))
 TESTS = sorted((ROOT / "tests").rglob("*.py"))
 
 BUDGET = {  # lines, files
-    "data": (9_400, 46),
+    "data": (8_500, 39),
     "evaluation": (7_852, 45),
     "report": (4_480, 31),
     "cli": (3_380, 43),
@@ -33,7 +33,7 @@ BUDGET = {  # lines, files
     "demo": (420, 3),
     "learn": (480, 4),
 }
-TOTAL = (46_100, 288)  # on the way to (32_000, 270)
+TOTAL = (39_900, 270)  # on the way to (32_000, 270)
 TEST_LINES = 29_760  # on the way to 24_000
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80

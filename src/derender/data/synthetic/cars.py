@@ -136,8 +136,8 @@ def draw_car(seed: int, index: int, image_size: int, settings: CarSettings, car:
     inplane = min(max(view.inplane_sd_deg * normal[0], view.inplane_deg[0]), view.inplane_deg[1])
     kind = settings.backgrounds[int(uniform[7] * len(settings.backgrounds))]
     rotation = view_rotation(elevation, azimuth, inplane) @ about_x(CANONICAL_ELEVATION_DEG).T
-    x, y, z = rotation.astype(np.float32) @ car.mesh.vertices.T
-    reach = np.float32(np.tan(np.deg2rad(FOV_DEG / 2))) * (z + np.float32(1.0))
+    x, y, z = rotation @ car.mesh.vertices.T
+    reach = np.tan(np.deg2rad(FOV_DEG / 2)) * (z + 1.0)
     low = np.array([(-reach - x).max(), (-reach - y).max()])  # so that all vertices stay in the image
     high, (least, most) = np.array([(reach - x).min(), (reach - y).min()]), view.shift
     shift = np.minimum(np.maximum(view.shift_sd * normal[1:], least), most)
