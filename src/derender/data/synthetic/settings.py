@@ -66,7 +66,7 @@ def _equal_shares(value: object) -> object:
 Shares = Annotated[Mapping[str, float], BeforeValidator(_equal_shares)]
 
 
-class _Checked(Settings):
+class _DrawnSettings(Settings):
     """Settings whose ranges lie within ``limits``, and whose names are among ``known``; ``place`` is the
     dotted place of the settings. An angle ``X_beyond_deg`` lies within the range ``X_deg`` on both sides."""
 
@@ -96,7 +96,7 @@ class _Checked(Settings):
         return value
 
 
-class LightSettings(_Checked):
+class LightSettings(_DrawnSettings):
     """Uniform ranges. With ``beyond_deg`` either yaw or pitch (60 : 40) is at least so far off the front, on
     either side, and the other at most 20 degrees."""
 
@@ -122,7 +122,7 @@ class LightSettings(_Checked):
         return np.array([ambient, diffuse, *np.deg2rad([pitch, yaw])], np.float32)
 
 
-class ViewSettings(_Checked):
+class ViewSettings(_DrawnSettings):
     """Ranges of the camera's angles. A spread (``*_sd_deg``) draws a normal about the middle of the range,
     clipped at its ends; without one (null) the range is uniform. With ``yaw_beyond_deg`` yaw is uniform on
     either side, from there to the range's ends. Shifts are scene units, right and down; one pixel of 64 is
@@ -144,7 +144,7 @@ class ViewSettings(_Checked):
     shift_sd: float | None = Field(default=0.0035, ge=0, le=0.1)
 
 
-class CarViewSettings(_Checked):
+class CarViewSettings(_DrawnSettings):
     """A turntable seen from above: uniform elevation above the ground and azimuth about the car's vertical
     axis.
 
@@ -192,7 +192,7 @@ CAR_VIEWS: Mapping[str, CarViewSettings] = {
 }
 
 
-class FaceSettings(_Checked):
+class FaceSettings(_DrawnSettings):
     """Every option of generated faces.
 
     With ``tracks`` (per identity) images come as sequences of ``frames``: light and background stay, head
@@ -221,7 +221,7 @@ class FaceSettings(_Checked):
         return self.tracks * self.frames or self.pictures_per_identity
 
 
-class CarSettings(_Checked):
+class CarSettings(_DrawnSettings):
     """Every option of generated cars."""
 
     known: ClassVar = {"classes": CLASSES, "backgrounds": BACKGROUNDS}
