@@ -6,7 +6,7 @@ from safetensors.torch import load_file
 
 from derender.baselines import baseline_config, load_baseline, train_baseline
 from derender.baselines.e4e import E4e, E4eConfig, E4eSettings, EncoderSettings, open_generator
-from derender.baselines.stylegan2_generator import GeneratorSettings
+from derender.baselines.generator import GeneratorSettings
 from derender.report.run import baseline_sheet
 from derender.training.checkpoint import WEIGHTS_FILE
 from derender.training.run_folder import read_metrics

@@ -15,6 +15,7 @@ from torch.nn.functional import interpolate
 from transformers import Dinov2Config, Dinov2Model, ViTConfig, ViTModel
 
 from derender.baselines.e4e import E4e, E4eSettings
+from derender.baselines.generator import FILTER, Generator, GeneratorSettings
 from derender.baselines.published import (
     GENERATOR_NAMES,
     IMAGENET_MEAN,
@@ -25,7 +26,6 @@ from derender.baselines.published import (
     load_published_generator,
     published_names,
 )
-from derender.baselines.stylegan2_generator import FILTER, Generator, GeneratorSettings
 from derender.storage.tensors import reads_safely
 
 reads_pickles = pytest.mark.skipif(not reads_safely(), reason="this PyTorch is not trusted with pickles")

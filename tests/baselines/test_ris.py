@@ -7,6 +7,7 @@ from PIL import Image
 
 from derender.baselines import load_baseline
 from derender.baselines.e4e import E4e, E4eSettings
+from derender.baselines.generator import Generator, GeneratorSettings, style_layers
 from derender.baselines.ris import (
     RisConfig,
     build_catalogue,
@@ -17,7 +18,6 @@ from derender.baselines.ris import (
     part_matrix,
     spherical_kmeans,
 )
-from derender.baselines.stylegan2_generator import Generator, GeneratorSettings, style_layers
 from derender.data import MASK_CLASSES, read_images
 
 PARTS = ("hair", "skin", "nose", "mouth")  # of the planted generator: quarters of the width, left to right
@@ -48,7 +48,7 @@ def plant(net: Generator) -> None:
 
 @pytest.fixture(scope="module")
 def planted() -> E4e:
-    """An encoder nobody trained, with the planted generator."""
+    """An untrained encoder, with the planted generator."""
     torch.manual_seed(0)
     model = E4e(E4eSettings(image_size=32, width=4, units=(1, 1, 1, 1), generator=SIZES))
     plant(model.generator)

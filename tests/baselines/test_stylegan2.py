@@ -4,10 +4,10 @@ import pytest
 import torch
 from torch import nn
 
+from derender.baselines.generator import EqualConv, GeneratorSettings
 from derender.baselines.stylegan2 import (
     AdversarialObjective,
     Discriminator,
-    EqualConv,
     Stylegan,
     StyleganConfig,
     energy_distance,
@@ -15,7 +15,6 @@ from derender.baselines.stylegan2 import (
     path_lengths,
     r1_penalty,
 )
-from derender.baselines.stylegan2_generator import GeneratorSettings
 
 TINY = GeneratorSettings(image_size=8, style_size=6, mapping_layers=2, channel_base=32, channel_max=6)
 

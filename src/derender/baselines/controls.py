@@ -137,7 +137,7 @@ class Untrained:
 
     @staticmethod
     def open(source: str | Path | None, *, image_size: int = 0, seed: int = 0) -> Any:
-        """See `registry.open_baseline`."""
+        """See `open_baseline`."""
         if source is None:
             raise ValueError("the baseline untrained needs a model: the derender model to copy")
         return untrained_twin(load(source), seed)

@@ -23,18 +23,9 @@ from pydantic import Field, PositiveInt
 from torch import Tensor, nn
 from torch.nn.functional import adaptive_avg_pool2d, interpolate, leaky_relu, mse_loss
 
-from derender.baselines.model import (
-    BaselineConfig,
-    BaselineModel,
-    BaselineSettings,
-    Features,
-    Images,
-    LoopModel,
-    LossInputs,
-    load_baseline,
-)
+from derender.baselines.generator import Codes, EqualLinear, Generator, GeneratorSettings, Side
+from derender.baselines.model import BaselineConfig, BaselineSettings, Features, Images, LoopModel, LossInputs
 from derender.baselines.stylegan2 import CENTRE_LATENTS, Stylegan
-from derender.baselines.stylegan2_generator import Codes, EqualLinear, Generator, GeneratorSettings, Side
 from derender.objectives.perceptual import build_perceptual
 from derender.objectives.perceptual_features import PerceptualFeatures
 from derender.objectives.self_features import SelfFeatures, load_self_features
@@ -180,7 +171,7 @@ class E4e(LoopModel):
         self.register_buffer("released", torch.tensor(codes))
 
     @classmethod
-    def open(cls, source: str | Path | None, *, image_size: int = 0, seed: int = 0) -> BaselineModel:
+    def open(cls, source: str | Path | None, *, image_size: int = 0, seed: int = 0) -> Any:
         """The encoder of a run, or a published one (a .pt file); see `open_baseline`."""
         if source is not None and Path(source).suffix.lower() == ".pt":
             from derender.baselines.published import load_published_e4e
@@ -270,6 +261,4 @@ def open_generator(source: str | Path | None) -> Generator:
         from derender.baselines.published import load_published_generator
 
         return load_published_generator(source)
-    model = load_baseline(source, "stylegan2")
-    assert isinstance(model, Stylegan)
-    return model.generator
+    return Stylegan.open(source).generator

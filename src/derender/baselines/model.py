@@ -93,7 +93,7 @@ class BaselineModel(nn.Module, ABC):
         self.settings, self.chosen = settings, self.features[:1]
 
     @classmethod
-    def open(cls, source: str | Path | None, *, image_size: int = 0, seed: int = 0) -> "BaselineModel":
+    def open(cls, source: str | Path | None, *, image_size: int = 0, seed: int = 0) -> Any:
         """A trained one; see `open_baseline`."""
         if source is None:
             raise ValueError(f"the baseline {cls.name} needs a model: its run folder")

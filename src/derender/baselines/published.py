@@ -26,6 +26,7 @@ from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
 from derender.baselines.e4e import E4e, E4eSettings
+from derender.baselines.generator import FILTER, Generator, GeneratorSettings
 from derender.baselines.model import (
     PICKLES,
     WEIGHTS_FILE,
@@ -35,7 +36,6 @@ from derender.baselines.model import (
     Images,
     optional,
 )
-from derender.baselines.stylegan2_generator import FILTER, Generator, GeneratorSettings
 from derender.storage.tensors import refuse_old_torch
 
 GENERATOR_FILE = (

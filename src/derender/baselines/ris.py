@@ -26,8 +26,8 @@ from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d, interpolate, normalize, one_hot
 
 from derender.baselines.e4e import E4e, E4eSettings
+from derender.baselines.generator import TINY, Codes, Maps, StyleLayer
 from derender.baselines.model import BaselineModel, Features, Images, SheetOf, ShortRun
-from derender.baselines.stylegan2_generator import TINY, Codes, Maps, StyleLayer
 from derender.data import ImageSet, read_masks, split_indices
 from derender.settings import Settings
 from derender.training.batches import random_stream
@@ -133,7 +133,6 @@ class Ris(BaselineModel):
                 "train --model e4e) or a published file"
             )
         e4e = E4e.open(config.e4e).to(accelerator)
-        assert isinstance(e4e, E4e)
         if e4e.image_size != config.image_size:
             raise ValueError(
                 f"{config.e4e} takes images of {e4e.image_size} pixels: set image_size={e4e.image_size}"

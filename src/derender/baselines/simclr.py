@@ -206,12 +206,7 @@ class Simclr(LoopModel):
 
 
 def views_of(config: SimclrConfig, device: torch.device) -> Views:
-    """The function that gives one random view of every image.
-
-    Raises:
-        FileNotFoundError: there is no such model for physical views.
-        ValueError: it takes images of another size.
-    """
+    """The function that gives one random view of every image; a model of another size is an error."""
     objective, size = config.objective, config.model.image_size
     if objective.physics is None:
         return lambda images, generator: augment(images, objective.augment, generator)

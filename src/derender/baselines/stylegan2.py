@@ -19,21 +19,18 @@ from pydantic import Field
 from torch import Generator as RandomGenerator
 from torch import Tensor, nn
 from torch.func import functional_call
-from torch.nn.functional import adaptive_avg_pool2d, conv2d, leaky_relu, softplus
+from torch.nn.functional import adaptive_avg_pool2d, softplus
 
-from derender.baselines.model import Features, Images, LoopModel, LossInputs
-from derender.baselines.stylegan2_generator import (
-    FILTER,
-    GAIN,
-    SLOPE,
+from derender.baselines.generator import (
     TINY,
     Codes,
+    EqualConv,
     EqualLinear,
     Generator,
     GeneratorSettings,
     Maps,
-    upfirdn,
 )
+from derender.baselines.model import Features, Images, LoopModel, LossInputs
 from derender.settings import Settings
 from derender.training.batches import random_stream
 from derender.training.config import LoopSettings, OptimiserSettings
@@ -41,16 +38,14 @@ from derender.training.config import LoopSettings, OptimiserSettings
 GROUP = 4
 JUDGED_SIDE = 16  # held-out images and samples are compared at most this large
 CENTRE_LATENTS = 4_096
-R1_PER_PIXEL = (
-    2e-4  # 6.6 at 1024 pixels and 0.026 at 64 in batches of 32, as its gradient is summed over pixels
-)
+R1_PER_PIXEL = 2e-4  # times pixels over batch: a gradient is summed over pixels
 SHOWN = 6
 
 
 class AdversarialObjective(Settings):
     """Weights and intervals of the regularisers, style mixing, and the moving average."""
 
-    r1_weight: float | None = Field(default=None, ge=0)  # None: R1_PER_PIXEL x pixels / batch
+    r1_weight: float | None = Field(default=None, ge=0)  # None: as R1_PER_PIXEL says
     r1_every: int = Field(default=16, ge=1)
     path_weight: float = Field(default=2.0, ge=0)
     path_every: int = Field(default=4, ge=1)
@@ -69,34 +64,6 @@ class StyleganConfig(LoopSettings):
     optimiser: OptimiserSettings = OptimiserSettings(learning_rate=2e-3, weight_decay=0.0, betas=(0.0, 0.99))
     patience: int = Field(default=1_000, ge=1)
     channels_last: bool = False
-
-
-class EqualConv(nn.Module):
-    """A convolution with equalised learning rate; ``down`` halves the size behind the filter.
-
-    ``active``: bias, leaky ReLU with its gain; otherwise neither.
-    """
-
-    taps: Tensor
-
-    def __init__(self, inputs: int, outputs: int, kernel: int, *, down: bool = False, active: bool = True):
-        super().__init__()
-        self.weight = nn.Parameter(torch.randn(outputs, inputs, kernel, kernel))
-        self.bias = nn.Parameter(torch.zeros(outputs)) if active else None
-        self.down = down
-        self.register_buffer("taps", torch.tensor(FILTER), persistent=False)
-
-    def forward(self, images: Maps) -> Maps:
-        weight, bias = self.weight / sqrt(self.weight[0].numel()), self.bias
-        kernel = weight.shape[-1]
-        stride, padding = (2, 0) if self.down else (1, kernel // 2)
-        if bias is not None:
-            weight, bias = GAIN * weight, GAIN * bias  # as well as behind the activation, and cheaper
-        if self.down:
-            around = len(FILTER) - 2 + kernel - 1
-            images = upfirdn(images, self.taps, padding=((around + 1) // 2, around // 2))
-        made = conv2d(images, weight, bias, stride, padding)
-        return made if bias is None else leaky_relu(made, SLOPE)
 
 
 class ResidualDown(nn.Module):

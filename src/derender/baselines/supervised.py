@@ -87,13 +87,9 @@ class Resnet18(BaselineModel):
         cls, config: SupervisedConfig, images: ImageSet, out: str | Path, *, sample_sheet: Any = None,
         accelerator: str = "cpu", **how: Any,
     ) -> TrainResult:  # fmt: skip
-        """Train on ``config.labelled`` images; see `registry.train_baseline`. No resume, no sample sheet.
+        """Train on ``config.labelled`` images; see `train_baseline`. No resume, no sample sheet.
 
         The same seed gives the same weights; torch's global generator is left as it was.
-
-        Raises:
-            FileExistsError: the folder is not empty.
-            ValueError: too few images with these labels.
         """
         rows = labelled_rows(images, config)  # wrong labels are an error before a folder is made
         names, targets = encode_labels(images, config.labels, rows)
@@ -103,12 +99,11 @@ class Resnet18(BaselineModel):
             model = cls(Resnet18Settings(image_size=size, width=config.width, classes=names))
         run = ShortRun(config, images, out, accelerator=accelerator, **how)
         inputs, wanted = as_float(images.images[rows]).to(accelerator), targets.to(accelerator)
-        model = model.to(accelerator).train()
-        rate, decay = config.learning_rate, config.weight_decay
+        model, rate, decay = model.to(accelerator).train(), config.learning_rate, config.weight_decay
         optimiser = torch.optim.AdamW(model.parameters(), rate, weight_decay=decay)
-        batch = min(config.batch_size, len(rows))
+        batch, seen = min(config.batch_size, len(rows)), 0
         each = len(rows) // batch * batch
-        total, seen = config.epochs * each, 0
+        total = config.epochs * each
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, total // batch)
         generator = Generator().manual_seed(config.seed)
         for _ in range(config.epochs):
@@ -132,11 +127,7 @@ class Resnet18(BaselineModel):
 
 
 def labelled_rows(images: ImageSet, config: SupervisedConfig) -> np.ndarray:
-    """Rows of the images to learn from: of the training part, drawn by the seed, every label known.
-
-    Raises:
-        ValueError: there are fewer than asked for, or no label was named.
-    """
+    """Rows of the images to learn from: of the training part, drawn by the seed, every label known."""
     if not config.labels:
         known = ", ".join(images.labels) or "no labels"
         raise ValueError(f"name a label to learn, as in --set labels=NAME; the images have {known}")

@@ -108,6 +108,34 @@ class EqualLinear(nn.Module):
         return leaky_relu(made, SLOPE) * GAIN if self.active else made
 
 
+class EqualConv(nn.Module):
+    """A convolution with equalised learning rate; ``down`` halves the size behind the filter.
+
+    ``active``: bias, leaky ReLU with its gain; otherwise neither.
+    """
+
+    taps: Tensor
+
+    def __init__(self, inputs: int, outputs: int, kernel: int, *, down: bool = False, active: bool = True):
+        super().__init__()
+        self.weight = nn.Parameter(torch.randn(outputs, inputs, kernel, kernel))
+        self.bias = nn.Parameter(torch.zeros(outputs)) if active else None
+        self.down = down
+        self.register_buffer("taps", torch.tensor(FILTER), persistent=False)
+
+    def forward(self, images: Maps) -> Maps:
+        weight, bias = self.weight / sqrt(self.weight[0].numel()), self.bias
+        kernel = weight.shape[-1]
+        stride, padding = (2, 0) if self.down else (1, kernel // 2)
+        if bias is not None:
+            weight, bias = GAIN * weight, GAIN * bias  # as well as behind the activation, and cheaper
+        if self.down:
+            around = len(FILTER) - 2 + kernel - 1
+            images = upfirdn(images, self.taps, padding=((around + 1) // 2, around // 2))
+        made = conv2d(images, weight, bias, stride, padding)
+        return made if bias is None else leaky_relu(made, SLOPE)
+
+
 class ModulatedConv(nn.Module):
     """A convolution whose input channels are scaled by each image's style, and the affine map to it from w.
 

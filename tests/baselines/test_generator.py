@@ -6,8 +6,7 @@ import torch
 from scipy import signal
 from torch.nn.functional import conv2d, conv_transpose2d
 
-from derender.baselines.stylegan2 import Discriminator
-from derender.baselines.stylegan2_generator import (
+from derender.baselines.generator import (
     FILTER,
     EqualLinear,
     Generator,
@@ -17,6 +16,7 @@ from derender.baselines.stylegan2_generator import (
     style_layers,
     upfirdn,
 )
+from derender.baselines.stylegan2 import Discriminator
 
 TAPS = torch.tensor(FILTER, dtype=torch.float64)
 SMALL = GeneratorSettings(image_size=16, style_size=12, mapping_layers=3, channel_base=128, channel_max=10)
