@@ -9,47 +9,45 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
+from tests.data.conftest import noise
 
 from derender.data import image as module
 from derender.data import read_image
-from derender.data.image import FITS, Unreadable
+from derender.data.image import FITS, Unreadable, decode
 
-MODE_NAMES = ["grey", "bilevel", "palette", "opaque", "clear", "translucent", "grey-alpha"]
-MODE_NAMES += ["cmyk", "cmyk-jpeg", "float", "ycbcr"]
 RAMP = np.linspace(0, 255, 12).astype(np.uint8)[None, :].repeat(12, 0)
 
 
-def flat(colour: tuple[int, ...] | int, mode: str, size: tuple[int, int] = (16, 16)) -> Image.Image:
+def flat(colour: tuple[int, ...] | int | float, mode: str, size: tuple[int, int] = (16, 16)) -> Image.Image:
     return Image.new(mode, size, colour)
 
 
-def test_rgb_of_the_right_size_is_untouched(encoded):
-    array = np.random.default_rng(0).integers(0, 256, (12, 12, 3), dtype=np.uint8)
+def test_rgb_of_the_right_size_is_untouched_in_bytes_and_in_a_file(encoded, tmp_path):
+    array = noise(0)
     np.testing.assert_array_equal(read_image(encoded(array), 12), array.transpose(2, 0, 1))
+    (tmp_path / "a.png").write_bytes(encoded(array))
+    np.testing.assert_array_equal(read_image(tmp_path / "a.png", 8), read_image(encoded(array), 8))
+    with pytest.raises(FileNotFoundError, match=r"gone\.png"):
+        read_image(tmp_path / "gone.png", 16)
 
 
-def test_bytes_and_file_agree(encoded, tmp_path):
-    (tmp_path / "a.png").write_bytes(encoded(3))
-    np.testing.assert_array_equal(read_image(tmp_path / "a.png", 8), read_image(encoded(3), 8))
+GREEN = flat((10, 200, 30), "RGB").convert("P", palette=Image.Palette.ADAPTIVE)
+MODES = {
+    "grey": (flat(100, "L"), "PNG", (100, 100, 100)),
+    "bilevel": (flat(1, "1"), "PNG", (255, 255, 255)),
+    "palette": (GREEN, "PNG", (10, 200, 30)),
+    "opaque": (flat((200, 100, 0, 255), "RGBA"), "PNG", (200, 100, 0)),
+    "clear": (flat((200, 100, 0, 0), "RGBA"), "PNG", (255, 255, 255)),
+    "translucent": (flat((200, 100, 0, 51), "RGBA"), "PNG", (244, 224, 204)),
+    "grey-alpha": (flat((100, 0), "LA"), "PNG", (255, 255, 255)),
+    "cmyk": (flat((0, 255, 255, 0), "CMYK"), "TIFF", (255, 0, 0)),
+    "cmyk-jpeg": (flat((0, 255, 255, 0), "CMYK"), "JPEG", (254, 0, 0)),
+    "float": (flat(0.5, "F"), "TIFF", (128, 128, 128)),
+    "ycbcr": (flat((82, 90, 240), "YCbCr"), "JPEG", (239, 15, 14)),
+}
 
 
-@pytest.mark.parametrize(
-    ("picture", "form", "expected"),
-    [
-        (flat(100, "L"), "PNG", (100, 100, 100)),
-        (flat(1, "1"), "PNG", (255, 255, 255)),
-        (flat((10, 200, 30), "RGB").convert("P", palette=Image.Palette.ADAPTIVE), "PNG", (10, 200, 30)),
-        (flat((200, 100, 0, 255), "RGBA"), "PNG", (200, 100, 0)),
-        (flat((200, 100, 0, 0), "RGBA"), "PNG", (255, 255, 255)),
-        (flat((200, 100, 0, 51), "RGBA"), "PNG", (244, 224, 204)),
-        (flat((100, 0), "LA"), "PNG", (255, 255, 255)),
-        (flat((0, 255, 255, 0), "CMYK"), "TIFF", (255, 0, 0)),
-        (flat((0, 255, 255, 0), "CMYK"), "JPEG", (254, 0, 0)),
-        (flat(0.5, "F"), "TIFF", (128, 128, 128)),
-        (flat((82, 90, 240), "YCbCr"), "JPEG", (239, 15, 14)),
-    ],
-    ids=MODE_NAMES,
-)
+@pytest.mark.parametrize(("picture", "form", "expected"), MODES.values(), ids=MODES)
 def test_modes(encoded, picture, form, expected):
     options = {"quality": 100} if form == "JPEG" else {}
     pixels = read_image(encoded(picture, form, **options), 16)
@@ -57,11 +55,8 @@ def test_modes(encoded, picture, form, expected):
 
 
 def test_palette_with_transparent_colour(encoded):
-    picture = flat((10, 200, 30), "RGB").convert("P", palette=Image.Palette.ADAPTIVE)
-    index = picture.getpixel((0, 0))
-    np.testing.assert_array_equal(
-        read_image(encoded(picture, transparency=index), 16)[:, 0, 0], (255, 255, 255)
-    )
+    clear = encoded(GREEN, transparency=GREEN.getpixel((0, 0)))
+    np.testing.assert_array_equal(read_image(clear, 16)[:, 0, 0], (255, 255, 255))
 
 
 @pytest.mark.parametrize("form", ["PNG", "TIFF", "PPM"])
@@ -77,61 +72,49 @@ def png(width: int, height: int, bits: int, colour_type: int, rows: bytes) -> by
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
     header = struct.pack(">IIBBBBB", width, height, bits, colour_type, 0, 0, 0)
-    return (
-        b"\x89PNG\r\n\x1a\n"
-        + chunk(b"IHDR", header)
-        + chunk(b"IDAT", zlib.compress(rows))
-        + chunk(b"IEND", b"")
-    )
+    chunks = chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
+    return b"\x89PNG\r\n\x1a\n" + chunks
 
 
-def test_sixteen_bit_colour(encoded):
+def test_sixteen_bit_colour():
     row = b"\0" + b"".join(struct.pack(">HHH", 0x2010, 0x8020, 0xFFFF) for _ in range(4))
     np.testing.assert_array_equal(read_image(png(4, 4, 16, 2, row * 4), 4)[:, 0, 0], (0x20, 0x80, 0xFF))
 
 
-@pytest.mark.parametrize("value", [-1.0, 2.0, float("nan")])
-def test_floats_outside_their_range_are_refused(encoded, value):
-    with pytest.raises(Unreadable, match=r"outside 0\.\.1"):
-        read_image(encoded(flat(value, "F"), "TIFF"), 16)
-
-
-def test_integers_beyond_sixteen_bits_are_refused(encoded):
-    with pytest.raises(Unreadable, match=r"outside 0\.\.65535"):
-        read_image(encoded(flat(70_000, "I"), "TIFF"), 16)
+@pytest.mark.parametrize(
+    ("value", "mode", "message"),
+    [
+        *((value, "F", r"outside 0\.\.1") for value in (-1.0, 2.0, float("nan"))),
+        (70_000, "I", r"outside 0\.\.65535"),
+    ],
+)
+def test_numbers_outside_their_range_are_refused(encoded, value, mode, message):
+    with pytest.raises(Unreadable, match=message):
+        read_image(encoded(flat(value, mode), "TIFF"), 16)
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
-@pytest.mark.parametrize("form", ["JPEG", "PNG", "TIFF", "WEBP"])
-def test_exif_orientation_is_applied(encoded, orientation, form):
+@pytest.mark.parametrize(
+    ("form", "options"),
+    [("JPEG", {"quality": 95, "subsampling": 0}), ("PNG", {}), ("TIFF", {}), ("WEBP", {"lossless": True})],
+)
+def test_exif_orientation_is_applied(encoded, orientation, form, options):
     """An image stored turned, with the tag that says so, reads as the upright one."""
     upright = Image.new("RGB", (16, 16), "white")
     upright.paste("black", (0, 0, 8, 8))
     upright.paste("red", (8, 0, 16, 8))
-    undo = {
-        2: 0,
-        3: 3,
-        4: 1,
-        5: 5,
-        6: 2,
-        7: 6,
-        8: 4,
-    }  # Pillow's transpositions that lead from upright to stored
+    undo = {2: 0, 3: 3, 4: 1, 5: 5, 6: 2, 7: 6, 8: 4}  # Pillow's transpositions from upright to stored
     stored = upright if orientation == 1 else upright.transpose(Image.Transpose(undo[orientation]))
     exif = Image.Exif()
     exif[0x0112] = orientation
-    options = (
-        {"quality": 95, "subsampling": 0} if form == "JPEG" else {"lossless": True} if form == "WEBP" else {}
-    )
     pixels = read_image(encoded(stored, form, exif=exif, **options), 16)
     corners = pixels[:, [2, 2, 13, 13], [2, 13, 2, 13]].T.astype(int)
     np.testing.assert_allclose(corners, [(0, 0, 0), (255, 0, 0), (255,) * 3, (255,) * 3], atol=12)
 
 
 def test_damaged_exif_counts_as_none(encoded):
-    plain = encoded(7, "JPEG")
     damaged = encoded(7, "JPEG", exif=b"Exif\0\0II*\0\xff\xff\xff\xff")
-    np.testing.assert_array_equal(read_image(damaged, 12), read_image(plain, 12))
+    np.testing.assert_array_equal(read_image(damaged, 12), read_image(encoded(7, "JPEG"), 12))
 
 
 @pytest.mark.parametrize("form", ["GIF", "WEBP", "PNG", "TIFF"])
@@ -144,13 +127,10 @@ def test_first_frame_of_an_animation(encoded, form):
 
 def striped(width: int, height: int) -> Image.Image:
     """Three parts along the long side: red, green, blue."""
-    picture = Image.new("RGB", (width, height), (255, 0, 0))
-    long = max(width, height)
-    box = (long // 3, 0, long, height) if width > height else (0, long // 3, width, long)
-    picture.paste((0, 255, 0), box)
-    box = (2 * long // 3, 0, long, height) if width > height else (0, 2 * long // 3, width, long)
-    picture.paste((0, 0, 255), box)
-    return picture
+    places = np.arange(max(width, height)) * 3 // max(width, height)
+    colours = (np.eye(3)[places] * 255).astype(np.uint8)
+    wide = np.broadcast_to(colours[None], (min(width, height), len(places), 3))
+    return Image.fromarray(np.ascontiguousarray(wide if width > height else wide.transpose(1, 0, 2)))
 
 
 @pytest.mark.parametrize("size", [(36, 12), (12, 36), (90, 30)])
@@ -171,25 +151,21 @@ def test_pad_and_stretch(encoded, wide):
 
 
 def test_unknown_fit_names_the_nearest(encoded):
-    with pytest.raises(
-        ValueError, match=r"unknown fit 'crops'; did you mean 'crop'\? \(known: crop, pad, stretch\)"
-    ):
+    message = r"unknown fit 'crops'; did you mean 'crop'\? \(known: crop, pad, stretch\)"
+    with pytest.raises(ValueError, match=message):
         read_image(encoded(0), 8, fit="crops")
 
 
 def test_resizing_is_antialiased(encoded):
     """A fine checkerboard shrinks to grey; picking single pixels would give black or white."""
     board = ((np.indices((256, 256)).sum(0) % 2) * 255).astype(np.uint8)
-    pixels = read_image(encoded(board), 16)
-    assert np.abs(pixels.astype(int) - 128).max() <= 3
+    assert np.abs(read_image(encoded(board), 16).astype(int) - 128).max() <= 3
 
 
 def test_reduced_jpeg_decoding_agrees_with_full(encoded, monkeypatch):
     ramp = np.linspace(0, 255, 1024).astype(np.uint8)
-    array = np.stack(
-        [ramp[None].repeat(768, 0), ramp[:768, None].repeat(1024, 1), np.full((768, 1024), 90, np.uint8)], 2
-    )
-    content = encoded(array, "JPEG", quality=95)
+    channels = ramp[None].repeat(768, 0), ramp[:768, None].repeat(1024, 1), np.full((768, 1024), 90, np.uint8)
+    content = encoded(np.stack(channels, 2), "JPEG", quality=95)
     for fit in FITS:
         reduced = read_image(content, 32, fit=fit).astype(int)
         with monkeypatch.context() as patch:
@@ -200,60 +176,36 @@ def test_reduced_jpeg_decoding_agrees_with_full(encoded, monkeypatch):
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 300), (300, 1), (2, 3)])
 @pytest.mark.parametrize("fit", FITS)
-def test_tiny_and_narrow_pictures(encoded, size, fit):
+def test_tiny_and_narrow_images(encoded, size, fit):
     assert read_image(encoded(flat((9, 9, 9), "RGB", size)), 8, fit=fit).shape == (3, 8, 8)
 
 
-def test_huge_pictures_are_refused_before_decoding():
-    huge = png(30_000, 30_000, 8, 2, b"")
-    with pytest.raises(Unreadable, match=r"30000 x 30000 is more than 170 million|exceeds limit"):
-        read_image(huge, 16)
-    with pytest.raises(Unreadable, match="13500 x 13000 is more than 170 million"):
-        read_image(png(13_500, 13_000, 8, 2, b""), 16)
-
-
-def test_large_pictures_within_the_limit_raise_no_warning(encoded, monkeypatch):
+def test_huge_images_are_refused_before_decoding_and_large_ones_raise_no_warning(encoded, monkeypatch):
+    for side in (30_000, 13_100):
+        with pytest.raises(Unreadable, match=f"{side} x {side} is more than 170 million|exceeds limit"):
+            read_image(png(side, side, 8, 2, b""), 16)
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 3_000)
     monkeypatch.setattr(module, "_LARGE_PIXELS", 1_000)
     assert read_image(encoded(flat((5, 6, 7), "RGB", (64, 64))), 16)[:, 0, 0].tolist() == [5, 6, 7]
 
 
-def test_truncated_jpeg_has_a_reason(encoded):
-    content = encoded(np.random.default_rng(0).integers(0, 256, (200, 200, 3), dtype=np.uint8), "JPEG")
+def test_damage_has_a_reason(encoded):
+    content = encoded(noise(0, 200, 200), "JPEG")
     with pytest.raises(Unreadable, match=r"the given bytes cannot be used as an image: damaged .*truncated"):
         read_image(content[: len(content) // 2], 16)
-
-
-@pytest.mark.parametrize(
-    "content", [b"", b"text", b"\xff\xd8\xff", b"<svg></svg>", b"%!PS-Adobe-3.0 EPSF-3.0\n"]
-)
-def test_what_is_no_picture_has_a_reason(content):
-    with pytest.raises(Unreadable, match=r"not an image in a known format|damaged"):
-        read_image(content, 16)
-
-
-def test_missing_file_is_an_os_error(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"gone\.png"):
-        read_image(tmp_path / "gone.png", 16)
+    for none in (b"", b"text", b"\xff\xd8\xff", b"<svg></svg>", b"%!PS-Adobe-3.0 EPSF-3.0\n"):
+        with pytest.raises(Unreadable, match=r"not an image in a known format|damaged"):
+            read_image(none, 16)
 
 
 def _samples() -> list[bytes]:
-    samples = []
-    picture = Image.fromarray(np.random.default_rng(1).integers(0, 256, (24, 20, 3), dtype=np.uint8))
     exif = Image.Exif()
     exif[0x0112] = 6
-    for form, mode in [
-        ("JPEG", "RGB"),
-        ("PNG", "P"),
-        ("GIF", "P"),
-        ("TIFF", "RGB"),
-        ("BMP", "RGB"),
-        ("WEBP", "RGB"),
-    ]:
-        buffer = io.BytesIO()
-        picture.convert(mode).save(
-            buffer, form, **({"exif": exif} if form in ("JPEG", "PNG", "TIFF") else {})
-        )
+    samples = []
+    for form in ("JPEG", "PNG", "GIF", "TIFF", "BMP", "WEBP"):
+        buffer, mode = io.BytesIO(), "P" if form in ("PNG", "GIF") else "RGB"
+        options = {"exif": exif} if form in ("JPEG", "PNG", "TIFF") else {}
+        Image.fromarray(noise(1, 20, 24)).convert(mode).save(buffer, form, **options)
         samples.append(buffer.getvalue())
     return samples
 
@@ -269,3 +221,55 @@ def test_no_damage_raises_anything_but_unreadable(content, data):
         assert read_image(bytes(damaged[:cut]), 8).shape == (3, 8, 8)
     except Unreadable as problem:
         assert "cannot be used as an image" in str(problem)
+
+
+def box(*sides: float) -> np.ndarray:
+    return np.array(sides, np.float32)
+
+
+@pytest.mark.parametrize("fit", FITS)
+@pytest.mark.parametrize("sides", [(3, 5, 23, 25), (0, 0, 40, 30), (2.4, 4.6, 22.4, 24.6), (1, 2, 31, 12)])
+def test_a_box_is_the_same_as_cutting_first(encoded, fit, sides):
+    whole = noise(1, width=40, height=30)
+    left, top, right, bottom = np.round(sides).astype(int)
+    expected = decode(encoded(np.ascontiguousarray(whole[top:bottom, left:right])), 12, fit)
+    assert (decode(encoded(whole), 12, fit, box(*sides)) == expected).all()
+
+
+@pytest.mark.parametrize(
+    ("sides", "inside"),
+    [
+        ((-5, -7, 15, 13), (0, 0, 20, 20)),
+        ((30, 20, 50, 40), (20, 10, 40, 30)),
+        ((-20, -30, 60, 50), (5, 0, 35, 30)),
+        ((-10, 5, 70, 15), (0, 5, 40, 15)),
+    ],
+)
+def test_a_box_that_sticks_out_is_moved_and_shrunk_into_the_image(encoded, sides, inside):
+    whole = encoded(noise(2, width=40, height=30))
+    assert (decode(whole, 10, "crop", box(*sides)) == decode(whole, 10, "crop", box(*inside))).all()
+
+
+@pytest.mark.parametrize("sides", [(np.nan,) * 4, (5, 5, 5, 9), (9, 9, 3, 3), (0, 0, np.inf, 9)])
+def test_a_box_that_is_none_makes_the_image_unreadable(encoded, sides):
+    with pytest.raises(Unreadable, match="no usable box is known"):
+        decode(encoded(3), 8, "crop", box(*sides))
+
+
+def test_a_box_in_a_turned_image_is_in_upright_pixels(encoded):
+    upright, exif = Image.fromarray(noise(4, width=40, height=30)), Image.Exif()
+    exif[0x0112] = 6  # stored lying, to be turned by 90 degrees
+    turned = encoded(upright.transpose(Image.Transpose.ROTATE_90), exif=exif)
+    sides = box(10, 2, 30, 22)
+    assert (decode(turned, 9, "crop", sides) == decode(encoded(upright), 9, "crop", sides)).all()
+
+
+def test_a_box_holds_where_the_jpeg_is_decoded_at_a_reduced_scale(encoded):
+    """A ramp says where the pixels came from: the mean of each column is its place in the image."""
+    ramp = np.broadcast_to(np.linspace(0, 255, 1024)[None, :, None], (512, 1024, 3)).astype(np.uint8)
+    jpeg = encoded(ramp, "JPEG", quality=95)
+    part = decode(jpeg, 16, "crop", box(256, 100, 640, 484)).mean(axis=(0, 1))
+    centres = 256 + (np.arange(16) + 0.5) * 384 / 16
+    assert np.abs(part - centres / 1024 * 255).max() < 1.5
+    small = decode(jpeg, 16, "crop", box(512, 100, 528, 116)).mean()
+    assert abs(small - 520 / 1024 * 255) < 1.5

@@ -1,4 +1,4 @@
-"""Folders, zips and single files: which files are seen, and what hostile ones lead to."""
+"""Folders, zips and single files: which files are seen, and what odd and hostile ones lead to."""
 
 import contextlib
 import io
@@ -11,22 +11,21 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from derender.data import open_source, zip_source
+from derender.data import is_image, list_images, open_source, read_images, read_masks, zip_source
+
+ODD = ["ann lee", "ÄÖ ß 日本", "two\nlines", "quote\"'", "tab\there"]
+ZIPPED = pytest.mark.parametrize("zipped", [False, True])
 
 
-@pytest.mark.parametrize("zipped", [False, True])
+def test_an_image_has_a_known_suffix():
+    names = ("a.png", "b/a.JPG", "b.c/a.jpeg", "a.png/b", "png", "a.png.txt", "")
+    assert [is_image(name) for name in names] == [True] * 3 + [False] * 4
+
+
+@ZIPPED
 def test_files_are_sorted_and_hidden_ones_left_out(tree, zipped):
-    names = [
-        "b/2.png",
-        "a/10.png",
-        "a/9.png",
-        ".hidden.png",
-        "__MACOSX/a/._9.png",
-        ".git/x.png",
-        "B/1.png",
-        "n.txt",
-    ]
-    with open_source(tree(names, zipped)) as source:
+    hidden = [".hidden.png", "__MACOSX/a/._9.png", ".git/x.png", "a/..b/c.png"]
+    with open_source(tree(["b/2.png", "a/10.png", "a/9.png", "B/1.png", "n.txt", *hidden], zipped)) as source:
         assert source.files == ("B/1.png", "a/10.png", "a/9.png", "b/2.png", "n.txt")
         assert source.skipped == ()
 
@@ -38,37 +37,19 @@ def test_same_bytes_from_folder_and_zip(tree):
         assert [folder.read(file) for file in folder.files] == [archive.read(file) for file in archive.files]
 
 
-def test_link_loops_end_and_linked_folders_are_read_once(tree):
-    folder = tree(["a/1.png", "b/2.png"])
+def test_links_are_followed_once_and_what_cannot_be_read_is_listed(tree):
+    folder, outside = tree(["a/1.png", "b/2.png"]), tree(["3.png"], name="outside")
     (folder / "a" / "up").symlink_to(folder, target_is_directory=True)
     (folder / "z").symlink_to(folder / "b", target_is_directory=True)
-    with open_source(folder) as source:
-        assert source.files == ("a/1.png", "b/2.png")
-
-
-def test_hard_links_are_files_of_their_own(tree):
-    folder = tree(["a/1.png"])
-    os.link(folder / "a" / "1.png", folder / "a" / "2.png")
-    with open_source(folder) as source:
-        assert source.files == ("a/1.png", "a/2.png")
-        assert source.read("a/1.png") == source.read("a/2.png")
-
-
-def test_linked_folder_outside_is_read(tree):
-    outside = tree(["1.png"], name="outside")
-    folder = tree(["2.png"])
     (folder / "linked").symlink_to(outside, target_is_directory=True)
-    with open_source(folder) as source:
-        assert source.files == ("2.png", "linked/1.png")
-
-
-def test_broken_links_and_pipes_are_listed_not_read(tree):
-    folder = tree(["1.png"])
     (folder / "gone.png").symlink_to(folder / "nowhere.png")
+    (folder / "self").symlink_to("self")
+    os.link(folder / "a" / "1.png", folder / "a" / "hard.png")
     os.mkfifo(folder / "pipe.png")
     with open_source(folder) as source:
-        assert source.files == ("1.png",)
-        assert [row.file for row in source.skipped] == ["gone.png", "pipe.png"]
+        assert source.files == ("a/1.png", "a/hard.png", "b/2.png", "linked/3.png")
+        assert source.read("a/1.png") == source.read("a/hard.png")
+        assert [row.file for row in source.skipped] == ["gone.png", "pipe.png", "self"]
         assert "broken link" in source.skipped[0].reason
 
 
@@ -81,54 +62,83 @@ def test_names_that_are_not_utf8_can_be_stored(tree):
         "".join(source.files).encode("utf-8")
 
 
-def test_unsafe_names_in_a_zip_are_passed_over(tree):
-    names = ["../up.png", "/absolute.png", "a/../../b.png", "C:\\drive.png", "a\\windows.png", "good.png"]
-    path = tree(names, zipped=True)
+@ZIPPED
+def test_odd_names_reach_every_label(tree, zipped):
+    images = read_images(tree([f"{name}/{name} 1.png" for name in ODD], zipped), 8)
+    assert images.layout == "classes" and images.skipped == ()
+    assert sorted(images.labels["class"]) == sorted(ODD)
+    people = read_images(tree([f"{name}/{name}_0001.jpg" for name in ODD], zipped, name="people"), 8)
+    assert people.layout == "lfw"
+    assert sorted(people.labels["identity"]) == sorted(ODD)
+    files = {"x y.ids": "CVHCI_TRACKLABELS_V1\n3 Ann Lee\n", "x y/03/日本 1.jpg": None}
+    assert read_images(tree(files, zipped, name="tracks"), 8).labels["identity"].tolist() == ["Ann Lee"]
+    raf = {"list_patition_label.txt": "test_two words.jpg 2\n", "test_two words_aligned.jpg": None}
+    assert read_images(tree(raf, zipped, name="raf"), 8).labels["emotion"].tolist() == ["fear"]
+
+
+def test_unsafe_names_in_a_zip_are_passed_over_and_reach_no_layout(tree):
+    unsafe = ["../up.png", "/absolute.png", "a/../../b.png", "C:\\drive.png"]
+    files = {
+        **dict.fromkeys([*unsafe, "a\\windows.png", "good/3.png"]),
+        "../list_attr_celeba.txt": "1\nBald\n",
+    }
+    path = tree(files, zipped=True)
     before = set(path.parent.rglob("*"))
     with open_source(path) as source:
-        assert source.files == ("a/windows.png", "good.png")
-        assert len(source.skipped) == 4
+        assert source.files == ("a/windows.png", "good/3.png")
+        assert len(source.skipped) == 5
         assert all("unsafe name" in row.reason for row in source.skipped)
         source.read("a/windows.png")
+    assert read_images(path, 8).layout == "classes"
     assert set(path.parent.rglob("*")) == before
 
 
-def test_zip_bomb_is_bounded(tmp_path, monkeypatch):
-    path = tmp_path / "bomb.zip"
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("bomb.png", bytes(2_000_000))
+def bomb(path: Path, name: str, monkeypatch) -> Path:
+    """The zip with a member that unpacks to more than is allowed."""
     monkeypatch.setattr(zip_source, "FILE_LIMIT_BYTES", 1 << 20)
-    with open_source(path) as source, pytest.raises(ValueError, match="unpacks to 1 MiB, more than 1 MiB"):
-        source.read("bomb.png")
+    with zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr(name, bytes(3 << 20))
+    return path
 
 
-def test_encrypted_member_is_listed(tree):
-    path = tree(["secret.png", "open.png"], zipped=True)
+def test_an_image_that_is_a_bomb_is_skipped_and_a_mask_is_an_error(tree, monkeypatch):
+    images = read_images(bomb(tree(["a.png"], zipped=True), "b.png", monkeypatch), 8)
+    assert images.files == ("a.png",)
+    assert [row.reason for row in images.skipped] == ["unpacks to 3 MiB, more than 1 MiB"]
+    masked = bomb(tree(["images/0.jpg"], zipped=True, name="masked"), "masks/0.png", monkeypatch)
+    with pytest.raises(ValueError, match=r"masks/0\.png in .* cannot be read: unpacks to 3 MiB"):
+        read_masks(masked, 8)
+
+
+@pytest.mark.parametrize("name", ["list_attr_celeba.txt", "list_patition_label.txt", "x.ids", "data.csv"])
+def test_a_list_that_is_a_bomb_is_an_error(tree, monkeypatch, name):
+    path = bomb(tree(["1/000001.jpg"], zipped=True), name, monkeypatch)
+    with pytest.raises(ValueError, match="unpacks to 3 MiB, more than 1 MiB"):
+        list_images(path)
+
+
+def test_encrypted_and_damaged_members_are_listed_or_say_so(tree):
+    path = tree({"secret.png": None, "open.bin": b"x" * 100}, zipped=True)
     raw = bytearray(path.read_bytes())
     for mark, offset in ((b"PK\x03\x04", 6), (b"PK\x01\x02", 8)):
         raw[raw.index(mark) + offset] |= 1
-    path.write_bytes(bytes(raw))
+    path.write_bytes(bytes(raw).replace(b"x" * 100, b"x" * 99 + b"y"))
     with open_source(path) as source:
-        assert source.files == ("open.png",)
+        assert source.files == ("open.bin",)
         assert [(row.file, row.reason) for row in source.skipped] == [("secret.png", "encrypted in the zip")]
+        with pytest.raises(ValueError, match="cannot be unpacked: Bad size or CRC"):
+            source.read("open.bin")
 
 
-def test_damaged_member_says_so(tree):
-    path = tree({"a.bin": b"x" * 100}, zipped=True)
-    raw = path.read_bytes()
-    path.write_bytes(raw.replace(b"x" * 100, b"x" * 99 + b"y"))
-    with open_source(path) as source, pytest.raises(ValueError, match="cannot be unpacked: Bad size or CRC"):
-        source.read("a.bin")
+def test_a_zip_that_is_none_or_cut_is_named(tree, tmp_path):
+    whole = tree(["1.png", "2.png"], zipped=True).read_bytes()
+    for content in (b"", b"no zip at all", b"PK\x03\x04 cut short", whole[:-30]):
+        (tmp_path / "faces.zip").write_bytes(content)
+        with pytest.raises(ValueError, match=r"faces\.zip is damaged or not a whole zip file .*again"):
+            open_source(tmp_path / "faces.zip")
 
 
-@pytest.mark.parametrize("content", [b"", b"no zip at all", b"PK\x03\x04 cut short"])
-def test_a_zip_that_is_none_is_named(tmp_path, content):
-    (tmp_path / "faces.zip").write_bytes(content)
-    with pytest.raises(ValueError, match=r"faces\.zip is damaged or not a whole zip file .*again"):
-        open_source(tmp_path / "faces.zip")
-
-
-def _deflated_zip() -> bytes:
+def _packed() -> bytes:
     buffer = io.BytesIO()
     for method in (zipfile.ZIP_DEFLATED, zipfile.ZIP_LZMA, zipfile.ZIP_BZIP2):
         with zipfile.ZipFile(buffer, "a", method) as archive:
@@ -136,13 +146,13 @@ def _deflated_zip() -> bytes:
     return buffer.getvalue()
 
 
-DEFLATED_ZIP = _deflated_zip()
+PACKED = _packed()
 
 
 @settings(max_examples=150, deadline=None, derandomize=True)
 @given(st.data())
 def test_no_damage_to_a_zip_raises_anything_but_value_errors(data):
-    damaged = bytearray(DEFLATED_ZIP)
+    damaged = bytearray(PACKED)
     for _ in range(data.draw(st.integers(1, 4))):
         damaged[data.draw(st.integers(0, len(damaged) - 1))] = data.draw(st.integers(0, 255))
     with tempfile.TemporaryDirectory() as folder:
@@ -157,39 +167,24 @@ def test_no_damage_to_a_zip_raises_anything_but_value_errors(data):
             assert "damaged or not a whole zip" in str(problem)
 
 
-def test_cut_zip_is_named(tree):
-    path = tree(["1.png", "2.png"], zipped=True)
-    path.write_bytes(path.read_bytes()[:-30])
-    with pytest.raises(ValueError, match="damaged or not a whole zip"):
-        open_source(path)
-
-
-def test_missing_source_names_the_nearest(tree):
+def test_missing_sources_name_the_nearest_and_others_are_refused(tree, tmp_path):
     folder = tree(["1.png"], name="UTKFace")
-    with pytest.raises(ValueError, match=r"utkfaces does not exist; did you mean 'UTKFace'\?"):
-        open_source(folder.parent / "utkfaces")
     (folder / "11.py").touch()
-    with pytest.raises(ValueError, match=r"11\.pn does not exist; did you mean '1\.png'\?"):
-        open_source(folder / "11.pn")
-    with pytest.raises(ValueError, match="does not exist; nor does its folder"):
-        open_source(folder.parent / "no" / "where")
-
-
-def test_other_files_are_refused(tmp_path):
     (tmp_path / "faces.tar").write_bytes(b"x" * 2000)
-    with pytest.raises(ValueError, match=r"faces\.tar is no folder, zip or image .* unpack"):
-        open_source(tmp_path / "faces.tar")
-
-
-def test_a_zip_by_another_name_and_a_pipe(tree, tmp_path):
-    path = tree(["1.png"], zipped=True).rename(tmp_path / "comic.cbz")
-    with open_source(path) as source:
+    comic = tree(["1.png"], zipped=True).rename(tmp_path / "comic.cbz")
+    with open_source(comic) as source:
         assert source.files == ("1.png",)
-    path.write_bytes(path.read_bytes()[:-1])
+    comic.write_bytes(comic.read_bytes()[:-1])
     os.mkfifo(tmp_path / "pipe.zip")
-    for other in (path, tmp_path / "pipe.zip"):
-        with pytest.raises(ValueError, match="is no folder, zip or image"):
-            open_source(other)
+    for path, message in (
+        (tmp_path / "utkfaces", r"utkfaces does not exist; did you mean 'UTKFace'\?"),
+        (folder / "11.pn", r"11\.pn does not exist; did you mean '1\.png'\?"),
+        (tmp_path / "no" / "where", "does not exist; nor does its folder"),
+        *((tmp_path / name, f"{name} is no folder, zip or image .* unpack")
+          for name in ("faces.tar", "comic.cbz", "pipe.zip")),
+    ):  # fmt: skip
+        with pytest.raises(ValueError, match=message):
+            open_source(path)
 
 
 def test_text_must_be_utf8(tree):

@@ -1,10 +1,9 @@
 """Decoded images of a large data set in one file that is mapped into memory; the folder of such files.
 
-The file is the rows themselves, appended as they are decoded, then a JSON note (what they were made from,
-which files they are, labels that came with them), then the note's length and a mark. It is moved into place
-when complete, so a reader never sees half of one. It counts only if the note's fingerprint is that of the
-source as it is now, its length is right, and a sample of its rows has the recorded checksum; otherwise it is
-made again. One file per source and setting: a new version takes the old one's place.
+The file is the rows, then a JSON note (what they were made from, which files they are, labels that came with
+them), then the note's length and a mark. It counts only if the note's fingerprint is that of the source as it
+is now, its length is right, and a sample of its rows has the recorded checksum; otherwise it is made again.
+One file per source and setting: a new version takes the old one's place.
 """
 
 import hashlib

@@ -1,8 +1,8 @@
 """From any source to one array of decoded images with their labels: ``read_images``.
 
-There is one way to read: a stream of samples, decoded in order on every core. What is known to fit lies in
-memory; everything else is appended to a cache file, decoded once, and mapped into memory, so that training
-has random access. Besides its pixels, an image takes its name, its labels and 24 bytes that find copies.
+A stream of samples is decoded in order on every core. What is known to fit lies in memory; everything else is
+appended to a cache file, decoded once, and mapped into memory, so that training has random access. Besides
+its pixels, an image takes its name, its labels and 24 bytes that find copies.
 """
 
 import hashlib
@@ -45,7 +45,7 @@ class ImageSet:
     Attributes:
         images: (N, 3, S, S) RGB; a memory map for large sets.
         files: the name of each image, relative to the source.
-        labels: columns by name, one value per image ("" / NaN / -1 where unknown: see ``layouts/layout.py``).
+        labels: columns by name, one value per image ("" / NaN / -1 where unknown).
         layout: the name of the layout they were read by ("utkface", "classes", "folder", ...).
         skipped: files that could not be read, with reasons.
         duplicates: files with the very pixels of an earlier one; not in ``images`` unless copies were kept.
@@ -173,7 +173,10 @@ def read_images(
                         done = chunk.start + len(chunk)
                         progress(done, estimated_total(done, chunk.share, stream.limit))
             if not found.files:
-                raise _nothing_readable(stream, found.skipped)
+                where, skipped = f"{stream.source} ({stream.layout})", found.skipped
+                first = f"the first is {skipped[0].file!r}: {skipped[0].reason}" if skipped else ""
+                none = f"none of the {len(skipped):,} images in {where} can be read; {first}"
+                raise ValueError(none if skipped else f"no image in {where}: it is empty")
             return found.content()
 
         count = None if stream.table is None else len(stream.table.files)
@@ -272,15 +275,6 @@ class _Found:
             "labels": {name: [self.kinds[name], column] for name, column in self.columns.items()},
             "partition": self.partitions if any(self.partitions) else None,
         }
-
-
-def _nothing_readable(stream: Stream, skipped: list[Skipped]) -> ValueError:
-    """The error for a stream without a usable image."""
-    where = f"{stream.source} ({stream.layout})"
-    if not skipped:
-        return ValueError(f"no image in {where}: it is empty")
-    first = f"the first is {skipped[0].file!r}: {skipped[0].reason}"
-    return ValueError(f"none of the {len(skipped):,} images in {where} can be read; {first}")
 
 
 def _joined(stream: Stream, images: np.ndarray, content: Mapping[str, Any]) -> ImageSet:

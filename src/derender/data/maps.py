@@ -1,15 +1,12 @@
 """Images with a map of every pixel: masks of classes, and the exact depth, normals and albedo of a rendering.
 
-Masks lie in the data set itself (CelebAMask-HQ, rendered sets), or in another folder or zip beside images
-of any layout: one of class numbers for each, named alike. They are only ever resized to the nearest value,
-after the same crop as their image's. A mask in parts is merged as CelebAMask-HQ's owners do it (their
-g_mask.py): the parts are laid over one another in the order of the classes, so that a later class hides an
-earlier one. Leaves out colours as classes, and a number for pixels without a class.
+Masks are only ever resized to the nearest value, after the same crop as their image's. A mask in parts is
+merged as CelebAMask-HQ's owners do it (their g_mask.py): a later class hides an earlier one. Leaves out
+colours as classes, and a number for pixels without a class.
 
-Exact maps are in the camera frame of their image, as docs/conventions.md defines it. With a params.csv depth
-is stored as z = 0.8 + value / 65535 * 0.4, normals as (n + 1) / 2 * 255, albedo as 0..255, and value 0 is
-background. Depth maps alone (unsup3d's synthetic faces) are grey: a value, as a share v of the largest (255
-or 65,535), is nearness, z = 1.1 - 0.2 v, so that the nearest surface that the model can predict is white, and
+Exact maps are in the camera frame of their image (docs/conventions.md). With a params.csv depth is stored as
+z = 0.8 + value / 65535 * 0.4, normals as (n + 1) / 2 * 255, albedo as 0..255, and value 0 is background.
+Depth maps alone (unsup3d's synthetic faces) are grey: a share v of the largest value is z = 1.1 - 0.2 v, and
 0 is background. The set's own words do not say this, and the archive could not be had to check it: look at
 the average depth first, for which unsup3d gives SIDE 1.990e-2 and MAD 23.26 degrees.
 """
@@ -38,13 +35,7 @@ DEPTH_RANGE = (0.9, 1.1)
 
 
 class MaskedImages(NamedTuple):
-    """What ``read_masks`` returns.
-
-    Attributes:
-        images: the images with their labels and partition.
-        masks: (N, S, S) the class number of every pixel, a row for each image.
-        classes: the name of every class number.
-    """
+    """Images, the class number of every pixel, a row for each image, and the name of every class number."""
 
     images: ImageSet
     masks: UInt8[np.ndarray, "n s s"]

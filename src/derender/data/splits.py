@@ -37,29 +37,26 @@ def split_indices(
     if any(not 0 <= fraction <= 1 for fraction in fractions) or abs(sum(fractions) - 1) > 1e-6:
         raise ValueError(f"split fractions must be three numbers in 0..1 that add up to 1, got {fractions}")
     names = [str(row) for row in range(files)] if isinstance(files, int) else list(files)
-    keys = names if groups is None else _group_keys(names, groups)
+    keys = names
+    if groups is not None:
+        if len(groups) != len(names):
+            raise ValueError(f"expected one group for each of {len(names)} images, got {len(groups)}")
+        alone = [str(group) in ("", "nan") for group in groups]
+        rows = zip(names, groups, alone, strict=True)
+        keys = [f"file {name}" if single else f"group {group}" for name, group, single in rows]
     members: dict[str, list[int]] = {}
     for row, key in enumerate(keys):
         members.setdefault(key, []).append(row)
-    ordered = sorted(members, key=lambda key: _hash(key, seed))
+
+    def digest(key: str) -> bytes:
+        return hashlib.sha256(f"{seed}\0{key}".encode("utf-8", "surrogateescape")).digest()
+
+    ordered = sorted(members, key=digest)
     ends = np.cumsum([0, *(len(members[key]) for key in ordered)])
     targets = np.cumsum(_counts(len(names), fractions))
     cuts = [int(np.abs(ends - end).argmin()) for end in targets[:2]]
     parts = (ordered[: cuts[0]], ordered[cuts[0] : cuts[1]], ordered[cuts[1] :])
     return Split(*(np.array(sorted(row for key in part for row in members[key]), np.int64) for part in parts))
-
-
-def _group_keys(names: list[str], groups: Sequence[object] | np.ndarray) -> list[str]:
-    if len(groups) != len(names):
-        raise ValueError(f"expected one group for each of {len(names)} images, got {len(groups)}")
-    return [
-        f"file {name}" if str(group) in ("", "nan") else f"group {group}"
-        for name, group in zip(names, groups, strict=True)
-    ]
-
-
-def _hash(key: str, seed: int) -> bytes:
-    return hashlib.sha256(f"{seed}\0{key}".encode("utf-8", "surrogateescape")).digest()
 
 
 def _counts(total: int, fractions: tuple[float, float, float]) -> list[int]:

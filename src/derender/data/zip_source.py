@@ -6,11 +6,9 @@ unpacked than the directory says. Refused are a directory that cannot be, a memb
 comes after it (members within each other are how small archives unpack to endless ones), another CRC-32 than
 in the directory, and a size beyond ``FILE_LIMIT_BYTES``.
 
-Members with absolute names or ``..`` in them and encrypted ones are passed over and listed. The remembered
-listing of a very large archive holds while its directory is, byte for byte, the one it was made from.
-
-Written from PKWARE's description of the format (APPNOTE.TXT 6.3.10, sections 4.3.12 to 4.3.16, 4.4.4 and
-4.5.3). Leaves out archives in several parts and encrypted directories.
+Members with absolute names or ``..`` in them and encrypted ones are passed over and listed. A remembered
+listing holds while the directory is, byte for byte, the one it was made from. Written from PKWARE's
+APPNOTE.TXT 6.3.10; leaves out archives in several parts and encrypted directories.
 """
 
 import bz2
@@ -43,7 +41,8 @@ _LARGEST = 1 << 62  # claims beyond are cut to this, so that sums of two stay wh
 _ENCRYPTED, _UTF8_NAME = 1, 0x800
 _EMPTY = b"PK\5\6" + bytes(18)
 _SMALLEST_DICTIONARY = 4096
-_HIDDEN = re.compile(r"(^|/)(\.(?!\.?(/|$))|__MACOSX(/|$))")
+_DOUBTFUL = re.compile(r"^[./]|/\.|:|__MACOSX|/$|^$")  # of a million names few are, and are looked at again
+_HIDDEN = re.compile(r"(^|/)(\.(?!\.?(/|$))|__MACOSX(/|$))|/$|^$")
 _UNSAFE = re.compile(r"^/|^[^/]*:|(^|/)\.\.(/|$)")
 
 # What unpacking raises on damaged members (found by feeding it such).
@@ -116,9 +115,10 @@ class ZipSource(ListedSource):
         faults: list[tuple[str, str]] = []
         for row, (name, flags) in enumerate(zip(names, members[:, 5].tolist(), strict=True)):
             file = self.shown(name)
-            if not file or file.endswith("/") or _HIDDEN.search(file):
+            doubtful = _DOUBTFUL.search(file)
+            if doubtful and _HIDDEN.search(file):
                 continue
-            if _UNSAFE.search(file):
+            if doubtful and _UNSAFE.search(file):
                 faults.append((file, "unsafe name in the zip (absolute or with ..)"))
             elif flags & _ENCRYPTED:
                 faults.append((file, "encrypted in the zip"))
@@ -185,8 +185,8 @@ def members_of(content: bytes, start: int, shift: int) -> tuple[list[str], Int64
         if needed > _NEWEST_VERSION:
             raise ValueError(f"it needs version {needed / 10:.1f} of the format")
         end = at + _ENTRY.size + name
-        written = content[at + _ENTRY.size : end].decode("utf-8" if flags & _UTF8_NAME else "cp437")
-        names.append(written.partition("\0")[0] if "\0" in written else written)
+        raw = content[at + _ENTRY.size : end].partition(b"\0")[0]
+        names.append(raw.decode("utf-8" if raw.isascii() or flags & _UTF8_NAME else "cp437"))
         if _IN_EXTRA in (size, packed, offset):
             size, packed, offset = _from_extra((size, packed, offset), content[end : end + extra])
         at = end + extra + comment

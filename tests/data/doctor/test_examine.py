@@ -1,6 +1,5 @@
 """Good sets are accepted, bad ones objected to for the right reason, with no more certainty than is due."""
 
-import zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,8 +18,9 @@ def levels(examination) -> dict[str, str]:
     return {finding.name: finding.level for finding in examination.findings}
 
 
-def test_varied_faces_are_only_few():
-    found = doctor(made.as_set(made.generated("faces")))
+def test_varied_faces_are_only_few_and_an_examination_can_be_repeated():
+    found, again = (doctor(made.as_set(made.generated("faces")), seed=5) for _ in range(2))
+    assert found.findings == again.findings and found.examples == again.examples
     assert found.verdict.word == "will struggle"
     assert found.verdict.because == ("144 distinct images are too few",)
     assert {name for name, level in levels(found).items() if level != "good"} == {"number"}
@@ -97,24 +97,24 @@ def test_few_pictures_are_too_few_and_nothing_is_claimed_of_them(count):
     assert len(found.examples["all distinct"]) == min(count, 8)
 
 
-def test_fifty_faces_are_judged_with_wider_errors_than_all():
-    few = doctor(made.as_set(made.generated("faces")[:50])).values
-    many = doctor(made.as_set(made.generated("faces"))).values
-    assert few["agreement"].error > many["agreement"].error
-    assert abs(few["agreement"].value - many["agreement"].value) < 3 * few["agreement"].error
-
-
 def test_an_objection_needs_certainty():
     check, one_sided = (replace(CHECKS["symmetry"], objects=limit, struggles=0.2) for limit in (0.1, None))
-    assert judged(JackknifeEstimate(0.05, 0.01), check) == ("objection", True)
-    assert judged(JackknifeEstimate(0.05, 0.04), check) == ("trouble", False)
-    assert judged(JackknifeEstimate(0.15, 0.01), check) == ("trouble", True)
-    assert judged(JackknifeEstimate(0.15, 0.04), check) == ("trouble", False)
-    assert judged(JackknifeEstimate(0.25, 0.04), check) == ("good", False)
-    assert judged(JackknifeEstimate(0.25, 0.01), check) == ("good", True)
-    assert judged(JackknifeEstimate(0.05, 0.01), one_sided) == ("trouble", True)
-    assert judged(JackknifeEstimate(0.3, 0.01), replace(one_sided, noted=0.1)) == ("trouble", True)
-    assert judged(JackknifeEstimate(0.15), replace(one_sided, noted=0.1)) == ("note", True)
+    share = replace(one_sided, noted=0.1)
+    for value, error, judge, *expected in (
+        (0.05, 0.01, check, "objection", True),
+        (0.05, 0.04, check, "trouble", False),
+        (0.15, 0.01, check, "trouble", True),
+        (0.15, 0.04, check, "trouble", False),
+        (0.25, 0.04, check, "good", False),
+        (0.25, 0.01, check, "good", True),
+        (0.05, 0.01, one_sided, "trouble", True),
+        (0.3, 0.01, share, "trouble", True),
+        (0.3, 0.06, share, "trouble", False),
+        (0.15, 0.0, share, "note", True),
+        (0.15, 0.03, share, "note", False),
+        (0.05, 0.0, share, "good", True),
+    ):
+        assert judged(JackknifeEstimate(value, error), judge) == tuple(expected)
 
 
 def test_the_worst_finding_makes_the_verdict():
@@ -153,11 +153,6 @@ def test_unreadable_files_and_copies_to_the_pixel_are_counted():
     assert "1 % of the images are copies or near copies (2 of 146: 2 to the pixel" in by_name["copies"].text
 
 
-def test_an_examination_can_be_repeated():
-    first, second = (doctor(made.as_set(made.generated("faces")), seed=5) for _ in range(2))
-    assert first.findings == second.findings and first.examples == second.examples
-
-
 def test_sizes_come_from_the_headers(tmp_path: Path):
     for number, size in enumerate([(40, 40), (80, 80), (200, 100), (64, 64)]):
         Image.new("RGB", size, (number, 0, 0)).save(tmp_path / f"{number}.png")
@@ -184,24 +179,3 @@ def test_faces_and_cars_are_two_kinds(shared_data):
     ]
     found = doctor(made.as_set(np.concatenate(halves)))
     assert "they fall into two kinds of thing" in found.verdict.because
-
-
-def test_limits_stand_between_good_and_bad_in_order():
-    both = [one for one in CHECKS.values() if one.objects is not None and one.struggles is not None]
-    assert len(both) >= 4
-    for check in both:
-        assert check.objects < check.struggles, check.name
-
-
-def test_a_zip_is_examined_like_a_folder(tmp_path: Path):
-    names = []
-    for number, picture in enumerate(made.generated("faces")[:30]):
-        names.append(tmp_path / f"{number}.png")
-        Image.fromarray(picture.transpose(1, 2, 0)).save(names[-1])
-    with zipfile.ZipFile(tmp_path / "set.zip", "w") as archive:
-        for name in names:
-            archive.write(name, name.name)
-    (inside, beside) = (
-        doctor(read_images(where, 64, keep_duplicates=True)) for where in (tmp_path / "set.zip", tmp_path)
-    )
-    assert inside.findings == beside.findings

@@ -56,14 +56,8 @@ SHOWN = 8
 
 @dataclass(frozen=True)
 class Shared:
-    """What distinct images share, and in what they vary.
-
-    Attributes:
-        rows: which images were compared.
-        values: agreement, symmetry, fill, view, light, odd, and kinship where it can be judged.
-        axis: where the mean image of edges is symmetric.
-        orders: pairs of names for the two ends of an order of the compared images, and what orders them.
-    """
+    """What distinct images share: which rows were compared, the measures by their names in ``CHECKS``, where
+    the mean of edges is symmetric, and orders of these images by the names of their two ends."""
 
     rows: Int64[np.ndarray, " k"]
     values: Mapping[str, JackknifeEstimate]
@@ -73,12 +67,11 @@ class Shared:
 
 @dataclass(frozen=True)
 class Examination:
-    """What was found.
+    """What was found in images.
 
     Attributes:
-        images: the images that were examined.
-        verdict: whether the set suits the method.
-        findings: one for each thing that was looked at.
+        images: those examined.
+        verdict, findings: whether the set suits the method, and one finding for each thing looked at.
         values: every measured number by its name in ``CHECKS``.
         group: the first image of each image's group of copies and near copies.
         identical: copies to the last pixel, the first of each not counted.

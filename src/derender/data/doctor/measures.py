@@ -75,12 +75,8 @@ class Pixels:
 class Originals:
     """Sizes of a sample of files, in pixels, upright.
 
-    Attributes:
-        sampled: how many headers were read.
-        median_short, smallest_short, largest_long: short and long sides.
-        smaller: share of files whose short side is below ``image_size``, 0..1.
-        oblong: share of files whose sides differ by more than a quarter, 0..1.
-        image_size: what ``smaller`` is about.
+    ``smaller`` and ``oblong`` are shares, 0..1, of files whose short side is below ``image_size``, and of
+    those whose sides differ by more than a quarter.
     """
 
     sampled: int
@@ -102,12 +98,8 @@ class JackknifeEstimate:
 
 @dataclass(frozen=True)
 class SymmetryAxis:
-    """The axis about which the mean image of edges is most symmetric.
-
-    Attributes:
-        offset: its distance from the middle as a share of the width; right is positive.
-        correlation: of the two sides about it, -1..1, best 1.
-    """
+    """The axis about which the mean image of edges is most symmetric: its distance from the middle as a share
+    of the width (right is positive), and the correlation of the two sides about it, -1..1, best 1."""
 
     offset: float
     correlation: float
@@ -263,20 +255,14 @@ def mirrored(cells: Float[np.ndarray, "*n 6 6 8"]) -> Float[np.ndarray, "*n 6 6 
 
 
 def agreement(structure: Cells) -> float:
-    """Mean cosine between two different images: 0 nothing in common, 1 all alike.
-
-    Unbiased, so it may fall below 0 by chance.
-    """
+    """Mean cosine between two different images: 0 nothing in common (or less, by chance), 1 all alike."""
     rows = structure.reshape(len(structure), -1).astype(np.float64)
     total = rows.sum(axis=0)
     return float((total @ total - (rows**2).sum()) / (len(rows) * (len(rows) - 1)))
 
 
 def symmetry(structure: Cells) -> float:
-    """Agreement between images and other images' mirror images, over agreement: about -1..1, best 1.
-
-    Unbiased above and below, so that few images look no less symmetric than many; it may pass 1 by chance.
-    """
+    """Agreement with other images' mirror images over agreement, both unbiased: about -1..1, best 1."""
     return _to_others(structure) / max(agreement(structure), 1e-3)
 
 
@@ -326,10 +312,7 @@ def light_variety(sides: Float[np.ndarray, "n 2"]) -> float:
 
 
 def symmetry_axis(grey: Grey) -> SymmetryAxis:
-    """Look for an axis in steps of half a pixel, up to 7 pixels to either side.
-
-    An axis off the middle has to be better than the middle by 0.02.
-    """
+    """Look for an axis in steps of half a pixel, up to 7 pixels away; it has to beat the middle by 0.02."""
     right, down = np.gradient(grey, axis=2), np.gradient(grey, axis=1)
     mean = np.sqrt(np.hypot(right, down)).mean(axis=0, dtype=np.float64)
     mean -= mean.mean(axis=1, keepdims=True)
@@ -344,10 +327,7 @@ def symmetry_axis(grey: Grey) -> SymmetryAxis:
 
 
 def likeness(structure: Cells) -> Float[np.ndarray, " n"]:
-    """Cosine of each image with the mean direction of the others; about 0 for a stranger among them.
-
-    Where the images agree at all, each has sqrt(agreement) in the mean.
-    """
+    """Cosine of each image with the mean direction of the others; about 0 for a stranger among them."""
     rows = structure.reshape(len(structure), -1).astype(np.float64)
     with_others = (rows @ rows.sum(axis=0) - (rows**2).sum(axis=1)) / (len(rows) - 1)
     return with_others / np.sqrt(max(agreement(structure), 1e-4))

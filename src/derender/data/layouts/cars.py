@@ -1,16 +1,11 @@
 """ShapeNet's cars, rendered: folders train, val and test of images whose paths hold the model's id.
 
-unsup3d released the images that the paper uses (github.com/elliottwu/unsup3d, issue 18): 28,000, 7,000
-and 7,000. Images of 128 x 128 are cropped to rows 8 to 108 and columns 14 to 114; of any other size,
-whole. We could not see the archive itself: which model an image shows is read from an id in its path as
-ShapeNet's are (24 to 32 hexadecimal digits). Images named by such digits may be anything, so the layout
-is recognised by itself only beside ShapeNet's table or below a folder 02958343, the number of its cars;
-else ask for it by name.
-
-What a model is called comes from ShapeNet's own table (``02958343.csv`` or ``metadata.csv``, with the
-columns fullId, wnlemmas, name, tags of its taxonomy viewer). The label ``class`` is one of five, found by
-words in name, tags and wnlemmas, in this order; "" for other cars. The paper's fifth is Ferrari, which is
-among its words here.
+unsup3d released the paper's images (github.com/elliottwu/unsup3d, issue 18). Those of 128 x 128 are cropped
+to rows 8 to 108 and columns 14 to 114. We could not see the archive itself: a model's id is taken to be 24 to
+32 hexadecimal digits in the path. Images named by such digits may be anything, so the layout is recognised
+only beside ShapeNet's table or below a folder 02958343, the number of its cars; else ask for it by name. That
+table (``02958343.csv`` or ``metadata.csv``) gives names, and by words in them the label ``class``, one of
+five or "". The paper's fifth is Ferrari, which is among its words here.
 """
 
 import re
@@ -106,11 +101,7 @@ def car_class(*texts: str) -> str:
 
 
 SHAPENET_CARS = Layout(
-    "shapenet_cars",
-    "ShapeNet cars, rendered: train, val and test, model ids in the names",
-    _is_cars,
-    _load_cars,
-    home=HOME,
-    terms="models: ShapeNet's terms, non-commercial research and education only",
-    split_from="a folder train, val or test",
-)
+    "shapenet_cars", "ShapeNet cars, rendered: train, val and test, model ids in the names",
+    _is_cars, _load_cars, HOME,
+    "models: ShapeNet's terms, non-commercial research and education only", "a folder train, val or test",
+)  # fmt: skip

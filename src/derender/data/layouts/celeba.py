@@ -1,10 +1,8 @@
 """CelebA: 202,599 faces of 10,177 people with 40 attributes, aligned or in the wild; and CelebAMask-HQ.
 
-Lists are read as the owners publish them (``list_attr_celeba.txt``: a count, the columns, a row for each
-image; ``identity_CelebA.txt`` and ``list_eval_partition.txt``: rows only) and as their CSV copies. Only
-the attributes must be there. Aligned images (``img_align_celeba``, 178 x 218) are used whole. Images
-in the wild (``img_celeba``, any size) show a scene with a face in it, so each gets a square box about its
-face:
+Lists are read as the owners publish them and as their CSV copies; only the attributes must be there. Aligned
+images (``img_align_celeba``) are used whole. Images in the wild (``img_celeba``) show a scene with a face in
+it, so each gets a square box about its face:
 
 - from a list of the user's own, ``boxes.csv`` (or ``.txt``), those boxes as they are: a first line
   ``file,left,top,width,height`` or ``file,left,top,right,bottom``, then a row for each image;
@@ -14,17 +12,13 @@ face:
 - else from ``list_bbox_celeba.txt``, the square about the middle of the owners' box whose side is the
   box's longer one.
 
-unsup3d was trained on its own crops of the images in the wild. It publishes those boxes as a list,
-``celeba_crop_bbox.txt``, and not the rule behind them (github.com/elliottwu/unsup3d, issue 30). How its rows
-are laid out is written nowhere that we found: without a first line of names they are taken for a name, left,
-top, width and height.
+unsup3d publishes its own boxes as a list, ``celeba_crop_bbox.txt``, and not the rule behind them
+(github.com/elliottwu/unsup3d, issue 30). How its rows are laid out is written nowhere that we found: without
+a first line of names they are taken for a name, left, top, width and height.
 
-CelebAMask-HQ: 30,000 faces, each with a mask of 19 classes, as published (``CelebA-HQ-img/0.jpg`` and for
-every part of a face ``CelebAMask-HQ-mask-anno/0/00000_skin.png``) or merged (``images/0.jpg`` and
-``masks/0.png`` of class numbers). ``CelebA-HQ-to-CelebA-mapping.txt`` says which image of CelebA each one
-was, and so its official partition. The owners' own script compares that table's count from zero with
-CelebA's numbers, which start at one; here an image is in the part in which CelebA has it, which moves an
-image at each border at most.
+CelebAMask-HQ: 30,000 faces with a mask of 19 classes each, in parts as published or merged. Its mapping to
+CelebA gives the official partition. The owners' own script compares that table's count from zero with
+CelebA's numbers, which start at one; here an image is in the part in which CelebA has it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -346,20 +340,10 @@ def _load_celebamask(source: Source) -> Table:
 
 
 CELEBA = Layout(
-    "celeba",
-    "CelebA: faces with 40 attributes",
-    _is_celeba,
-    _load_celeba,
-    home=CELEBA_HOME,
-    terms="non-commercial research only",
-    split_from="list_eval_partition.txt",
-)
+    "celeba", "CelebA: faces with 40 attributes", _is_celeba, _load_celeba,
+    CELEBA_HOME, "non-commercial research only", "list_eval_partition.txt",
+)  # fmt: skip
 CELEBAMASK = Layout(
-    "celebamask",
-    "CelebAMask-HQ: faces with masks of their parts",
-    _is_celebamask,
-    _load_celebamask,
-    home=MASK_HOME,
-    terms="non-commercial research and education only",
-    split_from=_MAPPING,
-)
+    "celebamask", "CelebAMask-HQ: faces with masks of their parts", _is_celebamask, _load_celebamask,
+    MASK_HOME, "non-commercial research and education only", _MAPPING,
+)  # fmt: skip

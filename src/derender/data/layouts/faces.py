@@ -5,18 +5,15 @@ made by data/splits.py. LFW: ``First_Last/First_Last_0001.jpg``; where the lists
 (``peopleDevTrain.txt``, ``peopleDevTest.txt``: a count, then a name and a count a line) lie beside the
 images they are the official split by people. The pairs of its verification protocol are not read.
 
-RAF-DB, the basic set: ``basic/Image/aligned/train_00001_aligned.jpg`` (100 x 100) and
+RAF-DB, the basic set: ``basic/Image/aligned/train_00001_aligned.jpg`` and
 ``basic/EmoLabel/list_patition_label.txt``, spelt so, with a line ``train_00001.jpg 5`` for each image; the
-name says the part (12,271 train, 3,068 test). The images before alignment and the compound emotions are not
-read.
+name says the part. The images before alignment and the compound emotions are not read.
 
-Tracks have two forms: ``NAME.ids`` as published for The Big Bang Theory and Buffy (episodes bbt_s01e01..06
-and buffy_s05e01..06; github.com/makarandtapaswi/BallClustering_ICCV2019, after Baeuml et al., CVPR 2013): a
-line ``CVHCI_TRACKLABELS_V1``, then a track's number and a name a line. The frames cannot be published; cut
-them from the video into ``NAME/NUMBER/FRAME.jpg``, leading zeros as you like. ``NAME/`` may be left out
-where there is one list only. Or, without a list, ``IDENTITY/TRACK/FRAME.jpg`` as in YouTube Faces, where
-tracks and frames are numbered. Every track of a list is read, background people (unknown_...) too; the paper
-used 568 tracks of six people of buffy_s05e02 and 644 of five of bbt_s01e01. There is no official split.
+Tracks have two forms: ``NAME.ids`` as published for The Big Bang Theory and Buffy
+(github.com/makarandtapaswi/BallClustering_ICCV2019, after Baeuml et al., CVPR 2013) with frames cut from the
+video into ``NAME/NUMBER/FRAME.jpg``, where ``NAME/`` may be left out if there is one list only. Or, without a
+list, ``IDENTITY/TRACK/FRAME.jpg`` as in YouTube Faces, where tracks and frames are numbered. Every track of a
+list is read, background people (unknown_...) too.
 """
 
 import re
@@ -207,35 +204,23 @@ def _listed_tracks(source: Source, lists: dict[str, str]) -> Labels:
 
 
 UTKFACE = Layout(
-    "utkface",
-    "UTKFace: faces with age, gender and race in their names",
-    lambda source: mostly(_UTK_NAME, [base_name(file) for file in source.images]),
-    _load_utkface,
-    home=_UTK_HOME,
-    terms="non-commercial research only",
-)
+    "utkface", "UTKFace: faces with age, gender and race in their names",
+    lambda source: mostly(_UTK_NAME, [base_name(file) for file in source.images]), _load_utkface,
+    _UTK_HOME, "non-commercial research only",
+)  # fmt: skip
 LFW = Layout(
-    "lfw",
-    "Labeled Faces in the Wild: one folder per person",
-    lambda source: mostly(_LFW_NAME, source.images),
-    _load_lfw,
-    home=_LFW_HOME,
-    terms="no licence stated; news photographs, collected for research",
-    split_from="peopleDevTrain.txt",
-)
+    "lfw", "Labeled Faces in the Wild: one folder per person",
+    lambda source: mostly(_LFW_NAME, source.images), _load_lfw,
+    _LFW_HOME, "no licence stated; news photographs, collected for research", "peopleDevTrain.txt",
+)  # fmt: skip
 RAFDB = Layout(
-    "rafdb",
-    "RAF-DB: faces with one of seven emotions",
-    lambda source: _raf_list(source) is not None,
-    _load_rafdb,
-    home=_RAF_HOME,
-    terms="non-commercial research only, on request",
-)
+    "rafdb", "RAF-DB: faces with one of seven emotions",
+    lambda source: _raf_list(source) is not None, _load_rafdb,
+    _RAF_HOME, "non-commercial research only, on request",
+)  # fmt: skip
 FACE_TRACKS = Layout(
     "face_tracks",
     "face tracks: NAME.ids and NAME/TRACK/FRAME (Buffy, Big Bang Theory), or IDENTITY/TRACK/FRAME",
-    _is_tracks,
-    _load_tracks,
-    home=_TRACKS_HOME,
-    terms="lists for research; frames are the broadcasters', to be cut from one's own copy",
-)
+    _is_tracks, _load_tracks,
+    _TRACKS_HOME, "lists for research; frames are the broadcasters', to be cut from one's own copy",
+)  # fmt: skip

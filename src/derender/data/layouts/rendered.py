@@ -161,30 +161,19 @@ def _load_pairs(source: Source) -> Table:
 
 
 SYNCAR = Layout(
-    "syncar",
-    "rendered cars with exact factors",
-    lambda source: "class" in _columns(source),
-    _load_rendered,
-    default_parts=("train",),
-)
+    "syncar", "rendered cars with exact factors",
+    lambda source: "class" in _columns(source), _load_rendered, default_parts=("train",),
+)  # fmt: skip
 SYNFACE = Layout(
-    "synface",
-    "rendered faces with exact factors",
+    "synface", "rendered faces with exact factors",
     lambda source: "file" in (columns := _columns(source)) and "class" not in columns,
-    _load_rendered,
-    default_parts=("train",),
-)
+    _load_rendered, default_parts=("train",),
+)  # fmt: skip
 SYNFACE_TRACKS = Layout(
-    "synface_tracks",
-    "rendered tracks: tracks/IDENTITY/TRACK/FRAME",
-    lambda source: bool(source.images) and all(map(_TRACK.fullmatch, source.images)),
-    _load_tracks,
-)
+    "synface_tracks", "rendered tracks: tracks/IDENTITY/TRACK/FRAME",
+    lambda source: bool(source.images) and all(map(_TRACK.fullmatch, source.images)), _load_tracks,
+)  # fmt: skip
 DEPTH_PAIRS = Layout(
-    "depth_pairs",
-    "images and depth maps: image/NAME.png, depth/NAME.png",
-    _is_paired,
-    _load_pairs,
-    home="https://github.com/elliottwu/unsup3d",
-    terms="see its owners' page",
-)
+    "depth_pairs", "images and depth maps: image/NAME.png, depth/NAME.png", _is_paired, _load_pairs,
+    "https://github.com/elliottwu/unsup3d", "see its owners' page",
+)  # fmt: skip
