@@ -18,8 +18,8 @@ TESTS = sorted((ROOT / "tests").rglob("*.py"))
 BUDGET = {  # lines, files
     "data": (8_500, 39),
     "evaluation": (7_852, 45),
-    "report": (4_480, 31),
-    "cli": (3_380, 43),
+    "report": (4_460, 31),
+    "cli": (3_350, 43),
     "training": (3_340, 16),
     "baselines": (2_710, 11),
     "render": (1_730, 16),
@@ -30,7 +30,7 @@ BUDGET = {  # lines, files
     "objectives": (720, 6),
     "postprocess": (650, 6),
     "scene": (710, 10),
-    "demo": (420, 3),
+    "demo": (405, 3),
     "learn": (480, 4),
 }
 TOTAL = (39_900, 270)  # on the way to (32_000, 270)
@@ -111,8 +111,9 @@ def public_texts(path: Path) -> list[str]:
     for node in ast.walk(tree):
         if isinstance(node, ast.ClassDef | ast.FunctionDef) and not node.name.startswith("_"):
             found.append(ast.get_docstring(node) or "")
-        if isinstance(node, ast.keyword) and node.arg == "help" and isinstance(node.value, ast.Constant):
-            found.append(str(node.value.value))
+        helps = isinstance(node, ast.keyword) and node.arg == "help"
+        if (helps or isinstance(node, ast.Assign)) and isinstance(node.value, ast.Constant):
+            found.append(str(node.value.value))  # of options, some named before
     return found
 
 
@@ -132,7 +133,7 @@ def test_help_texts_are_whole_phrases():
         f"{path.relative_to(PACKAGE)}: {value.value}"
         for path in (PACKAGE / "cli").rglob("*.py")
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
-        if isinstance(node, ast.keyword) and node.arg == "help"
+        if isinstance(node, ast.Assign) or (isinstance(node, ast.keyword) and node.arg == "help")
         if isinstance(value := node.value, ast.Constant) and str(value.value).startswith(("Of ", "Or "))
     ]
     assert not headless, "\n".join(headless)

@@ -50,24 +50,11 @@ def demo_page(result: DemoResult) -> Page:
     known = np.stack([one.picture for one in rendered_examples(BUNDLED, result.bundled.image_size)])
     models = {"this run": result.model, BUNDLED: result.bundled}
     same_size = result.model.image_size == result.bundled.image_size
-    tiles = {
-        "Depth error, SIDE x 100": _tile(tables["geometry"], 0, "average depth", "plane"),
-        "Normals, mean angle in degrees": _tile(tables["geometry"], 1, "average depth", "plane"),
-        "Identity, cluster accuracy": _tile(tables["clustering"], 0, "chance"),
-        "Reconstruction, L1": _tile(tables["reconstruction"], 0, "mean image"),
-    }
-    verdicts = {
-        "Depth": tables["geometry"].verdict(0),
-        "Normals": tables["geometry"].verdict(1),
-        "Clusters by identity": tables["clustering"].verdict(0),
-        "Reconstruction": tables["reconstruction"].verdict(0),
-    }
     values = {
         "result": result,
         "usual": PRESETS[result.config.preset].images,
         "tables": tables,
-        "tiles": tiles,
-        "verdicts": verdicts,
+        "tile": _tile,
         "inputs": colours.pictures(result.seen.images[:: max(1, len(result.seen) // INPUTS_SHOWN)]),
         "inputs_shown": INPUTS_SHOWN,
         "names": names,

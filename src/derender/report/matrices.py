@@ -41,12 +41,6 @@ class Matrix:
     sizes: Sequence[int] | None = None
     note: str = ""
 
-    def __post_init__(self) -> None:
-        whole = None if self.sizes is None else sum(self.sizes)
-        expected = (whole or len(self.rows), whole or len(self.columns))
-        if self.values.shape != expected:
-            raise ValueError(f"{self.title}: a matrix {self.values.shape} does not fit its names {expected}")
-
 
 def card_matrices(card: DisentanglementCard) -> list[Matrix]:
     """The matrices of a disentanglement card, means over seeds, the model's own."""
