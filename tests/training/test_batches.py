@@ -11,9 +11,8 @@ from derender.training.config import OptimiserSettings
 
 
 def numbered(count: int) -> torch.Tensor:
-    """Images whose first pixel row holds their own number, left to right ascending."""
-    images = torch.zeros(count, 3, 4, 4, dtype=torch.uint8)
-    images[:] = torch.arange(count, dtype=torch.uint8)[:, None, None, None]
+    """Images whose pixels hold their own number, with a bright column at the left."""
+    images = torch.arange(count, dtype=torch.uint8)[:, None, None, None].repeat(1, 3, 4, 4)
     images[..., 0] = 255
     return images
 
@@ -22,7 +21,7 @@ def numbers(batch: torch.Tensor) -> list[int]:
     return (batch[:, 0, 0, 1] * 255).round().int().tolist()
 
 
-def test_an_epoch_shows_every_picture_once_in_a_new_order_each_time():
+def test_an_epoch_shows_every_image_once_in_a_new_order_each_time():
     batches = Batches(numbered(12), 4, seed=3, horizontal_flips=False)
     epochs = [[n for i in range(3) for n in numbers(batches.at(3 * epoch + i))] for epoch in range(2)]
     assert sorted(epochs[0]) == sorted(epochs[1]) == list(range(12))
@@ -35,14 +34,14 @@ def test_rows_of_a_larger_set_are_batched_as_if_they_were_copied(monkeypatch):
     copied = Batches(numbered(40)[rows], 4, 3, True)
     assert all(torch.equal(part.at(position), copied.at(position)) for position in range(7))
     assert torch.equal(part.sample(), copied.sample())
+    assert not torch.equal(part.at(3), Batches(numbered(40), 4, 8, True, rows).at(3))
     monkeypatch.setattr(batches_module, "SAMPLED", 5)
     assert part.sample()[:, 0, 0, 1].tolist() == [1, 10, 19, 28, 37]
 
 
-def test_about_half_of_the_pictures_are_mirrored():
+def test_about_half_of_the_images_are_mirrored():
     batches = Batches(numbered(200), 100, 0, True)
-    batch = torch.cat([batches.at(i) for i in range(10)])
-    mirrored = batch[:, 0, 0, -1] == 1
+    mirrored = torch.cat([batches.at(i) for i in range(10)])[:, 0, 0, -1] == 1
     assert 0.42 < mirrored.float().mean() < 0.58
 
 
@@ -62,7 +61,7 @@ def test_a_reader_gives_the_same_batches_in_any_order():
 
 
 class SlowDisk(Batches):
-    """Reading takes five seconds of a clock that nothing else moves; in a thread it takes nobody's time."""
+    """Reading takes five seconds of a clock that nothing else moves; in a thread it takes none."""
 
     def read(self, position, *ranks):
         if threading.current_thread() is threading.main_thread():
@@ -77,12 +76,13 @@ CLOCK, ASKED = [0.0], threading.Event()
 
 
 def test_waiting_is_what_was_not_read_ahead(monkeypatch):
+    read_ahead = threading.Event()
+
     def clock() -> float:
         if read_ahead.is_set():
             ASKED.set()
         return CLOCK[0]
 
-    read_ahead = threading.Event()
     monkeypatch.setattr(batches_module.time, "perf_counter", clock)
     reader, waited = Reader(SlowDisk(numbered(12), 4, 3, False)), []
     for position in (0, 1, 2, 3, 9):
@@ -108,3 +108,4 @@ def test_learning_rate_warms_up_then_falls_along_a_cosine():
     settings = OptimiserSettings(learning_rate=1e-3, warmup_images=100, final_rate=0.1)
     rates = [settings.rate(images, 1100) for images in (0, 49, 99, 100, 600, 1100, 5000)]
     assert rates == pytest.approx([1e-5, 5e-4, 1e-3, 1e-3, 5.5e-4, 1e-4, 1e-4])
+    assert OptimiserSettings().rate(0, 100) == OptimiserSettings().rate(99, 100) == 1e-4

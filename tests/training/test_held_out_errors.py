@@ -19,16 +19,10 @@ from derender.training.held_out_errors import (
 )
 
 
-class Darker:
+class Darker(torch.nn.Module):
     """Renders every image a fifth darker, its left half only; black images not at all."""
 
-    device, training = torch.device("cpu"), False
-
-    def train(self, mode: bool = True) -> None:
-        self.training = mode
-
-    def eval(self) -> None:
-        self.training = False
+    device = torch.device("cpu")
 
     def reconstruct(self, images):
         mask = torch.zeros_like(images[:, 0])
@@ -38,28 +32,32 @@ class Darker:
 
 
 @pytest.fixture
-def pictures() -> np.ndarray:
+def pixels() -> np.ndarray:
     return np.random.default_rng(0).integers(0, 256, (30, 3, 32, 32), dtype=np.uint8)
 
 
-def test_errors_are_those_of_the_evaluation(pictures):
-    found = reconstruction_errors(Darker(), pictures, batch_size=7)
-    target = torch.from_numpy(pictures).float() / 255
+@pytest.fixture
+def folder(tmp_path):
+    net = Derenderer.from_preset("small", seed=0, image_size=32, width=4, light_width=4)
+    return net.save(tmp_path / "model")
+
+
+def test_errors_are_those_of_the_evaluation(pixels):
+    found = reconstruction_errors(Darker(), pixels, batch_size=7)
+    target = torch.from_numpy(pixels).float() / 255
     rendering = Darker().reconstruct(target)
-    scores = reconstruction_scores(rendering.image, target, rendering.mask)
-    assert found == pytest.approx(scores.l1_each)
+    assert found == pytest.approx(reconstruction_scores(rendering.image, target, rendering.mask).l1_each)
     assert found[0] == pytest.approx(0.2 * target[0, :, :, :16].mean().item())
 
 
-def test_a_picture_into_which_nothing_is_rendered_counts_as_infinitely_wrong(pictures):
-    pictures[3] = 0
-    assert np.isinf(reconstruction_errors(Darker(), pictures)[3])
-    assert errors_of(Darker(), pictures).pictures == 29
+def test_an_image_into_which_nothing_is_rendered_counts_as_infinitely_wrong(pixels):
+    pixels[3] = 0
+    assert np.isinf(reconstruction_errors(Darker(), pixels)[3])
+    assert errors_of(Darker(), pixels).pictures == 29
 
 
-def test_quantiles_survive_the_file(pictures, tmp_path):
-    errors = errors_of(Darker(), pictures)
-    each = reconstruction_errors(Darker(), pictures)
+def test_quantiles_survive_the_file(pixels, tmp_path):
+    errors, each = errors_of(Darker(), pixels), reconstruction_errors(Darker(), pixels)
     assert errors.quantiles[[0, 50, 100]] == pytest.approx([each.min(), np.median(each), each.max()])
     write_errors(tmp_path, errors)
     again = read_errors(tmp_path)
@@ -67,33 +65,20 @@ def test_quantiles_survive_the_file(pictures, tmp_path):
     assert again.quantiles == pytest.approx(errors.quantiles, rel=1e-5)
 
 
-def test_a_model_that_was_saved_anew_has_no_old_errors(tmp_path, pictures):
-    net = Derenderer.from_preset("small", seed=0, image_size=32, width=4, light_width=4)
-    folder = net.save(tmp_path / "model")
-    assert read_errors(folder) is None
-    stored = store_errors(folder, torch.from_numpy(pictures))
-    assert stored is not None and read_errors(folder) is not None
-    net.save(folder, overwrite=True)
-    assert read_errors(folder) is None
-
-
-def test_too_few_pictures_leave_nothing(tmp_path, pictures):
-    net = Derenderer.from_preset("small", seed=0, image_size=32, width=4, light_width=4)
-    folder = net.save(tmp_path / "model")
-    assert store_errors(folder, torch.from_numpy(pictures[:19])) is None
-    assert read_errors(folder) is None
+def test_errors_are_stored_with_a_model_and_go_when_it_is_saved_anew(folder, pixels):
+    assert store_errors(folder, torch.from_numpy(pixels[:19])) is None and read_errors(folder) is None
     with pytest.raises(ValueError, match="errors need 20 images or more"):
-        errors_of(net, pictures[:19])
+        errors_of(Darker(), pixels[:19])
+    assert store_errors(folder, torch.from_numpy(pixels)) is not None and read_errors(folder) is not None
+    Derenderer.from_preset("small", image_size=32, width=4).save(folder, overwrite=True)
+    assert read_errors(folder) is None
 
 
 @pytest.mark.parametrize("damage", ["", "{", '{"format": 1}', "backwards", "newer"])
 def test_a_damaged_file_says_how_to_make_it_again(tmp_path, damage):
     file = write_errors(tmp_path, HeldOutErrors(np.linspace(0, 1, 101), 50))
     values = json.loads(file.read_text())
-    if damage == "backwards":
-        values["quantiles"].reverse()
-    if damage == "newer":
-        values["format"] = 2
-    file.write_text(json.dumps(values) if damage in ("backwards", "newer") else damage)
+    changed = {"backwards": {"quantiles": values["quantiles"][::-1]}, "newer": {"format": 2}}
+    file.write_text(json.dumps(values | changed[damage]) if damage in changed else damage)
     with pytest.raises(ValueError, match="evaluate reconstruction --store"):
         read_errors(tmp_path)
