@@ -10,6 +10,7 @@ from derender.objectives.perceptual_features import Vgg16Features, load_vgg16
 from derender.storage.tensors import reads_safely
 
 PICKLED = pytest.mark.skipif(not reads_safely(), reason="this PyTorch is not trusted with pickles")
+CONTAINERS = [".npz", ".safetensors", pytest.param(".pth", marks=PICKLED)]
 
 NUMBERS = (0, 2, 5, 7, 10, 12, 14)
 CHANNELS = (3, 64, 64, 128, 128, 256, 256, 256)
@@ -20,13 +21,11 @@ MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet, as torc
 def weights():
     """Random weights under torchvision's names, with a later layer and a classifier that must be ignored."""
     generator = torch.Generator().manual_seed(0)
-    found = {}
+    found = {"features.17.weight": torch.zeros(2, 2), "classifier.0.weight": torch.zeros(3)}
     for number, fan_in, fan_out in zip(NUMBERS, CHANNELS[:-1], CHANNELS[1:], strict=True):
         scale = (2 / (9 * fan_in)) ** 0.5
         found[f"features.{number}.weight"] = torch.randn(fan_out, fan_in, 3, 3, generator=generator) * scale
         found[f"features.{number}.bias"] = torch.randn(fan_out, generator=generator) * 0.1
-    found["features.17.weight"] = torch.zeros(2, 2)
-    found["classifier.0.weight"] = torch.zeros(3)
     return found
 
 
@@ -52,7 +51,7 @@ def write(weights, path):
     return path
 
 
-@pytest.mark.parametrize("suffix", [".npz", ".safetensors", pytest.param(".pth", marks=PICKLED)])
+@pytest.mark.parametrize("suffix", CONTAINERS)
 def test_every_container_gives_the_features_by_definition(weights, tmp_path, generator, suffix):
     net = load_vgg16(write(weights, tmp_path / f"vgg{suffix}"))
     images = torch.rand(2, 3, 16, 24, generator=generator)
@@ -65,11 +64,9 @@ def test_every_container_gives_the_features_by_definition(weights, tmp_path, gen
 def test_torch_hubs_cache_is_found_and_never_filled(weights, tmp_path, monkeypatch):
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
     monkeypatch.setattr(torch.hub, "load_state_dict_from_url", lambda *a, **k: pytest.fail("downloads"))
-    with pytest.raises(ValueError, match=r"no vgg16-\*\.pth in torch hub's cache .*vgg16-397923af\.pth"):
-        load_vgg16()
     (tmp_path / "checkpoints").mkdir()
     write({"features.0.weight": torch.zeros(1)}, tmp_path / "checkpoints" / "vgg16_bn-6c64b313.pth")
-    with pytest.raises(ValueError, match="torch hub's cache"):
+    with pytest.raises(ValueError, match=r"no vgg16-\*\.pth in torch hub's cache .*vgg16-397923af\.pth"):
         load_vgg16()
     write(weights, tmp_path / "checkpoints" / "vgg16-397923af.pth")
     torch.testing.assert_close(load_vgg16().features[0].weight, weights["features.0.weight"])
@@ -79,7 +76,6 @@ def test_only_seven_convolutions_remain():
     net = Vgg16Features()
     assert sum(parameter.numel() for parameter in net.parameters()) == 1_735_488
     assert [i for i, layer in enumerate(net.features) if isinstance(layer, torch.nn.Conv2d)] == list(NUMBERS)
-    assert len(net.features) == 16
 
 
 def test_weights_that_do_not_fit_are_named(weights, tmp_path):
@@ -91,34 +87,26 @@ def test_weights_that_do_not_fit_are_named(weights, tmp_path):
         load_vgg16(write(wrong, tmp_path / "wrong.npz"))
 
 
+class Harmful:
+    def __reduce__(self):
+        return (pytest.fail, ("ran code from a weight file",))
+
+
 @PICKLED
-def test_a_file_without_names_is_refused(tmp_path):
+def test_pickles_of_something_else_are_refused(tmp_path):
     torch.save(torch.zeros(3), tmp_path / "tensor.pth")
     with pytest.raises(ValueError, match="holds no named weights"):
         load_vgg16(tmp_path / "tensor.pth")
-
-
-@pytest.mark.parametrize("suffix", [".npz", ".safetensors", pytest.param(".pth", marks=PICKLED)])
-def test_damaged_files_are_refused_in_one_sentence(tmp_path, suffix):
-    path = tmp_path / f"damaged{suffix}"
-    path.write_bytes(b"this is not a weight file")
-    with pytest.raises(ValueError, match=r"VGG16 weights in .*damaged.* cannot be read"):
-        load_vgg16(path)
-
-
-def test_a_pickle_that_would_run_code_is_refused(tmp_path):
-    class Harmful:
-        def __reduce__(self):
-            return (pytest.fail, ("ran code from a weight file",))
-
     torch.save({"features.0.weight": Harmful()}, tmp_path / "harmful.pth")
     with pytest.raises(ValueError, match="cannot be read"):
         load_vgg16(tmp_path / "harmful.pth")
 
 
-def test_other_files_are_refused(tmp_path):
-    (tmp_path / "vgg.onnx").write_bytes(b"x")
-    with pytest.raises(ValueError, match=r"expected a \.npz, \.safetensors or \.pth"):
-        load_vgg16(tmp_path / "vgg.onnx")
-    with pytest.raises(ValueError, match=r"no VGG16 weights at .*absent"):
-        load_vgg16(tmp_path / "absent.pth")
+@pytest.mark.parametrize("suffix", [*CONTAINERS, ".onnx"])
+def test_damaged_and_other_files_are_refused_in_one_sentence(tmp_path, suffix):
+    path = tmp_path / f"damaged{suffix}"
+    with pytest.raises(ValueError, match=r"no VGG16 weights at .*damaged"):
+        load_vgg16(path)
+    path.write_bytes(b"this is not a weight file")
+    with pytest.raises(ValueError, match=r"VGG16 weights in .*damaged.*(cannot be read|expected a \.npz)"):
+        load_vgg16(path)

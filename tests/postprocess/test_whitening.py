@@ -11,10 +11,9 @@ VIEWS, IMAGES, SIZE = 5, 400, 12
 
 
 def planted(seed: int = 0) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Codes in which axes 0..2 say which image it is and axes 3..5, far larger, how it was lit.
+    """Codes in which axes 0..2 tell the image and axes 3..5, far larger, how it was lit, mixed by a rotation.
 
-    All axes are mixed by a rotation. Gives codes (views, images, size), the directions of the image's and
-    of the light's axes.
+    Gives codes (views, images, size), the directions of the image's and of the light's axes.
     """
     generator = torch.Generator().manual_seed(seed)
     codes = 0.05 * torch.randn(VIEWS, IMAGES, SIZE, generator=generator)
@@ -24,37 +23,41 @@ def planted(seed: int = 0) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     return codes @ rotation, rotation[:3], rotation[3:6]
 
 
+@pytest.fixture(scope="module")
+def codes() -> torch.Tensor:
+    return planted()[0]
+
+
+def fitted(codes, directions, shrinkage=0.0, **how):
+    return fit_projection(Scatter().add(codes), directions, shrinkage, **how)
+
+
 def test_directions_of_lighting_shrink_and_discriminative_ones_are_kept():
     codes, told, lit = planted()
-    found = fit_projection(Scatter().add(codes), directions=3, shrinkage=1e-6)
-    kept = (told @ found.map).norm(dim=1)
-    left = (lit @ found.map).norm(dim=1)
-    assert (kept > 10).all()  # 1 of identity counts 20 times the 0.05 that views move there
-    assert (left < 0.2).all()
-    every = fit_projection(Scatter().add(codes), directions=SIZE, shrinkage=1e-6).ratios
+    found = fitted(codes, 3, 1e-6)
+    assert ((told @ found.map).norm(dim=1) > 10).all()  # 1 of identity is 20 times what views move there
+    assert ((lit @ found.map).norm(dim=1) < 0.2).all()
+    every = fitted(codes, SIZE, 1e-6).ratios
     assert len(every) == SIZE
     assert every[:3].min() > 100 > 1 > every[3:].max()
     torch.testing.assert_close(found.ratios, every[:3])
 
 
-def test_renderings_of_one_picture_differ_by_one_in_every_kept_direction():
-    codes, _, _ = planted()
-    found = fit_projection(Scatter().add(codes), directions=5, shrinkage=0.0)
+def test_renderings_of_one_image_differ_by_one_in_every_kept_direction(codes):
+    found = fitted(codes, 5)
     features = (codes - found.mean) @ found.map
     within = (features - features.mean(dim=0)).flatten(0, 1)
-    covariance = within.T @ within / (IMAGES * (VIEWS - 1))
-    values = torch.linalg.eigvalsh(covariance)
+    values = torch.linalg.eigvalsh(within.T @ within / (IMAGES * (VIEWS - 1)))
     assert values[-5:] == pytest.approx(np.ones(5), abs=2e-3)
     assert values[:-5].abs().max() < 1e-4
     assert torch.linalg.matrix_rank(found.map, rtol=1e-4) == 5
 
 
-def test_at_evenness_one_pictures_differ_alike_in_every_kept_direction():
-    codes, _, _ = planted()
-    readings = codes.double()
+def test_at_evenness_one_images_differ_alike_in_every_kept_direction(codes):
+    codes = codes.double()
     for evenness in (0.0, 0.5, 1.0):
-        found = fit_projection(Scatter().add(codes), 5, 0.0, evenness=evenness)
-        features = (readings - found.mean) @ found.map.double()
+        found = fitted(codes.float(), 5, evenness=evenness)
+        features = (codes - found.mean) @ found.map.double()
         within = (features - features.mean(dim=0)).flatten(0, 1)
         total = within.T @ within / (IMAGES * (VIEWS - 1)) + torch.cov(features.mean(0).T, correction=0)
         variances = torch.linalg.eigvalsh(total)[-5:].numpy()
@@ -62,13 +65,23 @@ def test_at_evenness_one_pictures_differ_alike_in_every_kept_direction():
         assert variances == pytest.approx(expected.sort().values.numpy(), rel=1e-3)
 
 
+def test_directions_count_by_how_much_of_them_is_the_images_own(codes):
+    spread = Scatter().add(codes)
+    plain, weighted = fit_projection(spread, 3, 0.1), fit_projection(spread, 3, 0.1, power=2)
+    matrices = ((found.map.T @ spread.between.float() @ found.map) for found in (plain, weighted))
+    kept, shrunk = (torch.linalg.eigvalsh(matrix).flip(0)[:3] for matrix in matrices)
+    own = plain.ratios / (1 + plain.ratios)
+    torch.testing.assert_close(shrunk, kept * own**4, rtol=1e-3, atol=1e-5)
+
+
 def test_activations_longer_than_the_code_give_features_of_its_size_and_distinguish_more():
     told, _, _ = planted(0)
     code, _, lit = planted(1)
     code = code - code @ lit.T @ lit  # the code itself is distinguished by other images' axes
-    found = fit_projection(Scatter().add(torch.cat([code, told], dim=2)), 6, 1e-6, size=SIZE)
+    both = torch.cat([code, told], dim=2)
+    found = fitted(both, 6, 1e-6, size=SIZE)
     assert found.map.shape == (2 * SIZE, SIZE)
-    features = (torch.cat([code, told], dim=2) - found.mean) @ found.map
+    features = (both - found.mean) @ found.map
     assert torch.linalg.matrix_rank(features.flatten(0, 1), rtol=1e-4) == 6
     within = (features - features.mean(dim=0)).flatten(0, 1)
     assert torch.linalg.eigvalsh(within.T @ within)[-6:].max() < 1.1 * IMAGES * (VIEWS - 1)
@@ -76,45 +89,26 @@ def test_activations_longer_than_the_code_give_features_of_its_size_and_distingu
 
 
 def test_features_stand_in_the_place_of_the_code_that_they_are_nearest_to():
-    codes = torch.randn(3, 200, 4, generator=torch.Generator().manual_seed(0)) * torch.tensor(
-        [1.0, 2.0, 3.0, 4.0]
-    )
-    codes = codes.mean(dim=0) + 0.1 * torch.randn(3, 200, 4, generator=torch.Generator().manual_seed(1))
-    found = fit_projection(Scatter().add(codes), 4, 0.0)
+    generator = torch.Generator().manual_seed(0)
+    own = torch.randn(1, 200, 4, generator=generator) * torch.tensor([0.6, 1.2, 1.8, 2.4])
+    codes = own + 0.1 * torch.randn(3, 200, 4, generator=generator)
+    found = fitted(codes, 4)
     features = ((codes - found.mean) @ found.map).flatten(0, 1)
     together = torch.corrcoef(torch.cat([codes.flatten(0, 1), features], dim=1).T)[:4, 4:]
     assert (together.diagonal() > 0.95).all()
     assert (together - torch.diag(together.diagonal())).abs().max() < 0.3
 
 
-def test_codes_where_activations_are_needed_are_refused():
-    whitening = Whitening({"geometry": fit_projection(Scatter().add(planted()[0]), 3, 0.1)})
-    with pytest.raises(ValueError, match="features of geometry are made of 12 numbers, got 7"):
-        whitening({"geometry": torch.zeros(2, 7)})
-
-
-def test_codes_that_never_move_are_survived():
+def test_codes_that_never_move_are_survived_and_too_few_refused():
     codes = torch.zeros(3, 10, 4)
-    found = fit_projection(Scatter().add(codes), 2, 0.1)
-    assert torch.isfinite(found.map).all()
-    assert ((codes - found.mean) @ found.map).abs().max() == 0
+    found = fitted(codes, 2, 0.1)
+    assert torch.isfinite(found.map).all() and ((codes - found.mean) @ found.map).abs().max() == 0
+    for few in (codes[:1], codes[:, :1]):
+        with pytest.raises(ValueError, match="at least 2 views of 2 images"):
+            fitted(few, 2, 0.1)
 
 
-@pytest.mark.parametrize("shape", [(1, 10, 4), (3, 1, 4)])
-def test_one_view_or_one_image_is_refused(shape):
-    with pytest.raises(ValueError, match="at least 2 views of 2 images"):
-        fit_projection(Scatter().add(torch.zeros(shape)), 2, 0.1)
-
-
-def test_maps_that_do_not_fit_are_refused(tmp_path):
-    wrong = {"geometry_mean": torch.zeros(4), "geometry_map": torch.eye(3), "geometry_ratios": torch.ones(4)}
-    save_file(wrong, tmp_path / "w")
-    with pytest.raises(ValueError, match=r"geometry: a map of \(3, 3\) beside a mean of 4"):
-        Whitening.load(tmp_path / "w")
-
-
-def test_sums_over_batches_are_those_of_all_at_once():
-    codes = planted()[0]
+def test_sums_over_batches_are_those_of_all_at_once(codes):
     whole, parts = Scatter().add(codes), Scatter()
     for batch in codes.split(37, dim=1):
         parts.add(batch)
@@ -126,38 +120,33 @@ def test_sums_over_batches_are_those_of_all_at_once():
         torch.testing.assert_close(found.between, between, rtol=1e-6, atol=1e-9)
 
 
-def test_mirrored_maps_take_the_mean_of_both_readings():
-    codes = planted()[0]
-    found = fit_projection(Scatter().add(codes), 3, 0.1)
+def test_mirrored_maps_take_the_mean_of_both_readings_and_all_of_them(codes):
+    found, (own, mirror) = fitted(codes, 3, 0.1), codes[:2]
     plain, both = Whitening({"geometry": found}), Whitening({"geometry": found}, mirrored=["geometry"])
-    own, mirror = codes[0], codes[1]
     expected = (plain({"geometry": own})["geometry"] + plain({"geometry": mirror})["geometry"]) / 2
     got = both({"geometry": torch.cat([own, mirror], dim=1)})["geometry"]
     torch.testing.assert_close(got, expected, rtol=1e-4, atol=1e-5)
-    with pytest.raises(ValueError, match="give what model"):
-        both({"geometry": own})
+    for whitening, few in ((both, own), (plain, own[:, :7])):
+        with pytest.raises(ValueError, match=r"features of geometry are made of .* give what model"):
+            whitening({"geometry": few})
 
 
-def test_of_several_maps_each_is_read_again_as_it_was_written(tmp_path):
-    codes = planted()[0]
-    maps = {name: fit_projection(Scatter().add(codes), 3, 0.1) for name in ("geometry", "light")}
-    for mirrored in (["geometry"], ["geometry", "light"], []):
-        written = Whitening(maps, mirrored=mirrored)
-        written.save(tmp_path / "whitening.safetensors")
-        again = Whitening.load(tmp_path / "whitening.safetensors")
-        assert again.mirrored == written.mirrored == set(mirrored)
-        readings = {
-            name: torch.cat([codes[0], codes[1]], dim=1) if name in mirrored else codes[0] for name in maps
-        }
-        for name, feature in written(readings).items():
-            assert torch.equal(again(readings)[name], feature)
+@pytest.mark.parametrize("mirrored", [["geometry"], ["geometry", "light"], []])
+def test_of_several_maps_each_is_read_again_as_it_was_written(codes, tmp_path, mirrored):
+    maps = {name: fitted(codes, 3, 0.1) for name in ("geometry", "light")}
+    written = Whitening(maps, mirrored=mirrored)
+    written.save(tmp_path / "whitening.safetensors")
+    again = Whitening.load(tmp_path / "whitening.safetensors")
+    assert again.mirrored == written.mirrored == set(mirrored)
+    both = torch.cat([codes[0], codes[1]], dim=1)
+    given = {name: both if name in mirrored else codes[0] for name in maps} | {"camera": codes[0]}
+    found = written(given)
+    assert found.keys() == maps.keys() and all(torch.equal(again(given)[name], found[name]) for name in found)
+    assert written.state_dict() == {}  # a model's weights are the same with it and without
 
 
-def test_directions_count_by_how_much_of_them_is_the_pictures_own():
-    spread = Scatter().add(planted()[0])
-    plain, weighted = fit_projection(spread, 3, 0.1), fit_projection(spread, 3, 0.1, power=2)
-    before, after = ((found.map.T @ spread.between.float() @ found.map) for found in (plain, weighted))
-    own = plain.ratios / (1 + plain.ratios)
-    kept, shrunk = (torch.linalg.eigvalsh(matrix).flip(0)[:3] for matrix in (before, after))
-    torch.testing.assert_close(shrunk, kept * own**4, rtol=1e-3, atol=1e-5)
-    torch.testing.assert_close(fit_projection(spread, 3, 0.1, power=0).map, plain.map)
+def test_maps_that_do_not_fit_are_refused(tmp_path):
+    wrong = {"geometry_mean": torch.zeros(4), "geometry_map": torch.eye(3), "geometry_ratios": torch.ones(4)}
+    save_file(wrong, tmp_path / "w")
+    with pytest.raises(ValueError, match=r"geometry: a map of \(3, 3\) beside a mean of 4"):
+        Whitening.load(tmp_path / "w")
