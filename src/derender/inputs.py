@@ -30,13 +30,11 @@ def as_model(
     Args:
         model: a model, a run folder, a saved folder, a bundled name or a Hugging Face Hub id.
         device: "auto", "cpu" or "cuda", for a model that is loaded here.
-        fit_steps: Adam steps of test-time optimisation that its features are made with; 0 makes none, None
-            keeps the model's own.
+        fit_steps: Adam steps of test-time optimisation for its features; 0 makes none, None keeps its own.
 
     Raises:
         FileNotFoundError: no model is there.
-        ValueError: the model is damaged, has weights that are NaN or infinite, or cannot be optimised per
-            image.
+        ValueError: the model is damaged, has weights that are not finite, or cannot be optimised per image.
     """
     if isinstance(model, Derenderer):
         source, loaded = str(model.source or "this model"), model
@@ -76,12 +74,10 @@ def as_images(
     Args:
         images: a set, or a folder, zip, ``PATH::SUBSET``, shards or Hugging Face id.
         image_size: side in pixels to read at.
-        dataset: the layout's name, or "auto" to recognise it.
-        limit: at most so many images, evenly spaced in the sorted list; of a stream the first.
-        part: "all", or the "train", "validation" or "test" part of the split that ``model`` was trained with.
-        model: a run folder or a saved model that records its split.
-        at_least: fewer images raise an error.
-        keep_duplicates: keep every one of identical images.
+        dataset, limit: the layout's name, or "auto"; at most so many images, evenly spaced in the sorted
+        list.
+        part, model: "all", or the "train", "validation" or "test" part of the split that a model records.
+        at_least, keep_duplicates: fewer images raise an error; keep every one of identical images.
         progress: called with (done, total) while reading.
     """
     if not isinstance(images, ImageSet):

@@ -1,7 +1,7 @@
 """Stages 1 to 4 joined: images to scenes and features, scenes to images.
 
-Source: Klinghoffer et al., ECCV 2022, Sec. 3; networks and scene of unsup3d (Wu et al., CVPR 2020).
-Training lives in training/, scores in evaluation/, saving in storage/; the model knows none of them.
+Source: Klinghoffer et al., ECCV 2022, Sec. 3; networks and scene of unsup3d (Wu et al., CVPR 2020). Training
+lives in training/, scores in evaluation/, saving in storage/; the model knows none of them.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -160,11 +160,9 @@ def load(
 
     Args:
         source: a run folder, a saved folder, the name of a bundled model (`bundled_models`), or a Hugging
-        Face
-            Hub id ("owner/name", downloaded and cached).
+        Face Hub id ("owner/name", downloaded and cached).
         device: where to put it.
-        factors: the rows the model was made with, if not the paper's four.
-        renderer: the renderer it was made with, if not the project's own.
+        factors, renderer: what the model was made with, if not the paper's four and the project's own.
 
     Raises:
         FileNotFoundError: there is no model.

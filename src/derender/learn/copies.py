@@ -96,8 +96,8 @@ def refine(
     """A copy of a model that predicts at once the scenes that test-time optimisation finds slowly.
 
     Scenes are fitted to these images once, without labels; then the encoders learn to predict them. Every
-    tenth image is held out: errors are measured on those. Arguments are those of `whiten`, for a model with
-    a fitting (`whiten` makes one); settings are changes of `RefineConfig`, as ``{"refining.images": 9000}``.
+    tenth image is held out: errors are measured on those. Arguments are those of `whiten`, for a model with a
+    fitting (`whiten` makes one); settings are changes of `RefineConfig`, as ``{"refining.images": 9000}``.
 
     Returns:
         The copy; "held_out" is the number of held-out images, "errors" and "gaps" are those of `Refined`.

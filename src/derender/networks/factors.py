@@ -119,10 +119,7 @@ def _radians(angle_deg: float) -> float:
 
 
 def map_net(channels: int, initial_scale: float = 1.0) -> Callable[[NetworkSettings], FactorNet]:
-    """Builder of a network that predicts an image-sized map.
-
-    ``initial_scale`` shrinks the last layer's first weights, for maps that must not start as noise.
-    """
+    """Builder of a network for an image-sized map, whose last layer's first weights are scaled."""
 
     def build(settings: NetworkSettings) -> FactorNet:
         if settings.encoder == "unet":

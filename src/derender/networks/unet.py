@@ -1,8 +1,8 @@
 """The expanding half of a U-Net, over the skip features of one encoder or of several side by side.
 
 Source: Ronneberger et al., MICCAI 2015; Klinghoffer et al., ECCV 2022, Sec. 4.7 joins two encoders by
-stacking
-their features at each skip, and here at the centre, too. Leaves out cropping: convolutions are padded.
+stacking their features at each skip, and here at the centre, too. Leaves out cropping: convolutions are
+padded.
 """
 
 import copy
@@ -58,8 +58,8 @@ class SegmentationNet(nn.Module):
         frozen: encoders never change: weights take no gradient, and statistics are kept.
         kept_statistics: the encoders' BatchNorm keeps the statistics it came with in training, too; beside a
             ``decoder`` that of the two finest levels of either.
-        decoder: one that has learnt over these encoders, of which all but the last layer is taken. Without
-            it the decoder is fresh.
+        decoder: one that has learnt over these encoders, of which all but the last layer is taken. Without it
+            the decoder is fresh.
     """
 
     def __init__(

@@ -1,10 +1,9 @@
 """The weights in a checkpoint of unsup3d (Wu et al., CVPR 2020), as those of our networks.
 
 Tensors are matched by net (``netD`` depth, ``netA`` albedo, ``netL`` light, ``netV`` view, ``netC``
-confidence)
-and order, and every shape is compared. 1x1 convolutions become linear layers, and light comes as (ambient,
-diffuse, x, y) where derender has pitch, y, first. The file is a pickle, read with torch's reader for weights:
-other objects become empty ones, no code is run. Leaves out the ranges, which no file holds.
+confidence) and order, and every shape is compared. 1x1 convolutions become linear layers, and light comes as
+(ambient, diffuse, x, y) where derender has pitch, y, first. The file is a pickle, read with torch's reader
+for weights: other objects become empty ones, no code is run. Leaves out the ranges, which no file holds.
 """
 
 import pickle

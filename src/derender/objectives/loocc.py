@@ -1,8 +1,7 @@
 """Leave-one-out, cycle contrastive loss (LOOCC): what was not perturbed must be recognised again.
 
 Source: the paper, section 3.2; NT-Xent from SimCLR (Chen et al. 2020). Left open there: the perturbed factor
-is
-drawn per image, which is absent from the contrast of that factor altogether; the loss is the mean over all
+is drawn per image, which is absent from the contrast of that factor altogether; the loss is the mean over all
 contrasted (image, factor); a factor that fewer than two images kept is dropped. Leaves out the perturbation
 (scene/perturb.py) and the encoding of the new rendering.
 """

@@ -100,8 +100,7 @@ class EmbeddingModel(nn.Module):
         """Scenes optimised per image, images in 0..1: from ``decompose`` on, downhill through the renderer.
 
         A hundred times as slow as ``decompose``, with a smaller error, also under other lighting and
-        viewpoints. A
-        model without a fitting (``derender whiten`` makes one) is a ValueError.
+        viewpoints. A model without a fitting (``derender whiten`` makes one) is a ValueError.
         """
         refuse_not_finite(images)
         fitting = self.features.required_fitting()

@@ -35,11 +35,7 @@ class Projection:
 
 
 class Scatter:
-    """Within-class and between-class covariance of activations, one class an image, summed batch by batch.
-
-    Attributes:
-        views, count: activations of each image, and images so far.
-    """
+    """Within-class and between-class covariance, one class an image, of so many views of ``count`` images."""
 
     def __init__(self) -> None:
         self.views = self.count = 0
@@ -118,8 +114,7 @@ class Whitening(nn.Module):
     """The projections of some factors, applied to activations by name; gives those factors' features alone.
 
     A projection takes the first of the activations, as many as it has rows. Those of names in ``mirrored``
-    take
-    the mean over an image and its mirror image, whose activations follow.
+    take the mean over an image and its mirror image, whose activations follow.
     """
 
     def __init__(self, projections: Mapping[str, Projection], *, mirrored: Collection[str] = ()):

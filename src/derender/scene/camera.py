@@ -2,8 +2,8 @@
 
 Frames: camera at the origin looking along +z, x right, y down. The canonical frame has the same axes; the
 object rotates about its centre c = (0, 0, 1). Pixel centres lie at integers, pixels are square, the principal
-point is ((W-1)/2, (H-1)/2). A camera is (rx, ry, rz, tx, ty, tz), radians and scene units.
-Leaves out lens distortion and any focal length that varies over the batch.
+point is ((W-1)/2, (H-1)/2). A camera is (rx, ry, rz, tx, ty, tz), radians and scene units. Leaves out lens
+distortion and any focal length that varies over the batch.
 """
 
 import math

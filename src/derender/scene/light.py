@@ -1,8 +1,8 @@
 """One ambient plus one directional light: its direction, and Lambertian shading.
 
 A light is (ambient, diffuse, pitch, yaw), angles in radians. The direction is the one in which light travels,
-(tan yaw, tan pitch, 1) normalised: yaw > 0 lights the left of the image, pitch > 0 lights from above.
-Leaves out cast shadows, specular reflection and gamma.
+(tan yaw, tan pitch, 1) normalised: yaw > 0 lights the left of the image, pitch > 0 lights from above. Leaves
+out cast shadows, specular reflection and gamma.
 """
 
 import torch

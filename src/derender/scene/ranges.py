@@ -1,7 +1,7 @@
 """Which values a scene may take: the bounds that networks' raw outputs are scaled to.
 
-Source: unsup3d's published settings for faces and cats; cars differ in border depth, diffuse range
-and translation. Angles are degrees here because people write settings; radians everywhere else.
+Source: unsup3d's published settings for faces and cats; cars differ in border depth, diffuse range and
+translation. Angles are degrees here because people write settings; radians everywhere else.
 """
 
 import math

@@ -78,11 +78,7 @@ _CAMERA_SIGNS = (1.0, -1.0, -1.0, -1.0, 1.0, 1.0)  # rotation about x, y, z; tra
 
 
 def seen_in_mirror(scene: Scene) -> Scene:
-    """Scenes whose images are the mirror images (left to right) of these scenes' images.
-
-    Raises:
-        ValueError: there are further factors, for which no mirror image is defined.
-    """
+    """Scenes whose images are the mirror images of these scenes' images; further factors are a ValueError."""
     if scene.extra:
         raise ValueError(f"what a mirror does to {', '.join(scene.extra)} is not known")
     return Scene(

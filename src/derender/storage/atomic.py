@@ -1,8 +1,8 @@
 """Files and folders that appear complete or not at all, and folders with checksums of their files.
 
 Both are written under another name beside their place and moved there at the end: a kill or a full disk
-leaves
-the previous content. The checksums of a sealed folder show a changed bit; they protect from no attacker.
+leaves the previous content. The checksums of a sealed folder show a changed bit; they protect from no
+attacker.
 """
 
 import ctypes
@@ -58,8 +58,7 @@ def atomic_folder(folder: Path, *, previous: Path | None = None) -> Iterator[Pat
     """Give a temporary folder to fill; it takes the place of ``folder``, if nothing is raised.
 
     The old one becomes ``previous``, or is deleted. They are exchanged in one step where the system can
-    (Linux);
-    elsewhere the old one is moved first.
+    (Linux); elsewhere the old one is moved first.
     """
     folder.parent.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(prefix=_prefix(folder), dir=folder.parent))

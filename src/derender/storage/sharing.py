@@ -77,9 +77,8 @@ class Shareable:
     ) -> str:
         """Upload the model to the Hugging Face Hub as ``save_pretrained`` writes it; returns its address.
 
-        Raises:
-            ValueError: it has no card, and its data and licence are not given.
-            PermissionError, ConnectionError: the Hub refuses, or cannot be reached.
+        A ValueError: no card, data and licence; PermissionError, ConnectionError: the Hub refuses or is not
+        reached.
         """
         beside = texts_beside(self.source, self.tensors())
         if not (card or (data and licence) or CARD_FILE in beside):

@@ -196,10 +196,9 @@ def resolve(preset: str, overrides: Iterable[str] = (), **explicit: Any) -> Trai
     """The configuration of a run: a preset, then ``key=value`` overrides, then explicit dotted keys.
 
     Keys are dotted (``optimiser.learning_rate``); a unique last part may stand alone. Values are read as
-    YAML. In
-    ``explicit`` dots are written as double underscores and None means not given. With ``start_from`` the
-    model
-    has that model's settings (without a U-Net decoder) instead of the preset's, before overrides change them.
+    YAML. In ``explicit`` dots are written as double underscores and None means not given. With ``start_from``
+    the model has that model's settings (without a U-Net decoder) instead of the preset's, before overrides
+    change them.
 
     Raises:
         ValueError: unknown preset or key (names the nearest), or a value that does not fit.

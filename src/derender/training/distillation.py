@@ -298,10 +298,7 @@ def _where(rows: Tensor, one: Tensor, other: Tensor) -> Tensor:
 
 
 class SceneUnit:
-    """The unit of errors: the mean deviation of fitted scenes from their mean.
-
-    Numbers that the model cannot change (a translation whose range is 0) do not count.
-    """
+    """The unit of errors: the mean deviation of fitted scenes, of numbers that the model can change."""
 
     @torch.no_grad()
     def __init__(self, model: Derenderer, fitted: Scene):

@@ -2,8 +2,8 @@
 
 Each rank (one process, one device) takes its rows of every batch. What couples the images of a batch goes
 through `Ranks`, with gradient where one is due: a rank's loss is its share of the whole, such that the mean
-over ranks is the loss of the batch, and DDP averages gradients accordingly. Processes are started by
-torchrun and joined by Lightning Fabric. Leaves out splitting a model over devices.
+over ranks is the loss of the batch, and DDP averages gradients accordingly. Processes are started by torchrun
+and joined by Lightning Fabric. Leaves out splitting a model over devices.
 """
 
 import logging

@@ -332,9 +332,7 @@ def passed(before: int, now: int, interval: int, *, ended: bool) -> bool:
 
 
 def kept(before: int, now: int, interval: int, *, ended: bool) -> bool:
-    """Whether a state in (before, now] is to be kept: as ``passed``, and at halves of the first interval.
-
-    Down to ``FIRST_KEPT_IMAGES``, so that a collapse, which comes early if at all, leaves a good state
+    """As ``passed``, and at halves of the first interval: a collapse comes early and leaves a good state
     behind.
     """
     early = interval // 2

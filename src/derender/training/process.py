@@ -21,10 +21,7 @@ class TrainingInterrupted(KeyboardInterrupt):
 
 @contextmanager
 def stop_on_signal() -> Iterator[threading.Event]:
-    """Turn the first Ctrl-C or SIGTERM into an event; a second one ends the program at once.
-
-    Outside the main thread signals cannot be caught, and the event never comes.
-    """
+    """Turn the first Ctrl-C or SIGTERM, in the main thread, into an event; a second one ends the program."""
     stop = threading.Event()
 
     def note(number: int, frame: object) -> None:

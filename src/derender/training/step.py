@@ -147,8 +147,7 @@ def perturb_one_factor(
     """Change one factor of every scene, drawn per image; also which, as an index into ``model.factors``.
 
     Ranks draw for all of the batch, as one process would. A ValueError: ``objective.loocc`` names no factor
-    of
-    the model that can be perturbed.
+    of the model that can be perturbed.
     """
     factors = _contrasted(model, objective)
     if not factors:
@@ -194,8 +193,7 @@ def cycle_loss(
     """How far light and camera, predicted from a rendering, are from those it was rendered with; best 0.
 
     Mean absolute difference (radians, intensities, scene units) over the perturbed vector factors; the
-    rendered
-    scene is a fixed, exact target for what an image alone leaves open (pitch above all).
+    rendered scene is a fixed, exact target for what an image alone leaves open (pitch above all).
     """
     total = rendered.depth.new_zeros(())
     for factor in _contrasted(model, objective):
@@ -217,8 +215,8 @@ def in_chunks(function: Callable[[Columns], Columns], inputs: Columns, chunks: i
     """Apply a function of rows to ``inputs`` in chunks of rows, each computed again in backward.
 
     A row's output must not depend on other rows, as under batch norm. Source: gradient caching (Gao et al.
-    2021),
-    through torch's activation checkpointing: losses and gradients of the batch for one more forward pass.
+    2021), through torch's activation checkpointing: losses and gradients of the batch for one more forward
+    pass.
     """
     if chunks == 1:
         return dict(function(inputs))
@@ -234,9 +232,7 @@ def in_chunks(function: Callable[[Columns], Columns], inputs: Columns, chunks: i
 def own_share(objective: ObjectiveSettings, done: float) -> float:
     """The template start: an image's share in its own maps after this share of the run, 0 (all shared) to 1.
 
-    While all images share the same maps only camera and light can explain how they differ, so both are
-    learnt.
-    Then each image's own code is let in gradually.
+    While maps are shared only camera and light can explain how images differ, so both are learnt.
     """
     if done < objective.template_share:
         return 0.0

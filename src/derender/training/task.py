@@ -127,13 +127,12 @@ class TrainResult:
 
     Attributes:
         folder: the run folder; `derender.load` takes it.
-        images: images seen.
-        seconds: time spent training, resumed parts included.
-        images_per_second: of this call.
+        images, seconds: images seen, and time spent training, resumed parts included.
+        images_per_second, waiting: of this call; the latter the share of its time spent waiting for images,
+        0..1.
         validation: last validation losses by name.
         stopped: "images", "minutes", "patience" or "collapse".
         findings: what the watcher found last; empty without problems.
-        waiting: share of this call's time spent waiting for images, 0..1.
         model_images: images that the weights of the saved model had seen; None where that is unknown.
     """
 

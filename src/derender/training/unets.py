@@ -72,8 +72,7 @@ class DistilledUNets:
     Attributes:
         model: the copy, in evaluation mode and without whitening or fitting.
         errors: mean absolute error of up to 256 images: "place" (pixels), "depth" (share of the range),
-        "albedo"
-            (0..1), and "reconstruction" of the copy beside "reconstruction before".
+        "albedo" (0..1), and "reconstruction" of the copy beside "reconstruction before".
     """
 
     model: Derenderer

@@ -127,11 +127,7 @@ def not_finite(what: str) -> Finding:
 
 @dataclass
 class FiniteWatch:
-    """Looks at every step for a loss that is not finite: the watcher of what has no scene.
-
-    Attributes:
-        uneasy: whether the present state is no good checkpoint.
-    """
+    """Looks for a loss that is not finite; while ``uneasy``, the present state is no good checkpoint."""
 
     uneasy: bool = field(default=False, init=False)
 
@@ -227,9 +223,9 @@ def measure(scene: Scene, ranges: SceneRanges) -> dict[str, float]:
     """The measurements of all signs, each a mean over the batch.
 
     depth_at_bound, view_at_bound, light_at_bound: shares, 0..1. depth_spread: standard deviation of a depth
-    map over its range. depth_roughness: mean step between neighbours over that deviation. bulge: how far
-    the rim lies behind the middle, over the range; negative is hollow. shading_contrast: standard deviation
-    of the shading in an image over its mean.
+    map over its range. depth_roughness: mean step between neighbours over that deviation. bulge: how far the
+    rim lies behind the middle, over the range; negative is hollow. shading_contrast: standard deviation of
+    the shading in an image over its mean.
     """
     columns = ranges.border_columns(scene.depth.shape[-1])
     depth = scene.depth[..., columns:-columns] if columns else scene.depth
