@@ -31,12 +31,6 @@ def test_the_papers_decoder_has_the_parameters_of_its_widths():
         assert found == expected
 
 
-@pytest.mark.parametrize("size", [32, 64])
-def test_one_logit_for_each_class_and_pixel(size):
-    net = SegmentationNet([encoder(0, size), encoder(1, size)], CLASSES).eval()
-    assert net(torch.rand(2, 3, size, size)).shape == (2, CLASSES, size, size)
-
-
 def test_the_joint_net_uses_both_centres_once():
     """Gradients reach both centres; the first step up has a channel for each of theirs, in order."""
     one, two = encoder(0), encoder(1)

@@ -10,7 +10,7 @@ from derender.model import Derenderer
 from derender.objectives import SelfFeatures
 from derender.render import render_scene
 from derender.training.config import ObjectiveSettings, resolve
-from derender.training.step import in_chunks, training_step
+from derender.training.step import training_step
 
 OBJECTIVE = ObjectiveSettings(loocc="all", cycle_weight=1.0, smoothness_weight=0.1)
 FEATURES = SelfFeatures((4, 8, 8))
@@ -53,22 +53,3 @@ def test_a_batch_in_chunks_has_the_losses_and_gradients_of_the_whole(exactly, ge
         for name, gradient in gradients.items():
             scale = gradient.abs().max().clamp(min=1e-12)
             assert (same[name] - gradient).abs().max() <= 1e-9 * scale, name
-
-
-def test_only_one_chunk_is_held_at_a_time():
-    """What is saved for backward grows with a chunk, not with the batch."""
-    net = nn.Sequential(*[nn.Sequential(nn.Linear(8, 8), nn.Tanh()) for _ in range(20)])
-    rows = torch.rand(64, 8)
-
-    def kept(chunks: int) -> int:
-        sizes: list[int] = []
-
-        def count(tensor: torch.Tensor) -> torch.Tensor:
-            sizes.append(tensor.numel())
-            return tensor
-
-        with torch.autograd.graph.saved_tensors_hooks(count, lambda tensor: tensor):
-            in_chunks(lambda columns: {"y": net(columns["x"])}, {"x": rows}, chunks)
-        return sum(sizes)
-
-    assert kept(4) < kept(1) / 10

@@ -12,7 +12,6 @@ from derender.postprocess import Features
 from derender.postprocess.fitting import Fitting, FittingSettings, coordinates_of
 from derender.postprocess.morphable import MorphableMaps
 from derender.scene.perturb import PerturbSettings
-from derender.storage.folder import FITTING_FILE, WHITENING_FILE
 from derender.training.config import FeatureSettings, WhiteningSettings, with_changes
 from derender.training.features import BATCH_SIZE, fit_whitening, make_features, make_fitting
 
@@ -57,16 +56,6 @@ def test_features_of_unseen_images_follow_other_factors_less_than_codes(plain, w
         assert after[place, place] > 0.95 * before[place, place]
 
 
-def test_scenes_are_those_of_the_codes_and_the_fingerprint_changes(plain, white, images):
-    some = images[:4].float() / 255
-    with torch.no_grad():
-        codes, features = white.encode(some), white.embed(some)
-        assert torch.equal(white.decompose(some).depth, white.decode(codes).depth)
-    for name, feature in features.items():
-        assert feature.shape == codes[name].shape and not torch.allclose(feature, codes[name])
-    assert model_fingerprint(plain) != model_fingerprint(white)
-
-
 def test_light_and_camera_keep_their_codes_without_vectors(plain, white, images):
     model = whitened(plain, images[:80], CODES_OF_VECTORS)
     for name in ("geometry_map", "albedo_map"):
@@ -94,24 +83,6 @@ def test_a_mirror_image_has_the_features_of_the_image_where_both_are_read(plain,
         assert torch.allclose(one[name], two[name], atol=1e-4) is mirrored
         assert torch.equal(kept[name], one[name])
     assert not torch.allclose(one["camera"], two["camera"], atol=1e-2)
-
-
-@pytest.mark.parametrize("file", [WHITENING_FILE, FITTING_FILE])
-def test_a_damaged_file_is_named(fitted, tmp_path, file):
-    folder = fitted.save(tmp_path / "model")
-    (folder / file).write_bytes(b"not a safetensors file")
-    with pytest.raises(ValueError, match="is damaged"):
-        derender.load(folder)
-
-
-def test_fitted_renderings_come_nearer_to_the_image(fitted, images):
-    some = images[:8].float() / 255
-    found = fitted.fit_scenes(some, 20)
-    assert found.after.mean() < 0.9 * found.before.mean()
-    predicted, optimised = (fitted.render(scene) for scene in (fitted.decompose(some), found.scene))
-    both = (predicted.mask * optimised.mask)[:, None]
-    apart = [((made.image - some).abs() * both).sum() / both.sum() for made in (predicted, optimised)]
-    assert both.mean() > 0.5 and apart[1] < 0.9 * apart[0]
 
 
 def test_fitted_coordinates_follow_the_feed_forward_features_with_the_set_length(fitted, images):
