@@ -264,10 +264,9 @@ def finch_levels(features: np.ndarray, labels: np.ndarray, memory: Memory | None
     labels = np.asarray(labels)
     known = ~missing(labels)
     hierarchy = finch_hierarchy(np.asarray(features)[known], memory)
-    return tuple(
-        Level(count, cluster_scores(labels[known], partition), chance_scores(labels[known], partition))
-        for count, partition in zip(hierarchy.counts, hierarchy.partitions, strict=True)
-    )
+    counted = zip(hierarchy.counts, hierarchy.partitions, strict=True)
+    own = labels[known]
+    return tuple(Level(count, cluster_scores(own, one), chance_scores(own, one)) for count, one in counted)
 
 
 def finch_table(name: str, levels: Sequence[Level], classes: int) -> ScoreTable:

@@ -45,7 +45,7 @@ def copy_cost(
         raise ValueError(f"the models have other factors: {', '.join(names[0])}; {', '.join(names[1])}")
     passes = []
     for number, one in enumerate((model, copy)):
-        report = None if progress is None else partial(_pass, progress, number)
+        report = progress and partial(lambda start, done, of: progress(start * of + done, 2 * of), number)
         passes.append(embed_images(one, images, progress=report))
     moved = {}
     for name in names[0]:
@@ -54,7 +54,3 @@ def copy_cost(
         moved[name] = float(np.linalg.norm(own - other, axis=1).mean() / apart) if apart else 0.0
     errors = [evaluate_reconstruction(one, images).model.l1 for one in (copy, model)]
     return CopyCost(moved, *errors)
-
-
-def _pass(progress: Progress, number: int, done: int, of: int) -> None:
-    progress(number * of + done, 2 * of)

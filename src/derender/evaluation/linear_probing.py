@@ -49,7 +49,7 @@ LINEAR_COLUMNS = {
     "balanced_accuracy": Column("balanced", "high", note="mean recall over values or classes, 0 to 1"),
     "average_precision": Column("AP", "high", note="average precision, 0 to 1"),
 }
-FINETUNED = "fine-tuned"
+FINETUNED, ABOVE = "fine-tuned", "above the strongest control?"
 PROBE_NAMES = {**PROBES, FINETUNED: "the paper's head, encoders trained too"}
 
 
@@ -230,24 +230,17 @@ def _row(
 
 def linear_tables(found: LinearComparison) -> list[ScoreTable]:
     """Every head at every number of labels, each with its differences to the strongest control."""
-    tables = []
-    for part in found.parts:
-        caption = f"{part.count:,} labelled rows, {part.head}: above the strongest control?"
-        tables += [linear_part_table(found, part), verdict_table(part.rows, LINEAR_COLUMNS, caption)]
-    return tables
-
-
-def linear_part_table(found: LinearComparison, part: LinearPart) -> ScoreTable:
-    """One head at one number of labels: a row for each feature and control."""
-    count = len(found.names)
+    tables, count = [], len(found.names)
     asked = f"{count} classes" if found.kind == "classes" else f"mean of {count} yes/no labels"
-    caption = (
-        f"{part.count:,} labelled rows, {PROBE_NAMES[part.head]}: {found.n_test:,} rows tested, {asked}, "
-        f"{len(found.seeds)} seeds"
-    )
+    asked = f"{found.n_test:,} rows tested, {asked}, {len(found.seeds)} seeds"
     if found.n_dropped:
-        caption += f"; {found.n_dropped:,} rows without label left out"
-    return scored_table(caption, "features", part.rows, LINEAR_COLUMNS)
+        asked += f"; {found.n_dropped:,} rows without label left out"
+    for part in found.parts:
+        rows = f"{part.count:,} labelled rows"
+        caption, judged = f"{rows}, {PROBE_NAMES[part.head]}: {asked}", f"{rows}, {part.head}: {ABOVE}"
+        tables.append(scored_table(caption, "features", part.rows, LINEAR_COLUMNS))
+        tables.append(verdict_table(part.rows, LINEAR_COLUMNS, judged))
+    return tables
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,6 @@ from derender.evaluation.clustering_scores import CLUSTER_COLUMNS
 from derender.evaluation.controls import with_controls
 from derender.evaluation.feature_rows import (
     FeatureSource,
-    ModelSource,
     chosen_labels,
     is_model,
     prepare,
@@ -74,14 +73,27 @@ def compare(
     spec, how = table_named(table), Options(images=images, **options)
     models = {name: [run for run in runs_of(runs) if is_model(run)] for name, runs in features.items()}
     models = {name: runs for name, runs in models.items() if runs}
-    numbers = {"table": spec.name, "number": spec.number}
+    numbers = {"table": table, "number": spec.number}
     if spec.kind == "segment":
         if images is None or isinstance(images, ImageSet) or not models or len(models) < len(features):
             raise ValueError(
                 f"table {table!r} trains nets from a model's encoders, and features do not do: give models "
                 "and the address of images that have masks"
             )
-        tables, values = _segmentations(models, spec.parts[0].paper, images, masks, epochs, seeds, how)
+        tables, values = [], {}
+        for name, (model, *others) in models.items():
+            if others:
+                raise ValueError(f"two models have the name {name!r}: give each its own")
+            found = segment(
+                as_model(model, device=how.device), images, masks=masks, dataset=how.dataset,
+                limit=how.limit, variants=PAPER_VARIANTS, seeds=how.seeds(seeds),
+                settings=SegmentSettings(epochs=epochs), resample_count=how.resamples, memory=how.memory,
+                progress=how.progress,
+            )  # fmt: skip
+            shown = (found.tables[-1], *found.tables[:-1])
+            tables += [replace(one, caption=f"{name}: {one.caption}") for one in shown]
+            more = {"differs": found.result.differs, "paper": spec.parts[0].paper}
+            values[name] = {**found.result.numbers(), **more}
         return Scores(tables, {**numbers, "parts": values}, [how.memory.summary()])
     if masks is not None:
         raise ValueError(f"masks go with the table of segmentation, not with {table}")
@@ -96,7 +108,7 @@ def compare(
         needed = " or ".join(", ".join(part.labels) for part in spec.parts)
         have = ", ".join(first.labels) or "none"
         raise ValueError(
-            f"table {spec.name!r} needs labels ({needed}), the features have {have}: embed other data"
+            f"table {table!r} needs labels ({needed}), the features have {have}: embed other data"
         )
     tables, values, notes = [], {}, list(how.notes)
     for part in parts:
@@ -183,29 +195,3 @@ def heads_table(caption: str, found: LinearComparison, paper: Sequence[PaperRow]
         if set(scores) & set(columns)
     ]
     return beside_the_paper(caption, columns, ours, controls, known, differs)
-
-
-def _segmentations(
-    models: Mapping[str, Sequence[ModelSource]],
-    paper: Sequence[PaperRow],
-    images: str | Path,
-    masks: str | Path | None,
-    epochs: int,
-    seeds: int,
-    options: Options,
-) -> tuple[list[ScoreTable], dict[str, Any]]:
-    """The table of segmentation and its numbers, once for each model."""
-    tables, values = [], {}
-    for name, (model, *others) in models.items():
-        if others:
-            raise ValueError(f"two models have the name {name!r}: give each its own")
-        found = segment(
-            as_model(model, device=options.device), images, masks=masks, dataset=options.dataset,
-            limit=options.limit, variants=PAPER_VARIANTS, seeds=options.seeds(seeds),
-            settings=SegmentSettings(epochs=epochs), resample_count=options.resamples,
-            memory=options.memory, progress=options.progress,
-        )  # fmt: skip
-        shown = (found.tables[-1], *found.tables[:-1])
-        tables += [replace(table, caption=f"{name}: {table.caption}") for table in shown]
-        values[name] = {**found.result.numbers(), "differs": found.result.differs, "paper": paper}
-    return tables, values

@@ -95,28 +95,22 @@ SEGMENTATION = Part(
 
 @dataclass(frozen=True)
 class TableSpec:
-    """One of the paper's tables, or a part of one: its name on the command line, its number in the paper,
-    the protocol that makes it, its questions.
-    """
+    """One of the paper's tables, or a part: its number there, the protocol that makes it, its questions."""
 
-    name: str
     number: int
     kind: Literal["cluster", "linear", "segment"]
     parts: tuple[Part, ...]
 
 
-TABLES: dict[str, TableSpec] = {
-    spec.name: spec
-    for spec in (
-        TableSpec("clustering", 1, "cluster", (IDENTITY, EMOTION, FACE_ATTRIBUTES)),
-        TableSpec("identity", 1, "cluster", (IDENTITY,)),
-        TableSpec("emotion", 1, "cluster", (EMOTION,)),
-        TableSpec("linear", 2, "linear", (LINEAR,)),
-        TableSpec("segmentation", 3, "segment", (SEGMENTATION,)),
-        TableSpec("cars", 4, "cluster", (CARS,)),
-    )
+TABLES = {
+    "clustering": TableSpec(1, "cluster", (IDENTITY, EMOTION, FACE_ATTRIBUTES)),
+    "identity": TableSpec(1, "cluster", (IDENTITY,)),
+    "emotion": TableSpec(1, "cluster", (EMOTION,)),
+    "linear": TableSpec(2, "linear", (LINEAR,)),
+    "segmentation": TableSpec(3, "segment", (SEGMENTATION,)),
+    "cars": TableSpec(4, "cluster", (CARS,)),
 }
-"""By name, in the order of the paper's tables: parts of one come after the whole."""
+"""By name on the command line, in the order of the paper's tables: parts of one come after the whole."""
 
 
 def table_named(name: str) -> TableSpec:

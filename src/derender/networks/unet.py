@@ -86,9 +86,9 @@ class SegmentationNet(nn.Module):
             self.decoder = copy.deepcopy(decoder).requires_grad_(True)
             last = decoder.to_outputs
             self.decoder.to_outputs = nn.Conv2d(last.in_channels, outputs, 1, device=last.weight.device)
-        self.frozen = frozen
+        self.frozen, self.kept_statistics = frozen, frozen or kept_statistics
         self._fixed: list[nn.Module] = []  # parts whose BatchNorm keeps its statistics
-        if frozen or kept_statistics:
+        if self.kept_statistics:
             finest = [encoder.levels[:LEVELS_KEPT] for encoder in encoders]
             self._fixed += [self.encoders] if frozen or decoder is None else finest
             self._fixed += [] if decoder is None else [self.decoder.convolve[-LEVELS_KEPT:]]
