@@ -41,11 +41,6 @@ from derender.data.source import Skipped, is_image, nearest_sibling, suggestion
 from derender.data.splits import Split, split_indices
 from derender.data.stream import Kinds, Sample, Stream, Value, column_of
 
-PictureSet = ImageSet  # the names of before, while callers change
-read_pictures = read_images
-read_picture = read_image
-check_pictures = check_images
-
 __all__ = [
     "LAYOUTS", "MASK_CLASSES", "READER_VERSION", "Decoded", "Duplicate", "GroundTruth", "ImageSet", "Kinds",
     "ListedStream", "MaskedImages", "Progress", "Sample", "SeenPixels", "Skipped", "Split", "Stream",

@@ -8,9 +8,6 @@ can do harm. A damaged shard gives what was read before the damage, then one unr
 Source: the format as described at https://github.com/webdataset/webdataset; read with Python's tarfile.
 """
 
-import bz2
-import gzip
-import io
 import json
 import lzma
 import re
@@ -32,7 +29,6 @@ SHARD_SUFFIXES = (".tar", ".tar.gz", ".tgz", ".tar.bz2", ".tar.xz")
 _LABELS = ("json", "cls")
 _BLOCK = 512
 _DAMAGE = (tarfile.TarError, OSError, EOFError, zlib.error, lzma.LZMAError, ValueError, OverflowError)
-_PACKINGS = {b"\x1f\x8b": gzip.open, b"BZh": bz2.open, b"\xfd7zXZ": lzma.open}
 _MOST_SHARDS = 1_000_000
 
 
@@ -83,11 +79,7 @@ class ShardStream(Stream):
         """Members that belong together, in order; the last group may be the shard's damage."""
         group: _Group | None = None
         try:
-            with (
-                shard.open("rb") as raw,
-                _unpacked(raw) as stream,
-                tarfile.open(fileobj=stream, mode="r:") as tar,
-            ):
+            with shard.open("rb") as raw, tarfile.open(fileobj=raw, mode="r:*") as tar:
                 while (member := tar.next()) is not None:
                     tar.members = []  # pyright: ignore[reportAttributeAccessIssue]  (it would keep them all)
                     folder, slash, base = printable(member.name).rpartition("/")
@@ -102,8 +94,9 @@ class ShardStream(Stream):
                     group.content[ending] = None
                     group.read_bytes = raw.tell()
                     self._take(group, ending, tar, member)
-                stream.seek(tar.offset)
-                if stream.read(_BLOCK) != bytes(_BLOCK):
+                assert tar.fileobj is not None
+                tar.fileobj.seek(tar.offset)
+                if tar.fileobj.read(_BLOCK) != bytes(_BLOCK):
                     raise tarfile.ReadError("no end mark")
         except _DAMAGE as problem:
             if group is not None and group.images:
@@ -149,14 +142,6 @@ class ShardStream(Stream):
         except ValueError as problem:
             read = unreadable(str(problem))
         return Sample(f"{name}.{images[0]}", read, share, labels, partition)
-
-
-def _unpacked(raw: io.BufferedIOBase) -> io.BufferedIOBase:
-    """The stream that a packed file holds, known by its first bytes; the file itself if it is not packed."""
-    head = raw.read(6)
-    raw.seek(0)
-    opener = next((opener for mark, opener in _PACKINGS.items() if head.startswith(mark)), None)
-    return raw if opener is None else opener(raw)
 
 
 def find_shards(path: Path, source: str, part: str | None = None) -> list[Path]:
