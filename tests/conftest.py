@@ -9,6 +9,14 @@ import torch
 ROOT = Path(__file__).resolve().parents[1]
 
 
+LONGEST = ("test_pyright_finds_nothing", "test_readers_refuse_what_is_broken", "test_two_processes")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The longest tests begin first, so that no worker ends with one alone."""
+    items.sort(key=lambda item: not item.name.startswith(LONGEST))
+
+
 def shared_folder() -> Path | None:
     """Where the development data lies: $DERENDER_SHARED, or ``shared`` beside the checkout, or None."""
     candidates = (
