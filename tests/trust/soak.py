@@ -265,7 +265,7 @@ def main() -> int:
         finally:
             soak.kill()
     verdicts = soak.judged()
-    print(markdown(verdicts), soak.answers.markdown(), sep="\n\n", end="\n\n")
+    print(markdown(verdicts), soak.answers.told(), sep="\n\n", end="\n\n")
     print(", ".join(f"{count:,} {what}" for what, count in soak.counts.items()))
     print("odd connections that were ended:", dict(Counter(soak.answers.ended)))
     print(*(f"FAULT: {fault}" for fault in soak.faults), f"{len(soak.faults)} faults", sep="\n")
@@ -276,7 +276,7 @@ def main() -> int:
         facts = {
             "minutes": asked.minutes, "clients": asked.clients, "faults": soak.faults, "counts": soak.counts,
             "verdicts": told,
-            "answers": soak.answers.rows(), "ended_connections": Counter(soak.answers.ended),
+            "answers": soak.answers.told(), "ended_connections": Counter(soak.answers.ended),
             "samples": soak.series,
         }  # fmt: skip
         asked.json.write_text(json.dumps(facts, indent=1) + "\n")

@@ -14,7 +14,6 @@ import struct
 import threading
 import time
 import zipfile
-from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -47,25 +46,13 @@ class Answers:
     failures: list[tuple[str, str]] = field(default_factory=list)
     ended: list[str] = field(default_factory=list)
 
-    def rows(self) -> list[dict[str, Any]]:
-        """Per kind and for all: how many, failures, and waits in milliseconds."""
-        failed = Counter(kind for kind, _ in self.failures)
-        rows = []
-        for kind in [*sorted({kind for kind, _ in self.waits} | failed.keys()), "all"]:
-            waits = [1000 * wait for name, wait in list(self.waits) if kind in (name, "all")] or [0.0]
-            shares = {f"p{share}_ms": float(np.percentile(waits, share)) for share in (50, 95, 99)}
-            count = sum(kind in (name, "all") for name, _ in self.waits)
-            lost = failed.total() if kind == "all" else failed[kind]
-            shares["longest_ms"] = max(waits)
-            rows.append({"request": kind, "answers": count, "failed": lost, **shares})
-        return rows
-
-    def markdown(self) -> str:
-        lines = ["| request | answers | failed | median ms | 95 % | 99 % | longest |"]
-        lines.append("| --- |" + " ---: |" * 6)
-        for kind, *numbers in (row.values() for row in self.rows()):
-            lines.append(f"| {kind} | {' | '.join(f'{number:,.0f}' for number in numbers)} |")
-        return "\n".join(lines)
+    def told(self) -> dict[str, Any]:
+        """How many answers and failures, and waits in milliseconds."""
+        waits = [1000 * wait for _, wait in self.waits] or [0.0]
+        shares = {f"p{share}_ms": float(np.percentile(waits, share)) for share in (50, 95, 99)}
+        slowest = max(self.waits, key=lambda one: one[1], default=("none", 0.0))[0]
+        counts = {"answers": len(self.waits), "failed": len(self.failures)}
+        return {**counts, **shares, "longest_ms": max(waits), "slowest": slowest}
 
 
 class Unfit(Exception):
