@@ -23,7 +23,7 @@ from derender.cli.console import duration, notice, progress_bar
 from derender.cli.plan.jobs import Collapsed, Comparison, Job, Note, embed, jobs_of, score, train
 from derender.training import TrainingInterrupted
 
-GRACE_SECONDS = 30.0  # after the budget, for a worker to save
+GRACE_SECONDS = 30.0  # after the budget or Ctrl-C, for a worker to save
 WORK = {"train": train, "embed": embed, "score": score}
 
 
@@ -40,7 +40,6 @@ def do_all(at: Comparison, workers: int = 1, minutes: float | None = None) -> di
     lanes: dict[Job, list[Job]] = defaultdict(list)
     for job in jobs:
         lanes[job.after[0] if job.kind == "embed" and job.after else job].append(job)
-    scores = [lane for lane in lanes.values() if lane[0].kind == "score"]
 
     def do(lane: list[Job]) -> None:
         for job in lane:
@@ -58,10 +57,12 @@ def do_all(at: Comparison, workers: int = 1, minutes: float | None = None) -> di
     try:
         with FileLock(at.path / ".lock", timeout=0), ThreadPoolExecutor(workers) as pool:
             try:
-                for stage in ([lane for lane in lanes.values() if lane not in scores], scores):
+                for kind in ("embed", "train", "score"):  # features that need no training come first
+                    stage = [lane for lane in lanes.values() if lane[0].kind == kind]
                     list((map if workers == 1 else pool.map)(do, stage))
             finally:
-                for process in multiprocessing.active_children():
+                for process in multiprocessing.active_children():  # after Ctrl-C, which they got as well
+                    process.join(GRACE_SECONDS)
                     process.terminate()
     except Timeout as error:
         raise ValueError(
