@@ -24,12 +24,7 @@ CopyProgress = Callable[[int, int], object]
 
 @dataclass(frozen=True)
 class ModelCopy:
-    """A model made of another one.
-
-    Attributes:
-        folder, model: where it was saved, for `derender.load`; the model, ready for use.
-        images, scores: how many images it was made with; measurements by name.
-    """
+    """A model made of another one: where it lies, the model, number of images, measurements by name."""
 
     folder: Path
     model: Derenderer

@@ -52,14 +52,9 @@ def pixel_decoder(settings: NetworkSettings) -> UNetDecoder:
 class SegmentationNet(nn.Module):
     """Images in 0..1 to one logit a class and pixel, from U-Net encoders and a decoder over all of them.
 
-    Args:
-        encoders: of one width; their features are joined in this order.
-        outputs: classes.
-        frozen: encoders never change: weights take no gradient, and statistics are kept.
-        kept_statistics: the encoders' BatchNorm keeps the statistics it came with in training, too; beside a
-            ``decoder`` that of the two finest levels of either.
-        decoder: one that has learnt over these encoders, of which all but the last layer is taken. Without it
-            the decoder is fresh.
+    ``frozen`` encoders never change. With ``kept_statistics`` their BatchNorm keeps its statistics in
+    training, too; beside a learnt ``decoder``, of which all but the last layer is taken, that of the two
+    finest levels of either.
     """
 
     def __init__(

@@ -15,12 +15,9 @@ from derender.storage.folder import FITTING_FILE, WHITENING_FILE
 
 @dataclass(frozen=True)
 class Features:
-    """Post-processing of encoder activations; without it a feature is the encoder output (the code).
+    """Post-processing of encoder activations: without whitening a feature is the encoder output (the code).
 
-    Attributes:
-        whitening: maps activations of some factors to their features; None leaves the codes.
-        fitting: fits scenes to images, whose coordinates follow; None cannot. With 0 steps features do
-        without.
+    Coordinates of scenes that the fitting finds follow, unless it makes 0 steps.
     """
 
     whitening: Whitening | None = None

@@ -64,12 +64,10 @@ class FittingSettings(Settings):
 
 @dataclass(frozen=True)
 class Fitted:
-    """Scenes fitted to images.
+    """Scenes fitted to images, and by factor their coordinates, in the training maps' standard deviations.
 
-    Attributes:
-        scene: the optimised scenes.
-        coordinates: by factor (geometry, albedo), in standard deviations of the training images' maps.
-        before, after: (N,) mean absolute error where the surface is seen, each pixel's error limited softly.
+    ``before`` and ``after`` are (N,) mean absolute errors where the surface is seen, each pixel's limited
+    softly.
     """
 
     scene: Scene

@@ -32,11 +32,8 @@ _DAMAGE = (ValueError, RecursionError, LookupError, TypeError, AttributeError, S
 class TrainState:
     """Counters of a run; with the weights and the optimiser they determine everything that follows.
 
-    Attributes:
-        images, seconds: images seen so far, repeats counted, and time spent training.
-        best_loss: lowest validation loss so far, None before the first validation.
-        validations_since_best: number of validations after that one.
-        watcher: state of the collapse detector.
+    ``images`` and ``seconds`` so far; the lowest validation loss, None before the first validation, and the
+    number of validations since; the state of the collapse detector.
     """
 
     __pydantic_config__ = ConfigDict(strict=True, extra="forbid")

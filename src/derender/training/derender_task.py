@@ -44,14 +44,8 @@ def train(
 ) -> TrainResult:
     """Train a model on images and estimate its features; all files lie in the folder ``out``.
 
-    Args:
-        config: see `derender.training.config.resolve`.
-        images: at the model's image size.
-        out: a new folder, or with ``resume`` the folder of an unfinished run.
-        resume: go on with the run in ``out``.
-        progress: called after every step.
-        accelerator: "auto", "cpu" or "cuda".
-        how: ``sample_sheet``, which draws a sheet for a few held-out images from time to time.
+    Images are at the model's size; ``out`` is new, or with ``resume`` that of an unfinished run; ``how`` may
+    hold a ``sample_sheet``, which draws a few held-out images from time to time.
 
     Raises:
         FileExistsError: ``out`` is not empty and ``resume`` was not requested.

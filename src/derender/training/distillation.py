@@ -126,14 +126,8 @@ def refine(
     """A copy of a trained model that predicts what fitting finds; the model stays as it is.
 
     The same seed gives the same weights on the same machine and thread count; torch's global random state is
-    neither read nor changed. The student fits scenes within the linear model that the model has.
-
-    Args:
-        model: trained, with a fitting.
-        images: its training images, or more of the kind.
-        held_out: other images, on which errors are measured.
-        config: how, and how features are made afterwards.
-        seed, progress: of every random choice; called once for each part of the work.
+    neither read nor changed. Errors are measured on ``held_out`` images. The student fits scenes within the
+    linear model that the model has.
 
     Raises:
         ValueError: a model that cannot fit scenes or has further factors; too few images, or images of

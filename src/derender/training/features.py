@@ -49,17 +49,9 @@ def make_features(
 ) -> Derenderer:
     """A model that shares these weights, with whitening and fitting as far as the settings have them.
 
-    A feature keeps the size of the code: fitted coordinates leave the rest of it to activations.
-
-    Args:
-        model: trained.
-        images: its training images, uint8 or float in 0..1; random subsets, drawn with ``seed``, are used.
-        settings: how.
-        seed, progress: of the subsets; called after each batch.
-        maps: to fit scenes within, by default estimated here.
-
-    Raises:
-        ValueError: too few images, or more fitted coordinates than a feature has numbers.
+    A feature keeps the size of the code: fitted coordinates leave the rest of it to activations. Images are
+    training images, uint8 or float in 0..1, of which ``seed`` draws subsets; ``maps`` to fit scenes within
+    are by default estimated here. Too few images or too many coordinates are a ValueError.
     """
     size, fitting = model.settings.network.code_size, settings.fitting
     model = model.with_features(Features(model.whitening))
@@ -93,14 +85,10 @@ def fit_whitening(
 ) -> Whitening:
     """The map from a trained model's activations to its features; arguments as of `make_features`.
 
-    Args:
-        perturb: how far light and camera are changed.
-        describe: another encoder, all of whose activations of the model's renderings are measured; by default
-            the model's own of geometry and albedo.
-        size: of the features; by default that of the model's code, or of all activations of ``describe``.
-
-    Raises:
-        ValueError: fewer than two images, or activations that are NaN or infinite.
+    ``describe`` is another encoder, all of whose activations of the model's renderings are measured; by
+    default it is the model's own of geometry and albedo. ``size`` is that of the features, by default the
+    code's, or of all activations of ``describe``. Fewer than two images, or activations that are not finite,
+    are a ValueError.
     """
     generator = Generator().manual_seed(seed)
     others = Generator().manual_seed(seed)  # of the vector factors: it changes no other feature

@@ -35,11 +35,9 @@ Columns = Mapping[str, Shaped[Tensor, "n ..."]]
 class StepResult(StepLosses):
     """Losses of one batch, and the values that the watcher looks at.
 
-    Attributes:
-        terms: every weighted term of the total by name, and the plain masked L1 ("l1"), detached.
-        scene, rendering: the scenes predicted for the batch, and their renderings, without the twins.
-        codes: the images' codes by factor, with gradient, for an objective beside this one.
-        confidence: the output of the confidence net, where it is used.
+    ``terms`` are every weighted term of the total by name, and the plain masked L1 ("l1"), detached;
+    ``scene`` and ``rendering`` are without the twins; ``codes``, by factor, have gradient, for an objective
+    beside this one.
     """
 
     scene: Scene
@@ -73,10 +71,7 @@ def training_step(
     """Losses for one batch of images in 0..1; networks run under ``precision``, geometry in float32.
 
     Args:
-        model, objective: the model; which terms, and their weights.
-        images: this rank's rows of the batch.
-        perceptual: features to compare, or None.
-        generator: of the perturbations; in the same state on every rank.
+        images, generator: this rank's rows of the batch; of the perturbations, in one state on every rank.
         own: each image's share in its maps (`own_share`).
         ranks: those that share the batch; the mean of their terms is the batch's.
         chunks: number of chunks in which networks and renderer work, to save memory.

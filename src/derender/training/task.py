@@ -42,12 +42,10 @@ class Held:
 
 
 class TrainingTask(ABC):
-    """What the loop needs to know of what it trains; the base class of all tasks.
+    """What the loop needs to know of what it trains: a `LoopSettings`, and the methods below.
 
-    Attributes:
-        config: a `LoopSettings`.
-        outside_loss: names of terms that held-out images are not judged by.
-        every_parameter_learns: gets a gradient in every step, which saves DDP a search.
+    Held-out images are not judged by terms ``outside_loss``; where ``every_parameter_learns``, DDP saves a
+    search.
     """
 
     config: Any

@@ -52,12 +52,9 @@ DEFAULT_UNETS = UNetSettings()
 class PixelTargets:
     """A model's predictions for each pixel of a batch.
 
-    Attributes:
-        maps: by factor; geometry (N, 3, H, W) is the place on the object (-1..1 across and down) and the
-            depth (-1..1 over the model's range, the camera's own distance taken off), albedo (N, 3, H, W)
-            0..1; 0 where nothing is covered.
-        mask: (N, H, W) 1 where the surface is visible.
-        codes: by factor, (N, code).
+    ``maps``, by factor, are (N, 3, H, W): geometry is the place on the object (-1..1 across and down) and the
+    depth (-1..1 over the model's range, without the camera's distance), albedo is 0..1; 0 where nothing is
+    covered. ``mask`` (N, H, W) is 1 where the surface is visible; ``codes`` are (N, code).
     """
 
     maps: dict[str, Tensor]

@@ -34,12 +34,7 @@ SLOWER = "use a smaller learning_rate (1e-4 or less), a weight_decay of 5e-4 and
 
 @dataclass(frozen=True)
 class Finding:
-    """A problem of a run.
-
-    Attributes:
-        sign, text: short name; the problem in plain words, with the number.
-        advice, fatal: what to change; whether training on is pointless.
-    """
+    """A problem of a run: its short name, the problem in plain words, what to change, whether to stop."""
 
     sign: str
     text: str
@@ -148,13 +143,7 @@ class FiniteWatch:
 
 @dataclass
 class Watcher(FiniteWatch):
-    """The collapse detector: looks at training batches and remembers its measurements.
-
-    Args:
-        ranges, batch_size: bounds of the scene; images in every update.
-        averages, on_since: measurements, smoothed; images seen when a sign came on.
-        last_images, ranks: images seen at the latest look; those that share a batch, and all see the same.
-    """
+    """The collapse detector: looks at batches, smooths its measurements and notes since when signs are on."""
 
     ranges: SceneRanges
     batch_size: int
