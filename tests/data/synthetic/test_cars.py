@@ -14,9 +14,8 @@ from derender.data.synthetic.settings import CLASSES
 from derender.data.synthetic.synthetic_set import SyntheticSet
 from derender.evaluation.depth import geometry_scores
 from derender.render import render
-from derender.scene.camera import project, rotation_matrix, to_camera, to_canonical, unproject
+from derender.scene.camera import project, rotation_matrix, to_camera
 
-MAPS = ("images", "depth", "normal", "albedo", "mask", "parts", "light", "camera", "identity")
 FOUR_EACH = CarSettings(pictures_per_model=4)
 FRONTAL = CarSettings(light=CAR_LIGHTS["frontal"], view=CAR_VIEWS["frontal"], pictures_per_model=1)
 
@@ -95,9 +94,7 @@ def test_the_renderer_makes_the_picture_from_the_stored_truth():
     assert np.median(error) < 1.5 and np.percentile(error, 75) < 6.0  # grey levels
 
 
-def test_maps_agree_on_where_the_car_is(sample):
-    assert ((sample.parts > 0) == sample.mask).all() and ((sample.depth > 0) == sample.mask).all()
-    assert not sample.albedo.transpose(0, 2, 3, 1)[~sample.mask].any()
+def test_depth_and_parts_lie_in_the_stated_ranges(sample):
     assert sample.depth[sample.mask].min() > 0.9 and sample.depth[sample.mask].max() < 1.1
     assert 0.2 < sample.mask.mean() < 0.4
     assert set(np.unique(sample.parts).tolist()) == set(range(len(sample.part_names)))
@@ -113,29 +110,6 @@ def test_windows_are_dark_and_wheels_are_low(sample):
     row = np.broadcast_to(np.arange(64)[:, None], sample.parts.shape)
     wheel = sample.parts == sample.part_names.index("wheel")
     assert row[wheel].mean() > row[sample.mask].mean() + 2
-
-
-def test_unprojected_points_lie_on_the_canonical_surface():
-    """The same cars from ahead and turned: points turned back land on the frontal depth map."""
-    names = ("sedan", "van", "suv")
-    turned = cars.generate(3, seed=5, settings=CarSettings(classes=names, pictures_per_model=1))
-    ahead = cars.generate(
-        3, seed=5, settings=CarSettings(classes=names, pictures_per_model=1, view=CAR_VIEWS["frontal"])
-    )
-    for n in range(3):
-        assert np.median(distance(turned, ahead, n, turned.camera[n])) < 8e-4
-        assert np.median(distance(turned, ahead, n, -turned.camera[n])) > 3e-3
-
-
-def distance(turned: SyntheticSet, ahead: SyntheticSet, n: int, camera: np.ndarray) -> np.ndarray:
-    """Distance along z of image n's points, taken back by ``camera``, from the surface seen from ahead."""
-    seen = unproject(torch.from_numpy(turned.depth[n : n + 1]), turned.fov_deg)
-    points = to_canonical(seen, torch.from_numpy(camera[None]))[0][torch.from_numpy(turned.mask[n])]
-    column, row = project(points, 64, 64, turned.fov_deg).round().int().clamp(0, 63).numpy().T
-    z = points[:, 2].numpy()
-    covered = ahead.mask[n][row, column]
-    assert covered.sum() > 400
-    return np.abs(ahead.depth[n][row, column] - z)[covered]
 
 
 def test_cameras_are_the_turntable_that_the_labels_say(sample):
@@ -197,10 +171,6 @@ def test_written_sets_read_back_as_rendered_cars(sample, tmp_path):
     pictures, truth = read_images(folder, 64), read_ground_truth(folder)
     assert pictures.layout == "syncar" and len(pictures.images) == 32
     assert pictures.labels["class"].tolist() == sample.labels["class"].tolist()
-    assert (truth.mask == sample.mask).all() and np.abs(truth.depth - sample.depth).max() < 0.4 / 65535
-    assert np.allclose(truth.camera, sample.camera, atol=1e-5) and np.allclose(
-        truth.light, sample.light, atol=1e-5
-    )
     assert np.allclose(np.rad2deg(truth.labels["azimuth_rad"]), sample.labels["azim"], atol=1e-3)
     depth, mask = torch.from_numpy(truth.depth), torch.from_numpy(truth.mask)
     scores = geometry_scores(depth * 1.1, mask, depth, mask, 10.0)

@@ -9,8 +9,9 @@ import pytest
 import torch
 from scipy.ndimage import binary_erosion
 
-from derender.data.synthetic import CarSettings, FaceSettings, cars, faces
+from derender.data.synthetic import CAR_VIEWS, VIEWS, CarSettings, FaceSettings, cars, faces
 from derender.data.synthetic.synthetic_set import SyntheticSet, camera_rotation_and_light
+from derender.scene.camera import project, to_canonical, unproject
 from derender.scene.normals import normals_from_depth
 
 MAPS = ("images", "depth", "normal", "albedo", "mask", "parts", "light", "camera", "identity")
@@ -35,6 +36,11 @@ KINDS = {
     "faces": Kind(faces.generate, FaceSettings, (1.0, 90, 8.0), 2.0, MEANS["faces"]),
     "cars": Kind(cars.generate, CarSettings, (0.6, 80, 8.0), 5.0, MEANS["cars"]),
 }
+
+TURNED = [
+    (faces.generate, FaceSettings(expressions=("neutral",), asymmetry=0.0, gaze_px=0.0), VIEWS, 1e-3),
+    (cars.generate, CarSettings(classes=("sedan", "van", "suv"), pictures_per_model=1), CAR_VIEWS, 8e-4),
+]
 
 
 @pytest.fixture(scope="module", params=KINDS)
@@ -103,6 +109,27 @@ def test_normals_are_those_of_the_depth_map(kind, sample):
     assert np.median(np.rad2deg(np.arccos(cosine))) < kind.normals_deg
     length = np.linalg.norm(sample.normal, axis=-1)
     assert np.allclose(length[sample.mask], 1.0, atol=1e-5) and not length[~sample.mask].any()
+
+
+@pytest.mark.parametrize(("generate", "settings", "views", "closer"), TURNED, ids=KINDS)
+def test_unprojected_points_lie_on_the_canonical_surface(generate, settings, views, closer):
+    """The same objects from ahead and turned: points turned back land on the frontal depth map."""
+    turned = generate(4, seed=5, settings=settings)
+    ahead = generate(4, seed=5, settings=settings.model_copy(update={"view": views["frontal"]}))
+    assert np.abs(turned.camera).max() > 0.1 and np.abs(ahead.camera).max() < 1e-6
+    for n in range(4):
+        assert np.median(distance(turned, ahead, n, turned.camera[n])) < closer
+        assert np.median(distance(turned, ahead, n, -turned.camera[n])) > 3e-3
+
+
+def distance(turned: SyntheticSet, ahead: SyntheticSet, n: int, camera: np.ndarray) -> np.ndarray:
+    """Distance along z of image n's points, taken back by ``camera``, from the surface seen from ahead."""
+    seen = unproject(torch.from_numpy(turned.depth[n : n + 1]), turned.fov_deg)
+    points = to_canonical(seen, torch.from_numpy(camera[None]))[0][torch.from_numpy(turned.mask[n])]
+    column, row = project(points, 64, 64, turned.fov_deg).round().int().clamp(0, 63).numpy().T
+    covered = ahead.mask[n][row, column]
+    assert covered.sum() > 400
+    return np.abs(ahead.depth[n][row, column] - points[:, 2].numpy())[covered]
 
 
 def test_maps_agree_on_where_the_object_is(sample):

@@ -17,12 +17,9 @@ given by its Euler angles."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from jaxtyping import Float64
 from numpy import ndarray
 
@@ -57,7 +54,7 @@ from derender.data.synthetic.car_paint import (
     wheel_paint,
 )
 from derender.data.synthetic.mesh_image import TriangleMesh
-from derender.data.synthetic.settings import CLASSES, CarSettings, drawn, pick
+from derender.data.synthetic.settings import CLASSES, CarSettings, drawn, numbers_of, pick
 from derender.data.synthetic.synthetic_set import FOV_DEG, Row, Shot, SyntheticSet, draw_background, make_set
 
 CANONICAL_ELEVATION_DEG = 42.5
@@ -142,11 +139,8 @@ def draw_car(seed: int, index: int, image_size: int, settings: CarSettings, car:
     high, (least, most) = np.array([(reach - x).min(), (reach - y).min()]), view.shift
     shift = np.minimum(np.maximum(view.shift_sd * normal[1:], least), most)
     shift = np.where(low < high, np.minimum(np.maximum(shift, low), high), 0.5 * (low + high))
-    labels: Row = {
-        "class": car.traits.name,
-        "style": car.traits.style,
-        "model": f"{car.traits.name}/{number:05d}",
-    }
+    name = car.traits.name
+    labels: Row = {"class": name, "style": car.traits.style, "model": f"{name}/{number:05d}"}
     labels |= {"elev": np.float32(elevation), "azim": np.float32(azimuth), "inplane": np.float32(inplane)}
     return Shot(
         car.mesh,
@@ -179,17 +173,12 @@ def euler_angles(rotation: Float64[ndarray, "3 3"]) -> Float64[ndarray, "3"]:
     return np.array([x, y, np.arctan2(rotation[1, 0], rotation[0, 0])])
 
 
-@lru_cache(maxsize=1)
-def _numbers() -> dict[str, Any]:
-    return yaml.safe_load(Path(__file__).with_name("cars.yaml").read_text(encoding="utf-8"))
-
-
 def draw_traits(name: str, generator: np.random.Generator) -> CarTraits:
     """A model of class ``name``. Draws the same number of random values whatever the class."""
     uniform, spread = generator.random(24).tolist(), generator.standard_normal(8)
     style = CLASSES[name][int(uniform[0] * len(CLASSES[name]))]
     shape = _draw_shape(style, generator, 1.5 + 1.0 * uniform[1] if name == "limousine" else 0.0)
-    livery, palettes = int(uniform[2] * 3), _numbers()["palettes"]
+    livery, palettes = int(uniform[2] * 3), numbers_of("cars")["palettes"]
     palette = np.array(palettes.get(name, palettes["usual"]))
     tint = np.clip(spread[:3], -2, 2)  # a little lighter or darker, and each channel on its own
     colour = palette[pick(palette[:, 3], uniform[3]), :3] * (1.0 + 0.10 * tint[0]) * (1.0 + 0.05 * tint)
@@ -205,30 +194,19 @@ def draw_traits(name: str, generator: np.random.Generator) -> CarTraits:
     bright = 0.25 if uniform[8] < 0.2 else 0.55 + 0.25 * uniform[9]
     trim = 0.07 + 0.06 * uniform[10]
     plastic = (trim, trim, trim * 1.05)
-    return CarTraits(
-        name=name,
-        style=style,
-        shape=shape,
-        paint=paint,
-        roof=roof,
-        glass=(grey, grey * (1.05 + 0.2 * uniform[7]), grey * (1.15 + 0.5 * uniform[7])),
-        rim=(bright, bright, bright * 1.02),
-        trim=plastic,
-        bumpers=plastic if uniform[11] < _PLASTIC.get(name, 0.0) else paint,
-        spokes=5 + int(uniform[12] * 4),
-        chances=uniform[13:23],
-        livery=livery,
-    )
+    glass = (grey, grey * (1.05 + 0.2 * uniform[7]), grey * (1.15 + 0.5 * uniform[7]))
+    rim, spokes = (bright, bright, bright * 1.02), 5 + int(uniform[12] * 4)
+    bumpers = plastic if uniform[11] < _PLASTIC.get(name, 0.0) else paint
+    fittings = (rim, plastic, bumpers, spokes, uniform[13:23], livery)
+    return CarTraits(name, style, shape, paint, roof, glass, *fittings)
 
 
 def _draw_shape(style: str, generator: np.random.Generator, stretch: float) -> CarShape:
     """A model of that style; ``stretch`` metres are put in behind the front doors (limousines)."""
-    row = CarShape(*_numbers()["measures"][style])
+    row = CarShape(*numbers_of("cars")["measures"][style])
     normal = np.clip(generator.standard_normal(len(row)), -2.0, 2.0).tolist()
     factor = {name: 1.0 + 0.03 * z for name, z in zip(CarShape._fields, normal, strict=True)}
-    common = dict.fromkeys(_ALONG, factor["length"]) | dict.fromkeys(
-        _UP, factor["height"]
-    )  # keep their order
+    common = dict.fromkeys(_ALONG, factor["length"]) | dict.fromkeys(_UP, factor["height"])  # as ordered
     drawn_row = {name: value * (factor | common)[name] for name, value in row._asdict().items()}
     between = factor["cowl"] - 1.0  # a longer or shorter bonnet moves the windscreen as a whole
     drawn_row["cowl_at"] += 1.2 * between
@@ -260,14 +238,9 @@ def build_car(car: CarTraits) -> TriangleMesh:
             houses = [wheel_house(out - 0.25, at, s, flank, black)]
         pieces += both([template.moved((out, 0, at)), *houses])
     ahead, tall = (0.1, 0.15) if car.style in ("van", "cab") else (0.28, 0.08)
-    mirror = (
-        half_width(flank, s.cowl_at + ahead, s.cowl - 0.05) + 0.09,
-        s.cowl + 0.02 + tall,
-        s.cowl_at + ahead,
-    )
-    pieces += both(
-        rounded_box(mirror, (0.11, tall, 0.05), 0.04, Surface(car.trim if car.plastic else car.paint))
-    )
+    at, own = s.cowl_at + ahead, Surface(car.trim if car.plastic else car.paint)
+    mirror = half_width(flank, at, s.cowl - 0.05) + 0.09, s.cowl + 0.02 + tall, at
+    pieces += both(rounded_box(mirror, (0.11, tall, 0.05), 0.04, own))
     fittings = {"police": _light_bar, "ambulance": _ambulance_box, "sports": _wing, "jeep": _jeep}
     if car.name in fittings:
         pieces += fittings[car.name](car)

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from numpy import ndarray
 
-from derender.data.synthetic.face_shape import face_numbers
-from derender.data.synthetic.settings import Range, drawn, pick
+from derender.data.synthetic.settings import Range, drawn, numbers_of, pick
 from derender.data.synthetic.synthetic_set import Row
 
 Identity = dict[str, Any]
@@ -27,7 +26,7 @@ def draw_identity(
 ) -> Identity:
     """One person of an age and a skin tone within those ranges: traits that no image changes, by name.
     Colours are stored RGB values, 0..1; lengths are face pixels."""
-    numbers, uniform = face_numbers(), generator.uniform
+    numbers, uniform = numbers_of("faces"), generator.uniform
     build = float(np.clip(0.5 + 0.45 * np.sign(uniform(-1, 1)) * uniform() ** 0.35, 0, 1))
     years = drawn(age_years, uniform() ** 1.25)
     age = min(max((years - YOUNG) / (OLD - YOUNG), 0.0), 1.2)
@@ -110,7 +109,7 @@ def identity_columns(who: Identity) -> Row:
 
 def _shape(modes: tuple[str, ...], z: ndarray, build: float, age: float) -> ndarray:
     """Coefficients of modes from normal numbers."""
-    tables = face_numbers()
+    tables = numbers_of("faces")
     spread, heavy, old = (
         np.array([tables[table].get(name, default) for name in modes])
         for table, default in (("spread", 1.0), ("heavy", 0.0), ("old", 0.0))

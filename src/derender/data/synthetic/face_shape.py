@@ -15,16 +15,15 @@ renders of a published morphable model (ICT-FaceKit, MIT licence; 0.2 face pixel
 
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from jaxtyping import Float, Int32
 from numpy import ndarray
 from scipy.interpolate import PchipInterpolator
 
 from derender.data.synthetic.mesh_image import grid_triangles
+from derender.data.synthetic.settings import numbers_of
 
 THETA_MAX = np.deg2rad(112.0)
 Q_TOP, Q_BOTTOM = -51.0, 58.0
@@ -80,15 +79,10 @@ class FaceShape:
     actions: list[tuple[ndarray, tuple[slice, slice]]]
 
 
-@lru_cache(maxsize=1)
-def face_numbers() -> dict[str, Any]:
-    return yaml.safe_load(Path(__file__).with_name("faces.yaml").read_text(encoding="utf-8"))
-
-
 @lru_cache(maxsize=4)
 def face_shape(detail: float = 1.0) -> FaceShape:
     """The family on a grid with ``detail`` times the rows and columns that suit a 64-pixel image."""
-    numbers, grid = face_numbers(), _grid(detail)
+    numbers, grid = numbers_of("faces"), _grid(detail)
     fields, head = _named_fields(grid), _bare_head(grid)
     left = 1.0 - smoothstep(-4.0, 4.0, grid.p)[..., None]
     actions = []
@@ -170,7 +164,7 @@ def _named_fields(grid: FaceGrid) -> dict[str, Float[ndarray, "rows columns"]]:
     below_line = smoothstep(MOUTH_Q - MOUTH_BAND, MOUTH_Q + MOUTH_BAND, q)
     lens = np.sqrt(np.clip(1.0 - (p / 9.2) ** 2, 0.0, 1.0))
     hinge = hill(p, 0.0, 24.0, 4) * (1.0 - smoothstep(33.0, 52.0, q))
-    steps = {name: smoothstep(low, high, q) for name, (low, high) in face_numbers()["steps"].items()}
+    steps = {name: smoothstep(low, high, q) for name, (low, high) in numbers_of("faces")["steps"].items()}
     return {
         **steps,
         **age_lines(grid),
@@ -213,7 +207,7 @@ def _fold(p: ndarray, q: ndarray, reach: float, depth: float) -> ndarray:
 
 def _bare_head(grid: FaceGrid) -> Float[ndarray, "rows columns 3"]:
     """Skull, jaw and neck without features: elliptic sections, lifted at the sides to follow the jaw line."""
-    sections = np.array(face_numbers()["sections"])
+    sections = np.array(numbers_of("faces")["sections"])
     profile = PchipInterpolator(sections[:, 0], sections[:, 1:])(np.minimum(grid.q, 34.0))
     width, front = profile[..., 0], profile[..., 1]
     sin, cos = np.sin(grid.theta), np.cos(grid.theta)
@@ -232,7 +226,7 @@ def _mean_head(grid: FaceGrid, head: ndarray) -> Float[ndarray, "rows columns 3"
     """The bare head with its relief, and what averages blur away: the lips' fullness, the line between them
     and their corners, nostrils; without ears."""
     p, q = np.abs(grid.p), grid.q
-    height, *hills = np.array(face_numbers()["relief"]).T[..., None, None]
+    height, *hills = np.array(numbers_of("faces")["relief"]).T[..., None, None]
     upper = 0.7 * hill(p, 0.0, 6.8, 4) * gauss(q, 12.4, 1.0)
     lower = 0.9 * hill(p, 0.0, 6.2, 4) * gauss(q, 16.0, 1.3)
     line = 1.1 * np.clip(1.0 - (p / 10.0) ** 4, 0.0, 1.0) * gauss(q, MOUTH_Q, 1.6 * MOUTH_BAND)

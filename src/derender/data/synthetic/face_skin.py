@@ -27,12 +27,12 @@ from derender.data.synthetic.face_shape import (
     FaceShape,
     age_lines,
     ear_angle,
-    face_numbers,
     face_shape,
     gauss,
     hill,
     smoothstep,
 )
+from derender.data.synthetic.settings import numbers_of
 
 PART = {name: number for number, name in enumerate(MASK_CLASSES)}
 _FIELD_SEED = 7  # the noise fields are part of the model, the same for everyone; identities mix them
@@ -75,7 +75,7 @@ class Skin(NamedTuple):
 
 
 def hair_style(who: Identity) -> HairStyle:
-    return HairStyle(*face_numbers()["hair_styles"][who["hair_style"]])
+    return HairStyle(*numbers_of("faces")["hair_styles"][who["hair_style"]])
 
 
 @lru_cache(maxsize=4)
@@ -84,16 +84,15 @@ def skin_fields(detail: float = 1.0) -> dict[str, ndarray]:
     grid, generator = face_shape(detail).grid, np.random.default_rng(_FIELD_SEED)
     p, q, bump = np.abs(grid.p), grid.q, grid.bump
     freckles = _waves(generator, grid, 60, 1.5, 2.3)
+    cheeks_and_nose = np.maximum(bump(11.0, -2.0, 7.0, 4.5), bump(0.0, -4.0, 4.0, 4.0))
     arc = np.clip(1.0 - (p / 9.3) ** 2, 0.0, 1.0)
     upper = MOUTH_Q - 2.9 * arc**0.9 + 0.55 * hill(p, 0.0, 1.3)
     lower = MOUTH_Q + 3.6 * np.clip(1.0 - (p / 8.9) ** 2, 0.0, 1.0) ** 0.7
     lips = smoothstep(-0.45, 0.45, q - upper) * smoothstep(-0.6, 0.6, lower - q) * smoothstep(0.0, 0.08, arc)
     away = ear_angle(grid)
     is_ear = (np.abs(q + 5.5) < 7.6) & (away > -0.14) & (away < 0.2)  # where an ear folds out of the head
-    lines = {
-        name: np.clip(line / top, 0.0, 1.0)
-        for (name, line), top in zip(age_lines(grid).items(), (0.3, 0.12, 0.16), strict=True)
-    }
+    depths = ("fold", 0.30, 0.30), ("forehead_lines", 0.16, 0.12), ("crows_feet", 0.26, 0.16)
+    lines = sum(share * np.clip(age_lines(grid)[name] / top, 0.0, 1.0) for name, share, top in depths)
     parts = np.full(p.shape, PART["skin"], np.int32)
     width = np.interp(q, [-13.0, -6.0, -2.5, 0.0, 2.5, 4.0], [2.2, 3.4, 5.2, 6.4, 5.8, 3.0])
     for name, where in {  # left and right being the person's own
@@ -109,19 +108,15 @@ def skin_fields(detail: float = 1.0) -> dict[str, ndarray]:
         "mottling": np.stack([_waves(generator, grid, 10, 9.0, 24.0) for _ in range(SKIN_FIELDS)]),
         "strands": _waves(generator, grid, 40, 1.4, 7.0, along=9.0),
         "curls": _waves(generator, grid, 50, 3.5, 7.0),
-        "freckles": smoothstep(1.1, 1.9, freckles)
-        * np.maximum(bump(11.0, -2.0, 7.0, 4.5), bump(0.0, -4.0, 4.0, 4.0)),
+        "freckles": smoothstep(1.1, 1.9, freckles) * cheeks_and_nose,
         "grain": _waves(generator, grid, 40, 1.3, 2.6),
         "blush": bump(13.0, 1.0, 5.5, 4.5) + 0.55 * bump(0.0, -1.5, 3.2, 2.6),
         "under_eye": bump(10.8, -9.9, 4.3, 1.5),
-        "lines": 0.30 * lines["fold"]
-        + 0.16 * lines["forehead_lines"]
-        + 0.26 * lines["crows_feet"]
-        + 0.16 * bump(10.5, -9.2, 4.0, 0.8),
+        "lines": lines + 0.16 * bump(10.5, -9.2, 4.0, 0.8),
         "lips": lips,
         "nostrils": bump(2.4, 3.3, 1.05, 0.6),
         "ear": gauss(np.abs(grid.theta), 1.44, 0.06) * gauss(q, -3.0, 4.0),
-        **_beards(p, q),
+        **{kind: where * (1.0 - lips) for kind, where in _beards(p, q).items()},
     }
     single = {name: field.astype(np.float32) for name, field in fields.items()}
     return single | {"parts": parts, "is_ear": is_ear}
@@ -129,7 +124,7 @@ def skin_fields(detail: float = 1.0) -> dict[str, ndarray]:
 
 def _beards(p: ndarray, q: ndarray) -> dict[str, ndarray]:
     """Where beards grow, 0..1."""
-    line = PchipInterpolator(*np.transpose(face_numbers()["beard_line"]))(p)
+    line = PchipInterpolator(*np.transpose(numbers_of("faces")["beard_line"]))(p)
     moustache = np.exp(-(((q - 9.6 - 0.030 * p**2) / 2.0) ** 4))
     moustache = moustache * hill(p, 0.0, 10.5, 6) * (1.0 - 0.45 * hill(p, 0.0, 1.2))
     chin = smoothstep(-1.0, 1.5, q - np.maximum(line, 10.0)) * hill(p, 0.0, 9.5, 6)
@@ -138,13 +133,8 @@ def _beards(p: ndarray, q: ndarray) -> dict[str, ndarray]:
         np.maximum(smoothstep(-soft, 1.6 * soft, q - line) * (1.0 - smoothstep(32.0, 37.0, q)), moustache)
         for soft in (5.0, 2.0)
     )
-    return {
-        "stubble": stubble,
-        "moustache": moustache,
-        "goatee": np.maximum(chin, moustache),
-        "short beard": short,
-        "full beard": short,
-    }
+    full = {"stubble": stubble, "short beard": short, "full beard": short}
+    return full | {"moustache": moustache, "goatee": np.maximum(chin, moustache)}
 
 
 def _waves(
@@ -179,14 +169,10 @@ def paint_skin(who: Identity, shape: FaceShape, fields: dict[str, ndarray]) -> S
     strands = 1.0 + 0.09 * fields["strands"] + 0.05 * fields["mottling"][0]
     strand_colour = _rgb(who["hair"]) * strands
     if who["beard"] == "stubble":
-        alpha = np.clip(
-            0.5 * fields["stubble"] * (1.0 - fields["lips"]) * (1.0 + 0.1 * fields["grain"]), 0.0, 1.0
-        )
-        _over(albedo, _rgb(0.35 * who["hair"] + 0.40 * who["skin"]), alpha)
+        shade = _rgb(0.35 * who["hair"] + 0.40 * who["skin"])
+        _over(albedo, shade, 0.5 * fields["stubble"] * (1.0 + 0.1 * fields["grain"]))
     elif who["beard"] != "none":
-        rough = np.clip(
-            fields[who["beard"]] * (1.0 - fields["lips"]) * (1.0 + 0.2 * fields["strands"]), 0.0, 1.0
-        )
+        rough = fields[who["beard"]] * (1.0 + 0.2 * fields["strands"])
         _over(albedo, 0.9 * strand_colour, 0.9 * smoothstep(0.1, 0.8, rough))
         length = {"full beard": 1.7, "short beard": 0.6}.get(who["beard"], 0.9)
         thickness = length * smoothstep(0.3, 1.0, rough) * (1.0 + 0.06 * fields["strands"])
@@ -257,7 +243,7 @@ def _hair_distance(grid: FaceGrid, style: HairStyle, who: Identity) -> Float[nda
     """How far a point lies inside the hair (> 0) or outside it, in face pixels."""
     if style.cover == 0.0:
         return np.full(grid.p.shape, -50.0)
-    numbers, turn, p = face_numbers(), np.rad2deg(grid.theta[0]), grid.p[0]
+    numbers, turn, p = numbers_of("faces"), np.rad2deg(grid.theta[0]), grid.p[0]
     away, front, parting = np.abs(turn), -31.3 + who["hair_line"], who["hair_parting"]
     rows = np.minimum(numbers["hair_lines"][style.line], style.end - front)
     limit = front + PchipInterpolator(numbers["turns"], rows)(away)

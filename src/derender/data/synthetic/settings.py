@@ -7,7 +7,9 @@ it, so the same seed shows the same people in another light. ``LIGHTS``, ``VIEWS
 """
 
 from collections.abc import Iterable, Mapping, Sequence
+from functools import lru_cache
 from itertools import chain
+from pathlib import Path
 from typing import Annotated, Any, ClassVar, TypeVar
 
 import numpy as np
@@ -41,6 +43,12 @@ CLASSES: dict[str, tuple[str, ...]] = {  # body styles of each class of cars
 }
 _OTHER_DEG = 20.0  # with beyond_deg, the angle that is not beyond stays within this
 _YAW_SHARE = 0.6
+
+
+@lru_cache(maxsize=2)
+def numbers_of(kind: str) -> dict[str, Any]:
+    """The measures and colours in ``faces.yaml`` or ``cars.yaml``."""
+    return yaml.safe_load(Path(__file__).with_name(f"{kind}.yaml").read_text(encoding="utf-8"))
 
 
 def drawn(ends: Range, share: float, beyond: float = 0.0) -> float:
