@@ -82,8 +82,7 @@ def test_frontal_pictures_are_their_own_mirror_images():
 
 
 def test_the_renderer_makes_the_picture_from_the_stored_truth():
-    """Depth and albedo of a frontal image are canonical maps: rendered with its light they are the
-    image."""
+    """Depth and albedo of a frontal image are canonical: rendered with its light they are the image."""
     settings = CarSettings(view=CAR_VIEWS["frontal"], pictures_per_model=1)
     made = cars.generate(3, image_size=128, seed=5, settings=settings)
     depth = torch.from_numpy(np.where(made.mask, made.depth, 1.08).astype(np.float32))
@@ -101,15 +100,6 @@ def test_depth_and_parts_lie_in_the_stated_ranges(sample):
     for name in ("body", "window", "light", "trim"):
         shown = (sample.parts == sample.part_names.index(name)).any(axis=(1, 2))
         assert shown.mean() > 0.9, name
-
-
-def test_windows_are_dark_and_wheels_are_low(sample):
-    level = sample.albedo.mean(axis=1)
-    window, plate = (sample.parts == sample.part_names.index(name) for name in ("window", "plate"))
-    assert level[window].max() < 80 < level[plate].min()
-    row = np.broadcast_to(np.arange(64)[:, None], sample.parts.shape)
-    wheel = sample.parts == sample.part_names.index("wheel")
-    assert row[wheel].mean() > row[sample.mask].mean() + 2
 
 
 def test_cameras_are_the_turntable_that_the_labels_say(sample):
@@ -151,8 +141,7 @@ def test_wide_light_and_view_are_outside_of_usual():
 
 
 def test_shifts_keep_cars_inside_the_picture():
-    """Shifts far beyond the frame are cut so that every vertex still projects between the outermost
-    pixels."""
+    """Shifts far beyond the frame are cut: every vertex still projects between the outermost pixels."""
     view = CarViewSettings(shift_sd=0.1, shift=(-0.1, 0.1))
     settings = CarSettings(view=view, classes=("sedan",), pictures_per_model=8)
     made = cars.generate(8, settings=settings)
@@ -161,9 +150,7 @@ def test_shifts_keep_cars_inside_the_picture():
     seen = to_camera(vertices.expand(8, -1, 3), torch.from_numpy(made.camera.astype(np.float64)))
     place = project(seen, 64, 64, made.fov_deg)
     assert place.min() > -1e-3 and place.max() < 63 + 1e-3
-    assert (place.amin(dim=(1, 2)) < 0.01).sum() + (
-        place.amax(dim=(1, 2)) > 62.99
-    ).sum() >= 7  # and no further
+    assert ((place.amin(dim=(1, 2)) < 0.01) | (place.amax(dim=(1, 2)) > 62.99)).sum() >= 7  # and no further
 
 
 def test_written_sets_read_back_as_rendered_cars(sample, tmp_path):

@@ -171,7 +171,6 @@ def test_bad_arguments_are_named(kind, arguments, message):
     ("kind_of", "setting", "message"),
     [
         (FaceSettings, {"light": {"ambient": (0.7, 0.2)}}, "light.ambient must be two numbers.* within 0..1"),
-        (FaceSettings, {"light": {"ambient": (0.2, 1.7)}}, "light.ambient must be"),
         (FaceSettings, {"view": {"yaw_beyond_deg": 50}}, "yaw_beyond_deg must lie within"),
         (FaceSettings, {"expressions": ("smug",)}, "expressions must be one or more of neutral"),
         (FaceSettings, {"expressions": ()}, "expressions must be one or more"),
@@ -180,15 +179,9 @@ def test_bad_arguments_are_named(kind, arguments, message):
         (FaceSettings, {"pictures_per_identity": 0}, "pictures_per_identity"),
         (FaceSettings, {"age_years": (10, 40)}, "age_years must be two numbers"),
         (FaceSettings, {"yaw": 3}, "yaw"),
-        (CarSettings, {"classes": ("tank",)}, "classes must be one or more of sedan"),
-        (CarSettings, {"classes": {"van": 0.0}}, "not all 0"),
         (CarSettings, {"view": {"elevation_deg": (-5, 40)}}, r"view.elevation_deg must be two.*0.0..90.0"),
-        (CarSettings, {"view": {"azimuth_deg": (40, 10)}}, "low <= high"),
         (CarSettings, {"view": {"azimuth_beyond_deg": 40}}, "azimuth_beyond_deg must lie within"),
-        (CarSettings, {"light": {"yaw_deg": (0, 95)}}, "light.yaw_deg must be"),
         (CarSettings, {"size": 0.5}, "size"),
-        (CarSettings, {"pictures_per_model": 0}, "pictures_per_model"),
-        (CarSettings, {"doors": 3}, "doors"),
     ],
 )
 def test_bad_settings_are_named(kind_of, setting, message):

@@ -19,22 +19,15 @@ def dome(rows: int = 24) -> tuple[np.ndarray, np.ndarray]:
     z = np.sqrt(np.maximum(128.0 - x**2 - y**2, 0.0))
     corner = np.arange(rows * rows).reshape(rows, rows)
     a, b, c, d = corner[:-1, :-1], corner[:-1, 1:], corner[1:, :-1], corner[1:, 1:]
-    triangles = np.concatenate(
-        [np.stack([a, c, b], -1).reshape(-1, 3), np.stack([b, c, d], -1).reshape(-1, 3)]
-    )
+    triangles = np.concatenate([np.stack(t, -1).reshape(-1, 3) for t in ((a, c, b), (b, c, d))])
     return np.stack([x, y, z], -1).reshape(-1, 3), triangles
 
 
 def arrays(**changes) -> dict[str, np.ndarray]:
     mean, triangles = dome()
     components = np.stack([mean * [0.1, 0.0, 0.0], mean * [0.0, 0.1, 0.0]])
-    made = {
-        "mean": mean,
-        "triangles": triangles,
-        "components": components,
-        "std": np.array([1.0, 0.5]),
-        "unit": 18.0,
-    }
+    made = {"mean": mean, "triangles": triangles, "components": components, "std": np.array([1.0, 0.5])}
+    made |= {"unit": 18.0}
     return {name: value for name, value in (made | changes).items() if value is not None}
 
 
@@ -116,9 +109,8 @@ def test_no_file_and_no_npz(tmp_path):
 
 @pytest.fixture(scope="module")
 def converter():
-    spec = importlib.util.spec_from_file_location(
-        "convert_ict_facekit", ROOT / "examples/convert_ict_facekit.py"
-    )
+    path = ROOT / "examples/convert_ict_facekit.py"
+    spec = importlib.util.spec_from_file_location("convert_ict_facekit", path)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
@@ -129,11 +121,8 @@ def converter():
 def published(tmp_path, converter, monkeypatch) -> Path:
     """A tiny tree in ICT-FaceKit's layout: a dome whose last row of vertices are 'teeth'."""
     mean, _ = dome()
-    monkeypatch.setattr(
-        converter,
-        "RANGES",
-        {"face": (0, 551, "skin", None), "teeth": (552, 575, "mouth", (0.9, 0.8, 0.7))},
-    )
+    ranges = {"face": (0, 551, "skin", None), "teeth": (552, 575, "mouth", (0.9, 0.8, 0.7))}
+    monkeypatch.setattr(converter, "RANGES", ranges)
     folder = tmp_path / "FaceXModel"
     folder.mkdir()
     write_obj(folder / "generic_neutral_mesh.obj", mean)
@@ -142,9 +131,7 @@ def published(tmp_path, converter, monkeypatch) -> Path:
     for name in {shape for weights in converter.EXPRESSIONS.values() for shape in weights}:
         sides = ("",) if name in ("jawOpen", "mouthShrugLower") else ("_L", "_R")
         for side in sides:
-            write_obj(
-                folder / f"{name}{side}.obj", mean + np.array([0.0, 0.0, 0.5 if name == "jawOpen" else 0.0])
-            )
+            write_obj(folder / f"{name}{side}.obj", mean + np.array([0.0, 0.0, 0.5 * (name == "jawOpen")]))
     return folder
 
 

@@ -2,10 +2,12 @@
 
 import csv
 import io
+from zipfile import ZipFile
 
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from derender.data import read_images
 from derender.data.maps import read_ground_truth, read_masks
@@ -39,8 +41,6 @@ def test_the_reader_gives_back_what_was_written(made, folder):
 
 
 def test_columns_are_those_of_the_rendered_development_set(folder, shared_data):
-    from zipfile import ZipFile
-
     with ZipFile(shared_data("data/synface64.zip")) as archive:
         theirs = archive.read("test_gt/params.csv").decode().splitlines()[0].split(",")
     with (folder / "params.csv").open() as file:
@@ -56,16 +56,11 @@ def test_light_columns_agree_with_each_other(made, folder):
         rows = list(csv.DictReader(file))
     for row in rows:
         value = {k: float(v) for k, v in row.items() if k not in _TEXTS}
-        slope = np.array(
-            [np.tan(np.deg2rad(value["light_yaw"])), np.tan(np.deg2rad(value["light_pitch"])), 1.0]
-        )
+        slope = [*np.tan(np.deg2rad([value["light_yaw"], value["light_pitch"]])), 1.0]
         direction = np.array([value["lx"], value["ly"], value["lz"]])
         assert np.allclose(direction, slope / np.linalg.norm(slope), atol=2e-6)
-        pitch, yaw, roll = np.deg2rad([value["pitch"], value["yaw"], value["roll"]])
-        about_x = np.array([[1, 0, 0], [0, np.cos(pitch), -np.sin(pitch)], [0, np.sin(pitch), np.cos(pitch)]])
-        about_y = np.array([[np.cos(yaw), 0, np.sin(yaw)], [0, 1, 0], [-np.sin(yaw), 0, np.cos(yaw)]])
-        about_z = np.array([[np.cos(roll), -np.sin(roll), 0], [np.sin(roll), np.cos(roll), 0], [0, 0, 1]])
-        seen = about_z @ about_y @ about_x @ direction
+        turn = Rotation.from_euler("xyz", [value["pitch"], value["yaw"], value["roll"]], degrees=True)
+        seen = turn.apply(direction)  # R = Rz Ry Rx
         assert np.allclose([value["lx_cam"], value["ly_cam"], value["lz_cam"]], seen, atol=5e-6)
 
 
@@ -83,9 +78,8 @@ def test_identities_are_listed_once_with_their_traits(made, folder):
     with (folder / "identities.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [int(row["identity"]) for row in rows] == [0]
-    assert float(rows[0]["shape_nose_length"]) == pytest.approx(
-        made.identity_traits["shape_nose_length"][0], abs=1e-4
-    )
+    nose = made.identity_traits["shape_nose_length"][0]
+    assert float(rows[0]["shape_nose_length"]) == pytest.approx(nose, abs=1e-4)
 
 
 def test_without_truth_only_pictures_and_tables_and_never_over_another_set(made, tmp_path):

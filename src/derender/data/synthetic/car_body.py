@@ -111,6 +111,7 @@ def join(pieces: Sequence[Grid]) -> TriangleMesh:
     starts = np.cumsum([0, *(g.points[..., 0].size for g in pieces[:-1])])
     cells = [grid_triangles(*g.points.shape[:2], (g.points.shape[1] - 1) / 2) for g in pieces]
     surfaces = list(dict.fromkeys(g.surface for g in pieces))
+    owner = np.array([surfaces.index(g.surface) for g in pieces], np.int32)
     holes, rows = np.zeros((len(surfaces), 2, 3), np.float32), [d for s in surfaces for d in s.decals]
     for n, surface in enumerate(surfaces):
         holes[n, : len(surface.holes)] = np.reshape(surface.holes, (-1, 3))
@@ -122,9 +123,7 @@ def join(pieces: Sequence[Grid]) -> TriangleMesh:
         vertices=(vertices * _DOWN).astype(np.float32),
         triangles=np.concatenate([c + s for c, s in zip(cells, starts, strict=True)]).astype(np.int32),
         values=chart.astype(np.float32),
-        number=np.repeat([surfaces.index(g.surface) for g in pieces], [len(c) for c in cells]).astype(
-            np.int32
-        ),
+        number=np.repeat(owner, [len(c) for c in cells]),
         normals=normals.astype(np.float32),
         paint=Paint(
             colour=np.array([s.colour for s in surfaces], np.float32),

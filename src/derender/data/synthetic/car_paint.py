@@ -30,13 +30,8 @@ from derender.data.synthetic.mesh_image import BOX, DECAL_LENGTH, ELLIPSE, MOST_
 BLACK: Colour = (0.03, 0.03, 0.035)
 CHROME: Colour = (0.72, 0.73, 0.75)
 WHITE: Colour = (0.93, 0.93, 0.92)
-_LAMP: Colour = (0.95, 0.95, 0.88)
-_AMBER: Colour = (0.95, 0.55, 0.08)
-_RED: Colour = (0.72, 0.04, 0.05)
-_PLATE: Colour = (0.93, 0.93, 0.90)
-_BLUE: Colour = (0.06, 0.18, 0.70)
-_YELLOW: Colour = (0.88, 0.90, 0.12)
-_CROSS_RED: Colour = (0.82, 0.06, 0.07)
+_LAMP, _AMBER, _RED, _PLATE = (0.95, 0.95, 0.88), (0.95, 0.55, 0.08), (0.72, 0.04, 0.05), (0.93, 0.93, 0.90)
+_BLUE, _YELLOW, _CROSS_RED = (0.06, 0.18, 0.70), (0.88, 0.90, 0.12), (0.82, 0.06, 0.07)
 _AMBULANCE: tuple[Colour, ...] = ((0.92, 0.30, 0.06), _CROSS_RED, _YELLOW)  # stripes of each livery
 _DOORS_M = {"van": 1.05, "cab": 1.0, "jeep_hard": 1.0, "jeep_open": 1.0}
 _THREE_BOXES = ("sedan", "coupe", "sports")

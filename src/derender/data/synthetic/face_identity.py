@@ -43,20 +43,14 @@ def draw_identity(
     iris = irises[pick(irises[:, 3:] @ often, uniform()), :3] * uniform(0.85, 1.2)
     lips = skin * np.array((0.90, 0.66, 0.66)) + np.array((0.02, 0.0, 0.01))
     stick = max(0.0, uniform(-0.35, 0.75)) * max(0.0, 1.0 - 1.6 * build)
-    lips = (1.0 - stick) * lips + stick * _between(numbers["lipsticks"], uniform()) * (
-        0.55 + 0.45 * skin.mean()
-    )
+    painted = _between(numbers["lipsticks"], uniform()) * (0.55 + 0.45 * skin.mean())
+    lips = (1.0 - stick) * lips + stick * painted
     weights = np.array([*numbers["hair_chances"].values()])
-    heavy, delicate = (
-        np.maximum(weights[:, k] + weights[:, k + 1] * age, 0.0)
-        + weights[:, 4 + k // 2] * max(0.0, melanin - 0.6)
-        for k in (0, 2)
-    )
-    style = pick(build**2 * heavy + (1.0 - build) ** 2 * delicate, uniform())
+    common = np.maximum(weights[:, [0, 2]] + weights[:, [1, 3]] * age, 0.0)  # of heavy and delicate builds
+    common += weights[:, 4:] * max(0.0, melanin - 0.6)
+    style = pick(common @ [build**2, (1.0 - build) ** 2], uniform())
     beard = pick([*numbers["beards"].values()], uniform())
-    cloth = np.array(numbers["cloths"])[pick(np.ones(len(numbers["cloths"])), uniform())] * uniform(
-        0.8, 1.15, 3
-    )
+    cloth = np.array(numbers["cloths"][int(uniform() * len(numbers["cloths"]))]) * uniform(0.8, 1.15, 3)
     normal = generator.standard_normal
     return {
         "shape": dict(zip(modes, shape.tolist(), strict=True)),  # coefficient of every mode of face_shape

@@ -45,19 +45,17 @@ _IRIS_RADIUS, _PUPIL_RADIUS = 2.4, 1.0
 
 
 class HairStyle(NamedTuple):
-    """Face pixels. ``top``, ``front``, ``side``, ``hang``: thickness on the crown, over the forehead's edge,
-    over the ears, and below them; ``curl`` unevenness; ``cover`` opacity; ``fall`` how far a fringe falls;
-    ``end`` the row at which hanging hair ends."""
+    """A row of ``hair_styles`` in ``faces.yaml``, face pixels."""
 
     line: str
-    top: float
-    front: float
-    side: float
-    hang: float
-    curl: float
-    cover: float
-    fall: float
-    end: float
+    top: float  # thickness on the crown
+    front: float  # over the forehead's edge
+    side: float  # over the ears
+    hang: float  # below them
+    curl: float  # unevenness
+    cover: float  # opacity
+    fall: float  # how far a fringe falls
+    end: float  # row at which hanging hair ends
 
     @property
     def covers_ears(self) -> bool:
@@ -258,9 +256,7 @@ def _hair_distance(grid: FaceGrid, style: HairStyle, who: Identity) -> Float[nda
     return (limit - grid.q) / np.sqrt(1.0 + np.gradient(limit, p) ** 2)
 
 
-def _hair_thickness(
-    shape: FaceShape, style: HairStyle, volume: float, distance: ndarray
-) -> tuple[ndarray, ndarray]:
+def _hair_thickness(shape: FaceShape, style: HairStyle, volume: float, distance: ndarray) -> Any:
     """How far hair stands off the head, and how far hanging hair comes forward of the neck (it falls from the
     temples and makes up for the head's half width), face pixels."""
     theta, q = np.abs(shape.grid.theta), shape.grid.q
