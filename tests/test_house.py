@@ -16,7 +16,7 @@ SOURCES = sorted(PACKAGE.rglob("*.py"))
 TESTS = sorted((ROOT / "tests").rglob("*.py"))
 
 BUDGET = {  # lines, files
-    "data": (8_353, 39),
+    "data": (8_300, 39),
     "evaluation": (7_852, 45),
     "report": (4_460, 31),
     "cli": (3_350, 43),
