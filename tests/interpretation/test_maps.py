@@ -184,31 +184,29 @@ def test_a_map_that_ignores_the_weights_is_not_trusted():
     assert flat.empty == 1 and flat.trusted is None
 
 
-def test_spearman_of_known_maps():
+def test_known_maps(model, images):
+    """Rank correlation, upsampling, and the feature itself where there is no probe."""
     up = torch.arange(9.0).reshape(1, 3, 3)
-    assert spearman(up, up.exp())[0] == pytest.approx(1)
-    assert spearman(up, -up)[0] == pytest.approx(-1)
+    assert [spearman(up, other)[0] for other in (up.exp(), -up)] == pytest.approx([1, -1])
     assert np.isnan(spearman(up, torch.ones(1, 3, 3))[0])
-
-
-def test_upsampling_keeps_a_constant_and_the_place():
     torch.testing.assert_close(upsampled(torch.ones(1, 4, 4), 9), torch.ones(1, 9, 9))
     corner = torch.zeros(1, 4, 4)
     corner[0, 0, 3] = 1
     assert divmod(int(upsampled(corner, 32)[0].argmax()), 32) == (0, 28)
-
-
-def test_without_a_probe_the_feature_itself_is_shown(model, images):
     maps = saliency("grad-cam", model, images, "light")
     assert maps.shape == (3, 4, 4) and bool((maps >= 0).all()) and float(maps.max()) > 0
 
 
-def test_bad_words(model, probe, images):
-    with pytest.raises(ValueError, match="did you mean 'grad-cam'"):
-        saliency("gradcam", model, images, "geometry")
-    with pytest.raises(ValueError, match="no factor 'shape'"):
-        saliency("grad-cam", model, images, "shape", probe, [0, 0, 0])
-    with pytest.raises(ValueError, match="3 images need as many targets, got 1"):
-        saliency("grad-cam", model, images, "geometry", probe, [0])
+@pytest.mark.parametrize(
+    ("method", "factor", "targets", "message"),
+    [
+        ("gradcam", "geometry", [0, 0, 0], "did you mean 'grad-cam'"),
+        ("grad-cam", "shape", [0, 0, 0], "no factor 'shape'"),
+        ("grad-cam", "geometry", [0], "3 images need as many targets, got 1"),
+    ],
+)
+def test_bad_words(model, probe, images, method, factor, targets, message):
+    with pytest.raises(ValueError, match=message):
+        saliency(method, model, images, factor, probe, targets)
     with pytest.raises(ValueError, match="2 images or more, got 1"):
         sanity_check(model, probe, None, images[:1], np.zeros(1, np.int64))

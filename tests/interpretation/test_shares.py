@@ -60,28 +60,25 @@ def test_a_yes_or_no_has_the_same_shares_as_logit_and_as_probability(z, weight):
     np.testing.assert_allclose(logit.sum(axis=1), 1)
 
 
-def test_a_probe_that_uses_one_factor_gives_it_everything(z, weight):
-    weight[:, :4] = weight[:, 8:] = 0
-    shares = factor_shares(integrated_gradients(probe_of(weight), z, 0)[0], probe_of(weight))
-    np.testing.assert_allclose(shares, np.tile([0.0, 1.0, 0.0], (len(z), 1)), atol=1e-12)
+def shares_of(features, weight):
+    return factor_shares(integrated_gradients(probe_of(weight), features, 0)[0], probe_of(weight))
 
 
-def test_symmetric_factors_get_equal_shares(z, weight):
+def test_one_used_factor_has_everything_and_symmetric_factors_equal_shares(z, weight):
+    alone = weight.copy()
+    alone[:, :4] = alone[:, 8:] = 0
+    np.testing.assert_allclose(shares_of(z, alone), np.tile([0.0, 1.0, 0.0], (len(z), 1)), atol=1e-12)
     z[:, 4:8] = z[:, 8:] = z[:, :4]
     weight[:, 4:8] = -weight[:, :4]
     weight[:, 8:] = weight[:, :4]
-    shares = factor_shares(integrated_gradients(probe_of(weight), z, 0)[0], probe_of(weight))
-    np.testing.assert_allclose(shares, 1 / 3, atol=1e-9)
+    np.testing.assert_allclose(shares_of(z, weight), 1 / 3, atol=1e-9)
 
 
 def test_scales_of_answer_and_of_feature_change_no_share(z, weight):
-    def shares(features, w):
-        return factor_shares(integrated_gradients(probe_of(w), features, 0)[0], probe_of(w))
-
     stretch = np.repeat([2.0, 1.0, 0.25], 4).astype(np.float32)
-    np.testing.assert_allclose(shares(z, 7 * weight), shares(z, weight), rtol=1e-5)
-    np.testing.assert_allclose(shares(z * stretch, weight / stretch), shares(z, weight), rtol=1e-5)
-    assert np.abs(shares(z * stretch, weight) - shares(z, weight)).max() > 0.1
+    np.testing.assert_allclose(shares_of(z, 7 * weight), shares_of(z, weight), rtol=1e-5)
+    np.testing.assert_allclose(shares_of(z * stretch, weight / stretch), shares_of(z, weight), rtol=1e-5)
+    assert np.abs(shares_of(z * stretch, weight) - shares_of(z, weight)).max() > 0.1
 
 
 def test_nothing_attributed_is_no_share(z, weight):
@@ -139,14 +136,10 @@ def test_the_factor_that_knows_has_the_share_and_the_drop(known):
     assert model.error < 1e-6 and model.shares.shape == (2, 2, 3) and controls[1].shares.shape[0] == 1
 
 
-def test_a_zero_baseline_counts_a_constant_feature_and_the_mean_does_not(known):
+def test_a_zero_baseline_counts_a_constant_feature_and_the_same_seed_repeats(known):
     zero, mean = (explained(known, baseline=name).rows[0].shares.mean(axis=0) for name in ("zero", "mean"))
     assert (zero[:, 1] > mean[:, 1]).all()
-
-
-def test_the_same_seed_gives_the_same_numbers(known):
-    first, again = explained(known), explained(known)
-    assert first.numbers() == again.numbers()
+    assert explained(known).numbers() == explained(known).numbers()
 
 
 def test_classes_are_explained_on_their_own_pictures(known):
