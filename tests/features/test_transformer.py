@@ -69,21 +69,16 @@ def test_clone_and_parameters(model):
     assert "runs/x" in repr(transformer)
 
 
-def test_the_model_is_loaded_late_once_and_again_when_another_is_asked_for(loads, pictures):
+def test_the_model_is_loaded_late_once_and_a_copy_carries_its_path_not_its_weights(loads, pictures):
     transformer = DisentangledFeatures("runs/x")
     assert loads == []
-    transformer.fit(pictures.images)
-    transformer.transform(pictures.images)
+    found = transformer.fit(pictures.images).transform(pictures.images)
     assert loads == [("runs/x", "cpu")]
-    transformer.set_params(model="runs/y").transform(pictures.images)
-    assert loads == [("runs/x", "cpu"), ("runs/y", "cpu")]
-
-
-def test_a_copy_carries_the_path_not_the_weights(loads, pictures):
-    transformer = DisentangledFeatures("runs/x").fit()
     copy = pickle.loads(pickle.dumps(transformer))
     assert "_model" not in vars(copy)
-    np.testing.assert_array_equal(copy.transform(pictures.images), transformer.transform(pictures.images))
+    np.testing.assert_array_equal(copy.transform(pictures.images), found)
+    transformer.set_params(model="runs/y").transform(pictures.images)
+    assert loads[1:] == [("runs/x", "cpu"), ("runs/y", "cpu")]
 
 
 def test_it_works_in_a_pipeline_under_grid_search_with_names_and_pandas(model, pictures):
@@ -100,23 +95,30 @@ def test_it_works_in_a_pipeline_under_grid_search_with_names_and_pandas(model, p
     assert list(frame.columns) == ["geometry_0", "geometry_1", "geometry_2", "albedo_0", "albedo_1"]
 
 
-def test_bad_input_is_refused_in_words(model, pictures):
-    transformer = DisentangledFeatures(model)
-    with pytest.raises(ValueError, match="unknown factor 'geomtry'; did you mean 'geometry'\\?"):
-        DisentangledFeatures(model, factors=("geomtry",)).fit(pictures.images)
-    with pytest.raises(ValueError, match="name at least one factor; there is geometry, albedo"):
-        DisentangledFeatures(model, factors=()).fit()
-    for wrong, message in [
-        (
-            pictures.images[:, :, :4],
-            r"expected images \(N, 3, 8, 8\) or \(N, 8, 8, 3\), got shape \(11, 3, 4, 8\)",
-        ),
-        (pictures.images[0], r"got shape \(3, 8, 8\)"),
-        (pictures.images.astype(np.int64), "expected images in uint8 or floats in 0..1, got int64"),
-        (pictures.images.astype(np.float32), "must lie in 0..1 without NaN: divide by 255"),
-        (np.full((1, 3, 8, 8), np.nan), "must lie in 0..1 without NaN"),
-        ("one.png", "got the one path 'one.png': give a list of paths"),
-        ([None, None], "expected paths of images, got NoneType"),
-    ]:
-        with pytest.raises(ValueError, match=message):
-            transformer.transform(wrong)
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda images: images[:, :, :4], r"\(N, 3, 8, 8\) or \(N, 8, 8, 3\), got shape \(11, 3, 4, 8\)"),
+        (lambda images: images[0], r"got shape \(3, 8, 8\)"),
+        (lambda images: images.astype(np.int64), "expected images in uint8 or floats in 0..1, got int64"),
+        (lambda images: images.astype(np.float32), "must lie in 0..1 without NaN: divide by 255"),
+        (lambda images: np.full((1, 3, 8, 8), np.nan), "must lie in 0..1 without NaN"),
+        (lambda images: "one.png", "got the one path 'one.png': give a list of paths"),
+        (lambda images: [None, None], "expected paths of images, got NoneType"),
+    ],
+)
+def test_wrong_images_are_refused_in_words(model, pictures, change, message):
+    with pytest.raises(ValueError, match=message):
+        DisentangledFeatures(model).transform(change(pictures.images))
+
+
+@pytest.mark.parametrize(
+    ("factors", "message"),
+    [
+        (("geomtry",), "unknown factor 'geomtry'; did you mean 'geometry'\\?"),
+        ((), "name at least one factor; there is geometry, albedo"),
+    ],
+)
+def test_wrong_factors_are_refused_in_words(model, factors, message):
+    with pytest.raises(ValueError, match=message):
+        DisentangledFeatures(model, factors=factors).fit()
