@@ -85,8 +85,8 @@ def test_bad_words(model, rendered, tmp_path, capsys):
         return capsys.readouterr().err.strip().splitlines()[-1]
 
     assert "--angles 'wide' should read like" in refused("--angles", "wide")
-        "--label", "hairs", "--people", 2
-    )
+    assert "within 0..60 degrees for pitch" in refused("--axes", "pitch")
+    assert "unknown head 'svm'" in refused("--head", "svm")
     assert "unknown kind of images 'facess'; did you mean 'faces'" in refused("--pictures", "facess")
     assert "take no images" in refused("--pictures", "cars", "-d", rendered)
     assert "need images" in refused("--pictures", "truth")
