@@ -15,7 +15,7 @@ from derender.baselines.controls import (
 )
 from derender.baselines.model import optional
 from derender.data import ImageSet
-from derender.features import embed_pictures, model_fingerprint
+from derender.features import embed_image_set, model_fingerprint
 
 
 def pictures(count: int = 30, size: int = 8, seed: int = 0) -> ImageSet:
@@ -85,7 +85,7 @@ def test_an_untrained_twin_has_the_shape_not_the_weights_and_leaves_the_generato
 def test_untrained_features_are_those_of_the_twin(small):
     given = pictures(5, small.image_size)
     table = untrained_features(small, given, seed=2)
-    expected = embed_pictures(untrained_twin(small, 2), given)
+    expected = embed_image_set(untrained_twin(small, 2), given)
     assert set(table.factors) == {"geometry", "albedo", "light", "camera"}
     for name in table.factors:
         np.testing.assert_array_equal(table.factors[name], expected.factors[name])

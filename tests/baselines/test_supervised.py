@@ -15,7 +15,7 @@ from derender.baselines.supervised import (
     labelled_rows,
 )
 from derender.data import split_indices
-from derender.features import embed_pictures, model_fingerprint
+from derender.features import embed_image_set, model_fingerprint
 from derender.training.config import with_changes
 from derender.training.run_folder import read_metrics
 
@@ -48,7 +48,7 @@ def test_it_learns_from_few_labels_and_repeats(blobs, tmp_path):
     test = blobs.select(split_indices(blobs.files, FEW.split, seed=0).test)
     assert set(accuracy(model, test)) == {"accuracy side"}
     model.choose(("pooled", "logits"))
-    table = embed_pictures(model, blobs)
+    table = embed_image_set(model, blobs)
     assert {name: values.shape[1] for name, values in table.factors.items()} == {"pooled": 64, "logits": 2}
     other = blobs.select(np.arange(48))
     hidden = sorted(set(range(48)) - set(labelled_rows(blobs, FEW).tolist()))

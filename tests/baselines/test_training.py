@@ -12,7 +12,7 @@ from safetensors.torch import load_file, save_file
 
 import derender
 from derender.baselines import baseline_config, load_baseline, network_type, read_any_config, train_baseline
-from derender.features import embed_pictures
+from derender.features import embed_image_set
 from derender.report.run import baseline_sheet, run_page
 from derender.training import resolve, train
 from derender.training.checkpoint import WEIGHTS_FILE
@@ -59,9 +59,9 @@ def test_a_run_leaves_what_ours_leave_makes_a_table_and_resumes_exactly(name, ru
     assert f"Baseline {name}, seed 0." in run_page(run).html()
 
     model = load_baseline(run)
-    table = embed_pictures(model, blobs, batch_size=7, origin={"baseline": name})
+    table = embed_image_set(model, blobs, batch_size=7, origin={"baseline": name})
     assert set(table.factors) == {model.features[0]} and table.origin["baseline"] == name
-    again = embed_pictures(load_baseline(run / "model", name), blobs, batch_size=48)
+    again = embed_image_set(load_baseline(run / "model", name), blobs, batch_size=48)
     for factor, values in table.factors.items():
         np.testing.assert_allclose(values, again.factors[factor], rtol=1e-3, atol=1e-4)
     best = weights(run, "best")

@@ -10,7 +10,6 @@ from derender.data import GroundTruth
 from derender.evaluation import albedo_error, camera_error, evaluate_factors, light_error
 from derender.scene import Scene
 from derender.scene.camera import rotation_matrix
-from derender.scene.light import light_direction
 
 
 def cameras(count: int = 20, seed: int = 0, spread_rad: float = 0.3) -> torch.Tensor:
@@ -71,28 +70,6 @@ def test_alignment_forgives_a_constant_turn_of_the_light_and_nothing_else():
     assert 5 < aligned.mean_deg <= plain.mean_deg + 1e-6
 
 
-def test_a_constant_light_aligned_is_the_mean_direction():
-    generator = torch.Generator().manual_seed(1)
-    light = torch.cat([torch.zeros(40, 2), 0.3 * torch.randn(40, 2, generator=generator) + 0.2], dim=1)
-    still, away = torch.zeros(40, 6), torch.zeros(40, 4)
-    away[:, 2] = -0.7
-    scores = light_error(away, still, light, still, aligned=True)
-    direction = torch.nn.functional.normalize(light_direction(light.double()).mean(dim=0), dim=0)
-    angle = torch.rad2deg(torch.arccos(light_direction(light.double()) @ direction))
-    np.testing.assert_allclose(scores.each_deg, angle, atol=1e-5)
-
-
-def test_light_error_is_the_angle_between_directions():
-    yaw_deg = torch.tensor([0.0, 10.0, 44.0])
-    light = torch.zeros(3, 4)
-    turned_light = light.clone()
-    turned_light[:, 3] = torch.deg2rad(yaw_deg)
-    still = torch.zeros(3, 6)
-    scores = light_error(light, still, turned_light, still)
-    np.testing.assert_allclose(scores.each_deg, yaw_deg, atol=1e-5)
-    assert scores.mean_deg == pytest.approx(18) and scores.median_deg == pytest.approx(10)
-
-
 def test_light_is_compared_in_the_frame_of_the_camera():
     """A light turned one way on an object turned back by as much is the same light."""
     light, camera = torch.zeros(1, 4), torch.zeros(1, 6)
@@ -114,12 +91,6 @@ def test_two_cameras_apart_about_one_axis_leave_half_the_angle_each():
     true, predicted = torch.zeros(2, 6), torch.zeros(2, 6)
     true[:, 1] = torch.deg2rad(torch.tensor([-20.0, 20.0]))
     np.testing.assert_allclose(camera_error(predicted, true).each_deg, [20, 20], atol=1e-4)
-
-
-def test_a_mirrored_camera_is_not_forgiven():
-    camera = cameras(200)
-    mirrored = camera * torch.tensor([1, -1, -1, 1, 1, 1])
-    assert camera_error(mirrored, camera).mean_deg > camera_error(torch.zeros_like(camera), camera).mean_deg
 
 
 class Oracle(torch.nn.Module):

@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 from derender.data import open_images, read_images
-from derender.features import FeatureTable, embed_pictures, embed_to_file, embedding
+from derender.features import FeatureTable, embed_image_set, embed_to_file, embedding
 from derender.features.blocks import BlockEmbedder
 
 COUNT = 110
@@ -86,7 +86,7 @@ def assert_same(path: Path, expected: FeatureTable) -> None:
 def in_memory(model, source: str, path: Path, **options) -> FeatureTable:
     """The table of the whole set in memory, once through a file as any table goes."""
     images = read_images(source, 8, **options)
-    return FeatureTable.read(embed_pictures(model, images, batch_size=16).write(path))
+    return FeatureTable.read(embed_image_set(model, images, batch_size=16).write(path))
 
 
 def streamed(model, source: str, path: Path, *, limit: int | None = None, **options):
@@ -182,7 +182,7 @@ def test_a_stopped_run_goes_on_to_the_same_table(model, source, tmp_path, out, s
 def test_a_set_is_written_as_a_stream_is(model, source, tmp_path, out):
     images = read_images(source, 8)
     part = images.select(np.arange(len(images)) % 2 == 0)
-    expected = FeatureTable.read(embed_pictures(model, part, batch_size=16).write(tmp_path / "m.parquet"))
+    expected = FeatureTable.read(embed_image_set(model, part, batch_size=16).write(tmp_path / "m.parquet"))
     with pytest.raises(KeyboardInterrupt, match="the same command goes on"):
         embed_to_file(part, model, out, batch_size=16, progress=stop_after(30))
     assert embed_to_file(part, model, out, batch_size=16).resumed == 32

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from derender.features import FeatureTable, embed_pictures, model_fingerprint
+from derender.features import FeatureTable, embed_image_set, model_fingerprint
 
 
 def test_features_are_those_of_the_model_whatever_the_batch(model, pictures):
@@ -15,14 +15,14 @@ def test_features_are_those_of_the_model_whatever_the_batch(model, pictures):
         def progress(*state: int, seen=seen) -> None:
             seen.append(state)
 
-        table = embed_pictures(model, pictures, batch_size=batch_size, progress=progress)
+        table = embed_image_set(model, pictures, batch_size=batch_size, progress=progress)
         assert seen == [(min(end, 11), 11) for end in range(batch_size, 11 + batch_size, batch_size)]
         for name in expected:
             np.testing.assert_allclose(table.factors[name], expected[name].detach(), rtol=1e-5, atol=1e-5)
 
 
 def test_labels_partition_and_origin_go_with_the_features(model, pictures, tmp_path):
-    table = embed_pictures(model, pictures, origin={"model": "runs/x"})
+    table = embed_image_set(model, pictures, origin={"model": "runs/x"})
     assert table.files == pictures.files
     assert table.label("identity").tolist() == pictures.labels["identity"].tolist()
     assert table.label("partition").tolist() == ["train"] * 6 + ["test"] * 5
@@ -34,7 +34,7 @@ def test_labels_partition_and_origin_go_with_the_features(model, pictures, tmp_p
 def test_the_model_is_left_in_its_mode_with_its_statistics(model, pictures):
     model.train()
     before = model_fingerprint(model)
-    embed_pictures(model, pictures)
+    embed_image_set(model, pictures)
     assert model.training and model_fingerprint(model) == before
 
 
@@ -47,12 +47,12 @@ def test_the_fingerprint_sees_one_changed_weight(model):
 def test_bad_input_is_refused_in_words(model, pictures):
     model.image_size = 16
     with pytest.raises(ValueError, match="are 8x8, the model takes 16x16: read them with image_size=16"):
-        embed_pictures(model, pictures)
+        embed_image_set(model, pictures)
     model.image_size = 8
     with pytest.raises(ValueError, match="batch_size must be 1 or more, got 0"):
-        embed_pictures(model, pictures, batch_size=0)
+        embed_image_set(model, pictures, batch_size=0)
     with pytest.raises(ValueError, match="no images"):
-        embed_pictures(model, pictures.select([]))
+        embed_image_set(model, pictures.select([]))
     model.b[:] = torch.nan
     with pytest.raises(ValueError, match=r"factor 'albedo' is not finite in 11 of 11 rows, first in 0\.png"):
-        embed_pictures(model, pictures)
+        embed_image_set(model, pictures)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from derender.data import ImageSet
-from derender.features import FeatureTable, embed_pictures, embed_to_file, embedding
+from derender.features import FeatureTable, embed_image_set, embed_to_file, embedding
 from derender.storage.atomic import DamageNoticed
 
 
@@ -60,7 +60,7 @@ def test_a_damaged_part_is_made_again_with_those_after_it(model, pictures, stopp
     with pytest.warns(DamageNoticed, match=rf"damaged \({words}\): going on from the 16 rows before it"):
         done = embed_to_file(pictures, model, tmp_path / "F.parquet", batch_size=8)
     assert (done.resumed, done.rows) == (16, 60)
-    assert same_table(tmp_path / "F.parquet", embed_pictures(model, pictures, batch_size=8))
+    assert same_table(tmp_path / "F.parquet", embed_image_set(model, pictures, batch_size=8))
     assert not list(tmp_path.glob("*.partial"))
 
 

@@ -107,12 +107,6 @@ def test_files_made_elsewhere_list_columns_are_factors(tmp_path):
     assert missing(back.label("who")).tolist() == [False, True]
 
 
-def test_several_row_groups_are_joined_in_order(tmp_path):
-    columns = {"file": [str(i) for i in range(10)], "f": [[float(i), -1.0] for i in range(10)]}
-    pq.write_table(pa.table(columns), tmp_path / "t.parquet", row_group_size=3)
-    np.testing.assert_array_equal(FeatureTable.read(tmp_path / "t.parquet").factors["f"][:, 0], np.arange(10))
-
-
 @pytest.mark.parametrize(
     ("columns", "message"),
     [
@@ -247,5 +241,16 @@ def test_mean_by_averages_groups_and_keeps_what_is_constant():
         (np.array([False, True]), [False, False]),
     ],
 )
-def test_missing_knows_every_way_to_be_missing(values, expected):
-    assert missing(values).tolist() == expected
+@pytest.mark.parametrize(
+    ("labels", "expected"),
+    [
+        (np.array(["", "a"]), [True, False]),
+        (np.array([np.nan, 0.0]), [True, False]),
+        (np.array([None, np.nan, "", 0, "a"], dtype=object), [True, True, True, False, False]),
+        (np.array([-1, 0, 1], np.int8), [True, False, False]),
+        (np.array([-1, 0, 1]), [False, False, False]),
+        (np.array([False, True]), [False, False]),
+    ],
+)
+def test_missing_knows_every_way_to_be_missing(labels, expected):
+    assert missing(labels).tolist() == expected

@@ -13,7 +13,7 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
 import derender
-from derender.features import DisentangledFeatures, embed_pictures
+from derender.features import DisentangledFeatures, embed_image_set
 
 
 @pytest.fixture
@@ -30,7 +30,7 @@ def loads(model, monkeypatch) -> list:
 
 
 def test_transform_gives_the_table_s_features_in_the_order_asked_for(model, pictures):
-    table = embed_pictures(model, pictures)
+    table = embed_image_set(model, pictures)
     features = DisentangledFeatures(model, factors=("albedo", "geometry")).fit_transform(pictures.images)
     np.testing.assert_allclose(features, table.concatenate(("albedo", "geometry")), rtol=1e-5, atol=1e-5)
     one = DisentangledFeatures(model, factors="albedo", batch_size=2).transform(pictures.images)

@@ -50,11 +50,6 @@ def test_scale_changes_shares_and_not_ratios(features, clusters):
     np.testing.assert_allclose(every.share, plain.share)
 
 
-def test_equal_factors_have_equal_shares(features, clusters):
-    same = dict.fromkeys(features, features["light"])
-    np.testing.assert_allclose(cluster_shares(same, clusters).share, 1 / 3)
-
-
 def test_parts_of_a_pair_sum_to_distance_and_cosine(features):
     found = pair_parts(features, 4, 7)
     whole = np.concatenate(list(features.values()), axis=1)

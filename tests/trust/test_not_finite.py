@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from derender.data import ImageSet
-from derender.features.extract import embed_pictures
+from derender.features.extract import embed_image_set
 from derender.model import Derenderer
 from derender.networks.confidence import Confidence
 from derender.objectives import self_features
@@ -246,7 +246,7 @@ def test_embedding(model, stage, bad):
         maps = {"albedo": Projection(torch.zeros(width), torch.full((width, 16), bad), torch.ones(16))}
         model = model.with_features(Features(Whitening(maps)))
     with pytest.raises(ValueError, match=r"factor 'albedo' is not finite in \d+ of 20 rows, first in 000"):
-        embed_pictures(model, picture_set(), batch_size=20)
+        embed_image_set(model, picture_set(), batch_size=20)
 
 
 def test_held_out_errors(model):

@@ -16,7 +16,7 @@ from sklearn.decomposition import PCA
 
 from derender.baselines.model import optional
 from derender.data import ImageSet
-from derender.features import FeatureTable, Progress, embed_pictures, table_labels
+from derender.features import FeatureTable, Progress, embed_image_set, table_labels
 from derender.inputs import as_images, part_of
 from derender.model import load
 
@@ -129,7 +129,7 @@ def untrained_features(
     """Features of the same architecture with fresh weights: the model's own factors."""
     origin = {"control": "untrained", "seed": seed}
     twin = untrained_twin(model, seed)
-    return embed_pictures(twin, images, batch_size=batch_size, progress=progress, origin=origin)
+    return embed_image_set(twin, images, batch_size=batch_size, progress=progress, origin=origin)
 
 
 class Untrained:

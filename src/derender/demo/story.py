@@ -27,7 +27,7 @@ from derender.evaluation import (
     evaluate_reconstruction,
     mean_image,
 )
-from derender.features import embed_pictures
+from derender.features import embed_image_set
 from derender.model import Derenderer, load
 from derender.report.run import decomposition_sheet
 from derender.settings import Settings
@@ -176,7 +176,7 @@ def run_demo(
     components = min(64, len(seen) // 4)
     pca = pca_features(unseen, components=components, fit_on=seen, seed=seed)
     features = {
-        " + ".join(FACTORS): embed_pictures(model, unseen).concatenate(FACTORS),
+        " + ".join(FACTORS): embed_image_set(model, unseen).concatenate(FACTORS),
         "untrained encoder": untrained_features(model, unseen, seed=seed).concatenate(FACTORS),
         f"PCA ({components})": pca.concatenate(None),
         "pixels": pixel_features(unseen).concatenate(None),

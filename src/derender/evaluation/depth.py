@@ -107,13 +107,11 @@ def geometry_scores(
     """SIDE and MAD of depth maps in the view of the image.
 
     Args:
-        depth_pred: metric or up to scale; values outside ``mask_pred`` do not matter.
-        mask_pred: where there is a prediction.
-        depth_true: true depth, positive inside ``mask_true``.
-        mask_true: the object.
+        depth_pred, mask_pred: metric or up to scale, and where there is a prediction; elsewhere values do not
+            matter.
+        depth_true, mask_true: true depth, positive inside the object.
         fov_deg: horizontal field of view of the images.
-        normal_true: true normals where they are known better than from depth (rendered ones); camera frame,
-            inward.
+        normal_true: true normals where they are known better than from depth; camera frame, inward.
     """
     inside, valid = erode(mask_true), erode(mask_true & mask_pred)
     if not inside.any():

@@ -173,12 +173,8 @@ def evaluate_factors(
 ) -> FactorResult:
     """Albedo, light and camera that a model predicts for images with ground truth, beside constant answers.
 
-    Args:
-        model: with ``decompose``, ``render``, ``image_size``, ``device``.
-        truth: images with albedo, light, camera and mask at the model's image size.
-        batch_size: images at a time; changes speed and memory only.
-        untrained: the same architecture with fresh weights, for the control.
-        progress: called with (images done, images in all) after every batch.
+    ``truth`` has albedo, light, camera and mask at the model's image size; the rest is as of
+    ``evaluate_geometry``.
     """
     for name in ("albedo", "light", "camera"):
         if getattr(truth, name) is None:

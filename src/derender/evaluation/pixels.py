@@ -5,10 +5,8 @@ geometry; and an untrained model. The first two are scored inside the model's ow
 proves nothing about geometry (a copied image has none): read it with evaluation/depth.py.
 
 SSIM: Wang et al., IEEE TIP 2004, computed by torchmetrics: a Gaussian window of 11 x 11 pixels with sigma
-1.5, constants 0.01 and 0.03, images in 0..1, mean over colours. A window that reaches over the edge of the
-mask would compare uncovered pixels, so its centre is left out; with a full mask the score is torchmetrics'
-own, without the same five pixels at the border of the image. Leaves out several scales and learned
-similarities.
+1.5, mean over colours. The centre of a window that reaches over the edge of the mask is left out, and so are
+five pixels at the border of the image. Leaves out several scales and learned similarities.
 """
 
 from collections.abc import Mapping
@@ -140,13 +138,10 @@ def evaluate_reconstruction(
     Args:
         model: with ``reconstruct`` and ``device``.
         images: at the model's image size.
-        mean: the control, best made of the training images; by default the mean of ``images`` themselves,
-            which is a little harder to beat.
+        mean: the control, best made of the training images; by default that of ``images`` themselves.
         components_of: images that give 64 principal components (fewer where they are fewer than 256), for
             that control.
-        untrained: the same architecture with fresh weights, for that control.
-        batch_size: images at a time; changes speed and memory only.
-        progress: called with (images done, images in all) after every batch.
+        untrained, batch_size, progress: as of ``evaluate_geometry``.
     """
 
     def rendered(net: Any, report: Progress | None = None) -> tuple[Tensor, ...]:

@@ -8,8 +8,8 @@ nearest rows by one factor.
 from derender.features.embedding import Embedded, embed, embed_to_file
 from derender.features.extract import (
     Progress,
+    embed_image_set,
     embed_images,
-    embed_pictures,
     evaluating,
     map_batches,
     model_fingerprint,
@@ -25,8 +25,8 @@ __all__ = [
     "FeatureTable",
     "Progress",
     "embed",
+    "embed_image_set",
     "embed_images",
-    "embed_pictures",
     "embed_to_file",
     "evaluating",
     "map_batches",

@@ -28,7 +28,7 @@ from derender.data import (
     suggestion,
 )
 from derender.features.blocks import local_blocks, ray_blocks
-from derender.features.extract import check_size, embed_pictures, model_facts, table_labels
+from derender.features.extract import check_size, embed_image_set, model_facts, table_labels
 from derender.features.parquet import Columns, write_columns
 from derender.features.parts import Parts, Rows, rows_of
 from derender.features.table import FeatureTable, check_names
@@ -44,17 +44,14 @@ class Embedded:
     """A feature table that was written.
 
     Attributes:
-        path: the table.
-        rows: images in it.
+        path, rows: the table, and how many images are in it.
         factors: numbers of each factor.
         labels: names of label columns.
         origin: as in the table.
-        skipped: how many images could not be read.
-        examples: the first of those, with reasons.
+        skipped, examples: how many images could not be read, and the first of those with reasons.
         copies: how many were identical copies of an earlier one.
         resumed: how many rows an earlier run had made.
-        source: the images, as the caller named them.
-        layout: of the data set.
+        source, layout: the images as the caller named them, and the layout of the data set.
     """
 
     path: Path
@@ -71,9 +68,8 @@ class Embedded:
 
     def describe(self) -> str:
         """One line: how many images of which data set, how many were left out or had been there."""
-        parts = [
-            f"{self.rows:,} {'image' if self.rows == 1 else 'images'} from {self.source} ({self.layout})"
-        ]
+        images = "image" if self.rows == 1 else "images"
+        parts = [f"{self.rows:,} {images} from {self.source} ({self.layout})"]
         parts += [f"{self.resumed:,} of them from the run before"] if self.resumed else []
         parts += [f"{self.skipped:,} skipped"] if self.skipped else []
         parts += [f"{self.copies:,} identical copies dropped"] if self.copies else []
@@ -107,7 +103,7 @@ def embed(
     net, origin = _network(model, device, fit_steps)
     how = {"dataset": dataset, "limit": limit, "part": part, "model": origin.get("source")}
     read = as_images(images, net.image_size, **how)
-    return embed_pictures(net, read, batch_size=batch_size, progress=progress, origin=origin)
+    return embed_image_set(net, read, batch_size=batch_size, progress=progress, origin=origin)
 
 
 def embed_to_file(
@@ -133,13 +129,9 @@ def embed_to_file(
 
     Args:
         images: as for ``embed``, or an open stream.
-        model: as for ``embed``.
         out: the parquet file; parts are in ``OUT.partial`` meanwhile.
-        dataset, part, limit: how an address is read; a part of a split is read whole first.
-        fit: how images that are not square are read (of a stream).
-        keep_duplicates: keep identical copies (of a stream).
-        batch_size: images at a time.
-        fit_steps, device: as for ``embed``.
+        fit, keep_duplicates: how images of a stream that are not square are read; keep identical copies.
+        model, dataset, part, limit, batch_size, fit_steps, device: as for ``embed``.
         engine: "local", or "ray": on the machines of a Ray cluster, which open ``images`` by their address.
         workers: decoding threads (default: one for each core); actors of Ray (default: 2).
         fresh: begin anew where an earlier run made something else; otherwise that is an error.
@@ -277,16 +269,6 @@ def _finish(
     write_columns(path, groups())
     parts.remove()
     passed_over = () if isinstance(images, ImageSet) else images.passed_over
-    return Embedded(
-        path,
-        so_far.rows,
-        factors,
-        tuple(labels),
-        facts,
-        so_far.skipped + len(passed_over),
-        (*passed_over, *(Skipped(*row) for row in so_far.examples)),
-        so_far.copies,
-        resumed,
-        images.source,
-        images.layout,
-    )
+    examples = (*passed_over, *(Skipped(*row) for row in so_far.examples))
+    counts = (so_far.skipped + len(passed_over), examples, so_far.copies, resumed)
+    return Embedded(path, so_far.rows, factors, tuple(labels), facts, *counts, images.source, images.layout)

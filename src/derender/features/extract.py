@@ -73,8 +73,8 @@ def as_batch(images: np.ndarray, device: torch.device) -> Tensor:
     """
     array = np.array(images)
     tensor = torch.from_numpy(array).to(device)
-    pictures = as_float(tensor) if array.dtype == np.uint8 else tensor.float()
-    return pictures.contiguous(memory_format=torch.channels_last)
+    batch = as_float(tensor) if array.dtype == np.uint8 else tensor.float()
+    return batch.contiguous(memory_format=torch.channels_last)
 
 
 def factor_codes(model: Any, batch: Tensor) -> dict[str, np.ndarray]:
@@ -90,9 +90,9 @@ def embed_images(
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
-def embed_pictures(
+def embed_image_set(
     model: Any,
-    pictures: ImageSet,
+    images: ImageSet,
     *,
     batch_size: int = 256,
     progress: Progress | None = None,
@@ -108,10 +108,10 @@ def embed_pictures(
         origin: further facts for the table, such as the model's path and preset; they win over those found
             here.
     """
-    check_size(model, pictures.images)
-    factors = embed_images(model, pictures.images, batch_size=batch_size, progress=progress)
-    facts = {**model_facts(model, pictures.source, pictures.layout), **(origin or {})}
-    return FeatureTable(pictures.files, factors, table_labels(pictures), facts)
+    check_size(model, images.images)
+    factors = embed_images(model, images.images, batch_size=batch_size, progress=progress)
+    facts = {**model_facts(model, images.source, images.layout), **(origin or {})}
+    return FeatureTable(images.files, factors, table_labels(images), facts)
 
 
 def check_size(model: Any, images: np.ndarray) -> None:
@@ -126,13 +126,8 @@ def check_size(model: Any, images: np.ndarray) -> None:
 
 def model_facts(model: Any, source: str, layout: str) -> dict[str, Any]:
     """What a table's origin says: version, model, weights, data."""
-    facts: dict[str, Any] = {
-        "derender": derender.__version__,
-        "model": type(model).__name__,
-        "weights": model_fingerprint(model),
-        "data": source,
-        "layout": layout,
-    }
+    facts: dict[str, Any] = {"derender": derender.__version__, "model": type(model).__name__}
+    facts |= {"weights": model_fingerprint(model), "data": source, "layout": layout}
     if getattr(model, "fitting", None) is not None:
         facts["fit_steps"] = model.fitting.settings.steps
     if hasattr(model, "settings"):
@@ -140,7 +135,7 @@ def model_facts(model: Any, source: str, layout: str) -> dict[str, Any]:
     return facts
 
 
-def table_labels(pictures: Any) -> dict[str, np.ndarray]:
+def table_labels(images: Any) -> dict[str, np.ndarray]:
     """An image set's labels, and the owners' split as one more label ``partition`` where there is one."""
-    owners = {} if pictures.partition is None else {"partition": pictures.partition}
-    return {**owners, **pictures.labels}
+    owners = {} if images.partition is None else {"partition": images.partition}
+    return {**owners, **images.labels}

@@ -8,7 +8,7 @@ approximate indices, which pay from some ten million rows on.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -26,19 +26,6 @@ SAME_IMAGE = 1e-3
 """Largest relative difference, in every factor, of one image embedded twice (batches and devices round)."""
 SAME_FITTED = 0.3
 """The same of scenes optimised per image: after sixty steps 0.12 (measured); others are 0.6 away."""
-
-
-@dataclass(frozen=True)
-class Neighbours:
-    """The nearest rows of Q queries, nearest first.
-
-    Attributes:
-        rows: (Q, k) rows of the table.
-        distances: (Q, k) in the metric.
-    """
-
-    rows: Int64[np.ndarray, "q k"]
-    distances: Float64[np.ndarray, "q k"]
 
 
 @dataclass(frozen=True)
@@ -127,9 +114,8 @@ def search(
     hidden = [] if copies else itself
     if len(hidden) == len(rows):
         raise ValueError(f"{name} has no row but {like} itself: include copies to find that")
-    near = nearest(rows, codes[factor], factor, k, metric=metric, exclude=hidden)
-    found = near.rows[0].tolist(), near.distances[0].tolist()
-    return Found(rows, like, factor, metric, *found, own_row, itself, unchecked)
+    near, away = nearest(rows, codes[factor], factor, k, metric=metric, exclude=hidden)
+    return Found(rows, like, factor, metric, near.tolist(), away.tolist(), own_row, itself, unchecked)
 
 
 def maker_of(table: FeatureTable, model: Any, name: str = "the table", *, device: str = "auto") -> Any:
@@ -153,31 +139,27 @@ def nearest(
     factor: str,
     k: int = 12,
     *,
-    metric: Literal["cosine", "euclidean"] | str = "cosine",
+    metric: str = "cosine",
     exclude: Sequence[int] = (),
-) -> Neighbours:
-    """The ``k`` rows of a table nearest to each query by one factor.
+) -> tuple[Int64[np.ndarray, " k"], Float64[np.ndarray, " k"]]:
+    """The ``k`` rows of a table nearest to a query by one factor, nearest first, and their distances.
 
     Args:
-        table: the rows to search.
-        query: (D,) or (Q, D) features of that factor.
-        factor: name of the factor.
-        k: how many; all rows if there are fewer.
-        metric: cosine or euclidean.
+        table, factor, k, metric: as of ``search``.
+        query: (D,) feature of that factor.
         exclude: rows to leave out, such as the query's own.
 
     Raises:
         ValueError: the factor or metric is unknown, or the query does not fit.
     """
     rows = named(table.factors, factor, "factor")
-    query = np.atleast_2d(np.asarray(query, dtype=np.float64))
     if metric not in METRICS:
         raise ValueError(
             f"unknown metric {metric!r}{suggestion(metric, METRICS)}; there is {', '.join(METRICS)}"
         )
-    if query.shape[1] != rows.shape[1]:
+    if len(query) != rows.shape[1]:
         raise ValueError(
-            f"{factor} has {rows.shape[1]} numbers in this table, the query {query.shape[1]}: "
+            f"{factor} has {rows.shape[1]} numbers in this table, the query {len(query)}: "
             "it was made by another model"
         )
     if not np.isfinite(query).all():
@@ -188,25 +170,18 @@ def nearest(
     count = min(k, len(rows) - len(hidden))
     if count < 1:
         raise ValueError(f"there is no row to find: the table has {len(rows)}, {len(hidden)} are left out")
-    found, distances = np.empty((len(query), count), np.int64), np.empty((len(query), count))
-    for number, one in enumerate(query):
-        away = _distances(one, rows, metric)
-        away[hidden] = np.inf
-        places = np.flatnonzero(away <= np.partition(away, count - 1)[count - 1])
-        found[number] = places[np.argsort(away[places], kind="stable")][:count]
-        distances[number] = away[found[number]]
-    return Neighbours(found, distances)
+    away = _distances(query, rows, metric)
+    away[hidden] = np.inf
+    places = np.flatnonzero(away <= np.partition(away, count - 1)[count - 1])
+    found = places[np.argsort(away[places], kind="stable")][:count]
+    return found, away[found]
 
 
 def same_image(table: FeatureTable, codes: Mapping[str, np.ndarray]) -> Int64[np.ndarray, " m"]:
     """Rows of an image itself, or copies of it under other names: alike in every factor they share.
 
-    Args:
-        table: the rows to search.
-        codes: (D,) features of the image by factor; factors that the table lacks are passed over.
-
-    Returns:
-        rows in the table's order, none where image and table share no factor.
+    ``codes`` are (D,) features of the image by factor; factors that the table lacks are passed over. Rows are
+    in the table's order, none where image and table share no factor.
     """
     shared = [name for name in codes if name in table.factors]
     fitted = PARAMETERS if table.origin.get("fit_steps") else ()

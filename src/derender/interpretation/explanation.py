@@ -22,7 +22,7 @@ from derender.evaluation.feature_rows import attribute_columns
 from derender.evaluation.linear_probes import PAPER_HEAD, HeadSettings
 from derender.evaluation.linear_task import Rows, Task, choose_rows
 from derender.evaluation.score_table import Scores
-from derender.features import FeatureTable, embed_pictures
+from derender.features import FeatureTable, embed_image_set
 from derender.inputs import as_images, as_model
 from derender.interpretation import tables
 from derender.interpretation.attribution import (
@@ -130,7 +130,7 @@ def explain(
     reading = {"dataset": dataset, "limit": limit, "part": part, "model": named}
     images = as_images(images, net.image_size, **reading, progress=progress("reading"))
     rows = [] if pair is None else [_row_of(images, name) for name in pair]
-    table = embed_pictures(net, images, batch_size=batch_size, progress=progress("embedding"))
+    table = embed_image_set(net, images, batch_size=batch_size, progress=progress("embedding"))
     names = (labels,) if isinstance(labels, str) else tuple(dict.fromkeys(labels)) or attribute_columns(table)
     if not names:
         raise ValueError(f"there is no yes/no label; there is {', '.join(table.labels) or 'no label'}")
@@ -194,12 +194,10 @@ def explain_labels(
 
     Args:
         features: by factor, (N, D_f).
-        task: the question.
-        split: training rows (one number of rows, S choices) and test rows.
+        task, split: the question; training rows (one number of rows, S choices) and test rows.
         untrained: features of untrained encoders, one for each of the first seeds; may be empty.
         seeds: (S) of probes and shuffled labels, one for each choice of rows.
-        head: "logistic" or the paper's "linear".
-        settings: of the paper's head.
+        head, settings: "logistic" or the paper's "linear", and the settings of that.
         output: the attributed output, "logit" or "probability".
         baseline: start of the path, "zero" (the paper's) or the training rows' "mean".
         steps: of the quadrature; None for as many as the output needs.

@@ -22,7 +22,7 @@ from derender.data.doctor import EXAMINED_PX, doctor
 from derender.evaluation import evaluate_factors, evaluate_geometry, evaluate_reconstruction, mean_image
 from derender.evaluation.disentanglement import disentangle
 from derender.evaluation.linear_task import choose_rows
-from derender.features import embed_pictures
+from derender.features import embed_image_set
 from derender.inputs import as_images, as_model
 from derender.interpretation import explain_labels, question
 from derender.model import Derenderer
@@ -220,7 +220,7 @@ def _explained(subject: Subject) -> Values:
     sample = _sample(subject.held_out, EXPLAINED)
     task = question(sample.labels, names, source=sample.source)
     split = choose_rows(task, sample.files, (max(2, int(0.4 * task.known.sum())),), (0,))
-    table = embed_pictures(subject.model, sample)
+    table = embed_image_set(subject.model, sample)
     fresh = untrained_features(subject.model, sample, seed=0).factors
     found = explain_labels(table.factors, task, split, untrained=[fresh], seeds=(0,))
     shares = share_values(found, share_chart(found)[0])

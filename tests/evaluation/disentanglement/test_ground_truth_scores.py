@@ -53,14 +53,6 @@ def test_the_true_factors_themselves_score_best():
     np.testing.assert_allclose(scores.score, np.eye(3), atol=0.02)
 
 
-def test_features_of_several_factors_are_complete_but_not_one_to_one():
-    scores = ground_truth_scores(perfect(), FACTORS)
-    assert scores.by_feature.completeness > 0.95 and scores.by_feature.sap > 0.95
-    assert scores.by_feature.disentanglement == pytest.approx(0.75, abs=0.03)  # light has two: half a weight
-    assert scores.placed == 1 and scores.together.min() > 0.99
-    assert scores.score[2, 3] == 1 and scores.chance[3] == np.bincount(CLASSES).max() / ROWS
-
-
 def test_shuffled_rows_score_chance():
     order = np.random.default_rng(1).permutation(ROWS)
     shuffled = {name: values[order] for name, values in perfect().items()}

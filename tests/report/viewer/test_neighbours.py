@@ -5,7 +5,7 @@ import pytest
 from PIL import Image
 
 from derender.data import read_images
-from derender.features import FeatureTable, embed_pictures
+from derender.features import FeatureTable, embed_image_set
 from derender.features.neighbours import nearest
 from derender.report.viewer.app import Application, Viewer
 from derender.report.viewer.neighbours import Gallery
@@ -27,7 +27,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def table(model, folder) -> FeatureTable:
-    return embed_pictures(model, read_images(folder, SIZE), origin={"data": str(folder)})
+    return embed_image_set(model, read_images(folder, SIZE), origin={"data": str(folder)})
 
 
 def test_neighbours_of_a_picture_of_the_table(model, folder, table, client):
@@ -40,15 +40,15 @@ def test_neighbours_of_a_picture_of_the_table(model, folder, table, client):
         name = visitor.post("/api/pictures", (folder / "3.png").read_bytes()).json["picture"]
         found = visitor.post("/api/neighbours", {"picture": name, "factor": "albedo", "k": 3}).json["rows"]
         rows = table.factors["albedo"]
-        first = nearest(table, rows[3], "albedo", 1, exclude=[3])  # itself is no neighbour
-        assert [found[0]["row"], found[0]["file"]] == [first.rows[0, 0], f"{first.rows[0, 0]}.png"]
-        assert found[0]["distance"] == pytest.approx(first.distances[0, 0], abs=1e-5)
+        (first,), (away,) = nearest(table, rows[3], "albedo", 1, exclude=[3])  # itself is no neighbour
+        assert [found[0]["row"], found[0]["file"]] == [first, f"{first}.png"]
+        assert found[0]["distance"] == pytest.approx(away, abs=1e-5)
         assert [row["distance"] for row in found] == sorted(row["distance"] for row in found)
         assert all(row["image"].startswith("data:image/png;base64,") for row in found)
         other = visitor.post("/api/rows/4").json["picture"]
         asked = {"picture": name, "swaps": {"albedo": other}, "factor": "albedo", "k": 1}
-        second = nearest(table, rows[4], "albedo", 1, exclude=[4])
-        assert visitor.post("/api/neighbours", asked).json["rows"][0]["row"] == second.rows[0, 0]
+        (second,), _ = nearest(table, rows[4], "albedo", 1, exclude=[4])
+        assert visitor.post("/api/neighbours", asked).json["rows"][0]["row"] == second
         reply = visitor.post("/api/neighbours", {"picture": name, "factor": "albdo"})
         assert (reply.status, "albedo" in reply.error) == (422, True)
         assert visitor.post("/api/rows/6").status == 404

@@ -29,7 +29,7 @@ from derender.evaluation.linear_probing import compare_prepared
 from derender.evaluation.memory import content_hash
 from derender.evaluation.options import Options, aligned
 from derender.evaluation.paper_tables import ATTRIBUTES, table_named
-from derender.features import FeatureTable, embed_pictures
+from derender.features import FeatureTable, embed_image_set
 from derender.inputs import as_images, as_model, split_of
 from derender.model import Derenderer
 from derender.presets import MODEL_PRESETS
@@ -245,7 +245,7 @@ def embed(at: Comparison, job: Job, progress: Callable[..., None]) -> Facts:
     if net is None:
         table = control_features(kind, images, components=COMPONENTS, seed=job.seed, progress=watch)
     else:
-        table = embed_pictures(net, images, progress=watch)
+        table = embed_image_set(net, images, progress=watch)
     seconds = time.perf_counter() - began
     table.write(at.result(job))
     factors = method.features or (("geometry", "albedo") if kind == OURS else tuple(table.factors))

@@ -3,13 +3,12 @@
 Source: DCI: Eastwood and Williams, ICLR 2018; MIG: Chen et al., NeurIPS 2018; SAP: Kumar et al., ICLR 2018;
 the weights of DCI and 20 bins for MIG as in Locatello et al., ICML 2019.
 
-These scores were made for codes of ten dimensions, each meant to hold one factor. Here one of four features
-of 256 dimensions is meant to hold a factor, in any basis. So each score is computed twice:
+Each score is computed twice, since one of four features of 256 dimensions is meant to hold a factor, in any
+basis:
 
-    by feature    a feature counts for its predictions on images that the predictor has not seen (ridge, in
-                  similarity.py): R2 of a number; of a class, accuracy above that of the largest class, over
-                  the possible gain. Blind to scale, order of dimensions and rotations inside a feature. The
-                  score to read.
+    by feature    a feature counts for its held-out predictions (ridge, in similarity.py): R2 of a number; of
+                  a class, accuracy above that of the largest class, over the possible gain. Blind to scale,
+                  order of dimensions and rotations inside a feature. The score to read.
     by dimension  as published: dimensions compete with each other, so a factor spread over two dimensions of
                   the right feature costs as much as one held twice by different features.
 
@@ -28,7 +27,6 @@ from derender.evaluation.disentanglement.similarity import held_out, side_by_sid
 from derender.features import missing
 
 BINS = 20
-METHODS = ("lasso", "trees")
 LASSO_PENALTIES = (0.5, 0.2, 0.1)  # a warm path to the last; as shares of the smallest one without a weight
 TOLERANCE = 1e-2  # of the duality gap, in units of the target's power
 
@@ -147,12 +145,8 @@ def ground_truth_scores(
 ) -> GroundTruthScores:
     """All scores of features by name, each (N, D), against two true factors or more of the same N images.
 
-    Args:
-        blocks: features.
-        factors: at least two.
-        dimensions: method of the importances of single dimensions ("lasso", fast, or "trees", slow); None
-            leaves the scores by dimension out.
-        folds, seed: of the predictions; the seed is also that of the trees.
+    ``dimensions`` is the method of the importances of single dimensions: "lasso", fast, or "trees", slow;
+    None leaves their scores out. ``folds`` and ``seed`` are of the predictions, the seed of the trees, too.
     """
     blocks = side_by_side(blocks)
     names, everything = tuple(blocks), np.concatenate(list(blocks.values()), axis=1)
@@ -196,14 +190,20 @@ def importance(codes: np.ndarray, factors: Sequence[TrueFactor], method: str, *,
     which ``seed`` belongs to. A column is 0 where no dimension helps. The lasso's penalty is a fixed share of
     the largest useful one, so scaling codes or factors changes nothing; a rotation does.
     """
-    if method not in METHODS:
+    from sklearn.ensemble import GradientBoostingClassifier, GradientBoostingRegressor
+
+    if method not in ("lasso", "trees"):
         raise ValueError(f"unknown method {method!r}: choose lasso or trees")
     deviation = codes.std(axis=0)
     alive = deviation > 1e-9 * np.abs(codes).max(axis=0, initial=0)
     standard = (codes[:, alive] - codes[:, alive].mean(axis=0)) / deviation[alive]
     found = np.zeros((codes.shape[1], len(factors)))
     for column, factor in enumerate(factors if alive.any() else []):
-        weights = _lasso(standard, factor) if method == "lasso" else _trees(standard, factor, seed)
+        if method == "lasso":
+            weights = _lasso(standard, factor)
+        else:
+            kind = GradientBoostingClassifier if factor.is_class else GradientBoostingRegressor
+            weights = np.asarray(kind(random_state=seed).fit(standard, factor.values).feature_importances_)
         found[alive, column] = weights / (weights.sum() or 1)
     return found
 
@@ -287,13 +287,6 @@ def _lasso(codes: np.ndarray, factor: TrueFactor) -> np.ndarray:
             how |= {"precompute": gram, "Xy": along / largest}
             weights += np.abs(lasso_path(codes, target / largest, **how)[1][:, -1]) * largest
     return weights
-
-
-def _trees(codes: np.ndarray, factor: TrueFactor, seed: int) -> np.ndarray:
-    from sklearn.ensemble import GradientBoostingClassifier, GradientBoostingRegressor
-
-    kind = GradientBoostingClassifier if factor.is_class else GradientBoostingRegressor
-    return np.asarray(kind(random_state=seed).fit(codes, factor.values).feature_importances_)
 
 
 def _explained(codes: np.ndarray, factor: TrueFactor) -> np.ndarray:

@@ -68,14 +68,9 @@ def swap_test(
     batch_size: int = 64,
     progress: Progress | None = None,
 ) -> SwapScores:
-    """The swap test on uint8 images (N, 3, H, W), N of 2 or more, at the size of the model.
+    """The swap test of a ``Derenderer`` on uint8 images (N, 3, H, W) of its size, N of 2 or more.
 
-    Args:
-        model: a ``Derenderer``; stays as it was.
-        images: at the model's image size.
-        seed: of the donors.
-        batch_size: images at a time; changes speed and memory only.
-        progress: called with (renderings done, renderings in all).
+    ``seed`` draws the donors; ``progress`` is called with (renderings done, renderings in all).
     """
     if len(images) < 2:
         raise ValueError(f"the swap test needs two images or more, got {len(images)}")

@@ -1,9 +1,8 @@
 """Face segmentation from pre-trained U-Net encoders: networks and controls on the same images, over seeds.
 
-Source: Klinghoffer et al., ECCV 2022, Sec. 4.7 and Table 3. Every network learns from the same images and is
-tested on the same others. A seed changes fresh weights (the decoder's always) and the order of images, not
-the split. Runs are cached by the content of their inputs, so that an interrupted comparison continues with
-the next run.
+Source: Klinghoffer et al., ECCV 2022, Sec. 4.7 and Table 3. A seed changes fresh weights (the decoder's
+always) and the order of images, not the split. Runs are cached by the content of their inputs, so that an
+interrupted comparison continues with the next run.
 
 Scores: mean intersection over union, that of the ten best classes, and pixel accuracy. Pixels are counted
 image by image and added up before they are divided, so that the same counts give the scores and their
@@ -228,8 +227,8 @@ def segment(
             trainable = sum(p.numel() for p in net.parameters() if p.requires_grad)
             inputs = {
                 "start": model_fingerprint(net), "frozen": variant.frozen, "seed": seed, **same,
-                "settings": settings.model_dump(mode="json"), "statistics": net.kept_statistics,
-                "decoder": variant.decoder,
+                "settings": settings.model_dump(mode="json"), "decoder": variant.decoder,
+                "statistics": variant.frozen or variant.pretrained,
             }  # fmt: skip
             runs.append(memory.recall(f"segment-{name}", inputs, partial(trained, net, seed, name)))
             done += each
@@ -261,9 +260,7 @@ def segment(
 def count_pixels(answers: np.ndarray, masks: np.ndarray, n_classes: int) -> np.ndarray:
     """(N, 3, C) int64: of each image and class, right pixels, answered pixels and pixels of the mask.
 
-    Args:
-        answers, masks: (N, H, W) class numbers below ``n_classes``.
-        n_classes: C, two or more.
+    ``answers`` and ``masks`` are (N, H, W) class numbers below ``n_classes``, C.
     """
     cell = n_classes * np.arange(len(masks))[:, None, None]
     kinds = ((cell + masks)[answers == masks], cell + answers, cell + masks)
@@ -277,13 +274,9 @@ def class_iou(counts: np.ndarray) -> np.ndarray:
 
 
 def resampled_scores(counts: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """The scores of ``COLUMNS`` on resamples: (B, 3).
+    """The scores of ``COLUMNS``, (B, 3), of (N, 3, C) counts; ``weights`` (B, N) say how often each is drawn.
 
     The ten best classes are those of all images, on every resample.
-
-    Args:
-        counts: (N, 3, C).
-        weights: (B, N) how often each image is drawn.
     """
     drawn = (weights.astype(np.float64) @ counts.reshape(len(counts), -1)).reshape(-1, *counts.shape[1:])
     iou = _iou(drawn)

@@ -66,8 +66,7 @@ def divide(
     Args:
         images, masks, classes: as from ``read_masks``.
         test_fraction: share of the images that is tested, where the data have no partition.
-        split_seed: of the split and of the choice of ``labelled``.
-        labelled: number of training images; smaller numbers are part of larger ones. None means all.
+        split_seed: of the split and of the choice of ``labelled`` training images, by default all.
 
     Raises:
         ValueError: nothing to learn from or to test, more requested than there is, or a single class.

@@ -252,10 +252,10 @@ class Studio:
         try:
             feature = named(features, question.factor, "factor")
             itself = same_image(self.table, features)
-            found = nearest(self.table, feature, question.factor, question.k, exclude=itself.tolist())
+            rows, away = nearest(self.table, feature, question.factor, question.k, exclude=itself.tolist())
         except ValueError as problem:
             raise Refused(422, str(problem)) from problem
-        return list(zip(found.rows[0].tolist(), found.distances[0].tolist(), strict=True))
+        return list(zip(rows.tolist(), away.tolist(), strict=True))
 
     def _rendered(self, scene: Scene) -> Image.Image:
         rendering = self.model.render(scene.to(self.model.device))
