@@ -34,7 +34,7 @@ BUDGET = {  # lines, files
     "learn": (480, 4),
 }
 TOTAL = (39_900, 270)  # on the way to (32_000, 270)
-TEST_LINES = 28_250  # on the way to 24_000
+TEST_LINES = 28_150  # on the way to 24_000
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80
 SHARED_BY_COMMANDS = {"__init__.py", "console.py", "gathered.py", "options.py", "scoring.py"}

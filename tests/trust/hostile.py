@@ -52,7 +52,8 @@ FOLDER_COMMANDS = {
     "compare": "compare --table cars --model m=MODEL --data DATA --device cpu --resamples 20",
     "explain": "explain READS --label class --seeds 1 --out PLACE/why",
 }
-REFUSING = ("evaluate geometry", "evaluate disentangle", "evaluate segment")
+REFUSING = ("evaluate geometry", "evaluate segment")
+UNCOUNTED = ("evaluate robustness", "evaluate disentangle", "report")  # the page of a report counts
 IMAGE_COMMANDS = {
     "decompose": "--out PLACE/apart",
     "relight": "--size 64 --stills 2 --film none --out PLACE/relit",
@@ -145,7 +146,7 @@ def run_all() -> int:
             return text.split()
 
         for name, text in FOLDER_COMMANDS.items():
-            counts = name not in (*REFUSING, "evaluate robustness")
+            counts = name not in (*REFUSING, *UNCOUNTED)
             bench.run(name, split(text), 2 * (name in REFUSING), f"{broken} skipped" if counts else "")
         archive = write_hostile_zip(place / "hostile.zip")
         embed = split("embed --model MODEL --device cpu --out PLACE/Z.parquet")
