@@ -231,17 +231,6 @@ def test_mean_by_averages_groups_and_keeps_what_is_constant():
 
 
 @pytest.mark.parametrize(
-    ("values", "expected"),
-    [
-        (np.array(["", "a"]), [True, False]),
-        (np.array([np.nan, 0.0]), [True, False]),
-        (np.array([None, np.nan, "", 0, "a"], dtype=object), [True, True, True, False, False]),
-        (np.array([-1, 0, 1], np.int8), [True, False, False]),
-        (np.array([-1, 0, 1]), [False, False, False]),
-        (np.array([False, True]), [False, False]),
-    ],
-)
-@pytest.mark.parametrize(
     ("labels", "expected"),
     [
         (np.array(["", "a"]), [True, False]),
