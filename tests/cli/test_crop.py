@@ -1,4 +1,4 @@
-"""`--crop auto` (formerly `--frame`): a model is shown the part of an image that it knows."""
+"""`--frame auto` (formerly `--crop`): a model is shown the part of an image that it knows."""
 
 import json
 from pathlib import Path
@@ -19,7 +19,7 @@ TRUE = Crop(0.7, 0.1, 0.2)
 def photos(tmp_path_factory) -> Path:
     """Two rendered faces: one as the model knows it, one small and off the middle of a wider image."""
     folder = tmp_path_factory.mktemp("framing")
-    near, far = (example.picture.transpose(1, 2, 0) for example in rendered_examples(KNOWN, 64)[2:4])
+    near, far = (example.picture for example in rendered_examples(KNOWN, 64)[2:4])
     Image.fromarray(near).save(folder / "near.png")
     left, top, side = TRUE.corner(200)
     coarse = np.random.default_rng(0).integers(0, 256, (6, 6, 3), dtype=np.uint8)
@@ -37,18 +37,18 @@ def _run(command: str, photos: Path, out: Path, *words: str) -> dict:
 
 
 def test_the_part_is_found_told_and_drawn(photos, tmp_path, capsys):
-    whole = _run("decompose", photos, tmp_path / "whole")
-    assert "--crop auto searches for that" in capsys.readouterr().err and "framing" not in whole
+    whole = _run("decompose", photos, tmp_path / "whole", "--frame", "none")
+    assert "in another crop (--frame)" in capsys.readouterr().err
     found = _run("decompose", photos, tmp_path / "framed", "--crop", "auto")
     said = capsys.readouterr().err
-    assert "shown in part, 70 % of their side: 1 of 2 images" in said and "--crop auto" not in said
+    assert "shown in part, 70 % of their side: 1 of 2 images" in said and "--frame" not in said
     near, wide = (found["framing"][str(photos / name)] for name in ("near.png", "wide.png"))
-    assert near == {"side": 1.0, "across": 0.0, "down": 0.0}
+    assert (near["side"], near["across"], near["down"], near["found"]) == (1.0, 0.0, 0.0, "auto")
     odd, percentile = (one["reconstruction_percentile"][str(photos / "wide.png")] for one in (whole, found))
     assert odd == 100 and percentile < 99
     shown = np.asarray(Image.open(tmp_path / "framed" / "wide" / "input.png").convert("RGB"), float)
-    face = rendered_examples(KNOWN, 64)[3].picture.transpose(1, 2, 0)
-    assert Crop(**wide) == TRUE
+    face = rendered_examples(KNOWN, 64)[3].picture
+    assert Crop(wide["side"], wide["across"], wide["down"]) == TRUE
     assert np.abs(shown - face).mean() < 6
     beside = np.asarray(Image.open(tmp_path / "whole" / "near" / "input.png"))
     np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "framed" / "near" / "input.png")), beside)

@@ -21,7 +21,10 @@ def model() -> derender.Derenderer:
 def faces_known() -> torch.Tensor:
     """Three rendered faces that the model was tested on, (3, 3, 64, 64) in 0..1."""
     examples = rendered_examples("rendered-faces-64", 64)[:3]
-    return torch.from_numpy(np.stack([example.picture for example in examples])).float() / 255
+    return (
+        torch.from_numpy(np.stack([example.picture for example in examples]).transpose(0, 3, 1, 2)).float()
+        / 255
+    )
 
 
 @pytest.fixture(scope="module")

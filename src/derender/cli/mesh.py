@@ -7,7 +7,7 @@ import typer
 from derender.cli.gathered import gathered
 from derender.cli.images import ImageFiles, opener_of
 from derender.cli.options import Output, TrainedModel
-from derender.report.opening import MESH_SIZE, ImageOptions, OpenedImage
+from derender.report.opening import MESH_SIZE, TEXTURE_SIZE, ImageOptions, OpenedImage
 
 if TYPE_CHECKING:
     from derender.report.mesh import MeshFiles
@@ -33,13 +33,13 @@ def mesh(
         typer.Option("--grazing", help="Angle in degrees beyond which the surface is cut off at its rim."),
     ] = 85.0,
 ) -> None:
-    """Write a folder per image with its surface as a mesh: albedo as texture, x right, y up, facing +z."""
-    from derender.report.mesh import MeshFiles, checked_format, model_mesh
+    """Write a folder per image with its surface as a mesh: its pixels as texture, x right, y up."""
+    from derender.report.mesh import MeshFiles, checked_format, image_mesh
 
     checked_format(form)
-    opener = opener_of(model, how, MESH_SIZE)
+    opener = opener_of(model, how, MESH_SIZE if how.detail == "model" else TEXTURE_SIZE)
 
     def edit(image: OpenedImage) -> "MeshFiles":
-        return MeshFiles(model_mesh(opener.model, image.scene, grazing), form)
+        return MeshFiles(image_mesh(opener.model, image, grazing), form)
 
     files.edit(opener, edit, output, sheet=False)

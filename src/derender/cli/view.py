@@ -21,8 +21,9 @@ TableData = Annotated[
 Host = Annotated[str, typer.Option(help="Address to listen on; by default only this machine reaches it.")]
 Port = Annotated[int, typer.Option(help="Port to listen on; 0 takes any free one.", metavar="N")]
 Keep = Annotated[int, typer.Option(min=2, max=10_000, help="Number of opened images in memory.")]
-Crop = Annotated[
-    str, typer.Option(help="auto: the part of each image reconstructed best.", metavar="whole|auto")
+Frame = Annotated[
+    str | None,
+    typer.Option(help="Part of each image: as for derender relight.", metavar="face|auto|none"),
 ]
 
 
@@ -41,15 +42,15 @@ def view(
     port: Port = 0,
     keep: Keep = 64,
     fit_steps: options.FitSteps = None,
-    crop: Crop = "whole",
-    frame: Annotated[str | None, typer.Option("--frame", hidden=True)] = None,
+    frame: Frame = None,
+    crop: Annotated[str | None, typer.Option("--crop", hidden=True)] = None,
     json_file: options.Json = None,
 ) -> None:
     """Serve a page: drop an image, see its factors, drag light and camera, orbit, swap, search, save.
 
     It listens on this machine only, stores no image on disk, and needs no network. Ctrl-C ends it.
     """
-    cropped = ImageOptions(crop=crop, frame=frame).cropped
+    frame = ImageOptions(crop=crop, frame=frame).frame
     missing = [name for name in ("starlette", "uvicorn") if find_spec(name) is None]
     if missing:
         raise ValueError(f"the viewer needs {' and '.join(missing)}: pip install 'derender[view]'")
@@ -68,7 +69,7 @@ def view(
             loaded = maker_of(table, loaded, str(features))
         viewer, notes = open_viewer(
             loaded, model.model, images or [], table=table, data=data, dataset=dataset, keep=keep,
-            fit_steps=fit_steps or 0, cropped=cropped,
+            fit_steps=fit_steps or 0, frame=frame,
         )  # fmt: skip
         if not is_loopback(host):
             notes.append(f"warning: anyone who can reach {host} can use this page, and there is no password")

@@ -23,14 +23,14 @@ from derender.data.decoding import (
     estimated_total,
     usable_cores,
 )
-from derender.data.image import READER_VERSION, Unreadable, decode, quiet_pillow, read_image
+from derender.data.given import GivenImages, as_batch, as_photos, read_photo
+from derender.data.image import READER_VERSION, Unreadable, decode, decode_whole, quiet_pillow, read_image
 from derender.data.image_set import (
     Duplicate,
     ImageSet,
     as_float,
     check_images,
     read_images,
-    refuse_not_finite,
 )
 from derender.data.layouts import LAYOUTS
 from derender.data.layouts.celeba import MASK_CLASSES
@@ -42,11 +42,12 @@ from derender.data.splits import Split, split_indices
 from derender.data.stream import Kinds, Sample, Stream, Value, column_of
 
 __all__ = [
-    "LAYOUTS", "MASK_CLASSES", "READER_VERSION", "Decoded", "Duplicate", "GroundTruth", "ImageSet", "Kinds",
-    "ListedStream", "MaskedImages", "Progress", "Sample", "SeenPixels", "Skipped", "Split", "Stream",
-    "Unreadable", "Value", "ahead", "as_float", "cache_folder", "check_images", "check_lists",
-    "checked_footer", "column_of", "decode", "decode_samples", "decoded", "estimated_total", "is_image",
-    "list_images", "nearest_sibling", "open_images", "open_source", "parse_source", "quiet_pillow",
-    "read_ground_truth", "read_image", "read_images", "read_masks", "refuse_not_finite", "sample_checksum",
+    "LAYOUTS", "MASK_CLASSES", "READER_VERSION", "Decoded", "Duplicate", "GivenImages", "GroundTruth",
+    "ImageSet", "Kinds", "ListedStream", "MaskedImages", "Progress", "Sample", "SeenPixels", "Skipped",
+    "Split", "Stream", "Unreadable", "Value", "ahead", "as_batch", "as_float", "as_photos",
+    "cache_folder", "check_images", "check_lists", "checked_footer", "column_of", "decode",
+    "decode_samples", "decode_whole", "decoded", "estimated_total", "is_image", "list_images",
+    "nearest_sibling", "open_images", "open_source", "parse_source", "quiet_pillow", "read_ground_truth",
+    "read_image", "read_images", "read_masks", "read_photo", "sample_checksum",
     "split_indices", "suggestion", "usable_cores",
 ]  # fmt: skip

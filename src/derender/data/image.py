@@ -91,24 +91,43 @@ def decode(
     """Decode one image; ``Unreadable`` if that cannot be done. Wrap many calls in ``quiet_pillow``."""
     if box is not None and not (np.isfinite(box).all() and (box[2:] > box[:2]).all()):
         raise Unreadable("no usable box is known for the part to read")
+    with _opened(encoded, pixel_limit) as opened:
+        width = opened.width
+        _reduce_while_decoding(opened, image_size, fit, box)
+        large = opened.width * opened.height > _LARGE_PIXELS
+        with _one_large_image_at_a_time if large else nullcontext():
+            image = upright_rgb(opened)
+            if box is not None:
+                image = _cut(image, box * (opened.width / width))
+            return np.ascontiguousarray(np.asarray(fit_square(image, image_size, fit)).transpose(2, 0, 1))
+
+
+def decode_whole(encoded: bytes, pixel_limit: int = PIXEL_LIMIT) -> UInt8[np.ndarray, "h w 3"]:
+    """Decode one image at its own size; ``Unreadable`` if that cannot be done."""
+    with _opened(encoded, pixel_limit) as opened, _one_large_image_at_a_time:
+        return np.array(upright_rgb(opened))
+
+
+@contextmanager
+def _opened(encoded: bytes, pixel_limit: int) -> Iterator[Image.Image]:
+    """An image's header, read; whatever goes wrong within is ``Unreadable``."""
     try:
         with Image.open(io.BytesIO(encoded), formats=_known_formats()) as opened:
             width, height = opened.size
             if width * height > pixel_limit:
                 raise Unreadable(f"{width} x {height} is more than {pixel_limit // 10**6} million pixels")
-            _reduce_while_decoding(opened, image_size, fit, box)
-            large = opened.width * opened.height > _LARGE_PIXELS
-            with _one_large_image_at_a_time if large else nullcontext():
-                image = upright(_as_rgb(opened), opened)
-                if box is not None:
-                    image = _cut(image, box * (opened.width / width))
-                return np.ascontiguousarray(np.asarray(fit_square(image, image_size, fit)).transpose(2, 0, 1))
+            yield opened
     except Unreadable:
         raise
     except Image.UnidentifiedImageError as problem:
         raise Unreadable("not an image in a known format") from problem
     except DECODER_ERRORS as problem:
         raise Unreadable(f"damaged or unsupported ({problem or type(problem).__name__})") from problem
+
+
+def upright_rgb(opened: Image.Image) -> Image.Image:
+    """An opened image as 8-bit RGB, turned as its EXIF orientation says."""
+    return upright(_as_rgb(opened), opened)
 
 
 @contextmanager

@@ -221,14 +221,6 @@ def check_images(images: Tensor, size: int) -> None:
         raise ValueError(f"images must be floating point in 0..1, got {images.dtype}: divide uint8 by 255")
 
 
-def refuse_not_finite(images: Tensor) -> None:
-    """NaN or infinity in images is an error; not looked for on other devices, which would have to wait."""
-    if images.device.type != "cpu" or torch.compiler.is_compiling() or bool(images.isfinite().all()):
-        return
-    first = int(images.isfinite().flatten(1).all(dim=1).int().argmin())
-    raise ValueError(f"image {first} of {len(images)} holds values that are not finite: give numbers in 0..1")
-
-
 @dataclass
 class _Found:
     """What is known after each chunk: names, labels and partitions of the rows, and what is left out."""

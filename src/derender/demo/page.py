@@ -47,7 +47,9 @@ def demo_page(result: DemoResult) -> Page:
     images, tables = result.truth.images[rows], score_tables(result)
     filmed = images[: result.settings.films]
     names = [f"unseen face {row + 1}" for row in range(len(images))]
-    known = np.stack([one.picture for one in rendered_examples(BUNDLED, result.bundled.image_size)])
+    known = np.stack(
+        [one.picture for one in rendered_examples(BUNDLED, result.bundled.image_size)]
+    ).transpose(0, 3, 1, 2)
     models = {"this run": result.model, BUNDLED: result.bundled}
     same_size = result.model.image_size == result.bundled.image_size
     values = {

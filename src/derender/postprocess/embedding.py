@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from derender.data import check_images, refuse_not_finite
+from derender.data import GivenImages, as_batch, check_images
 from derender.networks import Factor
 from derender.postprocess.features import Features
 from derender.postprocess.fitting import STEPS, Fitted, coordinates_of
@@ -59,9 +59,12 @@ class EmbeddingModel(nn.Module):
         """A model that shares these weights and whose features are the codes."""
         return self.with_features(Features())
 
-    def embed(self, images: Float[Tensor, "n 3 h w"]) -> dict[str, Float[Tensor, "n _"]]:
-        """One feature per factor for images in 0..1, by name: as ``features`` makes it, else the code."""
-        refuse_not_finite(images)
+    def embed(self, images: GivenImages) -> dict[str, Float[Tensor, "n _"]]:
+        """One feature per factor, by name: as ``features`` makes it, else the code.
+
+        Images are (N, 3, S, S) in 0..1, or whatever `as_batch` takes: paths, Pillow images, arrays.
+        """
+        images = as_batch(images, self.image_size, next(self.parameters()).device)
         if self.whitening is None and not self.features.fits_scenes:
             return self.encode(images)
         return self.features_from(self.activations(images))
@@ -96,12 +99,12 @@ class EmbeddingModel(nn.Module):
         """``embed`` of the images that these activations belong to; codes alone are a ValueError."""
         return self.features(self.codes(activations), activations)
 
-    def fit_scenes(self, images: Float[Tensor, "n 3 h w"], steps: int = STEPS) -> Fitted:
-        """Scenes optimised per image, images in 0..1: from ``decompose`` on, downhill through the renderer.
+    def fit_scenes(self, images: GivenImages, steps: int = STEPS) -> Fitted:
+        """Scenes optimised per image, from ``decompose`` on, downhill through the renderer.
 
         A hundred times as slow as ``decompose``, with a smaller error, also under other lighting and
         viewpoints. A model without a fitting (``derender whiten`` makes one) is a ValueError.
         """
-        refuse_not_finite(images)
+        images = as_batch(images, self.image_size, next(self.parameters()).device)
         fitting = self.features.required_fitting()
         return fitting.fit(images, self.decode(self.encode(images)), self.render, steps)

@@ -132,7 +132,7 @@ def decompose_images(model: Derenderer, images: Float[Tensor, "n 3 h w"]) -> Dec
 def decomposed(model: Derenderer, image: OpenedImage) -> Decomposition:
     """An opened image (``opening``) with its factors drawn; images opened together share the depth scale."""
     pixels = as_float(image.pixels[None])
-    return decomposition(pixels, image.scene, model.render, model.fov_deg, image.depth_range)
+    return decomposition(pixels, image.textured, model.render, model.fov_deg, image.depth_range)
 
 
 def scene_numbers(scene: Scene, index: int = 0) -> dict[str, Any]:

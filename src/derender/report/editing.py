@@ -6,6 +6,7 @@ read is left out and listed; the others are written. Leaves out opening (``openi
 (``decomposition``, ``edits``, ``mesh``).
 """
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,7 +17,6 @@ from PIL import Image
 from derender.evaluation.out_of_distribution import OUTLIER_PERCENTILE
 from derender.report.opening import ImageOpener, OpenedImage, readable
 from derender.report.panel import Sheets
-from derender.scene.crop_search import WHOLE, Crop
 from derender.storage.atomic import atomic_file, atomic_folder
 
 
@@ -43,7 +43,7 @@ class WrittenImages:
         sheets: files with a row for every image.
         refused: reasons why other images cannot be read, by path.
         percentiles: of the reconstruction errors, by path; empty where the model keeps none.
-        crops: the part of each image that is shown, by path; empty unless parts were searched.
+        framing: the part of each image that is shown, and how it was found, by path.
     """
 
     out: Path
@@ -51,7 +51,7 @@ class WrittenImages:
     sheets: Sequence[Path]
     refused: Mapping[str, str]
     percentiles: Mapping[str, float]
-    crops: Mapping[str, Crop] = field(default_factory=dict)
+    framing: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
     @property
     def out_of_distribution(self) -> dict[str, float]:
@@ -64,27 +64,31 @@ class WrittenImages:
         if self.percentiles:
             span = _span(self.percentiles.values())
             lines.append(f"reconstructed worse than {span} % of the images this model was validated on")
-        hint = "" if self.crops else ", or not in the crop it knows (--crop auto searches for that)"
         lines += [
             f"{path}: reconstructed worse than {OUTLIER_PERCENTILE:g} % of the images this model was "
-            f"validated on; it may be out-of-distribution{hint}"
+            f"validated on; it may be out-of-distribution, or shown in another crop (--frame)"
             for path in self.out_of_distribution
         ]
-        if self.crops:
-            sides = [100 * crop.side for crop in self.crops.values() if crop != WHOLE]
-            part = f"shown in part, {_span(sides)} % of their side: " if sides else "shown in part: "
-            lines.append(f"{part}{len(sides):,} of {len(self.crops):,} images")
+        found = Counter(part["found"] for part in self.framing.values())
+        if found["face"] or found["no face"]:
+            lines.append(f"a face was found in {found['face']:,} of {found.total():,} images")
+        if found["no face"]:
+            missing = next(path for path, part in self.framing.items() if part["found"] == "no face")
+            lines.append(f"no face: the middle of {found['no face']:,} is shown ({missing} for one)")
+        if found["auto"]:
+            sides = [100 * part["side"] for part in self.framing.values() if part["side"] < 1]
+            share = f", {_span(sides)} % of their side" if sides else ""
+            lines.append(f"shown in part{share}: {len(sides):,} of {found['auto']:,} images")
         return lines
 
     def values(self) -> dict[str, Any]:
         """All of it as JSON can hold it."""
-        crops = {"framing": {path: vars(crop) for path, crop in self.crops.items()}} if self.crops else {}
         return {
             "out": self.out,
             "pictures": self.images,
             "refused": self.refused,
             "reconstruction_percentile": self.percentiles,
-            **crops,
+            "framing": self.framing,
             "sheets": self.sheets,
         }
 
@@ -137,8 +141,8 @@ def write_images(
             drawn.save(temporary, format="PNG")
     every = [*images, *beside]
     percentiles = {str(one.path): one.percentile for one in every if one.percentile is not None}
-    crops = {str(one.path): one.crop for one in every} if opener.options.cropped else {}
-    return WrittenImages(out, records, files, refused, percentiles, crops)
+    framing = {str(one.path): one.framing for one in every}
+    return WrittenImages(out, records, files, refused, percentiles, framing)
 
 
 def _free_places(images: Sequence[Path], out: Path, sheet_rows: int | None, force: bool) -> list[Path]:

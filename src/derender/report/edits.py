@@ -22,6 +22,7 @@ from derender.report.colours import Images, pictures
 from derender.report.films import FILMS
 from derender.report.opening import FilmOptions, OpenedImage
 from derender.report.panel import GridLayout, labelled_grid
+from derender.scene.enlarge import at_size
 
 SMALLEST_CELL = 128
 
@@ -117,18 +118,23 @@ def rotated(
     pitch_deg: float = 0.0,
     film: FilmOptions | None = None,
 ) -> Edit:
-    """The image rotated from one side to the other, ``reach_deg`` to each, in its own lighting."""
+    """The image rotated from one side to the other, ``reach_deg`` to each, in its own lighting.
+
+    Drawn in its own pixels it keeps its place and roll in the image; the model's rendering has none.
+    """
     film = film or FilmOptions()
     angle = _angle_text(reach_deg, film.stills)
-    return _swept(
-        model,
-        image,
-        None,
-        "camera",
-        lambda t: sweeps.cameras_around(t, reach_deg, pitch_deg),
-        lambda _, row: f"yaw {angle(degrees(row[1]))}",
-        film,
-    )
+
+    def cameras(t: Tensor) -> Tensor:
+        rows = sweeps.cameras_around(t, reach_deg, pitch_deg)
+        if image.detail is not None:
+            rows[:, 2:] = image.scene.camera[:, 2:].to(rows)
+        return rows
+
+    def label(_: float, row: Tensor) -> str:
+        return f"yaw {angle(degrees(row[1]))}"
+
+    return _swept(model, image, None, "camera", cameras, label, film)
 
 
 def swapped_factors(
@@ -137,11 +143,18 @@ def swapped_factors(
     """The image with one factor of another, for each of ``factors`` by itself (default: every factor)."""
     parameters = swappable(model, factors)
     stills = {
-        f"its {name}": sweeps.drawn(sweeps.swapped(image.scene, donor.scene, parameter), model.render)[0]
+        f"its {name}": sweeps.drawn(
+            sweeps.swapped(image.scene, donor.scene, parameter), _drawn_by(image, donor, parameter)
+        )[0]
         for name, parameter in parameters.items()
     }
     numbers = {f"its {name}": {"factor": name, "from": str(donor.path)} for name in parameters}
     return Edit(_inputs(model, image, donor), stills, numbers)
+
+
+def _drawn_by(image: OpenedImage, donor: OpenedImage, parameter: str) -> sweeps.Render:
+    """What draws a swap: surface colours are of the image that gives the albedo."""
+    return donor.render if parameter == "albedo" else image.render
 
 
 def swappable(model: Derenderer, factors: Sequence[str] = ()) -> dict[str, str]:
@@ -162,7 +175,7 @@ def _swept(
     """Stills and film of one scene along a sweep of one parameter."""
 
     def drawn(rows: Tensor) -> Images:
-        return sweeps.drawn(sweeps.varied(image.scene, **{parameter: rows}), model.render)
+        return sweeps.drawn(sweeps.varied(image.scene, **{parameter: rows}), image.render)
 
     places = sweeps.stills(film.stills)
     rows = values(places)
@@ -181,10 +194,10 @@ def _inputs(
     model: Derenderer, image: OpenedImage, other: OpenedImage | None = None
 ) -> dict[str, Image.Image]:
     shown = {
-        "input": pictures(image.pixels[None])[0],
-        "reconstruction": sweeps.drawn(image.scene, model.render)[0],
+        "input": pictures(image.shown[None])[0],
+        "reconstruction": sweeps.drawn(at_size(image.scene, image.shown.shape[-1]), model.render)[0],
     }
-    return shown if other is None else {**shown, "the other": pictures(other.pixels[None])[0]}
+    return shown if other is None else {**shown, "the other": pictures(other.shown[None])[0]}
 
 
 def _angle_text(reach_deg: float, stills: int) -> Callable[[float], str]:

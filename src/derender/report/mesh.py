@@ -12,7 +12,7 @@ closing the back, several objects, and compressed geometry.
 """
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import ceil, cos, radians
 from pathlib import Path
 from typing import Any
@@ -27,8 +27,10 @@ from torch import Tensor
 from derender.data import suggestion
 from derender.model import Derenderer
 from derender.report.colours import pictures
+from derender.report.opening import MESH_SIZE, OpenedImage
 from derender.scene import Scene
 from derender.scene.camera import unproject
+from derender.scene.enlarge import at_size
 from derender.scene.normals import normals_from_depth
 
 FORMATS = ("glb", "obj")
@@ -127,16 +129,35 @@ def checked_format(form: str) -> str:
     return form
 
 
-def model_mesh(model: Derenderer, scene: Scene, grazing_deg: float = GRAZING_DEG) -> Mesh:
+def model_mesh(
+    model: Derenderer,
+    scene: Scene,
+    grazing_deg: float = GRAZING_DEG,
+    texture: Float[Tensor, "1 3 t t"] | None = None,
+) -> Mesh:
     """The mesh of one scene of a model, enlarged or not, without the border held at one depth.
 
-    Enlarging smooths the step at that border over one more of the model's columns.
+    Enlarging smooths the step at that border over one more of the model's columns. ``texture`` takes the
+    albedo's place; it covers the model's pixels to their outer edges, and may have any size.
     """
     own, size = model.image_size, scene.depth.shape[-1]
     border = model.settings.ranges.border_columns(own)
     if border and size != own:
         border = ceil((border + 1) * (size - 1) / (own - 1))
-    return mesh_of(scene, model.fov_deg, border, grazing_deg)
+    mesh = mesh_of(scene, model.fov_deg, border, grazing_deg)
+    if texture is None:
+        return mesh
+    grid = mesh.uv * size - 0.5  # pixels of the scene, whose outermost centres are the model's
+    uv = (grid * (own - 1) / (size - 1) + 0.5) / own
+    return replace(mesh, uv=uv.astype(np.float32), texture=pictures(texture)[0])
+
+
+def image_mesh(model: Derenderer, image: OpenedImage, grazing_deg: float = GRAZING_DEG) -> Mesh:
+    """The mesh of an opened image, with its own pixels as texture where those are drawn."""
+    if (detail := image.detail) is None:
+        return model_mesh(model, image.scene, grazing_deg)
+    scene = at_size(image.scene, max(MESH_SIZE, model.image_size))
+    return model_mesh(model, scene, grazing_deg, detail.albedo())
 
 
 def mesh_of(scene: Scene, fov_deg: float, border_columns: int = 0, grazing_deg: float = GRAZING_DEG) -> Mesh:

@@ -1,9 +1,9 @@
 """Options of the image commands, and opening images by them: files become pixels and scenes.
 
-An image is read (cropped on request), decomposed, optimised per image on request, enlarged, and given its own
-texture unless that is declined. Each field of ``ImageOptions`` is an option of every image command
-(``cli/gathered.py``): a new one is a field here and its use in ``ImageOpener``. Heavy packages are imported
-where they are used: the command line imports this module for its help. Leaves out edits and writing
+The part of an image that suits the model is found (a face, by default), decomposed, optimised per image on
+request, and drawn in its own detail unless that is declined. Each field of ``ImageOptions`` is an option of
+every image command (``cli/gathered.py``): a new one is a field here and its use in ``ImageOpener``. Heavy
+packages are imported where they are used: the command line imports this module for its help. Leaves out edits
 (``editing``).
 """
 
@@ -18,16 +18,18 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from derender.model import Derenderer
+    from derender.photo import Frame, PhotoDetail
+    from derender.render import Rendering
     from derender.scene import Scene
-    from derender.scene.crop_search import Crop
     from derender.training.held_out_errors import HeldOutErrors
 
 T = TypeVar("T")
-CHOICES = {"detail": ("photo", "model"), "crop": ("whole", "auto")}
+CHOICES = {"detail": ("photo", "model"), "frame": ("face", "auto", "none")}
 OLD_TEXTURES = {"original": "photo", "model": "model"}
+OLD_CROPS = {"whole": "none", "auto": "auto"}
 FILM_KINDS = ("gif", "mp4")
-EDIT_SIZE, MESH_SIZE = 256, 128
-"""Default sides of the output in pixels; decompositions have the model's own."""
+EDIT_SIZE, MESH_SIZE, TEXTURE_SIZE = 384, 128, 1024
+"""Default sides in pixels: of edits, of a mesh's grid and texture; decompositions have the model's own."""
 
 
 def option(default: Any, help: str, **shown: Any) -> Any:
@@ -40,37 +42,38 @@ class ImageOptions:
     """How an image is read and its scene drawn."""
 
     size: int | None = option(
-        None, "Side of the output: 256, of meshes 128, of decompositions the model's.", min=8, max=4096
+        None,
+        "Side of the output: 384, of a mesh's texture 1,024, of decompositions the model's.",
+        min=8,
+        max=4096,
     )
     detail: str | None = option(
         None,
-        "photo: texture from the image itself. model: the model's albedo. Decompositions default to model.",
+        "photo: the image's own pixels. model: the model's albedo. Decompositions default to model.",
         metavar="photo|model",
     )
     texture: str | None = option(None, "Old spelling of detail.", hidden=True)
     fit_steps: int | None = option(
         None, "Optimise each scene against its image in N steps (60, say; slow).", min=0, max=10_000
     )
-    crop: str = option(
-        "whole", "auto: the part of each image that the model reconstructs best.", metavar="whole|auto"
+    frame: str | None = option(
+        None,
+        "face: the largest face. auto: the part that the model reconstructs best. none: the middle square. "
+        "By default face for models of faces, else none.",
+        metavar="face|auto|none",
     )
-    frame: str | None = option(None, "Old spelling of crop.", hidden=True)
+    crop: str | None = option(None, "Old spelling of frame: whole or auto.", hidden=True)
     batch_size: int = option(64, "Images per batch; changes speed and memory only.", min=1, metavar="N")
 
     def __post_init__(self) -> None:
-        if self.frame is not None:
-            object.__setattr__(self, "crop", self.frame)
-        if self.texture is not None:
-            _require_known("texture", self.texture, tuple(OLD_TEXTURES))
-            object.__setattr__(self, "detail", OLD_TEXTURES[self.texture])
+        for old, name, known in (("texture", "detail", OLD_TEXTURES), ("crop", "frame", OLD_CROPS)):
+            if (value := getattr(self, old)) is not None:
+                _require_known(old, value, tuple(known))
+                object.__setattr__(self, name, known[value])
+        object.__setattr__(self, "frame", OLD_CROPS.get(self.frame or "", self.frame))
         for name, known in CHOICES.items():
             if (value := getattr(self, name)) is not None:
                 _require_known(name, value, known)
-
-    @property
-    def cropped(self) -> bool:
-        """Whether the part of each image is searched that the model reconstructs best."""
-        return self.crop == "auto"
 
 
 @dataclass(frozen=True)
@@ -110,18 +113,45 @@ class OpenedImage:
     Attributes:
         path: its file.
         pixels: (3, S, S) uint8 at the model's size.
-        crop: the part of the file that they show.
+        frame: the part of the file that they show.
+        framing: the same as JSON has it: beside the middle square, in pixels, and how it was found ("face",
+            "auto", "none", or "no face" where one was looked for in vain).
         scene: one scene, on the model's device.
+        render: draws scenes like this one.
         percentile: of its reconstruction error among the held-out ones; None where the model keeps none.
         depth_range: nearest and farthest depth of the images that were opened together.
     """
 
     path: Path
     pixels: "np.ndarray"
-    crop: "Crop"
+    frame: "Frame"
+    framing: Mapping[str, Any]
     scene: "Scene"
+    render: "Callable[[Scene], Rendering]"
     percentile: float | None
     depth_range: tuple[float, float]
+
+    @property
+    def detail(self) -> "PhotoDetail | None":
+        """What draws the image's own pixels; None where the model's albedo is drawn."""
+        from derender.photo import PhotoDetail
+
+        return self.render if isinstance(self.render, PhotoDetail) else None
+
+    @property
+    def shown(self) -> "np.ndarray | Tensor":
+        """(3, S, S) the image as it is drawn: its own pixels where these are, else the model's."""
+        return self.pixels if self.detail is None else self.detail.photo
+
+    @property
+    def textured(self) -> "Scene":
+        """The scene as it is drawn, at that size, with the image's own texture where that is drawn."""
+        from derender.scene.enlarge import at_size
+
+        if (detail := self.detail) is None:
+            return self.scene
+        scene = at_size(self.scene, detail.size)
+        return scene.with_parameters(albedo=detail.on_grid(detail.albedo(), detail.size))
 
 
 class ImageOpener:
@@ -159,21 +189,24 @@ class ImageOpener:
         (image,) = self.decomposed({path: self.read(path)})
         return self.finer(image)
 
-    def read(self, path: Path) -> "tuple[np.ndarray, Crop]":
-        """Pixels at the model's size, and the part of the file that they show.
+    def read(self, path: Path) -> "tuple[np.ndarray, Frame, dict[str, Any]]":
+        """Pixels at the model's size, the part of the file that they show, and the same as JSON has it.
 
-        A file that is no image is a ValueError or OSError that says so.
+        A file that is no image, or shows no face where one was asked for, is a ValueError or OSError.
         """
-        import torch
+        from derender.data import read_photo
+        from derender.photo import Frame, found_frame
 
-        from derender.scene.crop_search import SEARCH_SCALE, WHOLE, best_crops
+        photo = read_photo(path)
+        frame, found = found_frame(photo, self.model, self.options.frame)
+        middle = Frame.centred(photo.shape[1], photo.shape[0])
+        place = {"x": frame.x, "y": frame.y, "side_px": frame.side, "roll_deg": frame.roll_deg}
+        framing = {**frame.within(middle), **place, "found": found}
+        return frame.cut(photo, self.model.image_size), frame, framing
 
-        size, crop = self.model.image_size, WHOLE
-        if self.options.cropped:
-            (crop,) = best_crops(self.model, torch.from_numpy(read_file(path, SEARCH_SCALE * size)[None]))
-        return read_crop(path, crop, size), crop
-
-    def decomposed(self, read: "Mapping[Path, tuple[np.ndarray, Crop]]") -> list[OpenedImage]:
+    def decomposed(
+        self, read: "Mapping[Path, tuple[np.ndarray, Frame, Mapping[str, Any]]]"
+    ) -> list[OpenedImage]:
         """Every image with its scene, feed-forward or optimised, at the model's size."""
         import numpy as np
         import torch
@@ -182,7 +215,7 @@ class ImageOpener:
         from derender.features import map_batches
         from derender.report.colours import depth_range
 
-        steps, stacked = self.options.fit_steps, np.stack([pixels for pixels, _ in read.values()])
+        steps, stacked = self.options.fit_steps, np.stack([pixels for pixels, *_ in read.values()])
 
         def scenes_of(images: "Tensor") -> "Scene":
             return self.model.fit_scenes(images, steps).scene if steps else self.model.decompose(images)
@@ -195,24 +228,20 @@ class ImageOpener:
             percentiles = reconstruction_percentile(self.model, stacked, self.held_out).tolist()
         rows = zip(read.items(), scenes, percentiles, strict=True)
         return [
-            OpenedImage(path, pixels, crop, scene, percentile, limits)
-            for (path, (pixels, crop)), scene, percentile in rows
+            OpenedImage(path, pixels, frame, framing, scene, self.model.render, percentile, limits)
+            for (path, (pixels, frame, framing)), scene, percentile in rows
         ]
 
     def finer(self, image: OpenedImage) -> OpenedImage:
-        """The image with its scene at the output's size and, unless declined, its own texture."""
-        from derender.data import as_float
-        from derender.report.texture import picture_albedo, picture_on_grid
+        """The image as it is drawn: its scene at the output's size or, unless declined, its own pixels."""
+        from derender.data import as_float, read_photo
+        from derender.photo import PhotoDetail
         from derender.scene.enlarge import at_size
 
-        own, size = self.model.image_size, self.size
-        scene = at_size(image.scene, size)
-        if self.detail == "photo":
-            pixels = as_float(read_crop(image.path, image.crop, size)[None]).to(scene.depth)
-            if size != own:
-                pixels = picture_on_grid(pixels, own)
-            scene = scene.with_parameters(albedo=picture_albedo(pixels, scene, self.model.fov_deg))
-        return replace(image, scene=scene)
+        if self.detail == "model":
+            return replace(image, scene=at_size(image.scene, self.size))
+        pixels = as_float(image.frame.cut(read_photo(image.path), self.size)[None])[0]
+        return replace(image, render=PhotoDetail(pixels, image.scene, self.model.fov_deg))
 
 
 def readable(paths: Sequence[Path], read: Callable[[Path], T]) -> tuple[dict[Path, T], dict[str, str]]:
@@ -227,29 +256,6 @@ def readable(paths: Sequence[Path], read: Callable[[Path], T]) -> tuple[dict[Pat
     if refused and not found:
         raise ValueError(next(iter(refused.values())))
     return found, refused
-
-
-def read_file(path: Path, size: int) -> "np.ndarray":
-    """One image file, (3, size, size) uint8; a path that leads nowhere or to a folder is an error."""
-    from derender.data import nearest_sibling, read_image
-
-    if not path.exists():
-        raise FileNotFoundError(f"{path} does not exist{nearest_sibling(path)}")
-    if path.is_dir():
-        raise IsADirectoryError(f"{path} is a folder: name images, such as {path / '*.jpg'}")
-    return read_image(path, size)
-
-
-def read_crop(path: Path, crop: "Crop", size: int) -> "np.ndarray":
-    """A part of an image file, (3, size, size) uint8."""
-    import torch
-
-    from derender.scene.crop_search import WHOLE, as_bytes
-
-    if crop == WHOLE:
-        return read_file(path, size)
-    larger = torch.from_numpy(read_file(path, round(size / crop.side))[None])
-    return as_bytes(crop.cut(larger, size))[0].numpy()
 
 
 def held_out_errors(source: str | Path) -> "HeldOutErrors | None":

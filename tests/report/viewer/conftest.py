@@ -103,7 +103,7 @@ def model() -> Derenderer:
 
 @pytest.fixture(scope="session")
 def picture() -> np.ndarray:
-    return np.random.default_rng(1).integers(0, 256, (3, SIZE, SIZE), dtype=np.uint8)
+    return np.random.default_rng(1).integers(0, 256, (SIZE, SIZE, 3), dtype=np.uint8)
 
 
 @pytest.fixture(scope="session")

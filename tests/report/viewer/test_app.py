@@ -37,6 +37,7 @@ def test_a_picture_is_taken_apart_and_shown(client):
     found = client.opened(0)
     assert set(found) == {
         "picture",
+        "framed",
         "light",
         "camera",
         "l1",
@@ -58,7 +59,8 @@ def test_a_fitted_scene_is_nearer_to_the_picture():
     model, face = load("rendered-faces-64"), faces.generate(1, 64, seed=5).images[0]
     held_out = read_errors(model_folder("rendered-faces-64"))
     read, fitted = (
-        Studio(model, "faces", held_out=held_out, fit_steps=steps).open(face) for steps in (0, 10)
+        Studio(model, "faces", held_out=held_out, fit_steps=steps).open(face.transpose(1, 2, 0))
+        for steps in (0, 10)
     )
     assert fitted["l1_feed_forward"] == pytest.approx(read["l1"])
     assert fitted["l1"] < 0.9 * read["l1"]
@@ -70,7 +72,7 @@ def test_light_and_camera_move(client):
     name = client.opened(0)["picture"]
 
     def shown(light: dict, camera: dict | None = None) -> np.ndarray:
-        asked = {"picture": name, "light": {**LIGHT, **light}, "camera": camera or FRONT}
+        asked = {"picture": name, "light": {**LIGHT, **light}, "camera": camera or FRONT, "detail": "model"}
         return client.post("/api/view", asked).image[:, :32].astype(float)
 
     dark, bright = shown({"diffuse": 0.0, "ambient": 0.1}), shown({"diffuse": 0.0, "ambient": 1.0})
@@ -214,13 +216,12 @@ def test_too_much_work_is_refused_not_queued_for_ever(model, picture, client):
 
 def test_a_wider_picture_is_shown_in_the_part_that_the_model_knows():
     model, face = load("rendered-faces-64"), rendered_examples("rendered-faces-64", 64)[3].picture
-    wide = np.random.default_rng(0).integers(0, 256, (3, 8, 8), dtype=np.uint8).repeat(16, 1).repeat(16, 2)
+    wide = np.random.default_rng(0).integers(0, 256, (8, 8, 3), dtype=np.uint8).repeat(16, 0).repeat(16, 1)
     left, top, side = Crop(0.5, 0.0, 0.2).corner(128)
-    wide[:, top : top + side, left : left + side] = face
-    framed, whole = Studio(model, "faces", cropped=True), Studio(model, "faces")
-    assert (framed.reading_size, whole.reading_size) == (128, 64)
+    wide[top : top + side, left : left + side] = face
+    framed, whole = Studio(model, "faces", frame="auto"), Studio(model, "faces")
     found = framed.open(wide)
     assert found["side"] == 0.5
-    np.testing.assert_array_equal(framed.shelf.get(found["picture"]).pixels, face)
+    np.testing.assert_array_equal(framed.shelf.get(found["picture"]).pixels, face.transpose(2, 0, 1))
     assert found["l1"] == pytest.approx(whole.open(face)["l1"])
     assert framed.open(face)["side"] == 1.0  # of the model's own size: as it is

@@ -14,7 +14,7 @@ from derender.training.held_out_errors import read_errors
 def test_rendered_examples_are_known_to_the_model_and_differ(model, thing):
     examples = rendered_examples(model, 64)
     assert examples[0].name == f"rendered {thing} 1"
-    stacked = np.stack([example.picture for example in examples])
+    stacked = np.stack([example.picture for example in examples]).transpose(0, 3, 1, 2)
     assert stacked.shape == (8, 3, 64, 64) and stacked.dtype == np.uint8
     assert len({example.name for example in examples}) == 8
     assert len({picture.tobytes() for picture in stacked}) == 8
@@ -30,7 +30,7 @@ def test_every_bundled_model_has_examples():
 
 def test_other_models_and_sizes(tmp_path):
     assert rendered_examples(str(tmp_path / "faces"), 64) == []
-    assert [example.picture.shape for example in rendered_examples("faces-64", 32)] == [(3, 32, 32)] * 8
-    mine = np.zeros((3, 8, 8), np.uint8)
+    assert [example.picture.shape for example in rendered_examples("faces-64", 32)] == [(32, 32, 3)] * 8
+    mine = np.zeros((8, 8, 3), np.uint8)
     (only,) = named_examples({tmp_path / "me.png": mine})
     assert only.name == "me.png" and only.picture is mine

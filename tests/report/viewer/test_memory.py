@@ -16,7 +16,7 @@ from derender.scene import Scene
 @pytest.fixture
 def image() -> ShownImage:
     scene = Scene(torch.ones(1, 4, 4), torch.zeros(1, 3, 4, 4), torch.zeros(1, 4), torch.zeros(1, 6))
-    return ShownImage(np.zeros((3, 4, 4), np.uint8), scene, {})
+    return ShownImage(np.zeros((3, 4, 4), np.uint8), np.zeros((3, 4, 4), np.uint8), scene, {})
 
 
 def test_the_longest_unused_image_leaves_first(image):

@@ -25,11 +25,12 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
 from derender import __version__
+from derender.data import read_photo
 from derender.features import FeatureTable
 from derender.inputs import require_fitting
 from derender.model import Derenderer
 from derender.report.colours import pictures
-from derender.report.opening import held_out_errors, read_file, readable
+from derender.report.opening import held_out_errors, readable
 from derender.report.viewer.guard import Guard
 from derender.report.viewer.neighbours import Example, Gallery, named_examples, rendered_examples
 from derender.report.viewer.questions import (
@@ -40,7 +41,7 @@ from derender.report.viewer.questions import (
     Q,
     Refused,
     ViewRequest,
-    pixels_of,
+    photo_of,
     read_request,
     too_large,
 )
@@ -144,7 +145,7 @@ def open_viewer(
     dataset: str = "auto",
     keep: int = KEPT,
     fit_steps: int = 0,
-    cropped: bool = False,
+    frame: str | None = None,
 ) -> tuple[Viewer, list[str]]:
     """A model with images to begin with and rows to search, and notes on what is missing.
 
@@ -157,7 +158,7 @@ def open_viewer(
         dataset: layout of that place.
         keep: opened images held in memory.
         fit_steps: of test-time optimisation of each scene.
-        cropped: search the part of each image that the model reconstructs best.
+        frame: how the part of each image is found that the model is given (``photo.found_frame``).
     """
     if fit_steps:
         require_fitting(model, source)
@@ -168,8 +169,8 @@ def open_viewer(
                 f"the table has none of the factors of {source}: make it again with derender embed"
             )
         gallery = Gallery(table, data, dataset)
-    studio = Studio(model, Path(source).name, Shelf(keep), held_out_errors(source), table, fit_steps, cropped)
-    read, problems = readable(images, lambda path: read_file(path, studio.reading_size))
+    studio = Studio(model, Path(source).name, Shelf(keep), held_out_errors(source), table, fit_steps, frame)
+    read, problems = readable(images, read_photo)
     notes = [f"left out {path}: {reason}" for path, reason in problems.items()]
     if gallery is not None and gallery.without_pictures:
         notes.append(f"neighbours are shown without images: {gallery.without_pictures}")
@@ -235,7 +236,7 @@ class Application:
     async def about(self, request: Request) -> Response:
         """All that the page needs to draw itself."""
         examples = [
-            {"name": example.name, "image": data_url(pictures(example.picture[None])[0])}
+            {"name": example.name, "image": data_url(example.thumbnail(THUMBNAIL))}
             for example in self.viewer.examples
         ]
         table = None
@@ -257,8 +258,8 @@ class Application:
         """Decompose the image in the body."""
         with self._uploads.one() as body:
             await self._receive(request, body, BODY_LIMIT_BYTES)
-            pixels = await self._work(self._decoding, _decoded, body, self.viewer.studio.reading_size)
-        return await self._opened(pixels)
+            photo = await self._work(self._decoding, _decoded, body)
+        return await self._opened(photo)
 
     async def open_example(self, request: Request) -> Response:
         """Decompose one of the examples."""
@@ -272,8 +273,10 @@ class Application:
         gallery = self.viewer.gallery
         if gallery is None:
             raise Refused(404, "there is no table: start the viewer with --features FILE.parquet")
-        number, size = request.path_params["number"], self.viewer.studio.model.image_size
-        return await self._opened(await self._work(self._decoding, gallery.picture, number, size))
+        number = request.path_params["number"]
+        sizes = (LARGEST_SIZE, self.viewer.studio.model.image_size)
+        photo, pixels = [await self._work(self._decoding, gallery.picture, number, size) for size in sizes]
+        return await self._opened(photo.transpose(1, 2, 0), pixels)
 
     async def factors(self, request: Request) -> Response:
         """The maps of an image, by name, as images inside JSON."""
@@ -304,8 +307,8 @@ class Application:
         question = await self._question(request, ViewRequest)
         return Response(await self._work(self._computing, make, question), media_type=media_type)
 
-    async def _opened(self, pixels: Any) -> Response:
-        return JSONResponse(await self._work(self._computing, self.viewer.studio.open, pixels))
+    async def _opened(self, *images: Any) -> Response:
+        return JSONResponse(await self._work(self._computing, self.viewer.studio.open, *images))
 
     async def _work(self, pool: ThreadPoolExecutor, function: Callable[..., Any], *arguments: Any) -> Any:
         """Have a thread do it, in turn; ``Refused`` (503) if too many wait or it takes too long."""
@@ -345,8 +348,8 @@ class Application:
         body.whole = True
 
 
-def _decoded(body: Body, size: int) -> Any:
-    return pixels_of(bytes(body.content), size)
+def _decoded(body: Body) -> Any:
+    return photo_of(bytes(body.content))
 
 
 def _thumbnail(gallery: Gallery, row: int) -> str | None:

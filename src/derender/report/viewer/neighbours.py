@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
-from PIL import Image
+from PIL import Image, ImageOps
 
 from derender.data import ListedStream, open_images, parse_source
 from derender.features import FeatureTable
@@ -32,11 +32,15 @@ class Example:
 
     Attributes:
         name: shown on the page.
-        image: its pixels at the model's size.
+        picture: its pixels.
     """
 
     name: str
-    picture: UInt8[np.ndarray, "3 s s"]
+    picture: UInt8[np.ndarray, "h w 3"]
+
+    def thumbnail(self, size: int) -> Image.Image:
+        """Its middle square."""
+        return ImageOps.fit(Image.fromarray(self.picture), (size, size))
 
 
 def named_examples(images: Mapping[Path, np.ndarray]) -> list[Example]:
@@ -54,9 +58,8 @@ def rendered_examples(model: str, image_size: int) -> list[Example]:
     examples = []
     for number in range(row.width // row.height):
         tile = row.crop((number * row.height, 0, (number + 1) * row.height, row.height))
-        pixels = np.asarray(tile.convert("RGB").resize((image_size, image_size), Image.Resampling.LANCZOS))
-        name = f"rendered {ROWS[model].removesuffix('s.png')} {number + 1}"
-        examples.append(Example(name, np.moveaxis(pixels, -1, 0).copy()))
+        pixels = np.array(tile.convert("RGB").resize((image_size, image_size), Image.Resampling.LANCZOS))
+        examples.append(Example(f"rendered {ROWS[model].removesuffix('s.png')} {number + 1}", pixels))
     return examples
 
 

@@ -5,6 +5,7 @@ an upload is decoded by its own content, never by its name or stated type (data/
 than a data set needs). Angles are degrees here; ``light_row`` and ``camera_row`` give radians.
 """
 
+from collections.abc import Callable
 from math import degrees, radians
 from typing import Annotated, Literal, TypeVar
 
@@ -15,7 +16,7 @@ from PIL.Image import DecompressionBombError
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from torch import Tensor
 
-from derender.data import Unreadable, decode, quiet_pillow
+from derender.data import Unreadable, decode, decode_whole, quiet_pillow
 
 LARGEST_SIZE = 512
 BODY_LIMIT_BYTES = 20_000_000
@@ -89,6 +90,7 @@ class ViewRequest(_Checked):
         light: instead of the image's own.
         camera: instead of the image's own.
         size: side in pixels; the model's own if left out, and never less.
+        detail: whose pixels are drawn, the photograph's or the model's.
     """
 
     picture: ImageId
@@ -96,6 +98,7 @@ class ViewRequest(_Checked):
     light: Light | None = None
     camera: Camera | None = None
     size: Annotated[int, Field(ge=8, le=LARGEST_SIZE)] | None = None
+    detail: Literal["photo", "model"] = "photo"
 
 
 class NeighbourRequest(ViewRequest):
@@ -126,13 +129,22 @@ def too_large() -> Refused:
 
 def pixels_of(encoded: bytes, image_size: int, box: np.ndarray | None = None) -> UInt8[np.ndarray, "3 s s"]:
     """Decode one image, cut to its centre square; ``Refused`` (413 or 415) if that is impossible."""
+    return _decoded(encoded, lambda: decode(encoded, image_size, box=box, pixel_limit=PIXEL_LIMIT))
+
+
+def photo_of(encoded: bytes) -> UInt8[np.ndarray, "h w 3"]:
+    """Decode one image at its own size; ``Refused`` as `pixels_of` is."""
+    return _decoded(encoded, lambda: decode_whole(encoded, PIXEL_LIMIT))
+
+
+def _decoded(encoded: bytes, decoder: Callable[[], np.ndarray]) -> np.ndarray:
     if len(encoded) > BODY_LIMIT_BYTES:
         raise too_large()
     if not encoded:
         raise Refused(415, f"this file is empty: choose an image ({KINDS})")
     try:
         with quiet_pillow():
-            return decode(encoded, image_size, box=box, pixel_limit=PIXEL_LIMIT)
+            return decoder()
     except Unreadable as problem:
         if "million pixels" in str(problem) or isinstance(problem.__cause__, DecompressionBombError):
             most = f"{PIXEL_LIMIT // 10**6} million pixels"

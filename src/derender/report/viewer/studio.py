@@ -1,9 +1,8 @@
 """Requests of the page, answered: images opened, shown under other light and view, as maps, mesh, archive.
 
 Takes questions and gives bytes and plain values; knows no HTTP. Opened images stay in memory only, a bounded
-number of them. Factors of several images are joined at the model's size and enlarged afterwards
-(scene/enlarge.py). Not safe for several threads at once: the server gives it one. Leaves out the images' own
-detail as texture.
+number of them. Factors of several images are joined at the model's size; what is drawn has the photograph's
+own detail, or is enlarged (scene/enlarge.py). Not safe for several threads at once: the server gives it one.
 """
 
 import base64
@@ -29,18 +28,26 @@ from derender.evaluation.out_of_distribution import OUTLIER_PERCENTILE, percenti
 from derender.features import FeatureTable, named
 from derender.features.neighbours import nearest, same_image
 from derender.model import Derenderer
+from derender.photo import Frame, PhotoDetail, found_frame
 from derender.report import colours
 from derender.report.mesh import model_mesh
 from derender.report.panel import labelled_grid, strip
-from derender.report.viewer.questions import Camera, Light, NeighbourRequest, Refused, ViewRequest
+from derender.report.viewer.questions import (
+    LARGEST_SIZE,
+    Camera,
+    Light,
+    NeighbourRequest,
+    Refused,
+    ViewRequest,
+)
 from derender.scene import Scene
-from derender.scene.crop_search import SEARCH_SCALE, WHOLE, as_bytes, best_crops
 from derender.scene.enlarge import at_size
 from derender.scene.light import lambert_shading
 from derender.scene.normals import normals_from_depth
 from derender.training.held_out_errors import HeldOutErrors, masked_l1, reconstruction_errors
 
 KEPT = 64
+DETAILS_KEPT = 4
 OFFERED_SIZES = (128, 256)
 
 
@@ -50,11 +57,13 @@ class ShownImage:
 
     Attributes:
         pixels: at the model's size.
+        photo: the same part of the photograph at up to ``LARGEST_SIZE``.
         scene: one scene, on the CPU.
         features: by factor, (D,) each.
     """
 
     pixels: UInt8[np.ndarray, "3 s s"]
+    photo: UInt8[np.ndarray, "3 p p"]
     scene: Scene
     features: Mapping[str, np.ndarray]
 
@@ -106,7 +115,7 @@ class Studio:
         held_out: reconstruction errors that were stored with the model; None if there are none.
         table: features to look for neighbours in; None for none.
         fit_steps: of test-time optimisation of each scene; 0 shows feed-forward scenes.
-        cropped: whether the part of a larger image is searched that the model reconstructs best.
+        frame: how the part of an image is found that the model is given (``photo.found_frame``).
     """
 
     model: Derenderer
@@ -115,12 +124,8 @@ class Studio:
     held_out: HeldOutErrors | None = None
     table: FeatureTable | None = None
     fit_steps: int = 0
-    cropped: bool = False
-
-    @property
-    def reading_size(self) -> int:
-        """Side of the images that ``open`` takes, in pixels: larger where crops are searched."""
-        return self.model.image_size * (SEARCH_SCALE if self.cropped else 1)
+    frame: str | None = None
+    _details: OrderedDict[tuple[str, int], PhotoDetail] = field(default_factory=OrderedDict)
 
     def about(self, largest_size: int) -> dict[str, Any]:
         """The model's name, sizes to draw at, ranges of the camera, and the number of images in memory."""
@@ -134,16 +139,23 @@ class Studio:
             "kept": self.shelf.limit,
         }
 
-    def open(self, pixels: UInt8[np.ndarray, "3 s s"]) -> dict[str, Any]:
+    def open(
+        self, photo: UInt8[np.ndarray, "h w 3"], pixels: UInt8[np.ndarray, "3 s s"] | None = None
+    ) -> dict[str, Any]:
         """Decompose an image and store it; returns its name, light, camera and reconstruction error.
+
+        ``pixels`` are what the model is given, where that is known already.
 
         The percentile is that of the feed-forward reconstruction.
         """
-        crop = WHOLE
-        if self.cropped and pixels.shape[-1] != self.model.image_size:
-            larger = torch.from_numpy(pixels[None])
-            (crop,) = best_crops(self.model, larger)
-            pixels = as_bytes(crop.cut(larger, self.model.image_size))[0].numpy()
+        try:
+            way = self.frame if pixels is None else "none"
+            frame, framed = found_frame(photo, self.model, way)
+        except ValueError as problem:
+            raise Refused(422, str(problem)) from problem
+        if pixels is None:
+            pixels = frame.cut(photo, self.model.image_size)
+        shown = frame.cut(photo, min(max(round(frame.side), self.model.image_size), LARGEST_SIZE))
         with torch.inference_mode():
             images = as_float(pixels[None]).to(self.model.device)
             features = self.model.embed(images)
@@ -157,13 +169,14 @@ class Studio:
         scene = scene.to("cpu")
         percentile = None if self.held_out is None else float(percentile_of(errors, self.held_out)[0])
         return {
-            "picture": self.shelf.put(ShownImage(pixels, scene, rows)),
+            "picture": self.shelf.put(ShownImage(pixels, shown, scene, rows)),
             "light": Light.of(scene.light[0]).model_dump(),
             "camera": Camera.of(scene.camera[0]).model_dump(),
             "l1": l1 if isfinite(l1) else None,
             "l1_feed_forward": float(errors[0]) if self.fit_steps and isfinite(errors[0]) else None,
             "percentile": percentile,
-            "side": crop.side,
+            "side": frame.side / min(photo.shape[:2]),
+            "framed": framed,
             "out_of_distribution": percentile is not None and percentile > OUTLIER_PERCENTILE,
         }
 
@@ -185,12 +198,12 @@ class Studio:
         """The rendering and, right of it, the shading, as one PNG; transparent where nothing is seen."""
         with torch.inference_mode():
             scene = self.scene(question)
-            return _png(strip([self._rendered(scene), self._shading(scene)]), quick=True)
+            return _png(strip([self._drawn(question, scene), self._shading(scene)]), quick=True)
 
     def picture(self, question: ViewRequest) -> bytes:
         """The rendering alone, as a PNG with transparency."""
         with torch.inference_mode():
-            return _png(self._rendered(self.scene(question)))
+            return _png(self._drawn(question, self.scene(question)))
 
     def maps(self, question: ViewRequest) -> dict[str, Image.Image]:
         """Input, its reconstruction, the requested view, and the factors of that, by name."""
@@ -200,7 +213,7 @@ class Studio:
             return {
                 "input": colours.pictures(opened.pixels[None])[0],
                 "reconstruction": self._rendered(at_size(opened.scene, scene.depth.shape[-1])),
-                "view": self._rendered(scene),
+                "view": self._drawn(question, scene),
                 "depth": colours.depth_maps(scene.depth)[0],
                 "normals": colours.normal_maps(normals_from_depth(scene.depth, self.model.fov_deg))[0],
                 "albedo": colours.pictures(scene.albedo)[0],
@@ -227,7 +240,12 @@ class Studio:
         """The surface in its canonical view as GLB; ``Refused`` (422) where there is none."""
         scene = self.scene(question)
         try:
-            return model_mesh(self.model, scene).files("surface")["surface.glb"]
+            texture = None
+            if question.detail == "photo":
+                with torch.inference_mode():
+                    name = dict(question.swaps).get("albedo", question.picture)
+                    texture = self._detail(name, LARGEST_SIZE).albedo()
+            return model_mesh(self.model, scene, texture=texture).files("surface")["surface.glb"]
         except ValueError as problem:
             raise Refused(422, str(problem)) from problem
 
@@ -256,6 +274,28 @@ class Studio:
         except ValueError as problem:
             raise Refused(422, str(problem)) from problem
         return list(zip(rows.tolist(), away.tolist(), strict=True))
+
+    def _drawn(self, question: ViewRequest, scene: Scene) -> Image.Image:
+        """A requested scene in the detail of the photograph that gives its colours, or of the model."""
+        if question.detail == "model":
+            return self._rendered(scene)
+        size = scene.depth.shape[-1]
+        detail = self._detail(dict(question.swaps).get("albedo", question.picture), size)
+        return colours.pictures(detail(scene).image)[0]
+
+    def _detail(self, name: str, size: int) -> PhotoDetail:
+        """What draws an opened image; the last few are kept."""
+        if (name, size) not in self._details:
+            opened = self.shelf.get(name)
+            side = opened.photo.shape[-1]
+            photo = Frame.centred(side, side).cut(opened.photo.transpose(1, 2, 0), size)
+            self._details[name, size] = PhotoDetail(
+                as_float(photo[None])[0], opened.scene, self.model.fov_deg
+            )
+        self._details.move_to_end((name, size))
+        while len(self._details) > DETAILS_KEPT:
+            self._details.popitem(last=False)
+        return self._details[name, size]
 
     def _rendered(self, scene: Scene) -> Image.Image:
         rendering = self.model.render(scene.to(self.model.device))

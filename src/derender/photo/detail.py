@@ -1,0 +1,252 @@
+"""A photograph under other lighting and from other viewpoints, in its own detail.
+
+A model sees 64 or 128 pixels; a photograph has more. Geometry and light vary slowly, so they are drawn on a
+coarse grid and enlarged: where each point of the new image lies in the photograph, and by how much its
+shading changes. The photograph is looked up there at its own resolution. Its own light and viewpoint give it
+back. A point that it does not show is taken from its mirror image where that is seen, else from the model's
+albedo, moved to the photograph's colours; the three blend. Around the surface, motion and shading go on and
+fade out: hair, neck and background follow. The more shading changes, the more the model's colours weigh: what
+it explained wrongly would otherwise stay in the surface. Shading multiplies coded (sRGB)
+values, as in training: on Extended Yale B that is nearer to the truth than the same ratio in linear light.
+Leaves out cast shadows.
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, grid_sample, interpolate, max_pool2d, pad
+
+from derender.render import Rendering, warp
+from derender.scene import Scene
+from derender.scene.camera import project, to_camera, unproject
+from derender.scene.enlarge import at_size
+from derender.scene.light import lambert_shading
+from derender.scene.normals import normals_from_depth
+
+GRID = 256
+"""Largest side of the grid on which geometry and shading are drawn."""
+
+FACING = (
+    0.15,
+    0.40,
+)  # cosine between surface and ray: below the first the photograph tells nothing, above all
+MOVED = (0.01, 0.03)  # shares of the side: what moves less than the first is always the photograph's
+LIT = (0.10, 0.25)  # shading, likewise
+LEAST_SHADING, LARGEST_RATIO = 0.05, 20.0
+DISTRUST = 4.0  # the weight of the photograph's detail is 1 / (1 + DISTRUST m²), m the mean squared log ratio
+HIDDEN_BEHIND = 0.01  # scene units that a point may lie behind what is seen there
+FEATHER_SHARE = 1 / 32  # width of the blends, of the image's width
+COLOUR_SHARE = 1 / 12  # reach of the colours carried over to what is not seen
+RIM_SHARE = 0.05  # of the side: the surface's rim, where a model's depth ends in a wall
+FADE_SHARE = 1 / 8  # reach of motion and shading beyond the surface
+DARKEST = 1e-3
+
+
+class PhotoDetail:
+    """Draws scenes of one photograph in its own detail; called like a renderer.
+
+    Args:
+        photo: (3, S, S) in 0..1: the crop that the scene was made of, at any size from the scene's on.
+        scene: what the model found in it, one scene.
+        fov_deg: horizontal field of view.
+        margin: how far the photograph reaches beyond that crop on every side, in shares of the crop's side.
+    """
+
+    def __init__(self, photo: Float[Tensor, "3 s s"], scene: Scene, fov_deg: float, margin: float = 0.0):
+        if len(scene) != 1 or photo.ndim != 3 or photo.shape[-1] < scene.depth.shape[-1]:
+            raise ValueError(
+                f"a photograph (3, S, S) and its one scene are needed, S no smaller than the scene; got "
+                f"{tuple(photo.shape)} and {len(scene)} scenes of {scene.depth.shape[-1]} pixels"
+            )
+        self.photo, self.fov_deg, self.model_size = photo.to(scene.depth), fov_deg, scene.depth.shape[-1]
+        self.size, self.span = photo.shape[-1], 1 + 2 * margin
+        self.grid = min(max(GRID, self.model_size), self.size)
+        self.rim = round(margin * self.grid)
+        own = at_size(scene.detach(), self.grid)
+        points = to_camera(unproject(own.depth, fov_deg), own.camera)
+        self._place = project(points, self.grid, self.grid, fov_deg).permute(0, 3, 1, 2)
+        self._shading = lambert_shading(normals_from_depth(own.depth, fov_deg), own.light)
+        self._seen = self._visible(own, points) * _ramp(self._shading, *LIT)
+        self._colours = self._completed(own)
+        at_home = warp(self._place, own.depth, own.camera, fov_deg)
+        self._off = (at_home.image - self._pixels()) * at_home.mask[:, None]  # what rounding leaves
+
+    def __call__(self, scene: Scene) -> Rendering:
+        """Images (N, 3, S, S) of scenes that differ from the photograph's in light, camera or depth.
+
+        Albedo is the photograph's, whatever they hold. The mask is 1: around the surface is the photograph.
+        """
+        scene = at_size(scene, self.grid)
+        count, shading = (
+            len(scene),
+            lambert_shading(normals_from_depth(scene.depth, self.fov_deg), scene.light),
+        )
+        own = torch.cat((self._place, self._seen, self._shading), dim=1)
+        maps = torch.cat((own, own.flip(-1), self._colours), dim=1).expand(count, -1, -1, -1)
+        view = warp(torch.cat((maps, shading), dim=1), scene.depth, scene.camera, self.fov_deg)
+        own, mirrored, colours, shading = view.image.split((4, 4, 3, 1), dim=1)
+        place = own[:, :2] - _look_up(self._off.expand(count, -1, -1, -1), own[:, :2])
+        shift, mirror_shift = place - self._pixels(), mirrored[:, :2] - self._pixels()
+        moved = shift.norm(dim=1, keepdim=True) / self.grid
+        seen = torch.maximum(own[:, 2:3], 1 - _ramp(moved, *MOVED))
+        ratio, mirror_ratio = _ratio(shading, own[:, 3:]), _ratio(shading, mirrored[:, 3:])
+        mask = view.mask[:, None]
+        log_ratio = ratio.log()
+        change = (log_ratio.square() * mask).sum(dim=(2, 3)) / mask.sum(dim=(2, 3)).clamp(min=1)
+        trust = 1 / (1 + DISTRUST * change.square())
+        mask, shift, log_ratio = self._continued(mask, shift, log_ratio)
+        mirror_shift, mirror_ratio, drawn, seen, mirror_seen = (
+            pad(field, (self.rim,) * 4)
+            for field in (mirror_shift, mirror_ratio, colours * shading, seen, (1 - seen) * mirrored[:, 2:3])
+        )
+        seen, mirror_seen = 1 - mask * (1 - seen), mask * mirror_seen
+        trust = 1 - mask * (1 - trust[:, :, None, None])
+        fields = (
+            shift,
+            mirror_shift,
+            seen,
+            mirror_seen,
+            log_ratio.exp(),
+            mirror_ratio.clamp(min=DARKEST),
+            drawn,
+        )
+        image = self._composed(fields, trust)
+        depth = self._enlarged(pad(view.depth[:, None], (self.rim,) * 4))[:, 0]
+        return Rendering(image, depth, torch.ones_like(depth))
+
+    def albedo(self) -> Float[Tensor, "1 3 s s"]:
+        """The texture of the canonical view: the photograph without its shading, completed."""
+        bare = 1 / self._shading.clamp(min=LIT[0])
+        shift, mirror_shift = (place - self._pixels() for place in (self._place, self._place.flip(-1)))
+        weights = (self._seen, (1 - self._seen) * self._seen.flip(-1))
+        fields = (shift, mirror_shift, *weights, bare, bare.flip(-1), self._colours)
+        return self._composed(tuple(pad(field, (self.rim,) * 4) for field in fields), torch.ones(1, 1, 1, 1))
+
+    def _continued(self, mask: Tensor, shift: Tensor, log_ratio: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The mask without its rim; shift and ratio go on around it and fade out. On the wider grid."""
+        reach = round(RIM_SHARE * self.grid)
+        mask = -max_pool2d(-pad(mask, (reach,) * 4), 2 * reach + 1, stride=1)
+        mask, fields = (pad(field, (self.rim,) * 4) for field in (mask, torch.cat((shift, log_ratio), dim=1)))
+        near = _ramp(_blurred(mask, FADE_SHARE * self.grid), 0.02, 0.25)
+        near = torch.maximum(mask, near)
+        shift, log_ratio = _filled(fields * mask, mask).split((2, 1), dim=1)
+        return mask, shift * near, log_ratio * near
+
+    def _composed(
+        self, fields: tuple[Tensor, ...], trust: Float[Tensor, "n 1 h w"]
+    ) -> Float[Tensor, "n 3 s s"]:
+        """Images at the photograph's size, from fields on the wider grid.
+
+        Fields are shifts into the photograph and into its mirror image, weights of both, factors of both, and
+        the model's colours; trust is the weight of the photograph's detail beside these.
+        """
+        trust = trust.expand(-1, -1, *fields[0].shape[-2:])
+        channels = [*(field.shape[1] for field in fields), 1]
+        *enlarged, trust = self._enlarged(torch.cat((*fields, trust), dim=1)).split(channels, dim=1)
+        shift, mirror_shift, seen, mirror_seen, ratio, mirror_ratio, drawn = enlarged
+        drawn = drawn.clamp(DARKEST, 1)
+        image = seen * self._detailed(shift, ratio, drawn, trust)
+        if bool((seen < 1).any()):
+            image = image + mirror_seen * self._detailed(mirror_shift, mirror_ratio, drawn, trust)
+            image = image + (1 - seen - mirror_seen) * drawn
+        return image.clamp(0, 1)
+
+    def _detailed(self, shift: Tensor, ratio: Tensor, drawn: Tensor, trust: Tensor) -> Tensor:
+        """The photograph looked up at shifted places, its shading changed."""
+        unit = 2 * (self.model_size - 1) / (self.grid - 1) / self.model_size / self.span  # a grid pixel
+        places = _square((torch.arange(self.size) + 0.5) * 2 / self.size - 1).to(shift)
+        places = places + unit * shift.permute(0, 2, 3, 1)
+        photo = self.photo.expand(len(shift), -1, -1, -1)
+        found = grid_sample(photo, places, mode="bicubic", padding_mode="border", align_corners=False)
+        return (found * ratio).clamp(DARKEST, 1) ** trust * drawn ** (1 - trust)
+
+    def _enlarged(self, fields: Tensor) -> Tensor:
+        """Fields of the wider grid at the photograph's pixels; its border is continued."""
+        places = ((torch.arange(self.size) + 0.5) / self.size - 0.5) * self.span * self.model_size
+        across = places / (self.model_size - 1) * (self.grid - 1)  # from the middle, in grid pixels
+        centres = (
+            _square(across * 2 / (self.grid - 1 + 2 * self.rim)).to(fields).expand(len(fields), -1, -1, -1)
+        )
+        return grid_sample(fields, centres, padding_mode="border", align_corners=True)
+
+    def on_grid(self, image: Float[Tensor, "1 3 s s"], size: int) -> Float[Tensor, "1 3 size size"]:
+        """What covers the photograph, on a grid from the model's first to its last pixel centre."""
+        side = round(size * self.span)
+        if side < image.shape[-1]:
+            image = interpolate(image, (side, side), mode="bilinear", antialias=True)
+        edge = (1 - 1 / self.model_size) / self.span
+        centres = _square(torch.linspace(-edge, edge, size)).to(image)
+        return grid_sample(image, centres, mode="bicubic", padding_mode="border", align_corners=False).clamp(
+            0, 1
+        )
+
+    def _completed(self, own: Scene) -> Float[Tensor, "1 3 g g"]:
+        """The model's albedo in the photograph's colours, as far as those reach."""
+        photo = self.on_grid(self.photo[None], self.grid)
+        bare = (_look_up(photo, self._place) / self._shading.clamp(min=LIT[0])).clamp(0, 1)
+        weight, mirror_weight = self._seen, (1 - self._seen) * self._seen.flip(-1)
+        known = weight + mirror_weight
+        difference = weight * bare + mirror_weight * bare.flip(-1) - known * own.albedo
+        reach = COLOUR_SHARE * self.grid
+        return (own.albedo + _blurred(difference, reach) / _blurred(known, reach).clamp(min=0.05)).clamp(0, 1)
+
+    def _visible(self, own: Scene, points: Tensor) -> Float[Tensor, "1 1 g g"]:
+        """How well the photograph shows each canonical point, 0..1."""
+        view = warp(own.albedo[:, :1], own.depth, own.camera, self.fov_deg)
+        front = _look_up(view.depth[:, None], self._place, "nearest")
+        inside = ((self._place >= 0) & (self._place <= self.grid - 1)).all(dim=1, keepdim=True)
+        visible = inside & (points[..., 2][:, None] <= front + HIDDEN_BEHIND) & (front > 0)
+        share = visible * _ramp(_facing(points), *FACING)[:, None]
+        reach = max(1, round(FEATHER_SHARE * self.grid))
+        shrunk = -max_pool2d(-share, 2 * reach + 1, stride=1, padding=reach)
+        return avg_pool2d(shrunk, 2 * reach + 1, stride=1, padding=reach, count_include_pad=False)
+
+    def _pixels(self) -> Float[Tensor, "1 2 g g"]:
+        return _square(torch.arange(self.grid).float()).permute(0, 3, 1, 2).to(self.photo)
+
+
+def _square(along: Tensor) -> Float[Tensor, "1 k k 2"]:
+    """Points (across, down) of a square grid."""
+    return torch.stack(torch.meshgrid(along, along, indexing="xy"), dim=-1)[None]
+
+
+def _ratio(shading: Tensor, before: Tensor) -> Tensor:
+    """New shading over old, kept within bounds."""
+    ratio = shading.clamp(min=LEAST_SHADING) / before.clamp(min=LEAST_SHADING)
+    return ratio.clamp(1 / LARGEST_RATIO, LARGEST_RATIO)
+
+
+def _look_up(maps: Tensor, place: Float[Tensor, "n 2 h w"], mode: str = "bilinear") -> Tensor:
+    """Maps at pixel coordinates."""
+    grid = place.permute(0, 2, 3, 1) * 2 / (maps.shape[-1] - 1) - 1
+    return grid_sample(maps, grid, mode=mode, padding_mode="border", align_corners=True)
+
+
+def _facing(points: Float[Tensor, "n h w 3"]) -> Float[Tensor, "n h w"]:
+    """Cosine between the moved surface and the ray to it; negative where it is seen from behind."""
+    along_u, along_v = torch.gradient(points, dim=2)[0], torch.gradient(points, dim=1)[0]
+    normal = torch.linalg.cross(along_u, along_v)
+    return (normal * points).sum(dim=-1) / (normal.norm(dim=-1) * points.norm(dim=-1)).clamp(min=1e-12)
+
+
+def _ramp(value: Tensor, low: float, high: float) -> Tensor:
+    return ((value - low) / (high - low)).clamp(0, 1)
+
+
+def _blurred(maps: Tensor, reach: float) -> Tensor:
+    """Three box filters of so many pixels to either side, on a quarter of the resolution."""
+    reach = max(1, round(reach / 4))
+    small = interpolate(maps, scale_factor=0.25, mode="area")
+    for _ in range(3):
+        small = avg_pool2d(pad(small, (reach,) * 4, mode="replicate"), 2 * reach + 1, stride=1)
+    return interpolate(small, maps.shape[-2:], mode="bilinear")
+
+
+def _filled(maps: Tensor, known: Float[Tensor, "n 1 h w"]) -> Tensor:
+    """Maps times what is known of them (0..1), the rest filled smoothly from coarser and coarser averages."""
+    if min(maps.shape[-2:]) < 4:
+        return maps / known.clamp(min=1e-6)
+    coarse, coarse_known = (interpolate(field, scale_factor=0.5, mode="area") for field in (maps, known))
+    scale = coarse_known.clamp(min=1e-6)
+    coarse = _filled(coarse / scale * (coarse_known > 0), (coarse_known > 0).to(maps))
+    return maps + (1 - known) * interpolate(coarse, maps.shape[-2:], mode="bilinear")

@@ -1,0 +1,225 @@
+"""A photograph in, a photograph out: relit or turned, in its own detail and at its own size.
+
+The part that suits the model is found (a face, or the middle), decomposed, drawn under another light or from
+another side by ``PhotoDetail``, and put back into the photograph. Results have the kind of what was given:
+a Pillow image for a path or a Pillow image, an array for an array, a tensor for a tensor.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import radians
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import UInt8
+from PIL import Image
+from torch import Tensor
+
+from derender.data import GivenImages, as_photos, suggestion
+from derender.inputs import as_model
+from derender.model import Derenderer
+from derender.photo.detail import PhotoDetail
+from derender.photo.faces import UTKFACE, find_faces, frame_of, template_of
+from derender.photo.frame import Frame
+from derender.scene import Scene
+from derender.scene.crop_search import SEARCH_SCALE, best_crops
+
+AMBIENT_SHARE = 0.35
+"""Of a light's strength; the rest is diffuse."""
+
+LARGEST_CROP = 1024
+"""Side of the largest crop that is drawn pixel by pixel; of larger ones the change is enlarged."""
+
+MARGIN = 0.35
+"""How far edits reach beyond the frame, in shares of its side."""
+
+FRAMES = ("face", "auto", "none")
+"""Ways to find the part of a photograph that a model is given."""
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """A decomposed photograph.
+
+    Attributes:
+        pixels: all of it.
+        frame: the part that the model was given.
+        surroundings: the larger part that edits change.
+        scene: what it found there, one scene.
+        detail: draws scenes in the photograph's own detail.
+    """
+
+    pixels: UInt8[np.ndarray, "h w 3"]
+    frame: Frame
+    surroundings: Frame
+    scene: Scene
+    detail: PhotoDetail
+
+    def edited(self, **parameters: Tensor) -> UInt8[np.ndarray, "h w 3"]:
+        """The whole photograph with another ``light`` (1, 4) or ``camera`` (1, 6)."""
+        with torch.inference_mode():
+            seen = self.detail(self.scene.with_parameters(**parameters))
+            return self.surroundings.paste(self.pixels, self.detail.photo, seen.image[0])
+
+
+def open_photograph(
+    pixels: UInt8[np.ndarray, "h w 3"], model: Derenderer, *, frame: str | None = None, fit_steps: int = 0
+) -> Photograph:
+    """Find the part that suits the model, and decompose it.
+
+    Args:
+        pixels: the photograph.
+        model: trained.
+        frame: as `found_frame` takes it.
+        fit_steps: Adam steps that fit the scene to the photograph; 0 takes the networks' answer.
+    """
+    place = found_frame(pixels, model, frame)[0]
+    own = model.image_size
+    small = torch.from_numpy(place.cut(pixels, own)[None]).to(model.device).float() / 255
+    scene = model.fit_scenes(small, fit_steps).scene if fit_steps else model.decompose(small)
+    wide = place.widened(MARGIN)
+    size = min(max(own, round(wide.side)), LARGEST_CROP)
+    photo = torch.from_numpy(wide.cut(pixels, size)).to(model.device).float() / 255
+    with torch.inference_mode():
+        margin = (wide.side / place.side - 1) / 2
+        return Photograph(pixels, place, wide, scene, PhotoDetail(photo, scene, model.fov_deg, margin))
+
+
+def relight(
+    image: GivenImages,
+    model: Derenderer | str | Path = "faces-64",
+    *,
+    yaw_deg: float = 50.0,
+    pitch_deg: float = 10.0,
+    strength: float = 1.0,
+    like: GivenImages | None = None,
+    frame: str | None = None,
+    fit_steps: int = 0,
+) -> Any:
+    """A photograph under another light.
+
+    Args:
+        image: a path, a Pillow image, an array or tensor (bytes, or numbers in 0..1), or several.
+        model: a model, or the name of one.
+        yaw_deg, pitch_deg: where the light comes from: left of the image and above are positive; below 90.
+        strength: of the light, in multiples of the photograph's own; 0.35 of it is ambient.
+        like: take the light of this image instead.
+        frame, fit_steps: as in `open_photograph`.
+
+    Returns:
+        What was given, in kind and size; a list for a list.
+
+    Raises:
+        ValueError: no face is found, or the image has values outside 0..1.
+    """
+    loaded = as_model(model)
+    for name, angle in (("yaw_deg", yaw_deg), ("pitch_deg", pitch_deg)):
+        if not -90 < angle < 90:
+            raise ValueError(f"{name} must lie between -90 and 90 degrees, got {angle:g}")
+    if not 0 <= strength < float("inf"):
+        raise ValueError(f"strength must be 0 or more, got {strength}")
+    other = None
+    if like is not None:
+        other = open_photograph(as_photos(like)[0], loaded, frame=frame, fit_steps=fit_steps).scene.light
+
+    def edited(photo: Photograph) -> np.ndarray:
+        if other is not None:
+            return photo.edited(light=other)
+        power = strength * float(photo.scene.light[0, :2].sum())
+        light = [AMBIENT_SHARE * power, (1 - AMBIENT_SHARE) * power, radians(pitch_deg), radians(yaw_deg)]
+        return photo.edited(light=photo.scene.light.new_tensor([light]))
+
+    return _each(image, lambda one: edited(open_photograph(one, loaded, frame=frame, fit_steps=fit_steps)))
+
+
+def rotate(
+    image: GivenImages,
+    model: Derenderer | str | Path = "faces-64",
+    *,
+    yaw_deg: float = 20.0,
+    pitch_deg: float = 0.0,
+    frame: str | None = None,
+    fit_steps: int = 0,
+) -> Any:
+    """A photograph whose object is turned from where it looks, in its own light.
+
+    Args:
+        image: a path, a Pillow image, an array or tensor (bytes, or numbers in 0..1), or several.
+        model: a model, or the name of one.
+        yaw_deg: positive turns it to the left of the image.
+        pitch_deg: positive brings its top forward.
+        frame, fit_steps: as in `open_photograph`.
+
+    Returns:
+        What was given, in kind and size; a list for a list.
+    """
+    loaded = as_model(model)
+    for name, angle in (("yaw_deg", yaw_deg), ("pitch_deg", pitch_deg)):
+        if not -90 < angle < 90:
+            raise ValueError(f"{name} must lie between -90 and 90 degrees, got {angle:g}")
+
+    def turned(pixels: np.ndarray) -> np.ndarray:
+        photo = open_photograph(pixels, loaded, frame=frame, fit_steps=fit_steps)
+        camera = photo.scene.camera.clone()
+        camera[:, 0] += radians(pitch_deg)
+        camera[:, 1] += radians(yaw_deg)
+        return photo.edited(camera=camera)
+
+    return _each(image, turned)
+
+
+def found_frame(
+    pixels: UInt8[np.ndarray, "h w 3"], model: Derenderer, frame: str | None = None
+) -> tuple[Frame, str]:
+    """The part of a photograph that suits a model, and how it was found.
+
+    Args:
+        pixels: the photograph.
+        model: that is to be given the part.
+        frame: "face", the largest face (an error where none is found); "auto", the part that the model
+            reconstructs best; "none", the middle square. None: the largest face if the model is known to be
+            of faces and one is found ("no face" is said where not), else the middle square, as for images no
+            larger than the model's.
+    """
+    if frame is not None and frame not in FRAMES:
+        raise ValueError(f"unknown frame {frame!r}{suggestion(frame, FRAMES)}: choose {', '.join(FRAMES)}")
+    middle = Frame.centred(pixels.shape[1], pixels.shape[0])
+    if frame == "auto":
+        larger = torch.from_numpy(middle.cut(pixels, SEARCH_SCALE * model.image_size)[None])
+        (crop,) = best_crops(model, larger)
+        return middle.part(crop.across, crop.down, crop.side).snapped(), "auto"
+    template = template_of(model)
+    if frame == "none" or (frame is None and (template is None or middle.side <= model.image_size)):
+        return middle, "none"
+    faces = find_faces(pixels)
+    if faces:
+        return frame_of(faces[0], template or UTKFACE).snapped(), "face"
+    if frame is None:
+        return middle, "no face"
+    raise ValueError("no face is found in this image: choose frame auto or none")
+
+
+def _each(image: GivenImages, edit: Callable[[np.ndarray], np.ndarray]) -> Any:
+    """Edit every image, and return them in the kind they were given in."""
+    if isinstance(image, (list, tuple)):
+        return [_each(one, edit) for one in image]
+    edited = [edit(photo) for photo in as_photos(image)]
+    if isinstance(image, Tensor):
+        stacked = torch.from_numpy(_like(image.detach().cpu().numpy(), edited))
+        return stacked.to(image.device)
+    if isinstance(image, np.ndarray):
+        return _like(image, edited)
+    return Image.fromarray(edited[0])
+
+
+def _like(given: np.ndarray, edited: list[np.ndarray]) -> np.ndarray:
+    """Edited images in the layout, number type and range of an array."""
+    stacked = np.stack(edited)
+    if given.ndim == 2:
+        stacked = stacked.mean(axis=-1).round().astype(np.uint8)
+    elif given.shape[-1] != 3:
+        stacked = stacked.transpose(0, 3, 1, 2)
+    stacked = stacked if given.ndim == 4 else stacked[0]
+    return stacked if given.dtype == np.uint8 else (stacked / 255).astype(given.dtype)

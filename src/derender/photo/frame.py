@@ -1,0 +1,128 @@
+"""The square part of a photograph that a model is given: cut out at any size, and put back.
+
+Leaves out finding it (faces.py, scene/crop_search.py).
+"""
+
+from dataclasses import dataclass
+from math import ceil, cos, radians, sin
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from PIL import Image
+from torch import Tensor
+from torch.nn.functional import grid_sample
+
+BORDER_SHARE = 1 / 16
+"""Width over which an edited crop fades into its photograph, of the crop's side."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A square in a photograph, perhaps turned, perhaps reaching beyond it.
+
+    Attributes:
+        x, y: its centre in pixels from the photograph's upper left corner.
+        side: in pixels.
+        roll_deg: clockwise turn of its upright direction, as seen.
+    """
+
+    x: float
+    y: float
+    side: float
+    roll_deg: float = 0.0
+
+    @classmethod
+    def centred(cls, width: int, height: int) -> "Frame":
+        """The largest upright square in the middle."""
+        side = min(width, height)
+        left, top = (width - side) // 2, (height - side) // 2
+        return cls(left + side / 2, top + side / 2, side)
+
+    @property
+    def upright(self) -> bool:
+        """Whether it is not turned."""
+        return abs(self.roll_deg) < 1e-6
+
+    def snapped(self) -> "Frame":
+        """Moved to whole pixels where it is upright: cut out at its own side, nothing is resampled."""
+        if not self.upright:
+            return self
+        side = max(1, round(self.side))
+        return Frame(round(self.x - side / 2) + side / 2, round(self.y - side / 2) + side / 2, side)
+
+    def widened(self, share: float) -> "Frame":
+        """Larger by ``share`` of the side, in whole pixels, in every direction."""
+        return Frame(self.x, self.y, self.side + 2 * round(share * self.side), self.roll_deg)
+
+    def part(self, across: float, down: float, side: float) -> "Frame":
+        """A smaller square in this one: its centre from -1 to 1, its side as a share."""
+        return Frame(self.x + across * self.side / 2, self.y + down * self.side / 2, side * self.side)
+
+    def within(self, other: "Frame") -> dict[str, float]:
+        """Side as a share of another frame's, and centre from -1 to 1 across and down it."""
+        return {
+            "side": round(self.side / other.side, 6),
+            "across": round(2 * (self.x - other.x) / other.side, 6),
+            "down": round(2 * (self.y - other.y) / other.side, 6),
+        }
+
+    def corners(self) -> list[tuple[float, float]]:
+        """Upper left, upper right, lower right, lower left, in pixels."""
+        half, angle = self.side / 2, radians(self.roll_deg)
+        c, s = cos(angle), sin(angle)
+        signs = ((-1, -1), (1, -1), (1, 1), (-1, 1))
+        return [(self.x + half * (c * u - s * v), self.y + half * (s * u + c * v)) for u, v in signs]
+
+    def cut(self, photo: UInt8[np.ndarray, "h w 3"], size: int) -> UInt8[np.ndarray, "3 size size"]:
+        """The part at ``size`` x ``size``, antialiased; beyond the photograph its border is continued."""
+        angle = radians(self.roll_deg)
+        around = self.side if self.upright else self.side * (abs(cos(angle)) + abs(sin(angle)) + 6 / size)
+        box = [self.x - around / 2, self.y - around / 2, self.x + around / 2, self.y + around / 2]
+        height, width = photo.shape[:2]
+        margins = [ceil(max(0, beyond)) for beyond in (-box[0], -box[1], box[2] - width, box[3] - height)]
+        left, top, right, bottom = margins
+        if any(margins):
+            photo = np.pad(photo, ((top, bottom), (left, right), (0, 0)), mode="edge")
+        part = (box[0] + left, box[1] + top, box[2] + left, box[3] + top)
+        large = size if self.upright else round(size * around / self.side)
+        image = Image.fromarray(photo).resize((large, large), Image.Resampling.LANCZOS, box=part)
+        if not self.upright:
+            image = image.rotate(self.roll_deg, Image.Resampling.BICUBIC)
+            first = (large - size) // 2
+            image = image.crop((first, first, first + size, first + size))
+        return np.ascontiguousarray(np.asarray(image).transpose(2, 0, 1))
+
+    def paste(
+        self,
+        photo: UInt8[np.ndarray, "h w 3"],
+        before: Float[Tensor, "3 s s"],
+        after: Float[Tensor, "3 s s"],
+    ) -> UInt8[np.ndarray, "h w 3"]:
+        """The photograph with an edited crop (0..1): what changed is added, so the rest keeps its pixels."""
+        height, width = photo.shape[:2]
+        across, down = zip(*self.corners(), strict=True)
+        left, top = max(0, int(min(across))), max(0, int(min(down)))
+        right, bottom = min(width, ceil(max(across))), min(height, ceil(max(down)))
+        if left >= right or top >= bottom:
+            return photo
+        change = ((after - before) * _window(after.shape[-1]).to(after))[None].cpu()
+        angle, half = radians(self.roll_deg), self.side / 2
+        u = (torch.arange(left, right) + 0.5 - self.x)[None] / half
+        v = (torch.arange(top, bottom) + 0.5 - self.y)[:, None] / half
+        grid = torch.stack(
+            (cos(angle) * u + sin(angle) * v, cos(angle) * v - sin(angle) * u), dim=-1
+        )[None].float()  # fmt: skip
+        added = grid_sample(change, grid, mode="bilinear", padding_mode="zeros", align_corners=False)[0]
+        pasted = photo.copy()
+        region = torch.from_numpy(photo[top:bottom, left:right].astype(np.float32))
+        moved = (region + 255 * added.permute(1, 2, 0)).round().clamp(0, 255)
+        pasted[top:bottom, left:right] = moved.to(torch.uint8).numpy()
+        return pasted
+
+
+def _window(size: int) -> Float[Tensor, "s s"]:
+    """1 inside a square, 0 at its border."""
+    centres = (torch.arange(size) + 0.5) / size
+    rise = (torch.minimum(centres, 1 - centres) / BORDER_SHARE).clamp(0, 1)
+    return rise * rise[:, None]

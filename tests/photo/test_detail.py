@@ -1,0 +1,128 @@
+"""Laws of a photograph in its own detail: its own light and view return it, a mirror changes nothing else."""
+
+import math
+
+import pytest
+import torch
+
+from derender.photo import PhotoDetail
+from derender.render import render_scene
+from derender.scene import Scene
+from derender.scene.enlarge import at_size
+from derender.scene.scene import seen_in_mirror
+
+FOV = 10.0
+SMALL, LARGE = 32, 96
+
+
+def bump(light=(0.4, 0.5, 0.2, 0.3), camera=(0.05, 0.15, 0.02, 0.01, -0.01, 0.0)) -> Scene:
+    """A smooth bump, symmetric, with a pattern of its own."""
+    along = torch.linspace(-1, 1, SMALL)
+    radius = along**2 + along[:, None] ** 2
+    depth = 1.03 - 0.06 * (-2.5 * radius).exp()
+    albedo = torch.stack(
+        (0.5 + 0.2 * torch.sin(5 * along).expand(SMALL, -1), 0.6 + 0 * radius, 0.4 + 0.1 * radius / 2)
+    )
+    return Scene(depth[None], albedo[None], torch.tensor([light]), torch.tensor([camera]))
+
+
+def textured(scene: Scene, size: int = LARGE) -> torch.Tensor:
+    """A photograph of the scene with detail that the scene's albedo does not have."""
+    fine = at_size(scene, size)
+    generator = torch.Generator().manual_seed(1)
+    grain = 0.1 * torch.rand(1, 3, size, size, generator=generator)
+    return render_scene(fine.with_parameters(albedo=(fine.albedo + grain).clamp(0, 1)), FOV).image[0]
+
+
+@pytest.mark.parametrize("size", [SMALL, LARGE, 257])
+def test_own_light_and_view_return_the_photograph(size):
+    photo = torch.rand(3, size, size, generator=torch.Generator().manual_seed(0))
+    scene = bump()
+    seen = PhotoDetail(photo, scene, FOV)(scene)
+    assert seen.image.shape == (1, 3, size, size)
+    assert (seen.image[0] - photo).abs().max() <= 1 / 255
+
+
+def test_margin_returns_the_photograph_too():
+    photo = torch.rand(3, LARGE, LARGE, generator=torch.Generator().manual_seed(0))
+    scene = bump()
+    assert (PhotoDetail(photo, scene, FOV, margin=0.3)(scene).image[0] - photo).abs().max() <= 1 / 255
+
+
+def test_twice_the_light_doubles_what_is_not_clipped():
+    photo = torch.full((3, LARGE, LARGE), 0.3)
+    scene = bump()
+    light = scene.light * torch.tensor([2.0, 2, 1, 1])
+    seen = PhotoDetail(photo, scene, FOV)(scene.with_parameters(light=light)).image[0]
+    middle = seen[:, LARGE // 3 : -LARGE // 3, LARGE // 3 : -LARGE // 3]
+    # the model's colours weigh, too (DISTRUST)
+    assert (middle - 0.6).abs().max() < 0.12
+
+
+def test_new_light_is_nearer_to_the_truth_than_the_photograph():
+    scene, other = bump(), torch.tensor([[0.3, 0.6, 0.1, -0.7]])
+    photo, truth = (textured(s) for s in (scene, scene.with_parameters(light=other)))
+    seen = PhotoDetail(photo, scene, FOV)(scene.with_parameters(light=other)).image[0]
+    mask = (photo > 0) & (truth > 0)
+    mask[:, :8] = mask[:, -8:] = mask[..., :8] = mask[..., -8:] = False
+    assert (seen - truth)[mask].abs().mean() < 0.3 * (photo - truth)[mask].abs().mean()
+
+
+@pytest.mark.parametrize("degrees", [-15, 15])
+def test_new_view_is_nearer_to_the_truth_than_the_photograph(degrees):
+    scene = bump(camera=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+    camera = scene.camera.clone()
+    camera[:, 1] = math.radians(degrees)
+    photo, truth = (textured(s) for s in (scene, scene.with_parameters(camera=camera)))
+    seen = PhotoDetail(photo, scene, FOV)(scene.with_parameters(camera=camera)).image[0]
+    middle = (slice(None), slice(LARGE // 4, -LARGE // 4), slice(LARGE // 4, -LARGE // 4))
+    assert (seen - truth)[middle].abs().mean() < 0.6 * (photo - truth)[middle].abs().mean()
+
+
+def test_a_photograph_in_the_mirror_is_drawn_in_the_mirror():
+    scene = bump()
+    photo = textured(scene)
+    other = scene.with_parameters(camera=scene.camera + torch.tensor([[0.1, -0.3, 0, 0, 0, 0]]))
+    seen = PhotoDetail(photo, scene, FOV)(other).image
+    twin = PhotoDetail(photo.flip(-1), seen_in_mirror(scene), FOV)(seen_in_mirror(other)).image
+    # `_filled` halves odd sides, so that surroundings differ a little between the twins
+    assert (seen.flip(-1) - twin).abs().mean() < 0.005
+
+
+def test_hidden_surface_comes_from_the_mirror_image():
+    """The photograph has a colour that the model does not know; what is hidden shows it."""
+    scene = bump(camera=(0.0, math.radians(40), 0.0, 0.0, 0.0, 0.0))
+    photo = textured(
+        scene.with_parameters(albedo=scene.albedo * torch.tensor([0.2, 1.0, 0.2])[:, None, None])
+    )
+    turned = scene.with_parameters(camera=-scene.camera)
+    seen = PhotoDetail(photo, scene, FOV)(turned).image[0]
+    middle = seen[:, LARGE // 3 : -LARGE // 3, LARGE // 3 : -LARGE // 3]
+    assert middle[1].mean() > 2 * middle[0].mean()
+
+
+def test_albedo_is_free_of_shading():
+    scene = bump(light=(0.2, 0.7, 0.0, 0.6), camera=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+    detail = PhotoDetail(textured(scene), scene, FOV)
+    texture = detail.on_grid(detail.albedo(), SMALL)
+    middle = (..., slice(8, -8), slice(8, -8))
+    grain = 0.05  # on average
+    assert (texture - scene.albedo - grain)[middle].abs().mean() < 0.05
+
+
+def test_several_scenes_are_drawn_as_one_by_one():
+    scene = bump()
+    draw = PhotoDetail(textured(scene), scene, FOV)
+    lights = torch.tensor([[0.3, 0.6, 0.1, -0.7], [0.5, 0.3, -0.2, 0.2]])
+    both = draw(
+        scene.map(lambda value: value.expand(2, *value.shape[1:])).with_parameters(light=lights)
+    ).image
+    for row in range(2):
+        one = draw(scene.with_parameters(light=lights[row : row + 1])).image[0]
+        torch.testing.assert_close(both[row], one, atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("photo", [torch.rand(3, 16, 16), torch.rand(3, 31, 31)])
+def test_a_photograph_that_does_not_fit_is_refused(photo):
+    with pytest.raises(ValueError, match="a photograph"):
+        PhotoDetail(photo, bump(), FOV)

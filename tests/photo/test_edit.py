@@ -1,0 +1,125 @@
+"""A photograph in, a photograph out: any kind of image, faces found, edits where they belong."""
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image, ImageFilter
+
+import derender
+from derender.photo import Frame, find_faces, found_frame
+from derender.photo.faces import RENDERED, frame_of
+from derender.report.viewer.neighbours import rendered_examples
+
+
+@pytest.fixture(scope="module")
+def model():
+    return derender.load("rendered-faces-64")
+
+
+@pytest.fixture(scope="module")
+def head() -> Image.Image:
+    """A rendered head (nobody's), 256 pixels."""
+    tile = rendered_examples("rendered-faces-64", 64)[0].picture
+    return Image.fromarray(tile).resize((256, 256), Image.Resampling.LANCZOS)
+
+
+def scene_with(head: Image.Image, at=(150, 80), size=(640, 480), roll=0.0) -> Image.Image:
+    """A larger photograph with the head somewhere in it."""
+    noise = np.random.default_rng(0).integers(0, 255, (12, 16, 3), dtype=np.uint8)
+    photo = Image.fromarray(noise).resize(size, Image.Resampling.BICUBIC).filter(ImageFilter.GaussianBlur(8))
+    turned = head.convert("RGBA").rotate(-roll, Image.Resampling.BICUBIC, expand=True)
+    photo.paste(turned, at, turned)
+    return photo
+
+
+@pytest.fixture(scope="module")
+def photo(head) -> Image.Image:
+    return scene_with(head)
+
+
+def test_the_face_is_found_where_it_is(photo):
+    (face,) = find_faces(np.asarray(photo))
+    frame = frame_of(face, RENDERED)
+    assert abs(frame.x - 278) < 25 and abs(frame.y - 208) < 25
+    assert abs(frame.side - 256) < 50 and abs(frame.roll_deg) < 10
+
+
+@pytest.mark.parametrize("roll", [-20.0, 20.0])
+def test_a_rolled_face_gives_a_rolled_frame(head, roll):
+    upright = frame_of(find_faces(np.asarray(scene_with(head)))[0], RENDERED).roll_deg
+    (face,) = find_faces(np.asarray(scene_with(head, roll=roll)))
+    assert abs(frame_of(face, RENDERED).roll_deg - upright - roll) < 5
+
+
+def test_frames_by_name(photo, model):
+    pixels = np.asarray(photo)
+    assert found_frame(pixels, model, "none") == (Frame.centred(640, 480), "none")
+    assert found_frame(pixels, model)[1] == found_frame(pixels, model, "face")[1] == "face"
+    empty = np.full((200, 300, 3), 128, np.uint8)
+    assert found_frame(empty, model) == (Frame.centred(300, 200), "no face")
+    assert found_frame(empty[:64, :64], model)[1] == "none"
+    with pytest.raises(ValueError, match="no face is found"):
+        found_frame(empty, model, "face")
+    with pytest.raises(ValueError, match="did you mean 'face'"):
+        found_frame(empty, model, "fase")
+
+
+def test_edits_change_the_face_and_leave_the_rest(photo, model):
+    before = np.asarray(photo).astype(int)
+    for after in (derender.relight(photo, model, yaw_deg=-60), derender.rotate(photo, model, yaw_deg=20)):
+        change = np.abs(np.asarray(after).astype(int) - before).max(axis=-1)
+        assert change[150:270, 220:340].mean() > 3
+        assert (change[:, 560:] == 0).all() and (change[440:] == 0).all()
+
+
+def test_no_turn_returns_the_photograph(photo, model):
+    assert (
+        np.abs(np.asarray(derender.rotate(photo, model, yaw_deg=0)).astype(int) - np.asarray(photo)).max()
+        <= 1
+    )
+
+
+def test_its_own_light_returns_the_photograph(photo, model):
+    assert (
+        np.abs(np.asarray(derender.relight(photo, model, like=photo)).astype(int) - np.asarray(photo)).max()
+        <= 1
+    )
+
+
+def test_every_kind_of_image_comes_back_as_it_came(photo, model, tmp_path):
+    pixels = np.asarray(photo)
+    wanted = np.asarray(derender.relight(photo, model))
+    photo.save(tmp_path / "p.png")
+    from_path = derender.relight(tmp_path / "p.png", model)
+    assert isinstance(from_path, Image.Image) and (np.asarray(from_path) == wanted).all()
+    assert (derender.relight(pixels, model) == wanted).all()
+    floats = derender.relight(pixels[None] / 255, model)
+    assert floats.shape == (1, *pixels.shape) and floats.dtype == np.float64
+    assert np.abs(floats[0] * 255 - wanted).max() < 1e-6
+    tensor = derender.relight(torch.from_numpy(pixels.transpose(2, 0, 1).copy()).float() / 255, model)
+    assert tensor.shape == (3, *pixels.shape[:2])
+    assert (tensor * 255 - torch.from_numpy(wanted.transpose(2, 0, 1).copy())).abs().max() < 1e-3
+    listed = derender.relight([photo, pixels], model)
+    assert isinstance(listed[0], Image.Image) and (listed[1] == wanted).all()
+
+
+@pytest.mark.parametrize(
+    ("image", "words"),
+    [
+        (np.full((80, 80, 3), 200.0), "divide by 255"),
+        (np.full((80, 80, 3), -0.5), "add 1 and halve"),
+        (np.zeros((80, 80, 4)), r"\(80, 80, 4\) is no image"),
+        (np.zeros((80, 80, 3), np.int64), "int64"),
+        (np.full((80, 80, 3), np.nan), "not finite"),
+        ("no/such/file.jpg", "does not exist"),
+    ],
+)
+def test_what_is_no_image_is_refused_with_the_remedy(image, words, model):
+    with pytest.raises((ValueError, TypeError, FileNotFoundError), match=words):
+        derender.relight(image, model)
+
+
+@pytest.mark.parametrize(("name", "value"), [("yaw_deg", 90.0), ("pitch_deg", -91.0), ("strength", -1.0)])
+def test_impossible_lights_are_refused(name, value, photo, model):
+    with pytest.raises(ValueError, match=name):
+        derender.relight(photo, model, **{name: value})
