@@ -6,12 +6,7 @@ import torch
 from scipy.ndimage import binary_erosion
 
 from derender.data import GroundTruth, read_ground_truth
-from derender.evaluation.depth import (
-    average_depth,
-    evaluate_geometry,
-    geometry_scores,
-    predicted_depth,
-)
+from derender.evaluation.depth import average_depth, evaluate_geometry, geometry_scores, predicted_depth
 from derender.scene.camera import pixel_rays
 
 FOV_DEG = 10.0

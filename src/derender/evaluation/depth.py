@@ -51,13 +51,8 @@ class GeometryScores:
 
 @dataclass(frozen=True)
 class GeometryResult(ImageResult):
-    """A model's errors beside its controls, all on the same images.
-
-    Attributes:
-        model: of the predicted depth.
-        average_depth: of the mean true depth map, the same for every image.
-        plane: of constant depth.
-        untrained: of the same architecture with fresh weights; None without one.
+    """Errors of the predicted depth beside those of the mean true depth map, of constant depth, and of the
+    same architecture with fresh weights (None without one), all on the same images.
     """
 
     columns: ClassVar[Columns] = {

@@ -20,7 +20,7 @@ from derender.data import GroundTruth
 from derender.evaluation.depth import angle_deg
 from derender.evaluation.image_scores import Columns, ImageResult
 from derender.evaluation.score_table import Column
-from derender.features import Progress, map_batches
+from derender.features import map_batches
 from derender.features.extract import check_size
 from derender.scene.camera import rotation_matrix
 from derender.scene.light import light_direction
@@ -31,12 +31,7 @@ _LIGHT = "mean angle in degrees between true and predicted direction, best 0"
 
 @dataclass(frozen=True)
 class AngleScores:
-    """Angles between predictions and truth in degrees, 0..180, best 0.
-
-    Attributes:
-        mean_deg, median_deg: over images.
-        each_deg: (N,) per image.
-    """
+    """Angles between predictions and truth in degrees, 0..180, best 0: over images, and (N,) of each."""
 
     mean_deg: float
     median_deg: float
@@ -164,12 +159,7 @@ def camera_error(camera_pred: Float[Tensor, "n 6"], camera_true: Float[Tensor, "
 
 
 def evaluate_factors(
-    model: Any,
-    truth: GroundTruth,
-    *,
-    batch_size: int = 64,
-    untrained: Any = None,
-    progress: Progress | None = None,
+    model: Any, truth: GroundTruth, *, batch_size: int = 64, untrained: Any = None
 ) -> FactorResult:
     """Albedo, light and camera that a model predicts for images with ground truth, beside constant answers.
 
@@ -188,7 +178,7 @@ def evaluate_factors(
         flat = model.render(scene.with_parameters(light=white))
         return flat.image.cpu(), flat.mask.cpu() > 0.5, scene.light.cpu(), scene.camera.cpu()
 
-    parts = map_batches(see, model, truth.images, batch_size=batch_size, progress=progress)
+    parts = map_batches(see, model, truth.images, batch_size=batch_size)
     albedo, mask, light, camera = map(torch.cat, zip(*parts, strict=True))
     true, true_mask = torch.as_tensor(truth.albedo), torch.as_tensor(truth.mask)
     true_light, true_camera = torch.as_tensor(truth.light), torch.as_tensor(truth.camera)

@@ -67,21 +67,13 @@ class ImageResult:
 
 
 def image_rows(
-    scores: Mapping[str, Mapping[str, np.ndarray]],
-    columns: Columns,
-    *,
-    resample_count: int = RESAMPLES,
-    seed: int = 0,
+    scores: Mapping[str, Mapping[str, np.ndarray]], columns: Columns, *, resample_count: int = RESAMPLES
 ) -> tuple[ScoredRow, ...]:
-    """A row for each name, in their order; all but the first are controls.
-
-    Args:
-        scores: by row, every score's (N,) values of the same images, NaN where there is none.
-        columns: of the scores; they hold which end is better.
-        resample_count, seed: bootstrap resamples of the images.
+    """A row for each name in ``scores``, which holds every score's (N,) values of the same images, NaN where
+    there is none. All rows but the first are controls.
     """
     count = max(len(values) for each in scores.values() for values in each.values())
-    weights = np.concatenate(list(resamples(count, resample_count, seed)))
+    weights = np.concatenate(list(resamples(count, resample_count)))
     rows = [
         ScoredRow(name, at > 0, 1, {score: _estimate(values, weights) for score, values in each.items()})
         for at, (name, each) in enumerate(scores.items())

@@ -14,6 +14,7 @@ on their mean to answer with the majority; ``centred`` makes it the same for all
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -147,15 +148,31 @@ def train_heads(
     settings: HeadSettings = PAPER_HEAD,
     centred: bool = False,
 ) -> np.ndarray:
-    """Train one head for each seed, all in one program, and ask them: (S, T, A) probabilities.
+    """Answers of ``fitted_heads`` for the (T,) rows ``tested``: (S, T, A) probabilities."""
+    how: dict[str, Any] = {"kind": kind, "seeds": seeds, "settings": settings, "centred": centred}
+    asked = torch.from_numpy(np.ascontiguousarray(features[tested], np.float32))
+    heads = zip(*fitted_heads(features, targets, rows, **how), strict=True)
+    return np.stack([probabilities(torch.addmm(b, asked - m, w), kind).numpy() for m, w, b in heads])
+
+
+def fitted_heads(
+    features: np.ndarray,
+    targets: np.ndarray,
+    rows: np.ndarray,
+    *,
+    kind: str,
+    seeds: Sequence[int],
+    settings: HeadSettings = PAPER_HEAD,
+    centred: bool = False,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Train one head for each seed at once: (S, 1, D) means, (S, D, A) weights, (S, 1, A) biases.
 
     Args:
         features, targets: (N, D); (N, A) in -1 (unknown, no part in the loss), 0, 1.
-        rows, tested: (S, n) training rows of each seed; (T,) rows to answer for.
-        kind: "labels" or "classes".
+        rows: (S, n) training rows of each seed.
+        kind, settings: "labels" or "classes"; of the training.
         seeds: (S,) for the start and the order of rows.
-        settings: of the training.
-        centred: take the mean of each seed's training rows from all features first.
+        centred: take the mean of each seed's training rows from all features first; else the means are 0.
     """
     x = torch.from_numpy(np.ascontiguousarray(features, np.float32))
     y = torch.from_numpy(np.asarray(targets, np.float32))
@@ -179,10 +196,7 @@ def train_heads(
             optimiser.zero_grad(set_to_none=True)
             loss.backward()
             optimiser.step()
-    with torch.no_grad():
-        asked = x[torch.from_numpy(tested)]
-        heads = zip(means, weight, bias, strict=True)
-        return np.stack([probabilities(torch.addmm(b, asked - m, w), kind).numpy() for m, w, b in heads])
+    return means, weight.detach(), bias.detach()
 
 
 def head_loss(logits: Tensor, targets: Tensor, kind: str) -> Tensor:

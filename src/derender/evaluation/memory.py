@@ -31,12 +31,7 @@ _DAMAGED = (OSError, ValueError, EOFError, LookupError, RuntimeError, *_BROKEN_Z
 
 
 class Memory:
-    """Cached results in a folder; without a folder everything is computed.
-
-    Attributes:
-        folder: where the files lie, or None.
-        recalled, made: how many results came from the cache and how many were computed.
-    """
+    """Cached results in a folder, or None to compute everything; counts of those found and those computed."""
 
     def __init__(self, folder: str | Path | None = None):
         self.folder = None if folder is None else Path(folder)

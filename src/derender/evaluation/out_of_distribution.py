@@ -16,15 +16,15 @@ OUTLIER_PERCENTILE = 99.0
 
 
 def reconstruction_percentile(
-    model: Any, images: UInt8[np.ndarray, "n 3 h w"], held_out: HeldOutErrors, *, batch_size: int = 64
+    model: Any, images: UInt8[np.ndarray, "n 3 h w"], held_out: HeldOutErrors
 ) -> Float[np.ndarray, " n"]:
     """Percentage (0..100) of the held-out images that the model reconstructs better than each of these.
 
     Images like the training data have every percentile equally often. Between stored quantiles it is
-    interpolated; an image into which the model renders nothing has 100. ``batch_size`` changes speed and
-    memory only; ``held_out`` is stored with the model (``training/held_out_errors.py``).
+    interpolated; an image into which the model renders nothing has 100. ``held_out`` is stored with the
+    model (``training/held_out_errors.py``).
     """
-    return percentile_of(reconstruction_errors(model, images, batch_size), held_out)
+    return percentile_of(reconstruction_errors(model, images), held_out)
 
 
 def percentile_of(errors: Float[np.ndarray, " n"], held_out: HeldOutErrors) -> Float[np.ndarray, " n"]:

@@ -14,14 +14,7 @@ from derender.evaluation.clustering import clustering_table, compare_clusterings
 from derender.evaluation.clustering_methods import METHODS
 from derender.evaluation.clustering_scores import CLUSTER_COLUMNS
 from derender.evaluation.controls import with_controls
-from derender.evaluation.feature_rows import (
-    FeatureSource,
-    chosen_labels,
-    is_model,
-    prepare,
-    rows_of,
-    runs_of,
-)
+from derender.evaluation.feature_rows import FeatureSource, chosen_labels, is_model, prepare, rows_of, runs_of
 from derender.evaluation.linear_probing import FINETUNED, LinearComparison, compare_prepared, linear_tables
 from derender.evaluation.options import Options
 from derender.evaluation.paper_tables import ATTRIBUTES, PaperRow, table_named

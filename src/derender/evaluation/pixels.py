@@ -55,14 +55,8 @@ class ReconstructionScores:
 
 @dataclass(frozen=True)
 class ReconstructionResult(ImageResult):
-    """A model's reconstructions beside its controls.
-
-    Attributes:
-        model: of the renderings.
-        mean_picture: of the mean image in the same masks.
-        components: of the images from principal components in the same masks; None where not requested.
-        untrained: of the same architecture with fresh weights, in its own masks; None without one.
-        n_components: how many principal components.
+    """A model's reconstructions beside the mean image and the images from ``n_components`` principal
+    components in the same masks, and an untrained model in its own; None where not requested.
     """
 
     columns: ClassVar[Columns] = {

@@ -20,19 +20,7 @@ from derender.features.table import FeatureTable, missing, named
 from derender.features.transformer import DisentangledFeatures
 
 __all__ = [
-    "DisentangledFeatures",
-    "Embedded",
-    "FeatureTable",
-    "Progress",
-    "embed",
-    "embed_image_set",
-    "embed_images",
-    "embed_to_file",
-    "evaluating",
-    "map_batches",
-    "missing",
-    "model_fingerprint",
-    "named",
-    "search",
-    "table_labels",
-]
+    "DisentangledFeatures", "Embedded", "FeatureTable", "Progress", "embed", "embed_image_set",
+    "embed_images", "embed_to_file", "evaluating", "map_batches", "missing", "model_fingerprint", "named",
+    "search", "table_labels",
+]  # fmt: skip

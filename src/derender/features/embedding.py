@@ -41,17 +41,10 @@ ENGINES = ("local", "ray")
 
 @dataclass(frozen=True)
 class Embedded:
-    """A feature table that was written.
+    """A feature table that was written: its rows, sizes of the factors, names of the labels, and origin.
 
-    Attributes:
-        path, rows: the table, and how many images are in it.
-        factors: numbers of each factor.
-        labels: names of label columns.
-        origin: as in the table.
-        skipped, examples: how many images could not be read, and the first of those with reasons.
-        copies: how many were identical copies of an earlier one.
-        resumed: how many rows an earlier run had made.
-        source, layout: the images as the caller named them, and the layout of the data set.
+    ``skipped`` images could not be read (``examples`` has the first), ``copies`` were identical to an earlier
+    one, ``resumed`` rows were made by an earlier run.
     """
 
     path: Path

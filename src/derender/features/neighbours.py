@@ -30,17 +30,10 @@ SAME_FITTED = 0.3
 
 @dataclass(frozen=True)
 class Found:
-    """The rows of a table nearest to one image by one factor, nearest first.
+    """The rows of a table nearest to an image (or the row of that name) by one factor, nearest first.
 
-    Attributes:
-        table: what was searched.
-        like: the image, or the file name of its row.
-        factor, metric: how rows were compared.
-        rows: (k,) rows of the table.
-        distances: (k,) in the metric.
-        own_row: the row that ``like`` names, if it names one.
-        same_image: rows with the very same image, which are left out unless copies are asked for.
-        unchecked: whether the table does not record which model made it.
+    ``own_row`` is the row that ``like`` names, if any; ``same_image`` rows hold the very same image and are
+    left out unless copies are asked for; ``unchecked`` tables do not record which model made them.
     """
 
     table: FeatureTable

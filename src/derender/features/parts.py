@@ -39,16 +39,8 @@ Rows = tuple[pa.Table, Mapping[str, Any]]
 
 @dataclass
 class Progressed:
-    """How far the parts go.
-
-    Attributes:
-        following: the number of the first image that is in no part.
-        rows: rows in all parts.
-        skipped: unreadable images so far; the first few by name and reason in ``examples``.
-        examples: of skipped images.
-        copies: identical copies so far.
-        kinds: of labels that came with the stream.
-        partitioned: whether any row knows its partition.
+    """How far the parts go: the first image in no part, rows, unreadable images (a few by name), copies, the
+    kinds of labels that came with the stream, and whether any row knows its partition.
     """
 
     following: int = 0

@@ -11,17 +11,6 @@ from derender.interpretation.probe import Probe, fit_probe, load_probe, question
 from derender.interpretation.tables import Explanation, ShareRow
 
 __all__ = [
-    "ClusterShares",
-    "Explained",
-    "Explanation",
-    "PairParts",
-    "Probe",
-    "ShareRow",
-    "cluster_shares",
-    "explain",
-    "explain_labels",
-    "fit_probe",
-    "load_probe",
-    "pair_parts",
-    "question",
-]
+    "ClusterShares", "Explained", "Explanation", "PairParts", "Probe", "ShareRow", "cluster_shares",
+    "explain", "explain_labels", "fit_probe", "load_probe", "pair_parts", "question",
+]  # fmt: skip

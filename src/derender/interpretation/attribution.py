@@ -191,11 +191,7 @@ def _at_features(
 
 
 def pixel_attribution(
-    model: Any,
-    images: Float[Tensor, "n 3 h w"],
-    factor: str,
-    weight: Tensor | None,
-    steps: int = PIXEL_STEPS,
+    model: Any, images: Float[Tensor, "n 3 h w"], factor: str, weight: Tensor | None
 ) -> tuple[Float[Tensor, "n h w"], Float[Tensor, " n"]]:
     """|IG| of the pixels from a grey image, summed over colours, and the relative completeness error."""
 
@@ -206,7 +202,7 @@ def pixel_attribution(
     grey = torch.full_like(images[:1], GREY)
     with torch.enable_grad():
         attribution, delta = captum_attr().IntegratedGradients(answer).attribute(
-            images, grey, additional_forward_args=weight, n_steps=steps, return_convergence_delta=True,
+            images, grey, additional_forward_args=weight, n_steps=PIXEL_STEPS, return_convergence_delta=True,
             internal_batch_size=max(len(images), 64),
         )  # fmt: skip
     attribution, delta = attribution.detach(), delta.detach()
@@ -227,14 +223,10 @@ def to_one(maps: Float[Tensor, "n y x"]) -> Float[Tensor, "n y x"]:
 
 @dataclass(frozen=True)
 class Similarity:
-    """Similarity of a method's maps before and after a change.
+    """Similarity of the maps of one method and factor before and after a change (of ``CHANGES``).
 
-    Attributes:
-        method, factor, changed: which maps, and the change: one of ``CHANGES``.
-        spearman: mean rank correlation over images and seeds, -1..1; 1 means unchanged.
-        ssim: mean structural similarity, at most 1.
-        spread: standard deviation of the rank correlation over images and seeds.
-        empty: share of comparisons left out because a map was empty or flat.
+    ``spearman`` is the mean rank correlation over images and seeds, -1..1, 1 for unchanged, and ``spread``
+    its deviation; ``ssim`` at most 1; ``empty`` the share of comparisons left out, a map being empty or flat.
     """
 
     method: str

@@ -19,18 +19,12 @@ from derender.data import ImageSet, suggestion
 from derender.evaluation.bootstrap import LEVEL, resamples
 from derender.evaluation.clustering_methods import clusterings
 from derender.evaluation.feature_rows import attribute_columns
-from derender.evaluation.linear_probes import PAPER_HEAD, HeadSettings
 from derender.evaluation.linear_task import Rows, Task, choose_rows
 from derender.evaluation.score_table import Scores
 from derender.features import FeatureTable, embed_image_set
 from derender.inputs import as_images, as_model
 from derender.interpretation import tables
-from derender.interpretation.attribution import (
-    Similarity,
-    captum_attr,
-    factor_shares,
-    integrated_gradients,
-)
+from derender.interpretation.attribution import Similarity, captum_attr, factor_shares, integrated_gradients
 from derender.interpretation.grouping import ClusterShares, PairParts, cluster_shares, pair_parts
 from derender.interpretation.probe import Probe, fit_probe, question
 from derender.interpretation.tables import Explanation, ShareRow
@@ -43,16 +37,10 @@ LEARNED_SHARE, LEARNED_MOST = 0.4, 500
 
 @dataclass(frozen=True, eq=False)
 class Explained:
-    """An explanation of a model's features on images.
+    """An explanation of a model's features on labelled images.
 
-    Attributes:
-        shares: the share of each factor in every answer, beside controls.
-        model: the model.
-        images: the images, with labels.
-        task, split: the question, and who learns and who is tested.
-        clusters: parts of the distance between clusters, if requested.
-        pair: two file names and the parts of their distance, if requested.
-        checks: how maps over images answer to fresh weights; filled when they are drawn.
+    ``shares`` are of each factor in every answer; ``clusters`` and ``pair`` (two file names and parts) are
+    there if requested; ``checks``, how maps answer to fresh weights, are filled when maps are drawn.
     """
 
     shares: Explanation
@@ -129,7 +117,9 @@ def explain(
     named = str(model) if isinstance(model, str | Path) else getattr(model, "source", None)
     reading = {"dataset": dataset, "limit": limit, "part": part, "model": named}
     images = as_images(images, net.image_size, **reading, progress=progress("reading"))
-    rows = [] if pair is None else [_row_of(images, name) for name in pair]
+    for name in pair or ():
+        if name not in images.files:
+            raise ValueError(f"{images.source} has no image {name!r}{suggestion(name, images.files)}")
     table = embed_image_set(net, images, batch_size=batch_size, progress=progress("embedding"))
     names = (labels,) if isinstance(labels, str) else tuple(dict.fromkeys(labels)) or attribute_columns(table)
     if not names:
@@ -151,7 +141,7 @@ def explain(
         made = clusterings(table.concatenate(), [clusters], seed=seed)[clusters]
         apart = cluster_shares(table.factors, made, seed=seed)
     if pair is not None:
-        alike = pair, pair_parts(table.factors, rows[0], rows[1], seed=seed)
+        alike = pair, pair_parts(table.factors, *map(images.files.index, pair), seed=seed)
     return Explained(shares, net, images, task, split, apart, alike)
 
 
@@ -170,12 +160,6 @@ def split_rows(
     return choose_rows(task, table.files, (wanted,), seeds, partition=owners, groups=sides)
 
 
-def _row_of(images: ImageSet, name: str) -> int:
-    if name not in images.files:
-        raise ValueError(f"{images.source} has no image {name!r}{suggestion(name, images.files)}")
-    return images.files.index(name)
-
-
 def explain_labels(
     features: Features,
     task: Task,
@@ -184,10 +168,8 @@ def explain_labels(
     untrained: Sequence[Features] = (),
     seeds: Sequence[int] = (0, 1, 2),
     head: str = "logistic",
-    settings: HeadSettings = PAPER_HEAD,
     output: str = "logit",
     baseline: str = "zero",
-    steps: int | None = None,
     progress: Callable[[int, int], object] | None = None,
 ) -> Explanation:
     """Shares of each factor in the answers to a task, with controls.
@@ -197,10 +179,9 @@ def explain_labels(
         task, split: the question; training rows (one number of rows, S choices) and test rows.
         untrained: features of untrained encoders, one for each of the first seeds; may be empty.
         seeds: (S) of probes and shuffled labels, one for each choice of rows.
-        head, settings: "logistic" or the paper's "linear", and the settings of that.
+        head: "logistic" or the paper's "linear".
         output: the attributed output, "logit" or "probability".
         baseline: start of the path, "zero" (the paper's) or the training rows' "mean".
-        steps: of the quadrature; None for as many as the output needs.
         progress: called with (probes done, probes in all).
     """
     if baseline not in BASELINES:
@@ -217,10 +198,10 @@ def explain_labels(
         tried = [("model", features, task), ("shuffled labels", features, shuffled(task, rows, seed))]
         tried += [("untrained encoder", values, task) for values in untrained[place : place + 1]]
         for name, values, asked in tried:
-            probe = fit_probe(values, asked, rows, head=head, seed=seed, settings=settings)
+            probe = fit_probe(values, asked, rows, head=head, seed=seed)
             start = None if baseline == "zero" else probe.columns(values)[rows].mean(axis=0)
             z, targets = probe.columns(values)[split.test], task.targets[split.test]
-            parts = _shares(probe, z, targets, start, output, steps)
+            parts = _shares(probe, z, targets, start, output)
             fitted[name].append(probe)
             measured[name].append((*parts, *scores(probe, z, targets, seed)))
             if progress is not None:
@@ -241,16 +222,14 @@ def shuffled(task: Task, rows: np.ndarray, seed: int) -> Task:
 
 
 def _shares(
-    probe: Probe, z: np.ndarray, targets: np.ndarray, start: np.ndarray | None, output: str, steps: int | None
+    probe: Probe, z: np.ndarray, targets: np.ndarray, start: np.ndarray | None, output: str
 ) -> tuple[np.ndarray, np.ndarray]:
     """Per image (T, A, F) shares, NaN where not asked; and (2,) the largest completeness error and change."""
     shares = np.full((*targets.shape, len(probe.sizes)), np.nan)
     error, scale = np.zeros((2, 1))
     for answer in range(targets.shape[1]):
         asked = targets[:, answer] >= (0 if probe.kind == "labels" else 1)
-        found, delta = integrated_gradients(
-            probe, z[asked], answer, baseline=start, output=output, steps=steps
-        )
+        found, delta = integrated_gradients(probe, z[asked], answer, baseline=start, output=output)
         shares[asked, answer] = factor_shares(found, probe)
         error = np.append(error, np.abs(delta))
         scale = np.append(scale, np.abs(found.sum(axis=1) - delta))

@@ -14,14 +14,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import torch
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save
 from scipy.special import expit, softmax
 
 from derender.data import suggestion
 from derender.evaluation.linear_logistic import axes_of, fit_logistic, solve_logistic
-from derender.evaluation.linear_probes import PAPER_HEAD, HeadSettings, head_loss
+from derender.evaluation.linear_probes import PAPER_HEAD, HeadSettings, fitted_heads
 from derender.evaluation.linear_task import Task, task_of
 from derender.features import missing
 from derender.storage.atomic import new_folder
@@ -122,15 +121,10 @@ def without_rare(values: np.ndarray, min_count: int) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Probe:
-    """Logits that are linear in the features.
+    """Logits that are linear in the features: (A, D) float32 weights and (A,) biases of A labels (yes or no)
+    or classes.
 
-    Attributes:
-        kind: "labels" (yes or no, each apart) or "classes" (one of several).
-        names: (A) labels or classes.
-        sizes: factor name to the length of its feature, in the order in which they stand side by side.
-        weight: (A, D) float32.
-        bias: (A,) float32.
-        head: how it was fitted.
+    ``sizes`` holds the length of each factor's feature, in the order in which they stand side by side.
     """
 
     kind: str
@@ -236,9 +230,12 @@ def fit_probe(
         raise ValueError(f"unknown head {head!r}{suggestion(head, HEADS)}; there is {', '.join(HEADS)}")
     sizes = {name: values.shape[1] for name, values in features.items()}
     x, y = np.concatenate(list(features.values()), axis=1)[rows], task.targets[rows]
-    weight, bias = (
-        _logistic(x, y, task.kind, seed) if head == "logistic" else _paper(x, y, task.kind, seed, settings)
-    )
+    if head == "logistic":
+        weight, bias = _logistic(x, y, task.kind, seed)
+    else:
+        how = {"kind": task.kind, "seeds": [seed], "settings": settings}
+        _, found, start = fitted_heads(x, y, np.arange(len(x))[None], **how)
+        weight, bias = found[0].T.double().numpy(), start[0, 0].double().numpy()
     if task.kind == "classes":
         weight, bias = weight - weight.mean(axis=0), bias - bias.mean()
     return Probe(task.kind, task.names, sizes, weight.astype(np.float32), bias.astype(np.float32), head)
@@ -254,24 +251,3 @@ def _logistic(x: np.ndarray, targets: np.ndarray, kind: str, seed: int) -> tuple
     picked = found[:, own, answers] if kind == "labels" else found[:, own[0]]  # (R + 1, A)
     weight = (axes.rotation @ picked[:-1]) / axes.scale[:, None]
     return weight.T, picked[-1] - axes.mean @ weight
-
-
-def _paper(
-    x: np.ndarray, y: np.ndarray, kind: str, seed: int, settings: HeadSettings
-) -> tuple[np.ndarray, np.ndarray]:
-    """The head of ``train_heads`` for one seed, with its weights."""
-    generator = torch.Generator().manual_seed(seed)
-    inputs = torch.from_numpy(np.ascontiguousarray(x, np.float32))
-    targets = torch.from_numpy(y.astype(np.float32))
-    weight, bias = (
-        ((torch.rand(rows, y.shape[1], generator=generator) * 2 - 1) / x.shape[1] ** 0.5).requires_grad_()
-        for rows in (x.shape[1], 1)
-    )
-    optimiser = torch.optim.Adam([weight, bias], lr=settings.learning_rate)
-    for _ in range(settings.epochs):
-        for batch in torch.randperm(len(inputs), generator=generator).split(settings.batch_size):
-            loss = head_loss((inputs[batch] @ weight + bias)[None], targets[batch][None], kind).sum()
-            optimiser.zero_grad(set_to_none=True)
-            loss.backward()
-            optimiser.step()
-    return weight.detach().numpy().T.astype(np.float64), bias.detach().numpy()[0].astype(np.float64)

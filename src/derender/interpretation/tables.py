@@ -57,16 +57,10 @@ class ShareRow:
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
-    """Shares of every factor, beside controls.
+    """Shares of F factors in A answers, of the model's features first, then of the controls.
 
-    Attributes:
-        kind: "labels" or "classes".
-        names: (A) labels or classes.
-        factors: (F) in the features' order.
-        rows: the model's features first, then the controls.
-        probe, shuffled: of the first seed, on the true labels and on shuffled labels.
-        n_train, n_test: rows.
-        head, output, baseline: how probes were fitted and attributed.
+    ``probe`` and ``shuffled`` are the first seed's, on true and on shuffled labels; ``head``, ``output`` and
+    ``baseline`` say how probes were fitted and attributed.
     """
 
     kind: str

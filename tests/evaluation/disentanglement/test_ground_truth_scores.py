@@ -27,11 +27,7 @@ FACTORS = [
 
 def perfect() -> dict[str, np.ndarray]:
     """Each feature is its own true factors and nothing else."""
-    return {
-        "light": NUMBERS[:, :2],
-        "camera": NUMBERS[:, 2:3],
-        "geometry": np.eye(3)[CLASSES],
-    }
+    return {"light": NUMBERS[:, :2], "camera": NUMBERS[:, 2:3], "geometry": np.eye(3)[CLASSES]}
 
 
 def one_each() -> tuple[dict[str, np.ndarray], list[TrueFactor]]:

@@ -4,12 +4,7 @@ import numpy as np
 import pytest
 from sklearn.linear_model import RidgeCV
 
-from derender.evaluation.disentanglement.similarity import (
-    fit_predict,
-    held_out,
-    linear_cka,
-    similarity,
-)
+from derender.evaluation.disentanglement.similarity import fit_predict, held_out, linear_cka, similarity
 
 
 def normal(*shape: int, seed: int = 0) -> np.ndarray:

@@ -61,15 +61,14 @@ def pictures(count: int = 11) -> np.ndarray:
 
 
 def test_a_model_that_reads_every_factor_gives_the_identity():
-    seen = []
-    scores = swap_test(Reader(0), pictures(), batch_size=4, progress=lambda *step: seen.append(step))
+    scores = swap_test(Reader(0), pictures(), batch_size=4)
     np.testing.assert_allclose(scores.moved, np.eye(3), atol=1e-6)
     np.testing.assert_allclose(scores.moved_parameters, np.eye(3), atol=1e-6)
     np.testing.assert_allclose(scores.arrived, 0, atol=1e-6)
     np.testing.assert_allclose(scores.unexchanged, 0, atol=1e-6)
     assert scores.ratio == float("inf") and scores.factors == ("geometry", "albedo", "light")
     assert 0.3 < scores.moved_pixels.mean() < 0.9
-    assert seen[-1] == (44, 44) and scores.n_pictures == 11
+    assert scores.n_pictures == 11
 
 
 def test_features_that_hold_everything_move_alike_whatever_is_exchanged():

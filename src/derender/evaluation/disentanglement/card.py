@@ -77,12 +77,8 @@ _DIMENSIONS = {
 
 @dataclass(frozen=True)
 class FeatureScores:
-    """All scores of one set of features, with one seed.
-
-    Attributes:
-        pearson, similarity: between features.
-        truth: against the true factors; None where the labels hold none.
-        swap: the swap test; None for features without a decoder.
+    """All scores of one set of features, with one seed; ``truth`` is None where the labels hold no true
+    factors, ``swap`` for features without a decoder.
     """
 
     pearson: PearsonScores
@@ -101,15 +97,11 @@ class FeatureScores:
 
 @dataclass(frozen=True)
 class DisentanglementCard:
-    """A model beside its controls.
+    """A model of some named ``features`` beside its controls, on ``n_pictures`` images.
 
-    Attributes:
-        features: names of the model's features, in the order of every matrix.
-        rows: for the model and each control, one result per seed. Seeds change the folds of the predictions,
-            the donors and images of the swap test, and the random controls; the model stays the same.
-        correlations: (sum of D, sum of D) |correlation| between all dimensions of the model's features.
-        dimensions: length of each feature.
-        n_pictures: how many images.
+    ``rows`` has one result per seed of the model and each control: seeds change folds, donors, the images of
+    the swap test and random controls. ``correlations`` is (sum of D, sum of D), |correlation| between all
+    dimensions; ``dimensions`` are the lengths of the features.
     """
 
     features: tuple[str, ...]

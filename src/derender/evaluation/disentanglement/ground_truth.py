@@ -51,13 +51,8 @@ _KNOWN = {  # label: (name in tables, features that it belongs to)
 
 @dataclass(frozen=True)
 class TrueFactor:
-    """One factor that images were made from.
-
-    Attributes:
-        name: in tables.
-        values: (N,) float64 numbers, or integers from 0 for classes.
-        is_class: whether the values are classes.
-        belongs_to: names of the features that ought to hold it.
+    """One factor that images were made from: its name in tables, (N,) float64 numbers or integers from 0 for
+    classes, and the names of the features that ought to hold it.
     """
 
     name: str
@@ -140,17 +135,16 @@ def ground_truth_scores(
     factors: Sequence[TrueFactor],
     *,
     dimensions: str | None = None,
-    folds: int = 5,
     seed: int = 0,
 ) -> GroundTruthScores:
     """All scores of features by name, each (N, D), against two true factors or more of the same N images.
 
     ``dimensions`` is the method of the importances of single dimensions: "lasso", fast, or "trees", slow;
-    None leaves their scores out. ``folds`` and ``seed`` are of the predictions, the seed of the trees, too.
+    None leaves their scores out. ``seed`` is of the predictions' folds and of the trees.
     """
     blocks = side_by_side(blocks)
     names, everything = tuple(blocks), np.concatenate(list(blocks.values()), axis=1)
-    found = [_predicted(x, factors, folds, seed) for x in (*blocks.values(), everything)]
+    found = [_predicted(x, factors, seed) for x in (*blocks.values(), everything)]
     score, gain = (np.array([[one[part] for one in row] for row in found]) for part in (0, 1))
     share, informativeness = gain[:-1], float(gain[-1].mean())
     bins = [np.stack([row[k][2] for row in found[:-1]], axis=1) for k in range(len(factors))]
@@ -232,11 +226,11 @@ def mutual_information(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return (table * np.log(ratio)).sum(axis=(1, 2))
 
 
-def binned(values: np.ndarray, bins: int = BINS) -> np.ndarray:
-    """Columns of (N, D) numbers as integers 0..bins-1, bins of equal width between each column's ends."""
+def binned(values: np.ndarray) -> np.ndarray:
+    """Columns of (N, D) numbers as integers 0..19, bins of equal width between each column's ends."""
     low, high = values.min(axis=0), values.max(axis=0)
     width = np.where(high > low, high - low, 1)
-    return np.clip(((values - low) / width * bins).astype(np.int64), 0, bins - 1)
+    return np.clip(((values - low) / width * BINS).astype(np.int64), 0, BINS - 1)
 
 
 def _read(column: np.ndarray, name: str, features: tuple[str, ...]) -> TrueFactor | str:
@@ -255,12 +249,12 @@ def _read(column: np.ndarray, name: str, features: tuple[str, ...]) -> TrueFacto
 
 
 def _predicted(
-    x: np.ndarray, factors: Sequence[TrueFactor], folds: int, seed: int
+    x: np.ndarray, factors: Sequence[TrueFactor], seed: int
 ) -> list[tuple[float, float, np.ndarray]]:
     """For each factor: score, score above chance in 0..1, and the (N,) binned prediction from one feature."""
     every = np.concatenate([factor.targets for factor in factors], axis=1)
     ends = np.cumsum([factor.targets.shape[1] for factor in factors])[:-1]
-    answers = np.split(held_out(x, every, folds=folds, seed=seed), ends, axis=2)
+    answers = np.split(held_out(x, every, seed=seed), ends, axis=2)
     found = []
     for factor, (answer, constant) in zip(factors, answers, strict=True):
         if factor.is_class:

@@ -27,14 +27,11 @@ PENALTIES = tuple(10.0**power for power in range(-7, 3))
 
 @dataclass(frozen=True)
 class PearsonScores:
-    """Correlations between F features.
+    """Correlations between F features, (F, F) each, and their means over pairs of different features, best 0.
 
-    Attributes:
-        per_image: (F, F) mean correlation of an image's two vectors, -1..1; NaN for different lengths.
-        per_dimension: (F, F) mean |correlation| over pairs of dimensions, 0..1; on the diagonal between
-            different dimensions of one feature.
-        mean_per_image, mean_per_dimension: over the pairs of different features; best 0.
-        n_dead: by feature, dimensions that are the same in every image; left out.
+    ``per_image`` is -1..1, NaN for different lengths; ``per_dimension`` is the mean |correlation|, 0..1, on
+    the diagonal between different dimensions of one feature. ``n_dead`` dimensions, by feature, are the same
+    in every image and left out.
     """
 
     per_image: np.ndarray
@@ -46,13 +43,10 @@ class PearsonScores:
 
 @dataclass(frozen=True)
 class SimilarityScores:
-    """Similarity of F features.
+    """Similarity of F features, (F, F) each, and means over the pairs of different features, best 0.
 
-    Attributes:
-        cka_biased, cka_unbiased: (F, F) 0..1 (unbiased, a little below 0 too), 1 on the diagonal.
-        cross_r2: (F, F) held-out share of the variance of the feature in the column that the feature in the
-            row explains, at most 1; below 0 where the fit does harm.
-        mean_cka_biased, mean_cka_unbiased, mean_cross_r2: over the pairs of different features; best 0.
+    CKA is 0..1 (unbiased, a little below 0 too) and 1 on the diagonal. ``cross_r2`` is the held-out share of
+    the variance of the column's feature that the row's explains, at most 1; below 0 the fit does harm.
     """
 
     cka_biased: np.ndarray
@@ -87,13 +81,13 @@ def correlation_matrix(features: Mapping[str, np.ndarray]) -> np.ndarray:
     return np.where(alive[:, None] & alive, np.abs(values.T @ values), np.nan)
 
 
-def similarity(features: Mapping[str, np.ndarray], *, folds: int = 5, seed: int = 0) -> SimilarityScores:
+def similarity(features: Mapping[str, np.ndarray], *, seed: int = 0) -> SimilarityScores:
     """Both forms of CKA, and cross-prediction in random folds, between features by name, each (N, D)."""
     blocks = list(side_by_side(features).values())
     biased, unbiased, cross = np.full((3, len(blocks), len(blocks)), np.nan)
     every, ends = np.concatenate(blocks, axis=1), np.cumsum([values.shape[1] for values in blocks])[:-1]
     for i, a in enumerate(blocks):
-        squares = np.square(every - held_out(a, every, folds=folds, seed=seed)).sum(axis=1)
+        squares = np.square(every - held_out(a, every, seed=seed)).sum(axis=1)
         left, total = (np.split(each, ends) for each in squares)
         for j, b in enumerate(blocks):
             cross[i, j] = 1 - left[j].sum() / (total[j].sum() or np.nan)

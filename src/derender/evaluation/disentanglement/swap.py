@@ -24,7 +24,7 @@ from torch import Tensor
 
 from derender.data import as_float
 from derender.evaluation.bootstrap import RESAMPLES, resamples
-from derender.features import Progress, evaluating
+from derender.features import evaluating
 from derender.scene import Scene
 from derender.scene.perturb import derangement
 from derender.training.step import fill_uncovered
@@ -60,25 +60,15 @@ class SwapScores:
     resampled: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)), repr=False)
 
 
-def swap_test(
-    model: Any,
-    images: np.ndarray,
-    *,
-    seed: int = 0,
-    batch_size: int = 64,
-    progress: Progress | None = None,
-) -> SwapScores:
-    """The swap test of a ``Derenderer`` on uint8 images (N, 3, H, W) of its size, N of 2 or more.
-
-    ``seed`` draws the donors; ``progress`` is called with (renderings done, renderings in all).
-    """
+def swap_test(model: Any, images: np.ndarray, *, seed: int = 0, batch_size: int = 64) -> SwapScores:
+    """The swap test of a ``Derenderer`` on (N, 3, H, W) uint8 images, two or more; ``seed`` draws donors."""
     if len(images) < 2:
         raise ValueError(f"the swap test needs two images or more, got {len(images)}")
     names, count = [factor.name for factor in model.factors], len(images)
     parameters = [factor.parameter for factor in model.factors]
     donor = derangement(count, torch.Generator().manual_seed(seed))
 
-    def encoded(scenes: Scene | None = None, done: int = 0) -> dict[str, Tensor]:
+    def encoded(scenes: Scene | None = None) -> dict[str, Tensor]:
         """Features, decoded parameters and pixels of the renderings of scenes, or of the images."""
         parts = []
         for start in range(0, count, batch_size):
@@ -87,8 +77,6 @@ def swap_test(
             if scenes is not None:
                 found = model.render(scenes[rows].to(model.device))
                 pixels = fill_uncovered(found.image.float(), found.mask.float(), pixels)
-                if progress is not None:
-                    progress(done * count + min(start + batch_size, count), (len(names) + 1) * count)
             activations = model.activations(pixels)
             features, decoded = model.features_from(activations), model.decode(model.codes(activations))
             part = {f"parameter {name}": each for name, each in decoded.parameters.items()}
@@ -99,9 +87,9 @@ def swap_test(
     with evaluating(model):
         inputs = encoded()
         scene = {key[10:]: each for key, each in inputs.items() if key.startswith("parameter ")}
-        plain, swapped = encoded(Scene.from_parameters(scene)), []
-        for done, name in enumerate(parameters, 1):
-            swapped.append(encoded(Scene.from_parameters({**scene, name: scene[name][donor]}), done))
+        plain = encoded(Scene.from_parameters(scene))
+        given = [{**scene, name: scene[name][donor]} for name in parameters]
+        swapped = [encoded(Scene.from_parameters(one)) for one in given]
     donors = {key: each[donor] for key, each in plain.items()}
     apart = _distances(plain, donors)
     unit = {key: each.mean() or np.nan for key, each in apart.items()}

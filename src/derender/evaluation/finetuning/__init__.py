@@ -12,13 +12,6 @@ from derender.evaluation.finetuning.joint import (
 from derender.evaluation.finetuning.score import FinetuneScores, score_finetuned
 
 __all__ = [
-    "FinetuneScores",
-    "FinetuneTask",
-    "FinetunedModel",
-    "JointLabels",
-    "TargetHead",
-    "load_finetuned",
-    "score_finetuned",
-    "target_loss",
-    "target_of",
-]
+    "FinetuneScores", "FinetuneTask", "FinetunedModel", "JointLabels", "TargetHead", "load_finetuned",
+    "score_finetuned", "target_loss", "target_of",
+]  # fmt: skip

@@ -42,12 +42,9 @@ RENDERING_TERMS = (
 
 
 class TargetHead(nn.Module):
-    """One linear layer on standardised codes: every dimension with mean 0 and variance 1.
+    """One linear layer on the factors' codes, standardised: every dimension with mean 0 and variance 1.
 
-    Attributes:
-        factors: whose codes it takes, side by side.
-        kind: "labels" (yes or no, each apart) or "classes" (one of several).
-        names: of the labels, or of the classes.
+    ``kind`` is "labels" (yes or no, each apart) or "classes" (one of several), ``names`` are theirs.
     """
 
     def __init__(self, factors: Sequence[str], width: int, kind: str, names: Sequence[str]):
@@ -113,12 +110,8 @@ def load_finetuned(source: str | Path, *, device: str | torch.device = "cpu") ->
 
 @dataclass(frozen=True)
 class JointLabels:
-    """The labels of a joint training, and the part of them that it may see.
-
-    Attributes:
-        asked: the labels of all images.
-        visible: (N, A) the same; -1 for training images beyond those labelled, and for all tested ones.
-        split: the run's own parts; the test part is never seen by training.
+    """The labels asked of all images and (N, A) those that training may see: -1 for training images beyond
+    those labelled and for all tested ones. ``split`` is the run's own; its test part is never seen.
     """
 
     asked: Task
@@ -161,13 +154,8 @@ def target_of(images: ImageSet, config: FinetuneConfig) -> JointLabels:
 
 @dataclass(frozen=True)
 class FinetuneTask(TrainingTask):
-    """Train a `Derenderer` and a head on its codes.
-
-    Attributes:
-        config: how.
-        images: (N, 3, H, W) all images of the run.
-        target: their labels.
-        start: the pre-trained model, which stays as it is; None for fresh weights.
+    """Train a `Derenderer` and a head on its codes, on (N, 3, H, W) images; ``start``, the pre-trained model,
+    stays as it is (None: fresh weights).
     """
 
     config: FinetuneConfig

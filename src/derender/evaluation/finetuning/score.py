@@ -28,16 +28,11 @@ BOTH = ("accuracy", "balanced_accuracy")
 
 @dataclass(frozen=True)
 class FinetuneScores:
-    """Held-out scores.
+    """Held-out scores of ``fine-tuned``, both heads on frozen features, logistic regression on three
+    controls, and ``majority``: accuracy, balanced_accuracy, average_precision (0..1, best 1).
 
-    Attributes:
-        rows: ``fine-tuned``, both heads on frozen features, logistic regression on an untrained encoder's
-            features, on principal components of the training part, and on pixels, ``majority``; accuracy,
-            balanced_accuracy and average_precision (0..1, best 1) of each, the first two with intervals.
-        versus: by score, the fine-tuned model against the best of the others.
-        kind, names: of the task.
-        n_train, n_test: labelled images learned from, and tested.
-        n_unlabelled: images of the run without any of the labels: rendered, never asked.
+    ``versus`` compares the fine-tuned model with the best of the others, by score. ``n_unlabelled`` images of
+    the run have none of the labels: rendered, never asked.
     """
 
     rows: tuple[ScoredRow, ...]

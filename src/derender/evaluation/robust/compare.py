@@ -14,7 +14,7 @@ import numpy as np
 
 from derender.evaluation.bootstrap import RESAMPLES, ScoredRow, resamples, scored_row, with_verdicts
 from derender.evaluation.feature_rows import check_lengths
-from derender.evaluation.linear_probes import PAPER_HEAD, HeadSettings, majority_answers, probe_runs
+from derender.evaluation.linear_probes import PAPER_HEAD, majority_answers, probe_runs
 from derender.evaluation.linear_probing import count_scores
 from derender.evaluation.memory import Memory
 from derender.evaluation.robust.trial import Curve, Trial
@@ -129,7 +129,6 @@ def compare_robustness(
     *,
     controls: Collection[str] = (),
     head: str = "logistic",
-    settings: HeadSettings = PAPER_HEAD,
     resample_count: int = RESAMPLES,
     seed: int = 0,
     memory: Memory | None = None,
@@ -142,7 +141,7 @@ def compare_robustness(
             probe seed s uses run s modulo their number.
         trial, seeds: training and test rows; (S,) of the training subsets.
         controls: names of the features that learned nothing.
-        head, settings: kind of probe (``linear_probes.PROBES``); of the paper's head.
+        head: kind of probe (``linear_probes.PROBES``).
         resample_count, seed, memory: bootstrap resamples of the units; cache of the answers.
         progress: called with (probes done, probes in all).
     """
@@ -161,7 +160,7 @@ def compare_robustness(
         tested = np.unique(np.concatenate([rows for curve in curves for rows in curve.points]))
         answers = {}
         for name, arrays in features.items():
-            answers[name] = probe_runs(head, arrays, task, draws, tested, seeds, settings, memory)
+            answers[name] = probe_runs(head, arrays, task, draws, tested, seeds, PAPER_HEAD, memory)
             done += 1
             if progress is not None:
                 progress(done, total)

@@ -53,13 +53,10 @@ Progress = Callable[[int, int, str], object]
 class SegmentationRow:
     """One network or control.
 
-    Attributes:
-        scored: name, runs, ``COLUMNS`` with intervals and standard deviations, and differences to the
-            strongest control.
-        class_iou: (C,) mean over runs; NaN for classes that no tested mask shows.
-        trainable: number of trained weights; 0 for controls without a network.
-        losses: (R, epochs) mean training loss of each run.
-        shown: (K, S, S) answers of the first run for the images in ``SegmentationComparison.shown``.
+    ``scored`` holds ``COLUMNS`` with intervals and differences to the strongest control; ``class_iou`` is
+    (C,), a mean over runs, NaN for classes that no tested mask shows; ``trainable`` counts weights;
+    ``losses`` are (R, epochs), the mean of each epoch; ``shown`` are the first run's (K, S, S) answers for
+    the comparison's ``shown`` images.
     """
 
     scored: ScoredRow
@@ -71,14 +68,8 @@ class SegmentationRow:
 
 @dataclass(frozen=True)
 class SegmentationComparison:
-    """Networks side by side; the first row is the subject of the table.
-
-    Attributes:
-        rows: networks in the order requested, then controls.
-        data: the images and masks.
-        seeds: of the runs.
-        settings: of the training.
-        shown: (K,) rows of the data for overlays.
+    """Networks in the order requested, the subject of the table first, then controls; ``shown`` are (K,) rows
+    of the data for overlays.
     """
 
     rows: tuple[SegmentationRow, ...]

@@ -21,16 +21,10 @@ _CHUNK = 512
 
 @dataclass(frozen=True)
 class SegmentationData:
-    """Images with a mask each, divided.
+    """(N, 3, S, S) RGB images with (N, S, S) masks of class numbers, and the names of the classes.
 
-    Attributes:
-        images: (N, 3, S, S) RGB bytes.
-        masks: (N, S, S) class numbers.
-        classes: the name of every class number.
-        train: rows to learn from.
-        test: rows to be tested on; no others are ever scored.
-        split: the rule of the split, in words.
-        source, layout: of the data set.
+    ``train`` rows are learned from, ``test`` rows scored and no others ever; ``split`` is the rule in words,
+    ``source`` and ``layout`` are of the data set.
     """
 
     images: UInt8[np.ndarray, "n 3 s s"]

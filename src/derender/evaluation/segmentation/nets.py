@@ -35,14 +35,9 @@ STATISTICS_IMAGES = 512
 
 @dataclass(frozen=True)
 class Variant:
-    """One row of the table.
-
-    Attributes:
-        title: in tables.
-        factors: whose encoders, joined in this order.
-        pretrained: whether with the model's weights; otherwise fresh ones of the same shape.
-        frozen: whether only the decoder learns.
-        decoder: whether the decoder, too, begins with the model's weights (all but its last layer).
+    """One row of the table, by its title: encoders of these factors, joined in this order, ``pretrained`` or
+    fresh, ``frozen`` or learning; ``decoder``: it, too, begins with the model's weights (all but its last
+    layer).
     """
 
     title: str
