@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from scipy.cluster.hierarchy import is_valid_linkage, linkage
 from sklearn.metrics import adjusted_rand_score, pairwise_distances
 
-from derender.cli import main
 from derender.evaluation import clustering_methods, neighbours
 from derender.evaluation import ward as ward_module
 from derender.evaluation.clustering import finch_levels
@@ -21,7 +20,6 @@ from derender.evaluation.finch import finch, finch_clusters
 from derender.evaluation.memory import Memory
 from derender.evaluation.neighbours import cells, finite_rows, members, nearest_rows
 from derender.evaluation.ward import cut, cut_leaves, ward_in_cells, ward_tree
-from derender.features import FeatureTable
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # it says at import that its approximate search is not installed
@@ -70,15 +68,6 @@ def test_ward_holds_no_square_of_the_rows():
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 0.6 * 3_500**2 / 2 * 8, f"{peak / 1e6:.0f} MB"  # SciPy holds the distances: 49 MB
-
-
-@settings(max_examples=15, deadline=None)
-@given(st.integers(0, 999), st.sampled_from(["ward", "finch"]))
-def test_the_order_of_rows_does_not_matter(seed, method):
-    features, order = groups(60, seed), np.random.default_rng(seed).permutation(60)
-    straight = clusterings(features, [3], method)[3]
-    shuffled = clusterings(features[order], [3], method)[3]
-    assert adjusted_rand_score(straight[order], shuffled) == 1
 
 
 def test_nearest_rows_are_those_of_all_distances(monkeypatch):
@@ -178,17 +167,6 @@ def test_nearest_rows_by_cells_are_mostly_the_nearest(many, monkeypatch):
     np.testing.assert_allclose(near[same], nearest[same], atol=1e-4)  # float32 against float64
 
 
-def test_ward_with_sizes_goes_on_where_a_tree_stopped():
-    points = groups(200, 4)
-    whole = ward_tree(points)
-    leaf = cut(whole, 30)
-    sizes = np.bincount(leaf)
-    means = np.stack([points[leaf == one].mean(axis=0) for one in range(30)])
-    rest = ward_tree(means, sizes)
-    np.testing.assert_allclose(rest[:, 2], whole[-29:, 2], rtol=1e-9)
-    np.testing.assert_array_equal(rest[:, 3], whole[-29:, 3])
-
-
 def test_ward_by_cells_is_ward_where_no_merge_crosses_a_border():
     points = groups(600, 5, count=6, apart=30)
     found, exact = ward_in_cells(points, leaves=60, rows_per_cell=100), ward_tree(points)
@@ -205,13 +183,3 @@ def test_every_method_takes_many_rows_and_says_that_it_is_approximate(many, meth
     assert finite_rows(points, "a test").dtype == np.float32
     assert adjusted_rand_score(clusterings(points, [4], method)[4], np.arange(800) % 4) == 1
     assert method in approximation(method, 800) and approximation(method, 300) == ""
-
-
-def test_the_command_notes_the_approximation(many, tmp_path, capsys):
-    labels = {"kind": np.array(list("abcd"))[np.arange(400) % 4]}
-    table = FeatureTable(tuple(map(str, range(400))), {"geometry": groups(400, 1, count=4, apart=30)}, labels)
-    table.write(tmp_path / "t.parquet")
-    command = ["evaluate", "cluster", "--features", str(tmp_path / "t.parquet"), "--label", "kind"]
-    assert main([*command, "--factors", "geometry"]) == 0
-    shown = capsys.readouterr()
-    assert "400 rows are more than 300, so ward is approximate" in shown.out + shown.err

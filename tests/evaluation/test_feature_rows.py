@@ -71,8 +71,3 @@ def test_classes_are_chosen_by_size():
 def test_tables_that_do_not_fit_are_refused(rows, message):
     with pytest.raises(ValueError, match=message):
         prepare(rows, ("who",))
-
-
-def test_unknown_labels_name_the_nearest():
-    with pytest.raises(ValueError, match="unknown label 'whoo'; did you mean 'who'"):
-        prepare([row("a", table())], ("whoo",))

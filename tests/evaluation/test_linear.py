@@ -220,14 +220,6 @@ def test_nothing_of_the_test_part_reaches_what_is_learned(head):
     assert np.abs(changed[:, :10] - straight[:, :10]).max() > 0.01
 
 
-def test_a_label_of_one_value_among_the_learned_rows_is_answered_with_it():
-    features, columns = problem(80)
-    columns["a0"][:30] = 0
-    for head in ("logistic", "k-NN"):
-        answers = probe(head, features, task_of(columns), np.arange(30)[None], np.arange(40, 80), (0,))
-        assert np.isfinite(answers).all() and (answers[0, :, 0] < 0.2).all()
-
-
 def test_neighbours_are_scikit_learns():
     features, columns = problem(90)
     targets = task_of(columns).targets
@@ -332,13 +324,6 @@ def test_probes_refuse_bad_input_in_words(head, features, message):
     task = Task("labels", ("a",), np.array([[0], [1], [0], [1]], np.int8))
     with pytest.raises(ValueError, match=message):
         probe(head, features, task, np.array([[0, 1]]), np.array([2, 3]), (0,))
-
-
-def test_features_and_labels_are_of_the_same_rows():
-    task = task_of(problem(60)[1])
-    rows = choose_rows(task, files(60), (10,), (0,))
-    with pytest.raises(ValueError, match="features 'ours' have 59 rows, the labels 60"):
-        compare_linear({"ours": [np.ones((59, 2))]}, task, rows, (0,))
 
 
 def test_features_that_never_change_answer_with_the_shares():

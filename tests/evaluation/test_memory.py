@@ -38,15 +38,6 @@ def test_a_damaged_file_is_made_again(tmp_path):
         assert Memory(tmp_path).recall("x", {}, dict)["a"].tolist() == [0, 0]
 
 
-def test_a_failure_leaves_no_file(tmp_path):
-    def fail():
-        raise RuntimeError("no")
-
-    with pytest.raises(RuntimeError):
-        Memory(tmp_path).recall("x", {}, fail)
-    assert not list(tmp_path.iterdir())
-
-
 def test_without_a_folder_nothing_is_kept():
     memory = Memory()
     assert [memory.recall("x", {}, lambda: {"a": np.ones(1)})["a"][0] for _ in range(2)] == [1, 1]

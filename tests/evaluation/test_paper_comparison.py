@@ -13,8 +13,6 @@ from derender.evaluation.paper_tables import (
     IDENTITY,
     LINEAR,
     SEGMENTATION,
-    TABLES,
-    table_named,
 )
 from derender.features import FeatureTable
 
@@ -62,14 +60,6 @@ def test_a_part_says_what_differs():
         "subset: 640 + 160 images at 64 x 64, 19 classes, of celebamask; the paper: 24,127"
     )
     assert EMOTION.differs("lfw", 500).startswith("stand-in: 500 rows of lfw for 3,068 images of RAF-DB")
-
-
-def test_tables_are_known_by_name():
-    assert {"clustering", "linear", "segmentation", "cars", "identity", "emotion"} == set(TABLES)
-    named = [table_named(name) for name in ("clustering", "linear", "segmentation", "cars")]
-    assert [one.number for one in named] == [1, 2, 3, 4]
-    with pytest.raises(ValueError, match="unknown table 'clusterin'; did you mean 'clustering'"):
-        table_named("clusterin")
 
 
 WHO = np.arange(60) % 3

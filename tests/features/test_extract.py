@@ -1,7 +1,6 @@
 """Features do not depend on batches, leave the model as it was, and say where they come from."""
 
 import numpy as np
-import pytest
 import torch
 
 from derender.features import FeatureTable, embed_image_set, model_fingerprint
@@ -42,17 +41,3 @@ def test_the_fingerprint_sees_one_changed_weight(model):
     before = model_fingerprint(model)
     model.b[0, 0] += 1e-6
     assert model_fingerprint(model) != before
-
-
-def test_bad_input_is_refused_in_words(model, pictures):
-    model.image_size = 16
-    with pytest.raises(ValueError, match="are 8x8, the model takes 16x16: read them with image_size=16"):
-        embed_image_set(model, pictures)
-    model.image_size = 8
-    with pytest.raises(ValueError, match="batch_size must be 1 or more, got 0"):
-        embed_image_set(model, pictures, batch_size=0)
-    with pytest.raises(ValueError, match="no images"):
-        embed_image_set(model, pictures.select([]))
-    model.b[:] = torch.nan
-    with pytest.raises(ValueError, match=r"factor 'albedo' is not finite in 11 of 11 rows, first in 0\.png"):
-        embed_image_set(model, pictures)

@@ -28,15 +28,6 @@ def test_same_as_scikit_learn(table, factor, metric, monkeypatch):
     np.testing.assert_allclose([away for _, away in found], distances, atol=1e-9)
 
 
-def test_a_row_finds_itself_unless_it_is_left_out(table):
-    query = table.factors["light"][42]
-    for metric in ("cosine", "euclidean"):
-        first, away = nearest(table, query, "light", 3, metric=metric)
-        assert first[0] == 42 and away[0] == pytest.approx(0, abs=1e-12)
-        others, _ = nearest(table, query, "light", 2, metric=metric, exclude=[42])
-        np.testing.assert_array_equal(others, first[1:])
-
-
 def test_equal_rows_come_in_order_and_zero_rows_are_apart():
     table = FeatureTable(tuple("abcde"), {"f": np.array([[0.0, 1], [1, 0], [1, 0], [0, 0], [1, 0]])})
     rows, away = nearest(table, np.array([2.0, 0]), "f", 4)

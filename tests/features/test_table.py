@@ -6,9 +6,6 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from hypothesis.extra import numpy as hnp
 
 from derender.features import FeatureTable, missing
 
@@ -54,19 +51,6 @@ def test_round_trip_keeps_values_names_order_kinds_and_missing_labels(tmp_path):
     assert_same(table, back)
     assert back.labels["smiling"].dtype == np.int8
     assert back.labels["age"].dtype == np.float32
-
-
-@given(
-    values=hnp.arrays(
-        np.float32,
-        st.tuples(st.integers(0, 5), st.integers(1, 7)),
-        elements=st.floats(width=32, allow_nan=False, allow_infinity=False),
-    )
-)
-def test_any_finite_feature_survives_the_file_exactly(tmp_path_factory, values):
-    table = FeatureTable(tuple(map(str, range(len(values)))), {"f": values})
-    back = FeatureTable.read(table.write(tmp_path_factory.mktemp("t") / "t.parquet"))
-    np.testing.assert_array_equal(back.factors["f"], values)
 
 
 def test_other_tools_see_plain_columns_and_json(tmp_path):

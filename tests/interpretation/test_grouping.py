@@ -40,16 +40,6 @@ def test_shares_are_those_of_the_distance_between_means(features, clusters):
     assert found.ratio[1, 2] == pytest.approx(1 - (within**2).sum() / total)
 
 
-def test_scale_changes_shares_and_not_ratios(features, clusters):
-    plain = cluster_shares(features, clusters)
-    louder = cluster_shares({**features, "light": 10 * features["light"]}, clusters)
-    np.testing.assert_allclose(louder.ratio, plain.ratio)
-    np.testing.assert_allclose(louder.chance, plain.chance)
-    assert (louder.share[:, 2] > plain.share[:, 2]).all()
-    every = cluster_shares({name: 10 * values + 3 for name, values in features.items()}, clusters)
-    np.testing.assert_allclose(every.share, plain.share)
-
-
 def test_parts_of_a_pair_sum_to_distance_and_cosine(features):
     found = pair_parts(features, 4, 7)
     whole = np.concatenate(list(features.values()), axis=1)

@@ -74,13 +74,6 @@ def test_one_used_factor_has_everything_and_symmetric_factors_equal_shares(z, we
     np.testing.assert_allclose(shares_of(z, weight), 1 / 3, atol=1e-9)
 
 
-def test_scales_of_answer_and_of_feature_change_no_share(z, weight):
-    stretch = np.repeat([2.0, 1.0, 0.25], 4).astype(np.float32)
-    np.testing.assert_allclose(shares_of(z, 7 * weight), shares_of(z, weight), rtol=1e-5)
-    np.testing.assert_allclose(shares_of(z * stretch, weight / stretch), shares_of(z, weight), rtol=1e-5)
-    assert np.abs(shares_of(z * stretch, weight) - shares_of(z, weight)).max() > 0.1
-
-
 def test_nothing_attributed_is_no_share(z, weight):
     assert np.isnan(factor_shares(np.zeros((2, 12)), probe_of(weight))).all()
 

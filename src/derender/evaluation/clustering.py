@@ -135,13 +135,10 @@ def compare_clusterings(
 ) -> ClusterComparison:
     """Cluster and score every row of features on the same images.
 
-    Args:
-        features: by name, one (N, D) array for each run (seed) of the same thing.
-        labels: by name, (N,) classes; scores are averaged over them.
-        controls: names of the features that learned nothing.
-        method: see ``clusterings``; k-means is fitted with five seeds, each a run of its own.
-        n_clusters: by default as many as the label has classes.
-        resample_count, seed, memory: of the rows; of resamples and k-means; cache of the trees.
+    ``features`` holds by name one (N, D) array for each run (seed) of the same thing, ``labels`` by name (N,)
+    classes; scores are averaged over them. ``controls`` are names of features that learned nothing. There are
+    ``n_clusters``, by default as many as the label has classes; k-means is fitted with five seeds, each a run
+    of its own. ``memory`` caches the trees.
     """
     if not labels or not features or not all(features.values()):
         raise ValueError("clustering needs at least one label and one array of features in each row")

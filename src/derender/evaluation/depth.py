@@ -101,12 +101,9 @@ def geometry_scores(
 ) -> GeometryScores:
     """SIDE and MAD of depth maps in the view of the image.
 
-    Args:
-        depth_pred, mask_pred: metric or up to scale, and where there is a prediction; elsewhere values do not
-            matter.
-        depth_true, mask_true: true depth, positive inside the object.
-        fov_deg: horizontal field of view of the images.
-        normal_true: true normals where they are known better than from depth; camera frame, inward.
+    ``depth_pred`` is metric or up to scale, and does not matter where ``mask_pred`` is not; ``depth_true`` is
+    positive inside the object. ``fov_deg`` is horizontal; ``normal_true`` are true normals where they are
+    known better than from depth: camera frame, inward.
     """
     inside, valid = erode(mask_true), erode(mask_true & mask_pred)
     if not inside.any():
@@ -165,12 +162,8 @@ def evaluate_geometry(
 ) -> GeometryResult:
     """A model's geometry on images with ground truth, beside average depth, plane and an untrained model.
 
-    Args:
-        model: with ``decompose``, ``render``, ``fov_deg``, ``image_size``, ``device``.
-        truth: images with depth, normals and mask at the model's image size.
-        batch_size: images at a time; changes speed and memory only.
-        untrained: the same architecture with fresh weights, for the control.
-        progress: called with (images done, images in all) after every batch of ``model``.
+    ``model`` has ``decompose``, ``render``, ``fov_deg``, ``image_size`` and ``device``; ``truth`` is at its
+    image size. ``progress`` is called with (images done, images in all) after every batch.
     """
     check_size(model, truth.images)
     depth, mask = torch.as_tensor(truth.depth), torch.as_tensor(truth.mask) > 0

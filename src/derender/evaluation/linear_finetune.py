@@ -38,18 +38,10 @@ def finetune(
     settings: HeadSettings = PAPER_HEAD,
     progress: Progress | None = None,
 ) -> np.ndarray:
-    """Train copies of the encoders with a new head, answer for the test rows: (T, A) probabilities.
+    """Train copies of the factors' encoders with a new head, answer for the test rows: (T, A) probabilities.
 
-    The model itself stays as it was.
-
-    Args:
-        model: with ``nets[factor].encode`` and ``device``.
-        images, task: (N, 3, H, W) uint8; targets of the N images.
-        rows, tested: (n,) training rows; (T,) rows to answer for.
-        factors: whose encoders.
-        seed: of the head's start and the order of images.
-        settings: of the training.
-        progress: called with (epochs done, epochs in all).
+    The model itself stays as it was. ``images`` are (N, 3, H, W) uint8, ``rows`` (n,) training rows; the seed
+    is of the head's start and the order of images; ``progress`` is called with (epochs done, epochs in all).
     """
     device = model.device
     nets = nn.ModuleDict({name: copy.deepcopy(model.nets[name]) for name in factors}).to(device)

@@ -61,16 +61,11 @@ def fit_logistic(
     folds: int = FOLDS,
     seed: int = 0,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Choose C on the training rows alone, fit on all of them, answer for others.
+    """Choose C on the training rows alone, fit on all of them, answer for (T, D) others.
 
-    Args:
-        features, targets: (n, D) training rows; (n, A) in -1 (unknown), 0, 1, one-hot for classes.
-        tested: (T, D) rows to answer for; C is chosen without them.
-        kind: "labels" (a C for each label) or "classes" (one C).
-        penalties, folds, seed: the values of C tried; parts of the training rows, and how they are dealt.
-
-    Returns:
-        (T, A) probabilities, and the chosen C: (A,) or (1,).
+    ``features`` are (n, D), ``targets`` (n, A) in -1 (unknown), 0, 1, one-hot for classes. Of kind "labels"
+    each label has its C, of "classes" all have one. Returns (T, A) probabilities, and the chosen C: (A,) or
+    (1,).
     """
     if len(features) < folds or folds < 2:
         raise ValueError(
@@ -106,12 +101,9 @@ def solve_logistic(
 ) -> np.ndarray:
     """Solve P regressions on parts of the same rows: (R + 1, P, A) weights, the intercept last.
 
-    Args:
-        rows: (n, R) centred, with columns orthogonal to each other (from ``axes_of``).
-        targets: (n, A) in -1 (unknown), 0, 1, of ``kind`` "labels" or "classes".
-        learned: (n, P) bool: the rows that each regression learns from.
-        c: (P,) penalties.
-        tolerance: the scaled gradient at which to stop, relative to its start; or after ``most_steps``.
+    ``rows`` are (n, R), centred, with columns orthogonal to each other (from ``axes_of``); ``learned``, (n,
+    P) bool, are those that each regression learns from, ``c`` (P,) penalties. It stops when the scaled
+    gradient is below ``tolerance`` of its start, or after ``most_steps``.
     """
     dtype = rows.dtype
     design = np.column_stack((rows, np.ones(len(rows), dtype)))

@@ -66,12 +66,9 @@ def probe(
 ) -> np.ndarray:
     """Learn from some rows and answer for others, once for each seed: (S, T, A) float32 probabilities.
 
-    Args:
-        head: one of ``PROBES``.
-        features, task: (N, D), finite; targets of the N rows.
-        rows, tested: (S, n) training rows; (T,) rows to answer for, which take no part in any choice.
-        seeds: (S,) of starts and folds.
-        settings, memory: of the paper's head; cache of the answers.
+    ``features`` are (N, D), ``rows`` (S, n) training rows, the (T,) ``tested`` rows take no part in any
+    choice. The (S,) seeds are of starts and folds, ``settings`` of the paper's head, ``memory`` caches the
+    answers.
     """
     named(PROBES, head, "head")
     features = finite_rows(features, "a linear probe").astype(np.float32)

@@ -182,15 +182,10 @@ def compare_linear(
 ) -> LinearComparison:
     """Probe every row of features with every head.
 
-    Args:
-        features: by name, one (N, D) array for each run of the same thing; seed s uses run s modulo their
-            number.
-        task, rows: what is asked; who learns, drawn by the (S,) ``seeds``, and who is tested.
-        controls: names of the features that learned nothing.
-        heads, settings: kinds of probe; of the paper's head.
-        finetuned: by name and number of labels, (S, T, A) answers of fine-tuned models: a further head.
-        resample_count, memory: bootstrap resamples of the test rows; cache of the answers.
-        progress: called with (probes done, probes in all).
+    ``features`` holds by name one (N, D) array for each run of the same thing; seed s uses run s modulo their
+    number. ``rows`` were drawn by the (S,) ``seeds``; ``controls`` are names of features that learned
+    nothing. ``finetuned``, by name and number of labels (S, T, A) answers of fine-tuned models, are a further
+    head. ``progress`` is called with (probes done, probes in all).
     """
     check_lengths(features, len(task))
     truth = task.targets[rows.test]

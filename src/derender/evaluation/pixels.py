@@ -127,15 +127,11 @@ def evaluate_reconstruction(
     batch_size: int = 64,
     progress: Progress | None = None,
 ) -> ReconstructionResult:
-    """Score a model on uint8 images (N, 3, H, W) it has not seen.
+    """Score a model with ``reconstruct`` and ``device`` on uint8 images (N, 3, H, W) it has not seen.
 
-    Args:
-        model: with ``reconstruct`` and ``device``.
-        images: at the model's image size.
-        mean: the control, best made of the training images; by default that of ``images`` themselves.
-        components_of: images that give 64 principal components (fewer where they are fewer than 256), for
-            that control.
-        untrained, batch_size, progress: as of ``evaluate_geometry``.
+    The mean image is best that of the training images, by default of ``images``; ``components_of`` are images
+    that give 64 principal components (fewer where they are fewer than 256), for that control. The rest is as
+    of ``evaluate_geometry``.
     """
 
     def rendered(net: Any, report: Progress | None = None) -> tuple[Tensor, ...]:

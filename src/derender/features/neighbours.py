@@ -135,15 +135,10 @@ def nearest(
     metric: str = "cosine",
     exclude: Sequence[int] = (),
 ) -> tuple[Int64[np.ndarray, " k"], Float64[np.ndarray, " k"]]:
-    """The ``k`` rows of a table nearest to a query by one factor, nearest first, and their distances.
+    """The ``k`` rows of a table nearest to a (D,) query by one factor, nearest first, and their distances.
 
-    Args:
-        table, factor, k, metric: as of ``search``.
-        query: (D,) feature of that factor.
-        exclude: rows to leave out, such as the query's own.
-
-    Raises:
-        ValueError: the factor or metric is unknown, or the query does not fit.
+    Rows in ``exclude``, such as the query's own, are left out. ValueError: the factor or metric is unknown,
+    or the query does not fit.
     """
     rows = named(table.factors, factor, "factor")
     if metric not in METRICS:

@@ -69,16 +69,10 @@ def integrated_gradients(
 ) -> tuple[np.ndarray, np.ndarray]:
     """The contribution of each dimension to one answer, from the baseline to the image.
 
-    Args:
-        probe: A answers, D features.
-        features: (N, D).
-        target: number of the label or class.
-        baseline: (D,); zero by default, as in the paper.
-        output: "logit" or "probability".
-        steps: of the Gauss-Legendre quadrature; by default as many as the output needs.
-
-    Returns:
-        (N, D) attributions, and (N,) completeness errors: their sum less the change of the answer.
+    ``features`` are (N, D), ``target`` is the number of the label or class, ``baseline`` (D,), zero by
+    default, as in the paper; ``output`` is "logit" or "probability"; ``steps`` of the Gauss-Legendre
+    quadrature are as many as that needs. Returns (N, D) attributions, and (N,) completeness errors: their sum
+    less the change of the answer.
     """
     if output not in OUTPUTS:
         raise ValueError(
@@ -257,14 +251,9 @@ def sanity_check(
 ) -> list[Similarity]:
     """Compare the maps of a model with those of the same networks with fresh weights, and more.
 
-    Args:
-        model: with settings, from which untrained twins are made.
-        probe: whose answers are explained, the same when weights change.
-        shuffled: a probe of shuffled labels, or None.
-        images: (n, 3, s, s) in 0..1, two or more.
-        targets: (n,) the label or class explained for each.
-        methods: of ``METHODS``.
-        seeds: of the fresh weights.
+    ``probe`` is explained, the same when weights change; ``shuffled`` is one of shuffled labels, or None. Two
+    ``images`` or more are in 0..1, ``targets`` the label or class explained for each; ``seeds`` are of the
+    fresh weights.
     """
     if len(images) < 2:
         raise ValueError(f"a sanity check compares maps of 2 images or more, got {len(images)}")

@@ -172,17 +172,12 @@ def explain_labels(
     baseline: str = "zero",
     progress: Callable[[int, int], object] | None = None,
 ) -> Explanation:
-    """Shares of each factor in the answers to a task, with controls.
+    """Shares of each factor, (N, D_f) by name, in the answers to a task, with controls.
 
-    Args:
-        features: by factor, (N, D_f).
-        task, split: the question; training rows (one number of rows, S choices) and test rows.
-        untrained: features of untrained encoders, one for each of the first seeds; may be empty.
-        seeds: (S) of probes and shuffled labels, one for each choice of rows.
-        head: "logistic" or the paper's "linear".
-        output: the attributed output, "logit" or "probability".
-        baseline: start of the path, "zero" (the paper's) or the training rows' "mean".
-        progress: called with (probes done, probes in all).
+    ``split`` has one number of training rows and S choices, for the S ``seeds`` of probes and shuffled
+    labels; ``untrained`` are features of untrained encoders for the first seeds. ``head`` is "logistic" or
+    the paper's "linear", ``output`` "logit" or "probability"; ``baseline`` "zero" (the paper's) or the
+    training rows' "mean". ``progress`` is called with (probes done, probes in all).
     """
     if baseline not in BASELINES:
         raise ValueError(f"unknown baseline {baseline!r}; there is {', '.join(BASELINES)}")

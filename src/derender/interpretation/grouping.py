@@ -15,17 +15,11 @@ Features = Mapping[str, np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class ClusterShares:
-    """Each cluster against all other rows; C clusters, F factors.
+    """C clusters, of some sizes, each against all other rows, by F factors, (C, F) each.
 
-    Attributes:
-        names: (C) of the clusters.
-        factors: (F).
-        sizes: (C,) rows.
-        share: (C, F) part of the squared distance between the cluster's mean and the mean of the rest,
-            0..1, sums to 1 over factors.
-        ratio: (C, F) share of the factor's own variance that lies between cluster and rest (eta squared),
-            0..1; does not depend on the factor's scale.
-        chance: (C, F) mean ratio for clusters of these sizes, rows shuffled.
+    ``share`` is the part of the squared distance between the cluster's mean and the mean of the rest, 0..1,
+    and sums to 1 over factors; ``ratio`` the share of the factor's own variance that lies between cluster and
+    rest (eta squared), 0..1, whatever the factor's scale; ``chance`` its mean for rows shuffled.
     """
 
     names: tuple[str, ...]
@@ -66,12 +60,9 @@ class PairParts:
 def cluster_shares(
     features: Features, clusters: np.ndarray, *, permutations: int = 20, seed: int = 0
 ) -> ClusterShares:
-    """The share of each factor in separating every cluster from the rest.
+    """The share of each factor, (N, D_f) by name, in separating each of two clusters or more from the rest.
 
-    Args:
-        features: by factor, (N, D_f).
-        clusters: (N,) names or numbers; two or more different ones.
-        permutations, seed: of the rows, for the chance level.
+    ``clusters`` are (N,) names or numbers; ``permutations`` of the rows give the chance level.
     """
     names = np.unique(clusters)
     if len(names) < 2:
@@ -105,12 +96,8 @@ def cluster_shares(
 def pair_parts(
     features: Features, first: int, second: int, *, pairs: int = 2_000, seed: int = 0
 ) -> PairParts:
-    """Parts of the distance and the cosine between two of N rows, by factor.
-
-    Args:
-        features: by factor, (N, D_f).
-        first, second: row numbers.
-        pairs, seed: random pairs of rows that they are compared with.
+    """Parts of the distance and the cosine between two of N rows, by factor, each (N, D_f); and where they
+    lie among so many random ``pairs``.
     """
     rows = [np.asarray(values, np.float64) for values in features.values()]
     generator, count = np.random.default_rng(seed), len(rows[0])

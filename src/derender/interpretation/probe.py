@@ -216,15 +216,10 @@ def fit_probe(
     seed: int = 0,
     settings: HeadSettings = PAPER_HEAD,
 ) -> Probe:
-    """Learn from some rows.
+    """Learn from (n,) rows of finite features by factor, each (N, D_f).
 
-    Args:
-        features: by factor, (N, D_f), finite.
-        task: targets of the N rows.
-        rows: (n,) training rows.
-        head: "logistic" or "linear".
-        seed: of folds, or of the start and the order of rows.
-        settings: of the paper's head.
+    ``head`` is "logistic" or "linear"; the seed is of folds, or of the start and the order of rows;
+    ``settings`` are of the paper's head.
     """
     if head not in HEADS:
         raise ValueError(f"unknown head {head!r}{suggestion(head, HEADS)}; there is {', '.join(HEADS)}")

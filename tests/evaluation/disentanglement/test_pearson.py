@@ -26,15 +26,6 @@ def test_both_readings_are_what_numpy_says():
     assert scores.mean_per_image == pytest.approx(scores.per_image[off].mean())
 
 
-def test_a_copy_scores_one_and_its_negative_is_told_apart_only_per_image():
-    a = features()["geometry"]
-    scores = pearson({"a": a, "copy": 3 * a, "negative": -a})
-    np.testing.assert_allclose(scores.per_image, [[1, 1, -1], [1, 1, -1], [-1, -1, 1]])
-    assert scores.per_dimension[0, 1] == pytest.approx(scores.per_dimension[0, 2])
-    one = pearson({"a": a[:, :1], "b": -2 * a[:, :1] + 5})
-    assert one.mean_per_dimension == pytest.approx(1)
-
-
 def test_chance_per_dimension_is_the_stated_floor():
     blocks = features(rows=400, size=64)
     assert pearson(blocks).mean_per_dimension == pytest.approx(np.sqrt(2 / (np.pi * 399)), rel=0.03)

@@ -7,8 +7,6 @@ import pytest
 import torch
 
 from derender.evaluation.disentanglement.swap import diagonal_over_rest, swap_test
-from derender.model import Derenderer
-from derender.presets import MODEL_PRESETS
 from derender.render import Rendering
 from derender.scene import Scene
 
@@ -105,14 +103,3 @@ def test_ratio_and_bad_input():
     assert diagonal_over_rest(np.array([[0.8, 0.1], [0.3, 0.4]])) == pytest.approx(3)
     with pytest.raises(ValueError, match="two images or more, got 1"):
         swap_test(Reader(0), pictures(1))
-
-
-def test_a_whole_model_is_left_as_it_was():
-    settings = MODEL_PRESETS["small"]
-    network = settings.network.model_copy(update={"image_size": 32, "width": 4, "light_width": 4})
-    model = Derenderer.seeded(settings.model_copy(update={"network": network}), 0).train()
-    images = np.random.default_rng(0).integers(0, 256, (6, 3, 32, 32), dtype=np.uint8)
-    scores = swap_test(model, images)
-    assert model.training and scores.factors == ("geometry", "albedo", "light", "camera")
-    assert scores.moved.shape == (4, 4) and np.isfinite(scores.moved).all()
-    assert (scores.moved >= 0).all() and 0.2 < scores.ratio < 5

@@ -17,7 +17,7 @@ from derender.evaluation.finetuning import (
     target_loss,
     target_of,
 )
-from derender.evaluation.finetuning.joint import RENDERING_TERMS, FinetuneStep
+from derender.evaluation.finetuning.joint import RENDERING_TERMS
 from derender.evaluation.memory import Memory
 from derender.report.run import run_page
 from derender.training.batches import random_stream
@@ -124,22 +124,6 @@ def test_a_resumed_run_ends_with_the_very_weights_and_the_model_loads(pictures, 
     with pytest.raises(ValueError, match="was trained with another target"):
         other = task(pictures, "images=96", labels=("dark",))
         train_task(other, pictures, tmp_path / "whole", resume=True)
-
-
-def test_every_batch_of_the_loop_gets_its_labels(pictures, tmp_path, monkeypatch):
-    forward, seen = FinetuneStep.forward, set()
-
-    def noted(step, images, generator, precision, done=None, rows=None):
-        for image, row in zip((images * 255).round().byte().numpy(), rows.tolist(), strict=True):
-            views = pictures.images[row], pictures.images[row][..., ::-1]
-            assert any((image == view).all() for view in views)
-            seen.add(row)
-        return forward(step, images, generator, precision, done, rows)
-
-    monkeypatch.setattr(FinetuneStep, "forward", noted)
-    one = task(pictures, "images=48", "rendering_weight=0")
-    train_task(one, pictures, tmp_path / "run")
-    assert seen == {*one.target.split.train.tolist(), *one.target.split.validation.tolist()}
 
 
 def test_it_learns_beside_the_controls_and_leaves_its_start_alone(pictures, tmp_path):

@@ -49,24 +49,6 @@ def test_identity_itself_scores_one_and_the_light_itself_chance():
     assert found.curves[0].n_tested == (40, 40, 40, 40) and found.n_learned == {"light": 32}
 
 
-def test_what_fades_with_the_angle_has_the_smaller_area():
-    trial, who, angle = stack()
-    noise = np.random.default_rng(0).normal(size=(len(who), PEOPLE))[
-        trial.unit
-    ]  # a face fades in its own way
-    faded = {
-        f"{strength}": [np.eye(PEOPLE)[who] + strength * angle[:, None] / 60 * noise]
-        for strength in (0.0, 0.6, 3.0)
-    }
-    found = compare_robustness(faded, trial, (0,), resample_count=20)
-    rows, curve = rows_of(found), found.curves[0]
-    areas = [rows[name].scores["area"].value for name in ("0.0", "0.6", "3.0", "majority")]
-    assert areas == sorted(areas, reverse=True) and areas[0] == 1 and len(set(areas)) == 4
-    fading = curve.values(rows["3.0"])
-    assert fading == sorted(fading, reverse=True) and fading[0] == 1
-    assert rows["3.0"].scores["area"].value == pytest.approx(float(area_under(LEVELS, np.array(fading))))
-
-
 def test_the_area_is_the_known_one():
     assert area_under((0, 30, 60), np.array([1, 0.5, 0])) == pytest.approx(0.5)
     assert area_under((0, 10, 40), np.array([1, 1, 0])) == pytest.approx(0.625)  # wide steps count for more

@@ -134,16 +134,12 @@ def compare_robustness(
     memory: Memory | None = None,
     progress: Progress | None = None,
 ) -> RobustnessComparison:
-    """Probe every row of features along every curve.
+    """Probe every row of features along every curve of a trial.
 
-    Args:
-        features: by name, one (M, D) array for each run of the same features, of all images of the trial;
-            probe seed s uses run s modulo their number.
-        trial, seeds: training and test rows; (S,) of the training subsets.
-        controls: names of the features that learned nothing.
-        head: kind of probe (``linear_probes.PROBES``).
-        resample_count, seed, memory: bootstrap resamples of the units; cache of the answers.
-        progress: called with (probes done, probes in all).
+    ``features`` holds by name one (M, D) array for each run of the same features, of all images of the trial;
+    of the (S,) seeds of training subsets, seed s uses run s modulo their number. ``controls`` are names of
+    features that learned nothing, ``head`` one of ``PROBES``; resamples are of the units. ``progress`` is
+    called with (probes done, probes in all).
     """
     task = trial.task
     check_lengths(features, len(task))

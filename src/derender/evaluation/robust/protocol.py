@@ -12,20 +12,14 @@ from derender.evaluation.feature_rows import FeatureRow, ModelSource, chosen_lab
 from derender.evaluation.linear_probes import PROBES
 from derender.evaluation.linear_task import divide_rows, task_of
 from derender.evaluation.options import Options
+from derender.evaluation.robust import sources
 from derender.evaluation.robust.compare import AREA, SCORES, compare_robustness
-from derender.evaluation.robust.sources import (
-    KINDS,
-    Recipe,
-    generated_trial,
-    rendered_trial,
-    true_angle_trial,
-)
 from derender.evaluation.robust.trial import LEVELS, checked_levels, chosen_axes
 from derender.evaluation.score_table import Scores, verdict
 from derender.features import FeatureTable, named, table_labels
 from derender.inputs import as_model
 
-WAYS = (*KINDS, "render", "truth")
+WAYS = (*sources.KINDS, "render", "truth")
 
 
 def robustness(
@@ -76,7 +70,7 @@ def robustness(
     named(dict.fromkeys(WAYS), way, "kind of images")
     named(SCORES, score, "score")
     named(PROBES, head, "head")
-    generated, names = way in KINDS, [label] if isinstance(label, str) else list(label or ())
+    generated, names = way in sources.KINDS, [label] if isinstance(label, str) else list(label or ())
     if generated == (images is not None):
         what = "are generated and take no images" if generated else "need images"
         raise ValueError(f"images {way!r} {what}")
@@ -84,13 +78,15 @@ def robustness(
         raise ValueError(f"images {way!r} are asked one label; attributes and groups need images")
     turned = chosen_axes(axes, way if generated else None)
     levels = checked_levels(angles, turned)
-    sources = models if isinstance(models, Mapping) else {"model": models}
-    nets = {name: as_model(source, device=how.device) for name, source in sources.items()}
+    given = models if isinstance(models, Mapping) else {"model": models}
+    nets = {name: as_model(one, device=how.device) for name, one in given.items()}
     first = next(iter(nets.values()))
     if generated:
-        name = names[0] if names else KINDS[way].label
-        recipe = Recipe(way, name, people, learned, tested, first.image_size, how.seed)
-        trial = generated_trial(recipe, turned, levels, memory=how.memory, progress=how.stage("generating"))
+        name = names[0] if names else sources.KINDS[way].label
+        recipe = sources.Recipe(way, name, people, learned, tested, first.image_size, how.seed)
+        trial = sources.generated_trial(
+            recipe, turned, levels, memory=how.memory, progress=how.stage("generating")
+        )
     else:
         read = how.at(first.image_size)
         columns = FeatureTable(read.files, {"none": np.zeros((len(read), 1))}, table_labels(read))
@@ -103,11 +99,11 @@ def robustness(
         side = ready.table.label(groups) if groups else None
         read, task = how.at(first.image_size, ready.table.files), task_of(ready.labels)
         if way == "truth":
-            trial = true_angle_trial(read, task, turned)
+            trial = sources.true_angle_trial(read, task, turned)
         else:
             parts = divide_rows(task, **ready.split, test_fraction=test_fraction, groups=side)
             progress = how.stage("re-rendering")
-            trial = rendered_trial(
+            trial = sources.rendered_trial(
                 first, read, task, *parts, turned, levels, groups=side, memory=how.memory, progress=progress
             )
     rows = []

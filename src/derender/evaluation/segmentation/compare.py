@@ -23,14 +23,9 @@ from derender.evaluation.bootstrap import RESAMPLES, ScoredRow, estimate, resamp
 from derender.evaluation.memory import Memory, content_hash
 from derender.evaluation.paper_tables import SEGMENTATION
 from derender.evaluation.score_table import Cell, Column, Row, Scores, ScoreTable, scored_table, verdict_table
+from derender.evaluation.segmentation import nets
 from derender.evaluation.segmentation.data import CONTROLS, TEST_FRACTION, SegmentationData, divide
-from derender.evaluation.segmentation.nets import (
-    SegmentSettings,
-    answer,
-    build_variant,
-    chosen_variants,
-    train_segmenter,
-)
+from derender.evaluation.segmentation.nets import SegmentSettings
 from derender.features import model_fingerprint
 from derender.features.extract import check_size
 from derender.inputs import as_model
@@ -123,10 +118,10 @@ class SegmentationComparison:
         tables = [scored_table(caption, "net", scored, COLUMNS, more=learn)]
         if any(row.versus for row in scored):
             tables.append(verdict_table(scored, COLUMNS, "above the strongest control?"))
-        nets = [row for row in self.rows if row.trainable]
-        columns = [Column(row.scored.name, None, note="IoU, 0 to 1") for row in nets]
+        learning = [row for row in self.rows if row.trainable]
+        columns = [Column(row.scored.name, None, note="IoU, 0 to 1") for row in learning]
         classes = [
-            Row(data.classes[at], (float(share[at]), *(float(row.class_iou[at]) for row in nets)))
+            Row(data.classes[at], (float(share[at]), *(float(row.class_iou[at]) for row in learning)))
             for at in np.argsort(-share, kind="stable").tolist()
         ]
         heads = (Column("share", note="of the tested pixels"), *columns)
@@ -180,7 +175,7 @@ def segment(
         ValueError: the model has no U-Net encoders, or images of another size.
     """
     model, report = as_model(model), progress or (lambda *_: None)
-    chosen, notes = chosen_variants(model, variants), []
+    chosen, notes = nets.chosen_variants(model, variants), []
     if not len(seeds):
         raise ValueError("a comparison needs at least one seed")
     if not isinstance(data, SegmentationData):
@@ -207,14 +202,14 @@ def segment(
         def step(seen: int, loss: float) -> None:
             report(done + seen, total, f"{run}, seed {seed}, loss {loss:.2f}")
 
-        losses = train_segmenter(net, data, seed, settings, step)
-        return {**counted(answer(net, data.images[data.test])), "losses": np.array(losses)}
+        losses = nets.train_segmenter(net, data, seed, settings, step)
+        return {**counted(nets.answer(net, data.images[data.test])), "losses": np.array(losses)}
 
     rows: list[tuple[str, bool, list[dict[str, np.ndarray]], int]] = []
     for name, variant in chosen.items():
         runs, trainable = [], 0
         for seed in seeds:
-            net = build_variant(model, variant, data, seed)
+            net = nets.build_variant(model, variant, data, seed)
             trainable = sum(p.numel() for p in net.parameters() if p.requires_grad)
             inputs = {
                 "start": model_fingerprint(net), "frozen": variant.frozen, "seed": seed, **same,

@@ -51,19 +51,12 @@ def divide(
     split_seed: int = 0,
     labelled: int | None = None,
 ) -> SegmentationData:
-    """Choose training and test images.
+    """Choose training and test images of what ``read_masks`` gave.
 
     Where the data bring a partition, its "test" rows are tested, and its "train" rows (all others, where it
     has no "train") learn. Otherwise files are ordered by a hash of their name and ``split_seed``, and the
-    last of that order are tested.
-
-    Args:
-        images, masks, classes: as from ``read_masks``.
-        test_fraction: share of the images that is tested, where the data have no partition.
-        split_seed: of the split and of the choice of ``labelled`` training images, by default all.
-
-    Raises:
-        ValueError: nothing to learn from or to test, more requested than there is, or a single class.
+    last ``test_fraction`` of that order are tested. ``labelled`` limits the training images. ValueError:
+    nothing to learn from or to test, more requested than there is, or a single class.
     """
     if not 0 < test_fraction < 1:
         raise ValueError(f"the tested share must lie between 0 and 1, got {test_fraction}")
