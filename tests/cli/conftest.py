@@ -1,8 +1,11 @@
 """What tests of commands share: words of any kind, refusals, the smallest model and generated faces."""
 
+import json
 from pathlib import Path
 
+import numpy as np
 import pytest
+from PIL import Image
 
 from derender import Derenderer
 from derender.cli import main
@@ -18,6 +21,39 @@ def run(*words: object) -> int:
 def settings(*pairs: str) -> list[str]:
     """``--set`` before each."""
     return [word for pair in pairs for word in ("--set", pair)]
+
+
+def noise(folder: Path, count: int, size: int = 32, cells: int = 4, name: str = "{}.png") -> Path:
+    """A folder of so many images of coloured noise."""
+    for number in range(count):
+        coarse = np.random.default_rng(number).integers(0, 256, (cells, cells, 3), dtype=np.uint8)
+        file = folder / name.format(number)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(coarse).resize((size, size)).save(file)
+    return folder
+
+
+def coloured_people(folder: Path, count: int, size: int) -> Path:
+    """Images of four made-up people, one folder each, distinguished by their colour."""
+    rng, colours = np.random.default_rng(0), ((200, 40, 40), (40, 200, 40), (40, 40, 200), (200, 200, 40))
+    for row in range(count):
+        pixels = np.clip(colours[row % 4] + rng.integers(-30, 30, (size, size, 3)), 0, 255).astype(np.uint8)
+        (folder / "abcd"[row % 4]).mkdir(parents=True, exist_ok=True)
+        Image.fromarray(pixels).save(folder / "abcd"[row % 4] / f"{row:03d}.png")
+    return folder
+
+
+@pytest.fixture
+def numbers(capsys):
+    """Run a command that must succeed; gives what --json says, and the notes."""
+
+    def call(*words: object) -> tuple[dict, str]:
+        capsys.readouterr()
+        assert run(*words, "--json", "-") == 0
+        shown = capsys.readouterr()
+        return json.loads(shown.out), shown.err
+
+    return call
 
 
 @pytest.fixture

@@ -3,27 +3,23 @@
 import json
 from pathlib import Path
 
-import numpy as np
 import pytest
-from PIL import Image
+from tests.cli.conftest import noise, settings
+from tests.cli.conftest import run as call
 
 from derender import FeatureTable
 from derender.baselines import BASELINES
 from derender.cli import main
 
-TINY = ["image_size=32", "width=8", "codes=8", "batch_size=4", "images=8"]
-SETTINGS = [word for setting in TINY for word in ("--set", setting)]
+SETTINGS = settings("image_size=32", "width=8", "codes=8", "batch_size=4", "images=8")
 
 
 @pytest.fixture(scope="module")
 def faces(tmp_path_factory) -> Path:
     """24 images in the folders of two classes."""
-    folder, random = tmp_path_factory.mktemp("cli") / "faces", np.random.default_rng(0)
-    for index in range(24):
-        picture = Image.fromarray(random.integers(0, 256, (4, 4, 3), dtype=np.uint8)).resize((32, 32))
-        file = folder / ("happy" if index % 2 else "sad") / f"{index:02d}.png"
-        file.parent.mkdir(parents=True, exist_ok=True)
-        picture.save(file)
+    folder = tmp_path_factory.mktemp("cli") / "faces"
+    noise(folder / "happy", 12)
+    noise(folder / "sad", 12, cells=5)
     return folder
 
 
@@ -33,20 +29,6 @@ def run(faces: Path, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("cli") / "vqvae"
     assert main(["train", "--model", "vqvae", "--data", str(faces), "--out", str(folder), *SETTINGS]) == 0
     return folder
-
-
-@pytest.fixture
-def refused(capsys):
-    """Run a command that must fail with exit code 2 and one line of complaint; gives that line."""
-
-    def call(*arguments: object) -> str:
-        capsys.readouterr()
-        assert main([str(argument) for argument in arguments]) == 2
-        last = capsys.readouterr().err.strip().splitlines()[-1]
-        assert last.startswith("derender: ")
-        return last
-
-    return call
 
 
 def test_a_run_has_a_report_and_goes_on(run, faces, capsys):
@@ -61,10 +43,7 @@ def test_embed_then_cluster_as_with_our_own(run, faces, tmp_path, capsys):
     embed = ["embed", "--baseline", "vqvae", "-m", run, "-d", faces, "--features", "pooled,histogram"]
     assert main([str(word) for word in [*embed, "--out", table_file, "--json", numbers]]) == 0
     table = FeatureTable.read(table_file)
-    assert {name: values.shape for name, values in table.factors.items()} == {
-        "pooled": (24, 8),
-        "histogram": (24, 8),
-    }
+    assert {name: values.shape[1] for name, values in table.factors.items()} == {"pooled": 8, "histogram": 8}
     assert table.origin["baseline"] == "vqvae" and table.origin["source"] == str(run)
     assert json.loads(numbers.read_text())["factors"] == {"pooled": 8, "histogram": 8}
     cluster = ["evaluate", "cluster", "--features", table_file, "--label", "class", "--factors", "pooled"]
@@ -79,20 +58,8 @@ def test_embed_then_cluster_as_with_our_own(run, faces, tmp_path, capsys):
 @pytest.mark.parametrize(("name", "size"), [("pixels", 3072), ("pca", 4), ("hog", 324), ("noise", 4)])
 def test_controls_need_no_model(name, size, faces, run, tmp_path):
     out = tmp_path / "table.parquet"
-    embed = [
-        "embed",
-        "--baseline",
-        name,
-        "--data",
-        faces,
-        "--image-size",
-        32,
-        "--components",
-        4,
-        "--out",
-        out,
-    ]
-    assert main([str(word) for word in embed]) == 0
+    embed = ["embed", "--baseline", name, "-d", faces, "--image-size", 32, "--components", 4, "--out", out]
+    assert call(*embed) == 0
     table = FeatureTable.read(out)
     assert table.factors[name].shape == (24, size) and table.origin["control"] == name
     assert "class" in table.labels
@@ -105,9 +72,9 @@ def test_controls_need_no_model(name, size, faces, run, tmp_path):
 def test_resnet18_trains_on_labels_and_embeds(faces, tmp_path, refused):
     run, out = tmp_path / "resnet18", tmp_path / "table.parquet"
     train = ["train", "--model", "resnet18", "--data", faces, "--out", run]
-    few = ["labels=class", "labelled=8", "epochs=1", "batch_size=4", "image_size=32", "width=4"]
+    few = ("labels=class", "labelled=8", "epochs=1", "batch_size=4", "image_size=32", "width=4")
     assert "name a label to learn" in refused(*train)
-    train += [word for setting in few for word in ("--set", setting)]
+    train += settings(*few)
     assert main([str(word) for word in train]) == 0
     assert "is not resumed" in refused(*train, "--resume")
     embed = ["embed", "--baseline", "resnet18", "--model", run, "--data", faces, "--out", out]

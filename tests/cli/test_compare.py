@@ -1,12 +1,11 @@
 """Tables from the command line: files and models in, scores beside controls and the paper's numbers out;
 `--whiten-on` adds controls with the model's whitening."""
 
-import json
 from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
+from tests.cli.conftest import coloured_people
 
 from derender import Derenderer, FeatureTable
 from derender.cli import main
@@ -18,14 +17,7 @@ QUICK = ["--resamples", "20", "--untrained-seeds", "2", "--cache"]
 
 @pytest.fixture(scope="module")
 def people(tmp_path_factory) -> Path:
-    """Images of four made-up people, one folder each, distinguished by their colour."""
-    folder, rng = tmp_path_factory.mktemp("compare") / "people", np.random.default_rng(0)
-    for row in range(ROWS):
-        colour = np.array([[200, 40, 40], [40, 200, 40], [40, 40, 200], [200, 200, 40]])[row % 4]
-        pixels = np.clip(colour + rng.integers(-30, 30, (16, 16, 3)), 0, 255).astype(np.uint8)
-        (folder / "abcd"[row % 4]).mkdir(parents=True, exist_ok=True)
-        Image.fromarray(pixels).save(folder / "abcd"[row % 4] / f"{row:03d}.png")
-    return folder
+    return coloured_people(tmp_path_factory.mktemp("compare") / "people", ROWS, 16)
 
 
 @pytest.fixture(scope="module")
@@ -72,28 +64,12 @@ def tables(tmp_path_factory) -> dict[str, Path]:
     }
 
 
-@pytest.fixture
-def refused(capsys):
-    def call(*words: object) -> str:
-        capsys.readouterr()
-        assert main([str(word) for word in words]) == 2
-        return capsys.readouterr().err.strip().splitlines()[-1]
-
-    return call
-
-
-def run(capsys, *words: object) -> dict:
-    capsys.readouterr()
-    assert main([*map(str, words), "--json", "-"]) == 0
-    return json.loads(capsys.readouterr().out)
-
-
-def test_a_clustering_table_beside_the_papers(tables, tmp_path, capsys):
+def test_a_clustering_table_beside_the_papers(tables, tmp_path, capsys, numbers):
     words = ["compare", "--table", "identity", "--features", f"good={tables['good']}"]
     words += ["--features", f"noise={tables['noise']}", "--features", f"noise={tables['noise2']}"]
     text = tmp_path / "table.md"
     files = ["--markdown", text, "--latex", tmp_path / "t.tex", "--html", tmp_path / "t.html"]
-    told = run(capsys, *words, *QUICK, tmp_path / "cache", *files)
+    told = numbers(*words, *QUICK, tmp_path / "cache", *files)[0]
     page = (tmp_path / "t.html").read_text()
     assert "<svg" in page and "good" in page and "noise" in page
     part = told["parts"]["identity"]
@@ -112,10 +88,10 @@ def test_a_clustering_table_beside_the_papers(tables, tmp_path, capsys):
     assert "0 results computed, 3 found" in shown.err and "paper: Ours - LOOCC-L " in shown.out
 
 
-def test_a_model_is_embedded_once_beside_its_untrained_twins(model, people, tmp_path, capsys):
+def test_a_model_is_embedded_once_beside_its_untrained_twins(model, people, tmp_path, capsys, numbers):
     words = ["evaluate", "linear", "-m", model, "-d", people, "--label", "class", "--counts", "20"]
     words += ["--heads", "k-NN", "--seeds", "2", *QUICK, tmp_path]
-    told = run(capsys, *words, "--finetune", "--epochs", "1")
+    told = numbers(*words, "--finetune", "--epochs", "1")[0]
     knn, tuned = told["parts"]
     assert list(knn["rows"]) == ["geometry + albedo", "untrained encoder", "PCA (16)", "pixels", "majority"]
     assert knn["rows"]["pixels"]["scores"]["accuracy"]["value"] > 0.5 and told["kind"] == "classes"
@@ -124,7 +100,7 @@ def test_a_model_is_embedded_once_beside_its_untrained_twins(model, people, tmp_
         ["geometry + albedo", "untrained encoder", "PCA (16)", "pixels", "majority"],
     )
     head = ["evaluate", "linear", "-m", model, "-d", people, "--label", "class", "--counts", "20"]
-    head = run(capsys, *head, "--heads", "linear", "--seeds", "2", "--epochs", "1", *QUICK, tmp_path)
+    head = numbers(*head, "--heads", "linear", "--seeds", "2", "--epochs", "1", *QUICK, tmp_path)[0]
     alone = head["parts"][0]["rows"]
     assert tuned["rows"]["pixels"]["scores"] == alone["pixels"]["scores"]  # there is nothing else to train
     clustered = ["evaluate", "cluster", "-m", model, "-d", people, "--label", "class", *QUICK, tmp_path]
@@ -134,10 +110,10 @@ def test_a_model_is_embedded_once_beside_its_untrained_twins(model, people, tmp_
     assert "5 results computed, 8 found" in shown.err  # embeddings and PCA, and the levels' own trees
 
 
-def test_the_papers_linear_table_frozen_and_fine_tuned(smiling, model, tmp_path, capsys, refused):
+def test_the_papers_linear_table_frozen_and_fine_tuned(smiling, model, tmp_path, capsys, refused, numbers):
     words = ["compare", "--table", "linear", "-m", f"ours={model}", "-d", smiling, "--counts", "10"]
     words += ["--finetune", "--seeds", "1", "--resamples", "20", "--untrained-seeds", "1"]
-    told = run(capsys, *words, "--cache", tmp_path)
+    told = numbers(*words, "--cache", tmp_path)[0]
     part = told["parts"]["attributes"]
     assert part["names"] == ["smiles"]  # one is never so, one is so once
     names = ["ours", "untrained encoder", "PCA (6)", "pixels", "majority"]
@@ -157,11 +133,11 @@ def test_the_papers_linear_table_frozen_and_fine_tuned(smiling, model, tmp_path,
     assert "give the linear table, models and images" in refused(*wrong)
 
 
-def test_controls_for_a_table_made_before(model, people, tmp_path, capsys):
+def test_controls_for_a_table_made_before(model, people, tmp_path, numbers):
     table = tmp_path / "f.parquet"
     assert main(["embed", "-m", str(model), "-d", str(people), "--out", str(table)]) == 0
     words = ["evaluate", "cluster", "-f", table, "-d", people, "--label", "class", *QUICK, "none"]
-    assert list(run(capsys, *words)["rows"])[1:4] == ["untrained encoder", "PCA (16)", "pixels"]
+    assert list(numbers(*words)[0]["rows"])[1:4] == ["untrained encoder", "PCA (16)", "pixels"]
 
 
 def test_bad_input_is_one_line(tables, model, people, refused, tmp_path):
@@ -184,13 +160,13 @@ def test_bad_input_is_one_line(tables, model, people, refused, tmp_path):
     assert "no feature table at" in refused(*compare, "-f", f"b={tmp_path / 'none.parquet'}")
 
 
-def test_controls_get_the_models_whitening(tmp_path, capsys):
+def test_controls_get_the_models_whitening(tmp_path, capsys, numbers):
     net = Derenderer.from_preset("small", seed=0, image_size=32, width=4, light_width=4, code_size=8)
     model, images = net.save(tmp_path / "model"), tmp_path / "faces"
     write(faces.generate(32, 32, 0, FaceSettings(pictures_per_identity=8)), images)
     words = ["evaluate", "cluster", images, "-m", model, "-l", "identity", "--whiten-on", images]
     words += ["--resamples", "20", "--untrained-seeds", "1", "--cache", tmp_path / "cache"]
-    first, again = (run(capsys, *words)["rows"] for _ in range(2))
+    first, again = (numbers(*words)[0]["rows"] for _ in range(2))
     assert first == again and {name: row["control"] for name, row in first.items()} == {
         "geometry + albedo": False, "geometry + albedo, whitened here": False, "untrained encoder": True,
         "PCA (8)": True, "pixels": True, "untrained encoder, whitened": True, "PCA (8), whitened": True,

@@ -1,6 +1,7 @@
 """`evaluate disentangle` and `evaluate geometry`: images drawn, numbers told, bad words refused."""
 
 import json
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,6 @@ from PIL import Image
 from derender.cli import main
 from derender.data.synthetic import faces, write
 from derender.model import Derenderer
-from derender.presets import MODEL_PRESETS
 
 SIZE = 32
 
@@ -18,10 +18,7 @@ SIZE = 32
 @pytest.fixture(scope="module")
 def model(tmp_path_factory) -> Path:
     """An untrained model on disk, for 32 pixels."""
-    settings = MODEL_PRESETS["small"]
-    sizes = {"image_size": SIZE, "width": 4, "light_width": 4, "code_size": 12}
-    network = settings.network.model_copy(update=sizes)
-    made = Derenderer.seeded(settings.model_copy(update={"network": network}), 0)
+    made = Derenderer.from_preset("small", seed=0, image_size=SIZE, width=4, light_width=4, code_size=12)
     return made.save(tmp_path_factory.mktemp("disentangle") / "model")
 
 
@@ -65,11 +62,8 @@ def test_the_card_is_printed_drawn_and_written(model, rendered, tmp_path, capsys
     assert json.loads(again.out) == told and "0 results computed, 6 found" in again.err
 
 
-def test_bad_words(model, rendered, tmp_path, capsys):
-    def refused(*words) -> str:
-        capsys.readouterr()
-        assert main([str(w) for w in ("evaluate", "disentangle", "-m", model, "-d", rendered, *words)]) == 2
-        return capsys.readouterr().err.strip().splitlines()[-1]
+def test_bad_words(model, rendered, tmp_path, refused):
+    refused = partial(refused, "evaluate", "disentangle", "-m", model, "-d", rendered)
 
     assert "must end in .png" in refused("--out", tmp_path / "card.jpg")
     taken = tmp_path / "taken.png"

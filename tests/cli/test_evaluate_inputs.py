@@ -1,6 +1,5 @@
 """Bad input to every `derender evaluate`: one clear line, and nothing scored in silence."""
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +7,6 @@ import pytest
 import torch
 
 from derender import Derenderer, FeatureTable
-from derender.cli import main
 from derender.data.synthetic import faces, write
 
 ROWS = 40
@@ -35,35 +33,24 @@ def folder(tmp_path_factory) -> Path:
     return made
 
 
-@pytest.fixture
-def refused(folder, capsys):
-    def call(*words: object) -> str:
-        capsys.readouterr()
-        assert main(["evaluate", *(str(word) for word in words)]) == 2
-        (line,) = [one for one in capsys.readouterr().err.splitlines() if one.startswith("derender: ")]
-        return line
-
-    return call
-
-
 @pytest.mark.parametrize("protocol", ["geometry", "reconstruction", "disentangle", "robustness"])
 def test_a_model_that_went_wrong_is_not_scored(protocol, folder, refused):
     data = ["-d", folder / "faces"] if protocol != "robustness" else []
-    said = refused(protocol, "-m", folder / "broken", *data, "--cache", "none")
+    said = refused("evaluate", protocol, "-m", folder / "broken", *data, "--cache", "none")
     assert "has weights that are NaN or infinite (first nets.geometry." in said
 
 
 def test_labels_and_factors_that_ask_nothing(folder, refused):
     table = ("-f", folder / "ours.parquet", *ROOM)
-    said = refused("cluster", *table, "-l", "alone")
+    said = refused("evaluate", "cluster", *table, "-l", "alone")
     assert "every one of the 40 labelled rows of 'alone' is a class of its own" in said
-    said = refused("cluster", *table, "-l", "identity", "--factors", "geometri")
+    said = refused("evaluate", "cluster", *table, "-l", "identity", "--factors", "geometri")
     assert "unknown factor 'geometri'; did you mean 'geometry'" in said
-    said = refused("linear", *table, "-l", "identity", "--counts", "10", "--groups", "identity")
+    words = ("evaluate", "linear", *table, "-l", "identity")
+    said = refused(*words, "--counts", "10", "--groups", "identity")
     assert "classes tested is learned from" in said and "these groups hold whole classes" in said
 
 
-def test_features_of_another_kind_are_called_by_their_own_name(folder, capsys):
-    words = ["evaluate", "cluster", "-f", folder / "other.parquet", "-l", "identity", *ROOM, "--json", "-"]
-    assert main([str(word) for word in words]) == 0
-    assert next(iter(json.loads(capsys.readouterr().out)["rows"])) == "code"
+def test_features_of_another_kind_are_called_by_their_own_name(folder, numbers):
+    words = ("evaluate", "cluster", "-f", folder / "other.parquet", "-l", "identity", *ROOM)
+    assert next(iter(numbers(*words)[0]["rows"])) == "code"

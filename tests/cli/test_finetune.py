@@ -59,17 +59,7 @@ def test_from_a_run_to_features_and_scores(begun, faces, tmp_path, capsys, refus
 
 
 def test_from_fresh_weights_by_labels_alone(faces, tmp_path, capsys):
-    words = [
-        "finetune",
-        "--preset",
-        "small",
-        "-d",
-        faces,
-        "--label",
-        "expression",
-        "--out",
-        tmp_path / "run",
-    ]
+    words = ["finetune", "--preset", "small", "-d", faces, "--label", "expression", "--out", tmp_path / "run"]
     words += ["--rendering-weight", 0, "--factors", "albedo,light", "--cache", "none"]
     words += settings(*TINY, *STEPS)
     assert run(*words) == 0

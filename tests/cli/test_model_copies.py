@@ -114,6 +114,7 @@ def test_a_model_that_cannot_fit_is_told_how_to(folder, tmp_path, capsys):
         ["embed", str(folder), *plain, "-o", str(tmp_path / "t.parquet"), *steps],
         ["decompose", str(folder / "000.png"), *plain, "-o", str(tmp_path / "apart"), *steps],
         ["refine", str(folder), *plain, "-o", str(tmp_path / "mine")],
+        ["evaluate", "reconstruction", str(folder), *plain, "--limit", "20", "--cache", "none", *steps],
     ):
         assert main(words) == 2
         assert "derender whiten" in capsys.readouterr().err

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import trimesh
 from PIL import Image
+from tests.cli.conftest import noise
 
 from derender import Derenderer, FeatureTable
 from derender.cli import main
@@ -21,21 +22,14 @@ SIZE = 32
 
 
 @pytest.fixture(scope="module")
-def model(tmp_path_factory) -> str:
-    """An untrained model of the smallest kind, saved."""
-    folder = tmp_path_factory.mktemp("pictures") / "model"
-    return str(Derenderer.from_preset("small", seed=0, image_size=SIZE, width=4, light_width=4).save(folder))
+def model(tiny) -> str:
+    return str(tiny)
 
 
 @pytest.fixture(scope="module")
 def photos(tmp_path_factory) -> Path:
     """Six images of coloured noise, 64 pixels wide."""
-    folder = tmp_path_factory.mktemp("pictures") / "photos"
-    folder.mkdir()
-    for number in range(6):
-        coarse = np.random.default_rng(number).integers(0, 256, (8, 8, 3), dtype=np.uint8)
-        Image.fromarray(coarse).resize((64, 64)).save(folder / f"{number}.png")
-    return folder
+    return noise(tmp_path_factory.mktemp("pictures") / "photos", 6, 64, cells=8)
 
 
 @pytest.fixture(scope="module")
@@ -43,27 +37,6 @@ def table(model, photos) -> str:
     path = photos.parent / "F.parquet"
     assert main(["embed", "--model", model, "--data", str(photos), "--out", str(path)]) == 0
     return str(path)
-
-
-@pytest.fixture
-def refused(capsys):
-    """Run a command that must fail with exit code 2 and one line of complaint; gives that line."""
-
-    def call(*arguments: object) -> str:
-        capsys.readouterr()
-        assert main([str(argument) for argument in arguments]) == 2
-        *notes, last = capsys.readouterr().err.strip().splitlines()
-        assert last.startswith("derender: ")
-        assert not any(note.startswith(("derender:", "Traceback")) for note in notes)
-        return last
-
-    return call
-
-
-@pytest.mark.parametrize("name", ["relight", "rotate", "swap", "mesh", "search"])
-def test_help_has_an_example(name, capsys):
-    assert main([name, "--help"]) == 0
-    assert f"Example: derender {name}" in " ".join(capsys.readouterr().out.split())
 
 
 def test_relight_sweeps_and_says_which_light(model, photos, tmp_path):

@@ -4,9 +4,8 @@ import json
 import re
 from pathlib import Path
 
-import numpy as np
 import pytest
-from PIL import Image
+from tests.cli.conftest import noise
 
 from derender import Derenderer
 from derender.cli import main
@@ -16,12 +15,7 @@ from derender.training.run_folder import append_metrics, start_run
 
 @pytest.fixture(scope="module")
 def photos(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("report") / "photos"
-    folder.mkdir()
-    for number in range(40):
-        coarse = np.random.default_rng(number).integers(0, 256, (4, 4, 3), dtype=np.uint8)
-        Image.fromarray(coarse).resize((32, 32)).save(folder / f"{number}<b>.png")
-    return folder
+    return noise(tmp_path_factory.mktemp("report") / "photos", 40, name="{}<b>.png")
 
 
 @pytest.fixture

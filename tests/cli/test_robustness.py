@@ -1,13 +1,12 @@
 """`derender evaluate robustness`: curves of generated and real images, charts, and ways to get it wrong."""
 
-import json
+from functools import partial
 from pathlib import Path
 
 import pytest
 from PIL import Image
 
 from derender import Derenderer
-from derender.cli import main
 from derender.data.synthetic import FaceSettings, faces, write, write_tracks
 
 QUICK = ["--resamples", 20, "--untrained-seeds", 1, "--seeds", 2, "--angles", "0,40", "--cache"]
@@ -26,17 +25,10 @@ def rendered(tmp_path_factory) -> Path:
     return folder
 
 
-def run(capsys, *words: object) -> tuple[dict, str]:
-    capsys.readouterr()
-    assert main([*map(str, words), "--json", "-"]) == 0
-    told = capsys.readouterr()
-    return json.loads(told.out), told.err
-
-
-def test_generated_faces_by_angle_and_light(model, tmp_path, capsys):
+def test_generated_faces_by_angle_and_light(model, tmp_path, numbers):
     words = ["evaluate", "robustness", "-m", model, "--people", 4, "--learned", 6, *QUICK, tmp_path / "cache"]
     files = ["--out", tmp_path / "page.html", "--markdown", tmp_path / "t.md", "--latex", tmp_path / "t.tex"]
-    told, shown = run(capsys, *words, *files)
+    told, shown = numbers(*words, *files)
     assert list(told["curves"]) == ["yaw", "light"] and told["how"] == "identity of generated faces"
     names = ["geometry + albedo", "geometry", "albedo", "light", "camera"]
     controls = ["untrained encoder", "PCA (6)", "pixels", "majority"]
@@ -49,40 +41,36 @@ def test_generated_faces_by_angle_and_light(model, tmp_path, capsys):
     assert "<svg" in page and "light from the side" in page and "Robustness to light and view" in page
     assert (tmp_path / "t.tex").read_text().count(r"\begin{table}") == 6
     assert "| geometry + albedo |" in (tmp_path / "t.md").read_text()
-    again, shown = run(capsys, *words, "--score", "balanced", "--out", tmp_path / "curves.png")
+    again, shown = numbers(*words, "--score", "balanced", "--out", tmp_path / "curves.png")
     assert "0 results computed, 12 found" in shown and again["curves"] == told["curves"]
     with Image.open(tmp_path / "curves.png") as chart:
         assert chart.width > 800
 
 
-def test_pictures_rendered_again_and_pictures_of_known_angles(model, rendered, tmp_path, capsys):
+def test_pictures_rendered_again_and_pictures_of_known_angles(model, rendered, tmp_path, numbers):
     words = ["evaluate", "robustness", "-m", model, "--axes", "light", *QUICK, "none", "-d", rendered]
-    told, _ = run(capsys, *words, "--label", "expression", "--min-count", 4, "--groups", "identity")
+    told, _ = numbers(*words, "--label", "expression", "--min-count", 4, "--groups", "identity")
     assert told["pictures"] == "render" and told["how"].endswith("re-rendered")
     tested = told["curves"]["light"]["n_tested"]
     assert tested[0] == tested[1] and tested[2] == 2 * tested[0]
-    told, _ = run(capsys, *words, "--pictures", "truth", "--out", tmp_path / "curves.svg")
+    told, _ = numbers(*words, "--pictures", "truth", "--out", tmp_path / "curves.svg")
     light = told["curves"]["light"]
     assert told["kind"] == "classes" and len(light["levels_deg"]) == 4
     assert light["levels_deg"] == sorted(light["levels_deg"]) and light["n_tested"][0] == light["n_tested"][1]
     assert (tmp_path / "curves.svg").read_text().startswith("<svg")
 
 
-def test_tracks_in_light_that_nobody_trained_on(model, tmp_path, capsys):
+def test_tracks_in_light_that_nobody_trained_on(model, tmp_path, numbers):
     folder = tmp_path / "tracks"
     settings = FaceSettings(tracks=8, frames=2)
     write_tracks(faces.generate(32, 32, 0, settings), folder)
     words = ["evaluate", "robustness", "-m", model, "-d", folder, "--pictures", "truth", "--axes", "yaw"]
-    told, _ = run(capsys, *words, *QUICK, "none")
+    told, _ = numbers(*words, *QUICK, "none")
     assert told["curves"]["yaw"]["n_tested"] == [4, 4, 6, 6, 4] and told["names"] == ["identity"]
 
 
-def test_bad_words(model, rendered, tmp_path, capsys):
-    def refused(*words: object) -> str:
-        capsys.readouterr()
-        whole = ["evaluate", "robustness", "-m", model, "--cache", "none", *words]
-        assert main([str(word) for word in whole]) == 2
-        return capsys.readouterr().err.strip().splitlines()[-1]
+def test_bad_words(model, rendered, tmp_path, refused):
+    refused = partial(refused, "evaluate", "robustness", "-m", model, "--cache", "none")
 
     assert "--angles 'wide' should read like" in refused("--angles", "wide")
     assert "within 0..60 degrees for pitch" in refused("--axes", "pitch")

@@ -35,16 +35,6 @@ def model(folder: Path, encoder: str) -> Path:
     return Derenderer.from_preset("small", seed=0, **sizes).save(folder / encoder)
 
 
-@pytest.fixture
-def refused(capsys):
-    def call(*words: object) -> str:
-        capsys.readouterr()
-        assert main([str(word) for word in words]) == 2
-        return capsys.readouterr().err.strip().splitlines()[-1]
-
-    return call
-
-
 def test_tables_overlays_and_going_on(parts, tmp_path, capsys, refused):
     net, out = model(tmp_path, "unet"), tmp_path / "out"
     words = ["evaluate", "segment", "-m", net, "-d", parts, "--out", out, "--epochs", 1, "--batch-size", 8]

@@ -9,9 +9,8 @@ import time
 import urllib.error
 import urllib.request
 
-import numpy as np
 import pytest
-from PIL import Image
+from tests.cli.conftest import noise
 
 from derender import Derenderer
 from derender.cli import main
@@ -20,33 +19,13 @@ SIZE = 32
 
 
 @pytest.fixture(scope="module")
-def model(tmp_path_factory) -> str:
-    """An untrained model of the smallest kind, saved."""
-    folder = tmp_path_factory.mktemp("view") / "model"
-    return str(Derenderer.from_preset("small", seed=0, image_size=SIZE, width=4, light_width=4).save(folder))
+def model(tiny) -> str:
+    return str(tiny)
 
 
 @pytest.fixture(scope="module")
 def photos(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("photos")
-    for number in range(3):
-        coarse = np.random.default_rng(number).integers(0, 256, (6, 6, 3), dtype=np.uint8)
-        Image.fromarray(coarse).resize((SIZE, SIZE)).save(folder / f"{number}.png")
-    return folder
-
-
-@pytest.fixture
-def refused(capsys):
-    """Run a command that must fail with exit code 2 and one line of complaint; gives that line."""
-
-    def call(*arguments: object) -> str:
-        capsys.readouterr()
-        assert main([str(argument) for argument in arguments]) == 2
-        last = capsys.readouterr().err.strip().splitlines()[-1]
-        assert last.startswith("derender: ")
-        return last
-
-    return call
+    return noise(tmp_path_factory.mktemp("photos"), 3, SIZE, cells=6)
 
 
 @pytest.fixture
@@ -65,11 +44,6 @@ def served(monkeypatch):
 def test_a_model_that_cannot_fit_scenes_is_told_how_it_could(model, refused):
     said = refused("view", "--model", model, "--fit-steps", 5)
     assert "cannot optimise scenes per image yet: derender whiten" in said
-
-
-def test_help_has_an_example(capsys):
-    assert main(["view", "--help"]) == 0
-    assert "Example: derender view" in " ".join(capsys.readouterr().out.split())
 
 
 def test_it_listens_on_this_machine_only(model, photos, served, tmp_path, capsys):
@@ -124,13 +98,9 @@ def test_what_is_not_installed_is_named(model, refused, monkeypatch):
 def test_it_answers_until_ctrl_c(model, photos, tmp_path):
     told = tmp_path / "told.json"
     words = ["view", "-m", model, str(photos / "1.png"), "--json", str(told)]
-    with subprocess.Popen(
-        [sys.executable, "-m", "derender", *words],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        cwd=tmp_path,
-    ) as process:
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    command = [sys.executable, "-m", "derender", *words]
+    with subprocess.Popen(command, text=True, cwd=tmp_path, **pipes) as process:
         try:
             url = _url(process, told)
             with urllib.request.urlopen(url, timeout=60) as page:

@@ -44,19 +44,8 @@ def test_animated_png_keeps_transparency():
 
 def test_mp4_has_every_frame_and_even_sides(tmp_path):
     (tmp_path / "film.mp4").write_bytes(mp4(frames(), seconds=1.2))
-    decode = [
-        get_ffmpeg_exe(),
-        "-v",
-        "error",
-        "-i",
-        tmp_path / "film.mp4",
-        "-f",
-        "rawvideo",
-        "-pix_fmt",
-        "rgb24",
-        "-",
-    ]
-    raw = subprocess.run(decode, capture_output=True, check=True).stdout
+    words = ["-v", "error", "-i", "film.mp4", "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
+    raw = subprocess.run([get_ffmpeg_exe(), *words], cwd=tmp_path, capture_output=True, check=True).stdout
     shown = np.frombuffer(raw, np.uint8).reshape(6, 24, 34, 3)
     assert shown[3, 12, 20].astype(int).tolist() == pytest.approx([130] * 3, abs=6)
     assert shown[3, 12, 3].min() > 245

@@ -16,27 +16,23 @@ from derender import __version__
 from derender.cli import (
     bench,
     compare,
+    copies,
     decompose,
     demo,
+    distil,
     doctor,
+    edits,
     embed,
     evaluate,
     explain,
     finetune,
     importing,
-    mesh,
     pack,
-    refine,
-    relight,
     report,
-    rotate,
     search,
-    swap,
     synth,
     train,
-    unet,
     view,
-    whiten,
 )
 from derender.cli.console import damage_as_notices, visible
 
@@ -68,9 +64,10 @@ def _options(
 
 
 for one in (
-    demo.demo, doctor.doctor, train.train, whiten.whiten, refine.refine, unet.unet, pack.pack, embed.embed,
-    evaluate, explain.explain, finetune.finetune, importing.import_checkpoint, compare.compare,
-    report.report, decompose, relight, rotate, swap, mesh, search.search, view, synth, bench.bench,
+    demo.demo, doctor.doctor, train.train, copies.whiten, distil.refine, distil.unet, pack.pack,
+    embed.embed, evaluate, explain.explain, finetune.finetune, importing.import_checkpoint, compare.compare,
+    report.report, decompose.decompose, edits.relight, edits.rotate, edits.swap, decompose.mesh,
+    search.search, view.view, synth, bench.bench,
 ):  # fmt: skip
     one.register(app)
 

@@ -14,16 +14,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from rich import progress as bars
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    SpinnerColumn,
-    TaskProgressColumn,
-    TextColumn,
-    TimeRemainingColumn,
-)
 from rich.table import Table
 from rich.text import Text
 
@@ -104,11 +96,12 @@ def progress_bar(description: str, unit: str = "images") -> Iterator[Callable[..
         yield say
         return
     columns = (
-        SpinnerColumn(), TextColumn("{task.description}", markup=False), BarColumn(), TaskProgressColumn(),
-        MofNCompleteColumn(), TextColumn("{task.fields[unit]}", markup=False),
-        TimeRemainingColumn(compact=True), TextColumn("{task.fields[note]}", style="dim", markup=False),
+        bars.SpinnerColumn(), bars.TextColumn("{task.description}", markup=False), bars.BarColumn(),
+        bars.TaskProgressColumn(), bars.MofNCompleteColumn(),
+        bars.TextColumn("{task.fields[unit]}", markup=False), bars.TimeRemainingColumn(compact=True),
+        bars.TextColumn("{task.fields[note]}", style="dim", markup=False),
     )  # fmt: skip
-    with Progress(*columns, console=console) as progress:
+    with bars.Progress(*columns, console=console) as progress:
         task = progress.add_task(description, total=None, unit=unit, note="")
 
         def report(done: int, total: int, note: str = "", **fields: Any) -> None:
@@ -162,7 +155,7 @@ def plain(value: Any) -> Any:
 
 
 def refuse_existing_file(path: Path, force: bool) -> None:
-    """Refuse to write over an existing file unless told to."""
+    """Refuse a folder, and to write over an existing file unless told to."""
     if path.is_dir():
         raise IsADirectoryError(f"{path} is a folder: give --out the name of a file")
     refuse_existing(path, force)

@@ -1,30 +1,29 @@
-"""The common part of whiten, refine and unet: write a copy of a trained model, changed by means of images."""
+"""`derender whiten`, and the part it shares with refine and unet: a copy of a model, changed by images."""
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-import typer
+from typer import Option
 
-from derender.cli.console import progress_bar, report_images
-from derender.cli.options import Output, PartOfImages, TrainedModel
+from derender.cli.console import notice, progress_bar, report_images
+from derender.cli.gathered import command
+from derender.cli.options import OutModel, Output, PartOfImages, Seed, TrainedModel
 
-
-def changes(help: str) -> Any:
-    """The option ``--set`` with the names of its settings."""
-    return typer.Option("--set", metavar="KEY=VALUE", help=help)
+SETTINGS = (
+    "images, views, spatial, mirrored, directions, shrinkage, evenness, vectors, vector_power of whitening; "
+    "examples, coordinates, steps, prior, tolerance, weight of fitting; the size of perturbations, as "
+    "perturb.light_deg."
+)
+Changes = Annotated[list[str] | None, Option("--set", metavar="KEY=VALUE", help=SETTINGS)]
+MEAN_ONLY = "Keep the model's own directions; take only the mean of its features from these images."
+MeanOnly = Annotated[bool, Option("--mean-only", help=MEAN_ONLY)]
 
 
 def copied(
-    make: Callable[..., Any],
-    doing: str,
-    images: PartOfImages,
-    model: TrainedModel,
-    out: Path,
-    output: Output,
-    settings: list[str] | None,
-    **more: Any,
-) -> dict[str, Any]:
+    make: Callable[..., Any], doing: str, images: PartOfImages, model: TrainedModel, out: Path,
+    output: Output, settings: list[str] | None, **more: Any,
+) -> dict[str, Any]:  # fmt: skip
     """Make and report a copy by a call of `derender.learn`; gives its measurements by name."""
     output.refuse_existing(out)
     with progress_bar(doing) as report:
@@ -35,3 +34,23 @@ def copied(
     output.result(f"model {made.folder}")
     output.write(made.values())
     return made.scores
+
+
+@command("whiten", "whiten photos/ --model rendered-faces-64 --out mine")
+def whiten(
+    images: PartOfImages, model: TrainedModel, out: OutModel, output: Output, settings: Changes = None,
+    mean_only: MeanOnly = False, seed: Seed = 0,
+) -> None:  # fmt: skip
+    """Write a copy of a model whose features move as little as possible with other factors.
+
+    They are estimated on these images, without labels. Weights and scenes stay as they are. Training ends
+    with this by itself. With --set steps=60 features also hold scenes optimised for each image by rendering.
+    """
+    from derender import learn
+
+    how = {"mean_only": mean_only, "seed": seed}
+    scores = copied(learn.whiten, "re-rendering", images, model, out, output, settings, **how)
+    for name, ratios in scores["between_over_within"].items():
+        clear = sum(ratio > 1 for ratio in ratios)
+        differ = f"in {clear} images differ more than one does where other factors change"
+        notice(f"{name}: {len(ratios)} directions kept; {differ}")

@@ -1,34 +1,46 @@
-"""`derender decompose`: each image as its factors: panels, single images and numbers."""
+"""`derender decompose` and `mesh`: each image as its factors, and as a surface for other programs."""
 
 from functools import partial
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
-import typer
+from typer import Option
 
-from derender.cli.gathered import gathered
+from derender.cli.gathered import command
 from derender.cli.images import ImageFiles, opener_of
 from derender.cli.options import Output, TrainedModel
-from derender.report.opening import ImageOptions
+from derender.report.opening import MESH_SIZE, TEXTURE_SIZE, ImageOptions, OpenedImage
+
+if TYPE_CHECKING:
+    from derender.report.mesh import MeshFiles
+
+Sheet = Annotated[bool, Option("--sheet", help="Also draw all images below each other as sheet.png.")]
+Format = Annotated[str, Option("--format", help="glb, or obj with its .mtl and .png.", metavar="glb|obj")]
+Grazing = Annotated[float, Option(help="Angle in degrees beyond which the surface is cut off at its rim.")]
 
 
-def register(app: typer.Typer) -> None:
-    app.command(
-        "decompose", epilog="Example: derender decompose --model runs/faces me.jpg you.png --out apart/"
-    )(decompose)
-
-
-@gathered
+@command("decompose", "decompose --model runs/faces me.jpg you.png --out apart/")
 def decompose(
-    files: ImageFiles,
-    model: TrainedModel,
-    how: ImageOptions,
-    output: Output,
-    sheet: Annotated[
-        bool, typer.Option("--sheet", help="Also draw all images below each other as sheet.png.")
-    ] = False,
+    files: ImageFiles, model: TrainedModel, how: ImageOptions, output: Output, sheet: Sheet = False
 ) -> None:
     """Write a folder per image: panel.png, one PNG per factor, scene.json and scene.npz."""
     from derender.report.decomposition import decomposed
 
     opener = opener_of(model, how, default_detail="model")
     files.edit(opener, partial(decomposed, opener.model), output, sheet=sheet)
+
+
+@command("mesh", "mesh --model runs/faces me.jpg --format glb --out meshes/")
+def mesh(
+    files: ImageFiles, model: TrainedModel, how: ImageOptions, output: Output, form: Format = "glb",
+    grazing: Grazing = 85.0,
+) -> None:  # fmt: skip
+    """Write a folder per image with its surface as a mesh: its pixels as texture, x right, y up."""
+    from derender.report.mesh import MeshFiles, checked_format, image_mesh
+
+    checked_format(form)
+    opener = opener_of(model, how, MESH_SIZE if how.detail == "model" else TEXTURE_SIZE)
+
+    def edit(image: OpenedImage) -> "MeshFiles":
+        return MeshFiles(image_mesh(opener.model, image, grazing), form)
+
+    files.edit(opener, edit, output, sheet=False)

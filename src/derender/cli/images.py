@@ -51,12 +51,7 @@ class ImageFiles:
             raise typer.Exit(2)
 
 
-def opener_of(
-    model: TrainedModel, how: ImageOptions, default_size: int = 0, default_detail: str = "photo"
-) -> ImageOpener:
+def opener_of(model: TrainedModel, how: ImageOptions, default_size: int = 0, **more: str) -> ImageOpener:
     """What opens images: the loaded model with the options."""
-    loaded = model.open()
-    return ImageOpener(
-        loaded, how, default_size=default_size, default_detail=default_detail,
-        held_out=held_out_errors(model.model),
-    )  # fmt: skip
+    held_out = held_out_errors(model.model)
+    return ImageOpener(model.open(), how, default_size=default_size, held_out=held_out, **more)

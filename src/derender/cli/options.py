@@ -19,58 +19,30 @@ if TYPE_CHECKING:
 MODELS = (
     "Run folder, saved model, Hugging Face Hub id, or a bundled model: faces-64, rendered-faces-64, cars-64."
 )
-
+IMAGES = "Folder, zip, .tar shards or Hugging Face id; ADDRESS::PART for a part of it."
+DATASET = "Layout of the images, if it is not recognised."
+JSON = "Also write the numbers as JSON; - is standard output."
+LIMIT = "Read at most N images: evenly spaced, or the first of a stream."
+BATCH = "Images per batch; changes speed and memory only."
+PART = "all, or the train, validation or test part of the model's training split."
+SEED = "Seed of every random choice: sampling, splits, initial weights."
+FIT = "Optimise each scene against its image by rendering, in N steps (60, say; slow)."
+SETTING = "Change one setting; may be repeated."
 Model = Annotated[str, typer.Option("--model", "-m", help=MODELS, metavar="MODEL")]
-Images = Annotated[
-    str | None,
-    typer.Argument(
-        help="Folder, zip, .tar shards or Hugging Face id; ADDRESS::PART for a part of it.", metavar="IMAGES",
-        show_default=False,
-    ),
-]  # fmt: skip
+Images = Annotated[str | None, typer.Argument(help=IMAGES, metavar="IMAGES", show_default=False)]
 DataAlias = Annotated[str | None, typer.Option("--data", "-d", hidden=True, metavar="IMAGES")]
-Dataset = Annotated[
-    str, typer.Option("--dataset", help="Layout of the images, if it is not recognised.", metavar="NAME")
-]
-Json = Annotated[
-    str | None,
-    typer.Option("--json", help="Also write the numbers as JSON; - is standard output.", metavar="FILE"),
-]
-Limit = Annotated[
-    int | None,
-    typer.Option(
-        "--limit", min=1, metavar="N", help="Read at most N images: evenly spaced, or the first of a stream."
-    ),
-]
-BatchSize = Annotated[
-    int,
-    typer.Option("--batch-size", min=1, metavar="N", help="Images per batch; changes speed and memory only."),
-]
-Part = Annotated[
-    str,
-    typer.Option("--part", help="all, or the train, validation or test part of the model's training split."),
-]
-Seed = Annotated[
-    int,
-    typer.Option(
-        "--seed", min=0, metavar="N", help="Seed of every random choice: sampling, splits, initial weights."
-    ),
-]
+Dataset = Annotated[str, typer.Option("--dataset", help=DATASET, metavar="NAME")]
+Json = Annotated[str | None, typer.Option("--json", help=JSON, metavar="FILE")]
+Limit = Annotated[int | None, typer.Option("--limit", min=1, metavar="N", help=LIMIT)]
+BatchSize = Annotated[int, typer.Option("--batch-size", min=1, metavar="N", help=BATCH)]
+Part = Annotated[str, typer.Option("--part", help=PART)]
+Seed = Annotated[int, typer.Option("--seed", min=0, metavar="N", help=SEED)]
 Force = Annotated[bool, typer.Option("--force", help="Replace what is there.")]
 OutFolder = Annotated[Path, typer.Option("--out", "-o", help="Folder to write to.", metavar="DIR")]
 OutModel = Annotated[Path, typer.Option("--out", "-o", help="Folder of the new model.", metavar="DIR")]
 Device = Annotated[str, typer.Option("--device", help="cpu, cuda, or auto.", metavar="NAME")]
-FitSteps = Annotated[
-    int | None,
-    typer.Option(
-        "--fit-steps", min=0, max=10_000, metavar="N",
-        help="Optimise each scene against its image by rendering, in N steps (60, say; slow).",
-    ),
-]  # fmt: skip
-Settings = Annotated[
-    list[str] | None,
-    typer.Option("--set", help="Change one setting; may be repeated.", metavar="KEY=VALUE"),
-]
+FitSteps = Annotated[int | None, typer.Option("--fit-steps", min=0, max=10_000, metavar="N", help=FIT)]
+Settings = Annotated[list[str] | None, typer.Option("--set", help=SETTING, metavar="KEY=VALUE")]
 
 
 @dataclass(frozen=True)

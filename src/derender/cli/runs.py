@@ -13,9 +13,8 @@ if TYPE_CHECKING:
     from derender.data import ImageSet
     from derender.training import Progress, TrainResult
 
-OutRun = Annotated[
-    Path, typer.Option("--out", "-o", help="Run folder to make, or to go on with.", metavar="RUN")
-]
+OUT = "Run folder to make, or to go on with."
+OutRun = Annotated[Path, typer.Option("--out", "-o", help=OUT, metavar="RUN")]
 Resume = Annotated[bool, typer.Option("--resume", help="Go on with the run in --out.")]
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Show all settings and stop.")]
 PHASES = {

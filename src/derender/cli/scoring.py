@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
+from typer import Option
 
 from derender.cli import options
 from derender.cli.console import notice, refuse_existing_file, show_scores, write_json
@@ -26,26 +27,26 @@ Factors = Annotated[str, typer.Option(help="Features to use, with commas between
 Counts = Annotated[str, typer.Option(help="Numbers of labelled rows to learn from, with commas between.")]
 UntrainedSeeds = Annotated[int, number(help="Number of untrained encoders averaged.")]
 Resamples = Annotated[int, number(min=2, help="Number of bootstrap resamples of the rows.")]
-Groups = Annotated[
-    str | None, typer.Option(help="Label whose rows stay on one side of the split, as identity.")
-]
-Cache = Annotated[
-    str | None, typer.Option(metavar="DIR", help="Folder of cached results, or none; default: the user's.")
-]
-Masks = Annotated[
-    str | None,
-    typer.Option(metavar="PATH", help="Folder or zip of masks named as the images, if they lie apart."),
-]
+GROUPS = "Label whose rows stay on one side of the split, as identity."
+Groups = Annotated[str | None, typer.Option(help=GROUPS)]
+CACHE = "Folder of cached results, or none; default: the user's."
+Cache = Annotated[str | None, typer.Option(metavar="DIR", help=CACHE)]
+MASKS = "Folder or zip of masks named as the images, if they lie apart."
+Masks = Annotated[str | None, typer.Option(metavar="PATH", help=MASKS)]
+LABEL = "Label column; repeated: mean over yes/no labels."
+FEATURES = "Table made by derender embed."
+MODEL = f"Instead of --features, with IMAGES. {options.MODELS}"
+WHITEN_ON = (
+    "Also score the codes without whitening, and controls whitened by the model's renderings of these images "
+    "(best those of its training)."
+)
 
 
 @dataclass(frozen=True)
 class Labels:
     """The labels of a score, and the rows that carry them."""
 
-    label: Annotated[
-        list[str] | None,
-        typer.Option("--label", "-l", help="Label column; repeated: mean over yes/no labels."),
-    ] = None
+    label: Annotated[list[str] | None, typer.Option("--label", "-l", help=LABEL)] = None
     attributes: Annotated[bool, typer.Option("--attributes", help="Score by every yes/no label.")] = False
     min_count: Annotated[int, number(help="Leave out classes of fewer rows.")] = 1
     max_count: Annotated[int | None, number(help="Use at most N rows of a class.")] = None
@@ -55,23 +56,10 @@ class Labels:
 class ScoredSubject:
     """The features that are scored: one table or one model."""
 
-    features: Annotated[
-        str | None,
-        typer.Option("--features", "-f", metavar="FILE.parquet", help="Table made by derender embed."),
-    ] = None
-    model: Annotated[
-        str | None,
-        typer.Option("--model", "-m", help=f"Instead of --features, with IMAGES. {options.MODELS}"),
-    ] = None
+    features: Annotated[str | None, Option("--features", "-f", metavar="FILE.parquet", help=FEATURES)] = None
+    model: Annotated[str | None, Option("--model", "-m", help=MODEL)] = None
     factors: Factors = "geometry,albedo"
-    whiten_on: Annotated[
-        str | None,
-        typer.Option(
-            metavar="PATH",
-            help="Also score the codes without whitening, and controls whitened by the model's renderings of "
-            "these images (best those of its training).",
-        ),
-    ] = None
+    whiten_on: Annotated[str | None, Option(metavar="PATH", help=WHITEN_ON)] = None
 
     def source(self, images: str | None) -> "FeatureSource":
         """The table or the model."""

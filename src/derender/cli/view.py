@@ -8,7 +8,7 @@ import typer
 
 from derender.cli import options
 from derender.cli.console import notice, result, write_json
-from derender.cli.gathered import gathered
+from derender.cli.gathered import command
 from derender.report.opening import ImageOptions
 
 Named = Annotated[list[Path] | None, typer.Argument(help="Images to begin with.", metavar="[IMAGE]...")]
@@ -21,31 +21,18 @@ TableData = Annotated[
 Host = Annotated[str, typer.Option(help="Address to listen on; by default only this machine reaches it.")]
 Port = Annotated[int, typer.Option(help="Port to listen on; 0 takes any free one.", metavar="N")]
 Keep = Annotated[int, typer.Option(min=2, max=10_000, help="Number of opened images in memory.")]
-Frame = Annotated[
-    str | None,
-    typer.Option(help="Part of each image: as for derender relight.", metavar="face|auto|none"),
-]
+FRAME = "Part of each image: as for derender relight."
+Frame = Annotated[str | None, typer.Option(help=FRAME, metavar="face|auto|none")]
+Crop = Annotated[str | None, typer.Option("--crop", hidden=True)]
 
 
-def register(app: typer.Typer) -> None:
-    app.command("view", epilog="Example: derender view --model rendered-faces-64 --port 8000")(view)
-
-
-@gathered
+@command("view", "view --model rendered-faces-64 --port 8000")
 def view(
-    model: options.TrainedModel,
-    images: Named = None,
-    features: Features = None,
-    data: TableData = None,
-    dataset: options.Dataset = "auto",
-    host: Host = "127.0.0.1",
-    port: Port = 0,
-    keep: Keep = 64,
-    fit_steps: options.FitSteps = None,
-    frame: Frame = None,
-    crop: Annotated[str | None, typer.Option("--crop", hidden=True)] = None,
+    model: options.TrainedModel, images: Named = None, features: Features = None, data: TableData = None,
+    dataset: options.Dataset = "auto", host: Host = "127.0.0.1", port: Port = 0, keep: Keep = 64,
+    fit_steps: options.FitSteps = None, frame: Frame = None, crop: Crop = None,
     json_file: options.Json = None,
-) -> None:
+) -> None:  # fmt: skip
     """Serve a page: drop an image, see its factors, drag light and camera, orbit, swap, search, save.
 
     It listens on this machine only, stores no image on disk, and needs no network. Ctrl-C ends it.
@@ -75,9 +62,8 @@ def view(
             notes.append(f"warning: anyone who can reach {host} can use this page, and there is no password")
         for note in notes:
             notice(note)
-        url = address_of(listener, host)
+        url, port = address_of(listener, host), listener.getsockname()[1]
         result(f"open {url} (Ctrl-C ends)", json_file)
-        port = listener.getsockname()[1]
         write_json(json_file, {"url": url, "host": host, "port": port, "model": model.model})
         serve(Application(viewer, host), listener)
     except KeyboardInterrupt:  # where the shell has SIGINT ignored, the server ends without one

@@ -47,9 +47,9 @@ def demo_page(result: DemoResult) -> Page:
     images, tables = result.truth.images[rows], score_tables(result)
     filmed = images[: result.settings.films]
     names = [f"unseen face {row + 1}" for row in range(len(images))]
-    known = np.stack(
-        [one.picture for one in rendered_examples(BUNDLED, result.bundled.image_size)]
-    ).transpose(0, 3, 1, 2)
+    examples = rendered_examples(BUNDLED, result.bundled.image_size)
+    known = np.stack([one.picture for one in examples]).transpose(0, 3, 1, 2)
+    faces = [f"rendered face {number + 1}" for number in range(len(known))]
     models = {"this run": result.model, BUNDLED: result.bundled}
     same_size = result.model.image_size == result.bundled.image_size
     values = {
@@ -66,11 +66,9 @@ def demo_page(result: DemoResult) -> Page:
         "bundled": BUNDLED,
         "same_size": same_size,
         "bundled_films": looping_films(
-            result.bundled,
-            known[:BUNDLED_SHOWN],
-            [f"rendered face {number + 1}, by {BUNDLED}" for number in range(BUNDLED_SHOWN)],
+            result.bundled, known[:BUNDLED_SHOWN], [f"{name}, by {BUNDLED}" for name in faces[:BUNDLED_SHOWN]]
         ),
-        "known_names": [f"rendered face {number + 1}" for number in range(len(known[::2]))],
+        "known_names": faces[: len(known[::2])],
         "beside_known": _beside(models if same_size else {BUNDLED: result.bundled}, known[::2]),
         "beside": _beside(models, images[:BUNDLED_SHOWN]) if same_size else {},
         "geometry": _beside_truth(result, rows),

@@ -12,21 +12,10 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field
 
+from derender import evaluation
 from derender.baselines.controls import pca_features, pixel_features, untrained_features, untrained_twin
 from derender.data import GroundTruth, ImageSet
 from derender.data.synthetic import faces
-from derender.evaluation import (
-    ClusterComparison,
-    FactorResult,
-    GeometryResult,
-    ReconstructionResult,
-    clusterings,
-    compare_clusterings,
-    evaluate_factors,
-    evaluate_geometry,
-    evaluate_reconstruction,
-    mean_image,
-)
 from derender.features import embed_image_set
 from derender.model import Derenderer, load
 from derender.report.run import decomposition_sheet
@@ -80,17 +69,13 @@ QUICK = DemoSettings(
 
 @dataclass(frozen=True)
 class DemoResult:
-    """The content of the page.
+    """The content of the page; scores are of the unseen images.
 
     Attributes:
-        settings, seed, config: of the demo, and the training's resolved configuration.
-        trained: end of the training.
-        model: the trained model.
-        bundled: the bundled model.
-        bundled_geometry: its scores on the same images; None where they are not of its size.
+        config: the training's resolved configuration.
+        bundled_geometry: scores of the bundled model; None where the images are not of its size.
         seen: images of the training.
         truth: the unseen images with everything that made them.
-        geometry, factors, reconstruction: scores on the unseen images.
         clustering: Ward clustering by identity for each kind of feature, the model's own first.
         clusters: (N,) the cluster of each unseen image by the model's features.
         seconds: time of each stage.
@@ -102,13 +87,13 @@ class DemoResult:
     trained: TrainResult
     model: Derenderer
     bundled: Derenderer
-    bundled_geometry: GeometryResult | None
+    bundled_geometry: evaluation.GeometryResult | None
     seen: ImageSet
     truth: GroundTruth
-    geometry: GeometryResult
-    factors: FactorResult
-    reconstruction: ReconstructionResult
-    clustering: ClusterComparison
+    geometry: evaluation.GeometryResult
+    factors: evaluation.FactorResult
+    reconstruction: evaluation.ReconstructionResult
+    clustering: evaluation.ClusterComparison
     clusters: np.ndarray
     seconds: dict[str, float]
 
@@ -167,11 +152,13 @@ def run_demo(
         raise ValueError(f"training collapsed before a model was saved ({reason}): try another --seed")
     model, bundled = load(out / "run", device="cpu"), load(BUNDLED, device="cpu")
     report(STAGES[3], 0, 4, "geometry")
-    geometry = evaluate_geometry(model, truth, untrained=untrained_twin(model, seed))
-    factors = evaluate_factors(model, truth)
-    bundled_geometry = evaluate_geometry(bundled, truth) if size == bundled.image_size else None
+    geometry = evaluation.evaluate_geometry(model, truth, untrained=untrained_twin(model, seed))
+    factors = evaluation.evaluate_factors(model, truth)
+    bundled_geometry = evaluation.evaluate_geometry(bundled, truth) if size == bundled.image_size else None
     report(STAGES[3], 1, 4, "reconstruction")
-    reconstruction = evaluate_reconstruction(model, unseen.images, mean=mean_image(seen.images))
+    reconstruction = evaluation.evaluate_reconstruction(
+        model, unseen.images, mean=evaluation.mean_image(seen.images)
+    )
     report(STAGES[3], 2, 4, "features")
     components = min(64, len(seen) // 4)
     pca = pca_features(unseen, components=components, fit_on=seen, seed=seed)
@@ -184,9 +171,11 @@ def run_demo(
     own, *controls = features
     report(STAGES[3], 3, 4, "clusters")
     runs = {name: [values] for name, values in features.items()}
-    clustering = compare_clusterings(runs, {"identity": truth.labels["identity"]}, controls=controls)
+    clustering = evaluation.compare_clusterings(
+        runs, {"identity": truth.labels["identity"]}, controls=controls
+    )
     people = len(np.unique(truth.labels["identity"]))
-    clusters = clusterings(features[own], [people])[people]
+    clusters = evaluation.clusterings(features[own], [people])[people]
     report(STAGES[3], 4, 4, "")
     lap(STAGES[3])
     return DemoResult(

@@ -59,10 +59,6 @@ class ScoredQuestion:
     head: str = ""
     count: int = 0
 
-    def cost(self, name: str) -> list[Cell]:
-        """The cells of a row's cost."""
-        return _cost_cells(self.costs.get(name, {}))
-
     def absence(self, name: str) -> str | None:
         """``failed`` or ``missing``; None where nothing is known of the method."""
         return self.absent[name].partition(":")[0] if name in self.absent else None
@@ -139,7 +135,7 @@ def set_tables(one: ScoredQuestion, methods: Sequence[str]) -> list[ScoreTable]:
     """One data set's own table, with every score, interval and cost, and who is above the controls."""
     rows = list(one.rows.values())
     costs = {
-        column: lambda row, place=place: one.cost(row.name)[place]
+        column: lambda row, place=place: _cost_cells(one.costs.get(row.name, {}))[place]
         for place, column in enumerate(COST_COLUMNS.values())
     }
     table = scored_table(f"{one.name}: {one.about}", "features", rows, one.columns, more=costs)
@@ -147,7 +143,7 @@ def set_tables(one: ScoredQuestion, methods: Sequence[str]) -> list[ScoreTable]:
     blank = [None] * (len(table.columns) - 1 - len(COST_COLUMNS))
     for name in one.absent.keys() - found.keys():
         why = shorten(one.absent[name], LONGEST_REASON, placeholder=" ...")
-        found[name] = Row(name, (why, *blank, *one.cost(name)))
+        found[name] = Row(name, (why, *blank, *_cost_cells(one.costs.get(name, {}))))
     order = dict.fromkeys((*methods, *one.rows))
     verdict = verdict_table(rows, one.columns, f"{one.name}, above the strongest control? {one.about}")
     return [replace(table, rows=[found[name] for name in order if name in found]), verdict]
@@ -194,9 +190,7 @@ def _shown(scores: Sequence[ScoredQuestion]) -> list[ScoredQuestion]:
 def _whole_cost(scores: Sequence[ScoredQuestion], name: str) -> list[Cell]:
     """A method's cost over several data sets: trainings that several share count once."""
     costs = [one.costs[name] for one in scores if name in one.costs]
-    known = {
-        part: [value for cost in costs if (value := cost.get(part)) is not None] for part in COST_COLUMNS
-    }
+    known = {part: [cost[part] for cost in costs if cost.get(part) is not None] for part in COST_COLUMNS}
     whole = {part: values[0] for part, values in known.items() if values}
     trained = {(cost.get("images"), cost["seconds"]) for cost in costs if cost.get("seconds") is not None}
     if trained:

@@ -1,7 +1,4 @@
-"""One page for a comparison: its tables as they stand, a chart for each, what was compared, what failed.
-
-Leaves out computing anything (``derender.evaluation``).
-"""
+"""One page for a comparison: its tables as they stand, a chart for each, what was compared, what failed."""
 
 from collections.abc import Mapping, Sequence
 from math import isfinite
@@ -48,12 +45,8 @@ def comparison_page(
 def chart_of(table: ScoreTable) -> Chart | None:
     """Bars of the first column that is a score, controls in grey; None where there are fewer than two."""
     for place, column in enumerate(table.columns):
-        cells = {row.name: row.cells[place] for row in table.rows}
-        values = {
-            name: float(cell)
-            for name, cell in cells.items()
-            if isinstance(cell, float | int) and isfinite(cell)
-        }
+        cells = ((row.name, row.cells[place]) for row in table.rows)
+        values = {name: float(x) for name, x in cells if isinstance(x, float | int) and isfinite(x)}
         if column.best is not None and len(values) > 1:
             models = [row.name for row in table.rows if not row.control]
             svg = charts.bars(values, f"{column.name} ({DIRECTIONS[column.best]})", models)

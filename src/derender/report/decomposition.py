@@ -28,7 +28,7 @@ from derender.scene import Scene
 from derender.scene.light import lambert_shading
 from derender.scene.normals import normals_from_depth
 
-OTHER_LIGHT = {"ambient_share": 0.3, "yaw_rad": radians(40), "pitch_rad": radians(10)}
+OTHER_AMBIENT_SHARE, OTHER_LIGHT_YAW_RAD, OTHER_LIGHT_PITCH_RAD = 0.3, radians(40), radians(10)
 OTHER_VIEW_YAW_RAD = radians(35)
 COLUMN_MEANING = {
     "input": "the image as the model takes it",
@@ -101,11 +101,7 @@ def decomposition(
     """
     scene = scene.detach()
     with torch.no_grad():
-        own, relit, rotated = (
-            render(scene),
-            render(under_another_light(scene)),
-            render(from_another_view(scene)),
-        )
+        own, relit, rotated = map(render, (scene, under_another_light(scene), from_another_view(scene)))
         normal = normals_from_depth(scene.depth, fov_deg)
         shading = lambert_shading(normal, scene.light)
     columns = {
@@ -137,29 +133,21 @@ def decomposed(model: Derenderer, image: OpenedImage) -> Decomposition:
 
 def scene_numbers(scene: Scene, index: int = 0) -> dict[str, Any]:
     """Light and camera of one scene, angles in degrees."""
-    ambient, diffuse, light_pitch, light_yaw = scene.light[index].tolist()
+    ambient, diffuse, pitch, yaw = scene.light[index].tolist()
     *rotation, x, y, z = scene.camera[index].tolist()
+    strengths = {"ambient": ambient, "diffuse": diffuse}
     return {
-        "light": {
-            "ambient": ambient,
-            "diffuse": diffuse,
-            "pitch_deg": degrees(light_pitch),
-            "yaw_deg": degrees(light_yaw),
-        },
+        "light": {**strengths, "pitch_deg": degrees(pitch), "yaw_deg": degrees(yaw)},
         "camera": {"rotation_deg": [degrees(angle) for angle in rotation], "translation": [x, y, z]},
     }
 
 
 def under_another_light(scene: Scene) -> Scene:
     """The scenes under a light as strong as their own, most of it from the opposite side."""
-    light = scene.light
-    strength = light[:, 0] + light[:, 1]
-    other = torch.empty_like(light)
-    other[:, 0] = OTHER_LIGHT["ambient_share"] * strength
-    other[:, 1] = strength - other[:, 0]
-    other[:, 2] = OTHER_LIGHT["pitch_rad"]
-    other[:, 3] = OTHER_LIGHT["yaw_rad"] * torch.where(light[:, 3] > 0, -1.0, 1.0)
-    return scene.with_parameters(light=other)
+    strength = scene.light[:, 0] + scene.light[:, 1]
+    ambient, pitch = OTHER_AMBIENT_SHARE * strength, torch.full_like(strength, OTHER_LIGHT_PITCH_RAD)
+    yaw = OTHER_LIGHT_YAW_RAD * torch.where(scene.light[:, 3] > 0, -1.0, 1.0)
+    return scene.with_parameters(light=torch.stack((ambient, strength - ambient, pitch, yaw), dim=1))
 
 
 def from_another_view(scene: Scene) -> Scene:

@@ -52,15 +52,10 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Subject:
-    """A model and images to report on.
+    """A trained model and images of its size to report on.
 
-    Attributes:
-        model: trained.
-        images: all there are, at the model's size.
-        held_out: those of them the model was not trained on, or all where they are of another set.
-        which: a description of ``held_out``.
-        truth: rendered images with exact maps, if there are any.
-        labels: columns to explain by factors.
+    ``held_out`` are those it was not trained on, or all where they are of another set; ``which`` describes
+    them. ``truth`` are rendered images with exact maps, ``labels`` columns to explain by factors.
     """
 
     model: Derenderer
@@ -185,10 +180,8 @@ def looping_films(
     with torch.no_grad():
         scenes = model.decompose(as_float(images).to(model.device))
     loops = [relit_and_rotated(scenes[index], model.render) for index in range(len(names))]
-    return [
-        (animated_png(frames), frames[len(frames) // 4], name)
-        for frames, name in zip(loops, names, strict=True)
-    ]
+    shown = zip(loops, names, strict=True)
+    return [(animated_png(frames), frames[len(frames) // 4], name) for frames, name in shown]
 
 
 def _scores(subject: Subject) -> Values:

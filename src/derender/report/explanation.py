@@ -9,19 +9,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from PIL import Image
 
-from derender.interpretation import Explained, Explanation
+from derender.interpretation import Explained, Explanation, tables
 from derender.interpretation.attribution import UNCHANGED
-from derender.interpretation.tables import (
-    cluster_share_table,
-    drop_table,
-    pair_table,
-    sanity_table,
-    share_table,
-    share_verdicts,
-    unasked,
-    untrusted,
-)
 from derender.report.charts import INK, SERIES, side_by_side
+from derender.report.colours import pictures
 from derender.report.page import Page
 from derender.report.saliency import draw_maps, safe_name
 from derender.storage.atomic import atomic_folder
@@ -40,15 +31,9 @@ def write_explanation(
 ) -> Explained:
     """Write the folder of an explanation, whole or not at all: page, chart, sheets of maps, and probe.
 
-    Args:
-        explained: of `derender.explain`.
-        out: the folder.
-        sheets: labels to draw maps for, best distinguished first.
-        rows: images on a sheet.
-        progress: called with (labels done, labels in all).
-
-    Returns:
-        the explanation with ``checks``: how the maps answer to fresh weights.
+    ``sheets`` labels get maps, best distinguished first, with so many ``rows`` of images; ``progress`` is
+    called with (labels done, labels in all). Returns the explanation with ``checks``: how the maps answer to
+    fresh weights.
     """
     drawn, checks = draw_maps(explained, labels=sheets, rows=rows, progress=progress)
     explained = replace(explained, checks=checks)
@@ -74,28 +59,25 @@ def explanation_page(
     if shares.kind == "labels" and count > 1:
         asked = f"{count} yes/no labels"
     values: dict[str, Any] = {"shares": share_values(shares, chart), "sheets": sheets, "unchanged": UNCHANGED}
-    values["checks"] = sanity_table(checks) if checks else None
-    values |= {"untrusted": "; ".join(untrusted(checks)), "unasked": "; ".join(unasked(checks))}
-    values["clusters"] = None if explained.clusters is None else cluster_share_table(explained.clusters)
+    values["checks"] = tables.sanity_table(checks) if checks else None
+    values |= {"untrusted": "; ".join(tables.untrusted(checks)), "unasked": "; ".join(tables.unasked(checks))}
+    values["clusters"] = (
+        None if explained.clusters is None else tables.cluster_share_table(explained.clusters)
+    )
     values["pair"] = None
     if explained.pair is not None:
         names, parts = explained.pair
-        shown = [images.images[images.files.index(name)].transpose(1, 2, 0) for name in names]
-        faces = [
-            (Image.fromarray(one), f"the image {name}", name) for name, one in zip(names, shown, strict=True)
-        ]
-        values["pair"] = {"images": faces, "table": pair_table(parts, names)}
+        shown = pictures(np.stack([images.images[images.files.index(name)] for name in names]))
+        faces = [(one, f"the image {name}", name) for name, one in zip(names, shown, strict=True)]
+        values["pair"] = {"images": faces, "table": tables.pair_table(parts, names)}
     lead = f"{explained.model.source or 'a model'} on {images.source}: {asked}."
     return Page("explanation.html", "Which factor made the answer", lead, values)
 
 
 def share_values(found: Explanation, chart: str) -> dict[str, Any]:
     """What ``templates/shares.html`` shows: verdicts, the chart of the shares (SVG text) and their tables."""
-    return {
-        "verdicts": share_verdicts(found),
-        "chart": chart,
-        "tables": [share_table(found), drop_table(found)],
-    }
+    shown = [tables.share_table(found), tables.drop_table(found)]
+    return {"verdicts": tables.share_verdicts(found), "chart": chart, "tables": shown}
 
 
 def share_chart(found: Explanation) -> tuple[str, bytes]:

@@ -67,9 +67,8 @@ def run_page(folder: str | Path, evidence: Evidence | None = None) -> Page:
         "watcher": [
             str(text)
             for row in metrics
-            if row.get("kind") == "collapse"
             for sign, text in row.items()
-            if sign not in ("kind", "images", "seconds")
+            if row.get("kind") == "collapse" and sign not in ("kind", "images", "seconds")
         ],
         "charts": loss_charts(metrics, CHARTS if isinstance(config, TrainConfig) else BASELINE_CHARTS),
         "samples": _samples(run),

@@ -19,16 +19,7 @@ from torch import Tensor
 from derender.baselines.controls import untrained_twin
 from derender.features.extract import as_batch
 from derender.interpretation import Explained, Probe
-from derender.interpretation.attribution import (
-    METHODS,
-    Similarity,
-    factor_shares,
-    integrated_gradients,
-    saliency,
-    sanity_check,
-    to_one,
-    upsampled,
-)
+from derender.interpretation import attribution as attributed
 from derender.report.colours import Images, pictures
 from derender.report.panel import GridLayout, contact_sheet, labelled_grid
 
@@ -48,9 +39,9 @@ def overlays(images: Pixels, maps: Float[Tensor, "n y x"]) -> Images:
     if maps.shape[-1] == size:
         side = max(1, round(BLURRED_PX * size / SHOWN_PX)) // 2 * 2 + 1
         how = {"stride": 1, "padding": side // 2, "count_include_pad": False}
-        heat = to_one(torch.nn.functional.avg_pool2d(maps[:, None], side, **how)[:, 0])
+        heat = attributed.to_one(torch.nn.functional.avg_pool2d(maps[:, None], side, **how)[:, 0])
     else:
-        heat = to_one(upsampled(maps, size))
+        heat = attributed.to_one(attributed.upsampled(maps, size))
     heat, grey = heat.cpu().numpy()[..., None], images.mean(dim=1).cpu().numpy()[..., None]
     blended = grey * (1 - STRENGTH * heat) + colormaps["inferno"](heat[..., 0])[..., :3] * STRENGTH * heat
     return pictures(np.moveaxis(blended, -1, 1))
@@ -62,13 +53,11 @@ def saliency_sheet(
     """One row for each image: the input and its answer, then each factor's map and share of |IG|."""
     with torch.no_grad():
         features = {name: code.float().cpu().numpy() for name, code in model.embed(images).items()}
-    attribution, _ = integrated_gradients(probe, probe.columns(features), target)
-    shares, answers = factor_shares(attribution, probe), probe.probabilities(features)[:, target]
+    attribution, _ = attributed.integrated_gradients(probe, probe.columns(features), target)
+    shares, answers = attributed.factor_shares(attribution, probe), probe.probabilities(features)[:, target]
     targets = [target] * len(images)
-    columns = [pictures(images)]
-    columns += [
-        overlays(images, saliency(method, model, images, name, probe, targets)) for name in probe.factors
-    ]
+    maps = (attributed.saliency(method, model, images, name, probe, targets) for name in probe.factors)
+    columns = [pictures(images), *(overlays(images, drawn) for drawn in maps)]
     captions = []
     for answer, row in zip(answers, shares, strict=True):
         captions.append(f"input, p = {answer:.2f}")
@@ -83,21 +72,17 @@ def draw_maps(
     labels: int = 3,
     rows: int = 6,
     progress: Callable[[int, int], object] | None = None,
-) -> tuple[dict[str, dict[str, Image.Image]], list[Similarity]]:
-    """Sheets for the labels with the highest AUC, and the sanity check of the maps on the first of them.
+) -> tuple[dict[str, dict[str, Image.Image]], list[attributed.Similarity]]:
+    """Sheets for so many labels with the highest AUC, and the sanity check of the maps on the first of them.
 
-    Args:
-        explained: shares, probes, model and images.
-        labels: how many labels.
-        rows: held-out images with the label on a sheet.
-        progress: called with (labels done, labels in all).
+    A sheet has ``rows`` held-out images with the label; ``progress`` is called with (labels done, in all).
     """
     model, shares, targets = explained.model, explained.shares, explained.task.targets
     probe, test, seeds = shares.probe, explained.split.test, range(len(shares.rows[0].shares))
     auc = np.nan_to_num(shares.rows[0].auc.mean(axis=0), nan=-1)
     best = [int(at) for at in np.argsort(-auc, kind="stable") if (targets[test, at] == 1).sum() >= 2][:labels]
     sheets: dict[str, dict[str, Image.Image]] = {}
-    checks: list[Similarity] = []
+    checks: list[attributed.Similarity] = []
     for place, target in enumerate(best):
         carriers = test[targets[test, target] == 1]
         chosen = np.random.default_rng(0).permutation(carriers)[:rows]
@@ -105,11 +90,11 @@ def draw_maps(
         name = shares.names[target]
         made = sheets[name] = {
             method: saliency_sheet(model, probe, batch, target, method, f"{name}: {method}")
-            for method in METHODS
+            for method in attributed.METHODS
         }
         if not checks:
             asked = np.full(len(batch), target)
-            checks = sanity_check(model, probe, shares.shuffled, batch, asked, seeds=seeds)
+            checks = attributed.sanity_check(model, probe, shares.shuffled, batch, asked, seeds=seeds)
             fresh, title = untrained_twin(model, 0), f"{name}: grad-cam with fresh weights"
             made["fresh weights"] = saliency_sheet(fresh, probe, batch, target, "grad-cam", title)
             made["feature"] = feature_sheet(model, batch, shares.factors)
@@ -121,7 +106,9 @@ def draw_maps(
 def feature_sheet(model: Any, images: Pixels, factors: Sequence[str]) -> Image.Image:
     """Where each factor's feature comes from, without a question."""
     columns = {"input": pictures(images)}
-    columns |= {name: overlays(images, saliency("grad-cam", model, images, name)) for name in factors}
+    columns |= {
+        name: overlays(images, attributed.saliency("grad-cam", model, images, name)) for name in factors
+    }
     return labelled_grid(columns, title="the feature itself", layout=LAYOUT)
 
 

@@ -52,14 +52,9 @@ def segmentation_sheet(
     classes: Sequence[str],
     layout: GridLayout | None = None,
 ) -> Image.Image:
-    """A row for each image: itself, its mask, every answer; the legend of the classes below.
+    """A row for each image (N, 3, S, S) uint8: itself, its true mask (N, S, S), every answer by name.
 
-    Args:
-        pictures: (N, 3, S, S) uint8.
-        masks: (N, S, S) true class numbers.
-        answers: by column name, (N, S, S).
-        classes: the name of every class number.
-        layout: sizes in pixels.
+    The legend of the classes, named by number, is below.
     """
     layout = layout or GridLayout()
     scale = ceil(layout.cell / masks.shape[-1])  # pixels stay squares when the grid shrinks them

@@ -7,10 +7,10 @@ import sys
 import time
 from pathlib import Path
 
-import numpy as np
 import pytest
 from filelock import FileLock
 from PIL import Image
+from tests.cli.conftest import coloured_people
 
 from derender.cli import main
 from derender.cli.plan.jobs import Comparison, jobs_of, run_progress
@@ -53,12 +53,8 @@ main(sys.argv[1:])
 @pytest.fixture(scope="module")
 def plan(tmp_path_factory) -> Path:
     """Forty images of four made-up people, distinguished by their colour, and a plan that scores them."""
-    folder, rng = tmp_path_factory.mktemp("plan"), np.random.default_rng(0)
-    for row in range(40):
-        colour = np.array([[200, 40, 40], [40, 200, 40], [40, 40, 200], [200, 200, 40]])[row % 4]
-        pixels = np.clip(colour + rng.integers(-30, 30, (32, 32, 3)), 0, 255).astype(np.uint8)
-        (folder / "people" / "abcd"[row % 4]).mkdir(parents=True, exist_ok=True)
-        Image.fromarray(pixels).save(folder / "people" / "abcd"[row % 4] / f"{row:03d}.png")
+    folder = tmp_path_factory.mktemp("plan")
+    coloured_people(folder / "people", 40, 32)
     (folder / "plan.yaml").write_text(PLAN.replace("PEOPLE", str(folder / "people")))
     return folder / "plan.yaml"
 

@@ -1,16 +1,14 @@
 """`derender evaluate`: one protocol a command, each beside its controls.
 
-One file per protocol: a function of its name, which takes a place in ``EXAMPLES``.
+A protocol is a function of its name, which takes a place in ``EXAMPLES``.
 """
 
 import typer
 
-from derender.cli.evaluate.cluster import cluster
 from derender.cli.evaluate.disentangle import disentangle
-from derender.cli.evaluate.geometry import geometry
-from derender.cli.evaluate.linear import linear
-from derender.cli.evaluate.reconstruction import reconstruction
+from derender.cli.evaluate.features import cluster, linear
 from derender.cli.evaluate.robustness import robustness
+from derender.cli.evaluate.scenes import geometry, reconstruction
 from derender.cli.evaluate.segment import segment
 from derender.cli.gathered import command
 

@@ -17,23 +17,19 @@ class CardImages(options.PartOfImages):
     limit: options.Limit = 2000
 
 
+PNG = "PNG file for all matrices."
+Out = Annotated[Path | None, typer.Option("--out", "-o", metavar="FILE.png", help=PNG)]
+Seeds = Annotated[int, scoring.number(max=20, help="Number of seeds.")]
+Swapped = Annotated[int, scoring.number(min=2, help="Most images in the swap test.")]
+DIMENSIONS = "Scores by dimension: lasso, trees (takes minutes), or none."
+Dimensions = Annotated[Literal["lasso", "trees", "none"], typer.Option(help=DIMENSIONS)]
+
+
 def disentangle(
-    images: CardImages,
-    trained: options.TrainedModel,
-    published: scoring.Published,
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", metavar="FILE.png", help="PNG file for all matrices.")
-    ] = None,
-    seeds: Annotated[int, scoring.number(max=20, help="Number of seeds.")] = 3,
-    swap_pictures: Annotated[int, scoring.number(min=2, help="Most images in the swap test.")] = 256,
-    dimensions: Annotated[
-        Literal["lasso", "trees", "none"],
-        typer.Option(help="Scores by dimension: lasso, trees (takes minutes), or none."),
-    ] = "lasso",
-    batch_size: options.BatchSize = 64,
-    seed: options.Seed = 0,
-    cache: scoring.Cache = None,
-) -> None:
+    images: CardImages, trained: options.TrainedModel, published: scoring.Published, out: Out = None,
+    seeds: Seeds = 3, swap_pictures: Swapped = 256, dimensions: Dimensions = "lasso",
+    batch_size: options.BatchSize = 64, seed: options.Seed = 0, cache: scoring.Cache = None,
+) -> None:  # fmt: skip
     """Does each feature hold its own factor? Correlation, CKA, swap test; on rendered data DCI, MIG, SAP."""
     published.check(out, [".png"])
     from derender import evaluation

@@ -9,18 +9,21 @@ import typer
 from derender.cli import options, scoring
 from derender.cli.console import progress_bar, result
 
+PICTURES = "faces or cars: generated. render: IMAGES, re-rendered. truth: IMAGES of known angles."
+MODEL = "A model; the first renders."
+Model = Annotated[list[str], typer.Option("--model", "-m", metavar="[NAME=]MODEL", help=MODEL)]
+Axes = Annotated[str, typer.Option(help="yaw, pitch, light, light-pitch; with commas.")]
+Angles = Annotated[str, typer.Option(help="Growing degrees off the front.")]
+Score = Annotated[Literal["accuracy", "balanced"], typer.Option(help="The score shown; --json has both.")]
+OUT = "Also draw the curves: .svg, .png, .html."
+Out = Annotated[Path | None, typer.Option("--out", "-o", metavar="FILE", help=OUT)]
+
 
 @dataclass(frozen=True)
 class TrialOptions:
     """The images of a trial; named as in `derender.evaluation.robustness`."""
 
-    pictures: Annotated[
-        str | None,
-        typer.Option(
-            metavar="faces|cars|render|truth",
-            help="faces or cars: generated. render: IMAGES, re-rendered. truth: IMAGES of known angles.",
-        ),
-    ] = None
+    pictures: Annotated[str | None, typer.Option(metavar="faces|cars|render|truth", help=PICTURES)] = None
     groups: scoring.Groups = None
     test_fraction: Annotated[float, scoring.share(help="Tested share of re-rendered IMAGES.")] = 0.3
     people: Annotated[int, scoring.number(min=2, help="Number of generated people (or cars).")] = 40
@@ -32,26 +35,10 @@ class TrialOptions:
 
 
 def robustness(
-    images: options.DataOptions,
-    trial: TrialOptions,
-    labels: scoring.Labels,
-    computed: scoring.Computed,
-    published: scoring.Published,
-    model: Annotated[
-        list[str],
-        typer.Option("--model", "-m", metavar="[NAME=]MODEL", help="A model; the first renders."),
-    ],
-    factors: scoring.Factors = "geometry,albedo",
-    axes: Annotated[str, typer.Option(help="yaw, pitch, light, light-pitch; with commas.")] = "yaw,light",
-    angles: Annotated[str, typer.Option(help="Growing degrees off the front.")] = "0,15,30,45,60,75",
-    score: Annotated[
-        Literal["accuracy", "balanced"], typer.Option(help="The score shown; --json has both.")
-    ] = "accuracy",
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", "-o", metavar="FILE", help="Also draw the curves: .svg, .png, .html."),
-    ] = None,
-) -> None:
+    images: options.DataOptions, trial: TrialOptions, labels: scoring.Labels, computed: scoring.Computed,
+    published: scoring.Published, model: Model, factors: scoring.Factors = "geometry,albedo",
+    axes: Axes = "yaw,light", angles: Angles = "0,15,30,45,60,75", score: Score = "accuracy", out: Out = None,
+) -> None:  # fmt: skip
     """Does a probe learned in ordinary light and view hold in others? Curves over angles, area 1 is best.
 
     Images are generated, so that light and view are known; or IMAGES are re-rendered by the first model; or

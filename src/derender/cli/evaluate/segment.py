@@ -8,29 +8,24 @@ import typer
 from derender.cli import options, scoring
 from derender.cli.console import progress_bar, result
 
+VARIANTS = "Networks to train, the subject first, with commas; default: all."
+Variants = Annotated[str, typer.Option(help=VARIANTS)]
+Epochs = Annotated[int, scoring.number(help="Epochs of every network.")]
+Seeds = Annotated[int, scoring.number(help="Runs of every network.")]
+BATCH = "Images a step; default: 64, fewer of few images."
+BatchSize = Annotated[int | None, scoring.number(min=2, help=BATCH)]
+Tested = Annotated[float, scoring.share(help="Tested share of data without a partition.")]
+Labelled = Annotated[int | None, scoring.number(min=2, help="Number of training images.")]
+OUT = "Folder for runs (to continue) and overlays."
+Out = Annotated[Path | None, typer.Option("--out", "-o", metavar="DIR", help=OUT)]
+
 
 def segment(
-    images: options.DataOptions,
-    trained: options.TrainedModel,
-    published: scoring.Published,
-    masks: scoring.Masks = None,
-    variants: Annotated[
-        str, typer.Option(help="Networks to train, the subject first, with commas; default: all.")
-    ] = "all",
-    epochs: Annotated[int, scoring.number(help="Epochs of every network.")] = 20,
-    seeds: Annotated[int, scoring.number(help="Runs of every network.")] = 3,
-    batch_size: Annotated[
-        int | None, scoring.number(min=2, help="Images a step; default: 64, fewer of few images.")
-    ] = None,
-    test_fraction: Annotated[float, scoring.share(help="Tested share of data without a partition.")] = 0.2,
-    labelled: Annotated[int | None, scoring.number(min=2, help="Number of training images.")] = None,
-    resamples: scoring.Resamples = 1_000,
-    seed: options.Seed = 0,
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", "-o", metavar="DIR", help="Folder for runs (to continue) and overlays."),
-    ] = None,
-) -> None:
+    images: options.DataOptions, trained: options.TrainedModel, published: scoring.Published,
+    masks: scoring.Masks = None, variants: Variants = "all", epochs: Epochs = 20, seeds: Seeds = 3,
+    batch_size: BatchSize = None, test_fraction: Tested = 0.2, labelled: Labelled = None,
+    resamples: scoring.Resamples = 1_000, seed: options.Seed = 0, out: Out = None,
+) -> None:  # fmt: skip
     """Do pre-trained U-Net encoders help segmentation? mIoU, mIoU of the ten best classes, pixel accuracy.
 
     The model must have U-Net encoders: derender unet makes a copy that has. Runs are cached in --out (without

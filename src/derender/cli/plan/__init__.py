@@ -13,6 +13,11 @@ import typer
 
 from derender.cli.console import notice, result, show_scores, write_json
 
+PLAN = "YAML or TOML file of methods and data sets to compare."
+OUT = "Folder of --plan for runs, tables and charts; resumed."
+WORKERS = "Number of jobs of --plan at a time."
+MINUTES = "Minutes after which --plan scores what is finished."
+
 
 def _option(*names: str, **how: Any) -> Any:
     return typer.Option(*names, rich_help_panel="Many methods on many data sets", **how)
@@ -22,21 +27,10 @@ def _option(*names: str, **how: Any) -> Any:
 class Planned:
     """The options of a comparison by plan."""
 
-    plan: Annotated[
-        Path | None,
-        _option("--plan", metavar="FILE", help="YAML or TOML file of methods and data sets to compare."),
-    ] = None
-    out: Annotated[
-        Path | None,
-        _option("--out", "-o", metavar="DIR", help="Folder of --plan for runs, tables and charts; resumed."),
-    ] = None
-    workers: Annotated[
-        int, _option("--workers", min=1, metavar="N", help="Number of jobs of --plan at a time.")
-    ] = 1
-    minutes: Annotated[
-        float | None,
-        _option("--minutes", min=0, metavar="M", help="Minutes after which --plan scores what is finished."),
-    ] = None
+    plan: Annotated[Path | None, _option("--plan", metavar="FILE", help=PLAN)] = None
+    out: Annotated[Path | None, _option("--out", "-o", metavar="DIR", help=OUT)] = None
+    workers: Annotated[int, _option("--workers", min=1, metavar="N", help=WORKERS)] = 1
+    minutes: Annotated[float | None, _option("--minutes", min=0, metavar="M", help=MINUTES)] = None
     dry_run: Annotated[bool, _option("--dry-run", help="List the jobs of --plan, and stop.")] = False
 
 

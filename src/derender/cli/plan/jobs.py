@@ -50,14 +50,9 @@ class Collapsed(ValueError):
 
 @dataclass(frozen=True)
 class Job:
-    """One training, feature table or set of scores.
+    """One training, feature table or set of scores (of all methods) on a training set or a scored set.
 
-    Attributes:
-        kind: which of them.
-        method: whose; empty for scores, which are those of all methods.
-        where: the training set of a training, else the scored set.
-        seed: of the training.
-        after: jobs that must have ended, well or not.
+    Jobs in ``after`` must have ended before, well or not.
     """
 
     kind: Literal["train", "embed", "score"]
@@ -227,12 +222,11 @@ def embed(at: Comparison, job: Job, progress: Callable[..., None]) -> Facts:
     """Write the feature table of a scored set by one method."""
     plan, method, kind = at.plan, at.plan.methods[job.method], at.plan.kind(job.method)
     source = str(at.result(job.after[0])) if job.after else plan.methods[plan.source(job.method)].model
-    net, size = None, plan.image_size
+    net, size, chosen = None, plan.image_size, method.features or None
     if kind == OURS:
         net = as_model(str(source), device=at.device)
         net = net if method.whitened else net.without_features()
     elif kind not in CONTROLS:
-        chosen = method.features or None
         net = open_baseline(kind, source, device=at.device, features=chosen, image_size=size)
     images = _scored_images(at, job, size if net is None else net.image_size, source if job.after else None)
 
@@ -294,11 +288,8 @@ def score(at: Comparison, job: Job, progress: Callable[..., None]) -> Facts:
             numbers = {key: value for key, value in result.numbers().items() if key != "per_label"}
             found.append(plain({"name": name, "protocol": protocol, **numbers}))
     widths = {row.name: int(row.tables[0].concatenate(row.factors).shape[1]) for row in rows}
-    return {
-        "questions": found,
-        "numbers": widths,
-        "untrained": parameter_count(Derenderer.seeded(settings, 0)),
-    }
+    untrained = parameter_count(Derenderer.seeded(settings, 0))
+    return {"questions": found, "numbers": widths, "untrained": untrained}
 
 
 def _scored_images(at: Comparison, job: Job, image_size: int, run: str | None = None) -> ImageSet:

@@ -104,7 +104,7 @@ def _apart(at: Comparison, job: Job) -> Note:
 
 
 def died(at: Comparison, job: Job, code: int) -> Note:
-    """The note of a process that ended without one."""
+    """Leave the note of a process that ended without one."""
     if at.over and job.kind != "score":
         return at.stopped(job)
     how = f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"

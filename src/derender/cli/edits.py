@@ -1,0 +1,70 @@
+"""`derender relight`, `rotate`, `swap`: images in other light, from other sides, with factors of another."""
+
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+from typer import Option
+
+from derender.cli.gathered import command
+from derender.cli.images import ImageFiles, opener_of
+from derender.cli.options import Output, TrainedModel
+from derender.report.opening import EDIT_SIZE, FilmOptions, ImageOptions
+
+Like = Annotated[Path | None, Option(help="Go to the lighting of this image.", metavar="IMAGE")]
+LightReach = Annotated[float, Option("--reach", help="Reach of the light to either side, in degrees.")]
+Height = Annotated[float, Option("--pitch", help="Height of the light, in degrees.")]
+Strength = Annotated[float, Option(min=0, max=10, help="Strength in multiples of the image's own.")]
+ViewReach = Annotated[float, Option("--reach", help="Rotation of the object to either side, in degrees.")]
+Nod = Annotated[float, Option("--pitch", help="Nod in degrees: the top comes forward.")]
+Source = Annotated[Path, Option("--from", help="Image to take from.", metavar="IMAGE")]
+FACTOR = "Factor to take; may be repeated. By default each in turn."
+Factors = Annotated[list[str] | None, Option("--factor", help=FACTOR, metavar="NAME")]
+
+
+@command("relight", "relight --model runs/faces me.jpg --like sunset.jpg --out relit/")
+def relight(
+    files: ImageFiles, model: TrainedModel, how: ImageOptions, output: Output, film: FilmOptions,
+    like: Like = None, reach: LightReach = 60.0, pitch: Height = 10.0, strength: Strength = 1.0,
+) -> None:  # fmt: skip
+    """Write strips and films of images under other lighting: from right to left, or to that of --like.
+
+    A light is relative to the object, not to the camera: it falls on the same side of every face. Going
+    round, it is as strong as the image's own, a third of it ambient.
+    """
+    from derender.report.edits import relit
+
+    opener = opener_of(model, how, EDIT_SIZE)
+    others = [] if like is None else [opener.open(like)]
+    edit = partial(
+        relit, opener.model, reach_deg=reach, pitch_deg=pitch, strength=strength,
+        like=others[0] if others else None, film=film,
+    )  # fmt: skip
+    files.edit(opener, edit, output, beside=others)
+
+
+@command("rotate", "rotate --model runs/faces me.jpg --reach 45 --out rotated/")
+def rotate(
+    files: ImageFiles, model: TrainedModel, how: ImageOptions, output: Output, film: FilmOptions,
+    reach: ViewReach = 40.0, pitch: Nod = 0.0,
+) -> None:  # fmt: skip
+    """Write strips and films of images rotated from one side to the other, in their own lighting."""
+    from derender.report.edits import rotated
+
+    opener = opener_of(model, how, EDIT_SIZE)
+    files.edit(opener, partial(rotated, opener.model, reach_deg=reach, pitch_deg=pitch, film=film), output)
+
+
+@command("swap", "swap --model runs/faces me.jpg --from you.jpg --factor albedo --out mixed/")
+def swap(
+    files: ImageFiles, model: TrainedModel, how: ImageOptions, output: Output, source: Source,
+    factor: Factors = None,
+) -> None:  # fmt: skip
+    """Write images with one factor of another: its geometry, albedo, light or camera, each by itself."""
+    from derender.report.edits import swappable, swapped_factors
+
+    opener = opener_of(model, how, EDIT_SIZE)
+    factors = list(swappable(opener.model, factor or ()))
+    donor = opener.open(source)
+    edit = partial(swapped_factors, opener.model, donor=donor, factors=factors)
+    files.edit(opener, edit, output, beside=[donor])
