@@ -22,36 +22,22 @@ from derender.data.stream import Sample, Stream, Value
 
 T = TypeVar("T")
 
-Progress = Callable[[int, int], object]
-"""Called with (images done, images in all), from the calling thread."""
-
-CHUNK = 32
-"""Images that one thread decodes before it hands them on."""
-
+Progress = Callable[[int, int], object]  # called with (images done, images in all), from the calling thread
+CHUNK = 32  # images that one thread decodes before it hands them on
 DIGEST_BYTES = 16
 
 
 @dataclass(frozen=True)
 class Decoded:
-    """A few consecutive samples.
+    """A few consecutive samples."""
 
-    Attributes:
-        start: the number of the first one in the stream.
-        files: their names.
-        images: (n, 3, S, S) RGB; rows of unreadable images are waste.
-        outcomes: the digest of the pixels, or why there are none.
-        labels: of each sample.
-        partitions: of each sample.
-        share: how much of the stream has been read, 0..1; None where that is unknown.
-    """
-
-    start: int
-    files: tuple[str, ...]
-    images: UInt8[np.ndarray, "n 3 s s"]
-    outcomes: tuple[bytes | Unreadable, ...]
-    labels: tuple[Mapping[str, Value], ...]
-    partitions: tuple[str, ...]
-    share: float | None
+    start: int  # the number of the first one in the stream
+    files: tuple[str, ...]  # their names
+    images: UInt8[np.ndarray, "n 3 s s"]  # (n, 3, S, S) RGB; rows of unreadable images are waste
+    outcomes: tuple[bytes | Unreadable, ...]  # the digest of the pixels, or why there are none
+    labels: tuple[Mapping[str, Value], ...]  # of each sample
+    partitions: tuple[str, ...]  # of each sample
+    share: float | None  # how much of the stream has been read, 0..1; None where that is unknown
 
     def __len__(self) -> int:
         return len(self.files)

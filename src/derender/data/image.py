@@ -30,9 +30,7 @@ from derender.data.source import Source, read_bounded, suggestion
 READER_VERSION = 1
 """Goes up whenever the same file would decode to other pixels, so that cached images are made again."""
 
-FITS = ("crop", "pad", "stretch")
-"""What becomes of an image that is not square."""
-
+FITS = ("crop", "pad", "stretch")  # what becomes of an image that is not square
 PIXEL_LIMIT = 170_000_000
 """Images with more pixels are refused before a pixel is decoded (Pillow itself refuses at 179 million)."""
 

@@ -24,29 +24,19 @@ from derender.data.cache import cache_folder
 from derender.data.source import Skipped, Source, printable
 from derender.storage.atomic import atomic_file
 
-REMEMBERED_FROM = 50_000
-"""Folders and zips with this many files or more are remembered."""
-
+REMEMBERED_FROM = 50_000  # folders and zips with this many files or more are remembered
 _DIGEST_BYTES = 32
 
 
 @dataclass(frozen=True)
 class Listing:
-    """Files, and what is known of them.
+    """Files, and what is known of them."""
 
-    Attributes:
-        files: their names as the system or archive has them, sorted by their shown form.
-        numbers: a row of whole numbers for each file.
-        faults: names of what is no usable file, and why.
-        proof: what must still be so for the listing to hold.
-        layout: the layout that was recognised, "" for none.
-    """
-
-    files: tuple[str, ...]
-    numbers: Int64[np.ndarray, "n k"]
-    faults: Sequence[Sequence[str]]
-    proof: Mapping[str, Any]
-    layout: str = ""
+    files: tuple[str, ...]  # their names as the system or archive has them, sorted by their shown form
+    numbers: Int64[np.ndarray, "n k"]  # a row of whole numbers for each file
+    faults: Sequence[Sequence[str]]  # names of what is no usable file, and why
+    proof: Mapping[str, Any]  # what must still be so for the listing to hold
+    layout: str = ""  # the layout that was recognised, "" for none
 
     def write(self, file: Path) -> None:
         """Write the listing to a file; one that cannot be written is only slower next time."""
@@ -87,10 +77,9 @@ class ListedSource(Source):
 
     Attributes:
         listing: the files, a row of numbers each.
-        stamped: the two columns of these numbers that change with a file's content.
     """
 
-    stamped: tuple[int, int] = (0, 1)
+    stamped: tuple[int, int] = (0, 1)  # the two columns of these numbers that change with a file's content
 
     def __init__(self, path: Path):
         self.path = path

@@ -37,16 +37,13 @@ class Source(ABC):
     """Named files, read by name.
 
     Attributes:
-        path: the folder or file that the user named.
-        files: every regular file, as sorted posix paths relative to the source.
         skipped: files that cannot be opened (unsafe names, broken links, no permission, encrypted).
-        recognised: the layout that it was recognised as, "" until then.
     """
 
-    path: Path
-    files: tuple[str, ...]
+    path: Path  # the folder or file that the user named
+    files: tuple[str, ...]  # every regular file, as sorted posix paths relative to the source
     skipped: tuple[Skipped, ...] = ()
-    recognised: str = ""
+    recognised: str = ""  # the layout that it was recognised as, "" until then
 
     @abstractmethod
     def read(self, file: str) -> bytes:

@@ -12,9 +12,7 @@ from derender.data.layouts.layout import Table, number_column, text_column
 from derender.data.source import Skipped
 
 S = TypeVar("S", bound="Stream")
-Value = str | int | float | bool | None
-"""One label of one image; None is unknown."""
-
+Value = str | int | float | bool | None  # one label of one image; None is unknown
 _EXACT_IN_FLOAT32 = 1 << 24
 
 
@@ -23,39 +21,29 @@ class Sample:
     """One image on its way.
 
     Attributes:
-        file: its name, unique in the stream.
         read: gives its encoded bytes, or raises ValueError or OSError with the reason. Any thread may call
             it, once.
         share: how much of the stream lies before the next sample, 0..1; None where that is unknown.
         labels: value by column; a column that is not here is unknown for this image.
-        partition: the owners' own split ("train", "validation", "test"), or "".
         box: the part of the image that is read (``Table.boxes``), or None for all of it.
     """
 
-    file: str
+    file: str  # its name, unique in the stream
     read: Callable[[], bytes]
     share: float | None = None
     labels: Mapping[str, Value] = field(default_factory=dict)
-    partition: str = ""
+    partition: str = ""  # the owners' own split ("train", "validation", "test"), or ""
     box: np.ndarray | None = None
 
 
 class Stream(ABC):
-    """Samples in a fixed order.
+    """Samples in a fixed order."""
 
-    Attributes:
-        source: what the user named.
-        layout: "webdataset", "huggingface", or the layout of a folder or zip.
-        terms: on what terms the owners of a published set give it, in a few words.
-        passed_over: files that are known beforehand to be no use.
-        limit: read only the first so many samples; None for all.
-    """
-
-    source: str
-    layout: str
-    terms: str = ""
-    passed_over: tuple[Skipped, ...] = ()
-    limit: int | None = None
+    source: str  # what the user named
+    layout: str  # "webdataset", "huggingface", or the layout of a folder or zip
+    terms: str = ""  # on what terms the owners of a published set give it, in a few words
+    passed_over: tuple[Skipped, ...] = ()  # files that are known beforehand to be no use
+    limit: int | None = None  # read only the first so many samples; None for all
 
     @property
     def table(self) -> Table | None:

@@ -38,20 +38,11 @@ __all__ = [
     "CHECKS", "Check", "CheckFinding", "Examination", "Verdict", "doctor", "measure_originals", "percent",
 ]  # fmt: skip
 
-EXAMINED_PX = 64
-"""Side at which images are read for an examination."""
-
-COMPARED = 4_000
-"""Most distinct images that are compared with one another, evenly spaced."""
-
-FEWEST_COMPARED = 2 * measures.GROUPS
-"""With fewer distinct images nothing can be said about what they share."""
-
-ODD_LIKENESS = 0.15
-"""An image less like the others than this is unlike all of them."""
-
-SHOWN = 8
-"""Images in each row of examples, at most."""
+EXAMINED_PX = 64  # side at which images are read for an examination
+COMPARED = 4_000  # most distinct images that are compared with one another, evenly spaced
+FEWEST_COMPARED = 2 * measures.GROUPS  # with fewer distinct images nothing can be said about what they share
+ODD_LIKENESS = 0.15  # an image less like the others than this is unlike all of them
+SHOWN = 8  # images in each row of examples, at most
 
 
 @dataclass(frozen=True)
@@ -70,24 +61,18 @@ class Examination:
     """What was found in images.
 
     Attributes:
-        images: those examined.
         verdict, findings: whether the set suits the method, and one finding for each thing looked at.
-        values: every measured number by its name in ``CHECKS``.
-        group: the first image of each image's group of copies and near copies.
-        identical: copies to the last pixel, the first of each not counted.
-        originals: sizes of the files, or None for a stream.
-        shared: None where too few distinct images show anything.
         examples: rows of images by what they show ("most typical", "least typical", "one group", ...).
     """
 
-    images: ImageSet
+    images: ImageSet  # those examined
     verdict: Verdict
     findings: tuple[CheckFinding, ...]
-    values: Mapping[str, JackknifeEstimate]
-    group: Int64[np.ndarray, " n"]
-    identical: int
-    originals: Originals | None
-    shared: Shared | None
+    values: Mapping[str, JackknifeEstimate]  # every measured number by its name in ``CHECKS``
+    group: Int64[np.ndarray, " n"]  # the first image of each image's group of copies and near copies
+    identical: int  # copies to the last pixel, the first of each not counted
+    originals: Originals | None  # sizes of the files, or None for a stream
+    shared: Shared | None  # None where too few distinct images show anything
     examples: Mapping[str, tuple[int, ...]]
 
     @property

@@ -14,35 +14,22 @@ from derender.data.doctor.measures import JackknifeEstimate, SymmetryAxis
 Level = Literal["good", "note", "trouble", "objection", "open"]
 """``trouble``: will struggle; ``objection``: does not suit; ``open``: cannot be judged on this set."""
 
-AXIS_OFFSET = 0.06
-"""An axis of symmetry farther from the middle than this share of the width is off it."""
-
-AXIS_SYMMETRIC = 0.7
-"""Both sides about an axis correlate by this much where it is one."""
-
+AXIS_OFFSET = 0.06  # an axis of symmetry farther from the middle than this share of the width is off it
+AXIS_SYMMETRIC = 0.7  # both sides about an axis correlate by this much where it is one
 NOTE_SHARE = 0.1
 """Of images that are small, oblong, grey or clipped, a share above this is worth a note, by convention."""
 
 
 @dataclass(frozen=True)
 class CheckFinding:
-    """One thing that was looked at.
+    """One thing that was looked at."""
 
-    Attributes:
-        name: what, in a word or two.
-        level: how bad.
-        text: what was found, one or two plain sentences.
-        advice: what to do about it; "" where there is nothing to do.
-        short: the finding as a reason, to stand after "because"; "" for what is no reason.
-        value: the number behind it with its error, if it is one.
-    """
-
-    name: str
-    level: Level
-    text: str
-    advice: str = ""
-    short: str = ""
-    value: JackknifeEstimate | None = None
+    name: str  # what, in a word or two
+    level: Level  # how bad
+    text: str  # what was found, one or two plain sentences
+    advice: str = ""  # what to do about it; "" where there is nothing to do
+    short: str = ""  # the finding as a reason, to stand after "because"; "" for what is no reason
+    value: JackknifeEstimate | None = None  # the number behind it with its error, if it is one
 
 
 @dataclass(frozen=True)
@@ -71,25 +58,19 @@ class Check:
     """How a measure is judged and told.
 
     Attributes:
-        name: of the finding.
-        label: of the measure, in tables.
-        note: what it is, and which way is better.
-        objects: past this a set does not suit; None: it never objects.
-        struggles: past this the method will struggle; None: it never does.
         good, bad: the finding as a clause, in order and not.
-        advice: what to do about it.
         noted: of a share (less is better) the value from which on it is worth a note; None for what is better
             the larger it is.
     """
 
-    name: str
-    label: str
-    note: str
-    objects: float | None
-    struggles: float | None
+    name: str  # of the finding
+    label: str  # of the measure, in tables
+    note: str  # what it is, and which way is better
+    objects: float | None  # past this a set does not suit; None: it never objects
+    struggles: float | None  # past this the method will struggle; None: it never does
     good: str
     bad: str
-    advice: str
+    advice: str  # what to do about it
     noted: float | None = None
 
 

@@ -28,12 +28,8 @@ from derender.data.source import Source
 GREY_PX, TINY_PX = 32, 16
 """Sides of the grey images that structure is measured on, and that near copies are found by."""
 
-DARK, BRIGHT = 2, 253
-"""At or beyond these values of 255 a channel counts as clipped."""
-
-COPY_CORRELATION = 0.98
-"""Tiny grey images that correlate by this much or more are near copies."""
-
+DARK, BRIGHT = 2, 253  # at or beyond these values of 255 a channel counts as clipped
+COPY_CORRELATION = 0.98  # tiny grey images that correlate by this much or more are near copies
 GROUPS = 12
 CELLS, ORIENTATIONS = 6, 8
 _CELL_PX = 5
@@ -56,19 +52,12 @@ Cells = Float32[np.ndarray, "n 6 6 8"]
 
 @dataclass(frozen=True)
 class Pixels:
-    """One row for each image.
+    """One row for each image."""
 
-    Attributes:
-        tiny: grey images with mean 0 and length 1 (0 throughout for blank ones).
-        clipped: share of pixels that are black or white in every channel, 0..1.
-        colourless: the image shows no colour.
-        blank: the image shows one brightness only.
-    """
-
-    tiny: Float32[np.ndarray, "n 256"]
-    clipped: Float32[np.ndarray, " n"]
-    colourless: Bool[np.ndarray, " n"]
-    blank: Bool[np.ndarray, " n"]
+    tiny: Float32[np.ndarray, "n 256"]  # grey images with mean 0 and length 1 (0 throughout for blank ones)
+    clipped: Float32[np.ndarray, " n"]  # share of pixels that are black or white in every channel, 0..1
+    colourless: Bool[np.ndarray, " n"]  # the image shows no colour
+    blank: Bool[np.ndarray, " n"]  # the image shows one brightness only
 
 
 @dataclass(frozen=True)

@@ -33,16 +33,14 @@ class Table:
     """The images of a data set before any is decoded.
 
     Attributes:
-        files: images, as named by the source.
-        labels: columns by name, one value per file.
         partition: the owners' own split of each file ("train", "validation", "test"; "" unknown), or None.
         boxes: (N, 4) left, top, right, bottom of the part of each image that is read, in pixels of the
             upright image, or None for whole images. NaN: no box is known, and the image is passed over.
         skipped: images that a user's own list names and that are not there, with reasons.
     """
 
-    files: tuple[str, ...]
-    labels: Labels = field(default_factory=dict)
+    files: tuple[str, ...]  # images, as named by the source
+    labels: Labels = field(default_factory=dict)  # columns by name, one value per file
     partition: np.ndarray | None = None
     boxes: Float32[np.ndarray, "n 4"] | None = None
     skipped: tuple[Skipped, ...] = ()
@@ -63,23 +61,17 @@ class Layout:
     """One row of ``LAYOUTS``.
 
     Attributes:
-        name: what the user writes to ask for this layout.
-        title: what it is, in a few words.
         recognise: whether a source looks like it, from the names of its files (and a header line).
-        load: every image with its labels. An error names the file that is missing.
-        home: where the owners publish it; "" for layouts without owners.
-        terms: on what terms the owners give it, in a few words; "" for layouts without owners.
-        split_from: the file that gives the official split, for messages.
         default_parts: the first of these that is there is read unless a part is asked for; () for all images.
     """
 
-    name: str
-    title: str
+    name: str  # what the user writes to ask for this layout
+    title: str  # what it is, in a few words
     recognise: Callable[[Source], bool]
-    load: Callable[[Source], Table]
-    home: str = ""
-    terms: str = ""
-    split_from: str = ""
+    load: Callable[[Source], Table]  # every image with its labels. An error names the file that is missing
+    home: str = ""  # where the owners publish it; "" for layouts without owners
+    terms: str = ""  # on what terms the owners give it, in a few words; "" for layouts without owners
+    split_from: str = ""  # the file that gives the official split, for messages
     default_parts: Sequence[str] = ()
 
     def read(

@@ -59,10 +59,7 @@ class FaceShape:
 
     Attributes:
         grid, triangles: the domain, and the mesh of its vertices row by row.
-        mean: the mean head without ears; symmetric.
-        ear: displacement by ears, kept apart because hair may cover them.
         outward: unit vectors out of the bare head, level below the ears, where hair hangs.
-        reach: half width of the bare head.
         names, modes: one displacement per trait of shape.
         actions: the left and the right half of each of ``ACTIONS``: displacement, and the rows and columns
             that it moves.
@@ -70,10 +67,10 @@ class FaceShape:
 
     grid: FaceGrid
     triangles: Int32[ndarray, "f 3"]
-    mean: Float[ndarray, "rows columns 3"]
-    ear: Float[ndarray, "rows columns 3"]
+    mean: Float[ndarray, "rows columns 3"]  # the mean head without ears; symmetric
+    ear: Float[ndarray, "rows columns 3"]  # displacement by ears, kept apart because hair may cover them
     outward: Float[ndarray, "rows columns 3"]
-    reach: Float[ndarray, "rows 1"]
+    reach: Float[ndarray, "rows 1"]  # half width of the bare head
     names: tuple[str, ...]
     modes: Float[ndarray, "modes rows columns 3"]
     actions: list[tuple[ndarray, tuple[slice, slice]]]
