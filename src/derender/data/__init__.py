@@ -25,13 +25,7 @@ from derender.data.decoding import (
 )
 from derender.data.given import GivenImages, as_batch, as_photos, read_photo
 from derender.data.image import READER_VERSION, Unreadable, decode, decode_whole, quiet_pillow, read_image
-from derender.data.image_set import (
-    Duplicate,
-    ImageSet,
-    as_float,
-    check_images,
-    read_images,
-)
+from derender.data.image_set import Duplicate, ImageSet, as_float, check_images, read_images
 from derender.data.layouts import LAYOUTS
 from derender.data.layouts.celeba import MASK_CLASSES
 from derender.data.maps import GroundTruth, MaskedImages, read_ground_truth, read_masks

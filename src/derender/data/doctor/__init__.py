@@ -1,6 +1,6 @@
 """Whether a set of images suits the method, before anyone trains: ``doctor``.
 
-measures has what is measured; findings makes sentences and a verdict of it, and has every threshold.
+measures has what is measured; findings makes sentences and a verdict of it, by the thresholds in checks.yaml.
 """
 
 from collections.abc import Callable, Mapping
@@ -12,30 +12,14 @@ import numpy as np
 from jaxtyping import Float, Int64
 
 from derender.data.doctor import measures
-from derender.data.doctor.findings import (
-    CHECKS,
-    Check,
-    CheckFinding,
-    Verdict,
-    findings_of,
-    percent,
-    verdict_of,
-)
-from derender.data.doctor.measures import (
-    JackknifeEstimate,
-    Originals,
-    Pixels,
-    SymmetryAxis,
-    evenly,
-    jackknife,
-    measure_originals,
-)
+from derender.data.doctor.findings import CHECKS, CheckFinding, Verdict, findings_of, percent, verdict_of
+from derender.data.doctor.measures import JackknifeEstimate, evenly, jackknife, measure_originals
 from derender.data.image_set import ImageSet, read_images
 from derender.data.opening import ListedStream, open_images
 from derender.data.source import is_image
 
 __all__ = [
-    "CHECKS", "Check", "CheckFinding", "Examination", "Verdict", "doctor", "measure_originals", "percent",
+    "CHECKS", "CheckFinding", "Examination", "Verdict", "doctor", "measure_originals", "percent",
 ]  # fmt: skip
 
 EXAMINED_PX = 64  # side at which images are read for an examination
@@ -52,7 +36,7 @@ class Shared:
 
     rows: Int64[np.ndarray, " k"]
     values: Mapping[str, JackknifeEstimate]
-    axis: SymmetryAxis
+    axis: measures.SymmetryAxis
     orders: Mapping[tuple[str, str], Float[np.ndarray, " k"]]
 
 
@@ -71,7 +55,7 @@ class Examination:
     values: Mapping[str, JackknifeEstimate]  # every measured number by its name in ``CHECKS``
     group: Int64[np.ndarray, " n"]  # the first image of each image's group of copies and near copies
     identical: int  # copies to the last pixel, the first of each not counted
-    originals: Originals | None  # sizes of the files, or None for a stream
+    originals: measures.Originals | None  # sizes of the files, or None for a stream
     shared: Shared | None  # None where too few distinct images show anything
     examples: Mapping[str, tuple[int, ...]]
 
@@ -205,7 +189,9 @@ def _compare(
     return Shared(rows, values, measures.symmetry_axis(grey), orders)
 
 
-def _examples(pixels: Pixels, group: np.ndarray, shared: Shared | None) -> dict[str, tuple[int, ...]]:
+def _examples(
+    pixels: measures.Pixels, group: np.ndarray, shared: Shared | None
+) -> dict[str, tuple[int, ...]]:
     """Images for the page, by what they show; those of the extremes are extreme, no pick."""
     examples: dict[str, np.ndarray] = {}
     copies = np.flatnonzero(group != np.arange(len(group)))

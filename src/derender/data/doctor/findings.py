@@ -1,13 +1,16 @@
 """From measures to sentences and a verdict: one finding for each thing that was looked at.
 
-Every threshold stands in ``CHECKS``. Limits were chosen on one half of the material of docs/doctor.md and
-checked on the other; those of distinct, unreadable, small and clipped are conventions: nothing was measured
-to set them.
+Every threshold stands in the table ``checks.yaml``. Limits were chosen on one half of the material of
+docs/doctor.md and checked on the other. Of distinct, unreadable, small, oblong, grey and clipped images they
+are conventions: nothing was measured to set them.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Literal
+
+import yaml
 
 from derender.data.doctor.measures import JackknifeEstimate, SymmetryAxis
 
@@ -16,8 +19,6 @@ Level = Literal["good", "note", "trouble", "objection", "open"]
 
 AXIS_OFFSET = 0.06  # an axis of symmetry farther from the middle than this share of the width is off it
 AXIS_SYMMETRIC = 0.7  # both sides about an axis correlate by this much where it is one
-NOTE_SHARE = 0.1
-"""Of images that are small, oblong, grey or clipped, a share above this is worth a note, by convention."""
 
 
 @dataclass(frozen=True)
@@ -74,87 +75,8 @@ class Check:
     noted: float | None = None
 
 
-CHECKS = {
-    "distinct": Check(
-        "number", "distinct images", "copies and near copies counted once; more is better", 100, 1000,
-        "{number} distinct images", "{number} distinct images are too few",
-        "Add images: a few thousand different ones of the same kind of thing.",
-    ),
-    "copies": Check(
-        "copies", "copies", "share of all images; less is better", None, 0.3,
-        "no image is a copy or near copy", "{number} of the images are copies or near copies",
-        "Training drops copies to the pixel; delete near copies, or some end up on both sides of a split.", 0,
-    ),
-    "unreadable": Check(
-        "files", "unreadable", "share of all files; less is better", None, 0.2,
-        "every file can be read", "{number} of the files cannot be read",
-        "They are left out; the list of unreadable files says why.", 0,
-    ),
-    "small": Check(
-        "sizes", "small", "share of files below the examined size; less is better", None, 0.5,
-        "no file is too small", "{number} of the files are smaller than the examined size",
-        "Small images are enlarged, which blurs them: find larger ones.", NOTE_SHARE,
-    ),
-    "oblong": Check(
-        "shapes", "oblong", "share of files far from square; less is better", None, None,
-        "every file is about square", "{number} of the files are far from square, cropped to their middle",
-        "Look whether the thing is still in the image, and crop around it if not.", NOTE_SHARE,
-    ),
-    "clipped": Check(
-        "brightness", "clipped", "mean share of black or white pixels; less is better", None, 0.3,
-        "no pixel is black or white", "{number} of all pixels are black or white",
-        "Where pixels are clipped no shading is left: see whether it is the thing or the background.",
-        NOTE_SHARE,
-    ),
-    "blank": Check(
-        "empty images", "empty", "share of images of one brightness; less is better", None, None,
-        "no image is empty", "{number} of the images show one brightness only",
-        "Delete empty images.", 0,
-    ),
-    "grey": Check(
-        "colour", "grey", "share of images without colour", None, None,
-        "all images are in colour", "{number} of the images are grey",
-        "Features distinguish grey from colour: leave the fewer out. Of grey images the albedo is grey.",
-        NOTE_SHARE,
-    ),
-    "agreement": Check(
-        "alignment", "agreement", "mean cosine between the edges of two images; 0: unrelated", 0.1, 0.18,
-        "the images show the same thing at the same place",
-        "the images have too little in common at the same place",
-        "Take images of one kind of thing, and crop them all alike: the same points at the same place.",
-    ),
-    "kinship": Check(
-        "kinds", "kinship", "agreement across the two most different groups over that within", 0.45, None,
-        "even the two most different groups share their structure", "they fall into two kinds of thing",
-        "One model learns one kind of thing: train on one of the two groups, or on each by itself.",
-    ),
-    "odd": Check(
-        "out-of-distribution", "unlike the others", "share of images; less is better", None, 0.05,
-        "no image is unlike the others", "{number} of the images are unlike the others",
-        "Look at the least typical ones and delete what does not belong.", 0.05,
-    ),
-    "symmetry": Check(
-        "symmetry", "symmetry", "agreement with other mirror images over agreement; best 1", 0.6, 0.85,
-        "on average left mirrors right", "left does not mirror right (seen from one side only?)",
-        "One shape explains an image and its mirror image: add views from the other side, or mirror half.",
-    ),
-    "fill": Check(
-        "crop", "frame filled", "share of the image that the common structure covers", None, 0.56,
-        "the thing fills the image", "the thing is small in the image",
-        "Crop more tightly: the thing should fill the image and leave little background.",
-    ),
-    "view": Check(
-        "view", "variety of view", "distance to the own over that to others' mirror images", None, 0.72,
-        "the viewpoint varies", "all are seen from the same side",
-        "Add images with the thing turned left and right: depth shows by what moves.",
-    ),
-    "light": Check(
-        "light", "variety of light", "standard deviation of left against right", 0.015, 0.035,
-        "the lighting varies", "all are lit alike",
-        "Add images lit from the left and from the right: shading shows how the surface bends.",
-    ),
-}  # fmt: skip
-"""By the names of the measures."""
+_TABLE = yaml.safe_load(Path(__file__).with_name("checks.yaml").read_text(encoding="utf-8"))
+CHECKS = {name: Check(**row) for name, row in _TABLE.items()}  # by the names of the measures
 
 
 def judged(value: JackknifeEstimate, check: Check) -> tuple[Level, bool]:

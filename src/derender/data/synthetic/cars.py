@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
+from scipy.spatial.transform import Rotation
 
 from derender.data.synthetic.car_body import (
     ARCH,
@@ -155,22 +156,16 @@ def draw_car(seed: int, index: int, image_size: int, settings: CarSettings, car:
 
 def view_rotation(elevation_deg: float, azimuth_deg: float, inplane_deg: float) -> Float64[ndarray, "3 3"]:
     """M, from the upright car to the camera's axes."""
-    a, b = np.deg2rad([azimuth_deg, inplane_deg])
-    about_y = np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
-    about_z = np.array([[np.cos(b), -np.sin(b), 0], [np.sin(b), np.cos(b), 0], [0, 0, 1]])
-    return about_z @ about_x(elevation_deg) @ about_y
+    return Rotation.from_euler("ZXY", [inplane_deg, elevation_deg, azimuth_deg], degrees=True).as_matrix()
 
 
 def about_x(angle_deg: float) -> Float64[ndarray, "3 3"]:
-    cos, sin = np.cos(np.deg2rad(angle_deg)), np.sin(np.deg2rad(angle_deg))
-    return np.array([[1, 0, 0], [0, cos, -sin], [0, sin, cos]])
+    return Rotation.from_euler("x", angle_deg, degrees=True).as_matrix()
 
 
 def euler_angles(rotation: Float64[ndarray, "3 3"]) -> Float64[ndarray, "3"]:
     """Angles about x, y, z (radians) of R = Rz Ry Rx."""
-    x = np.arctan2(rotation[2, 1], rotation[2, 2])
-    y = np.arcsin(min(max(-rotation[2, 0], -1.0), 1.0))
-    return np.array([x, y, np.arctan2(rotation[1, 0], rotation[0, 0])])
+    return Rotation.from_matrix(rotation).as_euler("xyz")
 
 
 def draw_traits(name: str, generator: np.random.Generator) -> CarTraits:
