@@ -70,10 +70,7 @@ REFUSED = [
     ([*FIRST, "000003.jpg,1,2,0,4"], "line 4: the box has no area"),
     (["file,left,top,right,bottom", *SIDES[:2], "000003.jpg,9,2,5,4"], "line 4: the box has no area"),
     (["file,x,y,w,h", *SIZED], "line 1: expected file,left,top,width,height or file,left,top,right,bottom"),
-    (
-        [*FIRST, "000003.jpg,30,20,30,20"],
-        r"line 4: the box from \(30, 20\) to \(60, 40\) lies outside 00000",
-    ),
+    ([*FIRST, "000003.jpg,30,20,30,20"], r"line 4: the box from \(30, 20\) to \(60, 40\) lies outside 00000"),
 ]
 
 

@@ -11,8 +11,8 @@ from tests.data.conftest import noise
 
 from derender.data import LAYOUTS, list_images, read_images
 from derender.data.image import decode
-from derender.data.layouts.cars import CAR_CLASSES, car_class
 from derender.data.layouts.faces import EMOTIONS
+from derender.data.layouts.rendered import CAR_CLASSES, car_class
 from derender.data.layouts.tables import label_column
 
 NAN = math.nan

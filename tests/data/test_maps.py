@@ -10,7 +10,6 @@ from tests.data.conftest import noise
 
 from derender.data import MASK_CLASSES, list_images, read_ground_truth, read_images, read_masks
 from derender.data.maps import DEPTH_RANGE
-from derender.data.synthetic import faces, write
 
 HEADER = "file,identity,expression,ambient,diffuse,light_pitch,light_yaw,pitch,yaw,roll,tx,ty\n"
 ROWS = (
@@ -123,24 +122,6 @@ def test_images_of_another_size_and_missing_maps(rendered, encoded):
     gone = rendered({"depth/000000.png": None, "depth/000001.png": None}, zipped=True)
     with pytest.raises(ValueError, match=r"no depth maps for its images \(expected test_gt/depth/000000"):
         read_ground_truth(gone)
-
-
-def test_what_our_generator_writes_is_read_back(tmp_path):
-    made = faces.generate(3, 32, 0)
-    write(made, tmp_path / "faces")
-    truth = read_ground_truth(tmp_path / "faces")
-    np.testing.assert_array_equal(truth.mask, made.mask)
-    for read, written, error in [
-        (truth.depth, made.depth, 0.4 / 65_535),
-        (truth.normal, made.normal, 0.01),
-        (truth.albedo * 255, made.albedo, 1e-4),
-        (truth.light, made.light, 1e-6),
-        (truth.camera, made.camera, 1e-6),
-    ]:
-        np.testing.assert_allclose(read, written, atol=error)
-    images = read_images(tmp_path / "faces", 32)
-    assert images.layout == "synface"
-    np.testing.assert_array_equal(images.images, truth.images)
 
 
 @pytest.fixture

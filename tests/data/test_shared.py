@@ -17,6 +17,7 @@ from derender.data import (
     split_indices,
 )
 from derender.data.layouts import layout_named
+from derender.data.synthetic.synthetic_set import camera_rotation_and_light
 
 
 @pytest.mark.parametrize(
@@ -89,15 +90,7 @@ def test_synface_ground_truth_explains_its_pictures(shared_data):
     """Depth, normals, albedo, light and camera fit together: shading by them gives the stored image."""
     truth = read_ground_truth(shared_data("data/synface64.zip"), limit=40)
     assert 0.93 < truth.depth[truth.mask].min() < truth.depth[truth.mask].max() < 1.16
-    pitch, yaw = truth.light[:, 2], truth.light[:, 3]
-    light = np.stack([np.tan(yaw), np.tan(pitch), np.ones_like(yaw)], axis=1)
-    light /= np.linalg.norm(light, axis=1, keepdims=True)
-    x, y, z = truth.camera[:, 0], truth.camera[:, 1], truth.camera[:, 2]
-    zero, one = np.zeros_like(x), np.ones_like(x)
-    about_x = np.array([[one, zero, zero], [zero, np.cos(x), -np.sin(x)], [zero, np.sin(x), np.cos(x)]])
-    about_y = np.array([[np.cos(y), zero, np.sin(y)], [zero, one, zero], [-np.sin(y), zero, np.cos(y)]])
-    about_z = np.array([[np.cos(z), -np.sin(z), zero], [np.sin(z), np.cos(z), zero], [zero, zero, one]])
-    in_camera = np.einsum("ijn,jkn,kln,nl->ni", about_z, about_y, about_x, light)
+    _, in_camera = camera_rotation_and_light(truth.camera, truth.light)
     cosine = np.maximum(0, np.einsum("nhwi,ni->nhw", truth.normal, in_camera))
     shading = truth.light[:, 0, None, None] + truth.light[:, 1, None, None] * cosine
     picture = np.clip(truth.albedo * shading[:, None], 0, 1) * 255

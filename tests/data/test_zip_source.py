@@ -11,7 +11,6 @@ import zlib
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -220,10 +219,3 @@ def test_of_a_damaged_archive_is_read_what_its_directory_says_or_nothing(content
                 with contextlib.suppress(ValueError):
                     found = source.read(file)
                     assert (len(found), zlib.crc32(found)) == known[file]
-
-
-def test_very_many_members_are_few_arrays():
-    content = packed({f"{row:05d}": b"" for row in range(3000)})
-    names, rows = members_of(*read_directory(io.BytesIO(content)))
-    assert names == [f"{row:05d}" for row in range(3000)] and len(set(np.diff(rows[:, 0]))) == 1
-    assert rows[:-1, 1].tolist() == rows[1:, 0].tolist() and rows[-1, 1] == content.index(b"PK\1\2")

@@ -8,7 +8,6 @@ of its images, of which there may be millions.
 from collections.abc import Callable
 from functools import cache
 
-from derender.data.layouts.cars import SHAPENET_CARS
 from derender.data.layouts.celeba import CELEBA, CELEBAMASK
 from derender.data.layouts.faces import FACE_TRACKS, LFW, RAFDB, UTKFACE
 from derender.data.layouts.layout import (
@@ -20,7 +19,7 @@ from derender.data.layouts.layout import (
     partition_column,
     text_column,
 )
-from derender.data.layouts.rendered import DEPTH_PAIRS, SYNCAR, SYNFACE, SYNFACE_TRACKS
+from derender.data.layouts.rendered import DEPTH_PAIRS, SHAPENET_CARS, SYNCAR, SYNFACE, SYNFACE_TRACKS
 from derender.data.layouts.tables import TABLE
 from derender.data.source import Source, suggestion
 

@@ -140,9 +140,7 @@ def _write_table(path: Path, columns: dict[str, list[str]]) -> None:
         writer.writerows(zip(*columns.values(), strict=True))
 
 
-def encode_png(
-    pixels: UInt8[ndarray, "h w"] | UInt16[ndarray, "h w"] | UInt8[ndarray, "h w 3"],
-) -> bytes:
+def encode_png(pixels: UInt8[ndarray, "h w"] | UInt16[ndarray, "h w"] | UInt8[ndarray, "h w 3"]) -> bytes:
     """The PNG file of one image: grey of 8 or 16 bits, or RGB of 8 bits.
 
     Whole rows are predicted from the row above, with light compression. Pillow tries five predictions on
