@@ -38,10 +38,10 @@ def tree(tmp_path: Path, encoded) -> Callable[..., Path]:
     ) -> Path:
         contents = dict.fromkeys(files) if isinstance(files, list) else files
         data = {
-            file: encoded(seed)
-            if content is None
-            else content.encode()
+            file: content.encode()
             if isinstance(content, str)
+            else encoded(seed)
+            if content is None
             else content
             for seed, (file, content) in enumerate(contents.items())
         }

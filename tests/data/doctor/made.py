@@ -37,22 +37,16 @@ def landscapes(count: int, generator: np.random.Generator) -> np.ndarray:
     made = np.empty((count, 3, SIDE, SIDE))
     for picture in made:
         horizon = generator.uniform(0.3, 0.7)
-        sky, haze, ground = (
-            generator.uniform(80, 255, (2, 3)),
-            generator.uniform(0, 60),
-            generator.uniform(20, 130, 3),
-        )
+        sky, haze = generator.uniform(80, 255, (2, 3)), generator.uniform(0, 60)
+        ground = generator.uniform(20, 130, 3)
         share = np.clip(down / horizon, 0, 1)
         picture[:] = sky[0][:, None, None] * (1 - share) + (sky[1][:, None, None] + haze) * share
         ridge = horizon - 0.1 * np.sin(across[0] * generator.uniform(3, 12) + generator.uniform(0, 6))
         texture = 1 + 0.5 * gaussian_filter(generator.standard_normal((SIDE, SIDE)), 1)
         picture[:] = np.where(down > ridge, ground[:, None, None] * texture, picture)
         for _ in range(generator.integers(1, 7)):
-            x, y, size = (
-                generator.uniform(-0.2, 1.2),
-                generator.uniform(horizon, 1),
-                generator.uniform(0.03, 0.12),
-            )
+            x, y = generator.uniform(-0.2, 1.2), generator.uniform(horizon, 1)
+            size = generator.uniform(0.03, 0.12)
             tree = ((across - x) / size) ** 2 + ((down - y) / (1.6 * size)) ** 2 < 1
             picture[:] = np.where(tree, generator.uniform(10, 90, 3)[:, None, None], picture)
     return np.clip(made, 0, 255).astype(np.uint8)
@@ -66,9 +60,7 @@ def moved(images: np.ndarray, generator: np.random.Generator, reach: int = 19) -
     """Each image shifted by chance, its edges continued."""
     wide = np.pad(images, ((0, 0), (0, 0), (reach, reach), (reach, reach)), mode="edge")
     corners = generator.integers(0, 2 * reach + 1, (len(images), 2))
-    return np.stack(
-        [picture[:, y : y + SIDE, x : x + SIDE] for picture, (y, x) in zip(wide, corners, strict=True)]
-    )
+    return np.stack([one[:, y : y + SIDE, x : x + SIDE] for one, (y, x) in zip(wide, corners, strict=True)])
 
 
 def copies(count: int, generator: np.random.Generator) -> np.ndarray:
