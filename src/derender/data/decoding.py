@@ -71,15 +71,9 @@ def decoded(
 def decode_samples(start: int, samples: Sequence[Sample], image_size: int, fit: str = "crop") -> Decoded:
     """Decode consecutive samples, at least one, the first of them number ``start``, in this thread."""
     images = np.empty((len(samples), 3, image_size, image_size), np.uint8)
-    return Decoded(
-        start,
-        tuple(sample.file for sample in samples),
-        images,
-        tuple(_decode_one(target, sample, fit) for target, sample in zip(images, samples, strict=True)),
-        tuple(sample.labels for sample in samples),
-        tuple(sample.partition for sample in samples),
-        samples[-1].share,
-    )
+    outcomes = tuple(_decode_one(target, sample, fit) for target, sample in zip(images, samples, strict=True))
+    files, labels, parts = zip(*((one.file, one.labels, one.partition) for one in samples), strict=True)
+    return Decoded(start, files, images, outcomes, labels, parts, samples[-1].share)
 
 
 def _decode_one(target: np.ndarray, sample: Sample, fit: str) -> bytes | Unreadable:

@@ -24,15 +24,10 @@ _LABEL_KINDS = ("string", "large_string", "int", "uint", "float", "bool")
 
 
 class HuggingFaceStream(Stream):
-    """The rows of one split, or of all of them.
+    """The rows of one split, or of all ("all"), of a folder, .parquet file or id "owner/name".
 
-    Args:
-        source: what the user named, for messages.
-        place: a folder or .parquet file; or the id of a data set, "owner/name".
-        split: its name, "all", or None for "train" or the only one there is.
-        column: the image column, or None for the only one there is.
-        config: which configuration of the data set, or None for the only one there is.
-        revision: branch, tag or commit; of an id only.
+    None takes the split "train" or the only one there is, and the only image column and configuration.
+    ``revision`` (of an id) is a branch, tag or commit; ``source`` is what the user named, for messages.
     """
 
     layout = "huggingface"

@@ -282,14 +282,7 @@ def _joined(stream: Stream, images: np.ndarray, content: Mapping[str, Any]) -> I
         row_of = {file: row for row, file in enumerate(stream.table.files)}
         table = stream.table.select(np.array([row_of[file] for file in files], np.int64))
         labels, partition = table.labels, table.partition
-    return ImageSet(
-        images=images,
-        files=files,
-        labels=labels,
-        layout=stream.layout,
-        skipped=(*stream.passed_over, *(Skipped(**row) for row in content["skipped"])),
-        duplicates=tuple(Duplicate(**row) for row in content["duplicates"]),
-        partition=partition,
-        source=stream.source,
-        terms=stream.terms,
-    )
+    skipped = (*stream.passed_over, *(Skipped(**row) for row in content["skipped"]))
+    copies = tuple(Duplicate(**row) for row in content["duplicates"])
+    found = (images, files, labels, stream.layout, skipped, copies, partition)
+    return ImageSet(*found, source=stream.source, terms=stream.terms)

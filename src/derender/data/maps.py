@@ -283,14 +283,14 @@ def _read_maps(source: Source, table: Table, limit: int | None) -> GroundTruth:
         normal = normal.astype(np.float32) / 255 * 2 - 1
         normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)
         normal *= mask[..., None]
-    camera = np.stack([table.labels[name] for name in CAMERA], axis=1)
+    camera, light = (np.stack([table.labels[name] for name in names], axis=1) for names in (CAMERA, LIGHT))
     return GroundTruth(
         images=_channels_first(images),
         depth=np.where(code > 0, 0.8 + code / 65535 * 0.4, 0).astype(np.float32),
         normal=normal,
         albedo=None if albedo is None else _channels_first(albedo).astype(np.float32) / 255,
         mask=mask,
-        light=np.stack([table.labels[name] for name in LIGHT], axis=1),
+        light=light,
         camera=np.pad(camera, ((0, 0), (0, 1))),
         files=table.files,
         labels={name: one for name, one in table.labels.items() if name not in (*LIGHT, *CAMERA, "mask")},

@@ -238,10 +238,7 @@ def _names(folder: Path) -> Iterator[str]:
     """Names of the files below a folder, its own first, no more of them looked up than are taken."""
     waiting = [str(folder)]
     while waiting:
-        with (
-            suppress(OSError),
-            os.scandir(waiting.pop(0)) as entries,
-        ):  # reading it says what is wrong with it
+        with suppress(OSError), os.scandir(waiting.pop(0)) as entries:  # reading it says what is wrong
             for entry in entries:
                 if not entry.is_dir(follow_symlinks=False):
                     yield entry.name

@@ -43,18 +43,12 @@ class _Group:
 
     @property
     def images(self) -> list[str]:
-        """The endings of its images."""
         return [ending for ending, one in self.content.items() if one is not None and ending not in _LABELS]
 
 
 class ShardStream(Stream):
-    """Samples of shards, one shard after the other.
-
-    Args:
-        source: what the user named, for messages.
-        shards: the tar files, in order; at least one.
-        column: which image to take where samples have several ("jpg", "input.png"), or None.
-    """
+    """Samples of one or more tar files, in order; ``column`` ("jpg", "input.png") is the image to take where
+    samples have several, ``source`` what the user named."""
 
     layout = "webdataset"
 

@@ -186,15 +186,9 @@ def measure_originals(source: Source, files: tuple[str, ...], image_size: int) -
     if not sizes:
         return None
     short, long = np.array(sizes).T
-    return Originals(
-        sampled=len(sizes),
-        median_short=int(np.median(short)),
-        smallest_short=int(short.min()),
-        largest_long=int(long.max()),
-        smaller=float((short < image_size).mean()),
-        oblong=float((long > 1.25 * short).mean()),
-        image_size=image_size,
-    )
+    pixels = int(np.median(short)), int(short.min()), int(long.max())
+    shares = float((short < image_size).mean()), float((long > 1.25 * short).mean())
+    return Originals(len(sizes), *pixels, *shares, image_size)
 
 
 def jackknife(measure: Callable[[Int64[np.ndarray, " k"]], float], count: int) -> JackknifeEstimate:

@@ -66,12 +66,10 @@ def pick(weights: Sequence[float] | ndarray, at: float) -> int:
     return min(int(np.searchsorted(ends, at * ends[-1], side="right")), len(ends) - 1)
 
 
-def _equal_shares(value: object) -> object:
-    """A list of names means equal shares."""
-    return dict.fromkeys(value, 1.0) if isinstance(value, (list, tuple)) else value
-
-
-Shares = Annotated[Mapping[str, float], BeforeValidator(_equal_shares)]
+Shares = Annotated[  # a list of names means equal shares
+    Mapping[str, float],
+    BeforeValidator(lambda v: dict.fromkeys(v, 1.0) if isinstance(v, (list, tuple)) else v),
+]
 
 
 class _DrawnSettings(Settings):
