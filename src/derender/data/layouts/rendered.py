@@ -48,15 +48,8 @@ CAMERA = ("camera_x_rad", "camera_y_rad", "camera_z_rad", "camera_tx", "camera_t
 # by column of params.csv, what it is called here
 _NUMBERS = {name: name for name in ("strength", "age", "skin_tone", "ambient", "diffuse")}
 _NUMBERS |= {"tx": "camera_tx", "ty": "camera_ty"}
-_DEGREES = {
-    "light_pitch": "light_pitch_rad",
-    "light_yaw": "light_yaw_rad",
-    "pitch": "camera_x_rad",
-    "yaw": "camera_y_rad",
-    "roll": "camera_z_rad",
-    "elev": "elevation_rad",
-    "azim": "azimuth_rad",
-}
+_DEGREES = {"light_pitch": "light_pitch_rad", "light_yaw": "light_yaw_rad", "pitch": "camera_x_rad"}
+_DEGREES |= {"yaw": "camera_y_rad", "roll": "camera_z_rad", "elev": "elevation_rad", "azim": "azimuth_rad"}
 _TEXTS = (
     *("identity", "expression", "class", "model", "track", "frame", "light_kind"),
     *("hair", "hair_colour", "beard", "style"),

@@ -22,33 +22,18 @@ from derender.settings import Settings
 Kind = TypeVar("Kind", bound=Settings)
 Range = tuple[float, float]
 BACKGROUNDS = ("plain", "gradient", "noise")
-EXPRESSIONS: dict[str, dict[str, float]] = {  # weights of the actions in face_shape, and of the two lids'
-    "neutral": {},
-    "happiness": {"smile": 1.0, "cheek_raise": 0.9, "lips_part": 0.75, "squint": 0.45, "stretch": 0.2},
-    "sadness": {"brow_inner_up": 1.0, "frown": 0.85, "brow_lower": 0.25, "squint": 0.4},
-    "surprise": {"jaw_open": 1.0, "stretch": -0.6, "brow_inner_up": 0.9, "brow_outer_up": 1.0, "wide": 0.9},
-    "anger": {"brow_lower": 1.15, "press": 0.8, "squint": 0.3, "sneer": 0.3, "frown": 0.45},
-    "disgust": {"sneer": 1.1, "brow_lower": 0.6, "squint": 0.6, "frown": 0.5, "cheek_raise": 0.6,
-                "lips_part": 0.25},
-    "fear": {"brow_inner_up": 1.0, "brow_outer_up": 0.5, "wide": 0.9, "stretch": 1.0, "lips_part": 0.6,
-             "jaw_open": 0.25},
-}  # fmt: skip
-CLASSES: dict[str, tuple[str, ...]] = {  # body styles of each class of cars
-    **{name: (name,) for name in ("sedan", "hatchback", "estate", "suv", "van", "pickup", "coupe")},
-    "police": ("sedan", "sedan", "estate", "suv"),
-    "ambulance": ("cab",),
-    "limousine": ("sedan",),
-    "jeep": ("jeep_hard", "jeep_open"),
-    "sports": ("sports",),
-}
 _OTHER_DEG = 20.0  # with beyond_deg, the angle that is not beyond stays within this
 _YAW_SHARE = 0.6
 
 
 @lru_cache(maxsize=2)
 def numbers_of(kind: str) -> dict[str, Any]:
-    """The measures and colours in ``faces.yaml`` or ``cars.yaml``."""
+    """The tables in ``faces.yaml`` or ``cars.yaml``."""
     return yaml.safe_load(Path(__file__).with_name(f"{kind}.yaml").read_text(encoding="utf-8"))
+
+
+EXPRESSIONS: dict[str, dict[str, float]] = numbers_of("faces")["expressions"]
+CLASSES: dict[str, list[str]] = numbers_of("cars")["classes"]  # body styles of each class of cars
 
 
 def drawn(ends: Range, share: float, beyond: float = 0.0) -> float:
@@ -173,29 +158,12 @@ class CarViewSettings(_DrawnSettings):
     shift_sd: float = Field(default=0.003, ge=0, le=0.1)
 
 
-_WIDE_LIGHT = LightSettings(
-    yaw_deg=(-70, 70), pitch_deg=(-60, 60), beyond_deg=35, ambient=(0.05, 0.3), diffuse=(0.6, 1.0)
-)
-LIGHTS: Mapping[str, LightSettings] = {
-    "usual": LightSettings(),
-    "wide": _WIDE_LIGHT,
-    "frontal": LightSettings(yaw_deg=(0, 0), pitch_deg=(0, 0), ambient=(0.45, 0.45), diffuse=(0.5, 0.5)),
-}
-VIEWS: Mapping[str, ViewSettings] = {
-    "usual": ViewSettings(),
-    "wide": ViewSettings(yaw_deg=(-60, 60), yaw_beyond_deg=20),
-    "frontal": ViewSettings(yaw_sd_deg=0, pitch_sd_deg=0, roll_sd_deg=0, shift_sd=0),
-}
-CAR_LIGHTS: Mapping[str, LightSettings] = {
-    "usual": LightSettings(diffuse=(0.5, 1.0)),
-    "wide": _WIDE_LIGHT,
-    "frontal": LightSettings(yaw_deg=(0, 0), pitch_deg=(0, 0), ambient=(0.4, 0.4), diffuse=(0.6, 0.6)),
-}
-CAR_VIEWS: Mapping[str, CarViewSettings] = {
-    "usual": CarViewSettings(),
-    "wide": CarViewSettings(azimuth_deg=(-75, 75), azimuth_beyond_deg=35),
-    "frontal": CarViewSettings(elevation_deg=(42.5, 42.5), azimuth_deg=(0, 0), inplane_sd_deg=0, shift_sd=0),
-}
+def _named(settings: type[Kind], kind: str, table: str) -> Mapping[str, Kind]:
+    return {name: settings.model_validate(row) for name, row in numbers_of(kind)[table].items()}
+
+
+LIGHTS, CAR_LIGHTS = (_named(LightSettings, kind, "lights") for kind in ("faces", "cars"))
+VIEWS, CAR_VIEWS = _named(ViewSettings, "faces", "views"), _named(CarViewSettings, "cars", "views")
 
 
 class FaceSettings(_DrawnSettings):
