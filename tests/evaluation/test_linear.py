@@ -239,8 +239,8 @@ def answered(draw):
 
 
 @settings(max_examples=30, deadline=None)
-@given(answered(), st.integers(0, 99))
-def test_scores_are_scikit_learns_and_blind_to_order(case, seed):
+@given(answered())
+def test_scores_of_labels_are_scikit_learns(case):
     targets, answers = case
     found = linear_scores(targets, answers, "labels")
     columns = list(zip(targets.T, answers.T, strict=True))
@@ -249,11 +249,6 @@ def test_scores_are_scikit_learns_and_blind_to_order(case, seed):
     assert found.balanced_accuracy == pytest.approx(expected)
     expected = np.mean([average_precision_score(y, p) for y, p in columns])
     assert found.average_precision == pytest.approx(expected)
-    rows = np.random.default_rng(seed).permutation(len(targets))
-    labels = np.random.default_rng(seed).permutation(targets.shape[1])
-    moved = linear_scores(targets[rows][:, labels], answers[rows][:, labels], "labels")
-    for name in ("accuracy", "balanced_accuracy", "average_precision"):
-        assert getattr(moved, name) == pytest.approx(getattr(found, name))
 
 
 def test_scores_of_classes_are_scikit_learns():

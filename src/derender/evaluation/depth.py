@@ -32,13 +32,10 @@ from derender.scene.normals import normals_from_depth
 class GeometryScores:
     """Errors of predicted depth; means over the images that have at least one pixel to compare.
 
-    Attributes:
-        side: scale-invariant depth error, 0 and up, best 0. Papers print it times 100.
-        mad_deg: mean angle between normals in degrees, 0..180, best 0.
-        coverage: share of the eroded true mask that the prediction covers, 0..1, best 1: errors count only
-            there, so a prediction without the hard part must be visible.
-        n_empty: images where prediction and truth share no pixel; left out of the two means.
-        side_each, mad_deg_each: (N,) per image, NaN where there is nothing to compare.
+    ``side`` is scale-invariant, 0 and up, best 0; papers print it times 100. ``mad_deg`` is the mean angle
+    between normals, 0..180, best 0. Errors count only where the prediction covers the eroded true mask:
+    ``coverage`` is that share, 0..1, best 1. ``n_empty`` images share no pixel with the truth and are left
+    out; (N,) values per image are NaN there.
     """
 
     side: float

@@ -42,18 +42,11 @@ class AngleScores:
 class FactorResult(ImageResult):
     """A model's errors in albedo, light and camera, each beside the best constant answer.
 
-    Attributes:
-        albedo, albedo_control: mean over images of ``albedo_error`` in the view of the image, and that of the
-            mean true albedo; 0 and up, best 0.
-        albedo_global, albedo_global_control: the same after one scale for all images, so that a model that
-            confuses bright skin under weak light with dark skin under strong light scores worse.
-        light, light_control: of the predictions, and of the mean true direction.
-        light_aligned: of the predictions after the best rotation of all of them at once; its control is
-            ``light_control`` too, since a rotation brings any constant to the mean direction.
-        camera, camera_control: of the predictions, and of a camera that never turns.
-        albedo_each, albedo_global_each: (N,) of the predictions, NaN where no pixel is shared with the truth.
-        albedo_control_each, albedo_global_control_each: (N,) of the mean true albedo.
-        untrained: of the same architecture with fresh weights; None without one.
+    ``albedo`` is the mean of ``albedo_error`` in the view of the image (control: the mean true albedo),
+    ``albedo_global`` the same after one scale for all images, so that a model that confuses bright skin under
+    weak light with dark skin under strong light scores worse. ``light_aligned`` is after the best rotation of
+    all predictions at once; its control is ``light_control``, too, the mean true direction. The control of
+    ``camera`` never turns. Values per image are (N,). ``untrained`` is of the same architecture with fresh weights.
     """
 
     columns: ClassVar[Columns] = {

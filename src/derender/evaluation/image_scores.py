@@ -21,11 +21,8 @@ Columns = Mapping[str, tuple[Column, float]]
 class ImageResult:
     """A model's scores beside its controls, all on the same images.
 
-    Attributes:
-        columns: of the scores.
-        caption: of the table, with a place for the number of images.
-        coverage: the column of ``coverage``, where rows have that.
-        notes: on rows, by their name.
+    ``columns`` are of the scores, ``caption`` has a place for the number of images, ``coverage`` is the
+    column of ``coverage`` where rows have that, ``notes`` are on rows, by their name.
     """
 
     columns: ClassVar[Columns]

@@ -99,14 +99,11 @@ def finetuned_answers(
             "settings": settings.model_dump(),
         }  # fmt: skip
         progress = options.stage(f"fine-tuning {what}, {count:,} labels, seed {seeds[at]}", "epochs")
-        how: dict[str, Any] = {
-            "factors": chosen,
-            "seed": seeds[at],
-            "settings": settings,
-            "progress": progress,
-        }
+        how: dict[str, Any] = {"seed": seeds[at], "settings": settings, "progress": progress}
         return options.memory.recall_one(
-            "finetuned", inputs, lambda: finetune(model, images, task, rows, split.test, **how)
+            "finetuned",
+            inputs,
+            lambda: finetune(model, images, task, rows, split.test, factors=chosen, **how),
         )
 
     trained = {name: [as_model(run, device=options.device) for run in runs] for name, runs in models.items()}

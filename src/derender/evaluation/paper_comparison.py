@@ -110,10 +110,8 @@ def compare(
             columns, left_out = chosen_labels(first, None, True, 2 if spec.kind == "linear" else 1)
             notes += left_out
         ready = prepare(rows, columns, **part.rows(first))
-        layout, beside = (
-            str(first.origin.get("layout", "unknown data")),
-            f"beside the paper's Table {spec.number}",
-        )
+        layout = str(first.origin.get("layout", "unknown data"))
+        beside = f"beside the paper's Table {spec.number}"
         more: dict[str, Any] = {"paper": part.paper}
         if spec.kind == "cluster":
             found = compare_clusterings(

@@ -30,17 +30,11 @@ AT_A_TIME = 32  # images: convolutions with windows this large take memory
 
 @dataclass(frozen=True)
 class ReconstructionScores:
-    """Errors inside the mask; means over images.
+    """Errors inside the mask; means over images, and (N,) values per image.
 
-    Attributes:
-        l1: mean absolute difference, 0..1, best 0.
-        psnr_db: peak signal-to-noise ratio in decibels, 0 and up, more is better; infinite for a copy.
-        coverage: share of all pixels inside the mask, 0..1.
-        n_empty: images with an empty mask, left out of the means.
-        l1_each, psnr_db_each: (N,) per image, NaN where the mask is empty.
-        ssim: structural similarity, -1..1, best 1; mean over the images with a window of 11 x 11 pixels
-            inside the mask, NaN where there is none (or the images are smaller than that).
-        ssim_each: (N,) per image, NaN where there is no such window.
+    ``l1`` is 0..1, best 0; ``psnr_db`` 0 and up, infinite for a copy; ``ssim`` -1..1, best 1, over images
+    with a window of 11 x 11 pixels inside the mask, NaN without. ``coverage`` is the share of all pixels
+    inside the mask; images with an empty mask (``n_empty``) are left out.
     """
 
     l1: float

@@ -37,10 +37,7 @@ def ward_tree(features: np.ndarray, sizes: np.ndarray | None = None) -> np.ndarr
     count = len(means)
     sizes = np.ones(count) if sizes is None else np.array(sizes, np.float64)
     dtype = np.float64 if count <= FLOAT64_ROWS else np.float32
-    cluster, height = (
-        np.arange(count),
-        np.zeros(count),
-    )  # of each place: its number, the height it was made at
+    cluster, height = np.arange(count), np.zeros(count)  # of each place: number, height it was made at
     nearest, distance = np.zeros(count, np.int64), np.zeros(count)
     stale, merges, done = np.arange(count), [], 0
     while True:

@@ -98,15 +98,11 @@ def embed_image_set(
     progress: Progress | None = None,
     origin: Mapping[str, Any] | None = None,
 ) -> FeatureTable:
-    """Run a model's encoders over an image set.
+    """Run a model's encoders over an image set of its size; labels and the owners' split go into the table.
 
-    Args:
-        model: a module with ``embed(images in 0..1) -> {factor: (N, D)}``, ``device`` and ``image_size``.
-        images: read at the model's image size; their labels and the owners' split go into the table.
-        batch_size: images at a time; changes speed and memory only.
-        progress: called with (images done, images in all) after every batch.
-        origin: further facts for the table, such as the model's path and preset; they win over those found
-            here.
+    ``model`` has ``embed(images in 0..1) -> {factor: (N, D)}``, ``device`` and ``image_size``. Facts in
+    ``origin``, such as the model's path, win over those found here; ``progress`` is called with (images done,
+    images in all) after every batch.
     """
     check_size(model, images.images)
     factors = embed_images(model, images.images, batch_size=batch_size, progress=progress)

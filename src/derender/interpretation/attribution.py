@@ -125,13 +125,9 @@ def saliency(
 ) -> Float[Tensor, "n height width"]:
     """A map by the name of its method, none below 0: 4 x 4 for the two CAMs, the image's size for pixels.
 
-    Args:
-        method: "grad-cam", "hires-cam" or "pixels".
-        model: with ``nets[factor].encoder``, which has ``spatial`` and ``to_code``.
-        images: in 0..1.
-        factor: whose encoder.
-        probe: whose logit is explained; None explains the feature itself (half its squared length).
-        targets: (n,) the label or class of each image; needed with a probe.
+    The encoder of ``factor`` has ``spatial`` and ``to_code``; images are in 0..1. The probe's logit for the
+    (n,) label or class of each image is explained; None explains the feature itself (half its squared
+    length).
     """
     if method not in METHODS:
         raise ValueError(

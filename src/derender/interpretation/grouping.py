@@ -32,16 +32,12 @@ class ClusterShares:
 
 @dataclass(frozen=True, eq=False)
 class PairParts:
-    """Parts of the distance and the cosine of two images.
+    """Parts of the distance and the cosine of two images, (F,) by factor.
 
-    Attributes:
-        factors: (F).
-        distance: (F,) squared distance in each factor; their sum is the whole one.
-        distance_share: (F,) parts of it, sum 1 (0 for identical features).
-        cosine: (F,) parts of the cosine of the whole features; their sum is the cosine.
-        own_cosine: (F,) cosine of each factor alone, -1..1; NaN where a feature is 0.
-        quantile: (F,) share of all pairs of images that lie farther apart in this factor, 0..1; near 1
-            where the two are unusually alike.
+    The squared ``distance`` and the ``cosine`` add up to those of the whole features, ``distance_share`` to 1
+    (0 for identical features). ``own_cosine`` is of each factor alone, -1..1, NaN where a feature is 0.
+    ``quantile`` is the share of all pairs of images that lie farther apart in this factor, near 1 where the
+    two are unusually alike.
     """
 
     factors: tuple[str, ...]

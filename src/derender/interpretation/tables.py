@@ -16,14 +16,11 @@ from derender.interpretation.probe import Probe
 class ShareRow:
     """Shares of one set of features; S seeds, A labels or classes, F factors.
 
-    Attributes:
-        name: of the features.
-        control: whether it learned nothing.
-        shares: (S, A, F) mean share of |IG| over test images, 0..1, each sums to 1 over factors.
-        low, high: (A, F) 95 % interval of the mean over seeds, over resamples of the test images.
-        auc: (S, A) area under the ROC curve on the test rows; 0.5 at chance, best 1.
-        drop: (S, A, F) how much of it is lost when this factor's features are exchanged between images.
-        error: the largest completeness error, relative to the largest change of an answer.
+    ``shares`` (S, A, F) are means over test images of the share of |IG|, 0..1, that sum to 1 over factors;
+    ``low`` and ``high`` (A, F) end the 95 % interval of their mean over seeds. ``auc`` (S, A) is the area
+    under the ROC curve on the test rows, 0.5 at chance, best 1; ``drop`` (S, A, F) is lost when this factor's
+    features are exchanged between images. ``error`` is the largest completeness error over the largest change
+    of an answer.
     """
 
     name: str

@@ -75,12 +75,10 @@ class TrueFactor:
 class ModularityScores:
     """DCI, MIG and SAP; each 0..1, best 1.
 
-    Attributes:
-        disentanglement: each feature (or dimension) matters for one factor only.
-        completeness: each factor matters in one feature only.
-        informativeness: how well all features together predict the factors, mean over factors.
-        mig: gap of mutual information between the best and the second best, over the factor's entropy.
-        sap: gap of predictive score between the best and the second best.
+    Disentanglement: each feature (or dimension) matters for one factor only; completeness: each factor
+    matters in one feature only; informativeness: all features together predict the factors, mean over
+    factors. ``mig`` and ``sap`` are gaps between the best and the second best: of mutual information over the
+    factor's entropy, and of predictive score.
     """
 
     disentanglement: float
@@ -92,17 +90,13 @@ class ModularityScores:
 
 @dataclass(frozen=True)
 class GroundTruthScores:
-    """F features against K true factors.
+    """F features against K true factors, by name.
 
-    Attributes:
-        features, factors: names of the rows and columns.
-        score: (F, K) held-out R2 of numbers (negative where the fit does harm), accuracy of classes; best 1.
-        together: (K,) the same of all features side by side.
-        chance: (K,) of a constant answer: 0 for numbers, the largest class's share for classes.
-        by_feature, by_dimension: scores of whole features, and where requested of single dimensions.
-        grouped_dci: disentanglement and completeness of the dimensions' importances added up by feature.
-        placed: share of the factors that the right feature predicts best, 0..1, best 1; NaN where none of
-            the features has a factor of its own.
+    ``score`` is (F, K): held-out R2 of numbers (negative where the fit does harm), accuracy of classes, best
+    1; ``together`` (K,) the same of all features side by side; ``chance`` (K,) of a constant answer.
+    ``by_dimension`` and ``grouped_dci`` (importances of dimensions added up by feature) are there where
+    requested. ``placed`` is the share of factors that the right feature predicts best, 0..1; NaN where no
+    feature has a factor of its own.
     """
 
     features: tuple[str, ...]

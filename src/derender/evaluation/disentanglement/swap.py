@@ -32,20 +32,13 @@ from derender.training.step import fill_uncovered
 
 @dataclass(frozen=True)
 class SwapScores:
-    """How far F features moved, in units of the mean distance between an image and its donor; NaN where that
-    is 0 (a feature or parameter that is the same for every image).
+    """How far F features moved, in units of the mean distance of an image and its donor; NaN where that is 0.
 
-    Attributes:
-        factors: names, in the order of rows and columns.
-        moved, moved_parameters: (F, F) features, and decoded depth, albedo, light and camera; row: the factor
-            exchanged, column: what moved. Best 1 on the diagonal, 0 elsewhere.
-        moved_pixels: (F,) how far the image itself moved when this factor was exchanged.
-        arrived: (F,) remaining distance from the exchanged feature to the donor's, best 0.
-        unexchanged: (F,) how far features move from an image to its own rendering, best 0.
-        ratio, ratio_parameters: mean of the diagonal over mean of the rest; 1 where nothing is disentangled,
-            more is better.
-        n_pictures: how many images each number is a mean of.
-        resampled: (B, 2) ``ratio`` and ``ratio_parameters`` on resamples of the images, for intervals.
+    ``moved`` and ``moved_parameters`` (of decoded depth, albedo, light and camera) are (F, F): row, the
+    factor exchanged, column, what moved; best 1 on the diagonal, 0 elsewhere. (F,) ``moved_pixels`` is the
+    image's own move, ``arrived`` the remaining distance to the donor's feature, ``unexchanged`` the move from
+    an image to its own rendering, both best 0. Each ``ratio`` is the mean of the diagonal over that of the
+    rest, 1 where nothing is disentangled; ``resampled`` (B, 2) has both on resamples of the images.
     """
 
     factors: tuple[str, ...]
