@@ -46,7 +46,7 @@ class FactorResult(ImageResult):
     ``albedo_global`` the same after one scale for all images, so that a model that confuses bright skin under
     weak light with dark skin under strong light scores worse. ``light_aligned`` is after the best rotation of
     all predictions at once; its control is ``light_control``, too, the mean true direction. The control of
-    ``camera`` never turns. Values per image are (N,). ``untrained`` is of the same architecture with fresh weights.
+    ``camera`` never turns. Values per image are (N,). ``untrained`` has fresh weights.
     """
 
     columns: ClassVar[Columns] = {
