@@ -82,15 +82,17 @@ class PhotoDetail:
             lambert_shading(normals_from_depth(scene.depth, self.fov_deg), scene.light),
         )
         own = torch.cat((self._place, self._seen, self._shading), dim=1)
-        maps = torch.cat((own, own.flip(-1), self._colours), dim=1).expand(count, -1, -1, -1)
+        edge = round(RIM_SHARE * self.grid)
+        within = pad(torch.ones_like(self._seen[..., edge:-edge, edge:-edge]), (edge,) * 4)
+        maps = torch.cat((own, own.flip(-1), self._colours, within), dim=1).expand(count, -1, -1, -1)
         view = warp(torch.cat((maps, shading), dim=1), scene.depth, scene.camera, self.fov_deg)
-        own, mirrored, colours, shading = view.image.split((4, 4, 3, 1), dim=1)
+        own, mirrored, colours, within, shading = view.image.split((4, 4, 3, 1, 1), dim=1)
         place = own[:, :2] - _look_up(self._off.expand(count, -1, -1, -1), own[:, :2])
         shift, mirror_shift = place - self._pixels(), mirrored[:, :2] - self._pixels()
         moved = shift.norm(dim=1, keepdim=True) / self.grid
         seen = torch.maximum(own[:, 2:3], 1 - _ramp(moved, *MOVED))
         ratio, mirror_ratio = _ratio(shading, own[:, 3:]), _ratio(shading, mirrored[:, 3:])
-        mask = view.mask[:, None]
+        mask = (within > 0.99).to(within)
         log_ratio = ratio.log()
         change = (log_ratio.square() * mask).sum(dim=(2, 3)) / mask.sum(dim=(2, 3)).clamp(min=1)
         trust = 1 / (1 + DISTRUST * change.square())
