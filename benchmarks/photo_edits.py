@@ -1,10 +1,11 @@
 """How near edits of photographs come to the truth.
 
-Yale B (``--yale``, the cropped set or a zip of it): the picture of each person in frontal light is given the
-light of each other picture, by the angle between light and view. Heads are generated at 256 pixels, the same
-head once more in the new light or view, so that the truth is exact. PSNR in dB and SSIM, where the model draws
-a surface. Beside derender's edits: the model's own rendering, the unchanged input, the input with the
-brightness of the truth, the ratio of another person's two pictures, and for views the input turned as a plane.
+Extended Yale B (``--yale``, the cropped set or a zip of it): the picture of each person in frontal light is
+given the light of each other picture, by the angle between light and view. Heads are generated at 256 pixels,
+the same head once more in the new light or view, so that the truth is exact. PSNR in dB and SSIM, where the
+model draws a surface. Beside derender's edits: the model's own rendering, the unchanged input, the input with
+the brightness of the truth, the ratio of another person's two pictures, and for views the input turned as a
+plane.
 
     .venv/bin/python benchmarks/photo_edits.py --yale yaleb.zip --json benchmarks/results/photo_edits.json
 """
@@ -92,7 +93,7 @@ def flat(model: derender.Derenderer) -> Callable[[Case], Tensor]:
 def yale(model: derender.Derenderer, path: Path, half: str) -> dict[str, dict[str, tuple[float, float]]]:
     """Mean scores by method and by the angle between light and view."""
     source, lights = open_source(path), {}
-    for file in source.files():
+    for file in source.files:
         if found := re.search(r"(yaleB\d+)_P00A([+-]\d+)E([+-]\d+)", file):
             lights[found[1], int(found[2]), int(found[3])] = file
     people = sorted({person for person, *_ in lights})
@@ -151,7 +152,8 @@ def heads(model: derender.Derenderer, count: int, seed: int) -> dict[str, dict[s
                 camera = scene.camera.clone()
                 camera[:, 1] += radians(yaw)
                 other = scene.with_parameters(camera=camera)
-            place = shown[row] & masks[row] if kind == "light" else shown[row]
+            drawn = model.render(at_size(other, SIZE["heads"])).mask[0] > 0.5
+            place = shown[row] & drawn & (masks[row] if kind == "light" else True)
             case = Case(photos[row], truths[row], scene, other, place)
             methods = (
                 edits(model) if kind == "light" else {**edits(model), "input turned as a plane": flat(model)}

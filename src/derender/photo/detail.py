@@ -125,14 +125,21 @@ class PhotoDetail:
         return self._composed(tuple(pad(field, (self.rim,) * 4) for field in fields), torch.ones(1, 1, 1, 1))
 
     def _continued(self, mask: Tensor, shift: Tensor, log_ratio: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """The mask without its rim; shift and ratio go on around it and fade out. On the wider grid."""
+        """The mask without its rim; shift and ratio continue around it and fade out. On the wider grid."""
         reach = round(RIM_SHARE * self.grid)
         mask = -max_pool2d(-pad(mask, (reach,) * 4), 2 * reach + 1, stride=1)
         mask, fields = (pad(field, (self.rim,) * 4) for field in (mask, torch.cat((shift, log_ratio), dim=1)))
         near = _ramp(_blurred(mask, FADE_SHARE * self.grid), 0.02, 0.25)
         near = torch.maximum(mask, near)
         shift, log_ratio = _filled(fields * mask, mask).split((2, 1), dim=1)
-        return mask, shift * near, log_ratio * near
+        return mask, shift * self._inward().to(shift), log_ratio * near**2
+
+    def _inward(self) -> Float[Tensor, "h w"]:
+        """1 in the crop, falling to 0 at the border of the photograph around it."""
+        along = torch.arange(self.grid + 2 * self.rim) + 0.5
+        depth = torch.minimum(along, along.flip(0))
+        rise = torch.ones_like(depth) if self.rim == 0 else (depth / self.rim).clamp(max=1)
+        return rise * rise[:, None]
 
     def _composed(
         self, fields: tuple[Tensor, ...], trust: Float[Tensor, "n 1 h w"]
