@@ -37,6 +37,7 @@ DISTRUST = 4.0  # the weight of the photograph's detail is 1 / (1 + DISTRUST m²
 HIDDEN_BEHIND = 0.01  # scene units that a point may lie behind what is seen there
 FEATHER_SHARE = 1 / 32  # width of the blends, of the image's width
 COLOUR_SHARE = 1 / 12  # reach of the colours carried over to what is not seen
+COLOUR_MARGIN = 0.25  # of the canonical map, left out of what colours are carried over from
 RIM_SHARE = 0.05  # of the side: the surface's rim, where a model's depth ends in a wall
 FADE_SHARE = 1 / 8  # reach of motion and shading beyond the surface
 DARKEST = 1e-3
@@ -82,8 +83,7 @@ class PhotoDetail:
             lambert_shading(normals_from_depth(scene.depth, self.fov_deg), scene.light),
         )
         own = torch.cat((self._place, self._seen, self._shading), dim=1)
-        edge = round(RIM_SHARE * self.grid)
-        within = pad(torch.ones_like(self._seen[..., edge:-edge, edge:-edge]), (edge,) * 4)
+        within = self._margin(RIM_SHARE)
         maps = torch.cat((own, own.flip(-1), self._colours, within), dim=1).expand(count, -1, -1, -1)
         view = warp(torch.cat((maps, shading), dim=1), scene.depth, scene.camera, self.fov_deg)
         own, mirrored, colours, within, shading = view.image.split((4, 4, 3, 1, 1), dim=1)
@@ -125,14 +125,15 @@ class PhotoDetail:
         return self._composed(tuple(pad(field, (self.rim,) * 4) for field in fields), torch.ones(1, 1, 1, 1))
 
     def _continued(self, mask: Tensor, shift: Tensor, log_ratio: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """The mask without its rim; shift and ratio continue around it and fade out. On the wider grid."""
+        """How far inside the surface, 0..1; shift and ratio continue around it and fade. On the wide grid."""
         reach = round(RIM_SHARE * self.grid)
         mask = -max_pool2d(-pad(mask, (reach,) * 4), 2 * reach + 1, stride=1)
         mask, fields = (pad(field, (self.rim,) * 4) for field in (mask, torch.cat((shift, log_ratio), dim=1)))
         near = _ramp(_blurred(mask, FADE_SHARE * self.grid), 0.02, 0.25)
         near = torch.maximum(mask, near)
         shift, log_ratio = _filled(fields * mask, mask).split((2, 1), dim=1)
-        return mask, shift * self._inward().to(shift), log_ratio * near**2
+        inside = mask * _ramp(_blurred(mask, 2 * FEATHER_SHARE * self.grid), 0.5, 1.0)
+        return inside, shift * self._inward().to(shift), log_ratio * near**2
 
     def _inward(self) -> Float[Tensor, "h w"]:
         """1 in the crop, falling to 0 at the border of the photograph around it."""
@@ -193,7 +194,8 @@ class PhotoDetail:
         """The model's albedo in the photograph's colours, as far as those reach."""
         photo = self.on_grid(self.photo[None], self.grid)
         bare = (_look_up(photo, self._place) / self._shading.clamp(min=LIT[0])).clamp(0, 1)
-        weight, mirror_weight = self._seen, (1 - self._seen) * self._seen.flip(-1)
+        inner = self._seen * self._margin(COLOUR_MARGIN)
+        weight, mirror_weight = inner, (1 - inner) * inner.flip(-1)
         known = weight + mirror_weight
         difference = weight * bare + mirror_weight * bare.flip(-1) - known * own.albedo
         reach = COLOUR_SHARE * self.grid
@@ -209,6 +211,11 @@ class PhotoDetail:
         reach = max(1, round(FEATHER_SHARE * self.grid))
         shrunk = -max_pool2d(-share, 2 * reach + 1, stride=1, padding=reach)
         return avg_pool2d(shrunk, 2 * reach + 1, stride=1, padding=reach, count_include_pad=False)
+
+    def _margin(self, share: float) -> Float[Tensor, "1 1 g g"]:
+        """1 in the canonical map, 0 within a share of its side from its border."""
+        edge = round(share * self.grid)
+        return pad(torch.ones_like(self._seen[..., edge:-edge, edge:-edge]), (edge,) * 4)
 
     def _pixels(self) -> Float[Tensor, "1 2 g g"]:
         return _square(torch.arange(self.grid).float()).permute(0, 3, 1, 2).to(self.photo)
