@@ -80,42 +80,29 @@ def test_dry_run_shows_the_resolved_settings_and_makes_nothing(tmp_path, capsys)
     assert not out.exists()
 
 
-def test_embed_then_cluster(trained, faces, tmp_path, capsys):
-    table_file, numbers = tmp_path / "features.parquet", tmp_path / "embed.json"
-    assert run("embed", "--model", trained, "--data", faces, "--out", table_file, "--json", numbers) == 0
-    table, told = FeatureTable.read(table_file), json.loads(numbers.read_text())
+def test_embed_then_cluster(trained, faces, tmp_path, numbers):
+    table_file = tmp_path / "features.parquet"
+    told, _ = numbers("embed", "--model", trained, "--data", faces, "--out", table_file)
+    table = FeatureTable.read(table_file)
     assert told["rows"] == len(table) == 40
     assert told["factors"] == {name: values.shape[1] for name, values in table.factors.items()}
     assert "identity" in told["labels"]
-    capsys.readouterr()
-    words = ("evaluate", "cluster", "--label", "identity", "--json", "-")
-    assert run(*words, "--features", table_file) == 0
-    shown = capsys.readouterr()
-    result = json.loads(shown.out)
-    assert "geometry + albedo" in shown.err
+    words = ("evaluate", "cluster", "--label", "identity")
+    result, shown = numbers(*words, "--features", table_file)
+    assert "geometry + albedo" in shown
     assert result["n_rows"] == 40 and result["labels"] == {"identity": 5}
     assert list(result["rows"]) == ["geometry + albedo", "majority", "chance"]
     assert 0 < result["rows"]["chance"]["scores"]["accuracy"]["value"] <= 1
-    assert run(*words, "-m", trained, "-d", faces, "--cache", "none") == 0
-    rows = json.loads(capsys.readouterr().out)["rows"]
+    rows = numbers(*words, "-m", trained, "-d", faces, "--cache", "none")[0]["rows"]
     controls = ["untrained encoder", "PCA (10)", "pixels", "majority", "chance"]
     assert [name for name, row in rows.items() if row["control"]] == controls
     assert list(rows) == ["geometry + albedo", *controls] and rows["untrained encoder"]["runs"] == 3
 
 
-def test_geometry_and_reconstruction_of_generated_faces(trained, faces, capsys):
-    words = ("-m", trained, "-d", faces, "--json", "-")
-    assert run("evaluate", "geometry", *words, "--limit", 6) == 0
-    shown = capsys.readouterr()
-    found = json.loads(shown.out)
-    assert found["pictures"] == 6
-    assert {"model", "average_depth", "plane", "untrained"} <= set(found["geometry"])
-    assert found["geometry"]["plane"]["side"] > found["geometry"]["average_depth"]["side"] > 0
-    assert "average depth" in shown.err and "untrained model" in shown.err
-    assert run("evaluate", "reconstruction", *words, "--part", "test") == 0
-    shown = capsys.readouterr()
-    assert json.loads(shown.out)["pictures"] == 4  # a tenth of 40
-    assert "mean image" in shown.err
+def test_reconstruction_of_the_test_part(trained, faces, numbers):
+    found, shown = numbers("evaluate", "reconstruction", "-m", trained, "-d", faces, "--part", "test")
+    assert found["pictures"] == 4  # a tenth of 40
+    assert "mean image" in shown
 
 
 def test_decompose_writes_panels_factors_and_numbers(trained, faces, tmp_path, refused, capsys):

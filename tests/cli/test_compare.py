@@ -133,13 +133,6 @@ def test_the_papers_linear_table_frozen_and_fine_tuned(smiling, model, tmp_path,
     assert "give the linear table, models and images" in refused(*wrong)
 
 
-def test_controls_for_a_table_made_before(model, people, tmp_path, numbers):
-    table = tmp_path / "f.parquet"
-    assert main(["embed", "-m", str(model), "-d", str(people), "--out", str(table)]) == 0
-    words = ["evaluate", "cluster", "-f", table, "-d", people, "--label", "class", *QUICK, "none"]
-    assert list(numbers(*words)[0]["rows"])[1:4] == ["untrained encoder", "PCA (16)", "pixels"]
-
-
 def test_bad_input_is_one_line(tables, model, people, refused, tmp_path):
     good = tables["good"]
     cluster = ("evaluate", "cluster", "-f", good, "--cache", "none")

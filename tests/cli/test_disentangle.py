@@ -1,6 +1,5 @@
 """`evaluate disentangle` and `evaluate geometry`: images drawn, numbers told, bad words refused."""
 
-import json
 from functools import partial
 from pathlib import Path
 
@@ -8,7 +7,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from derender.cli import main
 from derender.data.synthetic import faces, write
 from derender.model import Derenderer
 
@@ -35,31 +33,27 @@ def rendered(tmp_path_factory, made) -> Path:
     return folder
 
 
-def test_the_card_is_printed_drawn_and_written(model, rendered, tmp_path, capsys):
+def test_the_card_is_printed_drawn_and_written(model, rendered, tmp_path, numbers):
     out = tmp_path / "card.png"
     words = ["evaluate", "disentangle", "-m", model, "-d", rendered, "--seeds", "1", "--swap-pictures", "4"]
     words += ["--cache", tmp_path / "cache"]
     text, typeset = tmp_path / "card.md", tmp_path / "card.tex"
-    files = ["--json", "-", "--markdown", text, "--latex", typeset]
-    assert main([str(word) for word in [*words, "--out", out, *files]]) == 0
+    told, shown = numbers(*words, "--out", out, "--markdown", text, "--latex", typeset)
     assert text.read_text().count("| :--- |") == typeset.read_text().count(r"\begin{table}") == 6
-    shown = capsys.readouterr()
-    told = json.loads(shown.out)
     assert told["pictures"] == 24 and told["features"]["geometry"] == 12 and told["seeds"] == [0]
     assert list(told["rows"]) == ["model", "untrained encoder", "shuffled rows", "random pixels", "PCA"]
     scores = told["rows"]["model"][0]
     assert len(scores["swap"]["moved"]) == 4 and scores["truth"]["factors"][:2] == ["ambient", "diffuse"]
     assert told["rows"]["random pixels"][0]["swap"] is None
     for words_shown in ("Swap test", "true factor", "swap test, decoded:", "random pixels"):
-        assert words_shown in shown.err
+        assert words_shown in shown
     with Image.open(out) as sheet:
         assert sheet.width > 900
     low, high = scores["swap"]["ratio_95"]
     assert low < scores["swap"]["ratio"] < high and "resampled" not in scores["swap"]
-    assert "6 results computed, 0 found" in shown.err
-    assert main([str(word) for word in [*words, "--json", "-"]]) == 0
-    again = capsys.readouterr()
-    assert json.loads(again.out) == told and "0 results computed, 6 found" in again.err
+    assert "6 results computed, 0 found" in shown
+    again, shown = numbers(*words)
+    assert again == told and "0 results computed, 6 found" in shown
 
 
 def test_bad_words(model, rendered, tmp_path, refused):
@@ -73,7 +67,7 @@ def test_bad_words(model, rendered, tmp_path, refused):
     assert "needs 20 images or more" in refused("--limit", "5")
 
 
-def test_geometry_of_pictures_beside_depth_maps(model, made, tmp_path, capsys):
+def test_geometry_of_pictures_beside_depth_maps(model, made, tmp_path, numbers):
     """unsup3d's layout, written here at twice the model's size: scores as for the same maps in our own."""
     folder = tmp_path / "pairs" / "test"
     for kind in ("image", "depth"):
@@ -88,13 +82,11 @@ def test_geometry_of_pictures_beside_depth_maps(model, made, tmp_path, capsys):
     own = tmp_path / "own"
     write(made, own)
     for data in (tmp_path / "pairs", own):
-        words = ["evaluate", "geometry", "-m", model, "-d", data, "--limit", "6", "--json", "-"]
+        words = ["evaluate", "geometry", "-m", model, "-d", data, "--limit", "6"]
         words += ["--cache", tmp_path / "cache", "--resamples", "50"]
-        assert main([str(word) for word in words]) == 0
-        results.append(json.loads(capsys.readouterr().out))
-    assert main([str(word) for word in [*words, "--markdown", tmp_path / "geometry.md"]]) == 0
-    again = capsys.readouterr()
-    assert json.loads(again.out) == results[1] and "0 results computed, 3 found" in again.err
+        results.append(numbers(*words)[0])
+    again, shown = numbers(*words, "--markdown", tmp_path / "geometry.md")
+    assert again == results[1] and "0 results computed, 3 found" in shown
     assert "| prediction | SIDE x 100 ↓ | 95 % | MAD ↓ | 95 % |" in (tmp_path / "geometry.md").read_text()
     pairs, ours = results
     assert pairs["pictures"] == 6 and "factors" not in pairs and "factors_untrained" in ours

@@ -1,10 +1,10 @@
 """`derender whiten`, `refine` and `unet`: copies of a model, their measurements and refusals."""
 
-import json
-
 import pytest
 import torch
 from PIL import Image
+from tests.cli.conftest import run as call
+from tests.cli.conftest import settings
 
 import derender
 from derender.cli import main
@@ -25,9 +25,8 @@ def folder(tmp_path_factory):
     return folder
 
 
-def run(command, folder, out, *settings, words=(), model=KNOWN) -> int:
-    changes = [f"--set={setting}" for setting in settings]
-    return main([command, str(folder), "-m", str(model), "-o", str(out), *changes, *words])
+def run(command, folder, out, *pairs, words=(), model=KNOWN) -> int:
+    return call(command, folder, "-m", model, "-o", out, *settings(*pairs), *words)
 
 
 @pytest.fixture(scope="module")
@@ -39,10 +38,9 @@ def fits(folder, tmp_path_factory):
     return made
 
 
-def test_a_whitened_copy_has_other_features_and_the_same_scenes(folder, tmp_path, capsys):
-    few = ("views=2", "directions=8", "spatial=false")
-    assert run("whiten", folder, tmp_path / "mine", *few, words=("--limit", "24", "--json", "-")) == 0
-    told = json.loads(capsys.readouterr().out)
+def test_a_whitened_copy_has_other_features_and_the_same_scenes(folder, tmp_path, numbers):
+    few = settings("views=2", "directions=8", "spatial=false")
+    told, _ = numbers("whiten", folder, "-m", KNOWN, "-o", tmp_path / "mine", *few, "--limit", "24")
     assert told["pictures"] == 24 and len(told["between_over_within"]["geometry"]) == 8
     one, two = derender.load(KNOWN), derender.load(tmp_path / "mine")
     assert torch.linalg.matrix_rank(two.whitening.get_buffer("albedo_map"), rtol=1e-3) == 8
@@ -93,17 +91,14 @@ def test_images_are_made_of_fitted_scenes(fits, folder, tmp_path, command):
     assert any(a.read_bytes() != b.read_bytes() for a, b in zip(one, two, strict=True))
 
 
-def test_a_table_of_fitted_scenes_is_searched_as_it_was_made(fits, folder, tmp_path, capsys):
-    table, given = tmp_path / "table.parquet", ["-m", str(fits)]
-    words = ["--limit", "10", "-o", str(table), "--fit-steps", "3"]
-    assert main(["embed", str(folder), *given, *words]) == 0
+def test_a_table_of_fitted_scenes_is_searched_as_it_was_made(fits, folder, tmp_path, numbers):
+    table, given = tmp_path / "table.parquet", ["-m", fits]
+    assert call("embed", folder, *given, "--limit", "10", "-o", table, "--fit-steps", "3") == 0
     read = derender.FeatureTable.read(table)
     assert read.factors["geometry"].shape == (10, 266)
     like = str(folder / read.files[3])
-    search = ["search", "--features", str(table), "--like", like, *given, "--factor", "geometry"]
-    capsys.readouterr()
-    assert main([*search, "--copies", "--json", "-"]) == 0
-    first = json.loads(capsys.readouterr().out)["found"][0]
+    search = ["search", "--features", table, "--like", like, *given, "--factor", "geometry"]
+    first = numbers(*search, "--copies")[0]["found"][0]
     assert first["file"] == read.files[3] and first["distance"] == pytest.approx(0, abs=1e-4)
 
 
@@ -121,26 +116,22 @@ def test_a_model_that_cannot_fit_is_told_how_to(folder, tmp_path, capsys):
     assert [path.name for path in tmp_path.iterdir()] == ["plain"]
 
 
-def test_a_refined_copy_comes_with_its_measurements(folder, tmp_path, capsys):
-    settings = (*SHORT, "spatial=false", "steps=2")
-    assert run("refine", folder, tmp_path / "mine", *settings, words=("--json", "-")) == 0
-    shown = capsys.readouterr()
-    told = json.loads(shown.out)
+def test_a_refined_copy_comes_with_its_measurements(folder, tmp_path, numbers):
+    short = settings(*SHORT, "spatial=false", "steps=2")
+    told, shown = numbers("refine", folder, "-m", KNOWN, "-o", tmp_path / "mine", *short)
     assert told["pictures"] == 180 and told["held_out"] == 20
     assert told["errors"]["before"] > told["errors"]["fitted"] > 0
-    assert "20 held-out images: reconstructed with an error of" in shown.err
+    assert "20 held-out images: reconstructed with an error of" in shown
     assert set(told["gaps"]) == {"depth", "albedo", "light", "camera"}
     copy, errors = derender.load(tmp_path / "mine"), read_errors(tmp_path / "mine")
     assert copy.fitting.settings.steps == 2 and copy.whitening is not None and errors.pictures == 20
 
 
-def test_a_copy_with_u_nets_comes_with_its_errors(folder, tmp_path, capsys):
-    short = ("images=16", "batch_size=8", "unet_width=4")
-    assert run("unet", folder, tmp_path / "mine", *short, words=("--limit", "12", "--json", "-")) == 0
-    shown = capsys.readouterr()
-    told = json.loads(shown.out)
+def test_a_copy_with_u_nets_comes_with_its_errors(folder, tmp_path, numbers):
+    short = settings("images=16", "batch_size=8", "unet_width=4")
+    told, shown = numbers("unet", folder, "-m", KNOWN, "-o", tmp_path / "mine", *short, "--limit", "12")
     assert told["pictures"] == 12 and told["errors"]["place"] > 0
-    assert "mean errors against rendered-faces-64: place" in shown.err
+    assert "mean errors against rendered-faces-64: place" in shown
     copy = derender.load(tmp_path / "mine")
     assert copy.settings.network.encoder == "unet" and copy.whitening is None and copy.fitting is None
 

@@ -39,12 +39,10 @@ def table(model, photos) -> str:
     return str(path)
 
 
-def test_relight_sweeps_and_says_which_light(model, photos, tmp_path):
+def test_relight_sweeps_and_says_which_light(model, photos, tmp_path, numbers):
     out = tmp_path / "out"
     words = ["--stills", "3", "--frames", "4", "--size", "40", "--reach", "30", "--film", "gif"]
-    told = tmp_path / "told.json"
-    names = [str(photos / "0.png"), str(photos / "1.png")]
-    assert main(["relight", "-m", model, *names, "-o", str(out), *words, "--json", str(told)]) == 0
+    told, _ = numbers("relight", "-m", model, photos / "0.png", photos / "1.png", "-o", out, *words)
     assert sorted(path.name for path in out.iterdir()) == ["0", "1", "sheet.png"]
     stills = json.loads((out / "0" / "moved.json").read_text())["stills"]
     assert [still["label"] for still in stills] == ["light -30°", "light 0°", "light +30°"]
@@ -54,7 +52,7 @@ def test_relight_sweeps_and_says_which_light(model, photos, tmp_path):
     with Image.open(out / "0" / "film.gif") as film:
         assert film.n_frames == 4
     assert not (out / "0" / "film.mp4").exists()
-    assert json.loads(told.read_text())["sheets"] == [str(out / "sheet.png")]
+    assert told["sheets"] == [str(out / "sheet.png")]
 
 
 def test_relight_ends_in_the_light_of_another(model, photos, tmp_path):
@@ -118,32 +116,27 @@ def test_decompose_at_another_size_with_a_sheet(model, photos, tmp_path):
         assert sheet.height > 2 * 128 and albedo.size == (48, 48)
 
 
-def test_search_with_a_picture_of_the_table(table, model, photos, tmp_path, capsys):
+def test_search_with_a_picture_of_the_table(table, model, photos, tmp_path, numbers):
     """It is not found itself, whatever its name, unless copies are asked for."""
-    sheet, told = tmp_path / "sheet.png", tmp_path / "told.json"
-    renamed = str(shutil.copy(photos / "4.png", tmp_path / "mine.png"))
-    words = ["--model", model, "-k", "3", "--out", str(sheet), "--json", str(told)]
-    assert main(["search", "-f", table, "--like", renamed, *words]) == 0
-    answer = json.loads(told.read_text())
+    sheet, renamed = tmp_path / "sheet.png", shutil.copy(photos / "4.png", tmp_path / "mine.png")
+    words = ("search", "-f", table, "--like", renamed, "--model", model, "-k", "3", "--out", sheet)
+    answer, said = numbers(*words)
     assert answer["same_picture"] == ["4.png"] and len(answer["found"]) == 3
     assert "4.png" not in {row["file"] for row in answer["found"]}
     distances = [row["distance"] for row in answer["found"]]
     assert distances == sorted(distances) and distances[0] > 1e-5
-    assert "left out as the very same image: 4.png (--copies" in capsys.readouterr().err
-    assert main(["search", "-f", table, "--like", renamed, *words, "--copies", "--force"]) == 0
-    found = json.loads(told.read_text())["found"]
-    assert found[0]["file"] == "4.png" and len(found) == 3
+    assert "left out as the very same image: 4.png (--copies" in said
+    answer, said = numbers(*words, "--copies", "--force")
+    found = answer["found"]
+    assert found[0]["file"] == "4.png" and len(found) == 3 and "4.png" in said
     assert found[0]["distance"] == pytest.approx(0, abs=1e-5)
     with Image.open(sheet) as drawn:
         assert drawn.width > 4 * 160
-    assert "4.png" in capsys.readouterr().out
 
 
-def test_search_with_a_row_leaves_that_row_out(table, tmp_path):
-    told = tmp_path / "told.json"
-    words = ["--factor", "light", "--metric", "euclidean", "-k", "9", "--json", str(told)]
-    assert main(["search", "-f", table, "--like", "2.png", *words]) == 0
-    found = json.loads(told.read_text())["found"]
+def test_search_with_a_row_leaves_that_row_out(table, numbers):
+    words = ("--like", "2.png", "--factor", "light", "--metric", "euclidean", "-k", "9")
+    found = numbers("search", "-f", table, *words)[0]["found"]
     assert sorted(row["file"] for row in found) == ["0.png", "1.png", "3.png", "4.png", "5.png"]
     features = FeatureTable.read(table).factors["light"].astype(float)
     assert found[0]["distance"] == pytest.approx(np.linalg.norm(features[2] - features[found[0]["row"]]))

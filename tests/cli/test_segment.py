@@ -1,6 +1,5 @@
 """Segmentation on the command line: tables, overlays, going on, and ways to get it wrong."""
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -35,7 +34,7 @@ def model(folder: Path, encoder: str) -> Path:
     return Derenderer.from_preset("small", seed=0, **sizes).save(folder / encoder)
 
 
-def test_tables_overlays_and_going_on(parts, tmp_path, capsys, refused):
+def test_tables_overlays_and_going_on(parts, tmp_path, capsys, numbers, refused):
     net, out = model(tmp_path, "unet"), tmp_path / "out"
     words = ["evaluate", "segment", "-m", net, "-d", parts, "--out", out, "--epochs", 1, "--batch-size", 8]
     words += ["--resamples", 20, "--variants", "joint,random"]
@@ -47,11 +46,9 @@ def test_tables_overlays_and_going_on(parts, tmp_path, capsys, refused):
     (sheet,) = out.glob("overlays-*.png")
     with Image.open(sheet) as drawn:
         assert drawn.width > 4 * 160
-    again = [*words, "--seeds", 2, "--json", "-", "--markdown", text]
-    assert main([str(word) for word in again]) == 0
-    shown = capsys.readouterr()
-    told = json.loads(shown.out)
-    assert "2 runs computed, 2 found" in shown.err
+    again = [*words, "--seeds", 2, "--markdown", text]
+    told, shown = numbers(*again)
+    assert "2 runs computed, 2 found" in shown
     assert list(told["rows"])[:2] == ["joint encoders", "random start"] and told["seeds"] == [0, 1]
     joint = told["rows"]["joint encoders"]
     assert set(joint["scores"]) == {"mean_iou", "top10_iou", "pixel_accuracy"} and joint["runs"] == 2
@@ -61,13 +58,11 @@ def test_tables_overlays_and_going_on(parts, tmp_path, capsys, refused):
     assert "exists already" in refused(*again)
 
 
-def test_the_papers_table_beside_the_papers_numbers(parts, tmp_path, capsys, refused):
+def test_the_papers_table_beside_the_papers_numbers(parts, tmp_path, capsys, numbers, refused):
     words = ["compare", "--table", "segmentation", "-m", f"ours={model(tmp_path, 'unet')}", "-d", parts]
     words += ["--epochs", 1, "--resamples", 20, "--cache", tmp_path / "cache", "--seeds"]
     text, typeset = tmp_path / "t.md", tmp_path / "t.tex"
-    files = ["--json", "-", "--markdown", text, "--latex", typeset]
-    assert main([str(word) for word in [*words, 1, *files]]) == 0
-    told = json.loads(capsys.readouterr().out)
+    told, _ = numbers(*words, 1, "--markdown", text, "--latex", typeset)
     ours = told["parts"]["ours"]
     assert told["number"] == 3 and ours["differs"].startswith("subset: 13 + 3 images at 32 x 32, 19 classes")
     names = ["joint encoders", "geometry encoder", "albedo encoder", "joint encoders, frozen", "random start"]

@@ -83,11 +83,6 @@ def test_a_folder_of_cars_holds_what_was_requested(car_folder):
     assert facts["models"] == 3 and facts["settings"]["classes"] == {"jeep": 1.0, "police": 1.0}
 
 
-def test_geometry_is_evaluated_on_cars(car_folder, tiny, capsys):
-    assert run("evaluate", "geometry", "--model", tiny, "--json", "-", "--data", car_folder) == 0
-    assert json.loads(capsys.readouterr().out)["pictures"] == 12
-
-
 @pytest.mark.parametrize(
     ("kind", "arguments", "message"),
     [

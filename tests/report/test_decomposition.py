@@ -51,18 +51,12 @@ def drawn_text(monkeypatch) -> list[str]:
     return seen
 
 
-def test_decomposition_has_every_column_for_every_picture():
-    scene = bump()
-    drawn = decomposition(render(scene).image.clamp(0, 1), scene, render, FOV_DEG)
-    assert list(drawn.columns) == list(COLUMN_MEANING)
-    assert all([image.size for image in images] == [(16, 16)] * 3 for images in drawn.columns.values())
-
-
-def test_a_further_factor_is_drawn_where_its_parameter_is_a_map():
+def test_every_column_is_drawn_and_a_further_factor_where_its_parameter_is_a_map():
     extra = {"gloss": torch.rand(3, 16, 16), "tint": torch.rand(3, 3, 16, 16), "age": torch.rand(3, 2)}
     scene = replace(bump(), extra=extra)
     drawn = decomposition(render(scene).image.clamp(0, 1), scene, render, FOV_DEG)
     assert list(drawn.columns) == [*COLUMN_MEANING, "gloss", "tint"]
+    assert all([image.size for image in images] == [(16, 16)] * 3 for images in drawn.columns.values())
 
 
 def test_panel_has_the_expected_size_and_labels(drawn_text):
@@ -77,18 +71,10 @@ def test_panel_has_the_expected_size_and_labels(drawn_text):
     assert {"a.jpg", "b.jpg", "c.jpg"} <= set(drawn_text)
 
 
-def test_panel_cells_show_their_images():
-    shades = {"red": (200, 0, 0), "blue": (0, 0, 200)}
-    images = {name: [Image.new("RGB", (4, 4), colour)] for name, colour in shades.items()}
-    layout = GridLayout(cell=40, gap=10, margin=20, label=10)
-    sheet = labelled_grid(images, layout=layout)
-    y = 20 + 10 + 10 + 20
-    assert sheet.getpixel((20 + 20, y)) == (200, 0, 0)
-    assert sheet.getpixel((20 + 40 + 10 + 20, y)) == (0, 0, 200)
-
-
 def test_contact_sheet_and_pairs():
     images = [Image.new("RGB", (8, 8), (index * 20, 0, 0)) for index in range(5)]
+    grid = labelled_grid({"a": images[:1], "b": images[4:]}, layout=GridLayout(40, 10, 20, 10))
+    assert [grid.getpixel((x, 60))[0] for x in (40, 90)] == [0, 80]  # cells show their images
     layout = GridLayout(cell=20, gap=5, margin=10, label=10)
     assert contact_sheet(images, across=3, layout=layout).size == (10 + 3 * 25 - 5 + 10, 10 + 2 * 25 - 5 + 10)
     assert contact_sheet(images, ["x"] * 5, across=3, layout=layout).height == 10 + 2 * (25 + 15) - 5 + 10
@@ -121,11 +107,7 @@ def test_near_is_brighter_and_the_scale_is_one_for_the_set():
 
 
 def test_normals_are_red_to_the_right_and_green_upwards():
-    toward, right, up = (
-        [0, 0, 1],
-        [-0.6, 0, 0.8],
-        [0, 0.6, 0.8],
-    )  # inward normals, y down, of surfaces facing so
+    toward, right, up = [0, 0, 1], [-0.6, 0, 0.8], [0, 0.6, 0.8]  # inward normals, y down
     image = colours.normal_maps(np.array([[toward, right, up]], np.float32)[:, None])[0]
     flat, to_right, upwards = (image.getpixel((x, 0)) for x in range(3))
     assert flat == (128, 128, 255)
@@ -140,9 +122,6 @@ def test_uncovered_pixels_are_transparent_and_white_on_paper():
     assert image.mode == "RGBA" and image.getpixel((0, 1))[3] == 0
     paper = colours.on_background(image)
     assert paper.getpixel((0, 0)) == (0, 0, 0) and paper.getpixel((0, 1)) == (255, 255, 255)
-
-
-def test_pictures_need_channels_first():
     with pytest.raises(ValueError, match=r"shape \(N, 3, H, W\)"):
         colours.pictures(np.zeros((2, 4, 4, 3)))
 

@@ -18,8 +18,5 @@ def test_the_sheet_shows_every_matrix():
     assert dark < light - 40
     nothing = Matrix("m", np.full((2, 2), np.nan), "ab", "ab")
     assert light > np.asarray(matrix_sheet([nothing]), np.float64).mean() > dark
-
-
-def test_a_sheet_of_nothing_is_refused():
     with pytest.raises(ValueError, match="at least one matrix"):
         matrix_sheet([])

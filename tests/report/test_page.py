@@ -106,12 +106,6 @@ def test_charts_take_the_colour_of_the_page_and_are_the_same_every_time():
     assert ">score</text>" in first  # text stays text
 
 
-def test_light_dark_print_and_phone_are_provided_for():
-    html = full_page()
-    for needed in ("prefers-color-scheme: dark", "@media print", "max-width: 560px", "width=device-width"):
-        assert needed in html
-
-
 def test_table_marks_the_best_and_gives_numbers_to_sort_by():
     columns = [Column("up", "high"), Column("down", "low", 1), Column("size")]
     rows = [

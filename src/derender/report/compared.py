@@ -36,17 +36,11 @@ Costs = Mapping[str, Mapping[str, Any]]
 
 @dataclass(frozen=True)
 class ScoredQuestion:
-    """One question under one protocol (and one head at one number of labels, for the linear one).
+    """One question under one protocol (and one ``head`` at one ``count`` of labels, for the linear one).
 
-    Attributes:
-        name: of the data set, and of the question if it has several; then the number of labels.
-        about: rows, classes and the like, in words.
-        columns: the protocol's scores.
-        main: those of them in the one table; the first is drawn.
-        rows: methods and controls.
-        costs: by row, each by the names of ``COST_COLUMNS``.
-        absent: by method, why it is not among the rows: "failed: ..." or "missing: ...".
-        head, count: of the linear protocol.
+    ``about`` has rows, classes and the like in words; the ``main`` ones of the protocol's columns are in the
+    one table, and the first is drawn. ``costs`` are by row, each by the names of ``COST_COLUMNS``; ``absent``
+    says by method why it has no row: "failed: ..." or "missing: ...".
     """
 
     name: str
@@ -102,11 +96,9 @@ def _rows_from(values: Mapping[str, Any]) -> dict[str, ScoredRow]:
 
 
 def protocol_table(scores: Sequence[ScoredQuestion], methods: Sequence[str]) -> ScoreTable:
-    """The one table: a row for each method and control, the main scores of each data set, and the cost.
+    """The one table: a row for each method, then control, the main scores of each data set, and the cost.
 
-    Args:
-        scores: of one protocol; of the linear one those with ``SUMMARY_HEAD`` are shown.
-        methods: in order; controls come after them.
+    Scores are of one protocol; of the linear one those with ``SUMMARY_HEAD`` are shown.
     """
     shown = _shown(scores)
     columns = [

@@ -21,15 +21,10 @@ def comparison_page(
     failed: Sequence[str] = (),
     picture: str | None = None,
 ) -> Page:
-    """A self-contained page.
+    """A self-contained page with the tables in reading order, one or two sentences (``lead``) over them.
 
-    Args:
-        title: its heading.
-        tables: in reading order; controls in them stay set back.
-        lead: one or two sentences under the heading.
-        facts: what was compared and how: models, data, seeds, settings.
-        failed: a sentence for whatever is missing, with the reason.
-        picture: SVG text over the tables; the first of them then has no chart of its own.
+    ``facts`` are models, data, seeds, settings; ``failed`` has a sentence for whatever is missing, with the
+    reason. ``picture`` is SVG text over the tables; the first of them then has no chart of its own.
     """
     if not tables:
         raise ValueError("a comparison needs at least one table")

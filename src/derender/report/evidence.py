@@ -82,11 +82,9 @@ def run_evidence(
     A run without a model (a baseline, a collapse, a run that has just begun) has only its images examined.
 
     Args:
-        run: a run folder.
-        images: a set of images or its address: those it was trained with, or others.
+        images: a set of images or its address, read by ``dataset`` and ``limit``: its own, or others.
         truth: address of rendered images with exact depth, to score geometry.
         labels: columns to explain by factors; by default the first suitable one.
-        dataset, limit: how the address is read.
         device: "auto", "cpu" or "cuda".
         progress: called with (parts done, parts in all).
     """
@@ -149,15 +147,14 @@ def gather(subject: Subject, progress: Progress | None = None) -> Evidence:
         "card": ("Does each feature hold its own factor?", _card),
         "explained": ("Labels explained by factors", _explained),
     }
-    progress = progress or (lambda done, total: None)
-    sections, failed = {}, []
-    for done, (name, (title, make)) in enumerate(parts.items()):
-        progress(done, len(parts))
+    progress, sections, failed = progress or (lambda done, total: None), {}, []
+    progress(0, len(parts))
+    for done, (name, (title, make)) in enumerate(parts.items(), 1):
         try:
             sections[name] = make(subject)
         except ValueError as reason:
             failed.append(f"{title}: {reason}")
-    progress(len(parts), len(parts))
+        progress(done, len(parts))
     return Evidence(sections, failed)
 
 

@@ -24,14 +24,9 @@ CELL_NUMBERS_UP_TO = 400  # cells; larger matrices are shown without numbers
 
 @dataclass(frozen=True)
 class Matrix:
-    """One heat map.
+    """One heat map of values (rows, columns), clipped to 0..1 for the colour; NaN is grey.
 
-    Attributes:
-        title: above it.
-        values: (rows, columns), clipped to 0..1 for the colour; NaN is grey.
-        rows, columns: names of the rows and columns, or of equal groups of them.
-        sizes: where the names stand for groups: how many rows and columns each takes.
-        note: below it: what would be best.
+    Where names of rows and columns stand for groups, ``sizes`` is how many each takes. The note is below.
     """
 
     title: str
