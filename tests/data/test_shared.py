@@ -12,7 +12,6 @@ from derender.data import (
     list_images,
     quiet_pillow,
     read_ground_truth,
-    read_images,
     read_masks,
     split_indices,
 )
@@ -39,13 +38,6 @@ def test_every_archive_is_recognised_and_whole(shared_data, source, layout, coun
     with list_images(shared_data(f"data/{name}"), subset=subset or None) as listed:
         assert (listed.layout, len(listed.table.files), listed.files.skipped) == (layout, count, ())
         assert labels <= set(listed.table.labels)
-
-
-def test_utkface_labels(shared_data):
-    pictures = read_images(shared_data("data/utkface64.zip"), 64, limit=300)
-    assert len(pictures) == 300
-    assert set(pictures.label("race")) <= {"white", "black", "asian", "indian", "other"}
-    assert (pictures.label("age").min(), pictures.label("age").max()) > (0, 90)
 
 
 def test_utkface_copies(shared_data):
@@ -97,9 +89,3 @@ def test_synface_ground_truth_explains_its_pictures(shared_data):
     error = np.abs(picture - truth.images).mean(axis=1)[truth.mask]
     assert np.median(error) < 2
     assert error.mean() < 3
-
-
-def test_syncar_ground_truth(shared_data):
-    truth = read_ground_truth(shared_data("data/syncar64.zip"), limit=10)
-    assert truth.normal is None and truth.albedo is None
-    assert 0.85 < truth.depth[truth.mask].min() < truth.depth[truth.mask].max() < 1.15

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 import torch
-from scipy.ndimage import binary_erosion
 from scipy.spatial import cKDTree
+from tests.data.synthetic.test_generated import inner
 
 from derender.data.synthetic import CAR_LIGHTS, CAR_VIEWS, CarSettings, CarViewSettings, cars
 from derender.data.synthetic.cars import about_x, class_of, euler_angles, view_rotation
@@ -19,10 +19,6 @@ FRONTAL = CarSettings(light=CAR_LIGHTS["frontal"], view=CAR_VIEWS["frontal"], pi
 @pytest.fixture(scope="module")
 def sample() -> SyntheticSet:
     return cars.generate(32, seed=3, settings=FOUR_EACH)
-
-
-def inner(mask: np.ndarray, pixels: int = 1) -> np.ndarray:
-    return np.stack([binary_erosion(m, iterations=pixels) for m in mask])
 
 
 def test_every_class_occurs_soon_and_shares_are_kept(sample):

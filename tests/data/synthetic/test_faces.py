@@ -5,7 +5,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 import torch
-from scipy.ndimage import binary_erosion
+from tests.data.synthetic.test_generated import inner
 
 from derender.data.layouts.celeba import MASK_CLASSES
 from derender.data.synthetic import LIGHTS, VIEWS, FaceSettings, LightSettings, ViewSettings, faces
@@ -20,10 +20,6 @@ EVEN_LIGHT = LightSettings(yaw_deg=(0, 0), pitch_deg=(0, 0), ambient=(0.6, 0.6),
 @pytest.fixture(scope="module")
 def sample() -> SyntheticSet:
     return faces.generate(24, seed=3)
-
-
-def inner(mask: np.ndarray, pixels: int = 1) -> np.ndarray:
-    return np.stack([binary_erosion(m, iterations=pixels) for m in mask])
 
 
 def test_depth_lies_in_the_stated_range_and_fills_the_picture(sample):

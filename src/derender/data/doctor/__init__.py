@@ -165,16 +165,9 @@ def _compare(
     edges, sides = measures.structure_of(measures.edge_cells(grey)), measures.side_light(grey)
     alike = measures.likeness(edges)
     odd = float((alike < ODD_LIKENESS).mean())
-    of_edges = {
-        "agreement": measures.agreement,
-        "symmetry": measures.symmetry,
-        "fill": measures.frame_filled,
-        "view": measures.view_variety,
-    }
-    values = {
-        name: jackknife(lambda kept, measure=measure: measure(edges[kept]), count)
-        for name, measure in of_edges.items()
-    }
+    of_edges = {"agreement": measures.agreement, "symmetry": measures.symmetry}
+    of_edges |= {"fill": measures.frame_filled, "view": measures.view_variety}
+    values = {name: jackknife(lambda kept, of=of: of(edges[kept]), count) for name, of in of_edges.items()}
     values["light"] = jackknife(lambda kept: measures.light_variety(sides[kept]), count)
     values["odd"] = JackknifeEstimate(odd, float(np.sqrt(odd * (1 - odd) / count)))
     orders = {

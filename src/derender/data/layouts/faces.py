@@ -141,12 +141,9 @@ def _is_tracks(source: Source) -> bool:
     """A list of tracks, or numbered frames in numbered tracks throughout, of two people or more."""
     if _track_lists(source):
         return bool(source.images)
-    people: set[str] = set()
-    for file in source.images:
-        match = _NUMBERED.fullmatch(file)
-        if match is None:
-            return False
-        people.add(match["identity"])
+    if not all(map(_NUMBERED.fullmatch, source.images)):
+        return False
+    people = {match["identity"] for file in source.images if (match := _NUMBERED.fullmatch(file))}
     return len(people - PARTITION_NAMES.keys()) > 1
 
 

@@ -263,19 +263,12 @@ def _ambulance_box(car: CarTraits) -> list[Grid]:
     low, high, front, rear = s.sill + 0.32, s.height + 0.62, s.screen_at + 0.62, s.length
     half, tall, long = s.width / 2 + 0.1, 0.5 * (high - low), 0.5 * (rear - front)
     above, ahead, beside = ambulance_paint(car, low, high, front, rear)
-    walls = [
-        Surface(WHITE, "body", above),
-        Surface(WHITE, "body", ahead, folded=True),
-        Surface(WHITE, "body"),
-    ]
+    roof, face = Surface(WHITE, "body", above), Surface(WHITE, "body", ahead, folded=True)
+    walls = roof, face, Surface(WHITE, "body"), Surface(WHITE, "body", beside)
+    middle = (0, low + tall, 0.5 * (front + rear))
     lamp = Surface(_BAR_RED if car.livery != 2 and car.chances[8] < 0.5 else _BAR_BLUE, "light")
     return [
-        *rounded_box(
-            (0, low + tall, 0.5 * (front + rear)),
-            (half, tall, long),
-            0.07,
-            [*walls, Surface(WHITE, "body", beside)],
-        ),
+        *rounded_box(middle, (half, tall, long), 0.07, walls),
         *both(rounded_box((half - 0.3, high - 0.02, front + 0.08), (0.24, 0.12, 0.14), 0.05, lamp)),
         *both(rounded_box((half - 0.3, high - 0.02, rear - 0.12), (0.2, 0.09, 0.1), 0.04, lamp)),
         *rounded_box((0, s.height + 0.07, s.screen_at + 0.2), (0.55, 0.08, 0.13), 0.05, lamp),

@@ -54,8 +54,7 @@ def draw_identity(
     normal = generator.standard_normal
     return {
         "shape": dict(zip(modes, shape.tolist(), strict=True)),  # coefficient of every mode of face_shape
-        "scale": 0.865
-        + 0.02 * min(max(normal(), -2), 2),  # size in the image, 1 = the mean face of the domain
+        "scale": 0.865 + 0.02 * min(max(normal(), -2), 2),  # size, 1 = the mean face of the domain
         "build": build,  # 0 delicate .. 1 heavy
         "age_years": years,
         "age": age,  # 0 at 18 years .. 1 at 80, and a little beyond

@@ -90,6 +90,7 @@ def face_shape(detail: float = 1.0) -> FaceShape:
             rows, columns = (np.flatnonzero(moved.any(axis=axes)) for axes in ((1, 2), (0, 2)))
             box = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
             actions.append(((half * moved)[box].astype(np.float32), box))
+    modes = [_displacement(grid, fields, terms) for terms in numbers["modes"].values()]
     normal = _unit(np.cross(np.gradient(head, axis=0), np.gradient(head, axis=1)))
     level = np.stack([np.sin(grid.theta), np.zeros(grid.p.shape), -np.cos(grid.theta)], axis=-1)
     low = smoothstep(2.0, 20.0, grid.q)[..., None]
@@ -101,9 +102,7 @@ def face_shape(detail: float = 1.0) -> FaceShape:
         outward=_unit((1.0 - low) * normal + low * level).astype(np.float32),
         reach=np.abs(head[..., 0]).max(axis=1, keepdims=True).astype(np.float32),
         names=tuple(numbers["modes"]),
-        modes=np.array(
-            [_displacement(grid, fields, terms) for terms in numbers["modes"].values()], np.float32
-        ),
+        modes=np.array(modes, np.float32),
         actions=actions,
     )
 

@@ -110,9 +110,8 @@ class MorphableFaces:
         normal = np.clip(generator.standard_normal(len(self.texture_std)), -_LIMIT, _LIMIT)
         weights = (normal * self.texture_std).astype(np.float32)
         albedo = albedo + np.tensordot(weights, self.texture_components, 1)
-        albedo = np.clip(
-            np.where(np.isfinite(self.colours).all(axis=1, keepdims=True), self.colours, albedo), 0.0, 1.0
-        )
+        own = np.isfinite(self.colours).all(axis=1, keepdims=True)
+        albedo = np.clip(np.where(own, self.colours, albedo), 0.0, 1.0)
         labels: Row = {} if self.texture_mean is not None else {"skin_tone": round(who["melanin"], 4)}
         traits: Row = {f"shape_{k:03d}": float(value) for k, value in enumerate(coefficients)}
         return MorphablePerson(self, surface, albedo, labels, traits)
@@ -167,6 +166,7 @@ def _checked(arrays: dict[str, ndarray]) -> MorphableFaces:
             f"expression_names must give one of {', '.join(EXPRESSIONS)} "
             f"for each of {len(expressions)} expressions, got {names}"
         )
+    colours = floats("colours", v, 3, default=np.full((v, 3), np.nan), holes=True, unit=True)
     return MorphableFaces(
         mean=placed.astype(np.float32) - np.array([0, 0, 1], np.float32),
         triangles=np.ascontiguousarray(triangles[:, ::-1], np.int32),  # clockwise in the image
@@ -176,8 +176,6 @@ def _checked(arrays: dict[str, ndarray]) -> MorphableFaces:
         texture_components=texture.astype(np.float32),
         texture_std=(floats("texture_std", len(texture)) if len(texture) else np.zeros(0)).astype(np.float32),
         parts=parts.astype(np.int32),
-        colours=floats("colours", v, 3, default=np.full((v, 3), np.nan), holes=True, unit=True).astype(
-            np.float32
-        ),
+        colours=colours.astype(np.float32),
         expressions=dict(zip(names, expressions.astype(np.float32), strict=True)),
     )

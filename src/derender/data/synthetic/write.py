@@ -93,11 +93,8 @@ def _write(
 
 
 def _encoded(synthetic: SyntheticSet, i: int) -> dict[str, ndarray]:
-    mask, depth, normal = (
-        synthetic.mask[i],
-        synthetic.depth[i].astype(float),
-        synthetic.normal[i].astype(float),
-    )
+    mask = synthetic.mask[i]
+    depth, normal = synthetic.depth[i].astype(float), synthetic.normal[i].astype(float)
     code = np.clip(np.round((depth - DEPTH_LOW) / DEPTH_SPAN * 65535), 1, 65535)
     return {
         "depth": np.where(depth > 0, code, 0).astype(np.uint16),
