@@ -13,7 +13,6 @@ from derender.baselines.ris import (
     build_catalogue,
     masked_rows,
     name_clusters,
-    nearest_cluster,
     part_energy,
     part_matrix,
     spherical_kmeans,
@@ -75,11 +74,6 @@ def test_spherical_kmeans_finds_directions_whatever_their_length(generator):
     assert len(set(zip(truth.tolist(), found.tolist(), strict=True))) == 3
     with pytest.raises(ValueError, match="4 clusters need at least as many places, got 3"):
         spherical_kmeans(rows[:3], 4, generator)
-
-
-def test_a_place_belongs_to_the_direction_of_its_squared_activation():
-    activation = torch.tensor([[3.0, -5.0], [-1.0, 0.5]]).T.reshape(1, 2, 1, 2)
-    assert nearest_cluster(activation, torch.eye(2)).tolist() == [[[1, 0]]]
 
 
 def test_small_parts_get_the_cluster_where_they_gather():

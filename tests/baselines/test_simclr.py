@@ -127,15 +127,6 @@ def test_found_is_one_for_twins_and_low_for_strangers(seeded, losses):
     assert losses(net, images, config(SimclrObjective()), aid=strangers)["found"] == 0
 
 
-def test_features_come_before_the_head(seeded):
-    net, images = seeded(Simclr, TINY).eval(), torch.rand(3, 3, 32, 32)
-    assert list(net.embed(images)) == ["features"]
-    net.choose(("projection", "features"))
-    made = net.embed(images)
-    torch.testing.assert_close(made["projection"], net.head(made["features"]))
-    assert made["features"].shape == (3, 16) and made["projection"].shape == (3, 6)
-
-
 def test_physical_views_without_any_change_are_the_reconstruction(physics):
     images = torch.rand(3, 3, 32, 32, generator=drawn())
     still = PerturbSettings(ambient=0, diffuse=0, light_deg=0, camera_pitch_deg=0, camera_yaw_deg=0)

@@ -1,7 +1,6 @@
 """Baselines through the training loop: what a run leaves, exact resume, files that are not what they say."""
 
 import json
-import pickle
 import shutil
 
 import numpy as np
@@ -138,29 +137,6 @@ def test_damaged_and_foreign_folders_are_named(runs, copy, tmp_path):
         load_baseline(tmp_path / "nowhere")
     with pytest.raises(ValueError, match=r"holds the baseline 'ae'.*--baseline ae"):
         derender.load(runs / "ae")
-
-
-def test_a_pickle_is_refused_and_never_opened(tmp_path):
-    """Its code would make a file."""
-
-    class Trap:
-        def __reduce__(self):
-            return (open, (str(tmp_path / "sprung"), "w"))
-
-    folder = tmp_path / "folder"
-    folder.mkdir()
-    for file in (tmp_path / "weights.pth", folder / "pytorch_model.bin"):
-        file.write_bytes(pickle.dumps(Trap()))
-    for source in (tmp_path / "weights.pth", folder):
-        with pytest.raises(
-            ValueError, match=r"(weights\.pth|pytorch_model\.bin) is a pickle, which can run code"
-        ):
-            load_baseline(source)
-    (folder / "config.json").write_text(json.dumps({"format": 1, "baseline": "ae", "settings": {}}))
-    shutil.copy(tmp_path / "weights.pth", folder / "model.safetensors")
-    with pytest.raises(ValueError, match=r"model\.safetensors is damaged"):
-        load_baseline(folder)
-    assert not (tmp_path / "sprung").exists()
 
 
 def test_a_run_of_one_kind_is_not_taken_for_another(runs, blobs):

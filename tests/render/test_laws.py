@@ -87,26 +87,6 @@ def test_plane_from_an_angle(backend, view, height, width):
     assert_agrees(seen.uv[0], torch.where(inside[..., None], uv, 0))
 
 
-def test_ball_from_an_angle(backend):
-    size, radius, behind = 64, 0.3, 0.3  # the ball touches (0, 0, 1)
-    ray = rays(size, size)
-
-    def nearest_hit(middle: Tensor) -> Tensor:
-        along, length2 = ray @ middle, ray.square().sum(-1)
-        return (along - (along.square() - length2 * (middle.square().sum() - radius**2)).sqrt()) / length2
-
-    pose = camera(rx=0.2, ry=-0.3, rz=0.5, tx=0.005)
-    offset = torch.tensor([0.0, 0.0, behind], dtype=torch.float64)
-    seen, _ = look(nearest_hit(CENTRE + offset)[None], pose, backend)
-    middle = rotation_matrix(pose[0, :3]) @ offset + CENTRE + pose[0, 3:]
-    covered = seen.mask[0] > 0
-    error = (seen.depth[0] - nearest_hit(middle))[covered]
-    cell = 2 / focal_px(size, FOV_DEG)  # a generous side of a triangle; chords stay inside the ball
-    assert covered.float().mean() > 0.7
-    assert error.min() > -1e-12
-    assert error.max() < cell**2 / radius
-
-
 @pytest.mark.parametrize("yaw", [0.6, -0.6])
 def test_step_from_an_angle_and_occlusion_takes_the_nearer_surface(backend, yaw):
     """A near left half, a far right half, the wall between: the middle row, intersected by hand."""

@@ -15,7 +15,7 @@ from derender.scene.ranges import SceneRanges
 from derender.training import resolve, train
 from derender.training import watch as watching
 from derender.training.run_folder import read_metrics
-from derender.training.watch import SIGNS, Finding, Watcher, measure
+from derender.training.watch import SIGNS, Finding, Watcher
 
 RANGES = SceneRanges()
 STEP = 500
@@ -105,23 +105,11 @@ def test_a_watcher_goes_on_from_its_memory():
 
 
 @pytest.mark.parametrize(
-    "memory",
-    [{"averages": {"bulge": "0"}}, {"on_since": [3]}, {"last_images": None}, {"uneasy_since": 3}],
+    "memory", [{"averages": {"bulge": "0"}}, {"on_since": [3]}, {"last_images": None}, {"uneasy_since": 3}]
 )
 def test_a_memory_that_no_watcher_gave_is_refused(memory):
     with pytest.raises(ValueError, match="does not hold what the collapse detector remembers"):
         Watcher.remembering(RANGES, BATCH, memory)
-
-
-def test_measurements_of_known_scenes():
-    healthy, flat = measure(healthy_scene(), RANGES), measure(with_depth(torch.ones_like), RANGES)
-    assert flat["depth_spread"] == pytest.approx(0, abs=1e-6)
-    assert flat["bulge"] == pytest.approx(0, abs=1e-5)
-    assert measure(FAILED_SCENES["saturated depth"], RANGES)["depth_at_bound"] == 1
-    assert measure(FAILED_SCENES["view at its bound"], RANGES)["view_at_bound"] == 1
-    assert healthy["view_at_bound"] == 0
-    hollow = measure(FAILED_SCENES["hollow depth"], RANGES)
-    assert hollow["bulge"] == pytest.approx(-healthy["bulge"], rel=1e-4)
 
 
 COLLAPSING = ["image_size=32", "width=8", "light_width=4", "batch_size=16", "perceptual=none", "images=4000"]

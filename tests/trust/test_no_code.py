@@ -156,8 +156,15 @@ def test_model_folders_with_pickles_in_them_run_nothing(canary, folder):
     assert derender.load(folder).image_size == 32
     for name in ("model.safetensors", "whitening.safetensors", "config.json"):
         refused_as_damaged(folder, name, pickled)
-    with pytest.raises(ValueError, match="is a pickle, which can run code"):
-        load_baseline(folder / "pytorch_model.bin")
+    (folder / "config.json").unlink()
+    for source in (folder, folder / "pytorch_model.bin"):
+        with pytest.raises(ValueError, match="is a pickle, which can run code"):
+            load_baseline(source)
+    config = {"format": 1, "baseline": "ae", "settings": {}}
+    (folder / "config.json").write_text(json.dumps(config))
+    (folder / "model.safetensors").write_bytes(pickled)
+    with pytest.raises(ValueError, match=r"model\.safetensors is damaged"):
+        load_baseline(folder)
 
 
 def test_safetensors_with_other_sizes_than_they_say_are_refused(folder):

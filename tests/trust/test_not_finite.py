@@ -25,7 +25,7 @@ from derender.training.features import fit_whitening
 from derender.training.held_out_errors import NotFinite, errors_of
 from derender.training.step import training_step
 from derender.training.task import StepLosses
-from derender.training.watch import Finding, FiniteWatch, Watcher, broken_gradient, first_not_finite
+from derender.training.watch import Finding, FiniteWatch, Watcher, broken_gradient
 
 SIZE = 32
 MIDDLE = SIZE // 2
@@ -155,12 +155,6 @@ def test_a_sum_that_overflows_is_no_broken_gradient(model):
     for value in model.parameters():
         value.grad = torch.full_like(value, 3e38)
     assert broken_gradient(model) is None
-
-
-def test_first_not_finite_names_the_first():
-    good, bad = torch.ones(2), torch.tensor([1.0, inf])
-    assert first_not_finite([]) is None
-    assert first_not_finite([("a", good), ("b", bad), ("c", bad)]) == "b"
 
 
 def picture_set(count: int = 20) -> ImageSet:

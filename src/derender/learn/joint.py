@@ -19,7 +19,6 @@ from derender.evaluation.finetuning import (
 from derender.evaluation.memory import Memory
 from derender.inputs import as_images, as_model, device_named
 from derender.learn.runs import Changes, OnImages, texts_of
-from derender.report.run import decomposition_sheet, run_page
 from derender.training.config import PRESETS, FinetuneConfig, TrainConfig, resolve, with_changes
 from derender.training.loop import train_task
 from derender.training.run_folder import refuse_taken
@@ -130,6 +129,8 @@ def finetune(
         config = with_changes(config, target__labels=_attributes(images))
     task = FinetuneTask(config, images.images, target_of(images, config), start)
     how = {"resume": resume, "progress": report, "accelerator": accelerator}
+    from derender.report.run import decomposition_sheet, run_page
+
     run = train_task(
         task, images, out, sample_sheet=lambda tuned, few: decomposition_sheet(tuned.model, few), **how
     )

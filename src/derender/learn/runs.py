@@ -7,8 +7,6 @@ from typing import Any
 from derender.baselines import baseline_config, image_size_of, stored_config, train_baseline
 from derender.data import ImageSet
 from derender.inputs import as_images, device_named
-from derender.report.evidence import Evidence, look_at_data
-from derender.report.run import baseline_sheet, decomposition_sheet, run_page
 from derender.training import derender_task
 from derender.training.config import TrainConfig, as_overrides, resolve
 from derender.training.distributed import first_then_others, leave, open_fabric, this_rank_writes
@@ -117,15 +115,31 @@ def train(
         on_images(images)
     how = {"resume": resume, "progress": report, "accelerator": accelerator}
     if isinstance(config, TrainConfig):
-        result = derender_task.train(config, images, out, sample_sheet=decomposition_sheet, **how)
+        result = derender_task.train(config, images, out, sample_sheet=_decomposition_sheet, **how)
     else:
-        result = train_baseline(config, images, out, sample_sheet=baseline_sheet, **how)
+        result = train_baseline(config, images, out, sample_sheet=_baseline_sheet, **how)
     writes = this_rank_writes()
     leave()
     if writes and page:
+        from derender.report.evidence import Evidence, look_at_data
+        from derender.report.run import run_page
+
         examined = Evidence({"data": look_at_data(images)})
         run_page(out, examined).write(out / "report.html")
     return result
+
+
+def _decomposition_sheet(*given: Any) -> Any:
+    """Drawn by report/run.py, whose import would delay the start of a training by seconds."""
+    from derender.report.run import decomposition_sheet
+
+    return decomposition_sheet(*given)
+
+
+def _baseline_sheet(columns_of: Any) -> Callable[..., Any]:
+    from derender.report.run import baseline_sheet
+
+    return baseline_sheet(columns_of)
 
 
 def texts_of(settings: Changes) -> list[str]:
