@@ -26,12 +26,10 @@ from torch.nn.functional import adaptive_avg_pool2d, interpolate, leaky_relu, ms
 from derender.baselines.generator import Codes, EqualLinear, Generator, GeneratorSettings, Side
 from derender.baselines.model import BaselineConfig, BaselineSettings, Features, Images, LoopModel, LossInputs
 from derender.baselines.stylegan2 import CENTRE_LATENTS, Stylegan
-from derender.objectives.perceptual import build_perceptual
 from derender.objectives.perceptual_features import PerceptualFeatures
-from derender.objectives.self_features import SelfFeatures, load_self_features
 from derender.settings import Settings
-from derender.storage.atomic import atomic_file
 from derender.training.batches import random_stream
+from derender.training.derender_task import self_features_of
 from derender.training.task import PhaseProgress
 
 FIRST_MIDDLE, FIRST_FINE = 3, 7  # numbers of the codes
@@ -195,18 +193,10 @@ class E4e(LoopModel):
         config: E4eConfig, images: UInt8[Tensor, "n 3 h w"], file: Path, progress: PhaseProgress
     ) -> PerceptualFeatures | None:
         """Features learnt from the images; None if they have no weight."""
-        if config.objective.perceptual_weight == 0:
+        objective = config.objective
+        if objective.perceptual_weight == 0:
             return None
-        if file.exists():
-            return load_self_features(file).to(images.device)
-        features = build_perceptual(
-            "self", images, seed=config.seed, steps=config.objective.self_features_steps,
-            progress=lambda done, total, _: progress(done, total), device=images.device,
-        )  # fmt: skip
-        assert isinstance(features, SelfFeatures)
-        with atomic_file(file) as temporary:
-            features.save(temporary)
-        return features
+        return self_features_of(file, images, config.seed, objective.self_features_steps, progress)
 
     def invert(self, images: Images) -> Codes:
         """W+ of images in 0..1."""

@@ -24,7 +24,7 @@ from torch import Generator, Tensor, nn
 from derender.baselines import network_type
 from derender.data import ImageSet, split_indices, suggestion
 from derender.settings import Settings
-from derender.storage.atomic import atomic_folder
+from derender.storage.atomic import new_folder
 from derender.storage.folder import CONFIG_FILE, FORMAT, WEIGHTS_FILE, saved_config
 from derender.storage.tensors import read_tensors, write_tensors
 from derender.training import run_folder
@@ -134,14 +134,11 @@ class BaselineModel(nn.Module, ABC):
 
     def save(self, folder: str | Path, *, overwrite: bool = False) -> Path:
         """Write settings and weights to ``folder``; complete or not at all."""
-        folder = Path(folder)
-        if folder.exists() and not overwrite:
-            raise FileExistsError(f"{folder} exists already: choose another folder or pass overwrite=True")
         config = {"format": FORMAT, "baseline": self.name, "settings": self.settings.model_dump(mode="json")}
-        with atomic_folder(folder) as temporary:
+        with new_folder(folder, overwrite=overwrite) as temporary:
             write_tensors(self.state_dict(), temporary / WEIGHTS_FILE)
             (temporary / CONFIG_FILE).write_text(json.dumps(config, indent=1))
-        return folder
+        return Path(folder)
 
 
 def load_baseline(source: str | Path, name: str | None = None) -> BaselineModel:

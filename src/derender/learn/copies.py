@@ -37,15 +37,9 @@ class ModelCopy:
 
 
 def whiten(
-    model: Derenderer | str | Path,
-    images: ImageSet | str | Path,
-    *,
-    out: str | Path,
-    settings: Changes = (),
-    mean_only: bool = False,
-    seed: int = 0,
-    **how: Any,
-) -> ModelCopy:
+    model: Derenderer | str | Path, images: ImageSet | str | Path, *, out: str | Path,
+    settings: Changes = (), mean_only: bool = False, seed: int = 0, **how: Any,
+) -> ModelCopy:  # fmt: skip
     """A copy of a model whose features move as little as possible with other factors.
 
     Whitening and fitting are estimated on these images, without labels. Weights and scenes stay as they are.
@@ -80,14 +74,9 @@ def whiten(
 
 
 def refine(
-    model: Derenderer | str | Path,
-    images: ImageSet | str | Path,
-    *,
-    out: str | Path,
-    settings: Changes = (),
-    seed: int = 0,
-    **how: Any,
-) -> ModelCopy:
+    model: Derenderer | str | Path, images: ImageSet | str | Path, *, out: str | Path,
+    settings: Changes = (), seed: int = 0, **how: Any,
+) -> ModelCopy:  # fmt: skip
     """A copy of a model that predicts at once the scenes that test-time optimisation finds slowly.
 
     Scenes are fitted to these images once, without labels; then the encoders learn to predict them. Every
@@ -110,14 +99,9 @@ def refine(
 
 
 def unet(
-    model: Derenderer | str | Path,
-    images: ImageSet | str | Path,
-    *,
-    out: str | Path,
-    settings: Changes = (),
-    seed: int = 0,
-    **how: Any,
-) -> ModelCopy:
+    model: Derenderer | str | Path, images: ImageSet | str | Path, *, out: str | Path,
+    settings: Changes = (), seed: int = 0, **how: Any,
+) -> ModelCopy:  # fmt: skip
     """A copy of a model with U-Net encoders, which learn its scenes pixel by pixel; for segmentation.
 
     Arguments are those of `whiten`; settings are changes of `UNetSettings`, as ``{"images": 50_000}``.
@@ -135,19 +119,10 @@ class _Copying:
     """What every copy of a model needs: the model, the images, and a free place."""
 
     def __init__(
-        self,
-        model: Derenderer | str | Path,
-        images: ImageSet | str | Path,
-        out: Path,
-        at_least: int,
-        *,
-        part: str = "all",
-        device: str = "auto",
-        overwrite: bool = False,
-        on_images: OnImages | None = None,
-        progress: CopyProgress | None = None,
-        **reading: Any,
-    ):
+        self, model: Derenderer | str | Path, images: ImageSet | str | Path, out: Path, at_least: int, *,
+        part: str = "all", device: str = "auto", overwrite: bool = False, on_images: OnImages | None = None,
+        progress: CopyProgress | None = None, **reading: Any,
+    ):  # fmt: skip
         if out.exists() and not overwrite:
             raise FileExistsError(f"{out} exists already: choose another folder or pass overwrite=True")
         self.out, self.part, self.overwrite, self.progress = out, part, overwrite, progress

@@ -35,19 +35,12 @@ class Finetuned:
 
 
 def finetune_settings(
-    out: str | Path,
-    *,
-    model: str | Path | None = None,
-    preset: str | None = None,
-    labels: Sequence[str] | None = None,
-    attributes: bool = False,
-    factors: Sequence[str] | str | None = None,
-    weight: float | None = None,
-    rendering_weight: float | None = None,
-    labelled: int | None = None,
-    settings: Changes | None = None,
+    out: str | Path, *, model: str | Path | None = None, preset: str | None = None,
+    labels: Sequence[str] | None = None, attributes: bool = False,
+    factors: Sequence[str] | str | None = None, weight: float | None = None,
+    rendering_weight: float | None = None, labelled: int | None = None, settings: Changes | None = None,
     resume: bool = False,
-) -> FinetuneConfig:
+) -> FinetuneConfig:  # fmt: skip
     """The settings of a joint training; arguments as for `finetune`."""
     names = locals()
     if resume:
@@ -85,17 +78,10 @@ def finetune_settings(
 
 
 def finetune(
-    images: ImageSet | str | Path,
-    *,
-    out: str | Path,
-    dataset: str = "auto",
-    limit: int | None = None,
-    device: str = "auto",
-    memory: Memory | None = None,
-    on_images: OnImages | None = None,
-    progress: Callable[[Progress], None] | None = None,
-    **choices: Any,
-) -> Finetuned:
+    images: ImageSet | str | Path, *, out: str | Path, dataset: str = "auto", limit: int | None = None,
+    device: str = "auto", memory: Memory | None = None, on_images: OnImages | None = None,
+    progress: Callable[[Progress], None] | None = None, **choices: Any,
+) -> Finetuned:  # fmt: skip
     """Train encoders with a head on labels and with the rendering objective at once, then score them.
 
     The test part of the run's split is scored, beside heads on the frozen features that training began with.

@@ -20,16 +20,10 @@ Changes = Mapping[str, Any] | Sequence[str]
 
 
 def run_settings(
-    out: str | Path | None = None,
-    *,
-    model: str | None = None,
-    preset: str | None = None,
-    start_from: str | None = None,
-    loocc: str | None = None,
-    config: str | Path | None = None,
-    settings: Changes = (),
-    resume: bool = False,
-) -> Any:
+    out: str | Path | None = None, *, model: str | None = None, preset: str | None = None,
+    start_from: str | None = None, loocc: str | None = None, config: str | Path | None = None,
+    settings: Changes = (), resume: bool = False,
+) -> Any:  # fmt: skip
     """The settings of a training run.
 
     Args:
@@ -64,19 +58,10 @@ def run_settings(
 
 
 def train(
-    images: ImageSet | str | Path,
-    *,
-    out: str | Path,
-    config: Any = None,
-    resume: bool = False,
-    dataset: str = "auto",
-    limit: int | None = None,
-    device: str = "auto",
-    page: bool = True,
-    on_images: OnImages | None = None,
-    progress: Callable[[Progress], None] | None = None,
-    **choices: Any,
-) -> TrainResult:
+    images: ImageSet | str | Path, *, out: str | Path, config: Any = None, resume: bool = False,
+    dataset: str = "auto", limit: int | None = None, device: str = "auto", page: bool = True,
+    on_images: OnImages | None = None, progress: Callable[[Progress], None] | None = None, **choices: Any,
+) -> TrainResult:  # fmt: skip
     """Train a model on unlabelled images of one kind of object, into a run folder with a report page.
 
     Args:
@@ -113,33 +98,28 @@ def train(
         )  # fmt: skip
     if on_images is not None:
         on_images(images)
-    how = {"resume": resume, "progress": report, "accelerator": accelerator}
+    how: dict[str, Any] = {"resume": resume, "progress": report, "accelerator": accelerator}
     if isinstance(config, TrainConfig):
-        result = derender_task.train(config, images, out, sample_sheet=_decomposition_sheet, **how)
+        how["sample_sheet"] = lambda *given: _pages().decomposition_sheet(*given)
+        result = derender_task.train(config, images, out, **how)
     else:
-        result = train_baseline(config, images, out, sample_sheet=_baseline_sheet, **how)
+        how["sample_sheet"] = lambda columns: _pages().baseline_sheet(columns)
+        result = train_baseline(config, images, out, **how)
     writes = this_rank_writes()
     leave()
     if writes and page:
         from derender.report.evidence import Evidence, look_at_data
-        from derender.report.run import run_page
 
         examined = Evidence({"data": look_at_data(images)})
-        run_page(out, examined).write(out / "report.html")
+        _pages().run_page(out, examined).write(out / "report.html")
     return result
 
 
-def _decomposition_sheet(*given: Any) -> Any:
-    """Drawn by report/run.py, whose import would delay the start of a training by seconds."""
-    from derender.report.run import decomposition_sheet
+def _pages() -> Any:
+    """report/run.py, whose import would delay the start of a training by seconds."""
+    from derender.report import run
 
-    return decomposition_sheet(*given)
-
-
-def _baseline_sheet(columns_of: Any) -> Callable[..., Any]:
-    from derender.report.run import baseline_sheet
-
-    return baseline_sheet(columns_of)
+    return run
 
 
 def texts_of(settings: Changes) -> list[str]:

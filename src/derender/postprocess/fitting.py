@@ -99,12 +99,9 @@ class Fitting(nn.Module):
     @torch.inference_mode(False)
     @torch.enable_grad()
     def fit(
-        self,
-        images: Float[Tensor, "n 3 h w"],
-        scene: Scene,
-        render: Callable[[Scene], Rendering],
+        self, images: Float[Tensor, "n 3 h w"], scene: Scene, render: Callable[[Scene], Rendering],
         steps: int | None = None,
-    ) -> Fitted:
+    ) -> Fitted:  # fmt: skip
         """Fit scenes to images in 0..1, each by itself, from a scene on, by so many steps of Adam."""
         steps = self.settings.steps if steps is None else steps
         if steps < 1:

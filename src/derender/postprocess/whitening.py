@@ -69,13 +69,9 @@ class Scatter:
 
 
 def fit_projection(
-    scatter: Scatter,
-    directions: int,
-    shrinkage: float,
-    size: int | None = None,
-    evenness: float = 0.0,
+    scatter: Scatter, directions: int, shrinkage: float, size: int | None = None, evenness: float = 0.0,
     power: float = 0.0,
-) -> Projection:
+) -> Projection:  # fmt: skip
     """The map that makes the mean within-class variance 1 in every kept direction, or evens out the total.
 
     Features are rotated so that each is as near as can be to the number of the code in its place.

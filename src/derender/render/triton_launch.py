@@ -52,13 +52,9 @@ def float64_bits(value: float) -> int:
 
 
 def launch(
-    kernel: Any,
-    images: Tensor,
-    per_image: int,
-    *arguments: Any,
-    lanes: int = PIXELS_PER_PROGRAM,
+    kernel: Any, images: Tensor, per_image: int, *arguments: Any, lanes: int = PIXELS_PER_PROGRAM,
     **constants: Any,
-) -> None:
+) -> None:  # fmt: skip
     """Run ``kernel(*arguments, BLOCK=…, **constants)`` over ``per_image`` lanes of each row of ``images``."""
     programs = len(images) * programs_per_image(per_image, lanes)
     if programs == 0:

@@ -36,12 +36,9 @@ def focal_px(width: int, fov_deg: float) -> float:
 
 
 def pixel_rays(
-    height: int,
-    width: int,
-    fov_deg: float,
-    device: torch.device | str | None = None,
+    height: int, width: int, fov_deg: float, device: torch.device | str | None = None,
     dtype: torch.dtype = torch.float32,
-) -> Float[Tensor, "h w 3"]:
+) -> Float[Tensor, "h w 3"]:  # fmt: skip
     """The point with z = 1 that each pixel centre sees."""
     focal = focal_px(width, fov_deg)
     x = (torch.arange(width, device=device, dtype=dtype) - (width - 1) / 2) / focal

@@ -40,15 +40,9 @@ class Shareable:
         return Path(folder)
 
     def save_pretrained(
-        self,
-        folder: str | Path,
-        *,
-        card: str | None = None,
-        data: str | None = None,
-        licence: str | None = None,
-        scores: str | None = None,
-        overwrite: bool = False,
-    ) -> Path:
+        self, folder: str | Path, *, card: str | None = None, data: str | None = None,
+        licence: str | None = None, scores: str | None = None, overwrite: bool = False,
+    ) -> Path:  # fmt: skip
         """As ``save``, with what a shared model needs: a card (README.md), held-out errors and its split.
 
         They are those of the folder it was loaded from, as long as its weights are. Otherwise the card is
@@ -65,16 +59,10 @@ class Shareable:
         return Path(folder)
 
     def push_to_hub(
-        self,
-        repository: str,
-        *,
-        card: str | None = None,
-        data: str | None = None,
-        licence: str | None = None,
-        scores: str | None = None,
-        private: bool = False,
+        self, repository: str, *, card: str | None = None, data: str | None = None,
+        licence: str | None = None, scores: str | None = None, private: bool = False,
         token: str | None = None,
-    ) -> str:
+    ) -> str:  # fmt: skip
         """Upload the model to the Hugging Face Hub as ``save_pretrained`` writes it; returns its address.
 
         A ValueError: no card, data and licence; PermissionError, ConnectionError: the Hub refuses or is not

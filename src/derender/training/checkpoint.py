@@ -57,13 +57,9 @@ class DamagedCheckpoint(Damaged):
 
 
 def save_checkpoint(
-    folder: Path,
-    model: nn.Module,
-    optimiser: torch.optim.Optimizer,
-    state: TrainState,
-    *,
+    folder: Path, model: nn.Module, optimiser: torch.optim.Optimizer, state: TrainState, *,
     previous: Path | None = None,
-) -> None:
+) -> None:  # fmt: skip
     """Write a checkpoint, read it back, put it in place of ``folder``; the old one becomes ``previous``."""
     kept = optimiser.state_dict()
     moments = {

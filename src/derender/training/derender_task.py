@@ -33,15 +33,9 @@ from derender.training.watch import Watcher
 
 
 def train(
-    config: TrainConfig,
-    images: ImageSet,
-    out: str | Path,
-    *,
-    resume: bool = False,
-    progress: Callable[[Progress], None] | None = None,
-    accelerator: str = "auto",
-    **how: Any,
-) -> TrainResult:
+    config: TrainConfig, images: ImageSet, out: str | Path, *, resume: bool = False,
+    progress: Callable[[Progress], None] | None = None, accelerator: str = "auto", **how: Any,
+) -> TrainResult:  # fmt: skip
     """Train a model on images and estimate its features; all files lie in the folder ``out``.
 
     Images are at the model's size; ``out`` is new, or with ``resume`` that of an unfinished run; ``how`` may
@@ -129,23 +123,16 @@ class DerenderStep(nn.Module):
     """Model, objective and perceptual features; held-out images are each judged by one of the ``ranks``."""
 
     def __init__(
-        self,
-        model: Derenderer,
-        config: TrainConfig,
-        perceptual: PerceptualFeatures | None,
+        self, model: Derenderer, config: TrainConfig, perceptual: PerceptualFeatures | None,
         ranks: Ranks = ALONE,
-    ):
+    ):  # fmt: skip
         super().__init__()
         self.model, self.config, self.perceptual, self.ranks = model, config, perceptual, ranks
 
     def forward(
-        self,
-        images: Tensor,
-        generator: Generator,
-        precision: Precision,
-        done: float | None = None,
+        self, images: Tensor, generator: Generator, precision: Precision, done: float | None = None,
         rows: Tensor | None = None,
-    ) -> tuple[Tensor, Held]:
+    ) -> tuple[Tensor, Held]:  # fmt: skip
         objective, chunks = self.config.objective, self.config.accumulate
         own, ranks = (1.0, ALONE) if done is None else (own_share(objective, done), self.ranks)
         result = training_step(
@@ -154,34 +141,40 @@ class DerenderStep(nn.Module):
         return result.total, Held(result)
 
 
-def perceptual_of(
-    config: TrainConfig, run: RunFolder, images: UInt8[Tensor, "n 3 h w"], progress: PhaseProgress
-) -> PerceptualFeatures | None:
-    """The perceptual features of a run, None without weight; self-trained ones are kept in its folder."""
-    objective, file = config.objective, run.perceptual
-    if objective.perceptual == "none" or objective.perceptual_weight == 0:
-        return None
-    features = None
-    if objective.perceptual == "self" and file.exists():
+def self_features_of(
+    file: Path, images: UInt8[Tensor, "n 3 h w"], seed: int, steps: int, progress: PhaseProgress
+) -> PerceptualFeatures:
+    """Self-trained features from a run's file, or learnt from its images, again where it is damaged."""
+    if file.exists():
         try:
-            features = load_self_features(file).to(images.device)
+            return load_self_features(file).to(images.device)
         except ValueError as problem:
             warnings.warn(
                 f"{problem}: they are learnt again, from the same seed", DamageNoticed, stacklevel=2
             )
-    if features is None:
-        features = build_perceptual(
-            objective.perceptual,
-            images,
-            weights=objective.vgg16_path,
-            seed=config.seed,
-            steps=objective.self_features_steps,
-            progress=lambda done, total, _: progress(done, total),
-            device=images.device,
+    features = build_perceptual(
+        "self", images, seed=seed, steps=steps, progress=lambda done, total, _: progress(done, total),
+        device=images.device,
+    )  # fmt: skip
+    assert isinstance(features, SelfFeatures)
+    with atomic_file(file) as temporary:
+        features.save(temporary)
+    return features
+
+
+def perceptual_of(
+    config: TrainConfig, run: RunFolder, images: UInt8[Tensor, "n 3 h w"], progress: PhaseProgress
+) -> PerceptualFeatures | None:
+    """The perceptual features of a run, None without weight; self-trained ones are kept in its folder."""
+    objective = config.objective
+    if objective.perceptual == "none" or objective.perceptual_weight == 0:
+        return None
+    if objective.perceptual == "self":
+        features = self_features_of(
+            run.perceptual, images, config.seed, objective.self_features_steps, progress
         )
-        if isinstance(features, SelfFeatures):
-            with atomic_file(file) as temporary:
-                features.save(temporary)
+    else:
+        features = build_perceptual("vgg16", images, weights=objective.vgg16_path, device=images.device)
     if config.channels_last and features is not None:
         features = features.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
     return features

@@ -115,14 +115,9 @@ class Refined:
 
 
 def refine(
-    model: Derenderer,
-    images: UInt8[Tensor, "n 3 h w"],
-    held_out: UInt8[Tensor, "m 3 h w"],
-    config: RefineConfig | None = None,
-    *,
-    seed: int = 0,
-    progress: Progress | None = None,
-) -> Refined:
+    model: Derenderer, images: UInt8[Tensor, "n 3 h w"], held_out: UInt8[Tensor, "m 3 h w"],
+    config: RefineConfig | None = None, *, seed: int = 0, progress: Progress | None = None,
+) -> Refined:  # fmt: skip
     """A copy of a trained model that predicts what fitting finds; the model stays as it is.
 
     The same seed gives the same weights on the same machine and thread count; torch's global random state is
@@ -201,14 +196,9 @@ def fit_scenes(
 
 
 def _learn(
-    student: Derenderer,
-    images: UInt8[Tensor, "n 3 h w"],
-    maps: MorphableMaps,
-    fitted: FittedScenes,
-    config: RefineConfig,
-    generator: Generator,
-    report: Progress,
-) -> None:
+    student: Derenderer, images: UInt8[Tensor, "n 3 h w"], maps: MorphableMaps, fitted: FittedScenes,
+    config: RefineConfig, generator: Generator, report: Progress,
+) -> None:  # fmt: skip
     """Train the student's networks of the four factors in place."""
     settings = config.refining
     learning = nn.ModuleList([student.nets[name] for name in FACTORS])
@@ -238,12 +228,9 @@ def _learn(
 
 @torch.no_grad()
 def examples(
-    model: Derenderer,
-    images: Float[Tensor, "n 3 h w"],
-    fitted: Scene,
-    config: RefineConfig,
+    model: Derenderer, images: Float[Tensor, "n 3 h w"], fitted: Scene, config: RefineConfig,
     generator: Generator,
-) -> tuple[Float[Tensor, "n 3 h w"], Scene]:
+) -> tuple[Float[Tensor, "n 3 h w"], Scene]:  # fmt: skip
     """A batch to learn from, and its scenes: renderings first, then images, half of them mirrored."""
     settings, ranges = config.refining, model.settings.ranges
     rendered = round(len(images) * settings.rendered)
@@ -270,12 +257,9 @@ def examples(
 
 
 def _cropped(
-    images: Float[Tensor, "n 3 h w"],
-    scene: Scene,
-    model: Derenderer,
-    config: RefineConfig,
+    images: Float[Tensor, "n 3 h w"], scene: Scene, model: Derenderer, config: RefineConfig,
     generator: Generator,
-) -> tuple[Float[Tensor, "n 3 h w"], Scene]:
+) -> tuple[Float[Tensor, "n 3 h w"], Scene]:  # fmt: skip
     """Images and their scenes, a share of both in other crops."""
     settings = config.refining
     if not settings.reframed:

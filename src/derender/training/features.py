@@ -11,7 +11,6 @@ when a model is used (postprocess/fitting.py).
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
 
 import torch
 from jaxtyping import Float, Int64, Shaped
@@ -27,6 +26,7 @@ from derender.postprocess.whitening import Scatter, Whitening, fit_projection
 from derender.scene import Scene
 from derender.scene.perturb import PerturbSettings
 from derender.training.config import FeatureSettings, WhiteningSettings
+from derender.training.process import evaluating
 from derender.training.step import fill_uncovered
 
 BATCH_SIZE = 128
@@ -39,14 +39,9 @@ Progress = Callable[[int, int], object]
 
 
 def make_features(
-    model: Derenderer,
-    images: Shaped[Tensor, "n 3 h w"],
-    settings: FeatureSettings,
-    *,
-    seed: int = 0,
-    progress: Progress | None = None,
-    maps: MorphableMaps | None = None,
-) -> Derenderer:
+    model: Derenderer, images: Shaped[Tensor, "n 3 h w"], settings: FeatureSettings, *, seed: int = 0,
+    progress: Progress | None = None, maps: MorphableMaps | None = None,
+) -> Derenderer:  # fmt: skip
     """A model that shares these weights, with whitening and fitting as far as the settings have them.
 
     A feature keeps the size of the code: fitted coordinates leave the rest of it to activations. Images are
@@ -73,16 +68,10 @@ def make_features(
 
 @torch.no_grad()
 def fit_whitening(
-    model: Derenderer,
-    images: Shaped[Tensor, "n 3 h w"],
-    settings: WhiteningSettings,
-    perturb: PerturbSettings,
-    *,
-    describe: Describe | None = None,
-    size: int | None = None,
-    seed: int = 0,
+    model: Derenderer, images: Shaped[Tensor, "n 3 h w"], settings: WhiteningSettings,
+    perturb: PerturbSettings, *, describe: Describe | None = None, size: int | None = None, seed: int = 0,
     progress: Progress | None = None,
-) -> Whitening:
+) -> Whitening:  # fmt: skip
     """The map from a trained model's activations to its features; arguments as of `make_features`.
 
     ``describe`` is another encoder, all of whose activations of the model's renderings are measured; by
@@ -100,7 +89,7 @@ def fit_whitening(
     maps, vectors = ([f for f in model.factors if f.mirrored is which] for which in (True, False))
     mirrored: dict[str, Scatter] = {}
     alone: dict[str, Scatter] = {}
-    with _evaluating(model):
+    with evaluating(model):
         for start, batch in _batches(model, images, rows, progress):
             scene = model.decompose(batch)
             shown = _renderings(model, scene, batch, vectors, perturb, generator, settings.views)
@@ -156,14 +145,9 @@ def recentre(
 
 @torch.no_grad()
 def make_fitting(
-    model: Derenderer,
-    images: Shaped[Tensor, "n 3 h w"],
-    settings: FittingSettings,
-    *,
-    seed: int = 0,
-    progress: Progress | None = None,
-    maps: MorphableMaps | None = None,
-) -> Fitting:
+    model: Derenderer, images: Shaped[Tensor, "n 3 h w"], settings: FittingSettings, *, seed: int = 0,
+    progress: Progress | None = None, maps: MorphableMaps | None = None,
+) -> Fitting:  # fmt: skip
     """The morphable model of a model's predicted maps, and the length of features made of fitted scenes.
 
     Arguments are those of `make_features`. Fewer than two images, maps that are NaN or infinite, or a model
@@ -178,7 +162,7 @@ def make_fitting(
     model = model.with_features(Features(model.whitening))
     examples: dict[str, list[Tensor]] = {parameter: [] for parameter in PARAMETERS.values()}
     squares = torch.zeros((), dtype=torch.float64)
-    with _evaluating(model):
+    with evaluating(model):
         for start, batch in _batches(model, images, rows, progress):
             scene, features = model.decompose(batch), model.embed(batch)
             _check_finite("fitting", {name: scene.parameters[name] for name in examples}, start)
@@ -203,14 +187,9 @@ def make_fitting(
 
 
 def _renderings(
-    model: Derenderer,
-    scene: Scene,
-    images: Float[Tensor, "n 3 h w"],
-    changing: Iterable[Factor],
-    perturb: PerturbSettings,
-    generator: Generator,
-    count: int,
-) -> list[Float[Tensor, "n 3 h w"]]:
+    model: Derenderer, scene: Scene, images: Float[Tensor, "n 3 h w"], changing: Iterable[Factor],
+    perturb: PerturbSettings, generator: Generator, count: int,
+) -> list[Float[Tensor, "n 3 h w"]]:  # fmt: skip
     """The images, then renderings of their scenes with other values of these factors, all pixels filled."""
     shown, ranges = [images], model.settings.ranges
     for _ in range(count):
@@ -233,17 +212,6 @@ def _batches(
         yield start, (as_float(batch) if batch.dtype == torch.uint8 else batch.float()).to(model.device)
         if progress is not None:
             progress(min(start + BATCH_SIZE, len(rows)), len(rows))
-
-
-@contextmanager
-def _evaluating(model: Derenderer) -> Iterator[None]:
-    """Evaluation mode within the block."""
-    was_training = model.training
-    model.eval()
-    try:
-        yield
-    finally:
-        model.train(was_training)
 
 
 def _check_finite(what: str, values: Mapping[str, Tensor], start: int) -> None:

@@ -20,6 +20,7 @@ from derender.model import load
 from derender.settings import Settings
 from derender.storage.atomic import atomic_file
 from derender.storage.folder import ERRORS_FILE
+from derender.training.process import evaluating
 
 QUANTILES = 101
 FEWEST = 20
@@ -53,16 +54,11 @@ def reconstruction_errors(model: Any, images: Images, batch_size: int = 64) -> F
     A NaN among the reconstructions raises `NotFinite`.
     """
     pixels = torch.as_tensor(np.array(images) if isinstance(images, np.ndarray) else images)
-    was_training = model.training
-    model.eval()
     parts = []
-    try:
-        with torch.inference_mode():
-            for batch in pixels.split(batch_size):
-                target = as_float(batch.to(model.device))
-                parts.append(masked_l1(model.reconstruct(target), target).cpu())
-    finally:
-        model.train(was_training)
+    with evaluating(model), torch.inference_mode():
+        for batch in pixels.split(batch_size):
+            target = as_float(batch.to(model.device))
+            parts.append(masked_l1(model.reconstruct(target), target).cpu())
     errors = torch.cat(parts).numpy()
     if broken := int(np.isnan(errors).sum()):
         raise NotFinite(

@@ -78,16 +78,10 @@ class _Run:
     """A run in progress: everything that lasts from one step to the next."""
 
     def __init__(
-        self,
-        task: TrainingTask,
-        images: ImageSet,
-        out: Path,
-        *,
-        resume: bool = False,
-        sample_sheet: SampleSheet | None = None,
-        progress: Callable[[Progress], None] | None = None,
+        self, task: TrainingTask, images: ImageSet, out: Path, *, resume: bool = False,
+        sample_sheet: SampleSheet | None = None, progress: Callable[[Progress], None] | None = None,
         accelerator: str = "auto",
-    ):
+    ):  # fmt: skip
         config = self.config = task.config
         self.report, self.sample_sheet = progress or (lambda _: None), sample_sheet
         fabric = self.fabric = open_fabric(accelerator, every_parameter_learns=task.every_parameter_learns)

@@ -58,16 +58,10 @@ class StepResult(StepLosses):
 
 
 def training_step(
-    model: Derenderer,
-    images: Float[Tensor, "n 3 h w"],
-    objective: ObjectiveSettings,
-    perceptual: PerceptualFeatures | None,
-    generator: Generator,
-    precision: Precision = nullcontext,
-    own: float = 1.0,
-    ranks: Ranks = ALONE,
-    chunks: int = 1,
-) -> StepResult:
+    model: Derenderer, images: Float[Tensor, "n 3 h w"], objective: ObjectiveSettings,
+    perceptual: PerceptualFeatures | None, generator: Generator, precision: Precision = nullcontext,
+    own: float = 1.0, ranks: Ranks = ALONE, chunks: int = 1,
+) -> StepResult:  # fmt: skip
     """Losses for one batch of images in 0..1; networks run under ``precision``, geometry in float32.
 
     Args:

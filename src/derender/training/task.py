@@ -78,13 +78,9 @@ class TrainingTask(ABC):
 
 
 def compute_step(
-    module: nn.Module,
-    images: Float[Tensor, "n 3 h w"],
-    generator: Generator,
-    precision: Precision,
-    done: float | None = None,
-    rows: Int64[Tensor, " n"] | None = None,
-) -> Any:
+    module: nn.Module, images: Float[Tensor, "n 3 h w"], generator: Generator, precision: Precision,
+    done: float | None = None, rows: Int64[Tensor, " n"] | None = None,
+) -> Any:  # fmt: skip
     """The losses of one batch through a task's step module, wrapped by a strategy or not.
 
     ``done`` is the share of the run so far, None in evaluation; ``rows`` are the images' places in the data

@@ -77,13 +77,9 @@ class DistilledUNets:
 
 
 def distil_unets(
-    model: Derenderer,
-    images: UInt8[Tensor, "n 3 h w"],
-    settings: UNetSettings = DEFAULT_UNETS,
-    *,
-    seed: int = 0,
-    progress: Progress | None = None,
-) -> DistilledUNets:
+    model: Derenderer, images: UInt8[Tensor, "n 3 h w"], settings: UNetSettings = DEFAULT_UNETS, *,
+    seed: int = 0, progress: Progress | None = None,
+) -> DistilledUNets:  # fmt: skip
     """A copy of a trained model with U-Net encoders of geometry and albedo and a decoder that learnt from it.
 
     The same seed gives the same weights on the same machine and thread count; torch's global random state is
@@ -128,14 +124,9 @@ def _encoders(model: Derenderer) -> dict[str, UNetEncoder]:
 
 
 def _learn(
-    model: Derenderer,
-    student: Derenderer,
-    heads: nn.ModuleDict,
-    images: UInt8[Tensor, "n 3 h w"],
-    settings: UNetSettings,
-    generator: Generator,
-    progress: Progress | None,
-) -> None:
+    model: Derenderer, student: Derenderer, heads: nn.ModuleDict, images: UInt8[Tensor, "n 3 h w"],
+    settings: UNetSettings, generator: Generator, progress: Progress | None,
+) -> None:  # fmt: skip
     """Train the student's encoders and decoder and the heads in place."""
     joint, encoders = student.unet_decoder, _encoders(student)
     assert joint is not None
