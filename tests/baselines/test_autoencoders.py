@@ -136,15 +136,6 @@ def test_an_entry_that_is_never_chosen_is_given_to_a_place_of_the_batch(dead_bel
     assert (model.codebook._codebook.embed[0, 3].abs().max() < 100) == (dead_below > 0)
 
 
-def test_the_library_draws_from_our_generator_alone(seeded, losses):
-    state, models = torch.random.get_rng_state(), [seeded(Vqvae, TINY) for _ in range(3)]
-    for model, seed in zip(models, (1, 1, 2), strict=True):
-        losses(model, IMAGES, VqvaeConfig(), seed)
-    assert torch.equal(torch.random.get_rng_state(), state)
-    first, again, other = (model.codebook.codebook for model in models)
-    assert torch.equal(first, again) and not torch.equal(first, other)
-
-
 def test_features_are_the_map_its_mean_and_its_histogram(seeded, losses):
     model = seeded(Vqvae, TINY)
     losses(model, IMAGES, VqvaeConfig())

@@ -5,14 +5,7 @@ import pytest
 import torch
 from sklearn.decomposition import PCA
 
-from derender.baselines.controls import (
-    hog_features,
-    noise_features,
-    pca_features,
-    pixel_features,
-    untrained_features,
-    untrained_twin,
-)
+from derender.baselines import controls
 from derender.baselines.model import optional
 from derender.data import ImageSet
 from derender.features import embed_image_set, model_fingerprint
@@ -27,7 +20,7 @@ def pictures(count: int = 30, size: int = 8, seed: int = 0) -> ImageSet:
 
 def test_pixels_are_the_pixels():
     given = pictures()
-    table = pixel_features(given)
+    table = controls.pixel_features(given)
     np.testing.assert_allclose(table.concatenate("pixels"), given.images.reshape(30, -1) / 255, rtol=1e-6)
     assert table.files == given.files and table.label("who").tolist() == given.labels["who"].tolist()
     assert table.origin == {"data": "made", "layout": "folder", "control": "pixels"}
@@ -35,7 +28,7 @@ def test_pixels_are_the_pixels():
 
 def test_pca_agrees_with_its_definition():
     given = pictures()
-    codes = pca_features(given, components=5).concatenate("pca")
+    codes = controls.pca_features(given, components=5).concatenate("pca")
     flat = given.images.reshape(30, -1) / 255
     centred = flat - flat.mean(axis=0)
     u, _, _ = np.linalg.svd(centred, full_matrices=False)
@@ -45,23 +38,23 @@ def test_pca_agrees_with_its_definition():
 
 def test_pca_takes_its_components_from_other_pictures():
     train, test = pictures(), pictures(6, seed=1)
-    codes = pca_features(test, components=4, fit_on=train).concatenate("pca")
+    codes = controls.pca_features(test, components=4, fit_on=train).concatenate("pca")
     flat = [p.images.reshape(len(p), -1).astype(np.float32) / 255 for p in (train, test)]
     expected = PCA(4, whiten=True, random_state=0).fit(flat[0]).transform(flat[1])
     np.testing.assert_allclose(codes, expected, rtol=1e-4, atol=1e-4)
     with pytest.raises(ValueError, match=r"64 components cannot be had from 30 images: ask for 1 to 30"):
-        pca_features(train)
+        controls.pca_features(train)
     with pytest.raises(ValueError, match=r"fitted on images \(3, 4, 4\) does not take \(3, 8, 8\)"):
-        pca_features(train, components=4, fit_on=pictures(size=4))
+        controls.pca_features(train, components=4, fit_on=pictures(size=4))
 
 
 def test_noise_knows_nothing_and_repeats():
-    table = noise_features(pictures(500), dimensions=7, seed=3)
-    again = noise_features(pictures(500, seed=9), dimensions=7, seed=3)
+    table = controls.noise_features(pictures(500), dimensions=7, seed=3)
+    again = controls.noise_features(pictures(500, seed=9), dimensions=7, seed=3)
     np.testing.assert_array_equal(table.factors["noise"], again.factors["noise"])
     assert table.factors["noise"].shape == (500, 7) and abs(table.factors["noise"].std() - 1) < 0.05
     assert not np.allclose(
-        table.factors["noise"], noise_features(pictures(500), dimensions=7, seed=4).factors["noise"]
+        table.factors["noise"], controls.noise_features(pictures(500), dimensions=7, seed=4).factors["noise"]
     )
 
 
@@ -74,7 +67,11 @@ def small():
 
 def test_an_untrained_twin_has_the_shape_not_the_weights_and_leaves_the_generator(small):
     state = torch.random.get_rng_state()
-    first, again, other = untrained_twin(small, 0), untrained_twin(small, 0), untrained_twin(small, 1)
+    first, again, other = (
+        controls.untrained_twin(small, 0),
+        controls.untrained_twin(small, 0),
+        controls.untrained_twin(small, 1),
+    )
     assert torch.equal(torch.random.get_rng_state(), state)
     assert model_fingerprint(first) == model_fingerprint(again) != model_fingerprint(other)
     assert model_fingerprint(first) != model_fingerprint(small)
@@ -84,8 +81,8 @@ def test_an_untrained_twin_has_the_shape_not_the_weights_and_leaves_the_generato
 
 def test_untrained_features_are_those_of_the_twin(small):
     given = pictures(5, small.image_size)
-    table = untrained_features(small, given, seed=2)
-    expected = embed_image_set(untrained_twin(small, 2), given)
+    table = controls.untrained_features(small, given, seed=2)
+    expected = embed_image_set(controls.untrained_twin(small, 2), given)
     assert set(table.factors) == {"geometry", "albedo", "light", "camera"}
     for name in table.factors:
         np.testing.assert_array_equal(table.factors[name], expected.factors[name])
@@ -102,13 +99,13 @@ def stripes(*images: np.ndarray) -> ImageSet:
 def test_hog_knows_orientations_and_neither_brightness_nor_contrast():
     upright = np.tile(100 + 60 * np.sin(np.arange(32) / 2), (32, 1)).round()
     seen = []
-    table = hog_features(
+    table = controls.hog_features(
         stripes(upright, upright.T, upright + 40, np.full((32, 32), 7)),
         progress=lambda *counts: seen.append(counts),
     )
     values = table.factors["hog"]
     assert values.shape == (4, 3 * 3 * 2 * 2 * 9) and seen == [(4, 4)]
-    assert hog_features(stripes(np.zeros((64, 64)))).factors["hog"].shape == (1, 1764)
+    assert controls.hog_features(stripes(np.zeros((64, 64)))).factors["hog"].shape == (1, 1764)
     assert table.origin["control"] == "hog" and table.label("n").tolist() == [0, 1, 2, 3]
     by_orientation = values[:2].reshape(2, -1, 9).sum(axis=1)
     assert by_orientation.argmax(axis=1).tolist() == [0, 4]
@@ -122,6 +119,6 @@ def test_bad_input_and_a_missing_package_are_named():
     with pytest.raises(
         ValueError, match="cells of 20 pixels do not fit 2 a side into 32x32: ask for 1 to 16"
     ):
-        hog_features(stripes(np.zeros((32, 32))), cell_px=20)
+        controls.hog_features(stripes(np.zeros((32, 32))), cell_px=20)
     with pytest.raises(ValueError, match=r"the baseline x needs the package no_such.*derender\[baselines\]"):
         optional("no_such.thing", "the baseline x")

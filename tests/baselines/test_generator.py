@@ -6,30 +6,23 @@ import torch
 from scipy import signal
 from torch.nn.functional import conv2d, conv_transpose2d
 
-from derender.baselines.generator import (
-    FILTER,
-    EqualLinear,
-    Generator,
-    GeneratorSettings,
-    ModulatedConv,
-    StyledConv,
-    style_layers,
-    upfirdn,
-)
+from derender.baselines import generator as gan
 from derender.baselines.stylegan2 import Discriminator
 
-TAPS = torch.tensor(FILTER, dtype=torch.float64)
-SMALL = GeneratorSettings(image_size=16, style_size=12, mapping_layers=3, channel_base=128, channel_max=10)
+TAPS = torch.tensor(gan.FILTER, dtype=torch.float64)
+SMALL = gan.GeneratorSettings(
+    image_size=16, style_size=12, mapping_layers=3, channel_base=128, channel_max=10
+)
 
 
-def config_f(size: int) -> GeneratorSettings:
+def config_f(size: int) -> gan.GeneratorSettings:
     """The published networks' sizes."""
-    return GeneratorSettings(image_size=size, style_size=512, channel_base=32_768, channel_max=512)
+    return gan.GeneratorSettings(image_size=size, style_size=512, channel_base=32_768, channel_max=512)
 
 
 @pytest.fixture
 def net(seeded):
-    return seeded(Generator, SMALL).requires_grad_(False)
+    return seeded(gan.Generator, SMALL).requires_grad_(False)
 
 
 @pytest.mark.parametrize(
@@ -37,14 +30,14 @@ def net(seeded):
 )
 def test_the_published_sizes(size, parameters, codes, space):
     with torch.device("meta"):
-        net, discriminator = Generator(config_f(size)), Discriminator(config_f(1024))
+        net, discriminator = gan.Generator(config_f(size)), Discriminator(config_f(1024))
     assert sum(value.numel() for value in net.parameters()) == parameters
     assert net.settings.codes == codes and sum(layer.channels for layer in net.layers) == space
     assert sum(value.numel() for value in discriminator.parameters()) == 29_012_513
 
 
 def test_style_space_is_ordered_as_images_are_made():
-    layers = style_layers(config_f(1024))
+    layers = gan.style_layers(config_f(1024))
     assert sum(layer.channels for layer in layers[:4]) == 2_048
     assert [(layer.colour, layer.resolution) for layer in layers[:5]] == [
         (False, 4), (True, 4), (False, 4), (False, 8), (True, 8),
@@ -66,7 +59,7 @@ def test_w_its_repetition_and_its_styles_give_the_same_image(net, generator):
     with pytest.raises(ValueError, match=r"W\+ of 6 x 12, got \(5, 12\)"):
         net.w_plus(torch.zeros(1, 5, 12))
     with pytest.raises(ValueError, match="8, 16, 32"):
-        GeneratorSettings(image_size=48)
+        gan.GeneratorSettings(image_size=48)
 
 
 def test_only_the_length_of_z_is_lost(net, generator):
@@ -109,7 +102,7 @@ def scipy_upfirdn(image, taps, up, padding):
 def test_upfirdn_is_scipys(up, padding, generator):
     taps = torch.tensor([0.1, 0.5, -0.2, 0.4, 0.3], dtype=torch.float64)  # not symmetric
     images = torch.randn(2, 3, 7, 10, dtype=torch.float64, generator=generator)
-    found = upfirdn(images, taps, up=up, padding=padding)
+    found = gan.upfirdn(images, taps, up=up, padding=padding)
     for one, image in zip(found.flatten(0, 1), images.flatten(0, 1), strict=True):
         wanted = scipy_upfirdn(image.numpy(), taps.numpy(), up, padding)
         torch.testing.assert_close(one, torch.from_numpy(wanted))
@@ -126,7 +119,7 @@ def by_one_kernel_an_image(images, weight, style, demodulate, up):
     if up:
         kernels = own.transpose(1, 2).reshape(n * inputs, outputs, kernel, kernel)
         found = conv_transpose2d(flat, kernels, stride=2, groups=n)
-        return upfirdn(found.reshape(n, outputs, *found.shape[2:]), 2 * TAPS, padding=(1, 1))
+        return gan.upfirdn(found.reshape(n, outputs, *found.shape[2:]), 2 * TAPS, padding=(1, 1))
     kernels = own.reshape(n * outputs, inputs, kernel, kernel)
     return conv2d(flat, kernels, padding=kernel // 2, groups=n).reshape(n, outputs, *images.shape[2:])
 
@@ -134,7 +127,7 @@ def by_one_kernel_an_image(images, weight, style, demodulate, up):
 @pytest.mark.parametrize("demodulate", [True, False])
 @pytest.mark.parametrize("up", [True, False])
 def test_modulation_is_that_of_one_kernel_for_each_image(demodulate, up, generator):
-    conv = ModulatedConv(4, 7, 3, 8, demodulate=demodulate, up=up).double()
+    conv = gan.ModulatedConv(4, 7, 3, 8, demodulate=demodulate, up=up).double()
     draw = [torch.randn(shape, dtype=torch.float64, generator=generator) for shape in ((3, 4, 5, 6), (3, 4))]
     inputs = (*(value.requires_grad_() for value in draw), conv.weight)
     found, wanted = conv(*draw), by_one_kernel_an_image(draw[0], conv.weight, draw[1], demodulate, up)
@@ -148,7 +141,7 @@ def test_modulation_is_that_of_one_kernel_for_each_image(demodulate, up, generat
 def test_equalised_layers_keep_the_variance_whatever_their_rate(seeded, generator):
     values = torch.randn(2000, 256, generator=generator)
     for rate in (1.0, 0.01):
-        layer = seeded(EqualLinear, 256, 256, rate=rate, seed=1)
+        layer = seeded(gan.EqualLinear, 256, 256, rate=rate, seed=1)
         assert layer.weight.var().item() == pytest.approx(1 / rate**2, rel=0.05)
         assert layer(values).var().item() == pytest.approx(1, rel=0.05)
-    assert torch.equal(StyledConv(64, 8, 512).affine(torch.zeros(2, 512)), torch.ones(2, 64))
+    assert torch.equal(gan.StyledConv(64, 8, 512).affine(torch.zeros(2, 512)), torch.ones(2, 64))

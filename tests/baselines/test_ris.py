@@ -5,18 +5,9 @@ import pytest
 import torch
 from PIL import Image
 
-from derender.baselines import load_baseline
+from derender.baselines import load_baseline, ris
 from derender.baselines.e4e import E4e, E4eSettings
 from derender.baselines.generator import Generator, GeneratorSettings, style_layers
-from derender.baselines.ris import (
-    RisConfig,
-    build_catalogue,
-    masked_rows,
-    name_clusters,
-    part_energy,
-    part_matrix,
-    spherical_kmeans,
-)
 from derender.data import MASK_CLASSES, read_images
 
 PARTS = ("hair", "skin", "nose", "mouth")  # of the planted generator: quarters of the width, left to right
@@ -60,7 +51,9 @@ def catalogue(planted):
     """Four clusters, named by masks of the four quarters."""
     images = torch.rand(8, 3, 32, 32, generator=torch.Generator().manual_seed(1))
     parts = torch.eye(4).repeat_interleave(8, dim=1)[None, :, None].expand(8, -1, 32, -1)
-    return build_catalogue(planted, images, parts, PARTS, RisConfig(image_size=32, clusters=4, samples=20))
+    return ris.build_catalogue(
+        planted, images, parts, PARTS, ris.RisConfig(image_size=32, clusters=4, samples=20)
+    )
 
 
 def test_spherical_kmeans_finds_directions_whatever_their_length(generator):
@@ -68,12 +61,12 @@ def test_spherical_kmeans_finds_directions_whatever_their_length(generator):
     truth = torch.randint(3, (300,), generator=generator)
     lengths = 10 ** (4 * torch.rand(300, 1, generator=generator))
     rows = (directions[truth] + 0.05 * torch.rand(300, 5, generator=generator)) * lengths
-    centres = spherical_kmeans(rows, 3, generator)
+    centres = ris.spherical_kmeans(rows, 3, generator)
     torch.testing.assert_close(centres.norm(dim=1), torch.ones(3))
     found = (rows @ centres.T).argmax(dim=1)
     assert len(set(zip(truth.tolist(), found.tolist(), strict=True))) == 3
     with pytest.raises(ValueError, match="4 clusters need at least as many places, got 3"):
-        spherical_kmeans(rows[:3], 4, generator)
+        ris.spherical_kmeans(rows[:3], 4, generator)
 
 
 def test_small_parts_get_the_cluster_where_they_gather():
@@ -83,7 +76,7 @@ def test_small_parts_get_the_cluster_where_they_gather():
     eye = torch.zeros(10, 100)
     eye[9, :60] = 1
     eye[0, :5] = 1
-    found = name_clusters(clusters, 3, torch.stack([1 - eye, eye])[None])
+    found = ris.name_clusters(clusters, 3, torch.stack([1 - eye, eye])[None])
     assert found.tolist() == [0, 1, 0]  # cluster 2 was never seen: the largest part
 
 
@@ -92,12 +85,12 @@ def test_scores_are_mean_energy_over_a_part(generator):
     activation[:, 0, :, 4:] *= 10
     left = torch.zeros(3, 1, 8, 8)
     left[..., :4] = 1
-    energy, area = part_energy(activation, torch.cat([left, 1 - left], dim=1))
+    energy, area = ris.part_energy(activation, torch.cat([left, 1 - left], dim=1))
     scores = energy / area
     assert area.tolist() == [[96], [96]]
     torch.testing.assert_close(scores.mean(dim=0), torch.ones(4), rtol=1e-4, atol=1e-4)
     assert scores[1, 0] > 1.8 and (scores[:, 1:] - 1).abs().max() < 0.3
-    assert torch.allclose(part_energy(activation * 7 + 1, left)[0], energy[:1], rtol=1e-3)
+    assert torch.allclose(ris.part_energy(activation * 7 + 1, left)[0], energy[:1], rtol=1e-3)
 
 
 def test_the_rules_of_the_matrix_for_the_published_network(generator):
@@ -108,7 +101,7 @@ def test_the_rules_of_the_matrix_for_the_published_network(generator):
     parts = ("background", "skin", "hair", "eyes", "nose", "mouth", "neck", "ears")
     scores = torch.rand(8, 9_088, generator=generator)
     scores[2, :100] = 5
-    matrix = part_matrix(scores, layers, parts)
+    matrix = ris.part_matrix(scores, layers, parts)
     assert matrix.shape == (9, 9_088)
     colour = torch.cat([torch.full((layer.channels,), layer.colour) for layer in layers])
     assert colour.sum() == 3_040
@@ -133,15 +126,17 @@ def test_classes_become_parts(tmp_path):
         Image.fromarray(mask).save(tmp_path / "masks" / f"{number}.png")
     (tmp_path / "masks" / "classes.txt").write_text("\n".join(MASK_CLASSES))
     images = read_images(tmp_path / "images", 32)
-    inputs, parts, names = masked_rows(images, RisConfig(image_size=32, masks=str(tmp_path / "masks")))
+    inputs, parts, names = ris.masked_rows(
+        images, ris.RisConfig(image_size=32, masks=str(tmp_path / "masks"))
+    )
     assert len(inputs) == len(parts) == 8 and names == ("background", "nose", "eyes")
     assert parts[0, :, ::8, 0].tolist() == [[0, 0, 0, 1], [0, 0, 1, 0], [1, 1, 0, 0]]
 
 
 @pytest.mark.parametrize(("side", "wanted"), [(32, 32), (16, 16), (20, 16), (4, 4), (1000, 32)])
 def test_the_clustered_layer_is_the_last_at_its_resolution(side, wanted, planted):
-    config = RisConfig(image_size=32, clusters=2, samples=2, cluster_side=side)
-    model = build_catalogue(planted, torch.rand(1, 3, 32, 32), torch.ones(1, 1, 32, 32), ("all",), config)
+    config = ris.RisConfig(image_size=32, clusters=2, samples=2, cluster_side=side)
+    model = ris.build_catalogue(planted, torch.rand(1, 3, 32, 32), torch.ones(1, 1, 32, 32), ("all",), config)
     sizes = [layer.resolution for layer in planted.generator.layers]
     assert model.settings.cluster_layer == max(n for n, size in enumerate(sizes) if size == wanted)
 

@@ -4,28 +4,19 @@ import pytest
 import torch
 from torch import nn
 
+from derender.baselines import stylegan2
 from derender.baselines.generator import GeneratorSettings
-from derender.baselines.stylegan2 import (
-    AdversarialObjective,
-    Discriminator,
-    Stylegan,
-    StyleganConfig,
-    energy_distance,
-    mixed_w,
-    path_lengths,
-    r1_penalty,
-)
 
 TINY = GeneratorSettings(image_size=8, style_size=6, mapping_layers=2, channel_base=32, channel_max=6)
 
 
-def config(**objective) -> StyleganConfig:
-    return StyleganConfig(objective=AdversarialObjective(**objective))
+def config(**objective) -> stylegan2.StyleganConfig:
+    return stylegan2.StyleganConfig(objective=stylegan2.AdversarialObjective(**objective))
 
 
 @pytest.fixture
 def model(seeded):
-    return seeded(Stylegan, TINY).train()
+    return seeded(stylegan2.Stylegan, TINY).train()
 
 
 @pytest.fixture
@@ -49,7 +40,7 @@ def test_each_loss_moves_its_own_network(model, images, generator, losses):
 
 def test_r1_of_a_linear_score_is_half_its_squared_slope(generator):
     score = nn.Sequential(nn.Flatten(), nn.Linear(12, 1), nn.Flatten(0))
-    found = r1_penalty(score, torch.rand(5, 3, 2, 2, generator=generator))
+    found = stylegan2.r1_penalty(score, torch.rand(5, 3, 2, 2, generator=generator))
     torch.testing.assert_close(found, score[1].weight.square().sum() / 2)
 
 
@@ -66,7 +57,7 @@ def test_path_lengths_are_those_of_the_jacobian(model, generator):
     """One column for each number of W+, by central differences of the images."""
     net, w = model.learner.double(), torch.randn(2, TINY.codes, 6, generator=generator, dtype=torch.float64)
     state = generator.get_state()
-    found = path_lengths(net, w, generator)
+    found = stylegan2.path_lengths(net, w, generator)
     generator.set_state(state)
     noise = net.random_noise(2, generator)
     direction = torch.randn(2, 3, 8, 8, generator=generator).double() / 8
@@ -89,9 +80,9 @@ def test_the_path_penalty_moves_its_mean_towards_the_lengths(model, images, loss
 
 
 def test_mixing_changes_the_code_at_one_depth(model, generator):
-    plain = mixed_w(model.learner, 5, 0.0, generator)
+    plain = stylegan2.mixed_w(model.learner, 5, 0.0, generator)
     assert torch.equal(plain, plain[:, :1].expand_as(plain))
-    mixed = mixed_w(model.learner, 50, 1.0, generator)
+    mixed = stylegan2.mixed_w(model.learner, 50, 1.0, generator)
     assert ((mixed[:, 1:] != mixed[:, :-1]).any(dim=2).sum(dim=1) == 1).all()
 
 
@@ -110,10 +101,10 @@ def test_the_average_follows_at_its_half_life(model):
 
 def test_energy_distance_is_zero_for_one_distribution_only(generator):
     first, second = (torch.randn(400, 4, generator=generator) for _ in range(2))
-    assert energy_distance(first, second).abs() < 0.02
-    assert energy_distance(first, second + 1) > 0.2
-    assert energy_distance(torch.zeros(2, 1), torch.full((2, 1), 3.0)) == 6
-    assert energy_distance(first[:1], second) == 0  # one image says nothing
+    assert stylegan2.energy_distance(first, second).abs() < 0.02
+    assert stylegan2.energy_distance(first, second + 1) > 0.2
+    assert stylegan2.energy_distance(torch.zeros(2, 1), torch.full((2, 1), 3.0)) == 6
+    assert stylegan2.energy_distance(first[:1], second) == 0  # one image says nothing
 
 
 def test_held_out_images_are_judged_by_samples_of_the_average(model, images, losses):
@@ -131,7 +122,7 @@ def test_held_out_images_are_judged_by_samples_of_the_average(model, images, los
 
 def test_features_of_the_discriminator_do_not_see_the_batch_but_scores_see_their_group(seeded, generator):
     settings = GeneratorSettings(image_size=16, style_size=12, channel_base=128, channel_max=10)
-    net = seeded(Discriminator, settings).requires_grad_(False)
+    net = seeded(stylegan2.Discriminator, settings).requires_grad_(False)
     images = torch.randn(8, 3, 16, 16, generator=generator)
     torch.testing.assert_close(net.describe(images)[2:3], net.describe(images[2:3]), rtol=1e-4, atol=1e-5)
     changed = images.clone()

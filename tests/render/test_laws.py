@@ -181,17 +181,6 @@ def test_gradcheck_of_render(backend, generator):
     assert gradcheck(outputs, inputs)
 
 
-def test_gradcheck_of_rasterize(backend, generator):
-    depth, _, _, pose = scene(2, 5, 6, generator, torch.float64)
-    vertices = to_camera(unproject(depth, 40.0), pose).requires_grad_()
-
-    def outputs(points: Tensor) -> tuple[Tensor, Tensor]:
-        seen = rasterize(points, focal_px(6, 40.0), backend)
-        return seen.uv, seen.depth
-
-    assert gradcheck(outputs, (vertices,))
-
-
 def test_uncovered_pixels_are_empty_and_send_no_gradient(backend, generator):
     values = scene(3, 12, 15, generator, torch.float64)
     values[3][:, 3] += 0.05

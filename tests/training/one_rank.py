@@ -65,16 +65,6 @@ def largest_difference(own: float, ranks: Ranks) -> dict[str, float]:
     }
 
 
-def gathered_rows(ranks: Ranks) -> dict[str, object]:
-    """What every rank gathers, and the gradient that comes back to this one."""
-    piece = torch.full((2, 1), float(ranks.rank), requires_grad=True)
-    whole = ranks.gather(piece)
-    (whole * (1 + ranks.rank) * torch.arange(4.0)[:, None]).sum().backward()
-    assert piece.grad is not None
-    back = ranks.gather(piece.grad)
-    return {"gathered": whole.flatten().tolist(), "gradient": back.flatten().tolist()}
-
-
 def main() -> None:
     torch.set_num_threads(1)
     for words in json.loads(sys.argv[2]):
@@ -85,7 +75,6 @@ def main() -> None:
     ranks = ranks_of(open_fabric("cpu"))
     found = {
         "count": ranks.count,
-        **gathered_rows(ranks),
         "steps": [largest_difference(own, ranks) for own in (1.0, 0.3)],
     }
     if ranks.first:

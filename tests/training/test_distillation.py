@@ -8,21 +8,13 @@ from derender.data.synthetic import faces
 from derender.objectives.reconstruction import masked_l1
 from derender.render import Rendering
 from derender.scene.crop import CropSettings, crop_images
-from derender.training.distillation import (
-    FACTORS,
-    FittedScenes,
-    RefineConfig,
-    RefiningSettings,
-    examples,
-    fit_scenes,
-    refine,
-)
+from derender.training import distillation
 
 FRAMES = CropSettings(nearer=1.15, farther=1.9, shift=0.25)
-LESSONS = RefiningSettings(
+LESSONS = distillation.RefiningSettings(
     images=192, batch_size=8, learning_rate=5e-4, fit_steps=8, rendered=0.25, worst=0, picture_weight=0
 )
-SHORT = RefineConfig.model_validate(
+SHORT = distillation.RefineConfig.model_validate(
     {
         "refining": LESSONS.model_dump(),
         "whitening": {"pictures": 16, "views": 2, "directions": 8, "spatial": False},
@@ -31,7 +23,7 @@ SHORT = RefineConfig.model_validate(
 )
 
 
-def changed(**refining) -> RefineConfig:
+def changed(**refining) -> distillation.RefineConfig:
     return SHORT.model_copy(update={"refining": LESSONS.model_copy(update=refining)})
 
 
@@ -48,7 +40,7 @@ def images():
 @pytest.fixture(scope="module")
 def refined(model, images):
     """Taught by few images of a kind the model does not know, and measured on the same."""
-    return refine(model, images, images, SHORT, seed=5)
+    return distillation.refine(model, images, images, SHORT, seed=5)
 
 
 def test_what_is_read_comes_nearer_to_what_fitting_finds(refined):
@@ -61,19 +53,19 @@ def test_what_is_read_comes_nearer_to_what_fitting_finds(refined):
 def test_the_same_seed_teaches_the_same_and_nothing_else_is_touched(model, images):
     before = {name: value.clone() for name, value in model.state_dict().items()}
     state = torch.random.get_rng_state()
-    one, again = (refine(model, images, images, changed(images=16), seed=5) for _ in range(2))
+    one, again = (distillation.refine(model, images, images, changed(images=16), seed=5) for _ in range(2))
     assert torch.equal(torch.random.get_rng_state(), state)
     assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())
     assert again.errors == one.errors and again.gaps == one.gaps
     ours = one.model.state_dict()
     assert all(torch.equal(value, ours[name]) for name, value in again.model.state_dict().items())
-    other = refine(model, images, images, changed(images=16), seed=6).model.state_dict()
+    other = distillation.refine(model, images, images, changed(images=16), seed=6).model.state_dict()
     assert any(not torch.equal(value, ours[name]) for name, value in other.items())
 
 
 def test_the_confidence_net_stays_and_the_linear_model_is_the_same(model, refined, images):
     theirs, ours = model.state_dict(), refined.model.state_dict()
-    taught = tuple(f"nets.{name}." for name in FACTORS)
+    taught = tuple(f"nets.{name}." for name in distillation.FACTORS)
     kept = [name for name in theirs if not name.startswith(taught)]
     assert kept and all(torch.equal(ours[name], theirs[name]) for name in kept)
     assert not refined.model.training and not any(p.requires_grad for p in refined.model.parameters())
@@ -86,10 +78,10 @@ def test_the_confidence_net_stays_and_the_linear_model_is_the_same(model, refine
 
 def test_renderings_come_with_the_scene_they_show(model, images):
     pictures = images[:16].float() / 255
-    fitted = fit_scenes(model, images[:16], 2, print)
+    fitted = distillation.fit_scenes(model, images[:16], 2, print)
     meant = fitted.scene(model.fitting.maps)
     half = changed(rendered=0.5, exchanged=0.5)
-    shown, scene = examples(model, pictures, meant, half, torch.Generator().manual_seed(0))
+    shown, scene = distillation.examples(model, pictures, meant, half, torch.Generator().manual_seed(0))
     assert shown.shape == pictures.shape and len(scene) == 16
     made: Rendering = model.render(scene[:8])
     seen = made.mask.bool()[:, None].expand_as(made.image)
@@ -105,15 +97,17 @@ def test_renderings_come_with_the_scene_they_show(model, images):
     torch.testing.assert_close(scene.light[8:][straight], meant.light[8:][straight])
 
 
-def framed(**refining) -> RefineConfig:
+def framed(**refining) -> distillation.RefineConfig:
     """Lessons half of which are shown in other frames."""
     return changed(reframed=0.5, **refining).model_copy(update={"reframe": FRAMES})
 
 
 def test_pictures_in_other_frames_come_with_the_camera_that_sees_them_so(model, images):
     pictures = images[:16].float() / 255
-    meant = fit_scenes(model, images[:16], 2, print).scene(model.fitting.maps)
-    shown, scene = examples(model, pictures, meant, framed(rendered=0), torch.Generator().manual_seed(0))
+    meant = distillation.fit_scenes(model, images[:16], 2, print).scene(model.fitting.maps)
+    shown, scene = distillation.examples(
+        model, pictures, meant, framed(rendered=0), torch.Generator().manual_seed(0)
+    )
     away = scene.camera[:, 5] - meant.camera[:, 5]
     moved = away.abs() > 1e-6
     assert 3 < moved.sum() < 13
@@ -129,7 +123,9 @@ def test_pictures_in_other_frames_come_with_the_camera_that_sees_them_so(model, 
 
 
 def test_a_copy_taught_so_steps_back_from_smaller_faces(model, images):
-    taught = refine(model, images, images, framed(images=480, rendered=0, fit_steps=4), seed=5).model
+    taught = distillation.refine(
+        model, images, images, framed(images=480, rendered=0, fit_steps=4), seed=5
+    ).model
     assert taught.settings.ranges.translation_z == pytest.approx(0.9 / 0.75)
     assert model.settings.ranges.translation_z == 0
     pictures = images.float() / 255
@@ -141,11 +137,11 @@ def test_a_copy_taught_so_steps_back_from_smaller_faces(model, images):
 
 def test_what_cannot_be_refined_is_named(model, images):
     with pytest.raises(ValueError, match="2 images or more of 64 pixels and one held out, got 1 of 64"):
-        refine(model, images[:1], images[1:])
+        distillation.refine(model, images[:1], images[1:])
     with pytest.raises(ValueError, match="and one held out, got 16 of 64 and 0"):
-        refine(model, images, images[:0])
+        distillation.refine(model, images, images[:0])
     with pytest.raises(ValueError, match="cannot optimise scenes per image yet"):
-        refine(derender.load("cars-64"), images[:4], images[4:])
+        distillation.refine(derender.load("cars-64"), images[:4], images[4:])
 
 
 def test_weights_that_are_no_numbers_are_an_error(model, images):
@@ -153,7 +149,7 @@ def test_weights_that_are_no_numbers_are_an_error(model, images):
     broken.nets["confidence"].requires_grad_(False)
     next(broken.nets["confidence"].parameters()).fill_(float("nan"))
     with pytest.raises(ValueError, match="NaN or infinite after 32 images"):
-        refine(broken, images, images, changed(images=32, fit_steps=1))
+        distillation.refine(broken, images, images, changed(images=32, fit_steps=1))
 
 
 def test_only_clear_fits_teach():
@@ -161,6 +157,6 @@ def test_only_clear_fits_teach():
     error = torch.tensor([0.02, 0.03, 0.0, 0.01, 0.5])
     light = torch.rand(5, 4)
     light[3, 1] = float("nan")
-    fits = FittedScenes(torch.rand(5, 3), torch.rand(5, 3), light, torch.rand(5, 6), error)
+    fits = distillation.FittedScenes(torch.rand(5, 3), torch.rand(5, 3), light, torch.rand(5, 6), error)
     assert fits.clear(0.2).tolist() == [True, True, False, False, False]
     assert fits.clear(0).tolist() == [True, True, False, False, True]

@@ -67,11 +67,6 @@ def test_a_taught_decoder_is_left_behind(tmp_path):
         resolve("small", ["unet_decoder=true"])
 
 
-def test_nothing_to_start_from_is_said_at_once():
-    with pytest.raises(FileNotFoundError, match="no model at nowhere"):
-        resolve("small", start_from="nowhere")
-
-
 def test_a_resumed_run_needs_the_start_no_more_and_ends_with_the_same_weights(start, pictures, tmp_path):
     whole_config = resolve("small", [*SHORT, "images=32"], start_from=str(start))
     half_config = resolve("small", [*SHORT, "images=16"], start_from=str(start))

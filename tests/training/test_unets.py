@@ -9,14 +9,7 @@ from derender.networks.encoders import NetworkSettings, UNetEncoder
 from derender.networks.unet import PIXEL_CHANNELS
 from derender.presets import ModelSettings
 from derender.scene.ranges import SceneRanges
-from derender.training.unets import (
-    PixelTargets,
-    UNetSettings,
-    augmented,
-    distil_unets,
-    masked_error,
-    pixel_targets,
-)
+from derender.training import unets
 
 SIZES = NetworkSettings(image_size=32, width=8, light_width=4, code_size=16)
 
@@ -41,12 +34,12 @@ def said_jointly(model, images) -> torch.Tensor:
     return model.unet_decoder([torch.cat(level, dim=1) for level in levels])
 
 
-SHORT = UNetSettings(images=96, batch_size=8, unet_width=4, learning_rate=3e-3)
+SHORT = unets.UNetSettings(images=96, batch_size=8, unet_width=4, learning_rate=3e-3)
 
 
 @pytest.fixture(scope="module")
 def taught(model, images):
-    return distil_unets(model, images, SHORT, seed=5)
+    return unets.distil_unets(model, images, SHORT, seed=5)
 
 
 def test_seen_from_the_front_each_pixel_lies_where_it_is(model, images):
@@ -56,7 +49,7 @@ def test_seen_from_the_front_each_pixel_lies_where_it_is(model, images):
     model_facing = derender.Derenderer(model.settings)
     model_facing.load_state_dict(model.state_dict())
     model_facing.eval().decode = lambda codes: facing
-    said = pixel_targets(model_facing, pictures)
+    said = unets.pixel_targets(model_facing, pictures)
     line = torch.linspace(-1, 1, 32)
     inside = said.mask.bool()
     assert inside.float().mean() > 0.8
@@ -73,8 +66,8 @@ def test_pictures_and_what_is_said_of_them_move_together(model, images):
     pictures = images[:8].float() / 255
     line = torch.linspace(-1, 1, 32).expand(8, 32, 32)
     maps = {"geometry": torch.stack([line, line.mT, line * 0], dim=1), "albedo": pictures.clone()}
-    said = PixelTargets(maps, torch.ones(8, 32, 32), {})
-    shown, moved, mask = augmented(pictures, said, 2, torch.Generator().manual_seed(0))
+    said = unets.PixelTargets(maps, torch.ones(8, 32, 32), {})
+    shown, moved, mask = unets.augmented(pictures, said, 2, torch.Generator().manual_seed(0))
     torch.testing.assert_close(shown[:2], pictures[:2], atol=1e-5, rtol=0)
     torch.testing.assert_close(moved["geometry"][:2], maps["geometry"][:2], atol=1e-5, rtol=0)
     assert not torch.allclose(shown[2:], pictures[2:], atol=0.1)
@@ -110,16 +103,18 @@ def test_the_decoder_is_saved_with_the_copy(taught, images, tmp_path):
 def test_it_learns_what_the_model_says():
     model = derender.load("rendered-faces-64")
     images = torch.from_numpy(faces.generate(24, image_size=64, seed=9).images)
-    settings = UNetSettings(images=720, batch_size=12, unet_width=4, learning_rate=5e-3)
-    taught = distil_unets(model, images, settings)
-    hardly = distil_unets(model, images, settings.model_copy(update={"images": 16}))
+    settings = unets.UNetSettings(images=720, batch_size=12, unet_width=4, learning_rate=5e-3)
+    taught = unets.distil_unets(model, images, settings)
+    hardly = unets.distil_unets(model, images, settings.model_copy(update={"images": 16}))
     assert taught.errors["place"] < 0.75 * hardly.errors["place"]
     assert taught.errors["albedo"] < 0.65 * hardly.errors["albedo"]
     assert taught.errors["depth"] < 0.8 * hardly.errors["depth"]
     pictures = images.float() / 255
-    said = pixel_targets(model, pictures)
+    said = unets.pixel_targets(model, pictures)
     maps = torch.cat([*said.maps.values()], dim=1)
-    ours, none = (masked_error(said_jointly(one.model, images), maps, said.mask) for one in (taught, hardly))
+    ours, none = (
+        unets.masked_error(said_jointly(one.model, images), maps, said.mask) for one in (taught, hardly)
+    )
     assert ours < 0.85 * none, "the decoder over both learns it, too"
     theirs, ours, none = (one.encode(pictures)["albedo"] for one in (model, taught.model, hardly.model))
     assert (ours - theirs).square().mean() < 0.97 * (none - theirs).square().mean()
@@ -129,7 +124,7 @@ def test_it_learns_what_the_model_says():
 
 def test_the_same_seed_teaches_the_same_and_nothing_else_is_touched(model, images, taught):
     before, state = torch.random.get_rng_state(), {k: v.clone() for k, v in model.state_dict().items()}
-    again = distil_unets(model, images, SHORT, seed=5)
+    again = unets.distil_unets(model, images, SHORT, seed=5)
     assert torch.equal(torch.random.get_rng_state(), before)
     assert all(torch.equal(value, state[name]) for name, value in model.state_dict().items())
     assert all(torch.equal(v, taught.model.state_dict()[k]) for k, v in again.model.state_dict().items())
@@ -138,9 +133,9 @@ def test_the_same_seed_teaches_the_same_and_nothing_else_is_touched(model, image
 
 def test_what_cannot_be_taught_is_named(model, images):
     with pytest.raises(ValueError, match="2 images or more of 32 pixels to learn from, got 1 of 32"):
-        distil_unets(model, images[:1])
+        unets.distil_unets(model, images[:1])
     with pytest.raises(ValueError, match="got 24 of 16"):
-        distil_unets(model, images[..., :16, :16])
+        unets.distil_unets(model, images[..., :16, :16])
 
 
 def test_weights_that_are_no_numbers_are_an_error(model, images):
@@ -148,4 +143,4 @@ def test_weights_that_are_no_numbers_are_an_error(model, images):
     broken.load_state_dict(model.state_dict())
     next(broken.nets["albedo"].decoder.parameters()).data.fill_(float("nan"))
     with pytest.raises(ValueError, match="NaN or infinite after 16 images"):
-        distil_unets(broken.eval(), images, SHORT.model_copy(update={"images": 16}))
+        unets.distil_unets(broken.eval(), images, SHORT.model_copy(update={"images": 16}))

@@ -20,15 +20,7 @@ from pydantic import Field, field_validator
 from torch import Generator, Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits, mse_loss, one_hot
 
-from derender.baselines.model import (
-    BaselineConfig,
-    BaselineSettings,
-    Features,
-    Images,
-    LoopModel,
-    LossInputs,
-    optional,
-)
+from derender.baselines import model as base
 from derender.networks.decoders import MapDecoder
 from derender.networks.encoders import Encoder, NetworkSettings
 from derender.settings import Settings
@@ -37,7 +29,7 @@ Grid = Float[Tensor, "n d gh gw"]
 """One vector for each of the places of a grid."""
 
 
-class AutoencoderSettings(BaselineSettings):
+class AutoencoderSettings(base.BaselineSettings):
     """Sizes as in `NetworkSettings`; the defaults are the geometry net's."""
 
     width: int = Field(default=64, ge=4, multiple_of=4)
@@ -58,14 +50,14 @@ class AutoencoderSettings(BaselineSettings):
         return NetworkSettings(image_size=self.image_size, width=self.width, code_size=self.code_size)
 
 
-class AutoencoderConfig(BaselineConfig):
+class AutoencoderConfig(base.BaselineConfig):
     """One training run of a plain autoencoder."""
 
     baseline: Literal["ae"] = "ae"
     model: AutoencoderSettings = AutoencoderSettings()
 
 
-class Autoencoder(LoopModel):
+class Autoencoder(base.LoopModel):
     """Image to code to image. Feature: ``code``, as our own codes the output of a ReLU."""
 
     name, settings_type, config_type = "ae", AutoencoderSettings, AutoencoderConfig
@@ -77,17 +69,17 @@ class Autoencoder(LoopModel):
         self.encoder = settings.encoder()
         self.decoder = MapDecoder(settings.network, 3)
 
-    def reconstruct(self, images: Images) -> Images:
+    def reconstruct(self, images: base.Images) -> base.Images:
         """Images through the code, in 0..1."""
         return self.decoder(self.encoder(images)).float().tanh() / 2 + 0.5
 
-    def describe(self, images: Images) -> Features:
+    def describe(self, images: base.Images) -> base.Features:
         return {"code": self.encoder(images)}
 
-    def shown(self, images: Images, config: Any) -> dict[str, Images]:
+    def shown(self, images: base.Images, config: Any) -> dict[str, base.Images]:
         return {"input": images, "reconstruction": self.reconstruct(images)}
 
-    def losses(self, images: Images, run: LossInputs) -> dict[str, Tensor]:
+    def losses(self, images: base.Images, run: base.LossInputs) -> dict[str, Tensor]:
         """Mean squared error in 0..1, and beside it L1."""
         with run.precision():
             again = self.reconstruct(images)
@@ -107,7 +99,7 @@ class BetaVaeConfig(AutoencoderConfig):
     objective: BetaObjective = BetaObjective()
 
 
-class BetaVae(LoopModel):
+class BetaVae(base.LoopModel):
     """Image to a normal posterior over codes to an image. Feature: ``mean``, the posterior's mean."""
 
     name, settings_type, config_type = "beta-vae", AutoencoderSettings, BetaVaeConfig
@@ -120,19 +112,19 @@ class BetaVae(LoopModel):
         self.encoder.to_code = nn.Sequential(self.encoder.to_code[0])  # no ReLU: a mean has both signs
         self.decoder = MapDecoder(settings.network, 3)
 
-    def posterior(self, images: Images) -> tuple[Float[Tensor, "n code"], Float[Tensor, "n code"]]:
+    def posterior(self, images: base.Images) -> tuple[Float[Tensor, "n code"], Float[Tensor, "n code"]]:
         """Mean and log variance of every number of the code."""
         mean, log_variance = self.encoder(images).float().chunk(2, dim=1)
         return mean, log_variance.clamp(-20, 10)
 
-    def describe(self, images: Images) -> Features:
+    def describe(self, images: base.Images) -> base.Features:
         return {"mean": self.posterior(images)[0]}
 
-    def shown(self, images: Images, config: Any) -> dict[str, Images]:
+    def shown(self, images: base.Images, config: Any) -> dict[str, base.Images]:
         again = self.decoder(self.posterior(images)[0]).float().sigmoid()
         return {"input": images, "reconstruction": again}
 
-    def losses(self, images: Images, run: LossInputs) -> dict[str, Tensor]:
+    def losses(self, images: base.Images, run: base.LossInputs) -> dict[str, Tensor]:
         """Bernoulli likelihood and weighted divergence, both per colour value; beside them L1, ``active``.
 
         ``active`` counts the numbers of the code whose divergence, averaged over the batch, is above 0.01
@@ -155,7 +147,7 @@ class BetaVae(LoopModel):
         }
 
 
-class VqvaeSettings(BaselineSettings):
+class VqvaeSettings(base.BaselineSettings):
     """Sizes: channels (D) and entries of the codebook (K). Images are any multiple of 4 pixels wide."""
 
     image_size: int = Field(default=64, ge=8, multiple_of=4)
@@ -170,7 +162,7 @@ class VqvaeObjective(Settings):
     commitment: float = Field(default=0.25, ge=0)
 
 
-class VqvaeConfig(BaselineConfig):
+class VqvaeConfig(base.BaselineConfig):
     """One training run of a VQ-VAE; the learning rate is that of the paper's text."""
 
     baseline: Literal["vqvae"] = "vqvae"
@@ -178,7 +170,7 @@ class VqvaeConfig(BaselineConfig):
     objective: VqvaeObjective = VqvaeObjective()
 
 
-class Vqvae(LoopModel):
+class Vqvae(base.LoopModel):
     """Encoder, codebook, decoder.
 
     Features: ``pooled`` (D numbers: the mean entry over all places), ``map`` (the entries of all places,
@@ -201,7 +193,7 @@ class Vqvae(LoopModel):
             *(Residual(width, normalised=True), nn.BatchNorm2d(width)),
             *(Residual(width, normalised=True), nn.BatchNorm2d(width)),
         )
-        self.codebook = optional("vector_quantize_pytorch", "the baseline vqvae").VectorQuantize(
+        self.codebook = base.optional("vector_quantize_pytorch", "the baseline vqvae").VectorQuantize(
             dim=width, codebook_size=settings.codes, accept_image_fmap=True, learnable_codebook=True,
             ema_update=False, rotation_trick=False, kmeans_init=True, commitment_weight=0.0,
             threshold_ema_dead_code=settings.dead_below,
@@ -212,7 +204,7 @@ class Vqvae(LoopModel):
             nn.ConvTranspose2d(width, 3, *halves),
         )
 
-    def encode(self, images: Images) -> Grid:
+    def encode(self, images: base.Images) -> Grid:
         """Images in 0..1 to a grid of a quarter of their side, not yet quantised."""
         return self.encoder(images * 2 - 1)
 
@@ -224,20 +216,20 @@ class Vqvae(LoopModel):
         through, indices, _ = self.codebook(grid.float(), freeze_codebook=True)
         return through, self.codebook.get_codes_from_indices(indices), indices
 
-    def decode(self, grid: Grid) -> Images:
+    def decode(self, grid: Grid) -> base.Images:
         """Images, about 0..1 but not clipped."""
         return self.decoder(grid).float() / 2 + 0.5
 
-    def describe(self, images: Images) -> Features:
+    def describe(self, images: base.Images) -> base.Features:
         _, entries, indices = self.quantise(self.encode(images))
         share = one_hot(indices.flatten(1), self.settings.codes).float().mean(dim=1)
         return {"pooled": entries.mean(dim=(2, 3)), "map": entries.flatten(1), "histogram": share}
 
-    def shown(self, images: Images, config: Any) -> dict[str, Images]:
+    def shown(self, images: base.Images, config: Any) -> dict[str, base.Images]:
         again = self.decode(self.quantise(self.encode(images))[0]).clamp(0, 1)
         return {"input": images, "reconstruction": again}
 
-    def losses(self, images: Images, run: LossInputs) -> dict[str, Tensor]:
+    def losses(self, images: base.Images, run: base.LossInputs) -> dict[str, Tensor]:
         """Squared error in -1..1, codebook and commitment terms; beside them L1 in 0..1 and ``codes_used``.
 
         ``codes_used`` is exp(entropy) of the entries chosen in this batch: from 1 (one entry for all) to K.

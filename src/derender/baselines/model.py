@@ -27,16 +27,10 @@ from derender.settings import Settings
 from derender.storage.atomic import new_folder
 from derender.storage.folder import CONFIG_FILE, FORMAT, WEIGHTS_FILE, saved_config
 from derender.storage.tensors import read_tensors, write_tensors
+from derender.training import config as configs
 from derender.training import run_folder
 from derender.training import task as loop
 from derender.training.checkpoint import fit_weights
-from derender.training.config import (
-    FinetuneConfig,
-    LoopSettings,
-    OptimiserSettings,
-    TrainConfig,
-    with_changes,
-)
 from derender.training.loop import train_task
 from derender.training.watch import FiniteWatch
 
@@ -67,10 +61,10 @@ class BaselineSettings(Settings):
     image_size: int = 64
 
 
-class BaselineConfig(LoopSettings):
+class BaselineConfig(configs.LoopSettings):
     """Settings of a training run in the common loop."""
 
-    optimiser: OptimiserSettings = OptimiserSettings(learning_rate=1e-3, weight_decay=0.0)
+    optimiser: configs.OptimiserSettings = configs.OptimiserSettings(learning_rate=1e-3, weight_decay=0.0)
 
 
 class BaselineModel(nn.Module, ABC):
@@ -328,20 +322,20 @@ class ShortRun:
 
 def baseline_config(name: str, overrides: Sequence[str] = ()) -> Settings:
     """The settings of a baseline's run, with ``key=value`` changes."""
-    return with_changes(network_type(name).config_type(), overrides)
+    return configs.with_changes(network_type(name).config_type(), overrides)
 
 
 def read_any_config(path: Path) -> Any:
     """The configuration of a run: of our model, a fine-tuning, or a baseline."""
     tree = run_folder.read_config_tree(path)
-    name, ours = tree.get("baseline"), FinetuneConfig if "target" in tree else TrainConfig
+    name, ours = tree.get("baseline"), configs.FinetuneConfig if "target" in tree else configs.TrainConfig
     return run_folder.read_config(path, ours if name is None else network_type(str(name)).config_type)
 
 
 def stored_config(run: Path, name: str) -> Any:
     """The settings of a run to go on with, which has to be of ``name`` ("derender": of any)."""
     config = read_any_config(run)
-    if isinstance(config, FinetuneConfig):
+    if isinstance(config, configs.FinetuneConfig):
         raise ValueError(f"{run} was made by derender finetune: go on with derender finetune --resume")
     trained = getattr(config, "baseline", "derender")
     if name not in ("derender", trained):

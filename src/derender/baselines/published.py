@@ -25,17 +25,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
+from derender.baselines import model as base
 from derender.baselines.e4e import E4e, E4eSettings
 from derender.baselines.generator import FILTER, Generator, GeneratorSettings
-from derender.baselines.model import (
-    PICKLES,
-    WEIGHTS_FILE,
-    BaselineModel,
-    BaselineSettings,
-    Features,
-    Images,
-    optional,
-)
 from derender.storage.tensors import refuse_old_torch
 
 GENERATOR_FILE = (
@@ -229,14 +221,14 @@ def _fill(module: nn.Module, names: Names, weights: Mapping[str, Tensor], prefix
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 
-class Dinov2Settings(BaselineSettings):
+class Dinov2Settings(base.BaselineSettings):
     """Which weights, and the side to which images are enlarged: a multiple of the patches' 14 pixels."""
 
     weights: str = "facebook/dinov2-small"
     enlarged: int = 224
 
 
-class Dinov2(BaselineModel):
+class Dinov2(base.BaselineModel):
     """A vision transformer. Features: ``class`` (the class token) and ``patches`` (the mean patch)."""
 
     name, settings_type = "dinov2", Dinov2Settings
@@ -251,7 +243,7 @@ class Dinov2(BaselineModel):
         self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(1, 3, 1, 1), persistent=False)
         self.register_buffer("std", torch.tensor(IMAGENET_STD).view(1, 3, 1, 1), persistent=False)
 
-    def describe(self, images: Images) -> Features:
+    def describe(self, images: base.Images) -> base.Features:
         side = self.settings.enlarged
         large = interpolate(images, (side, side), mode="bicubic", align_corners=False, antialias=True)
         tokens = self.net((large.clamp(0, 1) - self.mean) / self.std).last_hidden_state
@@ -270,12 +262,14 @@ class Dinov2(BaselineModel):
         if source is not None:
             settings = settings.model_copy(update={"weights": str(source)})
         source, folder = settings.weights, Path(settings.weights)
-        if folder.suffix.lower() in PICKLES or (folder.is_dir() and not (folder / WEIGHTS_FILE).is_file()):
+        if folder.suffix.lower() in base.PICKLES or (
+            folder.is_dir() and not (folder / base.WEIGHTS_FILE).is_file()
+        ):
             raise ValueError(  # an index of shards could name files outside the folder (CVE-2026-75104)
-                f"{source} has no {WEIGHTS_FILE}: give a folder with config.json and the weights in that one "
-                "file; weights in several parts and pickles, which can run code, are not opened"
+                f"{source} has no {base.WEIGHTS_FILE}: give a folder with config.json and the weights in "
+                "that one file; weights in several parts and pickles, which can run code, are not opened"
             )
-        library = optional("transformers", "the baseline dinov2")
+        library = base.optional("transformers", "the baseline dinov2")
         try:
             tree, _ = library.PretrainedConfig.get_config_dict(source, local_files_only=True)
             if tree.get("model_type") != "dinov2":
@@ -286,7 +280,7 @@ class Dinov2(BaselineModel):
         except OSError as error:
             if folder.is_dir():
                 raise ValueError(
-                    f"{source} holds no config.json and {WEIGHTS_FILE} that can be read "
+                    f"{source} holds no config.json and {base.WEIGHTS_FILE} that can be read "
                     f"({str(error).splitlines()[0]})"
                 ) from error
             raise ValueError(

@@ -21,15 +21,7 @@ from torch import Tensor, nn
 from torch.func import functional_call
 from torch.nn.functional import adaptive_avg_pool2d, softplus
 
-from derender.baselines.generator import (
-    TINY,
-    Codes,
-    EqualConv,
-    EqualLinear,
-    Generator,
-    GeneratorSettings,
-    Maps,
-)
+from derender.baselines import generator as gan
 from derender.baselines.model import Features, Images, LoopModel, LossInputs
 from derender.settings import Settings
 from derender.training.batches import random_stream
@@ -58,7 +50,7 @@ class StyleganConfig(LoopSettings):
     """One training run of a StyleGAN2."""
 
     baseline: Literal["stylegan2"] = "stylegan2"
-    model: GeneratorSettings = GeneratorSettings()
+    model: gan.GeneratorSettings = gan.GeneratorSettings()
     objective: AdversarialObjective = AdversarialObjective()
     batch_size: int = Field(default=32, ge=2)
     optimiser: OptimiserSettings = OptimiserSettings(learning_rate=2e-3, weight_decay=0.0, betas=(0.0, 0.99))
@@ -71,26 +63,26 @@ class ResidualDown(nn.Module):
 
     def __init__(self, inputs: int, outputs: int):
         super().__init__()
-        self.first = EqualConv(inputs, inputs, 3)
-        self.second = EqualConv(inputs, outputs, 3, down=True)
-        self.skip = EqualConv(inputs, outputs, 1, down=True, active=False)
+        self.first = gan.EqualConv(inputs, inputs, 3)
+        self.second = gan.EqualConv(inputs, outputs, 3, down=True)
+        self.skip = gan.EqualConv(inputs, outputs, 1, down=True, active=False)
 
-    def forward(self, images: Maps) -> Maps:
+    def forward(self, images: gan.Maps) -> gan.Maps:
         return (self.second(self.first(images)) + self.skip(images)) / sqrt(2)
 
 
 class Discriminator(nn.Module):
     """Image in -1..1 to one number: high is real. ``describe`` gives the input of the last layer."""
 
-    def __init__(self, settings: GeneratorSettings):
+    def __init__(self, settings: gan.GeneratorSettings):
         super().__init__()
         widths = [settings.channels(size) for size in settings.resolutions[::-1]]
         last = widths[-1]
-        self.from_rgb = EqualConv(3, widths[0], 1)
+        self.from_rgb = gan.EqualConv(3, widths[0], 1)
         self.blocks = nn.Sequential(*(ResidualDown(whole, half) for whole, half in pairwise(widths)))
-        self.last_conv = EqualConv(last + 1, last, 3)
-        self.hidden = EqualLinear(16 * last, last, active=True)
-        self.score = EqualLinear(last, 1)
+        self.last_conv = gan.EqualConv(last + 1, last, 3)
+        self.hidden = gan.EqualLinear(16 * last, last, active=True)
+        self.score = gan.EqualLinear(last, 1)
 
     def describe(self, images: Images, *, group: int = 1) -> Float[Tensor, "n d"]:
         """The last hidden layer. With ``group`` 1 no image affects another's.
@@ -99,7 +91,7 @@ class Discriminator(nn.Module):
         """
         maps = self.blocks(self.from_rgb(images))
         variance = maps.reshape(group, len(maps) // group, -1).var(dim=0, unbiased=False)
-        extra = (variance + TINY).sqrt().mean(dim=1).repeat(group)[:, None, None, None]
+        extra = (variance + gan.TINY).sqrt().mean(dim=1).repeat(group)[:, None, None, None]
         maps = torch.cat([maps, extra.expand(-1, 1, *maps.shape[2:])], dim=1)
         return self.hidden(self.last_conv(maps).flatten(1))
 
@@ -112,16 +104,16 @@ class Discriminator(nn.Module):
 class Stylegan(LoopModel):
     """Generator, its moving average, and discriminator. Feature: the discriminator's last hidden layer."""
 
-    name, settings_type, config_type = "stylegan2", GeneratorSettings, StyleganConfig
+    name, settings_type, config_type = "stylegan2", gan.GeneratorSettings, StyleganConfig
     features = ("discriminator",)
     not_judged = ("generator", "discriminator", "r1", "path")
-    settings: GeneratorSettings
+    settings: gan.GeneratorSettings
     steps: Tensor
     path_length: Tensor
 
-    def __init__(self, settings: GeneratorSettings):
+    def __init__(self, settings: gan.GeneratorSettings):
         super().__init__(settings)
-        self.learner = Generator(settings)
+        self.learner = gan.Generator(settings)
         self.generator = deepcopy(self.learner).requires_grad_(False)
         self.discriminator = Discriminator(settings)
         self.register_buffer("steps", torch.zeros((), dtype=torch.int64))
@@ -191,7 +183,7 @@ class Stylegan(LoopModel):
         return terms
 
 
-def mixed_w(net: Generator, count: int, mixing: float, generator: RandomGenerator) -> Codes:
+def mixed_w(net: gan.Generator, count: int, mixing: float, generator: RandomGenerator) -> gan.Codes:
     """W+ of random latents; a share ``mixing`` of them changes to a second latent at a random layer."""
     first, second = net.w_plus(net.random_w(2 * count, generator)).chunk(2)
     codes = net.settings.codes
@@ -209,7 +201,7 @@ def r1_penalty(discriminator: nn.Module, real: Images) -> Float[Tensor, ""]:
     return gradient.square().sum(dim=(1, 2, 3)).mean() / 2
 
 
-def path_lengths(net: Generator, w_plus: Codes, generator: RandomGenerator) -> Float[Tensor, " n"]:
+def path_lengths(net: gan.Generator, w_plus: gan.Codes, generator: RandomGenerator) -> Float[Tensor, " n"]:
     """How far an image moves, in a random direction, for a unit step of W+: |J^T y| over the codes' mean."""
     if not w_plus.requires_grad:
         w_plus = w_plus.requires_grad_(True)

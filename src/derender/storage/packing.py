@@ -7,15 +7,8 @@ from pathlib import Path
 
 from torch import Tensor
 
+from derender.storage import folder as files
 from derender.storage.atomic import new_folder
-from derender.storage.folder import (
-    CONFIG_FILE,
-    TENSOR_FILES,
-    TEXT_FILES,
-    WEIGHTS_FILE,
-    model_folder,
-    read_config,
-)
 from derender.storage.tensors import UNIT, packed, read_described, write_tensors
 
 KINDS = ("bytes", "float16")
@@ -49,17 +42,17 @@ def pack_model(
     """
     if maps not in KINDS:
         raise ValueError(f"unknown kind of maps {maps!r}: choose {' or '.join(KINDS)}")
-    folder, own = Path(folder), model_folder(source)
-    read_config(own)
+    folder, own = Path(folder), files.model_folder(source)
+    files.read_config(own)
     before, after = {}, {}
     with new_folder(folder, overwrite=overwrite) as temporary:
-        for file in TENSOR_FILES:
+        for file in files.TENSOR_FILES:
             if not (own / file).is_file():
                 continue
             tensors, metadata = read_described(own / file)
             small = dict(tensors)
             for name, value in tensors.items():
-                if file == WEIGHTS_FILE:
+                if file == files.WEIGHTS_FILE:
                     small[name] = _half(name, value) if value.is_floating_point() else value
                 elif _LARGE.fullmatch(name) and maps == "bytes":
                     small[name], small[name + UNIT] = packed(value.float(), along=0)
@@ -67,7 +60,7 @@ def pack_model(
                     small[name] = _half(name, value)
             write_tensors(small, temporary / file, metadata)
             before[file], after[file] = ((place / file).stat().st_size for place in (own, temporary))
-        for file in (CONFIG_FILE, *TEXT_FILES):
+        for file in (files.CONFIG_FILE, *files.TEXT_FILES):
             if (own / file).is_file():
                 shutil.copyfile(own / file, temporary / file)
     return Packed(folder, before, after)

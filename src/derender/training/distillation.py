@@ -24,16 +24,7 @@ from derender.objectives.reconstruction import masked_l1
 from derender.objectives.self_features import one_cycle
 from derender.postprocess.fitting import PARAMETERS, STEPS
 from derender.postprocess.morphable import MorphableMaps
-from derender.scene import Scene
-from derender.scene.crop import (
-    DEFAULT_CROPS,
-    CropSettings,
-    crop_images,
-    crop_scene,
-    other_surroundings,
-    random_crops,
-    ranges_for_crops,
-)
+from derender.scene import Scene, crop
 from derender.scene.perturb import PerturbSettings, perturb_camera, perturb_light
 from derender.scene.scene import seen_in_mirror
 from derender.settings import Settings
@@ -94,7 +85,7 @@ class RefineConfig(FeatureSettings):
     perturb: PerturbSettings = PerturbSettings(
         ambient=1, diffuse=1, light_deg=90, camera_pitch_deg=30, camera_yaw_deg=60
     )
-    reframe: CropSettings = DEFAULT_CROPS
+    reframe: crop.CropSettings = crop.DEFAULT_CROPS
 
 
 @dataclass(frozen=True)
@@ -148,7 +139,7 @@ def refine(
     student = deepcopy(model.without_features())
     student.source = None
     if settings.reframed:
-        ranges = ranges_for_crops(student.settings.ranges, student.image_size, config.reframe)
+        ranges = crop.ranges_for_crops(student.settings.ranges, student.image_size, config.reframe)
         student.settings = student.settings.model_copy(update={"ranges": ranges})
     _learn(student, images[rows[clear]], maps, fitted.rows(clear), config, generator, report)
     settings.check(student, "refining")
@@ -264,11 +255,11 @@ def _cropped(
     settings = config.refining
     if not settings.reframed:
         return images, scene
-    crops = random_crops(len(images), generator, config.reframe, settings.reframed)
+    crops = crop.random_crops(len(images), generator, config.reframe, settings.reframed)
     strange = torch.rand(len(images), generator=generator) < settings.strange
-    surroundings = other_surroundings(images, generator)
-    shown = _where(strange, crop_images(images, crops, surroundings), crop_images(images, crops))
-    return shown, crop_scene(scene, crops, model.settings.ranges.fov_deg)
+    surroundings = crop.other_surroundings(images, generator)
+    shown = _where(strange, crop.crop_images(images, crops, surroundings), crop.crop_images(images, crops))
+    return shown, crop.crop_scene(scene, crops, model.settings.ranges.fov_deg)
 
 
 def _where(rows: Tensor, one: Tensor, other: Tensor) -> Tensor:

@@ -21,6 +21,7 @@ from torch.utils.tensorboard.writer import SummaryWriter
 
 from derender.data import ImageSet, split_indices
 from derender.storage.atomic import DamageNoticed, atomic_file
+from derender.training import run_folder
 from derender.training.batches import Reader, batches_of, random_stream
 from derender.training.checkpoint import (
     DamagedCheckpoint,
@@ -35,14 +36,6 @@ from derender.training.process import (
     deterministic_algorithms,
     freed_memory_kept,
     stop_on_signal,
-)
-from derender.training.run_folder import (
-    RunFolder,
-    append_metrics,
-    describe_data,
-    drop_metrics_after,
-    reopen_run,
-    start_run,
 )
 from derender.training.task import (
     Progress,
@@ -91,12 +84,12 @@ class _Run:
         batches = batches_of(images.images, split.train, config, fabric.device)
         self.reader, self.train_rows = Reader(batches, ranks), torch.from_numpy(split.train)
         task.check()
-        self.folder = RunFolder(out)
+        self.folder = run_folder.RunFolder(out)
         if ranks.first and resume:
-            reopen_run(out, config)
+            run_folder.reopen_run(out, config)
         elif ranks.first:
             device = f"{ranks.count} x {fabric.device.type}" if ranks.count > 1 else str(fabric.device)
-            start_run(out, config, describe_data(images, split), device)
+            run_folder.start_run(out, config, run_folder.describe_data(images, split), device)
         self.model: Any = task.build().to(fabric.device)
         if config.channels_last:
             self.model.to(memory_format=torch.channels_last)
@@ -124,9 +117,11 @@ class _Run:
         self.model_images: int | None = None
         self.writer: SummaryWriter | None = None
         if ranks.first:
-            drop_metrics_after(self.folder, self.state.images)
+            run_folder.drop_metrics_after(self.folder, self.state.images)
             if note is not None:
-                append_metrics(self.folder, {"kind": "note", "images": self.state.images, "text": note})
+                run_folder.append_metrics(
+                    self.folder, {"kind": "note", "images": self.state.images, "text": note}
+                )
             self.writer = SummaryWriter(str(out / "tensorboard"), purge_step=self.state.images)
 
     def go_on(self) -> TrainResult:
@@ -308,7 +303,7 @@ class _Run:
         if self.writer is None:
             return
         images, seconds = self.state.images, round(self.state.seconds, 2)
-        append_metrics(self.folder, {"kind": kind, "images": images, "seconds": seconds, **values})
+        run_folder.append_metrics(self.folder, {"kind": kind, "images": images, "seconds": seconds, **values})
         for name, value in values.items():
             if isinstance(value, float):
                 self.writer.add_scalar(f"{kind}/{name}", value, images)
