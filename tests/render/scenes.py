@@ -20,13 +20,9 @@ def smooth_depth(
 
 
 def scene(
-    count: int,
-    height: int,
-    width: int,
-    generator: torch.Generator,
-    dtype: torch.dtype = torch.float32,
+    count: int, height: int, width: int, generator: torch.Generator, dtype: torch.dtype = torch.float32,
     turn_rad: float = 0.4,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
     """depth, albedo, light, camera: a smooth surface with random colours under a moderate camera."""
 
     def uniform(*shape: int) -> Tensor:

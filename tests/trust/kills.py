@@ -113,14 +113,9 @@ class Trial:
     faults: list[str] = field(default_factory=list)
 
     def child(
-        self,
-        folder: Path,
-        *,
-        limit: int | None = None,
-        raise_after: float | None = None,
-        hold: tuple[int, int] | None = None,
-        record: bool = False,
-    ) -> int:
+        self, folder: Path, *, limit: int | None = None, raise_after: float | None = None,
+        hold: tuple[int, int] | None = None, record: bool = False,
+    ) -> int:  # fmt: skip
         """Start the command in a process of its own; gives its number. Can record writes and modules."""
 
         def work() -> int:

@@ -68,13 +68,9 @@ class BaselineConfig(configs.LoopSettings):
 
 
 class BaselineModel(nn.Module, ABC):
-    """A network that computes one or more features of an image.
+    """A network that computes ``features`` of an image, of which ``embed`` returns the ``chosen``.
 
-    Attributes:
-        name: its name in the package's list.
-        features: every feature it can compute; the first is the default.
-        settings_type, config_type: settings of the network, and of a training run.
-        chosen: the features that ``embed`` returns.
+    The first is the default. ``settings_type`` is of the network, ``config_type`` of a training run.
     """
 
     name: ClassVar[str]
@@ -138,11 +134,8 @@ class BaselineModel(nn.Module, ABC):
 def load_baseline(source: str | Path, name: str | None = None) -> BaselineModel:
     """The baseline saved in a run folder or a model folder, in evaluation mode, without gradient.
 
-    ``name`` says which baseline it has to be; None accepts any.
-
-    Raises:
-        FileNotFoundError: there is no such folder.
-        ValueError: it is a pickle, damaged, of another architecture, another baseline, or none.
+    ``name`` says which baseline it has to be; None accepts any. A FileNotFoundError: there is no such folder;
+    a ValueError: it is a pickle, damaged, of another architecture, another baseline, or none.
     """
     folder = _folder_of(Path(source))
     config, file = saved_config(folder), folder / WEIGHTS_FILE

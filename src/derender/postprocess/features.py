@@ -60,7 +60,7 @@ class Features:
     def tensors(self) -> dict[str, Tensor]:
         """All tensors that ``save`` writes, by name."""
         parts = (part for part in (self.whitening, self.fitting) if part is not None)
-        return {name: value for part in parts for name, value in part.tensors().items()}
+        return {name: value for part in parts for name, value in part.named_buffers()}
 
     def save(self, folder: Path) -> None:
         """Write a file for each part there is into a saved model's folder."""

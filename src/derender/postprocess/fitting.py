@@ -152,14 +152,11 @@ class Fitting(nn.Module):
         found = {name: value.detach() for name, value in coordinates.items()}
         return Fitted(fitted.detach(), found, before, after)
 
-    def tensors(self) -> dict[str, Tensor]:
-        """All tensors that ``save`` writes, by name."""
-        return dict(self.named_buffers())
-
     def save(self, file: Path) -> None:
         """Write it; complete or not at all."""
         with atomic_file(file) as temporary:
-            write_tensors(self.tensors(), temporary, {"settings": self.settings.model_dump_json()})
+            told = {"settings": self.settings.model_dump_json()}
+            write_tensors(dict(self.named_buffers()), temporary, told)
 
     @classmethod
     def load(cls, file: Path, image_size: int | None = None) -> "Fitting":

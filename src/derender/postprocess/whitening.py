@@ -153,14 +153,10 @@ class Whitening(nn.Module):
         projections = {name: Projection(means[name].float(), own, ratio) for name, own, ratio in rows}
         return Whitening(projections, mirrored=self.mirrored)
 
-    def tensors(self) -> dict[str, Tensor]:
-        """All tensors that ``save`` writes, by name."""
-        return dict(self.named_buffers())
-
     def save(self, file: Path) -> None:
         """Write the projections; complete or not at all."""
         with atomic_file(file) as temporary:
-            write_tensors(self.tensors(), temporary)
+            write_tensors(dict(self.named_buffers()), temporary)
 
     @classmethod
     def load(cls, file: Path) -> "Whitening":

@@ -31,14 +31,9 @@ def pack_model(
 ) -> Packed:
     """Write a model in fewer bytes, with what lies beside its weights; complete or not at all.
 
-    Args:
-        source: what `derender.load` takes.
-        folder, overwrite: to write; whether it may exist, else a FileExistsError.
-        maps: "bytes", a 127th of the largest number of each slice apart, or "float16".
-
-    Raises:
-        FileNotFoundError: no model is at ``source``.
-        ValueError: it is damaged, or a weight is no number of half precision.
+    ``maps`` are kept as "bytes", a 127th of the largest number of each slice apart, or "float16". A
+    FileExistsError: ``folder`` exists, without ``overwrite``; a FileNotFoundError: no model is at ``source``;
+    a ValueError: it is damaged, or a weight is no number of half precision.
     """
     if maps not in KINDS:
         raise ValueError(f"unknown kind of maps {maps!r}: choose {' or '.join(KINDS)}")

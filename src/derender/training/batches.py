@@ -63,9 +63,7 @@ class Batches:
         return self.images if self.rows is None else torch.from_numpy(_spread(self.images.numpy(), self.rows))
 
     def at(self, position: int, ranks: Ranks = ALONE) -> Float[Tensor, "b 3 h w"]:
-        """The batch at a position of the run, counted from 0, in 0..1; of several ``ranks`` each gets its
-        rows.
-        """
+        """The batch at a position of the run, from 0 on, in 0..1; of several ``ranks`` each gets its rows."""
         return self.ready(self.read(position, ranks), position, ranks)
 
     def order(self, position: int, ranks: Ranks = ALONE) -> Int64[Tensor, " b"]:

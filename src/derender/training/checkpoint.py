@@ -86,8 +86,7 @@ def resume_from(
 ) -> tuple[TrainState, str | None]:
     """Load the last checkpoint of a run, or the one before it where the last is damaged or gone.
 
-    Gives the counters (without any checkpoint zeros), and a sentence, warned of, too, where it was not the
-    last.
+    Gives the counters (without any checkpoint zeros), and a sentence, also a warning, where it was not last.
     A ValueError: both are damaged, or they are of another model.
     """
     if not last.exists() and not previous.exists():

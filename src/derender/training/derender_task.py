@@ -36,15 +36,10 @@ def train(
     config: TrainConfig, images: ImageSet, out: str | Path, *, resume: bool = False,
     progress: Callable[[Progress], None] | None = None, accelerator: str = "auto", **how: Any,
 ) -> TrainResult:  # fmt: skip
-    """Train a model on images and estimate its features; all files lie in the folder ``out``.
+    """Train a model on images of its size and estimate its features, in the run folder ``out``.
 
-    Images are at the model's size; ``out`` is new, or with ``resume`` that of an unfinished run; ``how`` may
-    hold a ``sample_sheet``, which draws a few held-out images from time to time.
-
-    Raises:
-        FileExistsError: ``out`` is not empty and ``resume`` was not requested.
-        ValueError: images and configuration do not fit, or the run to resume has other settings.
-        TrainingInterrupted: Ctrl-C or SIGTERM; the run can be resumed.
+    Arguments and errors are those of `derender.train`; ``how`` may hold a ``sample_sheet``, which draws a few
+    held-out images from time to time.
     """
     report, folder = progress or (lambda _: None), RunFolder(Path(out))
     task = DerenderTask(config, begins=not (resume and folder.resumable))

@@ -90,14 +90,10 @@ class RefineConfig(FeatureSettings):
 
 @dataclass(frozen=True)
 class Refined:
-    """A student of its own fitted scenes, and what that brought.
+    """The student, in evaluation mode, with features, and how it does on held-out images.
 
-    Attributes:
-        model: the student, in evaluation mode, with features.
-        errors: of images that it did not learn from: "before", "now" and "fitted" are the mean masked L1
-            (0..1) of their reconstructions.
-        gaps: by parameter of a scene (depth, albedo, light, camera), how far predictions lie from fitted
-            scenes, "before" and "now", in mean deviations of the fitted scenes.
+    ``errors`` "before", "now" and "fitted" are the mean masked L1 (0..1) of reconstructions; ``gaps``, by
+    parameter of a scene, how far predictions lie from fitted scenes, "before" and "now", in mean deviations.
     """
 
     model: Derenderer
@@ -112,12 +108,8 @@ def refine(
     """A copy of a trained model that predicts what fitting finds; the model stays as it is.
 
     The same seed gives the same weights on the same machine and thread count; torch's global random state is
-    neither read nor changed. Errors are measured on ``held_out`` images. The student fits scenes within the
-    linear model that the model has.
-
-    Raises:
-        ValueError: a model that cannot fit scenes or has further factors; too few images, or images of
-            another size; weights that are NaN or infinite in the end.
+    neither read nor changed. Errors are measured on ``held_out`` images. A ValueError: a model that cannot
+    fit scenes or has further factors; too few images, or of another size; weights that end up not finite.
     """
     config, report = config or RefineConfig(), progress or (lambda *_: None)
     settings = config.refining

@@ -278,9 +278,7 @@ class _Run:
             self.save_model(self.state.images)
 
     def leave_model(self) -> None:
-        """Make sure that a run that ends leaves the weights its settings name, or without validation its
-        last.
-        """
+        """Leave the weights that the settings name, or without validation the last."""
         if self.config.keep == "last" or self.state.best_loss is None:
             if self.model_images != self.state.images:
                 self.save_model(self.state.images)
@@ -321,9 +319,7 @@ def passed(before: int, now: int, interval: int, *, ended: bool) -> bool:
 
 
 def kept(before: int, now: int, interval: int, *, ended: bool) -> bool:
-    """As ``passed``, and at halves of the first interval: a collapse comes early and leaves a good state
-    behind.
-    """
+    """As ``passed``, and at halves of the first interval, so that an early collapse leaves a good state."""
     early = interval // 2
     while early >= FIRST_KEPT_IMAGES:
         if before < early <= now:

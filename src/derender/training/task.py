@@ -68,9 +68,7 @@ class TrainingTask(ABC):
     def step_module(
         self, model: nn.Module, run: RunFolder, images: UInt8[Tensor, "n 3 h w"], progress: PhaseProgress
     ) -> nn.Module:
-        """A module for `compute_step` that returns (total, Held), given all training images; its ``model``
-        learns.
-        """
+        """A module for `compute_step` that returns (total, Held), given all images; ``model`` learns."""
 
     @abstractmethod
     def watch(self, memory: dict[str, Any]) -> FiniteWatch:
@@ -83,8 +81,7 @@ def compute_step(
 ) -> Any:  # fmt: skip
     """The losses of one batch through a task's step module, wrapped by a strategy or not.
 
-    ``done`` is the share of the run so far, None in evaluation; ``rows`` are the images' places in the data
-    set.
+    ``done`` is the share of the run so far, None in evaluation; ``rows`` are images' places in the data set.
     """
     _, held = module(images, generator, precision, done, rows)
     return held.result
@@ -99,12 +96,9 @@ def network_precision(precision: str, device: torch.device) -> Precision:
 class Progress:
     """Where a run stands, for a progress bar.
 
-    Attributes:
-        phase: "perceptual" while perceptual features are learnt, "train", then "features".
-        done, total: steps of the first phase, images of the others.
-        images_per_second, waiting: since the start or resumption; the latter the share of time, 0..1, for
-        images.
-        terms: the latest losses by name.
+    ``phase`` is "perceptual" while perceptual features are learnt (``done`` of ``total`` are steps), "train",
+    then "features" (images). ``terms`` are the latest losses; ``waiting`` is the share of time, 0..1, spent
+    waiting for images.
     """
 
     phase: str
@@ -119,15 +113,10 @@ class Progress:
 class TrainResult:
     """How a run ended.
 
-    Attributes:
-        folder: the run folder; `derender.load` takes it.
-        images, seconds: images seen, and time spent training, resumed parts included.
-        images_per_second, waiting: of this call; the latter the share of its time spent waiting for images,
-        0..1.
-        validation: last validation losses by name.
-        stopped: "images", "minutes", "patience" or "collapse".
-        findings: what the watcher found last; empty without problems.
-        model_images: images that the weights of the saved model had seen; None where that is unknown.
+    ``images`` seen and ``seconds`` count resumed parts; ``images_per_second`` and ``waiting`` (share of time,
+    0..1, for images) are of this call; ``validation`` has the last losses by name. ``stopped`` is "images",
+    "minutes", "patience" or "collapse"; ``findings`` are the watcher's last; ``model_images`` had been seen
+    by the saved weights, None where that is unknown.
     """
 
     folder: Path

@@ -159,15 +159,9 @@ class Visitor:
         self.answers.ended.append("abandoned")
 
     def ask(
-        self,
-        kind: str,
-        path: str,
-        body: object = None,
-        fits: Check = lambda _: True,
-        *,
-        method: str = "POST",
-        status: int = 200,
-    ) -> bytes:
+        self, kind: str, path: str, body: object = None, fits: Check = lambda _: True, *,
+        method: str = "POST", status: int = 200,
+    ) -> bytes:  # fmt: skip
         """One request on the kept connection; notes the wait, or raises ``Unfit`` and notes why."""
         if self.stop.wait(self.draw.expovariate(1 / self.pause_seconds)):
             raise Unfit
