@@ -108,14 +108,6 @@ def test_another_architecture_names_the_first_key_that_differs(settings, change,
         load_baseline(copy)
 
 
-def test_a_checkpoint_of_another_architecture_names_the_key(runs, blobs, tmp_path):
-    run = shutil.copytree(runs / "ae", tmp_path / "run")
-    shutil.rmtree(run / "checkpoints" / "last")
-    shutil.copytree(runs / "simclr" / "checkpoints" / "last", run / "checkpoints" / "last")
-    with pytest.raises(ValueError, match=r"of another model \(it has no 'decoder\.layers\.0\.weight'"):
-        train_baseline(config("ae", 72), blobs, run, resume=True)
-
-
 def test_damaged_and_foreign_folders_are_named(runs, copy, tmp_path):
     file = copy / "model.safetensors"
     file.write_bytes(file.read_bytes()[:-50])

@@ -28,14 +28,8 @@ from derender.training.run_folder import read_config, read_metrics
 from derender.training.task import Progress
 
 TINY = ["image_size=32", "width=8", "light_width=4", "perceptual=none", "batch_size=8", "checkpoint_every=32"]
-TINY += [
-    "validate_every=32",
-    "sample_every=64",
-    "deterministic=true",
-    "learning_rate=1e-3",
-    "warmup_images=0",
-    "final_rate=1",
-]
+TINY += ["validate_every=32", "sample_every=64", "deterministic=true", "learning_rate=1e-3"]
+TINY += ["warmup_images=0", "final_rate=1"]
 
 
 @pytest.fixture(autouse=True)

@@ -18,10 +18,9 @@ from derender.data import read_images
 from derender.data.cache import _MARK, read_cache
 from derender.features import FeatureTable, missing
 from derender.interpretation.probe import Probe, load_probe
-from derender.storage.folder import CONFIG_FILE, ERRORS_FILE
+from derender.storage.folder import CONFIG_FILE
 from derender.training.checkpoint import TrainState, load_checkpoint
 from derender.training.config import config_from_tree
-from derender.training.held_out_errors import read_errors
 from derender.training.run_folder import read_config, read_config_tree, read_metrics
 
 RELEASES = Path(__file__).with_name("releases")
@@ -149,13 +148,6 @@ def test_a_run_from_before_formats_were_counted(copy):
     file = copy / "run" / "config.yaml"
     file.write_text(file.read_text().removeprefix("format: 1\n"))
     assert read_config(copy / "run").optimiser.learning_rate == 2e-4
-
-
-def test_held_out_errors_from_the_future(copy):
-    values = {"format": 2, "pictures": 30, "quantiles": [0.1] * 101}
-    (copy / "model" / ERRORS_FILE).write_text(json.dumps(values))
-    with pytest.raises(ValueError, match="is damaged or of a newer version: make it again with"):
-        read_errors(copy / "model")
 
 
 def test_a_cache_from_the_future_is_made_again(tmp_path):

@@ -100,20 +100,8 @@ PLAIN = st.recursive(
 WORDS = st.sampled_from(
     [
         *("1e400", "-0", ".inf", ".nan", "0x7fffffffffffffffffff", "1_000", "1e9999999", "1:30"),
-        *(
-            "!!python/none",
-            "!!binary aGk=",
-            "&a [*a]",
-            "*a",
-            "<<: 3",
-            "{",
-            "[[",
-            "'",
-            "\0",
-            "~",
-            "yes",
-            "1:30",
-        ),
+        *("!!python/none", "!!binary aGk=", "&a [*a]", "*a", "<<: 3"),
+        *("{", "[[", "'", "\0", "~", "yes", "1:30"),
         *("[" * 500, "- " * 500, LAUGHS),  # reading takes the square of the depth
     ]
 )
