@@ -1,4 +1,4 @@
-"""Scenes of images in other frames, rendered, show the images so framed; ranges give the camera room."""
+"""Images in other frames, their scenes rendered, and ranges that give the camera room."""
 
 import pytest
 import torch
@@ -9,6 +9,8 @@ from derender.render.renderer import render_scene
 from derender.scene import Scene
 from derender.scene.crop import CropSettings, crop_images, crop_scene, random_crops, ranges_for_crops
 from derender.scene.ranges import SceneRanges
+from derender.training.batches import Batches
+from derender.training.distributed import Ranks
 
 FRAMES = CropSettings(nearer=1.15, farther=1.9, shift=0.25, roll_deg=20)
 
@@ -60,3 +62,75 @@ def test_ranges_reach_every_camera_that_frames_ask_for():
     assert ranges.translation_z == pytest.approx(1.2)
     wide = SceneRanges(translation_xy=0.5, translation_z=2.0)
     assert ranges_for_crops(wide, 65, FRAMES) == wide
+
+
+STILL = {"nearer": 1, "farther": 1, "shift": 0, "roll_deg": 0}
+
+
+def spot(row: int, column: int) -> Tensor:
+    """A dark image of 33 pixels with one bright pixel, whose middle is pixel (16, 16)."""
+    image = torch.zeros(1, 3, 33, 33)
+    image[:, :, row, column] = 1
+    return image
+
+
+def brightest(image: Tensor) -> tuple[int, int]:
+    return divmod(int(image[0, 0].flatten().argmax()), image.shape[-1])
+
+
+def moves(**changes: float) -> Tensor:
+    settings = CropSettings(**{**STILL, **changes})
+    return random_crops(400, torch.Generator().manual_seed(0), settings)
+
+
+def test_frames_stay_within_their_bounds_and_reach_them():
+    zoomed, shifted, turned = moves(nearer=1.5, farther=1.25), moves(shift=0.2), moves(roll_deg=10)
+    assert 0.66 < zoomed[:, 0, 0].min() < 0.69 and 1.23 < zoomed[:, 0, 0].max() < 1.25
+    assert torch.equal(zoomed[:, 0, 0], zoomed[:, 1, 1]) and zoomed[:, 0, 1].abs().max() == 0
+    assert all(0.19 < shifted[:, axis, 2].abs().max() <= 0.2 for axis in (0, 1))
+    degrees = torch.rad2deg(torch.atan2(turned[:, 1, 0], turned[:, 0, 0]))
+    assert 9.7 < degrees.max() < 10.01 and -10.01 < degrees.min() < -9.7
+    assert turned[:, :, 2].abs().max() == 0
+
+
+def test_a_frame_says_where_its_pixels_lie_in_the_picture():
+    larger = torch.tensor([[[2.0, 0, 0], [0, 2.0, 0]]])  # shows twice as much: the spot moves inwards
+    assert brightest(crop_images(spot(16, 24), larger)) == (16, 20)
+    beside = torch.tensor([[[1.0, 0, 8 / 16.5], [0, 1.0, 0]]])  # looks 8 pixels to the right
+    assert brightest(crop_images(spot(16, 24), beside)) == (16, 16)
+    quarter = torch.tensor([[[0.0, -1.0, 0], [1.0, 0, 0]]])
+    assert brightest(crop_images(spot(16, 24), quarter)) == (8, 16)
+
+
+def test_beyond_the_edge_lies_the_reflection():
+    images = torch.rand(1, 3, 8, 8, generator=torch.Generator().manual_seed(1))
+    aside = crop_images(images, torch.tensor([[[1.0, 0, 0.5], [0, 1.0, 0]]]))  # two pixels to the right
+    assert torch.allclose(aside[..., :6], images[..., 2:], atol=1e-5)
+    assert torch.allclose(aside[..., 6:], images[..., 6:].flip(-1), atol=1e-5)
+
+
+def test_beyond_the_edge_can_lie_what_is_given():
+    images, around = torch.rand(2, 1, 3, 8, 8, generator=torch.Generator().manual_seed(1))
+    aside = torch.tensor([[[1.0, 0, 0.5], [0, 1.0, 0]]])  # two pixels to the right
+    shown = crop_images(images, aside, around)
+    assert torch.equal(shown[..., 6:], around[..., 6:])
+    assert torch.equal(shown[..., :6], crop_images(images, aside)[..., :6])
+    whole = torch.tensor([[[1.0, 0, 0], [0, 1.0, 0]]])
+    assert torch.equal(crop_images(images, whole, around), images)
+
+
+def test_the_share_that_is_not_framed_anew_stays_bit_for_bit():
+    images = torch.rand(300, 3, 8, 8, generator=torch.Generator().manual_seed(2))
+    frames = random_crops(300, torch.Generator().manual_seed(0), CropSettings(), share=0.25)
+    same = (crop_images(images, frames) == images).flatten(1).all(dim=1)
+    assert 0.68 < same.float().mean() < 0.82
+
+
+def test_batches_are_framed_anew_the_same_way_every_time_and_on_several_devices():
+    images = torch.randint(0, 256, (12, 3, 8, 8), generator=torch.Generator().manual_seed(3)).byte()
+    plain, framed = (Batches(images, 6, seed=3, horizontal_flips=True, reframed=share) for share in (0, 1.0))
+    whole = framed.at(5)
+    assert torch.equal(whole, framed.at(5))
+    assert not torch.equal(whole, plain.at(5))
+    pieces = torch.cat([framed.at(5, Ranks(rank, 2)) for rank in range(2)])
+    assert torch.allclose(pieces, whole, atol=1e-6)

@@ -1,13 +1,25 @@
-"""The step: what each term is made of, who gets which gradient, which factor is perturbed."""
+"""The step: what each term is made of, who gets which gradient, which factor is perturbed; the template start."""
+
+from contextlib import nullcontext
 
 import pytest
 import torch
 
 from derender.model import Derenderer
 from derender.objectives.reconstruction import masked_l1, photometric_loss
-from derender.training.config import ObjectiveSettings
-from derender.training.step import cycle_loss, fill_uncovered, perturb_one_factor, training_step
+from derender.training.config import ObjectiveSettings, TrainConfig
+from derender.training.derender_task import DerenderStep
+from derender.training.step import (
+    cycle_loss,
+    fill_uncovered,
+    own_share,
+    perturb_one_factor,
+    share_codes,
+    training_step,
+)
+from derender.training.task import compute_step
 
+TEMPLATE = ObjectiveSettings(perceptual="none", curvature_weight=0.0, template_share=0.1, release_share=0.2)
 PLAIN = ObjectiveSettings(perceptual="none", curvature_weight=0.0)
 
 
@@ -100,3 +112,39 @@ def test_bf16_networks_leave_geometry_in_float32(model, images, generator):
     mixed = training_step(model, images, PLAIN, None, generator, precision)
     assert mixed.scene.depth.dtype == mixed.rendering.image.dtype == mixed.total.dtype == torch.float32
     assert abs(mixed.terms["l1"] - exact.terms["l1"]) < 0.02
+
+
+@pytest.mark.parametrize(("done", "own"), [(0, 0), (0.09, 0), (0.1, 0), (0.2, 0.5), (0.3, 1), (1, 1)])
+def test_maps_are_shared_and_then_released_along_a_line(done, own):
+    assert own_share(TEMPLATE, done) == pytest.approx(own)
+
+
+def test_only_the_named_codes_move_to_their_mean(generator):
+    codes = {name: torch.randn(4, 8, generator=generator) for name in ("geometry", "light")}
+    half = share_codes(codes, ["geometry"], 0.5)
+    expected = (codes["geometry"] + codes["geometry"].mean(dim=0)) / 2
+    torch.testing.assert_close(half["geometry"], expected)
+    assert half["light"] is codes["light"]
+    assert share_codes(codes, ["geometry"], 1.0) == codes
+
+
+def test_a_shared_template_leaves_cameras_and_lights_their_own(model, images, generator):
+    scene = training_step(model, images, TEMPLATE, None, generator, own=0.0).scene
+    for shared in (scene.depth, scene.albedo):
+        torch.testing.assert_close(shared, shared[:1].expand_as(shared))
+    apart = model.decompose(images)
+    torch.testing.assert_close(scene.camera, apart.camera)
+    torch.testing.assert_close(scene.light, apart.light)
+    assert not torch.allclose(apart.albedo[0], apart.albedo[1])
+
+
+def test_the_step_follows_the_run_and_validation_does_not(model, images, generator):
+    module = DerenderStep(model, TrainConfig(objective=TEMPLATE), None)
+
+    def depth(done):
+        return compute_step(module, images, generator, nullcontext, done).scene.depth
+
+    assert (depth(0)[0] == depth(0)[1]).all()
+    torch.testing.assert_close(depth(None), model.decompose(images).depth)
+    torch.testing.assert_close(depth(0.3), depth(None))
+    assert (depth(None)[0] != depth(None)[1]).any()

@@ -34,11 +34,9 @@ DEFAULT_RANGES = SceneRanges()
 
 
 def perturb_light(
-    light: Float[Tensor, "n 4"],
-    generator: Generator,
-    settings: PerturbSettings = DEFAULT_CHANGES,
+    light: Float[Tensor, "n 4"], generator: Generator, settings: PerturbSettings = DEFAULT_CHANGES,
     ranges: SceneRanges = DEFAULT_RANGES,
-) -> Float[Tensor, "n 4"]:
+) -> Float[Tensor, "n 4"]:  # fmt: skip
     """New ambient, diffuse, pitch and yaw for every row, each drawn by itself about the old one."""
     angle, bound = math.radians(settings.light_deg), math.radians(ranges.light_deg)
     changes = (settings.ambient, settings.diffuse, angle, angle)
@@ -47,11 +45,9 @@ def perturb_light(
 
 
 def perturb_camera(
-    camera: Float[Tensor, "n 6"],
-    generator: Generator,
-    settings: PerturbSettings = DEFAULT_CHANGES,
+    camera: Float[Tensor, "n 6"], generator: Generator, settings: PerturbSettings = DEFAULT_CHANGES,
     ranges: SceneRanges = DEFAULT_RANGES,
-) -> Float[Tensor, "n 6"]:
+) -> Float[Tensor, "n 6"]:  # fmt: skip
     """New pitch (rotation about x) and yaw (about y) for every row; roll and translation stay as they are."""
     changes = (math.radians(settings.camera_pitch_deg), math.radians(settings.camera_yaw_deg))
     bound = math.radians(ranges.rotation_deg)
@@ -60,11 +56,9 @@ def perturb_camera(
 
 
 def exchange(
-    value: Shaped[Tensor, "n ..."],
-    generator: Generator,
-    settings: PerturbSettings = DEFAULT_CHANGES,
+    value: Shaped[Tensor, "n ..."], generator: Generator, settings: PerturbSettings = DEFAULT_CHANGES,
     ranges: SceneRanges = DEFAULT_RANGES,
-) -> Shaped[Tensor, "n ..."]:
+) -> Shaped[Tensor, "n ..."]:  # fmt: skip
     """Give every row another row's value, for factors without a range; the last two are not consulted."""
     return value[derangement(len(value), generator).to(value.device)]
 
@@ -89,11 +83,9 @@ def choose_factors(n: int, candidates: Sequence[int], generator: Generator) -> I
 
 
 def _uniform_about(
-    value: Float[Tensor, "n k"],
-    changes: Sequence[float],
-    bounds: Sequence[tuple[float, float]],
+    value: Float[Tensor, "n k"], changes: Sequence[float], bounds: Sequence[tuple[float, float]],
     generator: Generator,
-) -> Float[Tensor, "n k"]:
+) -> Float[Tensor, "n k"]:  # fmt: skip
     """Uniform over the part of [value - change, value + change] inside the bounds, with gradient to value.
 
     A value outside the bounds is first brought to the nearest one.

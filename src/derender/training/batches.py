@@ -97,11 +97,9 @@ class Batches:
 
 
 def batches_of(
-    images: UInt8[np.ndarray, "n 3 h w"],
-    rows: Int64[np.ndarray, " k"],
-    config: LoopSettings,
+    images: UInt8[np.ndarray, "n 3 h w"], rows: Int64[np.ndarray, " k"], config: LoopSettings,
     device: torch.device,
-) -> Batches:
+) -> Batches:  # fmt: skip
     """Batches of these rows: on the device, or left in the file where they lie mapped and train on a CPU."""
     stay = isinstance(images, np.memmap) and device.type == "cpu"
     lying = torch.from_numpy(images if stay else np.ascontiguousarray(images[rows])).to(device)

@@ -174,11 +174,9 @@ def fill_uncovered(
 
 
 def cycle_loss(
-    model: Derenderer,
-    codes_again: dict[str, Float[Tensor, "n _"]],
-    rendered: Scene,
+    model: Derenderer, codes_again: dict[str, Float[Tensor, "n _"]], rendered: Scene,
     objective: ObjectiveSettings,
-) -> Float[Tensor, ""]:
+) -> Float[Tensor, ""]:  # fmt: skip
     """How far light and camera, predicted from a rendering, are from those it was rendered with; best 0.
 
     Mean absolute difference (radians, intensities, scene units) over the perturbed vector factors; the
