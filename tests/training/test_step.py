@@ -1,4 +1,4 @@
-"""The step: what each term is made of, who gets which gradient, which factor is perturbed; the template start."""
+"""The step: its terms, who gets which gradient, which factor is perturbed; the template start."""
 
 from contextlib import nullcontext
 
