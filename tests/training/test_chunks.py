@@ -20,15 +20,8 @@ FEATURES = SelfFeatures((4, 8, 8))
 def exactly(monkeypatch):
     """The whole step in float64, where rounding cannot hide a difference."""
     monkeypatch.setattr(torch.Tensor, "float", torch.Tensor.double)
-    renderer = partial(render_scene, backend="reference")
-    model = Derenderer.seeded(
-        resolve("small").model.model_copy(update={"network": small()}), 0, renderer=renderer
-    )
-    return model.double()
-
-
-def small():
-    return resolve("small", ["image_size=32", "width=8", "light_width=4"]).model.network
+    settings = resolve("small", ["image_size=32", "width=8", "light_width=4"]).model
+    return Derenderer.seeded(settings, 0, renderer=partial(render_scene, backend="reference")).double()
 
 
 def losses_and_gradients(model: nn.Module, images: torch.Tensor, own: float, chunks: int):
