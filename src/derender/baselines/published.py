@@ -12,13 +12,13 @@ parameters, learnt on 142 million images, read through transformers from the use
 folder, as safetensors only. Nothing is ever downloaded here.
 """
 
+import pickle
 import re
 import warnings
 from argparse import Namespace
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from pickle import UnpicklingError
 from typing import Any
 
 import torch
@@ -35,6 +35,15 @@ GENERATOR_FILE = (
     "and of https://github.com/omertov/encoder4editing)"
 )
 E4E_FILE = "e4e_ffhq_encode.pt (linked from the README of https://github.com/omertov/encoder4editing)"
+UNREADABLE = (
+    pickle.UnpicklingError,
+    RuntimeError,
+    EOFError,
+    OSError,
+    ValueError,
+    LookupError,
+    AttributeError,
+)
 Names = Mapping[str, Callable[[re.Match[str]], str]]
 """Patterns of our names, and how to write the published name of a tensor that matches."""
 
@@ -148,7 +157,7 @@ def read_weights(path: str | Path, wanted: str) -> Mapping[str, Any]:
         with torch.serialization.safe_globals([Namespace]), warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # of unusual pickles: errors are raised below
             content = torch.load(path, map_location="cpu", weights_only=True)
-    except (UnpicklingError, RuntimeError, EOFError, OSError, ValueError, LookupError, AttributeError) as e:
+    except UNREADABLE as e:
         code = re.search(r"GLOBAL (\S+)", str(e))
         asked = code and f"wants to run code when it is read ({code[1]}): refused; get {wanted}"
         raise ValueError(f"{path} {asked or f'is damaged, or no file of torch: get {wanted} again'}") from e
