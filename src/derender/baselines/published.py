@@ -35,7 +35,7 @@ GENERATOR_FILE = (
     "and of https://github.com/omertov/encoder4editing)"
 )
 E4E_FILE = "e4e_ffhq_encode.pt (linked from the README of https://github.com/omertov/encoder4editing)"
-UNREADABLE = (
+DAMAGED = (
     pickle.UnpicklingError,
     RuntimeError,
     EOFError,
@@ -157,7 +157,7 @@ def read_weights(path: str | Path, wanted: str) -> Mapping[str, Any]:
         with torch.serialization.safe_globals([Namespace]), warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # of unusual pickles: errors are raised below
             content = torch.load(path, map_location="cpu", weights_only=True)
-    except UNREADABLE as e:
+    except DAMAGED as e:
         code = re.search(r"GLOBAL (\S+)", str(e))
         asked = code and f"wants to run code when it is read ({code[1]}): refused; get {wanted}"
         raise ValueError(f"{path} {asked or f'is damaged, or no file of torch: get {wanted} again'}") from e
