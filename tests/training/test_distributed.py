@@ -84,13 +84,12 @@ def folder(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def told(folder) -> tuple[dict, list[list[str]], Path]:
+def told(folder, tmp_path_factory) -> tuple[dict, list[list[str]], Path]:
     """Two processes that are refused a training, train, and compare steps.
 
     Gives what the steps came to; what each process said of each command, its exit code last; and the run.
     """
-    place = folder.parent / "told"
-    place.mkdir()
+    place = tmp_path_factory.mktemp("told")
     train_words = ["train", "--data", str(folder), "--preset", "small", "--device", "cpu"]
     commands = [
         [*train_words, "--out", str(place / "refused"), *settings("batch_size=7")],
