@@ -16,31 +16,30 @@ SOURCES = sorted(PACKAGE.rglob("*.py"))
 TESTS = sorted((ROOT / "tests").rglob("*.py"))
 
 BUDGET = {  # lines, files
-    "data": (8_431, 40),
-    "evaluation": (7_785, 45),
-    "report": (4_464, 31),
-    "cli": (3_350, 43),
-    "training": (3_270, 16),
-    "baselines": (2_710, 11),
+    "data": (8_120, 39),
+    "evaluation": (7_530, 45),
+    "report": (4_370, 30),
+    "cli": (3_060, 36),
+    "training": (3_150, 16),
+    "baselines": (2_660, 11),
     "render": (1_730, 16),
-    "features": (1_540, 9),
-    "interpretation": (1_300, 6),
-    "photo": (800, 5),  # photographs in their own pixels
+    "features": (1_500, 9),
+    "interpretation": (1_180, 6),
+    "photo": (790, 5),  # photographs in their own pixels
     "networks": (700, 7),
-    "storage": (720, 7),
+    "storage": (700, 7),
     "objectives": (720, 6),
-    "postprocess": (642, 6),
-    "scene": (700, 10),
-    "demo": (406, 3),
-    "learn": (480, 4),
+    "postprocess": (630, 6),
+    "scene": (690, 10),
+    "demo": (400, 3),
+    "learn": (440, 4),
 }
-TOTAL = (40_200, 275)  # on the way to (32_000, 270)
-TEST_LINES = 28_350  # on the way to 24_000
+TOTAL = (38_750, 262)  # on the way to (32_000, 270)
+TEST_LINES = 26_900  # on the way to 24_000
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80
 SHARED_BY_COMMANDS = {"__init__.py", "console.py", "gathered.py", "options.py", "scoring.py"}
 LONGER_SO_FAR = {  # these still hold logic that belongs into the library
-    "view.py",
     "jobs.py", "outcome.py", "settings.py", "sweep.py",
 }  # fmt: skip
 
