@@ -19,7 +19,7 @@ BUDGET = {  # lines, files
     "data": (8_120, 39),
     "evaluation": (7_530, 45),
     "report": (4_370, 30),
-    "cli": (3_060, 36),
+    "cli": (3_070, 37),
     "training": (3_150, 16),
     "baselines": (2_660, 11),
     "render": (1_730, 16),
@@ -27,15 +27,15 @@ BUDGET = {  # lines, files
     "interpretation": (1_180, 6),
     "photo": (790, 5),  # photographs in their own pixels
     "networks": (700, 7),
-    "storage": (700, 7),
+    "storage": (710, 7),
     "objectives": (720, 6),
     "postprocess": (630, 6),
     "scene": (690, 10),
     "demo": (400, 3),
     "learn": (440, 4),
 }
-TOTAL = (38_750, 262)  # on the way to (32_000, 270)
-TEST_LINES = 26_900  # on the way to 24_000
+TOTAL = (38_750, 263)  # on the way to (32_000, 270)
+TEST_LINES = 26_950  # on the way to 24_000
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80
 SHARED_BY_COMMANDS = {"__init__.py", "console.py", "gathered.py", "options.py", "scoring.py"}

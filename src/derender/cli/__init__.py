@@ -27,6 +27,7 @@ from derender.cli import (
     explain,
     finetune,
     importing,
+    models,
     pack,
     report,
     search,
@@ -40,7 +41,6 @@ app = typer.Typer(
     name="derender",
     help="Decompose images into geometry, albedo, light and camera. Start with: derender demo",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
@@ -66,8 +66,8 @@ def _options(
 for one in (
     demo.demo, doctor.doctor, train.train, copies.whiten, distil.refine, distil.unet, pack.pack,
     embed.embed, evaluate, explain.explain, finetune.finetune, importing.import_checkpoint, compare.compare,
-    report.report, decompose.decompose, edits.relight, edits.rotate, edits.swap, decompose.mesh,
-    search.search, view.view, synth, bench.bench,
+    models.models, report.report, decompose.decompose, edits.relight, edits.rotate, edits.swap,
+    decompose.mesh, search.search, view.view, synth, bench.bench,
 ):  # fmt: skip
     one.register(app)
 

@@ -135,6 +135,10 @@ def embed_to_file(
         ValueError: no image can be read, a feature is not finite, or the parts are of another run.
         KeyboardInterrupt: it was stopped; the message says what is kept.
     """
+    if Path(out).suffix.lower() not in ("", ".parquet"):
+        raise ValueError(
+            f"{out}: a feature table is a parquet file, name it so (pandas.read_parquet reads it)"
+        )
     if batch_size < 1:
         raise ValueError(f"batch_size must be 1 or more, got {batch_size}")
     if engine not in ENGINES:

@@ -4,6 +4,7 @@ A model is looked for in a folder, among the bundled models, then on the Hugging
 """
 
 import json
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -32,6 +33,20 @@ PRETRAINED = Path(__file__).parents[1] / "pretrained"
 def bundled_models() -> tuple[str, ...]:
     """Names of the trained models that come with derender; each has a card, ``pretrained/NAME/README.md``."""
     return tuple(sorted(folder.parent.name for folder in PRETRAINED.glob(f"*/{CONFIG_FILE}")))
+
+
+def bundled(name: str) -> dict[str, Any]:
+    """A bundled model's name, image size in pixels, size in megabytes, and what it was trained on."""
+    folder = PRETRAINED / name
+    network = json.loads((folder / CONFIG_FILE).read_text(encoding="utf-8"))["settings"]["network"]
+    card = (folder / CARD_FILE).read_text(encoding="utf-8")
+    size = sum(file.stat().st_size for file in folder.iterdir())
+    return {
+        "name": name,
+        "image_size": network["image_size"],
+        "megabytes": round(size / 1e6),
+        "about": re.split(r" ?[(:.\n]", card[card.index("**Trained on**") :].replace("**", ""))[0],
+    }
 
 
 def model_folder(source: str | Path) -> Path:
