@@ -35,7 +35,7 @@ BUDGET = {  # lines, files
     "learn": (440, 4),
 }
 TOTAL = (38_750, 263)  # on the way to (32_000, 270)
-TEST_LINES = 26_950  # on the way to 24_000
+TEST_LINES = 27_000  # on the way to 24_000
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80
 SHARED_BY_COMMANDS = {"__init__.py", "console.py", "gathered.py", "options.py", "scoring.py"}

@@ -102,3 +102,9 @@ def test_a_constant_is_made_once_for_each_kind_and_serves_gradients():
     factor = torch.ones(2, 2, dtype=torch.float64, requires_grad=True)
     (factor * first).sum().backward()
     assert factor.grad is not None and torch.equal(factor.grad, first)
+
+
+def test_translation_moves_right_down_and_away():
+    before = torch.tensor([[[0.02, 0.03, 1.05]]], dtype=torch.float64)
+    moved = pinhole.to_camera(before, camera(tx=0.1, ty=0.2, tz=0.3))
+    assert_agrees(moved - before, torch.tensor([[[0.1, 0.2, 0.3]]], dtype=torch.float64))

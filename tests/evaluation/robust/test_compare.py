@@ -80,3 +80,21 @@ def test_bad_features_are_refused():
     few = Curve("light", "light", curve.learn[:4], curve.ordinary, LEVELS, curve.tested)
     with pytest.raises(ValueError, match="light: 4 rows to learn from"):
         Trial(trial.images, trial.task, trial.unit, (few,), "made up")
+
+
+def test_what_fades_with_the_angle_has_the_smaller_area():
+    trial, who, angle = stack()
+    noise = np.random.default_rng(0).normal(size=(len(who), PEOPLE))[
+        trial.unit
+    ]  # a face fades in its own way
+    faded = {
+        f"{strength}": [np.eye(PEOPLE)[who] + strength * angle[:, None] / 60 * noise]
+        for strength in (0.0, 0.6, 3.0)
+    }
+    found = compare_robustness(faded, trial, (0,), resample_count=20)
+    rows, curve = rows_of(found), found.curves[0]
+    areas = [rows[name].scores["area"].value for name in ("0.0", "0.6", "3.0", "majority")]
+    assert areas == sorted(areas, reverse=True) and areas[0] == 1 and len(set(areas)) == 4
+    fading = curve.values(rows["3.0"])
+    assert fading == sorted(fading, reverse=True) and fading[0] == 1
+    assert rows["3.0"].scores["area"].value == pytest.approx(float(area_under(LEVELS, np.array(fading))))
