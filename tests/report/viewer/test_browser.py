@@ -129,7 +129,7 @@ def test_drop_a_file_drag_a_slider_save(page, rendered, tmp_path):
         page.click("[data-save=picture]")
     saved.value.save_as(tmp_path / "view.png")
     with Image.open(tmp_path / "view.png") as picture:
-        assert picture.size == (64, 64)
+        assert picture.size == (256, 256)
 
 
 def test_orbit_swap_and_neighbours_by_keyboard(page):
@@ -202,7 +202,7 @@ def test_without_webgl_the_server_draws_the_orbit(browser, address):
     shown = context.new_page()
     shown.set_default_timeout(PATIENCE_MS)
     shown.goto(address)
-    shown.wait_for_selector('#surface[data-drawn="server"][width="64"]')
+    shown.wait_for_selector('#surface[data-drawn="server"][width="256"]')
     shown.wait_for_timeout(500)
     front = pixels(shown, "#surface")
     shown.focus("#surface")

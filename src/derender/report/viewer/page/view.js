@@ -202,7 +202,8 @@ function buildControls() {
     slider("camera", label, [-reach, reach, turning ? 1 : 0.001, turning ? "°" : ""], () => list()[place % 3], (value) => { list()[place % 3] = value; });
   });
   for (const size of about.sizes) $("size").add(new Option(`${size} px`, size));
-  now.size = about.sizes[0];
+  now.size = about.sizes.filter((size) => size <= 256).at(-1);
+  $("size").value = now.size;
 }
 
 function buildMaps() {
@@ -243,7 +244,12 @@ async function openFirst(source, name, image = null, button = null) {
     const error = first.l1 === null ? "the model renders nothing into it" : `mean difference ${first.l1.toFixed(3)} where the surface is seen${before}`;
     const beaten = first.percentile >= 100 ? "any" : `${Math.floor(first.percentile)} %`;
     const rank = first.percentile === null ? "" : `, more than for ${beaten} of the images the model was validated on`;
-    const part = first.side === 1 ? "" : ` Shown is the part of it that the model reconstructs best, ${Math.round(100 * first.side)} % of its side.`;
+    const share = `${Math.round(100 * first.side)} % of its side`;
+    const part = {
+      face: ` Shown is the face that was found, ${share}.`,
+      auto: first.side === 1 ? "" : ` Shown is the part of it that the model reconstructs best, ${share}.`,
+      "no face": " No face was found: shown is its middle.",
+    }[first.framed] ?? "";
     say(`${name}: ${error}${rank}.${part}`);
     $("unlike").hidden = !first.out_of_distribution;
     $("unlike").textContent = "This image is reconstructed worse than nearly all the model was validated on: it may be out-of-distribution. Read its factors with care.";
