@@ -115,9 +115,7 @@ def relight(
         ValueError: no face is found, or the image has values outside 0..1.
     """
     loaded = as_model(model)
-    for name, angle in (("yaw_deg", yaw_deg), ("pitch_deg", pitch_deg)):
-        if not -90 < angle < 90:
-            raise ValueError(f"{name} must lie between -90 and 90 degrees, got {angle:g}")
+    _check_angles(yaw_deg=yaw_deg, pitch_deg=pitch_deg)
     if not 0 <= strength < float("inf"):
         raise ValueError(f"strength must be 0 or more, got {strength}")
     other = None
@@ -156,15 +154,12 @@ def rotate(
         What was given, in kind and size; a list for a list.
     """
     loaded = as_model(model)
-    for name, angle in (("yaw_deg", yaw_deg), ("pitch_deg", pitch_deg)):
-        if not -90 < angle < 90:
-            raise ValueError(f"{name} must lie between -90 and 90 degrees, got {angle:g}")
+    _check_angles(yaw_deg=yaw_deg, pitch_deg=pitch_deg)
 
     def turned(pixels: np.ndarray) -> np.ndarray:
         photo = open_photograph(pixels, loaded, frame=frame, fit_steps=fit_steps)
         camera = photo.scene.camera.clone()
-        camera[:, 0] += radians(pitch_deg)
-        camera[:, 1] += radians(yaw_deg)
+        camera[:, :2] += camera.new_tensor([radians(pitch_deg), radians(yaw_deg)])
         return photo.edited(camera=camera)
 
     return _each(image, turned)
@@ -199,6 +194,12 @@ def found_frame(
     if frame is None:
         return middle, "no face"
     raise ValueError("no face is found in this image: choose frame auto or none")
+
+
+def _check_angles(**angles: float) -> None:
+    for name, angle in angles.items():
+        if not -90 < angle < 90:
+            raise ValueError(f"{name} must lie between -90 and 90 degrees, got {angle:g}")
 
 
 def _each(image: GivenImages, edit: Callable[[np.ndarray], np.ndarray]) -> Any:
