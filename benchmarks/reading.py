@@ -2,12 +2,9 @@
 
 Made-up sets of tiny files lie in a temporary folder: a folder of class folders, a zip, tars. A start is what
 a command does before the first image is decoded: list, recognise the layout, read labels, ask every file's
-size and time of change (``identity``). The first start has no index to go by, later ones have the
-remembered one where there is one. Every start runs in a process of its own; imports are not counted. First it
-is shown that an added, a removed and a changed file are seen, in a folder and in a zip that are just large
-enough to be remembered; and that as many members of the zip as ``--read`` says, drawn at random, are those
-that Python's own reader reads, with both times.
-Files stay in the system's cache. A million small files take 4 GB; ``--place`` keeps the sets for another run.
+size and time of change (``identity``). Of shards the first start decodes, later ones find the decoded images
+in the cache. Every start runs in a process of its own; imports are not counted. Files stay in the system's
+cache. A million small files take 4 GB; ``--place`` keeps the sets for another run.
 
     python benchmarks/reading.py --files 1000000 --zip 1000000 --shards 100000
 """
@@ -16,16 +13,13 @@ import argparse
 import io
 import json
 import os
-import random
 import resource
-import shutil
 import subprocess
 import sys
 import tarfile
 import tempfile
 import time
 import zipfile
-from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
@@ -33,11 +27,9 @@ from typing import Any
 from machine import parser, publish
 from PIL import Image
 
-from derender.data import list_images, open_source, read_images
-from derender.data.listing import REMEMBERED_FROM
+from derender.data import list_images, read_images
 
 CLASSES = 20
-SETTLED_SECONDS = 2.5  # what changed a moment ago is never trusted (data/folder_source.py)
 
 
 def tiny(number: int) -> bytes:
@@ -112,70 +104,6 @@ def in_a_process_of_its_own(source: Path, cache: Path) -> dict[str, Any]:
     return json.loads(said.stdout)
 
 
-def changes_of_a_folder_are_seen(root: Path, cache: Path) -> None:
-    """A file added, removed or written over alters what is known of a folder that is just large enough."""
-    folder = root / "some"
-    make_folder(folder, REMEMBERED_FROM)
-    file, other = folder / "class00" / "0000000.png", folder / "class01" / "new.png"
-    content = file.read_bytes()
-    steps = (
-        ("added", lambda: other.write_bytes(content), 1),
-        ("removed", other.unlink, 0),
-        ("written over", lambda: file.write_bytes(content + b"\0"), 0),
-    )
-    compare(folder, cache, steps)
-    shutil.rmtree(folder)
-
-
-def changes_of_a_zip_are_seen(root: Path, cache: Path) -> None:
-    """The same for members of a zip."""
-    file = root / "some.zip"
-    make_zip(file, REMEMBERED_FROM)
-
-    def rewrite(last: dict[str, bytes]) -> None:
-        make_zip(file, REMEMBERED_FROM - 1)
-        with zipfile.ZipFile(file, "a") as archive:
-            for name, content in last.items():
-                archive.writestr(name, content)
-
-    name = f"class{(REMEMBERED_FROM - 1) % CLASSES:02d}/{REMEMBERED_FROM - 1:07d}.png"
-    steps = (
-        ("added", lambda: rewrite({name: tiny(0), "class01/new.png": tiny(0)}), 1),
-        ("removed", lambda: rewrite({name: tiny(0)}), 0),
-        ("written over", lambda: rewrite({name: tiny(1)}), 0),
-    )
-    compare(file, cache, steps)
-    file.unlink()
-
-
-def compare(source: Path, cache: Path, steps: tuple[tuple[str, Callable[[], object], int], ...]) -> None:
-    """After each step as many files more are known as it says, and the mark is another where one changed."""
-    before = in_a_process_of_its_own(source, cache)
-    for what, change, more in steps:
-        change()
-        time.sleep(SETTLED_SECONDS)  # so that the index of the next step is one that would be trusted
-        after = in_a_process_of_its_own(source, cache)
-        if after["files"] != before["files"] + more or (
-            what != "removed" and after["mark"] == before["mark"]
-        ):
-            raise SystemExit(f"{source}: a file that was {what} went unnoticed: nothing was measured")
-
-
-def reading_of_members(file: Path, count: int) -> dict[str, float]:
-    """Microseconds of processor time to read a member drawn at random, here and with Python's reader."""
-    with open_source(file) as source, zipfile.ZipFile(file) as archive:
-        names = random.Random(0).choices(source.files, k=count)
-        expected = [archive.read(name) for name in names]  # and the file is in the system's cache
-        took = []
-        for read in (source.read, archive.read):
-            began = time.process_time()
-            contents = [read(name) for name in names]
-            took.append((time.process_time() - began) / count * 1e6)
-            if contents != expected:
-                raise SystemExit(f"{file}: not the bytes that Python's reader gives")
-    return {"members": count, "ours_us": took[0], "pythons_us": took[1]}
-
-
 def starts(source: Path, cache: Path) -> dict[str, Any]:
     """The first start, and two later ones, which must know the same."""
     first = in_a_process_of_its_own(source, cache)
@@ -190,7 +118,6 @@ def main() -> None:
     asks.add_argument("--files", type=int, default=200_000, help="files in the folder")
     asks.add_argument("--zip", type=int, default=1_000_000, help="members of the zip")
     asks.add_argument("--shards", type=int, default=200_000, help="samples in the shards")
-    asks.add_argument("--read", type=int, default=20_000, help="members of the zip to read")
     asks.add_argument("--place", type=Path, help="make the sets here and leave them; those there are used")
     asks.add_argument("--start", type=Path, help=argparse.SUPPRESS)
     options = asks.parse_args()
@@ -213,16 +140,7 @@ def main() -> None:
                 continue
             if not file.exists():
                 make(file, count)
-            if kind == "folder":
-                changes_of_a_folder_are_seen(Path(kept), cache)
-            elif kind == "zip":
-                changes_of_a_zip_are_seen(Path(kept), cache)
-            for index in cache.glob("*.listing"):
-                index.unlink()
-            time.sleep(SETTLED_SECONDS)
             results[kind] = starts(file, cache)
-            if kind == "zip":
-                results[kind]["reading"] = reading_of_members(file, options.read)
     for kind, row in results.items():
         each = (row["first"], *row["later"])
         wall = ", ".join(f"{one['known_s']:.2f}" for one in each)

@@ -14,7 +14,6 @@ from safetensors.torch import save
 import derender
 from derender.baselines import load_baseline
 from derender.baselines.published import read_weights
-from derender.data.listing import read_listing
 from derender.evaluation.memory import Memory
 from derender.features import FeatureTable
 from derender.objectives.perceptual_features import _read_weights
@@ -189,8 +188,6 @@ def test_tables_and_caches_with_pickles_in_them_run_nothing(canary, tmp_path):
     np.savez(file, found=bomb)
     with pytest.warns(DamageNoticed):
         assert memory.recall("kind", {"a": 1}, lambda: {"found": np.ones(2)})["found"].tolist() == [1, 1]
-    np.savez(tmp_path / "listing.npz", note=bomb, names=bomb, stamps=bomb)
-    assert read_listing(tmp_path / "listing.npz") is None
 
 
 def test_configurations_run_nothing(canary, tmp_path):

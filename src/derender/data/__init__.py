@@ -1,14 +1,14 @@
 """Images in: folders, zips, shards and published data sets, decoded once into one array or streamed.
 
 opening       from what the user wrote to a stream of images: open_images
-source, folder_source, zip_source   named files; listing: what is remembered of very large ones
+source, folder_source, zip_source   named files
 layouts/      how data sets lie: recognised, and read into a table of files and labels
 stream        images one after another; shards (WebDataset), huggingface
 image         decode one; decoding: a stream, on every core
 image_set     a stream collected into an array: read_images; cache: large sets in a memory map
 maps          images with masks, with exact depth, normals and albedo
 splits        which rows are for training, validation, test
-parquet       a parquet footer, checked before it is believed
+parquet       a parquet file, its size checked before it is read
 doctor/       whether a set of images suits the method
 """
 
@@ -16,7 +16,6 @@ from derender.data.cache import cache_folder, sample_checksum
 from derender.data.decoding import (
     Decoded,
     Progress,
-    SeenPixels,
     ahead,
     decode_samples,
     decoded,
@@ -30,18 +29,17 @@ from derender.data.layouts import LAYOUTS
 from derender.data.layouts.celeba import MASK_CLASSES
 from derender.data.maps import GroundTruth, MaskedImages, read_ground_truth, read_masks
 from derender.data.opening import ListedStream, list_images, open_images, open_source, parse_source
-from derender.data.parquet import check_lists, checked_footer
+from derender.data.parquet import opened_parquet
 from derender.data.source import Skipped, is_image, nearest_sibling, suggestion
 from derender.data.splits import Split, split_indices
 from derender.data.stream import Kinds, Sample, Stream, Value, column_of
 
 __all__ = [
     "LAYOUTS", "MASK_CLASSES", "READER_VERSION", "Decoded", "Duplicate", "GivenImages", "GroundTruth",
-    "ImageSet", "Kinds", "ListedStream", "MaskedImages", "Progress", "Sample", "SeenPixels", "Skipped",
-    "Split", "Stream", "Unreadable", "Value", "ahead", "as_batch", "as_float", "as_photos",
-    "cache_folder", "check_images", "check_lists", "checked_footer", "column_of", "decode",
-    "decode_samples", "decode_whole", "decoded", "estimated_total", "is_image", "list_images",
-    "nearest_sibling", "open_images", "open_source", "parse_source", "quiet_pillow", "read_ground_truth",
-    "read_image", "read_images", "read_masks", "read_photo", "sample_checksum",
-    "split_indices", "suggestion", "usable_cores",
+    "ImageSet", "Kinds", "ListedStream", "MaskedImages", "Progress", "Sample", "Skipped", "Split", "Stream",
+    "Unreadable", "Value", "ahead", "as_batch", "as_float", "as_photos", "cache_folder", "check_images",
+    "column_of", "decode", "decode_samples", "decode_whole", "decoded", "estimated_total", "is_image",
+    "list_images", "nearest_sibling", "open_images", "open_source", "opened_parquet", "parse_source",
+    "quiet_pillow", "read_ground_truth", "read_image", "read_images", "read_masks", "read_photo",
+    "sample_checksum", "split_indices", "suggestion", "usable_cores",
 ]  # fmt: skip

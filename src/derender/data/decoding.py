@@ -1,4 +1,4 @@
-"""Samples to pixels, in order, on every core, a bounded number on the way; and which pixels came before.
+"""Samples to pixels, in order, on every core, a bounded number on the way.
 
 A pool decodes (Pillow does so without Python's lock), and ``ahead`` lets a thread of its own read while
 whoever takes the results computes. The bound counts images, so that memory does not grow with the stream.
@@ -15,7 +15,7 @@ from itertools import islice
 from typing import TypeVar
 
 import numpy as np
-from jaxtyping import Int64, UInt8
+from jaxtyping import UInt8
 
 from derender.data.image import Unreadable, decode
 from derender.data.stream import Sample, Stream, Value
@@ -117,40 +117,3 @@ def estimated_total(done: int, share: float | None, limit: int | None) -> int:
     """How many samples there will be, judged by the share of the stream that ``done`` of them took."""
     total = done if not share else max(done, round(done / share))
     return total if limit is None else min(total, limit)
-
-
-class SeenPixels:
-    """A growing map from the digest of an image to the number of the first row that had it, in 24 bytes each.
-
-    Digests lie in sorted runs, each at least twice as long as the next (a log-structured merge), so that a
-    batch is looked up in all of them by bisection and a run is copied a logarithmic number of times.
-    """
-
-    def __init__(self) -> None:
-        self._runs: list[tuple[np.ndarray, np.ndarray]] = []
-
-    def first(self, digests: Sequence[bytes], rows: Sequence[int]) -> Int64[np.ndarray, " n"]:
-        """For each digest (16 bytes) the row that had it first, itself if new; new ones are remembered.
-
-        ``rows`` are the numbers of these images, in order.
-        """
-        keys, position, inverse = np.unique(
-            np.array(digests, f"S{DIGEST_BYTES}"), return_index=True, return_inverse=True
-        )
-        found = np.array(rows, np.int64)[position]
-        new = np.ones(len(keys), bool)
-        for run_keys, run_rows in self._runs:
-            place = np.minimum(np.searchsorted(run_keys, keys), len(run_keys) - 1)
-            hit = run_keys[place] == keys
-            found[hit] = run_rows[place[hit]]
-            new &= ~hit
-        if new.any():
-            self._add(keys[new], found[new])
-        return found[inverse]
-
-    def _add(self, keys: np.ndarray, rows: np.ndarray) -> None:
-        while self._runs and len(self._runs[-1][0]) < 2 * len(keys):
-            keys, rows = (np.concatenate(pair) for pair in zip(self._runs.pop(), (keys, rows), strict=True))
-            order = np.argsort(keys, kind="stable")
-            keys, rows = keys[order], rows[order]
-        self._runs.append((keys, rows))

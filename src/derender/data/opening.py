@@ -137,13 +137,10 @@ def list_images(
     try:
         if options:
             raise ValueError(f"{source}: ?{next(iter(options))}= is for shards and Hugging Face data sets")
-        layout = layout or (layout_named(files.recognised) if files.recognised else recognise(files))
-        if dataset == "auto":
-            files.recognised = layout.name
+        layout = layout or recognise(files)
         table = layout.read(files, subset)
         if not table.files:
             raise ValueError(_nothing_found(files))
-        files.remember()
     except BaseException:
         files.close()
         raise

@@ -43,7 +43,6 @@ class Source(ABC):
     path: Path  # the folder or file that the user named
     files: tuple[str, ...]  # every regular file, as sorted posix paths relative to the source
     skipped: tuple[Skipped, ...] = ()
-    recognised: str = ""  # the layout that it was recognised as, "" until then
 
     @abstractmethod
     def read(self, file: str) -> bytes:
@@ -52,9 +51,6 @@ class Source(ABC):
     @abstractmethod
     def stamps(self, files: Sequence[str]) -> Int64[np.ndarray, "n 2"]:
         """Two numbers a file that change with its content: its size, and checksum or time of change."""
-
-    def remember(self) -> None:  # noqa: B027  (only large folders and zips are worth it)
-        """Cache what makes the next start of a very large source fast."""
 
     def close(self) -> None:  # noqa: B027  (folders hold nothing open)
         """Release what the source holds open."""

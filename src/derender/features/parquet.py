@@ -16,7 +16,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from derender.data import check_lists, checked_footer, suggestion
+from derender.data import opened_parquet, suggestion
 from derender.storage.atomic import atomic_file
 
 FORMAT = 1
@@ -87,12 +87,8 @@ def read_columns(path: Path, only: str | None = None) -> Columns:
     if not path.is_file():
         raise FileNotFoundError(f"no feature table at {path}: make one with 'derender embed --out {path}'")
     with _readable(path):
-        size = path.stat().st_size
-        with path.open("rb") as file:
-            footer = checked_footer(file, size)
-        opened = pq.ParquetFile(path, page_checksum_verification=True)
+        opened = opened_parquet(path)
         schema = opened.schema_arrow
-        check_lists(footer, schema, size)
     described = _described(schema.metadata, path)
     lists = [name for name in schema.names if name != "file" and _is_list(schema.field(name).type)]
     names = described.get("factors", lists)

@@ -19,7 +19,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from derender.data import Kinds, SeenPixels, Unreadable, column_of
+from derender.data import Kinds, Unreadable, column_of
 from derender.features.blocks import Block
 from derender.features.parquet import Columns, factor_column, factor_values
 from derender.features.table import check_finite
@@ -62,17 +62,19 @@ class Progressed:
             self.kinds.join(name, kind)
 
 
-def rows_of(block: Block, seen: SeenPixels, keep_duplicates: bool = False) -> Rows:
+def rows_of(block: Block, seen: set[bytes], keep_duplicates: bool = False) -> Rows:
     """The rows of a block in the order of the stream; copies are dropped, unless they are kept.
 
-    ``seen`` holds the pixels of the images before, and grows. A feature that is not finite is an error.
+    ``seen`` holds the digests of the images before, and grows. A feature that is not finite is an error.
     """
     chunk, codes = block
     good = np.flatnonzero([isinstance(outcome, bytes) for outcome in chunk.outcomes])
     digests = [outcome for outcome in chunk.outcomes if isinstance(outcome, bytes)]
     positions, first = chunk.start + good, np.ones(len(good), bool)
     if digests and digests[0]:  # copies are dropped from a set when it is read
-        first = seen.first(digests, positions.tolist()) == positions
+        for place, digest in enumerate(digests):
+            first[place] = digest not in seen
+            seen.add(digest)
     kept = np.flatnonzero(first | keep_duplicates)
     rows, kinds = good[kept].tolist(), Kinds()
     files, labels = [chunk.files[row] for row in rows], [chunk.labels[row] for row in rows]
@@ -156,13 +158,10 @@ class Parts:
             )
         self.remove()
 
-    def seen(self) -> SeenPixels:
-        """The pixels of every row there is."""
-        seen = SeenPixels()
-        for file in self.files:
-            table = pq.read_table(file, columns=["digest", "position"])
-            seen.first(table["digest"].to_pylist(), table["position"].to_pylist())
-        return seen
+    def seen(self) -> set[bytes]:
+        """The digests of every row there is."""
+        tables = (pq.read_table(file, columns=["digest"]) for file in self.files)
+        return {digest for table in tables for digest in table["digest"].to_pylist()}
 
     def write(self, blocks: Sequence[Rows]) -> None:
         """Add a part: the rows of blocks in order."""

@@ -12,7 +12,6 @@ label:
 - anything else is text. Empty cells are unknown.
 """
 
-import io
 import math
 import os
 import re
@@ -32,7 +31,7 @@ from derender.data.layouts.layout import (
     stem_of,
     text_column,
 )
-from derender.data.parquet import check_lists, checked_footer
+from derender.data.parquet import opened_parquet
 from derender.data.source import FileSource, Skipped, Source, is_image
 
 TABLE_SUFFIXES = (".csv", ".parquet")
@@ -162,14 +161,9 @@ def _cells(source: Source, file: str) -> dict[str, list[str]]:
         rows = read_csv(source, file)
         return {name: [row[name] for row in rows] for name in (rows[0] if rows else header_of(source, file))}
     import pyarrow as pa
-    import pyarrow.parquet as pq
 
     try:
-        content = source.read(file)
-        footer = checked_footer(io.BytesIO(content), len(content))
-        opened = pq.ParquetFile(io.BytesIO(content))
-        check_lists(footer, opened.schema_arrow, len(content))
-        table = opened.read()
+        table = opened_parquet(source.read(file)).read()
     except (pa.ArrowException, OSError) as problem:
         raise ValueError(f"{file} in {source.path} is no Parquet table ({problem})") from problem
     except ValueError as problem:
