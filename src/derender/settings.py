@@ -1,9 +1,24 @@
-"""The base of every settings class: frozen, strict about names and types."""
+"""The base of every settings class: frozen, strict about names and types; and values as JSON holds them."""
+
+from collections.abc import Mapping
+from typing import Any
 
 from pydantic import BaseModel, ConfigDict
+from pydantic_core import to_jsonable_python
 
 
 class Settings(BaseModel):
     """Immutable settings; an unknown name or a value of the wrong type is an error, never ignored."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True, allow_inf_nan=False)
+
+
+def plain(value: Any) -> Any:
+    """Dataclasses, arrays, tensors and paths as what JSON can hold; NaN and infinity become null."""
+
+    def listed(one: Any) -> Any:
+        if isinstance(one, Mapping):
+            return dict(one)
+        return one.tolist() if hasattr(one, "tolist") else list(one)
+
+    return to_jsonable_python(value, inf_nan_mode="null", fallback=listed)

@@ -125,17 +125,6 @@ def test_training_lowers_the_error_and_keeps_the_codebook_in_use(blobs, seeded, 
     assert history[-1] < 0.4 * history[0] and terms["codes_used"] > 6
 
 
-@pytest.mark.parametrize("dead_below", [1.0, 0.0])
-def test_an_entry_that_is_never_chosen_is_given_to_a_place_of_the_batch(dead_below, seeded, losses):
-    model = seeded(Vqvae, TINY.model_copy(update={"dead_below": dead_below})).train()
-    losses(model, IMAGES, VqvaeConfig())
-    with torch.no_grad():
-        model.codebook._codebook.embed[0, 3] = 1e4
-        model.codebook._codebook.cluster_size[0, 3] = 0.0
-    losses(model, IMAGES, VqvaeConfig())
-    assert (model.codebook._codebook.embed[0, 3].abs().max() < 100) == (dead_below > 0)
-
-
 def test_features_are_the_map_its_mean_and_its_histogram(seeded, losses):
     model = seeded(Vqvae, TINY)
     losses(model, IMAGES, VqvaeConfig())

@@ -48,16 +48,6 @@ def test_pca_takes_its_components_from_other_pictures():
         controls.pca_features(train, components=4, fit_on=pictures(size=4))
 
 
-def test_noise_knows_nothing_and_repeats():
-    table = controls.noise_features(pictures(500), dimensions=7, seed=3)
-    again = controls.noise_features(pictures(500, seed=9), dimensions=7, seed=3)
-    np.testing.assert_array_equal(table.factors["noise"], again.factors["noise"])
-    assert table.factors["noise"].shape == (500, 7) and abs(table.factors["noise"].std() - 1) < 0.05
-    assert not np.allclose(
-        table.factors["noise"], controls.noise_features(pictures(500), dimensions=7, seed=4).factors["noise"]
-    )
-
-
 @pytest.fixture
 def small():
     from derender.model import Derenderer

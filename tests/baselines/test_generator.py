@@ -62,21 +62,6 @@ def test_w_its_repetition_and_its_styles_give_the_same_image(net, generator):
         gan.GeneratorSettings(image_size=48)
 
 
-def test_only_the_length_of_z_is_lost(net, generator):
-    z = torch.randn(4, 12, generator=generator)
-    torch.testing.assert_close(net.mapping(5 * z), net.mapping(z), rtol=1e-4, atol=1e-5)
-    assert not torch.allclose(net.mapping(-z), net.mapping(z))
-
-
-def test_noise_counts_only_with_its_strength(net, generator):
-    w = net.random_w(2, generator)
-    assert torch.equal(net(w, net.random_noise(2, generator)), net(w))
-    for conv in net.convs:
-        conv.noise_strength.fill_(0.3)
-    assert torch.equal(net(w, net.fixed_noise()), net(w, net.fixed_noise()))
-    assert not torch.equal(net(w, net.random_noise(2, generator)), net(w, net.random_noise(2, generator)))
-
-
 def test_a_code_steers_the_layers_of_its_depth(net, generator):
     first, second = (net.w_plus(net.random_w(1, generator)) for _ in range(2))
     last = SMALL.codes - 1

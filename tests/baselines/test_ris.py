@@ -133,14 +133,6 @@ def test_classes_become_parts(tmp_path):
     assert parts[0, :, ::8, 0].tolist() == [[0, 0, 0, 1], [0, 0, 1, 0], [1, 1, 0, 0]]
 
 
-@pytest.mark.parametrize(("side", "wanted"), [(32, 32), (16, 16), (20, 16), (4, 4), (1000, 32)])
-def test_the_clustered_layer_is_the_last_at_its_resolution(side, wanted, planted):
-    config = ris.RisConfig(image_size=32, clusters=2, samples=2, cluster_side=side)
-    model = ris.build_catalogue(planted, torch.rand(1, 3, 32, 32), torch.ones(1, 1, 32, 32), ("all",), config)
-    sizes = [layer.resolution for layer in planted.generator.layers]
-    assert model.settings.cluster_layer == max(n for n, size in enumerate(sizes) if size == wanted)
-
-
 def test_a_planted_catalogue_is_found(catalogue, planted):
     """Each quarter's channels get its part, but for the coarse ones, which are hair's and the pose's."""
     model = catalogue

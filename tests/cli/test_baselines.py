@@ -8,7 +8,6 @@ from tests.cli.conftest import noise, settings
 from tests.cli.conftest import run as call
 
 from derender import FeatureTable
-from derender.baselines import BASELINES
 from derender.cli import main
 
 SETTINGS = settings("image_size=32", "width=8", "codes=8", "batch_size=4", "images=8")
@@ -105,9 +104,3 @@ def test_bad_words_are_one_line(run, faces, tmp_path, refused):
         "train", "--model", "ae", "--data", faces, "--out", run, "--resume"
     )
     assert not out.exists() and not (tmp_path / "run").exists()
-
-
-def test_help_names_every_baseline(capsys):
-    assert main(["embed", "--help"]) == 0
-    text = capsys.readouterr().out
-    assert all(name in text for name in BASELINES)

@@ -58,9 +58,3 @@ def test_what_is_no_set_of_pictures_is_refused(folder: Path, tmp_path: Path, ref
     assert "is no folder, zip or image" in refused("doctor", text)
     assert "is one image: a set is examined" in refused("doctor", folder / "00.png")
     assert "does not exist" in refused("doctor", tmp_path / "nowhere")
-
-
-def test_a_folder_with_one_picture_gets_a_verdict(tmp_path: Path, capsys):
-    Image.new("RGB", (80, 60), (200, 30, 30)).save(tmp_path / "one.png")
-    assert main(["doctor", str(tmp_path)]) == 0
-    assert "does not suit, because 1 distinct images are too few" in capsys.readouterr().out

@@ -49,8 +49,3 @@ def test_labels_and_factors_that_ask_nothing(folder, refused):
     words = ("evaluate", "linear", *table, "-l", "identity")
     said = refused(*words, "--counts", "10", "--groups", "identity")
     assert "classes tested is learned from" in said and "these groups hold whole classes" in said
-
-
-def test_features_of_another_kind_are_called_by_their_own_name(folder, numbers):
-    words = ("evaluate", "cluster", "-f", folder / "other.parquet", "-l", "identity", *ROOM)
-    assert next(iter(numbers(*words)[0]["rows"])) == "code"

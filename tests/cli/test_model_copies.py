@@ -152,7 +152,3 @@ def test_settings_that_make_no_sense_are_named(folder, tmp_path, capsys, command
     assert run(command, folder, tmp_path / "mine", setting) == 2
     assert message in capsys.readouterr().err
     assert not (tmp_path / "mine").exists()
-
-
-def test_an_existing_model_is_not_replaced_unasked(folder, tmp_path, refused):
-    assert "add --force" in refused("whiten", folder, "-m", KNOWN, "-o", tmp_path)

@@ -7,8 +7,6 @@ import numpy as np
 import pytest
 from tests.cli.conftest import run
 
-from derender.data import read_images
-
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
@@ -21,12 +19,6 @@ def made(folder, name: str, *arguments: str) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def test_wide_light_and_view_are_one_flag_each(folder):
-    rows = made(folder, "wide", "--count", "24", "--light", "wide", "--view", "wide")
-    assert min(abs(float(row["yaw"])) for row in rows) > 19.9
-    assert min(max(abs(float(row["light_yaw"])), abs(float(row["light_pitch"]))) for row in rows) > 34.9
-
-
 def test_single_settings_identities_and_expressions(folder):
     rows = made(
         folder, "set", "--count", "12", "--identities", "3", "--expressions", "fear,anger",
@@ -37,18 +29,6 @@ def test_single_settings_identities_and_expressions(folder):
     assert all(10 <= float(row["light_yaw"]) <= 12 and float(row["yaw"]) == 0 for row in rows)
     facts = json.loads((folder / "set.json").read_text())
     assert facts["identities"] == 3 and facts["settings"]["light"]["yaw_deg"] == [10, 12]
-
-
-def test_tracks_are_laid_out_by_identity_and_track(folder):
-    rows = made(folder, "tracks", "--identities", "2", "--tracks", "3", "--frames", "2")
-    assert len(rows) == 12 and rows[7]["file"] == "tracks/id0001/track_000/001.jpg"
-    assert len(read_images(folder / "tracks", 16)) == 12
-    assert not (folder / "tracks" / "depth").exists()
-
-
-def test_pictures_alone_on_request(folder):
-    made(folder, "plain", "--count", "4", "--no-truth")
-    assert {path.name for path in (folder / "plain").iterdir()} == {"images", "params.csv", "identities.csv"}
 
 
 def test_a_model_of_ones_own(folder):

@@ -6,7 +6,7 @@ import pytest
 import yaml
 from tests.cli.conftest import run
 
-from derender.cli.plan.settings import read_plan
+from derender.learn.plan import read_plan
 from derender.training.config import resolve
 
 EXAMPLES = Path(__file__).parents[2] / "examples" / "runs"
@@ -46,13 +46,6 @@ def test_the_settings_of_a_run_make_the_same_run(settings, tmp_path):
     (run / "config.yaml").write_text(yaml.safe_dump(tree, sort_keys=False))
     for given in (run, run / "config.yaml"):
         assert settings("--config", given) == asked.model_dump(mode="json")
-
-
-def test_a_baselines_settings_train_that_baseline(settings, tmp_path):
-    own = settings("--model", "ae", "--set", "images=99")
-    (tmp_path / "ae.yaml").write_text(yaml.safe_dump(own))
-    assert own["baseline"] == "ae"
-    assert settings("--config", tmp_path / "ae.yaml") == own
 
 
 @pytest.mark.parametrize(

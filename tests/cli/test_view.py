@@ -90,11 +90,6 @@ def test_what_is_refused(model, photos, refused, tmp_path):
     assert "made by another model" in refused("view", "-m", model, "-f", table)
 
 
-def test_what_is_not_installed_is_named(model, refused, monkeypatch):
-    monkeypatch.setattr("derender.cli.view.find_spec", lambda name: None)
-    assert "pip install 'derender[view]'" in refused("view", "-m", model)
-
-
 def test_it_answers_until_ctrl_c(model, photos, tmp_path):
     told = tmp_path / "told.json"
     words = ["view", "-m", model, str(photos / "1.png"), "--json", str(told)]

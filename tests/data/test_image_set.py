@@ -81,11 +81,6 @@ def test_nothing_or_too_little_that_can_be_read(tree, encoded):
         images.require(2)
 
 
-def test_limit_takes_evenly_spaced_images(tree):
-    images = read_images(tree([f"{row}.png" for row in range(10)]), 8, limit=4)
-    assert images.files == ("0.png", "3.png", "6.png", "9.png")
-
-
 def test_progress_counts_up_to_the_total(tree):
     source, calls = tree([f"{row}.png" for row in range(70)]), []
     read_images(source, 8, progress=lambda *call: calls.append(call))

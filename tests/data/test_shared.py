@@ -1,21 +1,15 @@
 """The readers on the development data as it is published: counts, labels, copies."""
 
-from collections import Counter
-
 import numpy as np
 import pytest
 
 from derender.data import (
     MASK_CLASSES,
-    ListedStream,
-    decoded,
     list_images,
-    quiet_pillow,
     read_ground_truth,
     read_masks,
     split_indices,
 )
-from derender.data.layouts import layout_named
 from derender.data.synthetic.synthetic_set import camera_rotation_and_light
 
 
@@ -38,22 +32,6 @@ def test_every_archive_is_recognised_and_whole(shared_data, source, layout, coun
     with list_images(shared_data(f"data/{name}"), subset=subset or None) as listed:
         assert (listed.layout, len(listed.table.files), listed.files.skipped) == (layout, count, ())
         assert labels <= set(listed.table.labels)
-
-
-def test_utkface_copies(shared_data):
-    """The archive's copies are byte for byte the same, so its checksums tell how many pixels must find."""
-    inventory = list_images(shared_data("data/utkface64.zip"))
-    with inventory, quiet_pillow():
-        assert (inventory.table.labels["race"] == "").sum() == 3
-        stamps = list(map(tuple, inventory.files.stamps(inventory.table.files).tolist()))
-        counts = Counter(stamps)
-        copied = [row for row, stamp in enumerate(stamps) if counts[stamp] > 1]
-        single = [row for row, stamp in enumerate(stamps) if counts[stamp] == 1][::200]
-        table = inventory.table.select(np.array([*copied, *single]))
-        some = ListedStream(inventory.files, layout_named("utkface"), table)
-        digests = [digest for chunk in decoded(some, 64) for digest in chunk.outcomes]
-    assert all(isinstance(digest, bytes) for digest in digests)
-    assert len(digests) - len(set(digests)) == sum(count - 1 for count in counts.values()) == 390
 
 
 def test_people_and_tracks(shared_data):

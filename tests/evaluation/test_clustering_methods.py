@@ -104,12 +104,6 @@ def test_finch_levels_are_nested_and_scored_beside_chance():
         assert len(np.unique(np.column_stack((fine, coarse)), axis=0)) == fine.max() + 1
 
 
-def test_two_rows_and_equal_rows():
-    assert finch(np.array([[1.0, 0], [0, 1]])).counts == (1,)
-    assert cut(ward_tree(np.array([[0.0], [2.0]])), 2).tolist() == [0, 1]
-    assert len(np.unique(clusterings(np.zeros((9, 2)), [4], "ward")[4])) == 4
-
-
 def test_forty_attributes_cost_one_tree(monkeypatch, tmp_path):
     built = []
     monkeypatch.setattr(

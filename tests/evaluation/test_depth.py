@@ -6,7 +6,7 @@ import torch
 from scipy.ndimage import binary_erosion
 
 from derender.data import GroundTruth, read_ground_truth
-from derender.evaluation.depth import average_depth, evaluate_geometry, geometry_scores, predicted_depth
+from derender.evaluation.depth import evaluate_geometry, geometry_scores
 from derender.scene.camera import pixel_rays
 
 FOV_DEG = 10.0
@@ -114,12 +114,6 @@ def test_bad_input_is_refused_in_words():
         geometry_scores(depth, mask, -depth, mask, FOV_DEG)
 
 
-def test_average_depth_takes_only_covered_pixels():
-    depth = torch.tensor([[[1.0, 2.0, 9.0]], [[3.0, 9.0, 9.0]]])
-    mask = torch.tensor([[[True, True, False]], [[True, False, False]]])
-    assert average_depth(depth, mask).tolist() == [[2.0, 2.0, 2.0]]
-
-
 class Oracle(torch.nn.Module):
     """A model that knows some depth maps and shows them in turn."""
 
@@ -165,15 +159,6 @@ def test_a_model_that_knows_the_truth_scores_best_beside_its_controls():
     assert result.plane.side == pytest.approx(result.untrained.side)
     assert result.plane.mad_deg == pytest.approx(result.untrained.mad_deg)
     assert 0 < result.average_depth.side < result.plane.side
-
-
-def test_a_model_of_another_size_is_refused_in_words():
-    truth = ground_truth(1)
-    model = Oracle(torch.ones(1, 64, 64), torch.ones(1, 64, 64))
-    with pytest.raises(ValueError, match="the images are 33x33, the model takes 64x64"):
-        evaluate_geometry(model, truth)
-    with pytest.raises(ValueError, match="no images"):
-        predicted_depth(model, truth.images[:0])
 
 
 def test_controls_on_rendered_faces_reach_what_is_known(shared_data):

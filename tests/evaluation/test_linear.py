@@ -321,12 +321,6 @@ def test_probes_refuse_bad_input_in_words(head, features, message):
         probe(head, features, task, np.array([[0, 1]]), np.array([2, 3]), (0,))
 
 
-def test_features_that_never_change_answer_with_the_shares():
-    task = task_of({"a": np.arange(40) % 2, "b": np.arange(40) // 4 % 2})
-    answers, _ = fit_logistic(np.ones((40, 3)), task.targets, np.ones((5, 3)), kind="labels")
-    assert answers == pytest.approx(np.full((5, 2), 0.5), abs=1e-3)
-
-
 def test_bright_and_dark_pictures_are_learned_through_the_encoders():
     rng = np.random.default_rng(0)
     bright = rng.integers(0, 2, 32)

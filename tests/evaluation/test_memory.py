@@ -94,14 +94,3 @@ def test_what_was_packed_is_unpacked(tmp_path):
     assert memory.recall_value("outer", {"k": 1}, Outer, lambda: outer(0.9)).value == 0.1
     assert memory.recall_value("outer", {"k": 2}, Outer, lambda: outer(0.9)).value == 0.9
     assert (memory.made, memory.recalled) == (2, 1)
-
-
-def test_a_class_with_other_fields_is_another_result(tmp_path):
-    @dataclass(frozen=True)
-    class Grown(Inner):
-        more: float = 1.0
-
-    memory = Memory(tmp_path)
-    memory.recall_value("x", {}, Inner, lambda: outer().inner)
-    found = memory.recall_value("x", {}, Grown, lambda: Grown(np.ones(1), (), {}, 2.0))
-    assert found.more == 2.0 and memory.made == 2

@@ -3,7 +3,6 @@
 import re
 
 import numpy as np
-import pytest
 
 from derender.evaluation import compare
 from derender.evaluation.paper_tables import (
@@ -93,24 +92,3 @@ def test_linear_tables_and_the_papers():
     values = compare("linear", tables_of(4), counts=(100,), **how).tables[0].values()
     assert values["paper: Ours - LOOCC-LV"] == {"100 frozen": 0.8226, "data": "CelebA"}
     assert "paper: Supervised ResNet-18" not in values  # it has no frozen head
-
-
-def test_one_call_compares_tables_beside_the_papers_lines():
-    rows = tables_of()
-    found = compare("emotion", rows, resamples=20, cache="none")
-    assert found.values["parts"]["emotion"]["differs"].startswith("stand-in: 60 rows of lfw")
-    values = found.tables[0].values()
-    assert values["paper: Ours - LOOCC-L"] == {
-        "accuracy": 0.4058, "F1": 0.3014, "95 %": None, "data": "RAF-DB"
-    }  # fmt: skip
-    assert values["ours"]["data"] == found.values["parts"]["emotion"]["differs"]
-    assert found.to_pandas().loc["paper: RIS", "accuracy"] == 0.3862
-    assert found.values["parts"]["emotion"]["rows"]["noise"]["runs"] == 2
-    for wrong, message in (
-        (("emotion", {}), "at least one feature table"),
-        (("cars", rows), r"needs labels \(class\), the features have expression, smiles"),
-        (("emotions", rows), "did you mean 'emotion'"),
-        (("emotion", {"m": "faces-64"}), "model 'm' needs images"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            compare(*wrong, cache="none")

@@ -202,13 +202,6 @@ def test_parts_of_another_run_are_an_error_until_told(model, source, tmp_path, o
     assert_same(out, in_memory(model, source, tmp_path / "m.parquet"))
 
 
-@pytest.mark.parametrize("source", ["folder", "shards"], indirect=True)
-@pytest.mark.parametrize("limit", [5, 40, 1000])
-def test_limits(model, source, tmp_path, out, limit):
-    streamed(model, source, out, limit=limit)
-    assert_same(out, in_memory(model, source, tmp_path / "m.parquet", limit=limit))
-
-
 def test_bad_input_leaves_nothing(model, tmp_path, out):
     bad = tmp_path / "bad"
     bad.mkdir()

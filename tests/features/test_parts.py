@@ -73,12 +73,6 @@ def test_what_a_run_leaves_that_was_killed_before_its_first_part_is_no_obstacle(
     assert embed_to_file(pictures, model, tmp_path / "F.parquet").rows == 60
 
 
-def test_parts_without_a_sound_plan_are_told_of(model, pictures, stopped, tmp_path):
-    (stopped[0].parent / "plan.json").write_text("{")
-    with pytest.raises(ValueError, match=r"unfinished table without a sound plan\.json: delete that folder"):
-        embed_to_file(pictures, model, tmp_path / "F.parquet", batch_size=8)
-
-
 @pytest.mark.parametrize("at", [0.2, 0.4, 0.6])
 def test_a_changed_byte_in_a_finished_table_is_an_error_and_not_another_number(model, pictures, tmp_path, at):
     file = tmp_path / "F.parquet"

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from sklearn.base import clone
 from sklearn.linear_model import LogisticRegression
 from sklearn.model_selection import GridSearchCV
 from sklearn.pipeline import make_pipeline
@@ -57,16 +56,6 @@ def test_every_form_of_picture_gives_the_same_features(model, pictures, tmp_path
     ]
     for form in forms:
         np.testing.assert_allclose(transformer.transform(form), expected, rtol=1e-4, atol=1e-4)
-
-
-def test_clone_and_parameters(model):
-    transformer = DisentangledFeatures("runs/x", factors=("albedo",), batch_size=3, device="cpu")
-    copy = clone(transformer)
-    assert copy is not transformer and copy.get_params() == transformer.get_params()
-    assert transformer.set_params(batch_size=5).batch_size == 5
-    twin = clone(DisentangledFeatures(model))
-    assert twin.model is not model and torch.equal(twin.model.a, model.a)
-    assert "runs/x" in repr(transformer)
 
 
 def test_the_model_is_loaded_late_once_and_a_copy_carries_its_path_not_its_weights(loads, pictures):

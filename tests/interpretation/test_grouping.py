@@ -58,8 +58,3 @@ def test_the_factor_two_pictures_share_is_named(features):
     np.testing.assert_allclose(louder.cosine, found.cosine)
     np.testing.assert_allclose(louder.quantile, found.quantile)
     np.testing.assert_allclose(pair_parts(features, 3, 3).distance_share, 0)
-
-
-def test_one_cluster_is_no_contrast(features):
-    with pytest.raises(ValueError, match="60 rows form 1 cluster"):
-        cluster_shares(features, np.zeros(N))

@@ -1,9 +1,5 @@
 """A comparison's page: every table with its chart, settings, and what is missing; all text escaped."""
 
-from dataclasses import replace
-
-import pytest
-
 from derender.evaluation.score_table import Column, Row, ScoreTable
 from derender.report.comparison import chart_of, comparison_page
 
@@ -33,23 +29,8 @@ def test_page_has_every_table_a_chart_settings_and_what_failed():
     assert "Clustering &amp; more" in html
 
 
-def test_a_long_caption_is_cut_between_words_in_the_navigation():
-    table = replace(scores(0.5), caption="same, Ward clustering, 64 rows, 4 classes of class")
-    html = comparison_page("One", [table]).html()
-    assert ">1 same, Ward clustering, 64 rows, 4…</a>" in html
-
-
-def test_without_failures_the_page_says_so():
-    assert "Nothing that was noticed." in comparison_page("One", [scores(0.5)]).html()
-
-
 def test_charts_show_the_first_score_and_only_finite_numbers():
     chart = chart_of(scores(0.25, None, float("nan")))
     assert chart is not None and "0.25" in chart[0] and "model 1" not in chart[0]
     assert chart_of(scores(0.5, best=None)) is None
     assert chart_of(scores(None)) is None
-
-
-def test_nothing_to_compare_is_an_error():
-    with pytest.raises(ValueError, match="needs at least one table"):
-        comparison_page("None", [])

@@ -126,12 +126,6 @@ def test_uncovered_pixels_are_transparent_and_white_on_paper():
         colours.pictures(np.zeros((2, 4, 4, 3)))
 
 
-def test_shading_is_white_where_fully_lit():
-    shading = np.stack([np.full((1, 2, 2), level) for level in (0.5, 1.0)])
-    dim, full = (image.getpixel((0, 0))[0] for image in colours.shading_maps(shading))
-    assert (dim, full) == (128, 255)
-
-
 def test_another_light_comes_from_the_other_side_and_another_view_turns_back():
     scene = bump()
     light, camera = under_another_light(scene).light, from_another_view(scene).camera

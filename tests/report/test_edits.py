@@ -11,7 +11,6 @@ from PIL import Image
 
 from derender.report.edits import Edit
 from derender.report.films import animated_png, gif, mp4
-from derender.report.opening import FilmOptions
 from derender.report.panel import Sheets
 
 
@@ -51,23 +50,10 @@ def test_mp4_has_every_frame_and_even_sides(tmp_path):
     assert shown[3, 12, 3].min() > 245
 
 
-def test_a_film_needs_frames():
-    for film in (animated_png, gif, mp4):
-        with pytest.raises(ValueError, match="at least two frames; got 1"):
-            film(frames(1))
-
-
 def test_no_ffmpeg_is_an_error_that_helps(monkeypatch):
     monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", "no-such-program")
     with pytest.raises(ValueError, match=r"ffmpeg cannot write MP4 here .*: write a GIF instead"):
         mp4(frames())
-
-
-def test_kinds_of_film():
-    assert FilmOptions(film="mp4, gif,mp4").kinds == ("mp4", "gif")
-    assert FilmOptions(film="none").kinds == ()
-    with pytest.raises(ValueError, match="unknown kind of film 'mp5'; did you mean 'mp4'"):
-        FilmOptions(film="mp5")
 
 
 def test_a_folder_has_strip_stills_film_and_numbers(tmp_path):

@@ -45,15 +45,6 @@ def test_everything_that_can_be_told_is_told_and_escaped(model, pictures, tmp_pa
     assert html.count("prefers-reduced-motion") == 2
 
 
-def test_parts_that_cannot_be_made_are_named_with_their_reason(model, pictures):
-    few = pictures.select(slice(3))
-    found = gather(Subject(model, few, few.select(slice(0)), "None"))
-    assert list(found.sections) == ["data"]
-    assert len(found.failed) == 5
-    assert "needs 1 images or more" in found.failed[0]
-    assert "no label of 2 to 12 classes" in found.failed[-1]
-
-
 def test_the_suitable_label_has_few_classes_with_pictures_enough(pictures):
     assert suitable_label(pictures) == ("tone",)
     names = np.array([f"id{number}" for number in range(COUNT)])

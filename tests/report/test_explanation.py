@@ -17,7 +17,7 @@ from derender.interpretation.tables import (
     untrusted,
 )
 from derender.report.charts import side_by_side
-from derender.report.saliency import overlays, safe_name
+from derender.report.saliency import overlays
 
 
 def test_an_empty_map_leaves_a_grey_picture_and_a_full_one_lights_its_place():
@@ -63,9 +63,3 @@ def test_a_chart_as_a_picture_has_a_ground_and_as_svg_has_none():
         corner, alpha = picture.convert("RGBA").getpixel((1, 1)), picture.convert("RGBA").getchannel("A")
     assert corner == (255, 255, 255, 255) and alpha.getextrema() == (255, 255)
     assert "#ffffff" not in svg and "currentColor" in svg
-
-
-def test_a_chart_of_no_panels_is_refused_and_names_are_safe():
-    with pytest.raises(ValueError, match="at least one panel"):
-        side_by_side({}, "share", (3, 2))
-    assert safe_name("1: 0.5 to 2/3") == "1-0-5-to-2-3" and safe_name("//") == "label"

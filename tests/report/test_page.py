@@ -120,14 +120,6 @@ def test_table_marks_the_best_and_gives_numbers_to_sort_by():
     assert ">1,200<" in html and '<tr class="control">' in html
 
 
-def test_a_sentence_in_a_cell_may_break_and_a_short_word_may_not():
-    long = "failed: the weights are not here, fetch them once"
-    table = ScoreTable("scores", "features", [Column("why")], [Row("a", [long]), Row("b", ["0.1-0.2"])])
-    html = ONE_TABLE.render(table=table)
-    assert f'<td class="words">{long}</td>' in html and "<td>0.1-0.2</td>" in html
-    assert ".numbers td.words { white-space: normal;" in full_page()
-
-
 def test_bytes_that_are_no_image_and_empty_charts_are_refused():
     with pytest.raises(ValueError, match="PNG, GIF or JPEG"):
         data_uri(b"<svg onload=alert(1)>")

@@ -1,13 +1,9 @@
 """Curves as tables and as a chart: what stands in which cell, and a line for each row."""
 
-import io
-
 import numpy as np
-from PIL import Image
 
 from derender.evaluation.bootstrap import ScoredRow, estimate, with_verdicts
 from derender.evaluation.robust import CurveResult, RobustnessComparison
-from derender.report.robustness import robustness_chart, robustness_page
 
 
 def made_up() -> RobustnessComparison:
@@ -40,14 +36,3 @@ def test_tables_say_what_was_learned_tested_and_lost():
     assert area.best(0) == cells["area"] and area.best(5) is None  # to lose nothing is no merit by itself
     assert [row.control for row in area.rows] == [False, True]
     assert list(curve.values()["majority"]) == ["0", "40"]
-
-
-def test_the_chart_and_the_page_show_every_row():
-    found = made_up()
-    svg, png = robustness_chart(found)
-    assert svg.startswith("<svg") and all(word in svg for word in ("albedo", "majority", "camera yaw"))
-    with Image.open(io.BytesIO(png)) as drawn:
-        assert drawn.width > drawn.height
-    page = robustness_page(found, "runs/faces").html()
-    assert "camera yaw: albedo has the area 0.700; camera yaw: majority has the area 0.250" in page
-    assert "camera yaw: above the strongest control?" in page

@@ -43,12 +43,6 @@ def test_only_first_last_and_evenly_chosen_samples_are_shown(tmp_path):
     assert len(shown) == 4 and shown[0] == 1 and shown[-1] == 20
 
 
-def test_a_damaged_environment_does_not_hide_the_rest(tmp_path):
-    run = start_run(tmp_path / "run", resolve("small"), {}, "cpu")
-    (run.path / "environment.json").write_text("{")
-    assert "<dt>environment.json</dt><dd>damaged</dd>" in run_page(run.path).html()
-
-
 def test_curves_need_two_points_and_leave_out_what_is_no_number():
     logged = ((1, 0.5), (2, float("nan")), (3, None))
     rows = [{"kind": "train", "images": images, "l1": value} for images, value in logged]

@@ -42,19 +42,6 @@ def test_light_goes_from_the_right_of_the_picture_to_its_left():
     assert float(left[1]) == pytest.approx(float(right[1]), abs=1e-3)
 
 
-def test_light_that_goes_round_is_as_strong_as_asked():
-    for strength in (0.0, 0.7, 1.6):
-        lights = sweeps.lights_around(sweeps.stills(3), 50, strength=strength)
-        torch.testing.assert_close(lights[:, :2].sum(dim=1), torch.full((3,), strength))
-        assert (lights[:, 0] <= lights[:, 1]).all()
-
-
-def test_light_between_two_lights():
-    start, end = torch.tensor([0.2, 0.4, 0.0, -0.3]), torch.tensor([0.6, 0.2, 0.2, 0.3])
-    path = sweeps.lights_between(sweeps.stills(3), start, end)
-    torch.testing.assert_close(path, torch.stack((start, (start + end) / 2, end)))
-
-
 def test_turning_looks_right_first_then_left():
     cameras = sweeps.cameras_around(sweeps.stills(3), 30)
     torch.testing.assert_close(cameras[1], torch.zeros(6))
@@ -85,13 +72,6 @@ def test_swapping_takes_one_parameter():
     torch.testing.assert_close(mixed.albedo, scene.albedo)
     with pytest.raises(ValueError, match="no 'geometry'; this scene has depth, albedo"):
         sweeps.swapped(scene, donor, "geometry")
-
-
-def test_drawing_in_parts_changes_nothing(monkeypatch):
-    scene = sweeps.varied(ball(), light=sweeps.lights_around(sweeps.stills(5), 40))
-    whole = [image.tobytes() for image in sweeps.drawn(scene, render)]
-    monkeypatch.setattr(sweeps, "FRAMES_AT_ONCE", 2)
-    assert [image.tobytes() for image in sweeps.drawn(scene, render)] == whole
 
 
 def test_loops_move_and_close():

@@ -30,10 +30,3 @@ def test_a_folder_is_replaced_only_at_the_end(tmp_path):
         raise KeyboardInterrupt
     assert [entry.name for entry in folder.iterdir()] == ["two"]
     assert [entry.name for entry in tmp_path.iterdir()] == ["model"]
-
-
-def test_the_longest_names_are_fine(tmp_path):
-    path = tmp_path / ("n" * 250 + ".txt")
-    with atomic_file(path) as temporary:
-        temporary.write_text("x")
-    assert path.read_text() == "x"

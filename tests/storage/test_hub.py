@@ -1,6 +1,5 @@
 """Released models: what save_pretrained writes, what reaches the Hub, what comes back, what is refused."""
 
-import json
 import shutil
 from pathlib import Path
 
@@ -98,26 +97,12 @@ def test_card_and_errors_go_with_the_weights_they_belong_to(model, tmp_path):
     assert not (third / ERRORS_FILE).exists()
 
 
-def test_scores_on_a_card_come_from_the_errors_beside_the_model(model, tmp_path):
-    folder = with_errors(model.save(tmp_path / "plain")).parent
-    card = (derender.load(folder).save_pretrained(tmp_path / "told", data="mugs") / "README.md").read_text()
-    assert "1,234 images it was not trained on have a masked L1 of 0.0600 in the median and 0.1090" in card
-
-
 def test_saving_over_the_folder_it_came_from_keeps_the_card(model, tmp_path):
     folder = model.save_pretrained(tmp_path / "mine", **MINE)
     with pytest.raises(FileExistsError, match="overwrite=True"):
         derender.load(folder).save_pretrained(folder)
     derender.load(folder).save_pretrained(folder, overwrite=True)
     assert "mugs" in (folder / "README.md").read_text()
-
-
-def test_bundled_cards_travel(fake):
-    derender.load("rendered-faces-64").push_to_hub("me/faces")
-    folder = fake.place / "me" / "faces"
-    assert fake.card().startswith("---\n") and "SIDE 0.786e-2" in fake.card()
-    assert json.loads((folder / ERRORS_FILE).read_text())["pictures"] > 0
-    assert (folder / "whitening.safetensors").exists()
 
 
 def test_what_the_hub_refuses_is_one_sentence(model, fake, monkeypatch):

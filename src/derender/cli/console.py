@@ -133,6 +133,8 @@ def write_json(target: str | None, values: Mapping[str, Any]) -> None:
     """What ``--json`` asks for: a file written whole, or standard output for ``-``; nothing for None."""
     if target is None or not is_main_process():
         return
+    from derender.settings import plain
+
     text = json.dumps(plain(values), indent=1, ensure_ascii=False) + "\n"
     if target == "-":
         sys.stdout.write(text)
@@ -140,18 +142,6 @@ def write_json(target: str | None, values: Mapping[str, Any]) -> None:
         from derender.report.page import write_whole
 
         write_whole(target, text.encode("utf-8", errors="replace"))
-
-
-def plain(value: Any) -> Any:
-    """Dataclasses, arrays, tensors and paths as what JSON can hold; NaN and infinity become null."""
-    from pydantic_core import to_jsonable_python
-
-    def listed(one: Any) -> Any:
-        if isinstance(one, Mapping):
-            return dict(one)
-        return one.tolist() if hasattr(one, "tolist") else list(one)
-
-    return to_jsonable_python(value, inf_nan_mode="null", fallback=listed)
 
 
 def refuse_existing_file(path: Path, force: bool) -> None:

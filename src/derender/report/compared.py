@@ -2,7 +2,7 @@
 
 Rows are methods and controls, columns data sets. Under the one table each data set has its own, with every
 score, its interval and the row's cost. What failed or is missing says so in its place. Leaves out computing
-(``derender.cli.plan``).
+(``derender.learn.sweep``).
 """
 
 from collections.abc import Mapping, Sequence

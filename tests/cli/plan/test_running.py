@@ -1,6 +1,7 @@
 """A plan from file to tables: what it leaves, kill -9 in the middle, the end of the budget, workers."""
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -13,9 +14,9 @@ from PIL import Image
 from tests.cli.conftest import coloured_people
 
 from derender.cli import main
-from derender.cli.plan.jobs import Comparison, jobs_of, run_progress
-from derender.cli.plan.settings import read_plan
-from derender.cli.plan.sweep import died
+from derender.learn.jobs import Comparison, jobs_of, run_progress
+from derender.learn.plan import read_plan
+from derender.learn.sweep import in_own_process
 from derender.training import loop
 
 PLAN = """
@@ -64,6 +65,11 @@ def whole(plan) -> Path:
     """The plan's folder after one uninterrupted call."""
     assert main(["compare", "--plan", str(plan), "--out", str(plan.parent / "whole")]) == 0
     return plan.parent / "whole"
+
+
+def killing(*_: object, **__: object) -> None:
+    """A progress bar that ends its process."""
+    os.kill(os.getpid(), signal.SIGKILL)
 
 
 def scores(out: Path) -> dict:
@@ -148,10 +154,10 @@ def test_worker_processes_do_the_same(plan, whole):
 
 
 def test_a_worker_that_was_killed_costs_itself_alone(plan, tmp_path):
-    at = Comparison(read_plan(plan), tmp_path)
+    at = Comparison(read_plan(plan), tmp_path, bar=killing)
     job = jobs_of(at.plan)[0]
-    note = died(at, job, -signal.SIGKILL)
-    assert note.state == "failed" and "was killed by SIGKILL" in note.why and at.note(job) == note
+    note = in_own_process(at, job)
+    assert note.state == "failed" and "its process was killed" in note.why and at.note(job) == note
 
 
 def test_two_at_once_in_one_folder_are_refused(plan, tmp_path, refused):

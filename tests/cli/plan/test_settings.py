@@ -2,8 +2,8 @@
 
 import pytest
 
-from derender.cli.plan.jobs import jobs_of
-from derender.cli.plan.settings import Plan, read_plan
+from derender.learn.jobs import jobs_of
+from derender.learn.plan import Plan, read_plan
 
 GOOD = """
 images: 1000

@@ -47,14 +47,6 @@ def test_pixels_know_black_white_grey_and_blank():
     np.testing.assert_allclose((found.tiny**2).sum(axis=1), [1, 1, 0, 0], atol=1e-5)
 
 
-def test_the_cells_of_a_mirrored_picture_are_the_mirrored_cells(numbers):
-    images = made.noise(5, numbers)
-    np.testing.assert_allclose(
-        edge_cells(shrunk(images[..., ::-1])), mirrored(edge_cells(shrunk(images))), rtol=1e-4, atol=1e-4
-    )
-    np.testing.assert_array_equal(mirrored(mirrored(edge_cells(shrunk(images)))), edge_cells(shrunk(images)))
-
-
 def test_an_edge_lies_in_its_cell_and_orientation():
     images = np.zeros((2, 3, 64, 64), np.uint8)
     images[0, :, :, 32:] = 255  # the gradient points right: orientation 0
@@ -131,15 +123,6 @@ def test_near_copies_are_grouped_under_the_first(numbers):
     assert group[70:72].tolist() == [0, 1]
     assert group[72:].tolist() == [72, 72], "blank images are copies of one another"
     assert near_copy_groups(measure_pixels(images[:1]).tiny).tolist() == [0]
-
-
-def test_near_copies_are_those_that_brute_force_finds(numbers):
-    base = numbers.standard_normal((60, 256))
-    rows = np.concatenate([base, base[:20] + numbers.normal(0, 0.1, (20, 256))])
-    rows = (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
-    alike = rows @ rows.T >= 0.98
-    assert near_copy_groups(rows).tolist() == [int(np.flatnonzero(row)[0]) for row in alike]
-    assert (near_copy_groups(rows) != np.arange(80)).sum() == 20
 
 
 def test_the_jackknife_of_a_mean_is_its_standard_error(numbers):

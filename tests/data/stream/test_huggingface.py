@@ -9,7 +9,7 @@ import pyarrow.parquet as pq
 import pytest
 from PIL import Image as Pillow
 
-from derender.data import read_image, read_images
+from derender.data import read_images
 
 datasets = pytest.importorskip("datasets", reason="needs the extra: pip install 'derender[huggingface]'")
 
@@ -108,16 +108,6 @@ def test_a_stream_goes_on_in_the_middle_of_its_splits(rows, places):
             rest = list(stream.samples(start))
             assert [sample.file for sample in rest] == names[start:]
             assert not rest or rest[-1].share == 1
-
-
-def test_a_folder_of_pictures_asked_for_as_a_data_set(places, encoded):
-    for name in ("cat/1.png", "dog/2.png"):
-        (places / "tree" / name).parent.mkdir(parents=True, exist_ok=True)
-        (places / "tree" / name).write_bytes(encoded(len(name) + ord(name[0])))
-    assert read_images("tree", 12).layout == "classes"
-    streamed = read_images("tree", 12, dataset="huggingface")
-    assert streamed.files == ("train/00000000-1.png", "train/00000001-2.png")
-    np.testing.assert_array_equal(streamed.images[0], read_image(places / "tree/cat/1.png", 12))
 
 
 def test_no_picture_column_and_several(rows, places):

@@ -195,23 +195,3 @@ def test_it_is_decoded_once_and_again_after_a_change(shard, cache, encoded):
     shard("c.tar", members(6))
     assert len(read_images(path, 8)) == 6
     assert len(list(cache.iterdir())) == 1
-
-
-def test_nothing_usable_leaves_nothing(shard, cache, tmp_path):
-    with pytest.raises(ValueError, match=r"no image in .*e\.tar \(webdataset\): it is empty"):
-        read_images(shard("e.tar", {}), 8)
-    with pytest.raises(ValueError, match=r"the first is 't\.tar/1': no image in this sample \(it has txt\)"):
-        read_images(shard("t.tar", {"1.txt": "x"}), 8)
-    (tmp_path / "folder").mkdir()
-    with pytest.raises(ValueError, match="holds no shards"):
-        read_images(tmp_path / "folder", 8, dataset="webdataset")
-    assert list(cache.iterdir()) == []
-
-
-def test_a_folder_with_an_image_beside_a_tar_and_progress_to_the_total(shard, tmp_path, encoded):
-    calls = []
-    read_images(shard("f/a.tar", members(70)), 8, progress=lambda *call: calls.append(call))
-    assert [done for done, _ in calls] == [32, 64, 70, 70]
-    assert all(done <= total <= 80 for done, total in calls) and calls[-1] == (70, 70)
-    (tmp_path / "f" / "own.png").write_bytes(encoded(1))
-    assert read_images(tmp_path / "f", 8).files == ("own.png",)

@@ -148,12 +148,6 @@ def test_other_sizes_show_the_same_object(kind, sample, size):
     assert np.allclose(made.mask.mean(axis=(1, 2)), sample.mask[:2].mean(axis=(1, 2)), atol=0.03)
 
 
-def test_progress_counts_up_to_the_end(kind):
-    seen: list[tuple[int, int]] = []
-    kind.generate(20, image_size=16, progress=lambda done, total: seen.append((done, total)))
-    assert seen[-1] == (20, 20) and [d for d, _ in seen] == sorted({d for d, _ in seen})
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

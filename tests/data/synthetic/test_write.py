@@ -72,14 +72,6 @@ def test_encodings_are_the_published_ones(made, folder):
     assert depth[row, column] == round((float(made.depth[3, row, column]) - 0.8) / 0.4 * 65535)
 
 
-def test_identities_are_listed_once_with_their_traits(made, folder):
-    with (folder / "identities.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    assert [int(row["identity"]) for row in rows] == [0]
-    nose = made.identity_traits["shape_nose_length"][0]
-    assert float(rows[0]["shape_nose_length"]) == pytest.approx(nose, abs=1e-4)
-
-
 def test_without_truth_only_pictures_and_tables_and_never_over_another_set(made, tmp_path):
     folder = write(made, tmp_path / "plain", truth=False)
     assert sorted(path.name for path in folder.iterdir()) == ["identities.csv", "images", "params.csv"]

@@ -69,12 +69,3 @@ def test_what_is_behind_flat_or_outside_is_skipped():
     _, owner = filled(points, np.array([[0, 2, 1], [0, 1, 5], [3, 4, 3], [1, 3, 4]]))
     assert set(np.unique(owner)) == {-1, 3}
     assert (owner[:, :20] == -1).all()
-
-
-def test_of_two_at_one_place_the_first_stays_and_the_nearer_hides():
-    points = np.array([[5, 5, 1], [20, 5, 1], [5, 20, 1], [5, 5, 1.1], [20, 5, 1.1], [5, 20, 1.1]], float)
-    _, owner = filled(points, np.array([[0, 1, 2], [0, 1, 2]]))
-    assert set(np.unique(owner)) == {-1, 0}
-    for order in ([[0, 1, 2], [3, 4, 5]], [[3, 4, 5], [0, 1, 2]]):
-        nearest, _ = filled(points, np.array(order))
-        assert nearest.max() == np.float32(1.1) and set(np.unique(nearest)) == {0, np.float32(1.1)}

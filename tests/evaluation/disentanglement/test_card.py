@@ -95,10 +95,3 @@ def test_tables_against_the_true_factors():
     assert list(cells) == ["light", "camera", "all", "all, shuffled", "chance"]
     assert cells["light"] > 0.99 > 0.2 > cells["camera"] and cells["chance"] == 0
     assert len(card(known=False).tables()) == 3
-
-
-def test_swap_tables_hold_the_matrix():
-    features, decoded = card().tables()[1:3]
-    assert features.values()["light"] == {"light": 0.9, "camera": 0.3, "picture": 0.9, "left": 0.1}
-    assert features.values()["nothing"]["light"] == 0.45
-    assert decoded.values()["camera"] == {"light": 0.1, "camera": 0.7}

@@ -26,12 +26,6 @@ def test_both_readings_are_what_numpy_says():
     assert scores.mean_per_image == pytest.approx(scores.per_image[off].mean())
 
 
-def test_chance_per_dimension_is_the_stated_floor():
-    blocks = features(rows=400, size=64)
-    assert pearson(blocks).mean_per_dimension == pytest.approx(np.sqrt(2 / (np.pi * 399)), rel=0.03)
-    assert abs(pearson(blocks).mean_per_image) < 0.01
-
-
 def test_dead_dimensions_and_constant_vectors_are_left_out_and_counted():
     blocks = features()
     dead = np.concatenate([blocks["light"], np.full((40, 2), 0.3)], axis=1)

@@ -79,8 +79,3 @@ def test_cross_prediction_has_a_direction():
     assert shuffled.cross_r2[0, 1] < 0.05 < scores.mean_cross_r2
     off = ~np.eye(3, dtype=bool)
     assert scores.mean_cka_biased == pytest.approx(scores.cka_biased[off].mean())
-
-
-def test_bad_input():
-    with pytest.raises(ValueError, match="6 rows cannot be dealt into 5 folds: use 2 to 3"):
-        held_out(normal(6, 2), normal(6, 2))

@@ -52,14 +52,6 @@ def test_a_generated_trial_is_made_once(tmp_path):
     assert trial.unit[light.tested[1]].tolist() == 2 * trial.unit[yaw.ordinary].tolist()
 
 
-def test_other_labels_are_asked_about_other_people():
-    trial = generated_trial(Recipe(label="age", people=8, learned=1, tested=1, image_size=16), [YAW], (0, 20))
-    assert trial.task.names == ("age",) and trial.how == "age of generated faces"
-    (curve,) = trial.curves
-    assert not set(trial.unit[curve.learn]) & set(trial.unit[curve.ordinary])
-    assert trial.task.targets[curve.learn].mean() == 0.5  # above and below the median
-
-
 def test_nobody_is_asked_what_nobody_could_learn():
     recipe = Recipe("cars", "class", people=16, learned=1, tested=1, image_size=16)
     trial = generated_trial(recipe, [LIGHT], (0, 20))
@@ -126,12 +118,6 @@ def test_true_angles_divide_tracks():
     still = ImageSet(pictures.images, pictures.files, {**labels, "camera_y_rad": np.zeros(32)})
     with pytest.raises(ValueError, match="all at one angle"):
         true_angle_trial(still, task, [YAW])
-
-
-def test_light_off_the_front_is_one_angle():
-    labels = {"light_yaw_rad": np.radians([30, 0, -45]), "light_pitch_rad": np.radians([0, -20, 45])}
-    expected = [30, 20, math.degrees(math.atan(2**0.5))]
-    assert LIGHT.true_deg(labels) == pytest.approx(expected)
 
 
 def test_bad_words_are_refused():

@@ -133,16 +133,6 @@ def test_a_comparison_goes_on_where_it_stopped(data, model, tmp_path, before):
     assert "paper: Joint Encoders" in paper.values()
 
 
-def test_few_pictures_come_in_small_batches_so_that_there_are_steps_to_learn_in(data, model):
-    sizes = {pictures: SegmentSettings().batch_for(pictures) for pictures in (24_127, 1_600, 640)}
-    assert sizes == {24_127: 64, 1_600: 5, 640: 2}
-    assert SegmentSettings(batch_size=3).batch_for(24_127) == 3
-    settings = SegmentSettings(epochs=1)
-    found = segment(model, data, variants=["random"], seeds=[0], settings=settings, resample_count=2).result
-    assert found.settings.batch_size == 2  # the table says what was used
-    assert found.rows[0].losses.shape == (1, 1)
-
-
 def test_the_split_is_the_datas_own_or_by_name():
     pictures, masks = bands(20)
     parts = np.array(["train"] * 8 + ["validation"] * 4 + ["test"] * 8)
@@ -154,12 +144,6 @@ def test_the_split_is_the_datas_own_or_by_name():
     few, more = (divide(pictures, masks, NAMES, labelled=count) for count in (4, 8))
     assert len(few.train) == 4 and set(few.train) < set(more.train) < set(hashed.train)
     assert few.test.tolist() == hashed.test.tolist()
-
-
-def test_all_that_a_model_has_is_compared_unless_something_is_named(model):
-    without = Derenderer.from_preset("small", seed=0, image_size=32, encoder="unet", unet_width=4)
-    assert list(chosen_variants(model)) == list(VARIANTS)
-    assert set(VARIANTS) - set(chosen_variants(without)) == {"joint-whole"}
 
 
 def test_bad_input_is_named(data, model):

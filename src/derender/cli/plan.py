@@ -1,8 +1,4 @@
-"""`derender compare --plan`: many methods on many data sets, trained, embedded and scored.
-
-settings: the plan file; jobs: what a job is, and does; sweep: all jobs, workers and budget; outcome: tables,
-charts, and what is missing.
-"""
+"""`derender compare --plan`: many methods on many data sets, trained, embedded and scored."""
 
 from collections import Counter
 from dataclasses import dataclass
@@ -11,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from derender.cli.console import notice, result, show_scores, write_json
+from derender.cli.console import notice, progress_bar, result, show_scores, write_json
 
 PLAN = "YAML or TOML file of methods and data sets to compare."
 OUT = "Folder of --plan for runs, tables and charts; resumed."
@@ -36,12 +32,9 @@ class Planned:
 
 def by_plan(planned: Planned, device: str, json_file: str | None) -> None:
     """Do a plan, or go on with it, and show the one table of each protocol."""
-    from derender.cli.plan.jobs import Comparison, jobs_of
-    from derender.cli.plan.outcome import write_outcome
-    from derender.cli.plan.settings import read_plan
-    from derender.cli.plan.sweep import do_all
-    from derender.storage.atomic import atomic_file
-    from derender.training.config import to_yaml
+    from derender import learn
+    from derender.learn.jobs import Comparison, jobs_of
+    from derender.learn.plan import read_plan
 
     plan, out = read_plan(str(planned.plan)), planned.out
     if planned.dry_run:
@@ -54,21 +47,15 @@ def by_plan(planned: Planned, device: str, json_file: str | None) -> None:
         return
     if out is None:
         raise ValueError("--plan needs --out DIR: a folder for runs, tables and images")
-    if out.exists() and not out.is_dir():
-        raise ValueError(f"{out} is a file: give --out the name of a folder")
-    if out.is_dir() and any(out.iterdir()) and not (out / "plan.yaml").is_file():
-        raise ValueError(f"{out} is not empty and holds no comparison: choose another --out")
-    with atomic_file(out / "plan.yaml") as temporary:
-        temporary.write_text(to_yaml(plan))
-    at = Comparison(plan, out, device)
-    tables, values = write_outcome(at, do_all(at, planned.workers, planned.minutes))
-    for table in tables:
+    how = {"workers": planned.workers, "minutes": planned.minutes, "device": device}
+    found = learn.compare_plan(plan, out, tell=notice, bar=progress_bar, **how)
+    for table in found.tables:
         show_scores(table, json_file)
     for state in ("failed", "missing"):
-        for sentence in values[state]:
+        for sentence in found.values[state]:
             notice(f"{state}: {sentence}")
-    if values["missing"]:
+    if found.values["missing"]:
         notice("the budget is used; the same command goes on where it stopped")
-    for written in values["files"]:
+    for written in found.values["files"]:
         result(str(written), json_file)
-    write_json(json_file, values)
+    write_json(json_file, found.values)

@@ -1,11 +1,11 @@
-"""A plan file: images to learn from, methods, data sets to score, and how.
+"""A plan: images to learn from, methods, data sets to score, and how; from a YAML or TOML file.
 
-A plan is YAML or TOML. Unknown names are errors with a suggestion, and every mistake that shows without
-images is found before anything is trained.
+Unknown names are errors with a suggestion, and every mistake that shows without images is found before
+anything is trained.
 """
 
 import tomllib
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -136,80 +136,76 @@ def read_plan(path: str | Path) -> Plan:
     except (yaml.YAMLError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ValueError(f"{path} cannot be read as a plan: {error}") from error
     try:
-        _require(isinstance(tree, dict), "it should have methods: and score:")
+        if not isinstance(tree, dict):
+            raise ValueError("it should have methods: and score:")
         plan = config_from_tree(tree, Plan)
-        _check(plan)
+        for fault in _faults(plan):
+            raise ValueError(fault)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
     return plan
 
 
-def _require(fits: bool, told: str) -> None:
-    if not fits:
-        raise ValueError(told)
+def _unknown(what: str, name: str, names: Collection[str]) -> Iterator[str]:
+    if name not in names:
+        yield f"unknown {what} {name!r}{suggestion(name, names)}; there is {', '.join(names) or 'none'}"
 
 
-def _require_known(what: str, name: str, names: Collection[str]) -> None:
-    known = ", ".join(names) or "none"
-    _require(name in names, f"unknown {what} {name!r}{suggestion(name, names)}; there is {known}")
-
-
-def _check(plan: Plan) -> None:
-    """Parts of a plan that do not fit the others are errors."""
-    _require(bool(plan.methods and plan.score), "a plan needs at least one of methods: and one of score:")
+def _faults(plan: Plan) -> Iterator[str]:
+    """What in a plan does not fit the rest of it."""
+    if not (plan.methods and plan.score):
+        yield "a plan needs at least one of methods: and one of score:"
     for name in (*plan.train, *plan.methods, *plan.score):
-        folder = name and not set(name) & set('/\\:*?"<>|') and not name.startswith(".")
-        _require(bool(folder), f"the name {name!r} cannot be a folder's: leave out / \\ : * ? and the like")
+        if not name or set(name) & set('/\\:*?"<>|') or name.startswith("."):
+            yield f"the name {name!r} cannot be a folder's: leave out / \\ : * ? and the like"
     for name, method in plan.methods.items():
         own = bool(method.settings or method.settings_on or method.runs)
         if (like := method.like) is not None:
-            _require_known("like", like, plan.methods)
-            chain = f"method {name!r} is like {like!r}, which is like another: name that one"
-            _require(plan.methods[like].like is None, chain)
-            alone = f"method {name!r} is like {like!r}: it takes features and whitened alone"
-            _require(not (own or method.kind or method.model), alone)
-        kind = plan.kind(name)
-        choices = f"{suggestion(kind, KINDS)}: choose {', '.join(KINDS)}"
-        _require(kind in KINDS, f"method {name!r} is of no known kind{choices}")
+            yield from _unknown("like", like, plan.methods)
+            if plan.methods[like].like is not None:
+                yield f"method {name!r} is like {like!r}, which is like another: name that one"
+            if own or method.kind or method.model:
+                yield f"method {name!r} is like {like!r}: it takes features and whitened alone"
+        if (kind := plan.kind(name)) not in KINDS:
+            choices = f"{suggestion(kind, KINDS)}: choose {', '.join(KINDS)}"
+            yield f"method {name!r} is of no known kind{choices}"
         for where in (*method.runs, *method.settings_on):
-            _require_known("training set", where, plan.train)
-        given = {
-            *plan.settings,
-            *method.settings,
-            *(key for one in method.settings_on.values() for key in one),
-        }
+            yield from _unknown("training set", where, plan.train)
+        given = [plan.settings, method.settings, *method.settings_on.values()]
         for key in RESERVED:
-            same = f"{key} is the plan's own and the same for all: not in settings of {name!r}"
-            _require(key not in given, same)
-        untrained = f"method {name!r} ({kind}) is not trained here: leave settings and runs out"
-        _require(not own or kind in (OURS, *TRAINED), untrained)
-        both = f"method {name!r}: model is one trained network; leave it or runs out"
-        _require(method.model is None or not (kind in CONTROLS or method.runs), both)
+            if any(key in one for one in given):
+                yield f"{key} is the plan's own and the same for all: not in settings of {name!r}"
+        if own and kind not in (OURS, *TRAINED):
+            yield f"method {name!r} ({kind}) is not trained here: leave settings and runs out"
+        if method.model is not None and (kind in CONTROLS or method.runs):
+            yield f"method {name!r}: model is one trained network; leave it or runs out"
     for name, scored in plan.score.items():
-        _check_score(plan, f"score {name!r}", scored)
+        yield from _score_faults(plan, f"score {name!r}", scored)
 
 
-def _check_score(plan: Plan, name: str, scored: ScoredSet) -> None:
-    asked = (scored.table is None) != (not scored.label)
-    _require(asked, f"{name} needs a table (identity, emotion, ...) or a label, not both")
+def _score_faults(plan: Plan, name: str, scored: ScoredSet) -> Iterator[str]:
+    if (scored.table is None) == (not scored.label):
+        yield f"{name} needs a table (identity, emotion, ...) or a label, not both"
     if scored.table is not None:
-        nets = f"{name}: segmentation trains nets of its own: use derender compare --table segmentation"
-        _require(table_named(scored.table).kind != "segment", nets)
-        rules = scored.mean_by or scored.min_count > 1 or scored.max_count is not None
-        _require(not rules, f"{name}: mean_by, min_count and max_count go with label, not with table")
+        if table_named(scored.table).kind == "segment":
+            yield f"{name}: segmentation trains nets of its own: use derender compare --table segmentation"
+        if scored.mean_by or scored.min_count > 1 or scored.max_count is not None:
+            yield f"{name}: mean_by, min_count and max_count go with label, not with table"
     trained = [method for method in plan.rows() if plan.is_trained(method)]
     if scored.trained_on is None:
-        first = repr(next(iter(trained), ""))
-        _require(not trained, f"{name} needs trained_on: {first} has to learn from something")
-        _require(scored.part == "all", f"{name}: part {scored.part} is of a training set: give trained_on")
+        if trained:
+            yield f"{name} needs trained_on: {trained[0]!r} has to learn from something"
+        if scored.part != "all":
+            yield f"{name}: part {scored.part} is of a training set: give trained_on"
         return
-    _require_known("training set", scored.trained_on, plan.train)
+    yield from _unknown("training set", scored.trained_on, plan.train)
     learnt = plan.train[scored.trained_on]
     if scored.part != "all":
-        other = f"the images of {scored.trained_on!r}: give the same data, dataset and limit"
-        same = (scored.data, scored.dataset, scored.limit) == (learnt.data, learnt.dataset, learnt.limit)
-        _require(same, f"{name}: part {scored.part} is of {learnt.data}, {other}")
-        _require(plan.seeds == 1, f"{name}: every seed splits anew, so part goes with seeds: 1")
+        if (scored.data, scored.dataset, scored.limit) != (learnt.data, learnt.dataset, learnt.limit):
+            other = f"the images of {scored.trained_on!r}: give the same data, dataset and limit"
+            yield f"{name}: part {scored.part} is of {learnt.data}, {other}"
+        if plan.seeds > 1:
+            yield f"{name}: every seed splits anew, so part goes with seeds: 1"
     for method in trained:
         if plan.methods[method].like is None and scored.trained_on not in plan.methods[method].runs:
-            plan.configuration(method, scored.trained_on, 0)
+            plan.configuration(method, scored.trained_on, 0)  # raises where a setting does not fit

@@ -9,19 +9,18 @@ import re
 import shutil
 import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from math import inf
 from pathlib import Path
-from typing import Any, Literal, TextIO
+from typing import Any, Literal
 
 from pydantic import Field
 
-from derender import learn
 from derender.baselines import CONTROLS, control_features, load_baseline, open_baseline
-from derender.cli.console import plain
-from derender.cli.plan.settings import OURS, WITHOUT_LOOP, Plan
 from derender.data import ImageSet, split_indices
+from derender.data.source import stamps_of
 from derender.evaluation.clustering import compare_clusterings
 from derender.evaluation.controls import architecture, control_rows
 from derender.evaluation.feature_rows import FeatureRow, chosen_labels, prepare
@@ -31,9 +30,11 @@ from derender.evaluation.options import Options, aligned
 from derender.evaluation.paper_tables import ATTRIBUTES, table_named
 from derender.features import FeatureTable, embed_image_set
 from derender.inputs import as_images, as_model, split_of
+from derender.learn.plan import OURS, WITHOUT_LOOP, Plan
+from derender.learn.runs import train as train_run
 from derender.model import Derenderer
 from derender.presets import MODEL_PRESETS
-from derender.settings import Settings
+from derender.settings import Settings, plain
 from derender.storage.atomic import atomic_file
 from derender.storage.folder import SplitRecord
 from derender.training import TrainingInterrupted
@@ -46,6 +47,12 @@ Facts = dict[str, Any]
 
 class Collapsed(ValueError):
     """A training that would collapse again."""
+
+
+@contextmanager
+def no_bar(text: str, unit: str) -> Iterator[Callable[..., None]]:
+    """No progress bar."""
+    yield lambda *done, **more: None
 
 
 @dataclass(frozen=True)
@@ -110,6 +117,7 @@ class Comparison:
     path: Path
     device: str = "auto"
     deadline: float = inf
+    bar: Callable[..., Any] = no_bar
 
     @property
     def over(self) -> bool:
@@ -118,6 +126,7 @@ class Comparison:
 
     def file(self, folder: str, job: Job, suffix: str) -> Path:
         """A job's file: its ``.json`` in jobs, ``.parquet`` in features, or ``.log`` in logs."""
+        (self.path / folder).mkdir(parents=True, exist_ok=True)
         return self.path / folder / f"{job.slug}{suffix}"
 
     def result(self, job: Job) -> Path:
@@ -127,12 +136,6 @@ class Comparison:
         name = job.method if job.seed == 0 else f"{job.method}-seed{job.seed}"
         given = self.plan.methods[job.method].runs.get(job.where)
         return self.path / "runs" / job.where / name if given is None else Path(given)
-
-    def log(self, job: Job) -> TextIO:
-        """The open file for the words of a worker and the traceback of a failure."""
-        file = self.file("logs", job, ".log")
-        file.parent.mkdir(parents=True, exist_ok=True)
-        return file.open("a")
 
     def note(self, job: Job) -> Note | None:
         """The note that a job left; None without one that can be read."""
@@ -169,7 +172,7 @@ class Comparison:
         """Changes with the settings and files of a job, and with the results of those before it."""
         plan, method, run = self.plan, self.plan.methods.get(job.method), self.result(job)
         source = plan.train[job.where] if job.kind == "train" else plan.score[job.where]
-        read, files = {"data", "dataset", "limit", "part", "split"}, [source.data.partition("::")[0]]
+        read, files = {"data", "dataset", "limit", "part", "split"}, [Path(source.data.partition("::")[0])]
         if method is None:
             how, read = plan.model_dump(mode="json", include=SCORING), None
         elif job.kind == "embed":
@@ -180,10 +183,9 @@ class Comparison:
             files += [run / "model" / "model.safetensors", run / "model.safetensors"]
         else:
             how = plan.configuration(job.method, job.where, job.seed).model_dump(mode="json")
-        found = [file.stat() for file in map(Path, files) if file.is_file()]
+        times = stamps_of(file for file in files if file.is_file()).tolist()
         before = [(note.key, note.state) for one in job.after if (note := self.note(one))]
         images = source.model_dump(mode="json", include=read)
-        times = [(file.st_size, file.st_mtime_ns) for file in found]
         return content_hash({"images": images, "how": how, "files": times, "before": before})
 
 
@@ -204,7 +206,7 @@ def train(at: Comparison, job: Job, progress: Callable[..., None]) -> Facts:
                 raise TrainingInterrupted
 
         learnt, config = plan.train[job.where], plan.configuration(job.method, job.where, job.seed)
-        result = learn.train(
+        result = train_run(
             learnt.data, out=run, config=config, resume=resume, dataset=learnt.dataset, limit=learnt.limit,
             device=at.device, page=False, progress=watch,
         )  # fmt: skip

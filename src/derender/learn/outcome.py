@@ -3,25 +3,26 @@
 Made anew from the notes of all jobs every time, so they always show the present results.
 """
 
+import json
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from derender.cli.console import write_json
-from derender.cli.plan.jobs import Comparison, Job, Note
-from derender.cli.plan.settings import OURS, Plan
-from derender.evaluation.score_table import Scores, ScoreTable
+from derender.evaluation.score_table import Scores
+from derender.learn.jobs import Comparison, Job, Note
+from derender.learn.plan import OURS, Plan
 from derender.report.compared import COST_COLUMNS, protocol_picture, protocol_table, scores_from, set_tables
 from derender.report.comparison import comparison_page
 from derender.report.page import write_whole
+from derender.settings import plain
 
 NAMES = {"cluster": "clustering", "linear": "linear"}
 MISSING = {"failed": "failed", "stopped": "missing"}
 Notes = Mapping[Job, Note]
 
 
-def write_outcome(at: Comparison, notes: Notes) -> tuple[list[ScoreTable], dict[str, Any]]:
+def write_outcome(at: Comparison, notes: Notes) -> Scores:
     """Write every protocol's files beside the plan; gives the one table of each, and what ``--json`` says.
 
     Raises:
@@ -71,18 +72,22 @@ def write_outcome(at: Comparison, notes: Notes) -> tuple[list[ScoreTable], dict[
             ".html": page.html(),
             ".svg": _standalone(svg),
             ".png": png,
-        }
+            ".json": json.dumps(
+                plain({
+                    "protocol": protocol, "questions": questions, **reasons,
+                    "plan": plan.model_dump(mode="json"),
+                }),
+                indent=1, ensure_ascii=False,
+            ) + "\n",
+        }  # fmt: skip
         for suffix, content in contents.items():
-            content = content if isinstance(content, bytes) else content.encode()
+            content = content if isinstance(content, bytes) else content.encode(errors="replace")
             files.append(write_whole(at.path / f"{name}{suffix}", content))
-        files.append(at.path / f"{name}.json")
-        values = {"protocol": protocol, "questions": questions, **reasons}
-        write_json(str(files[-1]), {**values, "plan": plan.model_dump(mode="json")})
         summaries.append(tables[0])
     if not summaries:
         raise ValueError(f"nothing could be scored: {'; '.join(absent)}")
     shown = [table.values() for table in summaries]
-    return summaries, {"out": at.path, "files": files, **reasons, "tables": shown}
+    return Scores(summaries, {"out": at.path, "files": files, **reasons, "tables": shown})
 
 
 def _standalone(svg: str) -> str:

@@ -1,0 +1,141 @@
+"""A comparison by plan: trainings, feature tables and scores as jobs that are each done once.
+
+A job whose note (``jobs``) says that it is done is not repeated; a training goes on from its last checkpoint.
+With several workers each job has a process of its own, so that one that is killed costs itself alone.
+"""
+
+import multiprocessing
+import os
+import sys
+import threading
+import time
+import traceback
+from collections import defaultdict
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from math import inf
+from multiprocessing import connection
+from pathlib import Path
+from typing import Any
+
+import torch
+from filelock import FileLock, Timeout
+
+from derender.evaluation.score_table import Scores
+from derender.learn.jobs import Collapsed, Comparison, Job, Note, embed, jobs_of, no_bar, score, train
+from derender.learn.outcome import write_outcome
+from derender.learn.plan import Plan, read_plan
+from derender.storage.atomic import atomic_file
+from derender.training import TrainingInterrupted
+from derender.training.config import to_yaml
+
+WORK = {"train": train, "embed": embed, "score": score}
+
+
+def compare_plan(
+    plan: Plan | str | Path,
+    out: str | Path,
+    *,
+    workers: int = 1,
+    minutes: float | None = None,
+    device: str = "auto",
+    tell: Callable[[str], object] = lambda text: None,
+    bar: Callable[..., Any] = no_bar,
+) -> Scores:
+    """Train, embed and score every method of a plan, or go on with it, and write its tables and charts.
+
+    Args:
+        plan: as ``learn.plan`` reads it from a YAML or TOML file, or that file.
+        out: the folder of runs, features, tables and charts.
+        workers: jobs at a time.
+        minutes: the budget: after it a training is saved and nothing but scoring is begun.
+        device: "auto", "cpu" or "cuda".
+        tell: called with a sentence when a job ends.
+        bar: makes the progress bar of a job, ``bar(text, unit=...)``; it must be picklable.
+
+    Returns:
+        The one table of each protocol; ``values`` has files, tables, and what failed or is missing.
+
+    Raises:
+        ValueError: the plan does not fit, the folder holds something else, another process works in it, or
+            nothing could be scored.
+    """
+    plan, out = (plan if isinstance(plan, Plan) else read_plan(plan)), Path(out)
+    if out.exists() and not out.is_dir():
+        raise ValueError(f"{out} is a file: give the name of a folder")
+    if out.is_dir() and any(out.iterdir()) and not (out / "plan.yaml").is_file():
+        raise ValueError(f"{out} is not empty and holds no comparison: choose another folder")
+    with atomic_file(out / "plan.yaml") as temporary:
+        temporary.write_text(to_yaml(plan))
+    at = Comparison(plan, out, device, inf if minutes is None else time.time() + 60 * minutes, bar)
+    jobs, notes = jobs_of(plan), {}
+    lanes: dict[Job, list[Job]] = defaultdict(list)
+    for job in jobs:
+        lanes[job.after[0] if job.kind == "embed" and job.after else job].append(job)
+
+    def do(lane: list[Job]) -> None:
+        for job in lane:
+            note, began = at.known(job), time.perf_counter()
+            if note is None:
+                note = perform(at, job) if workers == 1 else in_own_process(at, job)
+                why = "" if note.state == "done" else f": {note.why}"
+                took = f"{(time.perf_counter() - began) / 60:.1f} min"
+                tell(f"[{len(notes) + 1}/{len(jobs)}] {job.name}: {note.state}{why} ({took})")
+            notes[job] = note
+
+    if workers > 1:
+        os.environ.setdefault("OMP_NUM_THREADS", str(max(1, torch.get_num_threads() // workers)))
+    try:
+        with FileLock(out / ".lock", timeout=0), ThreadPoolExecutor(workers) as pool:
+            for kind in ("embed", "train", "score"):  # features that need no training come first
+                stage = [lane for lane in lanes.values() if lane[0].kind == kind]
+                list((map if workers == 1 else pool.map)(do, stage))
+    except Timeout as error:
+        raise ValueError(
+            f"another derender compare works in {out}: wait for it, or choose another folder"
+        ) from error
+    except KeyboardInterrupt as stop:
+        raise KeyboardInterrupt("stopped and saved; the same command goes on where it stopped") from stop
+    return write_outcome(at, {job: notes[job] for job in jobs})
+
+
+def perform(at: Comparison, job: Job) -> Note:
+    """Do one job and leave its note, whatever happens in it."""
+    try:
+        with at.bar(job.name, unit="steps" if job.kind == "score" else "images") as progress:
+            return at.leave(job, facts=WORK[job.kind](at, job, progress))
+    except TrainingInterrupted:
+        if not at.over:
+            raise
+        return at.stopped(job)
+    except Exception as error:
+        with at.file("logs", job, ".log").open("a") as stream:
+            traceback.print_exc(file=stream)
+        why, kind = " ".join(str(error).split()), type(error).__name__
+        if not why or not isinstance(error, ValueError | OSError):
+            why = f"{kind}: {why}".rstrip(": ")
+        return at.leave(job, state="failed", why=why, final=isinstance(error, Collapsed))
+
+
+def in_own_process(at: Comparison, job: Job) -> Note:
+    """The same in a process of its own, whose words go to a file."""
+    log, spawn = at.file("logs", job, ".log"), multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(1, spawn, initializer=_begin_worker, initargs=(log,)) as pool:
+        try:
+            return pool.submit(perform, at, job).result()
+        except BrokenProcessPool:
+            return at.leave(job, state="failed", why=f"its process was killed: see {log}")
+
+
+def _begin_worker(log: Path) -> None:
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    stream = log.open("a")
+    os.dup2(stream.fileno(), sys.stdout.fileno())
+    os.dup2(stream.fileno(), sys.stderr.fileno())
+
+
+def _end_with_parent() -> None:
+    if (parent := multiprocessing.parent_process()) is not None:
+        connection.wait([parent.sentinel])
+        os._exit(1)
