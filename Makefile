@@ -9,7 +9,7 @@ JOBS ?= $(shell n=$$(getconf _NPROCESSORS_ONLN 2>/dev/null || echo 2); [ $$n -gt
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test format bench constraints clean
+.PHONY: help setup demo test docs results release format bench constraints clean
 
 help:  ## list the commands
 	@sed -n 's/^\([a-z]*\):.*## \(.*\)/make \1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{printf "%-18s%s\n", $$1, $$2}'
@@ -21,6 +21,43 @@ demo: $(STAMP)  ## generate faces, train, score, write one report to ./derender-
 
 test: $(STAMP)  ## every test, ruff and pyright; ARGS="-k render" narrows it down
 	@OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 NUMBA_NUM_THREADS=2 $(BIN)/python -m pytest -n $(JOBS) --dist worksteal $(ARGS)
+
+docs: $(STAMP)  ## build the site into build/docs, warnings as errors
+	@$(BIN)/python docs/pages.py && $(BIN)/python -m sphinx -W --keep-going -q docs build/docs
+	@echo build/docs/index.html
+
+release: $(STAMP)  ## licences and known advisories of every package, into build/release
+	@$(BIN)/python tests/trust/licences.py && $(BIN)/python tests/trust/advisories.py
+
+# Results that need generated data only. Each step is one command and one file; what is there is kept, so a
+# stopped run goes on where it was. `make results RESULTS=folder` leaves the files of the repository alone.
+RESULTS := benchmarks/results/generated
+DATA := build/results
+SCORES := heads people cars-clusters cars-geometry
+results: $(STAMP) $(SCORES:%=$(RESULTS)/%.json)  ## repeat the results on generated images (tens of minutes, resumable)
+	@$(BIN)/python docs/pages.py
+
+$(DATA)/heads: | $(STAMP)
+	@rm -rf $@.part; $(BIN)/derender synth faces --out $@.part --count 400 --seed 11 && mv $@.part $@
+$(DATA)/tracks: | $(STAMP)
+	@rm -rf $@.part; $(BIN)/derender synth faces --out $@.part --identities 12 --tracks 10 --frames 6 --seed 11 \
+	  --light wide --view wide && mv $@.part $@
+$(DATA)/cars: | $(STAMP)
+	@rm -rf $@.part; $(BIN)/derender synth cars --out $@.part --count 500 --seed 11 --set pictures_per_model=1 \
+	  --classes police,ambulance,limousine,jeep,sports && mv $@.part $@
+
+HEADS := evaluate geometry $(DATA)/heads --model rendered-faces-64
+PEOPLE := evaluate cluster $(DATA)/tracks --model rendered-faces-64 --label identity --mean-by identity --mean-by track
+CARS-CLUSTERS := evaluate cluster $(DATA)/cars --model cars-64 --label class
+CARS-GEOMETRY := evaluate geometry $(DATA)/cars --model cars-64
+$(RESULTS)/heads.json: | $(DATA)/heads
+	@mkdir -p $(RESULTS) && $(BIN)/derender $(HEADS) --json $@.part && mv $@.part $@
+$(RESULTS)/people.json: | $(DATA)/tracks
+	@mkdir -p $(RESULTS) && $(BIN)/derender $(PEOPLE) --json $@.part && mv $@.part $@
+$(RESULTS)/cars-clusters.json: | $(DATA)/cars
+	@mkdir -p $(RESULTS) && $(BIN)/derender $(CARS-CLUSTERS) --json $@.part && mv $@.part $@
+$(RESULTS)/cars-geometry.json: | $(DATA)/cars
+	@mkdir -p $(RESULTS) && $(BIN)/derender $(CARS-GEOMETRY) --json $@.part && mv $@.part $@
 
 format: $(STAMP)  ## ruff: formatting and the fixes it is sure of
 	@$(BIN)/ruff format . && $(BIN)/ruff check --fix .
@@ -49,6 +86,6 @@ $(STAMP): pyproject.toml constraints.txt
 	echo "Setting up $(VENV) with $$($$found --version) (once; a few minutes, mostly PyTorch)"; \
 	$$found -m venv $(VENV); \
 	{ $(BIN)/python -m pip install --upgrade -c constraints.txt pip && \
-	  $(BIN)/python -m pip install -c constraints.txt -e . --group dev; } > $(VENV)/set-up.log 2>&1 \
+	  $(BIN)/python -m pip install -c constraints.txt -e . --group dev --group docs; } > $(VENV)/set-up.log 2>&1 \
 	|| { tail -n 25 $(VENV)/set-up.log >&2; echo "Set-up failed; the whole log is in $(VENV)/set-up.log" >&2; exit 1; }
 	@touch $@

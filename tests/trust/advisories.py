@@ -1,4 +1,4 @@
-"""Writes docs/advisories.md: which known security advisories reach a version of a package that is allowed.
+"""Writes advisories.md into build/release: known security advisories that reach an allowed version.
 
     python tests/trust/advisories.py
 
@@ -19,7 +19,7 @@ from packaging.utils import canonicalize_name
 from packaging.version import Version
 
 ROOT = Path(__file__).resolve().parents[2]
-PAGE = ROOT / "docs" / "advisories.md"
+PAGE = ROOT / "build" / "release" / "advisories.md"
 LIST = Path(__file__).with_name("advisories.yaml")
 PAGE_HEAD = """\
 # Security advisories of what derender needs
@@ -170,4 +170,5 @@ def page() -> str:
 
 
 if __name__ == "__main__":
+    PAGE.parent.mkdir(parents=True, exist_ok=True)
     PAGE.write_text(page())

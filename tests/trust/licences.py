@@ -1,4 +1,4 @@
-"""Writes docs/licences.md: every package that derender needs or can use, with version, licence and home.
+"""Writes licences.md into build/release: every package that derender needs or can use, with its licence.
 
     python tests/trust/licences.py
 
@@ -15,7 +15,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parents[2]
-PAGE = ROOT / "docs" / "licences.md"
+PAGE = ROOT / "build" / "release" / "licences.md"
 NAMED = {"BSD License": "BSD", "MIT License": "MIT", "Apache Software License": "Apache-2.0"}
 NAMED["Python Software Foundation License"] = "PSF-2.0"
 PAGE_HEAD = """\
@@ -90,7 +90,7 @@ def page() -> str:
     project = document["project"]
     base = needed(project["dependencies"])
     extras = needed(text for wanted in project["optional-dependencies"].values() for text in wanted)
-    development = needed(document["dependency-groups"]["dev"])
+    development = needed(text for group in document["dependency-groups"].values() for text in group)
     parts = {
         "Always needed, with what that needs in turn": base,
         "Needed by an extra (`pip install 'derender[view]'` and others)": {
@@ -104,4 +104,5 @@ def page() -> str:
 
 
 if __name__ == "__main__":
+    PAGE.parent.mkdir(parents=True, exist_ok=True)
     PAGE.write_text(page())

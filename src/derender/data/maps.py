@@ -4,7 +4,7 @@ Masks are only ever resized to the nearest value, after the same crop as their i
 merged as CelebAMask-HQ's owners do it (their g_mask.py): a later class hides an earlier one. Leaves out
 colours as classes, and a number for pixels without a class.
 
-Exact maps are in the camera frame of their image (docs/conventions.md). With a params.csv depth is stored as
+Exact maps are in the camera frame of their image (conventions.md). With a params.csv depth is stored as
 z = 0.8 + value / 65535 * 0.4, normals as (n + 1) / 2 * 255, albedo as 0..255, and value 0 is background.
 Depth maps alone (unsup3d's synthetic faces) are grey: a share v of the largest value is z = 1.1 - 0.2 v, and
 0 is background. The set's own words do not say this, and the archive could not be had to check it: look at

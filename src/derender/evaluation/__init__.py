@@ -2,7 +2,7 @@
 
 A protocol is one call that gives ``Scores``: ``cluster``, ``linear``, ``segment``, ``disentangle``,
 ``geometry``, ``reconstruction``, ``robustness``, and ``compare`` (the paper's tables). Every function states
-its range and its best value. docs/evaluation.md has a table of them.
+its range and its best value. docs/reference/metrics.md has a table of them.
 """
 
 from derender.evaluation.bootstrap import Difference, Estimate, ScoredRow, difference, estimate, resamples

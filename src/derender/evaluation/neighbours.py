@@ -61,7 +61,7 @@ def unit_rows(points: np.ndarray) -> np.ndarray:
 def nearest_rows(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """For each of (N, D) rows the nearest other row, (N,) integers, and its cosine distance, (N,), 0..2.
 
-    Above ``EXACT_ROWS`` rows some are not the nearest: docs/scale.md says how many.
+    Above ``EXACT_ROWS`` rows some are not the nearest: docs/how-to/scale.md says how many.
     """
     points = unit_rows(points)
     nearest, distance = np.zeros(len(points), np.int64), np.full(len(points), np.inf)

@@ -57,7 +57,7 @@ def robustness_page(found: RobustnessComparison, model: str, score: str = "accur
         "Robustness to light and view",
         f"{found.how.capitalize()}: learned in ordinary light and view, asked in others.",
         {"chart": chart, "alt": "; ".join(areas), "score": score_name, "tables": own},
-        f"Model: {model}. Definitions: docs/evaluation.md.",
+        f"Model: {model}. Definitions: docs/reference/metrics.md.",
     )
 
 

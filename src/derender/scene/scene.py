@@ -1,6 +1,6 @@
 """The value that travels through the left half of the program: one batch of scenes.
 
-Conventions (axes, signs, units) are written in docs/conventions.md.
+Conventions (axes, signs, units) are written in docs/reference/conventions.md.
 """
 
 from collections.abc import Callable, Mapping

@@ -4,7 +4,7 @@ Whitening: how other factors move a model's activations, measured on its own ren
 albedo every image is decomposed, rendered with other values of all its vector factors (light and camera), and
 encoded again, several times; mirror images count as views, too, for the object is symmetric. For each vector
 factor everything but that factor is changed: maps are another image's. Leaves out changing one map beside the
-other, which brought nothing (docs/log.md).
+other, which brought nothing (lab/log.md).
 
 Fitting: a morphable model of the depths and albedos that the model predicts. The optimisation itself happens
 when a model is used (postprocess/fitting.py).

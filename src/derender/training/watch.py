@@ -2,7 +2,7 @@
 
 Unsupervised geometry can fail in ways that reconstruction does not show. Each sign below is a number measured
 on training batches, smoothed, and compared with a limit; a sign that stays on for a while is a finding. The
-limits were set on healthy and collapsed runs (docs/log.md), the times on runs with batches of 16: networks
+limits were set on healthy and collapsed runs (lab/log.md), the times on runs with batches of 16: networks
 recover by updates, so larger batches get as many updates, not as many images.
 
 NaN and infinity are looked for at every stage: a NaN need not reach the loss, because a depth of NaN covers

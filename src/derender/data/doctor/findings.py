@@ -1,7 +1,7 @@
 """From measures to sentences and a verdict: one finding for each thing that was looked at.
 
 Every threshold stands in the table ``checks.yaml``. Limits were chosen on one half of the material of
-docs/doctor.md and checked on the other. Of distinct, unreadable, small, oblong, grey and clipped images they
+lab/doctor.md and checked on the other. Of distinct, unreadable, small, oblong, grey and clipped images they
 are conventions: nothing was measured to set them.
 """
 

@@ -1,7 +1,7 @@
 """Rendered collections: exact factors of every image in a params.csv, depth maps, or cars from ShapeNet.
 
 synface and syncar: folders with ``images`` beside a ``params.csv``. Tracks: ``tracks/IDENTITY/TRACK/FRAME``.
-Angles become radians here; light and camera are in the canonical frame (docs/conventions.md). Images with
+Angles become radians here; light and camera are canonical (docs/reference/conventions.md). Images with
 depth maps in folders side by side, as unsup3d's synthetic faces lie:
 
     SET/image/NAME.png          the image; SET is train, val or test, or nothing

@@ -48,7 +48,7 @@ class Axis:
         return found if self.held is None else {**found, self.held: (0.0, 0.0)}
 
     def rotated(self, scene: Scene, angle_deg: float) -> Scene:
-        """The scenes at this angle instead of their own; sign as in docs/conventions.md."""
+        """The scenes at this angle instead of their own; sign as in docs/reference/conventions.md."""
         name = "camera" if self.part == "view" else "light"
         values = scene.parameters[name].clone()
         if self.cleared is not None:

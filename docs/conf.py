@@ -1,0 +1,35 @@
+"""Sphinx configuration; pages of commands and settings are written from the code while Sphinx reads them."""
+
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+import reference
+
+import derender
+
+project = "derender"
+copyright = "the derender authors"
+version = release = derender.__version__
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+myst_enable_extensions = ["colon_fence", "dollarmath", "deflist", "attrs_inline"]
+myst_heading_anchors = 3
+exclude_patterns = ["_build"]
+html_theme = "furo"
+html_title = "derender"
+html_static_path: list[str] = []
+html_show_sphinx = False
+html_copy_source = False
+pygments_style, pygments_dark_style = "friendly", "monokai"
+autodoc_member_order = "bysource"
+autodoc_typehints = "none"
+autodoc_default_options = {"members": True, "undoc-members": False}
+napoleon_google_docstring, napoleon_numpy_docstring = True, False
+napoleon_use_ivar = True
+suppress_warnings = ["ref.python"]
+nitpicky = False
+
+
+def setup(app):
+    app.connect("source-read", reference.fill)

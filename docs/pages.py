@@ -1,0 +1,270 @@
+"""What the pages of this site take from files: tables of results, and the output of the tutorials.
+
+    python docs/pages.py                 # rewrite every table that a page names
+    python docs/pages.py tutorials       # run the tutorials and rewrite the output that they show
+
+A page names a table as ``<!-- table: people-lfw accuracy nmi -->``: the columns of
+benchmarks/results/tables/people-lfw.json that follow, all where none does. ``SPEED`` makes tables of files
+of benchmarks. The table ends with ``<!-- end -->``. A row with ``hidden`` stays in the file.
+"""
+
+import contextlib
+import io
+import json
+import os
+import re
+import shlex
+import sys
+import tempfile
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+RESULTS = ROOT / "benchmarks" / "results"
+TABLE = re.compile(r"<!-- table: (\S+)((?: \S+)*) -->\n(.*?)<!-- end -->", re.DOTALL)
+TUTORIALS = ("quickstart", "own-folder", "scikit-learn")
+STEP = re.compile(r"```(python|sh)\n(.*?)```(?:\n\n```text\n(.*?)```)?", re.DOTALL)
+
+
+def pages() -> list[Path]:
+    """Every page of the site that may hold a table, and the README."""
+    return [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+
+
+def with_tables(page: str) -> str:
+    """A page with each of its tables as its file has it."""
+    return TABLE.sub(
+        lambda m: f"<!-- table: {m[1]}{m[2]} -->\n{table(m[1], m[2].split())}\n<!-- end -->", page
+    )
+
+
+def table(name: str, keys: list[str] | None = None) -> str:
+    """One table as Markdown, with a note: its file, what it needs."""
+    if name in SPEED:
+        file, read = SPEED[name]
+        found = json.loads((RESULTS / file).read_text())
+        head, *rows = read(found)
+        lines = [head, ["---"] * len(head), *rows]
+        note = f"`benchmarks/results/{file}`"
+    else:
+        found = json.loads((RESULTS / "tables" / f"{name}.json").read_text())
+        lines = [*body(found, keys or [column["key"] for column in found["columns"]])]
+        note = f"`benchmarks/results/tables/{name}.json`"
+    shown = "\n".join("| " + " | ".join(map(str, line)) + " |" for line in lines)
+    return f"{shown}\n\nSource: {note}.\n"
+
+
+def body(found: Mapping[str, Any], keys: list[str]) -> Iterator[list[str]]:
+    """Rows of cells: the head, the rule, the rows; the best of each column is bold."""
+    columns = {column["key"]: column for column in found["columns"]}
+    rows = [row for row in found["rows"] if not row.get("hidden") and any(key in row for key in keys)]
+    yield ["", *(columns[key]["head"] for key in keys)]
+    yield ["---"] * (len(keys) + 1)
+    best = {key: best_of(columns[key], [row[key] for row in rows if key in row]) for key in keys}
+    for row in rows:
+        cells = [cell(row.get(key), columns[key].get("digits", 0), best[key]) for key in keys]
+        note = " (control)" if row.get("control") and "(control" not in row["name"] else ""
+        yield [row["name"] + note, *cells]
+
+
+def looked_up(reference: re.Match[str]) -> str:
+    """``{table|row|column}`` in a cell: that number, as its own table shows it, without its interval."""
+    name, row, key = reference[1].split("|")
+    if name in SPEED:
+        head, *rows = SPEED[name][1](json.loads((RESULTS / SPEED[name][0]).read_text()))
+        return next(cells for cells in rows if cells[0] == row)[head.index(key)]
+    found = json.loads((RESULTS / "tables" / f"{name}.json").read_text())
+    digits = next(column["digits"] for column in found["columns"] if column["key"] == key)
+    return cell(value_of(next(one for one in found["rows"] if one["name"] == row)[key]), digits, None)
+
+
+def value_of(entry: Any) -> float:
+    return entry["value"] if isinstance(entry, dict) else entry
+
+
+def best_of(column: Mapping[str, Any], entries: list[Any]) -> float | None:
+    if "best" not in column or not entries:
+        return None
+    return (max if column["best"] == "high" else min)(map(value_of, entries))
+
+
+def cell(entry: Any, digits: int, best: float | None) -> str:
+    """A number with its interval or its standard deviation."""
+    if entry is None:
+        return ""
+    if isinstance(entry, str):
+        return re.sub(r"\{(.+?)\}", looked_up, entry)
+    text = f"{value_of(entry):,.{digits}f}"
+    text = f"**{text}**" if value_of(entry) == best else text
+    if isinstance(entry, dict) and "low" in entry:
+        return f"{text} ({entry['low']:.{digits}f}-{entry['high']:.{digits}f})"
+    return f"{text} ± {entry['spread']:.{digits}f}" if isinstance(entry, dict) and "spread" in entry else text
+
+
+def edits(which: str, angles: dict[str, str]) -> Callable[[Any], Iterator[list[str]]]:
+    """PSNR and SSIM of edited photographs by angle."""
+    names = {
+        "derender": "derender, photograph's own pixels", "--detail model": "derender, `--detail model`",
+        "input": "unchanged photograph",
+        "input, brightness of the truth": "unchanged, brightness of the truth",
+        "input turned as a plane": "turned as a plane",
+        "another person's ratio": "ratio of another person's photographs",
+    }  # fmt: skip
+
+    def read(found: Any) -> Iterator[list[str]]:
+        yield ["PSNR, dB / SSIM", *angles.values()]
+        for name, scores in found[which].items():
+            shown = (scores.get(angle) for angle in angles)
+            cells = [
+                f"{psnr:.1f} / {ssim:.3f}" if psnr else "" for psnr, ssim in (s or (0, 0) for s in shown)
+            ]
+            yield [names.get(name, name), *cells]
+
+    return read
+
+
+def training_step(found: Any) -> Iterator[list[str]]:
+    yield ["step of preset `paper`, batch 64", "images/s", "slowest to fastest", "ratio", "GFLOP an image"]
+    for row in found["rows"]:
+        low, high = row["spread"]
+        rate, ratio = f"{row['images_per_second']:.2f}", f"{row['ratio']:.2f}"
+        yield [row["name"], rate, f"{low:.2f} to {high:.2f}", ratio, f"{row['gflop_per_image']:.1f}"]
+
+
+def rasterize(found: Any) -> Iterator[list[str]]:
+    yield ["64 depth maps of 64 x 64, ms an image", "plain torch", "Numba", "ratio"]
+    for row in found["rows"]:
+        ms = row["ms_per_image"]
+        yield [row["part"], f"{ms['reference']:.3f}", f"{ms['numba']:.3f}", f"{row['ratio']:.1f}"]
+
+
+def peers(found: Any) -> Iterator[list[str]]:
+    yield [
+        "16 depth maps, forward and backward, ms",
+        *(f"{row['size']} x {row['size']}" for row in found["rows"]),
+    ]
+    for name in found["rows"][0]["milliseconds"]:
+        yield [name, *(f"{row['milliseconds'][name]['both ways']:,.1f}" for row in found["rows"])]
+
+
+def reading(found: Any) -> Iterator[list[str]]:
+    yield ["", "first start, CPU s", "later starts, CPU s", "highest memory, MB"]
+    for name, kind in found["starts"].items():
+        later = ", ".join(f"{one['cpu_s']:.2f}" for one in kind["later"])
+        first = kind["first"]
+        yield [
+            f"{name}, {kind['files']:,} images",
+            f"{first['cpu_s']:.1f}",
+            later,
+            f"{first['memory_mb']:.0f}",
+        ]
+
+
+def memory(found: Any) -> Iterator[list[str]]:
+    yield ["images embedded", "highest memory, MB", "before the first image, MB", "CPU s"]
+    for row in found["rows"]:
+        yield [
+            f"{row['pictures']:,}",
+            *(f"{row[key]:,.0f}" for key in ("peak_mb", "before_mb", "cpu_seconds")),
+        ]
+
+
+def step_memory(found: Any) -> Iterator[list[str]]:
+    yield ["image size", "whole batch, MB", "four chunks, MB", "whole, CPU s", "four chunks, CPU s"]
+    by_size: dict[int, dict[int, Any]] = {}
+    for row in found["rows"]:
+        by_size.setdefault(row["size"], {})[row["chunks"]] = row
+    for size, rows in by_size.items():
+        mb = [f"{rows[chunks]['step_mb']:,.0f}" for chunks in (1, 4)]
+        yield [f"{size} pixels", *mb, *(f"{rows[chunks]['cpu_seconds']:.0f}" for chunks in (1, 4))]
+
+
+def million(found: Any) -> Iterator[list[str]]:
+    yield ["1,000,000 rows of 512", "seconds", "accuracy", "ARI with the drawn groups"]
+    for run in found["runs"]:
+        scores = run["scores"]["scores"]
+        cells = (f"{scores[key]['value']:.3f}" for key in ("accuracy", "ari"))
+        yield [run["method"], f"{run['seconds']:.0f}", *cells]
+
+
+def shares(found: Any) -> Iterator[list[str]]:
+    yield ["ratio, median of five rounds", "ratio", "least to most"]
+    for row in found["rows"]:
+        yield [row["what"], f"{row['ratio']:.2f}", f"{row['least']:.2f} to {row['most']:.2f}"]
+
+
+LIGHTS = {f"up to {angle}": f"up to {angle}°" for angle in (12, 25, 50, 77)} | {"beyond": "beyond 77°"}
+HEADS = {f"light {angle}": f"light {angle}°" for angle in (25, 45, 65)} | {
+    "view 15": "view 15°",
+    "view 30": "view 30°",
+}
+SPEED: dict[str, tuple[str, Callable[[Any], Iterator[list[str]]]]] = {
+    "edits-yale": ("photo_edits.json", edits("yale", LIGHTS)),
+    "edits-heads": ("photo_edits.json", edits("generated heads", HEADS)),
+    "training-step": ("training_step.json", training_step),
+    "rasterize": ("rasterize.json", rasterize),
+    "peers": ("rasterize_peers.json", peers),
+    "reading": ("reading.json", reading),
+    "memory": ("embedding_memory.json", memory),
+    "step-memory": ("step_memory.json", step_memory),
+    "million": ("clustering_million.json", million),
+    "bench": ("bench.json", shares),
+}
+
+
+def run_tutorial(text: str) -> tuple[str, dict[str, bytes]]:
+    """A tutorial run step by step in an empty folder: the page with its output, and the files it made.
+
+    Python blocks share one namespace; each line of a shell block is one derender command. A ```text block
+    below a step holds what the step prints.
+    """
+    from derender.cli import main
+
+    names: dict[str, Any] = {"__name__": "__main__"}
+
+    def run(match: re.Match[str]) -> str:
+        kind, code, shown = match.groups()
+        printed = io.StringIO()
+        with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(io.StringIO()) as notices:
+            if kind == "python":
+                exec(compile(code, "tutorial", "exec"), names)
+            else:
+                for line in code.replace("\\\n", " ").splitlines():
+                    words = shlex.split(line, comments=True)
+                    if words and main(words[1:]):
+                        raise RuntimeError(f"{line}\n{notices.getvalue()}")
+        output = "\n".join(line.rstrip() for line in printed.getvalue().strip().splitlines())
+        step = f"```{kind}\n{code}```"
+        return f"{step}\n\n```text\n{output}\n```" if shown is not None else step
+
+    before = Path.cwd()
+    with tempfile.TemporaryDirectory() as folder:
+        os.chdir(folder)
+        try:
+            text = STEP.sub(run, text)
+        finally:
+            os.chdir(before)
+        made = {path.name: path.read_bytes() for path in Path(folder).glob("*.png")}
+    return text, made
+
+
+def main() -> None:
+    if sys.argv[1:2] == ["tutorials"]:
+        for name in sys.argv[2:] or TUTORIALS:
+            page = ROOT / "docs" / "tutorials" / f"{name}.md"
+            text, made = run_tutorial(page.read_text())
+            page.write_text(text)
+            for image in re.findall(r"\(\.\./images/tutorials/([\w-]+\.png)\)", text):
+                (ROOT / "docs" / "images" / "tutorials" / image).write_bytes(made[image])
+            print(page.relative_to(ROOT))
+        return
+    for page in pages():
+        old = page.read_text()
+        if (new := with_tables(old)) != old:
+            page.write_text(new)
+            print(page.relative_to(ROOT))
+
+
+if __name__ == "__main__":
+    main()

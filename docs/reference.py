@@ -1,0 +1,130 @@
+"""Pages written from the code while Sphinx reads them: every command, every setting, every bundled model.
+
+A page asks for one with a line ``<!-- commands -->``, ``<!-- settings -->`` or ``<!-- models -->``.
+"""
+
+import ast
+import inspect
+import re
+import tokenize
+from collections.abc import Iterator
+from io import StringIO
+from typing import Any
+
+import typer
+from pydantic import BaseModel
+
+from derender.cli import app as commands
+
+
+def fill(_: Any, __: str, source: list[str]) -> None:
+    """Replace the marks of a page that is about to be parsed."""
+    for mark, write in {"commands": command_pages, "settings": setting_tables}.items():
+        if f"<!-- {mark} -->" in source[0]:
+            source[0] = source[0].replace(f"<!-- {mark} -->", "\n".join(write()))
+
+
+def all_commands(group: Any = None, before: str = "derender") -> Iterator[tuple[str, Any]]:
+    """Every command that is not hidden, by its full name."""
+    for name, command in (group or typer.main.get_command(commands)).commands.items():
+        full = f"{before} {name}"
+        if hasattr(command, "commands"):
+            yield from all_commands(command, full)
+        elif not command.hidden:
+            yield full, command
+
+
+def command_pages() -> Iterator[str]:
+    """A section for each command: what it does, its usage, an example, its options."""
+    for name, command in all_commands():
+        yield f"## {name}\n\n{clean(command.help or '')}\n"
+        shown = [one for one in command.params if not getattr(one, "hidden", False) and one.name != "help"]
+        arguments = " ".join(f"[{one.metavar}]" for one in shown if one.param_type_name == "argument")
+        example = re.sub(r"^Example: ", "", command.epilog or "")
+        yield f"```sh\n{name} {arguments} [OPTIONS]\n{f'{example}   # example' if example else ''}\n```\n"
+        yield "| option | meaning | default |\n| --- | --- | --- |"
+        for one in shown:
+            option = one.param_type_name == "option"
+            names = ", ".join(one.opts + one.secondary_opts) if option else one.metavar or one.name.upper()
+            default = one.default() if callable(one.default) else one.default
+            empty = default is None or default is False or default == ()
+            yield f"| `{names}` | {clean(one.help or '')} | {'' if empty else f'`{default}`'} |"
+        yield ""
+
+
+def clean(text: str) -> str:
+    """Help as one line of Markdown."""
+    text = re.sub(r"\[/?(?:bold|dim|italic|cyan)\]", "", text)
+    return re.sub(r"\s+", " ", text).replace("|", "\\|").replace("<", "&lt;").replace("*", "\\*").strip()
+
+
+def setting_tables() -> Iterator[str]:
+    """A table for each class of settings: name, default, range or choice, the comment beside it."""
+    from derender.evaluation.segmentation.nets import SegmentSettings
+    from derender.training.config import PRESETS, FinetuneConfig, TrainConfig
+    from derender.training.distillation import RefineConfig
+    from derender.training.unets import UNetSettings
+
+    wanted = {
+        "derender train": TrainConfig, "derender finetune": FinetuneConfig, "derender refine": RefineConfig,
+        "derender unet": UNetSettings, "derender evaluate segment": SegmentSettings,
+    }  # fmt: skip
+    seen: set[str] = set()
+    for command, kind in wanted.items():
+        yield f"## `{command}`\n\nOne row per key of `--set KEY=VALUE`.\n"
+        yield from rows_of(kind(), "", seen)
+        yield ""
+    yield "## Presets\n\nWhat each preset changes.\n\n| preset | key | value |\n| --- | --- | --- |"
+    plain = flat(TrainConfig())
+    for name, preset in PRESETS.items():
+        for key, value in flat(preset).items():
+            if value != plain[key] and key != "preset":
+                yield f"| `{name}` | `{key}` | `{value}` |"
+
+
+def flat(settings: BaseModel, before: str = "") -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for name in type(settings).model_fields:
+        value = getattr(settings, name)
+        found |= flat(value, f"{before}{name}.") if isinstance(value, BaseModel) else {before + name: value}
+    return found
+
+
+def rows_of(settings: BaseModel, before: str, seen: set[str]) -> Iterator[str]:
+    """Rows of a class and of the classes inside it; what another table has is left out."""
+    if not before:
+        yield "| key | default | meaning |\n| --- | --- | --- |"
+    comments = comments_of(type(settings))
+    for name in type(settings).model_fields:
+        value, key = getattr(settings, name), f"{before}{name}"
+        if isinstance(value, BaseModel):
+            yield from rows_of(value, f"{key}.", seen)
+        elif f"{key}={value}" not in seen:
+            seen.add(f"{key}={value}")
+            yield f"| `{key}` | `{value}` | {clean(comments.get(name, ''))} |"
+
+
+def comments_of(kind: type) -> dict[str, str]:
+    """The comment on the line of each field, of the class and of those it is made from."""
+    found: dict[str, str] = {}
+    for one in reversed(
+        [base for base in kind.__mro__ if issubclass(base, BaseModel) and base is not BaseModel]
+    ):
+        source = inspect.getsource(one)
+        lines = {
+            token.start[0]: token.string.lstrip("# ")
+            for token in tokenize.generate_tokens(StringIO(inspect.cleandoc("\n" + source)).readline)
+            if token.type == tokenize.COMMENT and "fmt:" not in token.string
+        }
+        for node in ast.parse(inspect.cleandoc("\n" + source)).body[0].body:  # type: ignore[attr-defined]
+            if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
+                text = next(
+                    (
+                        lines[n]
+                        for n in range(node.lineno, (node.end_lineno or node.lineno) + 1)
+                        if n in lines
+                    ),
+                    "",
+                )
+                found[node.target.id] = text
+    return found

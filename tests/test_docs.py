@@ -1,0 +1,228 @@
+"""The site builds; links, commands, settings and names exist; tables are their files; the prose is plain."""
+
+import ast
+import importlib
+import importlib.util
+import re
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+import typer
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCS = ROOT / "docs"
+TOP = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "SECURITY.md")]
+PAGES = sorted([*TOP, *DOCS.rglob("*.md")])
+LINKING = [*PAGES, ROOT / "CHANGELOG.md", ROOT / "benchmarks" / "README.md"]
+LONGEST_SENTENCE, LONGEST_LINE, WIDEST_TABLE, LONGEST_TABLE = 25, 120, 6, 12
+LONG_TABLES = {"robustness-generated", "loocc-tracks", "celeba-labels", "baselines"}  # rows of one comparison
+BANNED = re.compile(
+    r"\b(nobody|taken? apart|told apart|comes? along|given away|rendered again|as read|encoders say|asked of|"
+    r"odd (?:pictures?|images?)|goe?s on with|gone on with|pictures?|at hand|where this was written|"
+    r"numbers that are none|lessons)\b",
+    re.IGNORECASE,
+)
+
+
+def named(path: Path) -> str:
+    return str(path.relative_to(ROOT))
+
+
+def script(name: str) -> ModuleType:
+    """A script beside the pages as a module."""
+    spec = importlib.util.spec_from_file_location(f"docs_{name}", DOCS / f"{name}.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+pages = script("pages")
+
+
+def commands(group: object | None = None, before: str = "derender") -> dict[str, set[str]]:
+    """Every command with its options."""
+    found: dict[str, set[str]] = {}
+    for name, one in (
+        group or typer.main.get_command(importlib.import_module("derender.cli").app)
+    ).commands.items():
+        if hasattr(one, "commands"):
+            found |= commands(one, f"{before} {name}")
+        else:
+            found[f"{before} {name}"] = {
+                "--help",
+                *(word for option in one.params for word in option.opts + option.secondary_opts),
+            }
+    return found
+
+
+COMMANDS = commands()
+
+
+@pytest.mark.parametrize("path", LINKING, ids=named)
+def test_links_files_and_names_exist(path):
+    text = path.read_text(encoding="utf-8")
+    links = re.findall(r"\]\((?!https?:|#|mailto:)([^)#\s]+)", text)
+    missing = [link for link in links if not (path.parent / link).exists()]
+    for folder, name in re.findall(
+        r"`((?:src/derender|tests|benchmarks|docs|examples|lab)/)([\w/.-]+)(?:::[\w.\[\]-]+)?`", text
+    ):
+        missing += [] if (ROOT / folder / name).exists() else [folder + name]
+    missing += [dotted for dotted in set(re.findall(r"`(derender(?:\.\w+)+)`", text)) if not follow(dotted)]
+    for file, name in set(re.findall(r"`(tests/[\w/]+\.py)::(\w+)`", text)):
+        missing += [] if re.search(rf"def {name}\b", (ROOT / file).read_text()) else [f"{file}::{name}"]
+    assert not missing
+
+
+def follow(dotted: str) -> bool:
+    """Whether a dotted name leads to a module or to something in one."""
+    parts = dotted.split(".")
+    for cut in range(len(parts), 0, -1):
+        try:
+            value = importlib.import_module(".".join(parts[:cut]))
+        except ModuleNotFoundError:
+            continue
+        for part in parts[cut:]:
+            if not hasattr(value, part):
+                return False
+            value = getattr(value, part)
+        return True
+    return False
+
+
+@pytest.mark.parametrize("path", PAGES, ids=named)
+def test_commands_options_and_settings_exist(path):
+    known = script_settings()
+    wrong = []
+    for block in re.findall(r"```(?:sh|console)\n(.*?)```", path.read_text(), re.DOTALL):
+        for line in re.findall(r"(?:^|&& )(derender .*)", block.replace("\\\n", " "), re.MULTILINE):
+            words = re.sub(r"\s#\s.*", "", line).split()
+            name = " ".join(words[:3]) if words[1] in ("evaluate", "synth") else " ".join(words[:2])
+            options = {word.split("=")[0] for word in words if re.match(r"--?[a-z]", word)}
+            wrong += [line] if name not in COMMANDS else sorted(options - COMMANDS[name])
+            keys = re.findall(r'--set "?([\w.]+)=', line)
+            wrong += [
+                key for key in keys if name in ("derender train", "derender refine") and key not in known
+            ]
+    assert not wrong
+
+
+def script_settings() -> set[str]:
+    """Keys of --set, whole and by their last part."""
+    from derender.baselines import TRAINED, baseline_config
+    from derender.training.config import FinetuneConfig
+    from derender.training.distillation import RefineConfig
+
+    flat = script("reference").flat
+    keys = {*flat(FinetuneConfig()), *flat(RefineConfig())}
+    keys |= {key for name in TRAINED for key in flat(baseline_config(name))}
+    return keys | {".".join(key.split(".")[cut:]) for key in keys for cut in range(1, key.count(".") + 1)}
+
+
+@pytest.mark.parametrize("path", pages.pages(), ids=named)
+def test_tables_are_their_files(path):
+    text = path.read_text()
+    assert pages.with_tables(text) == text, "run: python docs/pages.py"
+
+
+def sentences(text: str) -> list[str]:
+    """Sentences of a page; code, tables, comments, and pictures are left out, a link counts as its words."""
+    text = re.sub(r"```.*?```|<!--.*?-->|\$\$.*?\$\$", "\n\n", text, flags=re.DOTALL)
+    text = re.sub(r"^(?:\||#|:::|!\[).*$", "\n", text, flags=re.MULTILINE)
+    text = re.sub(r"!?\[([^\]]*)\]\([^)]*\)", r"\1", text)
+    text = re.sub(r"`[^`]*`|\$[^$]*\$", "code", text)
+    blocks = re.split(r"\n\s*\n|\n(?=\s*(?:[-*]|\d+\.) )", text)
+    return [one for block in blocks for one in re.split(r"(?<=[.!?:])\s+", " ".join(block.split())) if one]
+
+
+@pytest.mark.parametrize("path", PAGES, ids=named)
+def test_prose_is_plain(path):
+    text = path.read_text()
+    long = [one for one in sentences(text) if len(re.findall(r"[\w'-]+", one)) > LONGEST_SENTENCE]
+    wide = [line for line in text.splitlines() if len(line) > LONGEST_LINE and not line.startswith("|")]
+    words = (
+        []
+        if path.name == "prose.md"
+        else [match[0] for one in sentences(text) for match in BANNED.finditer(one)]
+    )
+    tables = re.findall(r"(?:<!-- table: (\S+).*-->\n)?((?:^\|.*\n)+)", text, re.MULTILINE)
+    large = [
+        rows[:60]
+        for name, rows in tables
+        if rows.split("\n")[0].count("|") - 1 > WIDEST_TABLE + 1
+        or (rows.count("\n") - 2 > LONGEST_TABLE and name not in LONG_TABLES)
+    ]
+    assert not (long + wide + words + large), "\n".join([*long, *wide, *words, *large])
+
+
+def test_a_long_sentence_is_seen():
+    assert (
+        max(len(one.split()) for one in sentences("One two. " + "word " * 30 + ".\n\n| " + "cell " * 40))
+        == 31
+    )
+
+
+def test_the_readme_is_short_and_its_python_runs(capsys):
+    text = (ROOT / "README.md").read_text()
+    assert len(text.splitlines()) <= 150 and max(map(len, text.splitlines())) <= LONGEST_LINE
+    (block,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    names: dict[str, object] = {}
+    exec(compile(block.replace("generate(1, 512", "generate(1, 160"), "README.md", "exec"), names)
+    assert names["relit"].shape == (3, 160, 160) and set(names["features"]) >= {"geometry", "albedo", "light"}
+
+
+@pytest.mark.parametrize("path", [one for one in PAGES if "tutorials" not in one.parts], ids=named)
+def test_python_blocks_compile(path):
+    for block in re.findall(r"```python\n(.*?)```", path.read_text(), re.DOTALL):
+        for node in ast.walk(ast.parse(block)):
+            if (
+                isinstance(node, ast.Attribute)
+                and isinstance(node.value, ast.Name)
+                and node.value.id == "derender"
+            ):
+                assert follow(f"derender.{node.attr}"), node.attr
+
+
+def test_conventions_name_their_tests():
+    rules = re.split(r"^### ", (DOCS / "reference" / "conventions.md").read_text(), flags=re.MULTILINE)[1:]
+    assert len(rules) >= 10
+    assert not [rule.splitlines()[0] for rule in rules if not re.search(r"`tests/[\w/]+\.py::\w+`", rule)]
+
+
+@pytest.mark.parametrize("name", pages.TUTORIALS)
+def test_a_tutorial_runs_and_prints_what_it_shows(name):
+    """Words and layout must be the page's; measured numbers may differ between machines."""
+    text = (DOCS / "tutorials" / f"{name}.md").read_text()
+    done, made = pages.run_tutorial(text)
+    assert measured(done) == measured(text)
+    assert set(re.findall(r"\(\.\./images/tutorials/([\w-]+\.png)\)", text)) <= made.keys()
+
+
+def measured(text: str) -> str:
+    return re.sub(r" +", " ", re.sub(r"[-+]?\d+(?:\.\d+)?", "#", text))
+
+
+@pytest.mark.skipif(
+    any(importlib.util.find_spec(name) is None for name in ("sphinx", "myst_parser", "furo")),
+    reason="the site needs the dependency group docs: pip install --group docs",
+)
+def test_the_site_builds_without_a_warning(tmp_path):
+    words = [
+        sys.executable,
+        "-m",
+        "sphinx",
+        "-W",
+        "--keep-going",
+        "-q",
+        "-b",
+        "html",
+        str(DOCS),
+        str(tmp_path),
+    ]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=280)
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert "derender evaluate cluster" in (tmp_path / "reference" / "commands.html").read_text()
+    assert "template_share" in (tmp_path / "reference" / "settings.html").read_text()
