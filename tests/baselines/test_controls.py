@@ -112,3 +112,22 @@ def test_bad_input_and_a_missing_package_are_named():
         controls.hog_features(stripes(np.zeros((32, 32))), cell_px=20)
     with pytest.raises(ValueError, match=r"the baseline x needs the package no_such.*derender\[baselines\]"):
         optional("no_such.thing", "the baseline x")
+
+
+def test_gradientfaces_are_the_same_in_brighter_light():
+    shapes = np.add.outer(np.sin(np.arange(32) / 3), np.cos(np.arange(32) / 5))
+    table = controls.gradientfaces_features(stripes(*(100 + gain * shapes for gain in (25, 50, -50))))
+    one, brighter, inverted = table.factors["gradientfaces"]
+    assert one.shape == (2 * 32 * 32,) and one @ brighter > 0.97 * 32 * 32
+    assert one @ inverted < -0.97 * 32 * 32
+    ramp = controls.gradientfaces_features(stripes(np.tile(np.arange(32), (32, 1)) * 4))
+    np.testing.assert_allclose(ramp.factors["gradientfaces"], [[1] * 1024 + [0] * 1024], atol=1e-6)
+
+
+def test_local_binary_patterns_are_shares_in_cells():
+    upright = np.tile(100 + 60 * np.sin(np.arange(32) / 2), (32, 1)).round()
+    values = controls.lbp_features(stripes(upright, upright.T, upright + 40)).factors["lbp"]
+    assert values.shape == (3, 16 * 59)
+    np.testing.assert_allclose(np.linalg.norm(values.reshape(3, 16, 59), axis=2), 1, rtol=1e-5)
+    np.testing.assert_array_equal(values[0], values[2])
+    assert values[0] @ values[1] < 0.8 * 16

@@ -139,8 +139,16 @@ def test_pad_and_stretch(encoded, wide):
         np.testing.assert_allclose(picture[:, row, [1, 6, 10]].T, 255 * np.eye(3), atol=3)
 
 
+def test_room_continues_the_edge_all_around(encoded):
+    picture = striped(84, 96)
+    pixels, inside = read_image(encoded(picture), 124, fit="room"), np.asarray(picture).transpose(2, 0, 1)
+    np.testing.assert_array_equal(pixels[:, 14:110, 20:104], inside)
+    np.testing.assert_array_equal(pixels[:, :14, 20:104], np.repeat(inside[:, :1], 14, axis=1))
+    np.testing.assert_array_equal(pixels[:, 14:110, 104:], np.repeat(inside[:, :, -1:], 20, axis=2))
+
+
 def test_unknown_fit_names_the_nearest(encoded):
-    message = r"unknown fit 'crops'; did you mean 'crop'\? \(known: crop, pad, stretch\)"
+    message = r"unknown fit 'crops'; did you mean 'crop'\? \(known: crop, pad, stretch, room\)"
     with pytest.raises(ValueError, match=message):
         read_image(encoded(0), 8, fit="crops")
 

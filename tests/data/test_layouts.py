@@ -25,6 +25,9 @@ def images(*names: str) -> dict[str, None]:
 CHIP = "20170110183726390.jpg"
 UTKFACE = images("a/100_1_0_" + CHIP, "a/24_0_1_2017011622022 .jpg", "a/39_1_" + CHIP, "a/55_0_9_" + CHIP)
 LFW = images("lfw/Ann_Lee/Ann_Lee_0001.jpg", "lfw/Bo/Bo_0001.jpg", "lfw/Cy_X/Cy_X_0001.jpg")
+YALE = images(
+    *(f"CroppedYale/yaleB02/yaleB02_P00A{light}.pgm" for light in ("+000E+00", "-050E+00", "+120E-20"))
+)
 VIEW_1 = {"peopleDevTrain.txt": "2\nAnn_Lee\t1\nOther\t3\n", "peopleDevTest.txt": "1\nBo\t1\n"}
 ALIGNED = images(*(f"img_align_celeba/00000{row}.jpg" for row in (1, 2, 3)))
 ATTRIBUTES = {"list_attr_celeba.txt": "2\nBald Smiling \n000001.jpg -1  1\n000002.jpg  1 -1\n"}
@@ -91,6 +94,7 @@ TABLE = {**images("a b/1.png", "ünï/2.png", "new\nline.png", "other.png"), "da
 TREES = {
     "utkface": UTKFACE,
     "lfw": LFW,
+    "yaleb": YALE,
     "celeba": {**ALIGNED, **ATTRIBUTES},
     "celebamask": images("images/0.jpg", "images/1.jpg", "masks/0.png", "masks/1.png"),
     "synface": SYNFACE,
@@ -146,6 +150,9 @@ KNOWN = {  # files, how they are read; labels, and partition
         "race": ["other", "white", "white", ""]}, None),
     "utkface stray": (YOUNG, {}, {"age": [*range(10, 30), NAN]}, None),
     "lfw": (LFW, {}, {"identity": ["Ann_Lee", "Bo", "Cy_X"]}, None),
+    "yaleb": ({**YALE, "yaleB02_P00_Ambient.pgm": None}, {"dataset": "yaleb"}, {"identity": ["yaleB02"] * 3,
+        "light_azimuth_deg": [0, 120, -50], "light_elevation_deg": [0, -20, 0],
+        "light_deg": [0, 118.024, 50]}, None),
     "lfw emotions": ({**LFW, "emotions.csv": "file,emotion\nBo_0001.jpg,happiness\n"}, {}, {"emotion": ["",
         "happiness", ""]}, None),
     "lfw view 1": ({**LFW, **VIEW_1, "pairs.txt": "10\t300\n"}, {}, {}, ["train", "test", ""]),
@@ -391,3 +398,14 @@ def test_other_boxes_are_other_images_and_one_without_is_listed(tree, encoded, t
     tree({"list_bbox_celeba.txt": BOXES.replace(" 5  6 20  30", " 9  6 20  30")})
     second = read_images(source, 10, cache=tmp_path / "cache").images
     assert (second[0] != expected[0]).any() and (second[1] == expected[1]).all()
+
+
+def test_a_half_is_by_person_and_the_same_in_every_set(tree):
+    people = [f"P{row}/P{row}_{shot:04d}.jpg" for row in range(40) for shot in (1, 2)]
+    halves = [found_in(f"{tree(images(*people))}?half={half}").table for half in ("development", "test")]
+    first, second = (set(half.labels["identity"].tolist()) for half in halves)
+    assert not first & second and len(first | second) == 40 and min(len(first), len(second)) >= 12
+    some = found_in(f"{tree(images(*people[::3]), True)}?half=test").table
+    assert set(some.labels["identity"].tolist()) <= second
+    with pytest.raises(ValueError, match="unknown half 'tst'; did you mean 'test'"):
+        found_in(f"{tree(images(*people))}?half=tst")

@@ -25,7 +25,7 @@ NETWORKS: Mapping[str, str] = {
     "untrained": "controls.Untrained",
 }
 """Classes of those with a network, as ``module.name`` in this package."""
-CONTROLS = ("pixels", "pca", "hog", "noise")
+CONTROLS = ("pixels", "pca", "gradientfaces", "hog", "lbp", "noise")
 """Those without: `control_features` makes their tables."""
 BASELINES = (*NETWORKS, *CONTROLS)
 TRAINED = tuple(name for name in NETWORKS if name not in ("dinov2", "untrained"))

@@ -1,9 +1,11 @@
-"""Controls without training that every table carries: pixels, PCA, HOG, noise, and an untrained encoder.
+"""Controls without training: pixels, PCA, Gradientfaces, HOG, LBP, noise, and an untrained encoder.
 
 A learned feature has to beat these. On 1,000 labels of CelebA, PCA reaches a balanced accuracy of 0.674 and
 an untrained encoder 0.662. Histograms of oriented gradients: Dalal and Triggs (CVPR 2005), as scikit-image
 (BSD) computes them: nine orientations, cells of 8x8 pixels, blocks of 2x2 cells, L2-Hys; 1,764 numbers at
-64x64 pixels.
+64x64 pixels. Local binary patterns: Ahonen et al. (ECCV 2004), eight neighbours at two pixels, 59 uniform
+patterns, square roots of their shares in cells of 8x8 pixels. Gradientfaces: Zhang et al. (TIP 2009), the
+direction of the gradient, which keeps faces apart in any light.
 """
 
 from collections.abc import Mapping
@@ -12,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.ndimage import gaussian_filter
 from sklearn.decomposition import PCA
 
 from derender.baselines.model import optional
@@ -21,6 +24,8 @@ from derender.inputs import as_images, part_of
 from derender.model import load
 
 ORIENTATIONS, BLOCK_CELLS = 9, 2
+BLUR_PX = 0.75
+UNIFORM_PATTERNS = 59
 
 
 def control_features(
@@ -28,18 +33,18 @@ def control_features(
     limit: int | None = None, part: str = "all", model: str | Path | None = None, components: int = 64,
     seed: int = 0, progress: Progress | None = None,
 ) -> FeatureTable:  # fmt: skip
-    """The table of a control by its name, pixels, pca, hog or noise, which is also that of its only factor.
+    """The table of a control by its name, one of ``CONTROLS``, which is also that of its only factor.
 
     ``images``, an image set or the address of one, are read as by `derender.inputs.as_images`; the principal
     components of a part are those of the training part. ``components`` are those of pca, and noise has as
-    many dimensions; ``seed`` is of pca's solver and of noise; hog calls ``progress`` with (images done, all).
+    many dimensions; ``seed`` is of pca's solver and of noise; ``progress`` is called with (images done, all).
     """
     whole = as_images(images, image_size, dataset=dataset, limit=limit)
     chosen = part_of(whole, part, model)
     if name == "pixels":
         return pixel_features(chosen)
-    if name == "hog":
-        return hog_features(chosen, progress=progress)
+    if name in DESCRIPTORS:
+        return DESCRIPTORS[name](chosen, progress=progress)
     if name == "noise":
         return noise_features(chosen, dimensions=components, seed=seed)
     fit_on = chosen if part == "all" else part_of(whole, "train", model)
@@ -97,17 +102,68 @@ def hog_features(images: ImageSet, *, cell_px: int = 8, progress: Progress | Non
             f"ask for 1 to {largest}"
         )
     hog = optional("skimage.feature", "the baseline hog").hog
-    rows = []
-    for image in images.images:
-        values = hog(
-            np.moveaxis(np.asarray(image), 0, -1), orientations=ORIENTATIONS, block_norm="L2-Hys",
+
+    def described(image: np.ndarray) -> np.ndarray:
+        return hog(
+            np.moveaxis(image, 0, -1), orientations=ORIENTATIONS, block_norm="L2-Hys",
             pixels_per_cell=(cell_px, cell_px), cells_per_block=(BLOCK_CELLS, BLOCK_CELLS), channel_axis=-1,
         )  # fmt: skip
-        rows.append(values.astype(np.float32))
+
+    facts = {"orientations": ORIENTATIONS, "cell_px": cell_px, "block": BLOCK_CELLS}
+    return control_table(images, "hog", _each(images, described, progress), facts)
+
+
+def lbp_features(images: ImageSet, *, cell_px: int = 8, progress: Progress | None = None) -> FeatureTable:
+    """Square roots of the shares of local binary patterns in cells, factor ``lbp``; each cell has length 1.
+
+    ``cell_px`` is the side of a cell; what is left over at the right and below is not described.
+    """
+    patterns = optional("skimage.feature", "the baseline lbp").local_binary_pattern
+
+    def described(image: np.ndarray) -> np.ndarray:
+        codes = patterns(_luma(image).round().astype(np.uint8), 8, 2, "nri_uniform").astype(np.int64)
+        rows, columns = (side // cell_px for side in codes.shape)
+        cell = np.arange(rows * columns).reshape(rows, columns).repeat(cell_px, 0).repeat(cell_px, 1)
+        numbers = cell * UNIFORM_PATTERNS + codes[: rows * cell_px, : columns * cell_px]
+        return (
+            np.sqrt(np.bincount(numbers.ravel(), minlength=cell.size // cell_px**2 * UNIFORM_PATTERNS))
+            / cell_px
+        )
+
+    return control_table(images, "lbp", _each(images, described, progress), {"cell_px": cell_px})
+
+
+def gradientfaces_features(images: ImageSet, *, progress: Progress | None = None) -> FeatureTable:
+    """Cosine and sine of the direction of each pixel's gradient after a Gaussian blur of 0.75 pixels.
+
+    Factor ``gradientfaces``, two numbers a pixel; a pixel without a gradient has direction 0.
+    """
+
+    def described(image: np.ndarray) -> np.ndarray:
+        down, right = np.gradient(gaussian_filter(_luma(image), BLUR_PX))
+        angle = np.arctan2(down, right)
+        return np.concatenate([np.cos(angle).ravel(), np.sin(angle).ravel()])
+
+    return control_table(images, "gradientfaces", _each(images, described, progress), {"blur_px": BLUR_PX})
+
+
+DESCRIPTORS = {"gradientfaces": gradientfaces_features, "hog": hog_features, "lbp": lbp_features}
+"""Controls that describe each image by itself, and know nothing of others."""
+
+
+def _luma(image: np.ndarray) -> np.ndarray:
+    """Brightness 0..255 of (3, H, W)."""
+    return np.tensordot((0.299, 0.587, 0.114), image.astype(np.float64), 1)
+
+
+def _each(images: ImageSet, describe: Any, progress: Progress | None) -> np.ndarray:
+    """(N, D) numbers that describe each image."""
+    rows = []
+    for image in images.images:
+        rows.append(describe(np.asarray(image)).astype(np.float32))
         if progress is not None and (len(rows) % 64 == 0 or len(rows) == len(images)):
             progress(len(rows), len(images))
-    facts = {"orientations": ORIENTATIONS, "cell_px": cell_px, "block": BLOCK_CELLS}
-    return control_table(images, "hog", np.stack(rows), facts)
+    return np.stack(rows)
 
 
 def noise_features(images: ImageSet, *, dimensions: int = 64, seed: int = 0) -> FeatureTable:

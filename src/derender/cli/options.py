@@ -6,7 +6,7 @@ here, used in one method here.
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -22,6 +22,7 @@ MODELS = (
 IMAGES = "Folder, zip, .tar shards or Hugging Face id; ADDRESS::PART for a part of it."
 DATASET = "Layout of the images, if it is not recognised."
 JSON = "Also write the numbers as JSON; - is standard output."
+HALF = "all, or the development or test half, by a hash of identity, model or file."
 LIMIT = "Read at most N images: evenly spaced, or the first of a stream."
 BATCH = "Images per batch; changes speed and memory only."
 PART = "all, or the train, validation or test part of the model's training split."
@@ -34,6 +35,7 @@ DataAlias = Annotated[str | None, typer.Option("--data", "-d", hidden=True, meta
 Dataset = Annotated[str, typer.Option("--dataset", help=DATASET, metavar="NAME")]
 Json = Annotated[str | None, typer.Option("--json", help=JSON, metavar="FILE")]
 Limit = Annotated[int | None, typer.Option("--limit", min=1, metavar="N", help=LIMIT)]
+Half = Annotated[Literal["all", "development", "test"], typer.Option("--half", help=HALF)]
 BatchSize = Annotated[int, typer.Option("--batch-size", min=1, metavar="N", help=BATCH)]
 Part = Annotated[str, typer.Option("--part", help=PART)]
 Seed = Annotated[int, typer.Option("--seed", min=0, metavar="N", help=SEED)]
@@ -73,13 +75,18 @@ class DataOptions:
     data: DataAlias = None
     dataset: Dataset = "auto"
     limit: Limit = None
+    half: Half = "all"
 
     @property
     def optional_address(self) -> str | None:
-        """The address that was given, or None."""
+        """The address that was given, with its half, or None."""
         if self.images is not None and self.data is not None:
             raise ValueError(f"two sets of images were given, {self.images} and {self.data}: give one")
-        return self.images if self.data is None else self.data
+        address = self.images if self.data is None else self.data
+        if address is None or self.half == "all":
+            return address
+        place, separator, part = address.partition("::")
+        return f"{place}?half={self.half}{separator}{part}"
 
     @property
     def address(self) -> str:

@@ -1,7 +1,7 @@
 """Option groups of the commands that score features, and where their tables go (gathered.py)."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -10,7 +10,7 @@ import typer
 from typer import Option
 
 from derender.cli import options
-from derender.cli.console import notice, refuse_existing_file, show_scores, write_json
+from derender.cli.console import notice, progress_bar, refuse_existing_file, show_scores, write_json
 
 if TYPE_CHECKING:
     from derender.evaluation.feature_rows import FeatureSource
@@ -61,15 +61,16 @@ class ScoredSubject:
     factors: Factors = "geometry,albedo"
     whiten_on: Annotated[str | None, Option(metavar="PATH", help=WHITEN_ON)] = None
 
-    def source(self, images: str | None) -> "FeatureSource":
-        """The table or the model."""
+    def source(self, images: options.DataOptions) -> "FeatureSource":
+        """The table, or the half of it that was asked for, or the model."""
+        from derender.data import half_of
         from derender.features import FeatureTable
 
         if (self.features is None) == (self.model is None):
             raise ValueError("give either --features FILE, or --model M with IMAGES")
         if self.model is None:
-            return FeatureTable.read(str(self.features))
-        if images is None:
+            return half_of(FeatureTable.read(str(self.features)), images.half)
+        if images.optional_address is None:
             raise ValueError("--model needs IMAGES to embed")
         return self.model
 
@@ -119,10 +120,13 @@ class Published:
         """Show tables and notes, and write every form that was requested; ``values`` are further numbers."""
         from derender.storage.atomic import atomic_file
 
-        values, notes = {**scores.values, **values}, list(scores.notes)
+        values, notes, tables = {**scores.values, **values}, list(scores.notes), scores.tables
+        if (half := values.get("half", "all")) != "all":
+            tables = [replace(one, caption=f"{one.caption}; {half} half") for one in tables]
+            scores = replace(scores, tables=tables)
         if memory is not None:
             notes.append(memory.summary(what))
-        for table in scores.tables:
+        for table in tables:
             show_scores(table, self.json_file)
         for note in notes:
             notice(note)
@@ -136,8 +140,27 @@ class Published:
 
             facts = {name: one for name, one in values.items() if isinstance(one, str | int | float)}
             lead, title = ". ".join(notes), "Scores beside their controls"
-            page = comparison_page(title, scores.tables, lead=lead, facts=facts)
+            page = comparison_page(title, tables, lead=lead, facts=facts)
             notice(f"page {page.write(self.html)}")
+
+
+def score(
+    protocol: str,
+    published: Published,
+    images: options.DataOptions,
+    subject: ScoredSubject,
+    **how: Any,
+) -> None:
+    """Score features by a protocol of `derender.evaluation`, and publish."""
+    from derender import evaluation
+
+    published.check()
+    with progress_bar("scoring") as progress:
+        scores = getattr(evaluation, protocol)(
+            subject.source(images), images=images.optional_address, **images.how, **subject.how, **how,
+            progress=progress,
+        )  # fmt: skip
+    published.publish(scores, half=images.half)
 
 
 def names_of(text: str) -> tuple[str, ...] | None:

@@ -82,7 +82,7 @@ def _decode_one(target: np.ndarray, sample: Sample, fit: str) -> bytes | Unreada
         encoded = sample.read()
         if not encoded:
             return Unreadable("empty file")
-        target[:] = decode(encoded, target.shape[-1], fit, sample.box)
+        target[:] = decode(encoded, target.shape[-1], sample.fit if fit == "crop" else fit, sample.box)
     except ValueError as problem:
         return Unreadable(str(problem))
     except OSError as problem:

@@ -3,7 +3,8 @@
 Orientation from EXIF is applied; grey, palette and CMYK become RGB; transparent pixels are laid over white;
 16-bit images are scaled (65535 becomes 255), never clipped; of an animation the first frame is taken.
 Colour profiles are not applied. Images that are not square are cropped to their centre (``fit="crop"``),
-laid whole on white ("pad"), or squeezed ("stretch"); all are then resized with an antialiased Lanczos
+laid whole on white ("pad"), squeezed ("stretch"), or given room ("room": their edge goes on all around, to a
+square of 31/24 of the longer side); all are then resized with an antialiased Lanczos
 filter. A JPEG much larger than needed is decoded at a reduced scale. Images above ``PIXEL_LIMIT`` and
 damaged ones raise ``Unreadable``, nothing else. A box (left, top, right, bottom in pixels of the upright
 image) cuts out a part first; it is moved and shrunk as far as needed to lie inside the image.
@@ -30,7 +31,8 @@ from derender.data.source import Source, read_bounded, suggestion
 READER_VERSION = 1
 """Goes up whenever the same file would decode to other pixels, so that cached images are made again."""
 
-FITS = ("crop", "pad", "stretch")  # what becomes of an image that is not square
+FITS = ("crop", "pad", "stretch", "room")  # what becomes of an image that is not square
+ROOM = 31 / 24  # a tight crop of a face, 84 x 96, becomes 124 x 124
 PIXEL_LIMIT = 170_000_000
 """Images with more pixels are refused before a pixel is decoded (Pillow itself refuses at 179 million)."""
 
@@ -150,7 +152,7 @@ def _reduce_while_decoding(
 ) -> None:
     """Let the JPEG decoder scale by 1/2, 1/4 or 1/8, never below twice the size that is needed."""
     short, long = sorted(opened.size if box is None else (box[2:] - box[:2]).tolist())
-    kept = long if fit == "pad" else short
+    kept = long if fit in ("pad", "room") else short
     if opened.format in ("JPEG", "MPO") and kept >= 4 * image_size:
         scale = 2 * image_size / kept
         opened.draft(None, (int(opened.width * scale), int(opened.height * scale)))
@@ -233,6 +235,11 @@ def fit_square(
         resized = image.resize(inner, resample, reducing_gap=3.0)
         square.paste(resized, ((image_size - inner[0]) // 2, (image_size - inner[1]) // 2))
         return square
+    if fit == "room":
+        side = round(max(width, height) * ROOM)
+        margins = [((side - length) // 2, (side - length + 1) // 2) for length in (height, width)]
+        values = np.asarray(image)
+        image = Image.fromarray(np.pad(values, [*margins, (0, 0)][: values.ndim], mode="edge"))
     if fit == "crop" and width != height:
         side = min(width, height)
         left, top = (width - side) // 2, (height - side) // 2

@@ -24,7 +24,7 @@ from derender.data.decoding import Progress, usable_cores
 from derender.data.image import fit_square, opened_image, quiet_pillow, upright_size
 from derender.data.image_set import ImageSet, read_images
 from derender.data.layouts.celeba import MASK_CLASSES, parts_of
-from derender.data.layouts.layout import Labels, Table, stem_of
+from derender.data.layouts.layout import Labels, Table, half_of, stem_of
 from derender.data.layouts.rendered import CAMERA, DEPTH_PAIRS, LIGHT, SYNFACE, pairs_of, rendered_folders
 from derender.data.opening import list_images, open_source, parse_source
 from derender.data.source import Source
@@ -150,11 +150,12 @@ def read_ground_truth(
         image_size: side to bring images and maps to, where the set is images beside depth maps alone; a
             set in synface64's format is read at the size it was rendered in.
     """
-    place, named, _ = parse_source(source)
+    place, named, options = parse_source(source)
     with open_source(Path(place).expanduser()) as opened:
         pairs = {} if rendered_folders(opened) else pairs_of(opened)
         layout = DEPTH_PAIRS if pairs else SYNFACE
         table = layout.read(opened, subset or named, default_parts=("test_gt", "test", "train"))
+        table = half_of(table, options.get("half", "all"))
         if pairs:
             return _read_pairs(opened, {file: pairs[file] for file in table.files[:limit]}, image_size)
         return _read_maps(opened, table, limit)

@@ -3,7 +3,8 @@
 A path (of a folder, a zip, an image, a table of paths) may be followed by ``::PART``: a part of the
 official split or any folder. ``shards-{000..009}.tar``, a ``.tar``, a folder of them, ``owner/name`` of a
 Hugging Face data set, a folder or ``.parquet`` in a form of its library are read from front to back; they
-take ``?column=NAME`` (also ``config``, ``revision``) before ``::PART``. A path that exists is always a
+take ``?column=NAME`` (also ``config``, ``revision``) before ``::PART``, and others ``?half=test`` or
+``?half=development`` (``half_of``). A path that exists is always a
 path.
 """
 
@@ -24,7 +25,7 @@ import numpy as np
 from derender.data.folder_source import FolderSource
 from derender.data.huggingface import HuggingFaceStream, is_saved
 from derender.data.layouts import layout_named, recognise
-from derender.data.layouts.layout import Layout, Table
+from derender.data.layouts.layout import Layout, Table, half_of
 from derender.data.layouts.tables import TABLE_SUFFIXES, TableSource, holds_paths
 from derender.data.shards import SHARD_SUFFIXES, ShardStream, find_shards
 from derender.data.source import (
@@ -43,7 +44,7 @@ STREAMED = ("webdataset", "huggingface")
 """The layouts that are read from front to back, by the names one can ask for them."""
 
 _IDENTIFIER = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
-_OPTIONS = ("column", "config", "revision")
+_OPTIONS = ("column", "config", "revision", "half")
 _ENTRIES_LOOKED_AT = 10_000
 _HASHED_AT_ONCE = 10_000
 
@@ -55,11 +56,14 @@ class ListedStream(Stream):
         files: where they are read; closed with the stream.
     """
 
-    def __init__(self, files: Source, layout: Layout, table: Table, subset: str | None = None):
+    def __init__(
+        self, files: Source, layout: Layout, table: Table, subset: str | None = None, half: str = "all"
+    ):
         self.files = files
-        self.layout, self.terms = layout.name, layout.terms
+        self.layout, self.terms, self.fit = layout.name, layout.terms, layout.fit
         self._table = table
-        self.source = str(files.path) if subset is None else f"{files.path}::{subset}"
+        self.source = str(files.path) + ("" if half == "all" else f"?half={half}")
+        self.source += "" if subset is None else f"::{subset}"
         self.passed_over = (*files.skipped, *table.skipped)
 
     @property
@@ -70,7 +74,7 @@ class ListedStream(Stream):
         table, count = self.table, len(self.table.files)
         for row in range(start, count):
             file, box = table.files[row], None if table.boxes is None else table.boxes[row]
-            yield Sample(file, partial(self.files.read, file), (row + 1) / count, box=box)
+            yield Sample(file, partial(self.files.read, file), (row + 1) / count, box=box, fit=self.fit)
 
     def identity(self) -> object:
         """A digest of the layout, and of the name, size and checksum or time of change of every image."""
@@ -135,10 +139,11 @@ def list_images(
     subset = _only_part(source, part, subset)
     files = open_source(Path(place).expanduser())
     try:
+        half = options.pop("half", "all")
         if options:
             raise ValueError(f"{source}: ?{next(iter(options))}= is for shards and Hugging Face data sets")
         layout = layout or recognise(files)
-        table = layout.read(files, subset)
+        table = half_of(layout.read(files, subset), half)
         if not table.files:
             raise ValueError(_nothing_found(files))
     except BaseException:
@@ -146,7 +151,7 @@ def list_images(
         raise
     if limit is not None and limit < len(table.files):
         table = table.select(np.linspace(0, len(table.files) - 1, limit).astype(int))
-    return ListedStream(files, layout, table, subset)
+    return ListedStream(files, layout, table, subset, half)
 
 
 def open_source(path: Path) -> Source:

@@ -26,6 +26,7 @@ class Sample:
         share: how much of the stream lies before the next sample, 0..1; None where that is unknown.
         labels: value by column; a column that is not here is unknown for this image.
         box: the part of the image that is read (``Table.boxes``), or None for all of it.
+        fit: what becomes of it if it is not square and its reader does not say.
     """
 
     file: str  # its name, unique in the stream
@@ -34,6 +35,7 @@ class Sample:
     labels: Mapping[str, Value] = field(default_factory=dict)
     partition: str = ""  # the owners' own split ("train", "validation", "test"), or ""
     box: np.ndarray | None = None
+    fit: str = "crop"
 
 
 class Stream(ABC):

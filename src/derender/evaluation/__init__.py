@@ -1,8 +1,8 @@
 """Stage 7: protocols that score features and models, each beside its controls.
 
-A protocol is one call that gives ``Scores``: ``cluster``, ``linear``, ``segment``, ``disentangle``,
-``geometry``, ``reconstruction``, ``robustness``, and ``compare`` (the paper's tables). Every function states
-its range and its best value. docs/reference/metrics.md has a table of them.
+A protocol is one call that gives ``Scores``: ``cluster``, ``linear``, ``identify``, ``verify``, ``segment``,
+``disentangle``, ``geometry``, ``reconstruction``, ``robustness``, and ``compare`` (the paper's tables). Every
+function states its range and its best value. docs/reference/metrics.md has a table of them.
 """
 
 from derender.evaluation.bootstrap import Difference, Estimate, ScoredRow, difference, estimate, resamples
@@ -27,6 +27,7 @@ from derender.evaluation.factors import (
 )
 from derender.evaluation.feature_rows import at_least
 from derender.evaluation.finch import FinchHierarchy, finch, finch_clusters
+from derender.evaluation.identity import Pairs, area_under_roc, identify, read_pairs, verify
 from derender.evaluation.linear_probes import majority_answers, probe
 from derender.evaluation.linear_probing import (
     LinearComparison,
@@ -52,12 +53,14 @@ from derender.evaluation.ward import cut, ward_tree
 
 __all__ = [
     "AngleScores", "ClusterComparison", "Column", "Difference", "Estimate", "FactorResult", "FinchHierarchy",
-    "GeometryResult", "GeometryScores", "Level", "LinearComparison", "LinearScores", "ReconstructionResult",
-    "ReconstructionScores", "Row", "Rows", "ScoreTable", "ScoredRow", "Scores", "Task", "albedo_error",
-    "at_least", "camera_error", "chance_scores", "choose_rows", "cluster", "cluster_scores", "clusterings",
+    "GeometryResult", "GeometryScores", "Level", "LinearComparison", "LinearScores", "Pairs",
+    "ReconstructionResult", "ReconstructionScores", "Row", "Rows", "ScoreTable", "ScoredRow", "Scores",
+    "Task", "albedo_error",
+    "area_under_roc", "at_least", "camera_error", "chance_scores", "choose_rows", "cluster", "cluster_scores",
+    "clusterings",
     "compare", "compare_clusterings", "compare_linear", "cut", "difference", "disentangle", "estimate",
     "evaluate_factors", "evaluate_geometry", "evaluate_reconstruction", "finch", "finch_clusters",
-    "finch_levels", "geometry", "geometry_scores", "light_error", "linear", "linear_scores",
-    "majority_answers", "mean_image", "probe", "reconstruction", "reconstruction_scores", "resamples",
-    "robustness", "segment", "task_of", "ward_tree",
+    "finch_levels", "geometry", "geometry_scores", "identify", "light_error", "linear", "linear_scores",
+    "majority_answers", "mean_image", "probe", "read_pairs", "reconstruction", "reconstruction_scores",
+    "resamples", "robustness", "segment", "task_of", "verify", "ward_tree",
 ]  # fmt: skip

@@ -89,6 +89,12 @@ def resamples(n_rows: int, count: int = RESAMPLES, seed: int = 0) -> Iterator[np
         yield np.bincount(drawn.ravel(), minlength=size * n_rows).reshape(size, n_rows).astype(np.float32)
 
 
+def group_resamples(groups: np.ndarray, count: int = RESAMPLES, seed: int = 0) -> np.ndarray:
+    """How often each of N rows is drawn, (count, N), where rows of one group are drawn together."""
+    group = np.unique(groups, return_inverse=True)[1]
+    return np.concatenate(list(resamples(int(group.max()) + 1, count, seed)))[:, group]
+
+
 def estimate(runs: Runs, resampled: np.ndarray, *, centred: bool = False, most: float = np.inf) -> Estimate:
     """The mean over ``runs`` with its percentile interval, from (B,) means over runs on each resample.
 

@@ -71,7 +71,7 @@ def cluster(
     Raises:
         ValueError: labels, factors or images do not fit.
     """
-    how = Options(**options)
+    how = Options(**{"descriptors": label == "identity" or label == ["identity"], **options})
     rows = subject_and_controls(features, how)
     names, left_out = chosen_labels(rows[0].tables[0], label, attributes)
     ready = prepare(rows, names, mean_by=mean_by, min_count=min_count, max_count=max_count)

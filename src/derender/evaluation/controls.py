@@ -22,7 +22,13 @@ from sklearn.decomposition import PCA
 from torch import Tensor
 
 from derender.baselines import read_any_config
-from derender.baselines.controls import control_table, pca_features, pixel_features, untrained_twin
+from derender.baselines.controls import (
+    DESCRIPTORS,
+    control_table,
+    pca_features,
+    pixel_features,
+    untrained_twin,
+)
 from derender.data import ImageSet
 from derender.evaluation.feature_rows import (
     FeatureRow,
@@ -48,6 +54,7 @@ UNTRAINED = "untrained encoder"
 MISSING_CONTROLS = "without images there are no pixels, PCA and untrained encoder to compare with"
 DEFAULT_SIZE = 64  # of the controls beside features of an unknown architecture
 COMPONENTS, LENT_COMPONENTS = 64, 256
+_SHOWN = {"gradientfaces": "Gradientfaces", "hog": "HOG", "lbp": "LBP"}
 
 
 def subject_and_controls(features: FeatureSource, options: Options) -> list[FeatureRow]:
@@ -101,7 +108,18 @@ def control_rows(
         lambda: dict(pca_features(images, components=components, fit_on=fitted).factors),
     )  # fmt: skip
     rows.append(FeatureRow(f"PCA ({components})", (pca,), control=True))
-    return [*rows, FeatureRow("pixels", (pixel_features(images),), control=True)]
+    options.notes.append(
+        f"PCA ({components}), whitened, is fitted to {len(fitted):,} images of {fitted.source}"
+    )
+    rows.append(FeatureRow("pixels", (pixel_features(images),), control=True))
+    for name, describe in DESCRIPTORS.items() if options.descriptors else ():
+        try:
+            table = describe(images, progress=options.stage(name))
+        except ValueError as error:  # a package is missing, or images are smaller than a cell
+            options.notes.append(f"{name} left out: {error}")
+        else:
+            rows.append(FeatureRow(_SHOWN[name], (table,), control=True))
+    return rows
 
 
 def _untrained_row(

@@ -5,13 +5,20 @@ score less the row's, so that above 0 is better everywhere. An image without a s
 covered) is left out of its row's means; a single image has no interval.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from math import isfinite
 from typing import Any, ClassVar
 
 import numpy as np
 
-from derender.evaluation.bootstrap import RESAMPLES, Estimate, ScoredRow, estimate, resamples, with_verdicts
+from derender.evaluation.bootstrap import (
+    RESAMPLES,
+    Estimate,
+    ScoredRow,
+    estimate,
+    group_resamples,
+    with_verdicts,
+)
 from derender.evaluation.score_table import Cell, Column, Row, ScoreTable, interval_column, interval_of
 
 Columns = Mapping[str, tuple[Column, float]]
@@ -64,15 +71,27 @@ class ImageResult:
 
 
 def image_rows(
-    scores: Mapping[str, Mapping[str, np.ndarray]], columns: Columns, *, resample_count: int = RESAMPLES
+    scores: Mapping[str, Mapping[str, np.ndarray]],
+    columns: Columns,
+    *,
+    controls: Collection[str] | None = None,
+    groups: np.ndarray | None = None,
+    resample_count: int = RESAMPLES,
+    seed: int = 0,
 ) -> tuple[ScoredRow, ...]:
     """A row for each name in ``scores``, which holds every score's (N,) values of the same images, NaN where
-    there is none. All rows but the first are controls.
+    there is none. ``controls`` are by default all rows but the first; images of one of the (N,) ``groups``,
+    such as people, are resampled together.
     """
     count = max(len(values) for each in scores.values() for values in each.values())
-    weights = np.concatenate(list(resamples(count, resample_count)))
+    weights = group_resamples(np.arange(count) if groups is None else groups, resample_count, seed)
     rows = [
-        ScoredRow(name, at > 0, 1, {score: _estimate(values, weights) for score, values in each.items()})
+        ScoredRow(
+            name,
+            at > 0 if controls is None else name in controls,
+            1,
+            {score: _estimate(values, weights) for score, values in each.items()},
+        )
         for at, (name, each) in enumerate(scores.items())
     ]
     return with_verdicts(rows, lower=[name for name, (column, _) in columns.items() if column.best == "low"])

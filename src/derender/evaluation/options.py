@@ -31,6 +31,8 @@ class Options:
             images.
         resamples: bootstrap resamples of the rows.
         seed: the first seed of every random choice: resamples, subsets, k-means, untrained encoders.
+        keep_duplicates: of identical images keep every one.
+        descriptors: also compare with Gradientfaces, HOG and LBP, as tables of identity do.
         dataset, limit: how an address of images is read, see ``derender.inputs.as_images``.
         device: of models that are loaded here.
         cache: folder of cached results, "none" for none; by default the user's.
@@ -44,6 +46,8 @@ class Options:
     whiten_on: ImageSet | str | Path | None = None
     resamples: int = RESAMPLES
     seed: int = 0
+    keep_duplicates: bool = False
+    descriptors: bool = False
     dataset: str = "auto"
     limit: int | None = None
     device: str = "auto"
@@ -77,7 +81,9 @@ class Options:
         """The images at a side in pixels, read once for each; with ``files`` these, in this order."""
         if image_size not in self._read:
             assert self.images is not None
-            how: dict[str, Any] = {"dataset": self.dataset, "limit": self.limit}
+            how: dict[str, Any] = {
+                name: getattr(self, name) for name in ("dataset", "limit", "keep_duplicates")
+            }
             found = as_images(self.images, image_size, **how, progress=self.stage("reading"))
             if found.images.shape[-1] != image_size:
                 raise ValueError(

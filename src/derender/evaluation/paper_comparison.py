@@ -63,7 +63,10 @@ def compare(
     Raises:
         ValueError: an unknown table, or labels, factors or images that do not fit.
     """
-    spec, how = table_named(table), Options(images=images, **options)
+    spec, how = (
+        table_named(table),
+        Options(**{"images": images, "descriptors": table == "identity", **options}),
+    )
     models = {name: [run for run in runs_of(runs) if is_model(run)] for name, runs in features.items()}
     models = {name: runs for name, runs in models.items() if runs}
     numbers = {"table": table, "number": spec.number}

@@ -7,6 +7,7 @@ import typer
 
 from derender.cli.evaluate.disentangle import disentangle
 from derender.cli.evaluate.features import cluster, linear
+from derender.cli.evaluate.identity import identify, verify
 from derender.cli.evaluate.robustness import robustness
 from derender.cli.evaluate.scenes import geometry, reconstruction
 from derender.cli.evaluate.segment import segment
@@ -15,6 +16,8 @@ from derender.cli.gathered import command
 EXAMPLES = {
     cluster: "lfw.zip --model faces-64 --label identity",
     linear: "celeba.zip --model faces-64 --attributes",
+    identify: "CroppedYale.zip --model faces-64",
+    verify: "lfw.zip --model faces-64 --pairs pairs.txt",
     segment: "CelebAMask-HQ/ --model runs/unet --out segmented/",
     disentangle: "made/ --model runs/faces --out card.png",
     geometry: "made/::test_gt --model runs/faces",

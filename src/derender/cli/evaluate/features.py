@@ -1,11 +1,10 @@
 """`derender evaluate cluster` and `linear`: features by a label that training never saw."""
 
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from derender.cli import options, scoring
-from derender.cli.console import progress_bar
 
 MEAN_BY = "Average first over rows that share this label; may be repeated."
 MeanBy = Annotated[list[str] | None, typer.Option("--mean-by", help=MEAN_BY)]
@@ -26,8 +25,8 @@ def cluster(
 ) -> None:  # fmt: skip
     """Do features group images by a label that training never saw? 1 is best."""
     own = {"method": method, "clusters": clusters, "mean_by": mean_by or ()}
-    _score("cluster", published, images, subject, **vars(labels), **vars(computed), **own,
-           untrained_seeds=untrained_seeds)  # fmt: skip
+    own |= {"untrained_seeds": untrained_seeds}
+    scoring.score("cluster", published, images, subject, **vars(labels), **vars(computed), **own)
 
 
 def linear(
@@ -40,21 +39,5 @@ def linear(
     """How much does a linear head learn from features, given 100, 500 or 1,000 labels? 1 is best."""
     own = {"counts": scoring.numbers_of(counts, "--counts"), "heads": scoring.names_of(heads) or ()}
     own |= {"seeds": seeds, "test_fraction": test_fraction, "groups": groups}
-    _score("linear", published, images, subject, **vars(labels), **vars(computed), **own, finetune=finetune,
-           epochs=epochs, untrained_seeds=untrained_seeds)  # fmt: skip
-
-
-def _score(
-    protocol: str, published: scoring.Published, images: options.DataOptions, subject: scoring.ScoredSubject,
-    **how: Any,
-) -> None:  # fmt: skip
-    """Score by a protocol of `derender.evaluation`, and publish."""
-    from derender import evaluation
-
-    published.check()
-    address = images.optional_address
-    with progress_bar("scoring") as progress:
-        scores = getattr(evaluation, protocol)(
-            subject.source(address), images=address, **images.how, **subject.how, **how, progress=progress
-        )
-    published.publish(scores)
+    own |= {"finetune": finetune, "epochs": epochs, "untrained_seeds": untrained_seeds}
+    scoring.score("linear", published, images, subject, **vars(labels), **vars(computed), **own)

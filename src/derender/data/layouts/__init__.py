@@ -9,7 +9,7 @@ from collections.abc import Callable
 from functools import cache
 
 from derender.data.layouts.celeba import CELEBA, CELEBAMASK
-from derender.data.layouts.faces import FACE_TRACKS, LFW, RAFDB, UTKFACE
+from derender.data.layouts.faces import FACE_TRACKS, LFW, RAFDB, UTKFACE, YALE
 from derender.data.layouts.layout import (
     PARTITION_NAMES,
     Layout,
@@ -56,7 +56,7 @@ CLASSES = Layout("classes", "one folder per class", _is_classes, _load_classes)
 FOLDER = Layout("folder", "images in any arrangement", lambda source: True, _load_folder)
 
 LAYOUTS = (
-    *(TABLE, SYNCAR, SYNFACE, SYNFACE_TRACKS, DEPTH_PAIRS, RAFDB, CELEBAMASK, CELEBA, UTKFACE, LFW),
+    *(TABLE, SYNCAR, SYNFACE, SYNFACE_TRACKS, DEPTH_PAIRS, RAFDB, CELEBAMASK, CELEBA, UTKFACE, YALE, LFW),
     *(SHAPENET_CARS, FACE_TRACKS, CLASSES, FOLDER),
 )
 

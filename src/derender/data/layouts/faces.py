@@ -1,9 +1,11 @@
-"""Real faces: UTKFace, Labeled Faces in the Wild, RAF-DB, and faces followed through a video.
+"""Real faces: UTKFace, Labeled Faces in the Wild, Yale B, RAF-DB, and faces followed through a video.
 
 UTKFace: ``[age]_[gender]_[race]_[date].jpg.chip.jpg``. Its owners give no split; the paper's 80/10/10 is
-made by data/splits.py. LFW: ``First_Last/First_Last_0001.jpg``; where the lists of its view 1
-(``peopleDevTrain.txt``, ``peopleDevTest.txt``: a count, then a name and a count a line) lie beside the
-images they are the official split by people. The pairs of its verification protocol are not read.
+made by data/splits.py. Extended Yale B, cropped: ``yaleB01_P00A+035E-20.pgm`` has the light at azimuth 35
+degrees (positive lights the left of the image) and elevation -20; pictures in ambient light alone are left
+out, and crops are given room (data/image.py). LFW: ``First_Last/First_Last_0001.jpg``; where the lists of
+its view 1 (``peopleDevTrain.txt``, ``peopleDevTest.txt``: a count, then a name and a count a line) lie beside
+the images they are the official split by people.
 
 RAF-DB, the basic set: ``basic/Image/aligned/train_00001_aligned.jpg`` and
 ``basic/EmoLabel/list_patition_label.txt``, spelt so, with a line ``train_00001.jpg 5`` for each image; the
@@ -43,6 +45,8 @@ _UTK_CODES = {"gender": ("male", "female"), "race": ("white", "black", "asian", 
 _UTK_OLDEST = 116
 _UTK_HOME = "https://susanqq.github.io/UTKFace/"
 
+_YALE_NAME = re.compile(r"(?P<identity>yaleB\d+)_(?P<pose>P\d\d)A(?P<a>[+-]\d+)E(?P<e>[+-]\d+)\.\w+")
+_YALE_HOME = "http://vision.ucsd.edu/~iskwak/ExtYaleDatabase/ExtYaleB.html"
 _LFW_NAME = re.compile(r"(?:.*/)?(?P<identity>[^/]+)/(?P=identity)_\d{4}\.\w+")
 _LFW_PARTS = {"peopleDevTrain.txt": "train", "peopleDevTest.txt": "test"}
 _LFW_HOME = "https://vis-www.cs.umass.edu/lfw/"
@@ -74,6 +78,17 @@ def _load_utkface(source: Source) -> Table:
         by_code = dict(zip("01234", names, strict=False))
         labels[column] = text_column(by_code.get(one[column] or "", "") if one else "" for one in found)
     return Table(source.images, labels)
+
+
+def _load_yale(source: Source) -> Table:
+    """Person, pose and light from the names; ``light_deg`` is the angle between light and view."""
+    found = {file: match for file in source.images if (match := _YALE_NAME.fullmatch(base_name(file)))}
+    azimuth, elevation = (np.array([float(one[name]) for one in found.values()]) for name in ("a", "e"))
+    cosine = np.cos(np.radians(azimuth)) * np.cos(np.radians(elevation))
+    labels = {name: text_column(one[name] for one in found.values()) for name in ("identity", "pose")}
+    labels |= {"light_azimuth_deg": number_column(azimuth), "light_elevation_deg": number_column(elevation)}
+    labels["light_deg"] = number_column(np.degrees(np.arccos(cosine)).round(3))
+    return Table(tuple(found), labels)
 
 
 def _load_lfw(source: Source) -> Table:
@@ -204,6 +219,11 @@ UTKFACE = Layout(
     "utkface", "UTKFace: faces with age, gender and race in their names",
     lambda source: mostly(_UTK_NAME, [base_name(file) for file in source.images]), _load_utkface,
     _UTK_HOME, "non-commercial research only",
+)  # fmt: skip
+YALE = Layout(
+    "yaleb", "Extended Yale B, cropped: faces under known light",
+    lambda source: mostly(_YALE_NAME, [base_name(file) for file in source.images]), _load_yale,
+    _YALE_HOME, "free for research", fit="room",
 )  # fmt: skip
 LFW = Layout(
     "lfw", "Labeled Faces in the Wild: one folder per person",

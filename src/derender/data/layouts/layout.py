@@ -5,15 +5,17 @@ float32 with NaN where unknown; yes/no attributes are int8 with 1 yes, 0 no, -1 
 """
 
 import csv
+import hashlib
 import io
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Float32
 
-from derender.data.source import Skipped, Source
+from derender.data.source import Skipped, Source, suggestion
 
 Labels = dict[str, np.ndarray]
 
@@ -62,6 +64,7 @@ class Layout:
 
     Attributes:
         recognise: whether a source looks like it, from the names of its files (and a header line).
+        fit: what becomes of images that are not square (data/image.py).
         default_parts: the first of these that is there is read unless a part is asked for; () for all images.
     """
 
@@ -73,6 +76,7 @@ class Layout:
     terms: str = ""  # on what terms the owners give it, in a few words; "" for layouts without owners
     split_from: str = ""  # the file that gives the official split, for messages
     default_parts: Sequence[str] = ()
+    fit: str = "crop"
 
     def read(
         self, source: Source, subset: str | None = None, default_parts: Sequence[str] | None = None
@@ -100,6 +104,44 @@ class Layout:
                 f"its folders {', '.join(folders[:8]) or 'none'}"
             )
         return table.select(np.array(inside))
+
+
+HALVES = ("all", "development", "test")
+HALVED_BY = ("identity", "model")
+T = TypeVar("T", bound=Any)
+
+
+def half_of(rows: T, half: str) -> T:
+    """The development or test half of a table, set of images or feature table, or "all" of it.
+
+    A hash of its identity or model, else of its file's name without folders and suffix, puts a row into its
+    half. So a person or a shape is in one half only, the same in every set, at every size and on every
+    machine; the halves are about equally large. Choose settings on development, report test.
+
+    Raises:
+        ValueError: another half, or one that is empty.
+    """
+    if half not in HALVES:
+        raise ValueError(f"unknown half {half!r}{suggestion(half, HALVES)}: choose {', '.join(HALVES)}")
+    if half == "all":
+        return rows
+    keys = list(map(stem_of, rows.files))
+    for name in HALVED_BY:
+        if name in rows.labels:
+            keys = [
+                key if value in ("", None) else str(value)
+                for value, key in zip(rows.labels[name].tolist(), keys, strict=True)
+            ]
+            break
+    chosen = np.flatnonzero([in_test_half(key) == (half == "test") for key in keys])
+    if len(chosen) == 0:
+        raise ValueError(f"the {half} half of {len(keys):,} rows is empty: use all of them")
+    return rows.select(chosen)
+
+
+def in_test_half(name: str) -> bool:
+    """Whether a person, shape or image of this name belongs to the test half."""
+    return hashlib.sha256(name.encode("utf-8", "surrogateescape")).digest()[0] % 2 == 1
 
 
 def base_name(file: str) -> str:

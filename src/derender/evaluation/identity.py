@@ -1,0 +1,358 @@
+"""Identity of faces: who is this (``identify``), and are these two one person (``verify``)?
+
+Sources: nearest neighbours by the angle of light, as on Yale B (Georghiades et al., PAMI 2001); pairs of LFW
+(Huang et al., 2007), whose threshold for each fold is chosen on the others. Similarity is the cosine after
+the mean of the gallery, or of the other folds' images, is subtracted: codes agree in what all faces share.
+Nothing else is fitted. Leaves out networks trained on names of people.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from derender.data import half_of
+from derender.data.layouts.layout import stem_of
+from derender.evaluation.bootstrap import (
+    NAN,
+    ScoredRow,
+    constant,
+    estimate,
+    group_resamples,
+    with_verdicts,
+)
+from derender.evaluation.clustering import compare_clusterings
+from derender.evaluation.controls import subject_and_controls
+from derender.evaluation.feature_rows import FeatureSource, is_model, prepare
+from derender.evaluation.image_scores import image_rows
+from derender.evaluation.neighbours import unit_rows
+from derender.evaluation.options import Options
+from derender.evaluation.score_table import Column, Scores, scored_table, verdict, verdict_table
+from derender.features import FeatureTable, missing
+from derender.inputs import as_model
+
+LIGHT_BINS_DEG = (12.0, 25.0, 50.0, 77.0)
+"""Edges of Yale B's subsets: the angle between light and view."""
+CLUSTERED_DEG = 50.0
+FOLDS = 10
+
+
+def identify(
+    features: FeatureSource,
+    label: str = "identity",
+    *,
+    by: str | None = None,
+    bins: Sequence[float] = LIGHT_BINS_DEG,
+    gallery: str | None = None,
+    centred: bool = True,
+    cluster_within: float = CLUSTERED_DEG,
+    **options: Any,
+) -> Scores:
+    """Share of probes whose nearest gallery image, by cosine, shows the same person; 0 to 1, best 1.
+
+    Args:
+        features: a feature table or its ``.parquet`` file; a model or its name, with ``images``.
+        label: the column of people.
+        by: a column of angles, in degrees or (named ..._rad) radians, whose size groups the probes; by
+            default ``light_deg`` where there is one, as in Extended Yale B.
+        bins: upper edges of the groups, growing; larger angles are "beyond".
+        gallery: ``COLUMN=VALUE`` of the gallery's images; by default one of each person: that of the smallest
+            angle, without angles the first by name.
+        centred: subtract the gallery's mean before the cosine.
+        cluster_within: images up to this angle, gallery too, are also clustered into people by Ward's method.
+        options: images, factors, seed, resamples, cache, ...: the fields of ``Options``.
+
+    Raises:
+        ValueError: a column is missing, the gallery is empty, or no probe shows a person of the gallery.
+    """
+    if list(bins) != sorted(set(bins)):
+        raise ValueError(f"bins must grow, got {', '.join(map(str, bins))}")
+    how = Options(**{"keep_duplicates": True, "descriptors": True, **options})
+    rows = subject_and_controls(features, how)
+    ready = prepare(rows, [label])
+    who, table = ready.labels[label].astype(str), ready.table
+    angle = _angles(table, by)
+    known = ~missing(ready.labels[label])
+    shown = _gallery(table, who, angle, known, gallery)
+    probe = np.flatnonzero(known & ~shown & np.isin(who, who[shown]))
+    if len(probe) == 0:
+        raise ValueError("no probe shows a person of the gallery: give more than one image of each person")
+    names = {"all": np.ones(len(probe), bool)}
+    if angle is not None:
+        edges = [-1.0, *bins, np.inf]
+        for low, high in pairwise(edges):
+            name = "beyond" if high == np.inf else f"<= {high:g}"
+            names[name] = (angle[probe] > low) & (angle[probe] <= high)
+    names = {name: inside for name, inside in names.items() if inside.any()}
+    columns = {
+        name: Column(name, "high", note=f"{int(inside.sum()):,} probes") for name, inside in names.items()
+    }
+
+    def by_bin(right: np.ndarray) -> dict[str, np.ndarray]:
+        return {name: np.where(inside, right, NAN) for name, inside in names.items()}
+
+    right = {
+        name: by_bin(np.mean([_recognised(run, who, shown, probe, centred) for run in runs], axis=0))
+        for name, runs in ready.features.items()
+    }
+    right["chance"] = by_bin((who[shown] == who[probe, None]).mean(axis=1))
+    scored = image_rows(
+        right, {name: (column, 1.0) for name, column in columns.items()},
+        controls=(*ready.controls, "chance"), groups=who[probe], resample_count=how.resamples,
+        seed=how.seed,
+    )  # fmt: skip
+    near = known & (angle <= cluster_within) if angle is not None else np.zeros(len(who), bool)
+    if len(set(who[near])) > 1 and len(set(who[near])) < near.sum():
+        found = compare_clusterings(
+            {name: [run[near] for run in runs] for name, runs in ready.features.items()}, {label: who[near]},
+            controls=ready.controls, resample_count=how.resamples, seed=how.seed, memory=how.memory,
+        )  # fmt: skip
+        ward = {
+            row.name: {f"ward {name}": row.scores[name] for name in ("accuracy", "nmi")} for row in found.rows
+        }
+        scored = with_verdicts([replace(row, scores={**row.scores, **ward[row.name]}) for row in scored])
+        note = f"Ward clusters of {int(near.sum()):,} images up to {cluster_within:g} degrees, gallery too"
+        columns |= {"ward accuracy": Column("Ward", "high", note=f"purity of {note}")}
+        columns |= {"ward nmi": Column("Ward NMI", "high", note="normalised mutual information of the same")}
+    caption = (
+        f"Identification: {len(probe):,} probes of {len(set(who[probe]))} people, gallery of "
+        f"{int(shown.sum())}, nearest by cosine{' less the mean of the gallery' if centred else ''}"
+    )
+    tables = [
+        scored_table(caption, "features", scored, columns, deviations=()),
+        verdict_table(scored, columns, "Above the strongest control? (people are resampled together)"),
+    ]
+    values = {
+        "people": len(set(who[probe])), "gallery": [table.files[row] for row in np.flatnonzero(shown)],
+        "probes": {name: int(inside.sum()) for name, inside in names.items()}, "centred": centred,
+        "rows": {row.name: row.numbers() for row in scored},
+    }  # fmt: skip
+    return Scores(tables, values, [*how.notes, verdict(scored[0], "all"), how.memory.summary()], scored)
+
+
+def _angles(table: FeatureTable, by: str | None) -> np.ndarray | None:
+    """Sizes of a column of angles in degrees, (N,); None where no column was named and there is no light."""
+    if by is None and "light_deg" not in table.labels:
+        return None
+    name = by or "light_deg"
+    values = table.label(name)
+    if values.dtype.kind not in "fiu":
+        raise ValueError(f"label {name!r} holds no numbers: name a column of angles in degrees")
+    values = np.abs(values.astype(np.float64))
+    return np.degrees(values) if name.endswith("_rad") else values
+
+
+def _gallery(
+    table: FeatureTable, who: np.ndarray, angle: np.ndarray | None, known: np.ndarray, rule: str | None
+) -> np.ndarray:
+    """Which rows are the gallery, (N,) bool."""
+    if rule is not None:
+        name, equals, value = rule.partition("=")
+        if not equals:
+            raise ValueError(f"the gallery {rule!r} should read COLUMN=VALUE")
+        column = table.label(name)
+        wanted = column == float(value) if column.dtype.kind in "fiu" else column.astype(str) == value
+        if not (known & wanted).any():
+            raise ValueError(f"no image has {rule}: the gallery is empty")
+        return known & wanted
+    chosen = np.zeros(len(who), bool)
+    for person in np.unique(who[known]):
+        own = np.flatnonzero(known & (who == person))
+        chosen[own[0 if angle is None else int(np.argmin(angle[own]))]] = True
+    return chosen
+
+
+def _recognised(
+    run: np.ndarray, who: np.ndarray, shown: np.ndarray, probe: np.ndarray, centred: bool
+) -> np.ndarray:
+    """Whether the nearest image of the gallery shows the person of each probe, (P,)."""
+    codes = unit_rows(run - run[shown].mean(axis=0) * centred)
+    return who[shown][(codes[probe] @ codes[shown].T).argmax(axis=1)] == who[probe]
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Pairs of image names without folder and suffix, whether each shows one person, and its fold from 0."""
+
+    first: tuple[str, ...]
+    second: tuple[str, ...]
+    same: np.ndarray
+    fold: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.first)
+
+    def select(self, rows: np.ndarray) -> "Pairs":
+        """Only these pairs."""
+        first, second = (tuple(names[row] for row in rows) for names in (self.first, self.second))
+        return Pairs(first, second, self.same[rows], self.fold[rows])
+
+
+def read_pairs(path: str | Path) -> Pairs:
+    """Pairs of LFW: a line ``FOLDS PAIRS``, then for each fold so many of one person and of two people.
+
+    ``NAME 1 4`` and ``NAME 1 OTHER 2`` stand for NAME_0001 with NAME_0004, and with OTHER_0002. A first line
+    with one number, as of pairsDevTest.txt, is one list, dealt into ten folds.
+
+    Raises:
+        ValueError: the file is not of this form, with its line.
+    """
+    lines = Path(path).read_text(encoding="utf-8").splitlines()
+    head = lines[0].split() if lines else []
+    if len(head) not in (1, 2) or not all(word.isdecimal() and int(word) for word in head):
+        raise ValueError(f"{path}, line 1: expected FOLDS PAIRS, as LFW's pairs.txt begins, got {lines[:1]}")
+    folds, count = (int(head[0]), int(head[1])) if len(head) == 2 else (1, int(head[0]))
+    body = [line for line in lines[1:] if line.strip()]
+    if len(body) != 2 * folds * count:
+        raise ValueError(f"{path}: expected {2 * folds * count} pairs as line 1 says, got {len(body)}")
+    first, second, same, fold = [], [], [], []
+    for number, line in enumerate(body):
+        words, matched = line.split("\t") if "\t" in line else line.split(), number % (2 * count) < count
+        words = [words[0], words[1], words[0], words[2]] if matched and len(words) == 3 else words
+        if len(words) != 4 or not (words[1].isdecimal() and words[3].isdecimal()):
+            form = "NAME 1 4" if matched else "NAME 1 OTHER 2"
+            raise ValueError(f"{path}, line {number + 2}: expected {form}, got {line!r}")
+        first.append(f"{words[0]}_{int(words[1]):04d}")
+        second.append(f"{words[2]}_{int(words[3]):04d}")
+        same.append(matched)
+        fold.append(number // (2 * count) if folds > 1 else number % FOLDS)
+    return Pairs(tuple(first), tuple(second), np.array(same), np.array(fold))
+
+
+def verify(
+    features: FeatureSource, pairs: Pairs | str | Path, *, half: str = "all", **options: Any
+) -> Scores:
+    """Do two images show one person? Accuracy over folds and area under the ROC curve; 0.5 by chance, best 1.
+
+    The threshold on the cosine is chosen for each fold on the others, and so is the mean that is subtracted.
+
+    Args:
+        features: a feature table or its ``.parquet`` file; a model or its name, with ``images``.
+        pairs: pairs, or a file of them in LFW's format (``read_pairs``).
+        half: "development" or "test": only pairs whose people are all in that half, as many of one person as
+            of two in each fold.
+        options: images, factors, seed, resamples, cache, ...: the fields of ``Options``.
+
+    Raises:
+        ValueError: the pairs cannot be read, or name images that are not there.
+    """
+    pairs = pairs if isinstance(pairs, Pairs) else read_pairs(pairs)
+    pairs = _in_half(pairs, half)
+    how = Options(**{"keep_duplicates": True, "descriptors": True, **options})
+    names = {*pairs.first, *pairs.second}
+    if is_model(features):
+        features = as_model(features, device=how.device)
+        read = how.at(features.image_size)
+        chosen = read.select(np.array([stem_of(file) in names for file in read.files]))
+        how = replace(how, images=chosen)
+    else:
+        features = features if isinstance(features, FeatureTable) else FeatureTable.read(str(features))
+        features = features.select(np.array([stem_of(file) in names for file in features.files]))
+    rows = subject_and_controls(features, how)
+    place = {stem_of(file): row for row, file in enumerate(rows[0].tables[0].files)}
+    if absent := sorted(names - place.keys()):
+        raise ValueError(
+            f"{len(absent):,} of {len(names):,} images of the pairs are not there (first {absent[0]}): give "
+            "the images that the pairs were drawn from"
+        )
+    sides = np.array([[place[name] for name in side] for side in (pairs.first, pairs.second)])
+    weights = group_resamples(np.arange(len(pairs)), how.resamples, how.seed)
+    scored, errors = [], {}
+    for row in rows:
+        runs = [_judged(run, sides, pairs) for run in row.arrays()]
+        right = np.mean([own for own, _ in runs], axis=0)
+        areas = [area_under_roc(cosine, pairs.same) for _, cosine in runs]
+        drawn = np.mean([area_under_roc(cosine, pairs.same, weights) for _, cosine in runs], axis=0)
+        scores = {
+            "accuracy": estimate([float(right.mean())], weights @ right / weights.sum(axis=1)),
+            "auc": estimate(np.concatenate(areas), drawn),
+        }
+        each = [float(right[pairs.fold == fold].mean()) for fold in np.unique(pairs.fold)]
+        errors[row.name] = float(np.std(each, ddof=1) / np.sqrt(len(each)))
+        scored.append(ScoredRow(row.name, row.control, len(runs), scores))
+    half_right = {name: constant(0.5, how.resamples) for name in ("accuracy", "auc")}
+    scored = with_verdicts([*scored, ScoredRow("chance", True, 1, half_right)])
+    columns = {
+        "accuracy": Column("accuracy", "high", note="share of pairs judged right, mean over folds"),
+        "auc": Column("AUC", "high", note="area under the ROC curve over all pairs"),
+    }
+    error = Column("± SE", None, note="standard error of accuracy over folds")
+    n_folds, n_same = len(set(pairs.fold.tolist())), int(pairs.same.sum())
+    caption = (
+        f"Verification: {n_same:,} pairs of one person, {len(pairs) - n_same:,} of two, {n_folds} folds, "
+        "threshold and mean from the other folds"
+    )
+    shown = scored_table(
+        caption, "features", scored, columns, intervals=tuple(columns), deviations=(),
+        more={error: lambda row: errors.get(row.name)},
+    )  # fmt: skip
+    tables = [
+        shown,
+        verdict_table(scored, columns, "Above the strongest control? (paired resamples of pairs)"),
+    ]
+    values = {
+        "pairs": len(pairs), "folds": n_folds, "images": len(names), "half": half, "standard_error": errors,
+        "rows": {row.name: row.numbers() for row in scored},
+    }  # fmt: skip
+    return Scores(tables, values, [*how.notes, verdict(scored[0], "accuracy"), how.memory.summary()], scored)
+
+
+def _in_half(pairs: Pairs, half: str) -> Pairs:
+    """The pairs whose people all lie in one half; in each fold as many of one person as of two, the first."""
+    people = [
+        {name.rpartition("_")[0] for name in both} for both in zip(pairs.first, pairs.second, strict=True)
+    ]
+    if half == "all":
+        return pairs
+    names = sorted(set().union(*people))
+    whole = FeatureTable(tuple(names), {"none": np.zeros((len(names), 1))}, {"identity": np.array(names)})
+    inside = set(half_of(whole, half).files)
+    own = np.array([both <= inside for both in people])
+    kept: list[int] = []
+    for fold in np.unique(pairs.fold):
+        sides = [np.flatnonzero(own & (pairs.fold == fold) & (pairs.same == same)) for same in (True, False)]
+        kept += np.concatenate([side[: min(map(len, sides))] for side in sides]).tolist()
+    if not kept:
+        raise ValueError(f"no pair has all its people in the {half} half: use all of them")
+    return pairs.select(np.array(kept))
+
+
+def _judged(run: np.ndarray, sides: np.ndarray, pairs: Pairs) -> tuple[np.ndarray, np.ndarray]:
+    """Whether each pair is judged right, (P,), and its cosine."""
+    right, cosines = np.zeros(len(pairs), bool), np.zeros(len(pairs))
+    for fold in np.unique(pairs.fold):
+        held = pairs.fold == fold
+        learned = ~held if not held.all() else held
+        codes = unit_rows(run - run[np.unique(sides[:, learned])].mean(axis=0))
+        cosine = (codes[sides[0]] * codes[sides[1]]).sum(axis=1)
+        threshold = _best_threshold(cosine[learned], pairs.same[learned])
+        right[held] = (cosine[held] >= threshold) == pairs.same[held]
+        cosines[held] = cosine[held]
+    return right, cosines
+
+
+def _best_threshold(cosine: np.ndarray, same: np.ndarray) -> float:
+    """The threshold that judges most pairs right; half-way between the two cosines around it."""
+    order = np.argsort(-cosine, kind="stable")
+    gained = np.cumsum(np.where(same[order], 1, -1))
+    last = int(gained.argmax())
+    following = cosine[order][min(last + 1, len(order) - 1)]
+    return float(cosine[order][last] + following) / 2
+
+
+def area_under_roc(score: np.ndarray, positive: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
+    """Chance that a positive of (N,) outranks a negative, ties half, (B,); 0 to 1, best 1.
+
+    ``weights`` (B, N) say how often each is drawn; by default once.
+    """
+    weights = np.ones((1, len(score))) if weights is None else weights.astype(np.float64)
+    order = np.argsort(score, kind="stable")
+    starts = np.flatnonzero(np.r_[True, np.diff(score[order]) > 0])
+    wins, losses = (
+        np.add.reduceat((weights * side)[:, order], starts, axis=1) for side in (positive, ~positive)
+    )
+    below = np.cumsum(losses, axis=1) - losses / 2
+    return (wins * below).sum(axis=1) / (wins.sum(axis=1) * losses.sum(axis=1))
