@@ -239,19 +239,6 @@ def test_another_architecture_is_named_by_its_first_key(generator_weights, tmp_p
         load_published_generator(save({"g_ema": kept}, tmp_path / "generator.pt"))
 
 
-@reads_pickles
-def test_a_generator_is_no_encoder(generator_weights, e4e_content, tmp_path):
-    generator_file = save({"g_ema": generator_weights}, tmp_path / "generator.pt")
-    encoder_file = save(e4e_content, tmp_path / "e4e.pt")
-    with pytest.raises(ValueError, match=r"no 'state_dict'.*e4e_ffhq_encode\.pt.*github\.com/omertov"):
-        load_published_e4e(generator_file)
-    with pytest.raises(ValueError, match=r"no 'g_ema'.*stylegan2-ffhq-config-f\.pt.*github\.com/rosinality"):
-        load_published_generator(encoder_file)
-    del e4e_content["state_dict"]["encoder.latlayer2.bias"]
-    with pytest.raises(ValueError, match=r"it has no 'encoder\.latlayer2\.bias'"):
-        load_published_e4e(save(e4e_content, encoder_file))
-
-
 class Attack:
     """What a hostile pickle asks for; tests/trust/test_no_code.py has one for every reader."""
 

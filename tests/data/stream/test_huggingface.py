@@ -159,20 +159,6 @@ def test_a_path_wins_and_an_id_that_cannot_be_reached_names_both_readings(places
     assert len(asked) == 1
 
 
-def test_what_the_hub_answers_is_told(monkeypatch):
-    import huggingface_hub
-    from huggingface_hub.errors import RepositoryNotFoundError
-
-    def unknown(self, identifier, **_: object):
-        raise RepositoryNotFoundError.__new__(RepositoryNotFoundError)
-
-    monkeypatch.setattr(huggingface_hub.HfApi, "dataset_info", unknown)
-    with pytest.raises(ValueError, match=r"owner/none does not exist here.*and the Hugging Face Hub has no"):
-        read_images("owner/none", 8)
-    with pytest.raises(ValueError, match="no folder here and no id"):
-        read_images("not an id", 8, dataset="huggingface")
-
-
 def test_an_id_is_loaded_at_the_commit_the_hub_names(rows, places, monkeypatch):
     """The Hub stands in as a folder: the id, the commit and the configuration reach the library."""
     import huggingface_hub

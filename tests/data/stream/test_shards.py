@@ -180,18 +180,3 @@ def test_labels_that_are_missing_mixed_too_large_or_no_labels(shard):
         "yes": [-1, -1, 1],
     }
     assert [row.file for row in pictures.skipped] == ["l.tar/4.png", "l.tar/5.png", "l.tar/6"]
-
-
-def test_it_is_decoded_once_and_again_after_a_change(shard, cache, encoded):
-    path = shard("c.tar", members(5))
-    first = read_images(path, 8)
-    assert isinstance(first.images, np.memmap)
-    (file,) = cache.iterdir()
-    made = file.stat().st_mtime_ns
-    again = read_images(path, 8)
-    assert file.stat().st_mtime_ns == made
-    np.testing.assert_array_equal(first.images, again.images)
-    assert again.labels.keys() == first.labels.keys()
-    shard("c.tar", members(6))
-    assert len(read_images(path, 8)) == 6
-    assert len(list(cache.iterdir())) == 1

@@ -99,14 +99,6 @@ def test_bad_files_are_named(tmp_path, changes, message):
         MorphableFaces.read(saved(tmp_path / "m.npz", **changes))
 
 
-def test_no_file_and_no_npz(tmp_path):
-    with pytest.raises(FileNotFoundError, match="does not exist: expected a morphable model"):
-        MorphableFaces.read(tmp_path / "none.npz")
-    (tmp_path / "text.npz").write_text("hello")
-    with pytest.raises(ValueError, match=r"text.npz cannot be read as .npz"):
-        MorphableFaces.read(tmp_path / "text.npz")
-
-
 @pytest.fixture(scope="module")
 def converter():
     path = ROOT / "examples/convert_ict_facekit.py"

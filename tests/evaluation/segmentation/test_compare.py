@@ -87,17 +87,6 @@ def test_where_the_weights_come_from(data, model, before):
     assert not torch.equal(other.encoders[0].levels[0][0].weight, starts("random")[0])
 
 
-def test_a_frozen_random_encoder_has_the_statistics_of_the_training_pictures(data, model):
-    net = build_variant(model, VARIANTS["joint-random-frozen"], data, seed=0)
-    norm = net.encoders[0].levels[0][1]
-    seen = []
-    handle = norm.register_forward_hook(lambda module, inputs, output: seen.append(inputs[0]))
-    net.train()(torch.from_numpy(data.images[data.train]).float() / 255)
-    handle.remove()
-    assert norm.running_mean == pytest.approx(seen[0].mean(dim=(0, 2, 3)).numpy(), abs=1e-5)
-    assert norm.momentum == 0.1
-
-
 def test_a_comparison_goes_on_where_it_stopped(data, model, tmp_path, before):
     settings, variants = QUICK.model_copy(update={"epochs": 1}), ["albedo", "random"]
     options = {"settings": settings, "resample_count": 20}
