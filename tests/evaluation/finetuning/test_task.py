@@ -17,7 +17,7 @@ from derender.evaluation.finetuning import (
     target_loss,
     target_of,
 )
-from derender.evaluation.finetuning.joint import RENDERING_TERMS
+from derender.evaluation.finetuning.joint import RENDERING_TERMS, FinetuneStep
 from derender.evaluation.memory import Memory
 from derender.report.run import run_page
 from derender.training.batches import random_stream
@@ -221,3 +221,19 @@ def test_bad_input_is_named_before_a_folder_is_made(pictures, tmp_path):
     nothing = replace(one.target.asked, targets=np.full_like(one.target.asked.targets, -1))
     with pytest.raises(ValueError, match="test part has 0 images with a label"):
         score_finetuned(one.build(), replace(one, target=replace(one.target, asked=nothing)))
+
+
+def test_every_batch_of_the_loop_gets_its_labels(pictures, tmp_path, monkeypatch):
+    forward, seen = FinetuneStep.forward, set()
+
+    def noted(step, images, generator, precision, done=None, rows=None):
+        for image, row in zip((images * 255).round().byte().numpy(), rows.tolist(), strict=True):
+            views = pictures.images[row], pictures.images[row][..., ::-1]
+            assert any((image == view).all() for view in views)
+            seen.add(row)
+        return forward(step, images, generator, precision, done, rows)
+
+    monkeypatch.setattr(FinetuneStep, "forward", noted)
+    one = task(pictures, "images=48", "rendering_weight=0")
+    train_task(one, pictures, tmp_path / "run")
+    assert seen == {*one.target.split.train.tolist(), *one.target.split.validation.tolist()}
