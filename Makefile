@@ -50,14 +50,15 @@ HEADS := evaluate geometry $(DATA)/heads --model rendered-faces-64
 PEOPLE := evaluate cluster $(DATA)/tracks --model rendered-faces-64 --label identity --mean-by identity --mean-by track
 CARS-CLUSTERS := evaluate cluster $(DATA)/cars --model cars-64 --label class
 CARS-GEOMETRY := evaluate geometry $(DATA)/cars --model cars-64
+SCORE = @$(BIN)/python benchmarks/score.py $@
 $(RESULTS)/heads.json: | $(DATA)/heads
-	@mkdir -p $(RESULTS) && $(BIN)/derender $(HEADS) --json $@.part && mv $@.part $@
+	$(SCORE) $(HEADS)
 $(RESULTS)/people.json: | $(DATA)/tracks
-	@mkdir -p $(RESULTS) && $(BIN)/derender $(PEOPLE) --json $@.part && mv $@.part $@
+	$(SCORE) $(PEOPLE)
 $(RESULTS)/cars-clusters.json: | $(DATA)/cars
-	@mkdir -p $(RESULTS) && $(BIN)/derender $(CARS-CLUSTERS) --json $@.part && mv $@.part $@
+	$(SCORE) $(CARS-CLUSTERS)
 $(RESULTS)/cars-geometry.json: | $(DATA)/cars
-	@mkdir -p $(RESULTS) && $(BIN)/derender $(CARS-GEOMETRY) --json $@.part && mv $@.part $@
+	$(SCORE) $(CARS-GEOMETRY)
 
 format: $(STAMP)  ## ruff: formatting and the fixes it is sure of
 	@$(BIN)/ruff format . && $(BIN)/ruff check --fix .

@@ -73,7 +73,7 @@ def looked_up(reference: re.Match[str]) -> str:
     name, row, key = reference[1].split("|")
     if name in SPEED:
         head, *rows = SPEED[name][1](json.loads((RESULTS / SPEED[name][0]).read_text()))
-        return next(cells for cells in rows if cells[0] == row)[head.index(key)]
+        return next(cells for cells in rows if cells[0] == row)[head.index(key)].split(" (")[0]
     found = json.loads((RESULTS / "tables" / f"{name}.json").read_text())
     digits = next(column["digits"] for column in found["columns"] if column["key"] == key)
     return cell(value_of(next(one for one in found["rows"] if one["name"] == row)[key]), digits, None)
@@ -194,6 +194,34 @@ def shares(found: Any) -> Iterator[list[str]]:
         yield [row["what"], f"{row['ratio']:.2f}", f"{row['least']:.2f} to {row['most']:.2f}"]
 
 
+def scored(columns: dict[str, tuple[str, float, int]], *where: str) -> Callable[[Any], Iterator[list[str]]]:
+    """Rows of a protocol: for each head the score, what it is multiplied by, and its digits."""
+
+    def read(found: Any) -> Iterator[list[str]]:
+        for key in where:
+            found = found[key]
+        yield ["", *columns]
+        for name, row in found.items():
+            note = " (control)" if row["control"] else ""
+            yield [name + note, *(shown(row["scores"].get(key), by, n) for key, by, n in columns.values())]
+
+    def shown(score: Any, by: float, digits: int) -> str:
+        if score is None:
+            return ""
+        value, low, high = (None if score[k] is None else by * score[k] for k in ("value", "low", "high"))
+        text = f"{value:.{digits}f}"
+        return text if low is None else f"{text} ({low:.{digits}f}-{high:.{digits}f})"
+
+    return read
+
+
+CLUSTERS = {"accuracy": ("accuracy", 1, 3), "NMI": ("nmi", 1, 3), "ARI": ("ari", 1, 3)}
+DEPTH = {"SIDE x 100": ("side", 100, 3), "MAD, degrees": ("mad_deg", 1, 1)}
+FACTORS = {
+    "albedo": ("albedo", 1, 3),
+    "lighting, degrees": ("light", 1, 1),
+    "viewpoint, degrees": ("camera", 1, 1),
+}
 LIGHTS = {f"up to {angle}": f"up to {angle}°" for angle in (12, 25, 50, 77)} | {"beyond": "beyond 77°"}
 HEADS = {f"light {angle}": f"light {angle}°" for angle in (25, 45, 65)} | {
     "view 15": "view 15°",
@@ -210,6 +238,11 @@ SPEED: dict[str, tuple[str, Callable[[Any], Iterator[list[str]]]]] = {
     "step-memory": ("step_memory.json", step_memory),
     "million": ("clustering_million.json", million),
     "bench": ("bench.json", shares),
+    "heads-generated": ("generated/heads.json", scored(DEPTH, "intervals", "geometry")),
+    "factors-generated": ("generated/heads.json", scored(FACTORS, "intervals", "factors")),
+    "people-generated": ("generated/people.json", scored(CLUSTERS, "rows")),
+    "cars-generated": ("generated/cars-clusters.json", scored(CLUSTERS, "rows")),
+    "cars-depth-generated": ("generated/cars-geometry.json", scored(DEPTH, "intervals", "geometry")),
 }
 
 

@@ -6,8 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from PIL import Image
 
-from derender.demo import DemoSettings, demo_page, run_demo
+from derender.data.synthetic import faces
+from derender.demo import DemoSettings, demo_page, run_demo, run_own_demo
 from derender.demo.page import score_tables, shown_rows
 from derender.demo.story import STAGES
 from derender.evaluation import GeometryResult
@@ -19,6 +21,7 @@ TINY = DemoSettings(
     minutes=5,
     shown=2,
     films=1,
+    portrait_px=64,
     overrides=("image_size=32", "width=4", "light_width=4", "batch_size=8", "self_features_steps=1"),
 )
 
@@ -40,7 +43,7 @@ def html(told) -> str:
 
 def test_every_stage_happens_in_order_and_scores_stand_beside_their_controls(told):
     result, stages = told
-    assert stages == list(STAGES)
+    assert stages == ["editing photographs", *STAGES]
     assert set(result.seconds) == set(STAGES)
     assert result.trained.images == 16
     tables = score_tables(result)
@@ -90,6 +93,19 @@ def test_command_writes_page_and_numbers(tmp_path, monkeypatch, capsys):
     assert (tmp_path / "derender-demo" / "report.html").stat().st_size > 20_000
     numbers = json.loads((tmp_path / "numbers.json").read_text())
     assert numbers["geometry"]["plane"]["MAD"] > 0 and numbers["clustering"]["pixels"]["accuracy"] > 0
+
+
+def test_a_folder_of_ones_own_opens_with_photographs_and_ends_with_its_run(tmp_path):
+    photos, pages = tmp_path / "photos", []
+    photos.mkdir()
+    for row, image in enumerate(faces.generate(24, 64, seed=5).images):
+        Image.fromarray(image.transpose(1, 2, 0)).save(photos / f"{row}.png")
+    page = run_own_demo(photos, tmp_path / "out", TINY, opened=lambda page: pages.append(page.read_text()))
+    assert 'http-equiv="refresh"' in pages[0] and "lit from the left" in pages[0]
+    html = page.read_text()
+    assert "lit from the left" in html and "Decomposed" in html and "refresh" not in html
+    with pytest.raises(FileExistsError, match="not empty"):
+        run_own_demo(photos, tmp_path / "out", TINY)
 
 
 def test_the_bundled_model_is_beside_and_named(told, html):

@@ -3,7 +3,7 @@
 import time
 from itertools import count
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -19,38 +19,47 @@ QUICK_HELP = "About one minute: to see that it runs, not how good it is."
 
 @command("demo", "demo --quick")
 def demo(
+    images: options.Images = None,
     out: Out = None,
     quick: Annotated[bool, typer.Option("--quick", help=QUICK_HELP)] = False,
     seed: options.Seed = 0,
     json_file: options.Json = None,
 ) -> None:
-    """Generate faces, train on them without labels, score unseen ones, write one page. Offline."""
+    """Edit portraits, train on generated faces or your own images, score, write one page. Offline."""
     began = time.monotonic()
-    notice("decomposing faces, learned from scratch on this machine" + (" (quick)" if quick else ""))
-    from derender.demo import FULL, QUICK, demo_page, run_demo
+    notice("decomposing images, learned from scratch on this machine" + (" (quick)" if quick else ""))
+    from derender.demo import FULL, QUICK, demo_page, run_demo, run_own_demo
     from derender.demo.page import score_tables
     from derender.training.process import TrainingInterrupted
 
     names = (f"derender-demo{f'-{number}' if number > 1 else ''}" for number in count(1))
     folder = out or next(Path(name) for name in names if not Path(name).exists())
+    values: dict[str, Any] = {"report": folder / "report.html"}
     try:
         with progress_bar("starting", "") as report:
-            told = run_demo(
-                folder, QUICK if quick else FULL, seed=seed,
-                report=lambda stage, done, total, note: report(done, total, note, description=stage),
-            )  # fmt: skip
-            page = demo_page(told).write(folder / "report.html")
+            how: dict[str, Any] = {
+                "seed": seed,
+                "report": lambda stage, done, total, note: report(done, total, note, description=stage),
+                "opened": lambda page: notice(f"open {page} now: it fills in while a model trains"),
+            }
+            settings, told = QUICK if quick else FULL, None
+            if images is not None:
+                run_own_demo(images, folder, settings, **how)
+            else:
+                told = run_demo(folder, settings, **how)
+                demo_page(told).write(folder / "report.html")
     except TrainingInterrupted as stop:
         raise KeyboardInterrupt(
             f"stopped; run derender demo again to start over ({folder} can be deleted)"
         ) from stop
-    tables = score_tables(told)
-    for table in tables.values():
-        show_scores(table, json_file)
-        result("", json_file)
-    for finding in told.trained.findings:
-        notice(f"{finding.sign}: {finding.text}; {finding.advice}")
-    notice(f"done in {duration(time.monotonic() - began)}; the model is in {told.trained.folder}")
-    result(f"report {page}", json_file)
-    values = {name: table.values() for name, table in tables.items()}
-    write_json(json_file, {"report": page, "run": told.trained, "seconds": told.seconds, **values})
+    if told is not None:
+        for name, table in score_tables(told).items():
+            show_scores(table, json_file)
+            result("", json_file)
+            values[name] = table.values()
+        values |= {"run": told.trained, "seconds": told.seconds}
+        for finding in told.trained.findings:
+            notice(f"{finding.sign}: {finding.text}; {finding.advice}")
+    notice(f"done in {duration(time.monotonic() - began)}; the model is in {folder / 'run'}")
+    result(f"report {folder / 'report.html'}", json_file)
+    write_json(json_file, values)

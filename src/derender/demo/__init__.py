@@ -1,9 +1,10 @@
 """The whole story on built-in data: generate faces, train, score unseen ones beside controls, write one page.
 
-story   runs it and gives the measured values; page turns them into a report
+story   runs it and gives the measured values; page turns them into a report;
+opening shows edited photographs before anything is trained
 """
 
 from derender.demo.page import demo_page
-from derender.demo.story import FULL, QUICK, DemoResult, DemoSettings, Report, run_demo
+from derender.demo.story import FULL, QUICK, DemoResult, DemoSettings, Report, run_demo, run_own_demo
 
-__all__ = ["FULL", "QUICK", "DemoResult", "DemoSettings", "Report", "demo_page", "run_demo"]
+__all__ = ["FULL", "QUICK", "DemoResult", "DemoSettings", "Report", "demo_page", "run_demo", "run_own_demo"]

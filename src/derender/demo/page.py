@@ -56,6 +56,16 @@ def demo_page(result: DemoResult) -> Page:
         "result": result,
         "usual": PRESETS[result.config.preset].images,
         "tables": tables,
+        "lost": [
+            name
+            for name, table, column in (
+                ("depth", "geometry", 0),
+                ("normals", "geometry", 1),
+                ("clusters of people", "clustering", 0),
+                ("reconstruction", "reconstruction", 0),
+            )
+            if tables[table].verdict(column).startswith("behind")
+        ],
         "tile": _tile,
         "inputs": colours.pictures(result.seen.images[:: max(1, len(result.seen) // INPUTS_SHOWN)]),
         "inputs_shown": INPUTS_SHOWN,

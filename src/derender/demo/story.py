@@ -6,7 +6,7 @@ same faces. Leaves out the page (see ``page``) and output at the terminal (see c
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,9 +16,12 @@ from derender import evaluation
 from derender.baselines.controls import pca_features, pixel_features, untrained_features, untrained_twin
 from derender.data import GroundTruth, ImageSet
 from derender.data.synthetic import faces
+from derender.demo.opening import LivePage, Opening, opening
 from derender.features import embed_image_set
+from derender.learn import train as train_on
 from derender.model import Derenderer, load
-from derender.report.run import decomposition_sheet
+from derender.report.evidence import run_evidence
+from derender.report.run import decomposition_sheet, run_page
 from derender.settings import Settings
 from derender.training.config import TrainConfig, resolve
 from derender.training.derender_task import train
@@ -42,6 +45,7 @@ class DemoSettings(Settings):
     minutes: float = Field(default=4.3, gt=0)  # training stops here on a slow machine
     shown: int = Field(default=8, ge=1)  # unseen images on the page
     films: int = Field(default=4, ge=1)
+    portrait_px: int = Field(default=512, ge=64)  # of the photographs that open the page
     overrides: tuple[str, ...] = (  # of the preset `small`, as in --set
         "level_depth=true",
         "template_share=0.1",
@@ -50,13 +54,12 @@ class DemoSettings(Settings):
         "objective.self_features_steps=300",
     )
 
-    def training(self, seed: int) -> TrainConfig:
-        """The configuration of the demo's training run."""
+    def training(self, seed: int, split: tuple[float, float, float] = (0.95, 0.05, 0.0)) -> TrainConfig:
+        """The configuration of the demo's training run; scored faces are made apart, of other identities."""
         quarter, half = max(1, self.images // 4), max(1, self.images // 2)
-        split = [0.95, 0.05, 0.0]  # the scored images are made apart, of other identities
         return resolve(
             "small", self.overrides, images=self.images, minutes=self.minutes, validate_every=quarter,
-            sample_every=quarter, checkpoint_every=half, split=split, seed=seed,
+            sample_every=quarter, checkpoint_every=half, split=list(split), seed=seed,
         )  # fmt: skip
 
 
@@ -74,6 +77,7 @@ class DemoResult:
     Attributes:
         config: the training's resolved configuration.
         bundled_geometry: scores of the bundled model; None where the images are not of its size.
+        opening: photographs edited by a bundled model.
         seen: images of the training.
         truth: the unseen images with everything that made them.
         clustering: Ward clustering by identity for each kind of feature, the model's own first.
@@ -88,6 +92,7 @@ class DemoResult:
     model: Derenderer
     bundled: Derenderer
     bundled_geometry: evaluation.GeometryResult | None
+    opening: Opening
     seen: ImageSet
     truth: GroundTruth
     geometry: evaluation.GeometryResult
@@ -109,16 +114,18 @@ def run_demo(
     *,
     seed: int = 0,
     report: Report = lambda stage, done, total, note: None,
+    opened: Callable[[Path], object] = lambda page: None,
 ) -> DemoResult:
     """Generate, train, score; the training's run folder is ``out/run``.
+
+    ``opened`` is called with ``out/report.html`` once that shows photographs, before anything is trained.
 
     Raises:
         FileExistsError: ``out`` is not empty.
         ValueError: training collapsed before it saved a model.
     """
     out = Path(out)
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise FileExistsError(f"{out} exists and is not empty: choose another --out")
+    live = _open(out, None, settings, report, opened)
     seconds: dict[str, float] = {}
     began = time.perf_counter()
 
@@ -140,6 +147,7 @@ def run_demo(
 
     def training_report(progress: Progress) -> None:
         if progress.phase == "train":
+            live.update(f"{progress.done:,} of {progress.total:,} images seen", out / "run")
             report(STAGES[2], progress.done, progress.total, f"{progress.images_per_second:.0f} images/s")
         elif progress.phase == "perceptual":
             lap(STAGES[1])
@@ -179,9 +187,59 @@ def run_demo(
     report(STAGES[3], 4, 4, "")
     lap(STAGES[3])
     return DemoResult(
-        settings, seed, config, trained, model, bundled, bundled_geometry, seen, truth,
+        settings, seed, config, trained, model, bundled, bundled_geometry, live.opening, seen, truth,
         geometry, factors, reconstruction, clustering, clusters, seconds,
     )  # fmt: skip
+
+
+def run_own_demo(
+    images: str | Path,
+    out: str | Path,
+    settings: DemoSettings = FULL,
+    *,
+    seed: int = 0,
+    report: Report = lambda stage, done, total, note: None,
+    opened: Callable[[Path], object] = lambda page: None,
+) -> Path:
+    """The same with images of the user's own: edit, train, decompose held-out ones. Gives the page.
+
+    What needs true depth or names of people is left out. ``out`` and ``opened`` are as in `run_demo`.
+    """
+    out = Path(out)
+    live = _open(out, images, settings, report, opened)
+    plain = tuple(
+        one for one in settings.overrides if one.startswith(("warmup", "objective", "image", "batch"))
+    )
+    config = settings.model_copy(update={"overrides": plain}).training(seed, split=(0.8, 0.1, 0.1))
+
+    def training_report(progress: Progress) -> None:
+        if progress.phase == "train":
+            live.update(f"{progress.done:,} of {progress.total:,} images seen", out / "run")
+        report(STAGES[2], progress.done, progress.total, "")
+
+    train_on(images, out=out / "run", config=config, page=False, progress=training_report)
+    report(STAGES[3], 0, 1, "")
+    page = run_page(out / "run", run_evidence(out / "run", images))
+    return replace(page, template="demo_own.html", values={**page.values, "opening": live.opening}).write(
+        live.file
+    )
+
+
+def _open(
+    out: Path,
+    images: str | Path | None,
+    settings: DemoSettings,
+    report: Report,
+    opened: Callable[[Path], object],
+) -> LivePage:
+    """The first page in a new folder."""
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise FileExistsError(f"{out} exists and is not empty: choose another --out")
+    report("editing photographs", 0, 1, "")
+    live = LivePage(out / "report.html", opening(images, settings.portrait_px))
+    live.update("Training begins")
+    opened(live.file)
+    return live
 
 
 def _generated(

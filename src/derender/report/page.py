@@ -44,6 +44,7 @@ class Page:
         lead: one or two sentences under it.
         values: what the template shows, by name.
         footer: where the page comes from; plain text.
+        refresh_s: seconds after which a browser loads the file anew; None: never.
     """
 
     template: str | Template
@@ -51,6 +52,7 @@ class Page:
     lead: str
     values: Mapping[str, Any] = field(default_factory=dict)
     footer: str = f"derender {__version__}"
+    refresh_s: int | None = None
 
     def html(self) -> str:
         """The complete document."""
