@@ -8,7 +8,7 @@ has seen none of them. The five are chosen of fourteen for variety; the film has
 
 import argparse
 from collections.abc import Iterator
-from math import cos, pi, radians
+from math import cos, pi
 from pathlib import Path
 
 import numpy as np
@@ -17,11 +17,10 @@ from PIL import Image, ImageDraw, ImageFont
 import derender
 from derender.data.synthetic import faces
 from derender.data.synthetic.settings import LIGHTS, VIEWS, FaceSettings
-from derender.photo import Photograph, open_photograph
+from derender.photo import open_photograph
 
 CHOSEN, FILMED = (2, 4, 8, 9, 12), (0, 2, 4)
 SIZE, FILM_SIZE, FRAMES = 1024, 264, 24
-AMBIENT_SHARE = 0.35
 
 
 def portraits(size: int) -> list[Image.Image]:
@@ -58,22 +57,12 @@ def film(model: derender.Derenderer) -> Iterator[Image.Image]:
     opened = [open_photograph(np.asarray(one), model) for one in given]
     swings = [cos(2 * pi * frame / FRAMES) for frame in range(FRAMES)]
     for swing in swings:
-        yield frame_of(given, [lit(one, 60 * swing) for one in opened], f"relit: light at {60 * swing:+.0f}°")
+        yield frame_of(
+            given, [one.relit(60 * swing) for one in opened], f"relit: light at {60 * swing:+.0f}°"
+        )
     for swing in swings[FRAMES // 4 :] + swings[: FRAMES // 4]:
-        turned = [rotated(one, 16 * swing) for one in opened]
+        turned = [one.rotated(16 * swing) for one in opened]
         yield frame_of(given, turned, f"rotated by {16 * swing:+.0f}°")
-
-
-def lit(photo: Photograph, yaw_deg: float) -> np.ndarray:
-    power = float(photo.scene.light[0, :2].sum())
-    values = [AMBIENT_SHARE * power, (1 - AMBIENT_SHARE) * power, radians(10), radians(yaw_deg)]
-    return photo.edited(light=photo.scene.light.new_tensor([values]))
-
-
-def rotated(photo: Photograph, yaw_deg: float) -> np.ndarray:
-    camera = photo.scene.camera.clone()
-    camera[:, 1] += radians(yaw_deg)
-    return photo.edited(camera=camera)
 
 
 def frame_of(given: list[Image.Image], edited: list[np.ndarray], label: str) -> Image.Image:

@@ -192,6 +192,7 @@ def test_conventions_name_their_tests():
     assert not [rule.splitlines()[0] for rule in rules if not re.search(r"`tests/[\w/]+\.py::\w+`", rule)]
 
 
+@pytest.mark.timeout(900)  # half a minute of processor time in all
 @pytest.mark.parametrize("name", pages.TUTORIALS)
 def test_a_tutorial_runs_and_prints_what_it_shows(name):
     """Words and layout must be the page's; measured numbers may differ between machines."""

@@ -159,7 +159,7 @@ def load(
 
     Args:
         source: a run folder, a saved folder, the name of a bundled model (`bundled_models`), or a Hugging
-        Face Hub id ("owner/name", downloaded and cached).
+            Face Hub id ("owner/name", downloaded and cached).
         device: where to put it.
         factors, renderer: what the model was made with, if not the paper's four and the project's own.
 

@@ -17,7 +17,7 @@ from derender import __version__
 from derender.data import read_images
 from derender.data.synthetic import LIGHTS, VIEWS, FaceSettings, LightSettings, faces
 from derender.model import load
-from derender.photo import find_faces, relight, rotate
+from derender.photo import find_faces, open_photograph
 from derender.report.page import Page
 
 EDITOR = "faces-64"
@@ -64,14 +64,16 @@ def opening(address: str | Path | None = None, side: int = 512) -> Opening:
     if shown:
         source = "your photographs"
     shown = shown or portraits(side)
-    model, donors = load(EDITOR), [*shown[1:], shown[0]]
+    model = load(EDITOR)
+    photos = [open_photograph(photo, model) for photo in shown]
+    donors = [*photos[1:], photos[0]]
     columns = {
         "input": shown,
-        "lit from the left, 60°": relight(shown, model, yaw_deg=60),
-        "lit from the right, 60°": relight(shown, model, yaw_deg=-60),
-        "rotated by 15°": rotate(shown, model, yaw_deg=15),
+        "lit from the left, 60°": [photo.relit(60) for photo in photos],
+        "lit from the right, 60°": [photo.relit(-60) for photo in photos],
+        "rotated by 15°": [photo.rotated(15) for photo in photos],
         "in the light of the next": [
-            relight(photo, model, like=donor) for photo, donor in zip(shown, donors, strict=True)
+            photo.edited(light=donor.scene.light) for photo, donor in zip(photos, donors, strict=True)
         ],
     }
     names = [f"photograph {row + 1}" for row in range(len(shown))]

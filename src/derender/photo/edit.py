@@ -63,6 +63,20 @@ class Photograph:
             seen = self.detail(self.scene.with_parameters(**parameters))
             return self.surroundings.paste(self.pixels, self.detail.photo, seen.image[0])
 
+    def relit(
+        self, yaw_deg: float, pitch_deg: float = 10.0, strength: float = 1.0
+    ) -> UInt8[np.ndarray, "h w 3"]:
+        """The photograph under a light from there; arguments as in `relight`."""
+        power = strength * float(self.scene.light[0, :2].sum())
+        light = [AMBIENT_SHARE * power, (1 - AMBIENT_SHARE) * power, radians(pitch_deg), radians(yaw_deg)]
+        return self.edited(light=self.scene.light.new_tensor([light]))
+
+    def rotated(self, yaw_deg: float, pitch_deg: float = 0.0) -> UInt8[np.ndarray, "h w 3"]:
+        """The photograph with its object turned; arguments as in `rotate`."""
+        camera = self.scene.camera.clone()
+        camera[:, :2] += camera.new_tensor([radians(pitch_deg), radians(yaw_deg)])
+        return self.edited(camera=camera)
+
 
 def open_photograph(
     pixels: UInt8[np.ndarray, "h w 3"], model: Derenderer, *, frame: str | None = None, fit_steps: int = 0
@@ -123,11 +137,7 @@ def relight(
         other = open_photograph(as_photos(like)[0], loaded, frame=frame, fit_steps=fit_steps).scene.light
 
     def edited(photo: Photograph) -> np.ndarray:
-        if other is not None:
-            return photo.edited(light=other)
-        power = strength * float(photo.scene.light[0, :2].sum())
-        light = [AMBIENT_SHARE * power, (1 - AMBIENT_SHARE) * power, radians(pitch_deg), radians(yaw_deg)]
-        return photo.edited(light=photo.scene.light.new_tensor([light]))
+        return photo.relit(yaw_deg, pitch_deg, strength) if other is None else photo.edited(light=other)
 
     return _each(image, lambda one: edited(open_photograph(one, loaded, frame=frame, fit_steps=fit_steps)))
 
@@ -158,9 +168,7 @@ def rotate(
 
     def turned(pixels: np.ndarray) -> np.ndarray:
         photo = open_photograph(pixels, loaded, frame=frame, fit_steps=fit_steps)
-        camera = photo.scene.camera.clone()
-        camera[:, :2] += camera.new_tensor([radians(pitch_deg), radians(yaw_deg)])
-        return photo.edited(camera=camera)
+        return photo.rotated(yaw_deg, pitch_deg)
 
     return _each(image, turned)
 
