@@ -6,6 +6,8 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parent))
 
 import reference
+from docutils import nodes
+from docutils.utils.math.latex2mathml import tex2mathml
 
 import derender
 
@@ -34,5 +36,16 @@ suppress_warnings = ["ref.python"]
 nitpicky = False
 
 
+html_math_renderer = "mathml"  # drawn by the browser itself: no script from elsewhere
+
+
+def math(self, node):
+    """A formula as MathML."""
+    block = not isinstance(node, nodes.math)
+    self.body.append(tex2mathml(node.astext(), as_block=block))
+    raise nodes.SkipNode
+
+
 def setup(app):
     app.connect("source-read", reference.fill)
+    app.add_html_math_renderer("mathml", (math, None), (math, None))

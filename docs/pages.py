@@ -16,6 +16,7 @@ import re
 import shlex
 import sys
 import tempfile
+import textwrap
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -40,7 +41,7 @@ def with_tables(page: str) -> str:
 
 
 def table(name: str, keys: list[str] | None = None) -> str:
-    """One table as Markdown, with a note: its file, what it needs."""
+    """One table as Markdown, with a note: its file, and data that are not generated."""
     if name in SPEED:
         file, read = SPEED[name]
         found = json.loads((RESULTS / file).read_text())
@@ -51,8 +52,13 @@ def table(name: str, keys: list[str] | None = None) -> str:
         found = json.loads((RESULTS / "tables" / f"{name}.json").read_text())
         lines = [*body(found, keys or [column["key"] for column in found["columns"]])]
         note = f"`benchmarks/results/tables/{name}.json`"
+        kept = {False: "from its owners", True: "not published"}
+        sets = [
+            f"{re.split(r' at |: |, ', x)[0]} ({kept['not published' in x]})" for x in found.get("needs", ())
+        ]
+        note += "; data: " + ", ".join(sets) if sets else ""
     shown = "\n".join("| " + " | ".join(map(str, line)) + " |" for line in lines)
-    return f"{shown}\n\nSource: {note}.\n"
+    return f"{shown}\n\n{textwrap.fill(f'Source: {note}.', 118, break_on_hyphens=False)}\n"
 
 
 def body(found: Mapping[str, Any], keys: list[str]) -> Iterator[list[str]]:
