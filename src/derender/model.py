@@ -115,7 +115,7 @@ class Derenderer(EmbeddingModel, Shareable):
 
     def decompose(self, images: GivenImages) -> Scene:
         """Geometry, albedo, light and camera of images, (N, 3, S, S) in 0..1 or what `as_batch` takes."""
-        return self.decode(self.encode(as_batch(images, self.image_size, self.device)))
+        return self.balanced(self.decode(self.encode(as_batch(images, self.image_size, self.device))))
 
     def render(self, scene: Scene) -> Rendering:
         """Images of scenes, with the model's field of view."""

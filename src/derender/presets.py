@@ -10,6 +10,7 @@ from typing import TypeVar
 
 from derender.data import suggestion
 from derender.networks.encoders import NetworkSettings
+from derender.scene.brightness import BrightnessPrior
 from derender.scene.ranges import SceneRanges
 from derender.settings import Settings
 
@@ -21,6 +22,7 @@ class ModelSettings(Settings):
 
     network: NetworkSettings = NetworkSettings()
     ranges: SceneRanges = SceneRanges()
+    brightness: BrightnessPrior | None = None  # estimated after training; `decompose` applies it
 
     def description(self) -> str:
         """One sentence for a model's card: what such a model does, its sizes and ranges."""

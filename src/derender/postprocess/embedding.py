@@ -3,6 +3,7 @@
 import copy
 from abc import abstractmethod
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import TypeVar
 
 import torch
@@ -14,7 +15,9 @@ from derender.networks import Factor
 from derender.postprocess.features import Features
 from derender.postprocess.fitting import STEPS, Fitted, coordinates_of
 from derender.render import Rendering
+from derender.presets import ModelSettings
 from derender.scene import Scene
+from derender.scene.brightness import BrightnessPrior
 
 Model = TypeVar("Model", bound="EmbeddingModel")
 
@@ -24,6 +27,7 @@ class EmbeddingModel(nn.Module):
 
     factors: tuple[Factor, ...]
     nets: nn.ModuleDict
+    settings: ModelSettings
 
     def __init__(self, features: Features | None):
         super().__init__()
@@ -39,6 +43,17 @@ class EmbeddingModel(nn.Module):
 
     @abstractmethod
     def decode(self, codes: Mapping[str, Float[Tensor, "n code"]]) -> Scene: ...
+
+    def balanced(self: Model, scene: Scene) -> Scene:
+        """A decoded scene whose brightness the model's prior, if any, shares between albedo and light."""
+        prior = self.settings.brightness
+        return scene if prior is None else prior(scene)
+
+    def with_brightness(self: Model, prior: BrightnessPrior | None) -> Model:
+        """A model that shares these weights, with another prior."""
+        model = self.with_features(self.features)
+        model.settings = model.settings.model_copy(update={"brightness": prior})
+        return model
 
     @abstractmethod
     def render(self, scene: Scene) -> Rendering: ...
@@ -107,4 +122,5 @@ class EmbeddingModel(nn.Module):
         """
         images = as_batch(images, self.image_size, next(self.parameters()).device)
         fitting = self.features.required_fitting()
-        return fitting.fit(images, self.decode(self.encode(images)), self.render, steps)
+        fitted = fitting.fit(images, self.decode(self.encode(images)), self.render, steps)
+        return replace(fitted, scene=self.balanced(fitted.scene))

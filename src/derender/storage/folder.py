@@ -130,8 +130,15 @@ def write_model(
 ) -> None:
     """Write configuration and weights into a folder that exists."""
     write_tensors(weights, folder / WEIGHTS_FILE)
-    config = {"format": FORMAT, "factors": list(factors), "settings": settings}
-    (folder / CONFIG_FILE).write_text(json.dumps(config, indent=1))
+    write_config(folder, factors, settings)
+
+
+def write_config(folder: Path, factors: Sequence[str], settings: Mapping[str, Any]) -> None:
+    """Write a saved model's ``config.json``; complete or not at all."""
+    with atomic_file(folder / CONFIG_FILE) as temporary:
+        temporary.write_text(
+            json.dumps({"format": FORMAT, "factors": list(factors), "settings": settings}, indent=1)
+        )
 
 
 def read_weights(folder: Path, build: Callable[[], Net]) -> Net:

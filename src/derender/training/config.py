@@ -70,6 +70,7 @@ class FeatureSettings(Settings):
     whitening: WhiteningSettings = WhiteningSettings()
     fitting: FittingSettings = FittingSettings()
     perturb: PerturbSettings = PerturbSettings()
+    brightness: bool = True  # estimate the prior that shares brightness between albedo and light
 
 
 class OptimiserSettings(Settings):
@@ -124,6 +125,7 @@ class TrainConfig(LoopSettings):
     objective: ObjectiveSettings = ObjectiveSettings()
     whitening: WhiteningSettings = WhiteningSettings()
     fitting: FittingSettings = FittingSettings()
+    brightness: bool = True  # as in FeatureSettings
 
     @field_validator("model")
     @classmethod
@@ -135,7 +137,8 @@ class TrainConfig(LoopSettings):
     @property
     def features(self) -> FeatureSettings:
         """How features are estimated once training has ended."""
-        return FeatureSettings(whitening=self.whitening, fitting=self.fitting, perturb=self.objective.perturb)
+        how = {name: getattr(self, name) for name in ("whitening", "fitting", "brightness")}
+        return FeatureSettings(perturb=self.objective.perturb, **how)
 
 
 class TargetSettings(Settings):
@@ -171,6 +174,7 @@ _PRESET_CHANGES: dict[str, dict[str, Any]] = {
     "paper": {
         "objective": {"perceptual": "vgg16", "curvature_weight": 0.0},
         "whitening": {"pictures": 0},
+        "brightness": False,
     },
     "faces": {},
     "cats": {},
@@ -209,7 +213,8 @@ def resolve(preset: str, overrides: Iterable[str] = (), **explicit: Any) -> Trai
     if config.start_from is None:
         return config
     model = load(config.start_from).settings
-    model = model.model_copy(update={"network": model.network.model_copy(update={"unet_decoder": False})})
+    network = model.network.model_copy(update={"unet_decoder": False})
+    model = model.model_copy(update={"network": network, "brightness": None})
     return with_changes(row.model_copy(update={"model": model}), overrides, **explicit)
 
 

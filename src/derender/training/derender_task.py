@@ -18,6 +18,7 @@ from derender.objectives.perceptual import build_perceptual
 from derender.objectives.perceptual_features import PerceptualFeatures
 from derender.objectives.self_features import SelfFeatures, load_self_features
 from derender.storage.atomic import DamageNoticed, atomic_file
+from derender.storage.folder import write_config
 from derender.training.batches import some_of
 from derender.training.checkpoint import fit_weights
 from derender.training.config import TrainConfig
@@ -56,6 +57,8 @@ def train(
             seed=config.seed,
             progress=lambda done, total: report(Progress("features", done, total)),
         )
+        names = [factor.name for factor in model.factors]
+        write_config(folder.model, names, model.settings.model_dump(mode="json"))
         model.features.save(folder.model)
         held_out = images.images[split.validation[:MAX_VALIDATION_IMAGES]]
         store_errors(folder.model, torch.from_numpy(np.ascontiguousarray(held_out)))

@@ -112,6 +112,7 @@ def refine(
     fit scenes or has further factors; too few images, or of another size; weights that end up not finite.
     """
     config, report = config or RefineConfig(), progress or (lambda *_: None)
+    model = model.with_brightness(None)
     settings = config.refining
     further = [factor.name for factor in model.factors if factor.name not in FACTORS]
     if further:

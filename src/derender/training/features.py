@@ -6,6 +6,8 @@ encoded again, several times; mirror images count as views, too, for the object 
 factor everything but that factor is changed: maps are another image's. Leaves out changing one map beside the
 other, which brought nothing (lab/log.md).
 
+Brightness: the prior that shares it between albedo and light (scene/brightness.py).
+
 Fitting: a morphable model of the depths and albedos that the model predicts. The optimisation itself happens
 when a model is used (postprocess/fitting.py).
 """
@@ -24,12 +26,14 @@ from derender.postprocess.fitting import PARAMETERS, Fitting, FittingSettings
 from derender.postprocess.morphable import MorphableMaps
 from derender.postprocess.whitening import Scatter, Whitening, fit_projection
 from derender.scene import Scene
+from derender.scene.brightness import BrightnessPrior, brightness_cues
 from derender.scene.perturb import PerturbSettings
 from derender.training.config import FeatureSettings, WhiteningSettings
 from derender.training.process import evaluating
 from derender.training.step import fill_uncovered
 
 BATCH_SIZE = 128
+BRIGHTNESS_IMAGES = 8000
 LENGTH_IMAGES = 256  # that are fitted to measure the length of fitted coordinates, where features hold them
 
 Describe = Callable[[Float[Tensor, "n 3 h w"]], Mapping[str, Float[Tensor, "n _"]]]
@@ -49,7 +53,7 @@ def make_features(
     are by default estimated here. Too few images or too many coordinates are a ValueError.
     """
     size, fitting = model.settings.network.code_size, settings.fitting
-    model = model.with_features(Features(model.whitening))
+    model = model.with_features(Features(model.whitening)).with_brightness(None)
     if fitting.steps and (size := size - fitting.coordinates) < 1:
         raise ValueError(
             f"{fitting.coordinates} fitted coordinates leave none of a feature's "
@@ -63,7 +67,19 @@ def make_features(
     if fitting.examples >= 2 and PARAMETERS.keys() <= {factor.name for factor in model.factors}:
         made = make_fitting(model, images, fitting, seed=seed, progress=progress, maps=maps)
         model = model.with_features(Features(model.whitening, made))
-    return model
+    return model.with_brightness(fit_brightness(model, images) if settings.brightness else None)
+
+
+@torch.no_grad()
+def fit_brightness(model: Derenderer, images: Shaped[Tensor, "n 3 h w"]) -> BrightnessPrior | None:
+    """The prior of brightness over the first images; None for fewer than four or another kind of scene."""
+    model, found = model.with_brightness(None), []
+    if len(images) < 4 or {"light", "albedo"} - {factor.parameter for factor in model.factors}:
+        return None
+    with evaluating(model):
+        for _, batch in _batches(model, images, torch.arange(min(len(images), BRIGHTNESS_IMAGES)), None):
+            found.append(brightness_cues(model.decompose(batch)).cpu())
+    return BrightnessPrior.of(torch.cat(found))
 
 
 @torch.no_grad()
