@@ -14,8 +14,8 @@ from derender.data import GivenImages, as_batch, check_images
 from derender.networks import Factor
 from derender.postprocess.features import Features
 from derender.postprocess.fitting import STEPS, Fitted, coordinates_of
-from derender.render import Rendering
 from derender.presets import ModelSettings
+from derender.render import Rendering
 from derender.scene import Scene
 from derender.scene.brightness import BrightnessPrior
 
