@@ -44,7 +44,7 @@ class EmbeddingModel(nn.Module):
     @abstractmethod
     def decode(self, codes: Mapping[str, Float[Tensor, "n code"]]) -> Scene: ...
 
-    def balanced(self: Model, scene: Scene) -> Scene:
+    def balanced(self, scene: Scene) -> Scene:
         """A decoded scene whose brightness the model's prior, if any, shares between albedo and light."""
         prior = self.settings.brightness
         return scene if prior is None else prior(scene)
