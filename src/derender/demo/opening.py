@@ -82,7 +82,7 @@ def opening(address: str | Path | None = None, side: int = 512) -> Opening:
 
 def portraits(side: int) -> list[Photo]:
     """Generated heads of different people, lit from the front and, the last, from the side."""
-    lights = [LIGHTS["frontal"]] * (SHOWN - 1) + [LightSettings(yaw_deg=(55, 55), pitch_deg=(10, 10))]
+    lights = [LIGHTS["frontal"]] * (SHOWN - 1) + [LightSettings(yaw_deg=(32, 32), pitch_deg=(20, 20))]
     made = []
     for row, light in enumerate(lights):
         settings = FaceSettings(

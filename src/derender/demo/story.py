@@ -220,7 +220,8 @@ def run_own_demo(
     train_on(images, out=out / "run", config=config, page=False, progress=training_report)
     report(STAGES[3], 0, 1, "")
     page = run_page(out / "run", run_evidence(out / "run", images))
-    return replace(page, template="demo_own.html", values={**page.values, "opening": live.opening}).write(
+    values = {**page.values, "opening": live.opening}
+    return replace(page, template="demo_own.html", title="Your images decomposed", values=values).write(
         live.file
     )
 
