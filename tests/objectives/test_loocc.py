@@ -118,6 +118,33 @@ def test_a_factor_that_fewer_than_two_images_kept_contributes_nothing(generator)
     assert nothing.item() == 0 and torch.equal(light.grad, torch.zeros(2, 5))
 
 
+def test_the_joint_loss_compares_codes_side_by_side_without_what_was_perturbed(generator):
+    first, again = codes(generator, requires_grad=True), codes(generator)
+    nothing = torch.tensor([NOTHING_LEFT_OUT] * 6)
+    both = [torch.cat([side[name] for name in FACTORS], dim=1) for side in (first, again)]
+    torch.testing.assert_close(loocc_loss(first, again, nothing, joint=True), nt_xent(*both), **CLOSE)
+    without = [
+        torch.cat([side[name] for name in FACTORS if name != FACTORS[2]], dim=1) for side in (first, again)
+    ]
+    loss = loocc_loss(first, again, torch.tensor([2] * 6), joint=True)
+    torch.testing.assert_close(loss, nt_xent(*without), **CLOSE)
+    loss.backward()
+    assert first[FACTORS[2]].grad is None or not first[FACTORS[2]].grad.any()
+    mixed = torch.tensor([2, 2, -1, 2, -1, -1])
+    anchors = torch.tensor([2, 2, -1, 2, -1, -1] * 2)
+    rows = [_per_anchor(*pair) for pair in (without, both)]
+    expected = torch.where(anchors == 2, *rows).mean()
+    torch.testing.assert_close(loocc_loss(first, again, mixed, joint=True), expected, **CLOSE)
+
+
+def _per_anchor(a, b):
+    views = torch.nn.functional.normalize(torch.cat([a, b]), dim=1)
+    logits = (views @ views.T / 0.5).fill_diagonal_(-math.inf)
+    return -logits.log_softmax(dim=1)[
+        torch.arange(len(views)), (torch.arange(len(views)) + len(a)) % len(views)
+    ]
+
+
 def test_gradcheck_with_factors_left_out(generator):
     options = {"generator": generator, "dtype": torch.float64, "requires_grad": True}
     values = [torch.randn(3, 2, **options) for _ in range(4)]

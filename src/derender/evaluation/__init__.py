@@ -1,11 +1,14 @@
 """Stage 7: protocols that score features and models, each beside its controls.
 
 A protocol is one call that gives ``Scores``: ``cluster``, ``linear``, ``identify``, ``verify``, ``segment``,
-``disentangle``, ``geometry``, ``reconstruction``, ``robustness``, and ``compare`` (the paper's tables). Every
+``disentangle``, ``geometry``, ``reconstruction``, ``pose``, ``light``, ``relight``, ``brightness``,
+``robustness``, and ``compare`` (the paper's tables). Every
 function states its range and its best value. docs/reference/metrics.md has a table of them.
 """
 
+from derender.evaluation.angles import light, pose
 from derender.evaluation.bootstrap import Difference, Estimate, ScoredRow, difference, estimate, resamples
+from derender.evaluation.brightness import brightness
 from derender.evaluation.clustering import (
     ClusterComparison,
     Level,
@@ -45,6 +48,7 @@ from derender.evaluation.pixels import (
     mean_image,
     reconstruction_scores,
 )
+from derender.evaluation.relighting import relight
 from derender.evaluation.robust.protocol import robustness
 from derender.evaluation.scenes import geometry, reconstruction
 from derender.evaluation.score_table import Column, Row, Scores, ScoreTable
@@ -52,15 +56,15 @@ from derender.evaluation.segmentation import segment
 from derender.evaluation.ward import cut, ward_tree
 
 __all__ = [
-    "AngleScores", "ClusterComparison", "Column", "Difference", "Estimate", "FactorResult", "FinchHierarchy",
-    "GeometryResult", "GeometryScores", "Level", "LinearComparison", "LinearScores", "Pairs",
-    "ReconstructionResult", "ReconstructionScores", "Row", "Rows", "ScoreTable", "ScoredRow", "Scores",
-    "Task", "albedo_error",
-    "area_under_roc", "at_least", "camera_error", "chance_scores", "choose_rows", "cluster", "cluster_scores",
-    "clusterings",
-    "compare", "compare_clusterings", "compare_linear", "cut", "difference", "disentangle", "estimate",
+    "AngleScores", "ClusterComparison", "Column", "Difference", "Estimate", "FactorResult",
+    "FinchHierarchy", "GeometryResult", "GeometryScores", "Level", "LinearComparison", "LinearScores",
+    "Pairs", "ReconstructionResult", "ReconstructionScores", "Row", "Rows", "ScoreTable", "ScoredRow",
+    "Scores", "Task", "albedo_error", "area_under_roc", "at_least", "brightness", "camera_error",
+    "chance_scores", "choose_rows", "cluster", "cluster_scores", "clusterings", "compare",
+    "compare_clusterings", "compare_linear", "cut", "difference", "disentangle", "estimate",
     "evaluate_factors", "evaluate_geometry", "evaluate_reconstruction", "finch", "finch_clusters",
-    "finch_levels", "geometry", "geometry_scores", "identify", "light_error", "linear", "linear_scores",
-    "majority_answers", "mean_image", "probe", "read_pairs", "reconstruction", "reconstruction_scores",
-    "resamples", "robustness", "segment", "task_of", "verify", "ward_tree",
+    "finch_levels", "geometry", "geometry_scores", "identify", "light", "light_error", "linear",
+    "linear_scores", "majority_answers", "mean_image", "pose", "probe", "read_pairs", "reconstruction",
+    "reconstruction_scores", "relight", "resamples", "robustness", "segment", "task_of", "verify",
+    "ward_tree",
 ]  # fmt: skip

@@ -129,7 +129,7 @@ def light_error(
     With ``aligned``, after the one rotation of all predicted directions that fits the true ones best (least
     squares), which forgives a constant error.
     """
-    predicted, true = _light_in_camera(light_pred, camera_pred), _light_in_camera(light_true, camera_true)
+    predicted, true = light_in_camera(light_pred, camera_pred), light_in_camera(light_true, camera_true)
     return _angles(
         angle_deg(predicted @ _nearest_rotation(predicted.mT @ true) if aligned else predicted, true)
     )
@@ -179,7 +179,7 @@ def evaluate_factors(
     if not bool(both.any()):
         raise ValueError("prediction and truth share no pixel in any image: check the camera or the masks")
     constant = (true.sum(dim=0) / true_mask.sum(dim=0).clamp_min(1)).expand_as(true)
-    direction = _light_in_camera(true_light, true_camera)
+    direction = light_in_camera(true_light, true_camera)
     own, every = (albedo_error(albedo, true, both, one_scale=one) for one in (False, True))
     fixed, fixed_every = (albedo_error(constant, true, true_mask, one_scale=one) for one in (False, True))
     return FactorResult(
@@ -200,7 +200,7 @@ def evaluate_factors(
     )
 
 
-def _light_in_camera(light: Float[Tensor, "n 4"], camera: Float[Tensor, "n 6"]) -> Float[Tensor, "n 3"]:
+def light_in_camera(light: Float[Tensor, "n 4"], camera: Float[Tensor, "n 6"]) -> Float[Tensor, "n 3"]:
     return (rotation_matrix(camera[:, :3].double()) @ light_direction(light.double())[..., None])[..., 0]
 
 

@@ -8,7 +8,6 @@ Nothing else is fitted. Leaves out networks trained on names of people.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,6 @@ import numpy as np
 from derender.data import half_of
 from derender.data.layouts.layout import stem_of
 from derender.evaluation.bootstrap import (
-    NAN,
     ScoredRow,
     constant,
     estimate,
@@ -27,15 +25,13 @@ from derender.evaluation.bootstrap import (
 from derender.evaluation.clustering import compare_clusterings
 from derender.evaluation.controls import subject_and_controls
 from derender.evaluation.feature_rows import FeatureSource, is_model, prepare
-from derender.evaluation.image_scores import image_rows
+from derender.evaluation.image_scores import LIGHT_BINS_DEG, binned_rows
 from derender.evaluation.neighbours import unit_rows
 from derender.evaluation.options import Options
 from derender.evaluation.score_table import Column, Scores, scored_table, verdict, verdict_table
 from derender.features import FeatureTable, missing
 from derender.inputs import as_model
 
-LIGHT_BINS_DEG = (12.0, 25.0, 50.0, 77.0)
-"""Edges of Yale B's subsets: the angle between light and view."""
 CLUSTERED_DEG = 50.0
 FOLDS = 10
 
@@ -80,29 +76,14 @@ def identify(
     probe = np.flatnonzero(known & ~shown & np.isin(who, who[shown]))
     if len(probe) == 0:
         raise ValueError("no probe shows a person of the gallery: give more than one image of each person")
-    names = {"all": np.ones(len(probe), bool)}
-    if angle is not None:
-        edges = [-1.0, *bins, np.inf]
-        for low, high in pairwise(edges):
-            name = "beyond" if high == np.inf else f"<= {high:g}"
-            names[name] = (angle[probe] > low) & (angle[probe] <= high)
-    names = {name: inside for name, inside in names.items() if inside.any()}
-    columns = {
-        name: Column(name, "high", note=f"{int(inside.sum()):,} probes") for name, inside in names.items()
-    }
-
-    def by_bin(right: np.ndarray) -> dict[str, np.ndarray]:
-        return {name: np.where(inside, right, NAN) for name, inside in names.items()}
-
     right = {
-        name: by_bin(np.mean([_recognised(run, who, shown, probe, centred) for run in runs], axis=0))
+        name: np.mean([_recognised(run, who, shown, probe, centred) for run in runs], axis=0)
         for name, runs in ready.features.items()
     }
-    right["chance"] = by_bin((who[shown] == who[probe, None]).mean(axis=1))
-    scored = image_rows(
-        right, {name: (column, 1.0) for name, column in columns.items()},
-        controls=(*ready.controls, "chance"), groups=who[probe], resample_count=how.resamples,
-        seed=how.seed,
+    right["chance"] = (who[shown] == who[probe, None]).mean(axis=1)
+    scored, columns, probes = binned_rows(
+        right, None if angle is None else angle[probe], bins=bins, controls=(*ready.controls, "chance"),
+        groups=who[probe], resample_count=how.resamples, seed=how.seed,
     )  # fmt: skip
     near = known & (angle <= cluster_within) if angle is not None else np.zeros(len(who), bool)
     if len(set(who[near])) > 1 and len(set(who[near])) < near.sum():
@@ -127,7 +108,7 @@ def identify(
     ]
     values = {
         "people": len(set(who[probe])), "gallery": [table.files[row] for row in np.flatnonzero(shown)],
-        "probes": {name: int(inside.sum()) for name, inside in names.items()}, "centred": centred,
+        "probes": probes, "centred": centred,
         "rows": {row.name: row.numbers() for row in scored},
     }  # fmt: skip
     return Scores(tables, values, [*how.notes, verdict(scored[0], "all"), how.memory.summary()], scored)

@@ -6,8 +6,9 @@ covered) is left out of its row's means; a single image has no interval.
 """
 
 from collections.abc import Collection, Mapping, Sequence
+from itertools import pairwise
 from math import isfinite
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
@@ -20,6 +21,9 @@ from derender.evaluation.bootstrap import (
     with_verdicts,
 )
 from derender.evaluation.score_table import Cell, Column, Row, ScoreTable, interval_column, interval_of
+
+LIGHT_BINS_DEG = (12.0, 25.0, 50.0, 77.0)
+"""Edges of Extended Yale B's subsets: the angle between light and view."""
 
 Columns = Mapping[str, tuple[Column, float]]
 """By score, its column and the factor from the score to the unit of the column."""
@@ -95,6 +99,37 @@ def image_rows(
         for at, (name, each) in enumerate(scores.items())
     ]
     return with_verdicts(rows, lower=[name for name, (column, _) in columns.items() if column.best == "low"])
+
+
+def binned_rows(
+    scores: Mapping[str, np.ndarray],
+    angle: np.ndarray | None,
+    *,
+    best: Literal["high", "low"] = "high",
+    digits: int = 3,
+    bins: Sequence[float] = LIGHT_BINS_DEG,
+    **how: Any,
+) -> tuple[tuple[ScoredRow, ...], dict[str, Column], dict[str, int]]:
+    """Rows of (N,) scores; columns for all, and where there are (N,) angles in degrees for groups by these;
+    and the number of images in each.
+
+    ``bins`` are upper edges; larger angles are "beyond". ``how`` is that of ``image_rows``.
+    """
+    count = len(next(iter(scores.values())))
+    inside = {"all": np.ones(count, bool)}
+    for low, high in pairwise((-1.0, *bins, np.inf)):
+        if angle is None:
+            break
+        inside["beyond" if high == np.inf else f"<= {high:g}"] = (angle > low) & (angle <= high)
+    inside = {name: rows for name, rows in inside.items() if rows.any()}
+    counts = {name: int(rows.sum()) for name, rows in inside.items()}
+    columns = {name: Column(name, best, digits, f"{number:,} images") for name, number in counts.items()}
+    each = {
+        row: {name: np.where(rows, own, np.nan) for name, rows in inside.items()}
+        for row, own in scores.items()
+    }
+    rows = image_rows(each, {name: (column, 1.0) for name, column in columns.items()}, **how)
+    return rows, columns, counts
 
 
 def image_verdicts(row: ScoredRow, columns: Columns) -> list[str]:

@@ -62,7 +62,7 @@ def geometry(
     exact = truth if isinstance(truth, GroundTruth) else read_ground_truth(truth, image_size=model.image_size)
     names = ("images", "depth", "mask", "normal", "albedo", "light", "camera")
     known = {name: getattr(exact, name) for name in names if getattr(exact, name) is not None}
-    scored = _optimised(model, fit_steps)
+    scored = optimised(model, fit_steps)
     how: dict[str, Any] = {"batch_size": batch_size, "untrained": untrained_twin(model, seed)}
     again = partial(evaluate_reconstruction, scored, exact.images, components_of=exact.images, **how)
     protocols: dict[str, Callable[[], Any]] = {
@@ -107,7 +107,7 @@ def reconstruction(
 
     def make() -> ReconstructionResult:
         return evaluate_reconstruction(
-            _optimised(model, fit_steps), images.images, mean=mean_image(known), components_of=chosen,
+            optimised(model, fit_steps), images.images, mean=mean_image(known), components_of=chosen,
             untrained=untrained_twin(model, seed), batch_size=batch_size, progress=progress,
         )  # fmt: skip
 
@@ -135,7 +135,7 @@ def _scored(
     return Scores(tables, values, notes, result=next(iter(found.values())))
 
 
-def _optimised(model: Derenderer, steps: int | None) -> Derenderer:
+def optimised(model: Derenderer, steps: int | None) -> Derenderer:
     """The model, or with steps one whose scenes are optimised per image."""
     if not steps:
         return model

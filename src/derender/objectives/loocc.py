@@ -1,8 +1,10 @@
 """Leave-one-out, cycle contrastive loss (LOOCC): what was not perturbed must be recognised again.
 
 Source: the paper, section 3.2; NT-Xent from SimCLR (Chen et al. 2020). Left open there: the perturbed factor
-is drawn per image, which is absent from the contrast of that factor altogether; the loss is the mean over all
-contrasted (image, factor); a factor that fewer than two images kept is dropped. Leaves out the perturbation
+is drawn per image. By factor, an image is absent from the contrast of what was perturbed in it; the loss is
+the mean over all contrasted (image, factor); a factor that fewer than two images kept is dropped.
+Jointly, as Eq. 6 is written, the codes are compared side by side: for each image without the factor that was
+perturbed in it, in all images alike. Leaves out the perturbation
 (scene/perturb.py) and the encoding of the new rendering.
 """
 
@@ -34,9 +36,12 @@ def loocc_loss(
     features_again: Mapping[str, Float[Tensor, "n _"]],
     perturbed: Int64[Tensor, " n"],
     temperature: float = 0.5,
+    *,
+    joint: bool = False,
 ) -> Float[Tensor, ""]:
     """NT-Xent between both encodings of every factor that was not perturbed, mean over what was contrasted.
 
+    With ``joint`` of one code, the unperturbed factors' side by side (Eq. 6), mean over images.
     ``perturbed[i]`` is the place in ``tuple(features)`` of the factor that was perturbed in image i, or
     ``NOTHING_LEFT_OUT`` (-1). Gradient flows into both encodings; 0 if no factor kept two images.
     """
@@ -49,6 +54,18 @@ def loocc_loss(
     if asked and not NOTHING_LEFT_OUT <= int(perturbed.min()) <= int(perturbed.max()) < len(names):
         allowed = f"-1..{len(names) - 1} ({', '.join(names)})"
         raise ValueError(f"perturbed must lie in {allowed}, got {perturbed.tolist()}")
+    if joint:
+        everything = torch.ones_like(perturbed, dtype=torch.bool)
+        losses = []
+        for left_out in range(NOTHING_LEFT_OUT, len(names)):
+            kept = [name for place, name in enumerate(names) if place != left_out]
+            if kept:
+                both = (
+                    torch.cat([side[name] for name in kept], dim=1) for side in (features, features_again)
+                )
+                own = (perturbed == left_out).repeat(2)
+                losses.append(own * _anchor_losses("joint codes", *both, everything, temperature))
+        return torch.stack(losses).sum() / (2 * len(perturbed))
     totals, counts = [], []
     for index, (name, codes) in enumerate(features.items()):
         kept = (perturbed != index).to(codes.device)

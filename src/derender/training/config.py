@@ -42,6 +42,7 @@ class ObjectiveSettings(Settings):
     vgg16_path: str | None = None  # None: the file torch hub keeps
     self_features_steps: int = Field(default=600, ge=1)
     loocc: LooccKind = "none"
+    loocc_joint: bool = False  # Eq. 6: one code of all factors side by side, instead of factor by factor
     loocc_weight: float = Field(default=0.01, ge=0)
     loocc_temperature: float = Field(default=0.5, gt=0)
     cycle_weight: float = Field(default=0.0, ge=0)  # light and camera predicted from LOOCC's renderings

@@ -118,6 +118,7 @@ def training_step(
             {name: ranks.gather(code) for name, code in again.items()},
             ranks.gather(left_out),
             objective.loocc_temperature,
+            joint=objective.loocc_joint,
         )
         terms["loocc"] = objective.loocc_weight * contrast
         if objective.cycle_weight > 0:

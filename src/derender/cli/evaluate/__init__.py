@@ -8,6 +8,7 @@ import typer
 from derender.cli.evaluate.disentangle import disentangle
 from derender.cli.evaluate.features import cluster, linear
 from derender.cli.evaluate.identity import identify, verify
+from derender.cli.evaluate.photographs import brightness, light, pose, relight
 from derender.cli.evaluate.robustness import robustness
 from derender.cli.evaluate.scenes import geometry, reconstruction
 from derender.cli.evaluate.segment import segment
@@ -22,6 +23,10 @@ EXAMPLES = {
     disentangle: "made/ --model runs/faces --out card.png",
     geometry: "made/::test_gt --model runs/faces",
     reconstruction: "photos/ --model runs/faces --part test",
+    pose: "lfw.zip --model faces-64 --table angles.csv",
+    light: "CroppedYale.zip --model faces-64",
+    relight: "CroppedYale.zip --model faces-64",
+    brightness: "made/::test_gt --model runs/faces",
     robustness: "--model runs/faces --out curves.svg",
 }
 

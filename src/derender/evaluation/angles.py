@@ -1,0 +1,240 @@
+"""Angles that a model predicts against known ones: of the head (``pose``) and of the light (``light``).
+
+Known angles are labels of the images (rendered sets, Extended Yale B) or a table, such as another judge's.
+Correlation and slope ask whether angles move together; the error, after the mean difference is subtracted,
+how far they are apart: which way an average face looks is a convention. Beside the model stand the best
+constant answer and the same networks untrained. Leaves out translations.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from derender.baselines.controls import untrained_twin
+from derender.data import ImageSet
+from derender.data.layouts.layout import base_name
+from derender.evaluation.bootstrap import Estimate, ScoredRow, estimate, group_resamples
+from derender.evaluation.depth import angle_deg
+from derender.evaluation.factors import light_in_camera
+from derender.evaluation.image_scores import binned_rows
+from derender.evaluation.options import Options
+from derender.evaluation.scenes import optimised
+from derender.evaluation.score_table import Column, Scores, ScoreTable, scored_table
+from derender.features import map_batches
+from derender.features.table import named
+from derender.inputs import as_model
+from derender.model import Derenderer
+from derender.scene import Scene
+
+AGREEMENT = {
+    "r": Column("r", "high", note="Pearson's correlation, -1 to 1"),
+    "slope": Column("slope", None, note="of the regression of predicted on true, best 1"),
+    "error": Column("error", "low", 2, "mean absolute difference after the mean difference, best 0"),
+    "offset": Column("offset", None, 2, "mean difference, predicted less true"),
+}
+POSE = {"yaw": "camera_y_rad", "pitch": "camera_x_rad", "roll": "camera_z_rad"}
+LIGHT = {"azimuth": "light_azimuth_deg", "elevation": "light_elevation_deg"}
+_RENDERED_LIGHT = ("ambient", "diffuse", "light_pitch_rad", "light_yaw_rad")
+
+
+def agreement(predicted: np.ndarray, true: np.ndarray, weights: np.ndarray) -> dict[str, Estimate]:
+    """The scores of ``AGREEMENT`` of (N,) numbers, with intervals from (B, N) resamples."""
+    offset = float(np.mean(predicted - true))
+
+    def scores(weights: np.ndarray) -> tuple[np.ndarray, ...]:
+        total = weights.sum(axis=1)
+        x, y = predicted - predicted.mean(), true - true.mean()
+        mx, my, xy, xx, yy = (weights @ one / total for one in (x, y, x * y, x * x, y * y))
+        with np.errstate(invalid="ignore", divide="ignore"):  # a constant has no correlation: NaN
+            covariance, spread, true_spread = xy - mx * my, xx - mx * mx, yy - my * my
+            r = np.where(spread > 1e-12, covariance / np.sqrt(spread * true_spread), np.nan)
+            error = weights @ np.abs(predicted - true - offset) / total
+            return r, covariance / true_spread, error, weights @ (predicted - true) / total
+
+    once, drawn = scores(np.ones((1, len(true)))), scores(weights.astype(np.float64))
+    return {name: estimate(own, all_) for name, own, all_ in zip(AGREEMENT, once, drawn, strict=True)}
+
+
+def agreement_table(
+    caption: str,
+    predicted: Mapping[str, np.ndarray],
+    true: np.ndarray,
+    weights: np.ndarray,
+    digits: int = 2,
+) -> tuple[ScoreTable, dict[str, Any]]:
+    """A row for each name, all but the first controls, then the constant answer; and the numbers for JSON."""
+    answers = {**predicted, "constant answer": np.full(len(true), true.mean())}
+    rows = [
+        ScoredRow(name, at > 0, 1, agreement(np.asarray(own, np.float64), true, weights))
+        for at, (name, own) in enumerate(answers.items())
+    ]
+    shown = ("r", "slope", "error")
+    columns = {name: replace(one, digits=digits if one.digits == 2 else 3) for name, one in AGREEMENT.items()}
+    table = scored_table(caption, "prediction", rows, columns, intervals=shown, deviations=())
+    return table, {row.name: row.numbers() for row in rows}
+
+
+def pose(
+    model: Derenderer | str | Path,
+    images: ImageSet | str | Path,
+    table: str | Path | None = None,
+    *,
+    fit_steps: int | None = None,
+    **options: Any,
+) -> Scores:
+    """Yaw, pitch and roll of the head against known angles in degrees: r and slope best 1, error best 0.
+
+    Args:
+        model: a model, or the name or folder of one.
+        images: an image set at the model's size, or the address of a data set.
+        table: ``.npz``, ``.csv`` or ``.parquet`` with ``name`` (or ``file``), ``yaw``, ``pitch`` and ``roll``
+            in degrees, signs as of ``Scene.camera``; images that it does not name are left out. None takes
+            the labels of a rendered set.
+        fit_steps: steps of per-image optimisation of the model's scenes.
+        options: seed, resamples, dataset, limit, device, progress: fields of ``Options``.
+
+    Raises:
+        ValueError: neither labels nor a table hold the angles, or the table names none of the images.
+    """
+
+    def predicted(scene: Scene) -> Tensor:
+        return torch.rad2deg(scene.camera[:, [1, 0, 2]])
+
+    return _angles("Pose", model, images, table, POSE, predicted, fit_steps, options)
+
+
+def light(
+    model: Derenderer | str | Path,
+    images: ImageSet | str | Path,
+    table: str | Path | None = None,
+    *,
+    fit_steps: int | None = None,
+    **options: Any,
+) -> Scores:
+    """Azimuth and elevation of the light in the camera's frame, in degrees, against known ones.
+
+    Positive azimuth lights the left of the image, positive elevation comes from above. A further table has
+    the angle between both directions, by the angle between light and view. Arguments are those of ``pose``;
+    a table has the columns ``azimuth`` and ``elevation``.
+    """
+
+    def predicted(scene: Scene) -> Tensor:
+        return _spherical(light_in_camera(scene.light, scene.camera))
+
+    return _angles("Light", model, images, table, LIGHT, predicted, fit_steps, options)
+
+
+def _angles(
+    what: str, model: Any, images: Any, table: Any, labels: Mapping[str, str], predicted: Any,
+    fit_steps: int | None, options: Mapping[str, Any],
+) -> Scores:  # fmt: skip
+    how = Options(images=images, **{"keep_duplicates": True, **options})
+    model = as_model(model, device=how.device)
+    true, read = known_angles(how.at(model.image_size), table, labels)
+    nets = {"model": optimised(model, fit_steps), "untrained model": untrained_twin(model, how.seed)}
+
+    def seen(net: Any, name: str) -> np.ndarray:
+        def see(batch: Tensor) -> np.ndarray:
+            return predicted(net.decompose(batch)).double().numpy(force=True)
+
+        return np.concatenate(map_batches(see, net, read.images, batch_size=64, progress=how.stage(name)))
+
+    found = {name: seen(net, name) for name, net in nets.items()}
+    people = read.labels.get("identity", np.array(read.files))
+    weights = group_resamples(people.astype(str), how.resamples, how.seed)
+    tables: list[ScoreTable] = []
+    values: dict[str, Any] = {"pictures": len(read)}
+    for column, name in enumerate(labels):
+        answers = {row: angles[:, column] for row, angles in found.items()}
+        caption = f"{what}: {name} in degrees, {len(read):,} images"
+        shown, values[name] = agreement_table(caption, answers, true[:, column], weights)
+        tables.append(shown)
+    if what == "Light":
+        extra, values["direction"] = _directions(found, true, people.astype(str), how)
+        tables.append(extra)
+    return Scores(tables, values, how.notes)
+
+
+def _directions(
+    found: Mapping[str, np.ndarray], true: np.ndarray, people: np.ndarray, how: Options
+) -> tuple[ScoreTable, dict[str, Any]]:
+    """Angle between true and predicted direction, all and by the angle between light and view."""
+    aim = _unit(true)
+    answers = {name: _unit(angles) for name, angles in found.items()}
+    answers["constant answer"] = np.broadcast_to(aim.mean(axis=0), aim.shape)
+    off = np.degrees(np.arccos(np.clip(aim[:, 2], -1, 1))).round(3)
+    apart = {name: angle_deg(torch.tensor(own), torch.tensor(aim)).numpy() for name, own in answers.items()}
+    rows, columns, _ = binned_rows(
+        apart, off, best="low", digits=1, groups=people, resample_count=how.resamples, seed=how.seed
+    )
+    caption = "Light: degrees between true and predicted direction, by the angle between light and view"
+    numbers = {row.name: row.numbers() for row in rows}
+    return scored_table(caption, "prediction", rows, columns, deviations=()), numbers
+
+
+def known_angles(
+    images: ImageSet, table: str | Path | None, labels: Mapping[str, str]
+) -> tuple[np.ndarray, ImageSet]:
+    """(N, angles) in degrees by the names of ``labels``, and the images that have them all."""
+    if table is not None:
+        columns = read_columns(table, tuple(labels))
+        place = {base_name(name): row for row, name in enumerate(columns["name"].tolist())}
+        rows = np.array([place.get(base_name(file), -1) for file in images.files])
+        if not (rows >= 0).any():
+            raise ValueError(f"{table} names none of the images (its first is {columns['name'][0]})")
+        true = np.stack([columns[name].astype(np.float64)[rows] for name in labels], axis=1)
+        true[rows < 0] = np.nan
+    elif set(labels.values()) <= set(images.labels):
+        true = np.stack([images.labels[name].astype(np.float64) for name in labels.values()], axis=1)
+        true = np.degrees(true) if next(iter(labels.values())).endswith("_rad") else true
+    elif labels is LIGHT and {*_RENDERED_LIGHT, *POSE.values()} <= set(images.labels):
+        given = np.stack([images.labels[name] for name in _RENDERED_LIGHT], axis=1)
+        turned = np.stack([images.labels[f"camera_{axis}_rad"] for axis in "xyz"], axis=1)
+        camera = torch.from_numpy(np.concatenate((turned, np.zeros_like(turned)), axis=1).astype(np.float32))
+        true = _spherical(light_in_camera(torch.from_numpy(given.astype(np.float32)), camera)).numpy()
+    else:
+        have = ", ".join(images.labels) or "none"
+        raise ValueError(
+            f"{images.source} has no labels {', '.join(labels.values())} (it has {have}): give a table with "
+            f"name, {', '.join(labels)}"
+        )
+    known = np.flatnonzero(np.isfinite(true).all(axis=1))
+    if len(known) < 2:
+        raise ValueError(f"{len(known)} images have known angles: two or more are needed")
+    return true[known], images.select(known)
+
+
+def read_columns(path: str | Path, names: Sequence[str]) -> dict[str, np.ndarray]:
+    """Columns of a ``.npz``, ``.csv`` or ``.parquet`` table, and ``name``: its column name or file."""
+    import pyarrow.csv as csv
+    import pyarrow.parquet as parquet
+
+    try:
+        if Path(path).suffix == ".npz":
+            with np.load(path, allow_pickle=False) as stored:
+                kept = {name: stored[name] for name in stored.files if name in (*names, "name", "file")}
+        else:
+            table = csv.read_csv(path) if Path(path).suffix == ".csv" else parquet.read_table(path)
+            kept = {name: table[name].to_numpy() for name in table.column_names}
+    except (OSError, ValueError, EOFError) as problem:
+        raise ValueError(f"{path} cannot be read as .npz, .csv or .parquet: {problem}") from problem
+    kept = kept if "name" in kept or "file" not in kept else {**kept, "name": kept["file"]}
+    return {name: named(kept, name, f"column of {path}") for name in ("name", *names)}
+
+
+def _spherical(direction: Tensor) -> Tensor:
+    """Azimuth and elevation in degrees, (N, 2), of unit directions in which light travels."""
+    x, y, z = direction.unbind(-1)
+    return torch.rad2deg(torch.stack((torch.atan2(x, z), torch.asin(y.clamp(-1, 1))), dim=-1))
+
+
+def _unit(angles: np.ndarray) -> np.ndarray:
+    """The inverse of ``_spherical``, (N, 3)."""
+    azimuth, elevation = np.radians(angles.astype(np.float64)).T
+    flat = np.cos(elevation)
+    return np.stack((np.sin(azimuth) * flat, np.sin(elevation), np.cos(azimuth) * flat), axis=1)

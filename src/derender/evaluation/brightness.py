@@ -1,0 +1,189 @@
+"""Is albedo as bright as the surface is, or does a dark surface pass for dim light?
+
+On rendered images with true albedo: mean brightness (luma, 0..1) of predicted albedo over the object against
+the true one, distance of their mean colours, and whether the predicted light knows the true brightness, which
+it should not. On photographs there is no true albedo: groups of people (as race of UTKFace) differ in the
+brightness of their images; the share of that difference which albedo takes is 1 where light is the same for
+all groups, 0 where the model explains skin by light. Values are stored (sRGB) ones, as in training.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from derender.baselines.controls import untrained_twin
+from derender.data import ImageSet, read_ground_truth
+from derender.evaluation.angles import agreement, agreement_table
+from derender.evaluation.bootstrap import Estimate, ScoredRow, estimate, group_resamples
+from derender.evaluation.options import Options
+from derender.evaluation.scenes import optimised
+from derender.evaluation.score_table import (
+    Column,
+    Interval,
+    Row,
+    Scores,
+    ScoreTable,
+    interval_column,
+    scored_table,
+)
+from derender.features import map_batches, missing
+from derender.inputs import Progress, as_model
+from derender.model import Derenderer
+
+LUMA = np.array([0.299, 0.587, 0.114])
+_LIGHT = Column("light r", None, note="correlation of mean shading with true brightness of albedo, best 0")
+_CHROMA = Column("chroma error", "low", 4, "distance of mean colours divided by their sums, best 0")
+_SHARE = Column("share", None, note="of the groups' difference in brightness that albedo takes, best 1")
+
+
+def brightness(
+    model: Derenderer | str | Path,
+    images: ImageSet | str | Path,
+    *,
+    by: str | None = None,
+    fit_steps: int | None = None,
+    **options: Any,
+) -> Scores:
+    """Is albedo as bright as the surface? Slope and r best 1, chroma error and correlation of light best 0.
+
+    Args:
+        model: a model, or the name or folder of one.
+        images: the address of a rendered set with true albedo; with ``by`` any images.
+        by: a label of groups of people: compare their mean albedo, without truth.
+        fit_steps: steps of per-image optimisation of the model's scenes.
+        options: seed, resamples, dataset, limit, device, progress: fields of ``Options``.
+
+    Raises:
+        ValueError: the set has no true albedo, or the label fewer than two groups.
+    """
+    how = Options(images=images, **options)
+    model = as_model(model, device=how.device)
+    nets = {"model": optimised(model, fit_steps), "untrained model": untrained_twin(model, how.seed)}
+    if by is not None:
+        return _by_group(nets, how.at(model.image_size), by, how)
+    if isinstance(images, ImageSet):
+        raise ValueError("an image set holds no true albedo: give the address of a rendered set, or by")
+    truth = read_ground_truth(images, limit=how.limit, image_size=model.image_size)
+    if truth.albedo is None:
+        raise ValueError(f"{images} stores no true albedo: give a set that does, or by")
+    seen = {name: surfaces(net, truth.images, truth.mask, how.stage(name)) for name, net in nets.items()}
+    inside = truth.mask[:, None]
+    mean = (truth.albedo * inside).sum(axis=(2, 3)) / inside.sum(axis=(2, 3))
+    seen["image as albedo"] = {**seen["model"], "albedo": seen["model"]["image"]}
+    people = truth.labels.get("identity", np.arange(len(mean))).astype(str)
+    weights = group_resamples(people, how.resamples, how.seed)
+    caption = f"Brightness of albedo, 0 to 1: {len(mean):,} images of {len(set(people))} surfaces"
+    bright = {name: one["albedo"] @ LUMA for name, one in seen.items()}
+    table, numbers = agreement_table(caption, bright, mean @ LUMA, weights, digits=3)
+    known = {name: {"chroma": _mean(_apart(one["albedo"], mean), weights)} for name, one in seen.items()}
+    known["constant answer"] = {
+        "chroma": _mean(_apart(np.broadcast_to(mean.mean(axis=0), mean.shape), mean), weights)
+    }
+    for name in nets:
+        known[name]["light"] = agreement(seen[name]["light"], mean @ LUMA, weights)["r"]
+    nothing = {"light": estimate([np.nan], np.full(len(weights), np.nan))}
+    rows = [ScoredRow(name, name != "model", 1, {**nothing, **one}) for name, one in known.items()]
+    columns = {"chroma": _CHROMA, "light": _LIGHT}
+    colour = scored_table(
+        "Colour and light", "prediction", rows, columns, intervals=tuple(columns), deviations=()
+    )
+    values = {
+        "pictures": len(mean),
+        "brightness": numbers,
+        "colour": {row.name: row.numbers() for row in rows},
+    }
+    return Scores([table, colour], values, how.notes)
+
+
+def surfaces(
+    net: Any, images: np.ndarray, masks: np.ndarray | None = None, progress: Progress | None = None
+) -> dict[str, np.ndarray]:
+    """Means over the drawn surface (and the mask, (N, H, W)) of each image: (N, 3) colours of ``albedo`` and
+    ``image``, (N,) ``light``, the mean shading. Where nothing is drawn they are 0.
+    """
+
+    def see(batch: Tensor) -> tuple[Tensor, ...]:
+        scene = net.decompose(batch)
+        plain = torch.tensor([1.0, 0.0, 0.0, 0.0], device=batch.device).expand_as(scene.light)
+        white = scene.with_parameters(albedo=torch.ones_like(scene.albedo))
+        flat, lit = net.render(scene.with_parameters(light=plain)), net.render(white)
+        return (
+            flat.image.cpu(),
+            lit.image.mean(dim=1, keepdim=True).cpu(),
+            batch.cpu(),
+            flat.mask[:, None].cpu() > 0.5,
+        )
+
+    parts = map_batches(see, net, images, batch_size=64, progress=progress)
+    *maps, inside = map(torch.cat, zip(*parts, strict=True))
+    if masks is not None:
+        inside = inside & torch.from_numpy(masks > 0)[:, None]
+    count = inside.sum(dim=(2, 3)).clamp(min=1)
+    albedo, light, image = (((one * inside).sum(dim=(2, 3)) / count).double().numpy() for one in maps)
+    return {"albedo": albedo, "light": light[:, 0], "image": image}
+
+
+def _by_group(nets: Mapping[str, Any], images: ImageSet, by: str, how: Options) -> Scores:
+    """Mean brightness of images, albedo and light by group, and the share of the difference albedo takes."""
+    images = images.select(~missing(images.label(by)))
+    group = images.label(by).astype(str)
+    names = sorted(set(group))
+    if len(names) < 2:
+        raise ValueError(f"{by!r} has {len(names)} groups: two or more are needed")
+    seen = {name: surfaces(net, images.images, None, how.stage(name)) for name, net in nets.items()}
+    weights = group_resamples(np.arange(len(group)), how.resamples, how.seed).astype(np.float64)
+    once, member = np.ones((1, len(group))), (group[:, None] == names).astype(np.float64)
+
+    def means(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        return (weights * values) @ member / np.maximum(weights @ member, 1e-9)
+
+    def share(bright: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        own, shown = (np.log(np.maximum(means(one, weights), 1e-6)) for one in (bright, picture))
+        own, shown = (one - one.mean(axis=1, keepdims=True) for one in (own, shown))
+        return (own * shown).sum(axis=1) / (shown * shown).sum(axis=1)
+
+    picture = seen["model"]["image"] @ LUMA
+    shown = {"image": picture, "albedo": seen["model"]["albedo"] @ LUMA, "light": seen["model"]["light"]}
+    found = {what: (means(one, once)[0], means(one, weights)) for what, one in shown.items()}
+    columns = [Column("images")]
+    for what in found:
+        column = Column(what, None, note="mean shading" if what == "light" else "mean brightness, 0 to 1")
+        columns += [column, interval_column(column, "images")]
+    rows, values = [], {}
+    for at, name in enumerate(names):
+        ends = {what: estimate([own[at]], drawn[:, at]) for what, (own, drawn) in found.items()}
+        row = ScoredRow(name, False, 1, ends)
+        values[name] = {"images": int(member[:, at].sum()), **row.numbers()["scores"]}
+        cells = [cell for one in ends.values() for cell in (one.value, Interval(one.low, one.high))]
+        rows.append(Row(name, [int(member[:, at].sum()), *cells]))
+    answers = {name: one["albedo"] @ LUMA for name, one in seen.items()} | {"image as albedo": picture}
+    shares = [
+        ScoredRow(name, at > 0, 1, {"share": estimate(share(one, once), share(one, weights))})
+        for at, (name, one) in enumerate(answers.items())
+    ]
+    tables = [
+        scored_table(
+            f"Share of the brightness of {by} in albedo, {len(group):,} images",
+            "prediction",
+            shares,
+            {"share": _SHARE},
+            deviations=(),
+        ),
+        ScoreTable(f"Brightness by {by}", by, columns, rows),
+    ]
+    values = {"pictures": len(group), "share": {row.name: row.numbers() for row in shares}, "groups": values}
+    return Scores(tables, values, how.notes)
+
+
+def _apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Distance between colours divided by their sums, (N,)."""
+    a, b = (one / np.maximum(one.sum(axis=1, keepdims=True), 1e-9) for one in (a, b))
+    return np.linalg.norm(a - b, axis=1)
+
+
+def _mean(values: np.ndarray, weights: np.ndarray) -> Estimate:
+    return estimate([float(values.mean())], weights @ values / weights.sum(axis=1))
