@@ -18,7 +18,7 @@ from torch import Tensor
 from derender.baselines.controls import untrained_twin
 from derender.data import ImageSet
 from derender.data.layouts.layout import base_name
-from derender.evaluation.bootstrap import Estimate, ScoredRow, estimate, group_resamples
+from derender.evaluation.bootstrap import Estimate, ScoredRow, estimate, group_resamples, numbers_of
 from derender.evaluation.depth import angle_deg
 from derender.evaluation.factors import light_in_camera
 from derender.evaluation.image_scores import binned_rows
@@ -76,7 +76,7 @@ def agreement_table(
     shown = ("r", "slope", "error")
     columns = {name: replace(one, digits=digits if one.digits == 2 else 3) for name, one in AGREEMENT.items()}
     table = scored_table(caption, "prediction", rows, columns, intervals=shown, deviations=())
-    return table, {row.name: row.numbers() for row in rows}
+    return table, numbers_of(rows)
 
 
 def pose(
@@ -173,7 +173,7 @@ def _directions(
         apart, off, best="low", digits=1, groups=people, resample_count=how.resamples, seed=how.seed
     )
     caption = "Light: degrees between true and predicted direction, by the angle between light and view"
-    numbers = {row.name: row.numbers() for row in rows}
+    numbers = numbers_of(rows)
     return scored_table(caption, "prediction", rows, columns, deviations=()), numbers
 
 

@@ -7,7 +7,7 @@ corrections for many comparisons: of twenty rows that are no better than a contr
 better by chance.
 """
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -75,6 +75,11 @@ class ScoredRow:
             for name, one in self.scores.items()
         }
         return {"control": self.control, "runs": self.runs, "scores": scores, "versus": dict(self.versus)}
+
+
+def numbers_of(rows: Iterable[ScoredRow]) -> dict[str, dict[str, Any]]:
+    """Everything but the resamples by the names of the rows, as JSON takes it."""
+    return {row.name: row.numbers() for row in rows}
 
 
 def resamples(n_rows: int, count: int = RESAMPLES, seed: int = 0) -> Iterator[np.ndarray]:

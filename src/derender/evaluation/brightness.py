@@ -8,6 +8,7 @@ all groups, 0 where the model explains skin by light. Values are stored (sRGB) o
 """
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,18 +19,11 @@ from torch import Tensor
 from derender.baselines.controls import untrained_twin
 from derender.data import ImageSet, read_ground_truth
 from derender.evaluation.angles import agreement, agreement_table
-from derender.evaluation.bootstrap import Estimate, ScoredRow, estimate, group_resamples
+from derender.evaluation.bootstrap import ScoredRow, estimate, group_resamples, numbers_of
+from derender.evaluation.image_scores import image_rows
 from derender.evaluation.options import Options
 from derender.evaluation.scenes import optimised
-from derender.evaluation.score_table import (
-    Column,
-    Interval,
-    Row,
-    Scores,
-    ScoreTable,
-    interval_column,
-    scored_table,
-)
+from derender.evaluation.score_table import Column, Scores, scored_table
 from derender.features import map_batches, missing
 from derender.inputs import Progress, as_model
 from derender.model import Derenderer
@@ -73,29 +67,25 @@ def brightness(
     seen = {name: surfaces(net, truth.images, truth.mask, how.stage(name)) for name, net in nets.items()}
     inside = truth.mask[:, None]
     mean = (truth.albedo * inside).sum(axis=(2, 3)) / inside.sum(axis=(2, 3))
-    seen["image as albedo"] = {**seen["model"], "albedo": seen["model"]["image"]}
+    nothing = np.ones(len(mean))
+    seen["image as albedo"] = {"albedo": seen["model"]["image"], "light": nothing}
     people = truth.labels.get("identity", np.arange(len(mean))).astype(str)
     weights = group_resamples(people, how.resamples, how.seed)
     caption = f"Brightness of albedo, 0 to 1: {len(mean):,} images of {len(set(people))} surfaces"
     bright = {name: one["albedo"] @ LUMA for name, one in seen.items()}
     table, numbers = agreement_table(caption, bright, mean @ LUMA, weights, digits=3)
-    known = {name: {"chroma": _mean(_apart(one["albedo"], mean), weights)} for name, one in seen.items()}
-    known["constant answer"] = {
-        "chroma": _mean(_apart(np.broadcast_to(mean.mean(axis=0), mean.shape), mean), weights)
-    }
-    for name in nets:
-        known[name]["light"] = agreement(seen[name]["light"], mean @ LUMA, weights)["r"]
-    nothing = {"light": estimate([np.nan], np.full(len(weights), np.nan))}
-    rows = [ScoredRow(name, name != "model", 1, {**nothing, **one}) for name, one in known.items()]
+    seen["constant answer"] = {"albedo": np.tile(mean.mean(axis=0), (len(mean), 1)), "light": nothing}
+    apart = {name: {"chroma": _apart(one["albedo"], mean)} for name, one in seen.items()}
+    rows = image_rows(
+        apart, {"chroma": (_CHROMA, 1.0)}, groups=people, resample_count=how.resamples, seed=how.seed
+    )
+    light = {name: agreement(one["light"], mean @ LUMA, weights)["r"] for name, one in seen.items()}
+    rows = [replace(row, scores={**row.scores, "light": light[row.name]}) for row in rows]
     columns = {"chroma": _CHROMA, "light": _LIGHT}
     colour = scored_table(
         "Colour and light", "prediction", rows, columns, intervals=tuple(columns), deviations=()
     )
-    values = {
-        "pictures": len(mean),
-        "brightness": numbers,
-        "colour": {row.name: row.numbers() for row in rows},
-    }
+    values = {"pictures": len(mean), "brightness": numbers, "colour": numbers_of(rows)}
     return Scores([table, colour], values, how.notes)
 
 
@@ -149,17 +139,13 @@ def _by_group(nets: Mapping[str, Any], images: ImageSet, by: str, how: Options) 
     picture = seen["model"]["image"] @ LUMA
     shown = {"image": picture, "albedo": seen["model"]["albedo"] @ LUMA, "light": seen["model"]["light"]}
     found = {what: (means(one, once)[0], means(one, weights)) for what, one in shown.items()}
-    columns = [Column("images")]
-    for what in found:
-        column = Column(what, None, note="mean shading" if what == "light" else "mean brightness, 0 to 1")
-        columns += [column, interval_column(column, "images")]
-    rows, values = [], {}
-    for at, name in enumerate(names):
-        ends = {what: estimate([own[at]], drawn[:, at]) for what, (own, drawn) in found.items()}
-        row = ScoredRow(name, False, 1, ends)
-        values[name] = {"images": int(member[:, at].sum()), **row.numbers()["scores"]}
-        cells = [cell for one in ends.values() for cell in (one.value, Interval(one.low, one.high))]
-        rows.append(Row(name, [int(member[:, at].sum()), *cells]))
+    groups = [
+        ScoredRow(f"{name} ({int(number):,})", False, 1,
+                  {what: estimate([own[at]], drawn[:, at]) for what, (own, drawn) in found.items()})
+        for at, (name, number) in enumerate(zip(names, member.sum(axis=0), strict=True))
+    ]  # fmt: skip
+    columns = {what: Column(what, None, note="mean brightness, 0 to 1") for what in found}
+    columns["light"] = Column("light", None, note="mean shading")
     answers = {name: one["albedo"] @ LUMA for name, one in seen.items()} | {"image as albedo": picture}
     shares = [
         ScoredRow(name, at > 0, 1, {"share": estimate(share(one, once), share(one, weights))})
@@ -167,15 +153,15 @@ def _by_group(nets: Mapping[str, Any], images: ImageSet, by: str, how: Options) 
     ]
     tables = [
         scored_table(
-            f"Share of the brightness of {by} in albedo, {len(group):,} images",
+            f"Brightness of {by}, {len(group):,} images",
             "prediction",
             shares,
             {"share": _SHARE},
             deviations=(),
         ),
-        ScoreTable(f"Brightness by {by}", by, columns, rows),
+        scored_table(f"Brightness by {by}", by, groups, columns, intervals=tuple(columns), deviations=()),
     ]
-    values = {"pictures": len(group), "share": {row.name: row.numbers() for row in shares}, "groups": values}
+    values = {"pictures": len(group), "share": numbers_of(shares), "groups": numbers_of(groups)}
     return Scores(tables, values, how.notes)
 
 
@@ -183,7 +169,3 @@ def _apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Distance between colours divided by their sums, (N,)."""
     a, b = (one / np.maximum(one.sum(axis=1, keepdims=True), 1e-9) for one in (a, b))
     return np.linalg.norm(a - b, axis=1)
-
-
-def _mean(values: np.ndarray, weights: np.ndarray) -> Estimate:
-    return estimate([float(values.mean())], weights @ values / weights.sum(axis=1))

@@ -15,7 +15,15 @@ from typing import Any
 import numpy as np
 from scipy.sparse import csr_array
 
-from derender.evaluation.bootstrap import RESAMPLES, ScoredRow, constant, resamples, scored_row, with_verdicts
+from derender.evaluation.bootstrap import (
+    RESAMPLES,
+    ScoredRow,
+    constant,
+    numbers_of,
+    resamples,
+    scored_row,
+    with_verdicts,
+)
 from derender.evaluation.clustering_methods import METHODS, approximation, clusterings, finch_hierarchy
 from derender.evaluation.clustering_scores import (
     CLUSTER_COLUMNS,
@@ -112,7 +120,7 @@ class ClusterComparison:
 
     def numbers(self) -> dict[str, Any]:
         """Everything as JSON takes it."""
-        return {**vars(self), "rows": {row.name: row.numbers() for row in self.rows}}
+        return {**vars(self), "rows": numbers_of(self.rows)}
 
 
 def about_clustering(method: str, n_rows: int, labels: Mapping[str, int]) -> str:

@@ -13,13 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from derender.data import half_of
-from derender.data.layouts.layout import stem_of
+from derender.data.layouts.layout import in_test_half, stem_of
 from derender.evaluation.bootstrap import (
     ScoredRow,
     constant,
     estimate,
     group_resamples,
+    numbers_of,
     with_verdicts,
 )
 from derender.evaluation.clustering import compare_clusterings
@@ -109,7 +109,7 @@ def identify(
     values = {
         "people": len(set(who[probe])), "gallery": [table.files[row] for row in np.flatnonzero(shown)],
         "probes": probes, "centred": centred,
-        "rows": {row.name: row.numbers() for row in scored},
+        "rows": numbers_of(scored),
     }  # fmt: skip
     return Scores(tables, values, [*how.notes, verdict(scored[0], "all"), how.memory.summary()], scored)
 
@@ -276,26 +276,23 @@ def verify(
     ]
     values = {
         "pairs": len(pairs), "folds": n_folds, "images": len(names), "half": half, "standard_error": errors,
-        "rows": {row.name: row.numbers() for row in scored},
+        "rows": numbers_of(scored),
     }  # fmt: skip
     return Scores(tables, values, [*how.notes, verdict(scored[0], "accuracy"), how.memory.summary()], scored)
 
 
 def _in_half(pairs: Pairs, half: str) -> Pairs:
     """The pairs whose people all lie in one half; in each fold as many of one person as of two, the first."""
-    people = [
-        {name.rpartition("_")[0] for name in both} for both in zip(pairs.first, pairs.second, strict=True)
-    ]
     if half == "all":
         return pairs
-    names = sorted(set().union(*people))
-    whole = FeatureTable(tuple(names), {"none": np.zeros((len(names), 1))}, {"identity": np.array(names)})
-    inside = set(half_of(whole, half).files)
-    own = np.array([both <= inside for both in people])
-    kept: list[int] = []
+    sides = (
+        [in_test_half(name.rpartition("_")[0]) == (half == "test") for name in names]
+        for names in (pairs.first, pairs.second)
+    )
+    own, kept = np.all(list(sides), axis=0), []
     for fold in np.unique(pairs.fold):
-        sides = [np.flatnonzero(own & (pairs.fold == fold) & (pairs.same == same)) for same in (True, False)]
-        kept += np.concatenate([side[: min(map(len, sides))] for side in sides]).tolist()
+        both = [np.flatnonzero(own & (pairs.fold == fold) & (pairs.same == same)) for same in (True, False)]
+        kept += [row for rows in both for row in rows[: min(map(len, both))].tolist()]
     if not kept:
         raise ValueError(f"no pair has all its people in the {half} half: use all of them")
     return pairs.select(np.array(kept))

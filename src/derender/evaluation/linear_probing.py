@@ -17,7 +17,15 @@ from typing import Any
 import numpy as np
 from sklearn.metrics import average_precision_score
 
-from derender.evaluation.bootstrap import RESAMPLES, ScoredRow, constant, resamples, scored_row, with_verdicts
+from derender.evaluation.bootstrap import (
+    RESAMPLES,
+    ScoredRow,
+    constant,
+    numbers_of,
+    resamples,
+    scored_row,
+    with_verdicts,
+)
 from derender.evaluation.controls import subject_and_controls
 from derender.evaluation.feature_rows import (
     FeatureSource,
@@ -134,8 +142,7 @@ class LinearComparison:
     def numbers(self) -> dict[str, Any]:
         """Everything as JSON takes it."""
         parts = [
-            {"head": part.head, "labels": part.count, "rows": {row.name: row.numbers() for row in part.rows}}
-            for part in self.parts
+            {"head": part.head, "labels": part.count, "rows": numbers_of(part.rows)} for part in self.parts
         ]
         return {**vars(self), "parts": parts}
 

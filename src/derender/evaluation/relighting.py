@@ -17,6 +17,7 @@ from torch import Tensor
 
 from derender.data import ImageSet
 from derender.data.image_set import as_float
+from derender.evaluation.bootstrap import numbers_of
 from derender.evaluation.image_scores import binned_rows, image_verdicts
 from derender.evaluation.options import Options
 from derender.evaluation.pixels import reconstruction_scores
@@ -110,7 +111,7 @@ def relight(
         )  # fmt: skip
         caption = f"Relighting, {title} ({unit}): {len(rows):,} pictures of {len(people)} people, by light"
         tables.append(scored_table(caption, "prediction", scored, columns, deviations=()))
-        values[title.lower()] = {row.name: row.numbers() for row in scored}
+        values[title.lower()] = numbers_of(scored)
         notes += [f"{title}, {note}" for note in image_verdicts(scored[0], {"all": (columns["all"], 1.0)})]
     return Scores(tables, values, notes)
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from derender.baselines.controls import untrained_twin
 from derender.data import GroundTruth, ImageSet, read_ground_truth
-from derender.evaluation.bootstrap import RESAMPLES
+from derender.evaluation.bootstrap import RESAMPLES, numbers_of
 from derender.evaluation.depth import GeometryResult, evaluate_geometry
 from derender.evaluation.factors import FactorResult, evaluate_factors
 from derender.evaluation.image_scores import ImageResult, image_verdicts
@@ -129,7 +129,7 @@ def _scored(
     found = {name: kept.recall_value(name, inputs, _KINDS[name], make) for name, make in protocols.items()}
     rows = {name: one.rows(resample_count) for name, one in found.items()}
     notes = [note for name, one in found.items() for note in image_verdicts(rows[name][0], one.columns)]
-    intervals = {name: {row.name: row.numbers() for row in scored} for name, scored in rows.items()}
+    intervals = {name: numbers_of(scored) for name, scored in rows.items()}
     values = {"pictures": len(inputs["images"]), **found, "intervals": intervals}
     tables = [one.table(rows[name]) for name, one in found.items()]
     return Scores(tables, values, notes, result=next(iter(found.values())))

@@ -13,7 +13,7 @@ import torch
 
 from derender.baselines.controls import pca_features, pixel_features, untrained_twin
 from derender.data import ImageSet
-from derender.evaluation.bootstrap import RESAMPLES, Difference, ScoredRow, difference
+from derender.evaluation.bootstrap import RESAMPLES, Difference, ScoredRow, difference, numbers_of
 from derender.evaluation.finetuning.joint import FinetunedModel, FinetuneTask
 from derender.evaluation.linear_probing import LINEAR_COLUMNS, compare_linear
 from derender.evaluation.linear_task import Rows, Task
@@ -46,7 +46,7 @@ class FinetuneScores:
     def numbers(self) -> dict[str, Any]:
         """Everything as JSON takes it."""
         versus = {name: asdict(one) for name, one in self.versus.items()}
-        return {**vars(self), "rows": {row.name: row.numbers() for row in self.rows}, "versus": versus}
+        return {**vars(self), "rows": numbers_of(self.rows), "versus": versus}
 
     def table(self, began: str) -> ScoreTable:
         """A row each; ``began`` names the model whose frozen features the heads take."""

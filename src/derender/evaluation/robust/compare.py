@@ -12,7 +12,14 @@ from typing import Any
 
 import numpy as np
 
-from derender.evaluation.bootstrap import RESAMPLES, ScoredRow, resamples, scored_row, with_verdicts
+from derender.evaluation.bootstrap import (
+    RESAMPLES,
+    ScoredRow,
+    numbers_of,
+    resamples,
+    scored_row,
+    with_verdicts,
+)
 from derender.evaluation.feature_rows import check_lengths
 from derender.evaluation.linear_probes import PAPER_HEAD, majority_answers, probe_runs
 from derender.evaluation.linear_probing import count_scores
@@ -73,7 +80,7 @@ class RobustnessComparison:
                 "title": curve.title,
                 "levels_deg": curve.levels,
                 "n_tested": curve.n_tested,
-                **{score: {row.name: row.numbers() for row in rows} for score, rows in curve.rows.items()},
+                **{score: numbers_of(rows) for score, rows in curve.rows.items()},
             }
             for curve in self.curves
         }
