@@ -55,16 +55,13 @@ def loocc_loss(
         allowed = f"-1..{len(names) - 1} ({', '.join(names)})"
         raise ValueError(f"perturbed must lie in {allowed}, got {perturbed.tolist()}")
     if joint:
-        everything = torch.ones_like(perturbed, dtype=torch.bool)
-        losses = []
-        for left_out in range(NOTHING_LEFT_OUT, len(names)):
+        device = next(iter(features.values())).device
+        everything, losses = torch.ones(len(perturbed), dtype=torch.bool, device=device), []
+        for left_out in range(NOTHING_LEFT_OUT, len(names) if len(names) > 1 else 0):
             kept = [name for place, name in enumerate(names) if place != left_out]
-            if kept:
-                both = (
-                    torch.cat([side[name] for name in kept], dim=1) for side in (features, features_again)
-                )
-                own = (perturbed == left_out).repeat(2)
-                losses.append(own * _anchor_losses("joint codes", *both, everything, temperature))
+            code, again = (torch.cat([side[name] for name in kept], 1) for side in (features, features_again))
+            own = (perturbed == left_out).repeat(2).to(device)
+            losses.append(own * _anchor_losses("joint codes", code, again, everything, temperature))
         return torch.stack(losses).sum() / (2 * len(perturbed))
     totals, counts = [], []
     for index, (name, codes) in enumerate(features.items()):
