@@ -38,6 +38,7 @@ STAGES = [
     "features",
     "baselines",
     "evaluation",
+    "speed",
     "interpretation",
     "report",
     "learn",

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from derender.cli import main
-from derender.evaluation.speed import SpeedPair, measured, require_agreement
+from derender.speed import SpeedPair, measured, require_agreement
 
 
 def test_the_quick_bench_reports_every_pair_with_the_machine(tmp_path, capsys):

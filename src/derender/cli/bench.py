@@ -15,7 +15,7 @@ def bench(
     json_file: options.Json = None,
 ) -> None:
     """Measure speed on this machine, as ratios: rasteriser, embedding beside training, clustering."""
-    from derender.evaluation.speed import bench as measure
+    from derender.speed import bench as measure
 
     with progress_bar("measuring", unit="pairs") as report:
         measured = measure(quick, report)

@@ -145,11 +145,7 @@ class Published:
 
 
 def score(
-    protocol: str,
-    published: Published,
-    images: options.DataOptions,
-    subject: ScoredSubject,
-    **how: Any,
+    protocol: str, published: Published, images: options.DataOptions, subject: ScoredSubject, **how: Any
 ) -> None:
     """Score features by a protocol of `derender.evaluation`, and publish."""
     from derender import evaluation

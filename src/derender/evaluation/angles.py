@@ -61,11 +61,7 @@ def agreement(predicted: np.ndarray, true: np.ndarray, weights: np.ndarray) -> d
 
 
 def agreement_table(
-    caption: str,
-    predicted: Mapping[str, np.ndarray],
-    true: np.ndarray,
-    weights: np.ndarray,
-    digits: int = 2,
+    caption: str, predicted: Mapping[str, np.ndarray], true: np.ndarray, weights: np.ndarray, digits: int = 2
 ) -> tuple[ScoreTable, dict[str, Any]]:
     """A row for each name, all but the first controls, then the constant answer; and the numbers for JSON."""
     answers = {**predicted, "constant answer": np.full(len(true), true.mean())}
