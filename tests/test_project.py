@@ -28,6 +28,7 @@ STAGES = [
     "render",
     "data",
     "networks",
+    "renderers",
     "objectives",
     "presets",
     "postprocess",

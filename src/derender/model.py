@@ -4,7 +4,7 @@ Source: Klinghoffer et al., ECCV 2022, Sec. 3; networks and scene of unsup3d (Wu
 lives in training/, scores in evaluation/, saving in storage/; the model knows none of them.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,62 +13,63 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from derender.data import GivenImages, as_batch, check_images
-from derender.networks import FACTORS, Factor, NetworkSettings
+from derender.networks import Factor, NetworkSettings
 from derender.networks.confidence import Confidence, ConfidenceNet
 from derender.networks.unet import pixel_decoder
 from derender.networks.unsup3d import read_checkpoint
 from derender.postprocess import Features
 from derender.postprocess.embedding import EmbeddingModel
 from derender.presets import MODEL_PRESETS, ModelSettings, named_preset
-from derender.render import Rendering, render_scene
+from derender.render import Rendering
+from derender.renderers import Render, as_renderer, recorded_renderer
 from derender.scene import Scene
 from derender.scene.ranges import SceneRanges
-from derender.storage.folder import model_folder, naming_damage, read_config, read_weights, write_model
+from derender.storage import folder as files
 from derender.storage.sharing import Shareable
-
-Renderer = Callable[[Scene, float], Rendering]
 
 
 class Derenderer(EmbeddingModel, Shareable):
-    """Decomposes images of one kind of object into geometry, albedo, light and camera.
+    """Decomposes images of one kind of object into geometry, albedo, light, camera and what a renderer adds.
 
     Args:
-        settings: sizes of the networks and ranges of the scene.
-        factors: declared rows, by default the paper's four.
-        renderer: makes images of scenes, given the horizontal field of view in degrees.
+        settings: sizes of the networks, ranges of the scene, name of the renderer.
+        factors: declared rows, by default those of the renderer.
+        renderer: by name or itself, in place of the settings' one; or a function beside its ``factors``.
         features: how features are made of encoder activations; by default they are the codes.
     """
 
     def __init__(
-        self,
-        settings: ModelSettings | None = None,
-        factors: Sequence[Factor] = FACTORS,
-        renderer: Renderer = render_scene,
-        features: Features | None = None,
-    ):
+        self, settings: ModelSettings | None = None, factors: Sequence[Factor] | None = None,
+        renderer: str | Render | None = None, features: Features | None = None,
+    ):  # fmt: skip
         super().__init__(features)
-        self.settings, self.factors, self.renderer = settings or ModelSettings(), tuple(factors), renderer
+        settings = settings or ModelSettings()
+        self.renderer = as_renderer(renderer, settings.renderer)
+        self.settings = settings.model_copy(update={"renderer": self.renderer.name})
+        self.factors = tuple(self.renderer.all_factors if factors is None else factors)
         network = self.settings.network
         self.nets = nn.ModuleDict({factor.name: factor.build(network) for factor in self.factors})
         self.nets["confidence"] = ConfidenceNet(network)
         self.unet_decoder = pixel_decoder(network) if network.unet_decoder else None  # training/unets.py
 
     @classmethod
-    def from_preset(cls, name: str, *, seed: int | None = None, **network: Any) -> "Derenderer":
+    def from_preset(
+        cls, name: str, *, seed: int | None = None, renderer: str | Render | None = None, **network: Any
+    ) -> "Derenderer":
         """An untrained model by preset name; keywords change network sizes (``image_size=128``).
 
         With ``seed`` the initial weights are reproducible and torch's global generator is left as it was.
         """
         preset = named_preset(name, MODEL_PRESETS)
         sizes = NetworkSettings(**{**preset.network.model_dump(), **network})
-        settings = preset.model_copy(update={"network": sizes})
-        return cls(settings) if seed is None else cls.seeded(settings, seed)
+        return cls.seeded(preset.model_copy(update={"network": sizes}), seed, renderer=renderer)
 
     @classmethod
-    def seeded(cls, settings: ModelSettings, seed: int, **rows: Any) -> "Derenderer":
+    def seeded(cls, settings: ModelSettings, seed: int | None, **rows: Any) -> "Derenderer":
         """An untrained model with reproducible weights; torch's global generator is left as it was."""
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed)
+        with torch.random.fork_rng(devices=[], enabled=seed is not None):
+            if seed is not None:
+                torch.manual_seed(seed)
             return cls(settings, **rows)
 
     @classmethod
@@ -105,7 +106,7 @@ class Derenderer(EmbeddingModel, Shareable):
     def encode(self, images: Float[Tensor, "n 3 h w"]) -> dict[str, Float[Tensor, "n code"]]:
         """One code per factor for images in 0..1, by factor name: what ``decode`` takes."""
         check_images(images, self.image_size)
-        return {factor.name: self.nets[factor.name].encode(images) for factor in self.factors}  # type: ignore[operator]
+        return {f.name: self.nets[f.name].encode(images) for f in self.factors}  # type: ignore[operator]
 
     def decode(self, codes: Mapping[str, Float[Tensor, "n code"]]) -> Scene:
         """The scene that codes stand for."""
@@ -114,7 +115,7 @@ class Derenderer(EmbeddingModel, Shareable):
         return Scene.from_parameters({f.parameter: f.to_parameter(raw[f], ranges) for f in self.factors})
 
     def decompose(self, images: GivenImages) -> Scene:
-        """Geometry, albedo, light and camera of images, (N, 3, S, S) in 0..1 or what `as_batch` takes."""
+        """The scenes of images, (N, 3, S, S) in 0..1 or what `as_batch` takes."""
         return self.balanced(self.decode(self.encode(as_batch(images, self.image_size, self.device))))
 
     def render(self, scene: Scene) -> Rendering:
@@ -138,7 +139,7 @@ class Derenderer(EmbeddingModel, Shareable):
 
     def write(self, folder: Path) -> None:
         names = [factor.name for factor in self.factors]
-        write_model(folder, names, self.settings.model_dump(mode="json"), self.state_dict())
+        files.write_model(folder, names, self.settings.model_dump(mode="json"), self.state_dict())
         self.features.save(folder)
 
     def tensors(self) -> dict[str, Tensor]:
@@ -149,29 +150,30 @@ class Derenderer(EmbeddingModel, Shareable):
 
 
 def load(
-    source: str | Path,
-    *,
-    device: str | torch.device = "cpu",
-    factors: Sequence[Factor] = FACTORS,
-    renderer: Renderer = render_scene,
-) -> Derenderer:
+    source: str | Path, *, device: str | torch.device = "cpu", factors: Sequence[Factor] | None = None,
+    renderer: str | Render | None = None,
+) -> Derenderer:  # fmt: skip
     """A trained model, ready for use: evaluation mode, parameters without gradient.
 
     Args:
-        source: a run folder, a saved folder, the name of a bundled model (`bundled_models`), or a Hugging
-            Face Hub id ("owner/name", downloaded and cached).
+        source: a run folder, a saved folder, the name of a bundled model, or a Hugging Face Hub id.
         device: where to put it.
-        factors, renderer: what the model was made with, if not the paper's four and the project's own.
+        factors, renderer: what it was made with, if its ``config.json`` cannot tell; a user's module that a
+            model of the Hub names is imported only where it is given here.
 
     Raises:
         FileNotFoundError: there is no model.
-        ValueError: the model is damaged, or made with other factors or by a newer version.
+        ValueError: the model is damaged, of other factors, another renderer or a newer version.
     """
-    folder = model_folder(source)
-    config = read_config(folder, [factor.name for factor in factors])
-    with naming_damage(folder):
+    folder = files.model_folder(source)
+    config = files.read_config(folder)
+    with files.naming_damage(folder):
         settings = ModelSettings.model_validate(config["settings"])
-        model = read_weights(folder, lambda: Derenderer(settings, factors, renderer))
+    renderer = recorded_renderer(settings.renderer, renderer, source)
+    factors = renderer.all_factors if factors is None else factors
+    files.check_factors(folder, config, [factor.name for factor in factors])
+    with files.naming_damage(folder):
+        model = files.read_weights(folder, lambda: Derenderer(settings, factors, renderer))
         model = model.with_features(Features.load(folder, model.image_size))
     model.source = folder
     return model.to(device).eval().requires_grad_(False)

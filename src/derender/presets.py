@@ -8,6 +8,8 @@ How each is trained is in training/config.py under the same names.
 from collections.abc import Mapping
 from typing import TypeVar
 
+from pydantic import Field
+
 from derender.data import suggestion
 from derender.networks.encoders import NetworkSettings
 from derender.scene.brightness import BrightnessPrior
@@ -22,6 +24,7 @@ class ModelSettings(Settings):
 
     network: NetworkSettings = NetworkSettings()
     ranges: SceneRanges = SceneRanges()
+    renderer: str = Field(default="lambert", max_length=200)  # by name (renderers/): its factors are learnt
     brightness: BrightnessPrior | None = None  # estimated after training; `decompose` applies it
 
     def description(self) -> str:

@@ -15,8 +15,10 @@ PRESET = "faces (the default), cars, cats, paper, or small for a CPU."
 Preset = Annotated[str | None, typer.Option("--preset", help=PRESET)]
 START_FROM = "Begin with a trained model's weights: a run folder, a bundled name or a Hub id."
 StartFrom = Annotated[str | None, typer.Option("--start-from", metavar="MODEL", help=START_FROM)]
-LOOCC = "Contrast over none, light, light+camera or all factors."
+LOOCC = "Contrast over none, light, light+camera or all factors; names joined by +."
 Loocc = Annotated[str | None, typer.Option("--loocc", help=LOOCC)]
+RENDERER = "How scenes make images: lambert, lambert-shadow, phong, sh, haze, or several joined by +."
+Renderer = Annotated[str | None, typer.Option("--renderer", metavar="NAME", help=RENDERER)]
 GENERATOR = "stylegan2 run of e4e, or its published .pt."
 Generator = Annotated[str | None, typer.Option("--generator", metavar="RUN", help=GENERATOR)]
 CONFIG = "Settings in YAML, such as a run's; options come after."
@@ -26,17 +28,17 @@ ConfigFile = Annotated[str | None, typer.Option("--config", metavar="FILE", help
 @command("train", "train photos/ --preset faces --out runs/faces")
 def train(
     images: DataOptions, out: OutRun, model: Network = None, preset: Preset = None,
-    start_from: StartFrom = None, loocc: Loocc = None, generator: Generator = None, config: ConfigFile = None,
-    settings: Settings = None, resume: Resume = False, dry_run: DryRun = False, device: Device = "auto",
-    json_file: Json = None,
+    start_from: StartFrom = None, loocc: Loocc = None, renderer: Renderer = None, generator: Generator = None,
+    config: ConfigFile = None, settings: Settings = None, resume: Resume = False, dry_run: DryRun = False,
+    device: Device = "auto", json_file: Json = None,
 ) -> None:  # fmt: skip
     """Learn to decompose images from a folder of unlabelled images of one kind of object."""
     from derender import learn
 
     changes = [*(settings or ()), *([] if generator is None else [f"generator={generator}"])]
     chosen = learn.run_settings(
-        out, model=model, preset=preset, start_from=start_from, loocc=loocc, config=config, settings=changes,
-        resume=resume,
+        out, model=model, preset=preset, start_from=start_from, loocc=loocc, renderer=renderer, config=config,
+        settings=changes, resume=resume,
     )  # fmt: skip
     if dry_run:
         dry_run_shown(chosen, json_file)

@@ -21,8 +21,8 @@ Changes = Mapping[str, Any] | Sequence[str]
 
 def run_settings(
     out: str | Path | None = None, *, model: str | None = None, preset: str | None = None,
-    start_from: str | None = None, loocc: str | None = None, config: str | Path | None = None,
-    settings: Changes = (), resume: bool = False,
+    start_from: str | None = None, loocc: str | None = None, renderer: str | None = None,
+    config: str | Path | None = None, settings: Changes = (), resume: bool = False,
 ) -> Any:  # fmt: skip
     """The settings of a training run.
 
@@ -31,7 +31,9 @@ def run_settings(
         model: "derender", or a baseline: vqvae, simclr, ae, beta-vae, resnet18, stylegan2, e4e or ris.
         preset: faces (the default), cars, cats, paper, or small for a CPU.
         start_from: a trained model whose weights the run begins with.
-        loocc: contrast over "none", "light", "light+camera" or "all" factors.
+        loocc: factors that are contrasted: "none", "all", or names such as "light+camera".
+        renderer: how scenes make images: lambert (the default), lambert-shadow, phong, sh, haze, several
+            joined by +, or one of your own, "package.module:thing".
         config: a YAML file of settings, which the other arguments change.
         settings: changes of single settings, as ``{"batch_size": 32}`` or ``["batch_size=32"]``.
         resume: go on with the run in ``out``.
@@ -46,12 +48,18 @@ def run_settings(
         model, preset = trains, preset if base is None else str(base)
         changes = [*as_overrides(stored), *changes]
     model = model or "derender"
-    chosen = preset is not None or loocc is not None or start_from is not None or bool(changes)
+    chosen = any(one is not None for one in (preset, loocc, start_from, renderer)) or bool(changes)
     if resume and not chosen and out is not None and (Path(out) / "config.yaml").is_file():
         return stored_config(Path(out), model)
     if model == "derender":
-        return resolve(preset or "faces", changes, objective__loocc=loocc, start_from=start_from)
-    for name, value in (("preset", preset), ("loocc", loocc)):
+        return resolve(
+            preset or "faces",
+            changes,
+            objective__loocc=loocc,
+            model__renderer=renderer,
+            start_from=start_from,
+        )
+    for name, value in (("preset", preset), ("loocc", loocc), ("renderer", renderer)):
         if value is not None:
             raise ValueError(f"{name} is for derender models: leave it out with {model}, or change settings")
     return baseline_config(model, changes)
@@ -73,7 +81,8 @@ def train(
         device: "auto", "cpu" or "cuda".
         page: write a report page, for which the data are examined.
         on_images, progress: called with the images once they are read; called after every step.
-        choices: ``model``, ``preset``, ``start_from``, ``loocc`` and ``settings`` as for `run_settings`.
+        choices: ``model``, ``preset``, ``start_from``, ``loocc``, ``renderer`` and ``settings`` as for
+            `run_settings`.
 
     Raises:
         FileExistsError: ``out`` is not empty and ``resume`` was not requested.

@@ -52,6 +52,7 @@ class Factor:
         to_parameter: gives a raw network output its physical range.
         mirrored: whether the parameter is a map that the flipped twin of a scene shows mirrored.
         perturb: draws, for each row, another physically possible value; None if LOOCC never perturbs it.
+        numbers: name and range of each column of the parameter, for reports and sliders; none of a map.
     """
 
     name: str
@@ -60,6 +61,40 @@ class Factor:
     to_parameter: Callable[[Tensor, SceneRanges], Tensor]
     mirrored: bool
     perturb: Callable[[Tensor, Generator, PerturbSettings, SceneRanges], Tensor] | None
+    numbers: tuple["Number", ...] = ()
+
+
+@dataclass(frozen=True)
+class Number:
+    """One number of a factor: its name in reports, its range, and whether it is even in its logarithm."""
+
+    name: str
+    low: float
+    high: float
+    log: bool = False
+
+    def at(self, share: Tensor) -> Tensor:
+        """The value at shares of the range, 0..1."""
+        if self.log:
+            return self.low * (self.high / self.low) ** share
+        return self.low + (self.high - self.low) * share
+
+
+def numbers_factor(name: str, *numbers: Number) -> Factor:
+    """A row of a few numbers, ``Scene.extra[name]`` (N, K); LOOCC draws each anew from its range."""
+
+    def valued(shares: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
+        return torch.stack([one.at(share) for one, share in zip(numbers, shares.unbind(1), strict=True)], 1)
+
+    def drawn(
+        value: Float[Tensor, "n k"], generator: Generator, settings: PerturbSettings, ranges: SceneRanges
+    ) -> Float[Tensor, "n k"]:
+        return valued(torch.rand(value.shape, generator=generator, device=generator.device).to(value))
+
+    def from_raw(raw: Float[Tensor, "n k"], ranges: SceneRanges) -> Float[Tensor, "n k"]:
+        return valued(raw.float() / 2 + 0.5)
+
+    return Factor(name, name, vector_net(len(numbers)), from_raw, False, drawn, numbers)
 
 
 def depth_from_raw(raw: Float[Tensor, "n 1 h w"], ranges: SceneRanges) -> Float[Tensor, "n h w"]:

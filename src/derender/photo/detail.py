@@ -17,11 +17,10 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample, interpolate, max_pool2d, pad
 
 from derender.render import Rendering, warp
+from derender.renderers import Renderer
 from derender.scene import Scene
 from derender.scene.camera import project, to_camera, unproject
 from derender.scene.enlarge import at_size
-from derender.scene.light import lambert_shading
-from derender.scene.normals import normals_from_depth
 
 GRID = 256
 """Largest side of the grid on which geometry and shading are drawn."""
@@ -41,6 +40,7 @@ COLOUR_MARGIN = 0.25  # of the canonical map, left out of what colours are carri
 RIM_SHARE = 0.05  # of the side: the surface's rim, where a model's depth ends in a wall
 FADE_SHARE = 1 / 8  # reach of motion and shading beyond the surface
 DARKEST = 1e-3
+LAMBERT = Renderer("lambert")
 
 
 class PhotoDetail:
@@ -51,9 +51,13 @@ class PhotoDetail:
         scene: what the model found in it, one scene.
         fov_deg: horizontal field of view.
         margin: how far the photograph reaches beyond that crop on every side, in shares of the crop's side.
+        renderer: whose diffuse light multiplies the surface.
     """
 
-    def __init__(self, photo: Float[Tensor, "3 s s"], scene: Scene, fov_deg: float, margin: float = 0.0):
+    def __init__(
+        self, photo: Float[Tensor, "3 s s"], scene: Scene, fov_deg: float, margin: float = 0.0,
+        renderer: Renderer = LAMBERT,
+    ):  # fmt: skip
         if len(scene) != 1 or photo.ndim != 3 or photo.shape[-1] < scene.depth.shape[-1]:
             raise ValueError(
                 f"a photograph (3, S, S) and its one scene are needed, S no smaller than the scene; got "
@@ -66,7 +70,8 @@ class PhotoDetail:
         own = at_size(scene.detach(), self.grid)
         points = to_camera(unproject(own.depth, fov_deg), own.camera)
         self._place = project(points, self.grid, self.grid, fov_deg).permute(0, 3, 1, 2)
-        self._shading = lambert_shading(normals_from_depth(own.depth, fov_deg), own.light)
+        self._renderer = renderer
+        self._shading = self._light(own)
         self._seen = self._visible(own, points) * _ramp(self._shading, *LIT)
         self._colours = self._completed(own)
         at_home = warp(self._place, own.depth, own.camera, fov_deg)
@@ -78,10 +83,7 @@ class PhotoDetail:
         Albedo is the photograph's, whatever they hold. The mask is 1: around the surface is the photograph.
         """
         scene = at_size(scene, self.grid)
-        count, shading = (
-            len(scene),
-            lambert_shading(normals_from_depth(scene.depth, self.fov_deg), scene.light),
-        )
+        count, shading = len(scene), self._light(scene)
         own = torch.cat((self._place, self._seen, self._shading), dim=1)
         within = self._margin(RIM_SHARE)
         maps = torch.cat((own, own.flip(-1), self._colours, within), dim=1).expand(count, -1, -1, -1)
@@ -115,6 +117,9 @@ class PhotoDetail:
         image = self._composed(fields, trust)
         depth = self._enlarged(pad(view.depth[:, None], (self.rim,) * 4))[:, 0]
         return Rendering(image, depth, torch.ones_like(depth))
+
+    def _light(self, scene: Scene) -> Float[Tensor, "n 1 h w"]:
+        return self._renderer.shading(scene, self.fov_deg).mean(dim=1, keepdim=True)
 
     def albedo(self) -> Float[Tensor, "1 3 s s"]:
         """The texture of the canonical view: the photograph without its shading, completed."""

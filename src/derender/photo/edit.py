@@ -98,7 +98,9 @@ def open_photograph(
     photo = torch.from_numpy(wide.cut(pixels, size)).to(model.device).float() / 255
     with torch.inference_mode():
         margin = (wide.side / place.side - 1) / 2
-        return Photograph(pixels, place, wide, scene, PhotoDetail(photo, scene, model.fov_deg, margin))
+        return Photograph(
+            pixels, place, wide, scene, PhotoDetail(photo, scene, model.fov_deg, margin, model.renderer)
+        )
 
 
 def relight(

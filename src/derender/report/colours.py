@@ -54,10 +54,16 @@ def normal_maps(normal: Values, mask: Values | None = None) -> Images:
 
 
 def shading_maps(shading: Values) -> Images:
-    """(N, 1, H, W) shading as grey images; white is 1, or the 99th percentile where that is more."""
-    grey = as_numpy(shading)[:, 0, :, :, None]
-    white = max(1.0, float(np.percentile(grey, 99))) if grey.size else 1.0
-    return _images(np.repeat(grey / white, 3, axis=-1), None)
+    """(N, 1 or 3, H, W) shading as images; white is 1, or the 99th percentile where that is more."""
+    light = np.moveaxis(as_numpy(shading), 1, -1)
+    white = max(1.0, float(np.percentile(light, 99))) if light.size else 1.0
+    return _images(np.broadcast_to(light / white, (*light.shape[:3], 3)), None)
+
+
+def level_maps(values: Values) -> Images:
+    """(N, H, W) levels or (N, 3, H, W) colours in 0..1 as images."""
+    levels = as_numpy(values)
+    return pictures(np.stack([levels] * 3, axis=1) if levels.ndim == 3 else levels)
 
 
 def any_maps(values: Values) -> Images:

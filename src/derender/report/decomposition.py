@@ -7,7 +7,7 @@ parameters and normals as the renderer takes them, ``scene.json`` with light and
 
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import degrees, radians
 from pathlib import Path
 from typing import Any
@@ -20,19 +20,20 @@ from torch import Tensor
 
 from derender.data import as_float
 from derender.model import Derenderer
+from derender.networks import Factor
 from derender.render import Rendering
+from derender.renderers import Renderer
 from derender.report import colours
 from derender.report.opening import OpenedImage
 from derender.report.panel import GridLayout, labelled_grid, strip
 from derender.scene import Scene
-from derender.scene.light import lambert_shading
 from derender.scene.normals import normals_from_depth
 
 OTHER_AMBIENT_SHARE, OTHER_LIGHT_YAW_RAD, OTHER_LIGHT_PITCH_RAD = 0.3, radians(40), radians(10)
 OTHER_VIEW_YAW_RAD = radians(35)
 COLUMN_MEANING = {
     "input": "the image as the model takes it",
-    "reconstruction": "the image rendered from the four factors",
+    "reconstruction": "the image rendered from its factors",
     "depth": "geometry in the frontal view: bright is near, dark is far; one scale for all images",
     "normals": "direction of the surface: red to the right, green upwards, blue towards the viewer",
     "albedo": "colour of the surface without lighting",
@@ -47,15 +48,17 @@ class Decomposition:
     """Images of N decomposed images, one list of N per column.
 
     Attributes:
-        columns: column name to N images, in the order of a panel: those of ``COLUMN_MEANING``, then further
-            factors whose parameter is a map.
+        columns: column name to N images, in the order of a panel: those of ``COLUMN_MEANING``, then the
+            renderer's own, then further factors whose parameter is a map.
         scene: the N scenes.
         fov_deg: horizontal field of view.
+        numbers: rows of further factors whose parameter is a few named numbers, by parameter.
     """
 
     columns: Mapping[str, colours.Images]
     scene: Scene
     fov_deg: float
+    numbers: Mapping[str, Factor] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.scene)
@@ -76,7 +79,12 @@ class Decomposition:
     def write(self, folder: Path, record: Mapping[str, Any]) -> dict[str, Any]:
         """Write the first image's files; returns the content of its scene.json."""
         scene = self.scene[0].detach()
-        written = {**record, **scene_numbers(scene)}
+        named = {
+            row.name: {one.name: value for one, value in zip(row.numbers, values, strict=True)}
+            for row in self.numbers.values()
+            for values in scene.parameters[row.parameter].tolist()
+        }
+        written = {**record, **scene_numbers(scene), **named}
         self.panel().save(folder / "panel.png")
         for name, image in self.row.items():
             strip([image]).save(folder / f"{name.replace(' ', '_')}.png")
@@ -94,16 +102,20 @@ def decomposition(
     render: Callable[[Scene], Rendering],
     fov_deg: float,
     depth_range: tuple[float, float] | None = None,
+    model: Derenderer | None = None,
 ) -> Decomposition:
     """Draw the scenes of ``images`` (0..1); ``render`` is ``model.render`` or the plain renderer.
 
     ``depth_range`` is the nearest and farthest depth of the colour scale; by default that of these scenes.
+    The renderer of ``model``, by default ``lambert``, draws shading and its own columns.
     """
     scene = scene.detach()
     with torch.no_grad():
         own, relit, rotated = map(render, (scene, under_another_light(scene), from_another_view(scene)))
         normal = normals_from_depth(scene.depth, fov_deg)
-        shading = lambert_shading(normal, scene.light)
+        renderer = Renderer("lambert") if model is None else model.renderer
+        shading = renderer.shading(scene, fov_deg)
+        own_maps = {title: colours.level_maps(draw(scene, fov_deg)) for title, draw in renderer.maps.items()}
     columns = {
         "input": colours.pictures(images),
         "reconstruction": colours.pictures(own.image, own.mask),
@@ -115,20 +127,21 @@ def decomposition(
         "another view": colours.pictures(rotated.image, rotated.mask),
     }
     further = {name: drawn for name, value in scene.extra.items() if (drawn := colours.any_maps(value))}
-    return Decomposition({**columns, **further}, scene.to("cpu"), fov_deg)
+    numbers = {} if model is None else {row.parameter: row for row in model.factors if row.numbers}
+    return Decomposition({**columns, **own_maps, **further}, scene.to("cpu"), fov_deg, numbers)
 
 
 def decompose_images(model: Derenderer, images: Float[Tensor, "n 3 h w"]) -> Decomposition:
     """Decompose images (0..1) and draw the result."""
     with torch.no_grad():
         scene = model.decompose(images)
-    return decomposition(images, scene, model.render, model.fov_deg)
+    return decomposition(images, scene, model.render, model.fov_deg, model=model)
 
 
 def decomposed(model: Derenderer, image: OpenedImage) -> Decomposition:
     """An opened image (``opening``) with its factors drawn; images opened together share the depth scale."""
     pixels = as_float(image.pixels[None])
-    return decomposition(pixels, image.textured, model.render, model.fov_deg, image.depth_range)
+    return decomposition(pixels, image.textured, model.render, model.fov_deg, image.depth_range, model)
 
 
 def scene_numbers(scene: Scene, index: int = 0) -> dict[str, Any]:

@@ -241,7 +241,8 @@ class ImageOpener:
         if self.detail == "model":
             return replace(image, scene=at_size(image.scene, self.size))
         pixels = as_float(image.frame.cut(read_photo(image.path), self.size)[None])[0]
-        return replace(image, render=PhotoDetail(pixels, image.scene, self.model.fov_deg))
+        detail = PhotoDetail(pixels, image.scene, self.model.fov_deg, renderer=self.model.renderer)
+        return replace(image, render=detail)
 
 
 def readable(paths: Sequence[Path], read: Callable[[Path], T]) -> tuple[dict[Path, T], dict[str, str]]:

@@ -10,6 +10,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from derender.scene.environment import main_light
+
 
 @dataclass(frozen=True)
 class Scene:
@@ -20,7 +22,8 @@ class Scene:
         albedo: (N, 3, H, W) reflectance in the canonical view, 0..1.
         light: (N, 4) ambient, diffuse (both 0..1), pitch, yaw (radians; 0, 0 is frontal).
         camera: (N, 6) rotation about x, y, z (radians, about the point (0, 0, 1)), translation along x, y, z.
-        extra: parameters of factors beyond these four, by name, each with N rows.
+        extra: parameters of factors beyond these four, by name, each with N rows. An ``environment``
+            (scene/environment.py) is all of the light, and ``light`` is its main one.
     """
 
     depth: Float[Tensor, "n h w"]
@@ -31,7 +34,12 @@ class Scene:
 
     @classmethod
     def from_parameters(cls, parameters: Mapping[str, Tensor]) -> "Scene":
-        """Gather parameters by name; names other than the four fields go to ``extra``."""
+        """Gather parameters by name; names other than the four fields go to ``extra``.
+
+        Without a light, it is the main one of the environment.
+        """
+        if "environment" in parameters and "light" not in parameters:
+            parameters = {**parameters, "light": main_light(parameters["environment"])}
         missing = [name for name in _FIELDS if name not in parameters]
         if missing:
             raise ValueError(f"a scene needs {', '.join(_FIELDS)}; missing: {', '.join(missing)}")
@@ -44,13 +52,20 @@ class Scene:
         return {**{name: getattr(self, name) for name in _FIELDS}, **self.extra}
 
     def with_parameters(self, **changed: Tensor) -> "Scene":
-        """The same scenes with some parameters exchanged; an unknown name is an error."""
+        """The same scenes with some parameters exchanged; an unknown name is an error.
+
+        A light takes the place of an environment, and an environment brings its main light.
+        """
         unknown = sorted(set(changed) - set(self.parameters))
         if unknown:
             raise ValueError(
                 f"unknown scene parameter {unknown[0]!r}; this scene has {', '.join(self.parameters)}"
             )
-        return Scene.from_parameters({**self.parameters, **changed})
+        kept = dict(self.parameters)
+        for one, other in (("light", "environment"), ("environment", "light")):
+            if one in changed and other not in changed and "environment" in kept:
+                del kept[other]
+        return Scene.from_parameters({**kept, **changed})
 
     def map(self, function: Callable[[Tensor], Tensor]) -> "Scene":
         """Apply one function to every parameter."""

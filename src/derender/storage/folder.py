@@ -102,10 +102,10 @@ def saved_config(folder: Path) -> dict[str, Any]:
     return config
 
 
-def read_config(folder: Path, factors: Sequence[str] | None = None) -> dict[str, Any]:
+def read_config(folder: Path) -> dict[str, Any]:
     """``config.json`` of a saved model: its ``factors`` and ``settings``.
 
-    A ValueError: it is damaged, of a newer version, of a baseline, or of other ``factors``.
+    A ValueError: it is damaged, of a newer version, or of a baseline.
     """
     config = saved_config(folder)
     if "baseline" in config:
@@ -117,12 +117,17 @@ def read_config(folder: Path, factors: Sequence[str] | None = None) -> dict[str,
     names = config.get("factors")
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise ValueError(f"{folder / CONFIG_FILE} is damaged: copy or train the model again")
-    if factors is not None and names != list(factors):
+    return config
+
+
+def check_factors(folder: Path, config: Mapping[str, Any], factors: Sequence[str]) -> None:
+    """A ValueError where a saved model's configuration is of other factors."""
+    names = config["factors"]
+    if names != list(factors):
         raise ValueError(
             f"{folder} holds factors {', '.join(names)}, asked for {', '.join(factors)}: "
             "pass its rows as factors="
         )
-    return config
 
 
 def write_model(

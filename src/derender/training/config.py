@@ -16,18 +16,28 @@ from pydantic import Field, ValidationError, field_validator
 
 from derender.data import suggestion
 from derender.model import load
+from derender.networks import Factor
 from derender.postprocess.fitting import FittingSettings
 from derender.presets import MODEL_PRESETS, ModelSettings, named_preset
+from derender.renderers import renderer_named
 from derender.scene.crop import DEFAULT_CROPS, CropSettings
 from derender.scene.perturb import PerturbSettings
 from derender.settings import Settings
 
-LooccKind = Literal["none", "light", "light+camera", "all"]
 
-LOOCC_FACTORS: dict[str, tuple[str, ...] | None] = {
-    "none": (), "light": ("light",), "light+camera": ("light", "camera"), "all": None,
-}  # fmt: skip
-"""The factors that each kind of LOOCC perturbs; None: every one that can be."""
+def loocc_factors(kind: str, factors: Iterable[Factor]) -> list[Factor]:
+    """The factors that a kind of LOOCC perturbs: "none", "all", or names joined by +; else a ValueError."""
+    able = {factor.name: factor for factor in factors if factor.perturb is not None}
+    if kind in ("none", "all"):
+        return list(able.values()) if kind == "all" else []
+    for name in kind.split("+"):
+        if name not in able:
+            raise ValueError(
+                f"setting 'objective.loocc': {name!r} is no factor that this model perturbs"
+                f"{suggestion(name, able)}: write none, all, or some of {', '.join(able)} joined by +, such "
+                "as light+camera"
+            )
+    return [factor for name, factor in able.items() if name in kind.split("+")]
 
 
 class ObjectiveSettings(Settings):
@@ -41,7 +51,7 @@ class ObjectiveSettings(Settings):
     curvature_weight: float = Field(default=3.0, ge=0)  # on second differences of depth; 0 in the paper
     vgg16_path: str | None = None  # None: the file torch hub keeps
     self_features_steps: int = Field(default=600, ge=1)
-    loocc: LooccKind = "none"
+    loocc: str = "none"  # factors that are perturbed, joined by +; or all
     loocc_joint: bool = False  # Eq. 6: one code of all factors side by side, instead of factor by factor
     loocc_weight: float = Field(default=0.01, ge=0)
     loocc_temperature: float = Field(default=0.5, gt=0)
@@ -206,17 +216,23 @@ def resolve(preset: str, overrides: Iterable[str] = (), **explicit: Any) -> Trai
     change them.
 
     Raises:
-        ValueError: unknown preset or key (names the nearest), or a value that does not fit.
+        ValueError: unknown preset, renderer, factor or key (names the nearest), or a value that does not fit.
         FileNotFoundError: there is no model to start from.
     """
     overrides, row = list(overrides), named_preset(preset, PRESETS)
     config = with_changes(row, overrides, **explicit)
-    if config.start_from is None:
-        return config
-    model = load(config.start_from).settings
-    network = model.network.model_copy(update={"unet_decoder": False})
-    model = model.model_copy(update={"network": network, "brightness": None})
-    return with_changes(row.model_copy(update={"model": model}), overrides, **explicit)
+    if config.start_from is not None:
+        model = load(config.start_from).settings
+        network = model.network.model_copy(update={"unet_decoder": False})
+        model = model.model_copy(update={"network": network, "brightness": None})
+        config = with_changes(row.model_copy(update={"model": model}), overrides, **explicit)
+        if config.model.renderer != model.renderer:
+            raise ValueError(
+                f"cannot start from {config.start_from}: it was made with the renderer {model.renderer!r}, "
+                f"not {config.model.renderer!r}"
+            )
+    loocc_factors(config.objective.loocc, renderer_named(config.model.renderer).all_factors)
+    return config
 
 
 def with_changes(config: Config, overrides: Iterable[str] = (), **explicit: Any) -> Config:

@@ -15,7 +15,6 @@ from torch import Generator, Tensor
 from torch.utils.checkpoint import checkpoint
 
 from derender.model import Derenderer
-from derender.networks import Factor
 from derender.networks.confidence import Confidence
 from derender.objectives.loocc import loocc_loss
 from derender.objectives.perceptual import perceptual_loss
@@ -24,7 +23,7 @@ from derender.objectives.reconstruction import depth_curvature, depth_smoothness
 from derender.render import Rendering
 from derender.scene import Scene
 from derender.scene.perturb import choose_factors
-from derender.training.config import LOOCC_FACTORS, ObjectiveSettings
+from derender.training.config import ObjectiveSettings, loocc_factors
 from derender.training.distributed import ALONE, Ranks
 from derender.training.task import Precision, StepLosses
 
@@ -109,6 +108,8 @@ def training_step(
         terms["smoothness"] = objective.smoothness_weight * depth_smoothness(scene.depth, *inside)
     if objective.curvature_weight > 0:
         terms["curvature"] = objective.curvature_weight * depth_curvature(scene.depth, *inside)
+    if model.renderer.penalty is not None:
+        terms["penalty"] = model.renderer.penalty(scene, model.renderer.shading(scene, model.fov_deg))
     if left_out is not None:
         seen = {"seen": fill_uncovered(image[2 * count :], mask[2 * count :], images)}
         with precision():
@@ -139,11 +140,7 @@ def perturb_one_factor(
     Ranks draw for all of the batch, as one process would. A ValueError: ``objective.loocc`` names no factor
     of the model that can be perturbed.
     """
-    factors = _contrasted(model, objective)
-    if not factors:
-        raise ValueError(
-            f"loocc {objective.loocc!r} needs a factor that can be perturbed, this model has none of them"
-        )
+    factors = loocc_factors(objective.loocc, model.factors)
     indices = [model.factors.index(factor) for factor in factors]
     chosen = ranks.own(choose_factors(len(scene) * ranks.count, indices, generator)).to(scene.depth.device)
     changed = {}
@@ -154,13 +151,6 @@ def perturb_one_factor(
         rows = (chosen == index).view(-1, *[1] * (value.ndim - 1))
         changed[factor.parameter] = torch.where(rows, ranks.own(drawn), value)
     return scene.with_parameters(**changed), chosen
-
-
-def _contrasted(model: Derenderer, objective: ObjectiveSettings) -> list[Factor]:
-    """The model's factors that LOOCC perturbs."""
-    names = LOOCC_FACTORS[objective.loocc]
-    able = [factor for factor in model.factors if factor.perturb is not None]
-    return able if names is None else [factor for factor in able if factor.name in names]
 
 
 def fill_uncovered(
@@ -184,7 +174,7 @@ def cycle_loss(
     rendered scene is a fixed, exact target for what an image alone leaves open (pitch above all).
     """
     total = rendered.depth.new_zeros(())
-    for factor in _contrasted(model, objective):
+    for factor in loocc_factors(objective.loocc, model.factors):
         if not factor.mirrored:
             raw = model.nets[factor.name].decode(codes_again[factor.name].float())  # type: ignore[operator]
             predicted = factor.to_parameter(raw, model.settings.ranges)

@@ -42,7 +42,6 @@ from derender.report.viewer.questions import (
 )
 from derender.scene import Scene
 from derender.scene.enlarge import at_size
-from derender.scene.light import lambert_shading
 from derender.scene.normals import normals_from_depth
 from derender.training.held_out_errors import HeldOutErrors, masked_l1, reconstruction_errors
 
@@ -218,6 +217,10 @@ class Studio:
                 "normals": colours.normal_maps(normals_from_depth(scene.depth, self.model.fov_deg))[0],
                 "albedo": colours.pictures(scene.albedo)[0],
                 "shading": self._shading(scene),
+                **{
+                    title: colours.level_maps(draw(scene, self.model.fov_deg))[0]
+                    for title, draw in self.model.renderer.maps.items()
+                },
             }
 
     def panel(self, question: ViewRequest) -> bytes:
@@ -290,7 +293,7 @@ class Studio:
             side = opened.photo.shape[-1]
             photo = Frame.centred(side, side).cut(opened.photo.transpose(1, 2, 0), size)
             self._details[name, size] = PhotoDetail(
-                as_float(photo[None])[0], opened.scene, self.model.fov_deg
+                as_float(photo[None])[0], opened.scene, self.model.fov_deg, renderer=self.model.renderer
             )
         self._details.move_to_end((name, size))
         while len(self._details) > DETAILS_KEPT:
@@ -302,8 +305,7 @@ class Studio:
         return colours.pictures(rendering.image, rendering.mask)[0]
 
     def _shading(self, scene: Scene) -> Image.Image:
-        normal = normals_from_depth(scene.depth, self.model.fov_deg)
-        return colours.shading_maps(lambert_shading(normal, scene.light))[0]
+        return colours.shading_maps(self.model.renderer.shading(scene, self.model.fov_deg))[0]
 
 
 def data_url(image: Image.Image) -> str:

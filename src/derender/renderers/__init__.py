@@ -1,0 +1,128 @@
+"""Renderers by name: the built-in ones, their combinations, and those of a user's own module.
+
+A name is that of a file here, with settings in parentheses, and + between those that combine:
+``phong(gamma=2.2)+lambert-shadow+haze``. ``package.module:thing`` is the ``Renderer`` called thing there.
+"""
+
+import importlib
+import inspect
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from derender.data import suggestion
+from derender.render import Rendering
+from derender.renderers.haze import haze
+from derender.renderers.lambert import lambert
+from derender.renderers.phong import phong
+from derender.renderers.renderer import FunctionRenderer, Renderer
+from derender.renderers.sh import sh
+from derender.renderers.shadow import lambert_shadow
+from derender.scene import Scene
+from derender.storage.folder import bundled_models
+
+__all__ = [
+    "RENDERERS", "Render", "Renderer", "as_renderer", "brings_code", "recorded_renderer", "renderer_named",
+]  # fmt: skip
+
+Render = Callable[[Scene, float], Rendering]
+"""Anything that draws scenes with a horizontal field of view in degrees, such as a ``Renderer``."""
+
+RENDERERS: dict[str, Callable[..., Renderer]] = {
+    "lambert": lambert, "lambert-shadow": lambert_shadow, "phong": phong, "sh": sh, "haze": haze,
+}  # fmt: skip
+_PART = re.compile(r"\s*(?P<name>[\w.-]+(:\w+)?)\s*(\((?P<settings>[^()]*)\))?\s*")
+
+
+def brings_code(name: str) -> bool:
+    """Whether a renderer's name is that of a user's module, which is imported to find it."""
+    return ":" in name
+
+
+def renderer_named(name: str) -> Renderer:
+    """The renderer of that name; imports a user's own module.
+
+    Raises:
+        ValueError: an unknown name or setting (names the nearest), a value out of range, or renderers that
+            cannot be combined.
+    """
+    parts = [_PART.fullmatch(part) for part in name.split("+")]
+    if not all(parts):
+        raise ValueError(f"cannot read the renderer {name!r}: write NAME, NAME(setting=value) or NAME+NAME")
+    made = [_one(part["name"], part["settings"]) for part in parts if part is not None]
+    renderer = made[0]
+    for other in made[1:]:
+        renderer = renderer + other
+    return renderer
+
+
+def as_renderer(given: str | Render | None, stored: str) -> Renderer:
+    """A renderer by name or itself, by default the ``stored`` one; a function is called as it is."""
+    if given is None or isinstance(given, str):
+        return renderer_named(given or stored)
+    return given if isinstance(given, Renderer) else FunctionRenderer(stored, function=given)
+
+
+def recorded_renderer(stored: str, given: str | Render | None, source: str | Path) -> Renderer:
+    """What draws the scenes of a saved model: as it records (``stored``), or as the user gives it.
+
+    A ValueError: it was made with another renderer, or was downloaded and wants a user's module imported.
+    """
+    downloaded = not Path(source).exists() and source not in bundled_models()
+    asked = given.name if isinstance(given, Renderer) else given
+    if isinstance(asked, str) and asked != stored:
+        raise ValueError(
+            f"{source} was made with the renderer {stored!r}, not {asked!r}: leave the renderer out, or "
+            "train a model with it"
+        )
+    if downloaded and brings_code(stored) and given is None:
+        raise ValueError(
+            f"{source} was downloaded and wants the code of the renderer {stored!r}: if you trust that code, "
+            f"use derender.load({str(source)!r}, renderer={stored!r})"
+        )
+    return as_renderer(given, stored)
+
+
+def _one(name: str, settings: str | None) -> Renderer:
+    text = name if settings is None else f"{name}({settings})"
+    if brings_code(name):
+        return _imported(name, settings)
+    if name not in RENDERERS:
+        raise ValueError(
+            f"no renderer {name!r}{suggestion(name, RENDERERS)}: choose one of {', '.join(RENDERERS)}, or "
+            "package.module:thing"
+        )
+    make, given = RENDERERS[name], dict[str, Any]()
+    known = inspect.signature(make).parameters
+    for item in filter(str.strip, (settings or "").split(",")):
+        key, equals, value = (part.strip() for part in item.partition("="))
+        if not equals or key not in known:
+            has = f"it has {', '.join(known)}" if known else "it has none"
+            raise ValueError(f"renderer {name!r} has no setting {key!r}{suggestion(key, known)}: {has}")
+        given[key] = yaml.safe_load(value)
+        kind = known[key].annotation
+        if kind is float and type(given[key]) is int:
+            given[key] = float(given[key])
+        if type(given[key]) is not kind:
+            raise ValueError(f"renderer {name!r}: {key} must be a {kind.__name__}, got {value!r}")
+    return replace(make(**given), name=text)
+
+
+def _imported(name: str, settings: str | None) -> Renderer:
+    module, _, thing = name.partition(":")
+    if settings is not None:
+        raise ValueError(f"renderer {name!r} takes no settings here: set them where it is made")
+    try:
+        found = getattr(importlib.import_module(module), thing)
+    except (ImportError, AttributeError) as error:
+        raise ValueError(
+            f"no renderer {name!r} ({error}): put the folder of {module.partition('.')[0]} on PYTHONPATH, or "
+            "install it"
+        ) from error
+    if not isinstance(found, Renderer):
+        raise ValueError(f"{name!r} is a {type(found).__name__}, not a derender.renderers.Renderer")
+    return replace(found, name=name)

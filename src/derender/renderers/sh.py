@@ -1,0 +1,54 @@
+"""`sh`: light from all sides as second-order spherical harmonics, in place of one lamp.
+
+The factor ``light`` fills ``Scene.extra["environment"]``; ``scene.light`` is its main light. A scene that is
+given another ``light`` is lit by that, as nearly as the harmonics can. LOOCC gives an image the light of
+another. Source: Ramamoorthi and Hanrahan, SIGGRAPH 2001. Leaves out cast shadows.
+"""
+
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from derender.networks import FACTORS
+from derender.networks.factors import vector_net
+from derender.renderers.renderer import Renderer
+from derender.scene import Scene, environment
+from derender.scene.perturb import exchange
+from derender.scene.ranges import SceneRanges
+
+
+def sh(colour: bool = False) -> Renderer:
+    """Albedo times irradiance; ``colour``: nine coefficients of each channel instead of nine grey ones."""
+    channels = 3 if colour else 1
+
+    def from_raw(raw: Float[Tensor, "n k"], ranges: SceneRanges) -> Float[Tensor, "n k"]:
+        mean = [ranges.ambient[end] + ranges.diffuse[end] / 4 for end in (0, 1)]
+        return environment.bounded(raw.float(), (mean[0], mean[1]))
+
+    def lit(scene: Scene, normal: Tensor) -> Tensor:
+        return environment.irradiance(_environment(scene, channels), normal)
+
+    def ball(scene: Scene, fov_deg: float) -> Tensor:
+        """A white ball in the light, as large as the image."""
+        height, width = scene.depth.shape[1:]
+        y = torch.linspace(-1, 1, height, device=scene.depth.device)[:, None].expand(height, width)
+        x = torch.linspace(-1, 1, width, device=scene.depth.device).expand(height, width)
+        inside = 1 - x * x - y * y
+        normal = torch.stack([-x, -y, inside.clamp(min=0).sqrt()], dim=-1)
+        light = lit(scene, normal.expand(len(scene), -1, -1, -1)) * (inside > 0)
+        return light.expand(-1, 3, -1, -1)
+
+    light = next(row for row in FACTORS if row.name == "light")
+    row = replace(
+        light, parameter="environment", build=vector_net(9 * channels), to_parameter=from_raw,
+        perturb=exchange,
+    )  # fmt: skip
+    return Renderer("sh", (row,), irradiance=lit, maps={"a ball in this light": ball})
+
+
+def _environment(scene: Scene, channels: int) -> Float[Tensor, "n k"]:
+    if "environment" in scene.extra:
+        return scene.extra["environment"]
+    return environment.from_light(scene.light, channels)

@@ -1,0 +1,107 @@
+"""Renderers by name: found, refused, recorded with a model, and chosen for a training."""
+
+import json
+
+import pytest
+import torch
+
+from derender.learn import run_settings
+from derender.model import Derenderer, load
+from derender.networks import FACTORS
+from derender.render import render_scene
+from derender.renderers import RENDERERS, Renderer, recorded_renderer, renderer_named
+from derender.scene import Scene
+from derender.storage.folder import CONFIG_FILE
+
+TINY = {"image_size": 32, "width": 8, "light_width": 4}
+ALL = "phong(gamma=2.2)+lambert-shadow(softness_deg=8)+haze"
+
+
+@pytest.mark.parametrize("name", [*RENDERERS, ALL, "sh(colour=true)+haze"])
+def test_a_model_is_saved_with_its_renderer_and_found_again(name, tmp_path, generator):
+    model = Derenderer.from_preset("small", seed=0, renderer=name, **TINY)
+    config = json.loads((model.save(tmp_path / "m") / CONFIG_FILE).read_text())
+    assert config["settings"]["renderer"] == name == model.renderer.name
+    found, images = load(tmp_path / "m"), torch.rand(2, 3, 32, 32, generator=generator)
+    assert [row.name for row in found.factors] == config["factors"] == [row.name for row in model.factors]
+    assert torch.equal(found.reconstruct(images).image, model.eval().reconstruct(images).image)
+    with pytest.raises(ValueError, match=r"was made with the renderer .*, not 'unheard-of'"):
+        load(tmp_path / "m", renderer="unheard-of")
+
+
+def test_lambert_is_found_through_the_registry_and_draws_as_the_plain_renderer(generator):
+    model = Derenderer.from_preset("small", seed=0, **TINY)
+    assert model.renderer == renderer_named("lambert") and model.factors == FACTORS
+    scene = model.decompose(torch.rand(2, 3, 32, 32, generator=generator))
+    assert torch.equal(model.render(scene).image, render_scene(scene).image)
+
+
+def test_a_model_of_before_renderers_loads_as_lambert(tmp_path):
+    folder = Derenderer.from_preset("small", seed=0, **TINY).save(tmp_path / "m")
+    config = json.loads((folder / CONFIG_FILE).read_text())
+    del config["settings"]["renderer"]
+    (folder / CONFIG_FILE).write_text(json.dumps(config))
+    assert load(folder).renderer.name == "lambert"
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("phon", "no renderer 'phon'; did you mean 'phong'"),
+        ("phong(gama=2)", "no setting 'gama'; did you mean 'gamma'.*gamma, mean_diffuse"),
+        ("phong(gamma=9)", r"gamma must lie in 1\.\.3, got 9"),
+        ("phong(gamma=high)", "gamma must be a float, got 'high'"),
+        ("lambert-shadow(softness_deg=0)", r"must lie in 0\.1\.\.45"),
+        ("lambert(gamma=1)", "has no setting 'gamma': it has none"),
+        ("phong+phong", "'phong' twice"),
+        ("sh+lambert-shadow", "cannot be combined: each sets the light"),
+        ("phong(", "cannot read the renderer"),
+        ("nothing.here:glow", "no renderer 'nothing.here:glow'.*PYTHONPATH"),
+        ("json:dumps", "'json:dumps' is a function, not a derender.renderers.Renderer"),
+    ],
+)
+def test_a_name_that_is_none_says_what_to_write(name, message):
+    with pytest.raises(ValueError, match=message):
+        renderer_named(name)
+
+
+def test_a_users_module_is_imported_except_for_a_downloaded_model(tmp_path, monkeypatch):
+    (tmp_path / "my_glow.py").write_text(
+        "from derender.renderers import Renderer\nGLOW = Renderer('glow', gamma=2.0)\n"
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    name = "my_glow:GLOW"
+    folder = Derenderer.from_preset("small", seed=0, renderer=name, **TINY).save(tmp_path / "m")
+    assert load(folder).renderer.gamma == 2.0
+    with pytest.raises(ValueError, match="someone/model was downloaded and wants the code .*my_glow:GLOW"):
+        recorded_renderer(name, None, "someone/model")
+    assert recorded_renderer(name, name, "someone/model").gamma == 2.0
+
+
+def test_settings_of_a_run_name_renderer_and_factors():
+    config = run_settings(preset="small", renderer="phong+haze", loocc="light+specular")
+    assert config.model.renderer == "phong+haze" and config.objective.loocc == "light+specular"
+    assert run_settings(settings={"renderer": "sh"}).model.renderer == "sh"
+    with pytest.raises(ValueError, match="'specular' is no factor that this model perturbs.*light, camera"):
+        run_settings(loocc="light+specular")
+    with pytest.raises(ValueError, match="no renderer 'phng'; did you mean 'phong'"):
+        run_settings(renderer="phng")
+    with pytest.raises(ValueError, match="made with the renderer 'lambert', not 'haze'"):
+        run_settings(renderer="haze", start_from="faces-64")
+
+
+def _scene(**extra) -> Scene:
+    return Scene(
+        torch.ones(1, 8, 8), torch.ones(1, 3, 8, 8), torch.tensor([[0.5, 0.5, 0, 0]]), torch.zeros(1, 6), extra
+    )
+
+
+def test_a_renderer_refuses_scenes_that_are_not_its_own():
+    phong = renderer_named("phong")
+    with pytest.raises(ValueError, match="renderer 'phong' needs the scene's 'specular'.*another renderer"):
+        phong(_scene(), 10.0)
+    with pytest.raises(ValueError, match=r"exponent must lie in 1\.\.128 for the renderer 'phong', got 300"):
+        phong(_scene(specular=torch.tensor([[0.1, 300.0]])), 10.0)
+    broken = Renderer("mine", specular=lambda scene, normal, fov_deg: normal[None, ..., 0, 0].log() - 9)
+    with pytest.raises(ValueError, match="renderer 'mine' makes NaN or infinity of finite scenes"):
+        broken(_scene(), 10.0)
