@@ -92,7 +92,11 @@ def test_settings_of_a_run_name_renderer_and_factors():
 
 def _scene(**extra) -> Scene:
     return Scene(
-        torch.ones(1, 8, 8), torch.ones(1, 3, 8, 8), torch.tensor([[0.5, 0.5, 0, 0]]), torch.zeros(1, 6), extra
+        torch.ones(1, 8, 8),
+        torch.ones(1, 3, 8, 8),
+        torch.tensor([[0.5, 0.5, 0, 0]]),
+        torch.zeros(1, 6),
+        extra,
     )
 
 

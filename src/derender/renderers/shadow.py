@@ -1,6 +1,6 @@
 """`lambert-shadow`: Lambertian light that the surface itself keeps off, with a soft edge.
 
-Each point's ray is marched towards the light over the depth map, pixel by pixel. Its clearance at a step is
+Each point's ray is marched towards the light over the depth map, in steps that grow from one pixel. Its clearance at a step is
 how far the surface lies behind it, over the distance gone. The smallest clearance decides: lit where it is
 positive, dark below -tan(softness), smooth between. So a surface that bulges everywhere is lit as by
 ``lambert``, and light and depth get gradients at the edges of shadows. Leaves out occluders that the depth
@@ -10,16 +10,17 @@ map does not hold: those outside the image, and what lies behind the surface.
 import math
 
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Float, Int32, Int64
 from torch import Tensor
-from torch.nn.functional import grid_sample
 
 from derender.render import chosen_backend
 from derender.renderers.renderer import Renderer
 from derender.scene import Scene
-from derender.scene.camera import focal_px, unproject
+from derender.scene.camera import focal_px
 from derender.scene.light import light_direction
 
+Places = tuple[Int64[Tensor, " m"], Int64[Tensor, " m"], Int64[Tensor, " m"]]
+"""Image, row and column of some pixels."""
 _LEAST_SLANT = 1e-4  # of the light against the viewing axis; nearer to it nothing is in shadow
 
 
@@ -44,48 +45,57 @@ def visible(
         if chosen_backend(depth.device, backend) == "numba":
             from derender.renderers.shadow_numba import lowest_step
 
-            step = lowest_step(depth, towards, fov_deg)
+            step = lowest_step(depth, towards, focal_px(depth.shape[2], fov_deg))
         else:
-            step = _lowest_step(depth, towards, fov_deg)
-    share = 1 + clearance(depth, towards, step, fov_deg) / math.tan(math.radians(softness_deg))
-    share = share.clamp(0, 1)
-    return share * share * (3 - 2 * share)
+            step = _lowest_step(depth, towards, focal_px(depth.shape[2], fov_deg))
+    places = step.nonzero(as_tuple=True)  # usually few
+    found = clearance(depth, towards, places, step[places], focal_px(depth.shape[2], fov_deg))
+    share = (1 + found / math.tan(math.radians(softness_deg))).clamp(0, 1)
+    return torch.ones_like(depth).index_put(places, share * share * (3 - 2 * share))
 
 
 def clearance(
-    depth: Float[Tensor, "n h w"], towards: Float[Tensor, "n 3"], step: Int64[Tensor, "n h w"], fov_deg: float
-) -> Float[Tensor, "n h w"]:
-    """How far each ray runs in front of the surface after so many steps, over the distance gone.
+    depth: Float[Tensor, "n h w"], towards: Float[Tensor, "n 3"], places: Places, step: Int32[Tensor, " m"],
+    focal: float,
+) -> Float[Tensor, " m"]:  # fmt: skip
+    """How far the rays of some pixels run in front of the surface after so many steps, over the distance gone.
 
-    At step 0, and outside the image, it is 1: nothing is in the way.
+    Step k lies about k + k^2 / 16 pixels along the ray. Outside the image it is 1: nothing is in the way.
     """
-    height, width = depth.shape[1:]
-    focal, points = focal_px(width, fov_deg), unproject(depth, fov_deg)
-    gone = step * step_length(depth, towards, focal)
-    x, y, z = (points[..., axis] + gone * towards[:, axis, None, None] for axis in range(3))
-    place = torch.stack([x / z * (2 * focal / (width - 1)), y / z * (2 * focal / (height - 1))], dim=-1)
-    behind = grid_sample(depth[:, None], place, align_corners=True, padding_mode="border")[:, 0] - z
-    counts = (step > 0) & (place.detach().abs() <= 1).all(dim=-1)
-    return torch.where(counts, behind / torch.where(step > 0, gone, 1.0), 1.0)
+    (n, i, j), (height, width) = places, depth.shape[1:]
+    own, (x, y, z) = depth[places], towards[n].unbind(1)
+    gone = step * (1 + step / 16) * own / (focal * torch.hypot(x, y).clamp(min=_LEAST_SLANT))
+    reached = own + gone * z
+    middle_u, middle_v = (width - 1) / 2, (height - 1) / 2
+    u = ((j - middle_u) * own + focal * gone * x) / reached + middle_u
+    v = ((i - middle_v) * own + focal * gone * y) / reached + middle_v
+    inside = (u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1)
+    left, top = (at.detach().long().clamp(0, most - 2) for at, most in ((u, width), (v, height)))
+    across, down = u - left, v - top
+    above, below = (
+        torch.lerp(depth[n, row, left], depth[n, row, left + 1], across) for row in (top, top + 1)
+    )
+    return torch.where(inside, (torch.lerp(above, below, down) - reached) / gone, 1.0)
 
 
-def step_length(depth: Tensor, towards: Float[Tensor, "n 3"], focal: float) -> Float[Tensor, "n h w"]:
-    """The distance along each ray that moves it by about one pixel."""
-    slant = towards[:, :2].norm(dim=1).clamp(min=_LEAST_SLANT)
-    return depth / (focal * slant[:, None, None])
-
-
-def _lowest_step(depth: Tensor, towards: Tensor, fov_deg: float) -> Int64[Tensor, "n h w"]:
-    """The step of the smallest clearance; 0 where the ray leaves the range of depths free."""
-    step = torch.zeros_like(depth, dtype=torch.int64)
-    lowest = torch.ones_like(depth)
-    nearest = depth.amin(dim=(1, 2), keepdim=True)
-    length = step_length(depth, towards, focal_px(depth.shape[2], fov_deg))
+def _lowest_step(
+    depth: Float[Tensor, "n h w"], towards: Float[Tensor, "n 3"], focal: float
+) -> Int32[Tensor, "n h w"]:
+    """The step at which each ray runs deepest below the surface for its distance; 0 if it never does."""
+    step, lowest = torch.zeros_like(depth, dtype=torch.int32), torch.zeros_like(depth)
+    nearest, slant = depth.amin(dim=(1, 2)), towards[:, :2].norm(dim=1).clamp(min=_LEAST_SLANT)
+    rise = -towards[:, 2] / (focal * slant)  # of a ray by a step, over its depth
+    places = torch.ones_like(step).nonzero(as_tuple=True)
     for number in range(1, sum(depth.shape[1:])):
-        above = depth + number * length * towards[:, 2, None, None] > nearest
-        if number % 4 == 1 and not bool(above.any()):
+        n, own = places[0], depth[places]
+        under = own - number * (1 + number / 16) * own * rise[n] > nearest[n]
+        places = (places[0][under], places[1][under], places[2][under])
+        if not len(places[0]):
             break
-        found = clearance(depth, towards, torch.full_like(step, number), fov_deg)
-        lower = above & (found < lowest)
-        lowest, step = torch.where(lower, found, lowest), torch.where(lower, number, step)
+        found = clearance(
+            depth, towards, places, torch.full_like(places[0], number, dtype=torch.int32), focal
+        )
+        lower = found < lowest[places]
+        lowest[places] = torch.where(lower, found, lowest[places])
+        step[places] = torch.where(lower, number, step[places])
     return step

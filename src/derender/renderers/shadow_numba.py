@@ -1,26 +1,24 @@
-"""The search of `lambert-shadow` for the CPU: which step of each ray has the smallest clearance.
+"""The search of `lambert-shadow` for the CPU: the step at which each ray runs deepest below the surface.
 
-The same as ``shadow._lowest_step``; no derivative is needed, as clearance is differentiated at that
-step alone.
+The same as ``shadow._lowest_step``; no derivative is needed, as clearance is differentiated at that step
+alone. A ray ends where nothing further on could be deeper, given the nearest surface of all that it can reach.
 """
 
 from typing import no_type_check
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Float, Int32
 from torch import Tensor
 
 from derender.render.numba_threads import array, kernel, over_images
-from derender.scene.camera import focal_px
 
 
 def lowest_step(
-    depth: Float[Tensor, "n h w"], towards: Float[Tensor, "n 3"], fov_deg: float
-) -> Int64[Tensor, "n h w"]:
-    """The step of the smallest clearance; 0 where the ray leaves the range of depths free."""
-    step = torch.empty_like(depth, dtype=torch.int64, memory_format=torch.contiguous_format)
-    focal = focal_px(depth.shape[2], fov_deg)
+    depth: Float[Tensor, "n h w"], towards: Float[Tensor, "n 3"], focal: float
+) -> Int32[Tensor, "n h w"]:
+    """The step of the smallest clearance; 0 where it is nowhere below 0."""
+    step = torch.empty(depth.shape, dtype=torch.int32)
     over_images(_search, len(depth), array(depth), array(towards), focal, array(step))
     return step
 
@@ -29,25 +27,31 @@ def lowest_step(
 @no_type_check
 def _search(depth, towards, focal, step, first, last):
     height, width = depth.shape[1:]
-    middle_u, middle_v = 0.5 * (width - 1), 0.5 * (height - 1)
+    zero, one, sixteen = depth.dtype.type(0), depth.dtype.type(1), depth.dtype.type(16)
+    focal, middle_u, middle_v = zero + focal, zero + 0.5 * (width - 1), zero + 0.5 * (height - 1)
+    ahead = np.empty((height, width), depth.dtype)
     for n in range(first, last):
         tx, ty, tz = towards[n, 0], towards[n, 1], towards[n, 2]
-        own, slant = depth[n], max(np.sqrt(tx * tx + ty * ty), depth.dtype.type(1e-4))
-        nearest = own.min()
+        own, slant = depth[n], max(np.sqrt(tx * tx + ty * ty), zero + 1e-4)
+        _nearest_ahead(own, focal * tx / tz + middle_u, focal * ty / tz + middle_v, ahead)
         for i in range(height):
             for j in range(width):
                 z0 = own[i, j]
-                x0, y0 = z0 * (j - middle_u) / focal, z0 * (i - middle_v) / focal
+                nearest = ahead[i, j]
                 length = z0 / (focal * slant)
-                lowest, best = 1.0, 0
+                x0, y0 = (j - middle_u) * z0, (i - middle_v) * z0
+                across, down = focal * length * tx, focal * length * ty
+                lowest, best = zero, 0
                 for number in range(1, height + width - 1):
-                    gone = number * length
+                    pixels = number * (one + number / sixteen)
+                    gone = pixels * length
                     z = z0 + gone * tz
-                    if z <= nearest:
+                    if nearest - z >= lowest * gone:
                         break
-                    u = (x0 + gone * tx) / z * focal + middle_u
-                    v = (y0 + gone * ty) / z * focal + middle_v
-                    if u < 0.0 or v < 0.0 or u > width - 1 or v > height - 1:
+                    near = one / z
+                    u = (x0 + pixels * across) * near + middle_u
+                    v = (y0 + pixels * down) * near + middle_v
+                    if u < 0 or v < 0 or u > width - 1 or v > height - 1:
                         break
                     p, q = min(int(u), width - 2), min(int(v), height - 2)
                     a, b = u - p, v - q
@@ -57,3 +61,29 @@ def _search(depth, towards, focal, step, first, last):
                     if behind < lowest * gone:
                         lowest, best = behind / gone, number
                 step[n, i, j] = best
+
+
+@kernel
+@no_type_check
+def _nearest_ahead(own, source_u, source_v, ahead):
+    """Write for each pixel the smallest depth of all that lie further from the source in rows and columns.
+
+    Seen by the camera, parallel rays run away from the point that they come from.
+    """
+    height, width = own.shape
+    for k in range(height):
+        i = k
+        if k > source_v:  # from the last row back
+            i = height - 1 - (k - max(int(np.floor(source_v)) + 1, 0))
+        outer_i = i + 1 if i > source_v else i - 1
+        for m in range(width):
+            j = m
+            if m > source_u:
+                j = width - 1 - (m - max(int(np.floor(source_u)) + 1, 0))
+            outer_j = j + 1 if j > source_u else j - 1
+            nearest = own[i, j]
+            if 0 <= outer_i < height:
+                nearest = min(nearest, ahead[outer_i, j])
+            if 0 <= outer_j < width:
+                nearest = min(nearest, ahead[i, outer_j])
+            ahead[i, j] = nearest
