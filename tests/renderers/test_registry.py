@@ -73,7 +73,7 @@ def test_a_users_module_is_imported_except_for_a_downloaded_model(tmp_path, monk
     name = "my_glow:GLOW"
     folder = Derenderer.from_preset("small", seed=0, renderer=name, **TINY).save(tmp_path / "m")
     assert load(folder).renderer.gamma == 2.0
-    with pytest.raises(ValueError, match="someone/model was downloaded and wants the code .*my_glow:GLOW"):
+    with pytest.raises(ValueError, match=r"someone/model was downloaded and wants the code .*my_glow:GLOW"):
         recorded_renderer(name, None, "someone/model")
     assert recorded_renderer(name, name, "someone/model").gamma == 2.0
 

@@ -1,9 +1,9 @@
 """`lambert-shadow`: Lambertian light that the surface itself keeps off, with a soft edge.
 
-Each point's ray is marched towards the light over the depth map, in steps that grow from one pixel. Its clearance at a step is
-how far the surface lies behind it, over the distance gone. The smallest clearance decides: lit where it is
-positive, dark below -tan(softness), smooth between. So a surface that bulges everywhere is lit as by
-``lambert``, and light and depth get gradients at the edges of shadows. Leaves out occluders that the depth
+Each point's ray is marched towards the light over the depth map, in steps that grow from one pixel. Its
+clearance at a step is how far the surface lies behind it, over the distance gone. The smallest clearance
+decides: lit where it is positive, dark below -tan(softness), smooth between. So a surface that bulges
+everywhere is lit as by ``lambert``, and light and depth get gradients at the edges of shadows. Leaves out occluders that the depth
 map does not hold: those outside the image, and what lies behind the surface.
 """
 
@@ -19,7 +19,7 @@ from derender.scene import Scene
 from derender.scene.camera import focal_px
 from derender.scene.light import light_direction
 
-Places = tuple[Int64[Tensor, " m"], Int64[Tensor, " m"], Int64[Tensor, " m"]]
+Places = tuple[Int64[Tensor, " m"], ...]
 """Image, row and column of some pixels."""
 _LEAST_SLANT = 1e-4  # of the light against the viewing axis; nearer to it nothing is in shadow
 
@@ -58,7 +58,7 @@ def clearance(
     depth: Float[Tensor, "n h w"], towards: Float[Tensor, "n 3"], places: Places, step: Int32[Tensor, " m"],
     focal: float,
 ) -> Float[Tensor, " m"]:  # fmt: skip
-    """How far the rays of some pixels run in front of the surface after so many steps, over the distance gone.
+    """How far some pixels' rays run in front of the surface after so many steps, over the distance gone.
 
     Step k lies about k + k^2 / 16 pixels along the ray. Outside the image it is 1: nothing is in the way.
     """
@@ -89,7 +89,7 @@ def _lowest_step(
     for number in range(1, sum(depth.shape[1:])):
         n, own = places[0], depth[places]
         under = own - number * (1 + number / 16) * own * rise[n] > nearest[n]
-        places = (places[0][under], places[1][under], places[2][under])
+        places = tuple(axis[under] for axis in places)
         if not len(places[0]):
             break
         found = clearance(

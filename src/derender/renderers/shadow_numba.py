@@ -1,7 +1,7 @@
 """The search of `lambert-shadow` for the CPU: the step at which each ray runs deepest below the surface.
 
 The same as ``shadow._lowest_step``; no derivative is needed, as clearance is differentiated at that step
-alone. A ray ends where nothing further on could be deeper, given the nearest surface of all that it can reach.
+alone. A ray ends where nothing further on could be deeper, given the nearest surface that it can reach.
 """
 
 from typing import no_type_check
