@@ -82,7 +82,7 @@ def test_settings_of_a_run_name_renderer_and_factors():
     config = run_settings(preset="small", renderer="phong+haze", loocc="light+specular")
     assert config.model.renderer == "phong+haze" and config.objective.loocc == "light+specular"
     assert run_settings(settings={"renderer": "sh"}).model.renderer == "sh"
-    with pytest.raises(ValueError, match="'specular' is no factor that this model perturbs.*light, camera"):
+    with pytest.raises(ValueError, match=r"'specular' is no factor that this model perturbs.*light, camera"):
         run_settings(loocc="light+specular")
     with pytest.raises(ValueError, match="no renderer 'phng'; did you mean 'phong'"):
         run_settings(renderer="phng")
@@ -102,7 +102,7 @@ def _scene(**extra) -> Scene:
 
 def test_a_renderer_refuses_scenes_that_are_not_its_own():
     phong = renderer_named("phong")
-    with pytest.raises(ValueError, match="renderer 'phong' needs the scene's 'specular'.*another renderer"):
+    with pytest.raises(ValueError, match=r"renderer 'phong' needs the scene's 'specular'.*another renderer"):
         phong(_scene(), 10.0)
     with pytest.raises(ValueError, match=r"exponent must lie in 1\.\.128 for the renderer 'phong', got 300"):
         phong(_scene(specular=torch.tensor([[0.1, 300.0]])), 10.0)

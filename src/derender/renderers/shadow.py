@@ -3,8 +3,8 @@
 Each point's ray is marched towards the light over the depth map, in steps that grow from one pixel. Its
 clearance at a step is how far the surface lies behind it, over the distance gone. The smallest clearance
 decides: lit where it is positive, dark below -tan(softness), smooth between. So a surface that bulges
-everywhere is lit as by ``lambert``, and light and depth get gradients at the edges of shadows. Leaves out occluders that the depth
-map does not hold: those outside the image, and what lies behind the surface.
+everywhere is lit as by ``lambert``, and light and depth get gradients at the edges of shadows. Leaves out
+occluders that the depth map does not hold: those outside the image, and what lies behind the surface.
 """
 
 import math

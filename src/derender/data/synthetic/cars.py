@@ -89,7 +89,8 @@ def generate(
         car = model_car(seed, number, settings)
         return (draw_car(seed, index, image_size, settings, car, number) for index in indices)
 
-    return make_set(shots, count, image_size, seed, first, settings.pictures_per_model, PARTS, progress)
+    size = settings.pictures_per_model
+    return make_set(shots, count, image_size, seed, first, size, PARTS, progress, settings.effects)
 
 
 @dataclass(frozen=True)

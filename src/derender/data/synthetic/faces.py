@@ -68,7 +68,8 @@ def generate(
         for mesh, (_, background, light, camera, labels) in zip(meshes, draws, strict=True):
             yield Shot(mesh, background, light, camera, number, labels | person.labels, person.traits)
 
-    return make_set(shots, count, image_size, seed, first, settings.per_identity, MASK_CLASSES, progress)
+    size = settings.per_identity
+    return make_set(shots, count, image_size, seed, first, size, MASK_CLASSES, progress, settings.effects)
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,8 @@ sample alone, at the pixel's centre. Normals, colours and charts are interpolate
 a colour and a part at each vertex. A car's triangles lie on painted surfaces: each has a colour, a part, and
 flat shapes (decals) on its chart, a pair of coordinates that the mesh carries. Shapes are looked up at every
 sample, so their edges are as sharp at 512 pixels as at 32; the last shape that holds a point wins. Unlike
-``derender.render`` this needs no gradient. Leaves out cast shadows, speculars, and what is seen from behind.
+``derender.render`` this needs no gradient. Gloss, shadows and haze: lighting.py. Leaves out what is seen from
+behind.
 Numba's cache on disk refers to the named tuples by name: who renames one renames the kernels that take it.
 """
 
@@ -16,6 +17,7 @@ import numpy as np
 from jaxtyping import Int32
 from numpy import ndarray
 
+from derender.data.synthetic.lighting import is_plain, light_at
 from derender.render.numba_threads import kernel
 
 SAMPLES = 3  # of a pixel, in each direction
@@ -79,6 +81,7 @@ class ImageMaps(NamedTuple):
     albedo: ndarray  # (3,S,S) uint8
     mask: ndarray  # (S,S) bool
     parts: ndarray  # (S,S) uint8
+    effects: ndarray  # (4,S,S) float32, as in EFFECTS; (0,S,S) where they are not kept
 
 
 @lru_cache(maxsize=64)
@@ -94,8 +97,8 @@ def grid_triangles(rows: int, columns: int, mirrored: float = 0.0) -> Int32[ndar
 @kernel
 @no_type_check
 def draw_mesh(mesh, rotation, translation, light, background, focal_px, out):
-    """Fill ``out``. The mesh is turned by rotation (3,3) and moved to (0, 0, 1) + translation (3,). light
-    (5,): ambient, diffuse and the direction in the camera frame; background (S,S,3) 0..1."""
+    """Fill ``out``. The mesh is turned by rotation (3,3) and moved to (0, 0, 1) + translation (3,); light is
+    a ``Lighting``, background (S,S,3) 0..1."""
     painted = mesh.values.shape[1] == 2
     places = np.empty((len(mesh.vertices), 3), np.float32)  # sample column, row, 1 / z
     more = np.zeros((len(mesh.vertices), 8), np.float32)  # normal, chart or colour, cosine to the light
@@ -104,7 +107,7 @@ def draw_mesh(mesh, rotation, translation, light, background, focal_px, out):
     owner = np.full(nearest.shape, -1, np.int32)
     number = mesh.number if painted else mesh.number[:0]
     fill_triangles(places, mesh.triangles, number, more, mesh.paint.holes, nearest, owner)
-    _shade_samples(mesh, places, more, owner, light, background, out)
+    _shade_samples(mesh, places, more, owner, light, background, focal_px, nearest, out)
 
 
 @kernel
@@ -158,7 +161,7 @@ def _place(mesh, rotation, translation, focal_px, size, light, places, more):
         scale = _ONE / max(np.sqrt(x * x + y * y + z * z), np.float32(1e-20))
         x, y, z = x * scale, y * scale, z * scale
         more[v, 0], more[v, 1], more[v, 2] = x, y, z
-        more[v, 6] = x * light[2] + y * light[3] + z * light[4]
+        more[v, 6] = x * light.lamps[0, 1] + y * light.lamps[0, 2] + z * light.lamps[0, 3]
 
 
 @kernel
@@ -258,7 +261,7 @@ def _blend(more, k, a, b, c, wa, wb, wc):
 
 @kernel
 @no_type_check
-def _shade_samples(mesh, places, more, owner, light, background, out):
+def _shade_samples(mesh, places, more, owner, light, background, focal_px, nearest, out):
     painted, share, scale = mesh.values.shape[1] == 2, np.float32(1.0 / _ALL), _ONE
     weight = np.empty((_ALL, 3), np.float32)  # of the corners of each sample's triangle
     surface = np.empty(_ALL, np.int32)  # of each sample, -1 on the background
@@ -266,6 +269,13 @@ def _shade_samples(mesh, places, more, owner, light, background, out):
     inside = np.empty(_ALL, np.bool_)
     colour = np.empty((_ALL, 3), np.float32)
     part = np.empty(_ALL, np.int32)
+    plain, lamp, found, air = is_plain(light), light.lamps[0], np.ones(3, np.float32), light.haze[1]
+    middle, near, far = np.float32(0.5) * np.float32(len(background) - 1), _ZERO, np.float32(np.inf)
+    if light.haze[0] > _ZERO:
+        for w in nearest.flat:
+            if w > _ZERO:
+                near, far = max(near, w), min(far, w)
+    veil = np.exp(-light.haze[0])  # of what is farthest, and of the background
     for i in range(np.uint32(len(background))):
         for j in range(np.uint32(len(background))):
             seen = 0
@@ -288,6 +298,8 @@ def _shade_samples(mesh, places, more, owner, light, background, out):
             if painted and seen:
                 _paint_samples(mesh.paint, surface, spot, inside, colour, part)
             empty, behind = np.float32(_ALL - seen), background[i, j]
+            if light.haze[0] > _ZERO:
+                behind = behind * veil + air * (_ONE - veil)
             red, green, blue = empty * behind[0], empty * behind[1], empty * behind[2]
             for s in range(np.uint32(_ALL if seen else 0)):
                 if surface[s] < 0:
@@ -296,21 +308,32 @@ def _shade_samples(mesh, places, more, owner, light, background, out):
                 a, b, c = _corners(mesh.triangles, f)
                 wa, wb, wc = weight[s, 0], weight[s, 1], weight[s, 2]
                 x, y, z = _ZERO, _ZERO, _ZERO
-                if painted or s == _MIDDLE:
+                if painted or s == _MIDDLE or not plain:
                     x = _blend(more, 0, a, b, c, wa, wb, wc)
                     y = _blend(more, 1, a, b, c, wa, wb, wc)
                     z = _blend(more, 2, a, b, c, wa, wb, wc)
                     scale = _ONE / max(np.sqrt(x * x + y * y + z * z), np.float32(1e-20))
                 if painted:
-                    cosine = (x * light[2] + y * light[3] + z * light[4]) * scale
+                    cosine = (x * lamp[1] + y * lamp[2] + z * lamp[3]) * scale
                 else:
                     cosine = _blend(more, 6, a, b, c, wa, wb, wc)
                     for n in range(3):
                         colour[s, n] = _blend(more, 3 + n, a, b, c, wa, wb, wc)
-                lit = light[0] + light[1] * max(_ZERO, cosine)
-                red += min(colour[s, 0] * lit, _ONE)
-                green += min(colour[s, 1] * lit, _ONE)
-                blue += min(colour[s, 2] * lit, _ONE)
+                lit, shine, passed = light.ambient + lamp[0] * max(_ZERO, cosine), _ZERO, _ONE
+                if not plain:
+                    z_here = _ONE / _blend(places, 2, a, b, c, wa, wb, wc)
+                    u = (np.float32(SAMPLES * j + s % SAMPLES) - _ONE) / np.float32(SAMPLES) - middle
+                    v = (np.float32(SAMPLES * i + s // SAMPLES) - _ONE) / np.float32(SAMPLES) - middle
+                    x_here, y_here = u * z_here / focal_px, v * z_here / focal_px
+                    light_at(light, x_here, y_here, z_here, x * scale, y * scale, z * scale, found)
+                    lit, shine = found[0], found[2]
+                    if light.haze[0] > _ZERO and far < near:
+                        passed = (z_here - _ONE / near) / (_ONE / far - _ONE / near)
+                        passed = np.exp(-light.haze[0] * min(max(passed, _ZERO), _ONE))
+                veiled = air * (_ONE - passed)
+                red += min((colour[s, 0] * lit + shine) * passed + veiled, _ONE)
+                green += min((colour[s, 1] * lit + shine) * passed + veiled, _ONE)
+                blue += min((colour[s, 2] * lit + shine) * passed + veiled, _ONE)
                 if s == _MIDDLE:
                     if not painted:
                         part[s] = mesh.number[a if wa >= max(wb, wc) else (b if wb >= wc else c)]
@@ -319,6 +342,9 @@ def _shade_samples(mesh, places, more, owner, light, background, out):
                     out.normal[i, j, 0], out.normal[i, j, 1] = x * scale, y * scale
                     out.normal[i, j, 2] = z * scale
                     _store(out.albedo, i, j, colour[s])
+                    if len(out.effects):
+                        out.effects[0, i, j], out.effects[1, i, j] = lit, found[1]
+                        out.effects[2, i, j], out.effects[3, i, j] = shine, passed
             _store(out.image, i, j, (red * share, green * share, blue * share))
 
 

@@ -7,6 +7,7 @@ it, so the same seed shows the same people in another light. ``LIGHTS``, ``VIEWS
 """
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from itertools import chain
 from pathlib import Path
@@ -158,6 +159,63 @@ class CarViewSettings(_DrawnSettings):
     shift_sd: float = Field(default=0.003, ge=0, le=0.1)
 
 
+@dataclass(frozen=True)
+class DrawnEffects:
+    """What ``EffectSettings`` draw for one image: arrays as in ``lighting.Lighting``, and the same as labels;
+    ``more_lamps`` are (K, 4): strength, and unit direction in the canonical frame."""
+
+    gloss: ndarray
+    haze: ndarray
+    more_lamps: ndarray
+    labels: dict[str, int | float | np.float32 | str]
+
+
+class EffectSettings(_DrawnSettings):
+    """What light does beyond one lamp on a matt surface; by default nothing. Ranges are uniform, and even in
+    the logarithm for exponent and beta. Further lamps have 0.3 to 1 of the first one's strength."""
+
+    place = "effects."
+    limits: ClassVar = {
+        "gloss": (0.0, 0.5), "exponent": (1.0, 128.0), "haze": (0.0, 4.0), "airlight": (0.25, 1.0),
+    }  # fmt: skip
+    gloss: Range = (0.0, 0.0)  # strength of the highlight
+    exponent: Range = (4.0, 64.0)
+    shadows: bool = False
+    lamps: int = Field(default=1, ge=1, le=4)
+    lamp_deg: float = Field(default=60.0, ge=0, le=85)  # pitch and yaw of further lamps lie in +- this
+    haze: Range = (0.0, 0.0)  # beta, 0 for none
+    airlight: Range = (0.6, 1.0)
+
+    @property
+    def any(self) -> bool:
+        return self.shadows or self.lamps > 1 or self.gloss[1] > 0 or self.haze[1] > 0
+
+    def draw(self, generator: np.random.Generator, strength: float) -> DrawnEffects:
+        """The effects of one image; ``strength`` is its first lamp's. Settings change no other draw."""
+        share, lamps = generator.random(4), generator.random((3, 3))
+        gloss = np.array([drawn(self.gloss, share[0]), _even_in_log(self.exponent, share[1])], np.float32)
+        haze = np.array([_even_in_log(self.haze, share[2]), drawn(self.airlight, share[3])], np.float32)
+        lamps = lamps[: self.lamps - 1]
+        pitch, yaw = np.deg2rad(self.lamp_deg) * (2 * lamps[:, 1:].T - 1)
+        rows = np.stack([np.tan(yaw), np.tan(pitch), np.ones_like(yaw)], axis=1)
+        rows /= np.linalg.norm(rows, axis=1, keepdims=True)
+        power = strength * (0.3 + 0.7 * lamps[:, :1])
+        labels: dict[str, Any] = {}
+        if self.gloss[1] > 0:
+            labels |= {"gloss_strength": gloss[0], "gloss_exponent": gloss[1]}
+        if self.haze[1] > 0:
+            labels |= {"haze_beta": haze[0], "haze_airlight": haze[1]}
+        angles = np.rad2deg(np.stack([pitch, yaw], axis=1)).astype(np.float32)
+        for n, (force, own) in enumerate(zip(power[:, 0].astype(np.float32), angles, strict=True), 2):
+            labels |= {f"lamp{n}": force, f"lamp{n}_pitch": own[0], f"lamp{n}_yaw": own[1]}
+        return DrawnEffects(gloss, haze, np.hstack([power, rows]), labels)
+
+
+def _even_in_log(ends: Range, share: float) -> float:
+    """The value at that share of a range's logarithms; of one that starts at 0, of the range itself."""
+    return drawn(ends, share) if ends[0] <= 0 else float(ends[0] * (ends[1] / ends[0]) ** share)
+
+
 def _named(settings: type[Kind], kind: str, table: str) -> Mapping[str, Kind]:
     return {name: settings.model_validate(row) for name, row in numbers_of(kind)[table].items()}
 
@@ -177,6 +235,7 @@ class FaceSettings(_DrawnSettings):
     known: ClassVar = {"expressions": EXPRESSIONS, "backgrounds": BACKGROUNDS}
     light: LightSettings = LightSettings()
     view: ViewSettings = ViewSettings()
+    effects: EffectSettings = EffectSettings()
     pictures_per_identity: int = Field(default=8, ge=1)
     first_identity: int = Field(default=0, ge=0)  # other people from the same seed
     tracks: int = Field(default=0, ge=0)
@@ -202,6 +261,7 @@ class CarSettings(_DrawnSettings):
     light: LightSettings = CAR_LIGHTS["usual"]  # in the canonical frame
     brightest: float = Field(default=1.3, ge=0.1, le=2)  # limit of ambient and diffuse together
     view: CarViewSettings = CarViewSettings()
+    effects: EffectSettings = EffectSettings()
     classes: Shares = dict.fromkeys(CLASSES, 1.0)
     pictures_per_model: int = Field(default=4, ge=1)  # consecutive images that show one car
     first_model: int = Field(default=0, ge=0)  # other cars from the same seed

@@ -6,7 +6,7 @@ are drawn into the rows of the result. So threads decide when an image is made a
 
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import groupby
 from typing import Any, NamedTuple
 
@@ -15,7 +15,10 @@ import torch
 from jaxtyping import Bool, Float32, Float64, Int64, Shaped, UInt8
 from numpy import ndarray
 
+from derender.data.synthetic.lighting import EFFECTS
 from derender.data.synthetic.mesh_image import ImageMaps, TriangleMesh, draw_mesh
+from derender.data.synthetic.settings import EffectSettings
+from derender.data.synthetic.shadow_map import lit_by
 from derender.scene.camera import focal_px, rotation_matrix
 from derender.scene.light import light_direction
 
@@ -44,6 +47,8 @@ class SyntheticSet:
         identity_traits: the traits drawn for each image's identity, by name.
         part_names: names of the parts, background first.
         fov_deg: field of view of every image.
+        effects: with effects, further maps by name, 0 on the background: ``shading`` (all diffuse light),
+            ``visible`` (share of the first lamp's light that arrives), ``highlight`` and ``transmission``.
     """
 
     images: UInt8[ndarray, "n 3 s s"]
@@ -59,6 +64,7 @@ class SyntheticSet:
     identity_traits: Mapping[str, Shaped[ndarray, "n"]]
     part_names: tuple[str, ...]
     fov_deg: float = FOV_DEG
+    effects: Mapping[str, Float32[ndarray, "n s s"]] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.images)
@@ -104,6 +110,7 @@ def make_set(
     per_object: int,
     part_names: tuple[str, ...],
     progress: Progress | None,
+    effects: EffectSettings,
 ) -> SyntheticSet:
     """The set of ``count`` images from index ``first`` on; ``shots(indices)`` are those of images of one
     object.
@@ -121,6 +128,7 @@ def make_set(
     maps = ImageMaps(
         *(np.zeros(coloured, np.uint8), np.zeros(plain, np.float32), np.zeros((*plain, 3), np.float32)),
         *(np.zeros(coloured, np.uint8), np.zeros(plain, bool), np.zeros(plain, np.uint8)),
+        np.zeros((count, len(EFFECTS) if effects.any else 0, image_size, image_size), np.float32),
     )
     focal = np.float32(focal_px(image_size, FOV_DEG))
 
@@ -129,12 +137,19 @@ def make_set(
         run = [shot for _, group in groups for shot in shots(list(group))]
         light, camera = np.stack([shot.light for shot in run]), np.stack([shot.camera for shot in run])
         rotation, direction = camera_rotation_and_light(camera, light)
-        rays = np.hstack([light[:, :2], direction]).astype(np.float32)
-        for n, (index, shot) in enumerate(zip(indices, run, strict=True)):
+        rays = np.hstack([light[:, 1:2], direction]).astype(np.float32)
+        generators = [np.random.default_rng([seed, 5, index]) for index in indices]
+        drawn = [effects.draw(own, float(ray[0])) for own, ray in zip(generators, rays, strict=True)]
+        for n, (index, shot, own) in enumerate(zip(indices, run, drawn, strict=True)):
             out = ImageMaps(*(each[index - first] for each in maps))
-            turn = rotation[n].astype(np.float32)
-            draw_mesh(shot.mesh, turn, camera[n, 3:], rays[n], shot.background, focal, out)
-        return [shot[2:] for shot in run]  # without meshes
+            turn, shift = rotation[n].astype(np.float32), camera[n, 3:]
+            more = np.hstack([own.more_lamps[:, :1], own.more_lamps[:, 1:] @ turn.T])
+            lamps = np.vstack([rays[n], more]).astype(np.float32)
+            lit = (light[n, 0], lamps, own.gloss, own.haze, effects.shadows, image_size)
+            lighting = lit_by(shot.mesh, turn, shift, *lit)
+            draw_mesh(shot.mesh, turn, shift, lighting, shot.background, focal, out)
+        shown = zip(run, drawn, strict=True)
+        return [(*shot[2:5], shot.labels | own.labels, shot.traits) for shot, own in shown]  # without meshes
 
     whole = per_object * max(1, _LONGEST_RUN // per_object)  # objects where they fit
     runs = groupby(range(first, first + count), lambda i: (i // whole, i % whole // _LONGEST_RUN))
@@ -146,9 +161,11 @@ def make_set(
                 progress(len(made), count)
     light, camera, identity, *tables = zip(*made, strict=True)
     labels, traits = ({name: np.array([row[name] for row in rows]) for name in rows[0]} for rows in tables)
+    kept = {} if not effects.any else {name: maps.effects[:, n] for n, name in enumerate(EFFECTS)}
     return SyntheticSet(
-        *maps, np.stack(light), np.stack(camera), np.array(identity), labels, traits, part_names
-    )
+        *maps[:-1], np.stack(light), np.stack(camera), np.array(identity), labels, traits, part_names,
+        effects=kept,
+    )  # fmt: skip
 
 
 def draw_background(kind: str, generator: np.random.Generator, size: int) -> Float32[ndarray, "s s 3"]:

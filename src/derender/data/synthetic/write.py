@@ -3,6 +3,7 @@
 ``images/NNNNNN.jpg`` (JPEG quality 92, 4:4:4), ``params.csv`` (degrees), ``identities.csv``, and with truth
 ``depth/`` (16 bit, z = 0.8 + value/65535*0.4, 0 = background), ``normal/`` (round((n+1)/2*255)), ``albedo/``,
 ``mask/`` (255 = object) and ``masks/`` (number of the part, named line by line in ``classes.txt``) as PNG.
+With effects also ``shading/``, ``visible/``, ``highlight/`` and ``transmission/`` (16 bit, value/65535*2).
 Tracks lie at ``tracks/idNNNN/track_NNN/NNN.jpg`` without maps. The column ``expr_weights`` of the
 morphable-model sets has no counterpart here.
 """
@@ -19,7 +20,7 @@ from PIL import Image
 from derender.data.synthetic.synthetic_set import Progress, SyntheticSet, camera_rotation_and_light
 from derender.storage.atomic import atomic_folder
 
-DEPTH_LOW, DEPTH_SPAN = 0.8, 0.4
+DEPTH_LOW, DEPTH_SPAN, EFFECT_SPAN = 0.8, 0.4, 2.0
 _MAPS = ("depth", "normal", "albedo", "mask", "masks")
 
 
@@ -31,7 +32,7 @@ def write(
     ``progress(done, count)`` is called as images are written.
     """
     files = [f"images/{i:06d}.jpg" for i in range(len(synthetic))]
-    return _write(synthetic, Path(folder), files, _MAPS if truth else (), progress)
+    return _write(synthetic, Path(folder), files, (*_MAPS, *synthetic.effects) if truth else (), progress)
 
 
 def write_tracks(synthetic: SyntheticSet, folder: Path | str, progress: Progress | None = None) -> Path:
@@ -99,6 +100,10 @@ def _encoded(synthetic: SyntheticSet, i: int) -> dict[str, ndarray]:
         "albedo": synthetic.albedo[i].transpose(1, 2, 0),
         "mask": mask.astype(np.uint8) * 255,
         "masks": synthetic.parts[i],
+        **{
+            name: np.round(maps[i].astype(float) / EFFECT_SPAN * 65535).clip(0, 65535).astype(np.uint16)
+            for name, maps in synthetic.effects.items()
+        },
     }
 
 
