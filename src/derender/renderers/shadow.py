@@ -55,8 +55,8 @@ def visible(
 
 
 def clearance(
-    depth: Float[Tensor, "n h w"], towards: Float[Tensor, "n 3"], places: Places, step: Int32[Tensor, " m"],
-    focal: float,
+    depth: Float[Tensor, "n h w"], towards: Float[Tensor, "n 3"], places: Places,
+    step: Int32[Tensor, " m"] | Float[Tensor, " m"], focal: float,
 ) -> Float[Tensor, " m"]:  # fmt: skip
     """How far some pixels' rays run in front of the surface after so many steps, over the distance gone.
 

@@ -97,17 +97,19 @@ def relit(
     """
     film = film or FilmOptions()
     angle = _angle_text(reach_deg, film.stills)
+    parameter = "light" if like is None else swappable(model, ["light"])["light"]
 
     def lights(t: Tensor) -> Tensor:
         if like is not None:
-            return sweeps.lights_between(t, image.scene.light[0], like.scene.light[0])
+            own, other = (one.scene.parameters[parameter][0] for one in (image, like))
+            return sweeps.lights_between(t, own, other)
         own = float(image.scene.light[0, :2].sum())
         return sweeps.lights_around(t, reach_deg, pitch_deg, strength * own)
 
     def label(place: float, row: Tensor) -> str:
         return f"light {angle(degrees(row[3]))}" if like is None else f"{place:.0%} of its light"
 
-    return _swept(model, image, like, "light", lights, label, film)
+    return _swept(model, image, like, parameter, lights, label, film)
 
 
 def rotated(

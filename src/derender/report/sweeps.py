@@ -53,8 +53,8 @@ def lights_around(
 
 
 def lights_between(
-    t: Float[Tensor, " k"], start: Float[Tensor, " 4"], end: Float[Tensor, " 4"]
-) -> Float[Tensor, "k 4"]:
+    t: Float[Tensor, " k"], start: Float[Tensor, " n"], end: Float[Tensor, " n"]
+) -> Float[Tensor, "k n"]:
     """Lights from one to another, each number on a straight line."""
     return torch.lerp(start[None], end[None], t.to(start)[:, None])
 

@@ -145,7 +145,7 @@ def make_set(
             turn, shift = rotation[n].astype(np.float32), camera[n, 3:]
             more = np.hstack([own.more_lamps[:, :1], own.more_lamps[:, 1:] @ turn.T])
             lamps = np.vstack([rays[n], more]).astype(np.float32)
-            lit = (light[n, 0], lamps, own.gloss, own.haze, effects.shadows, image_size)
+            lit = (float(light[n, 0]), lamps, own.gloss, own.haze, effects.shadows, image_size)
             lighting = lit_by(shot.mesh, turn, shift, *lit)
             draw_mesh(shot.mesh, turn, shift, lighting, shot.background, focal, out)
         shown = zip(run, drawn, strict=True)
