@@ -29,7 +29,7 @@ def test_the_example_goes_through_every_command(made):
     model = derender.load(folder / "run")
     assert model.renderer.name == "05_new_factor:BALANCE" and model.factors[-1].name == "white"
     image, other = sorted((folder / "data" / "images").iterdir())[:2]
-    source = ("--model", folder / "run", "--detail", "model")
+    source = ("--model", folder / "run")
     assert run("decompose", *source, image, "--out", folder / "d") == 0
     scene = json.loads((folder / "d" / image.stem / "scene.json").read_text())
     assert set(scene["white"]) == {"red", "blue"} and 0.7 <= scene["white"]["red"] <= 1.4

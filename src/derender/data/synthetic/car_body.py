@@ -22,7 +22,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from derender.data.synthetic.mesh_image import DECAL_LENGTH, Paint, TriangleMesh, grid_triangles
+from derender.data.synthetic.decals import DECAL_LENGTH, Paint
+from derender.data.synthetic.mesh_image import TriangleMesh, grid_triangles
 
 PARTS = ("background", "body", "window", "wheel", "light", "trim", "plate")
 ARCH = 1.13  # radius of the wheel arches in wheel radii

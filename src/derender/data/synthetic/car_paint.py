@@ -25,7 +25,7 @@ from derender.data.synthetic.car_body import (
     Decal,
     body_lines,
 )
-from derender.data.synthetic.mesh_image import BOX, DECAL_LENGTH, ELLIPSE, MOST_CORNERS
+from derender.data.synthetic.decals import BOX, DECAL_LENGTH, ELLIPSE, MOST_CORNERS
 
 BLACK: Colour = (0.03, 0.03, 0.035)
 CHROME: Colour = (0.72, 0.73, 0.75)

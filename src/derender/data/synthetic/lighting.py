@@ -45,10 +45,31 @@ def is_plain(lighting):
 
 @kernel
 @no_type_check
-def light_at(lighting, x, y, z, nx, ny, nz, found):
-    """Light on a point with that inward normal: fills ``found`` with diffuse, visible and highlight."""
+def depths_seen(nearest):
+    """The least and the greatest depth in a buffer of 1 / z; equal where it is empty."""
+    near, far = _ZERO, np.float32(np.inf)
+    for w in nearest.flat:
+        if w > _ZERO:
+            near, far = max(near, w), min(far, w)
+    return (_ONE / near, _ONE / far) if near > _ZERO else (_ONE, _ONE)
+
+
+@kernel
+@no_type_check
+def light_at(lighting, place, normal, span, found):
+    """Light on a point with an inward normal: fills ``found`` in the order of ``EFFECTS``.
+
+    ``place`` is column, row, depth, focal length and side of the image; ``span`` the least and greatest depth
+    that are seen.
+    """
+    u, v, z, focal_px, size = place
+    middle, (nx, ny, nz) = np.float32(0.5) * np.float32(size - 1), normal
+    x, y = (u - middle) * z / focal_px, (v - middle) * z / focal_px
     away = _ONE / np.sqrt(x * x + y * y + z * z)
-    found[0], found[1], found[2] = lighting.ambient, _ONE, _ZERO
+    found[0], found[1], found[2], found[3] = lighting.ambient, _ONE, _ZERO, _ONE
+    if lighting.haze[0] > _ZERO and span[1] > span[0]:
+        share = min(max((z - span[0]) / (span[1] - span[0]), _ZERO), _ONE)
+        found[3] = np.exp(-lighting.haze[0] * share)
     for number in range(len(lighting.lamps)):
         lamp = lighting.lamps[number]
         cosine = nx * lamp[1] + ny * lamp[2] + nz * lamp[3]

@@ -17,42 +17,14 @@ import numpy as np
 from jaxtyping import Int32
 from numpy import ndarray
 
-from derender.data.synthetic.lighting import is_plain, light_at
+from derender.data.synthetic.decals import NO_PAINT, SAMPLES, Paint, paint_samples
+from derender.data.synthetic.lighting import depths_seen, is_plain, light_at
 from derender.render.numba_threads import kernel
 
-SAMPLES = 3  # of a pixel, in each direction
 _ALL = SAMPLES * SAMPLES
 _MIDDLE = _ALL // 2
 _SLIVER = np.float32(2e-6)  # area over squared sides; below, single precision cannot tell the sides apart
 _ONE, _ZERO = np.float32(1.0), np.float32(0.0)
-# columns of a decal: kind, multiplies, part (-1: that below), colour, bounds, then its own numbers: corners
-# of a polygon (the kind is their count), or of an ellipse the hollow share of its radius, and how many gaps
-# like those between spokes it has, each how large a share of the circle.
-BOX, ELLIPSE = 0, 1
-_MULTIPLIES, _PART, _COLOUR, _BOUNDS, _OWN = 1, 2, 3, 6, 10
-MOST_CORNERS = 9
-DECAL_LENGTH = _OWN + 2 * MOST_CORNERS
-
-
-class Paint(NamedTuple):
-    """Surfaces as arrays: k has rows ``first[k]`` to ``first[k + 1]`` of ``decals``.
-
-    ``folded`` takes a chart's first coordinate without its sign, so that paint is symmetric; ``holes`` are
-    circles (u, v, radius) where there is no surface, of radius 0 where there is no hole.
-    """
-
-    colour: ndarray  # (surfaces, 3) float32
-    part: ndarray  # (surfaces,) int32
-    folded: ndarray  # (surfaces,) bool
-    holes: ndarray  # (surfaces, 2, 3) float32
-    first: ndarray  # (surfaces + 1,) int32
-    decals: ndarray  # (decals, DECAL_LENGTH) float32
-
-
-NO_PAINT = Paint(
-    *(np.zeros((1, 3), np.float32), np.zeros(1, np.int32), np.zeros(1, bool)),
-    *(np.zeros((1, 2, 3), np.float32), np.zeros(2, np.int32), np.zeros((0, DECAL_LENGTH), np.float32)),
-)
 
 
 class TriangleMesh(NamedTuple):
@@ -269,13 +241,9 @@ def _shade_samples(mesh, places, more, owner, light, background, focal_px, neare
     inside = np.empty(_ALL, np.bool_)
     colour = np.empty((_ALL, 3), np.float32)
     part = np.empty(_ALL, np.int32)
-    plain, lamp, found, air = is_plain(light), light.lamps[0], np.ones(3, np.float32), light.haze[1]
-    middle, near, far = np.float32(0.5) * np.float32(len(background) - 1), _ZERO, np.float32(np.inf)
-    if light.haze[0] > _ZERO:
-        for w in nearest.flat:
-            if w > _ZERO:
-                near, far = max(near, w), min(far, w)
-    veil = np.exp(-light.haze[0])  # of what is farthest, and of the background
+    plain, lamp, found, air = is_plain(light), light.lamps[0], np.ones(4, np.float32), light.haze[1]
+    found[2] = _ZERO
+    span, veil = depths_seen(nearest), np.exp(-light.haze[0])  # of what is farthest, and of the background
     for i in range(np.uint32(len(background))):
         for j in range(np.uint32(len(background))):
             seen = 0
@@ -296,7 +264,7 @@ def _shade_samples(mesh, places, more, owner, light, background, focal_px, neare
                     spot[0, s] = abs(p) if mesh.paint.folded[surface[s]] else p
                     spot[1, s] = _blend(more, 4, a, b, c, wa, wb, wc)
             if painted and seen:
-                _paint_samples(mesh.paint, surface, spot, inside, colour, part)
+                paint_samples(mesh.paint, surface, spot, inside, colour, part)
             empty, behind = np.float32(_ALL - seen), background[i, j]
             if light.haze[0] > _ZERO:
                 behind = behind * veil + air * (_ONE - veil)
@@ -319,18 +287,15 @@ def _shade_samples(mesh, places, more, owner, light, background, focal_px, neare
                     cosine = _blend(more, 6, a, b, c, wa, wb, wc)
                     for n in range(3):
                         colour[s, n] = _blend(more, 3 + n, a, b, c, wa, wb, wc)
-                lit, shine, passed = light.ambient + lamp[0] * max(_ZERO, cosine), _ZERO, _ONE
+                found[0] = light.ambient + lamp[0] * max(_ZERO, cosine)
                 if not plain:
-                    z_here = _ONE / _blend(places, 2, a, b, c, wa, wb, wc)
-                    u = (np.float32(SAMPLES * j + s % SAMPLES) - _ONE) / np.float32(SAMPLES) - middle
-                    v = (np.float32(SAMPLES * i + s // SAMPLES) - _ONE) / np.float32(SAMPLES) - middle
-                    x_here, y_here = u * z_here / focal_px, v * z_here / focal_px
-                    light_at(light, x_here, y_here, z_here, x * scale, y * scale, z * scale, found)
-                    lit, shine = found[0], found[2]
-                    if light.haze[0] > _ZERO and far < near:
-                        passed = (z_here - _ONE / near) / (_ONE / far - _ONE / near)
-                        passed = np.exp(-light.haze[0] * min(max(passed, _ZERO), _ONE))
-                veiled = air * (_ONE - passed)
+                    u, v = (
+                        np.float32(j + (s % SAMPLES - 1) / SAMPLES),
+                        np.float32(i + (s // SAMPLES - 1) / SAMPLES),
+                    )
+                    place = u, v, _ONE / _blend(places, 2, a, b, c, wa, wb, wc), focal_px, len(background)
+                    light_at(light, place, (x * scale, y * scale, z * scale), span, found)
+                lit, shine, passed, veiled = found[0], found[2], found[3], air * (_ONE - found[3])
                 red += min((colour[s, 0] * lit + shine) * passed + veiled, _ONE)
                 green += min((colour[s, 1] * lit + shine) * passed + veiled, _ONE)
                 blue += min((colour[s, 2] * lit + shine) * passed + veiled, _ONE)
@@ -343,8 +308,7 @@ def _shade_samples(mesh, places, more, owner, light, background, focal_px, neare
                     out.normal[i, j, 2] = z * scale
                     _store(out.albedo, i, j, colour[s])
                     if len(out.effects):
-                        out.effects[0, i, j], out.effects[1, i, j] = lit, found[1]
-                        out.effects[2, i, j], out.effects[3, i, j] = shine, passed
+                        out.effects[:, i, j] = found
             _store(out.image, i, j, (red * share, green * share, blue * share))
 
 
@@ -354,66 +318,3 @@ def _store(target, i, j, colour):
     """A colour of 0..1 as rounded bytes of pixel (i, j) of ``target`` (3,S,S)."""
     for n in range(3):
         target[n, i, j] = np.uint8(min(max(colour[n], _ZERO), _ONE) * np.float32(255.0) + np.float32(0.5))
-
-
-@kernel
-@no_type_check
-def _paint_samples(paint, surface, spot, inside, colour, part):
-    """Fill in colour and part of a pixel's samples, surface by surface."""
-    current = -1
-    for start in range(np.uint32(_ALL)):
-        if surface[start] == current or surface[start] < 0:
-            continue
-        current = surface[start]
-        low_p, low_q = np.float32(np.inf), np.float32(np.inf)
-        high_p, high_q = -low_p, -low_q
-        for s in range(np.uint32(_ALL)):
-            if surface[s] == current:
-                low_p, high_p = min(low_p, spot[0, s]), max(high_p, spot[0, s])
-                low_q, high_q = min(low_q, spot[1, s]), max(high_q, spot[1, s])
-                part[s] = paint.part[current]
-                for n in range(3):
-                    colour[s, n] = paint.colour[current, n]
-        for d in range(np.uint32(paint.first[current]), np.uint32(paint.first[current + 1])):
-            decal = paint.decals[d]
-            outside = high_p < decal[_BOUNDS] or high_q < decal[_BOUNDS + 1]
-            if outside or low_p > decal[_BOUNDS + 2] or low_q > decal[_BOUNDS + 3]:
-                continue
-            _cover(decal, spot, inside)
-            for s in range(np.uint32(_ALL)):
-                if inside[s] and surface[s] == current:
-                    for n in range(3):
-                        below = colour[s, n] if decal[_MULTIPLIES] > _ZERO else _ONE
-                        colour[s, n] = below * decal[_COLOUR + n]
-                    if decal[_PART] >= _ZERO:
-                        part[s] = int(decal[_PART])
-
-
-@kernel
-@no_type_check
-def _cover(decal, spot, inside):
-    """Which of a pixel's samples a shape holds."""
-    kind = np.uint32(decal[0])
-    if kind > ELLIPSE:
-        inside[:] = False
-        x0, y0 = decal[_OWN + 2 * kind - 2], decal[_OWN + 2 * kind - 1]
-        for k in range(kind):
-            x, y = decal[_OWN + 2 * k], decal[_OWN + 1 + 2 * k]
-            slope = (x0 - x) / (y0 - y) if y0 != y else _ZERO
-            for s in range(np.uint32(_ALL)):
-                q = spot[1, s]
-                crosses = ((y > q) != (y0 > q)) & (spot[0, s] < slope * (q - y) + x)
-                inside[s] = inside[s] ^ crosses
-            x0, y0 = x, y
-        return
-    u0, v0, u1, v1 = decal[_BOUNDS], decal[_BOUNDS + 1], decal[_BOUNDS + 2], decal[_BOUNDS + 3]
-    for s in range(np.uint32(_ALL)):
-        p, q = spot[0, s], spot[1, s]
-        inside[s] = p >= u0 and q >= v0 and p <= u1 and q <= v1
-        if inside[s] and kind == ELLIPSE:
-            x, y = (p + p - u0 - u1) / (u1 - u0), (q + q - v0 - v1) / (v1 - v0)
-            away, turn = x * x + y * y, _ZERO
-            if decal[_OWN + 1] > _ZERO:
-                turn = np.arctan2(y, x) / np.float32(2.0 * np.pi) * decal[_OWN + 1]
-            hollow = decal[_OWN] * decal[_OWN]
-            inside[s] = hollow <= away <= _ONE and turn - np.floor(turn) < decal[_OWN + 2]
