@@ -74,7 +74,8 @@ def make_features(
 def fit_brightness(model: Derenderer, images: Shaped[Tensor, "n 3 h w"]) -> BrightnessPrior | None:
     """The prior of brightness over the first images; None for fewer than four or another kind of scene."""
     model, found = model.with_brightness(None), []
-    if len(images) < 4 or {"light", "albedo"} - {factor.parameter for factor in model.factors}:
+    moves = model.renderer.specular is not None or model.renderer.gamma != 1  # brightness would change images
+    if len(images) < 4 or moves or {"light", "albedo"} - {factor.parameter for factor in model.factors}:
         return None
     with evaluating(model):
         for _, batch in _batches(model, images, torch.arange(min(len(images), BRIGHTNESS_IMAGES)), None):
