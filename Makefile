@@ -33,7 +33,7 @@ release: $(STAMP)  ## licences and known advisories of every package, into build
 # stopped run goes on where it was. `make results RESULTS=folder` leaves the files of the repository alone.
 RESULTS := benchmarks/results/generated
 DATA := build/results
-SCORES := heads people cars-clusters cars-geometry
+SCORES := heads brightness people cars-clusters cars-geometry
 results: $(STAMP) $(SCORES:%=$(RESULTS)/%.json)  ## repeat the results on generated images (tens of minutes, resumable)
 	@$(BIN)/python docs/pages.py
 
@@ -47,12 +47,15 @@ $(DATA)/cars: | $(STAMP)
 	  --classes police,ambulance,limousine,jeep,sports && mv $@.part $@
 
 HEADS := evaluate geometry $(DATA)/heads --model rendered-faces-64
+BRIGHTNESS := evaluate brightness $(DATA)/heads --model rendered-faces-64
 PEOPLE := evaluate cluster $(DATA)/tracks --model rendered-faces-64 --label identity --mean-by identity --mean-by track
 CARS-CLUSTERS := evaluate cluster $(DATA)/cars --model cars-64 --label class
 CARS-GEOMETRY := evaluate geometry $(DATA)/cars --model cars-64
 SCORE = @$(BIN)/python benchmarks/score.py $@
 $(RESULTS)/heads.json: | $(DATA)/heads
 	$(SCORE) $(HEADS)
+$(RESULTS)/brightness.json: | $(DATA)/heads
+	$(SCORE) $(BRIGHTNESS)
 $(RESULTS)/people.json: | $(DATA)/tracks
 	$(SCORE) $(PEOPLE)
 $(RESULTS)/cars-clusters.json: | $(DATA)/cars

@@ -212,7 +212,7 @@ def scored(columns: dict[str, tuple[str, float, int]], *where: str) -> Callable[
             yield [name + note, *(shown(row["scores"].get(key), by, n) for key, by, n in columns.values())]
 
     def shown(score: Any, by: float, digits: int) -> str:
-        if score is None:
+        if score is None or score["value"] is None:
             return ""
         value, low, high = (None if score[k] is None else by * score[k] for k in ("value", "low", "high"))
         text = f"{value:.{digits}f}"
@@ -228,6 +228,7 @@ FACTORS = {
     "lighting, degrees": ("light", 1, 1),
     "viewpoint, degrees": ("camera", 1, 1),
 }
+BRIGHTNESS = {"correlation": ("r", 1, 3), "slope": ("slope", 1, 3), "error": ("error", 1, 4)}
 LIGHTS = {f"up to {angle}": f"up to {angle}°" for angle in (12, 25, 50, 77)} | {"beyond": "beyond 77°"}
 HEADS = {f"light {angle}": f"light {angle}°" for angle in (25, 45, 65)} | {
     "view 15": "view 15°",
@@ -246,6 +247,8 @@ SPEED: dict[str, tuple[str, Callable[[Any], Iterator[list[str]]]]] = {
     "bench": ("bench.json", shares),
     "heads-generated": ("generated/heads.json", scored(DEPTH, "intervals", "geometry")),
     "factors-generated": ("generated/heads.json", scored(FACTORS, "intervals", "factors")),
+    "brightness-generated": ("generated/brightness.json", scored(BRIGHTNESS, "brightness")),
+    "brightness-rendered": ("brightness-rendered.json", scored(BRIGHTNESS, "brightness")),
     "people-generated": ("generated/people.json", scored(CLUSTERS, "rows")),
     "cars-generated": ("generated/cars-clusters.json", scored(CLUSTERS, "rows")),
     "cars-depth-generated": ("generated/cars-geometry.json", scored(DEPTH, "intervals", "geometry")),
