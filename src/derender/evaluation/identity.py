@@ -226,19 +226,23 @@ def verify(
     names = {*pairs.first, *pairs.second}
     if is_model(features):
         features = as_model(features, device=how.device)
-        read = how.at(features.image_size)
-        chosen = read.select(np.array([stem_of(file) in names for file in read.files]))
-        how = replace(how, images=chosen)
+        files = how.at(features.image_size).files
     else:
         features = features if isinstance(features, FeatureTable) else FeatureTable.read(str(features))
-        features = features.select(np.array([stem_of(file) in names for file in features.files]))
-    rows = subject_and_controls(features, how)
-    place = {stem_of(file): row for row, file in enumerate(rows[0].tables[0].files)}
-    if absent := sorted(names - place.keys()):
+        files = features.files
+    stems = list(map(stem_of, files))
+    if absent := sorted(names.difference(stems)):
         raise ValueError(
             f"{len(absent):,} of {len(names):,} images of the pairs are not there (first {absent[0]}): give "
             "the images that the pairs were drawn from"
         )
+    chosen = np.array([stem in names for stem in stems])
+    if isinstance(features, FeatureTable):
+        features = features.select(chosen)
+    else:
+        how = replace(how, images=how.at(features.image_size).select(chosen))
+    rows = subject_and_controls(features, how)
+    place = {stem_of(file): row for row, file in enumerate(rows[0].tables[0].files)}
     sides = np.array([[place[name] for name in side] for side in (pairs.first, pairs.second)])
     weights = group_resamples(np.arange(len(pairs)), how.resamples, how.seed)
     scored, errors = [], {}
@@ -299,13 +303,17 @@ def _in_half(pairs: Pairs, half: str) -> Pairs:
 
 
 def _judged(run: np.ndarray, sides: np.ndarray, pairs: Pairs) -> tuple[np.ndarray, np.ndarray]:
-    """Whether each pair is judged right, (P,), and its cosine."""
+    """Whether each pair is judged right, (P,), and its cosine. No copy of (N, D) codes is made."""
     right, cosines = np.zeros(len(pairs), bool), np.zeros(len(pairs))
+    square = np.einsum("nd,nd->n", run, run, dtype=np.float64)
+    product = np.array([np.dot(run[a], run[b]) for a, b in sides.T], np.float64)
     for fold in np.unique(pairs.fold):
         held = pairs.fold == fold
         learned = ~held if not held.all() else held
-        codes = unit_rows(run - run[np.unique(sides[:, learned])].mean(axis=0))
-        cosine = (codes[sides[0]] * codes[sides[1]]).sum(axis=1)
+        mean = run[np.unique(sides[:, learned])].mean(axis=0, dtype=np.float64)
+        along, own = run @ mean, mean @ mean
+        length = np.sqrt(np.maximum(square - 2 * along + own, 1e-12))
+        cosine = (product - along[sides].sum(axis=0) + own) / length[sides].prod(axis=0)
         threshold = _best_threshold(cosine[learned], pairs.same[learned])
         right[held] = (cosine[held] >= threshold) == pairs.same[held]
         cosines[held] = cosine[held]
