@@ -47,12 +47,13 @@ class Column:
     def text(self, cell: Cell) -> str:
         """A cell as text; a dash where there is no number."""
         if isinstance(cell, Interval):
-            return f"{self.text(cell.low)}-{self.text(cell.high)}" if isfinite(cell.low) else "-"
+            between = " to " if cell.low < 0 else "-"
+            return f"{self.text(cell.low)}{between}{self.text(cell.high)}" if isfinite(cell.low) else "-"
         if cell is None or (isinstance(cell, float) and not isfinite(cell)):
             return "-"
         if isinstance(cell, str):
             return cell
-        return f"{cell:,}" if isinstance(cell, int) else f"{cell:.{self.digits}f}"
+        return f"{cell:,}" if isinstance(cell, int) else f"{round(cell, self.digits) + 0.0:.{self.digits}f}"
 
 
 @dataclass(frozen=True)
