@@ -13,7 +13,7 @@ from derender.postprocess.fitting import Fitting, FittingSettings, coordinates_o
 from derender.postprocess.morphable import MorphableMaps
 from derender.scene.perturb import PerturbSettings
 from derender.training.config import FeatureSettings, WhiteningSettings, with_changes
-from derender.training.features import BATCH_SIZE, fit_whitening, make_features, make_fitting
+from derender.training.features import BATCH_SIZE, fit_whitening, make_features, make_fitting, photographs
 
 SETTINGS = WhiteningSettings(pictures=80, views=2, directions=16, spatial=False)
 CODES_OF_VECTORS = SETTINGS.model_copy(update={"vectors": False})
@@ -143,3 +143,34 @@ def test_what_makes_no_sense_is_named(plain, images):
     next(broken.nets["albedo"].decoder.parameters()).data.fill_(float("nan"))
     with pytest.raises(ValueError, match="fitting: NaN or infinity in albedo of images 0"):
         make_fitting(broken, images[:4], FittingSettings())
+
+
+def test_views_that_keep_the_images_own_pixels(plain, images):
+    batch = images[:6].float() / 255
+    scene = plain.decompose(batch)
+    shown = photographs(plain, scene, batch, torch.Generator().manual_seed(3), 2)
+    again = photographs(plain, scene, batch, torch.Generator().manual_seed(3), 2)
+    assert len(shown) == 3 and torch.equal(shown[0], batch) and torch.equal(shown[1], again[1])
+    assert all(one.min() >= 0 and one.max() <= 1 for one in shown)
+    sharp = [one.mean(dim=1).diff(dim=-1).abs().flatten(1) for one in (batch, *shown[1:])]
+    drawn = plain.render(scene).image.mean(dim=1).diff(dim=-1).abs().flatten(1)
+    kept = [torch.nn.functional.cosine_similarity(sharp[0], one).mean() for one in (*sharp[1:], drawn)]
+    assert not torch.allclose(shown[1], shown[2], atol=0.05) and min(kept[:2]) > 2 * kept[2]
+
+
+def test_gradients_beside_activations_are_kept_with_the_model(tmp_path, monkeypatch):
+    monkeypatch.setattr("derender.postprocess.gradients.CELLS", 4)
+    model = derender.Derenderer.from_preset("small", seed=0, image_size=32)
+    pixels = torch.from_numpy(faces.generate(24, image_size=32, seed=5).images).float() / 255
+    settings = WhiteningSettings(pictures=24, views=2, gradients=True, photographs=True)
+    model = whitened(model, pixels, settings).eval()
+    own = model.without_features().factor_activations("albedo", pixels[:2]).shape[1]
+    assert model.whitening.size("albedo") == own + 2 * 4 * 4 and model.whitening.size("geometry") == own
+    model.save(tmp_path / "model")
+    found, expected = derender.load(tmp_path / "model").embed(pixels), model.embed(pixels)
+    for name, value in expected.items():
+        torch.testing.assert_close(found[name], value)
+    blank = model.whitening.get_buffer("albedo_map").clone()
+    blank[own:] = 0
+    model.whitening.get_buffer("albedo_map").copy_(blank)
+    assert not torch.allclose(model.embed(pixels)["albedo"], expected["albedo"], atol=1e-3)

@@ -14,6 +14,7 @@ from derender.data import GivenImages, as_batch, check_images
 from derender.networks import Factor
 from derender.postprocess.features import Features
 from derender.postprocess.fitting import STEPS, Fitted, coordinates_of
+from derender.postprocess.gradients import gradient_directions
 from derender.presets import ModelSettings
 from derender.render import Rendering
 from derender.scene import Scene
@@ -98,10 +99,21 @@ class EmbeddingModel(nn.Module):
             found |= {coordinates_of(name): value for name, value in fitted.items()}
         return found
 
-    def factor_activations(self, name: str, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n _"]:
-        """``activations`` for one factor, without coordinates."""
-        seen = (images, images.flip(-1)) if self.features.mirrors(name) else (images,)
-        return torch.cat([self.nets[name].activations(one) for one in seen], dim=1)  # type: ignore[operator]
+    def factor_activations(
+        self, name: str, images: Float[Tensor, "n 3 h w"], gradients: bool | None = None
+    ) -> Float[Tensor, "n _"]:
+        """``activations`` for one factor, without coordinates.
+
+        ``gradients``: followed by `gradient_directions`; by default where ``features`` take them.
+        """
+        parts = []
+        for one in (images, images.flip(-1)) if self.features.mirrors(name) else (images,):
+            parts.append(self.nets[name].activations(one))  # type: ignore[operator]
+            if self.whitening is not None and name in self.whitening.names and gradients is None:
+                gradients = self.whitening.size(name) > parts[0].shape[1]
+            if gradients:
+                parts.append(gradient_directions(one))
+        return torch.cat(parts, dim=1)
 
     def codes(self, activations: Mapping[str, Float[Tensor, "n _"]]) -> dict[str, Float[Tensor, "n code"]]:
         """The codes that activations begin with: ``encode`` of the same images."""

@@ -133,9 +133,13 @@ class Whitening(nn.Module):
             if name in activations
         }
 
+    def size(self, name: str) -> int:
+        """How many activations of an image a factor's projection takes."""
+        return len(self.get_buffer(f"{name}_mean"))
+
     def inputs(self, name: str, activations: Float[Tensor, "n _"]) -> Float[Tensor, "n input"]:
         """What a factor's projection is applied to, of its activations."""
-        size, mirrored = len(self.get_buffer(f"{name}_mean")), name in self.mirrored
+        size, mirrored = self.size(name), name in self.mirrored
         needed = size * (2 if mirrored else 1)
         if activations.shape[1] < needed:
             raise ValueError(

@@ -112,7 +112,6 @@ def refine(
     fit scenes or has further factors; too few images, or of another size; weights that end up not finite.
     """
     config, report = config or RefineConfig(), progress or (lambda *_: None)
-    model = model.with_brightness(None)
     settings = config.refining
     further = [factor.name for factor in model.factors if factor.name not in FACTORS]
     if further:
@@ -129,7 +128,7 @@ def refine(
     clear = fitted.clear(settings.worst).cpu()
     if not clear.any():
         raise ValueError("fitting finds no scene of any image: the model's training went wrong")
-    student = deepcopy(model.without_features())
+    student = deepcopy(model.without_features()).with_brightness(None)
     student.source = None
     if settings.reframed:
         ranges = crop.ranges_for_crops(student.settings.ranges, student.image_size, config.reframe)
@@ -170,7 +169,7 @@ def fit_scenes(
     model: Derenderer, images: UInt8[Tensor, "n 3 h w"], steps: int, report: Progress
 ) -> FittedScenes:
     """Scenes fitted to all images, batch by batch."""
-    parts = []
+    model, parts = model.with_brightness(None), []  # coordinates are of albedos as decoded
     for start in range(0, len(images), _FIT_BATCH):
         found = model.fit_scenes(as_float(images[start : start + _FIT_BATCH]).to(model.device), steps)
         own = found.coordinates
@@ -305,6 +304,7 @@ def _compared(
     model: Derenderer, student: Derenderer, images: UInt8[Tensor, "n 3 h w"], steps: int
 ) -> tuple[dict[str, float], dict[str, dict[str, float]]]:
     """Errors and gaps of ``Refined``."""
+    model, student = model.with_brightness(None), student.with_brightness(None)
     shown = as_float(images).to(model.device)
     fitted = model.fit_scenes(shown, steps).scene
     unit = SceneUnit(model, fitted)

@@ -12,11 +12,13 @@ Fitting: a morphable model of the depths and albedos that the model predicts. Th
 when a model is used (postprocess/fitting.py).
 """
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 
 import torch
 from jaxtyping import Float, Int64, Shaped
 from torch import Generator, Tensor
+from torch.nn.functional import grid_sample
 
 from derender.data import as_float
 from derender.model import Derenderer
@@ -25,15 +27,23 @@ from derender.postprocess import Features
 from derender.postprocess.fitting import PARAMETERS, Fitting, FittingSettings
 from derender.postprocess.morphable import MorphableMaps
 from derender.postprocess.whitening import Scatter, Whitening, fit_projection
+from derender.render import warp
 from derender.scene import Scene
 from derender.scene.brightness import BrightnessPrior, brightness_cues
-from derender.scene.perturb import PerturbSettings
+from derender.scene.camera import constant, project, to_camera, unproject
+from derender.scene.light import lambert_shading
+from derender.scene.normals import normals_from_depth
+from derender.scene.perturb import PerturbSettings, perturb_camera
 from derender.training.config import FeatureSettings, WhiteningSettings
 from derender.training.process import evaluating
 from derender.training.step import fill_uncovered
 
 BATCH_SIZE = 128
 BRIGHTNESS_IMAGES = 8000
+LIGHT_DEG = (60.0, 80.0)  # of photographs: how far pitch and yaw of their light go
+TURNS = PerturbSettings(camera_pitch_deg=6, camera_yaw_deg=12)  # of photographs
+GREY = 0.4  # share of photographs without colour
+DARKEST = 0.1  # shading by which an image is divided, at least
 LENGTH_IMAGES = 256  # that are fitted to measure the length of fitted coordinates, where features hold them
 
 Describe = Callable[[Float[Tensor, "n 3 h w"]], Mapping[str, Float[Tensor, "n _"]]]
@@ -101,15 +111,23 @@ def fit_whitening(
     rows = torch.randperm(len(images), generator=generator)[: settings.pictures]
     if not len(rows):
         raise ValueError("whitening needs at least 2 images, got 0")
-    model = model.without_features()
-    encode = describe or (model.activations if settings.spatial else model.encode)
+    model = model.without_features().with_brightness(None)
     maps, vectors = ([f for f in model.factors if f.mirrored is which] for which in (True, False))
+
+    def activated(batch: Float[Tensor, "n 3 h w"]) -> dict[str, Tensor]:
+        gradients = {f.name: settings.gradients and f.parameter == "albedo" for f in maps}
+        return {name: model.factor_activations(name, batch, own) for name, own in gradients.items()}
+
+    encode = describe or (activated if settings.spatial else model.encode)
     mirrored: dict[str, Scatter] = {}
     alone: dict[str, Scatter] = {}
     with evaluating(model):
         for start, batch in _batches(model, images, rows, progress):
             scene = model.decompose(batch)
-            shown = _renderings(model, scene, batch, vectors, perturb, generator, settings.views)
+            if settings.photographs and {"albedo", "depth", "light", "camera"} <= scene.parameters.keys():
+                shown = photographs(model, scene, batch, generator, settings.views)
+            else:
+                shown = _renderings(model, scene, batch, vectors, perturb, generator, settings.views)
             views = [encode(one) for one in shown]
             if settings.mirrored:
                 views += [encode(one.flip(-1)) for one in shown]
@@ -176,7 +194,7 @@ def make_fitting(
     rows = torch.randperm(len(images), generator=Generator().manual_seed(seed))[: settings.examples]
     if len(rows) < 2:
         raise ValueError(f"fitting needs at least 2 images, got {len(rows)}")
-    model = model.with_features(Features(model.whitening))
+    model = model.with_features(Features(model.whitening)).with_brightness(None)
     examples: dict[str, list[Tensor]] = {parameter: [] for parameter in PARAMETERS.values()}
     squares = torch.zeros((), dtype=torch.float64)
     with evaluating(model):
@@ -217,6 +235,38 @@ def _renderings(
         }
         rendering = model.render(scene.with_parameters(**changed))
         shown.append(fill_uncovered(rendering.image, rendering.mask, images))
+    return shown
+
+
+def photographs(
+    model: Derenderer, scene: Scene, images: Float[Tensor, "n 3 h w"], generator: Generator, count: int
+) -> list[Float[Tensor, "n 3 h w"]]:
+    """The images, then as often in light from any side, turned a little, by another camera; all in 0..1.
+
+    The images' own pixels lie on the surfaces; each is multiplied by the new shading over its own.
+    """
+    shown, (height, width), fov = [images], images.shape[-2:], model.fov_deg
+    place = project(to_camera(unproject(scene.depth, fov), scene.camera), height, width, fov)
+    grid = place * 2 / constant((width - 1.0, height - 1.0), place) - 1
+    texture = grid_sample(images, grid, padding_mode="border", align_corners=True)
+    normals = normals_from_depth(scene.depth, fov)
+    texture = texture / lambert_shading(normals, scene.light).clamp(min=DARKEST)
+
+    def drawn(low: float, high: float, *shape: int) -> Tensor:
+        return (low + (high - low) * torch.rand(len(images), *shape, generator=generator)).to(images)
+
+    for _ in range(count):
+        slopes = [math.radians(end) * drawn(-1, 1) for end in LIGHT_DEG]
+        light = torch.stack([0.02 + 0.6 * drawn(0, 1).square(), drawn(0.4, 1.3), *slopes], dim=1)
+        camera = perturb_camera(scene.camera, generator, TURNS, model.settings.ranges)
+        rendering = warp(texture * lambert_shading(normals, light), scene.depth, camera, fov)
+        view = fill_uncovered(rendering.image, rendering.mask, images)
+        view = view * (drawn(0.15, 0.6) / view.mean(dim=(1, 2, 3)).clamp(min=DARKEST)).view(-1, 1, 1, 1)
+        grey = view.mean(dim=1, keepdim=True).expand_as(view)
+        view = torch.where(drawn(0, 1, 1, 1, 1) < GREY, grey, view).clamp(0, 1)
+        view = view ** drawn(-0.35, 0.35, 1, 1, 1).exp()
+        noise = torch.randn(view.shape, generator=generator).to(view) * drawn(0, 0.02, 1, 1, 1)
+        shown.append((view + noise).clamp(0, 1))
     return shown
 
 
