@@ -248,6 +248,7 @@ SPEED: dict[str, tuple[str, Callable[[Any], Iterator[list[str]]]]] = {
     "heads-generated": ("generated/heads.json", scored(DEPTH, "intervals", "geometry")),
     "factors-generated": ("generated/heads.json", scored(FACTORS, "intervals", "factors")),
     "brightness-generated": ("generated/brightness.json", scored(BRIGHTNESS, "brightness")),
+    "brightness-races": ("brightness-races.json", scored({"share of brightness": ("share", 1, 3)}, "share")),
     "brightness-rendered": ("brightness-rendered.json", scored(BRIGHTNESS, "brightness")),
     "people-generated": ("generated/people.json", scored(CLUSTERS, "rows")),
     "cars-generated": ("generated/cars-clusters.json", scored(CLUSTERS, "rows")),
