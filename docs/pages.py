@@ -221,6 +221,20 @@ def scored(columns: dict[str, tuple[str, float, int]], *where: str) -> Callable[
     return read
 
 
+def angles(found: Any) -> Iterator[list[str]]:
+    """Correlation, slope and error of each angle, beside the error of a constant answer."""
+    yield ["angle", "r", "slope", "error, degrees", "constant answer, degrees"]
+    for name in ("yaw", "pitch", "roll", "azimuth", "elevation"):
+        if name in found:
+            model = {key: score["value"] for key, score in found[name]["model"]["scores"].items()}
+            control = found[name]["constant answer"]["scores"]["error"]["value"]
+            cells = [f"{model[key]:.3f}" for key in ("r", "slope")] + [f"{model['error']:.1f}"]
+            yield [name, *cells, f"{control:.1f}"]
+
+
+BINS = {f"to {angle}°": (f"<= {angle}", 1, 3) for angle in (25, 50, 77)} | {"beyond": ("beyond", 1, 3)}
+PSNR = {f"to {angle}°": (f"<= {angle}", 1, 1) for angle in (12, 25, 50, 77)} | {"beyond": ("beyond", 1, 1)}
+PAIRS = {"accuracy": ("accuracy", 1, 3), "AUC": ("auc", 1, 3)}
 CLUSTERS = {"accuracy": ("accuracy", 1, 3), "NMI": ("nmi", 1, 3), "ARI": ("ari", 1, 3)}
 DEPTH = {"SIDE x 100": ("side", 100, 3), "MAD, degrees": ("mad_deg", 1, 1)}
 FACTORS = {
@@ -248,6 +262,11 @@ SPEED: dict[str, tuple[str, Callable[[Any], Iterator[list[str]]]]] = {
     "heads-generated": ("generated/heads.json", scored(DEPTH, "intervals", "geometry")),
     "factors-generated": ("generated/heads.json", scored(FACTORS, "intervals", "factors")),
     "brightness-generated": ("generated/brightness.json", scored(BRIGHTNESS, "brightness")),
+    "identity": ("identity.json", scored(BINS | {"Ward": ("ward accuracy", 1, 3)}, "rows")),
+    "verification": ("verification.json", scored(PAIRS, "rows")),
+    "pose": ("pose.json", angles),
+    "light": ("light.json", angles),
+    "relighting": ("relighting.json", scored(PSNR, "psnr")),
     "brightness-races": ("brightness-races.json", scored({"share of brightness": ("share", 1, 3)}, "share")),
     "brightness-rendered": ("brightness-rendered.json", scored(BRIGHTNESS, "brightness")),
     "people-generated": ("generated/people.json", scored(CLUSTERS, "rows")),
