@@ -63,14 +63,15 @@ NUMBERS = {
 """The factor that holds an effect's numbers, and the labels that they have in a generated set."""
 
 
-def cells(seeds: int) -> list[tuple[int, str, str]]:
+def cells(protocol: str, seeds: int) -> list[tuple[int, str, str]]:
     """Seed, effect in the set, renderer; all renderers on the set without effects, too."""
     knowing = [name for name, _ in EFFECTS.values()]
     found = []
     for seed in range(seeds):
         for effect, (name, _) in EFFECTS.items():
             found += [(seed, effect, one) for one in (knowing if effect == "none" else ["lambert", name])]
-    found += [(seed, "gloss", "phong(mean_diffuse=1.0)") for seed in range(seeds)]
+    if protocol == "train":  # a fit has no such term
+        found += [(seed, "gloss", "phong(mean_diffuse=1.0)") for seed in range(seeds)]
     return found
 
 
@@ -226,6 +227,7 @@ def main() -> None:
     given.add_argument("protocol", choices=("fit", "train", "yale"))
     given.add_argument("--zip", type=Path, help="yale: the file of CroppedYale")
     given.add_argument("--seeds", type=int, default=3)
+    given.add_argument("--effects", nargs="*", help="only these sets; by default all")
     given.add_argument("--size", type=int, default=32, help="train: side of the images, pixels")
     given.add_argument("--count", type=int, default=2000, help="train: generated images of a set")
     given.add_argument("--images", type=int, default=16_000, help="train: images seen, repeats counted")
@@ -236,7 +238,7 @@ def main() -> None:
     options = given.parse_args()
     torch.set_num_threads(1)
     began, rows = time.monotonic(), []
-    left_out = ("json", "minutes", "seeds", "zip")
+    left_out = ("json", "minutes", "seeds", "zip", "effects")
     settings = {name: value for name, value in vars(options).items() if name not in left_out}
     if options.json and options.json.is_file():
         stored = json.loads(options.json.read_text())
@@ -244,8 +246,12 @@ def main() -> None:
             raise SystemExit(f"{options.json} was made with {stored['settings']}: choose another file")
         rows = stored["cells"]
     wanted = [(0, "yale", name) for name in ("lambert", "lambert-shadow", "phong", "phong+lambert-shadow")]
-    for seed, effect, renderer in wanted if options.protocol == "yale" else cells(options.seeds):
+    for seed, effect, renderer in (
+        wanted if options.protocol == "yale" else cells(options.protocol, options.seeds)
+    ):
         key = {"seed": seed, "effect": effect, "renderer": renderer}
+        if options.effects and effect not in options.effects:
+            continue
         if any(key.items() <= row.items() for row in rows) or time.monotonic() - began > options.minutes * 60:
             continue
         before = time.process_time()

@@ -106,6 +106,7 @@ class Fitting(nn.Module):
         steps = self.settings.steps if steps is None else steps
         if steps < 1:
             raise ValueError(f"fitting needs 1 step or more, got {steps}")
+        scene = scene.with_parameters(light=scene.light)  # in place of an environment, if there is one
         images, scene = images.detach().clone(), scene.map(lambda value: value.detach().clone())
         coordinates = {
             factor: self.maps.coordinates(parameter, scene.parameters[parameter].float()).clamp(

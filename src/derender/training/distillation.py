@@ -113,9 +113,12 @@ def refine(
     """
     config, report = config or RefineConfig(), progress or (lambda *_: None)
     settings = config.refining
-    further = [factor.name for factor in model.factors if factor.name not in FACTORS]
+    further = [row.name for row in model.factors if FACTORS.get(row.name) != row.parameter]
     if further:
-        raise ValueError(f"the model has {further[0]} beside the paper's factors: it cannot be refined")
+        raise ValueError(
+            f"the renderer {model.renderer.name!r} has a factor {further[0]} that is not the paper's: such a "
+            "model cannot be refined; fit scenes per image instead (--fit-steps)"
+        )
     maps = model.features.required_fitting().maps
     if len(images) < 2 or not len(held_out) or images.shape[-1] != model.image_size:
         raise ValueError(
