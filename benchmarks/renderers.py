@@ -11,8 +11,8 @@ are fitted per image, within the morphable maps of the bundled ``rendered-faces-
 (degrees), albedo (mean absolute error over the mean, after one scale per image; the same of chromaticity),
 reconstruction (masked L1), and the effect's own numbers (Spearman correlation; median error, also after the
 best line, and of the best constant). ``yale`` fits real faces within ``faces-64``: residual by the angle of
-the light, and the light's azimuth and elevation. A cell that the file holds is not computed again; it is
-written after each.
+the light, and the light's azimuth and elevation. ``speed`` takes processor time of each renderer. A cell that
+the file holds is not computed again; it is written after each.
 """
 
 import argparse
@@ -222,9 +222,27 @@ def row_size(row: Factor) -> int:
     return row.build(NetworkSettings(image_size=32, width=4, light_width=1)).decoder.linear.out_features
 
 
+def speed(renderer: str, given: argparse.Namespace) -> dict[str, float]:
+    """Processor time (best of twelve) of 64 predicted scenes of 64 pixels, forward and with gradients."""
+    model, drawn = derender.load("faces-64"), renderer_named(renderer)
+    start = model.decompose(torch.from_numpy(generated("none", 0, 64, 64, 0).images).float() / 255)
+    values = {name: value.clone().requires_grad_() for name, value in start.parameters.items()}
+    for row in drawn.factors:
+        values[row.parameter] = row.to_parameter(torch.zeros(64, row_size(row)), model.settings.ranges)
+    times = []
+    for _ in range(12):
+        began = time.process_time()
+        image = drawn(Scene.from_parameters(values), model.fov_deg).image
+        middle = time.process_time()
+        image.square().sum().backward()
+        times.append((middle - began, time.process_time() - began))
+    forward, whole = (min(column) * 1e3 for column in zip(*times, strict=True))
+    return {"forward_ms": round(forward, 2), "forward_and_backward_ms": round(whole, 2)}
+
+
 def main() -> None:
     given = parser(__doc__)
-    given.add_argument("protocol", choices=("fit", "train", "yale"))
+    given.add_argument("protocol", choices=("fit", "train", "yale", "speed"))
     given.add_argument("--zip", type=Path, help="yale: the file of CroppedYale")
     given.add_argument("--seeds", type=int, default=3)
     given.add_argument("--effects", nargs="*", help="only these sets; by default all")
@@ -245,18 +263,20 @@ def main() -> None:
         if stored["settings"] != settings:
             raise SystemExit(f"{options.json} was made with {stored['settings']}: choose another file")
         rows = stored["cells"]
-    wanted = [(0, "yale", name) for name in ("lambert", "lambert-shadow", "phong", "phong+lambert-shadow")]
-    for seed, effect, renderer in (
-        wanted if options.protocol == "yale" else cells(options.protocol, options.seeds)
-    ):
+    names = ("lambert", "lambert-shadow", "phong", "phong+lambert-shadow", "sh", "haze")
+    single = {"yale": (yale, names[:4]), "speed": (speed, names)}.get(options.protocol)
+    wanted = cells(options.protocol, options.seeds)
+    if single is not None:
+        wanted = [(0, options.protocol, name) for name in single[1]]
+    for seed, effect, renderer in wanted:
         key = {"seed": seed, "effect": effect, "renderer": renderer}
         if options.effects and effect not in options.effects:
             continue
         if any(key.items() <= row.items() for row in rows) or time.monotonic() - began > options.minutes * 60:
             continue
         before = time.process_time()
-        if options.protocol == "yale":
-            done = yale(renderer, options)
+        if single is not None:
+            done = single[0](renderer, options)
         else:
             done = (trained if options.protocol == "train" else fitted_cell)(effect, renderer, seed, options)
         rows.append({**key, **done, "seconds_cpu": round(time.process_time() - before, 1)})
