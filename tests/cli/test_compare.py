@@ -163,7 +163,7 @@ def test_controls_get_the_models_whitening(tmp_path, capsys, numbers):
     assert first == again and {name: row["control"] for name, row in first.items()} == {
         "geometry + albedo": False, "geometry + albedo, whitened here": False, "untrained encoder": True,
         "PCA (8)": True, "pixels": True, "untrained encoder, whitened": True, "PCA (8), whitened": True,
-        "majority": True, "chance": True,
+        "Gradientfaces": True, "HOG": True, "LBP": True, "majority": True, "chance": True,
     }  # fmt: skip
     assert main([*map(str, words)]) == 0
     assert "0 results computed" in capsys.readouterr().err
