@@ -21,7 +21,7 @@ from derender.postprocess.whitening import Projection, Whitening
 from derender.presets import ModelSettings
 from derender.render import Rendering, render_scene
 from derender.scene import Scene
-from derender.storage.folder import CONFIG_FILE, PRETRAINED, WEIGHTS_FILE, bundled_models
+from derender.storage.places import CONFIG_FILE, PRETRAINED, WEIGHTS_FILE, bundled_models
 from derender.training.config import ObjectiveSettings
 from derender.training.step import training_step
 

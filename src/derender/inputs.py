@@ -11,12 +11,12 @@ import torch
 
 from derender.data import ImageSet, read_images, split_indices, suggestion
 from derender.model import Derenderer, load
-from derender.storage.folder import SplitRecord, model_folder, read_split, write_split
+from derender.storage.folder import SplitRecord, read_split, write_split
+from derender.storage.places import DEVICES, model_folder, require_known
 from derender.training.config import TrainConfig
 from derender.training.run_folder import read_config_tree
 
 PARTS = ("all", "train", "validation", "test")
-DEVICES = ("auto", "cpu", "cuda")
 
 Progress = Callable[[int, int], object]
 """Called with (done, total)."""
@@ -126,8 +126,7 @@ def copy_split(folder: Path, model: str | Path) -> None:
 
 def device_named(device: str) -> str:
     """``cpu`` or ``cuda``; for ``auto`` the graphics card if there is one."""
-    if device not in DEVICES:
-        raise ValueError(f"unknown device {device!r}{suggestion(device, DEVICES)}: choose auto, cpu or cuda")
+    require_known("device", device, DEVICES)
     if device == "cuda" and not torch.cuda.is_available():
         raise ValueError("no CUDA device here: choose device cpu")
     return "cuda" if device != "cpu" and torch.cuda.is_available() else "cpu"

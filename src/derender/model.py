@@ -25,6 +25,7 @@ from derender.renderers import Render, as_renderer, recorded_renderer
 from derender.scene import Scene
 from derender.scene.ranges import SceneRanges
 from derender.storage import folder as files
+from derender.storage.places import model_folder
 from derender.storage.sharing import Shareable
 
 
@@ -165,7 +166,7 @@ def load(
         FileNotFoundError: there is no model.
         ValueError: the model is damaged, of other factors, another renderer or a newer version.
     """
-    folder = files.model_folder(source)
+    folder = model_folder(source)
     config = files.read_config(folder)
     with files.naming_damage(folder):
         settings = ModelSettings.model_validate(config["settings"])

@@ -14,8 +14,9 @@ from tests.cli.conftest import TINY, run, settings
 
 from derender import FeatureTable
 from derender.cli import main
-from derender.cli.console import duration, plain
+from derender.cli.console import duration
 from derender.report.decomposition import COLUMN_MEANING
+from derender.settings import plain
 
 COMMANDS = (
     *("demo", "doctor", "train", "embed", "decompose", "compare", "report", "synth faces", "synth cars"),
@@ -33,20 +34,53 @@ def trained(faces: Path, tmp_path_factory) -> Path:
     return folder
 
 
-def test_version_and_help_need_no_heavy_import():
+def imported_by(*arguments: str | Path, among: tuple[str, ...]) -> tuple[int, str, str]:
+    """Exit code and output of a command in a process of its own, and which of these packages it imported."""
     code = (
-        "import sys; from derender.cli import main; code = main(['--help']); "
-        "heavy = {'torch', 'numpy', 'numba', 'matplotlib', 'PIL', 'sklearn', 'pyarrow'} & set(sys.modules); "
-        "print(heavy, file=sys.stderr); sys.exit(code or len(heavy))"
+        f"import sys; from derender.cli import main; code = main({list(map(str, arguments))}); "
+        f"print('imported', *sorted(set({among}) & set(sys.modules)), file=sys.stderr); sys.exit(code)"
     )
     source = str(Path(__file__).resolve().parents[2] / "src")
     environment = {**os.environ, "PYTHONPATH": source}
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=False
     )
-    assert done.returncode == 0, done.stderr
+    said, _, found = done.stderr.rpartition("imported")
+    return done.returncode, done.stdout + said, found.strip()
+
+
+HEAVY = ("torch", "numpy", "numba", "matplotlib", "PIL", "sklearn", "scipy", "pyarrow")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        (["decompose", "nosuch.jpg", "-m", "faces-64", "-o", "x"], "nosuch.jpg does not exist"),
+        (["decompose", __file__, "-m", "faces-46", "-o", "x"], "no model at faces-46"),
+        (["rotate", __file__, "-m", "faces-64", "-o", "x", "--detail", "foto"], "did you mean 'photo'?"),
+        (["mesh", __file__, "-m", "faces-64", "-o", "x", "--format", "stl"], "choose glb or obj"),
+        (["embed", "nosuch", "-m", "faces-64", "-o", "x"], "nosuch does not exist"),
+        (["view", "-m", "faces-64", "--device", "gpu"], "choose auto, cpu or cuda"),
+    ],
+)  # fmt: skip
+def test_bad_arguments_are_refused_before_anything_heavy_is_imported(arguments, reason):
+    code, said, found = imported_by(*arguments, among=HEAVY)
+    assert (code, found) == (2, "") and reason in said
+
+
+def test_one_image_is_decomposed_without_slow_packages(tmp_path):
+    file = tmp_path / "a.png"
+    Image.fromarray(np.random.default_rng(0).integers(0, 256, (64, 64, 3), np.uint8)).save(file)
+    slow = ("numba", "matplotlib", "sklearn", "scipy", "pyarrow", "torch._dynamo", "tensorboard")
+    code, said, found = imported_by("decompose", file, "-m", "faces-64", "-o", tmp_path / "out", among=slow)
+    assert (code, found) == (0, ""), said
+
+
+def test_version_and_help_need_no_heavy_import():
+    code, shown, found = imported_by("--help", among=HEAVY)
+    assert (code, found) == (0, "")
     for name in ("demo", "train", "embed", "decompose", "evaluate", "synth"):
-        assert name in done.stdout
+        assert name in shown
 
 
 @pytest.mark.parametrize("command", COMMANDS)

@@ -1,6 +1,6 @@
 """`derender models`: what is bundled."""
 
-from derender.storage.folder import bundled_models
+from derender.storage.places import bundled_models
 
 
 def test_every_bundled_model_is_listed_with_what_it_was_trained_on(numbers):

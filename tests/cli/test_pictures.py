@@ -15,7 +15,7 @@ from tests.cli.conftest import noise
 
 from derender import Derenderer, FeatureTable
 from derender.cli import main
-from derender.storage.folder import ERRORS_FILE
+from derender.storage.places import ERRORS_FILE
 from derender.training.held_out_errors import HeldOutErrors, write_errors
 
 SIZE = 32

@@ -99,7 +99,7 @@ def test_it_answers_until_ctrl_c(model, photos, tmp_path):
         try:
             url = _url(process, told)
             with urllib.request.urlopen(url, timeout=60) as page:
-                assert b"An image, decomposed" in page.read()
+                assert b"relight and turn a photograph" in page.read()
             foreign = urllib.request.Request(url, headers={"Host": "rebound.example"})
             with pytest.raises(urllib.error.HTTPError, match="421") as answer:
                 urllib.request.urlopen(foreign, timeout=60)

@@ -5,13 +5,15 @@ import pytest
 
 import derender
 from derender.data import read_images
-from derender.evaluation.out_of_distribution import (
+from derender.storage.places import model_folder
+from derender.training.held_out_errors import (
     OUTLIER_PERCENTILE,
+    HeldOutErrors,
+    errors_of,
     percentile_of,
+    read_errors,
     reconstruction_percentile,
 )
-from derender.storage.folder import model_folder
-from derender.training.held_out_errors import HeldOutErrors, errors_of, read_errors
 
 
 def test_known_percentiles():

@@ -11,7 +11,7 @@ from derender.networks import FACTORS
 from derender.render import render_scene
 from derender.renderers import RENDERERS, Renderer, recorded_renderer, renderer_named
 from derender.scene import Scene
-from derender.storage.folder import CONFIG_FILE
+from derender.storage.places import CONFIG_FILE
 
 TINY = {"image_size": 32, "width": 8, "light_width": 4}
 ALL = "phong(gamma=2.2)+lambert-shadow(softness_deg=8)+haze"

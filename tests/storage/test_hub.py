@@ -10,7 +10,7 @@ import torch
 import derender
 from derender.model import Derenderer
 from derender.storage import hub
-from derender.storage.folder import ERRORS_FILE
+from derender.storage.places import ERRORS_FILE
 from derender.training.held_out_errors import HeldOutErrors, read_errors, write_errors
 
 MINE = {"data": "mugs", "licence": "MIT"}

@@ -10,7 +10,8 @@ from derender.cli import main
 from derender.data import read_images
 from derender.data.synthetic import faces
 from derender.inputs import copy_split, part_of, split_of
-from derender.storage.folder import SPLIT_FILE, SplitRecord, read_split, write_split
+from derender.storage.folder import SplitRecord, read_split, write_split
+from derender.storage.places import SPLIT_FILE
 from derender.training.config import TrainConfig
 from derender.training.run_folder import start_run
 

@@ -18,7 +18,7 @@ from derender.data import read_images
 from derender.data.cache import _MARK, read_cache
 from derender.features import FeatureTable, missing
 from derender.interpretation.probe import Probe, load_probe
-from derender.storage.folder import CONFIG_FILE
+from derender.storage.places import CONFIG_FILE
 from derender.training.checkpoint import TrainState, load_checkpoint
 from derender.training.config import config_from_tree
 from derender.training.run_folder import read_config, read_config_tree, read_metrics

@@ -25,7 +25,8 @@ from derender.baselines import network_type
 from derender.data import ImageSet, split_indices, suggestion
 from derender.settings import Settings
 from derender.storage.atomic import new_folder
-from derender.storage.folder import CONFIG_FILE, FORMAT, WEIGHTS_FILE, saved_config
+from derender.storage.folder import FORMAT, saved_config
+from derender.storage.places import CONFIG_FILE, WEIGHTS_FILE
 from derender.storage.tensors import read_tensors, write_tensors
 from derender.training import config as configs
 from derender.training import run_folder

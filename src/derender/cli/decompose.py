@@ -8,7 +8,8 @@ from typer import Option
 from derender.cli.gathered import command
 from derender.cli.images import ImageFiles, opener_of
 from derender.cli.options import Output, TrainedModel
-from derender.report.opening import MESH_SIZE, TEXTURE_SIZE, ImageOptions, OpenedImage
+from derender.report.opening import MESH_FORMATS, MESH_SIZE, TEXTURE_SIZE, ImageOptions, OpenedImage
+from derender.storage.places import require_known
 
 if TYPE_CHECKING:
     from derender.report.mesh import MeshFiles
@@ -35,9 +36,9 @@ def mesh(
     grazing: Grazing = 85.0,
 ) -> None:  # fmt: skip
     """Write a folder per image with its surface as a mesh: its pixels as texture, x right, y up."""
-    from derender.report.mesh import MeshFiles, checked_format, image_mesh
+    require_known("format", form, MESH_FORMATS)
+    from derender.report.mesh import MeshFiles, image_mesh
 
-    checked_format(form)
     opener = opener_of(model, how, MESH_SIZE if how.detail == "model" else TEXTURE_SIZE)
 
     def edit(image: OpenedImage) -> "MeshFiles":

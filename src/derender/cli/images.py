@@ -13,6 +13,7 @@ import typer
 from derender.cli.console import notice, progress_bar
 from derender.cli.options import OutFolder, Output, TrainedModel
 from derender.report.opening import ImageOpener, ImageOptions, OpenedImage, held_out_errors
+from derender.storage.places import require_image
 
 if TYPE_CHECKING:
     from derender.report.editing import Edited
@@ -24,6 +25,9 @@ class ImageFiles:
 
     images: Annotated[list[Path], typer.Argument(help="Image files.", metavar="IMAGE...")]
     out: OutFolder
+
+    def __post_init__(self) -> None:
+        require_image(self.images)
 
     def edit(
         self,

@@ -8,7 +8,7 @@ from derender.cli.gathered import command
 @command("models", "models --json models.json")
 def models(json_file: options.Json = None) -> None:
     """List the bundled models: their names, sizes, and what each was trained on."""
-    from derender.storage.folder import bundled, bundled_models
+    from derender.storage.places import bundled, bundled_models
 
     rows = [bundled(name) for name in bundled_models()]
     for row in rows:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from derender.cli.console import progress_bar, refuse_existing, report_images, result, write_json
+from derender.storage.places import DEVICES, hub_id, model_folder, require_images, require_known
 
 if TYPE_CHECKING:
     from derender.data import ImageSet
@@ -116,6 +117,10 @@ class PartOfImages(DataOptions):
 
     part: Part = "all"
 
+    def __post_init__(self) -> None:
+        if (address := self.optional_address) is not None and self.dataset == "auto":
+            require_images(address)
+
     @property
     def how(self) -> dict[str, Any]:
         return {**super().how, "part": self.part}
@@ -127,6 +132,11 @@ class TrainedModel:
 
     model: Model
     device: Device = "auto"
+
+    def __post_init__(self) -> None:
+        require_known("device", self.device, DEVICES)
+        if not hub_id(self.model):
+            model_folder(self.model)
 
     def open(self, fit_steps: int | None = None) -> "Derenderer":
         """Load it."""

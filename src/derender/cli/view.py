@@ -10,6 +10,7 @@ from derender.cli import options
 from derender.cli.console import notice, result, write_json
 from derender.cli.gathered import command
 from derender.report.opening import ImageOptions
+from derender.storage.places import require_image
 
 Named = Annotated[list[Path] | None, typer.Argument(help="Images to begin with.", metavar="[IMAGE]...")]
 Features = Annotated[
@@ -37,6 +38,7 @@ def view(
 
     It listens on this machine only, stores no image on disk, and needs no network. Ctrl-C ends it.
     """
+    require_image(images or [])
     frame = ImageOptions(crop=crop, frame=frame).frame
     missing = [name for name in ("starlette", "uvicorn") if find_spec(name) is None]
     if missing:

@@ -31,9 +31,10 @@ from derender.data.layouts.layout import HALVES, half_of
 from derender.data.maps import GroundTruth, MaskedImages, read_ground_truth, read_masks
 from derender.data.opening import ListedStream, list_images, open_images, open_source, parse_source
 from derender.data.parquet import opened_parquet
-from derender.data.source import Skipped, is_image, nearest_sibling, suggestion
+from derender.data.source import Skipped, is_image
 from derender.data.splits import Split, split_indices
 from derender.data.stream import Kinds, Sample, Stream, Value, column_of
+from derender.storage.places import nearest_sibling, suggestion
 
 __all__ = [
     "HALVES", "LAYOUTS", "MASK_CLASSES", "READER_VERSION", "Decoded", "Duplicate", "GivenImages",

@@ -16,7 +16,8 @@ from torch import Tensor
 
 from derender.data.image import Unreadable, decode_whole, fit_square, quiet_pillow, upright_rgb
 from derender.data.image_set import check_images
-from derender.data.source import nearest_sibling, read_bounded
+from derender.data.source import read_bounded
+from derender.storage.places import nearest_sibling
 
 GivenImages: TypeAlias = str | Path | Image.Image | np.ndarray | Tensor | Sequence[Any]
 

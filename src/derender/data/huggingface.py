@@ -16,8 +16,9 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from derender.data.layouts.layout import PARTITION_NAMES
-from derender.data.source import printable, read_bounded, stamps_of, suggestion
+from derender.data.source import printable, read_bounded, stamps_of
 from derender.data.stream import Sample, Stream, label_name, unreadable
+from derender.storage.places import suggestion
 
 _ANSWER_SECONDS = 10.0
 _LABEL_KINDS = ("string", "large_string", "int", "uint", "float", "bool")

@@ -26,7 +26,8 @@ from jaxtyping import Float32, UInt8
 from PIL import Image
 from PIL.Image import Resampling, Transpose
 
-from derender.data.source import Source, read_bounded, suggestion
+from derender.data.source import Source, read_bounded
+from derender.storage.places import suggestion
 
 READER_VERSION = 1
 """Goes up whenever the same file would decode to other pixels, so that cached images are made again."""

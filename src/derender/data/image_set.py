@@ -23,8 +23,9 @@ from derender.data.decoding import Decoded, Progress, ahead, decoded, estimated_
 from derender.data.image import READER_VERSION, Unreadable, check_fit, quiet_pillow
 from derender.data.layouts.layout import Labels, count_unknown, text_column
 from derender.data.opening import open_images
-from derender.data.source import Skipped, suggestion
+from derender.data.source import Skipped
 from derender.data.stream import Kinds, Stream, Value, column_of
+from derender.storage.places import suggestion
 
 MEMORY_LIMIT_BYTES = 2 << 30
 """Sets larger than this (175,000 images of 64 x 64) lie in a memory-mapped file instead of memory."""

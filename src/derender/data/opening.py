@@ -28,17 +28,10 @@ from derender.data.layouts import layout_named, recognise
 from derender.data.layouts.layout import Layout, Table, half_of
 from derender.data.layouts.tables import TABLE_SUFFIXES, TableSource, holds_paths
 from derender.data.shards import SHARD_SUFFIXES, ShardStream, find_shards
-from derender.data.source import (
-    SUFFIXES,
-    FileSource,
-    Source,
-    is_hidden,
-    is_image,
-    nearest_sibling,
-    suggestion,
-)
+from derender.data.source import FileSource, Source, is_hidden, is_image
 from derender.data.stream import Sample, Stream
 from derender.data.zip_source import ZipSource
+from derender.storage.places import SUFFIXES, nearest_sibling, suggestion
 
 STREAMED = ("webdataset", "huggingface")
 """The layouts that are read from front to back, by the names one can ask for them."""

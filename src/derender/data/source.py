@@ -8,18 +8,13 @@ import stat
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from difflib import get_close_matches
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Int64
 
-SUFFIXES = (
-    *(".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".webp", ".avif", ".bmp", ".gif"),
-    *(".tif", ".tiff", ".ppm", ".pgm", ".pnm"),
-)
-"""File names that end in one of these are taken for images."""
+from derender.storage.places import SUFFIXES
 
 FILE_LIMIT_BYTES = 512 << 20
 """No single file larger than this is read: a bound on memory, and on what a zip bomb can unpack to."""
@@ -143,23 +138,3 @@ def printable(name: str) -> str:
     except UnicodeEncodeError:
         return name.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
     return name
-
-
-def suggestion(name: str, known: Iterable[str]) -> str:
-    """``"; did you mean 'x'?"`` for the closest known name, or an empty string when nothing is close."""
-    by_lower = {candidate.lower(): candidate for candidate in known}
-    close = get_close_matches(name.lower(), by_lower, n=1, cutoff=0.5)
-    return f"; did you mean {by_lower[close[0]]!r}?" if close else ""
-
-
-def nearest_sibling(path: Path) -> str:
-    """For "does not exist": a suggestion among the folders, archives and images beside it."""
-    parent = path.absolute().parent
-    if not parent.is_dir():
-        return f"; nor does its folder {parent}"
-    try:
-        entries = sorted(parent.iterdir())
-    except OSError:
-        return ""
-    known = (*SUFFIXES, ".zip", ".tar")
-    return suggestion(path.name, [one.name for one in entries if one.is_dir() or one.name.endswith(known)])

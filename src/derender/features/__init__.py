@@ -5,7 +5,9 @@ scikit-learn; embedding: any images to a table in memory or a file (blocks, part
 nearest rows by one factor.
 """
 
-from derender.features.embedding import Embedded, embed, embed_to_file
+import importlib
+from typing import TYPE_CHECKING, Any
+
 from derender.features.extract import (
     Progress,
     embed_image_set,
@@ -15,12 +17,27 @@ from derender.features.extract import (
     model_fingerprint,
     table_labels,
 )
-from derender.features.neighbours import search
 from derender.features.table import FeatureTable, missing, named
-from derender.features.transformer import DisentangledFeatures
+
+if TYPE_CHECKING:
+    from derender.features.embedding import Embedded, embed, embed_to_file
+    from derender.features.neighbours import search
+    from derender.features.transformer import DisentangledFeatures
 
 __all__ = [
     "DisentangledFeatures", "Embedded", "FeatureTable", "Progress", "embed", "embed_image_set",
     "embed_images", "embed_to_file", "evaluating", "map_batches", "missing", "model_fingerprint", "named",
     "search", "table_labels",
 ]  # fmt: skip
+
+_HOME = {
+    **dict.fromkeys(("Embedded", "embed", "embed_to_file"), "embedding"),
+    "search": "neighbours",
+    "DisentangledFeatures": "transformer",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOME:  # scikit-learn and pyarrow are slow to import, and decomposing an image needs neither
+        return getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float64, Int64
-from scipy.spatial.distance import cdist
 
 from derender.data import nearest_sibling, read_image, suggestion
 from derender.features.extract import embed_images, model_fingerprint
@@ -183,6 +182,8 @@ def same_image(table: FeatureTable, codes: Mapping[str, np.ndarray]) -> Int64[np
 
 def _distances(query: np.ndarray, rows: np.ndarray, metric: Any) -> Float64[np.ndarray, " n"]:
     """From one feature (D,) to each of (N, D) rows."""
+    from scipy.spatial.distance import cdist
+
     away = np.empty(len(rows))
     for start in range(0, len(rows), BLOCK_ROWS):
         part = slice(start, start + BLOCK_ROWS)

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from derender.data import suggestion
-from derender.features.parquet import Columns, read_columns, write_columns
 
 
 def missing(labels: np.ndarray) -> np.ndarray:
@@ -127,6 +126,8 @@ class FeatureTable:
 
     def write(self, path: str | Path) -> Path:
         """Write parquet; at ``path`` stands the old file or the whole new one, never half of it."""
+        from derender.features.parquet import Columns, write_columns
+
         write_columns(Path(path), [Columns(self.files, self.factors, self.labels, self.origin)])
         return Path(path)
 
@@ -136,6 +137,8 @@ class FeatureTable:
 
         With ``only``, a factor's name, no other factor is read: much faster where a table is large.
         """
+        from derender.features.parquet import read_columns
+
         content = read_columns(Path(path), only)
         try:
             return cls(tuple(content.files), content.factors, content.labels, content.origin)

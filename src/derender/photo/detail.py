@@ -132,7 +132,7 @@ class PhotoDetail:
     def _continued(self, mask: Tensor, shift: Tensor, log_ratio: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """How far inside the surface, 0..1; shift and ratio continue around it and fade. On the wide grid."""
         reach = round(RIM_SHARE * self.grid)
-        mask = -max_pool2d(-pad(mask, (reach,) * 4), 2 * reach + 1, stride=1)
+        mask = pad(_eroded(pad(mask, (reach,) * 4), reach), (-reach,) * 4)
         mask, fields = (pad(field, (self.rim,) * 4) for field in (mask, torch.cat((shift, log_ratio), dim=1)))
         near = _ramp(_blurred(mask, FADE_SHARE * self.grid), 0.02, 0.25)
         near = torch.maximum(mask, near)
@@ -214,8 +214,9 @@ class PhotoDetail:
         visible = inside & (points[..., 2][:, None] <= front + HIDDEN_BEHIND) & (front > 0)
         share = visible * _ramp(_facing(points), *FACING)[:, None]
         reach = max(1, round(FEATHER_SHARE * self.grid))
-        shrunk = -max_pool2d(-share, 2 * reach + 1, stride=1, padding=reach)
-        return avg_pool2d(shrunk, 2 * reach + 1, stride=1, padding=reach, count_include_pad=False)
+        return avg_pool2d(
+            _eroded(share, reach), 2 * reach + 1, stride=1, padding=reach, count_include_pad=False
+        )
 
     def _margin(self, share: float) -> Float[Tensor, "1 1 g g"]:
         """1 in the canonical map, 0 within a share of its side from its border."""
@@ -261,6 +262,13 @@ def _blurred(maps: Tensor, reach: float) -> Tensor:
     for _ in range(3):
         small = avg_pool2d(pad(small, (reach,) * 4, mode="replicate"), 2 * reach + 1, stride=1)
     return interpolate(small, maps.shape[-2:], mode="bilinear")
+
+
+def _eroded(maps: Tensor, reach: int) -> Tensor:
+    """The least value within ``reach`` pixels across and down."""
+    for across, down in ((reach, 0), (0, reach)):
+        maps = -max_pool2d(-maps, (2 * down + 1, 2 * across + 1), stride=1, padding=(down, across))
+    return maps
 
 
 def _filled(maps: Tensor, known: Float[Tensor, "n 1 h w"]) -> Tensor:

@@ -17,14 +17,16 @@ from jaxtyping import UInt8
 from PIL import Image
 from torch import Tensor
 
-from derender.data import GivenImages, as_photos, suggestion
+from derender.data import GivenImages, as_photos
 from derender.inputs import as_model
 from derender.model import Derenderer
-from derender.photo.detail import PhotoDetail
+from derender.photo.detail import LAMBERT, PhotoDetail
 from derender.photo.faces import UTKFACE, find_faces, frame_of, template_of
 from derender.photo.frame import Frame
+from derender.renderers import Renderer
 from derender.scene import Scene
 from derender.scene.crop_search import SEARCH_SCALE, best_crops
+from derender.storage.places import require_known
 
 AMBIENT_SHARE = 0.35
 """Of a light's strength; the rest is diffuse."""
@@ -56,6 +58,20 @@ class Photograph:
     surroundings: Frame
     scene: Scene
     detail: PhotoDetail
+
+    @classmethod
+    def of(
+        cls, pixels: UInt8[np.ndarray, "h w 3"], frame: Frame, scene: Scene, fov_deg: float,
+        renderer: Renderer = LAMBERT,
+    ) -> "Photograph":  # fmt: skip
+        """A photograph with the one scene that a model found in a part of it."""
+        wide = frame.widened(MARGIN)
+        size = min(max(scene.depth.shape[-1], round(wide.side)), LARGEST_CROP)
+        photo = torch.from_numpy(wide.cut(pixels, size)).to(scene.depth.device).float() / 255
+        with torch.inference_mode():
+            margin = (wide.side / frame.side - 1) / 2
+            detail = PhotoDetail(photo, scene, fov_deg, margin, renderer)
+        return cls(pixels, frame, wide, scene, detail)
 
     def edited(self, **parameters: Tensor) -> UInt8[np.ndarray, "h w 3"]:
         """The whole photograph with another ``light`` (1, 4) or ``camera`` (1, 6)."""
@@ -93,14 +109,7 @@ def open_photograph(
     own = model.image_size
     small = torch.from_numpy(place.cut(pixels, own)[None]).to(model.device).float() / 255
     scene = model.fit_scenes(small, fit_steps).scene if fit_steps else model.decompose(small)
-    wide = place.widened(MARGIN)
-    size = min(max(own, round(wide.side)), LARGEST_CROP)
-    photo = torch.from_numpy(wide.cut(pixels, size)).to(model.device).float() / 255
-    with torch.inference_mode():
-        margin = (wide.side / place.side - 1) / 2
-        return Photograph(
-            pixels, place, wide, scene, PhotoDetail(photo, scene, model.fov_deg, margin, model.renderer)
-        )
+    return Photograph.of(pixels, place, scene, model.fov_deg, model.renderer)
 
 
 def relight(
@@ -188,8 +197,8 @@ def found_frame(
             of faces and one is found ("no face" is said where not), else the middle square, as for images no
             larger than the model's.
     """
-    if frame is not None and frame not in FRAMES:
-        raise ValueError(f"unknown frame {frame!r}{suggestion(frame, FRAMES)}: choose {', '.join(FRAMES)}")
+    if frame is not None:
+        require_known("frame", frame, FRAMES)
     middle = Frame.centred(pixels.shape[1], pixels.shape[0])
     if frame == "auto":
         larger = torch.from_numpy(middle.cut(pixels, SEARCH_SCALE * model.image_size)[None])

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from derender.postprocess.fitting import Fitting, coordinates_of
 from derender.postprocess.whitening import Whitening
-from derender.storage.folder import FITTING_FILE, WHITENING_FILE
+from derender.storage.places import FITTING_FILE, WHITENING_FILE
 
 
 @dataclass(frozen=True)

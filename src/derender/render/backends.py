@@ -9,6 +9,7 @@ Triton also runs on the CPU in its interpreter, slowly, for tests.
 import importlib
 import importlib.util
 from collections.abc import Callable, Sequence
+from math import inf
 from typing import Any
 
 import torch
@@ -21,6 +22,8 @@ WORKS_ON = {"numba": "cpu", "triton": "cuda"}
 INSTALLED = {name: importlib.util.find_spec(name) is not None for name in WORKS_ON}
 """Found at import, as torch 2.6 cannot trace it."""
 BACKENDS = ("auto", "reference", *WORKS_ON)
+FEW_PIXELS = 4 * 64 * 64
+"""So many, without gradients, are the reference's on a CPU: Numba takes half a second to start."""
 
 
 def available_backends() -> tuple[str, ...]:
@@ -29,12 +32,17 @@ def available_backends() -> tuple[str, ...]:
     return ("reference", *(name for name in WORKS_ON if INSTALLED[name] and runs[name]))
 
 
-def chosen_backend(device: torch.device | str, backend: str = "auto") -> str:
-    """The implementation that ``backend`` means for tensors on ``device``; an impossible one is an error."""
+def chosen_backend(device: torch.device | str, backend: str = "auto", pixels: float = inf) -> str:
+    """The implementation that ``backend`` means for tensors on ``device``; an impossible one is an error.
+
+    ``pixels``: of all images together.
+    """
     kind = torch.device(device).type
     if backend not in BACKENDS:
         raise ValueError(f"unknown render backend {backend!r}; choose one of {', '.join(BACKENDS)}")
     if backend == "auto":
+        if kind == "cpu" and pixels <= FEW_PIXELS and not torch.is_grad_enabled():
+            return "reference"
         return next(
             (name for name, works in WORKS_ON.items() if works == kind and INSTALLED[name]), "reference"
         )
@@ -90,13 +98,16 @@ def operators(
             suffix: str, tensors: Sequence[str], results: int, function: Operation, room: Operation
         ) -> Any:
             several = ", ".join(["Tensor"] * results)
+            whole = f"derender::{name}_{backend}{suffix}"
             schema = f"({', '.join(f'Tensor {one}' for one in tensors)}, float focal_px) -> "
-            operator = torch.library.custom_op(
-                f"derender::{name}_{backend}{suffix}", function, mutates_args=(), device_types=devices,
-                schema=schema + (several if results == 1 else f"({several})"),
-            )  # fmt: skip
-            operator.register_fake(lambda *values: _one_or_all(room(*values[:-1])))
-            return operator
+            torch.library.define(
+                whole,
+                schema + (several if results == 1 else f"({several})"),
+                tags=torch.Tag.pt2_compliant_tag,
+            )
+            torch.library.impl(whole, devices)(function)
+            torch.library.register_fake(whole, lambda *values: _one_or_all(room(*values[:-1])))
+            return getattr(torch.ops.derender, f"{name}_{backend}{suffix}").default
 
         def keep(ctx: Any, inputs: tuple, output: Any) -> None:
             *values, ctx.focal_px = inputs
@@ -109,7 +120,7 @@ def operators(
 
         operator = made("", inputs, len(outputs), run, room)
         derivative = made("_backward", [*grads, *inputs, *kept], len(inputs), run_backward, gradients)
-        operator.register_autograd(differentiate, setup_context=keep)
+        torch.library.register_autograd(operator, differentiate, setup_context=keep)
         return operator
 
     return {

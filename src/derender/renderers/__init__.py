@@ -23,7 +23,7 @@ from derender.renderers.renderer import FunctionRenderer, Renderer
 from derender.renderers.sh import sh
 from derender.renderers.shadow import lambert_shadow
 from derender.scene import Scene
-from derender.storage.folder import bundled_models
+from derender.storage.places import bundled_models
 
 __all__ = [
     "RENDERERS", "Render", "Renderer", "as_renderer", "brings_code", "recorded_renderer", "renderer_named",

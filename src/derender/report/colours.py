@@ -4,8 +4,8 @@ Every function takes one array for a whole set and uses one range for all of it,
 side can be compared. Leaves out layout (see ``panel``) and anything that needs a model.
 """
 
+import cv2
 import numpy as np
-from matplotlib import colormaps
 from PIL import Image
 from torch import Tensor
 
@@ -41,7 +41,8 @@ def depth_maps(
     near, far = limits or depth_range(depth, mask)
     values = np.nan_to_num(as_numpy(depth), nan=far)
     nearness = np.clip((far - values) / max(far - near, 1e-9), 0, 1)
-    return _images(colormaps["magma"](nearness)[..., :3], mask)
+    magma = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[:, None], cv2.COLORMAP_MAGMA)[:, 0, ::-1]
+    return _images(magma[np.minimum(256 * nearness, 255).astype(np.uint8)], mask)
 
 
 def normal_maps(normal: Values, mask: Values | None = None) -> Images:

@@ -14,10 +14,10 @@ from typing import Any, Protocol
 
 from PIL import Image
 
-from derender.evaluation.out_of_distribution import OUTLIER_PERCENTILE
 from derender.report.opening import ImageOpener, OpenedImage, readable
 from derender.report.panel import Sheets
 from derender.storage.atomic import atomic_file, atomic_folder
+from derender.training.held_out_errors import OUTLIER_PERCENTILE
 
 
 class Edited(Protocol):

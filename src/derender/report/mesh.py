@@ -24,16 +24,15 @@ from PIL import Image
 from scipy import ndimage
 from torch import Tensor
 
-from derender.data import suggestion
 from derender.model import Derenderer
 from derender.report.colours import pictures
-from derender.report.opening import MESH_SIZE, OpenedImage
+from derender.report.opening import MESH_FORMATS, MESH_SIZE, OpenedImage
 from derender.scene import Scene
 from derender.scene.camera import unproject
 from derender.scene.enlarge import at_size
 from derender.scene.normals import normals_from_depth
+from derender.storage.places import require_known
 
-FORMATS = ("glb", "obj")
 GRAZING_DEG = 85.0
 
 
@@ -63,6 +62,7 @@ class Mesh:
         The material is the albedo without gloss, seen from both sides. OBJ knows no names with spaces; such
         characters become underscores.
         """
+        require_known("format", form, MESH_FORMATS)
         import trimesh
         from trimesh.exchange.gltf import export_glb
         from trimesh.exchange.obj import export_obj
@@ -75,7 +75,7 @@ class Mesh:
                 self.vertices, self.faces, vertex_normals=self.normals, visual=visual, process=False
             )
 
-        if checked_format(form) == "glb":
+        if form == "glb":
             material = PBRMaterial(
                 name="albedo", baseColorTexture=self.texture, metallicFactor=0.0, roughnessFactor=1.0,
                 doubleSided=True,
@@ -120,13 +120,6 @@ class MeshFiles:
             "faces": len(self.mesh.faces),
             "trimmed": self.mesh.trimmed,
         }
-
-
-def checked_format(form: str) -> str:
-    """The format itself; an unknown one is an error that suggests another."""
-    if form not in FORMATS:
-        raise ValueError(f"unknown format {form!r}{suggestion(form, FORMATS)}: choose {' or '.join(FORMATS)}")
-    return form
 
 
 def model_mesh(

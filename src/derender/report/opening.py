@@ -13,6 +13,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from derender.storage.places import require_known
+
 if TYPE_CHECKING:
     import numpy as np
     from torch import Tensor
@@ -27,7 +29,7 @@ T = TypeVar("T")
 CHOICES = {"detail": ("photo", "model"), "frame": ("face", "auto", "none")}
 OLD_TEXTURES = {"original": "photo", "model": "model"}
 OLD_CROPS = {"whole": "none", "auto": "auto"}
-FILM_KINDS = ("gif", "mp4")
+FILM_KINDS, MESH_FORMATS = ("gif", "mp4"), ("glb", "obj")
 EDIT_SIZE, MESH_SIZE, TEXTURE_SIZE = 384, 128, 1024
 """Default sides in pixels: of edits, of a mesh's grid and texture; decompositions have the model's own."""
 
@@ -68,12 +70,12 @@ class ImageOptions:
     def __post_init__(self) -> None:
         for old, name, known in (("texture", "detail", OLD_TEXTURES), ("crop", "frame", OLD_CROPS)):
             if (value := getattr(self, old)) is not None:
-                _require_known(old, value, tuple(known))
+                require_known(old, value, tuple(known))
                 object.__setattr__(self, name, known[value])
         object.__setattr__(self, "frame", OLD_CROPS.get(self.frame or "", self.frame))
         for name, known in CHOICES.items():
             if (value := getattr(self, name)) is not None:
-                _require_known(name, value, known)
+                require_known(name, value, known)
 
 
 @dataclass(frozen=True)
@@ -89,21 +91,13 @@ class FilmOptions:
 
     def __post_init__(self) -> None:
         for kind in self.kinds:
-            _require_known("kind of film", kind, (*FILM_KINDS, "none"))
+            require_known("kind of film", kind, (*FILM_KINDS, "none"))
 
     @property
     def kinds(self) -> tuple[str, ...]:
         """The kinds of film by name; none for "none"."""
         kinds = tuple(dict.fromkeys(kind.strip().lower() for kind in self.film.split(",")))
         return () if kinds == ("none",) else kinds
-
-
-def _require_known(what: str, word: str, known: Sequence[str]) -> None:
-    """An unknown word is an error that suggests another."""
-    if word not in known:
-        from derender.data import suggestion
-
-        raise ValueError(f"unknown {what} {word!r}{suggestion(word, known)}: choose {' or '.join(known)}")
 
 
 @dataclass(frozen=True)
@@ -211,9 +205,9 @@ class ImageOpener:
         import numpy as np
         import torch
 
-        from derender.evaluation.out_of_distribution import reconstruction_percentile
         from derender.features import map_batches
         from derender.report.colours import depth_range
+        from derender.training.held_out_errors import reconstruction_percentile
 
         steps, stacked = self.options.fit_steps, np.stack([pixels for pixels, *_ in read.values()])
 
@@ -262,7 +256,7 @@ def readable(paths: Sequence[Path], read: Callable[[Path], T]) -> tuple[dict[Pat
 def held_out_errors(source: str | Path) -> "HeldOutErrors | None":
     """The reconstruction errors stored with a model; None, with a warning, where they are damaged."""
     from derender.storage.atomic import DamageNoticed
-    from derender.storage.folder import model_folder
+    from derender.storage.places import model_folder
     from derender.training.held_out_errors import read_errors
 
     try:

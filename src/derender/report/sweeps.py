@@ -115,6 +115,13 @@ def nodding_view(scene: Scene, frames: int = LOOP_FRAMES, reach_deg: float = LOO
     return varied(scene, camera=camera)
 
 
+def swaying_view(scene: Scene, frames: int = LOOP_FRAMES, reach_deg: float = LOOP_VIEW_DEG) -> Scene:
+    """One scene while it rotates to either side of its own view; a loop."""
+    camera = scene.camera.repeat(frames, 1)
+    camera[:, 1] += radians(reach_deg) * _angles(frames).sin().to(camera)
+    return varied(scene, camera=camera)
+
+
 def relit_and_rotated(scene: Scene, render: Render, frames: int = LOOP_FRAMES) -> Images:
     """The frames of both loops beside each other: the light goes round, the object rotates."""
     both = (drawn(loop(scene, frames), render) for loop in (circling_light, nodding_view))

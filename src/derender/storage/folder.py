@@ -1,10 +1,6 @@
-"""The folder of a saved model: its files, where it lies, its ``config.json``, whether weights fit.
-
-A model is looked for in a folder, among the bundled models, then on the Hugging Face Hub.
-"""
+"""The folder of a saved model: its files, its ``config.json``, whether weights fit."""
 
 import json
-import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -14,60 +10,19 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor, nn
 
-from derender.storage import hub
 from derender.storage.atomic import atomic_file
+from derender.storage.places import (
+    CONFIG_FILE,
+    SPLIT_FILE,
+    TENSOR_FILES,
+    TEXT_FILES,
+    WEIGHTS_FILE,
+)  # fmt: skip
 from derender.storage.tensors import check_fit, read_tensors, write_tensors
 
 Net = TypeVar("Net", bound=nn.Module)
 
 FORMAT = SPLIT_FORMAT = 1
-WEIGHTS_FILE, CONFIG_FILE = "model.safetensors", "config.json"
-# A model may lack any of these; training/held_out_errors.py writes and reads the third.
-WHITENING_FILE, FITTING_FILE = "whitening.safetensors", "fitting.safetensors"
-ERRORS_FILE, SPLIT_FILE, CARD_FILE = "held_out_errors.json", "split.json", "README.md"
-TENSOR_FILES = (WEIGHTS_FILE, WHITENING_FILE, FITTING_FILE)
-TEXT_FILES = (CARD_FILE, ERRORS_FILE, SPLIT_FILE)
-PRETRAINED = Path(__file__).parents[1] / "pretrained"
-
-
-def bundled_models() -> tuple[str, ...]:
-    """Names of the trained models that come with derender; each has a card, ``pretrained/NAME/README.md``."""
-    return tuple(sorted(folder.parent.name for folder in PRETRAINED.glob(f"*/{CONFIG_FILE}")))
-
-
-def bundled(name: str) -> dict[str, Any]:
-    """A bundled model's name, image size in pixels, size in megabytes, and what it was trained on."""
-    folder = PRETRAINED / name
-    network = json.loads((folder / CONFIG_FILE).read_text(encoding="utf-8"))["settings"]["network"]
-    card = (folder / CARD_FILE).read_text(encoding="utf-8")
-    size = sum(file.stat().st_size for file in folder.iterdir())
-    return {
-        "name": name,
-        "image_size": network["image_size"],
-        "megabytes": round(size / 1e6),
-        "about": re.split(r" ?[(:.\n]", card[card.index("**Trained on**") :].replace("**", ""))[0],
-    }
-
-
-def model_folder(source: str | Path) -> Path:
-    """The folder that ``load`` reads for this source; a FileNotFoundError where nothing is there."""
-    folder = Path(source)
-    for candidate in (folder, folder / "model"):
-        if (candidate / CONFIG_FILE).is_file() and (candidate / WEIGHTS_FILE).is_file():
-            return candidate
-    if folder.exists():
-        raise FileNotFoundError(
-            f"{folder} holds no model (expected {CONFIG_FILE} and {WEIGHTS_FILE} here or in 'model'): "
-            "give a run folder made by 'derender train' or a folder made by model.save"
-        )
-    if source in bundled_models():
-        return PRETRAINED / source
-    if isinstance(source, str) and source.count("/") == 1 and not source.startswith((".", "/", "~")):
-        return hub.download(source, (CONFIG_FILE, *TENSOR_FILES, *TEXT_FILES))
-    raise FileNotFoundError(
-        f"no model at {source}: give a run folder, a saved folder, a Hub id 'owner/name', or one of those "
-        f"that come with derender ({', '.join(bundled_models())})"
-    )
 
 
 def texts_beside(folder: Path | None, tensors: Mapping[str, Tensor]) -> dict[str, str]:

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from derender.storage import folder as files
 from derender.storage.atomic import new_folder
+from derender.storage.places import model_folder
 from derender.storage.tensors import UNIT, packed, read_described, write_tensors
 
 KINDS = ("bytes", "float16")
@@ -37,7 +38,7 @@ def pack_model(
     """
     if maps not in KINDS:
         raise ValueError(f"unknown kind of maps {maps!r}: choose {' or '.join(KINDS)}")
-    folder, own = Path(folder), files.model_folder(source)
+    folder, own = Path(folder), model_folder(source)
     files.read_config(own)
     before, after = {}, {}
     with new_folder(folder, overwrite=overwrite) as temporary:

@@ -13,7 +13,8 @@ from torch import Tensor
 
 from derender.storage import hub
 from derender.storage.atomic import new_folder
-from derender.storage.folder import CARD_FILE, ERRORS_FILE, SPLIT_FILE, texts_beside
+from derender.storage.folder import texts_beside
+from derender.storage.places import CARD_FILE, ERRORS_FILE, SPLIT_FILE
 
 
 class Shareable:

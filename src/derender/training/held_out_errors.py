@@ -1,7 +1,9 @@
 """The distance of a model's reconstructions from images it was not trained on, saved with the model.
 
 One number per image, the mean absolute difference inside the mask; of all of them 101 quantiles, in a small
-JSON file. Leaves out judging an image by them (``evaluation/out_of_distribution.py``).
+JSON file. Another image's error among them tells whether it may be out-of-distribution: a high percentile is
+a sign of another kind of object, another crop or a broken image. A low one proves nothing: a plain surface
+may be easy to render whatever it shows.
 """
 
 from dataclasses import dataclass
@@ -19,12 +21,15 @@ from derender.data import as_float
 from derender.model import load
 from derender.settings import Settings
 from derender.storage.atomic import atomic_file
-from derender.storage.folder import ERRORS_FILE
+from derender.storage.places import ERRORS_FILE
 from derender.training.process import evaluating
 
 QUANTILES = 101
 FEWEST = 20
 """Of fewer images nothing is saved: their largest error says little."""
+
+OUTLIER_PERCENTILE = 99.0
+"""Images above it are called out-of-distribution."""
 
 Images = UInt8[np.ndarray, "n 3 h w"] | UInt8[Tensor, "n 3 h w"]
 
@@ -124,3 +129,19 @@ def read_errors(folder: Path) -> HeldOutErrors | None:
         f"{file} is damaged or of a newer version: make it again with derender evaluate reconstruction "
         "--store"
     )
+
+
+def reconstruction_percentile(
+    model: Any, images: UInt8[np.ndarray, "n 3 h w"], held_out: HeldOutErrors
+) -> Float[np.ndarray, " n"]:
+    """Percentage (0..100) of the held-out images that the model reconstructs better than each of these.
+
+    Images like the training data have every percentile equally often. Between stored quantiles it is
+    interpolated; an image into which the model renders nothing has 100.
+    """
+    return percentile_of(reconstruction_errors(model, images), held_out)
+
+
+def percentile_of(errors: Float[np.ndarray, " n"], held_out: HeldOutErrors) -> Float[np.ndarray, " n"]:
+    """Where errors lie among the held-out ones, 0..100."""
+    return np.interp(errors, held_out.quantiles, np.linspace(0, 100, len(held_out.quantiles)))

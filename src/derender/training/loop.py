@@ -11,13 +11,12 @@ from collections.abc import Callable
 from contextlib import nullcontext
 from math import isfinite
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from PIL import Image
 from torch import Tensor
-from torch.utils.tensorboard.writer import SummaryWriter
 
 from derender.data import ImageSet, split_indices
 from derender.storage.atomic import DamageNoticed, atomic_file
@@ -46,6 +45,9 @@ from derender.training.task import (
     network_precision,
 )
 from derender.training.watch import Finding, broken_gradient, not_finite
+
+if TYPE_CHECKING:
+    from torch.utils.tensorboard.writer import SummaryWriter
 
 SAMPLE_COUNT = 8
 LOG_EVERY_STEPS = 50
@@ -115,13 +117,15 @@ class _Run:
         self.validation: dict[str, float] = {}
         self.findings: tuple[Finding, ...] = ()
         self.model_images: int | None = None
-        self.writer: SummaryWriter | None = None
+        self.writer: "SummaryWriter | None" = None
         if ranks.first:
             run_folder.drop_metrics_after(self.folder, self.state.images)
             if note is not None:
                 run_folder.append_metrics(
                     self.folder, {"kind": "note", "images": self.state.images, "text": note}
                 )
+            from torch.utils.tensorboard.writer import SummaryWriter
+
             self.writer = SummaryWriter(str(out / "tensorboard"), purge_step=self.state.images)
 
     def go_on(self) -> TrainResult:

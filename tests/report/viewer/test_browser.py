@@ -6,6 +6,7 @@ import os
 import shutil
 import zipfile
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -61,6 +62,8 @@ def page(browser, address):
     asked, wrong = [], []
     shown.on("request", lambda request: asked.append(request.url))
     shown.on("pageerror", lambda error: wrong.append(str(error)))
+    refusal = "Failed to load resource"  # which the page puts into words
+    shown.on("console", lambda m: m.type == "error" and refusal not in m.text and wrong.append(m.text))
     shown.goto(address)
     shown.wait_for_selector("body[data-ready]")
     yield shown
@@ -76,19 +79,14 @@ def pixels(page, selector: str) -> np.ndarray:
     )
 
 
-def drawn(page) -> int:
-    return int(page.eval_on_selector("#view", "element => element.dataset.drawn"))
-
-
-def after_one_more(page, before: int) -> None:
-    page.wait_for_selector(f'#view:not([data-drawn="{before}"])')
-    page.wait_for_timeout(150)
-
-
 def set_slider(page, name: str, value: float) -> None:
-    before = drawn(page)
     page.locator(f"#{name}").fill(str(value))
-    after_one_more(page, before)
+    at_rest(page)
+
+
+def at_rest(page) -> None:
+    page.wait_for_selector('#view[data-still="true"]')
+    page.wait_for_selector("body:not([data-busy])")
 
 
 def png(picture: np.ndarray) -> bytes:
@@ -97,19 +95,31 @@ def png(picture: np.ndarray) -> bytes:
     return stream.getvalue()
 
 
-def test_drop_a_file_drag_a_slider_save(page, rendered, tmp_path):
-    name = page.eval_on_selector("body", "element => element.dataset.ready")
+def dropped(page, name: str, content: bytes) -> None:
+    before = page.eval_on_selector("body", "element => element.dataset.ready")
     drop = """(zone, [name, bytes]) => {
       const given = new DataTransfer();
       given.items.add(new File([new Uint8Array(bytes)], name, {type: "image/png"}));
       zone.dispatchEvent(new DragEvent("drop", {dataTransfer: given, bubbles: true, cancelable: true}));
     }"""
-    page.eval_on_selector("#drop", drop, ["<b>mine</b>.png", list(png(rendered[1]))])
-    page.wait_for_selector(f'body:not([data-ready="{name}"])')
-    assert page.inner_text("#status").startswith("<b>mine</b>.png: mean difference")
+    page.eval_on_selector("#drop", drop, [name, list(content)])
+    page.wait_for_selector(f'body:not([data-ready="{before}"])')
+
+
+def saved(page, kind: str) -> tuple[str, bytes]:
+    with page.expect_download() as download:
+        page.click(f"[data-save={kind}]")
+    return download.value.suggested_filename, Path(download.value.path()).read_bytes()
+
+
+def test_drop_a_file_drag_a_slider_save(page, rendered):
+    dropped(page, "<b>mine</b>.png", png(rendered[1]))
+    assert page.inner_text("#status") == "<b>mine</b>.png: opened."
+    assert page.inner_text("#error").startswith("Mean difference")
 
     set_slider(page, "light-diffuse", 1.0)
     set_slider(page, "light-yaw", 60)
+    page.check("[name=drag][value=camera]", force=True)  # no sun before it
     left = pixels(page, "#view")
     set_slider(page, "light-yaw", -60)
     right = pixels(page, "#view")
@@ -118,18 +128,65 @@ def test_drop_a_file_drag_a_slider_save(page, rendered, tmp_path):
     assert change[:, : half // 2].mean() > 3 > -3 > change[:, -half // 2 :].mean()
     assert np.abs(pixels(page, "#map-shading")).mean() > 1
 
-    with page.expect_download() as saved:
-        page.click("[data-save=archive]")
-    assert saved.value.suggested_filename == "_b_mine_b_-archive.zip"
-    saved.value.save_as(tmp_path / "all.zip")
-    with zipfile.ZipFile(tmp_path / "all.zip") as archive:
+    name, content = saved(page, "archive")
+    assert name == "_b_mine_b_-archive.zip"
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
         assert {"panel.png", "view.png", "surface.glb"} <= set(archive.namelist())
         assert json.loads(archive.read("settings.json"))["light"]["yaw_deg"] == -60
-    with page.expect_download() as saved:
-        page.click("[data-save=picture]")
-    saved.value.save_as(tmp_path / "view.png")
-    with Image.open(tmp_path / "view.png") as picture:
-        assert picture.size == (256, 256)
+    with Image.open(io.BytesIO(saved(page, "picture")[1])) as picture:
+        assert picture.size == (64, 64)  # the photograph's own
+    assert saved(page, "gif")[1].startswith(b"GIF8")
+
+
+def test_the_result_is_dragged_compared_and_reset(page):
+    at_rest(page)
+    original = pixels(page, "#view-sheet")
+    box = page.locator("#view").bounding_box()
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    for mode, value in (("light", "#light-yaw"), ("camera", "#camera-yaw")):
+        page.check(f"[name=drag][value={mode}]", force=True)
+        was = float(page.input_value(value))
+        page.mouse.move(x, y)
+        page.mouse.down()
+        page.mouse.move(x - box["width"] / 10, y, steps=3)
+        page.mouse.up()
+        at_rest(page)
+        assert float(page.input_value(value)) > was  # the light comes from where it was dragged to
+    assert page.get_attribute("#view", "height") == "512"
+    assert np.abs(pixels(page, "#view-sheet") - original).mean() > 2
+    page.locator("#compare").fill("100")
+    assert np.abs(pixels(page, "#view-sheet") - original).mean() < 2  # the sun is hidden, too
+    page.click("#reset")
+    page.locator("#compare").fill("0")
+    assert page.locator("#sun").is_hidden()
+
+
+def test_a_crop_is_moved_by_mouse_and_keys_and_a_new_picture_resets_swaps(page, rendered):
+    page.click("#examples-second button:nth-child(2)")
+    page.check("#swaps [name=geometry]")
+    large = np.pad(rendered[0].repeat(3, 1).repeat(3, 2), ((0, 0), (40, 60), (80, 120)), mode="edge")
+    dropped(page, "large.png", png(large))
+    assert not page.is_checked("#swaps [name=geometry]")
+    page.locator("#photo-sheet").scroll_into_view_if_needed()
+    left = page.eval_on_selector("#crop", "element => element.offsetLeft")
+    ready = page.get_attribute("body", "data-ready")
+    box = page.locator("#crop").bounding_box()
+    page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    page.mouse.down()
+    page.mouse.move(box["x"] + box["width"] / 2 + 20, box["y"] + box["height"] / 2, steps=3)
+    page.mouse.up()
+    page.wait_for_selector(f'body:not([data-ready="{ready}"])')
+    assert page.eval_on_selector("#crop", "element => element.offsetLeft") == left + 20
+    assert page.input_value("#framing") == "own"
+    ready, width = page.get_attribute("body", "data-ready"), box["width"]
+    page.focus("#crop")
+    page.keyboard.press("+")
+    page.wait_for_selector(f'body:not([data-ready="{ready}"])')
+    assert page.locator("#crop").bounding_box()["width"] > width
+    ready = page.get_attribute("body", "data-ready")
+    page.select_option("#framing", "none")
+    page.wait_for_selector(f'body:not([data-ready="{ready}"])')
+    assert page.input_value("#framing") == "none"
 
 
 def test_orbit_swap_and_neighbours_by_keyboard(page):
@@ -149,12 +206,11 @@ def test_orbit_swap_and_neighbours_by_keyboard(page):
 
     page.click("#examples-second button:nth-child(3)")
     page.wait_for_selector("#swaps:visible")
-    before, albedo = drawn(page), page.get_attribute("#map-albedo", "src")
+    albedo = page.get_attribute("#map-albedo", "src")
     page.focus("#swaps [name=albedo]")
     page.keyboard.press("Space")
-    after_one_more(page, before)
+    page.wait_for_function("before => document.getElementById('map-albedo').src !== before", arg=albedo)
     page.wait_for_selector("#near-rows button")
-    assert page.get_attribute("#map-albedo", "src") != albedo
 
     names = page.locator("#near-rows button span:last-child").all_inner_texts()
     assert sorted(names) == ["b.png", "c.png"]  # not a<b>.png itself
@@ -175,19 +231,24 @@ def test_what_is_wrong_is_said_and_the_page_goes_on(page, rendered):
             "#file-second",
             {"name": f"{number}.png", "mimeType": "image/png", "buffer": png(rendered[number])},
         )
-        page.wait_for_selector(f'#second[alt="second image: {number}.png"]')
+        page.wait_for_selector(f'#second[alt="second photograph: {number}.png"]')
     set_slider(page, "camera-yaw", 30)  # opens it again
     assert "no longer stored" not in page.inner_text("#status")
 
 
-def test_it_fits_a_phone_and_follows_the_dark(browser, address):
-    context = browser.new_context(viewport={"width": 360, "height": 740}, color_scheme="dark", has_touch=True)
+@pytest.mark.parametrize(("width", "height"), [(390, 844), (820, 1180), (1280, 900)])
+def test_it_fits_every_width_and_follows_the_dark(browser, address, width, height):
+    size = {"width": width, "height": height}
+    context = browser.new_context(viewport=size, color_scheme="dark", has_touch=width < 1000)
     shown = context.new_page()
     shown.set_default_timeout(PATIENCE_MS)
     shown.goto(address)
     shown.wait_for_selector("body[data-ready]")
     wide = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
     assert shown.evaluate(wide) == 0
+    for name in ("#photo-sheet", "#view-sheet"):  # input and result are seen without scrolling
+        box = shown.locator(name).bounding_box()
+        assert box["y"] > 0 and box["y"] + box["height"] <= height and box["width"] > 100
     assert shown.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(20, 22, 26)"
     context.close()
 

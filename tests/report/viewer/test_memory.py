@@ -2,21 +2,24 @@
 
 import re
 from contextlib import ExitStack
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from derender.report.viewer.app import Body, Uploads
+from derender.photo import Frame
 from derender.report.viewer.questions import Refused
-from derender.report.viewer.studio import Shelf, ShownImage
+from derender.report.viewer.shelf import Shelf, ShownImage
+from derender.report.viewer.uploads import Body, Uploads
 from derender.scene import Scene
 
 
 @pytest.fixture
 def image() -> ShownImage:
     scene = Scene(torch.ones(1, 4, 4), torch.zeros(1, 3, 4, 4), torch.zeros(1, 4), torch.zeros(1, 6))
-    return ShownImage(np.zeros((3, 4, 4), np.uint8), np.zeros((3, 4, 4), np.uint8), scene, {})
+    small = np.zeros((3, 4, 4), np.uint8)
+    return ShownImage(np.zeros((9, 9, 3), np.uint8), (), Frame.centred(9, 9), "none", small, scene, {})
 
 
 def test_the_longest_unused_image_leaves_first(image):
@@ -30,6 +33,17 @@ def test_the_longest_unused_image_leaves_first(image):
     assert refused.value.status == 410
     with pytest.raises(ValueError, match="room for 2"):
         Shelf(1)
+
+
+def test_photographs_take_no_more_memory_than_allowed(image):
+    shelf = Shelf(10, limit_bytes=3 * image.photo.nbytes)
+    for _ in range(5):
+        shelf.put(replace(image, photo=image.photo.copy()))
+    assert len(shelf) == 3
+    crops = Shelf(10, limit_bytes=image.photo.nbytes)
+    for _ in range(5):
+        crops.put(image)  # crops of one photograph
+    assert len(crops) == 5
 
 
 def test_names_cannot_be_guessed(image):

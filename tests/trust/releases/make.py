@@ -19,7 +19,7 @@ from derender.model import Derenderer
 from derender.networks import NetworkSettings
 from derender.presets import ModelSettings
 from derender.scene.perturb import PerturbSettings
-from derender.storage.folder import WHITENING_FILE
+from derender.storage.places import WHITENING_FILE
 from derender.training import resolve
 from derender.training.checkpoint import TrainState, save_checkpoint
 from derender.training.config import WhiteningSettings

@@ -27,8 +27,8 @@ TIMEOUT_SECONDS = 60.0
 ENDED_WITHIN_SECONDS = 50.0
 """Later than any of the server's own limits for heads, bodies and answers that nobody takes."""
 
-PNG, GLB = b"\x89PNG\r\n\x1a\n", b"glTF"
-MAPS = {"input", "reconstruction", "view", "depth", "normals", "albedo", "shading"}
+PNG, JPEG, GLB = b"\x89PNG\r\n\x1a\n", b"\xff\xd8", b"glTF"
+MAPS = {"input", "reconstruction", "depth", "normals", "albedo", "shading"}
 Check = Callable[[bytes], bool]
 
 
@@ -148,7 +148,7 @@ class Visitor:
         """One step of a slider, at the model's size or larger."""
         size = self.draw.choices((None, 128, 256), (90, 8, 2))[0]
         kind = "view" if size is None else f"view at {size}"
-        self.ask(kind, "/api/view", {**question, "size": size}, lambda body: body.startswith(PNG))
+        self.ask(kind, "/api/view", {**question, "size": size}, lambda body: body.startswith(JPEG))
 
     def abandon(self, question: dict[str, Any]) -> None:
         """Ask for something heavy and go away before it comes."""

@@ -49,7 +49,7 @@ def reconstruction(
     from derender import evaluation
     from derender.evaluation.memory import memory_in
     from derender.inputs import part_of
-    from derender.storage.folder import model_folder
+    from derender.storage.places import model_folder
     from derender.training.held_out_errors import errors_of, write_errors
 
     model, memory = trained.open(), memory_in(cache)

@@ -21,7 +21,8 @@ from derender.data.layouts.layout import (
 )
 from derender.data.layouts.rendered import DEPTH_PAIRS, SHAPENET_CARS, SYNCAR, SYNFACE, SYNFACE_TRACKS
 from derender.data.layouts.tables import TABLE
-from derender.data.source import Source, suggestion
+from derender.data.source import Source
+from derender.storage.places import suggestion
 
 
 def _class(file: str) -> str:

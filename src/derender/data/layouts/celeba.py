@@ -39,7 +39,8 @@ from derender.data.layouts.layout import (
     stem_of,
     text_column,
 )
-from derender.data.source import Source, suggestion
+from derender.data.source import Source
+from derender.storage.places import suggestion
 
 CELEBA_HOME = "https://mmlab.ie.cuhk.edu.hk/projects/CelebA.html"
 MASK_HOME = "https://github.com/switchablenorms/CelebAMask-HQ"

@@ -15,7 +15,8 @@ from typing import Any, TypeVar
 import numpy as np
 from jaxtyping import Float32
 
-from derender.data.source import Skipped, Source, suggestion
+from derender.data.source import Skipped, Source
+from derender.storage.places import suggestion
 
 Labels = dict[str, np.ndarray]
 

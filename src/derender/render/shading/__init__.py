@@ -21,7 +21,7 @@ def shade(
     fov_deg: float, backend: str = "auto",
 ) -> Float[Tensor, "n c h w"]:  # fmt: skip
     """The canonical image, from 0 on and not clipped at 1."""
-    chosen = chosen_backend(depth.device, backend)
+    chosen = chosen_backend(depth.device, backend, depth.numel())
     if chosen == "reference":
         return albedo * lambert_shading(normals_from_depth(depth, fov_deg), light)
     lamp = torch.cat((light[:, :2], light_direction(light)), dim=1)

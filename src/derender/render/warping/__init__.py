@@ -28,7 +28,7 @@ def warp(
 ) -> tuple[Float[Tensor, "n c h w"], Float[Tensor, "n h w"], Float[Tensor, "n h w"]]:  # fmt: skip
     """Image, depth and mask as the camera sees them; 0 where nothing is seen."""
     rotation, offset = motion(camera.double())
-    chosen = chosen_backend(depth.device, backend)
+    chosen = chosen_backend(depth.device, backend, depth.numel())
     if chosen == "reference":
         return reference(image, depth, rotation, offset, fov_deg)
     return FORWARD[chosen](image, depth, rotation, offset, focal_px(depth.shape[2], fov_deg))[:3]

@@ -8,11 +8,9 @@ not hold up the sliders of others.
 
 import asyncio
 import json
-import time
-from collections.abc import Awaitable, Callable, Iterator, Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from importlib.resources import files
 from pathlib import Path
@@ -37,6 +35,8 @@ from derender.report.viewer.questions import (
     BODY_LIMIT_BYTES,
     LARGEST_SIZE,
     PIXEL_LIMIT,
+    CropRequest,
+    FilmRequest,
     NeighbourRequest,
     Q,
     Refused,
@@ -45,10 +45,14 @@ from derender.report.viewer.questions import (
     read_request,
     too_large,
 )
-from derender.report.viewer.studio import KEPT, Shelf, Studio, data_url
+from derender.report.viewer.shelf import KEPT, Shelf
+from derender.report.viewer.studio import Studio, data_url
+from derender.report.viewer.uploads import Body, Uploads
 
 BODY_SECONDS = 30.0
-WORK_SECONDS = 30.0
+WORK_SECONDS, LONG_WORK = 30.0, 6
+"""An answer has to be there; films and fits may take so many times as long."""
+
 REQUEST_LIMIT_BYTES = 10_000
 UPLOADS_LIMIT_BYTES = 10 * BODY_LIMIT_BYTES
 """Of all uploads together that arrive or wait to be decoded."""
@@ -57,7 +61,11 @@ WAITING_AT_MOST = 200
 DRAINED_AT_MOST_BYTES = 3 * BODY_LIMIT_BYTES
 """So much of a body that is too large is still read and dropped, so that browsers see the answer."""
 
-THUMBNAIL = 64
+THUMBNAIL = 96
+MEDIA_TYPES = {
+    b"\x89PNG": "image/png", b"\xff\xd8": "image/jpeg", b"GIF8": "image/gif", b"glTF": "model/gltf-binary",
+    b"PK": "application/zip",
+}  # fmt: skip
 PAGE_FILES = {
     "/": ("index.html", "text/html"),
     "/view.css": ("view.css", "text/css"),
@@ -73,66 +81,6 @@ class Viewer:
     studio: Studio
     examples: Sequence[Example] = ()
     gallery: Gallery | None = None
-
-
-@dataclass(eq=False)
-class Body:
-    """One body as it arrives: its kept content, all bytes received, and since when (a monotonic clock).
-
-    ``whole``: nothing more will come. ``dropped``: it made room for others, and nothing of it is kept.
-    """
-
-    content: bytearray = field(default_factory=bytearray)
-    received: int = 0
-    whole: bool = False
-    dropped: bool = False
-    began_s: float = field(default_factory=time.monotonic)
-
-    def take(self, part: bytes) -> None:
-        self.received += len(part)
-        if not self.dropped:
-            self.content += part
-
-    def drop(self) -> None:
-        self.dropped = True
-        self.content.clear()
-
-    def speed(self, now_s: float) -> float:
-        """Bytes a second since it began."""
-        return self.received / max(now_s - self.began_s, 1e-6)
-
-
-class Uploads:
-    """The uploads that arrive or wait to be decoded: at most ``limit_bytes`` of them all, in memory only.
-
-    No upload waits for another. Beyond the bound the slowest of those that still arrive is dropped, so that
-    one that stalls or trickles does not hold up the others.
-    """
-
-    def __init__(self, limit_bytes: int):
-        self.limit_bytes = limit_bytes
-        self._bodies: set[Body] = set()
-
-    @contextmanager
-    def one(self) -> Iterator[Body]:
-        """A body that counts meanwhile."""
-        body = Body()
-        self._bodies.add(body)
-        try:
-            yield body
-        finally:
-            self._bodies.remove(body)
-
-    @property
-    def kept_bytes(self) -> int:
-        return sum(len(body.content) for body in self._bodies)
-
-    def make_room(self) -> None:
-        """Drop the slowest that still arrive until the others fit; to be called after every part."""
-        while self.kept_bytes > self.limit_bytes:
-            now_s = time.monotonic()
-            arriving = [body for body in self._bodies if body.content and not body.whole]
-            min(arriving, key=lambda body: body.speed(now_s)).drop()
 
 
 def open_viewer(
@@ -174,7 +122,7 @@ def open_viewer(
     notes = [f"left out {path}: {reason}" for path, reason in problems.items()]
     if gallery is not None and gallery.without_pictures:
         notes.append(f"neighbours are shown without images: {gallery.without_pictures}")
-    examples = named_examples(read) if images else rendered_examples(source, model.image_size)
+    examples = named_examples(read) if images else rendered_examples(source)
     return Viewer(studio, examples, gallery), notes
 
 
@@ -211,13 +159,12 @@ class Application:
             "/api/rows/{number:int}": self.open_row,
             "/api/factors": self.factors,
             "/api/neighbours": self.neighbours,
-            "/api/view": partial(self.made, studio.view, "image/png"),
-            "/api/picture": partial(self.made, studio.picture, "image/png"),
-            "/api/panel": partial(self.made, studio.panel, "image/png"),
-            "/api/mesh": partial(self.made, studio.mesh, "model/gltf-binary"),
-            "/api/archive": partial(self.made, studio.archive, "application/zip"),
+            "/api/crop": self.crop,
+            "/api/film": partial(self.made, studio.film, FilmRequest, patience=LONG_WORK),
             "/api/settings": self.settings,
         }
+        makers = ("view", "before", "preview", "picture", "panel", "mesh", "archive")
+        posts |= {f"/api/{name}": partial(self.made, getattr(studio, name), ViewRequest) for name in makers}
         gets = {path: _page_file(*file) for path, file in PAGE_FILES.items()} | {"/api/about": self.about}
         routes = [Route(path, answer, methods=["POST"]) for path, answer in posts.items()]
         routes += [Route(path, answer, methods=["GET"]) for path, answer in gets.items()]
@@ -250,7 +197,7 @@ class Application:
                 "pixel_limit": PIXEL_LIMIT,
                 "examples": examples,
                 "table": table,
-                **self.viewer.studio.about(LARGEST_SIZE),
+                **self.viewer.studio.about(),
             }
         )
 
@@ -302,22 +249,33 @@ class Application:
             rows.append({**gallery.about(row), "distance": distance, "image": image})
         return JSONResponse({"factor": question.factor, "rows": rows})
 
-    async def made(self, make: Callable[[ViewRequest], bytes], media_type: str, request: Request) -> Response:
+    async def made(
+        self, make: Callable[[Any], bytes], kind: type[Q], request: Request, *, patience: int = 1
+    ) -> Response:
         """Bytes that the studio makes for a question."""
-        question = await self._question(request, ViewRequest)
-        return Response(await self._work(self._computing, make, question), media_type=media_type)
+        question = await self._question(request, kind)
+        content = await self._work(self._computing, make, question, patience=patience)
+        return Response(content, media_type=_media_type(content))
+
+    async def crop(self, request: Request) -> Response:
+        """Decompose an opened image again."""
+        question = await self._question(request, CropRequest)
+        again = self.viewer.studio.again
+        return JSONResponse(await self._work(self._computing, again, question, patience=LONG_WORK))
 
     async def _opened(self, *images: Any) -> Response:
         return JSONResponse(await self._work(self._computing, self.viewer.studio.open, *images))
 
-    async def _work(self, pool: ThreadPoolExecutor, function: Callable[..., Any], *arguments: Any) -> Any:
+    async def _work(
+        self, pool: ThreadPoolExecutor, function: Callable[..., Any], *arguments: Any, patience: int = 1
+    ) -> Any:
         """Have a thread do it, in turn; ``Refused`` (503) if too many wait or it takes too long."""
         if self._waiting >= WAITING_AT_MOST:
             raise Refused(503, "too many requests are waiting: try again in a moment")
         self._waiting += 1
         try:
             job = asyncio.get_running_loop().run_in_executor(pool, function, *arguments)
-            return await asyncio.wait_for(job, self.work_seconds)
+            return await asyncio.wait_for(job, patience * self.work_seconds)
         except TimeoutError as late:
             raise Refused(503, "this took too long: try again, or choose a smaller size") from late
         finally:
@@ -358,6 +316,11 @@ def _thumbnail(gallery: Gallery, row: int) -> str | None:
         return data_url(pictures(gallery.picture(row, THUMBNAIL)[None])[0])
     except Refused:
         return None
+
+
+def _media_type(content: bytes) -> str:
+    """What bytes are, by their first ones."""
+    return next((kind for start, kind in MEDIA_TYPES.items() if content.startswith(start)), "video/mp4")
 
 
 def _page_file(name: str, media_type: str) -> Answer:

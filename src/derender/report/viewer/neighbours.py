@@ -1,10 +1,11 @@
 """Images that the page offers: examples to begin with, and rows of a feature table by number.
 
-Rendered faces lie beside this file in faces.png, one row: eight of the 800 images that ``rendered-faces-64``
-was tested on, evenly spaced (geometry ICT-FaceKit, MIT; skins MakeHuman, CC0). They show no real person, and
-no model saw them in training. Cars lie in cars.png: eight of the 1,000 that ``cars-64`` was tested on, evenly
-by class (Kenney and Quaternius, CC0). Rows of a table are read from folders, zips and tables of paths in
-place; a stream (tar shards, Hugging Face) is read only from its beginning, so its images are not shown.
+Examples lie beside this file, eight in a row. portraits.webp, for ``faces-64``: heads that
+``derender.data.synthetic`` made (seed 7). faces.png, for ``rendered-faces-64``: eight of the 800 images that
+it was tested on, evenly spaced; cars.png: eight of the 1,000 that ``cars-64`` was tested on, evenly by class
+(Kenney and Quaternius, CC0). Heads: geometry ICT-FaceKit, MIT; skins MakeHuman, CC0. They show no real person
+and no model saw them in training. Rows of a table are read from folders, zips and tables of paths in place;
+a stream (tar shards, Hugging Face) is read only from its beginning, so its images are not shown.
 """
 
 from collections.abc import Mapping
@@ -22,7 +23,7 @@ from derender.data import ListedStream, open_images, parse_source
 from derender.features import FeatureTable
 from derender.report.viewer.questions import Refused, pixels_of
 
-ROWS = {"faces-64": "faces.png", "rendered-faces-64": "faces.png", "cars-64": "cars.png"}
+ROWS = {"faces-64": "portraits.webp", "rendered-faces-64": "faces.png", "cars-64": "cars.png"}
 LABELS_SHOWN = 4
 
 
@@ -48,19 +49,18 @@ def named_examples(images: Mapping[Path, np.ndarray]) -> list[Example]:
     return [Example(path.name, pixels) for path, pixels in images.items()]
 
 
-def rendered_examples(model: str, image_size: int) -> list[Example]:
-    """Rendered faces or cars for the bundled models; none for other models."""
+def rendered_examples(model: str, image_size: int | None = None) -> list[Example]:
+    """Rendered faces or cars for the bundled models, at their own size or another; none for other models."""
     if model not in ROWS:
         return []
     content = files("derender.report.viewer").joinpath(ROWS[model]).read_bytes()
     with Image.open(BytesIO(content)) as row:
-        row.load()
-    examples = []
-    for number in range(row.width // row.height):
-        tile = row.crop((number * row.height, 0, (number + 1) * row.height, row.height))
-        pixels = np.array(tile.convert("RGB").resize((image_size, image_size), Image.Resampling.LANCZOS))
-        examples.append(Example(f"rendered {ROWS[model].removesuffix('s.png')} {number + 1}", pixels))
-    return examples
+        side = image_size or row.height
+        pixels = np.array(
+            row.convert("RGB").resize((side * row.width // row.height, side), Image.Resampling.LANCZOS)
+        )
+    tiles = np.split(pixels, pixels.shape[1] // side, axis=1)
+    return [Example(f"example {number}", tile) for number, tile in enumerate(tiles, 1)]
 
 
 class Gallery:

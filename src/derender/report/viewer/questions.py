@@ -18,7 +18,7 @@ from torch import Tensor
 
 from derender.data import Unreadable, decode, decode_whole, quiet_pillow
 
-LARGEST_SIZE = 512
+LARGEST_SIZE = 1024
 BODY_LIMIT_BYTES = 20_000_000
 PIXEL_LIMIT = 40_000_000
 """Fewer than any decompression bomb needs, more than most cameras take."""
@@ -89,8 +89,9 @@ class ViewRequest(_Checked):
         swaps: other opened images that give their geometry or albedo.
         light: instead of the image's own.
         camera: instead of the image's own.
-        size: side in pixels; the model's own if left out, and never less.
+        size: longer side in pixels; the model's own if left out, and never less.
         detail: whose pixels are drawn, the photograph's or the model's.
+        whole: all of the photograph, not only the part around the crop.
     """
 
     picture: ImageId
@@ -99,6 +100,36 @@ class ViewRequest(_Checked):
     camera: Camera | None = None
     size: Annotated[int, Field(ge=8, le=LARGEST_SIZE)] | None = None
     detail: Literal["photo", "model"] = "photo"
+    whole: bool = False
+
+
+class FilmRequest(ViewRequest):
+    """A film of an image: the light goes round, or the view goes from side to side."""
+
+    kind: Literal["gif", "mp4"]
+    move: Literal["light", "camera"]
+
+
+class Place(_Checked):
+    """A square in the photograph: its centre and side in pixels, its clockwise turn in degrees."""
+
+    x: Annotated[float, Field(ge=0, le=PIXEL_LIMIT)]
+    y: Annotated[float, Field(ge=0, le=PIXEL_LIMIT)]
+    side: Annotated[float, Field(ge=8, le=PIXEL_LIMIT)]
+    roll_deg: Annotated[float, Field(ge=-180, le=180)] = 0.0
+
+
+class CropRequest(_Checked):
+    """An opened image to be decomposed again.
+
+    Attributes:
+        crop: the part that the model is given, or how it is found; the same as before if left out.
+        fit: whether the scene is optimised against the image.
+    """
+
+    picture: ImageId
+    crop: Place | Literal["face", "auto", "none"] | None = None
+    fit: bool = False
 
 
 class NeighbourRequest(ViewRequest):

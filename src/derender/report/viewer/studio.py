@@ -1,20 +1,19 @@
 """Requests of the page, answered: images opened, shown under other light and view, as maps, mesh, archive.
 
 Takes questions and gives bytes and plain values; knows no HTTP. Opened images stay in memory only, a bounded
-number of them. Factors of several images are joined at the model's size; what is drawn has the photograph's
-own detail, or is enlarged (scene/enlarge.py). Not safe for several threads at once: the server gives it one.
+number of them. Factors of several images are joined at the model's size; what is drawn is a photograph with
+the crop changed in its own detail, or the model's rendering. Not safe for several threads at once: the server
+gives it one.
 """
 
 import base64
 import io
 import json
-import secrets
-import threading
 import zipfile
 from collections import OrderedDict
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from math import isfinite
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from math import ceil, isfinite
 from typing import Any
 
 import numpy as np
@@ -24,83 +23,45 @@ from PIL import Image
 
 from derender import __version__
 from derender.data import as_float
-from derender.evaluation.out_of_distribution import OUTLIER_PERCENTILE, percentile_of
 from derender.features import FeatureTable, named
 from derender.features.neighbours import nearest, same_image
 from derender.model import Derenderer
-from derender.photo import Frame, PhotoDetail, found_frame
+from derender.photo import Frame, PhotoDetail, Photograph, find_faces, found_frame
+from derender.photo.edit import MARGIN
+from derender.photo.faces import frame_of, template_of
 from derender.report import colours
+from derender.report.films import FILMS
 from derender.report.mesh import model_mesh
-from derender.report.panel import labelled_grid, strip
+from derender.report.panel import labelled_grid
+from derender.report.sweeps import circling_light, swaying_view
 from derender.report.viewer.questions import (
-    LARGEST_SIZE,
     Camera,
+    CropRequest,
+    FilmRequest,
     Light,
     NeighbourRequest,
+    Place,
     Refused,
     ViewRequest,
 )
+from derender.report.viewer.shelf import Shelf, ShownImage
 from derender.scene import Scene
 from derender.scene.enlarge import at_size
 from derender.scene.normals import normals_from_depth
-from derender.training.held_out_errors import HeldOutErrors, masked_l1, reconstruction_errors
+from derender.training.held_out_errors import (
+    OUTLIER_PERCENTILE,
+    HeldOutErrors,
+    masked_l1,
+    percentile_of,
+    reconstruction_errors,
+)
 
-KEPT = 64
-DETAILS_KEPT = 4
-OFFERED_SIZES = (128, 256)
-
-
-@dataclass(frozen=True)
-class ShownImage:
-    """One opened image.
-
-    Attributes:
-        pixels: at the model's size.
-        photo: the same part of the photograph at up to ``LARGEST_SIZE``.
-        scene: one scene, on the CPU.
-        features: by factor, (D,) each.
-    """
-
-    pixels: UInt8[np.ndarray, "3 s s"]
-    photo: UInt8[np.ndarray, "3 p p"]
-    scene: Scene
-    features: Mapping[str, np.ndarray]
-
-
-class Shelf:
-    """At most ``limit`` opened images by names that cannot be guessed; safe to use from several threads.
-
-    When it is full, the image leaves that was not requested for longest.
-    """
-
-    def __init__(self, limit: int = KEPT):
-        if limit < 2:
-            raise ValueError(f"a shelf needs room for 2 images or more, for swaps; got {limit}")
-        self.limit = limit
-        self._images: OrderedDict[str, ShownImage] = OrderedDict()
-        self._lock = threading.Lock()
-
-    def __len__(self) -> int:
-        return len(self._images)
-
-    def put(self, image: ShownImage) -> str:
-        """Store an image; returns its name."""
-        name = secrets.token_urlsafe(16)
-        with self._lock:
-            self._images[name] = image
-            while len(self._images) > self.limit:
-                self._images.popitem(last=False)
-        return name
-
-    def get(self, name: str) -> ShownImage:
-        """The image of that name, which now counts as used; ``Refused`` (410) if it has left."""
-        with self._lock:
-            if name not in self._images:
-                raise Refused(
-                    410, f"this image is no longer stored (the last {self.limit} are): open it again"
-                )
-            self._images.move_to_end(name)
-            return self._images[name]
+PHOTOGRAPHS_KEPT = 6  # ready to be drawn
+LARGEST_PHOTO = 4096
+PREVIEW_SIZE, THUMBNAIL_SIZE, SURFACE_SIZE = 1024, 128, 128
+FIT_STEPS = 60
+FILM_SIZE, FILM_FRAMES, FILM_SECONDS = 384, 24, 3.0
+FILM_LIGHT_DEG, FILM_VIEW_DEG = 50.0, 20.0
 
 
 @dataclass
@@ -124,14 +85,16 @@ class Studio:
     table: FeatureTable | None = None
     fit_steps: int = 0
     frame: str | None = None
-    _details: OrderedDict[tuple[str, int], PhotoDetail] = field(default_factory=OrderedDict)
+    _photographs: OrderedDict[tuple[str, int, bool], Photograph] = field(default_factory=OrderedDict)
 
-    def about(self, largest_size: int) -> dict[str, Any]:
-        """The model's name, sizes to draw at, ranges of the camera, and the number of images in memory."""
-        own, ranges = self.model.image_size, self.model.settings.ranges
+    def about(self) -> dict[str, Any]:
+        """The model's name and abilities, ranges of the camera, and the number of images in memory."""
+        ranges = self.model.settings.ranges
         return {
             "model": self.name,
-            "sizes": sorted({own, *(size for size in (*OFFERED_SIZES, largest_size) if size > own)}),
+            "faces": template_of(self.model) is not None,
+            "can_fit": self.model.fitting is not None,
+            "fits": self.fit_steps > 0,
             "fov_deg": self.model.fov_deg,
             "rotation_deg": ranges.rotation_deg,
             "translation": [ranges.translation_xy, ranges.translation_xy, max(ranges.translation_z, 0.1)],
@@ -141,46 +104,79 @@ class Studio:
     def open(
         self, photo: UInt8[np.ndarray, "h w 3"], pixels: UInt8[np.ndarray, "3 s s"] | None = None
     ) -> dict[str, Any]:
-        """Decompose an image and store it; returns its name, light, camera and reconstruction error.
+        """Decompose an image and store it; returns its name, crop, light, camera and reconstruction error.
 
-        ``pixels`` are what the model is given, where that is known already.
-
-        The percentile is that of the feed-forward reconstruction.
+        ``pixels`` are what the model is given, where that is known already. The percentile is that of the
+        feed-forward reconstruction.
         """
+        if (longer := max(photo.shape[:2])) > LARGEST_PHOTO:
+            photo = _resized(photo, LARGEST_PHOTO / longer)
+        template, faces = template_of(self.model), ()
+        if pixels is None and template is not None and min(photo.shape[:2]) > self.model.image_size:
+            faces = tuple(frame_of(face, template).snapped() for face in find_faces(photo))
+        frame, framed = self._found(photo, faces, self.frame if pixels is None else "none")
+        return self._decomposed(photo, faces, frame, framed, self.fit_steps, pixels)
+
+    def again(self, question: CropRequest) -> dict[str, Any]:
+        """An opened image decomposed again: another crop, or its scene optimised; returns as `open` does."""
+        opened, crop = self.shelf.get(question.picture), question.crop
+        frame, framed, (height, width) = opened.frame, opened.framed, opened.photo.shape[:2]
+        if isinstance(crop, Place):
+            side = min(crop.side, 2.0 * max(height, width))
+            frame = Frame(min(crop.x, width), min(crop.y, height), side, crop.roll_deg).snapped()
+            framed = "own"
+        elif crop is not None:
+            frame, framed = self._found(opened.photo, opened.faces, crop)
+        steps = (self.fit_steps or FIT_STEPS) if question.fit else 0
+        return self._decomposed(opened.photo, opened.faces, frame, framed, steps)
+
+    def _found(self, photo: np.ndarray, faces: Sequence[Frame], way: str | None) -> tuple[Frame, str]:
+        """The part of a photograph that the model is given; its faces are known already."""
+        looked_for = template_of(self.model) is not None and min(photo.shape[:2]) > self.model.image_size
+        if faces and way in (None, "face"):
+            return faces[0], "face"
         try:
-            way = self.frame if pixels is None else "none"
-            frame, framed = found_frame(photo, self.model, way)
+            frame, framed = found_frame(photo, self.model, "none" if looked_for and way is None else way)
         except ValueError as problem:
             raise Refused(422, str(problem)) from problem
+        return frame, "no face" if looked_for and way is None else framed
+
+    def _decomposed(
+        self, photo: np.ndarray, faces: tuple[Frame, ...], frame: Frame, framed: str, fit_steps: int,
+        pixels: np.ndarray | None = None,
+    ) -> dict[str, Any]:  # fmt: skip
         if pixels is None:
             pixels = frame.cut(photo, self.model.image_size)
-        shown = frame.cut(photo, min(max(round(frame.side), self.model.image_size), LARGEST_SIZE))
         with torch.inference_mode():
             images = as_float(pixels[None]).to(self.model.device)
             features = self.model.embed(images)
             errors = reconstruction_errors(self.model, pixels[None])
-            if self.fit_steps:
-                scene = self.model.fit_scenes(images, self.fit_steps).scene
+            if fit_steps:
+                scene = self.model.fit_scenes(images, fit_steps).scene
                 l1 = float(masked_l1(self.model.render(scene), images)[0])
             else:
                 scene, l1 = self.model.decompose(images), float(errors[0])
         rows = {name: row[0].float().cpu().numpy() for name, row in features.items()}
         scene = scene.to("cpu")
         percentile = None if self.held_out is None else float(percentile_of(errors, self.held_out)[0])
+        opened = ShownImage(photo, faces, frame, framed, pixels, scene, rows)
         return {
-            "picture": self.shelf.put(ShownImage(pixels, shown, scene, rows)),
+            "picture": self.shelf.put(opened),
             "light": Light.of(scene.light[0]).model_dump(),
             "camera": Camera.of(scene.camera[0]).model_dump(),
             "l1": l1 if isfinite(l1) else None,
-            "l1_feed_forward": float(errors[0]) if self.fit_steps and isfinite(errors[0]) else None,
+            "l1_feed_forward": float(errors[0]) if fit_steps and isfinite(errors[0]) else None,
             "percentile": percentile,
-            "side": frame.side / min(photo.shape[:2]),
+            "width": photo.shape[1],
+            "height": photo.shape[0],
+            "crop": asdict(frame),
+            "faces": [asdict(face) for face in faces],
             "framed": framed,
             "out_of_distribution": percentile is not None and percentile > OUTLIER_PERCENTILE,
         }
 
     def scene(self, question: ViewRequest) -> Scene:
-        """The requested scene, at its size."""
+        """The requested scene, at the model's size."""
         scene = self.shelf.get(question.picture).scene
         parameters = {factor.name: factor.parameter for factor in self.model.factors}
         for factor, other in question.swaps.items():
@@ -191,32 +187,59 @@ class Studio:
             scene = scene.with_parameters(light=question.light.light_row())
         if question.camera is not None:
             scene = scene.with_parameters(camera=question.camera.camera_row())
-        return at_size(scene, max(question.size or 0, self.model.image_size))
+        return scene
 
     def view(self, question: ViewRequest) -> bytes:
-        """The rendering and, right of it, the shading, as one PNG; transparent where nothing is seen."""
-        with torch.inference_mode():
-            scene = self.scene(question)
-            return _png(strip([self._drawn(question, scene), self._shading(scene)]), quick=True)
+        """The requested view: JPEG, or PNG with transparency where the model's pixels are drawn."""
+        return _encoded(self._drawn(question))
+
+    def before(self, question: ViewRequest) -> bytes:
+        """The part of the photograph that `view` changes, as it was."""
+        opened, size = self.shelf.get(question.picture), self._size(question)
+        if question.detail == "model":
+            return _encoded(Image.fromarray(opened.frame.cut(opened.photo, size).transpose(1, 2, 0)))
+        return _encoded(Image.fromarray(self._photograph(question).pixels))
+
+    def preview(self, question: ViewRequest) -> bytes:
+        """The whole photograph, small enough for the page."""
+        photo = self.shelf.get(question.picture).photo
+        return _encoded(Image.fromarray(_resized(photo, min(1.0, PREVIEW_SIZE / max(photo.shape[:2])))))
 
     def picture(self, question: ViewRequest) -> bytes:
-        """The rendering alone, as a PNG with transparency."""
-        with torch.inference_mode():
-            return _png(self._drawn(question, self.scene(question)))
+        """The whole photograph, edited, at its own size as PNG; or what the model renders."""
+        if question.detail == "photo":
+            side = max(self.shelf.get(_source(question)).photo.shape[:2])
+            question = question.model_copy(update={"whole": True, "size": side})
+        return _png(self._drawn(question))
+
+    def film(self, question: FilmRequest) -> bytes:
+        """GIF or MP4: the light circles, or the view goes from side to side."""
+        question = question.model_copy(update={"size": min(self._size(question), FILM_SIZE)})
+        scene = self.scene(question)
+        scenes = (
+            circling_light(scene, FILM_FRAMES, FILM_LIGHT_DEG)
+            if question.move == "light"
+            else swaying_view(scene, FILM_FRAMES, FILM_VIEW_DEG)
+        )
+        frames = [self._drawn(question, scenes[number]) for number in range(len(scenes))]
+        try:
+            return FILMS[question.kind](frames, FILM_SECONDS)
+        except ValueError as problem:
+            raise Refused(422, str(problem)) from problem
 
     def maps(self, question: ViewRequest) -> dict[str, Image.Image]:
-        """Input, its reconstruction, the requested view, and the factors of that, by name."""
-        opened = self.shelf.get(question.picture)
+        """Input, its reconstruction, and the factors of the requested view, by name."""
+        opened, size = self.shelf.get(question.picture), self._size(question)
         with torch.inference_mode():
-            scene = self.scene(question)
+            scene = at_size(self.scene(question), size)
+            normal = normals_from_depth(scene.depth, self.model.fov_deg)
             return {
                 "input": colours.pictures(opened.pixels[None])[0],
-                "reconstruction": self._rendered(at_size(opened.scene, scene.depth.shape[-1])),
-                "view": self._drawn(question, scene),
+                "reconstruction": self._rendered(at_size(opened.scene, size)),
                 "depth": colours.depth_maps(scene.depth)[0],
-                "normals": colours.normal_maps(normals_from_depth(scene.depth, self.model.fov_deg))[0],
+                "normals": colours.normal_maps(normal)[0],
                 "albedo": colours.pictures(scene.albedo)[0],
-                "shading": self._shading(scene),
+                "shading": colours.shading_maps(self.model.renderer.shading(scene, self.model.fov_deg))[0],
                 **{
                     title: colours.level_maps(draw(scene, self.model.fov_deg))[0]
                     for title, draw in self.model.renderer.maps.items()
@@ -224,13 +247,13 @@ class Studio:
             }
 
     def panel(self, question: ViewRequest) -> bytes:
-        """All maps with their names in one PNG."""
-        return _panel(self.maps(question))
+        """All maps and the view with their names in one PNG."""
+        return _panel(self.maps(question) | {"view": self._drawn(question)})
 
     def archive(self, question: ViewRequest) -> bytes:
-        """A ZIP: the panel, every map, the mesh, and the settings."""
-        maps = self.maps(question)
-        files = {"panel.png": _panel(maps)} | {f"{name}.png": _png(image) for name, image in maps.items()}
+        """A ZIP: the panel, every map, the picture, the mesh, and the settings."""
+        files = {f"{name}.png": _png(image) for name, image in self.maps(question).items()}
+        files |= {"panel.png": self.panel(question), "view.png": self.picture(question)}
         files["surface.glb"] = self.mesh(question)
         files["settings.json"] = (json.dumps(self.settings(question), indent=1) + "\n").encode()
         packed = io.BytesIO()
@@ -240,14 +263,19 @@ class Studio:
         return packed.getvalue()
 
     def mesh(self, question: ViewRequest) -> bytes:
-        """The surface in its canonical view as GLB; ``Refused`` (422) where there is none."""
-        scene = self.scene(question)
+        """The surface in its canonical view as GLB; ``Refused`` (422) where there is none.
+
+        Its texture has the requested size.
+        """
+        scene = at_size(self.scene(question), max(SURFACE_SIZE, self.model.image_size))
         try:
             texture = None
             if question.detail == "photo":
+                opened = self.shelf.get(_source(question))
+                pixels = as_float(opened.frame.cut(opened.photo, self._size(question))[None])[0]
                 with torch.inference_mode():
-                    name = dict(question.swaps).get("albedo", question.picture)
-                    texture = self._detail(name, LARGEST_SIZE).albedo()
+                    fov_deg, renderer = self.model.fov_deg, self.model.renderer
+                    texture = PhotoDetail(pixels, opened.scene, fov_deg, renderer=renderer).albedo()
             return model_mesh(self.model, scene, texture=texture).files("surface")["surface.glb"]
         except ValueError as problem:
             raise Refused(422, str(problem)) from problem
@@ -261,7 +289,7 @@ class Studio:
             "light": (question.light or Light.of(scene.light[0])).model_dump(),
             "camera": (question.camera or Camera.of(scene.camera[0])).model_dump(),
             "from_another_picture": sorted(question.swaps),
-            "size": max(question.size or 0, self.model.image_size),
+            "size": self._size(question),
         }
 
     def neighbours(self, question: NeighbourRequest) -> list[tuple[int, float]]:
@@ -278,34 +306,66 @@ class Studio:
             raise Refused(422, str(problem)) from problem
         return list(zip(rows.tolist(), away.tolist(), strict=True))
 
-    def _drawn(self, question: ViewRequest, scene: Scene) -> Image.Image:
-        """A requested scene in the detail of the photograph that gives its colours, or of the model."""
-        if question.detail == "model":
-            return self._rendered(scene)
-        size = scene.depth.shape[-1]
-        detail = self._detail(dict(question.swaps).get("albedo", question.picture), size)
-        return colours.pictures(detail(scene).image)[0]
+    def _size(self, question: ViewRequest) -> int:
+        return max(question.size or 0, self.model.image_size)
 
-    def _detail(self, name: str, size: int) -> PhotoDetail:
-        """What draws an opened image; the last few are kept."""
-        if (name, size) not in self._details:
-            opened = self.shelf.get(name)
-            side = opened.photo.shape[-1]
-            photo = Frame.centred(side, side).cut(opened.photo.transpose(1, 2, 0), size)
-            self._details[name, size] = PhotoDetail(
-                as_float(photo[None])[0], opened.scene, self.model.fov_deg, renderer=self.model.renderer
+    def _drawn(self, question: ViewRequest, scene: Scene | None = None) -> Image.Image:
+        """A scene in the detail of the photograph that gives its colours, or of the model."""
+        with torch.inference_mode():
+            scene = self.scene(question) if scene is None else scene
+            if question.detail == "model":
+                return self._rendered(at_size(scene, self._size(question)))
+            changed = {name: value for name, value in scene.parameters.items() if name != "albedo"}
+            return Image.fromarray(self._photograph(question).edited(**changed))
+
+    def _photograph(self, question: ViewRequest) -> Photograph:
+        """The photograph that gives the colours, or its part around the crop; the last few are kept."""
+        key = _source(question), self._size(question), question.whole
+        if key not in self._photographs:
+            opened = self.shelf.get(key[0])
+            frame, (height, width) = opened.frame, opened.photo.shape[:2]
+            left, top, right, bottom = 0, 0, width, height
+            if not question.whole:
+                across, down = zip(*frame.widened(MARGIN).corners(), strict=True)
+                left, right = max(0, int(min(across))), min(width, ceil(max(across)))
+                top, bottom = max(0, int(min(down))), min(height, ceil(max(down)))
+            scale = key[1] / max(right - left, bottom - top)
+            pixels = _resized(opened.photo[top:bottom, left:right], scale)
+            place = Frame(
+                (frame.x - left) * scale, (frame.y - top) * scale, frame.side * scale, frame.roll_deg
             )
-        self._details.move_to_end((name, size))
-        while len(self._details) > DETAILS_KEPT:
-            self._details.popitem(last=False)
-        return self._details[name, size]
+            self._photographs[key] = Photograph.of(
+                pixels, place, opened.scene, self.model.fov_deg, self.model.renderer
+            )
+        self._photographs.move_to_end(key)
+        while len(self._photographs) > PHOTOGRAPHS_KEPT:
+            self._photographs.popitem(last=False)
+        return self._photographs[key]
 
     def _rendered(self, scene: Scene) -> Image.Image:
         rendering = self.model.render(scene.to(self.model.device))
         return colours.pictures(rendering.image, rendering.mask)[0]
 
-    def _shading(self, scene: Scene) -> Image.Image:
-        return colours.shading_maps(self.model.renderer.shading(scene, self.model.fov_deg))[0]
+
+def _source(question: ViewRequest) -> str:
+    """The image that gives the colours."""
+    return dict(question.swaps).get("albedo", question.picture)
+
+
+def _resized(photo: UInt8[np.ndarray, "h w 3"], scale: float) -> UInt8[np.ndarray, "h2 w2 3"]:
+    if scale == 1:
+        return photo
+    size = max(1, round(photo.shape[1] * scale)), max(1, round(photo.shape[0] * scale))
+    return np.asarray(Image.fromarray(photo).resize(size, Image.Resampling.LANCZOS))
+
+
+def _encoded(image: Image.Image) -> bytes:
+    """As fast as a page needs it: JPEG, or PNG where there is transparency."""
+    if image.mode != "RGB":
+        return _png(image, quick=True)
+    stream = io.BytesIO()
+    image.save(stream, format="JPEG", quality=92)
+    return stream.getvalue()
 
 
 def data_url(image: Image.Image) -> str:
