@@ -1,11 +1,15 @@
 """Fitting by rendering: known scenes are found again, each image by itself; damaged files are refused."""
 
 import math
+import sys
 
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import save_file
 
+import derender
+from derender.data.synthetic import faces
 from derender.postprocess.fitting import Fitting, FittingSettings
 from derender.postprocess.morphable import MorphableMaps
 from derender.render import render_scene
@@ -90,6 +94,29 @@ def test_each_picture_is_fitted_by_itself(maps, truth, wrong):
         torch.testing.assert_close(
             together.coordinates[name][2:3], alone.coordinates[name], rtol=1e-3, atol=1e-4
         )
+
+
+def test_features_do_not_depend_on_neighbours_or_threads():
+    """Encoders differ by rounding; 20 steps downhill would magnify it to a tenth if batches met there."""
+    images = torch.from_numpy(np.ascontiguousarray(faces.generate(24, 64, seed=3).images)).float() / 255
+    model = derender.load("rendered-faces-64")
+    model = model.with_features(model.features.with_steps(20))
+    threads, encoded = torch.get_num_threads(), {"geometry": 192, "albedo": 192}
+    with torch.inference_mode():
+        together, alone = model.embed(images), [model.embed(one[None]) for one in images]
+        try:
+            torch.set_num_threads(3 - min(threads, 2))
+            otherwise = model.embed(images)
+        finally:
+            torch.set_num_threads(threads)
+    for name, one in together.items():
+        for other in (torch.cat([each[name] for each in alone]), otherwise[name]):
+            apart = (one - other).abs().amax(dim=0) / one.abs().max()
+            by_encoder, by_fit = apart[: encoded.get(name)], apart[encoded.get(name, len(apart)) :]
+            largest = float(by_encoder.max()), max(by_fit.tolist(), default=0.0)
+            sys.stdout.write(f"{name}: {largest[0]:.1e} of encoders, {largest[1]:.1e} of fitted scenes\n")
+            assert largest[0] <= 1e-5 and largest[1] <= 1e-3
+    assert threads == torch.get_num_threads()
 
 
 def test_what_was_given_stays_and_no_gradient_is_left(maps, truth, wrong):

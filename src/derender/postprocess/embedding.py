@@ -15,6 +15,7 @@ from derender.networks import Factor
 from derender.postprocess.features import Features
 from derender.postprocess.fitting import STEPS, Fitted, coordinates_of
 from derender.postprocess.gradients import gradient_directions
+from derender.postprocess.portions import by_portions
 from derender.presets import ModelSettings
 from derender.render import Rendering
 from derender.scene import Scene
@@ -94,8 +95,7 @@ class EmbeddingModel(nn.Module):
         check_images(images, self.image_size)
         found = {factor.name: self.factor_activations(factor.name, images) for factor in self.factors}
         if self.features.fits_scenes:
-            scene = self.decode(self.codes(found))
-            fitted = self.features.required_fitting().fit(images, scene, self.render).coordinates
+            fitted = self.fit_scenes(images, self.features.required_fitting().settings.steps).coordinates
             found |= {coordinates_of(name): value for name, value in fitted.items()}
         return found
 
@@ -130,9 +130,16 @@ class EmbeddingModel(nn.Module):
         """Scenes optimised per image, from ``decompose`` on, downhill through the renderer.
 
         A hundred times as slow as ``decompose``, with a smaller error, also under other lighting and
-        viewpoints. A model without a fitting (``derender whiten`` makes one) is a ValueError.
+        viewpoints. On a CPU an image's scene is the same whatever images stand beside it, on any number of
+        threads. A model without a fitting (``derender whiten`` makes one) is a ValueError.
         """
         images = as_batch(images, self.image_size, next(self.parameters()).device)
         fitting = self.features.required_fitting()
-        fitted = fitting.fit(images, self.decode(self.encode(images)), self.render, steps)
-        return replace(fitted, scene=self.balanced(fitted.scene))
+
+        def fitted(few: Tensor) -> Fitted:
+            with torch.no_grad():
+                scene = self.decode(self.encode(few))
+            return fitting.fit(few, scene, self.render, steps)
+
+        found = Fitted.joined(by_portions(fitted, images), len(images))
+        return replace(found, scene=self.balanced(found.scene))

@@ -7,7 +7,7 @@ out the parameters of further factors, which stay as predicted.
 
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -74,6 +74,20 @@ class Fitted:
     coordinates: dict[str, Float[Tensor, "n k"]]
     before: Float[Tensor, " n"]
     after: Float[Tensor, " n"]
+
+    @classmethod
+    def joined(cls, parts: Sequence["Fitted"], count: int) -> "Fitted":
+        """The first so many of all parts, one after the other."""
+
+        def join(values: Iterable[Tensor]) -> Tensor:
+            return torch.cat(list(values))[:count]
+
+        scene = {
+            name: join(one.scene.parameters[name] for one in parts) for name in parts[0].scene.parameters
+        }
+        coordinates = {name: join(one.coordinates[name] for one in parts) for name in parts[0].coordinates}
+        errors = (join(one.before for one in parts), join(one.after for one in parts))
+        return cls(Scene.from_parameters(scene), coordinates, *errors)
 
 
 class Fitting(nn.Module):

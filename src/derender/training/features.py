@@ -211,9 +211,10 @@ def make_fitting(
     # squared length of coordinates, all factors together: feed-forward every one varies by 1
     own = float(sum(maps.size(parameter) for parameter in PARAMETERS.values()))
     if settings.steps:
+        able = model.with_features(Features(None, fitting))
         total, few = 0.0, rows[:LENGTH_IMAGES]
         for _, batch in _batches(model, images, few, None):
-            fitted = fitting.fit(batch, model.decompose(batch), model.render).coordinates
+            fitted = able.fit_scenes(batch, settings.steps).coordinates
             total += sum(float(value.double().square().sum()) for value in fitted.values())
         own = total / len(few)
     length = (float(squares / len(rows)) / own) ** 0.5 if own else 0.0

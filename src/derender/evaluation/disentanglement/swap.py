@@ -53,18 +53,17 @@ class SwapScores:
     resampled: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)), repr=False)
 
 
-def swap_test(model: Any, images: np.ndarray, *, seed: int = 0, batch_size: int = 64) -> SwapScores:
-    """The swap test of a ``Derenderer`` on (N, 3, H, W) uint8 images, two or more; ``seed`` draws donors."""
-    if len(images) < 2:
-        raise ValueError(f"the swap test needs two images or more, got {len(images)}")
-    names, count = [factor.name for factor in model.factors], len(images)
-    parameters = [factor.parameter for factor in model.factors]
-    donor = derangement(count, torch.Generator().manual_seed(seed))
+Encodings = dict[str, Tensor]
+"""Features, decoded parameters and pixels of N images, by "feature NAME", "parameter NAME" and "pixels"."""
 
-    def encoded(scenes: Scene | None = None) -> dict[str, Tensor]:
-        """Features, decoded parameters and pixels of the renderings of scenes, or of the images."""
-        parts = []
-        for start in range(0, count, batch_size):
+
+def encodings(
+    model: Any, images: np.ndarray, scenes: Scene | None = None, *, batch_size: int = 64
+) -> Encodings:
+    """Of (N, 3, H, W) uint8 images, or of the renderings of scenes, filled from the images."""
+    parts = []
+    with evaluating(model):
+        for start in range(0, len(images), batch_size):
             rows = slice(start, start + batch_size)
             pixels = as_float(images[rows]).to(model.device)
             if scenes is not None:
@@ -73,16 +72,39 @@ def swap_test(model: Any, images: np.ndarray, *, seed: int = 0, batch_size: int 
             activations = model.activations(pixels)
             features, decoded = model.features_from(activations), model.decode(model.codes(activations))
             part = {f"parameter {name}": each for name, each in decoded.parameters.items()}
-            part |= {"pixels": pixels, **{f"feature {name}": features[name] for name in names}}
+            part |= {"pixels": pixels, **{f"feature {f.name}": features[f.name] for f in model.factors}}
             parts.append({key: each.float().cpu() for key, each in part.items()})
-        return {key: torch.cat([part[key] for part in parts]) for key in parts[0]}
+    return {key: torch.cat([part[key] for part in parts]) for key in parts[0]}
 
-    with evaluating(model):
-        inputs = encoded()
-        scene = {key[10:]: each for key, each in inputs.items() if key.startswith("parameter ")}
-        plain = encoded(Scene.from_parameters(scene))
-        given = [{**scene, name: scene[name][donor]} for name in parameters]
-        swapped = [encoded(Scene.from_parameters(one)) for one in given]
+
+def of_images(model: Any, images: np.ndarray, *, batch_size: int = 64) -> tuple[Encodings, Encodings]:
+    """Encodings of images, and of their own renderings."""
+    inputs = encodings(model, images, batch_size=batch_size)
+    return inputs, encodings(model, images, _decoded(inputs), batch_size=batch_size)
+
+
+def swap_test(
+    model: Any, images: np.ndarray, *, seed: int = 0, batch_size: int = 64,
+    known: Sequence[Encodings] | None = None,
+) -> SwapScores:  # fmt: skip
+    """The swap test of a ``Derenderer`` on (N, 3, H, W) uint8 images, two or more; ``seed`` draws donors.
+
+    ``known`` is what ``of_images`` gives of them, found here by default.
+    """
+    if len(images) < 2:
+        raise ValueError(f"the swap test needs two images or more, got {len(images)}")
+    names, count = [factor.name for factor in model.factors], len(images)
+    parameters = [factor.parameter for factor in model.factors]
+    donor = derangement(count, torch.Generator().manual_seed(seed))
+    inputs, plain = known or of_images(model, images, batch_size=batch_size)
+    scene = _decoded(inputs)
+    swapped = [
+        encodings(
+            model, images, scene.with_parameters(**{name: scene.parameters[name][donor]}),
+            batch_size=batch_size,
+        )
+        for name in parameters
+    ]  # fmt: skip
     donors = {key: each[donor] for key, each in plain.items()}
     apart = _distances(plain, donors)
     unit = {key: each.mean() or np.nan for key, each in apart.items()}
@@ -121,6 +143,11 @@ def diagonal_over_rest(moved: np.ndarray) -> np.ndarray | np.floating:
     own = np.eye(len(moved), dtype=bool)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.divide(moved[own].mean(axis=0), moved[~own].mean(axis=0))
+
+
+def _decoded(found: Encodings) -> Scene:
+    names = (key for key in found if key.startswith("parameter "))
+    return Scene.from_parameters({key.removeprefix("parameter "): found[key] for key in names})
 
 
 def _distances(a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> dict[str, np.ndarray]:

@@ -1,0 +1,32 @@
+"""The same result for an image whatever stands beside it: images in portions of one size, a thread each.
+
+Rounding depends on the shape of a batch and on how threads share it, and many steps downhill magnify it.
+"""
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+PORTION = 4
+T = TypeVar("T")
+
+
+def by_portions(function: Callable[[Tensor], T], images: Float[Tensor, "n 3 h w"]) -> list[T]:
+    """Results of portions of images in order, the last one filled up with its last image.
+
+    The function is called by as many threads as torch has, each with one of torch's; on a GPU once, with all.
+    """
+    if images.is_cuda:
+        return [function(images)]
+    missing = -len(images) % PORTION
+    images = torch.cat([images, images[-1:].expand(missing, -1, -1, -1)])
+    portions, threads = images.contiguous().split(PORTION), torch.get_num_threads()
+    try:
+        with ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
+            return list(pool.map(function, portions))
+    finally:
+        torch.set_num_threads(threads)  # of threads that are yet to come
