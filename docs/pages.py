@@ -221,6 +221,19 @@ def scored(columns: dict[str, tuple[str, float, int]], *where: str) -> Callable[
     return read
 
 
+def renderers(found: Any) -> Iterator[list[str]]:
+    """Reconstruction error of scenes optimised with each renderer, by effect, mean over seeds."""
+    cells = found["cells"]
+    names = list(dict.fromkeys(one["renderer"] for one in cells))
+    yield ["effect in the images; L1 with", *names]
+    for effect in dict.fromkeys(one["effect"] for one in cells):
+        means = []
+        for name in names:
+            errors = [one["l1"] for one in cells if (one["effect"], one["renderer"]) == (effect, name)]
+            means.append(f"{sum(errors) / len(errors):.4f}" if errors else "")
+        yield [effect, *means]
+
+
 def angles(found: Any) -> Iterator[list[str]]:
     """Correlation, slope and error of each angle, beside the error of a constant answer."""
     yield ["angle", "r", "slope", "error, degrees", "constant answer, degrees"]
@@ -267,6 +280,7 @@ SPEED: dict[str, tuple[str, Callable[[Any], Iterator[list[str]]]]] = {
     "pose": ("pose.json", angles),
     "light": ("light.json", angles),
     "relighting": ("relighting.json", scored(PSNR, "psnr")),
+    "renderers": ("renderers_fit.json", renderers),
     "brightness-races": ("brightness-races.json", scored({"share of brightness": ("share", 1, 3)}, "share")),
     "brightness-rendered": ("brightness-rendered.json", scored(BRIGHTNESS, "brightness")),
     "people-generated": ("generated/people.json", scored(CLUSTERS, "rows")),
