@@ -234,6 +234,18 @@ def renderers(found: Any) -> Iterator[list[str]]:
         yield [effect, *means]
 
 
+def million_rows(found: Any) -> Iterator[list[str]]:
+    yield ["1,000,000 rows of 128, one thread", "seconds"]
+    names = {
+        "faiss_build": f"FAISS, index of {found['lists']:,} cells",
+        "faiss_search": f"FAISS, {found['queries']} queries, recall {found['recall']}",
+        "exact_search": f"exact, {found['queries']} queries",
+        "duckdb_nearest_one": "DuckDB, one exact query",
+        "duckdb_count": "DuckDB, rows of each kind",
+    }
+    yield from ([name, f"{found['seconds'][key]:.2f}"] for key, name in names.items())
+
+
 def angles(found: Any) -> Iterator[list[str]]:
     """Correlation, slope and error of each angle, beside the error of a constant answer."""
     yield ["angle", "r", "slope", "error, degrees", "constant answer, degrees"]
@@ -281,6 +293,7 @@ SPEED: dict[str, tuple[str, Callable[[Any], Iterator[list[str]]]]] = {
     "light": ("light.json", angles),
     "relighting": ("relighting.json", scored(PSNR, "psnr")),
     "renderers": ("renderers_fit.json", renderers),
+    "table-million": ("table_million.json", million_rows),
     "brightness-races": ("brightness-races.json", scored({"share of brightness": ("share", 1, 3)}, "share")),
     "brightness-rendered": ("brightness-rendered.json", scored(BRIGHTNESS, "brightness")),
     "people-generated": ("generated/people.json", scored(CLUSTERS, "rows")),
