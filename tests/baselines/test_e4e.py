@@ -4,7 +4,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from derender.baselines import baseline_config, load_baseline, train_baseline
+from derender.baselines import baseline_config, load_baseline, open_baseline, train_baseline
 from derender.baselines.e4e import E4e, E4eConfig, E4eSettings, EncoderSettings, open_generator
 from derender.baselines.generator import GeneratorSettings
 from derender.report.run import baseline_sheet
@@ -120,6 +120,14 @@ def test_runs_leave_models_that_embed(runs, blobs):
     assert held_out["loss"] == pytest.approx(held_out["reconstruction"] + held_out["perceptual"])
     judged = [row for row in read_metrics(runs / "stylegan2") if row["kind"] == "validation"][-1]
     assert judged["loss"] == judged["energy"]
+
+
+def test_smaller_images_are_enlarged_to_the_encoder_when_they_are_requested(runs, blobs):
+    model = open_baseline("e4e", str(runs / "e4e"), device="cpu", image_size=16)
+    assert model.image_size == 16 and open_baseline("e4e", str(runs / "e4e"), device="cpu").image_size == 32
+    small = torch.from_numpy(blobs.images[:2, :, ::2, ::2].copy()).float() / 255
+    large = torch.nn.functional.interpolate(small, 32, mode="bilinear", align_corners=False)
+    torch.testing.assert_close(model.embed(small)["w+"], model.invert(large).flatten(1))
 
 
 def test_a_run_without_a_generator_is_refused_before_a_folder_is_made(runs, blobs, tmp_path):

@@ -12,6 +12,8 @@ from sklearn.metrics import accuracy_score, average_precision_score, balanced_ac
 from sklearn.neighbors import KNeighborsClassifier
 
 from derender import Derenderer
+from derender.baselines.autoencoders import Autoencoder, AutoencoderSettings
+from derender.baselines.supervised import fresh_resnet18
 from derender.evaluation.linear_finetune import finetune
 from derender.evaluation.linear_logistic import axes_of, fit_logistic, solve_logistic
 from derender.evaluation.linear_probes import (
@@ -321,11 +323,25 @@ def test_probes_refuse_bad_input_in_words(head, features, message):
         probe(head, features, task, np.array([[0, 1]]), np.array([2, 3]), (0,))
 
 
-def test_bright_and_dark_pictures_are_learned_through_the_encoders():
+def tiny_autoencoder() -> Autoencoder:
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        return Autoencoder(AutoencoderSettings(image_size=32, width=4))
+
+
+NETS = {
+    "ours": lambda: Derenderer.from_preset("small", seed=0, image_size=32, width=4, light_width=4),
+    "a baseline": tiny_autoencoder,
+    "a fresh ResNet-18": lambda: fresh_resnet18(32, 0, width=4),
+}
+
+
+@pytest.mark.parametrize("kind", NETS)
+def test_bright_and_dark_pictures_are_learned_through_the_encoders(kind):
     rng = np.random.default_rng(0)
     bright = rng.integers(0, 2, 32)
     images = (rng.integers(0, 60, (32, 3, 32, 32)) + 150 * bright[:, None, None, None]).astype(np.uint8)
-    model = Derenderer.from_preset("small", seed=0, image_size=32, width=4, light_width=4).eval()
+    model = NETS[kind]().eval()
     model.requires_grad_(False)
     before = {name: value.clone() for name, value in model.state_dict().items()}
     task = task_of({"bright": bright.astype(np.int8)})

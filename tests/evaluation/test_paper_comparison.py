@@ -81,6 +81,34 @@ def tables_of(repeats: int = 1) -> dict[str, list[FeatureTable]]:
     }
 
 
+def test_background_people_and_other_sports_cars_are_none_of_the_papers_classes():
+    people = np.array(["buffy", "giles", "unknown_e02_8", "unknown_e03_1"])[np.arange(80) % 4]
+    cars = np.array(["jeep", "sports", "sports"])[np.arange(60) % 3]
+    names = np.array(["Willys Jeep", "Ferrari 458", "Porsche sports car"])[np.arange(60) % 3]
+    for table, labels, kept, classes in (
+        ("identity", {"identity": people, "track": np.arange(80).astype(str)}, 40, {"buffy", "giles"}),
+        ("cars", {"class": cars, "name": names}, 40, {"jeep", "sports"}),
+    ):
+        count = len(next(iter(labels.values())))
+        features = {"geometry": np.random.default_rng(0).normal(size=(count, 4))}
+        rows = {"ours": FeatureTable(tuple(map(str, range(count))), features, labels)}
+        found = compare(table, rows, factors=None, resamples=20, cache="none")
+        part = found.values["parts"][table]
+        assert part["n_rows"] == kept and f"{count - kept} rows left out that are none" in " ".join(
+            found.notes
+        )
+        assert part["labels"] == {"identity" if table == "identity" else "class": len(classes)}
+
+
+def test_clustering_tables_have_rows_of_finch_beside_ward():
+    found = compare("emotion", tables_of(), resamples=20, cache="none")
+    values = found.tables[0].values()
+    assert values["ours"]["accuracy"] == values["ours, FINCH"]["accuracy"] == 1
+    alone = compare("emotion", tables_of(), method="finch", resamples=20, cache="none")
+    assert "ours, FINCH" not in alone.tables[0].values()
+    assert values["noise, FINCH"]["accuracy"] == alone.tables[0].values()["noise"]["accuracy"]
+
+
 def test_linear_tables_and_the_papers():
     how = {"seeds": 2, "resamples": 20, "cache": "none"}
     beside, first, judged, *_ = compare("linear", tables_of(), counts=(10, 20), **how).tables

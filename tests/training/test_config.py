@@ -1,9 +1,11 @@
 """Configuration: presets, overrides, and errors that name the nearest key."""
 
 import pytest
+import torch
 import yaml
 
 from derender.training.config import PRESETS, TrainConfig, config_from_tree, resolve, setting_names, to_yaml
+from derender.training.derender_task import DerenderTask
 
 
 def test_every_preset_survives_yaml():
@@ -69,3 +71,15 @@ def test_every_setting_has_a_name_that_resolves():
             value = value[part]
         if value is not None:
             resolve("paper", [f"{name}={yaml.safe_dump(value, default_flow_style=True).splitlines()[0]}"])
+
+
+def test_the_papers_preset_begins_and_measures_as_the_paper_does():
+    paper, faces = resolve("paper"), resolve("faces")
+    assert (paper.geometry_start, faces.geometry_start) == (1.0, 0.1)
+    assert (paper.objective.perceptual_rescaled, faces.objective.perceptual_rescaled) == (False, True)
+    size = ["image_size=32", "width=4", "light_width=4"]
+    plain, scaled = (
+        DerenderTask(resolve("small", [*size, *more])).build().nets["geometry"].decoder.last.weight
+        for more in ([], ["geometry_start=1"])
+    )
+    torch.testing.assert_close(10 * plain, scaled)

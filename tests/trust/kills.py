@@ -1,18 +1,18 @@
-"""Kills training, embedding and comparing at random moments, resumes each time, and compares what comes out.
+"""Kills commands at random moments, gives them again, and compares what comes out with an undisturbed run.
 
-    python tests/trust/kills.py --kills 30 --seed 0
+    python tests/trust/kills.py --kills 30 --seed 0 --what train,refine
 
-Each attempt is a process of its own that runs one command as a user would. It is ended by SIGKILL, SIGTERM,
-Ctrl-C, a full disk or an exception, at a moment drawn at random. Half of the signals are aimed: the process
-stops itself in the midst of writing a file drawn at random, and is ended there. What lies on disk is checked
-after each, and the command is given again until it comes through; the result must then be that of an
-undisturbed run, bit for bit. The disk is a small tmpfs, filled up, where one may be mounted (root); elsewhere
-a limit on the size of files.
+Each attempt is a process of its own. It is ended by SIGKILL, SIGTERM, Ctrl-C, a full disk or an exception, at
+a moment drawn at random. Half of the signals are aimed: the process stops itself in the midst of writing a
+file drawn at random, and is ended there. After each, whatever lies under its final name must be whole; the
+command is given again until it comes through, and what it leaves must be that of an undisturbed run, bit for
+bit. The disk is a small tmpfs, filled up, where one may be mounted (root); elsewhere a limit on file sizes.
 """
 
 import argparse
 import ctypes
 import importlib
+import json
 import os
 import random
 import resource
@@ -27,13 +27,19 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from pathlib import Path
 
+import numpy as np
 from apart import start, waited
-from killing.commands import Command, compare_command, embed_command, train_command
+from PIL import Image
+from safetensors.torch import load_file
 
 from derender.cli import main
+from derender.features import FeatureTable
 from derender.features import embedding as embedding_module
+from derender.model import load
+from derender.storage.atomic import check_seal
 
 SIGNALS = {"SIGKILL": signal.SIGKILL, "SIGTERM": signal.SIGTERM, "Ctrl-C": signal.SIGINT}
 CAUSES = (*SIGNALS, "full disk", "exception")
@@ -42,9 +48,47 @@ ENDINGS = {"SIGKILL": (-9,), "SIGTERM": (-15, 130), "Ctrl-C": (130,), "full disk
 ENDINGS["exception"] = (INJECTED, 2)
 """Exit codes of an attempt that was ended by each cause; 0 if it came through before or in spite of it."""
 
-PRELOADED = {"derender", "torch", "lightning_fabric", "tensorboard"}
-PRELOADED |= {"matplotlib", "sklearn", "scipy", "numba"}
-DISK_MEGABYTES = 200
+PRELOADED = {
+    "derender",
+    "torch",
+    "lightning_fabric",
+    "tensorboard",
+    "matplotlib",
+    "sklearn",
+    "scipy",
+    "numba",
+}
+DISK_MEGABYTES = 400
+
+LEARNS = " ".join(
+    f"--set {one}"
+    for one in (
+        *("image_size=32", "width=8", "light_width=4", "batch_size=8", "checkpoint_every=24"),
+        *("self_features_steps=2", "validate_every=48", "sample_every=48", "images=96", "deterministic=true"),
+        "whitening.pictures=8",
+    )
+)
+MADE = "--data DATA --model MODEL --device cpu"
+PHOTO = "PHOTO PHOTO2 --model MODEL --device cpu --frame none --size 64"
+TABLES = "--features one=ONE --features two=TWO --resamples 60 --cache OUT/cache --markdown OUT/scores.md"
+FEW = "--set images=16 --set fitted=8 --set fit_steps=2 --set whitening.pictures=8"
+LABELS = "--label class --set perceptual=none"
+COMMANDS = {  # and what is given beside it once the file or folder named last is there
+    "train": (f"train --data DATA --preset small --device cpu {LEARNS} --out", "run --resume"),
+    "finetune": (f"finetune --data DATA --preset small --device cpu {LEARNS} {LABELS} --out", "run --resume"),
+    "embed": (f"embed {MADE} --batch-size 4 --out", "table.parquet --force"),
+    "compare": (f"compare --table identity {TABLES} --force --json", "scores.json"),
+    "whiten": (f"whiten {MADE} --set pictures=8 --out", "white --force"),
+    "refine": (f"refine {MADE} {FEW} --out", "refined --force"),
+    "unet": (f"unet {MADE} --set images=16 --out", "unet --force"),
+    "decompose": ("decompose PHOTO PHOTO2 --model MODEL --device cpu --frame none --out", "parts --force"),
+    "relight": (f"relight {PHOTO} --stills 2 --film gif --frames 6 --out", "relit --force"),
+    "rotate": (f"rotate {PHOTO} --stills 2 --film gif --frames 6 --out", "turned --force"),
+    "swap": (f"swap {PHOTO} --from PHOTO2 --out", "mixed --force"),
+    "mesh": ("mesh PHOTO PHOTO2 --model MODEL --device cpu --frame none --out", "solid --force"),
+}
+UNTIMED = ("metrics.jsonl", "environment.json", "state.json", "checksums.json", "report.html", "run.lock")
+"""Files that hold times, or checksums of such."""
 
 
 class Injected(Exception):
@@ -82,23 +126,80 @@ class Writes:
         os.kill(os.getpid(), signal.SIGSTOP)
 
 
+def content_of(file: Path) -> bytes:
+    """What a file holds, wherever tensors lie in it; raises unless it is whole."""
+    content = file.read_bytes()
+    match file.suffix:
+        case ".safetensors":
+            tensors = sorted(load_file(file).items())
+            return b"".join(name.encode() + value.numpy().tobytes() for name, value in tensors)
+        case ".parquet":
+            table = FeatureTable.read(file)
+            return "\n".join(table.files).encode() + b"".join(one.tobytes() for one in table.factors.values())
+        case ".json":
+            json.loads(content)
+        case ".png" | ".gif" | ".jpg":
+            with Image.open(file) as image:
+                image.load()
+        case ".glb" if int.from_bytes(content[8:12], "little") != len(content):
+            raise ValueError(f"{file} is cut off")
+    return content
+
+
+def left_in(folder: Path) -> dict[str, bytes]:
+    """What lies in a folder under final names; raises unless all of it is whole, models load, seals hold."""
+    found = {}
+    for file in sorted(folder.rglob("*")):
+        inner = file.relative_to(folder)
+        if any(part.startswith(".") or part.endswith(".partial") for part in inner.parts):
+            continue
+        if file.is_dir() and inner.parts[0] not in ("cache",):
+            if file.parent.name == "checkpoints":
+                check_seal(file)
+            elif (file / "config.json").exists():
+                load(file)
+        elif file.is_file() and not {"cache", "tensorboard", "samples", "previous"} & set(inner.parts):
+            content = content_of(file)
+            if file.name not in UNTIMED:
+                found[str(inner)] = content
+    return found
+
+
+def made_material(place: Path, pictures: int) -> dict[str, str]:
+    """Smooth random images in two classes, a tenth as many broken ones, two photographs, two tables."""
+    draw, data = np.random.default_rng(0), place / "data"
+    for number in range(pictures):
+        folder = data / "ab"[number % 2]
+        folder.mkdir(parents=True, exist_ok=True)
+        small = Image.fromarray(draw.integers(0, 256, (4, 4, 3), dtype=np.uint8))
+        small.resize((32, 32)).save(folder / f"{number:03d}.png")
+        if number % 10 == 0:
+            (folder / f"broken{number}.png").write_bytes(b"no picture")
+        if number < 2:
+            small.resize((96, 80)).save(place / f"photo{number}.png")
+    identity = np.arange(150) % 6
+    for name in ("one", "two"):
+        geometry = draw.normal(size=(150, 8)) + 2 * np.eye(8)[identity]
+        factors = {"geometry": geometry, "albedo": draw.normal(size=(150, 8))}
+        labels = {"identity": np.array([f"person {value}" for value in identity])}
+        files = tuple(f"{row}.png" for row in range(150))
+        FeatureTable(files, factors, labels).write(place / f"{name}.parquet")
+    photos = {"PHOTO2": str(place / "photo1.png"), "PHOTO": str(place / "photo0.png")}
+    return {"DATA": str(data), **photos, "ONE": str(place / "one.parquet"), "TWO": str(place / "two.parquet")}
+
+
 @dataclass
 class Trial:
     """One command, where it is killed, and what happened.
 
-    Attributes:
-        disk: the folder that may be a small disk of its own; ``mounted`` says whether it is one.
-        log: what the command said last; not on that disk.
-        numbers: draws causes' moments.
-        seconds, bytes, writes: how long the command takes undisturbed, what it leaves and writes.
-        kills: by cause, of attempts that were ended before they came through.
-        writing: how many of them while a file was being written.
-        rounds: how many times the command was brought to its end.
-        survived: how many of these gave the undisturbed result.
-        faults: sentences on what went wrong.
+    ``disk`` may be a small disk of its own (``mounted``); ``log`` has what the command said last, ``numbers``
+    draws moments. ``seconds``, ``bytes``, ``writes``: how long the command takes undisturbed, what it leaves
+    and writes. ``kills`` by cause, ``writing`` of them while a file was written; ``rounds`` brought to their
+    end, ``survived`` of these with the undisturbed result; ``faults`` in sentences.
     """
 
-    command: Command
+    name: str
+    words: dict[str, str]
     disk: Path
     mounted: bool
     log: Path
@@ -111,6 +212,16 @@ class Trial:
     rounds: int = 0
     survived: int = 0
     faults: list[str] = field(default_factory=list)
+
+    def arguments(self, folder: Path) -> list[str]:
+        """Of the first attempt, or of a later one where it left something."""
+        text, (out, *again) = COMMANDS[self.name][0], COMMANDS[self.name][1].split()
+        begun = folder / out / "config.yaml" if again == ["--resume"] else folder / out
+        words = {**self.words, "OUT": str(folder)}
+        given = [words.get(word, word) for word in text.split()]
+        given = [word.replace("OUT/", f"{folder}/").replace("=ONE", f"={words['ONE']}") for word in given]
+        given = [word.replace("=TWO", f"={words['TWO']}") for word in given]
+        return [*given, str(folder / out), *(again if begun.exists() else [])]
 
     def child(
         self, folder: Path, *, limit: int | None = None, raise_after: float | None = None,
@@ -133,7 +244,7 @@ class Trial:
             writes = Writes(hold)
             sys.addaudithook(writes.seen)
             try:
-                code = main(self.command.arguments(folder))
+                code = main(self.arguments(folder))
             except Injected:
                 return INJECTED
             if record:
@@ -143,14 +254,14 @@ class Trial:
         return start(work, self.log)
 
     def undisturbed(self, folder: Path) -> dict[str, bytes]:
-        """The result of an undisturbed run; notes time and bytes it takes, and imports what it did.
+        """What an undisturbed run leaves; notes time and bytes it takes, and imports what it did.
 
         Later processes begin with those modules, and are killed at work.
         """
         folder.mkdir()
         began = time.monotonic()
-        if waited(self.child(folder, record=True), 900) != CAME_THROUGH:
-            raise RuntimeError(f"{self.command.name} does not come through:\n{self.log.read_text()}")
+        if waited(self.child(folder, record=True), 1800) != CAME_THROUGH:
+            raise RuntimeError(f"{self.name} does not come through:\n{self.log.read_text()}")
         self.seconds = time.monotonic() - began
         self.bytes = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
         writes, *modules = self.log.with_suffix(".record").read_text().splitlines()
@@ -158,7 +269,7 @@ class Trial:
         for name in modules:
             if name.split(".")[0] in PRELOADED:
                 importlib.import_module(name)
-        result = self.command.result(folder)
+        result = left_in(folder)
         shutil.rmtree(folder)
         return result
 
@@ -174,37 +285,38 @@ class Trial:
             how["limit"] = draw.randrange(1, 60_000)
         elif cause == "exception":
             how["raise_after"] = moment
-        elif cause in SIGNALS and draw.random() < 0.5:
+        elif cause in SIGNALS and draw.random() < 0.5 and self.writes:
             how["hold"] = draw.randint(1, self.writes), round(10 ** draw.uniform(0.5, 3))
         child = self.child(folder, **how)
-        code = waited(child, moment if cause in SIGNALS and not how else 600)
+        code = waited(child, moment if cause in SIGNALS and not how else 1800)
         if code in (None, "stopped") and cause in SIGNALS:
             self.writing += code == "stopped"
             os.kill(child, SIGNALS[cause])
             os.kill(child, signal.SIGCONT)
-            code = waited(child, 600)
+            code = waited(child, 1800)
         filler.unlink(missing_ok=True)
         if not isinstance(code, int):
             os.kill(child, signal.SIGKILL)
-            raise TimeoutError(f"{self.command.name} did not end within 10 minutes of {cause}")
+            raise TimeoutError(f"{self.name} did not end within 30 minutes of {cause}")
         return code
 
     def check(self, folder: Path, cause: str, code: int) -> None:
         """After a kill: an ending as promised, no traceback, and nothing half-written on disk."""
         said = self.log.read_text(errors="replace")
         if code not in ENDINGS.get(cause, ()) or "Traceback" in said:
-            self.faults.append(f"{self.command.name} ended by {cause} with exit code {code}: {said[-1500:]}")
+            self.faults.append(f"{self.name} ended by {cause} with exit code {code}: {said[-1500:]}")
         try:
-            self.command.sound(folder)
+            left_in(folder)
         except (ValueError, OSError) as problem:
-            self.faults.append(f"after {cause} {self.command.name} left something half-written: {problem}")
+            self.faults.append(f"after {cause} {self.name} left something half-written: {problem}")
 
     def kill(self, kills: int) -> None:
         """Kill the command so many times in all, from as many beginnings as that takes."""
-        self.undisturbed(self.disk / "first")
-        wanted = self.undisturbed(self.disk / "whole")
+        folder = self.disk / "work"  # what is written may name it
+        self.undisturbed(folder)
+        wanted = self.undisturbed(folder)
         while (done := self.kills.total()) < kills:
-            folder, code = self.disk / f"round{self.rounds}", -1
+            code = -1
             folder.mkdir()
             self.rounds += 1
             while code != CAME_THROUGH and done <= kills:
@@ -216,21 +328,27 @@ class Trial:
                 self.kills[cause] += 1
                 done += 1
                 self.check(folder, cause, code)
-            if code == CAME_THROUGH and self.command.result(folder) == wanted:
-                self.survived += 1
-            else:
-                self.faults.append(f"round {self.rounds} of {self.command.name} ended otherwise")
+            left = left_in(folder) if code == CAME_THROUGH else {}
+            self.survived += left == wanted
+            if differing := [name for name in wanted | left if wanted.get(name) != left.get(name)]:
+                self.faults.append(f"round {self.rounds} of {self.name} ended otherwise: {differing[:5]}")
             shutil.rmtree(folder)
             self.tell()
 
     def tell(self) -> None:
         by_cause = ", ".join(f"{cause} {count}" for cause, count in sorted(self.kills.items()))
         print(
-            f"{self.command.name}: {self.kills.total()} kills ({by_cause}), {self.writing} while writing; "
+            f"{self.name}: {self.kills.total()} kills ({by_cause}), {self.writing} while writing; "
             f"{self.survived} of {self.rounds} runs ended bit-identical to the undisturbed one; "
             f"{len(self.faults)} faults",
             flush=True,
         )
+
+    def numbers_told(self) -> dict[str, object]:
+        """For ``--json``."""
+        names = ("writing", "rounds", "survived", "faults")
+        counts = {name: getattr(self, name) for name in names}
+        return {"kills": self.kills.total(), "by_cause": dict(self.kills), **counts}
 
 
 @contextmanager
@@ -250,19 +368,19 @@ def small_disk(mount: bool) -> Iterator[tuple[Path, bool]]:
 def run(given: argparse.Namespace) -> int:
     """The script."""
     embedding_module.PART_ROWS = 8
-    faults = []
+    faults: list[str] = []
+    told = {"date": f"{datetime.now(UTC):%Y-%m-%d}", "seed": given.seed, "model": str(given.model)}
+    told |= {"commands": {}}
     with tempfile.TemporaryDirectory() as folder:
-        place = Path(folder)
-        commands = {
-            "train": lambda: train_command(place, given.images),
-            "embed": lambda: embed_command(place, given.model, given.pictures),
-            "compare": lambda: compare_command(place),
-        }
+        words = {**made_material(Path(folder), given.pictures), "MODEL": str(given.model)}
         for name in given.what.split(","):
             with small_disk(not given.no_mount) as (disk, mounted):
-                trial = Trial(commands[name](), disk, mounted, place / "log", random.Random(given.seed))
+                trial = Trial(name, words, disk, mounted, Path(folder) / "log", random.Random(given.seed))
                 trial.kill(given.kills)
             faults += trial.faults
+            told["commands"][name] = trial.numbers_told()
+            if given.json:
+                given.json.write_text(json.dumps(told, indent=1) + "\n")
     for fault in faults:
         print(f"  {fault}")
     return 1 if faults else 0
@@ -274,9 +392,9 @@ if __name__ == "__main__":
     )
     parser.add_argument("--kills", type=int, default=30, help="of each command")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--images", type=int, default=96, help="images seen in a training")
-    parser.add_argument("--pictures", type=int, default=120, help="embedded")
-    parser.add_argument("--model", type=Path, default=Path("rendered-faces-64"), help="that embeds")
+    parser.add_argument("--pictures", type=int, default=40, help="in the data set")
+    parser.add_argument("--model", type=Path, default=Path("rendered-faces-64"), help="that embeds and draws")
     parser.add_argument("--no-mount", action="store_true", help="limit the size of files instead")
-    parser.add_argument("--what", default="train,embed,compare")
+    parser.add_argument("--what", default=",".join(COMMANDS))
+    parser.add_argument("--json", type=Path, help="file for the counts")
     sys.exit(run(parser.parse_args()))

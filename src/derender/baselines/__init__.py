@@ -65,7 +65,7 @@ def train_baseline(config: Any, images: Any, out: Any, **how: Any) -> Any:
 
 def open_baseline(
     name: str, source: str | None = None, *, device: str = "auto", features: Sequence[str] | None = None,
-    image_size: int = 64, seed: int = 0,
+    image_size: int | None = None, seed: int = 0,
 ) -> Any:  # fmt: skip
     """A network that embeds images.
 
@@ -75,7 +75,8 @@ def open_baseline(
             (default: facebook/dinov2-small); for untrained the derender model to copy.
         device: "auto", "cpu" or "cuda".
         features: names of the features to compute; by default the baseline's first.
-        image_size: side of the input images, where the network does not fix it (dinov2).
+        image_size: side of the input images, where the network does not fix it (dinov2; default 64); e4e
+            enlarges smaller ones to its own.
         seed: of the fresh weights of untrained.
     """
     from derender.inputs import device_named
@@ -88,7 +89,7 @@ def open_baseline(
 
 def embed_baseline(
     name: str, images: Any, out: str | Path, source: str | None = None, *,
-    features: Sequence[str] | None = None, image_size: int = 64, components: int = 64, seed: int = 0,
+    features: Sequence[str] | None = None, image_size: int | None = None, components: int = 64, seed: int = 0,
     device: str = "auto", progress: Callable[[int, int], object] | None = None,
     reading: Mapping[str, Any] | None = None, **how: Any,
 ) -> "Embedded":  # fmt: skip
@@ -107,7 +108,7 @@ def embed_baseline(
         origin = {"source": source, "baseline": name}
         return embed_to_file(images, net, out, **reading, origin=origin, progress=progress, **how)
     table = control_features(
-        name, images, **reading, model=source, image_size=image_size, components=components, seed=seed,
+        name, images, **reading, model=source, image_size=image_size or 64, components=components, seed=seed,
         progress=progress,
     )  # fmt: skip
     table.write(out)

@@ -192,7 +192,7 @@ class Untrained:
     """The untrained twin of a derender model, among the baselines with a network."""
 
     @staticmethod
-    def open(source: str | Path | None, *, image_size: int = 0, seed: int = 0) -> Any:
+    def open(source: str | Path | None, *, image_size: int | None = None, seed: int = 0) -> Any:
         """See `open_baseline`."""
         if source is None:
             raise ValueError("the baseline untrained needs a model: the derender model to copy")

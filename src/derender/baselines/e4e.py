@@ -155,6 +155,7 @@ class E4e(LoopModel):
     features = ("w+",)
     not_judged = ("delta", "prior")
     settings: E4eSettings
+    given_size: int | None = None
     centre: Tensor
     seen: Tensor
     released: Tensor
@@ -169,13 +170,21 @@ class E4e(LoopModel):
         self.register_buffer("released", torch.tensor(codes))
 
     @classmethod
-    def open(cls, source: str | Path | None, *, image_size: int = 0, seed: int = 0) -> Any:
-        """The encoder of a run, or a published one (a .pt file); see `open_baseline`."""
+    def open(cls, source: str | Path | None, *, image_size: int | None = None, seed: int = 0) -> Any:
+        """The encoder of a run, or a published one (a .pt file), for such images; see `open_baseline`."""
         if source is not None and Path(source).suffix.lower() == ".pt":
             from derender.baselines.published import load_published_e4e
 
-            return load_published_e4e(source)
-        return super().open(source)
+            net = load_published_e4e(source)
+        else:
+            net = super().open(source)
+        net.given_size = image_size
+        return net
+
+    @property
+    def image_size(self) -> int:
+        """Side of the input images: the network's, or a smaller one that is enlarged to it."""
+        return self.given_size or self.settings.image_size
 
     @classmethod
     def build(cls, config: E4eConfig) -> "E4e":
@@ -199,7 +208,9 @@ class E4e(LoopModel):
         return self_features_of(file, images, config.seed, objective.self_features_steps, progress)
 
     def invert(self, images: Images) -> Codes:
-        """W+ of images in 0..1."""
+        """W+ of images in 0..1, which are enlarged to the encoder's size where they are smaller."""
+        if images.shape[-1] != self.settings.image_size:
+            images = interpolate(images, self.settings.image_size, mode="bilinear", align_corners=False)
         return self.encoder(2 * images - 1, released=int(self.released)) + self.centre
 
     def rebuild(self, w_plus: Codes) -> Images:

@@ -84,7 +84,7 @@ class BaselineModel(nn.Module, ABC):
         self.settings, self.chosen = settings, self.features[:1]
 
     @classmethod
-    def open(cls, source: str | Path | None, *, image_size: int = 0, seed: int = 0) -> Any:
+    def open(cls, source: str | Path | None, *, image_size: int | None = None, seed: int = 0) -> Any:
         """A trained one; see `open_baseline`."""
         if source is None:
             raise ValueError(f"the baseline {cls.name} needs a model: its run folder")
@@ -153,7 +153,7 @@ def load_baseline(source: str | Path, name: str | None = None) -> BaselineModel:
         setting = f"setting {'.'.join(map(str, first['loc']))!r}: {first['msg']}"
         raise ValueError(f"{folder / CONFIG_FILE}: {setting}; train it again") from error
     try:
-        weights = read_tensors(file)
+        weights = read_tensors(file, like=model.state_dict())
     except (ValueError, OSError) as error:
         raise ValueError(f"{file} is damaged ({error}): copy or train the model again") from error
     try:

@@ -28,7 +28,7 @@ from torch.nn.functional import interpolate
 from derender.baselines import model as base
 from derender.baselines.e4e import E4e, E4eSettings
 from derender.baselines.generator import FILTER, Generator, GeneratorSettings
-from derender.storage.tensors import refuse_old_torch
+from derender.storage.tensors import check_pickle, require_plain
 
 GENERATOR_FILE = (
     "stylegan2-ffhq-config-f.pt (linked from the READMEs of https://github.com/rosinality/stylegan2-pytorch "
@@ -144,6 +144,7 @@ def _parts(path: str | Path, wanted: str, kind: str, *names: str) -> list[Any]:
     weights = content[names[0]]
     if not isinstance(weights, Mapping) or not all(isinstance(v, Tensor) for v in weights.values()):
         raise ValueError(f"{path} holds no weights by name: train or fetch it again")
+    require_plain(weights, Path(path))
     return [content[name] for name in names]
 
 
@@ -152,7 +153,7 @@ def read_weights(path: str | Path, wanted: str) -> Mapping[str, Any]:
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"no file {path}: nothing is downloaded here; get {wanted} and give its path")
-    refuse_old_torch(path)
+    check_pickle(path)
     try:
         with torch.serialization.safe_globals([Namespace]), warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # of unusual pickles: errors are raised below
@@ -252,14 +253,15 @@ class Dinov2(base.BaselineModel):
 
     @classmethod
     def open(
-        cls, source: str | Path | None = None, *, image_size: int = 64, seed: int = 0, enlarged: int = 224
-    ) -> "Dinov2":
+        cls, source: str | Path | None = None, *, image_size: int | None = None, seed: int = 0,
+        enlarged: int = 224,
+    ) -> "Dinov2":  # fmt: skip
         """The network with its published weights, ready to embed; ``seed`` is ignored.
 
         ``source`` is an id in the Hugging Face cache, or a folder with config.json and model.safetensors;
         weights that are not there, a pickle, or another kind of network are a ValueError.
         """
-        settings = Dinov2Settings(image_size=image_size, enlarged=enlarged)
+        settings = Dinov2Settings(image_size=image_size or 64, enlarged=enlarged)
         if source is not None:
             settings = settings.model_copy(update={"weights": str(source)})
         source, folder = settings.weights, Path(settings.weights)

@@ -93,10 +93,7 @@ class Resnet18(BaselineModel):
         """
         rows = labelled_rows(images, config)  # wrong labels are an error before a folder is made
         names, targets = encode_labels(images, config.labels, rows)
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(config.seed)
-            size = images.images.shape[-1]
-            model = cls(Resnet18Settings(image_size=size, width=config.width, classes=names))
+        model = fresh_resnet18(images.images.shape[-1], config.seed, config.width, names)
         run = ShortRun(config, images, out, accelerator=accelerator, **how)
         inputs, wanted = as_float(images.images[rows]).to(accelerator), targets.to(accelerator)
         model, rate, decay = model.to(accelerator).train(), config.learning_rate, config.weight_decay
@@ -124,6 +121,15 @@ class Resnet18(BaselineModel):
             scores = accuracy(model, images.select(run.split.validation))
             run.record("validation", seen, scores)
         return run.finish(model, seen, scores)
+
+
+def fresh_resnet18(
+    image_size: int, seed: int, width: int = 64, classes: dict[str, tuple[str, ...]] | None = None
+) -> Resnet18:
+    """A ResNet-18 with fresh weights; torch's global generator is left as it was."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        return Resnet18(Resnet18Settings(image_size=image_size, width=width, classes=classes or {}))
 
 
 def labelled_rows(images: ImageSet, config: SupervisedConfig) -> np.ndarray:

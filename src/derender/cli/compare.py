@@ -13,6 +13,7 @@ from derender.cli.plan import Planned, by_plan
 TABLES = "clustering, identity, emotion, linear, segmentation or cars."
 FEATURES = "Table made by derender embed; a name given again is another seed."
 Features = typer.Option("--features", "-f", metavar="NAME=FILE.parquet", help=FEATURES)
+SUPERVISED = "With --finetune: also a ResNet-18 from fresh weights."
 Models = typer.Option("--model", "-m", help=f"Model, with IMAGES: {options.MODELS}", metavar="NAME=MODEL")
 
 
@@ -30,6 +31,7 @@ class PaperTable:
     seeds: Annotated[int, scoring.number(help="Number of training subsets; of runs of each net.")] = 5
     epochs: Annotated[int, scoring.number(help="Epochs of segmentation nets.")] = 20
     finetune: Annotated[bool, typer.Option("--finetune", help="Also train the models' encoders.")] = False
+    supervised: Annotated[bool, typer.Option("--supervised", help=SUPERVISED)] = False
     untrained_seeds: scoring.UntrainedSeeds = 3
 
 
@@ -69,6 +71,7 @@ def compare(
             paper.table, {**read, **models}, images.optional_address, **images.how, **vars(computed),
             factors=scoring.names_of(paper.factors), masks=paper.masks, epochs=paper.epochs,
             method=paper.method, counts=scoring.numbers_of(paper.counts, "--counts"), seeds=paper.seeds,
-            finetune=paper.finetune, untrained_seeds=paper.untrained_seeds, progress=progress,
+            finetune=paper.finetune, supervised=paper.supervised, untrained_seeds=paper.untrained_seeds,
+            progress=progress,
         )  # fmt: skip
     published.publish(scores)

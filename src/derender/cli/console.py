@@ -113,15 +113,15 @@ def progress_bar(description: str, unit: str = "images") -> Iterator[Callable[..
 def show_scores(scores: "ScoreTable", json_file: str | None) -> None:
     """A table of scores where results go: controls dim, the best of each column bold."""
     table = Table(
-        title=scores.caption, title_justify="left", title_style="none", box=None, pad_edge=False,
-        padding=(0, 3, 0, 0),
+        title=Text(visible(scores.caption)), title_justify="left", title_style="none", box=None,
+        pad_edge=False, padding=(0, 3, 0, 0),
     )  # fmt: skip
-    table.add_column(scores.first, header_style="dim")
+    table.add_column(Text(visible(scores.first, "")), header_style="dim")
     for column in scores.columns:
-        table.add_column(column.head, justify="right", no_wrap=True, header_style="dim")
+        table.add_column(Text(visible(column.head, "")), justify="right", no_wrap=True, header_style="dim")
     for row in scores.rows:
-        cells = [Text(text, style="bold" if best else "") for text, best in scores.texts(row)]
-        table.add_row(Text(row.name), *cells, style="dim" if row.control else "")
+        cells = [Text(visible(text, ""), style="bold" if best else "") for text, best in scores.texts(row)]
+        table.add_row(Text(visible(row.name, "")), *cells, style="dim" if row.control else "")
     console = Console(stderr=json_file == "-", highlight=False)
     if not console.is_terminal:  # a file or a pipe is as wide as the table
         widest = console.options.update(max_width=1_000)

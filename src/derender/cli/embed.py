@@ -12,6 +12,7 @@ from derender.cli.console import NAMED, notice, progress_bar, refuse_existing_fi
 from derender.cli.gathered import command
 
 NAMES = ", ".join(BASELINES)
+SIDE = "Side of the images in pixels, where no network fixes it (64); e4e enlarges them to its own."
 Out = Annotated[Path, typer.Option("--out", "-o", help="The table to write.", metavar="FILE.parquet")]
 Model = Annotated[str | None, typer.Option("--model", "-m", help=options.MODELS, metavar="MODEL")]
 Engine = Annotated[str, typer.Option(help="local, or ray: on a cluster of Ray.", metavar="NAME")]
@@ -29,7 +30,7 @@ class BaselineOptions:
     baseline: Annotated[str | None, _option(f"Instead of our model: {NAMES}.", "NAME")] = None
     checkpoint: Annotated[str | None, _option("Published e4e file (e4e_ffhq_encode.pt).", "FILE")] = None
     features: Annotated[str | None, _option("Features of a baseline, separated by commas.", "A,B")] = None
-    image_size: Annotated[int, _option("Side in pixels, where no network fixes it.", min=8)] = 64
+    image_size: Annotated[int | None, _option(SIDE, min=8)] = None
     components: Annotated[int, _option("Numbers in pca and noise.", min=1)] = 64
     seed: Annotated[int, _option("Seed of pca, noise and untrained.", min=0)] = 0
 

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from derender.cli import options
-from derender.cli.console import notice, progress_bar, refuse_existing_file, show_scores, visible
+from derender.cli.console import notice, progress_bar, refuse_existing_file, show_scores
 from derender.cli.gathered import command
 
 LABELS_SHOWN = 4
@@ -41,14 +41,13 @@ def search(
     found = derender.search(features, like, factor, k, **how)
     files, away = found.table.files, dict(zip(found.rows, found.distances, strict=True))
     shown = [name for name in found.table.labels if name != "partition"][:LABELS_SHOWN]
-    columns = (Column("distance", digits=4), *(Column(visible(name, "")) for name in shown))
+    columns = (Column("distance", digits=4), *map(Column, shown))
     rows = []
     for row, distance in away.items():
         labels = found.labels(row)
-        texts = (visible(str(labels[name]), "") for name in shown)
-        rows.append(Row(visible(files[row], ""), (distance, *texts)))
+        rows.append(Row(files[row], (distance, *(str(labels[name]) for name in shown))))
     caption = f"nearest to {like} by {factor}, {metric} distance, in {features} ({len(found.table):,} rows)"
-    show_scores(ScoreTable(visible(caption, ""), "file", columns, rows), output.json_file)
+    show_scores(ScoreTable(caption, "file", columns, rows), output.json_file)
     if found.unchecked:
         notice(f"{features} does not record which model made it: cannot check that it was {model}")
     if len(rows) < k:

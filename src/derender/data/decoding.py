@@ -9,7 +9,7 @@ import os
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from itertools import islice
 from typing import TypeVar
@@ -17,7 +17,7 @@ from typing import TypeVar
 import numpy as np
 from jaxtyping import UInt8
 
-from derender.data.image import Unreadable, decode
+from derender.data.image import LARGE_BYTES, Unreadable, decode, one_large_image_at_a_time
 from derender.data.stream import Sample, Stream, Value
 
 T = TypeVar("T")
@@ -79,10 +79,11 @@ def decode_samples(start: int, samples: Sequence[Sample], image_size: int, fit: 
 def _decode_one(target: np.ndarray, sample: Sample, fit: str) -> bytes | Unreadable:
     """Decode one sample into its row and digest its pixels, or say why that cannot be done."""
     try:
-        encoded = sample.read()
-        if not encoded:
-            return Unreadable("empty file")
-        target[:] = decode(encoded, target.shape[-1], sample.fit if fit == "crop" else fit, sample.box)
+        with one_large_image_at_a_time if sample.size() > LARGE_BYTES else nullcontext():
+            if not (encoded := sample.read()):
+                return Unreadable("empty file")
+            target[:] = decode(encoded, target.shape[-1], sample.fit if fit == "crop" else fit, sample.box)
+            del encoded
     except ValueError as problem:
         return Unreadable(str(problem))
     except OSError as problem:

@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Int64
 
-from derender.data.source import Skipped, Source, is_hidden, printable, read_bounded
+from derender.data.source import FILE_LIMIT_BYTES, Skipped, Source, is_hidden, printable
+from derender.storage.bounded import read_bounded
 
 
 class FolderSource(Source):
@@ -24,7 +25,7 @@ class FolderSource(Source):
         self.skipped = tuple(sorted(faults, key=lambda row: row.file))
 
     def read(self, file: str) -> bytes:
-        return read_bounded(self.path / self._found[file][0])
+        return read_bounded(self.path / self._found[file][0], FILE_LIMIT_BYTES)
 
     def stamps(self, files: Sequence[str]) -> Int64[np.ndarray, "n 2"]:
         return np.array([self._found[file][1:] for file in files], np.int64).reshape(-1, 2)

@@ -14,9 +14,10 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 from torch import Tensor
 
-from derender.data.image import Unreadable, decode_whole, fit_square, quiet_pillow, upright_rgb
+from derender.data.image import PIXEL_LIMIT, Unreadable, decode_whole, fit_square, quiet_pillow, upright_rgb
 from derender.data.image_set import check_images
-from derender.data.source import read_bounded
+from derender.data.source import FILE_LIMIT_BYTES
+from derender.storage.bounded import read_bounded
 from derender.storage.places import nearest_sibling
 
 GivenImages: TypeAlias = str | Path | Image.Image | np.ndarray | Tensor | Sequence[Any]
@@ -65,7 +66,7 @@ def as_photos(images: GivenImages) -> list[UInt8[np.ndarray, "h w 3"]]:
     return [_as_bytes(image) for image in (_batch_of(images))]
 
 
-def read_photo(path: str | Path) -> UInt8[np.ndarray, "h w 3"]:
+def read_photo(path: str | Path, pixel_limit: int = PIXEL_LIMIT) -> UInt8[np.ndarray, "h w 3"]:
     """One image file at its own size, upright, as RGB; ``Unreadable`` says what is wrong with it."""
     path = Path(path)
     if not path.exists():
@@ -74,7 +75,7 @@ def read_photo(path: str | Path) -> UInt8[np.ndarray, "h w 3"]:
         raise IsADirectoryError(f"{path} is a folder: name images, such as {path / '*.jpg'}")
     try:
         with quiet_pillow():
-            return decode_whole(read_bounded(path))
+            return decode_whole(read_bounded(path, FILE_LIMIT_BYTES), pixel_limit)
     except ValueError as problem:
         raise Unreadable(f"{path} cannot be used as an image: {problem}") from problem
 

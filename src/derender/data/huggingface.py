@@ -16,8 +16,9 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from derender.data.layouts.layout import PARTITION_NAMES
-from derender.data.source import printable, read_bounded, stamps_of
+from derender.data.source import FILE_LIMIT_BYTES, printable, stamps_of
 from derender.data.stream import Sample, Stream, label_name, unreadable
+from derender.storage.bounded import read_bounded
 from derender.storage.places import suggestion
 
 _ANSWER_SECONDS = 10.0
@@ -207,7 +208,7 @@ def _read_path(path: str, place: str | Path) -> bytes:
         inside = place if place.is_dir() else place.parent
         file = inside / path
         if file.resolve().is_relative_to(inside.resolve()) and file.is_file():
-            return read_bounded(file)
+            return read_bounded(file, FILE_LIMIT_BYTES)
     raise ValueError(f"the row holds no image, only the path {path!r}, which is not in the data set")
 
 

@@ -26,7 +26,8 @@ from jaxtyping import Float32, UInt8
 from PIL import Image
 from PIL.Image import Resampling, Transpose
 
-from derender.data.source import Source, read_bounded
+from derender.data.source import FILE_LIMIT_BYTES, Source
+from derender.storage.bounded import read_bounded
 from derender.storage.places import suggestion
 
 READER_VERSION = 1
@@ -37,8 +38,9 @@ ROOM = 31 / 24  # a tight crop of a face, 84 x 96, becomes 124 x 124
 PIXEL_LIMIT = 170_000_000
 """Images with more pixels are refused before a pixel is decoded (Pillow itself refuses at 179 million)."""
 
-_LARGE_PIXELS = 20_000_000
-_one_large_image_at_a_time = threading.Lock()
+_LARGE_PIXELS, _MOST_BYTES_A_PIXEL = 20_000_000, 24
+LARGE_BYTES, HEAD_BYTES = 64 << 20, 1 << 16
+one_large_image_at_a_time = threading.RLock()
 
 _FORMATS = ("JPEG", "PNG", "WEBP", "BMP", "GIF", "TIFF", "PPM", "AVIF")
 _BACKGROUND = (255, 255, 255)
@@ -69,7 +71,7 @@ def read_image(
     check_fit(fit)
     name = "the given bytes" if isinstance(image, bytes) else str(image)
     try:
-        encoded = image if isinstance(image, bytes) else read_bounded(Path(image))
+        encoded = image if isinstance(image, bytes) else read_bounded(Path(image), FILE_LIMIT_BYTES)
         with quiet_pillow():
             return decode(encoded, image_size, fit)
     except ValueError as problem:
@@ -96,7 +98,7 @@ def decode(
         width = opened.width
         _reduce_while_decoding(opened, image_size, fit, box)
         large = opened.width * opened.height > _LARGE_PIXELS
-        with _one_large_image_at_a_time if large else nullcontext():
+        with one_large_image_at_a_time if large else nullcontext():
             image = upright_rgb(opened)
             if box is not None:
                 image = _cut(image, box * (opened.width / width))
@@ -105,7 +107,7 @@ def decode(
 
 def decode_whole(encoded: bytes, pixel_limit: int = PIXEL_LIMIT) -> UInt8[np.ndarray, "h w 3"]:
     """Decode one image at its own size; ``Unreadable`` if that cannot be done."""
-    with _opened(encoded, pixel_limit) as opened, _one_large_image_at_a_time:
+    with _opened(encoded, pixel_limit) as opened, one_large_image_at_a_time:
         return np.array(upright_rgb(opened))
 
 
@@ -124,6 +126,17 @@ def _opened(encoded: bytes, pixel_limit: int) -> Iterator[Image.Image]:
         raise Unreadable("not an image in a known format") from problem
     except DECODER_ERRORS as problem:
         raise Unreadable(f"damaged or unsupported ({problem or type(problem).__name__})") from problem
+
+
+def refuse_by_header(head: bytes, size: int) -> None:
+    """Raise ``Unreadable`` where the first bytes of an image of ``size`` bytes show that it is not usable.
+
+    TIFF files may keep their header at the end, and are not judged.
+    """
+    if head[:4] not in (b"II*\0", b"MM\0*"):
+        with _opened(head, PIXEL_LIMIT) as opened:
+            if size > LARGE_BYTES + _MOST_BYTES_A_PIXEL * opened.width * opened.height:
+                raise Unreadable(f"{size >> 20:,} MiB of {opened.width} x {opened.height} pixels")
 
 
 def upright_rgb(opened: Image.Image) -> Image.Image:

@@ -28,6 +28,7 @@ from derender.data.layouts.layout import Labels, Table, half_of, stem_of
 from derender.data.layouts.rendered import CAMERA, DEPTH_PAIRS, LIGHT, SYNFACE, pairs_of, rendered_folders
 from derender.data.opening import list_images, open_source, parse_source
 from derender.data.source import Source
+from derender.storage.bounded import read_bounded
 
 CLASSES_FILE = "classes.txt"
 MOST_CLASSES = 255  # 255 itself marks pixels without a class in many sets
@@ -225,7 +226,7 @@ def _class_names(source: Source, masks: UInt8[np.ndarray, "n s s"], files: list[
     if listed is not None:
         text = source.read_text(listed)
     elif source.path.is_dir() and beside.is_file():
-        listed, text = str(beside), beside.read_text(encoding="utf-8", errors="replace")
+        listed, text = str(beside), read_bounded(beside).decode("utf-8", "replace")
     else:
         return tuple(f"class {number}" for number in range(int(largest.max()) + 1))
     names = tuple(line.strip() for line in text.splitlines() if line.strip())

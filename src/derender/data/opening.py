@@ -67,7 +67,8 @@ class ListedStream(Stream):
         table, count = self.table, len(self.table.files)
         for row in range(start, count):
             file, box = table.files[row], None if table.boxes is None else table.boxes[row]
-            yield Sample(file, partial(self.files.read, file), (row + 1) / count, box=box, fit=self.fit)
+            read, size = partial(self.files.read, file), partial(self.files.size, file)
+            yield Sample(file, read, (row + 1) / count, box=box, fit=self.fit, size=size)
 
     def identity(self) -> object:
         """A digest of the layout, and of the name, size and checksum or time of change of every image."""

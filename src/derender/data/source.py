@@ -4,7 +4,6 @@ Names are posix paths relative to the source, sorted. Nothing is ever extracted,
 can write anywhere. Nested archives are not opened.
 """
 
-import stat
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Int64
 
+from derender.storage.bounded import read_bounded
 from derender.storage.places import SUFFIXES
 
 FILE_LIMIT_BYTES = 512 << 20
@@ -46,6 +46,10 @@ class Source(ABC):
     @abstractmethod
     def stamps(self, files: Sequence[str]) -> Int64[np.ndarray, "n 2"]:
         """Two numbers a file that change with its content: its size, and checksum or time of change."""
+
+    def size(self, file: str) -> int:
+        """The bytes of one file, unpacked."""
+        return int(self.stamps((file,))[0, 0])
 
     def close(self) -> None:  # noqa: B027  (folders hold nothing open)
         """Release what the source holds open."""
@@ -93,7 +97,7 @@ class FileSource(Source):
         return self.path
 
     def read(self, file: str) -> bytes:
-        return read_bounded(self.on_disk(file))
+        return read_bounded(self.on_disk(file), FILE_LIMIT_BYTES)
 
     def stamps(self, files: Sequence[str]) -> Int64[np.ndarray, "n 2"]:
         return stamps_of(map(self.on_disk, files))
@@ -103,22 +107,6 @@ def stamps_of(paths: Iterable[Path]) -> Int64[np.ndarray, "n 2"]:
     """Size and time of change in nanoseconds of files on disk."""
     found = [path.stat() for path in paths]
     return np.array([(one.st_size, one.st_mtime_ns) for one in found], np.int64).reshape(-1, 2)
-
-
-def read_bounded(path: Path) -> bytes:
-    """A file's content; ValueError when it is no regular file or larger than ``FILE_LIMIT_BYTES``."""
-    status = path.stat()
-    if not stat.S_ISREG(status.st_mode):  # a pipe may never end, a device never does
-        raise ValueError("not a regular file")
-    if status.st_size > FILE_LIMIT_BYTES:
-        raise ValueError(
-            f"file of {status.st_size >> 20:,} MiB is larger than {FILE_LIMIT_BYTES >> 20:,} MiB"
-        )
-    with path.open("rb") as stream:
-        content = stream.read(status.st_size + 1)
-    if len(content) > status.st_size:
-        raise ValueError("the file grew while it was read")
-    return content
 
 
 def is_image(file: str) -> bool:

@@ -26,6 +26,7 @@ class Sample:
         share: how much of the stream lies before the next sample, 0..1; None where that is unknown.
         labels: value by column; a column that is not here is unknown for this image.
         box: the part of the image that is read (``Table.boxes``), or None for all of it.
+        size: gives the number of these bytes, 0 where they are in memory already.
         fit: what becomes of it if it is not square and its reader does not say.
     """
 
@@ -36,6 +37,7 @@ class Sample:
     partition: str = ""  # the owners' own split ("train", "validation", "test"), or ""
     box: np.ndarray | None = None
     fit: str = "crop"
+    size: Callable[[], int] = int
 
 
 class Stream(ABC):

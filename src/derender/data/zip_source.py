@@ -5,6 +5,7 @@ member that reaches into what comes after it (members within each other are how 
 endless ones), another size or CRC-32 than in the directory, and a size beyond ``FILE_LIMIT_BYTES``.
 """
 
+import bz2
 import lzma
 import re
 import struct
@@ -17,10 +18,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Int64
 
-from derender.data.source import FILE_LIMIT_BYTES, Skipped, Source
+from derender.data.image import HEAD_BYTES, LARGE_BYTES, Unreadable, refuse_by_header
+from derender.data.source import FILE_LIMIT_BYTES, Skipped, Source, is_image
 
 _HEADER_BYTES = 30
-_ENCRYPTED = 1
+_ENCRYPTED, _STEP = 1, 4096
 _HIDDEN = re.compile(r"(^|/)(\.(?!\.?(/|$))|__MACOSX(/|$))|/$|^$")
 _UNSAFE = re.compile(r"^/|^[^/]*:|(^|/)\.\.(/|$)")
 
@@ -61,20 +63,45 @@ class ZipSource(Source):
 
     def read(self, file: str) -> bytes:
         member = self._members[file]
-        if member.file_size > FILE_LIMIT_BYTES:
-            raise ValueError(
-                f"unpacks to {member.file_size >> 20:,} MiB, more than {FILE_LIMIT_BYTES >> 20:,} MiB"
-            )
+        size, as_asked = member.file_size, member.compress_type in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+        large = size > LARGE_BYTES and is_image(file)
+        most = LARGE_BYTES if large and not as_asked else FILE_LIMIT_BYTES
+        if size > most:
+            raise ValueError(f"unpacks to {size >> 20:,} MiB, more than {most >> 20:,} MiB")
         end = member.header_offset + _HEADER_BYTES + len(member.orig_filename) + member.compress_size
         try:
             if end > self._following[member.header_offset]:
                 raise ValueError("it reaches into what comes after it")
-            with self._archive.open(member) as stream:
-                content = stream.read(member.file_size)  # without a number it would unpack without end
-            if len(content) != member.file_size:
+            if member.compress_type == zipfile.ZIP_BZIP2:
+                content = self._from_bzip2(member)
+            else:
+                with self._archive.open(member) as stream:
+                    content = stream.read(min(size, HEAD_BYTES if as_asked else _STEP))
+                    if large:
+                        refuse_by_header(content, size)
+                    if as_asked:
+                        content += stream.read(size - len(content))  # without a number it would never end
+                    else:  # the fewer packed bytes zipfile reads, the less it unpacks at once
+                        content += b"".join(stream.read(_STEP) for _ in range(0, size - len(content), _STEP))
+            if len(content) != size:
                 raise ValueError("it is shorter than the directory says")
+        except Unreadable:
+            raise
         except _UNPACKING_ERRORS as problem:
             raise ValueError(f"cannot be unpacked: {problem}") from problem
+        return content
+
+    def _from_bzip2(self, member: zipfile.ZipInfo) -> bytes:
+        """The content, no more of it than the directory says: zipfile would unpack 4 KB to gigabytes."""
+        packed = zipfile.ZipInfo(member.orig_filename)
+        packed.header_offset, packed.flag_bits = member.header_offset, member.flag_bits
+        packed.compress_size = packed.file_size = member.compress_size
+        with self._archive.open(packed) as stream:
+            content = bz2.BZ2Decompressor().decompress(
+                stream.read(member.compress_size), member.file_size + 1
+            )
+        if zlib.crc32(content) != member.CRC:
+            raise ValueError("its CRC-32 is not that of the directory")
         return content
 
     def stamps(self, files: Sequence[str]) -> Int64[np.ndarray, "n 2"]:

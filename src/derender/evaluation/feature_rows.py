@@ -12,16 +12,18 @@ from typing import Any, TypeGuard
 
 import numpy as np
 
+from derender.baselines import load_baseline
 from derender.data import ImageSet
 from derender.evaluation.memory import Arrays, Memory
 from derender.evaluation.options import DEFAULT_FACTORS, Options
 from derender.features import FeatureTable, embed_images, missing, model_fingerprint, table_labels
-from derender.inputs import Progress, as_model
+from derender.inputs import Progress, as_model, device_named
 from derender.model import Derenderer
+from derender.storage.folder import CONFIG_FILE, saved_config
 
 ModelSource = Derenderer | str | Path
 FeatureSource = FeatureTable | ModelSource
-"""A table or its ``.parquet`` file; a model or its name."""
+"""A table or its ``.parquet`` file; a model or its name, or a baseline's run folder."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +81,7 @@ def _row(name: str, runs: Sequence[FeatureSource], options: Options) -> FeatureR
         elif options.images is None:
             raise ValueError(f"model {name!r} needs images to embed: give images")
         else:
-            model = as_model(run, device=options.device)
+            model = opened(run, options.device)
             progress = options.stage(f"embedding {name}")
             tables.append(embedded_table(model, options.at(model.image_size), options.memory, progress))
     chosen = options.chosen
@@ -104,6 +106,15 @@ def one_row(features: FeatureSource, options: Options) -> FeatureRow:
     return replace(row, name=" + ".join(table.factors))
 
 
+def opened(source: ModelSource, device: str) -> Any:
+    """A model ready for use: ours, or the baseline in a run folder."""
+    if not isinstance(source, Derenderer):
+        for folder in (Path(source), Path(source) / "model"):
+            if (folder / CONFIG_FILE).is_file() and "baseline" in saved_config(folder):
+                return load_baseline(folder).to(device_named(device))
+    return as_model(source, device=device)
+
+
 def is_model(source: FeatureSource) -> TypeGuard[ModelSource]:
     """Whether a source is a model or its name, not a feature table or its file."""
     if isinstance(source, FeatureTable | Derenderer):
@@ -117,7 +128,7 @@ def runs_of(runs: FeatureSource | Sequence[FeatureSource]) -> list[FeatureSource
 
 
 def embedded_table(
-    model: Derenderer, images: ImageSet, memory: Memory, progress: Progress | None = None
+    model: Any, images: ImageSet, memory: Memory, progress: Progress | None = None
 ) -> FeatureTable:
     """A model's features of images, cached by the content of both."""
     weights = model_fingerprint(model)

@@ -1,8 +1,9 @@
-"""The paper's head trained together with the encoders under it: models, and untrained ones as their control.
+"""The paper's head trained together with the encoders under it: models, baselines, and untrained controls.
 
 Source: Klinghoffer et al., ECCV 2022, Sec. 4.4 and Table 2 ("Finetune"). Encoders and head share Adam 2e-4,
     100 epochs and batches of 64, as the frozen head; the paper does not say whether the encoders had a rate
-    of their own. An untrained model under the same protocol is the control: a supervised training from
+    of their own. Of a baseline the whole network is trained; a ResNet-18 with fresh weights is the paper's
+    supervised row. An untrained model under the same protocol is the control: a supervised training from
     nothing. Controls without an encoder (pixels, principal components) have nothing below the head to
     train: theirs are the answers of the head alone. Leaves out the rendering objective beside the task.
 """
@@ -17,13 +18,15 @@ from torch import nn
 
 from derender.data import as_float
 from derender.evaluation.controls import UNTRAINED
-from derender.evaluation.feature_rows import ModelSource, Prepared
+from derender.evaluation.feature_rows import ModelSource, Prepared, opened
 from derender.evaluation.linear_probes import PAPER_HEAD, HeadSettings, head_loss, probabilities, probe_runs
 from derender.evaluation.linear_task import Rows, Task
 from derender.evaluation.options import Options
 from derender.features import model_fingerprint
-from derender.inputs import Progress, as_model
+from derender.inputs import Progress, device_named
 from derender.model import Derenderer
+
+SUPERVISED = "ResNet-18, supervised"
 
 
 def finetune(
@@ -40,21 +43,28 @@ def finetune(
 ) -> np.ndarray:
     """Train copies of the factors' encoders with a new head, answer for the test rows: (T, A) probabilities.
 
-    The model itself stays as it was. ``images`` are (N, 3, H, W) uint8, ``rows`` (n,) training rows; the seed
-    is of the head's start and the order of images; ``progress`` is called with (epochs done, epochs in all).
+    The model, ours or a baseline, stays as it was. ``images`` are (N, 3, H, W) uint8, ``rows`` (n,) training
+    rows; the seed is of the head's start and the order of images; ``progress`` is called with (epochs done,
+    epochs in all). A ValueError: features without a gradient.
     """
     device = model.device
-    nets = nn.ModuleDict({name: copy.deepcopy(model.nets[name]) for name in factors}).to(device)
+    ours = isinstance(model, Derenderer)
+    chosen = {name: model.nets[name] for name in factors} if ours else {"whole": model}
+    nets: Any = nn.ModuleDict(copy.deepcopy(chosen)).to(device)
     nets.requires_grad_(True).train()
 
     def embed(numbers: np.ndarray) -> torch.Tensor:
         pictures = as_float(np.ascontiguousarray(images[numbers])).to(device)
-        return torch.cat([nets[name].encode(pictures) for name in factors], dim=1)  # type: ignore[operator]
+        if not ours:
+            return torch.cat([*nets["whole"].embed(pictures).values()], dim=1)
+        return torch.cat([net.encode(pictures) for net in nets.values()], dim=1)
 
     generator = torch.Generator().manual_seed(seed)
     targets = torch.from_numpy(task.targets).float().to(device)
-    with torch.no_grad():
-        width = embed(rows[:1]).shape[1]
+    first = embed(rows[:2])
+    if not first.requires_grad:
+        raise ValueError(f"features of {type(model).__name__} have no gradient: leave it out of finetune")
+    width = first.shape[1]
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         head = nn.Linear(width, targets.shape[1]).to(device)
@@ -83,16 +93,20 @@ def finetuned_answers(
     seeds: Sequence[int],
     settings: HeadSettings,
     options: Options,
+    supervised: bool = False,
 ) -> dict[str, dict[int, np.ndarray]]:
     """By row name and number of labels, (S, T, A) answers: models, untrained ones, and other controls' heads.
+
+    ``supervised`` adds a ResNet-18 with fresh weights.
 
     Seed s trains run s of a model modulo their number. Controls of ``ready`` without an encoder answer by the
     head alone; ``options`` hold the images and the factors whose encoders are trained.
     """
 
-    def answers(model: Derenderer, count: int, at: int, what: str) -> np.ndarray:
+    def answers(model: Any, count: int, at: int, what: str) -> np.ndarray:
         rows, images = split.train[count][at], options.at(model.image_size, ready.table.files).images
-        chosen = list(options.chosen or (factor.name for factor in model.factors))
+        own = [factor.name for factor in model.factors] if isinstance(model, Derenderer) else model.chosen
+        chosen = list((isinstance(model, Derenderer) and options.chosen) or own)
         inputs = {
             "weights": model_fingerprint(model), "images": images, "targets": task.targets, "kind": task.kind,
             "rows": rows, "tested": split.test, "seed": seeds[at], "factors": chosen,
@@ -106,18 +120,24 @@ def finetuned_answers(
             lambda: finetune(model, images, task, rows, split.test, factors=chosen, **how),
         )
 
-    trained = {name: [as_model(run, device=options.device) for run in runs] for name, runs in models.items()}
-    first = next(iter(trained.values()))[0]
-    fresh = [
-        Derenderer.seeded(first.settings, seed, factors=first.factors).to(first.device).eval()
-        for seed in seeds
-    ]
+    trained = {name: [opened(run, options.device) for run in runs] for name, runs in models.items()}
+    first = next((run for runs in trained.values() for run in runs if isinstance(run, Derenderer)), None)
+    if first is not None:
+        trained[UNTRAINED] = [
+            Derenderer.seeded(first.settings, seed, factors=first.factors).to(first.device).eval()
+            for seed in seeds
+        ]
+    if supervised:
+        from derender.baselines.supervised import fresh_resnet18
+
+        size = next(iter(trained.values()))[0].image_size
+        trained[SUPERVISED] = [fresh_resnet18(size, seed).to(device_named(options.device)) for seed in seeds]
     found = {
         name: {
             count: np.stack([answers(runs[at % len(runs)], count, at, name) for at in range(len(seeds))])
             for count in split.train
         }
-        for name, runs in {**trained, UNTRAINED: fresh}.items()
+        for name, runs in trained.items()
     }
     for name in ready.controls:
         if not name.startswith(UNTRAINED):

@@ -156,16 +156,18 @@ def compare_prepared(
     heads: Sequence[str] = HEADS,
     settings: HeadSettings = PAPER_HEAD,
     models: Mapping[str, Sequence[ModelSource]] | None = None,
+    supervised: bool = False,
     **rows: Any,
 ) -> LinearComparison:
     """Ask rows that were put side by side for all their labels, in their owners' split where there is one.
 
-    ``models``, by name, are trained together with the head; ``rows`` are test_fraction and groups of
-    ``choose_rows``.
+    ``models``, by name, are trained together with the head; with ``supervised`` a ResNet-18, too. ``rows``
+    are test_fraction and groups of ``choose_rows``.
     """
     task = task_of(ready.labels)
     split = choose_rows(task, counts=counts, seeds=seeds, **ready.split, **rows)
-    tuned = finetuned_answers(models, ready, task, split, seeds, settings, options) if models else None
+    how = (ready, task, split, seeds, settings, options, supervised)
+    tuned = finetuned_answers(models, *how) if models else None
     return compare_linear(
         ready.features, task, split, seeds, controls=ready.controls, heads=heads, finetuned=tuned,
         settings=settings, resample_count=options.resamples, memory=options.memory,

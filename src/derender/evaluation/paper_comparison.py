@@ -43,6 +43,7 @@ def compare(
     counts: Sequence[int] = (100, 500, 1_000),
     seeds: int = 5,
     finetune: bool = False,
+    supervised: bool = False,
     masks: str | Path | None = None,
     epochs: int = 20,
     **options: Any,
@@ -56,7 +57,8 @@ def compare(
         method: of clustering tables: "ward", "finch" or "k-means".
         counts: of the linear table: numbers of labelled rows to learn from.
         seeds: random training subsets; of segmentation runs of each net.
-        finetune: of the linear table: also train the encoders of the models with the head.
+        finetune: of the linear table: also train models, ours and baselines', with the head.
+        supervised: beside them a ResNet-18 with fresh weights, trained in the same way.
         masks, epochs: of segmentation: a folder of masks that are not with the images; of training.
         options: factors, seed, resamples, cache, ...: the fields of ``Options``.
 
@@ -97,41 +99,46 @@ def compare(
         raise ValueError(f"model {next(iter(models))!r} needs images to embed: give images")
     if finetune and (spec.kind != "linear" or not models):
         raise ValueError("finetune trains the encoders of models: give the linear table, models and images")
+    if supervised and not finetune:
+        raise ValueError("supervised is a row among fine-tuned models: give finetune, too")
     rows = with_controls(rows_of(features, how), how)
     first = rows[0].tables[0]
     parts = [part for part in spec.parts if part.columns(first)]
     if not parts:
         needed = " or ".join(", ".join(part.labels) for part in spec.parts)
         have = ", ".join(first.labels) or "none"
-        raise ValueError(
-            f"table {table!r} needs labels ({needed}), the features have {have}: embed other data"
-        )
+        raise ValueError(f"table {table!r} needs labels ({needed}), the features have {have}: embed others")
     tables, values, notes = [], {}, list(how.notes)
     for part in parts:
         columns = part.columns(first)
         if part.labels == (ATTRIBUTES,):
             columns, left_out = chosen_labels(first, None, True, 2 if spec.kind == "linear" else 1)
             notes += left_out
-        ready = prepare(rows, columns, **part.rows(first))
+        out = part.left_out(first)
+        if out.any():
+            notes.append(f"{part.name}: {out.sum():,} rows left out that are none of the paper's classes")
+        kept = [replace(row, tables=tuple(one.select(~out) for one in row.tables)) for row in rows]
+        ready = prepare(kept, columns, **part.rows(first))
         layout = str(first.origin.get("layout", "unknown data"))
         beside = f"beside the paper's Table {spec.number}"
         more: dict[str, Any] = {"paper": part.paper}
         if spec.kind == "cluster":
-            found = compare_clusterings(
-                ready.features, ready.labels, controls=ready.controls, method=method,
-                resample_count=how.resamples, seed=how.seed, memory=how.memory,
-            )  # fmt: skip
+            asked = (ready.features, ready.labels)
+            again = {"controls": ready.controls, "resample_count": how.resamples, "seed": how.seed}
+            found = compare_clusterings(*asked, method=method, memory=how.memory, **again)
             more |= {"n_dropped_before": ready.n_dropped, "differs": part.differs(layout, found.n_rows)}
             shown = {name: CLUSTER_COLUMNS[name] for name in ("accuracy", "f1")}
+            scored = {row.name: row for row in found.rows}
+            if method == "ward":  # the paper's appendix has FINCH beside it
+                finch = compare_clusterings(*asked, method="finch", memory=how.memory, **again)
+                more["finch"] = finch.numbers()
+                scored |= {f"{row.name}, FINCH": row for row in finch.rows if row.name in ready.features}
             ours = {
-                row.name: {
-                    **{name: row.scores[name].value for name in shown},
-                    "interval": interval_of(row, "accuracy"),
-                }
-                for row in found.rows
+                name: {"interval": interval_of(row, "accuracy")} | {s: row.scores[s].value for s in shown}
+                for name, row in scored.items()
             }
             shown["interval"] = interval_column(shown["accuracy"])
-            quiet = [row.name for row in found.rows if row.control]
+            quiet = [name for name, row in scored.items() if row.control]
             caption = f"{part.name}, {beside} ({METHODS[method]})"
             tables += [
                 beside_the_paper(caption, shown, ours, quiet, part.paper, more["differs"]),
@@ -139,13 +146,12 @@ def compare(
                 verdict_table(found.rows, CLUSTER_COLUMNS, f"{part.name}: above the strongest control?"),
             ]
             if ready.n_dropped:
-                notes.append(
-                    f"{part.name}: {ready.n_dropped:,} rows without a label left out before averaging"
-                )
+                notes.append(f"{part.name}: {ready.n_dropped:,} rows without a label left out")
         else:
             found = compare_prepared(
-                ready, counts, how.seeds(seeds), how, models=models if finetune else None
-            )
+                ready, counts, how.seeds(seeds), how, models=models if finetune else None,
+                supervised=supervised,
+            )  # fmt: skip
             more |= {"differs": part.differs(layout, len(ready.table))}
             caption = f"{part.name}: accuracy of the paper's head, {beside}"
             tables += [heads_table(caption, found, part.paper, more["differs"]), *linear_tables(found)]

@@ -11,6 +11,9 @@ from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any, Literal
 
+import numpy as np
+from jaxtyping import Bool
+
 from derender.evaluation.feature_rows import attribute_columns
 from derender.features import FeatureTable, named
 
@@ -66,6 +69,15 @@ class Part:
         if self.name == "identity" and "track" in table.labels:
             return {"mean_by": (*self.columns(table), "track")}
         return {} if self.size is None else {"min_count": self.size, "max_count": self.size}
+
+    def left_out(self, table: FeatureTable) -> Bool[np.ndarray, " n"]:
+        """The rows that are none of the paper's: background people of tracks, sports cars but Ferraris."""
+        if self.name == "identity" and "track" in table.labels:
+            return np.char.startswith(table.label(self.columns(table)[0]).astype(str), "unknown_")
+        if self.name == "cars" and {"name", "class"} <= table.labels.keys():
+            names = np.char.lower(table.label("name").astype(str))
+            return (table.label("class") == "sports") & (np.char.find(names, "ferrari") < 0)
+        return np.zeros(len(table), bool)
 
     def differs(self, layout: str, n_rows: int, rows: str = "rows") -> str:
         """What to know before comparing a result on these data with the paper's."""

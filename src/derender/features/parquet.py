@@ -15,9 +15,11 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from pydantic import TypeAdapter
 
 from derender.data import opened_parquet, suggestion
 from derender.storage.atomic import atomic_file
+from derender.storage.bounded import parse_json
 
 FORMAT = 1
 METADATA_KEY = b"derender"
@@ -133,9 +135,9 @@ def _described(metadata: Mapping[bytes, bytes] | None, path: Path) -> dict[str, 
     if text is None:
         return {}
     try:
-        described = json.loads(text)
-        version = int(described["format"])
-    except (ValueError, KeyError, TypeError) as error:
+        described = parse_json(text, dict[str, Any])
+        version = TypeAdapter(int).validate_python(described.get("format"))
+    except ValueError as error:
         raise ValueError(f"the metadata of {path} is damaged: make it again with 'derender embed'") from error
     if version > FORMAT:
         raise ValueError(f"{path} has format {version}, this version reads up to {FORMAT}: update derender")

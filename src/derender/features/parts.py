@@ -24,6 +24,7 @@ from derender.features.blocks import Block
 from derender.features.parquet import Columns, factor_column, factor_values
 from derender.features.table import check_finite
 from derender.storage.atomic import Damaged, DamageNoticed, atomic_file, measured
+from derender.storage.bounded import parse_json, read_json
 
 PLAN = "plan.json"
 LISTED_SKIPPED = 20
@@ -142,7 +143,7 @@ class Parts:
         if not self.folder.is_dir():
             raise ValueError(f"{self.folder} is in the way: delete it")
         try:
-            stored = json.loads((self.folder / PLAN).read_text())
+            stored = read_json(self.folder / PLAN, dict[str, Any])
         except (OSError, ValueError):
             stored = None
         if stored == plan:
@@ -225,7 +226,7 @@ def _checked_note(file: Path, number: int) -> dict[str, Any]:
     if name[2] is not None and measured(file)[1] != int(name[2], 16):
         raise Damaged("its checksum differs")
     try:
-        note = json.loads((pq.read_schema(file).metadata or {})[_KEY])
+        note = parse_json((pq.read_schema(file).metadata or {})[_KEY], dict[str, Any])
         Progressed().join(note)
     except (pa.ArrowException, OSError, ValueError, LookupError, TypeError) as error:
         raise Damaged("it cannot be read") from error

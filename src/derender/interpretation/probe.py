@@ -14,8 +14,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from safetensors import SafetensorError
-from safetensors.numpy import load_file, save
+from safetensors.numpy import save
 from scipy.special import expit, softmax
 
 from derender.data import suggestion
@@ -23,7 +22,10 @@ from derender.evaluation.linear_logistic import axes_of, fit_logistic, solve_log
 from derender.evaluation.linear_probes import PAPER_HEAD, HeadSettings, fitted_heads
 from derender.evaluation.linear_task import Task, task_of
 from derender.features import missing
+from derender.settings import Settings
 from derender.storage.atomic import new_folder
+from derender.storage.bounded import read_json
+from derender.storage.tensors import read_tensors
 
 HEADS = ("logistic", "linear")
 PENALTIES = (1e-1, 1.0, 1e1)
@@ -182,6 +184,14 @@ class Probe:
         return Path(folder)
 
 
+class _ProbeFile(Settings):
+    format: int
+    kind: str
+    names: tuple[str, ...]
+    sizes: tuple[tuple[str, int], ...]
+    head: str
+
+
 def load_probe(folder: str | Path) -> Probe:
     """What ``Probe.save`` wrote.
 
@@ -195,15 +205,13 @@ def load_probe(folder: str | Path) -> Probe:
             f"no probe at {folder}: give a folder that holds {CONFIG_FILE} and {WEIGHTS_FILE}"
         )
     try:
-        facts = json.loads((folder / CONFIG_FILE).read_text())
-        if facts["format"] > FORMAT:
-            raise ValueError(f"format {facts['format']} is newer than this version of derender")
-        arrays = load_file(folder / WEIGHTS_FILE)
-        sizes = {str(name): int(size) for name, size in facts["sizes"]}
-        return Probe(
-            facts["kind"], tuple(facts["names"]), sizes, arrays["weight"], arrays["bias"], facts["head"]
-        )
-    except (KeyError, TypeError, ValueError, SafetensorError) as error:
+        facts = read_json(folder / CONFIG_FILE, _ProbeFile)
+        if facts.format > FORMAT:
+            raise ValueError(f"format {facts.format} is newer than this version of derender")
+        arrays = {name: value.numpy() for name, value in read_tensors(folder / WEIGHTS_FILE).items()}
+        sizes = dict(facts.sizes)
+        return Probe(facts.kind, facts.names, sizes, arrays["weight"], arrays["bias"], facts.head)
+    except (KeyError, ValueError) as error:
         raise ValueError(f"the probe in {folder} cannot be read ({error}): fit it again") from error
 
 

@@ -6,11 +6,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from derender.data import ImageSet, split_indices
 from derender.inputs import as_images, as_model, copy_split
 from derender.learn.runs import Changes, OnImages, texts_of
 from derender.model import Derenderer
+from derender.storage.atomic import new_folder
 from derender.training.config import FeatureSettings, with_changes
 from derender.training.distillation import RefineConfig
 from derender.training.distillation import refine as distil
@@ -93,8 +95,7 @@ def refine(
     training, held_out = work.pixels[split.train], work.pixels[split.validation]
     refined = distil(work.model, training, held_out, config, seed=seed, progress=work.progress)
     scores = {"held_out": len(held_out), "errors": refined.errors, "gaps": refined.gaps}
-    made = work.saved(refined.model, scores, split=work.part == "train")
-    store_errors(made.folder, held_out)
+    made = work.saved(refined.model, scores, split=work.part == "train", held_out=held_out)
     return replace(made, images=len(split.train))
 
 
@@ -135,9 +136,16 @@ class _Copying:
         if on_images is not None:
             on_images(self.images)
 
-    def saved(self, made: Derenderer, scores: dict[str, Any], *, split: bool = True) -> ModelCopy:
-        """Save the copy, and with ``split`` that of the original: other images were not seen."""
-        folder = made.save(self.out, overwrite=self.overwrite)
-        if split and self.source is not None:
-            copy_split(folder, self.source)
-        return ModelCopy(folder, made, len(self.images), scores)
+    def saved(
+        self, made: Derenderer, scores: dict[str, Any], *, split: bool = True, held_out: Tensor | None = None
+    ) -> ModelCopy:
+        """Save the copy with the errors of held-out images, and with ``split`` that of the original: other
+        images were not seen. Complete or not at all.
+        """
+        with new_folder(self.out, overwrite=self.overwrite) as folder:
+            made.write(folder)
+            if split and self.source is not None:
+                copy_split(folder, self.source)
+            if held_out is not None:
+                store_errors(folder, held_out)
+        return ModelCopy(self.out, made, len(self.images), scores)

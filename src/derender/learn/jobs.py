@@ -4,7 +4,6 @@ A job leaves a note beside its result: a key (the hash of its inputs), how it en
 note has the same key is not repeated; a training goes on from its last checkpoint.
 """
 
-import json
 import re
 import shutil
 import signal
@@ -36,6 +35,7 @@ from derender.model import Derenderer
 from derender.presets import MODEL_PRESETS
 from derender.settings import Settings, plain
 from derender.storage.atomic import atomic_file
+from derender.storage.bounded import read_json
 from derender.storage.folder import SplitRecord
 from derender.training import TrainingInterrupted
 from derender.training.config import with_changes
@@ -140,7 +140,7 @@ class Comparison:
     def note(self, job: Job) -> Note | None:
         """The note that a job left; None without one that can be read."""
         try:
-            return Note.model_validate_json(self.file("jobs", job, ".json").read_bytes())
+            return read_json(self.file("jobs", job, ".json"), Note)
         except (FileNotFoundError, ValueError):
             return None
 
@@ -314,7 +314,7 @@ def _scored_images(at: Comparison, job: Job, image_size: int, run: str | None = 
 def run_progress(run: Path) -> Facts:
     """Images seen and seconds of training by the last checkpoint; None where there is none."""
     try:
-        state = json.loads((run / "checkpoints" / "last" / "state.json").read_text())["state"]
+        state = read_json(run / "checkpoints" / "last" / "state.json", dict[str, Any])["state"]
         return {"images": state["images"], "seconds": state["seconds"]}
     except (OSError, ValueError, KeyError, TypeError):
         return {"images": None, "seconds": None}

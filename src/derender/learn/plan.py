@@ -9,13 +9,13 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import yaml
 from pydantic import BeforeValidator, Field
 
 from derender.baselines import BASELINES, CONTROLS, TRAINED, baseline_config
 from derender.data import suggestion
 from derender.evaluation.paper_tables import table_named
 from derender.settings import Settings
+from derender.storage.bounded import YAML_LIMIT, parse_yaml, read_text
 from derender.training.config import as_overrides, config_from_tree, resolve
 
 OURS = "derender"
@@ -131,9 +131,9 @@ def read_plan(path: str | Path) -> Plan:
     if not path.is_file():
         raise FileNotFoundError(f"no plan at {path}: give --plan the name of a YAML or TOML file")
     try:
-        text = path.read_text(encoding="utf-8")
-        tree = tomllib.loads(text) if path.suffix == ".toml" else yaml.safe_load(text)
-    except (yaml.YAMLError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        text = read_text(path, YAML_LIMIT)
+        tree = tomllib.loads(text) if path.suffix == ".toml" else parse_yaml(text)
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} cannot be read as a plan: {error}") from error
     try:
         if not isinstance(tree, dict):

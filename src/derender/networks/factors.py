@@ -179,8 +179,11 @@ def vector_net(numbers: int) -> Callable[[NetworkSettings], FactorNet]:
     return build
 
 
+GEOMETRY_START = 0.1
+"""Scale of the first weights of geometry's last layer: depth begins almost flat. Runs may set another."""
+
 FACTORS = (
-    Factor("geometry", "depth", map_net(1, 0.1), depth_from_raw, mirrored=True, perturb=exchange),
+    Factor("geometry", "depth", map_net(1, GEOMETRY_START), depth_from_raw, mirrored=True, perturb=exchange),
     Factor("albedo", "albedo", map_net(3), albedo_from_raw, mirrored=True, perturb=exchange),
     Factor("light", "light", vector_net(4), light_from_raw, mirrored=False, perturb=perturb_light),
     Factor("camera", "camera", vector_net(6), camera_from_raw, mirrored=False, perturb=perturb_camera),

@@ -21,7 +21,7 @@ from torch.serialization import safe_globals
 from derender.networks.confidence import ConfidenceNet
 from derender.networks.encoders import IMAGE_SIZES, NetworkSettings
 from derender.networks.factors import FACTORS
-from derender.storage.tensors import refuse_old_torch
+from derender.storage.tensors import check_pickle, require_plain
 
 NETS = {"netD": "geometry", "netA": "albedo", "netL": "light", "netV": "camera", "netC": "confidence"}
 OPTIONAL = "netC"
@@ -57,7 +57,7 @@ def read_checkpoint(file: str | Path) -> tuple[NetworkSettings, dict[str, Tensor
         raise ValueError(
             f"{file} holds {type(content).__name__}, no checkpoint of unsup3d: expected netD and others"
         )
-    theirs = {net: _tensors(content, net) for net in NETS}
+    theirs = {net: _tensors(content, net, file) for net in NETS}
     missing = [net for net, tensors in theirs.items() if not tensors and net != OPTIONAL]
     if missing:
         holds = ", ".join(sorted(map(str, content))[:8]) or "nothing"
@@ -77,7 +77,7 @@ def read_checkpoint(file: str | Path) -> tuple[NetworkSettings, dict[str, Tensor
 
 def _loaded(file: Path) -> Any:
     """What the file holds, with an empty object for whatever is neither tensor nor plain value."""
-    refuse_old_torch(file)
+    check_pickle(file)
     with ExitStack() as known:
         known.enter_context(warnings.catch_warnings())
         warnings.simplefilter("ignore")  # of torch, about how a file was pickled
@@ -100,12 +100,14 @@ def _loaded(file: Path) -> Any:
     raise ValueError(f"{file} holds more than {MOST_UNKNOWN} kinds of objects: no checkpoint of unsup3d")
 
 
-def _tensors(content: Mapping[Any, Any], net: str) -> dict[str, Tensor]:
+def _tensors(content: Mapping[Any, Any], net: str, file: Path) -> dict[str, Tensor]:
     """The tensors of one net in their order, whether it is an entry of its own or a prefix."""
     entry = content.get(net)
     if not isinstance(entry, Mapping):
         entry = {name: value for name, value in content.items() if str(name).startswith(f"{net}.")}
-    return {str(name): value for name, value in entry.items() if isinstance(value, Tensor)}
+    found = {str(name): value for name, value in entry.items() if isinstance(value, Tensor)}
+    require_plain(found, file)
+    return found
 
 
 def _sizes(theirs: Mapping[str, Mapping[str, Tensor]], file: Path) -> NetworkSettings:

@@ -14,10 +14,9 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from safetensors import SafetensorError
-from safetensors.torch import load_file
 from torch import Tensor, nn
 
-from derender.storage.tensors import check_fit, refuse_old_torch
+from derender.storage.tensors import check_fit, check_pickle, read_tensors, require_plain
 
 CALIBRATION_IMAGES = 256
 WHERE_TO_GET_IT = (
@@ -138,10 +137,12 @@ def _read_weights(path: Path) -> object:
                 with np.load(path, allow_pickle=False) as archive:
                     return {name: torch.from_numpy(archive[name]) for name in archive.files}
             case ".safetensors":
-                return load_file(path)
+                return read_tensors(path)
             case ".pth" | ".pt":
-                refuse_old_torch(path)
-                return torch.load(path, map_location="cpu", weights_only=True)
+                check_pickle(path)
+                weights = torch.load(path, map_location="cpu", weights_only=True)
+                require_plain(weights if isinstance(weights, dict) else {}, path)
+                return weights
     except _DAMAGED as problem:
         raise ValueError(f"VGG16 weights in {path} cannot be read ({problem})") from problem
     raise ValueError(f"VGG16 weights in {path}: expected a .npz, .safetensors or .pth file")

@@ -17,6 +17,7 @@ from torch import Generator, Tensor, nn
 
 from derender.objectives.loocc import nt_xent
 from derender.objectives.perceptual_features import CALIBRATION_IMAGES, PerceptualFeatures
+from derender.storage.bounded import parse_json
 from derender.storage.tensors import read_described, write_tensors
 
 DEFAULT_WIDTHS = (16, 32, 64)
@@ -47,7 +48,7 @@ def load_self_features(path: Path | str) -> SelfFeatures:
     if metadata.get("kind") != SelfFeatures.kind or "widths" not in metadata:
         raise ValueError(f"{path} holds no self-trained perceptual features; something else wrote it")
     try:
-        net = SelfFeatures(tuple(json.loads(metadata["widths"])))
+        net = SelfFeatures(parse_json(metadata["widths"], tuple[int, int, int]))
         net.load_state_dict(tensors)
     except (RuntimeError, ValueError, TypeError) as problem:
         raise ValueError(

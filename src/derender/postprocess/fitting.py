@@ -5,7 +5,6 @@ camera freely, so that the rendering comes near the image; coordinates far from 
 out the parameters of further factors, which stay as predicted.
 """
 
-import json
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -21,6 +20,7 @@ from derender.render import Rendering
 from derender.scene import Scene
 from derender.settings import Settings
 from derender.storage.atomic import atomic_file
+from derender.storage.bounded import parse_json
 from derender.storage.tensors import read_described, write_tensors
 
 PARAMETERS = {"geometry": "depth", "albedo": "albedo"}
@@ -178,13 +178,13 @@ class Fitting(nn.Module):
         """Read what ``save`` wrote; damage, or maps of another side than ``image_size``, is a ValueError."""
         tensors, metadata = read_described(file)
         try:
-            settings = FittingSettings.model_validate(json.loads(metadata["settings"]))
+            settings = parse_json(metadata["settings"], FittingSettings)
             means, axes = (
                 {name: tensors[f"maps.{name}_{part}"] for name in PARAMETERS.values()}
                 for part in ("mean", "axes")
             )
             fitting = cls(MorphableMaps(means, axes), settings, float(tensors["length"]))
-        except (KeyError, json.JSONDecodeError, ValidationError, RuntimeError) as error:
+        except (KeyError, ValidationError, RuntimeError) as error:
             raise ValueError(f"{Path(file).name} holds no fitting ({str(error).splitlines()[0]})") from error
         for name, mean in means.items():
             expected = (*mean.shape[:-2], image_size, image_size)

@@ -5,7 +5,6 @@ measure with more. A part that cannot be made is listed with its reason. Leaves 
 (``run``).
 """
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -32,6 +31,7 @@ from derender.report.explanation import share_chart, share_values
 from derender.report.films import animated_png
 from derender.report.matrices import card_matrices, matrix_sheet
 from derender.report.sweeps import relit_and_rotated
+from derender.storage.bounded import read_json
 
 EXAMINED, SCORED, CARD, EXPLAINED = 1_500, 200, 200, 400  # images each part looks at, at most
 SHOWN, FILMED, TRUTH_SHOWN = 5, 2, 100
@@ -121,8 +121,8 @@ def recorded_environment(run: Path) -> dict[str, Any]:
     if not file.is_file():
         return {}
     try:
-        values = json.loads(file.read_text())
-    except json.JSONDecodeError:
+        values = read_json(file, dict[str, Any])
+    except ValueError:
         return {file.name: "damaged"}
     flat: dict[str, Any] = {}
     for key, value in values.items():

@@ -17,6 +17,7 @@ from PIL import Image
 from torch import Tensor
 
 from derender.baselines import read_any_config
+from derender.data import read_photo
 from derender.model import Derenderer
 from derender.report import charts, colours
 from derender.report.decomposition import decompose_images
@@ -26,7 +27,7 @@ from derender.report.panel import labelled_grid
 from derender.training.config import TrainConfig, setting_names
 from derender.training.run_folder import RunFolder, read_metrics
 
-SHEETS_SHOWN, SHEET_PX = 4, 1080
+SHEETS_SHOWN, SHEET_PX, SHEET_PIXEL_LIMIT = 4, 1080, 20_000_000
 Columns = Callable[[Any, Tensor], Mapping[str, Tensor]]
 Metrics = Sequence[Mapping[str, Any]]
 CHARTS = {
@@ -58,6 +59,7 @@ def baseline_sheet(columns_of: Columns) -> Callable[[Any, Float[Tensor, "n 3 h w
 def run_page(folder: str | Path, evidence: Evidence | None = None) -> Page:
     """The page of a run folder, finished or not, with other evidence on its model."""
     run, evidence = RunFolder(Path(folder)), evidence or Evidence()
+    samples, unread = _samples(run)
     config = read_any_config(run.path)
     metrics, environment = read_metrics(run.path), recorded_environment(run.path)
     tree = config.model_dump(mode="json")
@@ -71,9 +73,9 @@ def run_page(folder: str | Path, evidence: Evidence | None = None) -> Page:
             if row.get("kind") == "collapse" and sign not in ("kind", "images", "seconds")
         ],
         "charts": loss_charts(metrics, CHARTS if isinstance(config, TrainConfig) else BASELINE_CHARTS),
-        "samples": _samples(run),
+        "samples": samples,
         "evidence": evidence,
-        "failures": _failures(run, config, metrics),
+        "failures": [*_failures(run, config, metrics), *unread],
         "settings": settings,
         "environment": environment,
     }
@@ -130,18 +132,23 @@ def _failures(run: RunFolder, config: Any, metrics: Metrics) -> list[str]:
     return [*lines, f"{rows:,} logged rows hold NaN or infinity."] if rows else lines
 
 
-def _samples(run: RunFolder) -> list[tuple[bytes, str]]:
-    """Sheets as JPEG at most ``SHEET_PX`` wide, first, last and evenly between, with the images seen."""
-    sheets, made = sorted(run.samples.glob("*.png")), []
+def _samples(run: RunFolder) -> tuple[list[tuple[bytes, str]], list[str]]:
+    """Sheets as JPEG at most ``SHEET_PX`` wide, first, last and evenly between, with the images seen; why
+    others cannot be drawn.
+    """
+    sheets, made, unread = sorted(run.samples.glob("*.png")), [], []
     shown = min(SHEETS_SHOWN, len(sheets))
     for place in np.linspace(0, len(sheets) - 1, shown).round().astype(int):
         stream, name = BytesIO(), sheets[place].stem
-        with Image.open(sheets[place]) as drawn:
-            small = drawn.convert("RGB")
+        try:
+            small = Image.fromarray(read_photo(sheets[place], SHEET_PIXEL_LIMIT))
+        except (ValueError, OSError) as problem:
+            unread.append(str(problem))
+            continue
         small.thumbnail((SHEET_PX, 16 * SHEET_PX), Image.Resampling.LANCZOS)
         small.save(stream, format="JPEG", quality=86)
         made.append((stream.getvalue(), f"{int(name):,}" if name.isdigit() else name))
-    return made
+    return made, unread
 
 
 def _finite(value: object) -> bool:

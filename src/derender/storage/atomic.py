@@ -16,6 +16,8 @@ from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 
+from derender.storage.bounded import read_json
+
 CHECKSUMS = "checksums.json"
 
 _LONGEST_PREFIX = 80  # of a name's characters, so that temporary names are no longer than file systems allow
@@ -115,15 +117,15 @@ def seal(folder: Path) -> None:
 def check_seal(folder: Path) -> None:
     """Compare the files with what was noted; `Damaged` names the first that is missing or differs."""
     try:
-        noted = json.loads((folder / CHECKSUMS).read_bytes())["crc32"]
-        rows = [(str(name), (int(size), int(checksum))) for name, (size, checksum) in noted.items()]
+        noted = read_json(folder / CHECKSUMS, dict[str, dict[str, tuple[int, int]]]).get("crc32", {})
     except FileNotFoundError as error:
         raise Damaged(f"{CHECKSUMS} is missing") from error
-    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
+    except (OSError, ValueError) as error:
         raise Damaged(f"{CHECKSUMS} cannot be read") from error
-    for name, (size, checksum) in rows:
+    for name, (size, checksum) in noted.items():
         try:
-            found = measured(folder / Path(name).name)
+            file = folder / Path(name).name
+            found = measured(file) if file.stat().st_size == size else (file.stat().st_size, 0)
         except OSError as error:
             raise Damaged(f"{name} is missing or cannot be read") from error
         if found != (size, checksum):

@@ -5,24 +5,22 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import torch
+from pydantic import AfterValidator, Field
 from torch import Tensor, nn
 
+from derender.settings import Settings
 from derender.storage.atomic import atomic_file
-from derender.storage.places import (
-    CONFIG_FILE,
-    SPLIT_FILE,
-    TENSOR_FILES,
-    TEXT_FILES,
-    WEIGHTS_FILE,
-)  # fmt: skip
+from derender.storage.bounded import read_json, read_text
+from derender.storage.places import CONFIG_FILE, SPLIT_FILE, TENSOR_FILES, TEXT_FILES, WEIGHTS_FILE
 from derender.storage.tensors import check_fit, read_tensors, write_tensors
 
 Net = TypeVar("Net", bound=nn.Module)
 
 FORMAT = SPLIT_FORMAT = 1
+QUANTILES = 101
 
 
 def texts_beside(folder: Path | None, tensors: Mapping[str, Tensor]) -> dict[str, str]:
@@ -37,23 +35,19 @@ def texts_beside(folder: Path | None, tensors: Mapping[str, Tensor]) -> dict[str
     ):
         return {}
     files = (folder / name for name in TEXT_FILES)
-    return {file.name: file.read_text(encoding="utf-8") for file in files if file.is_file()}
+    return {file.name: read_text(file) for file in files if file.is_file()}
 
 
 def saved_config(folder: Path) -> dict[str, Any]:
     """``config.json`` of a saved model or baseline, with its ``settings``; ValueError if damaged or newer."""
-    damaged = f"{folder / CONFIG_FILE} is damaged: copy or train the model again"
-    try:
-        config = json.loads((folder / CONFIG_FILE).read_text())
-        version, settings = config["format"], config.get("settings")
-    except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
-        raise ValueError(damaged) from error
-    if not isinstance(version, int) or version > FORMAT:
+    config = read_json(folder / CONFIG_FILE, dict[str, Any])
+    version = config.get("format")
+    if isinstance(version, int) and version > FORMAT:
         raise ValueError(
             f"{folder} was saved in format {version}, this version reads up to {FORMAT}: update derender"
         )
-    if not isinstance(settings, dict):
-        raise ValueError(damaged)
+    if version != FORMAT or not isinstance(config.get("settings"), dict):
+        raise ValueError(f"{folder / CONFIG_FILE} is damaged: copy or train the model again")
     return config
 
 
@@ -103,12 +97,18 @@ def write_config(folder: Path, factors: Sequence[str], settings: Mapping[str, An
 
 def read_weights(folder: Path, build: Callable[[], Net]) -> Net:
     """The network that ``build`` makes, with the weights of a saved folder; damage is a ValueError."""
-    weights = read_tensors(folder / WEIGHTS_FILE)
     with torch.device("meta"):  # sizes are compared before memory is taken for what the file only claims
-        check_fit(weights, build().state_dict())
+        expected = build().state_dict()
+    check_fit(weights := read_tensors(folder / WEIGHTS_FILE, like=expected), expected)
     network = build()
     network.load_state_dict(weights)
     return network
+
+
+def _ascending(values: list[float]) -> list[float]:
+    if sorted(values) != values:
+        raise ValueError("quantiles do not ascend")
+    return values
 
 
 @contextmanager
@@ -122,6 +122,19 @@ def naming_damage(folder: Path) -> Iterator[None]:
         ) from error
 
 
+class ErrorsFile(Settings):
+    """Errors of held-out images: the values (0..1) that 0, 1, ... 100 % of them do not exceed."""
+
+    format: Literal[1] = 1
+    measure: str = "mean absolute difference inside the mask, 0..1"
+    pictures: int = Field(ge=0)
+    quantiles: Annotated[
+        list[Annotated[float, Field(ge=0)]],
+        Field(min_length=QUANTILES, max_length=QUANTILES),
+        AfterValidator(_ascending),
+    ]
+
+
 @dataclass(frozen=True)
 class SplitRecord:
     """Which images a model was not trained on: its run's shares of training, validation, test, and seed.
@@ -129,6 +142,12 @@ class SplitRecord:
     Parts are drawn from files' names (``data.splits``), so that these define them.
     """
 
+    shares: tuple[float, float, float]
+    seed: int
+
+
+class _SplitFile(Settings):
+    format: Literal[1]
     shares: tuple[float, float, float]
     seed: int
 
@@ -144,11 +163,7 @@ def read_split(folder: Path) -> SplitRecord | None:
     file = folder / SPLIT_FILE
     if not file.is_file():
         return None
-    try:
-        values = json.loads(file.read_text())
-        train, validation, test = (float(share) for share in values["shares"])
-        if values["format"] == SPLIT_FORMAT and abs(train + validation + test - 1) < 1e-6:
-            return SplitRecord((train, validation, test), int(values["seed"]))
-    except (KeyError, TypeError, ValueError):
-        pass
-    raise ValueError(f"{file} is damaged or of a newer version: take the model again, or update derender")
+    stored = read_json(file, _SplitFile, "take the model again, or update derender")
+    if abs(sum(stored.shares) - 1) > 1e-6:
+        raise ValueError(f"{file} is damaged or of a newer version: its shares sum to {sum(stored.shares):g}")
+    return SplitRecord(stored.shares, stored.seed)

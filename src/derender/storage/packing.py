@@ -1,7 +1,6 @@
 """A saved model in fewer bytes: weights in half precision, large maps in bytes with a unit for each slice."""
 
 import re
-import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,6 +8,7 @@ from torch import Tensor
 
 from derender.storage import folder as files
 from derender.storage.atomic import new_folder
+from derender.storage.bounded import read_bounded
 from derender.storage.places import model_folder
 from derender.storage.tensors import UNIT, packed, read_described, write_tensors
 
@@ -58,7 +58,7 @@ def pack_model(
             before[file], after[file] = ((place / file).stat().st_size for place in (own, temporary))
         for file in (files.CONFIG_FILE, *files.TEXT_FILES):
             if (own / file).is_file():
-                shutil.copyfile(own / file, temporary / file)
+                (temporary / file).write_bytes(read_bounded(own / file))
     return Packed(folder, before, after)
 
 

@@ -13,7 +13,8 @@ from torch import Tensor
 
 from derender.storage import hub
 from derender.storage.atomic import new_folder
-from derender.storage.folder import texts_beside
+from derender.storage.bounded import parse_json
+from derender.storage.folder import ErrorsFile, texts_beside
 from derender.storage.places import CARD_FILE, ERRORS_FILE, SPLIT_FILE
 
 
@@ -109,12 +110,11 @@ def with_metadata(card: str, licence: str | None = None) -> str:
 def _errors_in_words(errors: str) -> str:
     """Median and 99th percentile of held-out errors (JSON); empty where there are none."""
     try:
-        stored = json.loads(errors)
-        quantiles, count = [float(value) for value in stored["quantiles"]], int(stored["pictures"])
-        median, high = quantiles[50], quantiles[99]
-    except (ValueError, LookupError, TypeError):
+        stored = parse_json(errors, ErrorsFile)
+    except ValueError:
         return ""
+    median, high = stored.quantiles[50], stored.quantiles[99]
     return (
-        f"Reconstructions of {count:,} images it was not trained on have a masked L1 of {median:.4f} in the "
-        f"median and {high:.4f} at the 99th percentile (0..1, best 0)."
+        f"Reconstructions of {stored.pictures:,} images it was not trained on have a masked L1 of "
+        f"{median:.4f} in the median and {high:.4f} at the 99th percentile (0..1, best 0)."
     )

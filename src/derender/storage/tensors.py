@@ -6,17 +6,22 @@ restricted reader runs no code, but before PyTorch 2.10 a crafted file could cor
 (CVE-2026-24747). derender never writes a pickle.
 """
 
+import zipfile
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
+from derender.storage.bounded import require_regular
+
 CHECKSUM = "crc32"
 SAFE_SINCE = "2.10.0"  # version of PyTorch that reads pickles of weights safely
+LIMIT_BYTES, _HEADER_BYTES = 2 << 30, 1 << 20
 UNIT = ".unit"
 """A tensor of bytes is in the unit that lies beside it under its name and this: read as their product."""
 
@@ -29,14 +34,22 @@ def write_tensors(
     Path(file).write_bytes(save(plain, {**(metadata or {}), CHECKSUM: checksum(plain)}))
 
 
-def read_tensors(file: str | Path) -> dict[str, Tensor]:
-    """The tensors of a safetensors file, on the CPU; damage is a ValueError, no file an OSError."""
-    return read_described(file)[0]
+def read_tensors(file: str | Path, like: Mapping[str, Tensor] | None = None) -> dict[str, Tensor]:
+    """The tensors of a safetensors file, on the CPU; damage is a ValueError, no file an OSError.
+
+    A file much larger than the expected tensors, which are ``like`` these, or than 2 GiB is not opened.
+    """
+    return read_described(file, like)[0]
 
 
-def read_described(file: str | Path) -> tuple[dict[str, Tensor], dict[str, str]]:
+def read_described(
+    file: str | Path, like: Mapping[str, Tensor] | None = None
+) -> tuple[dict[str, Tensor], dict[str, str]]:
     """As ``read_tensors``, with the file's metadata."""
+    expected = None if like is None else sum(value.numel() for value in like.values())
+    most = LIMIT_BYTES if expected is None else min(LIMIT_BYTES, 16 * expected + _HEADER_BYTES)
     try:
+        require_regular(Path(file), most)
         with safe_open(file, framework="pt") as stored:
             metadata = dict(stored.metadata() or {})
             tensors = {name: stored.get_tensor(name) for name in stored.keys()}  # noqa: SIM118, not a mapping
@@ -76,6 +89,18 @@ def packed(value: Tensor, along: int) -> tuple[Tensor, Tensor]:
     return (value / unit).round().to(torch.int8), unit.float()
 
 
+def require_plain(tensors: Mapping[str, Any], file: Path) -> None:
+    """Raise ValueError for a tensor of a pickle that is not dense numbers on the CPU, all of them stored."""
+    for name, value in tensors.items():
+        if not isinstance(value, Tensor):
+            continue
+        odd = value.layout is not torch.strided or value.is_nested or value.is_meta or value.is_quantized
+        if odd or value.is_complex():
+            raise ValueError(f"{file}: {name!r} is no dense tensor of real numbers: not opened")
+        if value.untyped_storage().nbytes() < value.numel() * value.element_size():
+            raise ValueError(f"{file}: {name!r} claims {tuple(value.shape)}, more numbers than are stored")
+
+
 def checksum(tensors: Mapping[str, Tensor]) -> str:
     """Eight hexadecimal digits that change with any name, kind, shape or bit."""
     found = 0
@@ -91,8 +116,17 @@ def reads_safely() -> bool:
     return torch.__version__ >= SAFE_SINCE
 
 
-def refuse_old_torch(file: str | Path) -> None:
-    """Raise ValueError where a crafted ``file`` could make the installed PyTorch run code."""
+def check_pickle(file: Path) -> None:
+    """Raise ValueError where a ``file`` is no regular file, larger than 2 GiB, unpacks to more than it holds,
+    or could, crafted, make the installed PyTorch run code."""
+    try:
+        size = require_regular(file, LIMIT_BYTES)
+        if zipfile.is_zipfile(file):
+            with zipfile.ZipFile(file) as archive:
+                if sum(member.file_size for member in archive.infolist()) > size:
+                    raise ValueError("it unpacks to more bytes than it holds")
+    except (ValueError, zipfile.BadZipFile) as error:
+        raise ValueError(f"{file} is no file of weights ({error}): not opened") from error
     if not reads_safely():
         raise ValueError(
             f"{file} is a pickle, and PyTorch {torch.__version__} can be made to run code by a crafted one "

@@ -12,20 +12,18 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import torch
-from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
+from safetensors.torch import save
 from torch import Tensor, nn
 
 from derender.storage.atomic import CHECKSUMS, Damaged, DamageNoticed, atomic_folder, check_seal, seal
-from derender.storage.tensors import check_fit
+from derender.storage.bounded import first_line, parse_json, read_bounded
+from derender.storage.tensors import check_fit, read_tensors
 
 FORMAT = 1
 WEIGHTS_FILE, OPTIMISER_FILE, STATE_FILE = "model.safetensors", "optimiser.safetensors", "state.json"
 
 _MOMENTS = ("exp_avg", "exp_avg_sq")  # Adam's
-_DAMAGE = (ValueError, RecursionError, LookupError, TypeError, AttributeError, SafetensorError, OSError)
-"""The errors that readers raise on files that are not as they were written."""
 
 
 @dataclass
@@ -43,6 +41,11 @@ class TrainState:
     best_loss: Annotated[float, Field(allow_inf_nan=False)] | None = None
     validations_since_best: Annotated[int, Field(ge=0, lt=1 << 62)] = 0
     watcher: dict[str, Any] = field(default_factory=dict)
+
+
+class _StateFile(BaseModel):
+    format: int = 0
+    state: dict[str, Any]
 
 
 class DamagedCheckpoint(Damaged):
@@ -116,28 +119,28 @@ def load_checkpoint(folder: Path, model: nn.Module, optimiser: torch.optim.Optim
             f"no checkpoint in {folder}: train without --resume, or give the run's own folder"
         )
     try:
-        stored = json.loads((folder / STATE_FILE).read_text())
-        version, counters = stored.get("format", 0), json.dumps(stored["state"])
+        stored = parse_json(read_bounded(folder / STATE_FILE), _StateFile)
+        version = stored.format
         if version or (folder / CHECKSUMS).exists():  # those of format 0 were not sealed
             check_seal(folder)
-        newer = isinstance(version, int) and version > FORMAT
-        weights = {} if newer else load_file(folder / WEIGHTS_FILE)
-        moments = {} if newer or optimiser is None else load_file(folder / OPTIMISER_FILE)
-    except _DAMAGE as error:
-        raise DamagedCheckpoint(folder, _first_line(error)) from error
+        newer, own = version > FORMAT, model.state_dict()
+        weights = {} if newer else read_tensors(folder / WEIGHTS_FILE, like=own)
+        moments = {} if newer or optimiser is None else read_tensors(folder / OPTIMISER_FILE, like=own)
+    except (ValueError, OSError) as error:
+        raise DamagedCheckpoint(folder, first_line(error)) from error
     if newer:
         raise ValueError(
             f"the checkpoint {folder} was made in format {version}, this version reads up to {FORMAT}: "
             "update derender"
         )
     try:
-        state = TypeAdapter(TrainState).validate_json(counters)
+        state = TypeAdapter(TrainState).validate_json(json.dumps(stored.state))
         fit_weights(model, weights)
         if optimiser is not None:
             _fit_moments(optimiser, moments)
     except (ValueError, RuntimeError) as error:
         raise ValueError(
-            f"the checkpoint {folder} is of another model ({_first_line(error)}): "
+            f"the checkpoint {folder} is of another model ({first_line(error)}): "
             "resume with the settings it was made with, or train in another folder"
         ) from error
     return state
@@ -172,11 +175,3 @@ def _fit_moments(optimiser: torch.optim.Optimizer, moments: Mapping[str, Tensor]
         step = entries["step"].to(own.device, torch.float32)
         likened = {name: torch.empty_like(own).copy_(entries[name]) for name in _MOMENTS}
         optimiser.state[own] = {"step": step, **likened}
-
-
-def _first_line(error: Exception) -> str:
-    """Of its message, and of a ValidationError its first finding."""
-    if isinstance(error, ValidationError):
-        first = error.errors()[0]
-        return f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
-    return str(error).splitlines()[0] if str(error) else type(error).__name__

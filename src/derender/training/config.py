@@ -17,12 +17,14 @@ from pydantic import Field, ValidationError, field_validator
 from derender.data import suggestion
 from derender.model import load
 from derender.networks import Factor
+from derender.networks.factors import GEOMETRY_START
 from derender.postprocess.fitting import FittingSettings
 from derender.presets import MODEL_PRESETS, ModelSettings, named_preset
 from derender.renderers import renderer_named
 from derender.scene.crop import DEFAULT_CROPS, CropSettings
 from derender.scene.perturb import PerturbSettings
 from derender.settings import Settings
+from derender.storage.bounded import parse_yaml
 
 
 def loocc_factors(kind: str, factors: Iterable[Factor]) -> list[Factor]:
@@ -49,6 +51,8 @@ class ObjectiveSettings(Settings):
     perceptual_weight: float = Field(default=1.0, ge=0)
     smoothness_weight: float = Field(default=0.0, ge=0)  # on steps of depth, as unsup3d for cars
     curvature_weight: float = Field(default=3.0, ge=0)  # on second differences of depth; 0 in the paper
+    photometric_weight: float = Field(default=1.0, gt=0)  # without confidence 2 is unsup3d's L1 in -1..1
+    perceptual_rescaled: bool = True  # VGG16's features by their standard deviation; not in the paper
     vgg16_path: str | None = None  # None: the file torch hub keeps
     self_features_steps: int = Field(default=600, ge=1)
     loocc: str = "none"  # factors that are perturbed, joined by +; or all
@@ -133,6 +137,7 @@ class TrainConfig(LoopSettings):
 
     preset: str = "faces"
     start_from: str | None = None  # a trained model whose weights the run begins with
+    geometry_start: float = Field(default=GEOMETRY_START, gt=0)  # last layer's first weights; 1 in the paper
     accumulate: int = Field(default=1, ge=1)  # chunks of a batch: less memory, same losses, slower
     model: ModelSettings = ModelSettings()
     objective: ObjectiveSettings = ObjectiveSettings()
@@ -191,7 +196,8 @@ LIGHT_ROBUST = {
 
 _PRESET_CHANGES: dict[str, dict[str, Any]] = {
     "paper": {
-        "objective": {"perceptual": "vgg16", "curvature_weight": 0.0},
+        "objective": {"perceptual": "vgg16", "curvature_weight": 0.0, "perceptual_rescaled": False},
+        "geometry_start": 1.0,
         "whitening": {"pictures": 0},
         "brightness": False,
     },
@@ -332,8 +338,8 @@ def _full_key(key: str, names: Iterable[str]) -> str:
 def _read_value(text: str) -> Any:
     """YAML, and numbers such as 1e-4 that YAML 1.1 takes for words."""
     try:
-        value = yaml.safe_load(text)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        value = parse_yaml(text)
+    except ValueError as error:
         raise ValueError(
             f"cannot read the value {text!r}: write a number, a word, true, false or [a, b]"
         ) from error

@@ -13,6 +13,7 @@ from torch import Generator, Tensor, nn
 
 from derender.data import ImageSet, split_indices
 from derender.model import Derenderer, load
+from derender.networks.factors import GEOMETRY_START
 from derender.objectives import load_vgg16
 from derender.objectives.perceptual import build_perceptual
 from derender.objectives.perceptual_features import PerceptualFeatures
@@ -25,6 +26,7 @@ from derender.training.config import TrainConfig
 from derender.training.distributed import ALONE, Ranks, this_rank_writes
 from derender.training.features import make_features
 from derender.training.held_out_errors import store_errors
+from derender.training.lock import locked
 from derender.training.loop import MAX_VALIDATION_IMAGES, NOT_RECONSTRUCTION, train_task
 from derender.training.process import deterministic_algorithms
 from derender.training.run_folder import RunFolder
@@ -44,9 +46,18 @@ def train(
     """
     report, folder = progress or (lambda _: None), RunFolder(Path(out))
     task = DerenderTask(config, begins=not (resume and folder.resumable))
-    result = train_task(task, images, out, resume=resume, progress=report, accelerator=accelerator, **how)
-    if not this_rank_writes() or result.stopped == "collapse":
-        return result
+    with locked(folder.path):
+        result = train_task(task, images, out, resume=resume, progress=report, accelerator=accelerator, **how)
+        if this_rank_writes() and result.stopped != "collapse":
+            _add_features(config, images, folder, report, accelerator)
+    return result
+
+
+def _add_features(
+    config: TrainConfig, images: ImageSet, folder: RunFolder, report: Callable[[Progress], None],
+    accelerator: str,
+) -> None:  # fmt: skip
+    """Estimate the features and the held-out errors of a run's model, and save both with it."""
     split = split_indices(images.files, config.split, seed=config.seed)
     on_gpu = accelerator != "cpu" and torch.cuda.is_available()
     with deterministic_algorithms(config.deterministic):
@@ -62,7 +73,6 @@ def train(
         model.features.save(folder.model)
         held_out = images.images[split.validation[:MAX_VALIDATION_IMAGES]]
         store_errors(folder.model, torch.from_numpy(np.ascontiguousarray(held_out)))
-    return result
 
 
 @dataclass(frozen=True)
@@ -95,6 +105,10 @@ class DerenderTask(TrainingTask):
         A FileNotFoundError: there is no such model; a ValueError: its weights do not fit, names the first.
         """
         model, start = Derenderer.seeded(self.config.model, self.config.seed), self.config.start_from
+        if self.config.geometry_start != GEOMETRY_START:
+            decoder: Any = model.nets["geometry"].decoder
+            with torch.no_grad():
+                decoder.last.weight.mul_(self.config.geometry_start / GEOMETRY_START)
         if start is not None and self.begins:
             try:
                 weights = load(start).state_dict()
@@ -172,7 +186,8 @@ def perceptual_of(
             run.perceptual, images, config.seed, objective.self_features_steps, progress
         )
     else:
-        features = build_perceptual("vgg16", images, weights=objective.vgg16_path, device=images.device)
+        seen = images if objective.perceptual_rescaled else None
+        features = build_perceptual("vgg16", seen, weights=objective.vgg16_path, device=images.device)
     if config.channels_last and features is not None:
         features = features.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
     return features

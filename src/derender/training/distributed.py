@@ -173,4 +173,6 @@ def leave() -> None:
 
 def this_rank_writes() -> bool:
     """Whether this process is the one that writes files: the only one, or the first of several."""
-    return not distributed.is_initialized() or distributed.get_rank() == 0
+    if distributed.is_initialized():
+        return distributed.get_rank() == 0
+    return "LOCAL_WORLD_SIZE" not in os.environ or os.environ.get("RANK", "0") == "0"

@@ -9,22 +9,21 @@ may be easy to render whatever it shows.
 from dataclasses import dataclass
 from math import inf
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
-from pydantic import Field
 from torch import Tensor
 
 from derender.data import as_float
 from derender.model import load
-from derender.settings import Settings
 from derender.storage.atomic import atomic_file
+from derender.storage.bounded import read_json
+from derender.storage.folder import QUANTILES, ErrorsFile
 from derender.storage.places import ERRORS_FILE
 from derender.training.process import evaluating
 
-QUANTILES = 101
 FEWEST = 20
 """Of fewer images nothing is saved: their largest error says little."""
 
@@ -44,13 +43,6 @@ class HeldOutErrors:
 
     quantiles: Float[np.ndarray, " 101"]
     pictures: int
-
-
-class _ErrorsFile(Settings):
-    format: Literal[1] = 1
-    measure: str = "mean absolute difference inside the mask, 0..1"
-    pictures: int = Field(ge=0)
-    quantiles: list[Annotated[float, Field(ge=0)]] = Field(min_length=QUANTILES, max_length=QUANTILES)
 
 
 def reconstruction_errors(model: Any, images: Images, batch_size: int = 64) -> Float[np.ndarray, " n"]:
@@ -109,7 +101,7 @@ def write_errors(folder: Path, errors: HeldOutErrors) -> Path:
     """Write the file into a saved model's folder, atomically."""
     quantiles = [float(f"{value:.6g}") for value in errors.quantiles.tolist()]
     with atomic_file(folder / ERRORS_FILE) as temporary:
-        stored = _ErrorsFile(pictures=errors.pictures, quantiles=quantiles)
+        stored = ErrorsFile(pictures=errors.pictures, quantiles=quantiles)
         temporary.write_text(stored.model_dump_json() + "\n")
     return folder / ERRORS_FILE
 
@@ -119,16 +111,8 @@ def read_errors(folder: Path) -> HeldOutErrors | None:
     file = folder / ERRORS_FILE
     if not file.is_file():
         return None
-    try:
-        stored = _ErrorsFile.model_validate_json(file.read_bytes())
-        if sorted(stored.quantiles) == stored.quantiles:
-            return HeldOutErrors(np.array(stored.quantiles, np.float64), stored.pictures)
-    except ValueError:
-        pass
-    raise ValueError(
-        f"{file} is damaged or of a newer version: make it again with derender evaluate reconstruction "
-        "--store"
-    )
+    stored = read_json(file, ErrorsFile, "make it again with derender evaluate reconstruction --store")
+    return HeldOutErrors(np.array(stored.quantiles, np.float64), stored.pictures)
 
 
 def reconstruction_percentile(

@@ -30,6 +30,7 @@ from derender.training.checkpoint import (
     save_checkpoint,
 )
 from derender.training.distributed import first_then_others, open_fabric, ranks_of
+from derender.training.lock import locked
 from derender.training.process import (
     TrainingInterrupted,
     deterministic_algorithms,
@@ -63,7 +64,7 @@ SampleSheet = Callable[[Any, Tensor], Image.Image]
 def train_task(task: TrainingTask, images: ImageSet, out: str | Path, **how: Any) -> TrainResult:
     """Train any task; arguments, files and errors are those of `derender.training.train`."""
     images.require(10)
-    with deterministic_algorithms(task.config.deterministic):
+    with deterministic_algorithms(task.config.deterministic), locked(Path(out)):
         run = _Run(task, images, Path(out), **how)
         with freed_memory_kept() if run.fabric.device.type == "cpu" else nullcontext():
             return run.go_on()

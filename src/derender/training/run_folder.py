@@ -7,15 +7,25 @@ from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from reprlib import Repr
-from typing import Any
+from typing import Annotated, Any, NotRequired
 
 import torch
-import yaml
+from pydantic import ConfigDict, Field, FiniteFloat
+from typing_extensions import TypedDict
 
 from derender.data import ImageSet, Split
 from derender.settings import Settings
 from derender.storage.atomic import atomic_file, remove_abandoned
+from derender.storage.bounded import (
+    LINES_LIMIT_BYTES,
+    first_line,
+    parse_json,
+    parse_yaml,
+    read_bounded,
+    read_text,
+)
 from derender.training.config import TrainConfig, config_from_tree, to_yaml, without_removed
+from derender.training.lock import LOCK_FILE
 
 FORMAT = 1
 """Of config.yaml, which says so in its first line; one that does not is of this format, too."""
@@ -25,7 +35,7 @@ _MAY_CHANGE_ON_RESUME = (
     "accumulate",
     "optimiser",  # a run that the watcher stopped goes on with a smaller rate
 )
-_BEGUN = ("environment.json", ".environment.json-", ".config.yaml-")  # there before config.yaml
+_BEGUN = (LOCK_FILE, "environment.json", ".environment.json-", ".config.yaml-")  # there before config.yaml
 _REPORTED_PACKAGES = ("derender", "torch", "numpy", "numba", "lightning-fabric", "safetensors", "pillow")
 
 
@@ -116,16 +126,27 @@ def read_settings(
     if not file.is_file():
         raise FileNotFoundError(f"no settings in {file}: give a YAML file, such as a run's config.yaml")
     try:
-        tree = yaml.safe_load(file.read_text(encoding="utf-8"))
-        found = tree.pop("format", FORMAT)
-    except (yaml.YAMLError, ValueError, RecursionError, AttributeError, TypeError) as error:
-        raise ValueError(f"{file} {otherwise}") from error
+        tree = parse_yaml(read_text(file))
+        if not isinstance(tree, dict):
+            raise ValueError("no settings by name")
+    except ValueError as error:
+        raise ValueError(f"{file} {otherwise} ({error})") from error
+    found = tree.pop("format", FORMAT)
     if not isinstance(found, int) or found > FORMAT:
         shown = Repr().repr(found)
         raise ValueError(
             f"{file} was written in format {shown}, this version reads up to {FORMAT}: update derender"
         )
     return without_removed(tree)
+
+
+class MetricsRow(TypedDict):
+    """A line of metrics.jsonl; numbers, which may be NaN, and words by further names."""
+
+    __pydantic_config__ = ConfigDict(extra="allow")  # pyright: ignore[reportGeneralTypeIssues]
+    kind: NotRequired[str]
+    images: Annotated[int, Field(ge=0)]
+    seconds: NotRequired[FiniteFloat]
 
 
 def append_metrics(run: RunFolder, row: dict[str, Any]) -> None:
@@ -135,14 +156,24 @@ def append_metrics(run: RunFolder, row: dict[str, Any]) -> None:
 
 
 def read_metrics(path: Path) -> list[dict[str, Any]]:
-    """Every complete line of a run's metrics.jsonl."""
+    """Every complete line of a run's metrics.jsonl; a ValueError names one that is none."""
     file = RunFolder(path).metrics
+    if not file.exists():
+        return []
     rows = []
-    for line in file.read_text().splitlines() if file.exists() else []:
+    try:
+        lines = read_bounded(file, LINES_LIMIT_BYTES).splitlines(keepends=True)
+    except ValueError as error:
+        raise ValueError(f"{file} is damaged ({error}): move it away") from error
+    for number, line in enumerate(lines, 1):
         try:
-            rows.append(json.loads(line))
-        except json.JSONDecodeError:  # the line a killed run was writing
-            continue
+            rows.append(dict(parse_json(line, MetricsRow)))
+        except ValueError as error:
+            if number == len(lines) and not line.endswith(b"\n"):  # a killed run was writing it
+                break
+            raise ValueError(
+                f"{file} is damaged (line {number}: {first_line(error)}): delete that line"
+            ) from error
     return rows
 
 

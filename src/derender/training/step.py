@@ -93,9 +93,10 @@ def training_step(
     covered = mask[:count] * mask[count : 2 * count]
     part = ranks.part_of_mean(covered)
     flipped = photometric_loss(twin, images, covered, sigmas.get("photometric_flip"))
+    weight = objective.photometric_weight
     terms = {
-        "photometric": part * photometric_loss(straight, images, covered, sigmas.get("photometric")),
-        "photometric_flip": part * objective.flip_weight * flipped,
+        "photometric": part * weight * photometric_loss(straight, images, covered, sigmas.get("photometric")),
+        "photometric_flip": part * weight * objective.flip_weight * flipped,
     }
     if perceptual is not None and objective.perceptual_weight > 0:
         columns = {"straight": straight, "twin": twin, "images": images, "covered": covered, **sigmas}

@@ -145,6 +145,19 @@ def test_what_follows_a_short_body_is_a_request_of_its_own_and_has_to_prove_itse
     assert b" 421 " in found
 
 
+@pytest.mark.parametrize("more", [CHUNKED + "Content-Length: 4\r\n", "Content-Length: 4\r\n" + CHUNKED])
+@pytest.mark.parametrize("method", ["GET", "POST"])
+def test_a_length_beside_chunks_is_refused_and_nothing_behind_it_is_served(client, method, more):
+    """A proxy that goes by one of them and a server that goes by the other see different requests."""
+    with connected(client.url) as connection:
+        one = head(client.url, "/api/view", more).replace(b"POST", method.encode())
+        connection.sendall(
+            one + b"0\r\n\r\n" + head(client.url, "/api/view", "Content-Length: 2\r\n") + b"{}"
+        )
+        found = answered(connection)
+    assert found.count(b"HTTP/1.1 ") == 1 and b" 400 " in found and b"Transfer-Encoding is refused" in found
+
+
 @pytest.mark.parametrize(
     "more",
     [

@@ -19,6 +19,7 @@ from numpy import ndarray
 from pydantic import BeforeValidator, Field, ValidationError, field_validator
 
 from derender.settings import Settings
+from derender.storage.bounded import parse_yaml
 
 Kind = TypeVar("Kind", bound=Settings)
 Range = tuple[float, float]
@@ -294,8 +295,8 @@ def named_settings(
             nested = ([f"{k}.{n}" for n in v] if isinstance(v, dict) else [k] for k, v in tree.items())
             raise ValueError(f"unknown setting {key!r}; there are {', '.join(chain(*nested))}")
         try:
-            branch[last] = yaml.safe_load(text)
-        except (yaml.YAMLError, ValueError, RecursionError) as error:
+            branch[last] = parse_yaml(text)
+        except ValueError as error:
             raise ValueError(f"cannot read the value {text!r} of {key}") from error
     try:
         return kind.model_validate(tree)

@@ -25,6 +25,7 @@ from derender.evaluation.linear_task import Task, task_of
 from derender.model import Derenderer, load
 from derender.objectives.perceptual_features import PerceptualFeatures
 from derender.storage.atomic import atomic_file, new_folder
+from derender.storage.bounded import read_json
 from derender.storage.tensors import read_tensors, write_tensors
 from derender.training.config import FinetuneConfig
 from derender.training.derender_task import DerenderTask, perceptual_of
@@ -99,7 +100,7 @@ def load_finetuned(source: str | Path, *, device: str | torch.device = "cpu") ->
     if not (folder / HEAD_FILE).is_file():
         raise FileNotFoundError(f"{source} has no head ({HEAD_FILE}): give a run made by 'derender finetune'")
     try:
-        about = json.loads((folder / HEAD_CONFIG_FILE).read_text())
+        about = read_json(folder / HEAD_CONFIG_FILE, dict[str, str | tuple[str, ...]])
         width = model.settings.network.code_size * len(about["factors"])
         head = TargetHead(about["factors"], width, about["kind"], about["names"])
         head.load_state_dict(read_tensors(folder / HEAD_FILE))

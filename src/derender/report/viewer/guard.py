@@ -72,6 +72,8 @@ class Guard:
         reading = method in ("GET", "HEAD")
         if site not in ("same-origin", "none") and not (reading and path == "/"):
             return 403, "requests from other pages are refused"
+        if "content-length" in headers and "transfer-encoding" in headers:
+            return 400, "a request with Content-Length and Transfer-Encoding is refused"
         if reading:
             return None
         origin = headers.get("origin")
