@@ -22,6 +22,7 @@ from torch import Tensor
 from derender.data.synthetic import faces
 from derender.model import Derenderer
 from derender.render import render_scene
+from derender.renderers import as_renderer
 from derender.training.batches import random_stream
 from derender.training.config import ObjectiveSettings
 from derender.training.step import training_step
@@ -65,7 +66,7 @@ def course(way: Way, steps: int, seed: int = 0) -> Tensor:
     """Train for some steps; the L1 of each."""
     pictures = torch.from_numpy(faces.generate(PICTURES, image_size=SIZE, seed=seed).images).float() / 255
     model = Derenderer.from_preset("small", seed=seed, image_size=SIZE, width=8, light_width=4, code_size=32)
-    model.renderer = partial(render_scene, backend=way.backend)
+    model.renderer = as_renderer(partial(render_scene, backend=way.backend), "lambert")
     if way.compiled:
         torch._dynamo.reset()
         torch._dynamo.config.recompile_limit = PROGRAMS  # pyright: ignore[reportAttributeAccessIssue]

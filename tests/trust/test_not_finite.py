@@ -17,6 +17,7 @@ from derender.objectives import self_features
 from derender.objectives.self_features import SelfFeatures, SelfTraining
 from derender.postprocess import Features
 from derender.postprocess.whitening import Projection, Whitening
+from derender.renderers import as_renderer
 from derender.scene.perturb import PerturbSettings
 from derender.training import resolve, train
 from derender.training.config import ObjectiveSettings, WhiteningSettings
@@ -78,7 +79,9 @@ def spoil_confidence(name: str, model: Derenderer, bad: float) -> None:
 
 def spoil_rendering(name: str, model: Derenderer, bad: float) -> None:
     plain = model.renderer
-    model.renderer = lambda scene, fov_deg: spoil_field(plain(scene, fov_deg), name, bad)
+    model.renderer = as_renderer(
+        lambda scene, fov_deg: spoil_field(plain(scene, fov_deg), name, bad), "lambert"
+    )
 
 
 STAGES = {

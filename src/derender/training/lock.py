@@ -43,7 +43,6 @@ def locked(run: Path) -> Iterator[None]:
         yield
         return
     made = not run.exists()
-    run.mkdir(parents=True, exist_ok=True)
     handle = _acquired(file)
     _held[file] = threading.get_ident()
     try:
@@ -62,7 +61,11 @@ def _acquired(file: Path) -> int:
     assert fcntl is not None
     own = _Owner(pid=os.getpid(), host=socket.gethostname())
     while True:
-        handle = os.open(file, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o644)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            handle = os.open(file, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o644)
+        except FileNotFoundError:  # its last owner has just removed the folder
+            continue
         try:
             if not stat.S_ISREG(os.fstat(handle).st_mode):
                 raise ValueError(f"{file} is no regular file: delete it")

@@ -169,7 +169,7 @@ def read_metrics(path: Path) -> list[dict[str, Any]]:
         try:
             rows.append(dict(parse_json(line, MetricsRow)))
         except ValueError as error:
-            if number == len(lines) and not line.endswith(b"\n"):  # a killed run was writing it
+            if number == len(lines) and line[:1] == b"{" and line[-1:] != b"\n":  # cut off by a kill
                 break
             raise ValueError(
                 f"{file} is damaged (line {number}: {first_line(error)}): delete that line"
