@@ -58,17 +58,10 @@ def require_fitting(model: Derenderer, source: str = "this model") -> None:
 
 
 def as_images(
-    images: ImageSet | str | Path,
-    image_size: int,
-    *,
-    dataset: str = "auto",
-    limit: int | None = None,
-    part: str = "all",
-    model: str | Path | None = None,
-    at_least: int = 1,
-    keep_duplicates: bool = False,
+    images: ImageSet | str | Path, image_size: int, *, dataset: str = "auto", limit: int | None = None,
+    part: str = "all", model: str | Path | None = None, at_least: int = 1, keep_duplicates: bool = False,
     progress: Progress | None = None,
-) -> ImageSet:
+) -> ImageSet:  # fmt: skip
     """Decoded images: a set that is read already is returned as it is, an address is read.
 
     Args:

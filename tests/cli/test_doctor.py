@@ -31,6 +31,7 @@ def test_terminal_page_and_json_tell_the_same(folder: Path, tmp_path: Path, numb
     assert told["originals"]["median_short"] == 64
     assert f"verdict: does not suit, because {'; '.join(told['because'])}" in said
     assert "unreadable: 27.png" in said
+    assert main(["doctor", str(folder)]) == 0 and main(["doctor", str(folder), "--check"]) == 1
     html = page.read_text()
     for finding in told["findings"]:
         assert finding["text"] in html and finding["text"] in said

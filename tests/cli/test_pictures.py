@@ -151,6 +151,33 @@ def test_bad_pictures_are_left_out_and_named(model, photos, tmp_path, capsys):
     assert [folder.name for folder in (tmp_path / "out").iterdir()] == ["0"]
 
 
+def test_a_folder_goes_on_where_it_was_stopped(model, photos, tmp_path, numbers):
+    folder, out = Path(shutil.copytree(photos, tmp_path / "folder")), tmp_path / "out"
+    (folder / "bad.jpg").write_bytes(b"no picture")
+    words = ("rotate", "-m", model, folder, "-o", out, "--size", 32, "--stills", 2, "--film", "none")
+    told, said = numbers(*words)  # exit code 0: of a folder the others are used
+    assert len(told["pictures"]) == 6 and "left out" in said and (out / "sheet.png").exists()
+    shutil.rmtree(out / "3")
+    kept = (out / "1" / "strip.png").stat().st_mtime_ns
+    told, said = numbers(*words, "--resume")
+    assert [Path(one["folder"]).name for one in told["pictures"]] == ["3"] and "5 images were done" in said
+    assert (out / "1" / "strip.png").stat().st_mtime_ns == kept
+
+
+def test_the_whole_photograph_is_written_unless_the_frame_is_asked_for(model, photos, tmp_path):
+    wide = Image.new("RGB", (160, 96), (200, 30, 30))
+    wide.paste(Image.open(photos / "0.png"), (48, 16))
+    wide.save(tmp_path / "wide.png")
+    words = ["-m", model, str(tmp_path / "wide.png"), "--stills", "2", "--frames", "2", "--film", "mp4"]
+    assert main(["relight", *words, "-o", str(tmp_path / "whole")]) == 0
+    still = np.asarray(Image.open(tmp_path / "whole" / "wide" / "still-01.png").convert("RGB"))
+    assert still.shape == (96, 160, 3) and (still[:, :2] == (200, 30, 30)).all()
+    assert np.abs(still.astype(int) - np.asarray(wide)).max() > 20
+    assert main(["relight", *words, "-o", str(tmp_path / "frame"), "--only-frame", "--size", "48"]) == 0
+    with Image.open(tmp_path / "frame" / "wide" / "still-01.png") as frame:
+        assert frame.size == (48, 48)
+
+
 def test_bad_questions_about_pictures(model, photos, tmp_path, refused):
     one, out = photos / "0.png", tmp_path / "out"
     given = ("-m", model, one, "-o", out)
@@ -158,7 +185,7 @@ def test_bad_questions_about_pictures(model, photos, tmp_path, refused):
         "swap", *given, "--from", photos / "1.png", "--factor", "albdo"
     )
     assert "none.png does not exist" in refused("relight", *given, "--like", tmp_path / "none.png")
-    assert "is a folder: name images" in refused("rotate", "-m", model, photos, "-o", out)
+    assert "holds no images" in refused("rotate", "-m", model, tmp_path, "-o", out)
     assert "reach must lie between" in refused("rotate", *given, "--reach", "120")
     assert "reach must be above 0" in refused("relight", *given, "--reach", "0")
     assert "size 16 is below the model's 32" in refused("relight", *given, "--size", "16")
@@ -216,8 +243,8 @@ def test_pictures_unlike_what_the_model_was_validated_on_are_named(model, photos
     words = ["--size", "32", "--from", str(two), "--factor", "light", "--json", str(told)]
     assert main(["swap", "-m", str(known), str(one), "-o", str(tmp_path / "swapped"), *words]) == 0
     said = capsys.readouterr().err
-    for path in (one, two):
-        assert f"{path}: reconstructed worse than 99 % of the images this model was validated on" in said
+    assert "2 of 2 images are reconstructed worse than 99 % of those this model was validated on" in said
+    assert f"{one} is one" in said
     assert json.loads(told.read_text())["reconstruction_percentile"] == {str(one): 100, str(two): 100}
     write_errors(known, HeldOutErrors(np.linspace(0, 2, 101), 50))
     assert main(["mesh", "-m", str(known), str(one), "-o", str(tmp_path / "usual"), "--size", "32"]) == 0

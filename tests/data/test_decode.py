@@ -193,6 +193,8 @@ def test_damage_has_a_reason(encoded):
     for none in (b"", b"text", b"\xff\xd8\xff", b"<svg></svg>", b"%!PS-Adobe-3.0 EPSF-3.0\n"):
         with pytest.raises(Unreadable, match=r"not an image in a known format|damaged"):
             read_image(none, 16)
+    with pytest.raises(Unreadable, match=r"HEIC photograph: pip install pillow-heif"):
+        read_image(b"\0\0\0\x18ftypheic" + bytes(40), 16)
 
 
 def box(*sides: float) -> np.ndarray:

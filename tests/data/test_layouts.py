@@ -302,7 +302,7 @@ FAULTS = [
     (images("1.png"), {"dataset": "utkfaces"}, r"unknown data set 'utkfaces'; did you mean 'utkface'\?"),
     (images("1.png"), {"dataset": "utkface"}, r"no image in .*set is named as in UTKFace .*: the first is"),
     (images("1.png"), {"dataset": "synface"}, r"no params\.csv with an images folder"),
-    ({"a.txt": "x", "b.txt": "x", "c.heic": "x", "faces.zip": "x"}, {}, r"no images found in .*: looked"),
+    ({"a.txt": "x", "b.txt": "x", "c.psd": "x", "faces.zip": "x"}, {}, r"no images found in .*: looked"),
 ]  # fmt: skip
 
 

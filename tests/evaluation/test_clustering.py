@@ -213,6 +213,7 @@ def test_one_call_averages_caps_clusters_and_scores(tracks, tmp_path):
     assert means.to_pandas().loc["geometry", "accuracy"] == 1 and "| geometry |" in means.to_markdown()
     capped = cluster(tracks, "who", min_count=20, max_count=4, **how)
     assert (capped.values["n_rows"], capped.values["labels"]) == (8, {"who": 2})
+    assert capped.values["n_dropped"] == len(tracks) - 8
     levels = cluster(tracks, "who", method="finch", mean_by=("who", "track"), **how)
     assert levels.tables[2].caption.startswith("FINCH on geometry") and levels.values["finch"]["geometry"]
     for bad, message in (

@@ -70,6 +70,8 @@ def test_settings_are_resolved_in_one_order(tmp_path):
     (tmp_path / "some.yaml").write_text("preset: small\nimages: 48\nseed: 3\n")
     chosen = run_settings(config=tmp_path / "some.yaml", settings={"seed": 4}, loocc="light")
     assert (chosen.preset, chosen.images, chosen.seed, chosen.objective.loocc) == ("small", 48, 4, "light")
+    assert run_settings(device="cpu").preset == "small"
+    assert run_settings(device="cpu", start_from="cars-64").preset == "faces"
     with pytest.raises(ValueError, match="loocc is for derender models"):
         run_settings(model="vqvae", loocc="light")
     with pytest.raises(ValueError, match="give either labels or attributes"):

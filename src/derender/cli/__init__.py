@@ -14,6 +14,7 @@ import typer
 
 from derender import __version__
 from derender.cli import (
+    align,
     bench,
     compare,
     copies,
@@ -64,7 +65,7 @@ def _options(
 
 
 for one in (
-    demo.demo, doctor.doctor, train.train, copies.whiten, distil.refine, distil.unet, pack.pack,
+    demo.demo, align.align, doctor.doctor, train.train, copies.whiten, distil.refine, distil.unet, pack.pack,
     embed.embed, evaluate, explain.explain, finetune.finetune, importing.import_checkpoint, compare.compare,
     models.models, report.report, decompose.decompose, edits.relight, edits.rotate, edits.swap,
     decompose.mesh, search.search, view.view, synth, bench.bench,

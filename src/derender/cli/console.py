@@ -84,13 +84,15 @@ def progress_bar(description: str, unit: str = "images") -> Iterator[Callable[..
 
     Where standard error is no terminal, a plain line appears every half minute instead.
     """
-    console, last = Console(stderr=True), time.monotonic()
+    console, begin = Console(stderr=True), time.monotonic()
+    last = begin
 
     def say(done: int, total: int, note: str = "", description: str = description, unit: str = unit) -> None:
         nonlocal last
         if time.monotonic() - last >= PLAIN_LINE_EVERY_SECONDS:
             last = time.monotonic()
-            notice(f"{description}: {done:,} of {total:,} {unit} {note}".rstrip())
+            left = f", {duration((total - done) * (last - begin) / done)} left" if done else ""
+            notice(f"{description}: {done:,} of {total:,} {unit}{left} {note}".rstrip())
 
     if not console.is_terminal or not is_main_process():
         yield say

@@ -10,6 +10,8 @@ from derender.cli.gathered import command
 from derender.cli.options import DataOptions, Output, Seed
 
 WORDS = {"objection": "NO", "trouble": "!", "note": "note", "open": "?", "good": "ok"}  # worst first
+CHECK = "Exit with 1 where the images do not suit the method."
+Check = Annotated[bool, typer.Option("--check", help=CHECK)]
 OUT = "Also write a page with example images."
 
 
@@ -19,6 +21,7 @@ def doctor(
     output: Output,
     out: Annotated[Path | None, typer.Option("--out", "-o", help=OUT, metavar="FILE.html")] = None,
     seed: Seed = 0,
+    check: Check = False,
 ) -> None:
     """Say whether images suit the method: copies, crop, symmetry, view and light. Trains nothing."""
     for file in (out, output.json_file):
@@ -46,3 +49,5 @@ def doctor(
     else:
         notice("add --out doctor.html for a page with example images")
     output.write(values)
+    if check and found.verdict.word == "does not suit":
+        raise typer.Exit(1)

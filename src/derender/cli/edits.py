@@ -9,7 +9,7 @@ from typer import Option
 from derender.cli.gathered import command
 from derender.cli.images import ImageFiles, opener_of
 from derender.cli.options import Output, TrainedModel
-from derender.report.opening import EDIT_SIZE, FilmOptions, ImageOptions
+from derender.report.opening import EDIT_SIZE, FilmOptions, ImageOptions, image_files
 
 Like = Annotated[Path | None, Option(help="Go to the lighting of this image.", metavar="IMAGE")]
 LightReach = Annotated[float, Option("--reach", help="Reach of the light to either side, in degrees.")]
@@ -32,15 +32,18 @@ def relight(
     A light is relative to the object, not to the camera: it falls on the same side of every face. Going
     round, it is as strong as the image's own, a third of it ambient.
     """
-    from derender.report.edits import relit
+    from derender.report.edits import relit, relit_video
 
-    opener = opener_of(model, how, EDIT_SIZE)
+    opener = opener_of(model, how, EDIT_SIZE, whole=True)
     others = [] if like is None else [opener.open(like)]
-    edit = partial(
-        relit, opener.model, reach_deg=reach, pitch_deg=pitch, strength=strength,
-        like=others[0] if others else None, film=film,
-    )  # fmt: skip
-    files.edit(opener, edit, output, beside=others)
+    moves = {
+        "reach_deg": reach,
+        "pitch_deg": pitch,
+        "strength": strength,
+        "like": others[0] if others else None,
+    }
+    edit, video = partial(relit, opener.model, **moves, film=film), relit_video(**moves, hold=film.hold)
+    files.edit(opener, edit, output, beside=others, video=video)
 
 
 @command("rotate", "rotate --model runs/faces me.jpg --reach 45 --out rotated/")
@@ -49,10 +52,11 @@ def rotate(
     reach: ViewReach = 40.0, pitch: Nod = 0.0,
 ) -> None:  # fmt: skip
     """Write strips and films of images rotated from one side to the other, in their own lighting."""
-    from derender.report.edits import rotated
+    from derender.report.edits import rotated, rotated_video
 
-    opener = opener_of(model, how, EDIT_SIZE)
-    files.edit(opener, partial(rotated, opener.model, reach_deg=reach, pitch_deg=pitch, film=film), output)
+    opener = opener_of(model, how, EDIT_SIZE, whole=True)
+    edit = partial(rotated, opener.model, reach_deg=reach, pitch_deg=pitch, film=film)
+    files.edit(opener, edit, output, video=rotated_video(reach_deg=reach, pitch_deg=pitch, hold=film.hold))
 
 
 @command("swap", "swap --model runs/faces me.jpg --from you.jpg --factor albedo --out mixed/")
@@ -61,10 +65,13 @@ def swap(
     factor: Factors = None,
 ) -> None:  # fmt: skip
     """Write images with one factor of another: its geometry, albedo, light or camera, each by itself."""
-    from derender.report.edits import swappable, swapped_factors
+    from derender.photo import is_video
+    from derender.report.edits import swappable, swapped_factors, swapped_video
 
-    opener = opener_of(model, how, EDIT_SIZE)
-    factors = list(swappable(opener.model, factor or ()))
+    opener = opener_of(model, how, EDIT_SIZE, whole=True)
+    parameters = swappable(opener.model, factor or ())
     donor = opener.open(source)
-    edit = partial(swapped_factors, opener.model, donor=donor, factors=factors)
-    files.edit(opener, edit, output, beside=[donor])
+    edit = partial(swapped_factors, opener.model, donor=donor, factors=list(parameters))
+    moving = any(is_video(path) for path in image_files(files.images))
+    video = swapped_video(list(parameters.values()), donor) if moving else None
+    files.edit(opener, edit, output, beside=[donor], video=video)

@@ -15,6 +15,8 @@ NAMES = ", ".join(BASELINES)
 SIDE = "Side of the images in pixels, where no network fixes it (64); e4e enlarges them to its own."
 Out = Annotated[Path, typer.Option("--out", "-o", help="The table to write.", metavar="FILE.parquet")]
 Model = Annotated[str | None, typer.Option("--model", "-m", help=options.MODELS, metavar="MODEL")]
+KEEP = "Keep every one of identical images, as labelled sets need."
+Keep = Annotated[bool, typer.Option("--keep-duplicates", help=KEEP)]
 Engine = Annotated[str, typer.Option(help="local, or ray: on a cluster of Ray.", metavar="NAME")]
 Workers = Annotated[int | None, typer.Option(min=1, metavar="N", help="Number of Ray actors; default: 2.")]
 
@@ -39,7 +41,8 @@ class BaselineOptions:
 def embed(
     images: options.PartOfImages, out: Out, baselines: BaselineOptions, output: options.Output,
     model: Model = None, batch_size: options.BatchSize = 256, fit_steps: options.FitSteps = None,
-    device: options.Device = "auto", engine: Engine = "local", workers: Workers = None,
+    keep_duplicates: Keep = False, device: options.Device = "auto", engine: Engine = "local",
+    workers: Workers = None,
 ) -> None:  # fmt: skip
     """Write a feature table: file, one list column per factor, and the labels of the data set.
 
@@ -60,7 +63,7 @@ def embed(
     with progress_bar("embedding") as report:
         how |= {"device": device, "progress": report}
         if name is None:
-            how |= {**images.how, "fit_steps": fit_steps}
+            how |= {**images.how, "fit_steps": fit_steps, "keep_duplicates": keep_duplicates}
             done = derender.embed_to_file(images.address, source, out, **how)
         else:
             how["features"] = baselines.features and [part.strip() for part in baselines.features.split(",")]
@@ -70,6 +73,8 @@ def embed(
     named = (f"skipped {visible(row.file, '')}: {row.reason}" for row in done.examples[:NAMED])
     notice("\n".join([done.describe(), *named]))
     sizes = ", ".join(f"{factor} {size}" for factor, size in done.factors.items())
+    if name is None and (odd := derender.features.unlike_training(images.address, source, **images.how)):
+        notice(odd)
     output.result(f"{done.rows:,} rows in {out}: {sizes}")
     names = ("rows", "factors", "labels", "origin", "skipped", "copies", "resumed")
     output.write({"out": out, **{name: getattr(done, name) for name in names}})

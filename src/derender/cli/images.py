@@ -6,7 +6,7 @@ How an image is read and drawn is in report/opening.py; a new option of all thes
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -16,6 +16,7 @@ from derender.report.opening import ImageOpener, ImageOptions, OpenedImage, held
 from derender.storage.places import require_image
 
 if TYPE_CHECKING:
+    from derender.photo.video import Edit as VideoEdit
     from derender.report.editing import Edited
 
 
@@ -23,8 +24,11 @@ if TYPE_CHECKING:
 class ImageFiles:
     """Image files, and the folder for what is made of them."""
 
-    images: Annotated[list[Path], typer.Argument(help="Image files.", metavar="IMAGE...")]
+    images: Annotated[
+        list[Path], typer.Argument(help="Image files, videos, or folders of them.", metavar="IMAGE...")
+    ]
     out: OutFolder
+    resume: Annotated[bool, typer.Option("--resume", help="Leave out images that are done.")] = False
 
     def __post_init__(self) -> None:
         require_image(self.images)
@@ -37,25 +41,27 @@ class ImageFiles:
         *,
         sheet: bool | None = None,
         beside: Sequence[OpenedImage] = (),
+        video: "VideoEdit | None" = None,
     ) -> None:
-        """Edit and write every image and report it; exit code 2 where one could not be read."""
+        """Edit and write every image and report it; exit code 2 where one that was named cannot be read."""
         from derender.report.editing import write_images
 
         with progress_bar("drawing", "images") as report:
             written = write_images(
                 opener, self.images, self.out, edit,
-                force=output.force, sheet=sheet, beside=beside, progress=report,
+                force=output.force, resume=self.resume, sheet=sheet, beside=beside, video=video,
+                progress=report,
             )  # fmt: skip
         for note in written.notes():
             notice(note)
         count = len(written.images)
         output.result(f"{count:,} image{'s' if count != 1 else ''} in {self.out}")
         output.write(written.values())
-        if written.refused:
+        if set(written.refused) & {str(path) for path in self.images}:  # of a folder others were used
             raise typer.Exit(2)
 
 
-def opener_of(model: TrainedModel, how: ImageOptions, default_size: int = 0, **more: str) -> ImageOpener:
+def opener_of(model: TrainedModel, how: ImageOptions, default_size: int = 0, **more: Any) -> ImageOpener:
     """What opens images: the loaded model with the options."""
     held_out = held_out_errors(model.model)
     return ImageOpener(model.open(), how, default_size=default_size, held_out=held_out, **more)

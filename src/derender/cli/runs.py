@@ -7,7 +7,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from derender.cli.console import duration, notice, progress_bar, report_images, result, write_json
+from derender.cli.console import (
+    duration,
+    is_main_process,
+    notice,
+    progress_bar,
+    report_images,
+    result,
+    write_json,
+)
 
 if TYPE_CHECKING:
     from derender.data import ImageSet
@@ -39,17 +47,19 @@ def run_progress() -> Iterator[dict[str, Any]]:
     """A progress bar for a run, as keywords of the library call; what was read is noted, with its terms."""
 
     def show(progress: "Progress") -> None:
-        speed = ""
-        if progress.phase == "train":
-            waiting = f"{progress.waiting:.1%} waiting for data"
-            speed = f"{progress.images_per_second:.0f} images/s, {waiting}"
+        speed = f"{progress.images_per_second:.0f} images/s, {progress.waiting:.1%} waiting for data"
+        speed = speed if progress.phase == "train" else ""
         description, unit = PHASES[progress.phase]
         report(progress.done, progress.total, speed, description=description, unit=unit)
+
+    from derender.data.doctor import quick_verdict
 
     def note(images: "ImageSet") -> None:
         report_images(images)
         if images.terms:
             notice(f"on its owners' terms: {images.terms}")
+        if is_main_process() and (doubts := quick_verdict(images)):
+            notice(f"the doctor: {doubts} (derender doctor has more)")
 
     with progress_bar("reading") as report:
         yield {"on_images": note, "progress": show}

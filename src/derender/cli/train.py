@@ -4,14 +4,14 @@ from typing import Annotated
 
 import typer
 
-from derender.cli.console import is_main_process, result, write_json
+from derender.cli.console import is_main_process, notice, result, write_json
 from derender.cli.gathered import command
 from derender.cli.options import DataOptions, Device, Json, Settings
 from derender.cli.runs import DryRun, OutRun, Resume, dry_run_shown, report_run, run_progress
 
 MODEL = "Instead of derender: vqvae, simclr, ae, beta-vae, resnet18, stylegan2, e4e or ris."
 Network = Annotated[str | None, typer.Option("--model", metavar="NAME", help=MODEL)]
-PRESET = "faces (the default), cars, cats, paper, or small for a CPU."
+PRESET = "faces (the default with a graphics card), cars, cats, paper, or small (without one)."
 Preset = Annotated[str | None, typer.Option("--preset", help=PRESET)]
 START_FROM = "Begin with a trained model's weights: a run folder, a bundled name or a Hub id."
 StartFrom = Annotated[str | None, typer.Option("--start-from", metavar="MODEL", help=START_FROM)]
@@ -38,8 +38,12 @@ def train(
     changes = [*(settings or ()), *([] if generator is None else [f"generator={generator}"])]
     chosen = learn.run_settings(
         out, model=model, preset=preset, start_from=start_from, loocc=loocc, renderer=renderer, config=config,
-        settings=changes, resume=resume,
+        settings=changes, resume=resume, device=device,
     )  # fmt: skip
+    if preset is None and not resume and getattr(chosen, "preset", "") == "small":
+        notice("preset small: there is no graphics card; faces has 16 times the work (--preset faces)")
+    if start_from is not None and preset is not None:
+        notice(f"sizes and ranges are those of {start_from}; preset {preset} says how it is trained")
     if dry_run:
         dry_run_shown(chosen, json_file)
         return

@@ -24,8 +24,12 @@ class FolderSource(Source):
         self.files = tuple(sorted(self._found))
         self.skipped = tuple(sorted(faults, key=lambda row: row.file))
 
+    def on_disk(self, file: str) -> Path:
+        """Where a file lies."""
+        return self.path / self._found[file][0]
+
     def read(self, file: str) -> bytes:
-        return read_bounded(self.path / self._found[file][0], FILE_LIMIT_BYTES)
+        return read_bounded(self.on_disk(file), FILE_LIMIT_BYTES)
 
     def stamps(self, files: Sequence[str]) -> Int64[np.ndarray, "n 2"]:
         return np.array([self._found[file][1:] for file in files], np.int64).reshape(-1, 2)

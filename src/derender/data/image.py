@@ -10,6 +10,7 @@ damaged ones raise ``Unreadable``, nothing else. A box (left, top, right, bottom
 image) cuts out a part first; it is moved and shrunk as far as needed to lie inside the image.
 """
 
+import importlib
 import io
 import logging
 import struct
@@ -17,7 +18,7 @@ import threading
 import warnings
 import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from functools import cache
 from pathlib import Path
 
@@ -42,7 +43,8 @@ _LARGE_PIXELS, _MOST_BYTES_A_PIXEL = 20_000_000, 24
 LARGE_BYTES, HEAD_BYTES = 64 << 20, 1 << 16
 one_large_image_at_a_time = threading.RLock()
 
-_FORMATS = ("JPEG", "PNG", "WEBP", "BMP", "GIF", "TIFF", "PPM", "AVIF")
+_FORMATS = ("JPEG", "PNG", "WEBP", "BMP", "GIF", "TIFF", "PPM", "AVIF", "HEIF")
+_HEIC_BRANDS = (b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1")
 _BACKGROUND = (255, 255, 255)
 _ORIENTATION_TAG = 0x0112
 _UPRIGHT = (  # by orientation, from 2 on
@@ -123,6 +125,8 @@ def _opened(encoded: bytes, pixel_limit: int) -> Iterator[Image.Image]:
     except Unreadable:
         raise
     except Image.UnidentifiedImageError as problem:
+        if encoded[4:8] == b"ftyp" and encoded[8:12] in _HEIC_BRANDS:
+            raise Unreadable("a HEIC photograph: pip install pillow-heif, or save it as JPEG") from problem
         raise Unreadable("not an image in a known format") from problem
     except DECODER_ERRORS as problem:
         raise Unreadable(f"damaged or unsupported ({problem or type(problem).__name__})") from problem
@@ -155,9 +159,14 @@ def quiet_pillow() -> Iterator[None]:
 
 @cache
 def _known_formats() -> tuple[str, ...]:
-    """Those of our formats that this build of Pillow opens (AVIF may lack); never PostScript and the like."""
+    """Those of our formats that this build of Pillow opens (AVIF may lack), never PostScript and the like.
+
+    HEIC is among them where the package pillow-heif is installed.
+    """
     logging.getLogger("PIL").addHandler(logging.NullHandler())  # what is wrong with a file is raised, too
     Image.init()
+    with suppress(ImportError):
+        importlib.import_module("pillow_heif").register_heif_opener()
     return tuple(form for form in _FORMATS if form in Image.OPEN)
 
 

@@ -9,7 +9,7 @@ Source: Klinghoffer et al., ECCV 2022, Sec. 4: Ward's hierarchical clustering wi
 """
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -97,7 +97,14 @@ def cluster(
     approximate = approximation(method, found.n_rows)
     notes = [*how.notes, *left_out, verdict(found.rows[0], "accuracy"), *filter(None, [approximate])]
     if ready.n_dropped:
-        notes.append(f"{ready.n_dropped:,} rows without a label of {', '.join((*names, *mean_by))} left out")
+        why = f"without a label of {', '.join((*names, *mean_by))}"
+        why += (
+            f", or beyond {min_count} to {max_count or 'all'} rows of a class"
+            if min_count > 1 or max_count
+            else ""
+        )
+        notes.append(f"{ready.n_dropped:,} rows {why} left out")
+        found = replace(found, n_dropped=found.n_dropped + ready.n_dropped)
     more = {"approximation": approximate, "n_dropped_before": ready.n_dropped, "finch": levels}
     return Scores(tables, {**found.numbers(), **more}, [*notes, how.memory.summary()])
 

@@ -205,6 +205,8 @@ def prepare(
         raise ValueError(f"min_count and max_count go with one label, not with {len(labels)}")
     absent = np.any([missing(first.label(name)) for name in (*labels, *mean_by)], axis=0)
 
+    dropped = [int(absent.sum()) if mean_by else 0]
+
     def arranged(table: FeatureTable) -> FeatureTable:
         table = replace(table, labels=first.labels)
         if mean_by:
@@ -216,6 +218,7 @@ def prepare(
         if capped:
             values = table.label(labels[0])
             kept = np.union1d(at_least(values, min_count, max_count), np.flatnonzero(missing(values)))
+            dropped.append(dropped[0] + len(table) - len(kept))
             table = table.select(kept)
         return table
 
@@ -226,7 +229,7 @@ def prepare(
         {name: table.label(name) for name in labels},
         table,
         tuple(row.name for row in rows if row.control),
-        int(absent.sum()) if mean_by else 0,
+        dropped[-1],
     )
 
 

@@ -111,8 +111,13 @@ def linear(
         models={rows[0].name: [features]} if finetune and is_model(features) else {},
         test_fraction=test_fraction, groups=ready.table.label(groups) if groups else None,
     )  # fmt: skip
-    notes = [*how.notes, *left_out, how.memory.summary()]
-    return Scores(linear_tables(found), {**found.numbers(), "labels": names}, notes)
+    tables, notes = linear_tables(found), [*how.notes, *left_out, how.memory.summary()]
+    if ready.n_dropped:
+        notes.insert(
+            0, f"{ready.n_dropped:,} rows beyond {min_count} to {max_count or 'all'} rows of a class left out"
+        )
+        found = replace(found, n_dropped=found.n_dropped + ready.n_dropped)
+    return Scores(tables, {**found.numbers(), "labels": names}, notes)
 
 
 @dataclass(frozen=True)

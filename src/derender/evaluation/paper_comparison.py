@@ -146,7 +146,9 @@ def compare(
                 verdict_table(found.rows, CLUSTER_COLUMNS, f"{part.name}: above the strongest control?"),
             ]
             if ready.n_dropped:
-                notes.append(f"{part.name}: {ready.n_dropped:,} rows without a label left out")
+                notes.append(
+                    f"{part.name}: {ready.n_dropped:,} rows without a label or beyond its sizes left out"
+                )
         else:
             found = compare_prepared(
                 ready, counts, how.seeds(seeds), how, models=models if finetune else None,

@@ -20,18 +20,18 @@ from derender.features.extract import (
 from derender.features.table import FeatureTable, missing, named
 
 if TYPE_CHECKING:
-    from derender.features.embedding import Embedded, embed, embed_to_file
+    from derender.features.embedding import Embedded, embed, embed_to_file, unlike_training
     from derender.features.neighbours import search
     from derender.features.transformer import DisentangledFeatures
 
 __all__ = [
     "DisentangledFeatures", "Embedded", "FeatureTable", "Progress", "embed", "embed_image_set",
     "embed_images", "embed_to_file", "evaluating", "map_batches", "missing", "model_fingerprint", "named",
-    "search", "table_labels",
+    "search", "table_labels", "unlike_training",
 ]  # fmt: skip
 
 _HOME = {
-    **dict.fromkeys(("Embedded", "embed", "embed_to_file"), "embedding"),
+    **dict.fromkeys(("Embedded", "embed", "embed_to_file", "unlike_training"), "embedding"),
     "search": "neighbours",
     "DisentangledFeatures": "transformer",
 }

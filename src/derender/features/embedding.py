@@ -33,9 +33,13 @@ from derender.features.parquet import Columns, write_columns
 from derender.features.parts import Parts, Rows, rows_of
 from derender.features.table import FeatureTable, check_names
 from derender.inputs import Progress, as_images, as_model
+from derender.storage.places import model_folder
+from derender.training.held_out_errors import read_errors, reconstruction_percentile, unlike
 
 PART_ROWS = 4096
 """A part is written when this many rows are there."""
+LOOKED_AT = 60
+"""Images that tell whether a model suits them."""
 ENGINES = ("local", "ray")
 
 
@@ -70,17 +74,10 @@ class Embedded:
 
 
 def embed(
-    images: ImageSet | str | Path,
-    model: Any = "faces-64",
-    *,
-    dataset: str = "auto",
-    part: str = "all",
-    limit: int | None = None,
-    batch_size: int = 256,
-    fit_steps: int | None = None,
-    device: str = "auto",
+    images: ImageSet | str | Path, model: Any = "faces-64", *, dataset: str = "auto", part: str = "all",
+    limit: int | None = None, batch_size: int = 256, fit_steps: int | None = None, device: str = "auto",
     progress: Progress | None = None,
-) -> FeatureTable:
+) -> FeatureTable:  # fmt: skip
     """The features of images as a table in memory: one row an image, one feature per factor, and the labels.
 
     Args:
@@ -100,24 +97,12 @@ def embed(
 
 
 def embed_to_file(
-    images: Stream | ImageSet | str | Path,
-    model: Any,
-    out: str | Path,
-    *,
-    dataset: str = "auto",
-    part: str = "all",
-    limit: int | None = None,
-    fit: str = "crop",
-    keep_duplicates: bool = False,
-    batch_size: int = 256,
-    fit_steps: int | None = None,
-    device: str = "auto",
-    engine: Literal["local", "ray"] | str = "local",
-    workers: int | None = None,
-    fresh: bool = False,
-    origin: Mapping[str, Any] | None = None,
-    progress: Progress | None = None,
-) -> Embedded:
+    images: Stream | ImageSet | str | Path, model: Any, out: str | Path, *, dataset: str = "auto",
+    part: str = "all", limit: int | None = None, fit: str = "crop", keep_duplicates: bool = False,
+    batch_size: int = 256, fit_steps: int | None = None, device: str = "auto",
+    engine: Literal["local", "ray"] | str = "local", workers: int | None = None, fresh: bool = False,
+    origin: Mapping[str, Any] | None = None, progress: Progress | None = None,
+) -> Embedded:  # fmt: skip
     """Write the feature table of any number of images, going on where an earlier run stopped.
 
     Args:
@@ -155,6 +140,7 @@ def embed_to_file(
             else:
                 split = {**made_by, **(origin or {})}.get("source")
                 how = {"dataset": dataset, "limit": limit, "part": part, "model": split}
+                how["keep_duplicates"] = keep_duplicates
                 images = as_images(address, net.image_size, **how)
         assert isinstance(images, Stream | ImageSet)
         facts = {**model_facts(net, images.source, images.layout), **made_by, **(origin or {})}
@@ -170,6 +156,20 @@ def embed_to_file(
             blocks = local_blocks(net, images, start, workers=workers, **options)
         _compute(parts, blocks, keep_duplicates, getattr(images, "limit", None), progress)
         return _finish(parts, path, images, facts, resumed)
+
+
+def unlike_training(images: ImageSet | str | Path, model: Any, **how: Any) -> str:
+    """How a sample of images differs from a model's training; "" where it does not, or errors are unknown.
+
+    The line names a bundled model that fits better. ``how`` is as for `derender.inputs.as_images`.
+    """
+    net = as_model(model)
+    known = None if net.source is None else read_errors(model_folder(net.source))
+    if known is None:
+        return ""
+    how["limit"] = min(how.get("limit") or LOOKED_AT, LOOKED_AT)
+    pixels = as_images(images, net.image_size, **how, model=model).images
+    return unlike(pixels, reconstruction_percentile(net, pixels, known))
 
 
 def _network(model: Any, device: str, fit_steps: int | None) -> tuple[Any, dict[str, Any]]:

@@ -22,7 +22,7 @@ class DisentangledFeatures(TransformerMixin, BaseEstimator):
     sequence of paths (read and resized). Nothing is learned in ``fit``; the model is loaded on first use.
 
     Args:
-        model: a run folder, a saved folder, a Hub id, or a model.
+        model: a model, a run folder, a saved folder, a Hub id, or a bundled model; by default faces-64.
         factors: which features, in which order; None means all of the model's.
         batch_size: images at a time.
         device: where to run ("cpu", "cuda"); None loads to the CPU and leaves a given model where it is.
@@ -30,7 +30,7 @@ class DisentangledFeatures(TransformerMixin, BaseEstimator):
 
     def __init__(
         self,
-        model: Any = "runs/faces",
+        model: Any = "faces-64",
         factors: Sequence[str] | None = ("geometry", "albedo"),
         batch_size: int = 256,
         device: str | None = None,

@@ -23,13 +23,15 @@ def run_settings(
     out: str | Path | None = None, *, model: str | None = None, preset: str | None = None,
     start_from: str | None = None, loocc: str | None = None, renderer: str | None = None,
     config: str | Path | None = None, settings: Changes = (), resume: bool = False,
+    device: str = "auto",
 ) -> Any:  # fmt: skip
     """The settings of a training run.
 
     Args:
         out: the run folder; with ``resume`` and nothing else the run keeps its own settings.
         model: "derender", or a baseline: vqvae, simclr, ae, beta-vae, resnet18, stylegan2, e4e or ris.
-        preset: faces (the default), cars, cats, paper, or small for a CPU.
+        preset: faces, cars, cats, paper, or small; by default faces with a graphics card or ``start_from``,
+            small on a CPU, and the run's own with ``resume``.
         start_from: a trained model whose weights the run begins with.
         loocc: factors that are contrasted: "none", "all", or names such as "light+camera".
         renderer: how scenes make images: lambert (the default), lambert-shadow, phong, sh, haze, several
@@ -37,6 +39,7 @@ def run_settings(
         config: a YAML file of settings, which the other arguments change.
         settings: changes of single settings, as ``{"batch_size": 32}`` or ``["batch_size=32"]``.
         resume: go on with the run in ``out``.
+        device: "auto", "cpu" or "cuda", where it will train.
     """
     changes = texts_of(settings)
     if config is not None:
@@ -52,13 +55,12 @@ def run_settings(
     if resume and not chosen and out is not None and (Path(out) / "config.yaml").is_file():
         return stored_config(Path(out), model)
     if model == "derender":
-        return resolve(
-            preset or "faces",
-            changes,
-            objective__loocc=loocc,
-            model__renderer=renderer,
-            start_from=start_from,
-        )
+        if preset is None and resume and out is not None and (Path(out) / "config.yaml").is_file():
+            preset = stored_config(Path(out), model).preset
+        if preset is None:
+            preset = "faces" if start_from or device_named(device) == "cuda" else "small"
+        explicit = {"objective__loocc": loocc, "model__renderer": renderer, "start_from": start_from}
+        return resolve(preset, changes, **explicit)
     for name, value in (("preset", preset), ("loocc", loocc), ("renderer", renderer)):
         if value is not None:
             raise ValueError(f"{name} is for derender models: leave it out with {model}, or change settings")
@@ -91,7 +93,7 @@ def train(
     """
     out, report = Path(out), progress or (lambda _: None)
     if config is None or isinstance(config, str | Path):
-        config = run_settings(out, config=config, resume=resume, **choices)
+        config = run_settings(out, config=config, resume=resume, device=device, **choices)
     elif choices:
         raise ValueError(f"config holds all settings already: leave out {', '.join(choices)}")
     if resume and not (out / "config.yaml").is_file():

@@ -70,7 +70,7 @@ class PhotoDetail:
         own = at_size(scene.detach(), self.grid)
         points = to_camera(unproject(own.depth, fov_deg), own.camera)
         self._place = project(points, self.grid, self.grid, fov_deg).permute(0, 3, 1, 2)
-        self._renderer = renderer
+        self.renderer = renderer
         self._shading = self._light(own)
         self._seen = self._visible(own, points) * _ramp(self._shading, *LIT)
         self._colours = self._completed(own)
@@ -119,7 +119,7 @@ class PhotoDetail:
         return Rendering(image, depth, torch.ones_like(depth))
 
     def _light(self, scene: Scene) -> Float[Tensor, "n 1 h w"]:
-        return self._renderer.shading(scene, self.fov_deg).mean(dim=1, keepdim=True)
+        return self.renderer.shading(scene, self.fov_deg).mean(dim=1, keepdim=True)
 
     def albedo(self) -> Float[Tensor, "1 3 s s"]:
         """The texture of the canonical view: the photograph without its shading, completed."""

@@ -6,7 +6,7 @@ a Pillow image for a path or a Pillow image, an array for an array, a tensor for
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import radians
 from pathlib import Path
 from typing import Any
@@ -20,12 +20,12 @@ from torch import Tensor
 from derender.data import GivenImages, as_photos
 from derender.inputs import as_model
 from derender.model import Derenderer
-from derender.photo.detail import LAMBERT, PhotoDetail
-from derender.photo.faces import UTKFACE, find_faces, frame_of, template_of
+from derender.photo.detail import PhotoDetail
+from derender.photo.faces import PROFILE_DEG, UTKFACE, find_faces, frame_of, template_of
 from derender.photo.frame import Frame
-from derender.renderers import Renderer
+from derender.render import Rendering
 from derender.scene import Scene
-from derender.scene.crop_search import SEARCH_SCALE, best_crops
+from derender.scene.crop_search import SEARCH_SCALE, best_crop
 from derender.storage.places import require_known
 
 AMBIENT_SHARE = 0.35
@@ -43,7 +43,7 @@ FRAMES = ("face", "auto", "none")
 
 @dataclass(frozen=True)
 class Photograph:
-    """A decomposed photograph.
+    """A decomposed photograph; called like a renderer, it draws scenes into the whole of it.
 
     Attributes:
         pixels: all of it.
@@ -61,23 +61,42 @@ class Photograph:
 
     @classmethod
     def of(
-        cls, pixels: UInt8[np.ndarray, "h w 3"], frame: Frame, scene: Scene, fov_deg: float,
-        renderer: Renderer = LAMBERT,
-    ) -> "Photograph":  # fmt: skip
-        """A photograph with the one scene that a model found in a part of it."""
+        cls, pixels: UInt8[np.ndarray, "h w 3"], frame: Frame, scene: Scene, model: Derenderer | PhotoDetail
+    ) -> "Photograph":
+        """A photograph with the one scene that a model found in a part of it; its ``renderer`` shades."""
         wide = frame.widened(MARGIN)
         size = min(max(scene.depth.shape[-1], round(wide.side)), LARGEST_CROP)
         photo = torch.from_numpy(wide.cut(pixels, size)).to(scene.depth.device).float() / 255
         with torch.inference_mode():
             margin = (wide.side / frame.side - 1) / 2
-            detail = PhotoDetail(photo, scene, fov_deg, margin, renderer)
+            detail = PhotoDetail(photo, scene, model.fov_deg, margin, model.renderer)
         return cls(pixels, frame, wide, scene, detail)
+
+    def at_most(self, side: int) -> "Photograph":
+        """The same with its longer side at most so many pixels."""
+        height, width = self.pixels.shape[:2]
+        share = side / max(height, width)
+        if share >= 1:
+            return self
+        size = max(1, round(width * share)), max(1, round(height * share))
+        small = np.asarray(Image.fromarray(self.pixels).resize(size, Image.Resampling.LANCZOS))
+        frame = Frame(
+            self.frame.x * share, self.frame.y * share, self.frame.side * share, self.frame.roll_deg
+        )
+        return Photograph.of(small, frame, self.scene, self.detail)
+
+    @torch.inference_mode()
+    def __call__(self, scene: Scene) -> Rendering:
+        """Whole photographs (N, 3, H, W) of scenes that differ from its own; the mask is 1, depth is 0."""
+        drawn = self.detail(scene).image
+        wholes = [self.surroundings.paste(self.pixels, self.detail.photo, one) for one in drawn]
+        images = torch.from_numpy(np.stack(wholes)).permute(0, 3, 1, 2).float() / 255
+        return Rendering(images, torch.zeros_like(images[:, 0]), torch.ones_like(images[:, 0]))
 
     def edited(self, **parameters: Tensor) -> UInt8[np.ndarray, "h w 3"]:
         """The whole photograph with another ``light`` (1, 4) or ``camera`` (1, 6)."""
-        with torch.inference_mode():
-            seen = self.detail(self.scene.with_parameters(**parameters))
-            return self.surroundings.paste(self.pixels, self.detail.photo, seen.image[0])
+        image = self(self.scene.with_parameters(**parameters)).image[0]
+        return (255 * image).round().byte().permute(1, 2, 0).numpy()
 
     def relit(
         self, yaw_deg: float, pitch_deg: float = 10.0, strength: float = 1.0
@@ -109,20 +128,14 @@ def open_photograph(
     own = model.image_size
     small = torch.from_numpy(place.cut(pixels, own)[None]).to(model.device).float() / 255
     scene = model.fit_scenes(small, fit_steps).scene if fit_steps else model.decompose(small)
-    return Photograph.of(pixels, place, scene, model.fov_deg, model.renderer)
+    return Photograph.of(pixels, place, scene, model)
 
 
 def relight(
-    image: GivenImages,
-    model: Derenderer | str | Path = "faces-64",
-    *,
-    yaw_deg: float = 50.0,
-    pitch_deg: float = 10.0,
-    strength: float = 1.0,
-    like: GivenImages | None = None,
-    frame: str | None = None,
-    fit_steps: int = 0,
-) -> Any:
+    image: GivenImages, model: Derenderer | str | Path = "faces-64", *, yaw_deg: float = 50.0,
+    pitch_deg: float = 10.0, strength: float = 1.0, like: GivenImages | None = None,
+    frame: str | None = None, fit_steps: int = 0,
+) -> Any:  # fmt: skip
     """A photograph under another light.
 
     Args:
@@ -154,14 +167,9 @@ def relight(
 
 
 def rotate(
-    image: GivenImages,
-    model: Derenderer | str | Path = "faces-64",
-    *,
-    yaw_deg: float = 20.0,
-    pitch_deg: float = 0.0,
-    frame: str | None = None,
-    fit_steps: int = 0,
-) -> Any:
+    image: GivenImages, model: Derenderer | str | Path = "faces-64", *, yaw_deg: float = 20.0,
+    pitch_deg: float = 0.0, frame: str | None = None, fit_steps: int = 0,
+) -> Any:  # fmt: skip
     """A photograph whose object is turned from where it looks, in its own light.
 
     Args:
@@ -192,7 +200,7 @@ def found_frame(
     Args:
         pixels: the photograph.
         model: that is to be given the part.
-        frame: "face", the largest face (an error where none is found); "auto", the part that the model
+        frame: "face", the largest face (an error where none is found); "auto", the square part that the model
             reconstructs best; "none", the middle square. None: the largest face if the model is known to be
             of faces and one is found ("no face" is said where not), else the middle square, as for images no
             larger than the model's.
@@ -201,18 +209,28 @@ def found_frame(
         require_known("frame", frame, FRAMES)
     middle = Frame.centred(pixels.shape[1], pixels.shape[0])
     if frame == "auto":
-        larger = torch.from_numpy(middle.cut(pixels, SEARCH_SCALE * model.image_size)[None])
-        (crop,) = best_crops(model, larger)
-        return middle.part(crop.across, crop.down, crop.side).snapped(), "auto"
+        squares = _squares(middle, pixels.shape[1], pixels.shape[0])
+        cuts = np.stack([square.cut(pixels, SEARCH_SCALE * model.image_size) for square in squares])
+        at, crop = best_crop(model, torch.from_numpy(cuts))
+        return squares[at].part(crop.across, crop.down, crop.side).snapped(), "auto"
     template = template_of(model)
     if frame == "none" or (frame is None and (template is None or middle.side <= model.image_size)):
         return middle, "none"
     faces = find_faces(pixels)
     if faces:
-        return frame_of(faces[0], template or UTKFACE).snapped(), "face"
+        found = "face" if abs(faces[0].yaw_deg) <= PROFILE_DEG else "profile"
+        return frame_of(faces[0], template or UTKFACE).snapped(), found
     if frame is None:
         return middle, "no face"
     raise ValueError("no face is found in this image: choose frame auto or none")
+
+
+def _squares(middle: Frame, width: int, height: int) -> list[Frame]:
+    """The middle square, then those of its side along a photograph's longer side, overlapping by half."""
+    steps = max(1, round(2 * (max(width, height) / middle.side - 1))) if width != height else 0
+    places = np.linspace(middle.side / 2, max(width, height) - middle.side / 2, steps + 1)
+    along = "x" if width > height else "y"
+    return [middle, *(replace(middle, **{along: float(place)}) for place in places if steps)]
 
 
 def _check_angles(**angles: float) -> None:

@@ -4,7 +4,7 @@ import copy
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Float
@@ -35,6 +35,15 @@ class EmbeddingModel(nn.Module):
         super().__init__()
         features = features or Features()
         self.whitening, self.fitting = features.whitening, features.fitting
+
+    def to(self, *args: Any, **kwargs: Any) -> Any:
+        """As `torch.nn.Module.to`; a graphics card that is not there is a ValueError."""
+        try:
+            return super().to(*args, **kwargs)
+        except (AssertionError, RuntimeError) as problem:
+            if "cuda" in str((*args, *kwargs.values())) and not torch.cuda.is_available():
+                raise ValueError("no CUDA device here: leave the model on 'cpu'") from problem
+            raise
 
     @property
     @abstractmethod

@@ -6,18 +6,30 @@ read is left out and listed; the others are written. Leaves out opening (``openi
 (``decomposition``, ``edits``, ``mesh``).
 """
 
+import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
+import numpy as np
 from PIL import Image
 
-from derender.report.opening import ImageOpener, OpenedImage, readable
+from derender.photo import edit_video, is_video
+from derender.photo.video import Edit as VideoEdit
+from derender.report.opening import ImageOpener, OpenedImage, image_files, readable
 from derender.report.panel import Sheets
 from derender.storage.atomic import atomic_file, atomic_folder
-from derender.training.held_out_errors import OUTLIER_PERCENTILE
+from derender.training.held_out_errors import OUTLIER_PERCENTILE, unlike
+
+FILM = "film.mp4"
+NOTED = {
+    "no face": "no face: the middle of {count:,} is shown",
+    "profile": "turned by more than 60 degrees, which the model does not know: {count:,}",
+}
+NAMED = 5
+"""So many images that cannot be read are named."""
 
 
 class Edited(Protocol):
@@ -44,6 +56,8 @@ class WrittenImages:
         refused: reasons why other images cannot be read, by path.
         percentiles: of the reconstruction errors, by path; empty where the model keeps none.
         framing: the part of each image that is shown, and how it was found, by path.
+        before: number of images that were left out, for their folders were there.
+        unlike: how images differ from those the model was validated on (``held_out_errors.unlike``).
     """
 
     out: Path
@@ -52,6 +66,8 @@ class WrittenImages:
     refused: Mapping[str, str]
     percentiles: Mapping[str, float]
     framing: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    unlike: str = ""
+    before: int = 0
 
     @property
     def out_of_distribution(self) -> dict[str, float]:
@@ -60,21 +76,25 @@ class WrittenImages:
 
     def notes(self) -> list[str]:
         """Lines for a person: what was left out, what is out-of-distribution, what was cropped."""
-        lines = [f"left out {path}: {reason}" for path, reason in self.refused.items()]
+        refused = list(self.refused.items())
+        lines = [f"left out {path}: {reason}" for path, reason in refused[:NAMED]]
+        if more := len(refused) - NAMED:
+            lines += [f"and {more:,} more (--json names all)"] if more > 0 else []
+        if self.before:
+            lines.append(f"{self.before:,} images were done before")
         if self.percentiles:
             span = _span(self.percentiles.values())
             lines.append(f"reconstructed worse than {span} % of the images this model was validated on")
-        lines += [
-            f"{path}: reconstructed worse than {OUTLIER_PERCENTILE:g} % of the images this model was "
-            f"validated on; it may be out-of-distribution, or shown in another crop (--frame)"
-            for path in self.out_of_distribution
-        ]
+        if self.unlike:
+            lines.append(f"{self.unlike}; {next(iter(self.out_of_distribution))} is one")
         found = Counter(part["found"] for part in self.framing.values())
-        if found["face"] or found["no face"]:
-            lines.append(f"a face was found in {found['face']:,} of {found.total():,} images")
-        if found["no face"]:
-            missing = next(path for path, part in self.framing.items() if part["found"] == "no face")
-            lines.append(f"no face: the middle of {found['no face']:,} is shown ({missing} for one)")
+        faces = found["face"] + found["profile"]
+        if faces or found["no face"]:
+            lines.append(f"a face was found in {faces:,} of {found.total():,} images")
+        for what, then in NOTED.items():
+            if count := found[what]:
+                first = next(path for path, part in self.framing.items() if part["found"] == what)
+                lines.append(f"{then.format(count=count)} ({first} for one)")
         if found["auto"]:
             sides = [100 * part["side"] for part in self.framing.values() if part["side"] < 1]
             share = f", {_span(sides)} % of their side" if sides else ""
@@ -94,39 +114,50 @@ class WrittenImages:
 
 
 def write_images(
-    opener: ImageOpener,
-    paths: Sequence[Path],
-    out: Path,
-    edit: Callable[[OpenedImage], Edited],
-    *,
-    force: bool = False,
-    sheet: bool | None = None,
-    beside: Sequence[OpenedImage] = (),
-    progress: Callable[[int, int], object] | None = None,
-) -> WrittenImages:
+    opener: ImageOpener, paths: Sequence[Path], out: Path, edit: Callable[[OpenedImage], Edited], *,
+    force: bool = False, sheet: bool | None = None, beside: Sequence[OpenedImage] = (),
+    resume: bool = False, video: VideoEdit | None = None, progress: Callable[..., object] | None = None,
+) -> WrittenImages:  # fmt: skip
     """Edit images, and write a folder for each.
 
     Args:
         opener: a model and how images are read and drawn.
-        paths: image files.
+        paths: image files, videos, and folders of them.
         out: folder of the folders.
         edit: makes of an opened image what is written.
         force: replace what is there.
         sheet: also draw a row for every image as sheet.png; by default for two images or more.
         beside: images that the edit takes something from; percentiles and crops list them, too.
-        progress: called with (images done, images in all).
+        resume: leave out images whose folders are there already.
+        video: what is done to videos; None refuses them.
+        progress: called with (images done, images in all), and what is being done as ``description``.
 
     Raises:
         FileExistsError: something would be replaced, and ``force`` is off.
         ValueError: no image can be read, or the edit is impossible.
     """
-    read, refused = readable(paths, opener.read)
-    if not read:
+    files = image_files(paths)
+    if not files:
         raise ValueError("give at least one image")
+    places = _places(files, out)
+    if resume:
+        files = [file for file in files if not places[file].exists()]
+        if not files:
+            return WrittenImages(out, [], [], {}, {}, before=len(places))
+    moving = [file for file in files if is_video(file)]
+    if moving and video is None:
+        raise ValueError(f"{moving[0]} is a video: relight, rotate or swap it")
+    read, refused = readable([file for file in files if file not in moving], opener.read, progress)
     with_sheet = len(read) > 1 if sheet is None else sheet
     sheets, records = Sheets(), []
-    folders = _free_places(list(read), out, sheets.rows if with_sheet else None, force)
-    images = opener.decomposed(read)
+    folders = [places[path] for path in read]
+    _require_free(
+        [*folders, *(places[path] for path in moving)],
+        out,
+        sheets.rows if with_sheet else None,
+        force or resume,
+    )
+    images = opener.decomposed(read) if read else []
     for image, folder in zip(images, folders, strict=True):
         made = edit(opener.finer(image))
         with atomic_folder(folder) as temporary:
@@ -134,7 +165,16 @@ def write_images(
         if with_sheet and made.row:
             sheets.add(image.path.name, made.row)
         if progress is not None:
-            progress(len(records), len(images))
+            progress(len(records), len(images), description="drawing")
+    for path in moving:
+        assert video is not None
+        with atomic_folder(places[path]) as temporary:
+            film = edit_video(
+                path, temporary / FILM, opener.model, video, frame=opener.options.frame, progress=progress
+            )
+            record = {"picture": str(path), "folder": str(places[path]), **vars(film), "out": FILM}
+            (temporary / "moved.json").write_text(json.dumps(record, indent=1), encoding="utf-8")
+        records.append(record)
     files = _sheet_files(out, len(sheets), sheets.rows)
     for file, drawn in zip(files, sheets.drawn(), strict=True):
         with atomic_file(file) as temporary:
@@ -142,27 +182,34 @@ def write_images(
     every = [*images, *beside]
     percentiles = {str(one.path): one.percentile for one in every if one.percentile is not None}
     framing = {str(one.path): one.framing for one in every}
-    return WrittenImages(out, records, files, refused, percentiles, framing)
+    odd = ""
+    if percentiles:
+        odd = unlike(np.stack([one.pixels for one in every]), [one.percentile or 0 for one in every])
+    before = len(places) - len(records) - len(refused)
+    return WrittenImages(out, records, files, refused, percentiles, framing, odd, before)
 
 
-def _free_places(images: Sequence[Path], out: Path, sheet_rows: int | None, force: bool) -> list[Path]:
-    """A folder in ``out`` for each image, named after it; what is there already is an error."""
-    if out.exists() and not out.is_dir():
-        raise NotADirectoryError(f"{out} is a file: name a folder to write to")
+def _places(images: Sequence[Path], out: Path) -> dict[Path, Path]:
+    """A folder in ``out`` for each image, named after it."""
     names: dict[str, Path] = {}
     for image in images:
         name, number = image.stem or "picture", 2
         while name.casefold() in names:
             name, number = f"{image.stem}-{number}", number + 1
         names[name.casefold()] = out / name
-    folders = list(names.values())
-    sheets = [] if sheet_rows is None else _sheet_files(out, len(images), sheet_rows)
+    return dict(zip(images, names.values(), strict=True))
+
+
+def _require_free(folders: Sequence[Path], out: Path, sheet_rows: int | None, force: bool) -> None:
+    """What is there already is an error, unless ``force`` allows it."""
+    if out.exists() and not out.is_dir():
+        raise NotADirectoryError(f"{out} is a file: name a folder to write to")
+    sheets = [] if sheet_rows is None else _sheet_files(out, len(folders), sheet_rows)
     existing = [place for place in (*folders, *sheets) if place.exists()]
     if existing and not force:
         raise FileExistsError(
             f"{existing[0]} exists already: choose another --out, or add --force to replace it"
         )
-    return folders
 
 
 def _sheet_files(out: Path, count: int, rows: int) -> list[Path]:

@@ -12,19 +12,25 @@ from math import ceil, degrees, log10
 from pathlib import Path
 from typing import Any
 
+import torch
 from PIL import Image
 from torch import Tensor
 
 from derender.features import named
 from derender.model import Derenderer
+from derender.photo import Photograph
+from derender.photo.video import Edit as VideoEdit
 from derender.report import sweeps
 from derender.report.colours import Images, pictures
 from derender.report.films import FILMS
 from derender.report.opening import FilmOptions, OpenedImage
 from derender.report.panel import GridLayout, labelled_grid
+from derender.scene import Scene
 from derender.scene.enlarge import at_size
 
-SMALLEST_CELL = 128
+SMALLEST_CELL, LARGEST_CELL = 128, 512
+FILM_SIZE = 512
+"""Largest side of a film of a whole photograph, in pixels."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +60,7 @@ class Edit:
 
     def strip(self) -> Image.Image:
         """All images in one labelled row, as large as the stills are, and large enough to see."""
-        cell = max(SMALLEST_CELL, *(still.width for still in self.stills.values()))
+        cell = min(LARGEST_CELL, max(SMALLEST_CELL, *(still.width for still in self.stills.values())))
         return labelled_grid(
             {name: [image] for name, image in self.row.items()}, layout=GridLayout(cell=cell)
         )
@@ -76,15 +82,9 @@ class Edit:
 
 
 def relit(
-    model: Derenderer,
-    image: OpenedImage,
-    *,
-    reach_deg: float = 60.0,
-    pitch_deg: float = 10.0,
-    strength: float = 1.0,
-    like: OpenedImage | None = None,
-    film: FilmOptions | None = None,
-) -> Edit:
+    model: Derenderer, image: OpenedImage, *, reach_deg: float = 60.0, pitch_deg: float = 10.0,
+    strength: float = 1.0, like: OpenedImage | None = None, film: FilmOptions | None = None,
+) -> Edit:  # fmt: skip
     """The image under other lighting: from right to left, or from its own to that of another image.
 
     Args:
@@ -113,13 +113,9 @@ def relit(
 
 
 def rotated(
-    model: Derenderer,
-    image: OpenedImage,
-    *,
-    reach_deg: float = 40.0,
-    pitch_deg: float = 0.0,
+    model: Derenderer, image: OpenedImage, *, reach_deg: float = 40.0, pitch_deg: float = 0.0,
     film: FilmOptions | None = None,
-) -> Edit:
+) -> Edit:  # fmt: skip
     """The image rotated from one side to the other, ``reach_deg`` to each, in its own lighting.
 
     Drawn in its own pixels it keeps its place and roll in the image; the model's rendering has none.
@@ -140,8 +136,8 @@ def rotated(
 
 
 def swapped_factors(
-    model: Derenderer, image: OpenedImage, donor: OpenedImage, factors: Sequence[str] = ()
-) -> Edit:
+    model: Derenderer, image: OpenedImage, donor: OpenedImage, factors: Sequence[str] = (),
+) -> Edit:  # fmt: skip
     """The image with one factor of another, for each of ``factors`` by itself (default: every factor)."""
     parameters = swappable(model, factors)
     stills = {
@@ -152,6 +148,43 @@ def swapped_factors(
     }
     numbers = {f"its {name}": {"factor": name, "from": str(donor.path)} for name in parameters}
     return Edit(_inputs(model, image, donor), stills, numbers)
+
+
+def relit_video(
+    *, reach_deg: float, pitch_deg: float, strength: float, like: OpenedImage | None, hold: bool,
+) -> VideoEdit:  # fmt: skip
+    """A light that goes round while a video plays, or stands still; arguments as for ``relit``."""
+
+    def edit(scene: Scene) -> dict[str, Tensor]:
+        if like is not None:
+            return {"light": like.scene.light.expand(len(scene), 4)}
+        own = float(scene.light[:, :2].sum(dim=1).mean())
+        return {"light": sweeps.lights_around(_over_time(scene, hold), reach_deg, pitch_deg, strength * own)}
+
+    return edit
+
+
+def rotated_video(*, reach_deg: float, pitch_deg: float, hold: bool) -> VideoEdit:
+    """A turn to either side on top of what the object does, while a video plays."""
+
+    def edit(scene: Scene) -> dict[str, Tensor]:
+        turn = sweeps.cameras_around(_over_time(scene, hold), reach_deg, pitch_deg)
+        return {"camera": scene.camera + turn.to(scene.camera)}
+
+    return edit
+
+
+def swapped_video(parameters: Sequence[str], donor: OpenedImage) -> VideoEdit:
+    """The donor's light, depth or camera in every frame; the surface's colours stay the video's."""
+    if "albedo" in parameters:
+        raise ValueError("the albedo of a video cannot be swapped: choose factors, such as --factor light")
+    own = donor.scene.parameters
+    return lambda scene: {name: own[name].expand(len(scene), *own[name].shape[1:]) for name in parameters}
+
+
+def _over_time(scene: Scene, hold: bool) -> Tensor:
+    """Places of a sweep for the frames of a video."""
+    return torch.ones(len(scene)) if hold else sweeps.there_and_back(len(scene))
 
 
 def _drawn_by(image: OpenedImage, donor: OpenedImage, parameter: str) -> sweeps.Render:
@@ -166,27 +199,24 @@ def swappable(model: Derenderer, factors: Sequence[str] = ()) -> dict[str, str]:
 
 
 def _swept(
-    model: Derenderer,
-    image: OpenedImage,
-    other: OpenedImage | None,
-    parameter: str,
-    values: Callable[[Tensor], Tensor],
-    label: Callable[[float, Tensor], str],
-    film: FilmOptions,
-) -> Edit:
+    model: Derenderer, image: OpenedImage, other: OpenedImage | None, parameter: str,
+    values: Callable[[Tensor], Tensor], label: Callable[[float, Tensor], str], film: FilmOptions,
+) -> Edit:  # fmt: skip
     """Stills and film of one scene along a sweep of one parameter."""
 
-    def drawn(rows: Tensor) -> Images:
-        return sweeps.drawn(sweeps.varied(image.scene, **{parameter: rows}), image.render)
+    def drawn(rows: Tensor, render: sweeps.Render) -> Images:
+        return sweeps.drawn(sweeps.varied(image.scene, **{parameter: rows}), render)
 
     places = sweeps.stills(film.stills)
     rows = values(places)
     labels = [label(place, row) for place, row in zip(places.tolist(), rows, strict=True)]
+    render = image.render
+    smaller = render.at_most(FILM_SIZE) if isinstance(render, Photograph) else render
     return Edit(
         _inputs(model, image, other),
-        dict(zip(labels, drawn(rows), strict=True)),
+        dict(zip(labels, drawn(rows, image.render), strict=True)),
         {text: {parameter: row} for text, row in zip(labels, rows.tolist(), strict=True)},
-        drawn(values(sweeps.there_and_back(film.frames))) if film.kinds else [],
+        drawn(values(sweeps.there_and_back(film.frames)), smaller) if film.kinds else [],
         film.kinds,
         film.seconds,
     )
@@ -197,7 +227,7 @@ def _inputs(
 ) -> dict[str, Image.Image]:
     shown = {
         "input": pictures(image.shown[None])[0],
-        "reconstruction": sweeps.drawn(at_size(image.scene, image.shown.shape[-1]), model.render)[0],
+        "reconstruction": sweeps.drawn(at_size(image.scene, image.side), model.render)[0],
     }
     return shown if other is None else {**shown, "the other": pictures(other.shown[None])[0]}
 

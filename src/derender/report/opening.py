@@ -30,8 +30,8 @@ CHOICES = {"detail": ("photo", "model"), "frame": ("face", "auto", "none")}
 OLD_TEXTURES = {"original": "photo", "model": "model"}
 OLD_CROPS = {"whole": "none", "auto": "auto"}
 FILM_KINDS, MESH_FORMATS = ("gif", "mp4"), ("glb", "obj")
-EDIT_SIZE, MESH_SIZE, TEXTURE_SIZE = 384, 128, 1024
-"""Default sides in pixels: of edits, of a mesh's grid and texture; decompositions have the model's own."""
+EDIT_SIZE, WHOLE_SIZE, MESH_SIZE, TEXTURE_SIZE = 384, 1024, 128, 1024
+"""Default sides in pixels: of edits, of whole photographs at most, of a mesh's grid and texture."""
 
 
 def option(default: Any, help: str, **shown: Any) -> Any:
@@ -45,7 +45,8 @@ class ImageOptions:
 
     size: int | None = option(
         None,
-        "Side of the output: 384, of a mesh's texture 1,024, of decompositions the model's.",
+        "Side of the output: 384, of whole photographs and textures of meshes at most 1,024, of "
+        "decompositions the model's.",
         min=8,
         max=4096,
     )
@@ -65,6 +66,7 @@ class ImageOptions:
         metavar="face|auto|none",
     )
     crop: str | None = option(None, "Old spelling of frame: whole or auto.", hidden=True)
+    only_frame: bool = option(False, "Draw the frame only, not the whole photograph around it.")
     batch_size: int = option(64, "Images per batch; changes speed and memory only.", min=1, metavar="N")
 
     def __post_init__(self) -> None:
@@ -87,6 +89,7 @@ class FilmOptions:
         "gif,mp4", "Kinds of film: gif, mp4, both with a comma between, or none.", metavar="KINDS"
     )
     frames: int = option(48, "Number of frames of the film.", min=2, max=1000, metavar="N")
+    hold: bool = option(False, "Hold a video's light or view at --reach, instead of going there and back.")
     seconds: float = option(4.0, "Length of the film in seconds.", min=0.1, max=60)
 
     def __post_init__(self) -> None:
@@ -112,7 +115,8 @@ class OpenedImage:
             "auto", "none", or "no face" where one was looked for in vain).
         scene: one scene, on the model's device.
         render: draws scenes like this one.
-        percentile: of its reconstruction error among the held-out ones; None where the model keeps none.
+        percentile: of its reconstruction error among the held-out ones, of the middle square's where the
+            part was chosen by that error; None where the model keeps none.
         depth_range: nearest and farthest depth of the images that were opened together.
     """
 
@@ -128,14 +132,25 @@ class OpenedImage:
     @property
     def detail(self) -> "PhotoDetail | None":
         """What draws the image's own pixels; None where the model's albedo is drawn."""
-        from derender.photo import PhotoDetail
+        from derender.photo import PhotoDetail, Photograph
 
-        return self.render if isinstance(self.render, PhotoDetail) else None
+        drawing = self.render.detail if isinstance(self.render, Photograph) else self.render
+        return drawing if isinstance(drawing, PhotoDetail) else None
 
     @property
     def shown(self) -> "np.ndarray | Tensor":
-        """(3, S, S) the image as it is drawn: its own pixels where these are, else the model's."""
+        """(3, H, W) the image as it is drawn: its own pixels where these are, else the model's."""
+        from derender.photo import Photograph
+
+        if isinstance(self.render, Photograph):
+            return self.render.pixels.transpose(2, 0, 1)
         return self.pixels if self.detail is None else self.detail.photo
+
+    @property
+    def side(self) -> int:
+        """Of a square drawing of its scene, in pixels: as ``shown``, of whole photographs 384."""
+        size = self.shown.shape
+        return size[-1] if size[-1] == size[-2] else EDIT_SIZE
 
     @property
     def textured(self) -> "Scene":
@@ -156,6 +171,7 @@ class ImageOpener:
         options: how images are read and drawn.
         default_size: side of the output where ``options`` names none; never below the model's.
         default_detail: "photo" or "model", where ``options`` names none.
+        whole: draw whole photographs, unless the options say otherwise.
         held_out: reconstruction errors that were stored with the model (``held_out_errors``).
 
     Raises:
@@ -169,11 +185,13 @@ class ImageOpener:
         *,
         default_size: int = 0,
         default_detail: str = "photo",
+        whole: bool = False,
         held_out: "HeldOutErrors | None" = None,
     ):
         self.model, self.options, self.held_out = model, options or ImageOptions(), held_out
         self.size = self.options.size or max(default_size, model.image_size)
         self.detail = self.options.detail or default_detail
+        self.whole = whole and self.detail == "photo" and not self.options.only_frame
         if self.size < model.image_size:
             raise ValueError(f"size {self.size} is below the model's {model.image_size}: give that or more")
 
@@ -183,9 +201,10 @@ class ImageOpener:
         (image,) = self.decomposed({path: self.read(path)})
         return self.finer(image)
 
-    def read(self, path: Path) -> "tuple[np.ndarray, Frame, dict[str, Any]]":
-        """Pixels at the model's size, the part of the file that they show, and the same as JSON has it.
+    def read(self, path: Path) -> "tuple[np.ndarray, Frame, dict[str, Any], np.ndarray]":
+        """Pixels at the model's size, the part of the file that they show, the same as JSON has it.
 
+        At last the pixels by which the image is judged, which no search by their error chose.
         A file that is no image, or shows no face where one was asked for, is a ValueError or OSError.
         """
         from derender.data import read_photo
@@ -196,10 +215,12 @@ class ImageOpener:
         middle = Frame.centred(photo.shape[1], photo.shape[0])
         place = {"x": frame.x, "y": frame.y, "side_px": frame.side, "roll_deg": frame.roll_deg}
         framing = {**frame.within(middle), **place, "found": found}
-        return frame.cut(photo, self.model.image_size), frame, framing
+        pixels = frame.cut(photo, self.model.image_size)
+        judged = middle.cut(photo, self.model.image_size) if found == "auto" else pixels
+        return pixels, frame, framing, judged
 
     def decomposed(
-        self, read: "Mapping[Path, tuple[np.ndarray, Frame, Mapping[str, Any]]]"
+        self, read: "Mapping[Path, tuple[np.ndarray, Frame, Mapping[str, Any], np.ndarray]]"
     ) -> list[OpenedImage]:
         """Every image with its scene, feed-forward or optimised, at the model's size."""
         import numpy as np
@@ -219,31 +240,59 @@ class ImageOpener:
         limits = depth_range(torch.cat([scene.depth.cpu() for scene in scenes]))
         percentiles: Sequence[float | None] = [None] * len(scenes)
         if self.held_out is not None:
-            percentiles = reconstruction_percentile(self.model, stacked, self.held_out).tolist()
+            judged = np.stack([middle for _, _, _, middle in read.values()])
+            percentiles = reconstruction_percentile(self.model, judged, self.held_out).tolist()
         rows = zip(read.items(), scenes, percentiles, strict=True)
         return [
             OpenedImage(path, pixels, frame, framing, scene, self.model.render, percentile, limits)
-            for (path, (pixels, frame, framing)), scene, percentile in rows
+            for (path, (pixels, frame, framing, _)), scene, percentile in rows
         ]
 
     def finer(self, image: OpenedImage) -> OpenedImage:
         """The image as it is drawn: its scene at the output's size or, unless declined, its own pixels."""
         from derender.data import as_float, read_photo
-        from derender.photo import PhotoDetail
+        from derender.photo import PhotoDetail, Photograph
         from derender.scene.enlarge import at_size
 
         if self.detail == "model":
             return replace(image, scene=at_size(image.scene, self.size))
-        pixels = as_float(image.frame.cut(read_photo(image.path), self.size)[None])[0]
+        photo = read_photo(image.path)
+        if self.whole and image.frame.side < max(photo.shape[:2]):
+            drawing = Photograph.of(photo, image.frame, image.scene, self.model)
+            return replace(image, render=drawing.at_most(self.options.size or WHOLE_SIZE))
+        pixels = as_float(image.frame.cut(photo, self.size)[None])[0]
         detail = PhotoDetail(pixels, image.scene, self.model.fov_deg, renderer=self.model.renderer)
         return replace(image, render=detail)
 
 
-def readable(paths: Sequence[Path], read: Callable[[Path], T]) -> tuple[dict[Path, T], dict[str, str]]:
+def image_files(paths: Sequence[Path]) -> list[Path]:
+    """The files that were named, and in place of a folder the images and videos in it, once each."""
+    from derender.data import is_image
+    from derender.data.folder_source import FolderSource
+    from derender.photo import is_video
+
+    files: list[Path] = []
+    for path in paths:
+        if not path.is_dir():
+            files.append(path)
+            continue
+        source = FolderSource(path)
+        wanted = [source.on_disk(f) for f in source.files if is_image(f) or is_video(Path(f))]
+        if not wanted:
+            raise ValueError(f"{path} holds no images")
+        files += wanted
+    return list(dict.fromkeys(files))
+
+
+def readable(
+    paths: Sequence[Path], read: Callable[[Path], T], progress: Callable[..., object] | None = None
+) -> tuple[dict[Path, T], dict[str, str]]:
     """Every file that can be read, and reasons why the others cannot; none at all is an error."""
     found: dict[Path, T] = {}
     refused: dict[str, str] = {}
-    for path in dict.fromkeys(paths):
+    for number, path in enumerate(paths):
+        if progress is not None:
+            progress(number, len(paths), description="reading")
         try:
             found[path] = read(path)
         except (ValueError, OSError) as problem:

@@ -103,9 +103,12 @@ def crop_errors(
     return torch.cat(columns, dim=1).numpy()
 
 
-def best_crops(model: Any, images: UInt8[Tensor, "n 3 r r"]) -> list[Crop]:
-    """The crop of each image that the model reconstructs best; the whole where none is clearly better."""
+def best_crop(model: Any, views: UInt8[Tensor, "n 3 r r"]) -> tuple[int, Crop]:
+    """Of squares of one photograph the number of one, and its crop, that the model reconstructs best.
+
+    The whole first square, where none is clearly better.
+    """
     crops = candidate_crops()
-    errors = crop_errors(model, images, crops)
-    clearly = errors.min(axis=0) < GAIN * errors[0]
-    return [crops[at] if better else WHOLE for at, better in zip(errors.argmin(axis=0), clearly, strict=True)]
+    errors = crop_errors(model, views, crops)
+    crop, view = divmod(int(errors.argmin()), len(views))
+    return (view, crops[crop]) if errors[crop, view] < GAIN * errors[0, 0] else (0, WHOLE)

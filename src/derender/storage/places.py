@@ -22,7 +22,7 @@ DEVICES = ("auto", "cpu", "cuda")
 PRETRAINED = Path(__file__).parents[1] / "pretrained"
 SUFFIXES = (
     *(".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".webp", ".avif", ".bmp", ".gif"),
-    *(".tif", ".tiff", ".ppm", ".pgm", ".pnm"),
+    *(".tif", ".tiff", ".ppm", ".pgm", ".pnm", ".heic", ".heif"),
 )
 """File names that end in one of these are taken for images."""
 

@@ -1,11 +1,11 @@
 """The distance of a model's reconstructions from images it was not trained on, saved with the model.
 
 One number per image, the mean absolute difference inside the mask; of all of them 101 quantiles, in a small
-JSON file. Another image's error among them tells whether it may be out-of-distribution: a high percentile is
-a sign of another kind of object, another crop or a broken image. A low one proves nothing: a plain surface
-may be easy to render whatever it shows.
+JSON file. An image with a high percentile shows another kind of object or another crop, or is broken. A low
+one proves nothing: a plain surface may be easy to render whatever it shows.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import inf
 from pathlib import Path
@@ -21,14 +21,17 @@ from derender.model import load
 from derender.storage.atomic import atomic_file
 from derender.storage.bounded import read_json
 from derender.storage.folder import QUANTILES, ErrorsFile
-from derender.storage.places import ERRORS_FILE
+from derender.storage.places import ERRORS_FILE, bundled_models, model_folder
 from derender.training.process import evaluating
 
 FEWEST = 20
 """Of fewer images nothing is saved: their largest error says little."""
-
 OUTLIER_PERCENTILE = 99.0
 """Images above it are called out-of-distribution."""
+EXPECTED_OUTLIERS = 0.1
+"""Share of the images that may be; of held-out ones 0.01 are."""
+FITTING = 98.0
+"""A model is recommended where images have such a percentile, or less."""
 
 Images = UInt8[np.ndarray, "n 3 h w"] | UInt8[Tensor, "n 3 h w"]
 
@@ -74,6 +77,49 @@ def masked_l1(rendering: Any, target: Float[Tensor, "n 3 h w"]) -> Float[Tensor,
     return torch.where(covered > 0, inside / covered, inf)
 
 
+def reconstruction_percentile(model: Any, images: Images, held_out: HeldOutErrors) -> Float[np.ndarray, " n"]:
+    """Percentage (0..100) of the held-out images that the model reconstructs better than each of these.
+
+    Images like the training data have every percentile equally often. Between stored quantiles it is
+    interpolated; an image into which the model renders nothing has 100.
+    """
+    return percentile_of(reconstruction_errors(model, images), held_out)
+
+
+def percentile_of(errors: Float[np.ndarray, " n"], held_out: HeldOutErrors) -> Float[np.ndarray, " n"]:
+    """Where errors lie among the held-out ones, 0..100."""
+    return np.interp(errors, held_out.quantiles, np.linspace(0, 100, len(held_out.quantiles)))
+
+
+def unlike(images: Images, percentiles: Sequence[float] | np.ndarray) -> str:
+    """What images that a model reconstructs badly have in common: their number, and the model that fits.
+
+    Args:
+        images: (N, 3, S, S) all of them.
+        percentiles: of the N errors among the model's held-out ones.
+
+    Returns:
+        One line; empty where no more images are out-of-distribution than among held-out ones.
+    """
+    odd = np.flatnonzero(np.asarray(percentiles) > OUTLIER_PERCENTILE)
+    if len(odd) <= EXPECTED_OUTLIERS * len(percentiles):
+        return ""
+    found = {}
+    for name in bundled_models():
+        known, model = read_errors(model_folder(name)), load(name)
+        if known is not None and model.image_size == images.shape[-1]:
+            found[name] = float(np.median(reconstruction_percentile(model, images[odd], known)))
+    best = min(found, key=lambda name: found[name], default="")
+    line = (
+        f"{len(odd):,} of {len(percentiles):,} images are reconstructed worse than {OUTLIER_PERCENTILE:g} % "
+        "of those this model was validated on: another kind of object, or another crop "
+        "(derender align, --frame)"
+    )
+    if best and found[best] < FITTING:
+        return f"{line}; {best} fits better (worse than {found[best]:.0f} % of its own): try --model {best}"
+    return line
+
+
 def errors_of(model: Any, images: Images, batch_size: int = 64) -> HeldOutErrors:
     """The quantiles for images it was not trained on; fewer than 20 or no rendering are a ValueError."""
     if len(images) < FEWEST:
@@ -113,19 +159,3 @@ def read_errors(folder: Path) -> HeldOutErrors | None:
         return None
     stored = read_json(file, ErrorsFile, "make it again with derender evaluate reconstruction --store")
     return HeldOutErrors(np.array(stored.quantiles, np.float64), stored.pictures)
-
-
-def reconstruction_percentile(
-    model: Any, images: UInt8[np.ndarray, "n 3 h w"], held_out: HeldOutErrors
-) -> Float[np.ndarray, " n"]:
-    """Percentage (0..100) of the held-out images that the model reconstructs better than each of these.
-
-    Images like the training data have every percentile equally often. Between stored quantiles it is
-    interpolated; an image into which the model renders nothing has 100.
-    """
-    return percentile_of(reconstruction_errors(model, images), held_out)
-
-
-def percentile_of(errors: Float[np.ndarray, " n"], held_out: HeldOutErrors) -> Float[np.ndarray, " n"]:
-    """Where errors lie among the held-out ones, 0..100."""
-    return np.interp(errors, held_out.quantiles, np.linspace(0, 100, len(held_out.quantiles)))

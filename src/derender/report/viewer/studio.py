@@ -334,9 +334,7 @@ class Studio:
             place = Frame(
                 (frame.x - left) * scale, (frame.y - top) * scale, frame.side * scale, frame.roll_deg
             )
-            self._photographs[key] = Photograph.of(
-                pixels, place, opened.scene, self.model.fov_deg, self.model.renderer
-            )
+            self._photographs[key] = Photograph.of(pixels, place, opened.scene, self.model)
         self._photographs.move_to_end(key)
         while len(self._photographs) > PHOTOGRAPHS_KEPT:
             self._photographs.popitem(last=False)

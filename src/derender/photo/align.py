@@ -1,0 +1,254 @@
+"""The faces of many photographs, each cut out upright where a model expects it, with the way back.
+
+``boxes.csv`` has a row for every box, accepted or rejected: where the crop lies, the affine transform from
+its pixels to the photograph's, and the reason of a rejection. Photographs are read one after another; a run
+that was stopped goes on after the last photograph that it finished. Leaves out finding (``faces``).
+"""
+
+import csv
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from math import cos, radians, sin
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from derender.data import Stream, decode_whole, estimated_total, open_images, quiet_pillow
+from derender.inputs import Progress, as_model
+from derender.model import Derenderer
+from derender.photo.faces import PROFILE_DEG, UTKFACE, Face, Template, face_candidates, frame_of, template_of
+from derender.photo.frame import Frame
+from derender.storage.atomic import atomic_file
+from derender.training.held_out_errors import (
+    OUTLIER_PERCENTILE,
+    HeldOutErrors,
+    read_errors,
+    reconstruction_percentile,
+)
+
+BOXES = "boxes.csv"
+AFFINE = ("xx", "xy", "x0", "yx", "yy", "y0")
+COLUMNS = (
+    *("file", "photo", "rejected", "confidence", "left", "top", "right", "bottom"),
+    *("x", "y", "side", "roll_deg", *AFFINE),
+)
+NO_FACE = "no face found"
+UNREADABLE = "cannot be read: "
+
+
+@dataclass(frozen=True)
+class Aligned:
+    """What `align` wrote.
+
+    Attributes:
+        out: the folder of crops and ``boxes.csv``.
+        rows: one for each box, and one for each photograph without any: ``COLUMNS`` by name, as text.
+        resumed: photographs that an earlier run had finished.
+    """
+
+    out: Path
+    rows: list[dict[str, str]]
+    resumed: int
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Photographs, faces, photographs without a face, rejected boxes, and unreadable files."""
+        faces, photos = [row for row in self.rows if row["file"]], {row["photo"] for row in self.rows}
+        unreadable = sum(row["rejected"].startswith(UNREADABLE) for row in self.rows)
+        return {
+            "photographs": len(photos),
+            "faces": len(faces),
+            "without_face": len(photos) - len({row["photo"] for row in faces}) - unreadable,
+            "rejected": sum(bool(row["rejected"] and row["left"]) for row in self.rows),
+            "unreadable": unreadable,
+        }
+
+    def describe(self) -> str:
+        """One line."""
+        n = self.counts
+        return (
+            f"{n['faces']:,} faces in {n['photographs']:,} photographs; no face in {n['without_face']:,}, "
+            f"{n['rejected']:,} boxes rejected, {n['unreadable']:,} files unreadable ({BOXES} names each)"
+        )
+
+
+def align(
+    photos: Stream | str | Path, out: str | Path, *, model: Derenderer | str | Path | None = None,
+    size: int = 256, margin: float = 0.0, largest: bool = False, dataset: str = "auto",
+    limit: int | None = None, overwrite: bool = False, progress: Progress | None = None,
+) -> Aligned:  # fmt: skip
+    """Cut every face of photographs out, upright, where UTKFace or a model of faces has it.
+
+    Args:
+        photos: a folder, zip, image, shards or Hugging Face id, or an open stream.
+        out: folder for the crops (PNG, in the folders of their photographs) and ``boxes.csv``.
+        model: cut as it was trained; a crop that it reconstructs worse than 99 % of its held-out images is
+            rejected.
+        size: side of the crops in pixels.
+        margin: more of the surroundings on every side, in shares of the side.
+        largest: only the largest face of each photograph.
+        dataset, limit: how the photographs are read.
+        overwrite: replace what an earlier run made; without, a stopped run is continued.
+        progress: called with (photographs done, in all).
+
+    Raises:
+        ValueError: the stopped run in ``out`` had other options, or the model is of no known faces.
+        FileExistsError: ``out`` holds a finished run.
+    """
+    if not (8 <= size <= 4096 and 0 <= margin <= 2):
+        raise ValueError(f"size must be 8 to 4096 and margin 0 to 2, got {size} and {margin:g}")
+    cutter = _Cutter(Path(out), size, margin, largest, *_known(model))
+    boxes, partial = cutter.out / BOXES, cutter.out / f"{BOXES}.partial"
+    if boxes.exists() and not overwrite:
+        raise FileExistsError(f"{boxes} exists already: choose another folder, or replace it (--force)")
+    stream = open_images(photos, dataset=dataset, limit=limit) if not isinstance(photos, Stream) else photos
+    with stream:
+        plan = {"photos": stream.place, "size": size, "margin": margin, "largest": largest, "limit": limit}
+        plan["model"] = None if model is None else str(getattr(model, "source", model))
+        if overwrite:
+            for row in [row for file in (boxes, partial) for row in _read(file)[1]]:
+                crop = (cutter.out / row["file"]).resolve()
+                if row["file"].endswith(".png") and crop.is_relative_to(cutter.out.resolve()):
+                    crop.unlink(missing_ok=True)
+            partial.unlink(missing_ok=True)
+        earlier, rows = _read(partial)
+        if earlier not in (None, plan):
+            raise ValueError(f"{partial} was made with other options: give those, or begin anew (--force)")
+        finished = {row["photo"] for row in rows}
+        resumed = len(finished)
+        cutter.out.mkdir(parents=True, exist_ok=True)
+        _write(partial, rows, plan)
+        try:
+            for number, sample in enumerate(stream.samples(), 1):
+                if sample.file not in finished:
+                    found = list(cutter.rows(sample.file, sample.read))
+                    with partial.open("a", newline="", encoding="utf-8") as file:
+                        csv.DictWriter(file, COLUMNS).writerows(found)
+                    rows += [{name: str(row.get(name, "")) for name in COLUMNS} for row in found]
+                if progress is not None:
+                    progress(number, estimated_total(number, sample.share, stream.limit))
+                if number == stream.limit:
+                    break
+        except KeyboardInterrupt as stopped:
+            count = len({row["photo"] for row in rows})
+            raise KeyboardInterrupt(
+                f"stopped by Ctrl-C; {count:,} photographs are done: the same command goes on"
+            ) from stopped
+    done = Aligned(cutter.out, rows, resumed)
+    if done.counts["unreadable"] == done.counts["photographs"]:
+        raise ValueError(f"none of the photographs can be read; {rows[0]['photo']}: {rows[0]['rejected']}")
+    with atomic_file(boxes) as temporary:
+        _write(temporary, rows)
+    partial.unlink()
+    return done
+
+
+@dataclass(frozen=True)
+class _Cutter:
+    """Cuts the faces of one photograph out, and writes them."""
+
+    out: Path
+    size: int
+    margin: float
+    largest: bool
+    template: Template
+    model: Derenderer | None
+    held_out: HeldOutErrors | None
+
+    def rows(self, name: str, read: Any) -> Iterator[dict[str, Any]]:
+        """Write the crops of one photograph; rows for its boxes."""
+        try:
+            with quiet_pillow():
+                pixels = decode_whole(read())
+        except (ValueError, OSError) as problem:
+            yield {"photo": name, "rejected": UNREADABLE + " ".join(str(problem).split())}
+            return
+        accepted, faces = 0, face_candidates(pixels)
+        for face in faces:
+            frame = frame_of(face, self.template)
+            row: dict[str, Any] = {
+                "photo": name,
+                "rejected": face.rejected or self._doubt(pixels, face, frame),
+            }
+            if not row["rejected"] and self.largest and accepted:
+                row["rejected"] = "not the largest face"
+            frame = Frame(frame.x, frame.y, frame.side * (1 + 2 * self.margin), frame.roll_deg)
+            if not row["rejected"]:
+                accepted += 1
+                stem = PurePosixPath(name).with_suffix("")
+                place = stem.with_name(stem.name + (f"-{accepted}" if accepted > 1 else "") + ".png")
+                row["file"] = str(place).lstrip("/").replace("..", "__")
+                with atomic_file(self.out / row["file"]) as temporary:
+                    cut = frame.cut(pixels, self.size).transpose(1, 2, 0)
+                    Image.fromarray(np.ascontiguousarray(cut)).save(temporary, format="PNG")
+            yield row | _place(face, frame, self.size)
+        if not accepted:
+            yield {"photo": name, "rejected": NO_FACE}
+
+    def _doubt(self, pixels: np.ndarray, face: Face, frame: Frame) -> str:
+        """Why a face is rejected that was found; empty where it is not."""
+        if abs(face.yaw_deg) > PROFILE_DEG:
+            return f"turned by about {face.yaw_deg:.0f} degrees: models of faces know {PROFILE_DEG:.0f}"
+        if self.model is None or self.held_out is None:
+            return ""
+        crop = frame.cut(pixels, self.model.image_size)[None]
+        percentile = float(reconstruction_percentile(self.model, crop, self.held_out)[0])
+        if percentile <= OUTLIER_PERCENTILE:
+            return ""
+        return f"the model reconstructs it worse than {percentile:.0f} % of the images it was validated on"
+
+
+def _place(face: Face, frame: Frame, size: int) -> dict[str, float]:
+    """Box, frame and transform: photograph = (xx u + xy v + x0, yx u + yy v + y0) for crop pixels (u, v)."""
+    scale, angle = frame.side / size, radians(frame.roll_deg)
+    c, s = scale * cos(angle), scale * sin(angle)
+    x0, y0 = frame.corners()[0]
+    values = {
+        "confidence": face.confidence,
+        **dict(zip(("left", "top", "right", "bottom"), face.box, strict=True)),
+        **dict(
+            zip(("x", "y", "side", "roll_deg"), (frame.x, frame.y, frame.side, frame.roll_deg), strict=True)
+        ),
+        **dict(zip(AFFINE, (c, -s, x0, s, c, y0), strict=True)),
+    }
+    return {name: round(float(value), 4) for name, value in values.items()}
+
+
+def _known(model: Derenderer | str | Path | None) -> tuple[Template, Derenderer | None, HeldOutErrors | None]:
+    """Where a model has its faces, the model, and its held-out errors."""
+    if model is None:
+        return UTKFACE, None, None
+    loaded = as_model(model)
+    template = template_of(loaded)
+    if template is None:
+        raise ValueError(
+            f"{model} is not known to be of faces: choose faces-64 or rendered-faces-64, or none"
+        )
+    assert loaded.source is not None  # template_of knows models by it
+    return template, loaded, read_errors(loaded.source)
+
+
+def _read(file: Path) -> tuple[dict[str, Any] | None, list[dict[str, str]]]:
+    """Options (None for none) and rows of an earlier run, without its last photograph if it was stopped."""
+    if not file.exists():
+        return None, []
+    first, *lines = file.read_text(encoding="utf-8").splitlines(keepends=True) or [""]
+    plan = json.loads(first[2:]) if first.startswith("# {") else None
+    reader = csv.DictReader(lines if plan is not None else [first, *lines])
+    if tuple(reader.fieldnames or ()) != COLUMNS:
+        raise ValueError(f"{file} is no table of derender align: choose another folder")
+    rows = list(reader)
+    last = rows[-1]["photo"] if rows and plan is not None else None
+    return plan, [row for row in rows if row["photo"] != last]
+
+
+def _write(file: Path, rows: list[dict[str, str]], plan: dict[str, Any] | None = None) -> None:
+    with file.open("w", newline="", encoding="utf-8") as stream:
+        if plan is not None:
+            stream.write(f"# {json.dumps(plan)}\n")
+        writer = csv.DictWriter(stream, COLUMNS)
+        writer.writeheader()
+        writer.writerows(rows)

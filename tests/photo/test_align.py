@@ -1,0 +1,121 @@
+"""`derender align`: every face of a folder upright where it belongs, and the way back into the photograph."""
+
+import csv
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import derender
+from derender.cli import main
+from derender.photo import Face, Frame, find_faces
+from derender.photo.align import AFFINE
+from derender.photo.faces import RENDERED, UTKFACE, YAW_PER_SHARE
+from derender.report.viewer.neighbours import rendered_examples
+
+
+def head(number: int, size: int) -> Image.Image:
+    """A rendered head (nobody's)."""
+    tile = rendered_examples("rendered-faces-64", 64)[number].picture
+    return Image.fromarray(tile).resize((size, size), Image.Resampling.LANCZOS)
+
+
+def scene(*heads: tuple[int, int, tuple[int, int], float]) -> Image.Image:
+    """A photograph with heads (number, size, place, roll) in it."""
+    noise = np.random.default_rng(1).integers(0, 255, (6, 8, 3), dtype=np.uint8)
+    photo = Image.fromarray(noise).resize((640, 480), Image.Resampling.BICUBIC)
+    for number, size, at, roll in heads:
+        turned = head(number, size).convert("RGBA").rotate(-roll, Image.Resampling.BICUBIC, expand=True)
+        photo.paste(turned, at, turned)
+    return photo
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("photos")
+    (folder / "two").mkdir()
+    scene((0, 220, (380, 30), 15.0), (1, 150, (60, 200), -20.0)).save(folder / "two" / "pair.png")
+    scene().save(folder / "none.png")
+    (folder / "broken.jpg").write_bytes(b"no image")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def aligned(photos, tmp_path_factory):
+    out = tmp_path_factory.mktemp("out") / "aligned"
+    return derender.align(photos, out, size=128, model="rendered-faces-64"), out
+
+
+def test_every_face_lies_where_the_model_has_it(aligned):
+    done, out = aligned
+    assert done.counts["faces"] == 2 and done.counts["photographs"] == 3
+    assert done.counts["without_face"] == done.counts["unreadable"] == 1
+    for name in ("two/pair.png", "two/pair-2.png"):
+        large = Image.open(out / name).resize((256, 256), Image.Resampling.BICUBIC)
+        (face,) = find_faces(np.asarray(large))
+        assert np.abs(face.points / 256 - RENDERED)[[0, 1, 3, 4]].max() < 0.04  # the nose turns
+    reasons = {row["photo"]: row["rejected"] for row in done.rows if not row["file"]}
+    assert reasons["none.png"] == "no face found" and "known format" in reasons["broken.jpg"]
+
+
+def test_the_transform_leads_back_into_the_photograph(aligned, photos):
+    _, out = aligned
+    with (out / "boxes.csv").open(newline="") as file:
+        row = next(row for row in csv.DictReader(file) if row["file"] == "two/pair.png")
+    xx, xy, x0, yx, yy, y0 = (float(row[name]) for name in AFFINE)
+    photo = np.asarray(Image.open(photos / row["photo"])).astype(float)
+    crop = np.asarray(Image.open(out / row["file"])).astype(float)
+    v, u = np.mgrid[20:108:11, 20:108:11] + 0.5
+    columns, rows = (xx * u + xy * v + x0).astype(int), (yx * u + yy * v + y0).astype(int)
+    assert np.abs(photo[rows, columns] - crop[v.astype(int), u.astype(int)]).mean() < 6
+    assert abs(float(row["roll_deg"]) - 15) < 6
+    place = {name: float(row[name]) for name in ("x", "y", "side", "roll_deg")}
+    assert np.allclose(Frame(**place).corners()[0], (x0, y0), atol=1e-2)
+
+
+def test_a_stopped_run_goes_on_and_a_finished_one_is_kept(photos, tmp_path, capsys):
+    stops = iter((None, KeyboardInterrupt))
+
+    def stop(done, total):
+        if (error := next(stops)) is not None:
+            raise error
+
+    with pytest.raises(KeyboardInterrupt, match="the same command goes on"):
+        derender.align(photos, tmp_path / "a", progress=stop)
+    with pytest.raises(ValueError, match="other options"):
+        derender.align(photos, tmp_path / "a", size=64)
+    finished = derender.align(photos, tmp_path / "a")
+    assert finished.resumed == 1
+    assert finished.rows == derender.align(photos, tmp_path / "b").rows
+    words = ["align", str(photos), "--out", str(tmp_path / "a"), "--largest"]
+    assert main(words) == 2 and "exists already" in capsys.readouterr().err
+    assert main([*words, "--force"]) == 0
+    assert "1 faces in 3 photographs; no face in 1, 1 boxes rejected" in capsys.readouterr().out
+    assert not (tmp_path / "a" / "two" / "pair-2.png").exists()
+    (tmp_path / "mine.png").write_bytes(b"kept")
+    text = (tmp_path / "a" / "boxes.csv").read_text().replace("two/pair.png,", "../mine.png,", 1)
+    (tmp_path / "a" / "boxes.csv").write_text(text)
+    assert main([*words, "--force"]) == 0 and (tmp_path / "mine.png").exists()
+    (tmp_path / "a" / "boxes.csv").write_text("a,b\n1,2\n")
+    assert main([*words, "--force"]) == 2 and "no table of derender align" in capsys.readouterr().err
+
+
+def test_a_model_of_other_objects_is_refused(photos, tmp_path):
+    with pytest.raises(ValueError, match="not known to be of faces"):
+        derender.align(photos, tmp_path, model="cars-64")
+
+
+@pytest.mark.parametrize("yaw", [-70, -30, 0, 30, 70])
+def test_the_turn_of_a_face_is_read_from_its_nose(yaw):
+    beside = np.sin(np.radians(yaw)) / YAW_PER_SHARE
+    marks = np.array([(-0.4, 0), (0.4, 0), (beside, 0.5), (-0.4, 1), (0.4, 1)])
+    turned = 50 * marks @ np.array([[0.8, 0.6], [-0.6, 0.8]]) + 90
+    assert Face((0, 0, 1, 1), turned.astype(np.float32), 1.0).yaw_deg == pytest.approx(yaw, abs=0.1)
+
+
+def test_faces_lying_on_their_side_are_found():
+    turned = np.rot90(np.asarray(scene((0, 220, (200, 100), 0.0)))).copy()
+    (face,) = find_faces(turned)
+    left, right = face.points[:2]
+    assert abs(right[0] - left[0]) < 0.2 * abs(right[1] - left[1]) and right[1] < left[1]
+    assert np.hypot(*(left - right)) == pytest.approx(220 * (UTKFACE[1][0] - UTKFACE[0][0]), rel=0.15)

@@ -1,0 +1,74 @@
+"""A video in, a video out: every frame, the same sound, parameters that do not flicker."""
+
+import subprocess
+
+import numpy as np
+import pytest
+import torch
+from imageio_ffmpeg import get_ffmpeg_exe
+from tests.photo.test_align import head, scene
+
+import derender
+from derender.cli import main
+from derender.photo import edit_video
+from derender.photo.video import _frames, write_video
+
+
+@pytest.fixture(scope="module")
+def film(tmp_path_factory):
+    """Twelve frames of a head that moves to the right and flickers, with a tone."""
+    folder = tmp_path_factory.mktemp("film")
+    still, face = scene().resize((240, 180)), head(0, 120)
+    frames = []
+    for number in range(12):
+        frame = still.copy()
+        frame.paste(face, (20 + 6 * number, 30))
+        frames.append((np.asarray(frame) * (1.0 if number % 2 else 0.8)).astype(np.uint8))
+    tone = folder / "tone.wav"
+    words = ["-f", "lavfi", "-i", "sine=frequency=440:duration=1.2", str(tone)]
+    subprocess.run([get_ffmpeg_exe(), "-loglevel", "error", *words], check=True)
+    write_video(folder / "film.mp4", iter(frames), (240, 180), 10.0, tone)
+    return folder / "film.mp4"
+
+
+def read(path):
+    return np.stack(list(_frames(path)))
+
+
+def has_sound(path):
+    words = ["-nostdin", "-loglevel", "error", "-i", str(path), "-map", "0:a:0", "-f", "null", "-"]
+    return subprocess.run([get_ffmpeg_exe(), *words], capture_output=True).returncode == 0
+
+
+def test_the_unchanged_scene_gives_the_film_back_with_its_sound(film, tmp_path):
+    model = derender.load("rendered-faces-64")
+    jumps = []
+
+    def unchanged(scenes):
+        jumps.append(scenes.light.diff(dim=0).abs().max().item())
+        return {"light": scenes.light}
+
+    done = edit_video(film, tmp_path / "same.mp4", model, unchanged)
+    assert (done.frames, done.width, done.height, done.searched, done.found) == (12, 240, 180, 6, 6)
+    before, after = read(film), read(tmp_path / "same.mp4")
+    assert has_sound(film) and has_sound(tmp_path / "same.mp4")
+    assert after.shape == before.shape == (12, 180, 240, 3)
+    assert np.abs(after.astype(int) - before).mean() < 2
+    cuts = torch.stack(
+        [torch.from_numpy(one[30:150, 20 + 6 * k : 140 + 6 * k].copy()) for k, one in enumerate(before)]
+    )
+    raw = model.decompose(cuts.numpy()).light.diff(dim=0).abs().max().item()
+    assert jumps[0] < 0.5 * raw
+
+
+def test_a_film_is_relit_where_its_face_is(film, tmp_path, capsys):
+    words = ["relight", "-m", "rendered-faces-64", str(film), "-o", str(tmp_path / "out"), "--hold"]
+    assert main(words) == 0
+    change = np.abs(read(tmp_path / "out" / "film" / "film.mp4").astype(int) - read(film))
+    first, last = change[0].mean(axis=(0, 2)), change[-1].mean(axis=(0, 2))
+    assert first[40:120].mean() > 4 * first[200:].mean() and last[110:190].mean() > 4 * last[:30].mean()
+    assert main(["mesh", "-m", "rendered-faces-64", str(film), "-o", str(tmp_path / "mesh")]) == 2
+    assert "is a video" in capsys.readouterr().err
+    with pytest.raises(ValueError, match="cannot be read as a video"):
+        (tmp_path / "none.mp4").write_bytes(b"no film")
+        edit_video(tmp_path / "none.mp4", tmp_path / "x.mp4", derender.load("faces-64"), dict)
