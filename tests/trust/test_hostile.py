@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.trust.hostile_files import UNSAFE, encoded, named_in, smooth, write_hostile, write_hostile_zip
+from tests.trust.hostile_files import UNSAFE, encoded, smooth, write_hostile, write_hostile_zip
 
 import derender
 from derender.cli import main
@@ -83,8 +83,10 @@ def test_commands_count_broken_files_and_name_them(hostile, model, tmp_path, cap
     assert f"{len(hostile.unreadable)} skipped" in said and said.count("\nskipped ") == 5
     broken = tuple(name for name in hostile.unreadable if "bomb" not in name and "cut" not in name)
     files = [str(hostile.folder / name) for name in ("plain.jpg", "one pixel.png", "two\nlines.png", *broken)]
-    assert main(["decompose", *files, *out, str(tmp_path / "out")]) == 2
-    assert named_in(capsys.readouterr().err, broken) == []
+    assert main(["decompose", *files, "--json", str(told), *out, str(tmp_path / "out")]) == 2
+    said = capsys.readouterr().err
+    assert said.count("left out ") == 5 and f"and {len(broken) - 5} more (--json names all)" in said
+    assert json.loads(told.read_text())["refused"].keys() == {str(hostile.folder / name) for name in broken}
     assert len(list((tmp_path / "out").iterdir())) == 3
 
 
