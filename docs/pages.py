@@ -246,6 +246,14 @@ def million_rows(found: Any) -> Iterator[list[str]]:
     yield from ([name, f"{found['seconds'][key]:.2f}"] for key, name in names.items())
 
 
+def aligned(found: Any) -> Iterator[list[str]]:
+    yield ["faces found", "recall", "precision", "eye error, mean", "90th percentile"]
+    for group in ("pasted", "lfw crops"):
+        for name, row in found[group].items():
+            keys = ("recall", "precision", "eye_error_mean", "eye_error_90th")
+            yield [f"{group}: {name}", *(f"{row[key]:.3f}" for key in keys)]
+
+
 def angles(found: Any) -> Iterator[list[str]]:
     """Correlation, slope and error of each angle, beside the error of a constant answer."""
     yield ["angle", "r", "slope", "error, degrees", "constant answer, degrees"]
@@ -294,6 +302,7 @@ SPEED: dict[str, tuple[str, Callable[[Any], Iterator[list[str]]]]] = {
     "relighting": ("relighting.json", scored(PSNR, "psnr")),
     "renderers": ("renderers_fit.json", renderers),
     "table-million": ("table_million.json", million_rows),
+    "align": ("align.json", aligned),
     "brightness-races": ("brightness-races.json", scored({"share of brightness": ("share", 1, 3)}, "share")),
     "brightness-rendered": ("brightness-rendered.json", scored(BRIGHTNESS, "brightness")),
     "people-generated": ("generated/people.json", scored(CLUSTERS, "rows")),
