@@ -16,33 +16,30 @@ SOURCES = sorted(PACKAGE.rglob("*.py"))
 TESTS = sorted((ROOT / "tests").rglob("*.py"))
 
 BUDGET = {  # lines, files
-    "data": (9_820, 49),
-    "evaluation": (9_230, 55),
-    "report": (6_070, 40),
-    "cli": (4_770, 47),
-    "training": (4_850, 26),
-    "baselines": (4_360, 21),
-    "render": (3_430, 26),
-    "features": (3_200, 19),
-    "interpretation": (2_880, 16),
-    "photo": (2_490, 15),  # photographs in their own pixels
-    "networks": (2_400, 17),
-    "storage": (2_410, 17),
-    "objectives": (2_420, 16),
-    "postprocess": (2_330, 16),
-    "scene": (2_390, 20),
-    "demo": (2_100, 13),
-    "learn": (2_140, 14),
+    "data": (8_020, 41),
+    "evaluation": (8_460, 47),
+    "report": (4_740, 32),
+    "cli": (2_510, 36),
+    "training": (3_450, 17),
+    "baselines": (2_740, 11),
+    "render": (1_740, 16),
+    "features": (1_520, 9),
+    "interpretation": (1_200, 6),
+    "photo": (1_410, 7),  # photographs in their own pixels
+    "networks": (750, 7),
+    "storage": (960, 9),
+    "objectives": (740, 6),
+    "postprocess": (760, 8),
+    "scene": (860, 12),
+    "demo": (570, 4),
+    "renderers": (670, 8),
+    "learn": (1_260, 8),
 }
-TOTAL = (45_000, 310)  # while capabilities are being added; on the way to (37_000, 285)
-TEST_LINES = 31_500  # the same; on the way to 26_000
+TOTAL = (42_810, 291)  # photographs, renderers, identity, pages; on the way to (37_000, 285)
+TEST_LINES = 27_400  # on the way to 26_000
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80
 SHARED_BY_COMMANDS = {"__init__.py", "console.py", "gathered.py", "options.py", "scoring.py"}
-LONGER_SO_FAR = {  # these still hold logic that belongs into the library
-    "jobs.py", "outcome.py", "settings.py", "sweep.py",
-}  # fmt: skip
-
 
 BANNED = re.compile(
     r"\b(nobody|taken? apart|takes apart|told apart|comes? along|given away|rendered again|as read|"
@@ -86,7 +83,7 @@ def test_the_model_fits_on_a_screen(name, most):
 
 
 def test_a_command_is_a_short_file():
-    left_out = SHARED_BY_COMMANDS | LONGER_SO_FAR
+    left_out = SHARED_BY_COMMANDS
     commands = [path for path in (PACKAGE / "cli").rglob("*.py") if path.name not in left_out]
     long = {
         str(path.relative_to(PACKAGE)): length(path) for path in commands if length(path) > LONGEST_COMMAND
