@@ -18,7 +18,7 @@ TESTS = sorted((ROOT / "tests").rglob("*.py"))
 BUDGET = {  # lines, files
     "data": (8_020, 41),
     "evaluation": (8_460, 47),
-    "report": (4_740, 32),
+    "report": (4_750, 32),
     "cli": (2_510, 36),
     "training": (3_450, 17),
     "baselines": (2_740, 11),
@@ -35,7 +35,7 @@ BUDGET = {  # lines, files
     "renderers": (670, 8),
     "learn": (1_260, 8),
 }
-TOTAL = (42_810, 291)  # photographs, renderers, identity, pages; on the way to (37_000, 285)
+TOTAL = (42_830, 291)  # photographs, renderers, identity, pages; on the way to (37_000, 285)
 TEST_LINES = 27_400  # on the way to 26_000
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80

@@ -67,11 +67,11 @@ class Edit:
 
     def write(self, folder: Path, record: Mapping[str, Any]) -> dict[str, Any]:
         """Write all files; returns the content of moved.json: the record, and each still's numbers."""
-        self.strip().save(folder / "strip.png")
+        self.strip().save(folder / "strip.png", compress_level=3)
         stills = []
         for number, (label, still) in enumerate(self.stills.items(), 1):
             name = f"still-{number:02d}.png"
-            still.save(folder / name)
+            still.save(folder / name, compress_level=3)
             stills.append({"file": name, "label": label, **self.numbers[label]})
         for kind in self.films if self.frames else ():
             (folder / f"film.{kind}").write_bytes(FILMS[kind](self.frames, self.seconds))
@@ -210,13 +210,16 @@ def _swept(
     places = sweeps.stills(film.stills)
     rows = values(places)
     labels = [label(place, row) for place, row in zip(places.tolist(), rows, strict=True)]
-    render = image.render
-    smaller = render.at_most(FILM_SIZE) if isinstance(render, Photograph) else render
+    render, way, moving = image.render, sweeps.there_and_back(film.frames), []
+    if film.kinds:
+        smaller = render.at_most(FILM_SIZE) if isinstance(render, Photograph) else render
+        there = drawn(values(way[: len(way) // 2 + 1]), smaller)  # the way back shows the same
+        moving = [there[min(number, len(way) - number)] for number in range(len(way))]
     return Edit(
         _inputs(model, image, other),
         dict(zip(labels, drawn(rows, image.render), strict=True)),
         {text: {parameter: row} for text, row in zip(labels, rows.tolist(), strict=True)},
-        drawn(values(sweeps.there_and_back(film.frames)), smaller) if film.kinds else [],
+        moving,
         film.kinds,
         film.seconds,
     )

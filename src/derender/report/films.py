@@ -25,8 +25,16 @@ def gif(frames: Images, seconds: float = 2.4) -> bytes:
 
     A GIF counts in hundredths of a second, at least two for each frame.
     """
-    flat = [on_background(frame).quantize(256, dither=Image.Dither.FLOYDSTEINBERG).copy() for frame in frames]
-    return _animated(flat, "GIF", 10 * max(2, round(100 * seconds / max(1, len(frames)))), optimize=False)
+    flat = {
+        id(frame): on_background(frame).quantize(256, dither=Image.Dither.FLOYDSTEINBERG).copy()
+        for frame in {id(frame): frame for frame in frames}.values()
+    }
+    return _animated(
+        [flat[id(frame)] for frame in frames],
+        "GIF",
+        10 * max(2, round(100 * seconds / max(1, len(frames)))),
+        optimize=False,
+    )
 
 
 def _animated(frames: Images, form: str, frame_ms: int, **settings: Any) -> bytes:
