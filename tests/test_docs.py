@@ -122,7 +122,7 @@ def sentences(text: str) -> list[str]:
 @pytest.mark.parametrize("path", PAGES, ids=named)
 def test_prose_is_plain(path):
     text = path.read_text()
-    long = [one for one in sentences(text) if len(re.findall(r"[\w'-]+", one)) > LONGEST_SENTENCE]
+    long = [one for one in sentences(text) if len(words_of(one)) > LONGEST_SENTENCE]
     wide = [line for line in text.splitlines() if len(line) > LONGEST_LINE and not line.startswith("|")]
     words = (
         []
@@ -139,11 +139,72 @@ def test_prose_is_plain(path):
     assert not (long + wide + words + large), "\n".join([*long, *wide, *words, *large])
 
 
-def test_a_long_sentence_is_seen():
-    assert (
-        max(len(one.split()) for one in sentences("One two. " + "word " * 30 + ".\n\n| " + "cell " * 40))
-        == 31
-    )
+def messages(path: Path) -> list[str]:
+    """What the program says: each string of a module but its docstrings, or the text of a page's source."""
+    text = path.read_text()
+    if path.suffix == ".py":
+        tree = ast.parse(text)
+        unsaid = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+        found: list[str] = []
+        for node in ast.walk(tree):
+            if id(node) not in unsaid and isinstance(node, (ast.JoinedStr, ast.BinOp, ast.Constant)):
+                unsaid.update(map(id, ast.walk(node)))
+                found.append(said(node))
+        return found
+    if path.suffix == ".js":
+        return re.findall(r"[\"`]((?:[^\"`\n])*)[\"`]", text)
+    text = re.sub(r"<(?:style|script|pre)\b.*?</(?:style|script|pre)>", "", text, flags=re.DOTALL)
+    quoted = re.findall(r'"([^"]*)"', " ".join(re.findall(r"\{[{%].*?[}%]\}|<[^>]+>", text, re.DOTALL)))
+    plain = re.sub(r"\{%.*?%\}", "\n\n", re.sub(r"\{\{.*?\}\}", "X", text), flags=re.DOTALL)
+    return [*quoted, *re.split(r"</?(?!b>|/?strong|/?code|/?em|/?a\b|span)[^>]*>|\n\s*\n", plain)]
+
+
+def said(node: ast.AST) -> str:
+    """The text of a string, with X for each value in it."""
+    if isinstance(node, ast.Constant):
+        return node.value if isinstance(node.value, str) else "X"
+    parts = [node.left, node.right] if isinstance(node, ast.BinOp) else getattr(node, "values", ())
+    return "".join(map(said, parts)) if parts else "X"
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "src/derender").iterdir()), ids=named)
+def test_messages_of_the_program_are_plain(path):
+    """Errors, notices, help, pages of reports and of the viewer."""
+    files = [
+        one for one in (path.rglob("*") if path.is_dir() else [path]) if one.suffix in (".py", ".html", ".js")
+    ]
+    assert not [f"{named(file)}: {one}" for file in files for text in messages(file) for one in unclear(text)]
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_is_plain(name):
+    command = COMMANDS[name]
+    texts = [command.help or "", *(getattr(one, "help", None) or "" for one in command.params)]
+    assert not [one for text in texts for one in unclear(text)]
+
+
+def unclear(text: str) -> list[str]:
+    """Sentences of a text that are too long or hold a banned word."""
+    text = re.sub(r"[\w/]+(?:\.\w+)+", "code", text)
+    found = sentences(text) if " " in text and "{" not in text and "#version" not in text else []
+    return [one for one in found if len(words_of(one)) > LONGEST_SENTENCE or BANNED.search(one)]
+
+
+def words_of(sentence: str) -> list[str]:
+    return re.findall(r"[\w'-]+", sentence)
+
+
+def test_a_long_sentence_is_seen(tmp_path):
+    long = "word " * 30
+    assert max(len(one.split()) for one in sentences(f"One two. {long}.\n\n| " + "cell " * 40)) == 31
+    shown = {
+        "a.py": f'"""{long}"""\nraise ValueError(f"{long} {{x}}" + "ends")\n',
+        "a.html": f'{{% call b.figure("{long}") %}}<p>nobody <b>sees</b> it</p><script>{long}</script>',
+        "a.js": f"const text = `{long}`;",
+    }
+    for name, count in {"a.py": 1, "a.html": 2, "a.js": 1}.items():
+        (tmp_path / name).write_text(shown[name])
+        assert len([one for text in messages(tmp_path / name) for one in unclear(text)]) == count
 
 
 def test_the_readme_is_short_and_its_python_runs(capsys):

@@ -28,13 +28,13 @@ class ModelSettings(Settings):
     brightness: BrightnessPrior | None = None  # estimated after training; `decompose` applies it
 
     def description(self) -> str:
-        """One sentence for a model's card: what such a model does, its sizes and ranges."""
+        """Two sentences for a model's card: what such a model does, its sizes and ranges."""
         network, ranges = self.network, self.ranges
         return (
             f"Decomposes {network.image_size} x {network.image_size} images of one kind of object into "
-            f"geometry, albedo, light and camera (field of view {ranges.fov_deg:g} degrees; depth "
+            f"geometry, albedo, light and camera. Field of view {ranges.fov_deg:g} degrees; depth "
             f"{ranges.depth_min:g} to {ranges.depth_max:g}; networks of width {network.width} and "
-            f"{network.light_width}, codes of {network.code_size})."
+            f"{network.light_width}; codes of {network.code_size}."
         )
 
 

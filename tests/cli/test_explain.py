@@ -56,8 +56,8 @@ def test_the_folder_holds_page_chart_maps_and_probe(why):
     assert len(maps) == 5 and any("hires-cam" in name for name in maps)
     page = (folder / "explain.html").read_text()
     for word in (
-        "Which factor answers",
-        "Whether the maps can be trusted",
+        "Shares of the factors",
+        "Checks of the maps",
         "most alike in",
         "shuffled labels",
         'alt="the image dark/00.png"',

@@ -128,7 +128,7 @@ def test_relighting_by_the_true_ratio_is_best(tmp_path):
     found = relight(model, folder, size=32, **QUICK)
     psnr = {name: row["scores"]["all"]["value"] for name, row in found.values["psnr"].items()}
     assert list(psnr) == [
-        "photograph relit", "model's rendering", "input", "mean picture", "another person's ratio"
+        "photograph relit", "model's rendering", "input", "mean image", "another person's ratio"
     ]  # fmt: skip
     assert psnr["another person's ratio"] > psnr["input"] + 3 and found.values["pictures"] == 6
     columns = [column.name for column in found.tables[0].columns if column.name != "95 %"]

@@ -270,7 +270,7 @@ class Dinov2(base.BaselineModel):
         ):
             raise ValueError(  # an index of shards could name files outside the folder (CVE-2026-75104)
                 f"{source} has no {base.WEIGHTS_FILE}: give a folder with config.json and the weights in "
-                "that one file; weights in several parts and pickles, which can run code, are not opened"
+                "that one file. Weights in parts, and pickles, which can run code, are not opened"
             )
         library = base.optional("transformers", "the baseline dinov2")
         try:

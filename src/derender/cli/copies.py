@@ -10,11 +10,7 @@ from derender.cli.console import notice, progress_bar, report_images
 from derender.cli.gathered import command
 from derender.cli.options import OutModel, Output, PartOfImages, Seed, TrainedModel
 
-SETTINGS = (
-    "images, views, spatial, mirrored, directions, shrinkage, evenness, vectors, vector_power of whitening; "
-    "examples, coordinates, steps, prior, tolerance, weight of fitting; the size of perturbations, as "
-    "perturb.light_deg."
-)
+SETTINGS = "Change a setting, as whitening.pictures=2000; the reference of settings lists all."
 Changes = Annotated[list[str] | None, Option("--set", metavar="KEY=VALUE", help=SETTINGS)]
 MEAN_ONLY = "Keep the model's own directions; take only the mean of its features from these images."
 MeanOnly = Annotated[bool, Option("--mean-only", help=MEAN_ONLY)]

@@ -9,15 +9,8 @@ from derender.cli.copies import copied
 from derender.cli.gathered import command
 from derender.cli.options import OutModel, Output, PartOfImages, Seed, TrainedModel
 
-REFINING = (
-    "images (how many are seen), batch_size, learning_rate, fitted (images), fit_steps, worst, rendered, "
-    "exchanged, picture_weight, reframed (share shown in other crops, as reframe.farther=1.9), strange; the "
-    "size of perturbations, as perturb.light_deg; for features those of derender whiten."
-)
-UNETS = (
-    "images (how many are seen), batch_size, learning_rate, weight_decay, code_weight, unet_width, precision "
-    "(32-true or bf16-mixed)."
-)
+REFINING = "Change a setting, as images=50000 or reframed=0.85; the reference of settings lists all."
+UNETS = "Change a setting, as images=50000 or unet_width=32; the reference of settings lists all."
 Refining = Annotated[list[str] | None, Option("--set", metavar="KEY=VALUE", help=REFINING)]
 UNets = Annotated[list[str] | None, Option("--set", metavar="KEY=VALUE", help=UNETS)]
 
@@ -29,9 +22,9 @@ def refine(
 ) -> None:  # fmt: skip
     """Write a copy of a model that predicts at once the scenes that test-time optimisation finds slowly.
 
-    Scenes are fitted to these images once, without labels; then the encoders learn to predict them, from the
-    images and from renderings of the fitted scenes under other lighting and viewpoints (knowledge
-    distillation). Every tenth image is held out: errors are measured on those.
+    Scenes are optimised for these images once, without labels. The encoders then learn to predict them from
+    the images and from renderings under other lighting and viewpoints (knowledge distillation). Errors are
+    measured on every tenth image, which is held out.
     """
     from derender import learn
 

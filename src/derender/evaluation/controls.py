@@ -272,9 +272,7 @@ def _whitening_settings(model: Derenderer) -> FeatureSettings:
         config = read_any_config(folder)
         settings = config.features if isinstance(config, TrainConfig) else settings
     if settings.whitening.pictures < 2:
-        raise ValueError(
-            f"{folder} was trained with whitening.pictures={settings.whitening.pictures}: nothing to compare"
-        )
+        raise ValueError(f"{folder} was trained without whitening: nothing to compare")
     return settings
 
 

@@ -3,7 +3,7 @@
 Of images with known light, such as the cropped Extended Yale B, each person's most frontal picture takes the
 light that a model predicts for the next person's picture in a light, and is compared with the person's own
 picture in that light, where the model draws a surface. Controls know the same two people: the picture as it
-is, the mean picture of all others in that light, and the picture times the ratio of the other person's two.
+is, the mean image of all others in that light, and the picture times the ratio of the other person's two.
 Leaves out cast shadows.
 """
 
@@ -34,7 +34,7 @@ PHOTO_SIZE = 128
 BORDER = {"yaleb": (15 / 128, 21 / 128)}
 """By layout, shares of rows and columns at each side that are no part of the photograph, but its edge."""
 NEEDED = ("identity", "light_azimuth_deg", "light_elevation_deg", "light_deg")
-CONTROLS = ("input", "mean picture", "another person's ratio")
+CONTROLS = ("input", "mean image", "another person's ratio")
 
 
 def relight(
@@ -45,12 +45,12 @@ def relight(
     fit_steps: int | None = None,
     **options: Any,
 ) -> Scores:
-    """PSNR in decibels and SSIM (at most 1) of relit pictures against photographs, inside the mask.
+    """PSNR in decibels and SSIM (at most 1) of relit images against photographs, inside the mask.
 
     Args:
         model: a model, or the name or folder of one.
         images: the address of images with identity and light, such as the cropped Extended Yale B.
-        size: side in pixels of the pictures that are relit, at least the model's.
+        size: side in pixels of the images that are relit, at least the model's.
         fit_steps: steps of per-image optimisation of the model's scenes.
         options: seed, resamples, dataset, limit, device, progress: fields of ``Options``.
 
@@ -101,7 +101,7 @@ def relight(
         if progress is not None:
             progress(number + 1, len(people))
     if not rows:
-        raise ValueError("no two people have pictures in the same two lights: nothing to compare")
+        raise ValueError("no two people have images in the same two lights: nothing to compare")
     tables, notes = [], list(how.notes)
     values: dict[str, Any] = {"pictures": len(rows), "people": len(people)}
     for title, unit, digits in (("PSNR", "dB", 1), ("SSIM", "at most 1", 3)):
@@ -109,7 +109,7 @@ def relight(
             {name: np.concatenate(parts) for name, parts in apart[title].items()}, off[rows],
             controls=CONTROLS, groups=who[rows], digits=digits, resample_count=how.resamples, seed=how.seed,
         )  # fmt: skip
-        caption = f"Relighting, {title} ({unit}): {len(rows):,} pictures of {len(people)} people, by light"
+        caption = f"Relighting, {title} ({unit}): {len(rows):,} images of {len(people)} people, by light"
         tables.append(scored_table(caption, "prediction", scored, columns, deviations=()))
         values[title.lower()] = numbers_of(scored)
         notes += [f"{title}, {note}" for note in image_verdicts(scored[0], {"all": (columns["all"], 1.0)})]

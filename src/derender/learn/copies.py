@@ -61,7 +61,7 @@ def whiten(
     """
     features = with_changes(FeatureSettings(), texts_of(settings))
     if features.whitening.pictures < 2:
-        raise ValueError("whitening needs 2 images or more: set pictures=2000, say")
+        raise ValueError("whitening needs 2 images or more: set whitening.pictures=2000")
     if mean_only and settings:
         raise ValueError("with mean_only nothing else is estimated: leave out settings")
     work = _Copying(model, images, Path(out), 2, **how)

@@ -115,6 +115,6 @@ def _errors_in_words(errors: str) -> str:
         return ""
     median, high = stored.quantiles[50], stored.quantiles[99]
     return (
-        f"Reconstructions of {stored.pictures:,} images it was not trained on have a masked L1 of "
-        f"{median:.4f} in the median and {high:.4f} at the 99th percentile (0..1, best 0)."
+        f"Masked L1 of reconstructions of {stored.pictures:,} held-out images: median {median:.4f}, "
+        f"99th percentile {high:.4f} (0..1, best 0)."
     )

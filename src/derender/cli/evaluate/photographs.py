@@ -10,7 +10,7 @@ from derender.cli.console import progress_bar
 
 TABLE = ".npz, .csv or .parquet with name and the angles in degrees; default: labels."
 Angles = Annotated[str | None, typer.Option("--table", metavar="FILE", help=TABLE)]
-Size = Annotated[int, scoring.number(help="Side in pixels of the pictures that are relit.")]
+Size = Annotated[int, scoring.number(help="Side in pixels of the images that are relit.")]
 BY = "Without true albedo: label of the groups to compare, as race."
 By = Annotated[str | None, typer.Option(metavar="LABEL", help=BY)]
 
@@ -55,9 +55,9 @@ def light(
 def relight(
     images: options.DataOptions, model: Decomposed, published: scoring.Published, size: Size = 128
 ) -> None:
-    """Relit pictures against photographs in that light: PSNR and SSIM inside the mask, beside controls.
+    """Relit images against photographs in that light: PSNR and SSIM inside the mask, beside controls.
 
-    The light is predicted for another person's picture. Images: the cropped Extended Yale B, or others with
+    The light is predicted for another person's image. Images: the cropped Extended Yale B, or others with
     identity and light among their labels.
     """
     model.score("relight", images, published, size=size)

@@ -192,10 +192,10 @@ def _face_boxes(source: Source, files: Sequence[str], names: Sequence[str]) -> F
         middle, side = box[:, :2] + box[:, 2:] / 2, box[:, 2:].max(axis=1)
     else:
         raise ValueError(
-            f"{source.path} holds CelebA's images in the wild (img_celeba), which are cropped to their "
-            f"face, but neither list_landmarks_celeba.txt nor list_bbox_celeba.txt; the owners publish both "
-            f"at {CELEBA_HOME}. A list of your own may stand in for them: {BOX_LISTS[0]}, with rows of "
-            f"file,left,top,width,height"
+            f"{source.path} holds CelebA's images in the wild (img_celeba), but neither "
+            f"list_landmarks_celeba.txt nor list_bbox_celeba.txt, which say where faces are. The owners "
+            f"publish both at {CELEBA_HOME}. A list of your own may stand in for them: {BOX_LISTS[0]}, with "
+            f"rows of file,left,top,width,height"
         )
     half = side[:, None] / 2
     return np.concatenate([middle - half, middle + half], axis=1).astype(np.float32)
@@ -243,7 +243,7 @@ def _own_boxes(
         close = suggestion(missing[0], boxes) if len(boxes) < _MOST_OPENED else ""
         raise ValueError(
             f"{where} has no row for {missing[0]} ({len(missing):,} of {len(names):,} images have none"
-            f"{close}); add the rows, or move these images or the list out of the folder"
+            f"{close}). Add the rows, or move these images or the list out of the folder"
         )
     for row in map(int, np.unique(np.linspace(0, len(names) - 1, _MOST_OPENED).astype(int))):
         number, (left, top, right, bottom) = boxes[names[row]]
@@ -255,7 +255,7 @@ def _own_boxes(
         if max(0.0, across) * max(0.0, down) < 0.5 * (right - left) * (bottom - top):
             raise ValueError(
                 f"{where}, line {number}: the box from ({left:g}, {top:g}) to ({right:g}, {bottom:g}) lies "
-                f"outside {names[row]}, which is {width} x {height} pixels; say in the first line "
+                f"outside {names[row]}, which is {width} x {height} pixels. Say in the first line "
                 f"whether boxes are file,{','.join(_SIZED)} or file,{','.join(_SIDES)}"
             )
     return np.array([boxes[name][1] for name in names], np.float32)

@@ -177,8 +177,7 @@ def _load_tracks(source: Source) -> Table:
     if None in matches:
         raise ValueError(
             f"{source.path}: {files[matches.index(None)]} does not lie in IDENTITY/TRACK/, and there is "
-            f"no list of tracks NAME.ids (those of Buffy and The Big Bang Theory are published "
-            f"at {_TRACKS_HOME})"
+            f"no list of tracks NAME.ids. Those of Buffy and The Big Bang Theory are at {_TRACKS_HOME}"
         )
     return Table(files, track_labels(files, [match for match in matches if match]))
 

@@ -506,7 +506,7 @@ function connect() {
   acceptFiles($("drop-second"), $("file-second"), openSecond);
   for (const kind of ["dragover", "drop"]) document.addEventListener(kind, (event) => event.preventDefault());
   document.addEventListener("drop", (event) => { if (event.dataTransfer.files.length) openFirst(event.dataTransfer.files[0], event.dataTransfer.files[0].name); });
-  document.addEventListener("paste", (event) => { const file = [...event.clipboardData.files][0]; if (file) openFirst(file, file.name || "pasted picture"); });
+  document.addEventListener("paste", (event) => { const file = [...event.clipboardData.files][0]; if (file) openFirst(file, file.name || "pasted image"); });
   for (const [strip, open] of [["examples", openFirst], ["examples-second", openSecond]]) {
     $(strip).append(...about.examples.map((example, number) => {
       const button = pictureButton(example.image, example.name, (own) => open(`api/examples/${number}`, example.name, example.image, own));
