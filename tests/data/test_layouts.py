@@ -33,13 +33,12 @@ ALIGNED = images(*(f"img_align_celeba/00000{row}.jpg" for row in (1, 2, 3)))
 ATTRIBUTES = {"list_attr_celeba.txt": "2\nBald Smiling \n000001.jpg -1  1\n000002.jpg  1 -1\n"}
 PARTITION = {"list_eval_partition.txt": "000001.jpg 0\n000002.jpg 1\n000003.jpg 2\n"}
 WILD = {**images(*(f"img_celeba/00000{row}.jpg" for row in (1, 2, 3))), **ATTRIBUTES}
-BOXES = "2\nimage_id x_1 y_1 width height\n000001.jpg    5  6 20  30\n000002.jpg   5  6 40  30\n"
-BOXED = {"list_bbox_celeba.txt": BOXES}
 LANDMARKS = (
     "2\nlefteye_x lefteye_y righteye_x righteye_y nose_x nose_y "
     "leftmouth_x leftmouth_y rightmouth_x rightmouth_y\n"
     "000001.jpg  20 30 30 30 25 35 21 40 29 40\n000002.jpg  20 30 24 30 22 35 20 40 24 40\n"
 )
+MARKED = {"list_landmarks_celeba.txt": LANDMARKS}
 PARAMS = "file,identity,expression,strength,ambient,diffuse,light_pitch,light_yaw,pitch,yaw,roll,tx,ty\n"
 FIRST = "images/000000.jpg,7,happy,0.5,0.3,0.6,30,-45,10,20,5,0.001,-0.002\n"
 SYNFACE = {
@@ -267,10 +266,10 @@ FAULTS = [
      r"list_attr_celeba\.txt in .*line 4: expected a name and 2 values of -1 or 1"),
     ({**ALIGNED, "list_attr_celeba.txt": "3\nBald\n000001.jpg -1\n"}, {}, "says 3 rows and it has 1; copy"),
     (ALIGNED, {"dataset": "celeba"}, r"has no list_attr_celeba\.txt; CelebA's owners publish it at https"),
-    (WILD, {}, r"neither list_landmarks_celeba\.txt nor list_bbox_celeba\.txt; the owners publish both at h"),
+    (WILD, {}, r"no list_landmarks_celeba\.txt, .* owners publish it at h"),
     ({**ATTRIBUTES, "img_align_celeba.zip": "x"}, {}, "list of attributes and no images: expected img_align"),
-    ({**WILD, **BOXED, "list_eval_partition.txt": "000001.jpg 3\n"}, {}, r"line 1: .* of 0 \(train\), .*"),
-    ({**WILD, "list_bbox_celeba.txt": BOXES.replace("width", "w")}, {}, "no column 'width'; its columns"),
+    ({**WILD, **MARKED, "list_eval_partition.txt": "000001.jpg 3\n"}, {}, r"line 1: .* of 0 \(train\), .*"),
+    ({**WILD, "list_landmarks_celeba.txt": LANDMARKS.replace("lefteye_x", "x")}, {}, "no column 'lefteye"),
     ({**ALIGNED, **ATTRIBUTES, **PARTITION}, {"subset": "tests"}, "no part 'tests': its parts are test,"),
     ({**SYNFACE, TRAIN: PARAMS.replace("file", "name")}, {"dataset": "synface"}, "no column 'file'; its"),
     ({**SYNFACE, TRAIN: f"{PARAMS}{ROW}{',x' * 12}\n"}, {}, "column 'strength' holds something that is no"),
@@ -373,19 +372,14 @@ def test_cars_of_the_published_size_are_cropped(tree, encoded):
     assert found_in(tree({**CARS, **SHAPENET}, name="small")).table.boxes is None
 
 
-def test_celeba_in_the_wild_is_cropped_by_landmarks_or_boxes(tree):
+def test_celeba_in_the_wild_is_cropped_by_landmarks(tree, encoded, tmp_path):
     """Eyes' middle (25, 30), 10 apart; mouth's 10 below: side max(40, 36), middle 1 above the eyes."""
-    landmarks = found_in(tree({**WILD, **BOXED, "list_landmarks_celeba.txt": LANDMARKS})).table
-    np.testing.assert_allclose(landmarks.boxes[:2], [[5, 9, 45, 49], [4, 11, 40, 47]])
-    assert np.isnan(landmarks.boxes[2]).all()
-    source = tree({**WILD, **BOXED, **PARTITION}, name="boxes")
-    assert found_in(source).table.boxes[:2].tolist() == [[0, 6, 30, 36], [5, 1, 45, 41]]
-    assert found_in(source, subset="val").table.boxes.tolist() == [[5, 1, 45, 41]]
-
-
-def test_other_boxes_are_other_images_and_one_without_is_listed(tree, encoded, tmp_path):
     contents = {file: encoded(noise(row, 60, 50)) for row, file in enumerate(WILD) if file.endswith("jpg")}
-    source, sides = tree({**WILD, **contents, **BOXED}), ([0, 6, 30, 36], [5, 1, 45, 41])
+    source, sides = tree({**WILD, **contents, **MARKED, **PARTITION}), ([5, 9, 45, 49], [4, 11, 40, 47])
+    boxes = found_in(source).table.boxes
+    np.testing.assert_allclose(boxes[:2], sides)
+    assert np.isnan(boxes[2]).all()
+    assert found_in(source, subset="val").table.boxes.tolist() == [sides[1]]
     expected = [
         decode(content, 10, "crop", np.array(box, np.float32))
         for content, box in zip(list(contents.values())[:2], sides, strict=True)
@@ -395,7 +389,7 @@ def test_other_boxes_are_other_images_and_one_without_is_listed(tree, encoded, t
         assert [row.file for row in pictures.skipped] == ["img_celeba/000003.jpg"]
         assert "no usable box is known" in pictures.skipped[0].reason
         assert (pictures.images == np.stack(expected)).all()
-    tree({"list_bbox_celeba.txt": BOXES.replace(" 5  6 20  30", " 9  6 20  30")})
+    tree({"list_landmarks_celeba.txt": LANDMARKS.replace("20 30 30 30", "22 30 32 30")})
     second = read_images(source, 10, cache=tmp_path / "cache").images
     assert (second[0] != expected[0]).any() and (second[1] == expected[1]).all()
 

@@ -40,10 +40,6 @@ def flipped(file) -> None:
     file.write_bytes(content)
 
 
-def unreadable(file) -> None:
-    file.rename(file.with_name("part-000002.parquet")).write_bytes(b"PAR1")
-
-
 @pytest.mark.parametrize(
     ("damage", "words"),
     [
@@ -51,7 +47,6 @@ def unreadable(file) -> None:
         (lambda file: file.write_bytes(file.read_bytes()[:-1]), "its checksum differs"),
         (lambda file: file.write_bytes(b""), "its checksum differs"),
         (lambda file: file.unlink(), "part 2 is missing"),
-        (unreadable, "it cannot be read"),
     ],
 )
 def test_a_damaged_part_is_made_again_with_those_after_it(model, pictures, stopped, tmp_path, damage, words):

@@ -7,7 +7,7 @@ run that was stopped goes on from them, and gives the same table, bit for bit: i
 
 import hashlib
 from collections.abc import Iterator, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
@@ -38,6 +38,8 @@ from derender.training.held_out_errors import read_errors, reconstruction_percen
 
 PART_ROWS = 4096
 """A part is written when this many rows are there."""
+LISTED_SKIPPED = 20
+"""So many unreadable images are named; all are counted."""
 LOOKED_AT = 60
 """Images that tell whether a model suits them."""
 ENGINES = ("local", "ray")
@@ -147,7 +149,7 @@ def embed_to_file(
         plan = _plan(net, images, facts, (fit, keep_duplicates), batch_size)
         path = Path(out)
         parts = Parts(path.with_name(f"{path.name}.partial"), plan, fresh=fresh)
-        resumed, start = parts.so_far.rows, parts.so_far.following
+        resumed, start = parts.rows, parts.following
         options = {"batch_size": batch_size, "fit": fit}
         if engine == "ray":
             assert isinstance(images, Stream) and reopen is not None
@@ -198,21 +200,16 @@ def _plan(
 def _compute(
     parts: Parts, blocks: Any, keep_duplicates: bool, limit: int | None, progress: Progress | None
 ) -> None:
-    """Write the parts that are missing, in a thread, one at a time; no folder stays without a part.
-
-    Ctrl-C writes the rows that wait; any other error drops them.
-    """
+    """Write the parts that are missing; what is computed is kept, and no folder stays without a part."""
     waiting: list[Rows] = []
-    written: list[Future[None]] = []
-
-    def write() -> None:
-        for future in written:
-            future.result()
-        written[:] = [pool.submit(parts.write, waiting.copy())]
-        waiting.clear()
-
     try:
         with blocks as made, ThreadPoolExecutor(1, thread_name_prefix="write") as pool:
+
+            def write() -> None:
+                if rows := waiting.copy():
+                    waiting.clear()
+                    pool.submit(parts.write, rows).result()  # in a thread that Ctrl-C does not stop
+
             seen = parts.seen()
             try:
                 for block in made:
@@ -222,36 +219,31 @@ def _compute(
                     if progress is not None:
                         done = block[0].start + len(block[0])
                         progress(done, estimated_total(done, block[0].share, limit))
-            except KeyboardInterrupt:
-                if waiting:
-                    write()
-                raise
-            if waiting:
+            finally:
                 write()
-            for future in written:
-                future.result()
-    except Exception:
-        parts.remove_if_empty()
+    except BaseException as stopped:
+        if not parts.files:
+            parts.remove()
+        elif isinstance(stopped, KeyboardInterrupt):
+            raise KeyboardInterrupt(
+                f"stopped by Ctrl-C; {parts.rows:,} rows are kept in {parts.folder}: "
+                "the same command goes on from there"
+            ) from stopped
         raise
-    except KeyboardInterrupt as stopped:
-        if parts.remove_if_empty():
-            raise
-        raise KeyboardInterrupt(
-            f"stopped by Ctrl-C; {parts.so_far.rows:,} rows are kept in {parts.folder}: "
-            "the same command goes on from there"
-        ) from stopped
     if progress is not None:
-        progress(parts.so_far.following, parts.so_far.following)
+        progress(parts.following, parts.following)
 
 
 def _finish(
     parts: Parts, path: Path, images: Stream | ImageSet, facts: dict[str, Any], resumed: int
 ) -> Embedded:
     """Put the parts together, then delete them."""
-    so_far, factors, labels = parts.so_far, {}, []
-    if not so_far.rows:
+    factors: dict[str, int] = {}
+    labels: list[str] = []
+    skipped = (*(images.passed_over if isinstance(images, Stream) else ()), *parts.skipped)
+    if not parts.rows:
         parts.remove()
-        more = f"; the first is {so_far.examples[0][0]!r}: {so_far.examples[0][1]}" if so_far.skipped else ""
+        more = f"; the first is {parts.skipped[0].file!r}: {parts.skipped[0].reason}" if parts.skipped else ""
         raise ValueError(f"no image in {images.source} ({images.layout}) can be read{more}")
     source = images if isinstance(images, ImageSet) else images.table
     known = None if source is None else table_labels(source)
@@ -265,7 +257,5 @@ def _finish(
 
     write_columns(path, groups())
     parts.remove()
-    passed_over = () if isinstance(images, ImageSet) else images.passed_over
-    examples = (*passed_over, *(Skipped(*row) for row in so_far.examples))
-    counts = (so_far.skipped + len(passed_over), examples, so_far.copies, resumed)
-    return Embedded(path, so_far.rows, factors, tuple(labels), facts, *counts, images.source, images.layout)
+    counts = (len(skipped), skipped[:LISTED_SKIPPED], parts.copies, resumed)
+    return Embedded(path, parts.rows, factors, tuple(labels), facts, *counts, images.source, images.layout)

@@ -7,11 +7,9 @@ kinds are known, at the end.
 """
 
 import json
-import re
 import shutil
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +17,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from derender.data import Kinds, Unreadable, column_of
+from derender.data import Kinds, Skipped, Unreadable, column_of
 from derender.features.blocks import Block
 from derender.features.parquet import Columns, factor_column, factor_values
 from derender.features.table import check_finite
@@ -27,40 +25,12 @@ from derender.storage.atomic import Damaged, DamageNoticed, atomic_file, measure
 from derender.storage.bounded import parse_json, read_json
 
 PLAN = "plan.json"
-LISTED_SKIPPED = 20
-"""So many unreadable images are remembered by name; all are counted."""
-
 _KEY = b"derender part"
-_NAME = re.compile(r"part-(\d{6})(?:-([0-9a-f]{8}))?\.parquet")  # earlier versions wrote no checksum
 _BEGUN = (PLAN, f".{PLAN}", "writing.parquet", ".writing.parquet")  # of a run killed before its first part
 
 Rows = tuple[pa.Table, Mapping[str, Any]]
-"""Rows of an unfinished table, and what `Progressed` counts of them."""
-
-
-@dataclass
-class Progressed:
-    """How far the parts go: the first image in no part, rows, unreadable images (a few by name), copies, the
-    kinds of labels that came with the stream, and whether any row knows its partition.
-    """
-
-    following: int = 0
-    rows: int = 0
-    skipped: int = 0
-    copies: int = 0
-    partitioned: bool = False
-    examples: list[Sequence[str]] = field(default_factory=list)
-    kinds: Kinds = field(default_factory=Kinds)
-
-    def join(self, note: Mapping[str, Any]) -> None:
-        """Take the note of further rows into account."""
-        self.following = note["following"]
-        for name in ("rows", "skipped", "copies"):
-            setattr(self, name, getattr(self, name) + note[name])
-        self.partitioned |= note["partitioned"]
-        self.examples = (self.examples + note["examples"])[:LISTED_SKIPPED]
-        for name, kind in note["kinds"].items():
-            self.kinds.join(name, kind)
+"""Rows of an unfinished table, and what else is known: the first sample ``following``, unreadable images
+(``skipped``: name and reason), and the number of ``copies``."""
 
 
 def rows_of(block: Block, seen: set[bytes], keep_duplicates: bool = False) -> Rows:
@@ -69,41 +39,33 @@ def rows_of(block: Block, seen: set[bytes], keep_duplicates: bool = False) -> Ro
     ``seen`` holds the digests of the images before, and grows. A feature that is not finite is an error.
     """
     chunk, codes = block
-    good = np.flatnonzero([isinstance(outcome, bytes) for outcome in chunk.outcomes])
-    digests = [outcome for outcome in chunk.outcomes if isinstance(outcome, bytes)]
-    positions, first = chunk.start + good, np.ones(len(good), bool)
-    if digests and digests[0]:  # copies are dropped from a set when it is read
-        for place, digest in enumerate(digests):
-            first[place] = digest not in seen
-            seen.add(digest)
-    kept = np.flatnonzero(first | keep_duplicates)
-    rows, kinds = good[kept].tolist(), Kinds()
-    files, labels = [chunk.files[row] for row in rows], [chunk.labels[row] for row in rows]
-    for one in labels:
-        kinds.see(one)
-    found = {name: values[kept] for name, values in codes.items()} if rows else {}
-    check_finite(found, files)
-    partitions = [chunk.partitions[row] for row in rows]
-    skipped = [
-        (file, str(outcome))
-        for file, outcome in zip(chunk.files, chunk.outcomes, strict=True)
-        if isinstance(outcome, Unreadable)
+    digests, kept, copies, skipped = [], [], 0, []
+    for row, outcome in enumerate(chunk.outcomes):
+        if isinstance(outcome, Unreadable):
+            skipped.append((chunk.files[row], str(outcome)))
+            continue
+        copy = outcome in seen and outcome != b""  # copies are dropped from a set when it is read
+        if keep_duplicates or not copy:
+            kept.append((row, len(digests)))
+        copies += copy
+        digests.append(outcome)
+        seen.add(outcome)
+    rows, places = [row for row, _ in kept], [place for _, place in kept]
+    files = [chunk.files[row] for row in rows]
+    factors = {name: values[places] for name, values in codes.items()} if rows else {}
+    check_finite(factors, files)
+    labels = [
+        ({"partition": chunk.partitions[row]} if chunk.partitions[row] else {}) | dict(chunk.labels[row])
+        for row in rows
     ]
-    note = {
-        "following": chunk.start + len(chunk), "rows": len(rows), "skipped": len(skipped),
-        "examples": skipped[:LISTED_SKIPPED], "copies": int((~first).sum()), "kinds": kinds,
-        "partitioned": any(partitions),
-    }  # fmt: skip
-    texts = [json.dumps(dict(one), ensure_ascii=False) if one else "" for one in labels]
     columns = {
         "file": pa.array(files, pa.string()),
-        "position": pa.array(positions[kept], pa.int64()),
-        "digest": pa.array([digests[row] for row in kept], pa.binary()),
-        "partition": pa.array(partitions, pa.string()),
-        "labels": pa.array(texts, pa.string()),
-        **{f"factor {name}": factor_column(values) for name, values in found.items()},
+        "position": pa.array([chunk.start + row for row in rows], pa.int64()),
+        "digest": pa.array([digests[place] for place in places], pa.binary()),
+        "labels": pa.array([json.dumps(one, ensure_ascii=False) for one in labels], pa.string()),
+        **{f"factor {name}": factor_column(values) for name, values in factors.items()},
     }
-    return pa.table(columns), note
+    return pa.table(columns), {"following": chunk.start + len(chunk), "skipped": skipped, "copies": copies}
 
 
 class Parts:
@@ -113,11 +75,16 @@ class Parts:
         folder: where; made if it is not there.
         plan: what they are made of: anything JSON can hold.
         fresh: delete parts of another plan; otherwise they are an error.
+
+    Attributes:
+        following: the first sample that is in no part.
+        rows, copies, skipped: rows so far, copies that were dropped, images that could not be read.
     """
 
     def __init__(self, folder: Path, plan: Mapping[str, Any], *, fresh: bool = False):
-        self.folder, self.so_far = folder, Progressed()
-        self.files: list[Path] = []
+        self.folder, self.files = folder, list[Path]()
+        self.following = self.rows = self.copies = 0
+        self.skipped: list[Skipped] = []
         if folder.exists():
             self._require(json.loads(json.dumps(plan)), fresh)
         folder.mkdir(parents=True, exist_ok=True)
@@ -126,14 +93,10 @@ class Parts:
         files = sorted(folder.glob("part-*.parquet"))
         for number, file in enumerate(files):
             try:
-                self.so_far.join(_checked_note(file, number))
-                self.files.append(file)
+                self._add(file, *_checked(file, number))
             except Damaged as problem:
-                warnings.warn(
-                    f"{file} is damaged ({problem}): going on from the {self.so_far.rows:,} rows before it",
-                    DamageNoticed,
-                    stacklevel=2,
-                )
+                went_on = f"going on from the {self.rows:,} rows before it"
+                warnings.warn(f"{file} is damaged ({problem}): {went_on}", DamageNoticed, stacklevel=2)
                 for rest in files[number:]:
                     rest.unlink()
                 break
@@ -150,7 +113,7 @@ class Parts:
             return
         if not fresh and any(not entry.name.startswith(_BEGUN) for entry in self.folder.iterdir()):
             how = f"without a sound {PLAN}"
-            if isinstance(stored, dict):
+            if stored is not None:
                 differs = ", ".join(name for name in plan if stored.get(name) != plan[name])
                 how = f"that was made otherwise (differs in {differs or 'its version'})"
             raise ValueError(
@@ -159,25 +122,36 @@ class Parts:
             )
         self.remove()
 
+    def _add(self, file: Path, rows: int, note: Mapping[str, Any]) -> None:
+        self.files.append(file)
+        self.rows, self.following = self.rows + rows, note["following"]
+        self.copies += note["copies"]
+        self.skipped += [Skipped(*one) for one in note["skipped"]]
+
     def seen(self) -> set[bytes]:
         """The digests of every row there is."""
-        tables = (pq.read_table(file, columns=["digest"]) for file in self.files)
-        return {digest for table in tables for digest in table["digest"].to_pylist()}
+        return {digest for (column,) in self._read("digest") for digest in column.to_pylist()}
+
+    def _read(self, *columns: str) -> Iterator[list[pa.ChunkedArray]]:
+        for file in self.files:
+            yield pq.read_table(file, columns=list(columns)).columns
 
     def write(self, blocks: Sequence[Rows]) -> None:
         """Add a part: the rows of blocks in order."""
-        note = Progressed()
-        for _, one in blocks:
-            note.join(one)
+        notes = [note for _, note in blocks]
+        note = {
+            "following": notes[-1]["following"],
+            "skipped": [one for note in notes for one in note["skipped"]],
+            "copies": sum(note["copies"] for note in notes),
+        }
         table = pa.concat_tables([table for table, _ in blocks if len(table)] or [blocks[0][0]])
-        table = table.replace_schema_metadata({_KEY: json.dumps(vars(note)).encode()})
+        table = table.replace_schema_metadata({_KEY: json.dumps(note).encode()})
         with atomic_file(self.folder / "writing.parquet", durable=True) as temporary:
             pq.write_table(table, temporary, use_dictionary=False)
             name = f"part-{len(self.files):06d}-{measured(temporary)[1]:08x}.parquet"
-        self.files.append((self.folder / "writing.parquet").rename(self.folder / name))
+        self._add((self.folder / "writing.parquet").rename(self.folder / name), len(table), note)
         del table
         pa.default_memory_pool().release_unused()
-        self.so_far.join(vars(note))
 
     def columns(self, origin: Mapping[str, Any], known: Mapping[str, np.ndarray] | None) -> Iterator[Columns]:
         """The finished table, part by part.
@@ -186,6 +160,11 @@ class Parts:
             origin: where it comes from.
             known: labels of all images, where they were known beforehand; None: the stream's.
         """
+        kinds = Kinds()
+        for (texts,) in self._read("labels") if known is None else ():
+            for text in texts.to_pylist():
+                kinds.see(json.loads(text))
+        names = sorted(kinds, key="partition".__ne__)  # the owners' split first
         for file in self.files:
             table = pq.read_table(file)
             if not len(table):
@@ -195,39 +174,25 @@ class Parts:
                 for name in table.column_names
                 if name.startswith("factor ")
             }
-            places = table["position"].to_numpy()
-            labels = {name: column[places] for name, column in (known or {}).items()}
-            labels = self._labels(table) if known is None else labels
+            if known is not None:
+                places = table["position"].to_numpy()
+                labels = {name: column[places] for name, column in known.items()}
+            else:
+                rows = [json.loads(text) for text in table["labels"].to_pylist()]
+                labels = {name: column_of(name, rows, kinds[name]) for name in names}
             yield Columns(table["file"].to_pylist(), factors, labels, origin)
-
-    def _labels(self, table: pa.Table) -> dict[str, np.ndarray]:
-        rows = [json.loads(text) if text else {} for text in table["labels"].to_pylist()]
-        labels = {name: column_of(name, rows, kind) for name, kind in self.so_far.kinds.items()}
-        if not self.so_far.partitioned:
-            return labels
-        return {"partition": np.array(table["partition"].to_pylist(), np.str_), **labels}
 
     def remove(self) -> None:
         """Delete the folder."""
         shutil.rmtree(self.folder, ignore_errors=True)
 
-    def remove_if_empty(self) -> bool:
-        """Delete the folder if it holds nothing to go on from, and return whether that was so."""
-        if not self.files:
-            self.remove()
-        return not self.files
 
-
-def _checked_note(file: Path, number: int) -> dict[str, Any]:
-    """The note of a part; ``Damaged`` if it is not the part of this number, as it was written."""
-    name = _NAME.fullmatch(file.name)
-    if name is None or int(name[1]) != number:
+def _checked(file: Path, number: int) -> tuple[int, dict[str, Any]]:
+    """Rows and note of a part; ``Damaged`` if it is not the part of this number, as it was written."""
+    _, named, checksum = file.stem.split("-")[:3] if file.stem.count("-") == 2 else ("", "-1", "")
+    if named != f"{number:06d}":
         raise Damaged(f"part {number} is missing")
-    if name[2] is not None and measured(file)[1] != int(name[2], 16):
+    if checksum != f"{measured(file)[1]:08x}":
         raise Damaged("its checksum differs")
-    try:
-        note = parse_json((pq.read_schema(file).metadata or {})[_KEY], dict[str, Any])
-        Progressed().join(note)
-    except (pa.ArrowException, OSError, ValueError, LookupError, TypeError) as error:
-        raise Damaged("it cannot be read") from error
-    return note
+    metadata = pq.read_metadata(file)
+    return metadata.num_rows, parse_json((metadata.metadata or {})[_KEY], dict[str, Any])

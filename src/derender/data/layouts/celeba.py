@@ -4,17 +4,11 @@ Lists are read as the owners publish them and as their CSV copies; only the attr
 images (``img_align_celeba``) are used whole. Images in the wild (``img_celeba``) show a scene with a face in
 it, so each gets a square box about its face:
 
-- from a list of the user's own, ``boxes.csv`` (or ``.txt``), those boxes as they are: a first line
-  ``file,left,top,width,height`` or ``file,left,top,right,bottom``, then a row for each image;
+- from a list of the user's own, ``boxes.csv``, whose first line is ``file,left,top,width,height`` or
+  ``file,left,top,right,bottom``, with a row for each image;
 - else from ``list_landmarks_celeba.txt``, the box of CelebA-HQ without its rotation (Karras et al.,
   Progressive Growing of GANs, 2018, appendix C): with the eyes' middle E, their distance e, the middle of
-  the mouth's corners M and m = |E - M|, the side is max(4 e, 3.6 m) and the middle E + 0.1 (E - M);
-- else from ``list_bbox_celeba.txt``, the square about the middle of the owners' box whose side is the
-  box's longer one.
-
-unsup3d publishes its own boxes as a list, ``celeba_crop_bbox.txt``, and not the rule behind them
-(github.com/elliottwu/unsup3d, issue 30). How its rows are laid out is written nowhere that we found: without
-a first line of names they are taken for a name, left, top, width and height.
+  the mouth's corners M and m = |E - M|, the side is max(4 e, 3.6 m) and the middle E + 0.1 (E - M).
 
 CelebAMask-HQ: 30,000 faces with a mask of 19 classes each, in parts as published or merged. Its mapping to
 CelebA gives the official partition. The owners' own script compares that table's count from zero with
@@ -27,20 +21,20 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float32
 
-from derender.data.image import DECODER_ERRORS, upright_size
 from derender.data.layouts.layout import (
     MOSTLY,
     Labels,
     Layout,
     Table,
     base_name,
+    header_of,
     parent_name,
+    read_csv,
     read_list,
     stem_of,
     text_column,
 )
 from derender.data.source import Source
-from derender.storage.places import suggestion
 
 CELEBA_HOME = "https://mmlab.ie.cuhk.edu.hk/projects/CelebA.html"
 MASK_HOME = "https://github.com/switchablenorms/CelebAMask-HQ"
@@ -52,7 +46,7 @@ MASK_CLASSES = (
 """The owners' names in their order, which is the class number: eye_g are glasses, ear_r earrings, neck_l a
 necklace."""
 
-BOX_LISTS = ("boxes.csv", "boxes.txt", "celeba_crop_bbox.txt", "celeba_crop_bbox.csv")
+BOX_LIST = "boxes.csv"
 
 _PARTITIONS = {"0": "train", "1": "validation", "2": "test"}
 _FIRST_NUMBERS = {"test": 182_638, "validation": 162_771, "train": 1}  # the parts are runs of image numbers
@@ -60,9 +54,7 @@ _EYES_AND_MOUTH = (
     *("lefteye_x", "lefteye_y", "righteye_x", "righteye_y"),
     *("leftmouth_x", "leftmouth_y", "rightmouth_x", "rightmouth_y"),
 )
-_BOX = ("x_1", "y_1", "width", "height")
 _SIZED, _SIDES = ("left", "top", "width", "height"), ("left", "top", "right", "bottom")
-_MOST_OPENED = 1000
 _MAPPING = "CelebA-HQ-to-CelebA-mapping.txt"
 
 
@@ -170,102 +162,49 @@ def _load_celeba(source: Source) -> Table:
     identities = _owners_list(source, "identity_CelebA")
     if identities is not None:
         labels["identity"] = text_column(identities.rows.get(name, [""])[0] for name in names)
-    boxes = _face_boxes(source, files, names) if wild and not aligned else None
+    boxes = _face_boxes(source, names) if wild and not aligned else None
     return Table(files, labels, _partition(source, names), boxes)
 
 
-def _face_boxes(source: Source, files: Sequence[str], names: Sequence[str]) -> Float32[np.ndarray, "n 4"]:
-    """A box about each face in the wild (left, top, right, bottom); NaN for an image without a row."""
-    own = source.named(*BOX_LISTS)
+def _face_boxes(source: Source, names: Sequence[str]) -> Float32[np.ndarray, "n 4"]:
+    """A box about each face in the wild (left, top, right, bottom); NaN for an image without landmarks."""
+    own, landmarks = source.named(BOX_LIST), _owners_list(source, "list_landmarks_celeba")
     if own is not None:
-        return _own_boxes(source, own, files, names)
-    landmarks = _owners_list(source, "list_landmarks_celeba")
-    boxes = _owners_list(source, "list_bbox_celeba") if landmarks is None else None
-    if landmarks is not None:
-        points = landmarks.numbers(_EYES_AND_MOUTH, names).reshape(-1, 4, 2)
-        eyes, mouth = points[:, :2].mean(axis=1), points[:, 2:].mean(axis=1)
-        apart = np.linalg.norm(points[:, 1] - points[:, 0], axis=1)
-        down = np.linalg.norm(eyes - mouth, axis=1)
-        middle, side = eyes + 0.1 * (eyes - mouth), np.maximum(4 * apart, 3.6 * down)
-    elif boxes is not None:
-        box = boxes.numbers(_BOX, names)
-        middle, side = box[:, :2] + box[:, 2:] / 2, box[:, 2:].max(axis=1)
-    else:
+        return _own_boxes(source, own, names)
+    if landmarks is None:
         raise ValueError(
-            f"{source.path} holds CelebA's images in the wild (img_celeba), but neither "
-            f"list_landmarks_celeba.txt nor list_bbox_celeba.txt, which say where faces are. The owners "
-            f"publish both at {CELEBA_HOME}. A list of your own may stand in for them: {BOX_LISTS[0]}, with "
-            f"rows of file,left,top,width,height"
+            f"{source.path} holds CelebA's images in the wild (img_celeba), but no "
+            f"list_landmarks_celeba.txt, which says where faces are. The owners publish it at {CELEBA_HOME}. "
+            f"A list of your own may stand in for it: {BOX_LIST}, with rows of file,{','.join(_SIZED)}"
         )
-    half = side[:, None] / 2
+    points = landmarks.numbers(_EYES_AND_MOUTH, names).reshape(-1, 4, 2)
+    eyes, mouth = points[:, :2].mean(axis=1), points[:, 2:].mean(axis=1)
+    apart = np.linalg.norm(points[:, 1] - points[:, 0], axis=1)
+    down = np.linalg.norm(eyes - mouth, axis=1)
+    middle, half = eyes + 0.1 * (eyes - mouth), np.maximum(4 * apart, 3.6 * down)[:, None] / 2
     return np.concatenate([middle - half, middle + half], axis=1).astype(np.float32)
 
 
-def _own_boxes(
-    source: Source, file: str, images: Sequence[str], names: Sequence[str]
-) -> Float32[np.ndarray, "n 4"]:
-    """The boxes of a list that the user made for exactly these images.
-
-    A row that is none, a second row of an image, an image without a row, or a box of which less than half
-    lies in its image (looked up in at most 1,000 images, evenly spaced) is an error.
-    """
-    where = f"{file} in {source.path}"
-    boxes: dict[str, tuple[int, tuple[float, ...]]] = {}
-    columns, started = _SIZED, False
-    for number, line in enumerate(map(str.strip, source.read_text(file).splitlines()), 1):
-        if not line or (not started and line.isdecimal()):
-            continue
-        name, *cells = [cell.strip() for cell in line.split(",")] if "," in line else line.rsplit(None, 4)
-        name, values = base_name(name.replace("\\", "/")), [_number(cell) for cell in cells]
-        if not started and not np.isfinite(values).any():
-            found = tuple(cell.lower() for cell in cells)
-            columns = _SIZED if found == _BOX else found
-            if columns not in (_SIZED, _SIDES):
-                known = " or ".join(",".join(("file", *one)) for one in (_SIZED, _SIDES))
-                there = ", ".join(cells) or "of no name"
-                raise ValueError(f"{where}, line {number}: expected {known}, got columns {there}")
-        else:
-            expected = f"an image's name and {', '.join(columns)}"
-            if len(values) != 4 or not np.isfinite(values).all():
-                raise ValueError(f"{where}, line {number}: expected {expected}, got {line!r}")
-            if columns == _SIZED:
-                values[2:] = values[0] + values[2], values[1] + values[3]
-            if values[2] <= values[0] or values[3] <= values[1]:
-                raise ValueError(
-                    f"{where}, line {number}: the box has no area; expected {expected}, got {line!r}"
-                )
-            if name in boxes:
-                raise ValueError(f"{where}, line {number}: a second row for {name}; keep one of them")
-            boxes[name] = number, tuple(values)
-        started = True
-    missing = [name for name in names if name not in boxes]
-    if missing:
-        close = suggestion(missing[0], boxes) if len(boxes) < _MOST_OPENED else ""
+def _own_boxes(source: Source, file: str, names: Sequence[str]) -> Float32[np.ndarray, "n 4"]:
+    """The boxes of a list that the user made; an image without a row or with an empty box is an error."""
+    columns = _SIZED if "width" in header_of(source, file) else _SIDES
+    rows = read_csv(source, file, ("file", *columns))
+    listed = _OwnersList(
+        f"{file} in {source.path}",
+        columns,
+        {base_name(row["file"]): [row[c] for c in columns] for row in rows},
+    )
+    if missing := [name for name in names if name not in listed.rows]:
         raise ValueError(
-            f"{where} has no row for {missing[0]} ({len(missing):,} of {len(names):,} images have none"
-            f"{close}). Add the rows, or move these images or the list out of the folder"
+            f"{listed.where} has no row for {missing[0]} ({len(missing):,} of {len(names):,} images have "
+            "none): add the rows, or move these images or the list out of the folder"
         )
-    for row in map(int, np.unique(np.linspace(0, len(names) - 1, _MOST_OPENED).astype(int))):
-        number, (left, top, right, bottom) = boxes[names[row]]
-        try:
-            width, height = upright_size(source.read(images[row]))
-        except DECODER_ERRORS:  # an unreadable image is listed elsewhere
-            continue
-        across, down = min(right, width) - max(left, 0), min(bottom, height) - max(top, 0)
-        if max(0.0, across) * max(0.0, down) < 0.5 * (right - left) * (bottom - top):
-            raise ValueError(
-                f"{where}, line {number}: the box from ({left:g}, {top:g}) to ({right:g}, {bottom:g}) lies "
-                f"outside {names[row]}, which is {width} x {height} pixels. Say in the first line "
-                f"whether boxes are file,{','.join(_SIZED)} or file,{','.join(_SIDES)}"
-            )
-    return np.array([boxes[name][1] for name in names], np.float32)
-
-
-def _number(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        return np.nan
+    boxes = listed.numbers(columns, names)
+    if columns == _SIZED:
+        boxes[:, 2:] += boxes[:, :2]
+    if not (has_area := (boxes[:, 2:] > boxes[:, :2]).all(axis=1)).all():
+        raise ValueError(f"{listed.where}: the box of {names[int(has_area.argmin())]} has no area")
+    return boxes
 
 
 def parts_of(source: Source) -> dict[str, dict[int, str]]:
