@@ -155,8 +155,8 @@ def test_shadows_are_those_of_a_ray_cast_outside_the_soft_edge(generator):
     towards, found = -light_direction(light.double()), visible(depth, light.double(), FOV_DEG, 5.0)
     places = torch.ones_like(depth).nonzero(as_tuple=True)
     lowest = torch.ones(depth.numel()).double()
-    for pixels in np.arange(0.1, 60, 0.1):  # fractions of the march's steps: k + k^2 / 16 = pixels
-        step = torch.full_like(lowest, (math.sqrt(1 + pixels / 4) - 1) * 8)
+    for pixels in np.arange(0.1, 60, 0.1):  # fractions of the march's steps: k + k^2 / 12 = pixels
+        step = torch.full_like(lowest, (math.sqrt(1 + pixels / 3) - 1) * 6)
         lowest = torch.minimum(lowest, clearance(depth, towards, places, step, focal_px(40, FOV_DEG)))
     lowest = lowest.view_as(depth)
     dark, lit = lowest < -math.tan(math.radians(7)), lowest > 0

@@ -66,12 +66,16 @@ class Factor:
 
 @dataclass(frozen=True)
 class Number:
-    """One number of a factor: its name in reports, its range, and whether it is even in its logarithm."""
+    """One number of a factor: its name in reports, its range, and whether it is even in its logarithm.
+
+    ``start`` is the share of the range, between 0 and 1, at which an untrained network begins.
+    """
 
     name: str
     low: float
     high: float
     log: bool = False
+    start: float = 0.5
 
     def at(self, share: Tensor) -> Tensor:
         """The value at shares of the range, 0..1."""
@@ -92,7 +96,9 @@ def numbers_factor(name: str, *numbers: Number) -> Factor:
         return valued(torch.rand(value.shape, generator=generator, device=generator.device).to(value))
 
     def from_raw(raw: Float[Tensor, "n k"], ranges: SceneRanges) -> Float[Tensor, "n k"]:
-        return valued(raw.float() / 2 + 0.5)
+        share = raw.float() / 2 + 0.5
+        odds = share.new_tensor([one.start / (1 - one.start) for one in numbers])
+        return valued(odds * share / (1 - share + odds * share))
 
     return Factor(name, name, vector_net(len(numbers)), from_raw, False, drawn, numbers)
 

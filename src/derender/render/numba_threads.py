@@ -21,9 +21,9 @@ from torch import Tensor
 PORTIONS_PER_THREAD = 4
 
 
-def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
+def kernel(function: Callable[..., Any], **own: Any) -> Callable[..., Any]:
     """Compile on first use, without the interpreter lock, keeping the machine code on disk where possible."""
-    options: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
+    options: dict[str, Any] = {"nogil": True, "error_model": "numpy", **own}
     try:
         return numba.njit(cache=True, **options)(function)
     except RuntimeError:  # no folder can be written

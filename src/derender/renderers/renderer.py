@@ -18,8 +18,8 @@ from torch import Tensor
 from derender.networks import FACTORS, Factor
 from derender.render import Rendering
 from derender.render.renderer import shade, warp
+from derender.render.shading import shade as lambert
 from derender.scene import Scene
-from derender.scene.light import lambert_shading
 from derender.scene.normals import normals_from_depth
 
 STAGES = ("visibility", "irradiance", "specular", "atmosphere")
@@ -74,39 +74,31 @@ class Renderer:
 
     def shade(self, scene: Scene, fov_deg: float, backend: str = "auto") -> Float[Tensor, "n 3 h w"]:
         """The canonical image, before any camera."""
-        lit = self.irradiance is None and self.specular is None and self.gamma == 1
-        if lit and self.visibility is None:
+        if not (self.irradiance or self.specular or self.visibility) and self.gamma == 1:
             return shade(scene.depth, scene.albedo, scene.light, fov_deg, backend)
         with torch.autocast(scene.depth.device.type, enabled=False):
-            if lit and self.visibility is not None:
-                image = shade(scene.depth, scene.albedo, scene.light, fov_deg, backend).movedim(1, 3)
-                visible = self.visibility(scene, fov_deg)
-                dim = (visible < 1).nonzero(as_tuple=True)  # few pixels, which alone are changed
-                ambient = scene.albedo.movedim(1, 3)[dim] * scene.light[dim[0], :1]
-                changed = torch.lerp(ambient, image[dim], visible[dim][:, None])
-                return image.index_put(dim, changed).movedim(3, 1)
-            normal = normals_from_depth(scene.depth, fov_deg)
-            visible = None if self.visibility is None else self.visibility(scene, fov_deg)[:, None]
-            image = self._light(scene, normal, visible) * scene.albedo.clamp(min=DARKEST) ** self.gamma
+            visible = None if self.visibility is None else self.visibility(scene, fov_deg)
+            albedo = scene.albedo if self.gamma == 1 else scene.albedo.clamp(min=DARKEST) ** self.gamma
+            image = albedo * self._light(scene, fov_deg, visible, backend)
             if self.specular is not None:
-                shine = self.specular(scene, normal, fov_deg)
-                image = image + (shine if visible is None else shine * visible)
+                shine = self.specular(scene, normals_from_depth(scene.depth, fov_deg), fov_deg)
+                image = image + (shine if visible is None else shine * visible[:, None])
             return image if self.gamma == 1 else image.clamp(min=DARKEST) ** (1 / self.gamma)
 
     def shading(self, scene: Scene, fov_deg: float) -> Float[Tensor, "n c h w"]:
         """The diffuse light on the canonical surface, by which albedo is multiplied; one channel or three."""
-        visible = None if self.visibility is None else self.visibility(scene, fov_deg)[:, None]
-        light = self._light(scene, normals_from_depth(scene.depth, fov_deg), visible)
+        visible = None if self.visibility is None else self.visibility(scene, fov_deg)
+        light = self._light(scene, fov_deg, visible)
         return light if self.gamma == 1 else light.clamp(min=DARKEST) ** (1 / self.gamma)
 
-    def _light(self, scene: Scene, normal: Tensor, visible: Tensor | None) -> Tensor:
+    def _light(self, scene: Scene, fov_deg: float, visible: Tensor | None, backend: str = "auto") -> Tensor:
         if self.irradiance is not None:
-            return self.irradiance(scene, normal)
-        light = lambert_shading(normal, scene.light)
+            return self.irradiance(scene, normals_from_depth(scene.depth, fov_deg))
+        white = torch.ones_like(scene.depth)[:, None]
+        light = lambert(scene.depth, white, scene.light, fov_deg, backend)
         if visible is None:
             return light
-        ambient = scene.light[:, 0, None, None, None]
-        return ambient + visible * (light - ambient)
+        return torch.lerp(scene.light[:, 0, None, None, None].expand_as(light), light, visible[:, None])
 
     def check(self, scene: Scene) -> None:
         """A ValueError: the scene lacks a parameter, or a number is out of its range (on the CPU only)."""

@@ -60,22 +60,32 @@ def clearance(
 ) -> Float[Tensor, " m"]:  # fmt: skip
     """How far some pixels' rays run in front of the surface after so many steps, over the distance gone.
 
-    Step k lies about k + k^2 / 16 pixels along the ray. Outside the image it is 1: nothing is in the way.
+    Step k lies k + k^2 / 12 pixels along the ray. Outside the image it is 1: nothing is in the way.
     """
     (n, i, j), (height, width) = places, depth.shape[1:]
-    own, (x, y, z) = depth[places], towards[n].unbind(1)
-    gone = step * (1 + step / 16) * own / (focal * torch.hypot(x, y).clamp(min=_LEAST_SLANT))
-    reached = own + gone * z
-    middle_u, middle_v = (width - 1) / 2, (height - 1) / 2
-    u = ((j - middle_u) * own + focal * gone * x) / reached + middle_u
-    v = ((i - middle_v) * own + focal * gone * y) / reached + middle_v
+    gone, nearer, u, v = _along(towards, places, step * (1 + step / 12), (height, width), focal)
     inside = (u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1)
     left, top = (at.detach().long().clamp(0, most - 2) for at, most in ((u, width), (v, height)))
-    across, down = u - left, v - top
-    above, below = (
-        torch.lerp(depth[n, row, left], depth[n, row, left + 1], across) for row in (top, top + 1)
-    )
-    return torch.where(inside, (torch.lerp(above, below, down) - reached) / gone, 1.0)
+    across, down, depths = u - left, v - top, depth.flatten()
+    here, corner = (n * height + i) * width + j, (n * height + top) * width + left
+    corners = torch.cat([here, corner, corner + 1, corner + width, corner + width + 1])
+    own, *four = depths.gather(0, corners).chunk(5)
+    above, below = torch.lerp(four[0], four[1], across), torch.lerp(four[2], four[3], across)
+    return torch.where(inside, (torch.lerp(above, below, down) * nearer - own) / (gone * own), 1.0)
+
+
+def _along(
+    towards: Float[Tensor, "n 3"], places: Places, pixels: Tensor, size: tuple[int, int], focal: float
+) -> tuple[Tensor, ...]:
+    """Where some pixels' rays are after so many pixels of the image.
+
+    The distance gone over the depth there; the depth at the start over that there; column and row.
+    """
+    (n, i, j), (height, width) = places, size
+    x, y, z = towards[n].unbind(1)
+    right, down = focal * x - (j - (width - 1) / 2) * z, focal * y - (i - (height - 1) / 2) * z
+    gone = pixels / torch.hypot(right, down).clamp(min=_LEAST_SLANT * focal)
+    return gone, 1 - gone * z, j + gone * right, i + gone * down
 
 
 def _lowest_step(
@@ -83,18 +93,16 @@ def _lowest_step(
 ) -> Int32[Tensor, "n h w"]:
     """The step at which each ray runs deepest below the surface for its distance; 0 if it never does."""
     step, lowest = torch.zeros_like(depth, dtype=torch.int32), torch.zeros_like(depth)
-    nearest, slant = depth.amin(dim=(1, 2)), towards[:, :2].norm(dim=1).clamp(min=_LEAST_SLANT)
-    rise = -towards[:, 2] / (focal * slant)  # of a ray by a step, over its depth
+    nearest, size = depth.amin(dim=(1, 2)), (depth.shape[1], depth.shape[2])
     places = torch.ones_like(step).nonzero(as_tuple=True)
-    for number in range(1, sum(depth.shape[1:])):
-        n, own = places[0], depth[places]
-        under = own - number * (1 + number / 16) * own * rise[n] > nearest[n]
-        places = tuple(axis[under] for axis in places)
-        if not len(places[0]):
+    for number in range(1, sum(size)):
+        numbers = torch.full(places[0].shape, number, dtype=torch.int32, device=depth.device)
+        nearer = _along(towards, places, numbers * (1 + numbers / 12), size, focal)[1]
+        under = depth[places] > nearest[places[0]] * nearer
+        places, numbers = tuple(axis[under] for axis in places), numbers[under]
+        if not len(numbers):
             break
-        found = clearance(
-            depth, towards, places, torch.full_like(places[0], number, dtype=torch.int32), focal
-        )
+        found = clearance(depth, towards, places, numbers, focal)
         lower = found < lowest[places]
         lowest[places] = torch.where(lower, found, lowest[places])
         step[places] = torch.where(lower, number, step[places])

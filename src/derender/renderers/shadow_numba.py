@@ -4,6 +4,7 @@ The same as ``shadow._lowest_step``; no derivative is needed, as clearance is di
 alone. A ray ends where nothing further on could be deeper, given the nearest surface that it can reach.
 """
 
+from functools import partial
 from typing import no_type_check
 
 import numpy as np
@@ -23,43 +24,40 @@ def lowest_step(
     return step
 
 
-@kernel
+@partial(kernel, fastmath={"contract"})
 @no_type_check
 def _search(depth, towards, focal, step, first, last):
     height, width = depth.shape[1:]
-    zero, one, sixteen = depth.dtype.type(0), depth.dtype.type(1), depth.dtype.type(16)
+    zero, one, twelve = depth.dtype.type(0), depth.dtype.type(1), depth.dtype.type(12)
     focal, middle_u, middle_v = zero + focal, zero + 0.5 * (width - 1), zero + 0.5 * (height - 1)
-    ahead = np.empty((height, width), depth.dtype)
+    least, ahead = focal * depth.dtype.type(1e-4), np.empty((height, width), depth.dtype)
     for n in range(first, last):
         tx, ty, tz = towards[n, 0], towards[n, 1], towards[n, 2]
-        own, slant = depth[n], max(np.sqrt(tx * tx + ty * ty), zero + 1e-4)
+        own = depth[n]
         _nearest_ahead(own, focal * tx / tz + middle_u, focal * ty / tz + middle_v, ahead)
         for i in range(height):
             for j in range(width):
-                z0 = own[i, j]
-                nearest = ahead[i, j]
-                length = z0 / (focal * slant)
-                x0, y0 = (j - middle_u) * z0, (i - middle_v) * z0
-                across, down = focal * length * tx, focal * length * ty
+                z0, nearest = own[i, j], ahead[i, j]
+                right, down = focal * tx - (j - middle_u) * tz, focal * ty - (i - middle_v) * tz
+                pixel = one / max(np.sqrt(right * right + down * down), least)
+                right, down = right * pixel, down * pixel
+                rise = -tz * pixel
                 lowest, best = zero, 0
-                for number in range(1, height + width - 1):
-                    pixels = number * (one + number / sixteen)
-                    gone = pixels * length
-                    z = z0 + gone * tz
-                    if nearest - z >= lowest * gone:
+                for number in range(1, height + width):
+                    pixels = number * (one + number / twelve)
+                    nearer = one + pixels * rise
+                    if nearest * nearer - z0 >= lowest * pixels:
                         break
-                    near = one / z
-                    u = (x0 + pixels * across) * near + middle_u
-                    v = (y0 + pixels * down) * near + middle_v
+                    u, v = j + pixels * right, i + pixels * down
                     if u < 0 or v < 0 or u > width - 1 or v > height - 1:
                         break
                     p, q = min(int(u), width - 2), min(int(v), height - 2)
                     a, b = u - p, v - q
                     above = own[q, p] + a * (own[q, p + 1] - own[q, p])
                     below = own[q + 1, p] + a * (own[q + 1, p + 1] - own[q + 1, p])
-                    behind = above + b * (below - above) - z
-                    if behind < lowest * gone:
-                        lowest, best = behind / gone, number
+                    behind = (above + b * (below - above)) * nearer - z0
+                    if behind < lowest * pixels:
+                        lowest, best = behind / pixels, number
                 step[n, i, j] = best
 
 
