@@ -12,7 +12,7 @@ from pathlib import Path
 import torch
 
 import derender
-from derender.data.synthetic import FaceSettings, faces, write_folder
+from derender.data.synthetic import FaceSettings, faces, write
 from derender.networks.factors import Number, numbers_factor
 from derender.render import Rendering
 from derender.renderers import Renderer
@@ -40,7 +40,7 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=64, help="side of the images, pixels")
     given = parser.parse_args()
 
-    write_folder(faces.generate(given.count, given.size, 0, FaceSettings()), given.out / "data")
+    write(faces.generate(given.count, given.size, 0, FaceSettings()), given.out / "data")
     settings = {"image_size": given.size, "images": given.images, "perceptual": "none"}  # sooner done
     run = given.out / "run"
     derender.train(

@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from derender import Derenderer
-from derender.data.synthetic import FaceSettings, faces, write, write_tracks
+from derender.data.synthetic import FaceSettings, faces, write
 
 QUICK = ["--resamples", 20, "--untrained-seeds", 1, "--seeds", 2, "--angles", "0,40", "--cache"]
 
@@ -63,7 +63,7 @@ def test_pictures_rendered_again_and_pictures_of_known_angles(model, rendered, t
 def test_tracks_in_light_that_nobody_trained_on(model, tmp_path, numbers):
     folder = tmp_path / "tracks"
     settings = FaceSettings(tracks=8, frames=2)
-    write_tracks(faces.generate(32, 32, 0, settings), folder)
+    write(faces.generate(32, 32, 0, settings), folder)
     words = ["evaluate", "robustness", "-m", model, "-d", folder, "--pictures", "truth", "--axes", "yaw"]
     told, _ = numbers(*words, *QUICK, "none")
     assert told["curves"]["yaw"]["n_tested"] == [4, 4, 6, 6, 4] and told["names"] == ["identity"]

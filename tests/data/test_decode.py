@@ -1,8 +1,6 @@
 """One image in, RGB of the wanted size out: every mode has its meaning, every damage its reason."""
 
 import struct
-import threading
-import time
 import zlib
 
 import numpy as np
@@ -10,8 +8,8 @@ import pytest
 from PIL import Image
 from tests.data.conftest import noise
 
-from derender.data import ahead, read_image
 from derender.data import image as module
+from derender.data import read_image
 from derender.data.image import FITS, Unreadable, decode
 
 RAMP = np.linspace(0, 255, 12).astype(np.uint8)[None, :].repeat(12, 0)
@@ -241,34 +239,3 @@ def test_a_box_holds_where_the_jpeg_is_decoded_at_a_reduced_scale(encoded):
     assert np.abs(part - centres / 1024 * 255).max() < 1.5
     small = decode(jpeg, 16, "crop", box(512, 100, 528, 116)).mean()
     assert abs(small - 520 / 1024 * 255) < 1.5
-
-
-def test_a_reader_is_never_further_ahead_than_asked():
-    made, taken = [], []
-    with ahead((made.append(number) or number for number in range(50)), depth=3) as ready:
-        for item in ready:
-            taken.append(item)
-            time.sleep(0.002)
-            assert len(made) - len(taken) <= 3 + 1
-    assert taken == list(range(50))
-
-
-def test_errors_arrive_and_leaving_ends_the_thread():
-    def failing():
-        yield 1
-        raise ValueError("broken pipe of images")
-
-    with pytest.raises(ValueError, match="broken pipe of images"), ahead(failing()) as ready:
-        assert list(ready) == [1]
-    closed = []
-
-    def endless():
-        try:
-            while True:
-                yield 0
-        finally:
-            closed.append(True)
-
-    with ahead(endless()) as ready:
-        assert next(ready) == 0
-    assert closed and not [thread for thread in threading.enumerate() if thread.name.startswith("read")]

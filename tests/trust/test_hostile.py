@@ -16,7 +16,7 @@ from tests.trust.hostile_files import UNSAFE, encoded, smooth, write_hostile, wr
 import derender
 from derender.cli import main
 from derender.data import Unreadable, read_image, read_images
-from derender.data.folder_source import FolderSource
+from derender.data.source import FolderSource
 
 
 @pytest.fixture(scope="module")

@@ -26,14 +26,14 @@ class Request:
     json_file: options.Json = None
 
     def generate(self, call: Any, count: int, objects: str, kind: Any, names: list[str], **own: Any) -> None:
-        from derender.data.synthetic import named_settings, require_empty, write_folder
+        from derender.data.synthetic import named_settings, require_empty, write
 
         require_empty(self.out)
         settings = named_settings(kind, self.light, self.view, [*names, *(self.overrides or [])], **own)
         with progress_bar("generating") as report:
             made = call(count, self.image_size, self.seed, settings, report)
         with progress_bar("writing") as report:
-            write_folder(made, self.out, self.truth, report)
+            write(made, self.out, self.truth, report)
         different = len(set(made.identity.tolist()))
         result(f"{count:,} images of {different:,} {objects} in {self.out}", self.json_file)
         facts = {"count": count, objects: different, "image_size": self.image_size, "seed": self.seed}

@@ -1,7 +1,7 @@
 """Images in: folders, zips, shards and published data sets, decoded once into one array or streamed.
 
 opening       from what the user wrote to a stream of images: open_images
-source, folder_source, zip_source   named files
+source, zip_source   named files
 layouts/      how data sets lie: recognised, and read into a table of files and labels
 stream        images one after another; shards (WebDataset), huggingface
 image         decode one; decoding: a stream, on every core
@@ -16,7 +16,6 @@ from derender.data.cache import cache_folder, sample_checksum
 from derender.data.decoding import (
     Decoded,
     Progress,
-    ahead,
     decode_samples,
     decoded,
     estimated_total,
@@ -39,7 +38,7 @@ from derender.storage.places import nearest_sibling, suggestion
 __all__ = [
     "HALVES", "LAYOUTS", "MASK_CLASSES", "READER_VERSION", "Decoded", "Duplicate", "GivenImages",
     "GroundTruth", "ImageSet", "Kinds", "ListedStream", "MaskedImages", "Progress", "Sample", "Skipped",
-    "Split", "Stream", "Unreadable", "Value", "ahead", "as_batch", "as_float", "as_photos",
+    "Split", "Stream", "Unreadable", "Value", "as_batch", "as_float", "as_photos",
     "cache_folder", "check_images", "column_of", "decode", "decode_samples", "decode_whole", "decoded",
     "estimated_total", "half_of", "is_image", "list_images", "nearest_sibling", "open_images",
     "open_source", "opened_parquet", "parse_source", "quiet_pillow", "read_ground_truth", "read_image",

@@ -1,26 +1,23 @@
 """Samples to pixels, in order, on every core, a bounded number on the way.
 
-A pool decodes (Pillow does so without Python's lock), and ``ahead`` lets a thread of its own read while
-whoever takes the results computes. The bound counts images, so that memory does not grow with the stream.
+A pool decodes (Pillow does so without Python's lock) while whoever takes the results computes. The bound
+counts images, so that memory does not grow with the stream.
 """
 
 import hashlib
 import os
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager, nullcontext
+from contextlib import nullcontext
 from dataclasses import dataclass
 from itertools import islice
-from typing import TypeVar
 
 import numpy as np
 from jaxtyping import UInt8
 
 from derender.data.image import LARGE_BYTES, Unreadable, decode, one_large_image_at_a_time
 from derender.data.stream import Sample, Stream, Value
-
-T = TypeVar("T")
 
 Progress = Callable[[int, int], object]  # called with (images done, images in all), from the calling thread
 CHUNK = 32  # images that one thread decodes before it hands them on
@@ -50,8 +47,9 @@ def usable_cores() -> int:
 
 def decoded(
     stream: Stream, image_size: int, *, fit: str = "crop", start: int = 0, workers: int | None = None
-) -> Iterator[Decoded]:
-    """Decode a stream from sample ``start`` on, up to its limit. Wrap in ``quiet_pillow``."""
+) -> Generator[Decoded]:
+    """Decode a stream from sample ``start`` on, up to its limit; close it to end its threads. Wrap in
+    ``quiet_pillow``."""
     cores = workers or usable_cores()
     samples = islice(stream.samples(start), None if stream.limit is None else max(0, stream.limit - start))
     waiting: deque[Future[Decoded]] = deque()
@@ -60,7 +58,7 @@ def decoded(
         while chunk := list(islice(samples, CHUNK)):
             waiting.append(pool.submit(decode_samples, start, chunk, image_size, fit))
             start += len(chunk)
-            if len(waiting) > 2 * cores:
+            if len(waiting) > max(16, 2 * cores):
                 yield waiting.popleft().result()
         while waiting:
             yield waiting.popleft().result()
@@ -89,29 +87,6 @@ def _decode_one(target: np.ndarray, sample: Sample, fit: str) -> bytes | Unreada
     except OSError as problem:
         return Unreadable(f"cannot be read: {problem.strerror or problem}")
     return hashlib.blake2b(target.data, digest_size=DIGEST_BYTES).digest()
-
-
-@contextmanager
-def ahead(items: Iterable[T], depth: int = 4) -> Iterator[Iterator[T]]:
-    """Run an iterable in a thread of its own, at most ``depth`` items ahead of whoever takes them.
-
-    What it raises is raised where it is taken. Leaving the block ends the thread.
-    """
-    iterator, end = iter(items), object()
-    pool = ThreadPoolExecutor(1, thread_name_prefix="read")
-    waiting = deque(pool.submit(next, iterator, end) for _ in range(depth))
-
-    def take() -> Iterator[T]:
-        while (item := waiting.popleft().result()) is not end:
-            waiting.append(pool.submit(next, iterator, end))
-            yield item  # pyright: ignore[reportReturnType]
-
-    try:
-        yield take()
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
-        if isinstance(iterator, Generator):
-            iterator.close()
 
 
 def estimated_total(done: int, share: float | None, limit: int | None) -> int:

@@ -10,7 +10,6 @@ Not tried against the Hub itself: what is tested are folders in the forms in whi
 import importlib
 import os
 from collections.abc import Iterator
-from contextlib import suppress
 from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -112,25 +111,20 @@ def _commit(identifier: str, revision: str | None) -> str:
     """The commit that an id stands for now; asked for first because the library itself retries for long."""
     from huggingface_hub import HfApi, errors
 
-    refusals = {
-        errors.GatedRepoError: f"the data set {identifier} is gated: accept its terms at https://huggingface.co/"
-        f"datasets/{identifier} and log in with 'hf auth login'",
-        errors.RepositoryNotFoundError: f"the Hugging Face Hub has no data set {identifier} "
-        "(or it is private): check the id, or log in",
-        errors.HFValidationError: f"{identifier!r} is no id of a Hugging Face data set",
-    }
-    transport: type[Exception] = OSError  # what the Hub's client raises without a network has changed twice
-    for module in ("httpx", "httpx2"):
-        with suppress(ImportError):
-            transport = importlib.import_module(module).HTTPError
     try:
-        info = HfApi().dataset_info(identifier, revision=revision, timeout=_ANSWER_SECONDS)
-    except (*refusals, errors.HfHubHTTPError, OSError, RuntimeError, transport) as problem:
-        why = type(problem).__name__
-        failed = f"the Hugging Face Hub cannot be asked for {identifier} ({why}): check the network"
-        told = (text for kind, text in refusals.items() if isinstance(problem, kind))
-        raise ValueError(next(told, failed)) from problem
-    return info.sha or "main"
+        return HfApi().dataset_info(identifier, revision=revision, timeout=_ANSWER_SECONDS).sha or "main"
+    except errors.GatedRepoError as problem:
+        terms = f"https://huggingface.co/datasets/{identifier}"
+        fault = f"{identifier} is gated: accept its terms at {terms} and log in with 'hf auth login'"
+        raise ValueError(f"the data set {fault}") from problem
+    except errors.RepositoryNotFoundError as problem:
+        fault = f"no data set {identifier} (or it is private): check the id, or log in"
+        raise ValueError(f"the Hugging Face Hub has {fault}") from problem
+    except errors.HFValidationError as problem:
+        raise ValueError(f"{identifier!r} is no id of a Hugging Face data set") from problem
+    except Exception as problem:  # what a broken connection raises changes with the client's HTTP library
+        fault = f"cannot be asked for {identifier} ({type(problem).__name__}): check the network"
+        raise ValueError(f"the Hugging Face Hub {fault}") from problem
 
 
 def _load(source: str, place: str | Path, config: str | None, revision: str | None) -> dict[str, Any]:

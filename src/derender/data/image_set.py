@@ -8,6 +8,7 @@ its pixels, an image takes its name, its labels and about 200 bytes that find co
 import hashlib
 import re
 from collections.abc import Callable, Mapping
+from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from jaxtyping import Float, Shaped, UInt8
 from torch import Tensor
 
 from derender.data.cache import cache_file, cache_folder, read_cache, write_cache
-from derender.data.decoding import Decoded, Progress, ahead, decoded, estimated_total
+from derender.data.decoding import Decoded, Progress, decoded, estimated_total
 from derender.data.image import READER_VERSION, Unreadable, check_fit, quiet_pillow
 from derender.data.layouts.layout import Labels, count_unknown, text_column
 from derender.data.opening import open_images
@@ -166,9 +167,8 @@ def read_images(
         def fill(append: Callable[[np.ndarray], object]) -> dict[str, Any]:
             """Decode everything and append the rows; what is known of them, as JSON has it."""
             found = _Found(keep_duplicates)
-            chunks = decoded(stream, image_size, fit=fit, workers=workers)
-            with quiet_pillow(), ahead(chunks) as ready:
-                for chunk in ready:
+            with quiet_pillow(), closing(decoded(stream, image_size, fit=fit, workers=workers)) as chunks:
+                for chunk in chunks:
                     append(chunk.images[found.add(chunk)])
                     if progress is not None:
                         done = chunk.start + len(chunk)

@@ -22,13 +22,12 @@ from urllib.parse import parse_qsl
 
 import numpy as np
 
-from derender.data.folder_source import FolderSource
 from derender.data.huggingface import HuggingFaceStream, is_saved
 from derender.data.layouts import layout_named, recognise
 from derender.data.layouts.layout import Layout, Table, half_of
 from derender.data.layouts.tables import TABLE_SUFFIXES, TableSource, holds_paths
 from derender.data.shards import SHARD_SUFFIXES, ShardStream, find_shards
-from derender.data.source import FileSource, Source, is_hidden, is_image
+from derender.data.source import FileSource, FolderSource, Source, is_hidden, is_image
 from derender.data.stream import Sample, Stream
 from derender.data.zip_source import ZipSource
 from derender.storage.places import SUFFIXES, nearest_sibling, suggestion

@@ -1,9 +1,12 @@
-"""Named files that are read by name: the interface of folders, zips, tables and single images.
+"""Named files that are read by name: the interface of folders, zips, tables and single images; and folders.
 
 Names are posix paths relative to the source, sorted. Nothing is ever extracted, so that no name in an archive
-can write anywhere. Nested archives are not opened.
+can write anywhere. Nested archives are not opened. A folder is walked once: hidden files and ``__MACOSX`` are
+left out, and links are followed, each real folder once, so that loops end.
 """
 
+import os
+import stat
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -101,6 +104,57 @@ class FileSource(Source):
 
     def stamps(self, files: Sequence[str]) -> Int64[np.ndarray, "n 2"]:
         return stamps_of(map(self.on_disk, files))
+
+
+class FolderSource(FileSource):
+    """Every file below a folder."""
+
+    def __init__(self, path: Path):
+        self.path = path
+        self._found, faults = _walk(str(path))
+        self.files = tuple(sorted(self._found))
+        self.skipped = tuple(sorted(faults, key=lambda row: row.file))
+
+    def on_disk(self, file: str) -> Path:
+        return self.path / self._found[file]
+
+
+def _walk(root: str) -> tuple[dict[str, str], list[Skipped]]:
+    """Each file's path by its printable path; and what is no file."""
+    found: dict[str, str] = {}
+    faults: list[Skipped] = []
+    seen: set[tuple[int, int]] = set()
+    waiting = [""]
+    while waiting:
+        here = waiting.pop()
+        try:
+            status = os.stat(f"{root}/{here}")  # noqa: PTH116  (a million times)
+            if (status.st_dev, status.st_ino) in seen:
+                continue
+            seen.add((status.st_dev, status.st_ino))
+            with os.scandir(f"{root}/{here}") as listed:
+                entries = [entry for entry in listed if not is_hidden(entry.name)]
+        except OSError as problem:
+            name = printable(here.rstrip("/") or ".")
+            faults.append(Skipped(name, f"folder cannot be listed: {problem.strerror}"))
+            continue
+        below: list[str] = []
+        for entry in entries:
+            path = f"{here}{entry.name}"
+            try:
+                status = entry.stat()
+            except OSError as problem:
+                reason = f"broken link or unreachable file: {problem.strerror}"
+                faults.append(Skipped(printable(path), reason))
+                continue
+            if stat.S_ISREG(status.st_mode):
+                found[printable(path)] = path
+            elif stat.S_ISDIR(status.st_mode):
+                below.append(f"{path}/")
+            else:
+                faults.append(Skipped(printable(path), "not a regular file"))
+        waiting += sorted(below, reverse=True)
+    return found, faults
 
 
 def stamps_of(paths: Iterable[Path]) -> Int64[np.ndarray, "n 2"]:

@@ -101,19 +101,13 @@ class Kinds(dict[str, str | None]):
     def see(self, labels: Mapping[str, Value]) -> None:
         """Take one image's labels into account."""
         for name, value in labels.items():
-            if isinstance(value, bool | None):
-                kind = None if value is None else "flag"
-            else:
-                small = isinstance(value, float) or (
-                    isinstance(value, int) and abs(value) <= _EXACT_IN_FLOAT32
-                )
-                kind = "number" if small else "text"
-            self.join(name, kind)
-
-    def join(self, name: str, kind: str | None) -> None:
-        """Take a kind into account that a column has elsewhere."""
-        known = self.get(name)
-        self[name] = kind if known is None else known if kind in (None, known) else "text"
+            kind, known = None, self.get(name)
+            if isinstance(value, bool):
+                kind = "flag"
+            elif value is not None:
+                large = isinstance(value, str) or (isinstance(value, int) and abs(value) > _EXACT_IN_FLOAT32)
+                kind = "text" if large else "number"
+            self[name] = kind if known is None else known if kind in (None, known) else "text"
 
 
 def column_of(name: str, rows: Iterable[Mapping[str, Value]], kind: str | None) -> np.ndarray:

@@ -8,7 +8,7 @@ the same bit for bit either way.
 import logging
 import pickle
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
 from dataclasses import replace
 from itertools import islice
 from typing import Any
@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from derender.data import Decoded, ImageSet, Sample, Stream, ahead, decode_samples, decoded, quiet_pillow
+from derender.data import Decoded, ImageSet, Sample, Stream, decode_samples, decoded, quiet_pillow
 from derender.features.extract import as_batch, evaluating, factor_codes
 
 OpenStream = Callable[[], AbstractContextManager[Stream]]
@@ -48,7 +48,7 @@ def local_blocks(
             chunks = _of_set(source, start, batch_size)
         else:
             pixels = decoded(source, model.image_size, fit=fit, start=start, workers=workers)
-            chunks = stack.enter_context(ahead(_regrouped(pixels, batch_size), 2))
+            chunks = _regrouped(stack.enter_context(closing(pixels)), batch_size)
         yield (embedded_block(model, chunk) for chunk in chunks)
 
 

@@ -11,6 +11,7 @@ from sklearn.base import BaseEstimator, TransformerMixin
 
 import derender
 from derender.data import read_image
+from derender.data.given import refuse_values
 from derender.features.extract import embed_images
 from derender.features.table import named
 
@@ -116,6 +117,5 @@ def as_pixels(X: Any, image_size: int) -> np.ndarray:
         return array
     if array.dtype.kind != "f":
         raise ValueError(f"expected images in uint8 or floats in 0..1, got {array.dtype}: convert them")
-    if not np.isfinite(array).all() or array.min(initial=0) < 0 or array.max(initial=0) > 1:
-        raise ValueError("images given as floats must lie in 0..1 without NaN: divide by 255, or pass uint8")
+    refuse_values(array)
     return np.ascontiguousarray(array, np.float32)

@@ -268,7 +268,7 @@ class ImageOpener:
 def image_files(paths: Sequence[Path]) -> list[Path]:
     """The files that were named, and in place of a folder the images and videos in it, once each."""
     from derender.data import is_image
-    from derender.data.folder_source import FolderSource
+    from derender.data.source import FolderSource
     from derender.photo import is_video
 
     files: list[Path] = []

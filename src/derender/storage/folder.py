@@ -19,7 +19,7 @@ from derender.storage.tensors import check_fit, read_tensors, write_tensors
 
 Net = TypeVar("Net", bound=nn.Module)
 
-FORMAT = SPLIT_FORMAT = 1
+FORMAT = 1
 QUANTILES = 101
 
 
@@ -144,18 +144,13 @@ class SplitRecord:
 
     shares: tuple[float, float, float]
     seed: int
-
-
-class _SplitFile(Settings):
-    format: Literal[1]
-    shares: tuple[float, float, float]
-    seed: int
+    format: Literal[1] = 1
 
 
 def write_split(folder: Path, split: SplitRecord) -> None:
     """Write the file into a saved model's folder; complete or not at all."""
     with atomic_file(folder / SPLIT_FILE) as temporary:
-        temporary.write_text(json.dumps({"format": SPLIT_FORMAT, **asdict(split)}) + "\n")
+        temporary.write_text(json.dumps(asdict(split)) + "\n")
 
 
 def read_split(folder: Path) -> SplitRecord | None:
@@ -163,7 +158,7 @@ def read_split(folder: Path) -> SplitRecord | None:
     file = folder / SPLIT_FILE
     if not file.is_file():
         return None
-    stored = read_json(file, _SplitFile, "take the model again, or update derender")
+    stored: SplitRecord = read_json(file, SplitRecord, "take the model again, or update derender")
     if abs(sum(stored.shares) - 1) > 1e-6:
         raise ValueError(f"{file} is damaged or of a newer version: its shares sum to {sum(stored.shares):g}")
-    return SplitRecord(stored.shares, stored.seed)
+    return stored

@@ -19,10 +19,10 @@ from derender.data.synthetic.settings import (
     named_settings,
 )
 from derender.data.synthetic.synthetic_set import SyntheticSet
-from derender.data.synthetic.write import require_empty, write, write_folder, write_tracks
+from derender.data.synthetic.write import require_empty, write
 
 __all__ = [
     "CAR_LIGHTS", "CAR_VIEWS", "LIGHTS", "VIEWS", "CarSettings", "CarViewSettings", "FaceSettings",
     "LightSettings", "MorphableFaces", "SyntheticSet", "ViewSettings", "cars", "faces", "named_settings",
-    "require_empty", "write", "write_folder", "write_tracks",
+    "require_empty", "write",
 ]  # fmt: skip

@@ -11,12 +11,12 @@ from dataclasses import dataclass
 from functools import lru_cache
 from itertools import chain
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 import yaml
 from numpy import ndarray
-from pydantic import BeforeValidator, Field, ValidationError, field_validator
+from pydantic import AfterValidator, BeforeValidator, Field, ValidationError
 
 from derender.settings import Settings
 from derender.storage.bounded import parse_yaml
@@ -53,53 +53,62 @@ def pick(weights: Sequence[float] | ndarray, at: float) -> int:
     return min(int(np.searchsorted(ends, at * ends[-1], side="right")), len(ends) - 1)
 
 
+def _within(low: float, high: float) -> AfterValidator:
+    """Of a range: that it ascends and lies within these limits."""
+
+    def check(ends: Range) -> Range:
+        if not low <= ends[0] <= ends[1] <= high:
+            raise ValueError(f"must be two numbers, low <= high, within {low:g}..{high:g}; got {ends}")
+        return ends
+
+    return AfterValidator(check)
+
+
+def _inside(name: str) -> AfterValidator:
+    """Of an angle: that the range of this name reaches beyond it on both sides."""
+
+    def check(value: float, info: Any) -> float:
+        ends = info.data.get(name)
+        if ends is not None and value > 0 and not ends[0] <= -value <= value <= ends[1]:
+            raise ValueError(f"must lie within {name} {ends} on both sides, got {value}")
+        return value
+
+    return AfterValidator(check)
+
+
+def _among(known: Iterable[str]) -> AfterValidator:
+    """Of names, which may have shares: that all are known, and that some share is not 0."""
+
+    def check(value: Any) -> Any:
+        if not set(value) or not set(value) <= set(known):
+            raise ValueError(f"must be one or more of {', '.join(known)}; got {tuple(value)}")
+        if isinstance(value, Mapping) and (min(value.values()) < 0 or sum(value.values()) <= 0):
+            raise ValueError(f"shares must be 0 or more and not all 0, got {dict(value)}")
+        return value
+
+    return AfterValidator(check)
+
+
 Shares = Annotated[  # a list of names means equal shares
     Mapping[str, float],
     BeforeValidator(lambda v: dict.fromkeys(v, 1.0) if isinstance(v, (list, tuple)) else v),
 ]
+Angles = Annotated[Range, _within(-180, 180)]
+LampAngles = Annotated[Range, _within(-85, 85)]
+Share = Annotated[Range, _within(0, 1)]
+Shift = Annotated[Range, _within(-0.1, 0.1)]
+Backgrounds = Annotated[tuple[str, ...], _among(BACKGROUNDS)]
 
 
-class _DrawnSettings(Settings):
-    """Settings whose ranges lie within ``limits``, and whose names are among ``known``; ``place`` is the
-    dotted place of the settings. An angle ``X_beyond_deg`` lies within the range ``X_deg`` on both sides."""
-
-    place: ClassVar[str] = ""
-    limits: ClassVar[Mapping[str, Range]] = {}
-    known: ClassVar[Mapping[str, Iterable[str]]] = {}
-
-    @field_validator("*")
-    @classmethod
-    def _check(cls, value: Any, info: Any) -> Any:
-        name = str(info.field_name)
-        if name in cls.limits:
-            low, high = cls.limits[name]
-            if not low <= value[0] <= value[1] <= high:
-                limits = f"two numbers, low <= high, within {low}..{high}"
-                raise ValueError(f"{cls.place}{name} must be {limits}; got {value}")
-        ends = info.data.get(name.replace("_beyond", "")) if "_beyond_" in name else None
-        if ends is not None and value > 0 and not ends[0] <= -value <= value <= ends[1]:
-            within = f"{cls.place}{name.replace('_beyond', '')} {ends}"
-            raise ValueError(f"{cls.place}{name} must lie within {within} on both sides, got {value}")
-        if name in cls.known:
-            if not set(value) or not set(value) <= set(cls.known[name]):
-                names = ", ".join(cls.known[name])
-                raise ValueError(f"{name} must be one or more of {names}; got {tuple(value)}")
-            if isinstance(value, Mapping) and (min(value.values()) < 0 or sum(value.values()) <= 0):
-                raise ValueError(f"{name}: shares must be 0 or more and not all 0, got {dict(value)}")
-        return value
-
-
-class LightSettings(_DrawnSettings):
+class LightSettings(Settings):
     """Uniform ranges. With ``beyond_deg`` either yaw or pitch (60 : 40) is at least so far off the front, on
     either side, and the other at most 20 degrees."""
 
-    place = "light."
-    limits: ClassVar = {"yaw_deg": (-85, 85), "pitch_deg": (-85, 85), "ambient": (0, 1), "diffuse": (0, 1)}
-    yaw_deg: Range = (-45.0, 45.0)
-    pitch_deg: Range = (-45.0, 45.0)
+    yaw_deg: LampAngles = (-45.0, 45.0)
+    pitch_deg: LampAngles = (-45.0, 45.0)
     beyond_deg: float = Field(default=0.0, ge=0, lt=85)
-    ambient: Range = (0.25, 0.7)
-    diffuse: Range = (0.2, 0.8)
+    ambient: Share = (0.25, 0.7)
+    diffuse: Share = (0.2, 0.8)
 
     def draw(self, uniform: ndarray, brightest: float = np.inf) -> ndarray:
         """Ambient, diffuse, pitch and yaw (radians) from five uniform numbers: one each, and which of the
@@ -115,29 +124,24 @@ class LightSettings(_DrawnSettings):
         return np.array([ambient, diffuse, *np.deg2rad([pitch, yaw])], np.float32)
 
 
-class ViewSettings(_DrawnSettings):
+class ViewSettings(Settings):
     """Ranges of the camera's angles. A spread (``*_sd_deg``) draws a normal about the middle of the range,
     clipped at its ends; without one (null) the range is uniform. With ``yaw_beyond_deg`` yaw is uniform on
     either side, from there to the range's ends. Shifts are scene units, right and down; one pixel of 64 is
     0.0028."""
 
-    place = "view."
-    limits: ClassVar = {
-        "yaw_deg": (-90.0, 90.0), "pitch_deg": (-60.0, 60.0), "roll_deg": (-180.0, 180.0),
-        "shift": (-0.1, 0.1),
-    }  # fmt: skip
-    yaw_deg: Range = (-45.0, 45.0)
+    yaw_deg: Annotated[Range, _within(-90, 90)] = (-45.0, 45.0)
     yaw_sd_deg: float | None = Field(default=18.0, ge=0, le=90)
-    yaw_beyond_deg: float = Field(default=0.0, ge=0, lt=90)
-    pitch_deg: Range = (-20.0, 20.0)
+    yaw_beyond_deg: Annotated[float, _inside("yaw_deg")] = Field(default=0.0, ge=0, lt=90)
+    pitch_deg: Annotated[Range, _within(-60, 60)] = (-20.0, 20.0)
     pitch_sd_deg: float | None = Field(default=8.0, ge=0, le=90)
-    roll_deg: Range = (-12.0, 12.0)
+    roll_deg: Angles = (-12.0, 12.0)
     roll_sd_deg: float | None = Field(default=4.0, ge=0, le=90)
-    shift: Range = (-0.008, 0.008)
+    shift: Shift = (-0.008, 0.008)
     shift_sd: float | None = Field(default=0.0035, ge=0, le=0.1)
 
 
-class CarViewSettings(_DrawnSettings):
+class CarViewSettings(Settings):
     """A turntable seen from above: uniform elevation above the ground and azimuth about the car's vertical
     axis.
 
@@ -146,17 +150,12 @@ class CarViewSettings(_DrawnSettings):
     normal, clipped at its range's ends, as are the shifts (scene units, right and down; one pixel of 64 is
     0.0028); a car that a shift would move out of the image is shifted less."""
 
-    place = "view."
-    limits: ClassVar = {
-        "elevation_deg": (0.0, 90.0), "azimuth_deg": (-180.0, 180.0), "inplane_deg": (-180.0, 180.0),
-        "shift": (-0.1, 0.1),
-    }  # fmt: skip
-    elevation_deg: Range = (25.0, 60.0)
-    azimuth_deg: Range = (-30.0, 30.0)
-    azimuth_beyond_deg: float = Field(default=0.0, ge=0, lt=180)
-    inplane_deg: Range = (-8.0, 8.0)
+    elevation_deg: Annotated[Range, _within(0, 90)] = (25.0, 60.0)
+    azimuth_deg: Angles = (-30.0, 30.0)
+    azimuth_beyond_deg: Annotated[float, _inside("azimuth_deg")] = Field(default=0.0, ge=0, lt=180)
+    inplane_deg: Angles = (-8.0, 8.0)
     inplane_sd_deg: float = Field(default=3.0, ge=0, le=90)
-    shift: Range = (-0.008, 0.008)
+    shift: Shift = (-0.008, 0.008)
     shift_sd: float = Field(default=0.003, ge=0, le=0.1)
 
 
@@ -171,21 +170,17 @@ class DrawnEffects:
     labels: dict[str, int | float | np.float32 | str]
 
 
-class EffectSettings(_DrawnSettings):
+class EffectSettings(Settings):
     """What light does beyond one lamp on a matt surface; by default nothing. Ranges are uniform, and even in
     the logarithm for exponent and beta. Further lamps have 0.3 to 1 of the first one's strength."""
 
-    place = "effects."
-    limits: ClassVar = {
-        "gloss": (0.0, 0.5), "exponent": (1.0, 128.0), "haze": (0.0, 4.0), "airlight": (0.25, 1.0),
-    }  # fmt: skip
-    gloss: Range = (0.0, 0.0)  # strength of the highlight
-    exponent: Range = (4.0, 64.0)
+    gloss: Annotated[Range, _within(0, 0.5)] = (0.0, 0.0)  # strength of the highlight
+    exponent: Annotated[Range, _within(1, 128)] = (4.0, 64.0)
     shadows: bool = False
     lamps: int = Field(default=1, ge=1, le=4)
     lamp_deg: float = Field(default=60.0, ge=0, le=85)  # pitch and yaw of further lamps lie in +- this
-    haze: Range = (0.0, 0.0)  # beta, 0 for none
-    airlight: Range = (0.6, 1.0)
+    haze: Annotated[Range, _within(0, 4)] = (0.0, 0.0)  # beta, 0 for none
+    airlight: Annotated[Range, _within(0.25, 1)] = (0.6, 1.0)
 
     @property
     def any(self) -> bool:
@@ -225,15 +220,13 @@ LIGHTS, CAR_LIGHTS = (_named(LightSettings, kind, "lights") for kind in ("faces"
 VIEWS, CAR_VIEWS = _named(ViewSettings, "faces", "views"), _named(CarViewSettings, "cars", "views")
 
 
-class FaceSettings(_DrawnSettings):
+class FaceSettings(Settings):
     """Every option of generated faces.
 
     With ``tracks`` (per identity) images come as sequences of ``frames``: light and background stay, head
     and expression move smoothly; otherwise an identity has ``pictures_per_identity`` images.
     """
 
-    limits: ClassVar = {"strength": (0.0, 1.5), "age_years": (16.0, 100.0), "skin_tone": (0.0, 1.0)}
-    known: ClassVar = {"expressions": EXPRESSIONS, "backgrounds": BACKGROUNDS}
     light: LightSettings = LightSettings()
     view: ViewSettings = ViewSettings()
     effects: EffectSettings = EffectSettings()
@@ -241,13 +234,13 @@ class FaceSettings(_DrawnSettings):
     first_identity: int = Field(default=0, ge=0)  # other people from the same seed
     tracks: int = Field(default=0, ge=0)
     frames: int = Field(default=6, ge=1)
-    expressions: Shares = dict.fromkeys(EXPRESSIONS, 1.0)
-    strength: Range = (0.4, 1.05)
+    expressions: Annotated[Shares, _among(EXPRESSIONS)] = dict.fromkeys(EXPRESSIONS, 1.0)
+    strength: Annotated[Range, _within(0, 1.5)] = (0.4, 1.05)
     asymmetry: float = Field(default=0.12, ge=0, le=1)  # sd by which the two halves of an expression differ
     gaze_px: float = Field(default=0.6, ge=0, le=3)  # sd of the irises' shift
-    age_years: Range = (18.0, 80.0)
-    skin_tone: Range = (0.0, 1.0)  # 0 fair .. 1 dark
-    backgrounds: tuple[str, ...] = BACKGROUNDS
+    age_years: Annotated[Range, _within(16, 100)] = (18.0, 80.0)
+    skin_tone: Share = (0.0, 1.0)  # 0 fair .. 1 dark
+    backgrounds: Backgrounds = BACKGROUNDS
 
     @property
     def per_identity(self) -> int:
@@ -255,19 +248,18 @@ class FaceSettings(_DrawnSettings):
         return self.tracks * self.frames or self.pictures_per_identity
 
 
-class CarSettings(_DrawnSettings):
+class CarSettings(Settings):
     """Every option of generated cars."""
 
-    known: ClassVar = {"classes": CLASSES, "backgrounds": BACKGROUNDS}
     light: LightSettings = CAR_LIGHTS["usual"]  # in the canonical frame
     brightest: float = Field(default=1.3, ge=0.1, le=2)  # limit of ambient and diffuse together
     view: CarViewSettings = CarViewSettings()
     effects: EffectSettings = EffectSettings()
-    classes: Shares = dict.fromkeys(CLASSES, 1.0)
+    classes: Annotated[Shares, _among(CLASSES)] = dict.fromkeys(CLASSES, 1.0)
     pictures_per_model: int = Field(default=4, ge=1)  # consecutive images that show one car
     first_model: int = Field(default=0, ge=0)  # other cars from the same seed
     size: float = Field(default=0.198, gt=0.01, le=0.3)  # diagonal of the bounding box; the image: 0.175
-    backgrounds: tuple[str, ...] = BACKGROUNDS
+    backgrounds: Backgrounds = BACKGROUNDS
 
 
 def named_settings(
@@ -303,5 +295,4 @@ def named_settings(
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"])
-        what = first["msg"].removeprefix("Value error, ")
-        raise ValueError(what if what.startswith(where) else f"setting {where}: {what}") from error
+        raise ValueError(f"{where} {first['msg'].removeprefix('Value error, ')}") from error

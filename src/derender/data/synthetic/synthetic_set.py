@@ -16,9 +16,8 @@ from jaxtyping import Bool, Float32, Float64, Int64, Shaped, UInt8
 from numpy import ndarray
 
 from derender.data.synthetic.lighting import EFFECTS
-from derender.data.synthetic.mesh_image import ImageMaps, TriangleMesh, draw_mesh
+from derender.data.synthetic.mesh_image import ImageMaps, TriangleMesh, draw_mesh, lit_by
 from derender.data.synthetic.settings import EffectSettings
-from derender.data.synthetic.shadow_map import lit_by
 from derender.scene.camera import focal_px, rotation_matrix
 from derender.scene.light import light_direction
 

@@ -27,21 +27,20 @@ _MAPS = ("depth", "normal", "albedo", "mask", "masks")
 def write(
     synthetic: SyntheticSet, folder: Path | str, truth: bool = True, progress: Progress | None = None
 ) -> Path:
-    """Write the set into ``folder`` (made if missing, refused if it holds a set) and return that folder.
+    """Write images or tracks into a new folder, which appears when it is complete; gives that folder.
 
-    ``progress(done, count)`` is called as images are written.
+    Tracks lie in one folder per identity and track, without maps. ``progress(done, count)`` is called as
+    images are written. A FileExistsError: the folder holds something.
     """
-    files = [f"images/{i:06d}.jpg" for i in range(len(synthetic))]
-    return _write(synthetic, Path(folder), files, (*_MAPS, *synthetic.effects) if truth else (), progress)
-
-
-def write_tracks(synthetic: SyntheticSet, folder: Path | str, progress: Progress | None = None) -> Path:
-    """Write a set of tracks into ``folder``, one folder per identity and track; no maps are kept."""
-    if "track" not in synthetic.labels:
-        raise ValueError("these images are no tracks: generate them with the setting tracks above 0")
-    numbers = zip(synthetic.identity, synthetic.labels["track"], synthetic.labels["frame"], strict=True)
-    files = [f"tracks/id{who:04d}/track_{track:03d}/{frame:03d}.jpg" for who, track, frame in numbers]
-    return _write(synthetic, Path(folder), files, (), progress)
+    require_empty(folder := Path(folder))
+    files, maps = [f"images/{i:06d}.jpg" for i in range(len(synthetic))], (*_MAPS, *synthetic.effects)
+    if "track" in synthetic.labels:
+        numbers = zip(synthetic.identity, synthetic.labels["track"], synthetic.labels["frame"], strict=True)
+        files = [f"tracks/id{who:04d}/track_{track:03d}/{frame:03d}.jpg" for who, track, frame in numbers]
+        truth = False
+    with atomic_folder(folder) as temporary:
+        _fill(temporary, synthetic, files, maps if truth else (), progress)
+    return folder
 
 
 def require_empty(folder: Path) -> None:
@@ -50,32 +49,17 @@ def require_empty(folder: Path) -> None:
         raise FileExistsError(f"{folder} exists and is not empty: choose another folder")
 
 
-def write_folder(
-    synthetic: SyntheticSet, folder: Path, truth: bool = True, progress: Progress | None = None
+def _fill(
+    folder: Path, synthetic: SyntheticSet, files: list[str], maps: tuple[str, ...], progress: Progress | None
 ) -> None:
-    """Write images or tracks into a new folder, which appears when it is complete."""
-    with atomic_folder(folder) as temporary:
-        if "track" in synthetic.labels:
-            write_tracks(synthetic, temporary, progress)
-        else:
-            write(synthetic, temporary, truth, progress)
-
-
-def _write(
-    synthetic: SyntheticSet, folder: Path, files: list[str], maps: tuple[str, ...], progress: Progress | None
-) -> Path:
-    if (folder / "params.csv").exists():
-        raise ValueError(f"{folder} already holds a set (params.csv): choose another folder or delete it")
     for parent in {(folder / file).parent for file in files} | {folder / name for name in maps}:
         parent.mkdir(parents=True, exist_ok=True)
 
     def save(i: int) -> None:
-        with (folder / files[i]).open("xb") as file:
-            picture = Image.fromarray(synthetic.images[i].transpose(1, 2, 0))
-            picture.save(file, "JPEG", quality=92, subsampling=0)
+        picture = Image.fromarray(synthetic.images[i].transpose(1, 2, 0))
+        picture.save(folder / files[i], quality=92, subsampling=0)
         for name, pixels in _encoded(synthetic, i).items() if maps else ():
-            with (folder / name / f"{i:06d}.png").open("xb") as file:
-                Image.fromarray(pixels).save(file, "PNG", compress_level=1)
+            Image.fromarray(pixels).save(folder / name / f"{i:06d}.png", compress_level=1)
 
     with ThreadPoolExecutor(torch.get_num_threads()) as pool:
         for done, _ in enumerate(pool.map(save, range(len(files))), 1):
@@ -87,7 +71,6 @@ def _write(
     traits = {name: _texts(values[rows], 5) for name, values in synthetic.identity_traits.items()}
     _write_table(folder / "params.csv", {"file": files, **_parameters(synthetic)})
     _write_table(folder / "identities.csv", {"identity": _texts(numbers), **traits})
-    return folder
 
 
 def _encoded(synthetic: SyntheticSet, i: int) -> dict[str, ndarray]:
