@@ -2,6 +2,7 @@
 
 import re
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -39,6 +40,12 @@ DEPTHS = {"plane": 3.0, "average": 2.0}
 )
 def test_verdict_compares(ours, controls, best, said):
     assert table(ours, controls, best).verdict(0) == said
+
+
+def test_verdict_leaves_out_rows_that_are_no_control():
+    scores = table(0.6, TWO | {"other model": 0.9})
+    rows = [*scores.rows[:-1], replace(scores.rows[-1], control=False)]
+    assert replace(scores, rows=rows).verdict(0).startswith("level with the strongest control")
 
 
 def test_best_ignores_what_is_no_number():

@@ -15,7 +15,6 @@ from jaxtyping import UInt8
 from derender import __version__
 from derender.data import as_float
 from derender.demo.story import BUNDLED, STAGES, DemoResult
-from derender.evaluation.clustering import clustering_table
 from derender.evaluation.depth import predicted_depth
 from derender.evaluation.score_table import ScoreTable
 from derender.model import Derenderer
@@ -56,16 +55,12 @@ def demo_page(result: DemoResult) -> Page:
         "result": result,
         "usual": PRESETS[result.config.preset].images,
         "tables": tables,
-        "lost": [
-            name
-            for name, table, column in (
-                ("depth", "geometry", 0),
-                ("normals", "geometry", 1),
-                ("clusters of people", "clustering", 0),
-                ("reconstruction", "reconstruction", 0),
-            )
-            if tables[table].verdict(column).startswith("behind")
-        ],
+        "verdicts": {
+            "Depth": tables["geometry"].verdict(0),
+            "Normals": tables["geometry"].verdict(1),
+            "Identity": tables["clustering"].verdict(0),
+            "Reconstruction": tables["reconstruction"].verdict(0),
+        },
         "tile": _tile,
         "inputs": colours.pictures(result.seen.images[:: max(1, len(result.seen) // INPUTS_SHOWN)]),
         "inputs_shown": INPUTS_SHOWN,
@@ -101,17 +96,16 @@ def demo_page(result: DemoResult) -> Page:
 
 def score_tables(result: DemoResult) -> dict[str, ScoreTable]:
     """Every table of the page by name."""
-    own = result.geometry.table()
-    tables = {"geometry": own}
-    if result.bundled_geometry is not None:
-        other = result.bundled_geometry.table().rows[0]
-        note = "bundled with derender; has not seen faces of this family"
-        models = [replace(own.rows[0], name="this run"), replace(other, name=BUNDLED, note=note)]
-        tables["beside"] = replace(own, caption=f"{own.caption}: both models", rows=[*models, *own.rows[1:]])
-    return tables | {
+    own, steps = result.geometry.table(), result.settings.fit_steps
+    notes = {BUNDLED: "bundled with derender; has not seen faces of this family"}
+    models = [replace(own.rows[0], name=f"this run, {steps} steps per image" if steps else "this run")]
+    for name, other in result.geometry_beside.items():
+        models.append(replace(other.table().rows[0], name=name, note=notes.get(name, "")))
+    return {
+        "geometry": replace(own, rows=[*models, *own.rows[1:]]),
         "factors": result.factors.table(),
         "reconstruction": result.reconstruction.table(),
-        "clustering": clustering_table(result.clustering),
+        "clustering": result.clustering,
     }
 
 
@@ -139,7 +133,7 @@ def _beside(models: Mapping[str, Derenderer], images: Pixels) -> dict[str, colou
 
 
 def _beside_truth(result: DemoResult, rows: np.ndarray) -> dict[str, colours.Images]:
-    truth, model = result.truth, result.model
+    truth, model = result.truth, result.optimised
     images, mask = truth.images[rows], truth.mask[rows]
     depth, covered = predicted_depth(model, images)
     both = (covered & torch.as_tensor(mask)).float()

@@ -13,10 +13,12 @@ import numpy as np
 from pydantic import Field
 
 from derender import evaluation
-from derender.baselines.controls import pca_features, pixel_features, untrained_features, untrained_twin
+from derender.baselines.controls import untrained_twin
 from derender.data import GroundTruth, ImageSet
 from derender.data.synthetic import faces
 from derender.demo.opening import LivePage, Opening, opening
+from derender.evaluation.scenes import optimised
+from derender.evaluation.score_table import ScoreTable
 from derender.features import embed_image_set
 from derender.learn import train as train_on
 from derender.model import Derenderer, load
@@ -30,8 +32,7 @@ from derender.training.task import Progress, TrainResult
 Report = Callable[[str, int, int, str], None]
 """Called with (stage, done, total, note)."""
 
-STAGES = ("generating faces", "learning perceptual features", "training", "scoring unseen faces")
-FACTORS = ("geometry", "albedo")
+STAGES = ("generating faces", "learning perceptual features", "training", "estimating features", "scoring")
 BUNDLED = "rendered-faces-64"
 """The bundled model that has seen rendered faces only, as this demo's has."""
 
@@ -41,8 +42,9 @@ class DemoSettings(Settings):
 
     train_pictures: int = Field(default=4_000, ge=20)
     test_pictures: int = Field(default=240, ge=16)
-    images: int = Field(default=24_000, ge=2)  # images seen in training, repeats counted
-    minutes: float = Field(default=4.3, gt=0)  # training stops here on a slow machine
+    images: int = Field(default=20_000, ge=2)  # images seen in training, repeats counted
+    minutes: float = Field(default=3.4, gt=0)  # training stops here on a slow machine
+    fit_steps: int = Field(default=60, ge=0)  # of each unseen scene before its depth is scored
     shown: int = Field(default=8, ge=1)  # unseen images on the page
     films: int = Field(default=4, ge=1)
     portrait_px: int = Field(default=512, ge=64)  # of the photographs that open the page
@@ -52,6 +54,8 @@ class DemoSettings(Settings):
         "release_share=0.3",
         "warmup_images=2000",
         "objective.self_features_steps=300",
+        "whitening.pictures=1000",
+        "fitting.examples=1000",
     )
 
     def training(self, seed: int, split: tuple[float, float, float] = (0.95, 0.05, 0.0)) -> TrainConfig:
@@ -65,8 +69,11 @@ class DemoSettings(Settings):
 
 FULL = DemoSettings()
 QUICK = DemoSettings(
-    train_pictures=1_500, test_pictures=160, images=3_000, minutes=0.6, shown=6, films=3,
-    overrides=("warmup_images=500", "objective.self_features_steps=60"),
+    train_pictures=1_500, test_pictures=160, images=3_000, minutes=0.5, fit_steps=0, shown=6, films=3,
+    overrides=(
+        "warmup_images=500", "objective.self_features_steps=60", "whitening.pictures=400",
+        "fitting.examples=300",
+    ),
 )  # fmt: skip
 
 
@@ -76,11 +83,12 @@ class DemoResult:
 
     Attributes:
         config: the training's resolved configuration.
-        bundled_geometry: scores of the bundled model; None where the images are not of its size.
+        geometry: of scenes optimised for ``settings.fit_steps``; ``geometry_beside`` without steps, and by
+            the bundled model where the images have its size.
         opening: photographs edited by a bundled model.
         seen: images of the training.
         truth: the unseen images with everything that made them.
-        clustering: Ward clustering by identity for each kind of feature, the model's own first.
+        clustering: Ward clusters by identity, of features and controls.
         clusters: (N,) the cluster of each unseen image by the model's features.
         seconds: time of each stage.
     """
@@ -91,16 +99,21 @@ class DemoResult:
     trained: TrainResult
     model: Derenderer
     bundled: Derenderer
-    bundled_geometry: evaluation.GeometryResult | None
     opening: Opening
     seen: ImageSet
     truth: GroundTruth
     geometry: evaluation.GeometryResult
+    geometry_beside: dict[str, evaluation.GeometryResult]
     factors: evaluation.FactorResult
     reconstruction: evaluation.ReconstructionResult
-    clustering: evaluation.ClusterComparison
+    clustering: ScoreTable
     clusters: np.ndarray
     seconds: dict[str, float]
+
+    @property
+    def optimised(self) -> Derenderer:
+        """The trained model, with its scenes optimised per image."""
+        return optimised(self.model, self.settings.fit_steps)
 
     @property
     def identities(self) -> np.ndarray:
@@ -127,68 +140,50 @@ def run_demo(
     out = Path(out)
     live = _open(out, None, settings, report, opened)
     seconds: dict[str, float] = {}
-    began = time.perf_counter()
+    began, now = time.perf_counter(), STAGES[0]
 
-    def lap(stage: str) -> None:
-        """The time since the last lap belongs to ``stage``."""
-        nonlocal began
-        seconds[stage] = seconds.get(stage, 0.0) + time.perf_counter() - began
-        began = time.perf_counter()
+    def at(stage: str, done: int, total: int, note: str = "") -> None:
+        """Report; the time since the last report belongs to its stage."""
+        nonlocal began, now
+        seconds[now] = seconds.get(now, 0.0) + time.perf_counter() - began
+        began, now = time.perf_counter(), stage
+        report(stage, done, total, note)
 
     config = settings.training(seed)
     size = config.model.network.image_size
     train_seed, test_seed = np.random.SeedSequence(seed).generate_state(2).tolist()
-    total = settings.train_pictures + settings.test_pictures
-    seen, _ = _generated(
-        settings.train_pictures, size, train_seed, lambda done, _: report(STAGES[0], done, total, "")
-    )
+    count = settings.train_pictures
+    seen, _ = _generated(count, size, train_seed, lambda done, _: at(STAGES[0], done, count))
     unseen, truth = _generated(settings.test_pictures, size, test_seed)
-    lap(STAGES[0])
-
-    def training_report(progress: Progress) -> None:
-        if progress.phase == "train":
-            live.update(f"{progress.done:,} of {progress.total:,} images seen", out / "run")
-            report(STAGES[2], progress.done, progress.total, f"{progress.images_per_second:.0f} images/s")
-        elif progress.phase == "perceptual":
-            lap(STAGES[1])
-            report(STAGES[1], progress.done, progress.total, "")
-
-    trained = train(config, seen, out / "run", sample_sheet=decomposition_sheet, progress=training_report)
-    lap(STAGES[2])
+    trained = train(
+        config, seen, out / "run", sample_sheet=decomposition_sheet, progress=_told(at, live, out / "run")
+    )
     if not (out / "run" / "model").exists():
         reason = "; ".join(finding.text for finding in trained.findings) or trained.stopped
         raise ValueError(f"training collapsed before a model was saved ({reason}): try another --seed")
     model, bundled = load(out / "run", device="cpu"), load(BUNDLED, device="cpu")
-    report(STAGES[3], 0, 4, "geometry")
-    geometry = evaluation.evaluate_geometry(model, truth, untrained=untrained_twin(model, seed))
+    at(STAGES[4], 0, 4, "geometry")
+    geometry = evaluation.evaluate_geometry(
+        optimised(model, settings.fit_steps), truth, untrained=untrained_twin(model, seed)
+    )
+    beside = {"this run, feed-forward": model} if settings.fit_steps else {}
+    beside |= {BUNDLED: bundled} if size == bundled.image_size else {}
+    geometry_beside = {name: evaluation.evaluate_geometry(one, truth) for name, one in beside.items()}
     factors = evaluation.evaluate_factors(model, truth)
-    bundled_geometry = evaluation.evaluate_geometry(bundled, truth) if size == bundled.image_size else None
-    report(STAGES[3], 1, 4, "reconstruction")
+    at(STAGES[4], 1, 4, "reconstruction")
     reconstruction = evaluation.evaluate_reconstruction(
         model, unseen.images, mean=evaluation.mean_image(seen.images)
     )
-    report(STAGES[3], 2, 4, "features")
-    components = min(64, len(seen) // 4)
-    pca = pca_features(unseen, components=components, fit_on=seen, seed=seed)
-    features = {
-        " + ".join(FACTORS): embed_image_set(model, unseen).concatenate(FACTORS),
-        "untrained encoder": untrained_features(model, unseen, seed=seed).concatenate(FACTORS),
-        f"PCA ({components})": pca.concatenate(None),
-        "pixels": pixel_features(unseen).concatenate(None),
-    }
-    own, *controls = features
-    report(STAGES[3], 3, 4, "clusters")
-    runs = {name: [values] for name, values in features.items()}
-    clustering = evaluation.compare_clusterings(
-        runs, {"identity": truth.labels["identity"]}, controls=controls
-    )
+    at(STAGES[4], 2, 4, "features")
+    scores = evaluation.cluster(model, "identity", images=unseen, seed=seed, cache="none")
+    at(STAGES[4], 3, 4, "clusters")
+    features = embed_image_set(model, unseen).concatenate(("geometry", "albedo"))
     people = len(np.unique(truth.labels["identity"]))
-    clusters = evaluation.clusterings(features[own], [people])[people]
-    report(STAGES[3], 4, 4, "")
-    lap(STAGES[3])
+    clusters = evaluation.clusterings(features, [people])[people]
+    at(STAGES[4], 4, 4)
     return DemoResult(
-        settings, seed, config, trained, model, bundled, bundled_geometry, live.opening, seen, truth,
-        geometry, factors, reconstruction, clustering, clusters, seconds,
+        settings, seed, config, trained, model, bundled, live.opening, seen, truth,
+        geometry, geometry_beside, factors, reconstruction, scores.tables[0], clusters, seconds,
     )  # fmt: skip
 
 
@@ -208,17 +203,14 @@ def run_own_demo(
     out = Path(out)
     live = _open(out, images, settings, report, opened)
     plain = tuple(
-        one for one in settings.overrides if one.startswith(("warmup", "objective", "image", "batch"))
+        one
+        for one in settings.overrides
+        if one.startswith(("warmup", "objective", "image", "batch", "whitening", "fitting"))
     )
     config = settings.model_copy(update={"overrides": plain}).training(seed, split=(0.8, 0.1, 0.1))
 
-    def training_report(progress: Progress) -> None:
-        if progress.phase == "train":
-            live.update(f"{progress.done:,} of {progress.total:,} images seen", out / "run")
-        report(STAGES[2], progress.done, progress.total, "")
-
-    train_on(images, out=out / "run", config=config, page=False, progress=training_report)
-    report(STAGES[3], 0, 1, "")
+    train_on(images, out=out / "run", config=config, page=False, progress=_told(report, live, out / "run"))
+    report(STAGES[4], 0, 1, "")
     page = run_page(out / "run", run_evidence(out / "run", images))
     values = {**page.values, "opening": live.opening}
     return replace(page, template="demo_own.html", title="Your images decomposed", values=values).write(
@@ -241,6 +233,20 @@ def _open(
     live.update("Training begins")
     opened(live.file)
     return live
+
+
+def _told(report: Callable[..., None], live: LivePage, run: Path) -> Callable[[Progress], None]:
+    """What training reports, for the terminal and for the page."""
+
+    def tell(progress: Progress) -> None:
+        stages = {"perceptual": STAGES[1], "train": STAGES[2], "features": STAGES[3]}
+        note, stage = "", stages.get(progress.phase, "reading images")
+        if progress.phase == "train":
+            note = f"{progress.images_per_second:.0f} images/s"
+            live.update(f"{progress.done:,} of {progress.total:,} images seen", run)
+        report(stage, progress.done, progress.total, note)
+
+    return tell
 
 
 def _generated(

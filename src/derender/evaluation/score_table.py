@@ -118,8 +118,9 @@ class ScoreTable:
     def verdict(self, column: int) -> str:
         """In words: whether the first row is better than every control in one column."""
         head, (first, *others) = self.columns[column], self.rows
+        judged = [row for row in others if row.control] or others
         value, shown = _number(first.cells[column]), head.text(first.cells[column])
-        rivals = {row.name: score for row in others if (score := _number(row.cells[column])) is not None}
+        rivals = {row.name: score for row in judged if (score := _number(row.cells[column])) is not None}
         if value is None or not rivals:
             return f"{first.name}: {shown} ({head.name})"
         sign = -1 if head.best == "low" else 1
