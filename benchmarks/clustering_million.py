@@ -26,8 +26,7 @@ from machine import parser, publish
 from sklearn.metrics import adjusted_rand_score
 
 from derender.evaluation import neighbours
-from derender.evaluation.clustering_methods import clusterings
-from derender.evaluation.finch import finch
+from derender.evaluation.clustering_methods import clusterings, finch
 from derender.evaluation.neighbours import nearest_rows
 from derender.evaluation.ward import cut, cut_leaves, ward_in_cells, ward_tree
 

@@ -15,8 +15,7 @@ from sklearn.metrics import adjusted_rand_score, pairwise_distances
 from derender.evaluation import clustering_methods, neighbours
 from derender.evaluation import ward as ward_module
 from derender.evaluation.clustering import finch_levels
-from derender.evaluation.clustering_methods import approximation, clusterings
-from derender.evaluation.finch import finch, finch_clusters
+from derender.evaluation.clustering_methods import approximation, clusterings, finch, finch_clusters
 from derender.evaluation.memory import Memory
 from derender.evaluation.neighbours import cells, finite_rows, members, nearest_rows
 from derender.evaluation.ward import cut, cut_leaves, ward_in_cells, ward_tree

@@ -15,14 +15,16 @@ from derender import Derenderer
 from derender.baselines.autoencoders import Autoencoder, AutoencoderSettings
 from derender.baselines.supervised import fresh_resnet18
 from derender.evaluation.linear_finetune import finetune
-from derender.evaluation.linear_logistic import axes_of, fit_logistic, solve_logistic
 from derender.evaluation.linear_probes import (
     HEADS,
     PROBES,
     HeadSettings,
+    axes_of,
+    fit_logistic,
     majority_answers,
     nearest_answers,
     probe,
+    solve_logistic,
     train_heads,
 )
 from derender.evaluation.linear_probing import compare_linear, count_scores, linear_scores

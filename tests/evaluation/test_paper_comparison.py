@@ -5,14 +5,7 @@ import re
 import numpy as np
 
 from derender.evaluation import compare
-from derender.evaluation.paper_tables import (
-    CARS,
-    EMOTION,
-    FACE_ATTRIBUTES,
-    IDENTITY,
-    LINEAR,
-    SEGMENTATION,
-)
+from derender.evaluation.paper_tables import CARS, EMOTION, FACE_ATTRIBUTES, IDENTITY, LINEAR, SEGMENTATION
 from derender.features import FeatureTable
 
 

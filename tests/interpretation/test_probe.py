@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from scipy.special import expit
 
-from derender.evaluation.linear_logistic import fit_logistic
-from derender.evaluation.linear_probes import HeadSettings, train_heads
+from derender.evaluation.linear_probes import HeadSettings, fit_logistic, train_heads
 from derender.evaluation.linear_task import task_of
 from derender.interpretation import fit_probe, load_probe, question
 from derender.interpretation.probe import FOLDS, PENALTIES, in_bins

@@ -35,15 +35,7 @@ GENERATOR_FILE = (
     "and of https://github.com/omertov/encoder4editing)"
 )
 E4E_FILE = "e4e_ffhq_encode.pt (linked from the README of https://github.com/omertov/encoder4editing)"
-DAMAGED = (
-    pickle.UnpicklingError,
-    RuntimeError,
-    EOFError,
-    OSError,
-    ValueError,
-    LookupError,
-    AttributeError,
-)
+DAMAGED = (pickle.UnpicklingError, RuntimeError, EOFError, OSError, ValueError, LookupError, AttributeError)
 Names = Mapping[str, Callable[[re.Match[str]], str]]
 """Patterns of our names, and how to write the published name of a tensor that matches."""
 

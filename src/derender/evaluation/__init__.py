@@ -16,7 +16,7 @@ from derender.evaluation.clustering import (
     compare_clusterings,
     finch_levels,
 )
-from derender.evaluation.clustering_methods import clusterings
+from derender.evaluation.clustering_methods import FinchHierarchy, clusterings, finch, finch_clusters
 from derender.evaluation.clustering_scores import chance_scores, cluster_scores
 from derender.evaluation.depth import GeometryResult, GeometryScores, evaluate_geometry, geometry_scores
 from derender.evaluation.disentanglement import disentangle
@@ -29,7 +29,6 @@ from derender.evaluation.factors import (
     light_error,
 )
 from derender.evaluation.feature_rows import at_least
-from derender.evaluation.finch import FinchHierarchy, finch, finch_clusters
 from derender.evaluation.identity import Pairs, area_under_roc, identify, read_pairs, verify
 from derender.evaluation.linear_probes import majority_answers, probe
 from derender.evaluation.linear_probing import (
@@ -49,7 +48,7 @@ from derender.evaluation.pixels import (
     reconstruction_scores,
 )
 from derender.evaluation.relighting import relight
-from derender.evaluation.robust.protocol import robustness
+from derender.evaluation.robust import robustness
 from derender.evaluation.scenes import geometry, reconstruction
 from derender.evaluation.score_table import Column, Row, Scores, ScoreTable
 from derender.evaluation.segmentation import segment

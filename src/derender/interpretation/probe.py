@@ -2,7 +2,7 @@
 
 A question is label columns: classes as they are, numbers cut into bins of equal size.
 
-Two ways to fit: ``logistic``, the penalised regression of ``evaluation/linear_logistic.py`` (its weights
+Two ways to fit: ``logistic``, the penalised regression of ``evaluation/linear_probes.py`` (its weights
 taken back to the features as they are), and ``linear``, the paper's head of ``evaluation/linear_probes.py``.
 Weights of classes are centred over the classes, which changes no probability and makes the logit of a class
 its lead over the mean. Leaves out scores (``derender.evaluation``).
@@ -18,8 +18,14 @@ from safetensors.numpy import save
 from scipy.special import expit, softmax
 
 from derender.data import suggestion
-from derender.evaluation.linear_logistic import axes_of, fit_logistic, solve_logistic
-from derender.evaluation.linear_probes import PAPER_HEAD, HeadSettings, fitted_heads
+from derender.evaluation.linear_probes import (
+    PAPER_HEAD,
+    HeadSettings,
+    axes_of,
+    fit_logistic,
+    fitted_heads,
+    solve_logistic,
+)
 from derender.evaluation.linear_task import Task, task_of
 from derender.features import missing
 from derender.settings import Settings

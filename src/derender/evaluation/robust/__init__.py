@@ -2,7 +2,7 @@
 
 trial     axes of light and camera; training images, and test images at each angle
 sources   trials of generated images, of images re-rendered by a model, and of images with known angles
-compare   probes, curves, intervals, controls; protocol: all of it in one call
+compare   probes, curves, intervals, controls: ``robustness``
 """
 
 from derender.evaluation.robust.compare import (
@@ -10,6 +10,7 @@ from derender.evaluation.robust.compare import (
     RobustnessComparison,
     area_under,
     compare_robustness,
+    robustness,
 )
 
-__all__ = ["CurveResult", "RobustnessComparison", "area_under", "compare_robustness"]
+__all__ = ["CurveResult", "RobustnessComparison", "area_under", "compare_robustness", "robustness"]

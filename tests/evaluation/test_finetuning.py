@@ -11,13 +11,14 @@ from torch.nn.functional import cross_entropy
 import derender
 from derender.data import ImageSet
 from derender.evaluation.finetuning import (
+    RENDERING_TERMS,
+    FinetuneStep,
     FinetuneTask,
     load_finetuned,
     score_finetuned,
     target_loss,
     target_of,
 )
-from derender.evaluation.finetuning.joint import RENDERING_TERMS, FinetuneStep
 from derender.evaluation.memory import Memory
 from derender.report.run import run_page
 from derender.training.batches import random_stream

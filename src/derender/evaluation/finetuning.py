@@ -2,15 +2,19 @@
 
 Source: Klinghoffer et al., ECCV 2022, Sec. 3.1, where it is future work ("jointly train a learned
 representation with the target task in mind"). Images without a label take part in the rendering objective
-alone. Held-out images are judged by the labels, which so choose the saved weights. Leaves out weights of
-classes, and a rate of its own for the head.
+alone. Held-out images are judged by the labels, which so choose the saved weights.
+
+The test part of the run's own split is scored; neither training nor the choice of weights saw it. The heads
+on frozen features (the paper's, and penalised logistic regression) learn from the very same labels, and so
+does the regression on features of an untrained encoder, on principal components and on pixels. Leaves out
+weights of classes, and a rate of its own for the head.
 """
 
 import copy
 import json
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +23,18 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Generator, Tensor, nn
 
+from derender.baselines.controls import untrained_twin
 from derender.data import ImageSet, Split, split_indices, suggestion
+from derender.evaluation.bootstrap import RESAMPLES, Difference, ScoredRow, difference, numbers_of
+from derender.evaluation.controls import control_rows
 from derender.evaluation.linear_probes import head_loss, probabilities
-from derender.evaluation.linear_task import Task, task_of
+from derender.evaluation.linear_probing import LINEAR_COLUMNS, compare_linear
+from derender.evaluation.linear_task import Rows, Task, task_of
+from derender.evaluation.memory import Memory
+from derender.evaluation.options import Options
+from derender.evaluation.score_table import ScoreTable, scored_table
+from derender.features import embed_images, map_batches, model_fingerprint
+from derender.inputs import Progress
 from derender.model import Derenderer, load
 from derender.objectives.perceptual_features import PerceptualFeatures
 from derender.storage.atomic import atomic_file, new_folder
@@ -36,6 +49,7 @@ from derender.training.task import Held, PhaseProgress, Precision, StepLosses, T
 from derender.training.watch import FiniteWatch, Watcher
 
 HEAD_FILE, HEAD_CONFIG_FILE = "head.safetensors", "head.json"
+BOTH = ("accuracy", "balanced_accuracy")
 RENDERING_TERMS = (
     *("photometric", "photometric_flip", "perceptual", "perceptual_flip", "smoothness", "curvature"),
     *NOT_RECONSTRUCTION,
@@ -266,3 +280,113 @@ def target_loss(logits: Float[Tensor, "n a"], targets: Float[Tensor, "n a"], kin
     known = (targets >= 0).any(dim=1)
     each = -(logits.log_softmax(dim=1) * targets.clamp(min=0)).sum(dim=1)
     return (each * known).sum() / known.sum().clamp(min=1)
+
+
+@dataclass(frozen=True)
+class FinetuneScores:
+    """Held-out scores of ``fine-tuned``, both heads on frozen features, logistic regression on three
+    controls, and ``majority``: accuracy, balanced_accuracy, average_precision (0..1, best 1).
+
+    ``versus`` compares the fine-tuned model with the best of the others, by score. ``n_unlabelled`` images of
+    the run have none of the labels: rendered, never asked.
+    """
+
+    rows: tuple[ScoredRow, ...]
+    versus: dict[str, Difference]
+    kind: str
+    names: tuple[str, ...]
+    n_train: int
+    n_test: int
+    n_unlabelled: int
+
+    def numbers(self) -> dict[str, Any]:
+        """Everything as JSON takes it."""
+        versus = {name: asdict(one) for name, one in self.versus.items()}
+        return {**vars(self), "rows": numbers_of(self.rows), "versus": versus}
+
+    def table(self, began: str) -> ScoreTable:
+        """A row each; ``began`` names the model whose frozen features the heads take."""
+        count = len(self.names)
+        task = f"{count} classes" if self.kind == "classes" else f"mean of {count} yes/no labels"
+        caption = (
+            f"{task}: {self.n_train:,} labelled images learned, {self.n_test:,} held out; frozen features "
+            f"of {began}"
+        )
+        if self.n_unlabelled:
+            caption += f"; {self.n_unlabelled:,} images without label never asked"
+        return scored_table(
+            caption, "trained on labels", self.rows, LINEAR_COLUMNS, intervals=BOTH, deviations=()
+        )
+
+
+def score_finetuned(
+    tuned: FinetunedModel,
+    task: FinetuneTask,
+    *,
+    resample_count: int = RESAMPLES,
+    memory: Memory | None = None,
+    progress: Progress | None = None,
+) -> FinetuneScores:
+    """Score a trained model on the task's test part; what took long is kept in ``memory``.
+
+    Raises:
+        ValueError: no tested image has a label.
+    """
+    target, seed, kept = task.target, task.config.seed, memory or Memory()
+    test = target.split.test[target.asked.known[target.split.test]]
+    train = target.split.train[(target.visible[target.split.train] >= 0).any(axis=1)]
+    if len(test) < 2:
+        raise ValueError(
+            f"the test part has {len(test)} images with a label, two are needed to score: "
+            "bring more images, or set a larger test share in split="
+        )
+
+    def answered() -> dict[str, np.ndarray]:
+        parts = map_batches(tuned.predict, tuned, task.images[test], batch_size=256)
+        return {"answers": torch.cat(parts).cpu().numpy()}
+
+    inputs = {"weights": model_fingerprint(tuned), "kind": target.asked.kind, "images": task.images[test]}
+    answers = kept.recall("finetuned-answers", inputs, answered)["answers"]
+    start = (task.start if task.start is not None else task.build().model).to(tuned.device)
+    features = _features(start, task, np.concatenate([train, test]), kept)
+    count, runs = len(train), {name: [values] for name, values in features.items()}
+    rows = Rows(np.arange(count, count + len(test)), {count: np.arange(count)[None]})
+    asked = Task(target.asked.kind, target.asked.names, target.asked.targets[np.concatenate([train, test])])
+    how: dict[str, Any] = {"resample_count": resample_count, "memory": kept}
+    tuned_answers = {"fine-tuned": {count: answers[None]}}
+    logistic, joint = compare_linear(
+        runs, asked, rows, (seed,), heads=("logistic",), finetuned=tuned_answers, progress=progress, **how
+    ).parts
+    frozen_alone = {"frozen": runs["frozen"]}
+    (paper,) = compare_linear(frozen_alone, asked, rows, (seed,), heads=("linear",), **how).parts
+    ours, majority = joint.rows
+    frozen, *controls = logistic.rows[: len(features)]
+    named = {"frozen, logistic": frozen, "frozen, paper's head": paper.rows[0]}
+    named |= {f"{row.name}, logistic": row for row in controls} | {"majority": majority}
+    others = {name: row.scores for name, row in named.items()}
+    rivals = {score: {name: scores[score] for name, scores in others.items()} for score in BOTH}
+    controls = (ScoredRow(name, True, 1, scores) for name, scores in others.items())
+    return FinetuneScores(
+        (ScoredRow("fine-tuned", False, 1, ours.scores), *controls),
+        {score: difference(ours.scores[score], rivals[score]) for score in BOTH},
+        asked.kind,
+        asked.names,
+        count,
+        len(test),
+        int((~target.asked.known).sum()),
+    )
+
+
+def _features(start: Any, task: FinetuneTask, rows: np.ndarray, kept: Memory) -> dict[str, np.ndarray]:
+    """(R, D) of some of the task's images: codes that training began with, and three that learned nothing."""
+
+    def codes(model: Any) -> np.ndarray:
+        inputs = {"weights": model_fingerprint(model), "images": task.images[rows]}
+        found = kept.recall("embedding", inputs, lambda: embed_images(model, task.images[rows]))
+        return np.concatenate([found[name] for name in task.config.target.factors], axis=1)
+
+    parts = (rows, task.target.split.train)
+    shown, fitted = (ImageSet(task.images[some], tuple(map(str, some.tolist()))) for some in parts)
+    plain = control_rows(shown, None, Options(cache=kept), fit_on=fitted)
+    untrained = {"untrained encoder": codes(untrained_twin(start, task.config.seed))}
+    return {"frozen": codes(start)} | untrained | {row.name: row.arrays()[0] for row in plain}
