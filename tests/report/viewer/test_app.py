@@ -9,14 +9,15 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 from PIL import Image
 
-from derender import load
+from derender import Derenderer, load
 from derender.data.synthetic import faces
 from derender.report.viewer.app import Application, Viewer
 from derender.report.viewer.neighbours import rendered_examples
-from derender.report.viewer.questions import CropRequest, Light, Place, ViewRequest
+from derender.report.viewer.questions import CropRequest, Light, Place, Refused, ViewRequest
 from derender.report.viewer.server import BoundedProtocol, serving
 from derender.report.viewer.studio import Shelf, Studio
 from derender.scene.crop_search import Crop
@@ -248,3 +249,33 @@ def test_every_face_is_offered_and_the_largest_is_taken():
     edited = np.asarray(Image.open(io.BytesIO(studio.picture(asked))))
     changed = np.abs(edited.astype(int) - photo).max(axis=-1) > 8
     assert edited.shape == photo.shape and changed[:, 280:].mean() > 0.2 and not changed[:, :150].any()
+
+
+@pytest.mark.parametrize("renderer", ["phong+haze", "sh"])
+def test_further_factors_move_and_swap(renderer):
+    model = Derenderer.from_preset("small", seed=0, image_size=32, width=4, light_width=4, renderer=renderer)
+    studio, noise = Studio(model.eval(), "tiny"), np.random.default_rng(0)
+    one, two = (studio.open(noise.integers(0, 256, (48, 48, 3), dtype=np.uint8)) for _ in range(2))
+    about, asked = studio.about(), ViewRequest(picture=one["picture"])
+    maps = studio.maps(asked)
+    assert set(about["maps"]) < set(maps) and zipfile.is_zipfile(io.BytesIO(studio.archive(asked)))
+    if renderer == "sh":
+        assert about["light"] is False and about["numbers"] == {}
+        lit = asked.model_copy(update={"swaps": {"light": two["picture"]}})
+        wanted = studio.shelf.get(two["picture"]).scene
+        assert torch.equal(studio.scene(lit).extra["environment"], wanted.extra["environment"])
+        assert Light.of(studio.scene(lit).light[0]).model_dump() == two["light"]
+        return
+    assert about["light"] and [one["name"] for one in about["numbers"]["haze"]] == ["beta", "airlight"]
+    assert studio.settings(asked)["numbers"] == one["numbers"]
+    moved = asked.model_copy(update={"numbers": {**one["numbers"], "haze": [4.0, 1.0]}, "detail": "model"})
+    own = asked.model_copy(update={"detail": "model"})
+    change = np.asarray(studio._drawn(moved)).astype(float) - np.asarray(studio._drawn(own))
+    assert change[..., :3].mean() > 5  # paler
+    for numbers, message in (
+        ({"haze": [9.0, 1.0]}, r"haze beta must lie in 0\.2\.\.4 for the renderer 'phong\+haze', got 9"),
+        ({"haze": [1.0]}, r"haze must be \(N, 2\): beta, airlight"),
+        ({"glow": [1.0]}, "this model has no 'glow'; it has specular, haze"),
+    ):
+        with pytest.raises(Refused, match=message):
+            studio.view(asked.model_copy(update={"numbers": numbers}))

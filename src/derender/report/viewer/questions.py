@@ -86,18 +86,20 @@ class ViewRequest(_Checked):
 
     Attributes:
         image: the name it got when it was opened.
-        swaps: other opened images that give their geometry or albedo.
+        swaps: other opened images that give their geometry, albedo or light.
         light: instead of the image's own.
         camera: instead of the image's own.
+        numbers: of the renderer's further factors, instead of the image's own.
         size: longer side in pixels; the model's own if left out, and never less.
         detail: whose pixels are drawn, the photograph's or the model's.
         whole: all of the photograph, not only the part around the crop.
     """
 
     picture: ImageId
-    swaps: dict[Literal["geometry", "albedo"], ImageId] = {}
+    swaps: dict[Literal["geometry", "albedo", "light"], ImageId] = {}
     light: Light | None = None
     camera: Camera | None = None
+    numbers: dict[str, list[float]] = {}
     size: Annotated[int, Field(ge=8, le=LARGEST_SIZE)] | None = None
     detail: Literal["photo", "model"] = "photo"
     whole: bool = False

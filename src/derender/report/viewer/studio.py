@@ -26,6 +26,7 @@ from derender.data import as_float
 from derender.features import FeatureTable, named
 from derender.features.neighbours import nearest, same_image
 from derender.model import Derenderer
+from derender.networks import Factor
 from derender.photo import Frame, PhotoDetail, Photograph, find_faces, found_frame
 from derender.photo.edit import MARGIN
 from derender.photo.faces import frame_of, template_of
@@ -96,6 +97,9 @@ class Studio:
             "can_fit": self.model.fitting is not None,
             "fits": self.fit_steps > 0,
             "fov_deg": self.model.fov_deg,
+            "light": any(row.parameter == "light" for row in self.model.factors),
+            "numbers": {row.name: [asdict(one) for one in row.numbers] for row in self._numbered},
+            "maps": list(self.model.renderer.maps),
             "rotation_deg": ranges.rotation_deg,
             "translation": [ranges.translation_xy, ranges.translation_xy, max(ranges.translation_z, 0.1)],
             "kept": self.shelf.limit,
@@ -164,6 +168,7 @@ class Studio:
             "picture": self.shelf.put(opened),
             "light": Light.of(scene.light[0]).model_dump(),
             "camera": Camera.of(scene.camera[0]).model_dump(),
+            "numbers": self._numbers(scene),
             "l1": l1 if isfinite(l1) else None,
             "l1_feed_forward": float(errors[0]) if fit_steps and isfinite(errors[0]) else None,
             "percentile": percentile,
@@ -187,7 +192,25 @@ class Studio:
             scene = scene.with_parameters(light=question.light.light_row())
         if question.camera is not None:
             scene = scene.with_parameters(camera=question.camera.camera_row())
+        for factor, values in question.numbers.items():
+            if factor not in (names := [row.name for row in self._numbered]):
+                raise Refused(
+                    422, f"numbers: this model has no {factor!r}; it has {', '.join(names) or 'none'}"
+                )
+            scene = scene.with_parameters(**{parameters[factor]: torch.tensor([values])})
+        try:
+            self.model.renderer.check(scene)
+        except ValueError as problem:
+            raise Refused(422, str(problem)) from problem
         return scene
+
+    @property
+    def _numbered(self) -> list[Factor]:
+        """The model's factors of a few named numbers."""
+        return [row for row in self.model.factors if row.numbers]
+
+    def _numbers(self, scene: Scene) -> dict[str, list[float]]:
+        return {row.name: scene.parameters[row.parameter][0].tolist() for row in self._numbered}
 
     def view(self, question: ViewRequest) -> bytes:
         """The requested view: JPEG, or PNG with transparency where the model's pixels are drawn."""
@@ -288,6 +311,7 @@ class Studio:
             "model": self.name,
             "light": (question.light or Light.of(scene.light[0])).model_dump(),
             "camera": (question.camera or Camera.of(scene.camera[0])).model_dump(),
+            "numbers": self._numbers(scene) | question.numbers,
             "from_another_picture": sorted(question.swaps),
             "size": self._size(question),
         }

@@ -26,9 +26,9 @@ const SAVES = {
 let about;
 let first = null; // {picture, source, name, image, light, camera, crop, faces, framed, fit, width, height}
 let second = null;
-const now = { light: null, camera: null, swaps: new Set(), size: SETTLED, detail: "photo", whole: false };
+const now = { light: null, camera: null, numbers: {}, swaps: new Set(), size: SETTLED, detail: "photo", whole: false };
 let waiting = 0;
-const sliders = { light: [], camera: [] };
+const sliders = { light: [], camera: [], numbers: [] };
 let surface;
 
 function say(text, wrong = false) {
@@ -58,8 +58,9 @@ async function ask(path, body) {
 
 function question(more = {}) {
   const swaps = {};
-  for (const factor of ["geometry", "albedo"]) if (second && now.swaps.has(factor)) swaps[factor] = second.picture;
-  return { picture: first.picture, swaps, light: now.light, camera: now.camera, size: now.size, detail: now.detail, whole: now.whole, ...more };
+  for (const factor of about.light ? ["geometry", "albedo"] : ["geometry", "albedo", "light"]) if (second && now.swaps.has(factor)) swaps[factor] = second.picture;
+  const light = about.light ? now.light : null;
+  return { picture: first.picture, swaps, light, camera: now.camera, numbers: now.numbers, size: now.size, detail: now.detail, whole: now.whole, ...more };
 }
 
 // Ask about the images on the page; those that are no longer stored are opened again first.
@@ -129,7 +130,7 @@ const refreshBefore = newest(async () => showBlob($("before"), await (await askA
 
 const refreshMaps = newest(async () => {
   const maps = await (await askAbout("api/factors", { size: DRAFT })).json();
-  for (const name of Object.keys(NAMES)) $(`map-${name}`).src = maps[name];
+  for (const name of Object.keys(maps)) $(`map-${name}`).src = maps[name];
 });
 
 const refreshSurface = newest(async () => {
@@ -204,10 +205,10 @@ function showSun() {
 const dragged = () => document.querySelector("[name=drag]:checked").value;
 
 function showSliders() {
-  for (const kind of ["light", "camera"]) for (const slider of sliders[kind]) slider.show();
+  for (const slider of Object.values(sliders).flat()) slider.show();
 }
 
-function slider(kind, id, label, range, get, set) {
+function slider(kind, id, label, range, get, set, shown = (value) => value) {
   const [low, high, step, unit] = range;
   const row = document.createElement("div");
   const [name, input, value] = ["label", "input", "output"].map((tag) => document.createElement(tag));
@@ -218,7 +219,7 @@ function slider(kind, id, label, range, get, set) {
   name.textContent = label;
   Object.assign(input, { min: low, max: high, step });
   const tell = () => {
-    value.textContent = `${get().toFixed(step < 0.01 ? 3 : step < 1 ? 2 : 0)}${unit}`;
+    value.textContent = `${shown(get()).toFixed(step < 0.01 ? 3 : step < 1 ? 2 : 0)}${unit}`;
     input.setAttribute("aria-valuetext", value.textContent);
   };
   input.addEventListener("input", () => { set(Number(input.value)); tell(); moved(); });
@@ -238,13 +239,31 @@ function buildControls() {
     const list = () => (turning ? now.camera.rotation_deg : now.camera.translation);
     slider("camera", id, label, [-reach, reach, turning ? 1 : 0.001, turning ? "°" : ""], () => list()[place % 3], (value) => { list()[place % 3] = value; });
   });
+  for (const [factor, numbers] of Object.entries(about.numbers)) {
+    numbers.forEach(({ name, low, high, log }, place) => {
+      const [to, from] = log ? [Math.log, Math.exp] : [(value) => value, (value) => value]; // even steps on the slider
+      const range = [to(low), to(high), (to(high) - to(low)) / 100, ""];
+      const set = (value) => { now.numbers[factor][place] = Math.min(high, Math.max(low, from(value))); };
+      slider("numbers", `${factor}-${name}`, `${factor} ${name}`, range, () => to(now.numbers[factor][place]), set, from);
+    });
+    const [label, box] = ["label", "input"].map((tag) => document.createElement(tag));
+    Object.assign(box, { type: "checkbox", name: factor });
+    label.append(box, ` ${factor}`);
+    $("swaps").append(label);
+  }
+  $("numbers-fields").hidden = !sliders.numbers.length;
+  if (!about.light) {
+    $("light-fields").hidden = true;
+    document.querySelector("[name=drag][value=camera]").checked = true;
+    document.querySelector("[name=drag][value=light]").disabled = true;
+  }
   $("fit-line").hidden = !about.can_fit;
   $("fit").checked = about.fits;
   $("framing").options[0].hidden = !about.faces;
 }
 
 function buildMaps() {
-  for (const [name, meaning] of Object.entries(NAMES)) {
+  for (const [name, meaning] of [...Object.entries(NAMES), ...about.maps.map((title) => [title, "an effect of the renderer"])]) {
     const cell = document.createElement("div");
     const shown = document.createElement("img");
     shown.id = `map-${name}`;
@@ -259,8 +278,10 @@ function buildMaps() {
 
 function asFound(kind) {
   const from = second && now.swaps.has(kind) ? second : first;
-  now[kind] = structuredClone(from[kind]);
+  if (kind in about.numbers) now.numbers[kind] = [...from.numbers[kind]]; else now[kind] = structuredClone(from[kind]);
 }
+
+const movable = () => ["light", "camera", ...Object.keys(about.numbers)];
 
 async function opened(source, name, image) {
   if (source instanceof Blob && source.size > about.body_limit_bytes) {
@@ -290,7 +311,7 @@ async function openFirst(source, name, image = null, button = null) {
 
 // What the model found in a photograph or in another part of it.
 async function begun() {
-  for (const kind of ["light", "camera"]) asFound(kind);
+  for (const kind of movable()) asFound(kind);
   showSliders();
   showSun();
   showCrop();
@@ -364,7 +385,7 @@ async function openSecond(source, name, image = null, button = null) {
     $("second").alt = `second photograph: ${name}`;
     $("second").hidden = $("swaps").hidden = false;
     say(`${name} is the second photograph. Choose what to take from it.`);
-    for (const kind of ["light", "camera"]) if (now.swaps.has(kind)) asFound(kind);
+    for (const kind of movable()) if (now.swaps.has(kind)) asFound(kind);
     showSliders();
     if (now.swaps.size) await refreshAll();
   } catch (problem) { say(problem.message, true); }
@@ -401,7 +422,7 @@ function nudge(x, y) {
 const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
 
 function backToOriginal() {
-  for (const kind of ["light", "camera"]) asFound(kind);
+  for (const kind of movable()) asFound(kind);
   showSliders();
   moved();
 }
@@ -495,6 +516,7 @@ async function loadSettings(file) {
     const numbers = [...Object.values(light), ...camera.rotation_deg, ...camera.translation];
     if (numbers.length !== 10 || !numbers.every(Number.isFinite)) throw new Error();
     Object.assign(now, { light, camera });
+    for (const factor of Object.keys(about.numbers)) if (found.numbers && found.numbers[factor]) now.numbers[factor] = found.numbers[factor].map(Number);
     showSliders();
     moved();
     say(`Light and camera are those of ${file.name}.`);
@@ -529,7 +551,7 @@ function connect() {
   $("swaps").addEventListener("change", (event) => {
     const { name, checked } = event.target;
     if (checked) now.swaps.add(name); else now.swaps.delete(name);
-    if (name === "light" || name === "camera") { asFound(name); showSliders(); moved(); } else refreshAll();
+    if (movable().includes(name) && (about.light || name !== "light")) { asFound(name); showSliders(); moved(); } else refreshAll();
   });
   for (const button of document.querySelectorAll("[data-save]")) button.addEventListener("click", () => save(button.dataset.save));
   $("load-settings").addEventListener("change", (event) => { if (event.target.files.length) loadSettings(event.target.files[0]); event.target.value = ""; });
