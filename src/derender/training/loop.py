@@ -9,6 +9,7 @@ import warnings
 from collections import defaultdict
 from collections.abc import Callable
 from contextlib import nullcontext
+from itertools import groupby
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -104,7 +105,7 @@ class _Run:
             step = task.step_module(self.model, self.folder, batches.sample(), prepared)
         how = config.optimiser.model_dump(include={"betas", "weight_decay"})
         rate = config.optimiser.learning_rate
-        self.optimiser = torch.optim.Adam(self.model.parameters(), rate, **how, fused=True)
+        self.optimiser = torch.optim.Adam(_groups(self.model), rate, **how, fused=True)
         self.module = fabric.setup_module(step)
         self.precision = network_precision(config.precision, fabric.device)
         held_out = split.validation[:MAX_VALIDATION_IMAGES]
@@ -316,6 +317,17 @@ class _Run:
         self.reader.close()
         if self.writer is not None:
             self.writer.close()
+
+
+def _groups(model: Any) -> list[dict[str, Any]]:
+    """Parameters in their order; networks of a renderer's few numbers have no weight decay.
+
+    Their gradients are small beside it: it would carry their weights to 0.
+    """
+    nets = [model.nets[row.name] for row in getattr(model, "factors", ()) if row.numbers]
+    bare = {id(parameter) for net in nets for parameter in net.parameters()}
+    parts = groupby(model.parameters(), lambda parameter: id(parameter) in bare)
+    return [{"params": list(part), **({"weight_decay": 0.0} if own else {})} for own, part in parts]
 
 
 def passed(before: int, now: int, interval: int, *, ended: bool) -> bool:

@@ -11,7 +11,7 @@ import io
 import json
 import zipfile
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from math import ceil, isfinite
 from typing import Any
@@ -26,7 +26,6 @@ from derender.data import as_float
 from derender.features import FeatureTable, named
 from derender.features.neighbours import nearest, same_image
 from derender.model import Derenderer
-from derender.networks import Factor
 from derender.photo import Frame, PhotoDetail, Photograph, find_faces, found_frame
 from derender.photo.edit import MARGIN
 from derender.photo.faces import frame_of, template_of
@@ -34,7 +33,7 @@ from derender.report import colours
 from derender.report.films import FILMS
 from derender.report.mesh import model_mesh
 from derender.report.panel import labelled_grid
-from derender.report.sweeps import circling_light, swaying_view
+from derender.report.sweeps import circling_light, swapped, swaying_view
 from derender.report.viewer.questions import (
     Camera,
     CropRequest,
@@ -90,15 +89,15 @@ class Studio:
 
     def about(self) -> dict[str, Any]:
         """The model's name and abilities, ranges of the camera, and the number of images in memory."""
-        ranges = self.model.settings.ranges
+        ranges, rows = self.model.settings.ranges, self.model.factors
         return {
             "model": self.name,
             "faces": template_of(self.model) is not None,
             "can_fit": self.model.fitting is not None,
             "fits": self.fit_steps > 0,
             "fov_deg": self.model.fov_deg,
-            "light": any(row.parameter == "light" for row in self.model.factors),
-            "numbers": {row.name: [asdict(one) for one in row.numbers] for row in self._numbered},
+            "light": any(row.parameter == "light" for row in rows),
+            "numbers": {row.name: [asdict(one) for one in row.numbers] for row in rows if row.numbers},
             "maps": list(self.model.renderer.maps),
             "rotation_deg": ranges.rotation_deg,
             "translation": [ranges.translation_xy, ranges.translation_xy, max(ranges.translation_z, 0.1)],
@@ -185,18 +184,14 @@ class Studio:
         scene = self.shelf.get(question.picture).scene
         parameters = {factor.name: factor.parameter for factor in self.model.factors}
         for factor, other in question.swaps.items():
-            parameter = parameters[factor]
-            donor = self.shelf.get(other).scene
-            scene = scene.with_parameters(**{parameter: donor.parameters[parameter]})
+            scene = swapped(scene, self.shelf.get(other).scene, parameters[factor])
         if question.light is not None:
             scene = scene.with_parameters(light=question.light.light_row())
         if question.camera is not None:
             scene = scene.with_parameters(camera=question.camera.camera_row())
         for factor, values in question.numbers.items():
-            if factor not in (names := [row.name for row in self._numbered]):
-                raise Refused(
-                    422, f"numbers: this model has no {factor!r}; it has {', '.join(names) or 'none'}"
-                )
+            if factor not in (own := self._numbers(scene)):
+                raise Refused(422, f"numbers: this model has no {factor!r}; it has {', '.join(own)}")
             scene = scene.with_parameters(**{parameters[factor]: torch.tensor([values])})
         try:
             self.model.renderer.check(scene)
@@ -204,13 +199,8 @@ class Studio:
             raise Refused(422, str(problem)) from problem
         return scene
 
-    @property
-    def _numbered(self) -> list[Factor]:
-        """The model's factors of a few named numbers."""
-        return [row for row in self.model.factors if row.numbers]
-
     def _numbers(self, scene: Scene) -> dict[str, list[float]]:
-        return {row.name: scene.parameters[row.parameter][0].tolist() for row in self._numbered}
+        return {f.name: scene.parameters[f.parameter][0].tolist() for f in self.model.factors if f.numbers}
 
     def view(self, question: ViewRequest) -> bytes:
         """The requested view: JPEG, or PNG with transparency where the model's pixels are drawn."""
@@ -239,11 +229,9 @@ class Studio:
         """GIF or MP4: the light circles, or the view goes from side to side."""
         question = question.model_copy(update={"size": min(self._size(question), FILM_SIZE)})
         scene = self.scene(question)
-        scenes = (
-            circling_light(scene, FILM_FRAMES, FILM_LIGHT_DEG)
-            if question.move == "light"
-            else swaying_view(scene, FILM_FRAMES, FILM_VIEW_DEG)
-        )
+        moves = {"light": (circling_light, FILM_LIGHT_DEG), "camera": (swaying_view, FILM_VIEW_DEG)}
+        move, reach_deg = moves[question.move]
+        scenes = move(scene, FILM_FRAMES, reach_deg)
         frames = [self._drawn(question, scenes[number]) for number in range(len(scenes))]
         try:
             return FILMS[question.kind](frames, FILM_SECONDS)
@@ -255,23 +243,21 @@ class Studio:
         opened, size = self.shelf.get(question.picture), self._size(question)
         with torch.inference_mode():
             scene = at_size(self.scene(question), size)
-            normal = normals_from_depth(scene.depth, self.model.fov_deg)
+            fov_deg, renderer = self.model.fov_deg, self.model.renderer
+            normal = normals_from_depth(scene.depth, fov_deg)
             return {
                 "input": colours.pictures(opened.pixels[None])[0],
                 "reconstruction": self._rendered(at_size(opened.scene, size)),
                 "depth": colours.depth_maps(scene.depth)[0],
                 "normals": colours.normal_maps(normal)[0],
                 "albedo": colours.pictures(scene.albedo)[0],
-                "shading": colours.shading_maps(self.model.renderer.shading(scene, self.model.fov_deg))[0],
-                **{
-                    title: colours.level_maps(draw(scene, self.model.fov_deg))[0]
-                    for title, draw in self.model.renderer.maps.items()
-                },
-            }
+                "shading": colours.shading_maps(renderer.shading(scene, fov_deg))[0],
+            } | {name: colours.level_maps(draw(scene, fov_deg))[0] for name, draw in renderer.maps.items()}
 
     def panel(self, question: ViewRequest) -> bytes:
         """All maps and the view with their names in one PNG."""
-        return _panel(self.maps(question) | {"view": self._drawn(question)})
+        columns = self.maps(question) | {"view": self._drawn(question)}
+        return _png(labelled_grid({name: [image] for name, image in columns.items()}))
 
     def archive(self, question: ViewRequest) -> bytes:
         """A ZIP: the panel, every map, the picture, the mesh, and the settings."""
@@ -393,10 +379,6 @@ def _encoded(image: Image.Image) -> bytes:
 def data_url(image: Image.Image) -> str:
     """An image that travels inside JSON."""
     return "data:image/png;base64," + base64.b64encode(_png(image, quick=True)).decode()
-
-
-def _panel(maps: Mapping[str, Image.Image]) -> bytes:
-    return _png(labelled_grid({name: [image] for name, image in maps.items()}))
 
 
 def _png(image: Image.Image, quick: bool = False) -> bytes:
