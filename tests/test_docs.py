@@ -18,7 +18,6 @@ TOP = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "SECURITY.md")]
 PAGES = sorted([*TOP, *DOCS.rglob("*.md")])
 LINKING = [*PAGES, ROOT / "CHANGELOG.md", ROOT / "benchmarks" / "README.md"]
 LONGEST_SENTENCE, LONGEST_LINE, WIDEST_TABLE, LONGEST_TABLE = 25, 120, 6, 12
-LONG_TABLES = {"robustness-generated", "loocc-tracks", "celeba-labels", "baselines"}  # rows of one comparison
 BANNED = re.compile(
     r"\b(nobody|taken? apart|told apart|comes? along|given away|rendered again|as read|encoders say|asked of|"
     r"odd (?:pictures?|images?)|goe?s on with|gone on with|pictures?|at hand|where this was written|"
@@ -129,12 +128,11 @@ def test_prose_is_plain(path):
         if path.name == "prose.md"
         else [match[0] for one in sentences(text) for match in BANNED.finditer(one)]
     )
-    tables = re.findall(r"(?:<!-- table: (\S+).*-->\n)?((?:^\|.*\n)+)", text, re.MULTILINE)
+    tables = re.findall(r"((?:^\|.*\n)+)", text, re.MULTILINE)
     large = [
         rows[:60]
-        for name, rows in tables
-        if rows.split("\n")[0].count("|") - 1 > WIDEST_TABLE + 1
-        or (rows.count("\n") - 2 > LONGEST_TABLE and name not in LONG_TABLES)
+        for rows in tables
+        if rows.split("\n")[0].count("|") - 1 > WIDEST_TABLE + 1 or rows.count("\n") - 2 > LONGEST_TABLE
     ]
     assert not (long + wide + words + large), "\n".join([*long, *wide, *words, *large])
 
