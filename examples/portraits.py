@@ -58,7 +58,9 @@ def film(model: derender.Derenderer) -> Iterator[Image.Image]:
     swings = [cos(2 * pi * frame / FRAMES) for frame in range(FRAMES)]
     for swing in swings:
         yield frame_of(
-            given, [one.relit(60 * swing) for one in opened], f"relit: light at {60 * swing:+.0f}°"
+            given,
+            [one.relit(60 * swing) for one in opened],
+            f"relit: light {abs(60 * swing):.0f}° from the {'left' if swing > 0 else 'right'}",
         )
     for swing in swings[FRAMES // 4 :] + swings[: FRAMES // 4]:
         turned = [one.rotated(16 * swing) for one in opened]
@@ -93,7 +95,7 @@ def main() -> None:
         append_images=rest,
         duration=90,
         loop=0,
-        quality=72,
+        quality=84,
         method=6,
     )
 

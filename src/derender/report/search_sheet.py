@@ -11,7 +11,7 @@ from derender.report.colours import pictures
 from derender.report.page import png_bytes, write_whole
 from derender.report.panel import GridLayout, contact_sheet
 
-CELL = 160
+CELL = 192
 Progress = Callable[[int, int], object]
 
 
