@@ -246,6 +246,13 @@ def million_rows(found: Any) -> Iterator[list[str]]:
     yield from ([name, f"{found['seconds'][key]:.2f}"] for key, name in names.items())
 
 
+def page_speed(found: Any) -> Iterator[list[str]]:
+    yield ["image, clients at once", "images a CPU second", "CPU ms an image", "memory, MB"]
+    for row in found["rows"]:
+        cells = (row[key] for key in ("pictures_per_cpu_second", "cpu_ms", "server_mb"))
+        yield [f"{row['size']} pixels, {row['clients']}", *(f"{cell:,.0f}" for cell in cells)]
+
+
 def aligned(found: Any) -> Iterator[list[str]]:
     yield ["faces found", "recall", "precision", "eye error, mean", "90th percentile"]
     for group in ("pasted", "lfw crops"):
@@ -302,6 +309,7 @@ SPEED: dict[str, tuple[str, Callable[[Any], Iterator[list[str]]]]] = {
     "relighting": ("relighting.json", scored(PSNR, "psnr")),
     "renderers": ("renderers_fit.json", renderers),
     "table-million": ("table_million.json", million_rows),
+    "view": ("view.json", page_speed),
     "align": ("align.json", aligned),
     "brightness-races": ("brightness-races.json", scored({"share of brightness": ("share", 1, 3)}, "share")),
     "brightness-rendered": ("brightness-rendered.json", scored(BRIGHTNESS, "brightness")),

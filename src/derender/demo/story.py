@@ -69,7 +69,7 @@ class DemoSettings(Settings):
 
 FULL = DemoSettings()
 QUICK = DemoSettings(
-    train_pictures=1_500, test_pictures=160, images=3_000, minutes=0.5, fit_steps=0, shown=6, films=3,
+    train_pictures=1_500, test_pictures=160, images=2_400, minutes=0.5, fit_steps=0, shown=6, films=3,
     overrides=(
         "warmup_images=500", "objective.self_features_steps=60", "whitening.pictures=400",
         "fitting.examples=300",
