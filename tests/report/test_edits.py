@@ -52,7 +52,7 @@ def test_mp4_has_every_frame_and_even_sides(tmp_path):
 
 def test_no_ffmpeg_is_an_error_that_helps(monkeypatch):
     monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", "no-such-program")
-    with pytest.raises(ValueError, match=r"ffmpeg cannot write MP4 here .*: write a GIF instead"):
+    with pytest.raises(ValueError, match=r"ffmpeg cannot write MP4 here: .*: write a GIF instead"):
         mp4(frames())
 
 

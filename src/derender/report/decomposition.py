@@ -112,23 +112,32 @@ def decomposition(
     scene = scene.detach()
     with torch.no_grad():
         own, relit, rotated = map(render, (scene, under_another_light(scene), from_another_view(scene)))
-        normal = normals_from_depth(scene.depth, fov_deg)
-        renderer = Renderer("lambert") if model is None else model.renderer
-        shading = renderer.shading(scene, fov_deg)
-        own_maps = {title: colours.level_maps(draw(scene, fov_deg)) for title, draw in renderer.maps.items()}
+    renderer = Renderer("lambert") if model is None else model.renderer
     columns = {
         "input": colours.pictures(images),
         "reconstruction": colours.pictures(own.image, own.mask),
-        "depth": colours.depth_maps(scene.depth, limits=depth_range),
-        "normals": colours.normal_maps(normal),
-        "albedo": colours.pictures(scene.albedo),
-        "shading": colours.shading_maps(shading),
+        **factor_images(scene, renderer, fov_deg, depth_range),
         "another light": colours.pictures(relit.image, relit.mask),
         "another view": colours.pictures(rotated.image, rotated.mask),
     }
+    columns |= {title: columns.pop(title) for title in renderer.maps}  # the renderer's own come last
     further = {name: drawn for name, value in scene.extra.items() if (drawn := colours.any_maps(value))}
     numbers = {} if model is None else {row.parameter: row for row in model.factors if row.numbers}
-    return Decomposition({**columns, **own_maps, **further}, scene.to("cpu"), fov_deg, numbers)
+    return Decomposition({**columns, **further}, scene.to("cpu"), fov_deg, numbers)
+
+
+@torch.no_grad()
+def factor_images(
+    scene: Scene, renderer: Renderer, fov_deg: float, depth_range: tuple[float, float] | None = None
+) -> dict[str, colours.Images]:
+    """Depth, normals, albedo and shading of scenes, then what the renderer itself shows, by column name."""
+    return {
+        "depth": colours.depth_maps(scene.depth, limits=depth_range),
+        "normals": colours.normal_maps(normals_from_depth(scene.depth, fov_deg)),
+        "albedo": colours.pictures(scene.albedo),
+        "shading": colours.shading_maps(renderer.shading(scene, fov_deg)),
+        **{title: colours.level_maps(draw(scene, fov_deg)) for title, draw in renderer.maps.items()},
+    }
 
 
 def decompose_images(model: Derenderer, images: Float[Tensor, "n 3 h w"]) -> Decomposition:

@@ -4,8 +4,6 @@ Leaves out measuring (see ``derender.data.doctor``). The page holds images of th
 the set itself.
 """
 
-from dataclasses import asdict
-from pathlib import PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -18,9 +16,6 @@ from derender.report.page import Page
 from derender.report.panel import strip
 
 GAP_PX = 4
-UNREADABLE_SHOWN = 200
-NAMED = 8
-"""Files named under a row of examples, at most."""
 
 
 def doctor_page(examination: Examination) -> Page:
@@ -36,39 +31,17 @@ def doctor_page(examination: Examination) -> Page:
 
 def doctor_values(examination: Examination) -> dict[str, Any]:
     """What ``templates/findings.html`` shows of an examination."""
-    verdict, values, images = examination.verdict, examination.values, examination.images
-    skipped = {row.file: row.reason for row in images.skipped}
-    tiles = {
-        "distinct images": (f"{values['distinct'].value:,.0f}", f"of {len(images):,} readable"),
-        "unreadable": (f"{len(skipped):,}", "left out"),
-    }
-    if "agreement" in values:
-        least = CHECKS["agreement"].struggles
-        tiles["agreement"] = (f"{values['agreement'].value:.2f}", f"should be {least} or more")
-    mean, examples = [], []
-    if examination.mean is not None:
-        both = pictures(np.stack([examination.mean, examination.mean[..., ::-1]]))
-        names = ("as it is", "mirrored")
-        mean = [
-            (enlarged(image, 128), f"the mean, {name}", name) for image, name in zip(both, names, strict=True)
-        ]
-    for title, rows in examination.examples.items():
-        shown = strip(pictures(np.stack([images.images[row] for row in rows])), GAP_PX)
-        names = ", ".join(PurePosixPath(images.files[row]).name for row in rows[:NAMED])
-        caption = f"{title[0].upper()}{title[1:]}: {names}"
-        examples.append((shown, f"{title}: {len(rows)} images", caption))
-    originals = {} if examination.originals is None else asdict(examination.originals)
+    images, mean = examination.images, examination.mean
+    mirrored = [] if mean is None else pictures(np.stack([mean, mean[..., ::-1]]))
     return {
-        "verdict": verdict.word,
-        "reasons": "; ".join(verdict.because),
-        "tiles": tiles,
-        "findings": examination.findings,
-        "mean": mean,
-        "examples": examples,
+        "examination": examination,
+        "least": CHECKS["agreement"].struggles,
+        "mean": [enlarged(image, 128) for image in mirrored],
+        "strips": {
+            title: strip(pictures(images.images[list(rows)]), GAP_PX)
+            for title, rows in examination.examples.items()
+        },
         "measures": measure_table(examination),
-        "originals": {name.replace("_", " "): one for name, one in originals.items()},
-        "skipped": skipped,
-        "listed": dict(list(skipped.items())[:UNREADABLE_SHOWN]),
     }
 
 

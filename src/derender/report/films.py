@@ -1,8 +1,9 @@
 """Films as bytes: animated PNG (all colours, transparency), GIF (256 colours a frame), MP4 (H.264).
 
-MP4 is written by the ffmpeg that imageio-ffmpeg brings. Leaves out the frames (``sweeps``).
+Leaves out the frames (``sweeps``).
 """
 
+from collections.abc import Iterator
 from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -11,6 +12,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from derender.photo.video import write_video
 from derender.report.colours import Images, on_background
 
 
@@ -45,34 +47,27 @@ def _animated(frames: Images, form: str, frame_ms: int, **settings: Any) -> byte
     return stream.getvalue()
 
 
-def mp4(frames: Images, seconds: float = 2.4, quality: int = 8) -> bytes:
+def mp4(frames: Images, seconds: float = 2.4) -> bytes:
     """The frames once as the bytes of an H.264 film on white, for any player; odd sides gain a pixel.
 
-    ``quality`` runs from 0 to 10. A computer without ffmpeg is an error that names the alternative.
+    A computer without ffmpeg is an error that names the alternative.
     """
     _enough(frames)
-    from imageio_ffmpeg import write_frames
-
     width, height = frames[0].size
-    rate: Any = len(frames) / seconds  # ffmpeg takes any number, imageio-ffmpeg's hint is int
     even = (width + width % 2, height + height % 2)
+
+    def on_white() -> Iterator[np.ndarray]:
+        for frame in frames:
+            canvas = Image.new("RGB", even, (255, 255, 255))
+            canvas.paste(on_background(frame), (0, 0))
+            yield np.asarray(canvas)
+
     with TemporaryDirectory() as folder:
         path = Path(folder) / "film.mp4"
         try:
-            writer = write_frames(
-                str(path), even, fps=rate, codec="libx264", quality=quality,
-                macro_block_size=2, ffmpeg_log_level="error",
-            )  # fmt: skip
-            writer.send(None)
-            for frame in frames:
-                canvas = Image.new("RGB", even, (255, 255, 255))
-                canvas.paste(on_background(frame), (0, 0))
-                writer.send(np.ascontiguousarray(canvas))
-            writer.close()
-        except (OSError, RuntimeError) as error:
-            raise ValueError(
-                f"ffmpeg cannot write MP4 here ({str(error).splitlines()[0]}): write a GIF instead"
-            ) from error
+            write_video(path, on_white(), even, len(frames) / seconds)
+        except ValueError as error:
+            raise ValueError(f"{str(error).replace(str(path), 'MP4 here')}: write a GIF instead") from error
         return path.read_bytes()
 
 

@@ -6,7 +6,6 @@ the crop changed in its own detail, or the model's rendering. Not safe for sever
 gives it one.
 """
 
-import base64
 import io
 import json
 import zipfile
@@ -30,8 +29,10 @@ from derender.photo import Frame, PhotoDetail, Photograph, find_faces, found_fra
 from derender.photo.edit import MARGIN
 from derender.photo.faces import frame_of, template_of
 from derender.report import colours
+from derender.report.decomposition import factor_images
 from derender.report.films import FILMS
 from derender.report.mesh import model_mesh
+from derender.report.page import data_uri
 from derender.report.panel import labelled_grid
 from derender.report.sweeps import circling_light, swapped, swaying_view
 from derender.report.viewer.questions import (
@@ -47,7 +48,6 @@ from derender.report.viewer.questions import (
 from derender.report.viewer.shelf import Shelf, ShownImage
 from derender.scene import Scene
 from derender.scene.enlarge import at_size
-from derender.scene.normals import normals_from_depth
 from derender.training.held_out_errors import (
     OUTLIER_PERCENTILE,
     HeldOutErrors,
@@ -242,17 +242,14 @@ class Studio:
         """Input, its reconstruction, and the factors of the requested view, by name."""
         opened, size = self.shelf.get(question.picture), self._size(question)
         with torch.inference_mode():
-            scene = at_size(self.scene(question), size)
-            fov_deg, renderer = self.model.fov_deg, self.model.renderer
-            normal = normals_from_depth(scene.depth, fov_deg)
+            factors = factor_images(
+                at_size(self.scene(question), size), self.model.renderer, self.model.fov_deg
+            )
             return {
                 "input": colours.pictures(opened.pixels[None])[0],
                 "reconstruction": self._rendered(at_size(opened.scene, size)),
-                "depth": colours.depth_maps(scene.depth)[0],
-                "normals": colours.normal_maps(normal)[0],
-                "albedo": colours.pictures(scene.albedo)[0],
-                "shading": colours.shading_maps(renderer.shading(scene, fov_deg))[0],
-            } | {name: colours.level_maps(draw(scene, fov_deg))[0] for name, draw in renderer.maps.items()}
+                **{name: image for name, (image,) in factors.items()},
+            }
 
     def panel(self, question: ViewRequest) -> bytes:
         """All maps and the view with their names in one PNG."""
@@ -378,7 +375,7 @@ def _encoded(image: Image.Image) -> bytes:
 
 def data_url(image: Image.Image) -> str:
     """An image that travels inside JSON."""
-    return "data:image/png;base64," + base64.b64encode(_png(image, quick=True)).decode()
+    return data_uri(_png(image, quick=True))
 
 
 def _png(image: Image.Image, quick: bool = False) -> bytes:
