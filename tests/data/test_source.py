@@ -6,15 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from derender.data import is_image, list_images, open_source, read_images, read_masks, zip_source
+from derender.data import list_images, open_source, read_images, read_masks, zip_source
 
 ODD = ["ann lee", "ÄÖ ß 日本", "two\nlines", "quote\"'", "tab\there"]
 ZIPPED = pytest.mark.parametrize("zipped", [False, True])
-
-
-def test_an_image_has_a_known_suffix():
-    names = ("a.png", "b/a.JPG", "b.c/a.jpeg", "a.png/b", "png", "a.png.txt", "")
-    assert [is_image(name) for name in names] == [True] * 3 + [False] * 4
 
 
 @ZIPPED
@@ -80,7 +75,7 @@ def test_a_mask_that_is_a_bomb_is_an_error(tree, monkeypatch):
 
 @pytest.mark.parametrize("name", ["list_attr_celeba.txt", "list_patition_label.txt", "x.ids", "data.csv"])
 def test_a_list_that_is_a_bomb_is_an_error(tree, monkeypatch, name):
-    path = bomb(tree(["1/000001.jpg"], zipped=True), name, monkeypatch)
+    path = bomb(tree(["1/000001_aligned.jpg"], zipped=True), name, monkeypatch)
     with pytest.raises(ValueError, match="unpacks to 3 MiB, more than 1 MiB"):
         list_images(path)
 

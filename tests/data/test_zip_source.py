@@ -8,7 +8,6 @@ import tracemalloc
 import warnings
 import zipfile
 import zlib
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -84,13 +83,6 @@ DAMAGED = {
 def test_a_damaged_directory_is_refused(content, contents):
     with pytest.raises(ValueError, match="damaged or not a whole zip"):
         contents(content)
-
-
-def test_threads_share_the_archive(tmp_path):
-    inside = {f"{row}.txt": bytes([row % 256]) * (row * 7) for row in range(300)}
-    (tmp_path / "a.zip").write_bytes(packed(inside))
-    with open_source(tmp_path / "a.zip") as source, ThreadPoolExecutor(8) as pool:
-        assert list(pool.map(source.read, inside)) == list(inside.values())
 
 
 REFUSED = {

@@ -28,10 +28,3 @@ def test_labels_partition_and_origin_go_with_the_features(model, pictures, tmp_p
     assert table.origin["model"] == "runs/x" and table.origin["data"] == "made"
     assert table.origin["weights"] == model_fingerprint(model)
     assert FeatureTable.read(table.write(tmp_path / "t.parquet")).origin == table.origin
-
-
-def test_the_model_is_left_in_its_mode_with_its_statistics(model, pictures):
-    model.train()
-    before = model_fingerprint(model)
-    embed_image_set(model, pictures)
-    assert model.training and model_fingerprint(model) == before

@@ -26,7 +26,7 @@ from derender.data.image import READER_VERSION, Unreadable, decode, decode_whole
 from derender.data.image_set import Duplicate, ImageSet, as_float, check_images, read_images
 from derender.data.layouts import LAYOUTS
 from derender.data.layouts.celeba import MASK_CLASSES
-from derender.data.layouts.layout import HALVES, half_of
+from derender.data.layouts.layout import HALVES, half_of, missing
 from derender.data.maps import GroundTruth, MaskedImages, read_ground_truth, read_masks
 from derender.data.opening import ListedStream, list_images, open_images, open_source, parse_source
 from derender.data.parquet import opened_parquet
@@ -40,7 +40,7 @@ __all__ = [
     "GroundTruth", "ImageSet", "Kinds", "ListedStream", "MaskedImages", "Progress", "Sample", "Skipped",
     "Split", "Stream", "Unreadable", "Value", "as_batch", "as_float", "as_photos",
     "cache_folder", "check_images", "column_of", "decode", "decode_samples", "decode_whole", "decoded",
-    "estimated_total", "half_of", "is_image", "list_images", "nearest_sibling", "open_images",
+    "estimated_total", "half_of", "is_image", "list_images", "missing", "nearest_sibling", "open_images",
     "open_source", "opened_parquet", "parse_source", "quiet_pillow", "read_ground_truth", "read_image",
     "read_images", "read_masks", "read_photo", "sample_checksum", "split_indices", "suggestion",
     "usable_cores",

@@ -22,7 +22,7 @@ from torch import Tensor
 from derender.data.cache import cache_file, cache_folder, read_cache, write_cache
 from derender.data.decoding import Decoded, Progress, decoded, estimated_total
 from derender.data.image import READER_VERSION, Unreadable, check_fit, quiet_pillow
-from derender.data.layouts.layout import Labels, count_unknown, text_column
+from derender.data.layouts.layout import Labels, missing, text_column
 from derender.data.opening import open_images
 from derender.data.source import Skipped
 from derender.data.stream import Kinds, Stream, Value, column_of
@@ -119,7 +119,7 @@ class ImageSet:
         if self.duplicates:
             verb = "kept" if {row.file for row in self.duplicates} <= set(self.files) else "dropped"
             parts.append(f"{len(self.duplicates):,} identical copies {verb}")
-        unknown = {name: count_unknown(column) for name, column in self.labels.items()}
+        unknown = {name: int(missing(column).sum()) for name, column in self.labels.items()}
         partly = [f"{name} unknown for {count:,}" for name, count in unknown.items() if count]
         if len(partly) > 3:
             partly[2:] = [f"{len(partly) - 2} more labels in part unknown"]

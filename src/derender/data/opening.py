@@ -14,7 +14,6 @@ import re
 import zipfile
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import suppress
 from functools import partial
 from itertools import islice
 from pathlib import Path, PurePosixPath
@@ -230,12 +229,7 @@ def _kind_of_folder(folder: Path) -> str | None:
 
 
 def _names(folder: Path) -> Iterator[str]:
-    """Names of the files below a folder, its own first, no more of them looked up than are taken."""
-    waiting = [str(folder)]
-    while waiting:
-        with suppress(OSError), os.scandir(waiting.pop(0)) as entries:  # reading it says what is wrong
-            for entry in entries:
-                if not entry.is_dir(follow_symlinks=False):
-                    yield entry.name
-                elif not is_hidden(entry.name):
-                    waiting.append(entry.path)
+    """Names of the files below a folder, its own first."""
+    for _, folders, names in os.walk(folder):
+        folders[:] = [name for name in folders if not is_hidden(name)]
+        yield from names

@@ -30,7 +30,7 @@ from derender.data import (
 from derender.features.blocks import local_blocks, ray_blocks
 from derender.features.extract import check_size, embed_image_set, model_facts, table_labels
 from derender.features.parquet import Columns, write_columns
-from derender.features.parts import Parts, Rows, rows_of
+from derender.features.parts import PARTS_FORMAT, Parts, Rows, rows_of
 from derender.features.table import FeatureTable, check_names
 from derender.inputs import Progress, as_images, as_model
 from derender.storage.places import model_folder
@@ -193,7 +193,7 @@ def _plan(
         content = (images.place, images.identity(), images.limit, reading, READER_VERSION)
     digest = hashlib.sha256(repr((PIL.__version__, content)).encode("utf-8", "replace")).hexdigest()
     machine = {"device": str(net.device), "torch": torch.__version__}
-    sizes = {"image_size": net.image_size, "batch_size": batch_size}
+    sizes = {"image_size": net.image_size, "batch_size": batch_size, "format": PARTS_FORMAT}
     return {"origin": facts, "pictures": digest, **sizes, **machine}
 
 

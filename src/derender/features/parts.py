@@ -7,6 +7,7 @@ kinds are known, at the end.
 """
 
 import json
+import re
 import shutil
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
@@ -24,7 +25,7 @@ from derender.features.table import check_finite
 from derender.storage.atomic import Damaged, DamageNoticed, atomic_file, measured
 from derender.storage.bounded import parse_json, read_json
 
-PLAN = "plan.json"
+PLAN, PARTS_FORMAT = "plan.json", 2
 _KEY = b"derender part"
 _BEGUN = (PLAN, f".{PLAN}", "writing.parquet", ".writing.parquet")  # of a run killed before its first part
 
@@ -189,10 +190,10 @@ class Parts:
 
 def _checked(file: Path, number: int) -> tuple[int, dict[str, Any]]:
     """Rows and note of a part; ``Damaged`` if it is not the part of this number, as it was written."""
-    _, named, checksum = file.stem.split("-")[:3] if file.stem.count("-") == 2 else ("", "-1", "")
-    if named != f"{number:06d}":
+    name = re.fullmatch(r"part-(\d{6})-([0-9a-f]{8})", file.stem)
+    if name is None or int(name[1]) != number:
         raise Damaged(f"part {number} is missing")
-    if checksum != f"{measured(file)[1]:08x}":
+    if measured(file)[1] != int(name[2], 16):
         raise Damaged("its checksum differs")
     metadata = pq.read_metadata(file)
     return metadata.num_rows, parse_json((metadata.metadata or {})[_KEY], dict[str, Any])

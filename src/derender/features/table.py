@@ -11,19 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from derender.data import suggestion
-
-
-def missing(labels: np.ndarray) -> np.ndarray:
-    """Which labels are missing, (N,) bool: None, NaN, an empty text, and -1 in int8 (yes/no attributes)."""
-    labels = np.asarray(labels)
-    if labels.dtype == np.int8:
-        return labels == -1
-    if labels.dtype.kind == "f":
-        return np.isnan(labels)
-    if labels.dtype.kind in "biu":
-        return np.zeros(labels.shape, dtype=bool)
-    return np.array([value is None or value != value or value == "" for value in labels.tolist()], dtype=bool)
+from derender.data import missing, suggestion
 
 
 def named(values: Mapping[str, Any], name: str, kind: str) -> Any:

@@ -51,8 +51,7 @@ class Shareable:
         ``card``, or is made of ``data`` (what it was trained on), ``licence`` and ``scores``.
         """
         beside = texts_beside(self.source, self.tensors())
-        stated = {"Trained on": data, "Scores": scores, "Licence": licence}
-        card = card or self._card(beside, Path(folder).name, stated)
+        card = card or self._card(beside, Path(folder).name, data, licence, scores)
         with new_folder(folder, overwrite=overwrite) as temporary:
             self.write(temporary)
             (temporary / CARD_FILE).write_text(with_metadata(card, licence), encoding="utf-8")
@@ -76,18 +75,18 @@ class Shareable:
                 "this model has no card: state what it was trained on and what it may be used for, "
                 "push_to_hub(..., data=..., licence=...), or pass card="
             )
-        stated = {"Trained on": data, "Scores": scores, "Licence": licence}
-        card = card or self._card(beside, repository, stated)
+        card = card or self._card(beside, repository, data, licence, scores)
         with TemporaryDirectory() as place:
             folder = self.save_pretrained(Path(place) / "model", card=card, licence=licence)
             return hub.upload(folder, repository, private=private, token=token)
 
-    def _card(self, beside: Mapping[str, str], title: str, stated: Mapping[str, str | None]) -> str:
-        """The card that lies beside the weights, unless something else is stated about them."""
-        if CARD_FILE in beside and not any(stated.values()):
+    def _card(self, beside: Mapping[str, str], title: str, *stated: str | None) -> str:
+        """The card that lies beside the weights, unless data, licence or scores are stated."""
+        if CARD_FILE in beside and not any(stated):
             return beside[CARD_FILE]
-        measured = [stated["Scores"], _errors_in_words(beside.get(ERRORS_FILE, ""))]
-        parts = {**stated, "Scores": " ".join(filter(None, measured))}
+        data, licence, scores = stated
+        measured = " ".join(filter(None, [scores, _errors_in_words(beside.get(ERRORS_FILE, ""))]))
+        parts = {"Trained on": data, "Scores": measured, "Licence": licence}
         paragraphs = [
             f"# {title}",
             self.description(),

@@ -26,15 +26,6 @@ def structure(images: np.ndarray) -> np.ndarray:
     return structure_of(edge_cells(shrunk(images)))
 
 
-def test_grey_is_the_mean_of_each_block():
-    images = np.random.default_rng(0).integers(0, 256, (3, 3, 64, 64), dtype=np.uint8)
-    found = shrunk(images)
-    block = images[1, :, 10:12, 40:42].astype(float).mean(axis=(1, 2)) @ [0.299, 0.587, 0.114] / 255
-    assert found[1, 5, 20] == pytest.approx(block, abs=1e-6)
-    with pytest.raises(ValueError, match="multiple of 32 pixels, got 40"):
-        shrunk(np.zeros((1, 3, 40, 40), np.uint8))
-
-
 def test_pixels_know_black_white_grey_and_blank():
     images = np.full((4, 3, 32, 32), 100, np.uint8)
     images[0, :, :8] = 0

@@ -62,16 +62,6 @@ def test_light_columns_agree_with_each_other(made, folder):
         assert np.allclose([value["lx_cam"], value["ly_cam"], value["lz_cam"]], seen, atol=5e-6)
 
 
-def test_encodings_are_the_published_ones(made, folder):
-    depth = np.asarray(Image.open(folder / "depth" / "000003.png"))
-    normal = np.asarray(Image.open(folder / "normal" / "000003.png"))
-    mask = np.asarray(Image.open(folder / "mask" / "000003.png"))
-    assert depth.dtype == np.uint16 and normal.shape == (64, 64, 3) and set(np.unique(mask)) == {0, 255}
-    assert (depth[mask == 0] == 0).all() and (normal[mask == 0] == 0).all()
-    row, column = np.argwhere(mask)[200]
-    assert depth[row, column] == round((float(made.depth[3, row, column]) - 0.8) / 0.4 * 65535)
-
-
 def test_without_truth_only_pictures_and_tables_and_never_over_another_set(made, tmp_path):
     folder = write(made, tmp_path / "plain", truth=False)
     assert sorted(path.name for path in folder.iterdir()) == ["identities.csv", "images", "params.csv"]

@@ -62,10 +62,3 @@ def test_a_sheet_of_triangles_has_no_gap(cells):
     triangles = np.concatenate([np.stack(t, -1).reshape(-1, 3) for t in ((a, b, c), (b, d, c))])
     _, owner = filled(points, triangles)
     assert (owner >= 0).all()
-
-
-def test_what_is_behind_flat_or_outside_is_skipped():
-    points = np.array([[5, 5, 1], [20, 5, 1], [5, 20, 1], [90, 5, 1], [90, 20, 1], [12.5, 5, 1]], float)
-    _, owner = filled(points, np.array([[0, 2, 1], [0, 1, 5], [3, 4, 3], [1, 3, 4]]))
-    assert set(np.unique(owner)) == {-1, 3}
-    assert (owner[:, :20] == -1).all()

@@ -141,17 +141,10 @@ def _is_celeba(source: Source) -> bool:
     return source.named("list_attr_celeba.txt", "list_attr_celeba.csv") is not None
 
 
-def _load_celeba(source: Source) -> Table:
+def _load_celeba(source: Source) -> Table | None:
     """Attributes, and identity and the official partition where their lists are there; boxes in the wild."""
-    if not _is_celeba(source):
-        raise ValueError(
-            f"{source.path} has no list_attr_celeba.txt; CelebA's owners publish it at {CELEBA_HOME}"
-        )
-    if not source.images:
-        raise ValueError(
-            f"{source.path} has CelebA's list of attributes and no images: expected img_align_celeba or "
-            f"img_celeba, unpacked; CelebA's owners publish both at {CELEBA_HOME}"
-        )
+    if not _is_celeba(source) or not source.images:
+        return None
     aligned, wild = (
         tuple(file for file in source.images if folder in file.split("/")[:-1])
         for folder in ("img_align_celeba", "img_celeba")
@@ -245,45 +238,33 @@ def _is_celebamask(source: Source) -> bool:
     return bool(files) and sum(map(bool, _mask_names(source, files))) >= MOSTLY * len(files)
 
 
-def _load_celebamask(source: Source) -> Table:
+def _load_celebamask(source: Source) -> Table | None:
     """The label ``mask`` names each mask ("" for none); attributes and parts where their lists are there."""
     files = _mask_images(source)
-    if not files:
-        raise ValueError(
-            f"{source.path} has no images of CelebAMask-HQ: expected CelebA-HQ-img/0.jpg, or images/0.jpg; "
-            f"the owners publish the set at {MASK_HOME}"
-        )
     masks = _mask_names(source, files)
     if not any(masks):
-        raise ValueError(
-            f"{source.path} has images and none of their masks: expected "
-            f"CelebAMask-HQ-mask-anno/0/00000_skin.png, or masks/0.png beside images/0.jpg; "
-            f"the owners publish them at {MASK_HOME}"
-        )
+        return None
     names = [base_name(file) for file in files]
     attributes, partition = _attributes(source, "CelebAMask-HQ-attribute-anno", names), None
-    mapping = source.named(_MAPPING)
-    if mapping is not None:
+    if (mapping := source.named(_MAPPING)) is not None:
         expected, header = "idx orig_idx orig_file, as in 0 119613 119614.jpg", r"idx\s+orig_idx\s+orig_file"
-        rows = read_list(source, mapping, r"(\d+)\s+\S+\s+(\d+(?:\.\w+)?)", expected, header)
-        origins = {f"{int(number)}.jpg": origin for _, (number, origin) in rows}
-        in_celeba = [origins.get(name, "") for name in names]
-        attributes = attributes or _attributes(source, "list_attr_celeba", in_celeba)
-        partition = _partition(source, in_celeba)
-        if partition is None:  # by number, which is the same
-            numbers = [int(stem_of(name)) if name else 0 for name in in_celeba]
-            partition = text_column(
-                next((part for part, first in _FIRST_NUMBERS.items() if number >= first), "")
-                for number in numbers
-            )
+        rows = read_list(source, mapping, r"(\d+)\s+\S+\s+(\d+)(?:\.\w+)?", expected, header)
+        origins = {f"{int(number)}.jpg": int(origin) for _, (number, origin) in rows}
+        numbers = [origins.get(name, 0) for name in names]
+        partition = text_column(
+            next((part for part, first in _FIRST_NUMBERS.items() if number >= first), "")
+            for number in numbers
+        )
     return Table(files, {"mask": text_column(masks), **(attributes or {})}, partition)
 
 
 CELEBA = Layout(
     "celeba", "CelebA: faces with 40 attributes", _is_celeba, _load_celeba,
+    "list_attr_celeba.txt and img_align_celeba or img_celeba, unpacked",
     CELEBA_HOME, "non-commercial research only", "list_eval_partition.txt",
 )  # fmt: skip
 CELEBAMASK = Layout(
     "celebamask", "CelebAMask-HQ: faces with masks of their parts", _is_celebamask, _load_celebamask,
+    "CelebA-HQ-img/0.jpg with CelebAMask-HQ-mask-anno/0/00000_skin.png, or images/0.jpg with masks/0.png",
     MASK_HOME, "non-commercial research and education only", _MAPPING,
 )  # fmt: skip

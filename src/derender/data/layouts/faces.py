@@ -64,14 +64,11 @@ _NUMBERED = re.compile(
 _NESTED = re.compile(r"(?:.*/)?(?P<identity>[^/]+)/(?P<track>[^/]+)/[^/]+")
 
 
-def _load_utkface(source: Source) -> Table:
+def _load_utkface(source: Source) -> Table | None:
     """Age, gender and race from the names; values outside the published codes count as unknown."""
     found = [_UTK_NAME.match(base_name(file)) for file in source.images]
     if source.images and not any(found):
-        raise ValueError(
-            f"no image in {source.path} is named as in UTKFace ([age]_[gender]_[race]_[date].jpg): "
-            f"the first is {source.images[0]!r}; the owners publish the set at {_UTK_HOME}"
-        )
+        return None
     ages = [float(one["age"]) if one else np.nan for one in found]
     labels = {"age": number_column(age if age <= _UTK_OLDEST else np.nan for age in ages)}
     for column, names in _UTK_CODES.items():
@@ -91,15 +88,11 @@ def _load_yale(source: Source) -> Table:
     return Table(tuple(found), labels)
 
 
-def _load_lfw(source: Source) -> Table:
+def _load_lfw(source: Source) -> Table | None:
     """Identity from the folder; emotion from ``emotions.csv`` (file, emotion) where there is one."""
     files = source.images
-    lonely = next((file for file in files if "/" not in file), None)
-    if lonely is not None:
-        raise ValueError(
-            f"LFW has one folder per person, but {lonely} in {source.path} lies in none; "
-            f"the owners publish the set at {_LFW_HOME}"
-        )
+    if not all("/" in file for file in files):
+        return None
     part_of_person: dict[str, str] = {}
     for name, part in _LFW_PARTS.items():
         if (file := source.named(name)) is not None:
@@ -124,23 +117,15 @@ def _raf_list(source: Source) -> str | None:
     return min(found, key=lambda file: (file.count("/"), file), default=None)
 
 
-def _load_rafdb(source: Source) -> Table:
+def _load_rafdb(source: Source) -> Table | None:
     """Emotions from the owners' list, the part from an image's name."""
     file = _raf_list(source)
-    if file is None:
-        raise ValueError(
-            f"{source.path} has no EmoLabel/list_patition_label.txt (the owners' spelling), as RAF-DB's "
-            f"basic set has; the owners send the set on request: {_RAF_HOME}"
-        )
+    files = tuple(name for name in source.images if stem_of(name).endswith("_aligned"))
+    if file is None or not files:
+        return None
     expected = f"an image and an emotion from 1 ({EMOTIONS[0]}) to {len(EMOTIONS)} ({EMOTIONS[-1]})"
     rows = read_list(source, file, rf"(\S.*) ([1-{len(EMOTIONS)}])", expected)
     emotions = {stem_of(name.strip()): EMOTIONS[int(code) - 1] for _, (name, code) in rows}
-    files = tuple(name for name in source.images if stem_of(name).endswith("_aligned"))
-    if not files:
-        raise ValueError(
-            f"{source.path} has RAF-DB's list of emotions and no aligned images: expected "
-            f"Image/aligned/train_00001_aligned.jpg; unpack aligned.zip into a folder of its name"
-        )
     names = [stem_of(name).removesuffix("_aligned") for name in files]
     if not emotions.keys() & set(names):
         raise ValueError(f"{file} in {source.path} names none of its images; the first is {files[0]!r}")
@@ -168,18 +153,14 @@ def _track_lists(source: Source) -> dict[str, str]:
     return dict(sorted(found.items()))
 
 
-def _load_tracks(source: Source) -> Table:
+def _load_tracks(source: Source) -> Table | None:
     """Identity, track (unique in the whole set) and frame, by lists or by folders."""
     files, lists = source.images, _track_lists(source)
     if lists:
-        return Table(files, _listed_tracks(source, lists))
-    matches = [_NESTED.fullmatch(file) for file in files]
-    if None in matches:
-        raise ValueError(
-            f"{source.path}: {files[matches.index(None)]} does not lie in IDENTITY/TRACK/, and there is "
-            f"no list of tracks NAME.ids. Those of Buffy and The Big Bang Theory are at {_TRACKS_HOME}"
-        )
-    return Table(files, track_labels(files, [match for match in matches if match]))
+        labels = _listed_tracks(source, lists)
+        return Table(files, labels) if not files or any(labels["identity"]) else None
+    matches = [match for file in files if (match := _NESTED.fullmatch(file))]
+    return Table(files, track_labels(files, matches)) if len(matches) == len(files) else None
 
 
 def _listed_tracks(source: Source, lists: dict[str, str]) -> Labels:
@@ -201,13 +182,6 @@ def _listed_tracks(source: Source, lists: dict[str, str]) -> Labels:
             rows.append((people.get((episode, track), ""), f"{episode}/{track}", episode))
         else:
             rows.append(("", "", episode))
-    if rows and not any(identity for identity, *_ in rows):
-        name, first = next(iter(lists.items()))
-        raise ValueError(
-            f"none of the images in {source.path} lies in the folder of a track that {first} lists "
-            f"(the first is {source.images[0]!r}): expected {name}/NUMBER/FRAME.jpg; the owners "
-            f"publish numbers and names, not images ({_TRACKS_HOME})"
-        )
     columns = dict(
         zip(("identity", "track", "episode"), map(text_column, zip(*rows, strict=True)), strict=True)
     )
@@ -217,26 +191,31 @@ def _listed_tracks(source: Source, lists: dict[str, str]) -> Labels:
 UTKFACE = Layout(
     "utkface", "UTKFace: faces with age, gender and race in their names",
     lambda source: mostly(_UTK_NAME, [base_name(file) for file in source.images]), _load_utkface,
+    "images named [age]_[gender]_[race]_[date].jpg",
     _UTK_HOME, "non-commercial research only",
 )  # fmt: skip
 YALE = Layout(
     "yaleb", "Extended Yale B, cropped: faces under known light",
     lambda source: mostly(_YALE_NAME, [base_name(file) for file in source.images]), _load_yale,
+    "images named yaleB01_P00A+035E-20.pgm",
     _YALE_HOME, "free for research", fit="room",
 )  # fmt: skip
 LFW = Layout(
     "lfw", "Labeled Faces in the Wild: one folder per person",
     lambda source: mostly(_LFW_NAME, source.images), _load_lfw,
+    "every image in the folder of a person",
     _LFW_HOME, "no licence stated; news photographs, collected for research", "peopleDevTrain.txt",
 )  # fmt: skip
 RAFDB = Layout(
     "rafdb", "RAF-DB: faces with one of seven emotions",
     lambda source: _raf_list(source) is not None, _load_rafdb,
+    "EmoLabel/list_patition_label.txt (spelt so) and Image/aligned/train_00001_aligned.jpg, unpacked",
     _RAF_HOME, "non-commercial research only, on request",
 )  # fmt: skip
 FACE_TRACKS = Layout(
     "face_tracks",
     "face tracks: NAME.ids and NAME/TRACK/FRAME (Buffy, Big Bang Theory), or IDENTITY/TRACK/FRAME",
     _is_tracks, _load_tracks,
+    "NAME.ids with some image in NAME/NUMBER/, or every image in IDENTITY/TRACK/",
     _TRACKS_HOME, "lists for research; frames are the broadcasters', to be cut from one's own copy",
 )  # fmt: skip

@@ -65,6 +65,8 @@ class Layout:
 
     Attributes:
         recognise: whether a source looks like it, from the names of its files (and a header line).
+        load: every image with its labels; None where nothing is laid out so.
+        expected: which files there must be, for messages.
         fit: what becomes of images that are not square (data/image.py).
         default_parts: the first of these that is there is read unless a part is asked for; () for all images.
     """
@@ -72,7 +74,8 @@ class Layout:
     name: str  # what the user writes to ask for this layout
     title: str  # what it is, in a few words
     recognise: Callable[[Source], bool]
-    load: Callable[[Source], Table]  # every image with its labels. An error names the file that is missing
+    load: Callable[[Source], Table | None]
+    expected: str = ""
     home: str = ""  # where the owners publish it; "" for layouts without owners
     terms: str = ""  # on what terms the owners give it, in a few words; "" for layouts without owners
     split_from: str = ""  # the file that gives the official split, for messages
@@ -84,6 +87,12 @@ class Layout:
     ) -> Table:
         """The images of one part: of the official split, else those in a folder of that name at any depth."""
         table = self.load(source)
+        if table is None:
+            owners = f"; its owners publish it at {self.home}" if self.home else ""
+            raise ValueError(
+                f"{source.path} cannot be read as {self.name} ({self.title}): expected "
+                f"{self.expected}{owners}"
+            )
         known = set() if table.partition is None else {*table.partition.tolist()}
         parts = sorted(known - {""})
         defaults = self.default_parts if default_parts is None else default_parts
@@ -177,11 +186,14 @@ def partition_column(values: Iterable[str]) -> np.ndarray | None:
     return column if (column != "").any() else None
 
 
-def count_unknown(column: np.ndarray) -> int:
-    """How many values of a column of labels are unknown: "", NaN, or -1 of a yes/no attribute."""
-    if column.dtype.kind == "U":
-        return int((column == "").sum())
-    return int(np.isnan(column).sum()) if column.dtype.kind == "f" else int((column == -1).sum())
+def missing(labels: np.ndarray) -> np.ndarray:
+    """Which labels are missing, (N,) bool: None, NaN, an empty text, and -1 in int8 (yes/no attributes)."""
+    labels = np.asarray(labels)
+    if labels.dtype == np.int8:
+        return labels == -1
+    if labels.dtype.kind in "fbiu":
+        return np.isnan(labels)
+    return np.array([value is None or value != value or value == "" for value in labels.tolist()], dtype=bool)
 
 
 def text_column(values: Iterable[str]) -> np.ndarray:

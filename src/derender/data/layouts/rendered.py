@@ -57,8 +57,6 @@ _TEXTS = (
 )
 _TRACK = re.compile(r"(?:.*/)?tracks/(?P<identity>[^/]+)/(?P<track>[^/]+)/[^/]+\.\w+")
 
-CARS_HOME = "https://github.com/elliottwu/unsup3d"
-
 CAR_CLASSES = {
     "police": ("police", "patrol car", "squad car", "prowl car"),
     "ambulance": ("ambulance",),
@@ -136,13 +134,11 @@ def _parameters(source: Source, folders: Sequence[str], files: Sequence[str]) ->
     return labels
 
 
-def _load_rendered(source: Source) -> Table:
+def _load_rendered(source: Source) -> Table | None:
     """The images beside every params.csv; their masks of parts, if they have such, as the label ``mask``."""
     folders = rendered_folders(source)
     if not folders:
-        raise ValueError(
-            f"{source.path} has no params.csv with an images folder beside it, as rendered sets have"
-        )
+        return None
     beside = tuple(f"{folder}images/" for folder in folders)
     files = tuple(file for file in source.images if file.startswith(beside))
     labels = _parameters(source, folders, files)
@@ -159,15 +155,14 @@ def _columns(source: Source) -> list[str]:
     return header_of(source, f"{folders[0]}params.csv") if folders else []
 
 
-def _load_tracks(source: Source) -> Table:
+def _load_tracks(source: Source) -> Table | None:
     """Identity and track from the folders, everything else from params.csv where it is there."""
-    matches = [_TRACK.fullmatch(file) for file in source.images]
-    if None in matches:
-        stray = source.images[matches.index(None)]
-        raise ValueError(f"{source.path}: {stray} does not lie in tracks/IDENTITY/TRACK/")
+    matches = [match for file in source.images if (match := _TRACK.fullmatch(file))]
+    if len(matches) < len(source.images):
+        return None
     table = source.named("params.csv")
     labels = {} if table is None else _parameters(source, [table.removesuffix("params.csv")], source.images)
-    return Table(source.images, labels | track_labels(source.images, [one for one in matches if one]))
+    return Table(source.images, labels | track_labels(source.images, matches))
 
 
 def _is_paired(source: Source) -> bool:
@@ -195,16 +190,12 @@ def _is_cars(source: Source) -> bool:
     return ours and bool(files) and sum(1 for file in files if _ID.search(file)) >= MOSTLY * len(files)
 
 
-def _load_cars(source: Source) -> Table:
+def _load_cars(source: Source) -> Table | None:
     files = tuple(file for file in source.images if not _MAPS & set(file.split("/")[:-1]))
     models = [found[0] if (found := _ID.search(file)) else "" for file in files]
     partition = partition_column(map(partition_by_folder, files))
     if not any(models) and partition is None:
-        raise ValueError(
-            f"{source.path} holds no rendered ShapeNet cars: expected folders train, val and test, "
-            f"or ids in the names (1a2b3c4d5e6f708192a3b4c5d6e7f809_000.png); unsup3d publishes its own by "
-            f"way of {CARS_HOME}"
-        )
+        return None
     labels: Labels = {"model": text_column(models)} if any(models) else {}
     if (table := _table_of(source)) is not None:
         known = {
@@ -240,23 +231,28 @@ def car_class(*texts: str) -> str:
 
 SYNCAR = Layout(
     "syncar", "rendered cars with exact factors",
-    lambda source: "class" in _columns(source), _load_rendered, default_parts=("train",),
+    lambda source: "class" in _columns(source), _load_rendered,
+    "params.csv with images in a folder images beside it", default_parts=("train",),
 )  # fmt: skip
 SYNFACE = Layout(
     "synface", "rendered faces with exact factors",
     lambda source: "file" in (columns := _columns(source)) and "class" not in columns,
-    _load_rendered, default_parts=("train",),
+    _load_rendered,
+    "params.csv with images in a folder images beside it", default_parts=("train",),
 )  # fmt: skip
 SYNFACE_TRACKS = Layout(
     "synface_tracks", "rendered tracks: tracks/IDENTITY/TRACK/FRAME",
     lambda source: bool(source.images) and all(map(_TRACK.fullmatch, source.images)), _load_tracks,
+    "every image in tracks/IDENTITY/TRACK/",
 )  # fmt: skip
 DEPTH_PAIRS = Layout(
     "depth_pairs", "images and depth maps: image/NAME.png, depth/NAME.png", _is_paired, _load_pairs,
+    "image/NAME.png and depth/NAME.png",
     "https://github.com/elliottwu/unsup3d", "see its owners' page",
 )  # fmt: skip
 SHAPENET_CARS = Layout(
     "shapenet_cars", "ShapeNet cars, rendered: train, val and test, model ids in the names",
-    _is_cars, _load_cars, CARS_HOME,
+    _is_cars, _load_cars, "folders train, val and test, or ids of 24 to 32 hexadecimal digits in the names",
+    "https://github.com/elliottwu/unsup3d",
     "models: ShapeNet's terms, non-commercial research and education only", "a folder train, val or test",
 )  # fmt: skip

@@ -84,11 +84,10 @@ def _is_listed(source: Source) -> bool:
         return stem_of(file) == "data"
 
 
-def _load_listed(source: Source) -> Table:
+def _load_listed(source: Source) -> Table | None:
     """The rows whose image is there; those whose image is not are listed as skipped."""
-    file = _table_of(source)
-    if file is None:
-        raise ValueError(f"{source.path} has no table of its images: expected {', '.join(_NAMES)}")
+    if (file := _table_of(source)) is None:
+        return None
     column, paths, columns = _columns(source, file)
     images = set(source.images)
     rows = [row for row, path in enumerate(paths) if path in images]
@@ -189,5 +188,6 @@ def _text(cell: object) -> str:
 
 TABLE = Layout(
     "table", "a table of paths and labels (CSV or Parquet)", _is_listed, _load_listed,
+    f"a table of its images: {', '.join(_NAMES)}",
     split_from="a column split in the table",
 )  # fmt: skip
