@@ -4,15 +4,19 @@ Either would stop the device in every step, and neither can be part of a CUDA gr
 the same calls are made.
 """
 
+import numpy as np
 import pytest
 import torch
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from derender.data import ImageSet
 from derender.model import Derenderer
 from derender.objectives import Vgg16Features
+from derender.training import loop, train
 from derender.training.config import resolve
 from derender.training.step import training_step
+from derender.training.watch import Watcher
 
 
 class ReadBack(TorchDispatchMode):
@@ -23,7 +27,14 @@ class ReadBack(TorchDispatchMode):
         self.seen = seen
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        if any(word in str(func) for word in ("_local_scalar_dense", "nonzero", "masked_select", "unique")):
+        waits = any(
+            word in str(func) for word in ("_local_scalar_dense", "nonzero", "masked_select", "unique")
+        )
+        by_mask = "index" in str(func) and any(
+            isinstance(index, torch.Tensor) and index.dtype == torch.bool
+            for given in args if isinstance(given, (list, tuple)) for index in given
+        )  # fmt: skip
+        if waits or by_mask:
             self.seen.append(str(func))
         return func(*args, **(kwargs or {}))
 
@@ -53,3 +64,32 @@ def test_a_step_stays_on_its_device(loocc):
         total.backward()
     asked_of_the_cpu_alone = {"none": 0, "light+camera": 2}[loocc]  # whether LOOCC's choice is in range
     assert seen == ["aten._local_scalar_dense.default"] * asked_of_the_cpu_alone
+
+
+def test_the_loop_reads_the_notes_of_many_steps_at_once(tmp_path, monkeypatch):
+    """A whole step, with update and watcher; notes are read every 16 steps, and where a state is kept."""
+    asked, read, looked = [], [], []
+    step, read_notes, look = loop._Run.step, loop._Run.read_notes, Watcher.look
+
+    def watched(run):
+        asked.append([])
+        with ReadBack(asked[-1]):
+            return step(run)
+
+    monkeypatch.setattr(loop._Run, "step", watched)
+    monkeypatch.setattr(loop._Run, "read_notes", lambda run: read.append(len(run.notes)) or read_notes(run))
+    monkeypatch.setattr(Watcher, "look", lambda self, at, *note: looked.append(at) or look(self, at, *note))
+    pixels = np.random.default_rng(0).integers(0, 256, (20, 3, 32, 32), dtype=np.uint8)
+    tiny = [
+        "image_size=32",
+        "width=4",
+        "light_width=4",
+        "perceptual=none",
+        "batch_size=2",
+        "split=[0.8,0.2,0]",
+    ]
+    tiny += ["images=80", "whitening.pictures=0", "fitting.examples=0"]
+    pictures = ImageSet(images=pixels, files=tuple(f"{number:02d}.png" for number in range(20)))
+    train(resolve("small", tiny), pictures, tmp_path / "run")
+    assert not any(asked[1:])  # in the first step tables are made
+    assert read == [16, 16, 8] and looked == list(range(2, 82, 2))

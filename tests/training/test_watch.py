@@ -59,11 +59,15 @@ FAILED_SCENES = {
 }
 
 
+def measured(scene: Scene) -> dict[str, float]:
+    return {name: float(value) for name, value in watching.measure(scene, RANGES).items()}
+
+
 def watch(scene: Scene, images: int, watcher: Watcher | None = None, start: int = 0) -> dict[str, Finding]:
     """The findings, by sign, after so many images of one scene."""
     watcher, findings = watcher or Watcher(RANGES, BATCH), ()
     for seen in range(start + STEP, images + 1, STEP):
-        findings = watcher.judge(seen, 0.1, scene)
+        findings = watcher.judge(seen, 0.1, measured(scene))
     return {finding.sign: finding for finding in findings}
 
 
@@ -100,7 +104,7 @@ def test_a_watcher_goes_on_from_its_memory():
     first = Watcher(RANGES, BATCH)
     assert watch(failed, 7_000, first) == {}
     second = Watcher.remembering(RANGES, BATCH, first.memory())
-    (finding,) = second.judge(9_000, 0.1, failed)
+    (finding,) = second.judge(9_000, 0.1, measured(failed))
     assert finding.sign == "view at its bound"
 
 

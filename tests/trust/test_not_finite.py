@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from functools import partial
-from math import inf, isnan, nan
+from math import inf, isfinite, isnan, nan
 
 import numpy as np
 import pytest
@@ -25,8 +25,8 @@ from derender.training.derender_task import DerenderTask
 from derender.training.features import fit_whitening
 from derender.training.held_out_errors import NotFinite, errors_of
 from derender.training.step import training_step
-from derender.training.task import StepLosses
-from derender.training.watch import Finding, FiniteWatch, Watcher, broken_gradient
+from derender.training.task import Progress, StepLosses
+from derender.training.watch import Finding, FiniteWatch, Watcher, largest_gradients
 
 SIZE = 32
 MIDDLE = SIZE // 2
@@ -94,12 +94,24 @@ STAGES = {
 """What the watcher has to name, and who spoils it."""
 
 
+def seen(watch: FiniteWatch, result: StepLosses) -> tuple[Finding, ...]:
+    stages, note = watch.note(result)
+    return watch.look(4, stages, note.tolist())
+
+
+def broken_gradient(model: Derenderer) -> str | None:
+    names, largest = largest_gradients(model)
+    return next(
+        (name for name, size in zip(names, largest.tolist(), strict=True) if not isfinite(size)), None
+    )
+
+
 def what_is_said(model: Derenderer, images: Tensor, perceptual: nn.Module | None = None) -> str:
     """What the watcher of a training says of one step; it has to end the run."""
     objective = ObjectiveSettings(loocc="light+camera", perceptual="self" if perceptual else "none")
     result = training_step(model, images, objective, perceptual, torch.Generator().manual_seed(0))  # type: ignore[arg-type]
     watch = Watcher(model.settings.ranges, 4)
-    findings = watch.look(len(images), result)
+    findings = seen(watch, result)
     assert watch.uneasy and findings and findings[0].fatal
     return findings[0].text
 
@@ -107,7 +119,7 @@ def what_is_said(model: Derenderer, images: Tensor, perceptual: nn.Module | None
 def test_a_sound_step_raises_nothing(model, images):
     result = training_step(model, images, ObjectiveSettings(perceptual="none"), None, torch.Generator())
     result.total.backward()
-    assert Watcher(model.settings.ranges, 4).look(4, result) == ()
+    assert seen(Watcher(model.settings.ranges, 4), result) == ()
     assert broken_gradient(model) is None
 
 
@@ -134,7 +146,7 @@ def test_a_depth_that_is_no_number_leaves_the_loss_finite_and_is_seen_all_the_sa
     spoil(model.nets["geometry"].decoder, nan)
     objective = ObjectiveSettings(perceptual="none", curvature_weight=0, confidence=False)
     result = training_step(model, images, objective, None, torch.Generator().manual_seed(0))
-    (finding,) = Watcher(model.settings.ranges, 4).look(4, result)
+    (finding,) = seen(Watcher(model.settings.ranges, 4), result)
     assert "the predicted depth" in finding.text
     assert result.total.isfinite()
 
@@ -197,6 +209,30 @@ def test_a_gradient_that_is_no_number_ends_a_run_before_it_is_used(tmp_path, mon
     assert all(bool(value.isfinite().all()) for value in trained[0].parameters())
 
 
+def test_a_broken_step_leaves_the_weights_of_the_step_before(model, monkeypatch, tmp_path):
+    """The third of nine; the notes of all of them are read at the end."""
+    after: list[list[Tensor]] = []
+
+    def built(task: DerenderTask) -> Derenderer:
+        model.nets["light"].decoder.register_full_backward_hook(
+            lambda _, inputs, __: tuple(one * (nan if len(after) == 2 else 1) for one in inputs)
+        )
+        return model
+
+    def keep(progress: Progress) -> None:
+        if progress.phase == "train":
+            after.append([value.detach().clone() for value in model.parameters()])
+
+    monkeypatch.setattr(DerenderTask, "build", built)
+    tiny = ("batch_size=4", "images=36", "perceptual=none", "whitening.pictures=0", "fitting.examples=0")
+    config = resolve("small", tiny).model_copy(update={"model": model.settings})
+    result = train(config, picture_set(), tmp_path / "run", progress=keep)
+    assert (result.stopped, result.images, len(after)) == ("collapse", 12, 9)
+    assert "the gradient of nets.light.encoder" in result.findings[-1].text
+    same = [all(map(torch.equal, after[1], weights)) for weights in after]
+    assert same == [False, True, *[True] * 7]
+
+
 def test_held_out_pictures_that_are_rendered_as_no_numbers_end_a_run(tmp_path, monkeypatch):
     def spoiler(model: Derenderer) -> None:
         def hook(net: nn.Module, _: object, output: Tensor) -> Tensor:
@@ -254,5 +290,5 @@ def test_held_out_errors(model):
 
 def test_baselines():
     terms = {"l1": torch.tensor(0.1), "commitment": torch.tensor(nan)}
-    (finding,) = FiniteWatch().look(4, StepLosses(torch.tensor(nan), terms))
+    (finding,) = seen(FiniteWatch(), StepLosses(torch.tensor(nan), terms))
     assert finding.fatal and "the first term that is not finite is 'commitment'" in finding.text

@@ -264,7 +264,7 @@ class FinetuneStep(nn.Module):
             codes = result.codes
         weight = target.rendering_weight
         terms = {name: value if name == "l1" else weight * value for name, value in result.terms.items()}
-        labels = self.labels[rows.to(self.labels.device)]
+        labels = self.labels[rows.to(self.labels.device, non_blocking=True)]
         loss = target.weight * target_loss(head(codes), labels, head.kind)
         total = weight * result.total + loss
         return total, Held(replace(result, total=total, terms={**terms, "target": loss.detach()}))

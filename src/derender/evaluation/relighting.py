@@ -66,9 +66,7 @@ def relight(
         images, size, dataset=how.dataset, limit=how.limit, keep_duplicates=True
     )  # fmt: skip
     batches = map_batches(model.decompose, model, read.images, batch_size=64, progress=how.stage("model"))
-    scenes = Scene.from_parameters(
-        {name: torch.cat([one.parameters[name] for one in batches]) for name in batches[0].parameters}
-    )
+    scenes = Scene.joined(batches)
     who, off = read.labels["identity"].astype(str), read.labels["light_deg"]
     lit = list(zip(read.labels[NEEDED[1]].tolist(), read.labels[NEEDED[2]].tolist(), strict=True))
     place = {(person, light): row for row, (person, light) in enumerate(zip(who, lit, strict=True))}

@@ -9,7 +9,7 @@ from derender.data import ImageSet
 from derender.inputs import as_images, device_named
 from derender.training import derender_task
 from derender.training.config import TrainConfig, as_overrides, resolve
-from derender.training.distributed import first_then_others, leave, open_fabric, this_rank_writes
+from derender.training.distributed import leave, open_fabric, this_rank_writes
 from derender.training.run_folder import read_settings, refuse_taken
 from derender.training.task import Progress, TrainResult
 
@@ -102,7 +102,7 @@ def train(
     fabric = open_fabric(accelerator)
     if this_rank_writes() and not resume:
         refuse_taken(out)
-    with first_then_others(fabric, local=True):
+    with fabric.rank_zero_first(local=True):
         images = as_images(
             images, image_size_of(config), dataset=dataset, limit=limit,
             progress=lambda *counts: report(Progress("reading", *counts)),

@@ -100,9 +100,7 @@ def edit_video(
             scenes.append(model.decompose(images).detach())
             cuts = []
         report(number + 1, count, description="decomposing")
-    scene = _smooth(Scene.from_parameters({
-        name: torch.cat([one.parameters[name] for one in scenes]) for name in scenes[0].parameters
-    }), fps)  # fmt: skip
+    scene = _smooth(Scene.joined(scenes), fps)
     edited = scene.with_parameters(**edit(scene))
 
     def drawn() -> Iterator[UInt8[np.ndarray, "h w 3"]]:

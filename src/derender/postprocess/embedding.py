@@ -15,7 +15,7 @@ from derender.networks import Factor
 from derender.postprocess.features import Features
 from derender.postprocess.fitting import STEPS, Fitted, coordinates_of
 from derender.postprocess.gradients import gradient_directions
-from derender.postprocess.portions import by_portions
+from derender.postprocess.portions import FEW, by_portions
 from derender.presets import ModelSettings
 from derender.render import Rendering
 from derender.scene import Scene
@@ -104,7 +104,7 @@ class EmbeddingModel(nn.Module):
         check_images(images, self.image_size)
         found = {factor.name: self.factor_activations(factor.name, images) for factor in self.factors}
         if self.features.fits_scenes:
-            fitted = self.fit_scenes(images, self.features.required_fitting().settings.steps).coordinates
+            fitted = self._fitted(images, self.features.required_fitting().settings.steps).coordinates
             found |= {coordinates_of(name): value for name, value in fitted.items()}
         return found
 
@@ -142,13 +142,16 @@ class EmbeddingModel(nn.Module):
         viewpoints. On a CPU an image's scene is the same whatever images stand beside it, on any number of
         threads. A model without a fitting (``derender whiten`` makes one) is a ValueError.
         """
-        images = as_batch(images, self.image_size, next(self.parameters()).device)
+        return self._fitted(as_batch(images, self.image_size, next(self.parameters()).device), steps)
+
+    def _fitted(self, images: Float[Tensor, "n 3 h w"], steps: int) -> Fitted:
         fitting = self.features.required_fitting()
 
-        def fitted(few: Tensor) -> Fitted:
+        def fitted(portion: Tensor) -> Fitted:
+            few = len(portion) if portion.is_cuda else FEW
             with torch.no_grad():
-                scene = self.decode(self.encode(few))
-            return fitting.fit(few, scene, self.render, steps)
+                scenes = [self.decode(self.encode(part)) for part in portion.split(few)]
+            return fitting.fit(portion, Scene.joined(scenes), self.render, steps)
 
         found = Fitted.joined(by_portions(fitted, images), len(images))
         return replace(found, scene=self.balanced(found.scene))

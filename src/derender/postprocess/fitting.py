@@ -29,13 +29,13 @@ PARAMETERS = {"geometry": "depth", "albedo": "albedo"}
 STEPS = 60
 """Twice as many bring the error down by 2 % more."""
 
-_COORDINATE_RATE, _LIGHT_RATE = 0.1, 0.03  # how far a step goes: standard deviations; shares and radians
-_ROTATION_RATE, _TRANSLATION_RATE = 0.01, 0.003  # radians, scene units
-_LATE, _LATE_RATE = 0.6, 0.3  # from this share of the steps on rates are multiplied by this
 _START_LIMIT = 2.5  # standard deviations; predictions beyond are unreliable
-_LIGHT_LIMIT, _ROTATION_LIMIT = math.radians(80), math.radians(75)
-_TRANSLATION_LIMIT = 0.4  # scene units; beyond, little is left in the image
-_BRIGHTNESS = (0.02, 1.2)  # of ambient and diffuse light; images may be brighter than the ranges allow
+_COORDINATES = (0.1, -math.inf, math.inf)  # how far a step goes, least and most: standard deviations
+_LIGHT = [(0.03, 0.02, 1.2)] * 2 + [(0.03, -math.radians(80), math.radians(80))] * 2
+"""Ambient, diffuse, radians; images may be brighter than the ranges allow."""
+_CAMERA = [(0.01, -math.radians(75), math.radians(75))] * 3 + [(0.003, -0.4, 0.4)] * 3
+"""Radians, scene units; beyond, little is left in the image."""
+_LATE, _LATE_RATE = 0.6, 0.3  # from this share of the steps on rates are multiplied by this
 _NOISE = 0.03  # mean absolute error, 0..1, that counts as much as coordinates of 1
 _BEYOND = 0.1  # what an error beyond the tolerance still counts
 
@@ -82,12 +82,9 @@ class Fitted:
         def join(values: Iterable[Tensor]) -> Tensor:
             return torch.cat(list(values))[:count]
 
-        scene = {
-            name: join(one.scene.parameters[name] for one in parts) for name in parts[0].scene.parameters
-        }
         coordinates = {name: join(one.coordinates[name] for one in parts) for name in parts[0].coordinates}
         errors = (join(one.before for one in parts), join(one.after for one in parts))
-        return cls(Scene.from_parameters(scene), coordinates, *errors)
+        return cls(Scene.joined([one.scene for one in parts])[:count], coordinates, *errors)
 
 
 class Fitting(nn.Module):
@@ -122,50 +119,42 @@ class Fitting(nn.Module):
             raise ValueError(f"fitting needs 1 step or more, got {steps}")
         scene = scene.with_parameters(light=scene.light)  # in place of an environment, if there is one
         images, scene = images.detach().clone(), scene.map(lambda value: value.detach().clone())
-        coordinates = {
-            factor: self.maps.coordinates(parameter, scene.parameters[parameter].float()).clamp(
-                -_START_LIMIT, _START_LIMIT
-            )
-            for factor, parameter in PARAMETERS.items()
-        }
-        light, (rotation, translation) = scene.light.float(), scene.camera.float().split(3, dim=1)
-        moved = [*coordinates.values(), light, rotation, translation]
-        rates = [_COORDINATE_RATE] * len(coordinates) + [_LIGHT_RATE, _ROTATION_RATE, _TRANSLATION_RATE]
-        groups = [
-            {"params": [value.requires_grad_()], "lr": rate} for value, rate in zip(moved, rates, strict=True)
+        coordinates = [
+            self.maps.coordinates(name, scene.parameters[name].float()).clamp(-_START_LIMIT, _START_LIMIT)
+            for name in PARAMETERS.values()
         ]
-        optimiser = torch.optim.Adam(groups, betas=(0.9, 0.95))
+        start = [*coordinates, scene.light.float(), scene.camera.float()]
+        sizes = [value.shape[1] for value in start]
+        table = [_COORDINATES] * sum(sizes[:-2]) + _LIGHT + _CAMERA
+        rates, low, high = images.new_tensor(table).T.contiguous()
+        moved = (torch.cat(start, dim=1) / rates).requires_grad_()  # Adam steps as far for any unit
+        optimiser = torch.optim.Adam([moved], lr=1.0, betas=(0.9, 0.95), fused=True)
 
-        def rendered() -> tuple[Scene, Tensor]:
-            """The present scenes and the error of each."""
-            depth, albedo = (self.maps.maps(PARAMETERS[name], value) for name, value in coordinates.items())
-            camera = torch.cat([rotation, translation], dim=1)
+        def rendered() -> tuple[Scene, Tensor, list[Tensor]]:
+            """The present scenes, the error of each, and their coordinates."""
+            *found, light, camera = (moved * rates).split(sizes, dim=1)
+            depth, albedo = map(self.maps.maps, PARAMETERS.values(), found)
             present = Scene(depth, albedo.clamp(0, 1), light, camera, scene.extra)
             rendering = render(present)
             apart = (rendering.image - images).abs().mean(dim=1)
             beyond = (apart - self.settings.tolerance).clamp(min=0)
             limited, covered = (apart - (1 - _BEYOND) * beyond).flatten(1), rendering.mask.flatten(1)
-            return present, (limited * covered).sum(dim=1) / covered.sum(dim=1).clamp(min=1)
+            return present, (limited * covered).sum(dim=1) / covered.sum(dim=1).clamp(min=1), found
 
         before = torch.empty(0)
         for step in range(steps):
-            for group, rate in zip(optimiser.param_groups, rates, strict=True):
-                group["lr"] = rate * (_LATE_RATE if step >= _LATE * steps else 1.0)
-            _, error = rendered()
+            optimiser.param_groups[0]["lr"] = _LATE_RATE if step >= _LATE * steps else 1.0
+            _, error, found = rendered()
             before = error.detach() if step == 0 else before
-            usual = torch.stack([value.square().mean(dim=1) for value in coordinates.values()]).sum(dim=0)
+            usual = torch.stack([value.square().mean(dim=1) for value in found]).sum(dim=0)
             optimiser.zero_grad(set_to_none=True)
             (error / _NOISE + self.settings.prior * usual).sum().backward()
             optimiser.step()
             with torch.no_grad():
-                light[:, :2].clamp_(*_BRIGHTNESS)
-                light[:, 2:].clamp_(-_LIGHT_LIMIT, _LIGHT_LIMIT)
-                rotation.clamp_(-_ROTATION_LIMIT, _ROTATION_LIMIT)
-                translation.clamp_(-_TRANSLATION_LIMIT, _TRANSLATION_LIMIT)
+                moved.clamp_(low / rates, high / rates)
         with torch.no_grad():
-            fitted, after = rendered()
-        found = {name: value.detach() for name, value in coordinates.items()}
-        return Fitted(fitted.detach(), found, before, after)
+            fitted, after, found = rendered()
+        return Fitted(fitted.detach(), dict(zip(PARAMETERS, found, strict=True)), before, after)
 
     def save(self, file: Path) -> None:
         """Write it; complete or not at all."""

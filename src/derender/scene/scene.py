@@ -3,7 +3,7 @@
 Conventions (axes, signs, units) are written in docs/reference/conventions.md.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -50,6 +50,12 @@ class Scene:
     def parameters(self) -> dict[str, Tensor]:
         """Every parameter by name, extras last."""
         return {**{name: getattr(self, name) for name in _FIELDS}, **self.extra}
+
+    @classmethod
+    def joined(cls, scenes: "Sequence[Scene]") -> "Scene":
+        """Batches of scenes one after the other."""
+        parts = [scene.parameters for scene in scenes]
+        return cls.from_parameters({name: torch.cat([part[name] for part in parts]) for name in parts[0]})
 
     def with_parameters(self, **changed: Tensor) -> "Scene":
         """The same scenes with some parameters exchanged; an unknown name is an error.

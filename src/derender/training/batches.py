@@ -76,7 +76,7 @@ class Batches:
         """The images of that batch as bytes: the part that may wait for a disk; one thread."""
         rows = self.order(position, ranks)
         if self.images.device.type != "cpu":
-            return self.images[rows.to(self.images.device)]
+            return self.images[rows.to(self.images.device, non_blocking=True)]
         chosen = rows.numpy() if self.rows is None else self.rows[rows.numpy()]
         return torch.from_numpy(np.take(self.images.numpy(), chosen, axis=0))
 
@@ -87,7 +87,7 @@ class Batches:
         batch = images.float() / 255
         if self.horizontal_flips:
             flip = torch.rand(self.batch_size, generator=random_stream(self.seed, "flip", position)) < 0.5
-            flip = ranks.own(flip).to(batch.device)[:, None, None, None]
+            flip = ranks.own(flip).to(batch.device, non_blocking=True)[:, None, None, None]
             batch = torch.where(flip, batch.flip(-1), batch)
         if self.reframed:
             generator = random_stream(self.seed, "frame", position)

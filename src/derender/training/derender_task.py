@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -49,30 +50,26 @@ def train(
     with locked(folder.path):
         result = train_task(task, images, out, resume=resume, progress=report, accelerator=accelerator, **how)
         if this_rank_writes() and result.stopped != "collapse":
-            _add_features(config, images, folder, report, accelerator)
+            device = "cuda" if accelerator != "cpu" and torch.cuda.is_available() else "cpu"
+            with deterministic_algorithms(config.deterministic):
+                _add_features(config, images, load(folder.model, device=device), folder.model, report)
     return result
 
 
 def _add_features(
-    config: TrainConfig, images: ImageSet, folder: RunFolder, report: Callable[[Progress], None],
-    accelerator: str,
-) -> None:  # fmt: skip
-    """Estimate the features and the held-out errors of a run's model, and save both with it."""
+    config: TrainConfig, images: ImageSet, model: Derenderer, out: Path, report: Callable[[Progress], None]
+) -> None:
+    """Estimate a trained model's features and held-out errors, and save both with it."""
     split = split_indices(images.files, config.split, seed=config.seed)
-    on_gpu = accelerator != "cpu" and torch.cuda.is_available()
-    with deterministic_algorithms(config.deterministic):
-        model = make_features(
-            load(folder.model, device="cuda" if on_gpu else "cpu"),
-            torch.from_numpy(some_of(images.images, split.train)),
-            config.features,
-            seed=config.seed,
-            progress=lambda done, total: report(Progress("features", done, total)),
-        )
-        names = [factor.name for factor in model.factors]
-        write_config(folder.model, names, model.settings.model_dump(mode="json"))
-        model.features.save(folder.model)
-        held_out = images.images[split.validation[:MAX_VALIDATION_IMAGES]]
-        store_errors(folder.model, torch.from_numpy(np.ascontiguousarray(held_out)))
+    some = torch.from_numpy(some_of(images.images, split.train))
+    told = partial(Progress, "features")
+    model = make_features(
+        model, some, config.features, seed=config.seed, progress=lambda *done: report(told(*done))
+    )
+    write_config(out, [factor.name for factor in model.factors], model.settings.model_dump(mode="json"))
+    model.features.save(out)
+    held_out = images.images[split.validation[:MAX_VALIDATION_IMAGES]]
+    store_errors(out, torch.from_numpy(np.ascontiguousarray(held_out)))
 
 
 @dataclass(frozen=True)
@@ -83,12 +80,6 @@ class DerenderTask(TrainingTask):
     begins: bool = True
     ranks: Ranks = ALONE
     outside_loss: tuple[str, ...] = NOT_RECONSTRUCTION
-
-    @property
-    def every_parameter_learns(self) -> bool:
-        """Both heads of the confidence net get gradients."""
-        objective = self.config.objective
-        return objective.confidence and objective.perceptual != "none" and objective.perceptual_weight > 0
 
     def shared(self, ranks: Ranks) -> "DerenderTask":
         ranks.check(self.config.batch_size)

@@ -30,7 +30,7 @@ from derender.scene.scene import seen_in_mirror
 from derender.settings import Settings
 from derender.training.config import FeatureSettings
 from derender.training.features import Progress, make_features
-from derender.training.step import concatenate, fill_uncovered
+from derender.training.step import fill_uncovered
 
 FACTORS = {**PARAMETERS, "light": "light", "camera": "camera"}
 """Factors that are distilled, and their parameters of a scene."""
@@ -233,7 +233,7 @@ def examples(
         made = model.render(otherwise)
         filled = fill_uncovered(made.image, made.mask, images[:rendered])
         shown = torch.cat([filled.clamp(0, 1), images[rendered:]])
-        scene = concatenate([otherwise, fitted[rendered:]])
+        scene = Scene.joined([otherwise, fitted[rendered:]])
     mirrored = torch.rand(len(shown), generator=generator) < 0.5
     mirrored[:rendered] = False  # their light and view are any already
     twin = seen_in_mirror(scene).parameters

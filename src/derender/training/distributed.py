@@ -9,8 +9,7 @@ and joined by Lightning Fabric. Leaves out splitting a model over devices.
 import logging
 import os
 import sys
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.metadata import version
 from inspect import signature
@@ -113,11 +112,8 @@ def started_together() -> int:
     return int(os.environ.get("WORLD_SIZE", "1")) if "LOCAL_WORLD_SIZE" in os.environ else 1
 
 
-def open_fabric(accelerator: str, *, every_parameter_learns: bool = False) -> Any:
-    """A Lightning Fabric of one device; under torchrun of one for each process, joined when this returns.
-
-    ``every_parameter_learns`` in every step saves DDP a search.
-    """
+def open_fabric(accelerator: str) -> Any:
+    """A Lightning Fabric of one device; under torchrun of one for each process, joined when this returns."""
     stub = ModuleType("torchmetrics")  # Fabric reads its version alone: two of the four seconds of its import
     stub.__dict__["__version__"] = version("torchmetrics")
     stands_in = sys.modules.setdefault("torchmetrics", stub) is stub
@@ -131,7 +127,7 @@ def open_fabric(accelerator: str, *, every_parameter_learns: bool = False) -> An
         return Fabric(accelerator=accelerator, devices=1)
     known = signature(torch.nn.parallel.DistributedDataParallel.__init__).parameters
     buffers = "forward_sync_buffers" if "forward_sync_buffers" in known else "broadcast_buffers"
-    options: dict[str, Any] = {"find_unused_parameters": not every_parameter_learns, buffers: False}
+    options: dict[str, Any] = {"find_unused_parameters": True, buffers: False}
     local = int(os.environ["LOCAL_WORLD_SIZE"])
     logging.getLogger("lightning_fabric").setLevel(logging.WARNING)  # quiet while processes find each other
     fabric = Fabric(
@@ -144,16 +140,6 @@ def open_fabric(accelerator: str, *, every_parameter_learns: bool = False) -> An
 def ranks_of(fabric: Any) -> Ranks:
     """Where this process stands among those of a fabric."""
     return Ranks(fabric.global_rank, fabric.world_size)
-
-
-@contextmanager
-def first_then_others(fabric: Any, *, local: bool = False) -> Iterator[None]:
-    """The first rank (``local``: of each machine) runs the block before the others do."""
-    if fabric.world_size == 1:
-        yield
-        return
-    with fabric.rank_zero_first(local=local):
-        yield
 
 
 def first_to_fail() -> bool:

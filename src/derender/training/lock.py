@@ -74,7 +74,9 @@ def _acquired(file: Path) -> int:
                 lives = False
             except OSError:
                 lives = True
-            owner = _owner(os.pread(handle, _OWNER_BYTES, 0))
+            owner = None
+            with suppress(ValueError):  # written by nobody yet
+                owner = parse_json(os.pread(handle, _OWNER_BYTES, 0), _Owner)
             if lives or (owner is not None and owner.host != own.host):
                 who = "another process" if owner is None else f"process {owner.pid} on {owner.host}"
                 gone = "" if lives else f"; if that has ended, delete {file}"
@@ -88,10 +90,3 @@ def _acquired(file: Path) -> int:
             os.close(handle)
             raise
         os.close(handle)
-
-
-def _owner(content: bytes) -> _Owner | None:
-    try:
-        return parse_json(content, _Owner)
-    except ValueError:  # written by nobody yet
-        return None

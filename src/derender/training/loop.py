@@ -7,7 +7,7 @@ optimiser and counters to go on where it stopped.
 import time
 import warnings
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from itertools import groupby
 from math import isfinite
@@ -30,7 +30,7 @@ from derender.training.checkpoint import (
     resume_from,
     save_checkpoint,
 )
-from derender.training.distributed import first_then_others, open_fabric, ranks_of
+from derender.training.distributed import open_fabric, ranks_of
 from derender.training.lock import locked
 from derender.training.process import (
     TrainingInterrupted,
@@ -46,13 +46,15 @@ from derender.training.task import (
     compute_step,
     network_precision,
 )
-from derender.training.watch import Finding, broken_gradient, not_finite
+from derender.training.watch import Finding, largest_gradients, not_finite
 
 if TYPE_CHECKING:
     from torch.utils.tensorboard.writer import SummaryWriter
 
 SAMPLE_COUNT = 8
 LOG_EVERY_STEPS = 50
+READ_EVERY_STEPS = 16
+"""Steps after which the host reads the notes of all of them; between, it never waits for the device."""
 MAX_VALIDATION_IMAGES = 1_000
 FIRST_KEPT_IMAGES = 300
 """About when the first state of a run with long intervals is kept."""
@@ -81,7 +83,7 @@ class _Run:
     ):  # fmt: skip
         config = self.config = task.config
         self.report, self.sample_sheet = progress or (lambda _: None), sample_sheet
-        fabric = self.fabric = open_fabric(accelerator, every_parameter_learns=task.every_parameter_learns)
+        fabric = self.fabric = open_fabric(accelerator)
         ranks = self.ranks = ranks_of(fabric)
         self.task = task = task.shared(ranks) if ranks.count > 1 else task
         split = split_indices(images.files, config.split, seed=config.seed)
@@ -101,7 +103,7 @@ class _Run:
         def prepared(done: int, total: int) -> None:
             self.report(Progress("perceptual", done, total))
 
-        with first_then_others(fabric):
+        with fabric.rank_zero_first():
             step = task.step_module(self.model, self.folder, batches.sample(), prepared)
         how = config.optimiser.model_dump(include={"betas", "weight_decay"})
         rate = config.optimiser.learning_rate
@@ -118,17 +120,18 @@ class _Run:
         self.watcher = task.watch(self.state.watcher) if config.watch else None
         self.validation: dict[str, float] = {}
         self.findings: tuple[Finding, ...] = ()
+        self.notes: list[tuple[int, list[str], list[str], Tensor]] = []
+        self.broken = torch.zeros((), device=fabric.device)
+        """1 as soon as a gradient is not finite: from there on no step changes the weights."""
         self.model_images: int | None = None
         self.writer: "SummaryWriter | None" = None
         if ranks.first:
             run_folder.drop_metrics_after(self.folder, self.state.images)
-            if note is not None:
-                run_folder.append_metrics(
-                    self.folder, {"kind": "note", "images": self.state.images, "text": note}
-                )
             from torch.utils.tensorboard.writer import SummaryWriter
 
             self.writer = SummaryWriter(str(out / "tensorboard"), purge_step=self.state.images)
+            if note is not None:
+                self.log("note", {"text": note})
 
     def go_on(self) -> TrainResult:
         """Train from where the run stands until something ends it."""
@@ -144,17 +147,21 @@ class _Run:
                 state.seconds, speed = seconds_before + elapsed, (state.images - images_before) / elapsed
                 waiting, terms = self.reader.waited_s / elapsed, None
                 if steps % LOG_EVERY_STEPS == 1:
-                    terms = self.ranks.mean({name: value.item() for name, value in result.terms.items()})
+                    terms = self.ranks.mean(_on_host(result.terms))
                     self.log("train", {**terms, "images_per_second": speed, "waiting": waiting})
                 self.report(Progress("train", state.images, config.images, speed, terms, waiting))
 
+                span = before, state.images
+                if steps % READ_EVERY_STEPS and not self.due(*span, stop=signals.is_set()):
+                    continue
                 elapsed, interrupted = self.ranks.largest(elapsed, signals.is_set())
                 state.seconds = seconds_before + elapsed
+                self.read_notes()
                 stopped = self.why_stop()
                 if stopped == "collapse":
                     break
                 healthy = self.watcher is None or not self.watcher.uneasy
-                span, ended = (before, state.images), stopped is not None
+                ended = stopped is not None
                 if healthy and kept(*span, config.validate_every, ended=ended):
                     self.validate()
                     stopped = self.why_stop() or stopped
@@ -175,17 +182,11 @@ class _Run:
             self.leave_model()
         self.close()
         took = max(time.perf_counter() - began, 1e-9)
+        speed, waiting = (state.images - images_before) / took, self.reader.waited_s / took
         return TrainResult(
-            folder=self.folder.path,
-            images=state.images,
-            seconds=state.seconds,
-            images_per_second=(state.images - images_before) / took,
-            validation=self.validation,
-            stopped=stopped or "images",
-            findings=self.findings,
-            waiting=self.reader.waited_s / took,
-            model_images=self.model_images,
-        )
+            self.folder.path, state.images, state.seconds, speed, self.validation, stopped or "images",
+            self.findings, waiting, self.model_images,
+        )  # fmt: skip
 
     def step(self) -> StepLosses:
         """One batch: losses, gradients, update, watcher."""
@@ -198,16 +199,37 @@ class _Run:
         done = state.images / config.images
         result = compute_step(self.module, self.reader.at(position), noise, self.precision, done, rows)
         self.fabric.backward(result.total)
-        broken = broken_gradient(self.model)
-        if broken is None:
-            self.optimiser.step()
+        gradients, largest = largest_gradients(self.model)
+        self.broken = torch.maximum(self.broken, 1 - largest.isfinite().all().float())
+        self.optimiser.found_inf = self.broken  # pyright: ignore[reportAttributeAccessIssue]
+        self.optimiser.step()
         self.optimiser.zero_grad(set_to_none=True)
         state.images += config.batch_size
-        if self.watcher is not None:
-            self.findings = self.watcher.look(state.images, result)
-        if broken is not None and not any(finding.fatal for finding in self.findings):
-            self.findings = (*self.findings, not_finite(broken))
+        stages, note = ([], largest[:0]) if self.watcher is None else self.watcher.note(result)
+        self.notes.append((state.images, gradients, stages, torch.cat([largest, note])))
         return result
+
+    def due(self, before: int, now: int, *, stop: bool) -> bool:
+        """Whether something is to be done that needs the notes of the steps so far; all ranks agree."""
+        config, stop = self.config, self.ranks.count == 1 and (stop or self.why_stop() is not None)
+        often = config.validate_every, config.checkpoint_every, config.sample_every
+        return stop or any(kept(before, now, every, ended=now >= config.images) for every in often)
+
+    def read_notes(self) -> None:
+        """Let the watcher look at every step since the last time; the first fatal one ends the run there."""
+        notes, self.notes = self.notes, []
+        numbers = torch.cat([note for *_, note in notes]).cpu().split([len(note) for *_, note in notes])
+        for (images, gradients, stages, _), note in zip(notes, numbers, strict=True):
+            own = note.tolist()
+            if self.watcher is not None:
+                self.findings = self.watcher.look(images, stages, own[len(gradients) :])
+            pairs = zip(gradients, own, strict=False)
+            broken = next((name for name, size in pairs if not isfinite(size)), None)
+            if broken is not None and not any(finding.fatal for finding in self.findings):
+                self.findings = (*self.findings, not_finite(broken))
+            if any(finding.fatal for finding in self.findings):
+                self.state.images = images
+                return
 
     def why_stop(self) -> str | None:
         """The reason that ends the run now, if there is one."""
@@ -255,8 +277,8 @@ class _Run:
                 continue
             noise = random_stream(self.config.seed, "perturb", position)
             result = compute_step(self.module, batch.float() / 255, noise, self.precision, rows=rows)
-            for name, value in result.terms.items():
-                sums[name] += value.item() * len(batch)
+            for name, value in _on_host(result.terms).items():
+                sums[name] += value * len(batch)
         self.module.train()
         means = {name: value / max(count, 1) for name, value in self.ranks.sum(sums).items()}
         return {"loss": sum(means[name] for name in means if name not in self.task.outside_loss), **means}
@@ -328,6 +350,10 @@ def _groups(model: Any) -> list[dict[str, Any]]:
     bare = {id(parameter) for net in nets for parameter in net.parameters()}
     parts = groupby(model.parameters(), lambda parameter: id(parameter) in bare)
     return [{"params": list(part), **({"weight_decay": 0.0} if own else {})} for own, part in parts]
+
+
+def _on_host(terms: Mapping[str, Tensor]) -> dict[str, float]:
+    return dict(zip(terms, torch.stack([value.float() for value in terms.values()]).tolist(), strict=True))
 
 
 def passed(before: int, now: int, interval: int, *, ended: bool) -> bool:

@@ -44,7 +44,7 @@ class StepResult(StepLosses):
     codes: dict[str, Tensor]
     confidence: Confidence | None
 
-    def stages(self) -> list[tuple[str, Tensor]]:
+    def stages(self) -> dict[str, Tensor]:
         """The output of every stage of the step by name, in the order in which they work."""
         named = {
             "the code of {}": self.codes,
@@ -53,7 +53,7 @@ class StepResult(StepLosses):
             "the rendered {}": vars(self.rendering),
             "the loss term {!r}": self.terms,
         }
-        return [(stage.format(name), value) for stage, row in named.items() for name, value in row.items()]
+        return {stage.format(name): value for stage, row in named.items() for name, value in row.items()}
 
 
 def training_step(
@@ -86,7 +86,7 @@ def training_step(
         perturbed, left_out = perturb_one_factor(model, scene, objective, generator, ranks)
         scenes.append(perturbed)
     rendered = in_chunks(
-        lambda rows: vars(model.render(Scene.from_parameters(rows))), concatenate(scenes).parameters, chunks
+        lambda rows: vars(model.render(Scene.from_parameters(rows))), Scene.joined(scenes).parameters, chunks
     )
     image, mask = rendered["image"], rendered["mask"]
     straight, twin = image[:count], image[count : 2 * count]
@@ -143,7 +143,8 @@ def perturb_one_factor(
     """
     factors = loocc_factors(objective.loocc, model.factors)
     indices = [model.factors.index(factor) for factor in factors]
-    chosen = ranks.own(choose_factors(len(scene) * ranks.count, indices, generator)).to(scene.depth.device)
+    chosen = ranks.own(choose_factors(len(scene) * ranks.count, indices, generator))
+    chosen = chosen.to(scene.depth.device, non_blocking=True)
     changed = {}
     for index, factor in zip(indices, factors, strict=True):
         assert factor.perturb is not None
@@ -181,13 +182,6 @@ def cycle_loss(
             predicted = factor.to_parameter(raw, model.settings.ranges)
             total = total + (predicted - rendered.parameters[factor.parameter].detach()).abs().mean()
     return total
-
-
-def concatenate(scenes: list[Scene]) -> Scene:
-    """Batches of scenes one after the other."""
-    return Scene.from_parameters(
-        {name: torch.cat([scene.parameters[name] for scene in scenes]) for name in scenes[0].parameters}
-    )
 
 
 def in_chunks(function: Callable[[Columns], Columns], inputs: Columns, chunks: int) -> dict[str, Tensor]:

@@ -44,13 +44,11 @@ class Held:
 class TrainingTask(ABC):
     """What the loop needs to know of what it trains: a `LoopSettings`, and the methods below.
 
-    Held-out images are not judged by terms ``outside_loss``; where ``every_parameter_learns``, DDP saves a
-    search.
+    Held-out images are not judged by terms ``outside_loss``.
     """
 
     config: Any
     outside_loss: Any = ()
-    every_parameter_learns = False
 
     def shared(self, ranks: Ranks) -> "TrainingTask":
         """The same task as one of several ranks; a ValueError where it needs its batch whole."""

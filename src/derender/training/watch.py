@@ -11,11 +11,12 @@ no pixel, and a pixel that nothing covers does not count.
 
 import copy
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from derender.scene import Scene
@@ -96,23 +97,14 @@ SIGNS = (
         advice="raise flip_weight, or check that images show the object from the front, roughly symmetric",
     ),
 )  # fmt: skip
+MEASURES = tuple(dict.fromkeys(sign.measure for sign in SIGNS))
 
 
-def first_not_finite(stages: Iterable[tuple[str, Tensor]]) -> str | None:
-    """The name of the first tensor that holds NaN or infinity; None where none does."""
-    named = [(name, value.detach()) for name, value in stages]
-    if not named:
-        return None
-    finite = torch.stack([value.isfinite().all() for _, value in named]).tolist()
-    return next((name for (name, _), one in zip(named, finite, strict=True) if not one), None)
-
-
-def broken_gradient(model: nn.Module) -> str | None:
-    """Names the first parameter whose gradient is not finite; None where all gradients are."""
-    gradients = [(name, value.grad) for name, value in model.named_parameters() if value.grad is not None]
-    if not gradients or bool(torch.stack([gradient.sum() for _, gradient in gradients]).isfinite().all()):
-        return None  # a sum is finite only if its terms are
-    return first_not_finite((f"the gradient of {name}", gradient) for name, gradient in gradients)
+def largest_gradients(model: nn.Module) -> tuple[list[str], Float[Tensor, " n"]]:
+    """Names of all gradients, and on the device the largest absolute value of each, NaN where one is."""
+    found = {name: value.grad for name, value in model.named_parameters() if value.grad is not None}
+    sizes = [torch.linalg.vector_norm(gradient, math.inf).float() for gradient in found.values()]
+    return [f"the gradient of {name}" for name in found], torch.stack(sizes)
 
 
 def not_finite(what: str) -> Finding:
@@ -126,14 +118,24 @@ class FiniteWatch:
 
     uneasy: bool = field(default=False, init=False)
 
-    def look(self, images: int, result: Any) -> tuple[Finding, ...]:
-        """The problems of a step's result (`StepLosses`) after so many images; usually none."""
-        loss = result.total.item()
-        if math.isfinite(loss):
+    def note(self, result: Any) -> tuple[list[str], Float[Tensor, " n"]]:
+        """Names of a step's stages, and on its device what ``look`` needs of its result (`StepLosses`)."""
+        stages, measured = self.parts(result)
+        finite = [value.detach().isfinite().all() for value in stages.values()]
+        values = [result.total.detach(), *finite, *measured]
+        return list(stages), torch.stack([value.float() for value in values])
+
+    def parts(self, result: Any) -> tuple[dict[str, Tensor], list[Tensor]]:
+        """What has to be finite, by name, and further numbers that ``look`` is given."""
+        return result.terms, []
+
+    def look(self, images: int, names: Sequence[str], note: Sequence[float]) -> tuple[Finding, ...]:
+        """The problems, usually none, of the step after so many images, by what was noted of it."""
+        if math.isfinite(note[0]):
             return ()
-        broken = first_not_finite(result.terms.items())
+        broken = _first(names, note[1:])
         first = "" if broken is None else f"; the first term that is not finite is {broken!r}"
-        text, advice = f"the loss is {loss}{first}", "use a smaller learning_rate"
+        text, advice = f"the loss is {note[0]}{first}", "use a smaller learning_rate"
         return (Finding("non-finite loss", text, advice, True),)
 
     def memory(self) -> dict[str, Any]:
@@ -174,15 +176,22 @@ class Watcher(FiniteWatch):
         kept = {"averages": self.averages, "on_since": self.on_since, "last_images": self.last_images}
         return copy.deepcopy(kept)
 
-    def look(self, images: int, result: Any) -> tuple[Finding, ...]:
-        broken = first_not_finite(result.stages())
-        shared = self.ranks.mean({"loss": result.total.item(), "broken": float(broken is not None)})
-        if shared["broken"] and broken is None:
-            broken = "that of another rank"
-        return self.judge(images, shared["loss"], result.scene, broken)
+    def parts(self, result: Any) -> tuple[dict[str, Tensor], list[Tensor]]:
+        measured = measure(result.scene, self.ranges)
+        return result.stages(), [measured[name] for name in MEASURES]
 
-    def judge(self, images: int, loss: float, scene: Scene, broken: str | None = None) -> tuple[Finding, ...]:
-        """The problems, usually none, given the latest batch's loss and scenes; ``broken`` names a stage."""
+    def look(self, images: int, names: Sequence[str], note: Sequence[float]) -> tuple[Finding, ...]:
+        broken = _first(names, note[1:])
+        latest = dict(zip(MEASURES, note[1 + len(names) :], strict=True))
+        latest = self.ranks.mean({"loss": note[0], "broken": float(broken is not None), **latest})
+        if latest.pop("broken") and broken is None:
+            broken = "that of another rank"
+        return self.judge(images, latest.pop("loss"), latest, broken)
+
+    def judge(
+        self, images: int, loss: float, latest: Mapping[str, float], broken: str | None = None
+    ) -> tuple[Finding, ...]:
+        """The problems, usually none, given a batch's loss and measurements; ``broken`` names a stage."""
         if broken is not None or not math.isfinite(loss):
             self.uneasy = True
             first = "" if broken is None else f"; the first value that is not finite is {broken}"
@@ -191,7 +200,6 @@ class Watcher(FiniteWatch):
         longer = max(1.0, self.batch_size / USUAL_BATCH)
         share = min(1.0, (images - self.last_images) / (longer * MEMORY_IMAGES))
         self.last_images, self.uneasy = images, False
-        latest = self.ranks.mean(measure(scene, self.ranges))
         findings = []
         for name, value in latest.items():
             before = self.averages.get(name, value)
@@ -207,9 +215,14 @@ class Watcher(FiniteWatch):
         return tuple(findings)
 
 
+def _first(names: Sequence[str], finite: Sequence[float]) -> str | None:
+    """The first name beside which stands no 1."""
+    return next((name for name, one in zip(names, finite, strict=False) if not one), None)
+
+
 @torch.no_grad()
-def measure(scene: Scene, ranges: SceneRanges) -> dict[str, float]:
-    """The measurements of all signs, each a mean over the batch.
+def measure(scene: Scene, ranges: SceneRanges) -> dict[str, Float[Tensor, ""]]:
+    """The measurements of all signs, each a mean over the batch, on the scene's device.
 
     depth_at_bound, view_at_bound, light_at_bound: shares, 0..1. depth_spread: standard deviation of a depth
     map over its range. depth_roughness: mean step between neighbours over that deviation. bulge: how far the
@@ -227,17 +240,16 @@ def measure(scene: Scene, ranges: SceneRanges) -> dict[str, float]:
     x = torch.linspace(-1, 1, width, device=depth.device)[None]
     radius = (x.square() + y.square()).sqrt()
     ring, core = (radius > 0.7) & (radius < 1.0), radius < 0.4
-    bulge = depth[:, ring].mean(dim=1) - depth[:, core].mean(dim=1)
+    rim, centre = ((depth * part).sum(dim=(1, 2)) / part.sum() for part in (ring, core))
     rotation = scene.camera[:, :2].abs() / math.radians(ranges.rotation_deg)
     light = scene.light[:, 2:].abs() / math.radians(ranges.light_deg)
     shading = lambert_shading(normals_from_depth(scene.depth, ranges.fov_deg), scene.light).squeeze(1)
-    values = {
+    return {
         "depth_at_bound": ((depth - middle).abs() > 0.97 * half).float().mean(),
         "depth_spread": (spread / (high - low)).mean(),
         "depth_roughness": (steps / spread.clamp(min=1e-6)).mean(),
-        "bulge": bulge.mean() / (high - low),
+        "bulge": (rim - centre).mean() / (high - low),
         "view_at_bound": (rotation > 0.95).any(dim=1).float().mean(),
         "light_at_bound": (light > 0.95).any(dim=1).float().mean(),
         "shading_contrast": (shading.std(dim=(1, 2)) / shading.mean(dim=(1, 2)).clamp(min=1e-6)).mean(),
     }
-    return {name: float(value) for name, value in values.items()}
