@@ -234,6 +234,25 @@ def renderers(found: Any) -> Iterator[list[str]]:
         yield [effect, *means]
 
 
+def renderer_speed(found: Any) -> Iterator[list[str]]:
+    yield ["renderer", "forward, ms", "with gradients, ms", "with gradients / lambert"]
+    for one in found["cells"]:
+        cells = (("forward_ms", 1), ("forward_and_backward_ms", 1), ("forward_and_backward_over_lambert", 2))
+        yield [one["renderer"], *(f"{one[key]:.{digits}f}" for key, digits in cells)]
+
+
+def renderers_trained(found: Any) -> Iterator[list[str]]:
+    """Errors of models trained with each renderer, by effect, mean over seeds."""
+    yield ["effect in the images, renderer", "normals, degrees", "albedo error", "L1", "seeds"]
+    groups: dict[tuple[str, str], list[Any]] = {}
+    for one in found["cells"]:
+        groups.setdefault((one["effect"], one["renderer"]), []).append(one)
+    for (effect, name), ones in groups.items():
+        digits = {"normal_deg": 1, "albedo": 3, "l1": 4}
+        means = (f"{sum(one[key] for one in ones) / len(ones):.{n}f}" for key, n in digits.items())
+        yield [f"{effect}: {name}", *means, str(len(ones))]
+
+
 def million_rows(found: Any) -> Iterator[list[str]]:
     yield ["1,000,000 rows of 128, one thread", "seconds"]
     names = {
@@ -308,6 +327,8 @@ SPEED: dict[str, tuple[str, Callable[[Any], Iterator[list[str]]]]] = {
     "light": ("light.json", angles),
     "relighting": ("relighting.json", scored(PSNR, "psnr")),
     "renderers": ("renderers_fit.json", renderers),
+    "renderers-speed": ("renderers_speed.json", renderer_speed),
+    "renderers-train": ("renderers_train.json", renderers_trained),
     "table-million": ("table_million.json", million_rows),
     "view": ("view.json", page_speed),
     "align": ("align.json", aligned),

@@ -7,6 +7,7 @@ import ast
 import inspect
 import re
 import tokenize
+from collections import Counter
 from collections.abc import Iterator
 from io import StringIO
 from typing import Any
@@ -34,22 +35,48 @@ def all_commands(group: Any = None, before: str = "derender") -> Iterator[tuple[
             yield full, command
 
 
+SHARED = 4
+"""An option that means the same in so many commands is explained once, above them."""
+
+
 def command_pages() -> Iterator[str]:
-    """A section for each command: what it does, its usage, an example, its options."""
+    """Shared options, then for each command: what it does, its usage, an example, its own options."""
+    rows = {name: dict(map(option_row, shown(command))) for name, command in all_commands()}
+    count = Counter(row for one in rows.values() for row in one.items())
+    shared: dict[str, str] = {}
+    for (row, text), times in count.most_common():
+        if times >= SHARED:
+            shared.setdefault(row, text)
+    yield from ("## Shared options\n", HEAD, *shared.values(), "")
     for name, command in all_commands():
         yield f"## {name}\n\n{clean(command.help or '')}\n"
-        shown = [one for one in command.params if not getattr(one, "hidden", False) and one.name != "help"]
-        arguments = " ".join(f"[{one.metavar}]" for one in shown if one.param_type_name == "argument")
+        arguments = " ".join(
+            f"[{one.metavar}]" for one in shown(command) if one.param_type_name == "argument"
+        )
         example = re.sub(r"^Example: ", "", command.epilog or "")
         yield f"```sh\n{name} {arguments} [OPTIONS]\n{f'{example}   # example' if example else ''}\n```\n"
-        yield "| option | meaning | default |\n| --- | --- | --- |"
-        for one in shown:
-            option = one.param_type_name == "option"
-            names = ", ".join(one.opts + one.secondary_opts) if option else one.metavar or one.name.upper()
-            default = one.default() if callable(one.default) else one.default
-            empty = default is None or default is False or default == ()
-            yield f"| `{names}` | {clean(one.help or '')} | {'' if empty else f'`{default}`'} |"
-        yield ""
+        own = [text for row, text in rows[name].items() if shared.get(row) != text]
+        yield from (HEAD, *own, "") if own else ()
+        others = [row for row, text in rows[name].items() if shared.get(row) == text]
+        yield f"Shared: {', '.join(f'`{row}`' for row in others)}.\n" if others else ""
+
+
+HEAD = "| option | meaning | default |\n| --- | --- | --- |"
+
+
+def shown(command: Any) -> list[Any]:
+    """Arguments and options that a user is told of."""
+    return [one for one in command.params if not getattr(one, "hidden", False) and one.name != "help"]
+
+
+def option_row(one: Any) -> tuple[str, str]:
+    """An option's first name, and its row."""
+    option = one.param_type_name == "option"
+    names = ", ".join(one.opts + one.secondary_opts) if option else one.metavar or one.name.upper()
+    default = one.default() if callable(one.default) else one.default
+    empty = default is None or default is False or default == ()
+    text = f"| `{names}` | {clean(one.help or '')} | {'' if empty else f'`{default}`'} |"
+    return (one.opts[0] if option else names), text
 
 
 def clean(text: str) -> str:
