@@ -1,6 +1,9 @@
 """`derender align`: every face of a folder upright where it belongs, and the way back into the photograph."""
 
 import csv
+import json
+import os
+import sys
 
 import numpy as np
 import pytest
@@ -9,9 +12,11 @@ from PIL import Image
 import derender
 from derender.cli import main
 from derender.photo import Face, Frame, find_faces
-from derender.photo.align import AFFINE
+from derender.photo.align import AFFINE, COLUMNS, _write
 from derender.photo.faces import RENDERED, UTKFACE, YAW_PER_SHARE
 from derender.report.viewer.neighbours import rendered_examples
+
+MODULE = sys.modules["derender.photo.align"]  # the package has the function by that name
 
 
 def head(number: int, size: int) -> Image.Image:
@@ -98,6 +103,72 @@ def test_a_stopped_run_goes_on_and_a_finished_one_is_kept(photos, tmp_path, caps
     assert main([*words, "--force"]) == 0 and (tmp_path / "mine.png").exists()
     (tmp_path / "a" / "boxes.csv").write_text("a,b\n1,2\n")
     assert main([*words, "--force"]) == 2 and "no table of derender align" in capsys.readouterr().err
+
+
+@pytest.fixture
+def two_faces(tmp_path, monkeypatch):
+    """A folder of photographs in each of which two faces are found at once."""
+    face = Face((8, 8, 56, 56), 64 * np.array(UTKFACE, np.float32), 1.0)
+    monkeypatch.setattr(MODULE, "face_candidates", lambda _: [face, face])
+    for shade, name in enumerate(("a-2.png", "a.jpg", "a.png", "b/A.png", "two\u2028lines.png")):
+        (tmp_path / "photos" / name).parent.mkdir(parents=True, exist_ok=True)
+        Image.new("RGB", (64, 64), (40 * shade,) * 3).save(tmp_path / "photos" / name)
+    return tmp_path / "photos"
+
+
+def test_no_crop_takes_the_place_of_another_or_of_a_photograph(two_faces, tmp_path):
+    out = tmp_path / "out"
+    rows = derender.align(two_faces, out, size=16).rows
+    assert len({row["file"].casefold() for row in rows}) == len(rows) == 10
+    for row in rows:
+        with Image.open(out / row["file"]) as crop, Image.open(two_faces / row["photo"]) as photo:
+            assert (
+                np.abs(np.asarray(crop)[8, 8] - np.asarray(photo.convert("RGB"))[8, 8].astype(int)).max() < 3
+            )
+    before = {file: file.read_bytes() for file in two_faces.rglob("*") if file.is_file()}
+    for place in (two_faces, two_faces / "b"):
+        for overwrite in (False, True):
+            with pytest.raises(FileExistsError, match="holds other files: choose an empty or new folder"):
+                derender.align(two_faces, place, size=16, overwrite=overwrite)
+    assert before == {file: file.read_bytes() for file in two_faces.rglob("*") if file.is_file()}
+
+
+def test_a_table_cut_off_anywhere_is_continued_to_the_same_one(two_faces, tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    calls = []
+    monkeypatch.setattr(MODULE, "_write", lambda *given: calls.append(given) or _write(*given))
+    whole = derender.align(two_faces, out, size=16)
+    table, plan = (out / "boxes.csv").read_bytes(), calls[0][2]
+    begun = f"# {json.dumps(plan)}\n".encode()
+    first = table.index(b"\n") + 1
+    for end in range(first, len(table), 61):
+        (out / "boxes.csv").unlink()
+        (out / "boxes.csv.partial").write_bytes(begun + table[:end])
+        assert derender.align(two_faces, out, size=16).rows == whole.rows
+
+
+BEGUN = "# {}\n" + ",".join(COLUMNS) + "\n"
+TABLES = {
+    "empty": "", "deep": "# {" + "[" * 100_000, "long": f"{BEGUN}{'x' * 200_000}\n",
+    "short row": f"{BEGUN}a,b\n", "binary": "\0",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("table", [*TABLES, "sparse", "pipe"])
+def test_a_table_of_a_stranger_is_refused_in_one_line(two_faces, tmp_path, table, capsys):
+    (tmp_path / "out").mkdir()
+    file = tmp_path / "out" / "boxes.csv.partial"
+    if table == "pipe":
+        os.mkfifo(file)
+    elif table == "sparse":
+        file.touch()
+        os.truncate(file, 8 << 30)
+    else:
+        file.write_text(TABLES[table])
+    for force in ([], ["--force"]):
+        assert main(["align", str(two_faces), "--out", str(tmp_path / "out"), *force]) == 2
+        said = capsys.readouterr().err.splitlines()[-1]
+        assert "boxes.csv.partial is no table of derender align (" in said and len(said) < 400
 
 
 def test_a_model_of_other_objects_is_refused(photos, tmp_path):

@@ -57,7 +57,13 @@ def test_a_model_of_before_renderers_loads_as_lambert(tmp_path):
         ("sh+lambert-shadow", "cannot be combined: each sets the light"),
         ("phong(", "cannot read the renderer"),
         ("nothing.here:glow", "no renderer 'nothing.here:glow'.*PYTHONPATH"),
-        ("json:dumps", "'json:dumps' is a function, not a derender.renderers.Renderer"),
+        ("yaml:dump", "'yaml:dump' is a function, not a derender.renderers.Renderer"),
+        ("this:x", "names a module of Python itself"),
+        (".:x", "cannot read the renderer"),
+        ("..os:x", "cannot read the renderer"),
+        ("phong(gamma=" + "[" * 180 + ")", "more than 50 levels"),
+        ("phong(gamma=" + "9" * 400 + ")", r"must lie in 1\.\.3, got inf"),
+        ("phong(gamma=!!python/name:os.system)", "could not determine a constructor"),
     ],
 )
 def test_a_name_that_is_none_says_what_to_write(name, message):

@@ -24,13 +24,14 @@ import tempfile
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
+import torch
 from apart import start, waited
 from PIL import Image
 from safetensors.torch import load_file
@@ -38,8 +39,14 @@ from safetensors.torch import load_file
 from derender.cli import main
 from derender.features import FeatureTable
 from derender.features import embedding as embedding_module
-from derender.model import load
+from derender.model import Derenderer, load
+from derender.photo.video import write_video
+from derender.postprocess import Features
+from derender.report.viewer.neighbours import rendered_examples
+from derender.scene.perturb import PerturbSettings
 from derender.storage.atomic import check_seal
+from derender.training.config import WhiteningSettings
+from derender.training.features import fit_whitening
 
 SIGNALS = {"SIGKILL": signal.SIGKILL, "SIGTERM": signal.SIGTERM, "Ctrl-C": signal.SIGINT}
 CAUSES = (*SIGNALS, "full disk", "exception")
@@ -69,26 +76,39 @@ LEARNS = " ".join(
     )
 )
 MADE = "--data DATA --model MODEL --device cpu"
-PHOTO = "PHOTO PHOTO2 --model MODEL --device cpu --frame none --size 64"
 TABLES = "--features one=ONE --features two=TWO --resamples 60 --cache OUT/cache --markdown OUT/scores.md"
 FEW = "--set images=16 --set fitted=8 --set fit_steps=2 --set whitening.pictures=8"
 LABELS = "--label class --set perceptual=none"
-COMMANDS = {  # and what is given beside it once the file or folder named last is there
-    "train": (f"train --data DATA --preset small --device cpu {LEARNS} --out", "run --resume"),
-    "finetune": (f"finetune --data DATA --preset small --device cpu {LEARNS} {LABELS} --out", "run --resume"),
-    "embed": (f"embed {MADE} --batch-size 4 --out", "table.parquet --force"),
-    "compare": (f"compare --table identity {TABLES} --force --json", "scores.json"),
-    "whiten": (f"whiten {MADE} --set pictures=8 --out", "white --force"),
-    "refine": (f"refine {MADE} {FEW} --out", "refined --force"),
-    "unet": (f"unet {MADE} --set images=16 --out", "unet --force"),
-    "decompose": ("decompose PHOTO PHOTO2 --model MODEL --device cpu --frame none --out", "parts --force"),
-    "relight": (f"relight {PHOTO} --stills 2 --film gif --frames 6 --out", "relit --force"),
-    "rotate": (f"rotate {PHOTO} --stills 2 --film gif --frames 6 --out", "turned --force"),
-    "swap": (f"swap {PHOTO} --from PHOTO2 --out", "mixed --force"),
-    "mesh": ("mesh PHOTO PHOTO2 --model MODEL --device cpu --frame none --out", "solid --force"),
+PICTURES = "PHOTO PHOTO2 --model MODEL --device cpu --frame none"
+FILM = f"{PICTURES} --size 64 --stills 2 --film gif,mp4 --frames 6"
+COMMANDS = {  # what to write, and what is given beside it once the file or folder named third is there
+    "train": (
+        f"train --data DATA --preset small --device cpu {LEARNS} --out",
+        "run",
+        "config.yaml",
+        "--resume",
+    ),
+    "finetune": (
+        f"finetune --data DATA --preset small --device cpu {LEARNS} {LABELS} --out",
+        *("run", "config.yaml", "--resume"),
+    ),
+    "embed": (f"embed {MADE} --batch-size 4 --out", "table.parquet", "", "--force"),
+    "compare": (f"compare --table identity {TABLES} --force --json", "scores.json", "", ""),
+    "whiten": (f"whiten {MADE} --set pictures=8 --out", "white", "", "--force"),
+    "refine": (f"refine DATA --model rendered-faces-64 --device cpu {FEW} --out", "refined", "", "--force"),
+    "unet": (f"unet {MADE} --set images=16 --out", "unet", "", "--force"),
+    "pack": ("pack --model MODEL --out", "packed", "", "--force"),
+    "align": ("align FACES --size 32 --out", "aligned", "boxes.csv", "--force"),
+    "decompose": (f"decompose {PICTURES} --out", "parts", "", "--force"),
+    "relight": (f"relight {FILM} --out", "relit", "", "--resume"),
+    "rotate": (f"rotate {FILM} --out", "turned", "", "--force"),
+    "swap": (f"swap {PICTURES} --size 64 --from PHOTO2 --out", "mixed", "", "--force"),
+    "mesh": (f"mesh {PICTURES} --out", "solid", "", "--force"),
+    "video": ("relight CLIP --model MODEL --device cpu --frame none --out", "clips", "", "--force"),
 }
 UNTIMED = ("metrics.jsonl", "environment.json", "state.json", "checksums.json", "report.html", "run.lock")
-"""Files that hold times, or checksums of such."""
+UNTIMED += ("sheet.png",)
+"""Files that hold times or checksums of such, and the sheet, which is drawn of whole runs only."""
 
 
 class Injected(Exception):
@@ -141,6 +161,8 @@ def content_of(file: Path) -> bytes:
         case ".png" | ".gif" | ".jpg":
             with Image.open(file) as image:
                 image.load()
+        case ".mp4" if b"moov" not in content:
+            raise ValueError(f"{file} is cut off")
         case ".glb" if int.from_bytes(content[8:12], "little") != len(content):
             raise ValueError(f"{file} is cut off")
     return content
@@ -184,8 +206,27 @@ def made_material(place: Path, pictures: int) -> dict[str, str]:
         labels = {"identity": np.array([f"person {value}" for value in identity])}
         files = tuple(f"{row}.png" for row in range(150))
         FeatureTable(files, factors, labels).write(place / f"{name}.parquet")
-    photos = {"PHOTO2": str(place / "photo1.png"), "PHOTO": str(place / "photo0.png")}
+    faces = rendered_examples("rendered-faces-64", 64)
+    for number in range(3):
+        (place / "faces").mkdir(exist_ok=True)
+        Image.fromarray(faces[number].picture).resize((160, 160)).save(place / "faces" / f"{number}.png")
+    clip = (draw.integers(0, 256, (48, 64, 3), dtype=np.uint8) for _ in range(4))
+    write_video(place / "clip.mp4", clip, (64, 48), 10.0)
+    photos = {
+        "FACES": str(place / "faces"),
+        "CLIP": str(place / "clip.mp4"),
+        "PHOTO2": str(place / "photo1.png"),
+        "PHOTO": str(place / "photo0.png"),
+    }
     return {"DATA": str(data), **photos, "ONE": str(place / "one.parquet"), "TWO": str(place / "two.parquet")}
+
+
+def made_model(place: Path) -> str:
+    """A small untrained model with whitened features; what it writes is judged by bytes only."""
+    model = Derenderer.from_preset("small", seed=0, image_size=32, width=4, light_width=4)
+    images = torch.rand(8, 3, 32, 32, generator=torch.Generator().manual_seed(0))
+    features = fit_whitening(model, images, WhiteningSettings(views=1), PerturbSettings())
+    return str(model.with_features(Features(features)).save(place / "model"))
 
 
 @dataclass
@@ -215,13 +256,12 @@ class Trial:
 
     def arguments(self, folder: Path) -> list[str]:
         """Of the first attempt, or of a later one where it left something."""
-        text, (out, *again) = COMMANDS[self.name][0], COMMANDS[self.name][1].split()
-        begun = folder / out / "config.yaml" if again == ["--resume"] else folder / out
+        text, out, begun, again = COMMANDS[self.name]
         words = {**self.words, "OUT": str(folder)}
         given = [words.get(word, word) for word in text.split()]
         given = [word.replace("OUT/", f"{folder}/").replace("=ONE", f"={words['ONE']}") for word in given]
         given = [word.replace("=TWO", f"={words['TWO']}") for word in given]
-        return [*given, str(folder / out), *(again if begun.exists() else [])]
+        return [*given, str(folder / out), *(again.split() if (folder / out / begun).exists() else [])]
 
     def child(
         self, folder: Path, *, limit: int | None = None, raise_after: float | None = None,
@@ -303,15 +343,15 @@ class Trial:
     def check(self, folder: Path, cause: str, code: int) -> None:
         """After a kill: an ending as promised, no traceback, and nothing half-written on disk."""
         said = self.log.read_text(errors="replace")
-        if code not in ENDINGS.get(cause, ()) or "Traceback" in said:
+        if code not in ENDINGS.get(cause, ()) or "Traceback" in said.partition("Exception ignored in")[0]:
             self.faults.append(f"{self.name} ended by {cause} with exit code {code}: {said[-1500:]}")
         try:
             left_in(folder)
         except (ValueError, OSError) as problem:
             self.faults.append(f"after {cause} {self.name} left something half-written: {problem}")
 
-    def kill(self, kills: int) -> None:
-        """Kill the command so many times in all, from as many beginnings as that takes."""
+    def kill(self, kills: int, after: Callable[[], None]) -> None:
+        """Kill the command so many times in all, from as many beginnings; calls ``after`` each of these."""
         folder = self.disk / "work"  # what is written may name it
         self.undisturbed(folder)
         wanted = self.undisturbed(folder)
@@ -334,6 +374,7 @@ class Trial:
                 self.faults.append(f"round {self.rounds} of {self.name} ended otherwise: {differing[:5]}")
             shutil.rmtree(folder)
             self.tell()
+            after()
 
     def tell(self) -> None:
         by_cause = ", ".join(f"{cause} {count}" for cause, count in sorted(self.kills.items()))
@@ -348,7 +389,8 @@ class Trial:
         """For ``--json``."""
         names = ("writing", "rounds", "survived", "faults")
         counts = {name: getattr(self, name) for name in names}
-        return {"kills": self.kills.total(), "by_cause": dict(self.kills), **counts}
+        date = f"{datetime.now(UTC):%Y-%m-%d}"
+        return {"date": date, "kills": self.kills.total(), "by_cause": dict(self.kills), **counts}
 
 
 @contextmanager
@@ -369,18 +411,29 @@ def run(given: argparse.Namespace) -> int:
     """The script."""
     embedding_module.PART_ROWS = 8
     faults: list[str] = []
-    told = {"date": f"{datetime.now(UTC):%Y-%m-%d}", "seed": given.seed, "model": str(given.model)}
-    told |= {"commands": {}}
+    earlier = json.loads(given.json.read_text())["commands"] if given.json and given.json.exists() else {}
+    told = {"command": f"python tests/trust/kills.py --kills {given.kills} --seed {given.seed}"}
+    told |= {"commands": {name: row for name, row in earlier.items() if name in COMMANDS}}
     with tempfile.TemporaryDirectory() as folder:
-        words = {**made_material(Path(folder), given.pictures), "MODEL": str(given.model)}
+        words = {**made_material(Path(folder), given.pictures)}
+        words["MODEL"] = given.model or made_model(Path(folder))
         for name in given.what.split(","):
+            if earlier.get(name, {}).get("kills", 0) >= given.kills:
+                continue
             with small_disk(not given.no_mount) as (disk, mounted):
                 trial = Trial(name, words, disk, mounted, Path(folder) / "log", random.Random(given.seed))
-                trial.kill(given.kills)
+
+                def save(trial: Trial = trial, name: str = name) -> None:
+                    told["commands"][name] = trial.numbers_told()
+                    if given.json:
+                        given.json.write_text(json.dumps(told, indent=1) + "\n")
+
+                try:
+                    trial.kill(given.kills, save)
+                except (RuntimeError, TimeoutError) as problem:
+                    trial.faults.append(str(problem))
+                save()
             faults += trial.faults
-            told["commands"][name] = trial.numbers_told()
-            if given.json:
-                given.json.write_text(json.dumps(told, indent=1) + "\n")
     for fault in faults:
         print(f"  {fault}")
     return 1 if faults else 0
@@ -393,8 +446,8 @@ if __name__ == "__main__":
     parser.add_argument("--kills", type=int, default=30, help="of each command")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--pictures", type=int, default=40, help="in the data set")
-    parser.add_argument("--model", type=Path, default=Path("rendered-faces-64"), help="that embeds and draws")
+    parser.add_argument("--model", help="that embeds and draws; an untrained one where none is named")
     parser.add_argument("--no-mount", action="store_true", help="limit the size of files instead")
     parser.add_argument("--what", default=",".join(COMMANDS))
-    parser.add_argument("--json", type=Path, help="file for the counts")
+    parser.add_argument("--json", type=Path, help="file for the counts, to which missing commands are added")
     sys.exit(run(parser.parse_args()))

@@ -171,11 +171,13 @@ def test_safetensors_with_other_sizes_than_they_say_are_refused(folder):
 def test_a_configuration_that_claims_a_giant_takes_no_memory(folder):
     config = json.loads((folder / "config.json").read_text())
     network = dict(config["settings"]["network"])
-    for name, size in (("width", 1 << 16), ("code_size", 1 << 40), ("light_width", 1 << 20)):
+    for name, size in (("width", 1 << 16), ("code_size", 10**30), ("light_width", 1 << 20)):
         config["settings"]["network"] = {**network, name: size}
         before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         refused_as_damaged(folder, "config.json", json.dumps(config).encode())
         assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200_000  # kB
+    config["settings"] = {"ranges": {"border_depth": 1e308}}
+    refused_as_damaged(folder, "config.json", json.dumps(config).encode())
 
 
 def test_tables_and_caches_with_pickles_in_them_run_nothing(canary, tmp_path):

@@ -1,6 +1,7 @@
 """Joint training with labels, and its held-out scores."""
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -44,9 +45,6 @@ def finetune_settings(
     """The settings of a joint training; arguments as for `finetune`."""
     names = locals()
     if resume:
-        given = [name for name, value in names.items() if name not in ("out", "resume") and value]
-        if given:
-            raise ValueError(f"a resumed run keeps its settings: leave out {', '.join(given)}")
         if not (Path(out) / "config.yaml").is_file():
             raise FileNotFoundError(
                 f"no run to resume in {out} (no config.yaml): run it without resume first"
@@ -54,7 +52,12 @@ def finetune_settings(
         config = read_any_config(Path(out))
         if not isinstance(config, FinetuneConfig):
             raise ValueError(f"{out} was made by derender train: go on with derender train --resume")
-        return config
+        given = {name: value for name, value in names.items() if name not in ("out", "resume") and value}
+        with suppress(ValueError):
+            labels = config.target.labels if attributes else None
+            if not given or with_changes(finetune_settings(out, **given), target__labels=labels) == config:
+                return config
+        raise ValueError(f"a resumed run keeps its settings: leave out {', '.join(given)}")
     if model is not None and preset is not None:
         raise ValueError("preset is for fresh weights, model for given ones: give one of them")
     if bool(labels) == attributes:

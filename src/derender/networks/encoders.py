@@ -22,6 +22,9 @@ Code = Float[Tensor, "n code"]
 Spatial = Float[Tensor, "n channels y x"]
 
 
+LARGEST = 1 << 16  # of channels and codes; more is no network
+
+
 class NetworkSettings(Settings):
     """Sizes of the networks; the defaults are the paper's.
 
@@ -30,12 +33,12 @@ class NetworkSettings(Settings):
     """
 
     image_size: int = 64
-    width: int = Field(default=64, ge=4, multiple_of=4)
-    light_width: int = Field(default=32, ge=1)
-    code_size: int = Field(default=256, ge=1)
-    confidence_code_size: int = Field(default=128, ge=1)
+    width: int = Field(default=64, ge=4, le=LARGEST, multiple_of=4)
+    light_width: int = Field(default=32, ge=1, le=LARGEST)
+    code_size: int = Field(default=256, ge=1, le=LARGEST)
+    confidence_code_size: int = Field(default=128, ge=1, le=LARGEST)
     encoder: Literal["conv", "unet"] = "conv"
-    unet_width: int = Field(default=16, ge=1)
+    unet_width: int = Field(default=16, ge=1, le=LARGEST)
     unet_decoder: bool = False
 
     @field_validator("image_size")

@@ -8,7 +8,8 @@ that was stopped goes on after the last photograph that it finished. Leaves out 
 import csv
 import json
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from io import StringIO
 from math import cos, radians, sin
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -22,6 +23,7 @@ from derender.model import Derenderer
 from derender.photo.faces import PROFILE_DEG, UTKFACE, Face, Template, face_candidates, frame_of, template_of
 from derender.photo.frame import Frame
 from derender.storage.atomic import atomic_file
+from derender.storage.bounded import LINES_LIMIT_BYTES, first_line, parse_json, read_text
 from derender.training.held_out_errors import (
     OUTLIER_PERCENTILE,
     HeldOutErrors,
@@ -96,7 +98,7 @@ def align(
 
     Raises:
         ValueError: the stopped run in ``out`` had other options, or the model is of no known faces.
-        FileExistsError: ``out`` holds a finished run.
+        FileExistsError: ``out`` holds a finished run, or other files, which no run replaces.
     """
     if not (8 <= size <= 4096 and 0 <= margin <= 2):
         raise ValueError(f"size must be 8 to 4096 and margin 0 to 2, got {size} and {margin:g}")
@@ -104,6 +106,9 @@ def align(
     boxes, partial = cutter.out / BOXES, cutter.out / f"{BOXES}.partial"
     if boxes.exists() and not overwrite:
         raise FileExistsError(f"{boxes} exists already: choose another folder, or replace it (--force)")
+    ours = boxes.exists() or partial.exists() or not cutter.out.exists()
+    if not ours and any(not one.name.startswith(".") for one in cutter.out.iterdir()):
+        raise FileExistsError(f"{cutter.out} holds other files: choose an empty or new folder")
     stream = open_images(photos, dataset=dataset, limit=limit) if not isinstance(photos, Stream) else photos
     with stream:
         plan = {"photos": stream.place, "size": size, "margin": margin, "largest": largest, "limit": limit}
@@ -113,13 +118,11 @@ def align(
                 crop = (cutter.out / row["file"]).resolve()
                 if row["file"].endswith(".png") and crop.is_relative_to(cutter.out.resolve()):
                     crop.unlink(missing_ok=True)
-            partial.unlink(missing_ok=True)
-        earlier, rows = _read(partial)
+        earlier, rows = (None, []) if overwrite else _read(partial)
         if earlier not in (None, plan):
             raise ValueError(f"{partial} was made with other options: give those, or begin anew (--force)")
         finished = {row["photo"] for row in rows}
-        resumed = len(finished)
-        cutter.out.mkdir(parents=True, exist_ok=True)
+        cutter.taken.update(row["file"].casefold() for row in rows)
         _write(partial, rows, plan)
         try:
             for number, sample in enumerate(stream.samples(), 1):
@@ -137,11 +140,10 @@ def align(
             raise KeyboardInterrupt(
                 f"stopped by Ctrl-C; {count:,} photographs are done: the same command goes on"
             ) from stopped
-    done = Aligned(cutter.out, rows, resumed)
+    done = Aligned(cutter.out, rows, len(finished))
     if done.counts["unreadable"] == done.counts["photographs"]:
         raise ValueError(f"none of the photographs can be read; {rows[0]['photo']}: {rows[0]['rejected']}")
-    with atomic_file(boxes) as temporary:
-        _write(temporary, rows)
+    _write(boxes, rows)
     partial.unlink()
     return done
 
@@ -157,6 +159,7 @@ class _Cutter:
     template: Template
     model: Derenderer | None
     held_out: HeldOutErrors | None
+    taken: set[str] = field(default_factory=set)  # names of crops, in lower case
 
     def rows(self, name: str, read: Any) -> Iterator[dict[str, Any]]:
         """Write the crops of one photograph; rows for its boxes."""
@@ -178,15 +181,21 @@ class _Cutter:
             frame = Frame(frame.x, frame.y, frame.side * (1 + 2 * self.margin), frame.roll_deg)
             if not row["rejected"]:
                 accepted += 1
-                stem = PurePosixPath(name).with_suffix("")
-                place = stem.with_name(stem.name + (f"-{accepted}" if accepted > 1 else "") + ".png")
-                row["file"] = str(place).lstrip("/").replace("..", "__")
+                row["file"] = self._name(str(PurePosixPath(name).with_suffix("")), accepted)
                 with atomic_file(self.out / row["file"]) as temporary:
                     cut = frame.cut(pixels, self.size).transpose(1, 2, 0)
                     Image.fromarray(np.ascontiguousarray(cut)).save(temporary, format="PNG")
             yield row | _place(face, frame, self.size)
         if not accepted:
             yield {"photo": name, "rejected": NO_FACE}
+
+    def _name(self, stem: str, number: int) -> str:
+        """A crop's name that no other has: images may differ in their suffix only, or be numbered."""
+        stem = stem.lstrip("/").replace("..", "__")
+        while (file := stem + (f"-{number}" if number > 1 else "") + ".png").casefold() in self.taken:
+            number += 1
+        self.taken.add(file.casefold())
+        return file
 
     def _doubt(self, pixels: np.ndarray, face: Face, frame: Frame) -> str:
         """Why a face is rejected that was found; empty where it is not."""
@@ -206,15 +215,9 @@ def _place(face: Face, frame: Frame, size: int) -> dict[str, float]:
     scale, angle = frame.side / size, radians(frame.roll_deg)
     c, s = scale * cos(angle), scale * sin(angle)
     x0, y0 = frame.corners()[0]
-    values = {
-        "confidence": face.confidence,
-        **dict(zip(("left", "top", "right", "bottom"), face.box, strict=True)),
-        **dict(
-            zip(("x", "y", "side", "roll_deg"), (frame.x, frame.y, frame.side, frame.roll_deg), strict=True)
-        ),
-        **dict(zip(AFFINE, (c, -s, x0, s, c, y0), strict=True)),
-    }
-    return {name: round(float(value), 4) for name, value in values.items()}
+    place = frame.x, frame.y, frame.side, frame.roll_deg
+    values = (face.confidence, *face.box, *place, c, -s, x0, s, c, y0)
+    return {name: round(float(value), 4) for name, value in zip(COLUMNS[3:], values, strict=True)}
 
 
 def _known(model: Derenderer | str | Path | None) -> tuple[Template, Derenderer | None, HeldOutErrors | None]:
@@ -235,18 +238,27 @@ def _read(file: Path) -> tuple[dict[str, Any] | None, list[dict[str, str]]]:
     """Options (None for none) and rows of an earlier run, without its last photograph if it was stopped."""
     if not file.exists():
         return None, []
-    first, *lines = file.read_text(encoding="utf-8").splitlines(keepends=True) or [""]
-    plan = json.loads(first[2:]) if first.startswith("# {") else None
-    reader = csv.DictReader(lines if plan is not None else [first, *lines])
-    if tuple(reader.fieldnames or ()) != COLUMNS:
-        raise ValueError(f"{file} is no table of derender align: choose another folder")
-    rows = list(reader)
+    try:
+        first, *lines = StringIO(read_text(file, LINES_LIMIT_BYTES), newline="").readlines() or [""]
+        plan = parse_json(first[2:], dict[str, Any]) if first.startswith("# {") else None
+        if lines and not lines[-1].endswith("\n"):  # the run was killed while it wrote
+            del lines[-1]
+        reader = csv.DictReader(lines if plan is not None else [first, *lines])
+        if tuple(reader.fieldnames or ()) != COLUMNS:
+            raise ValueError("its columns are others")
+        rows = list(reader)
+        if any(None in row or None in row.values() for row in rows):
+            raise ValueError("a row is longer or shorter than the first")
+    except (ValueError, csv.Error) as error:
+        raise ValueError(
+            f"{file} is no table of derender align ({first_line(error)}): choose another folder"
+        ) from error
     last = rows[-1]["photo"] if rows and plan is not None else None
     return plan, [row for row in rows if row["photo"] != last]
 
 
 def _write(file: Path, rows: list[dict[str, str]], plan: dict[str, Any] | None = None) -> None:
-    with file.open("w", newline="", encoding="utf-8") as stream:
+    with atomic_file(file) as temporary, temporary.open("w", newline="", encoding="utf-8") as stream:
         if plan is not None:
             stream.write(f"# {json.dumps(plan)}\n")
         writer = csv.DictWriter(stream, COLUMNS)

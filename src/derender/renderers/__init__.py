@@ -7,12 +7,11 @@ A name is that of a file here, with settings in parentheses, and + between those
 import importlib
 import inspect
 import re
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
-
-import yaml
 
 from derender.data import suggestion
 from derender.render import Rendering
@@ -23,6 +22,7 @@ from derender.renderers.renderer import FunctionRenderer, Renderer
 from derender.renderers.sh import sh
 from derender.renderers.shadow import lambert_shadow
 from derender.scene import Scene
+from derender.storage.bounded import parse_yaml
 from derender.storage.places import bundled_models
 
 __all__ = [
@@ -35,7 +35,7 @@ Render = Callable[[Scene, float], Rendering]
 RENDERERS: dict[str, Callable[..., Renderer]] = {
     "lambert": lambert, "lambert-shadow": lambert_shadow, "phong": phong, "sh": sh, "haze": haze,
 }  # fmt: skip
-_PART = re.compile(r"\s*(?P<name>[\w.-]+(:\w+)?)\s*(\((?P<settings>[^()]*)\))?\s*")
+_PART = re.compile(r"\s*(?P<name>\w[\w.-]*(:\w+)?)\s*(\((?P<settings>[^()]*)\))?\s*")
 
 
 def brings_code(name: str) -> bool:
@@ -103,10 +103,10 @@ def _one(name: str, settings: str | None) -> Renderer:
         if not equals or key not in known:
             has = f"it has {', '.join(known)}" if known else "it has none"
             raise ValueError(f"renderer {name!r} has no setting {key!r}{suggestion(key, known)}: {has}")
-        given[key] = yaml.safe_load(value)
+        given[key] = parse_yaml(value)
         kind = known[key].annotation
         if kind is float and type(given[key]) is int:
-            given[key] = float(given[key])
+            given[key] = float(value)  # a number too large for a float is infinite
         if type(given[key]) is not kind:
             raise ValueError(f"renderer {name!r}: {key} must be a {kind.__name__}, got {value!r}")
     return replace(make(**given), name=text)
@@ -116,6 +116,8 @@ def _imported(name: str, settings: str | None) -> Renderer:
     module, _, thing = name.partition(":")
     if settings is not None:
         raise ValueError(f"renderer {name!r} takes no settings here: set them where it is made")
+    if module.partition(".")[0] in sys.stdlib_module_names:  # a stranger's model may name any
+        raise ValueError(f"no renderer {name!r}: it names a module of Python itself")
     try:
         found = getattr(importlib.import_module(module), thing)
     except (ImportError, AttributeError) as error:

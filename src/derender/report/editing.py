@@ -81,7 +81,7 @@ class WrittenImages:
         if more := len(refused) - NAMED:
             lines += [f"and {more:,} more (--json names all)"] if more > 0 else []
         if self.before:
-            lines.append(f"{self.before:,} images were done before")
+            lines.append(f"{self.before:,} images were done before (a sheet is drawn of whole runs only)")
         if self.percentiles:
             span = _span(self.percentiles.values())
             lines.append(f"reconstructed worse than {span} % of the images this model was validated on")
@@ -126,7 +126,8 @@ def write_images(
         out: folder of the folders.
         edit: makes of an opened image what is written.
         force: replace what is there.
-        sheet: also draw a row for every image as sheet.png; by default for two images or more.
+        sheet: also draw a row for every image as sheet.png; by default for two images or more. With
+            ``resume`` none is drawn where images are left out.
         beside: images that the edit takes something from; percentiles and crops list them, too.
         resume: leave out images whose folders are there already.
         video: what is done to videos; None refuses them.
@@ -148,7 +149,7 @@ def write_images(
     if moving and video is None:
         raise ValueError(f"{moving[0]} is a video: relight, rotate or swap it")
     read, refused = readable([file for file in files if file not in moving], opener.read, progress)
-    with_sheet = len(read) > 1 if sheet is None else sheet
+    with_sheet = (len(read) > 1 if sheet is None else sheet) and len(files) == len(places)
     sheets, records = Sheets(), []
     folders = [places[path] for path in read]
     _require_free(

@@ -15,9 +15,9 @@ class SceneRanges(Settings):
     """Bounds of every scene parameter, and the field of view that all images share."""
 
     fov_deg: float = Field(default=10.0, gt=0, lt=180)
-    depth_min: float = Field(default=0.9, gt=0)
-    depth_max: float = Field(default=1.1, gt=0)
-    border_depth: float = Field(default=0.7 * 1.1 + 0.3 * 0.9, gt=0)  # held at the left and right edge
+    depth_min: float = Field(default=0.9, gt=0, le=1e6)
+    depth_max: float = Field(default=1.1, gt=0, le=1e6)
+    border_depth: float = Field(default=0.7 * 1.1 + 0.3 * 0.9, gt=0, le=1e6)  # held at the sides
     border_share: float = Field(default=2 / 64, ge=0, lt=0.5)  # of the width, each side, held at border_depth
     level_depth: bool = False  # remove each map's vertical slope: only the camera tilts; no published source
     # depth maps start out leaning back by this angle, for views from above; no published source
@@ -26,8 +26,8 @@ class SceneRanges(Settings):
     diffuse: tuple[float, float] = (0.0, 1.0)
     light_deg: float = Field(default=45.0, gt=0, lt=90)  # light pitch and yaw lie in +- this
     rotation_deg: float = Field(default=60.0, gt=0, lt=90)
-    translation_xy: float = Field(default=0.1, ge=0)
-    translation_z: float = Field(default=0.0, ge=0)
+    translation_xy: float = Field(default=0.1, ge=0, le=1e6)
+    translation_z: float = Field(default=0.0, ge=0, le=1e6)
 
     @model_validator(mode="after")
     def _ordered(self) -> "SceneRanges":
