@@ -253,13 +253,7 @@ def measured(text: str) -> str:
 def test_the_site_builds_without_a_warning(tmp_path):
     words = [
         sys.executable,
-        "-m",
-        "sphinx",
-        "-W",
-        "--keep-going",
-        "-q",
-        "-b",
-        "html",
+        *["-m", "sphinx", "-W", "--keep-going", "-q", "-b", "html"],
         str(DOCS),
         str(tmp_path),
     ]

@@ -22,30 +22,9 @@ DOCS = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "ben
 
 # A module imports only from its own stage or from stages to its left.
 STAGES = [
-    "settings",
-    "storage",
-    "scene",
-    "render",
-    "data",
-    "networks",
-    "renderers",
-    "objectives",
-    "presets",
-    "postprocess",
-    "model",
-    "training",
-    "inputs",
-    "photo",
-    "features",
-    "baselines",
-    "evaluation",
-    "speed",
-    "interpretation",
-    "report",
-    "learn",
-    "demo",
-    "cli",
-    "__main__",
+    *("settings", "storage", "scene", "render", "data", "networks", "renderers", "objectives"),
+    *("presets", "postprocess", "model", "training", "inputs", "photo", "features", "baselines"),
+    *("evaluation", "speed", "interpretation", "report", "learn", "demo", "cli", "__main__"),
 ]
 
 # Never imported by `import derender`: whatever is slow to load, or needed by one command only.
@@ -232,14 +211,8 @@ def test_the_library_never_prints():
 
 
 def test_no_file_names_a_place_on_one_machine():
-    everything = [
-        *SOURCES,
-        *TESTS,
-        *DOCS,
-        *(ROOT / "benchmarks").rglob("*.py"),
-        ROOT / "Makefile",
-        ROOT / "constraints.txt",
-    ]
+    files = (ROOT / "Makefile", ROOT / "constraints.txt")
+    everything = [*SOURCES, *TESTS, *DOCS, *(ROOT / "benchmarks").rglob("*.py"), *files]
     place = re.compile(r"(?<![\w.])/(?:home|root|Users|work|opt)/\w")
     found = [
         f"{path.relative_to(ROOT)}: {match[0]}"

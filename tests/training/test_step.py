@@ -14,7 +14,6 @@ from derender.training.step import (
     fill_uncovered,
     own_share,
     perturb_one_factor,
-    share_codes,
     training_step,
 )
 from derender.training.task import compute_step
@@ -117,15 +116,6 @@ def test_bf16_networks_leave_geometry_in_float32(model, images, generator):
 @pytest.mark.parametrize(("done", "own"), [(0, 0), (0.09, 0), (0.1, 0), (0.2, 0.5), (0.3, 1), (1, 1)])
 def test_maps_are_shared_and_then_released_along_a_line(done, own):
     assert own_share(TEMPLATE, done) == pytest.approx(own)
-
-
-def test_only_the_named_codes_move_to_their_mean(generator):
-    codes = {name: torch.randn(4, 8, generator=generator) for name in ("geometry", "light")}
-    half = share_codes(codes, ["geometry"], 0.5)
-    expected = (codes["geometry"] + codes["geometry"].mean(dim=0)) / 2
-    torch.testing.assert_close(half["geometry"], expected)
-    assert half["light"] is codes["light"]
-    assert share_codes(codes, ["geometry"], 1.0) == codes
 
 
 def test_a_shared_template_leaves_cameras_and_lights_their_own(model, images, generator):

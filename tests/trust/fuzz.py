@@ -5,8 +5,7 @@
 A reader may refuse an input with ValueError or OSError, which the command line tells in one line. Anything
 else that escapes, an input that takes longer than ``SLOW_SECONDS``, and one that makes the process ask for
 ``LARGE_BYTES`` more than before, is a finding; so is a whole file that is refused, or rubbish that is not.
-Each kind is told once, with the input; the same seed makes the same inputs again. fuzz_atheris.py looks for
-inputs by what they make the readers do.
+Each kind is told once, with the input; the same seed makes the same inputs again.
 """
 
 import argparse

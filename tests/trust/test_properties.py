@@ -1,4 +1,4 @@
-"""Laws that hold whatever the numbers are: scale, order, names, mirror images, and the way of computing."""
+"""Laws that hold whatever the numbers are: scale, order, names and mirror images."""
 
 import numpy as np
 import pytest
@@ -6,21 +6,16 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sklearn.metrics import adjusted_rand_score
-from tests.trust.apart import script
 
 from derender.evaluation.clustering_methods import clusterings
 from derender.evaluation.clustering_scores import cluster_scores
 from derender.evaluation.linear_probes import probe
 from derender.evaluation.linear_task import task_of
 from derender.model import Derenderer
-from derender.objectives.loocc import loocc_loss, nt_xent
 from derender.objectives.reconstruction import depth_curvature, depth_smoothness, masked_l1, photometric_loss
 from derender.render import render
 from derender.scene import Scene
 from derender.scene.scene import seen_in_mirror
-
-agreement = script("agreement")
-
 
 METHODS = ("ward", "finch", "k-means")
 
@@ -121,30 +116,3 @@ def test_a_model_mirrors_maps_and_nothing_else_and_twice_is_once():
         assert torch.equal(back.parameters[name], value)
         expected = value.flip(-1) if name in ("depth", "albedo") else value
         assert torch.equal(twin.parameters[name], expected)
-
-
-def test_loocc_sees_no_order_of_pictures_no_scale_and_no_side(generator):
-    one, other = (
-        {name: torch.rand(6, 4, generator=generator, dtype=torch.float64) for name in "ab"} for _ in range(2)
-    )
-    left_out = torch.tensor([0, 1, 0, 1, -1, 0])
-    plain = loocc_loss(one, other, left_out)
-    order = torch.randperm(6, generator=generator)
-    shuffled = [{name: code[order] for name, code in side.items()} for side in (one, other)]
-    torch.testing.assert_close(loocc_loss(*shuffled, left_out[order]), plain)
-    torch.testing.assert_close(loocc_loss(other, one, left_out), plain)
-    scaled = {name: 1e3 * code for name, code in one.items()}
-    torch.testing.assert_close(loocc_loss(scaled, other, left_out), plain)
-    torch.testing.assert_close(nt_xent(one["a"], 7 * other["a"], 0.5), nt_xent(one["a"], other["a"], 0.5))
-
-
-@pytest.fixture(scope="module")
-def float32_course():
-    return agreement.course(agreement.FLOAT32, 2)
-
-
-@pytest.mark.parametrize("way", [way for way in agreement.WAYS if not way.compiled], ids=lambda way: way.name)
-def test_ways_of_computing_agree_over_a_few_steps(way, float32_course):
-    """Those that the type checks of the test run allow; the script has torch.compile, too, and more steps."""
-    first, _, end = agreement.drift(agreement.course(way, 2), float32_course)
-    assert first <= way.first and end <= way.end

@@ -215,8 +215,7 @@ def _place(face: Face, frame: Frame, size: int) -> dict[str, float]:
     scale, angle = frame.side / size, radians(frame.roll_deg)
     c, s = scale * cos(angle), scale * sin(angle)
     x0, y0 = frame.corners()[0]
-    place = frame.x, frame.y, frame.side, frame.roll_deg
-    values = (face.confidence, *face.box, *place, c, -s, x0, s, c, y0)
+    values = (face.confidence, *face.box, frame.x, frame.y, frame.side, frame.roll_deg, c, -s, x0, s, c, y0)
     return {name: round(float(value), 4) for name, value in zip(COLUMNS[3:], values, strict=True)}
 
 
