@@ -106,8 +106,7 @@ def align(
     boxes, partial = cutter.out / BOXES, cutter.out / f"{BOXES}.partial"
     if boxes.exists() and not overwrite:
         raise FileExistsError(f"{boxes} exists already: choose another folder, or replace it (--force)")
-    ours = boxes.exists() or partial.exists() or not cutter.out.exists()
-    if not ours and any(not one.name.startswith(".") for one in cutter.out.iterdir()):
+    if not (boxes.exists() or partial.exists()) and any(one.name[0] != "." for one in cutter.out.glob("*")):
         raise FileExistsError(f"{cutter.out} holds other files: choose an empty or new folder")
     stream = open_images(photos, dataset=dataset, limit=limit) if not isinstance(photos, Stream) else photos
     with stream:
@@ -258,8 +257,7 @@ def _read(file: Path) -> tuple[dict[str, Any] | None, list[dict[str, str]]]:
 
 def _write(file: Path, rows: list[dict[str, str]], plan: dict[str, Any] | None = None) -> None:
     with atomic_file(file) as temporary, temporary.open("w", newline="", encoding="utf-8") as stream:
-        if plan is not None:
-            stream.write(f"# {json.dumps(plan)}\n")
+        stream.write("" if plan is None else f"# {json.dumps(plan)}\n")
         writer = csv.DictWriter(stream, COLUMNS)
         writer.writeheader()
         writer.writerows(rows)
