@@ -68,7 +68,7 @@ def test_ctrl_c_leaves_only_what_the_next_run_goes_on_with(tiny, tmp_path, capsy
     before = set(tmp_path.iterdir())
     capsys.readouterr()
     assert embed(tiny, data, out) == 130
-    kept = f"8 rows are kept in {out}.partial: the same command goes on from there"
+    kept = f"8 rows are kept in {out}.partial: the same command continues from there"
     assert capsys.readouterr().err.strip().endswith(kept)
     assert set(tmp_path.iterdir()) - before == {tmp_path / "f.parquet.partial"}
     assert embed(tiny, data, out, "--limit", "12") == 2

@@ -183,7 +183,7 @@ def test_a_set_is_written_as_a_stream_is(model, source, tmp_path, out):
     images = read_images(source, 8)
     part = images.select(np.arange(len(images)) % 2 == 0)
     expected = FeatureTable.read(embed_image_set(model, part, batch_size=16).write(tmp_path / "m.parquet"))
-    with pytest.raises(KeyboardInterrupt, match="the same command goes on"):
+    with pytest.raises(KeyboardInterrupt, match="the same command continues"):
         embed_to_file(part, model, out, batch_size=16, progress=stop_after(30))
     assert embed_to_file(part, model, out, batch_size=16).resumed == 32
     assert_same(out, expected)

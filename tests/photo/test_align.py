@@ -85,7 +85,7 @@ def test_a_stopped_run_goes_on_and_a_finished_one_is_kept(photos, tmp_path, caps
         if (error := next(stops)) is not None:
             raise error
 
-    with pytest.raises(KeyboardInterrupt, match="the same command goes on"):
+    with pytest.raises(KeyboardInterrupt, match="the same command continues"):
         derender.align(photos, tmp_path / "a", progress=stop)
     with pytest.raises(ValueError, match="other options"):
         derender.align(photos, tmp_path / "a", size=64)

@@ -330,7 +330,7 @@ def stored_config(run: Path, name: str) -> Any:
     """The settings of a run to go on with, which has to be of ``name`` ("derender": of any)."""
     config = read_any_config(run)
     if isinstance(config, configs.FinetuneConfig):
-        raise ValueError(f"{run} was made by derender finetune: go on with derender finetune --resume")
+        raise ValueError(f"{run} was made by derender finetune: continue with derender finetune --resume")
     trained = getattr(config, "baseline", "derender")
     if name not in ("derender", trained):
         raise ValueError(f"{run} trained {trained}, not {name}: give model {trained} or another folder")

@@ -24,7 +24,7 @@ def align(
     """Find every face of photographs, and write it upright and centred, as models of faces take it.
 
     boxes.csv names each box, rejected ones with the reason, and the transform from the crop's pixels to the
-    photograph's. A run that was stopped goes on when the command is given again.
+    photograph's. A stopped run continues when the command is given again.
     """
     import derender
 

@@ -46,8 +46,8 @@ def embed(
 ) -> None:  # fmt: skip
     """Write a feature table: file, one list column per factor, and the labels of the data set.
 
-    Images are read, embedded and written as they come, so memory does not grow with their number. A run that
-    was stopped goes on where it was when the command is given again.
+    Images are read, embedded and written as they come, so memory does not grow with their number. A stopped
+    run continues where it was when the command is given again.
     """
     refuse_existing_file(out, output.force)
     import derender

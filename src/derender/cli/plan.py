@@ -31,7 +31,7 @@ class Planned:
 
 
 def by_plan(planned: Planned, device: str, json_file: str | None) -> None:
-    """Do a plan, or go on with it, and show the one table of each protocol."""
+    """Do a plan, or continue it, and show the one table of each protocol."""
     from derender import learn
     from derender.learn.jobs import Comparison, jobs_of
     from derender.learn.plan import read_plan
@@ -55,7 +55,7 @@ def by_plan(planned: Planned, device: str, json_file: str | None) -> None:
         for sentence in found.values[state]:
             notice(f"{state}: {sentence}")
     if found.values["missing"]:
-        notice("the budget is used; the same command goes on where it stopped")
+        notice("the budget is used; the same command continues where it stopped")
     for written in found.values["files"]:
         result(str(written), json_file)
     write_json(json_file, found.values)

@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from derender.data import ImageSet
     from derender.training import Progress, TrainResult
 
-OUT = "Run folder to make, or to go on with."
+OUT = "Run folder to make or to continue."
 OutRun = Annotated[Path, typer.Option("--out", "-o", help=OUT, metavar="RUN")]
-Resume = Annotated[bool, typer.Option("--resume", help="Go on with the run in --out.")]
+Resume = Annotated[bool, typer.Option("--resume", help="Continue the run in --out.")]
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Show all settings and stop.")]
 PHASES = {
     "reading": ("reading", "images"),

@@ -227,7 +227,7 @@ def _compute(
         elif isinstance(stopped, KeyboardInterrupt):
             raise KeyboardInterrupt(
                 f"stopped by Ctrl-C; {parts.rows:,} rows are kept in {parts.folder}: "
-                "the same command goes on from there"
+                "the same command continues from there"
             ) from stopped
         raise
     if progress is not None:

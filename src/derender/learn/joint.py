@@ -51,7 +51,7 @@ def finetune_settings(
             )
         config = read_any_config(Path(out))
         if not isinstance(config, FinetuneConfig):
-            raise ValueError(f"{out} was made by derender train: go on with derender train --resume")
+            raise ValueError(f"{out} was made by derender train: continue with derender train --resume")
         given = {name: value for name, value in names.items() if name not in ("out", "resume") and value}
         with suppress(ValueError):
             labels = config.target.labels if attributes else None

@@ -96,7 +96,7 @@ def compare_plan(
             f"another derender compare works in {out}: wait for it, or choose another folder"
         ) from error
     except KeyboardInterrupt as stop:
-        raise KeyboardInterrupt("stopped and saved; the same command goes on where it stopped") from stop
+        raise KeyboardInterrupt("stopped and saved; the same command continues where it stopped") from stop
     return write_outcome(at, {job: notes[job] for job in jobs})
 
 

@@ -137,7 +137,7 @@ def align(
         except KeyboardInterrupt as stopped:
             count = len({row["photo"] for row in rows})
             raise KeyboardInterrupt(
-                f"stopped by Ctrl-C; {count:,} photographs are done: the same command goes on"
+                f"stopped by Ctrl-C; {count:,} photographs are done: the same command continues"
             ) from stopped
     done = Aligned(cutter.out, rows, len(finished))
     if done.counts["unreadable"] == done.counts["photographs"]:

@@ -124,7 +124,7 @@ def _failures(run: RunFolder, config: Any, metrics: Metrics) -> list[str]:
     lines = []
     seen, planned = (metrics[-1]["images"] if metrics else 0), getattr(config, "images", 0)
     if seen < planned:
-        why = "the run was stopped (time limit, patience, watcher or Ctrl-C), or goes on."
+        why = "the run was stopped (time limit, patience, watcher or Ctrl-C), or is running."
         lines.append(f"{seen:,} of {planned:,} planned images were seen: {why}")
     if not run.model.exists():
         lines.append("There is no saved model: no validation was reached.")

@@ -174,7 +174,7 @@ class _Run:
                 if interrupted and stopped is None:
                     self.close()
                     raise TrainingInterrupted(
-                        f"stopped after {state.images:,} images and saved; the same with --resume goes on"
+                        f"stopped after {state.images:,} images and saved; the same with --resume continues"
                     )
         if stopped == "collapse":
             self.log("collapse", {finding.sign: finding.text for finding in self.findings})

@@ -134,7 +134,7 @@ def test_the_budget_ends_a_training_and_leaves_tables(plan, whole, monkeypatch, 
         patch.setattr(time, "time", lambda: now[0])
         assert main([*words, "--minutes", "1.5"]) == 0
     said = capsys.readouterr().err
-    assert "the budget is used; the same command goes on where it stopped" in said
+    assert "the budget is used; the same command continues where it stopped" in said
     assert run_progress(out / "runs" / "colours" / "ae")["images"] == 32
     assert "missing: train ae on colours: the budget was used before it was done (32 of 64" in said
     told = json.loads((out / "clustering.json").read_text())
