@@ -53,7 +53,9 @@ def test_from_a_run_to_features_and_scores(begun, faces, tmp_path, capsys, refus
     assert json.loads(shown.out)["scores"] == told
     assert run(*words, "--resume") == 0
     assert "leave out weight" in refused("finetune", "-d", faces, "--out", out, "--resume", "--weight", 3)
-    assert "continue with derender finetune --resume" in refused("train", "-d", faces, "--out", out, "--resume")
+    assert "continue with derender finetune --resume" in refused(
+        "train", "-d", faces, "--out", out, "--resume"
+    )
     assert "continue with derender train --resume" in refused(
         "finetune", "-d", faces, "--out", begun, "--resume"
     )

@@ -74,8 +74,7 @@ def refuse_taken(path: Path) -> None:
         empty = entry.name == "samples" and entry.is_dir() and not any(entry.iterdir())
         if not empty and not entry.name.startswith(_BEGUN):
             raise FileExistsError(
-                f"{path} exists and is not empty: add --resume to continue that run, "
-                "or choose another --out"
+                f"{path} exists and is not empty: add --resume to continue that run, or choose another --out"
             )
 
 
