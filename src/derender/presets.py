@@ -27,6 +27,11 @@ class ModelSettings(Settings):
     renderer: str = Field(default="lambert", max_length=200)  # by name (renderers/): its factors are learnt
     brightness: BrightnessPrior | None = None  # estimated after training; `decompose` applies it
 
+    def grown(self, image_size: int) -> "ModelSettings":
+        """The settings of such a model after growing to a larger image size."""
+        sizes = {"image_size": image_size, "grown_from": self.network.encoded_size}
+        return self.model_copy(update={"network": NetworkSettings(**{**self.network.model_dump(), **sizes})})
+
     def description(self) -> str:
         """Two sentences for a model's card: what such a model does, its sizes and ranges."""
         network, ranges = self.network, self.ranges

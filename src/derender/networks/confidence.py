@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
-from derender.networks.decoders import NarrowConv2d, doubling
+from derender.networks.decoders import NarrowConv2d, doubled, doubling
 from derender.networks.encoders import Encoder, NetworkSettings
 
 
@@ -44,9 +44,12 @@ class ConfidenceNet(nn.Module):
             *doubling(previous, width), *doubling(width, width), NarrowConv2d(width, 2)
         )
         self.perceptual_head = nn.Conv2d(previous, 2, 3, padding=1, bias=False)
+        self.doublings = settings.doublings
 
     def forward(self, images: Float[Tensor, "n 3 h w"]) -> Confidence:
         trunk = self.trunk(self.encoder(images)[:, :, None, None])
-        photometric = softplus(self.photometric_head(trunk).float())
-        perceptual = softplus(self.perceptual_head(trunk).float())
+        maps = [self.photometric_head(trunk).float(), self.perceptual_head(trunk).float()]
+        for _ in range(self.doublings):
+            maps = [doubled(one, "smooth") for one in maps]
+        photometric, perceptual = map(softplus, maps)
         return Confidence(photometric[:, :1], photometric[:, 1:], perceptual[:, :1], perceptual[:, 1:])

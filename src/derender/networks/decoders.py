@@ -6,6 +6,7 @@ convolution is linear in its kernel, so kernels can be combined or shifted befor
 """
 
 from itertools import pairwise
+from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -13,6 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from derender.networks.encoders import NetworkSettings, NormReLU, stage_widths
+from derender.scene.enlarge import cubic_weights
 
 
 class MapDecoder(nn.Module):
@@ -31,9 +33,41 @@ class MapDecoder(nn.Module):
         layers += [nn.Conv2d(last, last, 5, padding=2, bias=False), NormReLU(last)]
         self.layers = nn.Sequential(*layers)
         self.last = NarrowConv2d(last, channels)
+        self.growth = nn.ModuleList(Growth(last, channels) for _ in range(settings.doublings))
 
     def forward(self, code: Float[Tensor, "n code"]) -> Float[Tensor, "n channels h w"]:
-        return self.last(self.layers(code[:, :, None, None]))
+        features = self.layers(code[:, :, None, None])
+        maps = self.last(features)
+        for growth in self.growth:
+            features, maps = growth(features, maps)
+        return maps
+
+
+class Growth(nn.Module):
+    """A map at twice its size, and what further features add to it: nothing before they are trained.
+
+    Source: progressive growing (Karras et al., ICLR 2018), as a residual instead of a fade.
+    """
+
+    def __init__(self, width: int, channels: int):
+        super().__init__()
+        self.layers = nn.Sequential(UpsampledConv2d(width, width), NormReLU(width))
+        self.last = NarrowConv2d(width, channels)
+        nn.init.zeros_(self.last.weight)
+
+    def forward(
+        self, features: Float[Tensor, "n width h w"], maps: Float[Tensor, "n channels h w"]
+    ) -> tuple[Float[Tensor, "n width h2 w2"], Float[Tensor, "n channels h2 w2"]]:
+        features = self.layers(features)
+        return features, doubled(maps, "smooth" if maps.shape[1] == 1 else "sharp") + self.last(features)
+
+
+def doubled(maps: Float[Tensor, "n c h w"], kind: Literal["smooth", "sharp"]) -> Float[Tensor, "n c h2 w2"]:
+    """Square maps at twice their size along cubic splines; 2x2 pixels lie where one was."""
+    side = maps.shape[-1]
+    places = (torch.arange(2 * side, dtype=torch.float64) - 0.5) / 2
+    weights = cubic_weights(places, side, kind).to(maps)
+    return weights @ maps @ weights.T
 
 
 class VectorDecoder(nn.Module):

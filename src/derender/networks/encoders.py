@@ -8,7 +8,7 @@ from typing import Literal
 
 import torch
 from jaxtyping import Float
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 from torch import Tensor, nn
 from torch.nn.functional import adaptive_avg_pool2d, leaky_relu
 
@@ -30,9 +30,12 @@ class NetworkSettings(Settings):
 
     Geometry and albedo start at ``width`` channels, light and camera at ``light_width``, and double to 8x
     that. ``unet_decoder`` adds a decoder over the U-Nets of geometry and albedo (``derender unet``).
+    Networks that were ``grown_from`` a smaller image size encode images reduced to it, and their decoders of
+    maps end in further doublings.
     """
 
     image_size: int = 64
+    grown_from: int | None = None
     width: int = Field(default=64, ge=4, le=LARGEST, multiple_of=4)
     light_width: int = Field(default=32, ge=1, le=LARGEST)
     code_size: int = Field(default=256, ge=1, le=LARGEST)
@@ -48,10 +51,34 @@ class NetworkSettings(Settings):
             raise ValueError(f"image_size must be one of {', '.join(map(str, IMAGE_SIZES))}, got {value}")
         return value
 
+    @model_validator(mode="after")
+    def _grown(self) -> "NetworkSettings":
+        if (
+            self.grown_from is not None
+            and self.grown_from not in IMAGE_SIZES[: IMAGE_SIZES.index(self.image_size)]
+        ):
+            raise ValueError(
+                f"grown_from must be an image size below {self.image_size}, one of "
+                f"{', '.join(map(str, IMAGE_SIZES))}, got {self.grown_from}"
+            )
+        if self.grown_from is not None and self.encoder == "unet":
+            raise ValueError("U-Net encoders cannot grow: train them at the image size that is needed")
+        return self
+
+    @property
+    def encoded_size(self) -> int:
+        """Side in pixels at which images are encoded."""
+        return self.grown_from or self.image_size
+
+    @property
+    def doublings(self) -> int:
+        """How many doublings take maps of the encoded size to the image size."""
+        return (self.image_size // self.encoded_size).bit_length() - 1
+
     @property
     def stages(self) -> int:
-        """How many halvings take an image to 4x4 pixels."""
-        return self.image_size.bit_length() - 3
+        """How many halvings take an encoded image to 4x4 pixels."""
+        return self.encoded_size.bit_length() - 3
 
 
 def stage_widths(first: int, stages: int) -> list[int]:
@@ -62,6 +89,12 @@ def stage_widths(first: int, stages: int) -> list[int]:
 def unet_widths(settings: NetworkSettings) -> list[int]:
     """Channels at each level of a U-Net, finest first, doubling down to 4x4 pixels."""
     return [settings.unet_width * 2**level for level in range(settings.stages + 1)]
+
+
+def reduced(images: Images, settings: NetworkSettings) -> Float[Tensor, "n 3 side side"]:
+    """Images at the size at which they are encoded: averages of blocks of pixels, or as they are."""
+    side = settings.encoded_size
+    return adaptive_avg_pool2d(images, side) if images.shape[-1] > side else images
 
 
 class NormReLU(nn.GroupNorm):
@@ -102,10 +135,10 @@ class Encoder(nn.Module):
             layers.append(NormReLU(channels, slope=0.2) if normalised and not last else rectifier)
         self.convolutions = nn.Sequential(*layers)
         self.to_code = nn.Sequential(nn.Conv2d(widths[-1], code_size, 4, bias=False), nn.ReLU())
-        self.code_size = code_size
+        self.code_size, self.settings = code_size, settings
 
     def spatial(self, images: Images) -> Spatial:
-        return self.convolutions(images * 2 - 1)
+        return self.convolutions(reduced(images, self.settings) * 2 - 1)
 
     def forward(self, images: Images) -> Code:
         return self.to_code(self.spatial(images)).flatten(1)

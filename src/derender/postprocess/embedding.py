@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from derender.data import GivenImages, as_batch, check_images
 from derender.networks import Factor
+from derender.networks.encoders import reduced
 from derender.postprocess.features import Features
 from derender.postprocess.fitting import STEPS, Fitted, coordinates_of
 from derender.postprocess.gradients import gradient_directions
@@ -115,7 +116,7 @@ class EmbeddingModel(nn.Module):
 
         ``gradients``: followed by `gradient_directions`; by default where ``features`` take them.
         """
-        parts = []
+        parts, images = [], reduced(images, self.settings.network)
         for one in (images, images.flip(-1)) if self.features.mirrors(name) else (images,):
             parts.append(self.nets[name].activations(one))  # type: ignore[operator]
             if self.whitening is not None and name in self.whitening.names and gradients is None:

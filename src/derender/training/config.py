@@ -137,6 +137,7 @@ class TrainConfig(LoopSettings):
 
     preset: str = "faces"
     start_from: str | None = None  # a trained model whose weights the run begins with
+    maps_only: bool = False  # train decoders of maps and the confidence net: features stay the start's
     geometry_start: float = Field(default=GEOMETRY_START, gt=0)  # last layer's first weights; 1 in the paper
     accumulate: int = Field(default=1, ge=1)  # chunks of a batch: less memory, same losses, slower
     model: ModelSettings = ModelSettings()
@@ -156,6 +157,8 @@ class TrainConfig(LoopSettings):
     def features(self) -> FeatureSettings:
         """How features are estimated once training has ended."""
         how = {name: getattr(self, name) for name in ("whitening", "fitting", "brightness")}
+        if self.maps_only:  # activations are those of the start
+            how["whitening"] = self.whitening.model_copy(update={"pictures": 0})
         return FeatureSettings(perturb=self.objective.perturb, **how)
 
 
@@ -227,7 +230,7 @@ def resolve(preset: str, overrides: Iterable[str] = (), **explicit: Any) -> Trai
     Keys are dotted (``optimiser.learning_rate``); a unique last part may stand alone. Values are read as
     YAML. In ``explicit`` dots are written as double underscores and None means not given. With ``start_from``
     the model has that model's settings (without a U-Net decoder) instead of the preset's, before overrides
-    change them.
+    change them; of a larger ``image_size`` than its own it is grown (``maps_only``).
 
     Raises:
         ValueError: unknown preset, renderer, factor or key (names the nearest), or a value that does not fit.
@@ -239,7 +242,11 @@ def resolve(preset: str, overrides: Iterable[str] = (), **explicit: Any) -> Trai
         model = load(config.start_from).settings
         network = model.network.model_copy(update={"unet_decoder": False})
         model = model.model_copy(update={"network": network, "brightness": None})
-        config = with_changes(row.model_copy(update={"model": model}), overrides, **explicit)
+        row = row.model_copy(update={"model": model})
+        config = with_changes(row, overrides, **explicit)
+        if (size := config.model.network.image_size) > network.image_size:
+            row = row.model_copy(update={"model": model.grown(size), "maps_only": True})
+            config = with_changes(row, overrides, **explicit)
         if config.model.renderer != model.renderer:
             raise ValueError(
                 f"cannot start from {config.start_from}: it was made with the renderer {model.renderer!r}, "

@@ -18,7 +18,9 @@ from derender.networks.factors import GEOMETRY_START
 from derender.objectives import load_vgg16
 from derender.objectives.perceptual import build_perceptual
 from derender.objectives.perceptual_features import PerceptualFeatures
-from derender.objectives.self_features import SelfFeatures, load_self_features
+from derender.objectives.self_features import load_self_features, train_self_features
+from derender.postprocess import Features
+from derender.postprocess.whitening import Whitening
 from derender.storage.atomic import DamageNoticed, atomic_file
 from derender.storage.folder import write_config
 from derender.training.batches import some_of
@@ -46,7 +48,10 @@ def train(
     held-out images from time to time.
     """
     report, folder = progress or (lambda _: None), RunFolder(Path(out))
-    task = DerenderTask(config, begins=not (resume and folder.resumable))
+    begins = not (resume and folder.resumable)
+    start = config.start_from if begins else folder.model  # a resumed run needs the start no more
+    kept = load(start).whitening if config.maps_only and start is not None else None
+    task = DerenderTask(config, begins, whitening=kept)
     with locked(folder.path):
         result = train_task(task, images, out, resume=resume, progress=report, accelerator=accelerator, **how)
         if this_rank_writes() and result.stopped != "collapse":
@@ -74,11 +79,12 @@ def _add_features(
 
 @dataclass(frozen=True)
 class DerenderTask(TrainingTask):
-    """Train a `Derenderer` as configured; ``begins`` is false where a checkpoint gives the weights."""
+    """Train a `Derenderer`, its features kept; ``begins`` is false where a checkpoint gives the weights."""
 
     config: TrainConfig
     begins: bool = True
     ranks: Ranks = ALONE
+    whitening: Whitening | None = None
     outside_loss: tuple[str, ...] = NOT_RECONSTRUCTION
 
     def shared(self, ranks: Ranks) -> "DerenderTask":
@@ -96,19 +102,23 @@ class DerenderTask(TrainingTask):
         A FileNotFoundError: there is no such model; a ValueError: its weights do not fit, names the first.
         """
         model, start = Derenderer.seeded(self.config.model, self.config.seed), self.config.start_from
+        for factor in model.factors if self.config.maps_only else ():
+            net: Any = model.nets[factor.name]
+            (net.encoder if factor.mirrored else net).requires_grad_(False)
         if self.config.geometry_start != GEOMETRY_START:
             decoder: Any = model.nets["geometry"].decoder
             with torch.no_grad():
                 decoder.last.weight.mul_(self.config.geometry_start / GEOMETRY_START)
         if start is not None and self.begins:
             try:
-                weights = load(start).state_dict()
+                weights = {k: v for k, v in model.state_dict().items() if ".growth." in k}
+                weights |= load(start).state_dict()
                 fit_weights(model, {k: v for k, v in weights.items() if not k.startswith("unet_decoder.")})
             except ValueError as error:
                 raise ValueError(
                     f"cannot start from {start}: {error}; leave its network settings as they are"
                 ) from error
-        return model
+        return model.with_features(Features(self.whitening))
 
     def step_module(
         self, model: nn.Module, run: RunFolder, images: UInt8[Tensor, "n 3 h w"], progress: PhaseProgress
@@ -155,11 +165,10 @@ def self_features_of(
             warnings.warn(
                 f"{problem}: they are learnt again, from the same seed", DamageNoticed, stacklevel=2
             )
-    features = build_perceptual(
-        "self", images, seed=seed, steps=steps, progress=lambda done, total, _: progress(done, total),
+    features = train_self_features(
+        images, seed=seed, steps=steps, progress=lambda done, total, _: progress(done, total),
         device=images.device,
     )  # fmt: skip
-    assert isinstance(features, SelfFeatures)
     with atomic_file(file) as temporary:
         features.save(temporary)
     return features

@@ -105,10 +105,11 @@ def training_step(
         terms["perceptual_flip"] = part * objective.perceptual_weight * objective.flip_weight * twin_term
     ranges = model.settings.ranges
     inside = ranges.depth_max - ranges.depth_min, ranges.border_columns(model.image_size)
+    finer = 2**model.settings.network.doublings  # differences between pixels are of the encoded size
     if objective.smoothness_weight > 0:
-        terms["smoothness"] = objective.smoothness_weight * depth_smoothness(scene.depth, *inside)
+        terms["smoothness"] = finer * objective.smoothness_weight * depth_smoothness(scene.depth, *inside)
     if objective.curvature_weight > 0:
-        terms["curvature"] = objective.curvature_weight * depth_curvature(scene.depth, *inside)
+        terms["curvature"] = finer**2 * objective.curvature_weight * depth_curvature(scene.depth, *inside)
     if model.renderer.penalty is not None:
         terms["penalty"] = model.renderer.penalty(scene, model.renderer.shading(scene, model.fov_deg))
     if left_out is not None:
