@@ -90,7 +90,7 @@ def test_sizes_that_cannot_be_grown_from_and_settings_without_growth():
     for wrong in ({"grown_from": 64}, {"grown_from": 128}, {"grown_from": 48}):
         with pytest.raises(ValueError, match="grown_from must be an image size below 64"):
             NetworkSettings(**wrong)
-    with pytest.raises(ValueError, match="U-Net encoders cannot grow"):
+    with pytest.raises(ValueError, match="and the encoder conv, got 64 and unet"):
         NetworkSettings(image_size=128, grown_from=64, encoder="unet")
     config = json.loads((derender.storage.places.PRETRAINED / "cars-64" / "config.json").read_text())
     assert NetworkSettings(**config["settings"]["network"]).doublings == 0
@@ -99,7 +99,7 @@ def test_sizes_that_cannot_be_grown_from_and_settings_without_growth():
 
 
 def test_curvature_of_the_same_surface_costs_the_same_after_growth():
-    from derender.networks.decoders import doubled
+    from derender.scene.enlarge import doubled
     from derender.objectives.reconstruction import depth_curvature
 
     rows = torch.linspace(-1, 1, 32)

@@ -9,8 +9,9 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
-from derender.networks.decoders import NarrowConv2d, doubled, doubling
+from derender.networks.decoders import NarrowConv2d, doubling
 from derender.networks.encoders import Encoder, NetworkSettings
+from derender.scene.enlarge import doubled
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,6 @@ convolution is linear in its kernel, so kernels can be combined or shifted befor
 """
 
 from itertools import pairwise
-from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -14,7 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from derender.networks.encoders import NetworkSettings, NormReLU, stage_widths
-from derender.scene.enlarge import cubic_weights
+from derender.scene.enlarge import doubled
 
 
 class MapDecoder(nn.Module):
@@ -60,14 +59,6 @@ class Growth(nn.Module):
     ) -> tuple[Float[Tensor, "n width h2 w2"], Float[Tensor, "n channels h2 w2"]]:
         features = self.layers(features)
         return features, doubled(maps, "smooth" if maps.shape[1] == 1 else "sharp") + self.last(features)
-
-
-def doubled(maps: Float[Tensor, "n c h w"], kind: Literal["smooth", "sharp"]) -> Float[Tensor, "n c h2 w2"]:
-    """Square maps at twice their size along cubic splines; 2x2 pixels lie where one was."""
-    side = maps.shape[-1]
-    places = (torch.arange(2 * side, dtype=torch.float64) - 0.5) / 2
-    weights = cubic_weights(places, side, kind).to(maps)
-    return weights @ maps @ weights.T
 
 
 class VectorDecoder(nn.Module):

@@ -53,16 +53,12 @@ class NetworkSettings(Settings):
 
     @model_validator(mode="after")
     def _grown(self) -> "NetworkSettings":
-        if (
-            self.grown_from is not None
-            and self.grown_from not in IMAGE_SIZES[: IMAGE_SIZES.index(self.image_size)]
-        ):
+        smaller = IMAGE_SIZES[: IMAGE_SIZES.index(self.image_size)]
+        if self.grown_from is not None and (self.grown_from not in smaller or self.encoder == "unet"):
             raise ValueError(
-                f"grown_from must be an image size below {self.image_size}, one of "
-                f"{', '.join(map(str, IMAGE_SIZES))}, got {self.grown_from}"
+                f"grown_from must be an image size below {self.image_size} and the encoder conv, got "
+                f"{self.grown_from} and {self.encoder}"
             )
-        if self.grown_from is not None and self.encoder == "unet":
-            raise ValueError("U-Net encoders cannot grow: train them at the image size that is needed")
         return self
 
     @property

@@ -33,6 +33,13 @@ def at_size(scene: Scene, size: int) -> Scene:
     return scene.with_parameters(depth=depth, albedo=albedo.clamp(0, 1))
 
 
+def doubled(maps: Float[Tensor, "n c h w"], kind: Literal["smooth", "sharp"]) -> Float[Tensor, "n c h2 w2"]:
+    """Square maps at twice their size along such splines; 2x2 pixels lie where one was."""
+    places = torch.arange(2 * maps.shape[-1], dtype=torch.float64) / 2 - 0.25
+    weights = cubic_weights(places, maps.shape[-1], kind).to(maps)
+    return weights @ maps @ weights.T
+
+
 def cubic_weights(
     places: Float[Tensor, " size"], count: int, kind: Literal["smooth", "sharp"]
 ) -> Float[Tensor, "size count"]:

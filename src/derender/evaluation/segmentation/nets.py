@@ -17,20 +17,24 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from pydantic import Field
-from torch import nn
+from torch import Tensor, nn
 from torch.nn.functional import cross_entropy
 from torch.optim.swa_utils import update_bn
 
 from derender.data import as_float, suggestion
 from derender.evaluation.segmentation.data import SegmentationData
 from derender.networks.encoders import UNetEncoder
-from derender.networks.unet import SegmentationNet
+from derender.networks.unet import UNetDecoder
 from derender.settings import Settings
 from derender.training.process import freed_memory_kept
 
 LARGEST_BATCH, SMALLEST_BATCH, STEPS_AN_EPOCH = 64, 2, 320
 STATISTICS_IMAGES = 512
+
+LEVELS_KEPT = 2
+"""Levels, finest first, whose BatchNorm keeps its statistics in encoders and a decoder trained together."""
 
 
 @dataclass(frozen=True)
@@ -101,6 +105,58 @@ def chosen_variants(model: Any, names: Sequence[str] | None = None) -> dict[str,
     if any(variant.decoder for variant in chosen.values()) and not own_decoder:
         raise ValueError("the model has no U-Net decoder: make a copy that has with derender unet")
     return chosen
+
+
+class SegmentationNet(nn.Module):
+    """Images in 0..1 to one logit a class and pixel, from U-Net encoders and a decoder over all of them.
+
+    ``frozen`` encoders never change. With ``kept_statistics`` their BatchNorm keeps its statistics in
+    training, too; beside a learnt ``decoder``, of which all but the last layer is taken, that of the two
+    finest levels of either.
+    """
+
+    def __init__(
+        self,
+        encoders: Sequence[UNetEncoder],
+        outputs: int,
+        *,
+        frozen: bool = False,
+        kept_statistics: bool = False,
+        decoder: UNetDecoder | None = None,
+    ):
+        super().__init__()
+        widths = {tuple(encoder.widths) for encoder in encoders}
+        if len(widths) != 1:
+            raise ValueError(
+                f"encoders of one net have the same widths, got {sorted(widths) or 'no encoder'}"
+            )
+        self.encoders = nn.ModuleList(encoders).requires_grad_(not frozen)
+        for encoder in encoders:
+            encoder.to_code.requires_grad_(False)  # the code takes no part here
+        if decoder is None:
+            self.decoder = UNetDecoder(widths.pop(), len(encoders), outputs)
+        else:
+            self.decoder = copy.deepcopy(decoder).requires_grad_(True)
+            last = decoder.to_outputs
+            self.decoder.to_outputs = nn.Conv2d(last.in_channels, outputs, 1, device=last.weight.device)
+        self.frozen, self.kept_statistics = frozen, frozen or kept_statistics
+        self._fixed: list[nn.Module] = []  # parts whose BatchNorm keeps its statistics
+        if self.kept_statistics:
+            finest = [encoder.levels[:LEVELS_KEPT] for encoder in encoders]
+            self._fixed += [self.encoders] if frozen or decoder is None else finest
+            self._fixed += [] if decoder is None else [self.decoder.convolve[-LEVELS_KEPT:]]
+
+    def train(self, mode: bool = True) -> "SegmentationNet":
+        super().train(mode)
+        for part in self._fixed:
+            part.eval()
+        return self
+
+    def forward(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n outputs h w"]:
+        with torch.set_grad_enabled(torch.is_grad_enabled() and not self.frozen):
+            levels = zip(*(encoder.skips(images) for encoder in self.encoders), strict=True)  # type: ignore[operator]
+            joined = [torch.cat(level, dim=1) for level in levels]
+        return self.decoder(joined)
 
 
 def build_variant(model: Any, variant: Variant, data: SegmentationData, seed: int) -> SegmentationNet:
