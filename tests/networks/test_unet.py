@@ -5,9 +5,10 @@ import copy
 import pytest
 import torch
 
+from derender.evaluation.segmentation.nets import SegmentationNet
 from derender.networks import NetworkSettings
 from derender.networks.encoders import UNetEncoder
-from derender.networks.unet import SegmentationNet, UNetDecoder, pixel_decoder
+from derender.networks.unet import UNetDecoder, pixel_decoder
 
 WIDTH, CLASSES = 4, 5
 

@@ -99,8 +99,8 @@ def test_sizes_that_cannot_be_grown_from_and_settings_without_growth():
 
 
 def test_curvature_of_the_same_surface_costs_the_same_after_growth():
-    from derender.scene.enlarge import doubled
     from derender.objectives.reconstruction import depth_curvature
+    from derender.scene.enlarge import doubled
 
     rows = torch.linspace(-1, 1, 32)
     bowl = 1 + 0.05 * (rows[:, None] ** 2 + rows**2)[None]
