@@ -28,15 +28,13 @@ def at_size(scene: Scene, size: int) -> Scene:
         return scene
     places = torch.linspace(0, width - 1, size, dtype=torch.float64)
     smooth, sharp = (cubic_weights(places, width, kind).to(scene.depth) for kind in ("smooth", "sharp"))
-    depth = smooth @ scene.depth @ smooth.T
-    albedo = sharp @ scene.albedo @ sharp.T
-    return scene.with_parameters(depth=depth, albedo=albedo.clamp(0, 1))
+    albedo = (sharp @ scene.albedo @ sharp.T).clamp(0, 1)
+    return scene.with_parameters(depth=smooth @ scene.depth @ smooth.T, albedo=albedo)
 
 
 def doubled(maps: Float[Tensor, "n c h w"], kind: Literal["smooth", "sharp"]) -> Float[Tensor, "n c h2 w2"]:
     """Square maps at twice their size along such splines; 2x2 pixels lie where one was."""
-    places = torch.arange(2 * maps.shape[-1], dtype=torch.float64) / 2 - 0.25
-    weights = cubic_weights(places, maps.shape[-1], kind).to(maps)
+    weights = cubic_weights(torch.arange(2 * maps.shape[-1]) / 2 - 0.25, maps.shape[-1], kind).to(maps)
     return weights @ maps @ weights.T
 
 
