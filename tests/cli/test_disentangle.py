@@ -3,7 +3,6 @@
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 import pytest
 from PIL import Image
 
@@ -21,15 +20,9 @@ def model(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory):
-    """Generated faces, in memory."""
-    return faces.generate(24, SIZE, 0)
-
-
-@pytest.fixture(scope="module")
-def rendered(tmp_path_factory, made) -> Path:
+def rendered(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("disentangle") / "faces"
-    write(made, folder)
+    write(faces.generate(24, SIZE, 0), folder)
     return folder
 
 
@@ -67,38 +60,21 @@ def test_bad_words(model, rendered, tmp_path, refused):
     assert "needs 20 images or more" in refused("--limit", "5")
 
 
-def test_geometry_of_pictures_beside_depth_maps(model, made, tmp_path, numbers):
-    """unsup3d's layout, written here at twice the model's size: scores as for the same maps in our own."""
-    folder = tmp_path / "pairs" / "test"
-    for kind in ("image", "depth"):
-        (folder / kind).mkdir(parents=True)
-    code = np.where(made.mask, np.clip((1.1 - made.depth) / 0.2, 1 / 65_535, 1) * 65_535, 0)
-    for row in range(6):
-        picture = Image.fromarray(made.images[row].transpose(1, 2, 0))
-        picture.resize((2 * SIZE, 2 * SIZE), Image.Resampling.NEAREST).save(folder / f"image/{row}_image.png")
-        depth = code[row].round().astype(np.uint16).repeat(2, axis=0).repeat(2, axis=1)
-        Image.fromarray(depth).save(folder / f"depth/{row}_depth.png")
-    results = []
-    own = tmp_path / "own"
-    write(made, own)
-    for data in (tmp_path / "pairs", own):
-        words = ["evaluate", "geometry", "-m", model, "-d", data, "--limit", "6"]
-        words += ["--cache", tmp_path / "cache", "--resamples", "50"]
-        results.append(numbers(*words)[0])
+def test_geometry_beside_controls_with_intervals(model, rendered, tmp_path, numbers):
+    words = ["evaluate", "geometry", "-m", model, "-d", rendered, "--limit", "6"]
+    words += ["--cache", tmp_path / "cache", "--resamples", "50"]
+    told = numbers(*words)[0]
     again, shown = numbers(*words, "--markdown", tmp_path / "geometry.md")
-    assert again == results[1] and "0 results computed, 3 found" in shown
+    assert again == told and "0 results computed, 3 found" in shown
     assert "| prediction | SIDE x 100 ↓ | 95 % | MAD ↓ | 95 % |" in (tmp_path / "geometry.md").read_text()
-    pairs, ours = results
-    assert pairs["pictures"] == 6 and "factors" not in pairs and "factors_untrained" in ours
-    for row in ("model", "average_depth", "plane", "untrained"):
-        assert pairs["geometry"][row]["side"] == pytest.approx(ours["geometry"][row]["side"], rel=0.02)
-    assert pairs["geometry"]["plane"]["side"] > pairs["geometry"]["average_depth"]["side"]
-    assert pairs["reconstruction"]["model"]["ssim"] is not None
-    side = ours["intervals"]["geometry"]["model"]["scores"]["side"]
-    assert side["value"] == pytest.approx(ours["geometry"]["model"]["side"])
+    assert told["pictures"] == 6 and "factors_untrained" in told
+    assert told["geometry"]["plane"]["side"] > told["geometry"]["average_depth"]["side"]
+    assert told["reconstruction"]["model"]["ssim"] is not None
+    side = told["intervals"]["geometry"]["model"]["scores"]["side"]
+    assert side["value"] == pytest.approx(told["geometry"]["model"]["side"])
     assert side["low"] <= side["value"] <= side["high"]
-    rows = ours["intervals"]["reconstruction"]
+    rows = told["intervals"]["reconstruction"]
     assert list(rows) == ["model", "mean image", "PCA (1)", "untrained model"]
     assert rows["model"]["versus"]["l1"]["rival"] in rows
-    assert 0 < ours["factors"]["albedo"] <= ours["factors"]["albedo_global"]
-    assert ours["factors"]["light_aligned"]["mean_deg"] <= ours["factors"]["light"]["mean_deg"] + 1
+    assert 0 < told["factors"]["albedo"] <= told["factors"]["albedo_global"]
+    assert told["factors"]["light_aligned"]["mean_deg"] <= told["factors"]["light"]["mean_deg"] + 1

@@ -2,9 +2,8 @@
 
 from pathlib import Path
 
-import numpy as np
 import pytest
-from PIL import Image
+from tests.cli.conftest import noise
 
 from derender.cli import main
 
@@ -12,11 +11,7 @@ from derender.cli import main
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     """Twenty-six images of noise, one of them twice, and one that cannot be read."""
-    made = tmp_path / "set"
-    made.mkdir()
-    noise = np.random.default_rng(0).integers(0, 256, (26, 64, 64, 3), dtype=np.uint8)
-    for number, picture in enumerate(noise):
-        Image.fromarray(picture).save(made / f"{number:02}.png")
+    made = noise(tmp_path / "set", 26, 64, cells=64, name="{:02}.png")
     (made / "26.png").write_bytes((made / "00.png").read_bytes())
     (made / "27.png").write_bytes(b"no picture")
     return made
@@ -33,6 +28,7 @@ def test_terminal_page_and_json_tell_the_same(folder: Path, tmp_path: Path, numb
     assert "unreadable: 27.png" in said
     assert main(["doctor", str(folder)]) == 0 and main(["doctor", str(folder), "--check"]) == 1
     html = page.read_text()
+    assert 'data-value="26">26' in html  # the table of measures: distinct images
     for finding in told["findings"]:
         assert finding["text"] in html and finding["text"] in said
 

@@ -13,7 +13,7 @@ import trimesh
 from PIL import Image
 from tests.cli.conftest import noise
 
-from derender import Derenderer, FeatureTable
+from derender import Derenderer
 from derender.cli import main
 from derender.storage.places import ERRORS_FILE
 from derender.training.held_out_errors import HeldOutErrors, write_errors
@@ -132,14 +132,6 @@ def test_search_with_a_picture_of_the_table(table, model, photos, tmp_path, numb
     assert found[0]["distance"] == pytest.approx(0, abs=1e-5)
     with Image.open(sheet) as drawn:
         assert drawn.width > 4 * 160
-
-
-def test_search_with_a_row_leaves_that_row_out(table, numbers):
-    words = ("--like", "2.png", "--factor", "light", "--metric", "euclidean", "-k", "9")
-    found = numbers("search", "-f", table, *words)[0]["found"]
-    assert sorted(row["file"] for row in found) == ["0.png", "1.png", "3.png", "4.png", "5.png"]
-    features = FeatureTable.read(table).factors["light"].astype(float)
-    assert found[0]["distance"] == pytest.approx(np.linalg.norm(features[2] - features[found[0]["row"]]))
 
 
 def test_bad_pictures_are_left_out_and_named(model, photos, tmp_path, capsys):

@@ -6,16 +6,9 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from derender import Derenderer
 from derender.data.synthetic import FaceSettings, faces, write
 
 QUICK = ["--resamples", 20, "--untrained-seeds", 1, "--seeds", 2, "--angles", "0,40", "--cache"]
-
-
-@pytest.fixture(scope="module")
-def model(tmp_path_factory) -> Path:
-    net = Derenderer.from_preset("small", seed=0, image_size=32, width=4, light_width=4, code_size=8)
-    return net.save(tmp_path_factory.mktemp("robustness") / "model")
 
 
 @pytest.fixture(scope="module")
@@ -25,8 +18,8 @@ def rendered(tmp_path_factory) -> Path:
     return folder
 
 
-def test_generated_faces_by_angle_and_light(model, tmp_path, numbers):
-    words = ["evaluate", "robustness", "-m", model, "--people", 4, "--learned", 6, *QUICK, tmp_path / "cache"]
+def test_generated_faces_by_angle_and_light(tiny, tmp_path, numbers):
+    words = ["evaluate", "robustness", "-m", tiny, "--people", 4, "--learned", 6, *QUICK, tmp_path / "cache"]
     files = ["--out", tmp_path / "page.html", "--markdown", tmp_path / "t.md", "--latex", tmp_path / "t.tex"]
     told, shown = numbers(*words, *files)
     assert list(told["curves"]) == ["yaw", "light"] and told["how"] == "identity of generated faces"
@@ -47,8 +40,8 @@ def test_generated_faces_by_angle_and_light(model, tmp_path, numbers):
         assert chart.width > 800
 
 
-def test_pictures_rendered_again_and_pictures_of_known_angles(model, rendered, tmp_path, numbers):
-    words = ["evaluate", "robustness", "-m", model, "--axes", "light", *QUICK, "none", "-d", rendered]
+def test_pictures_rendered_again_and_pictures_of_known_angles(tiny, rendered, tmp_path, numbers):
+    words = ["evaluate", "robustness", "-m", tiny, "--axes", "light", *QUICK, "none", "-d", rendered]
     told, _ = numbers(*words, "--label", "expression", "--min-count", 4, "--groups", "identity")
     assert told["pictures"] == "render" and told["how"].endswith("re-rendered")
     tested = told["curves"]["light"]["n_tested"]
@@ -60,17 +53,17 @@ def test_pictures_rendered_again_and_pictures_of_known_angles(model, rendered, t
     assert (tmp_path / "curves.svg").read_text().startswith("<svg")
 
 
-def test_tracks_in_light_that_nobody_trained_on(model, tmp_path, numbers):
+def test_tracks_in_light_that_nobody_trained_on(tiny, tmp_path, numbers):
     folder = tmp_path / "tracks"
     settings = FaceSettings(tracks=8, frames=2)
     write(faces.generate(32, 32, 0, settings), folder)
-    words = ["evaluate", "robustness", "-m", model, "-d", folder, "--pictures", "truth", "--axes", "yaw"]
+    words = ["evaluate", "robustness", "-m", tiny, "-d", folder, "--pictures", "truth", "--axes", "yaw"]
     told, _ = numbers(*words, *QUICK, "none")
     assert told["curves"]["yaw"]["n_tested"] == [4, 4, 6, 6, 4] and told["names"] == ["identity"]
 
 
-def test_bad_words(model, rendered, tmp_path, refused):
-    refused = partial(refused, "evaluate", "robustness", "-m", model, "--cache", "none")
+def test_bad_words(tiny, rendered, tmp_path, refused):
+    refused = partial(refused, "evaluate", "robustness", "-m", tiny, "--cache", "none")
 
     assert "--angles 'wide' should read like" in refused("--angles", "wide")
     assert "within 0..60 degrees for pitch" in refused("--axes", "pitch")
@@ -85,4 +78,4 @@ def test_bad_words(model, rendered, tmp_path, refused):
     taken.write_text("mine")
     assert "--force" in refused("--out", taken) and taken.read_text() == "mine"
     assert "is not one of 'accuracy', 'balanced'" in refused("--score", "f1")
-    assert "two models have the name 'a'" in refused("-m", f"a={model}", "-m", f"a={model}")
+    assert "two models have the name 'a'" in refused("-m", f"a={tiny}", "-m", f"a={tiny}")

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from PIL import Image
 
 import derender
 from derender.data import ImageSet
@@ -41,17 +40,6 @@ def test_a_run_is_a_model_with_a_page_and_goes_on(run, images):
         derender.train(images, out=run, settings=TINY)
     with pytest.raises(FileNotFoundError, match="train without resume first"):
         derender.train(images, out=run / "none", resume=True)
-
-
-def test_an_address_is_read(tmp_path):
-    (tmp_path / "photos").mkdir()
-    for row, pixels in enumerate(np.random.default_rng(1).integers(0, 256, (20, 40, 40, 3), dtype=np.uint8)):
-        Image.fromarray(pixels).save(tmp_path / "photos" / f"{row}.png")
-    read = []
-    result = derender.train(
-        str(tmp_path / "photos"), out=tmp_path / "run", preset="small", settings=TINY, on_images=read.append
-    )
-    assert result.images == 16 and len(read[0]) == 20
 
 
 def test_a_copy_is_made_of_a_model_or_of_its_place(run, images, tmp_path):

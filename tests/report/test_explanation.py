@@ -3,19 +3,11 @@
 from io import BytesIO
 
 import numpy as np
-import pytest
 import torch
 from PIL import Image
 
-from derender.interpretation import cluster_shares, pair_parts
 from derender.interpretation.attribution import Similarity
-from derender.interpretation.tables import (
-    cluster_share_table,
-    pair_table,
-    sanity_table,
-    unasked,
-    untrusted,
-)
+from derender.interpretation.tables import sanity_table, unasked, untrusted
 from derender.report.charts import side_by_side
 from derender.report.saliency import overlays
 
@@ -42,19 +34,6 @@ def test_the_sanity_table_names_what_not_to_trust():
     values = sanity_table(rows).values()
     assert values["pixels, light"]["changes"] == "no" and values["grad-cam, camera"]["changes"] == "yes"
     assert values["pixels, light"]["other image"] is None
-
-
-def test_tables_of_groups_hold_the_parts():
-    generator = np.random.default_rng(0)
-    features = {name: generator.standard_normal((20, 3)) for name in ("geometry", "light")}
-    parts = pair_parts(features, 0, 1)
-    table = pair_table(parts, ("a.png", "b.png")).values()
-    assert table["all"]["of the distance"] == pytest.approx(1)
-    assert table["geometry"]["of the cosine"] == pytest.approx(parts.cosine[0])
-    clusters = cluster_share_table(cluster_shares(features, np.arange(20) % 2)).values()
-    assert clusters["cluster 0"]["images"] == 10
-    shares = [clusters["cluster 0"][name] for name in features]
-    assert sum(float(share) for share in shares) == pytest.approx(1)
 
 
 def test_a_chart_as_a_picture_has_a_ground_and_as_svg_has_none():

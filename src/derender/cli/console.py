@@ -149,14 +149,14 @@ def write_json(target: str | None, values: Mapping[str, Any]) -> None:
 def refuse_existing_file(path: Path, force: bool) -> None:
     """Refuse a folder, and to write over an existing file unless told to."""
     if path.is_dir():
-        raise IsADirectoryError(f"{path} is a folder: give --out the name of a file")
+        raise IsADirectoryError(f"{path} is a folder: name a file to write")
     refuse_existing(path, force)
 
 
 def refuse_existing(path: Path, force: bool) -> None:
     """Refuse to write over an existing file or folder unless told to."""
     if path.exists() and not force:
-        raise FileExistsError(f"{path} exists already: choose another --out, or add --force to replace it")
+        raise FileExistsError(f"{path} exists already: choose another name, or add --force to replace it")
 
 
 def duration(seconds: float) -> str:

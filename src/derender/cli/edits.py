@@ -2,7 +2,7 @@
 
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from typer import Option
 
@@ -36,12 +36,8 @@ def relight(
 
     opener = opener_of(model, how, EDIT_SIZE, whole=True)
     others = [] if like is None else [opener.open(like)]
-    moves = {
-        "reach_deg": reach,
-        "pitch_deg": pitch,
-        "strength": strength,
-        "like": others[0] if others else None,
-    }
+    moves: dict[str, Any] = {"reach_deg": reach, "pitch_deg": pitch, "strength": strength}
+    moves["like"] = others[0] if others else None
     edit, video = partial(relit, opener.model, **moves, film=film), relit_video(**moves, hold=film.hold)
     files.edit(opener, edit, output, beside=others, video=video)
 

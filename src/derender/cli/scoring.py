@@ -107,12 +107,8 @@ class Published:
                 raise ValueError(f"--out {out} must end in {', '.join(forms)}: the kind of drawing")
             refuse_existing_file(out, self.force)
         for file in (self.markdown, self.latex, self.html, self.json_file):
-            if file is None or file == "-":
-                continue
-            if Path(file).is_dir():
-                raise ValueError(f"{file} is a folder: name a file to write")
-            if Path(file).exists() and not self.force and file != self.json_file:
-                raise ValueError(f"{file} exists already: choose another name, or add --force to replace it")
+            if file not in (None, "-"):
+                refuse_existing_file(Path(file), self.force or file == self.json_file)
 
     def publish(
         self, scores: "Scores", memory: "Memory | None" = None, what: str = "results", **values: Any

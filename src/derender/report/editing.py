@@ -18,8 +18,9 @@ from PIL import Image
 
 from derender.photo import edit_video, is_video
 from derender.photo.video import Edit as VideoEdit
+from derender.report.colours import enlarged
 from derender.report.opening import ImageOpener, OpenedImage, image_files, readable
-from derender.report.panel import Sheets
+from derender.report.panel import ROWS_PER_SHEET, SHEET, row_sheets
 from derender.storage.atomic import atomic_file, atomic_folder
 from derender.training.held_out_errors import OUTLIER_PERCENTILE, unlike
 
@@ -150,21 +151,18 @@ def write_images(
         raise ValueError(f"{moving[0]} is a video: relight, rotate or swap it")
     read, refused = readable([file for file in files if file not in moving], opener.read, progress)
     with_sheet = (len(read) > 1 if sheet is None else sheet) and len(files) == len(places)
-    sheets, records = Sheets(), []
+    rows: list[tuple[str, dict[str, Image.Image]]] = []
+    records: list[dict[str, Any]] = []
     folders = [places[path] for path in read]
-    _require_free(
-        [*folders, *(places[path] for path in moving)],
-        out,
-        sheets.rows if with_sheet else None,
-        force or resume,
-    )
+    _require_free([*folders, *(places[path] for path in moving)], out, with_sheet, force or resume)
     images = opener.decomposed(read) if read else []
     for image, folder in zip(images, folders, strict=True):
         made = edit(opener.finer(image))
         with atomic_folder(folder) as temporary:
             records.append(made.write(temporary, {"picture": str(image.path), "folder": str(folder)}))
         if with_sheet and made.row:
-            sheets.add(image.path.name, made.row)
+            small = {name: enlarged(one, SHEET.cell) for name, one in made.row.items()}
+            rows.append((image.path.name, small))
         if progress is not None:
             progress(len(records), len(images), description="drawing")
     for path in moving:
@@ -176,8 +174,8 @@ def write_images(
             record = {"picture": str(path), "folder": str(places[path]), **vars(film), "out": FILM}
             (temporary / "moved.json").write_text(json.dumps(record, indent=1), encoding="utf-8")
         records.append(record)
-    files = _sheet_files(out, len(sheets), sheets.rows)
-    for file, drawn in zip(files, sheets.drawn(), strict=True):
+    files = _sheet_files(out, len(rows))
+    for file, drawn in zip(files, row_sheets(rows), strict=True):
         with atomic_file(file) as temporary:
             drawn.save(temporary, format="PNG")
     every = [*images, *beside]
@@ -201,11 +199,11 @@ def _places(images: Sequence[Path], out: Path) -> dict[Path, Path]:
     return dict(zip(images, names.values(), strict=True))
 
 
-def _require_free(folders: Sequence[Path], out: Path, sheet_rows: int | None, force: bool) -> None:
+def _require_free(folders: Sequence[Path], out: Path, sheet: bool, force: bool) -> None:
     """What is there already is an error, unless ``force`` allows it."""
     if out.exists() and not out.is_dir():
         raise NotADirectoryError(f"{out} is a file: name a folder to write to")
-    sheets = [] if sheet_rows is None else _sheet_files(out, len(folders), sheet_rows)
+    sheets = _sheet_files(out, len(folders)) if sheet else []
     existing = [place for place in (*folders, *sheets) if place.exists()]
     if existing and not force:
         raise FileExistsError(
@@ -213,9 +211,9 @@ def _require_free(folders: Sequence[Path], out: Path, sheet_rows: int | None, fo
         )
 
 
-def _sheet_files(out: Path, count: int, rows: int) -> list[Path]:
+def _sheet_files(out: Path, count: int) -> list[Path]:
     """``sheet.png``, or ``sheet-1.png`` and so on where the rows fill several."""
-    number = -(-count // rows)
+    number = -(-count // ROWS_PER_SHEET)
     return [out / ("sheet.png" if number == 1 else f"sheet-{index}.png") for index in range(1, number + 1)]
 
 

@@ -101,8 +101,8 @@ def relit(
 
     def lights(t: Tensor) -> Tensor:
         if like is not None:
-            own, other = (one.scene.parameters[parameter][0] for one in (image, like))
-            return sweeps.lights_between(t, own, other)
+            own, other = (one.scene.parameters[parameter] for one in (image, like))
+            return torch.lerp(own, other, t.to(own)[:, None])
         own = float(image.scene.light[0, :2].sum())
         return sweeps.lights_around(t, reach_deg, pitch_deg, strength * own)
 

@@ -58,18 +58,15 @@ def explanation_page(
     asked = ", ".join(shares.names[:NAMED]) + (f" and {count - NAMED} more" if count > NAMED else "")
     if shares.kind == "labels" and count > 1:
         asked = f"{count} yes/no labels"
-    values: dict[str, Any] = {"shares": share_values(shares, chart), "sheets": sheets, "unchanged": UNCHANGED}
-    values["checks"] = tables.sanity_table(checks) if checks else None
-    values |= {"untrusted": "; ".join(tables.untrusted(checks)), "unasked": "; ".join(tables.unasked(checks))}
-    values["clusters"] = (
-        None if explained.clusters is None else tables.cluster_share_table(explained.clusters)
-    )
-    values["pair"] = None
-    if explained.pair is not None:
-        names, parts = explained.pair
-        shown = pictures(np.stack([images.images[images.files.index(name)] for name in names]))
-        faces = [(one, f"the image {name}", name) for name, one in zip(names, shown, strict=True)]
-        values["pair"] = {"images": faces, "table": tables.pair_table(parts, names)}
+    pair, faces = explained.pair, []
+    if pair is not None:
+        rows = [images.files.index(name) for name in pair[0]]
+        shown = zip(pictures(images.images[rows]), pair[0], strict=True)
+        faces = [(face, f"the image {name}", name) for face, name in shown]
+    values = {
+        "shares": share_values(shares, chart), "sheets": sheets, "unchanged": UNCHANGED, "tables": tables,
+        "checks": checks, "clusters": explained.clusters, "pair": pair, "faces": faces,
+    }  # fmt: skip
     lead = f"{explained.model.source or 'a model'} on {images.source}: {asked}."
     return Page("explanation.html", "Which factor made the answer", lead, values)
 

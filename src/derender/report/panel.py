@@ -30,6 +30,10 @@ class GridLayout:
     title: int = 24
 
 
+SHEET = GridLayout(cell=128)
+"""Of sheets with a row for each image."""
+
+
 def labelled_grid(
     columns: Mapping[str, Images],
     row_labels: Sequence[str] | None = None,
@@ -108,40 +112,16 @@ def _grid(
     return sheet
 
 
-class Sheets:
-    """Rows of images with the same columns, drawn as sheets of a few rows each.
-
-    Cells are scaled down as they come, so that memory grows with the sheet and not with the images' size.
-    """
-
-    layout = GridLayout(cell=128)
-
-    def __init__(self, rows: int = ROWS_PER_SHEET):
-        self.rows = rows
-        self._labels: list[str] = []
-        self._columns: dict[str, Images] = {}
-
-    def __len__(self) -> int:
-        return len(self._labels)
-
-    def add(self, label: str, images: Mapping[str, Image.Image]) -> None:
-        """One row; every row has the same columns."""
-        if self._labels and list(images) != list(self._columns):
-            raise ValueError(f"a sheet has the columns {', '.join(self._columns)}; got {', '.join(images)}")
-        self._labels.append(label)
-        for name, image in images.items():
-            self._columns.setdefault(name, []).append(enlarged(image, self.layout.cell))
-
-    def drawn(self) -> Images:
-        """The sheets, in order; none where nothing was added."""
-        parts = [slice(start, start + self.rows) for start in range(0, len(self), self.rows)]
-        return [
-            labelled_grid(
-                {name: images[part] for name, images in self._columns.items()}, self._labels[part],
-                layout=self.layout,
-            )
-            for part in parts
-        ]  # fmt: skip
+def row_sheets(rows: Sequence[tuple[str, Mapping[str, Image.Image]]], most: int = ROWS_PER_SHEET) -> Images:
+    """Labelled rows of images with the same columns, as sheets of at most so many rows; none without rows."""
+    return [
+        labelled_grid(
+            {name: [images[name] for _, images in part] for name in part[0][1]},
+            [label for label, _ in part],
+            layout=SHEET,
+        )
+        for part in (rows[start : start + most] for start in range(0, len(rows), most))
+    ]
 
 
 def strip(images: Images, gap: int = 0) -> Image.Image:

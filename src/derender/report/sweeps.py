@@ -12,13 +12,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from derender.photo.edit import AMBIENT_SHARE
 from derender.render import Rendering
 from derender.report.colours import Images, pictures
 from derender.report.panel import strip
 from derender.scene import Scene
 
-AMBIENT_SHARE = 0.35
-"""Of the strength of a light that goes round; the rest is diffuse."""
 FRAMES_AT_ONCE = 8
 LOOP_FRAMES, LOOP_LIGHT_DEG, LOOP_VIEW_DEG = 16, 45.0, 35.0
 
@@ -50,13 +49,6 @@ def lights_around(
     if not 0 <= strength < inf:
         raise ValueError(f"the strength of a light must be 0 or more, got {strength}: give such a number")
     return _light(strength, pitch, yaw)
-
-
-def lights_between(
-    t: Float[Tensor, " k"], start: Float[Tensor, " n"], end: Float[Tensor, " n"]
-) -> Float[Tensor, "k n"]:
-    """Lights from one to another, each number on a straight line."""
-    return torch.lerp(start[None], end[None], t.to(start)[:, None])
 
 
 def cameras_around(t: Float[Tensor, " k"], reach_deg: float, pitch_deg: float = 0.0) -> Float[Tensor, "k 6"]:

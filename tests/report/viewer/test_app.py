@@ -118,22 +118,11 @@ def test_exports_hold_what_they_promise(client):
 @pytest.mark.parametrize(
     "path",
     [
-        *(
-            "/etc/passwd",
-            "/../../etc/passwd",
-            "/%2e%2e/%2e%2e/etc/passwd",
-            "//etc/passwd",
-            "/page/index.html",
-        ),
-        *(
-            "/view.js/../../app.py",
-            "/app.py",
-            "/view.js%00.png",
-            "/api/examples/../../etc/passwd",
-            "/file=/etc/passwd",
-        ),
+        "/etc/passwd", "/../../etc/passwd", "/%2e%2e/%2e%2e/etc/passwd", "//etc/passwd", "/page/index.html",
+        "/view.js/../../app.py", "/app.py", "/view.js%00.png", "/api/examples/../../etc/passwd",
+        "/file=/etc/passwd",
     ],
-)
+)  # fmt: skip
 def test_no_path_is_served(client, path):
     for method in ("GET", "POST"):
         reply = client(method, path)
@@ -190,22 +179,14 @@ def test_several_visitors_at_once_get_their_own_answers(client):
     assert together == alone * 5
 
 
-def test_who_is_slow_is_not_waited_for(model, monkeypatch):
+@pytest.mark.parametrize("sent", [b"", b"POST /api/pictures HTTP/1.1\r\nHost: 127.0.0.1\r\n"])
+def test_who_sends_no_head_is_not_waited_for(model, monkeypatch, sent):
     monkeypatch.setattr(BoundedProtocol, "head_seconds", 0.3)
-    application = Application(Viewer(Studio(model, "tiny", Shelf(2))), body_seconds=0.3)
-    with serving(application) as url:
+    with serving(Application(Viewer(Studio(model, "tiny", Shelf(2))))) as url:
         place = ("127.0.0.1", int(url.rsplit(":", 1)[1].strip("/")))
-        head = f"POST /api/pictures HTTP/1.1\r\nHost: 127.0.0.1:{place[1]}\r\nX-Derender-Page: 1\r\n"
-        for sent, answer in (
-            (b"", b""),
-            (head.encode(), b""),
-            (f"{head}Content-Length: 99\r\n\r\nabc".encode(), b"408"),
-        ):
-            with socket.create_connection(place, timeout=10) as connection:
-                began = time.monotonic()
-                connection.sendall(sent)
-                assert answer in connection.recv(4096)
-                assert time.monotonic() - began < 5
+        with socket.create_connection(place, timeout=5) as connection:
+            connection.sendall(sent)
+            assert connection.recv(4096) == b""
 
 
 def test_too_much_work_is_refused_not_queued_for_ever(model, picture, client):

@@ -1,8 +1,8 @@
 """Rows near to an image, with images read from the table's own data and by number only."""
 
-import numpy as np
 import pytest
 from PIL import Image
+from tests.cli.conftest import noise
 
 from derender.data import read_images
 from derender.features import FeatureTable, embed_image_set
@@ -18,11 +18,7 @@ SIZE = 32
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    place = tmp_path_factory.mktemp("rows")
-    for number in range(6):
-        coarse = np.random.default_rng(number).integers(0, 256, (6, 6, 3), dtype=np.uint8)
-        Image.fromarray(coarse).resize((SIZE, SIZE)).save(place / f"{number}.png")
-    return place
+    return noise(tmp_path_factory.mktemp("rows"), 6, SIZE, cells=6)
 
 
 @pytest.fixture(scope="module")

@@ -1,28 +1,16 @@
 """The page's own files: they need nothing from elsewhere, write no text as HTML, and name what they show."""
 
 import re
-from html.parser import HTMLParser
 from importlib.resources import files
 
 import pytest
+from tests.report.test_page import Elements
 
 from derender.report.viewer.app import PAGE_FILES
 
 PAGE = {
     name: (files("derender.report.viewer") / "page" / name).read_text() for name, _ in PAGE_FILES.values()
 }
-
-
-class Elements(HTMLParser):
-    """Every element with its attributes."""
-
-    def __init__(self, html: str):
-        super().__init__()
-        self.found: list[tuple[str, dict[str, str | None]]] = []
-        self.feed(html)
-
-    def handle_starttag(self, tag, attrs):
-        self.found.append((tag, dict(attrs)))
 
 
 def test_every_file_of_the_page_is_served(client):
