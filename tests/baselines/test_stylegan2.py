@@ -86,14 +86,9 @@ def test_energy_distance_is_zero_for_one_distribution_only(generator):
 
 def test_held_out_images_are_judged_by_samples_of_the_average(model, images, losses):
     assert set(losses(model.eval(), images, config())) == {"energy"} and model.steps == 0
-    whole, again, half, none = (
-        model.sample(3, torch.Generator().manual_seed(5), truncation=strength)
-        for strength in (1.0, 1.0, 0.5, 0.0)
-    )
+    whole, again = (model.sample(3, torch.Generator().manual_seed(5)) for _ in range(2))
     assert whole.shape == (3, 3, 8, 8) and whole.min() >= 0 and whole.max() <= 1
     assert torch.equal(whole, again)
-    torch.testing.assert_close(none, none[:1].expand_as(none))
-    assert (half - none).abs().mean() < (whole - none).abs().mean()
     assert [column.shape for column in model.shown(whole, None).values()] == 7 * [whole.shape]
 
 

@@ -9,7 +9,7 @@ from PIL import Image
 
 from derender.cli import main
 from derender.data.synthetic import faces
-from derender.evaluation.copies import copy_cost
+from derender.evaluation.scenes import copy_cost
 from derender.model import load
 from derender.storage.packing import pack_model
 

@@ -23,7 +23,7 @@ from derender.features import FeatureTable, Progress, embed_image_set, table_lab
 from derender.inputs import as_images, part_of
 from derender.model import load
 
-ORIENTATIONS, BLOCK_CELLS = 9, 2
+ORIENTATIONS, BLOCK_CELLS, CELL_PX = 9, 2, 8
 BLUR_PX = 0.75
 UNIFORM_PATTERNS = 59
 
@@ -89,48 +89,39 @@ def pca_features(
     return control_table(images, "pca", pca.transform(_flat(images)), facts)
 
 
-def hog_features(images: ImageSet, *, cell_px: int = 8, progress: Progress | None = None) -> FeatureTable:
-    """Histograms of oriented gradients, factor ``hog``; each block of 36 has length 1 at most.
-
-    ``cell_px`` is the side of a cell; an image has at least two cells a side.
-    """
+def hog_features(images: ImageSet, *, progress: Progress | None = None) -> FeatureTable:
+    """Histograms of oriented gradients, factor ``hog``; each block of 36 has length 1 at most."""
     height, width = images.images.shape[-2:]
-    largest = min(height, width) // BLOCK_CELLS
-    if not 1 <= cell_px <= largest:
-        raise ValueError(
-            f"cells of {cell_px} pixels do not fit {BLOCK_CELLS} a side into {height}x{width}: "
-            f"ask for 1 to {largest}"
-        )
+    if min(height, width) < BLOCK_CELLS * CELL_PX:
+        raise ValueError(f"{height}x{width} pixels are too few: HOG needs {BLOCK_CELLS * CELL_PX} a side")
     hog = optional("skimage.feature", "the baseline hog").hog
 
     def described(image: np.ndarray) -> np.ndarray:
         return hog(
             np.moveaxis(image, 0, -1), orientations=ORIENTATIONS, block_norm="L2-Hys",
-            pixels_per_cell=(cell_px, cell_px), cells_per_block=(BLOCK_CELLS, BLOCK_CELLS), channel_axis=-1,
+            pixels_per_cell=(CELL_PX, CELL_PX), cells_per_block=(BLOCK_CELLS, BLOCK_CELLS), channel_axis=-1,
         )  # fmt: skip
 
-    facts = {"orientations": ORIENTATIONS, "cell_px": cell_px, "block": BLOCK_CELLS}
+    facts = {"orientations": ORIENTATIONS, "cell_px": CELL_PX, "block": BLOCK_CELLS}
     return control_table(images, "hog", _each(images, described, progress), facts)
 
 
-def lbp_features(images: ImageSet, *, cell_px: int = 8, progress: Progress | None = None) -> FeatureTable:
+def lbp_features(images: ImageSet, *, progress: Progress | None = None) -> FeatureTable:
     """Square roots of the shares of local binary patterns in cells, factor ``lbp``; each cell has length 1.
 
-    ``cell_px`` is the side of a cell; what is left over at the right and below is not described.
+    Pixels beyond the last whole cell at the right and below are not described.
     """
     patterns = optional("skimage.feature", "the baseline lbp").local_binary_pattern
 
     def described(image: np.ndarray) -> np.ndarray:
         codes = patterns(_luma(image).round().astype(np.uint8), 8, 2, "nri_uniform").astype(np.int64)
-        rows, columns = (side // cell_px for side in codes.shape)
-        cell = np.arange(rows * columns).reshape(rows, columns).repeat(cell_px, 0).repeat(cell_px, 1)
-        numbers = cell * UNIFORM_PATTERNS + codes[: rows * cell_px, : columns * cell_px]
-        return (
-            np.sqrt(np.bincount(numbers.ravel(), minlength=cell.size // cell_px**2 * UNIFORM_PATTERNS))
-            / cell_px
-        )
+        rows, columns = (side // CELL_PX for side in codes.shape)
+        cell = np.arange(rows * columns).reshape(rows, columns).repeat(CELL_PX, 0).repeat(CELL_PX, 1)
+        numbers = cell * UNIFORM_PATTERNS + codes[: rows * CELL_PX, : columns * CELL_PX]
+        counts = np.bincount(numbers.ravel(), minlength=rows * columns * UNIFORM_PATTERNS)
+        return np.sqrt(counts) / CELL_PX
 
-    return control_table(images, "lbp", _each(images, described, progress), {"cell_px": cell_px})
+    return control_table(images, "lbp", _each(images, described, progress), {"cell_px": CELL_PX})
 
 
 def gradientfaces_features(images: ImageSet, *, progress: Progress | None = None) -> FeatureTable:

@@ -123,13 +123,11 @@ class Stylegan(LoopModel):
         return {"discriminator": self.discriminator.describe(2 * images - 1)}
 
     @torch.no_grad()
-    def sample(self, count: int, generator: RandomGenerator, *, truncation: float = 1.0) -> Images:
-        """New images in 0..1, by the moving average; ``truncation`` 0 makes all of them from the mean w."""
+    def sample(self, count: int, generator: RandomGenerator) -> Images:
+        """New images in 0..1, by the moving average."""
         net = self.generator
-        w = net.random_w(count, generator)
-        if truncation != 1:
-            w = torch.lerp(net.random_w(CENTRE_LATENTS, generator).mean(dim=0).expand_as(w), w, truncation)
-        return (net(w, net.random_noise(count, generator)) / 2 + 0.5).clamp(0, 1)
+        made = net(net.random_w(count, generator), net.random_noise(count, generator))
+        return (made / 2 + 0.5).clamp(0, 1)
 
     def shown(self, images: Images, config: Any) -> dict[str, Images]:
         samples = self.sample(SHOWN * len(images), random_stream(0, "perturb", 0)).chunk(SHOWN)

@@ -20,7 +20,7 @@ def pack(
 
     Card, held-out errors and split are copied. With images, the loss of quality is measured on them.
     """
-    from derender.evaluation.copies import copy_cost
+    from derender.evaluation.scenes import copy_cost
     from derender.inputs import as_model, copy_split
     from derender.storage.packing import pack_model
 

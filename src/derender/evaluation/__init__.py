@@ -7,21 +7,14 @@ function states its range and its best value. docs/reference/metrics.md has a ta
 """
 
 from derender.evaluation.angles import light, pose
-from derender.evaluation.bootstrap import Difference, Estimate, ScoredRow, difference, estimate, resamples
+from derender.evaluation.bootstrap import difference, estimate, resamples
 from derender.evaluation.brightness import brightness
-from derender.evaluation.clustering import (
-    ClusterComparison,
-    Level,
-    cluster,
-    compare_clusterings,
-    finch_levels,
-)
-from derender.evaluation.clustering_methods import FinchHierarchy, clusterings, finch, finch_clusters
+from derender.evaluation.clustering import cluster, compare_clusterings, finch_levels
+from derender.evaluation.clustering_methods import clusterings, finch, finch_clusters
 from derender.evaluation.clustering_scores import chance_scores, cluster_scores
-from derender.evaluation.depth import GeometryResult, GeometryScores, evaluate_geometry, geometry_scores
+from derender.evaluation.depth import GeometryResult, evaluate_geometry, geometry_scores
 from derender.evaluation.disentanglement import disentangle
 from derender.evaluation.factors import (
-    AngleScores,
     FactorResult,
     albedo_error,
     camera_error,
@@ -31,18 +24,11 @@ from derender.evaluation.factors import (
 from derender.evaluation.feature_rows import at_least
 from derender.evaluation.identity import Pairs, area_under_roc, identify, read_pairs, verify
 from derender.evaluation.linear_probes import majority_answers, probe
-from derender.evaluation.linear_probing import (
-    LinearComparison,
-    LinearScores,
-    compare_linear,
-    linear,
-    linear_scores,
-)
+from derender.evaluation.linear_probing import compare_linear, linear, linear_scores
 from derender.evaluation.linear_task import Rows, Task, choose_rows, task_of
 from derender.evaluation.paper_comparison import compare
 from derender.evaluation.pixels import (
     ReconstructionResult,
-    ReconstructionScores,
     evaluate_reconstruction,
     mean_image,
     reconstruction_scores,
@@ -55,11 +41,9 @@ from derender.evaluation.segmentation import segment
 from derender.evaluation.ward import cut, ward_tree
 
 __all__ = [
-    "AngleScores", "ClusterComparison", "Column", "Difference", "Estimate", "FactorResult",
-    "FinchHierarchy", "GeometryResult", "GeometryScores", "Level", "LinearComparison", "LinearScores",
-    "Pairs", "ReconstructionResult", "ReconstructionScores", "Row", "Rows", "ScoreTable", "ScoredRow",
-    "Scores", "Task", "albedo_error", "area_under_roc", "at_least", "brightness", "camera_error",
-    "chance_scores", "choose_rows", "cluster", "cluster_scores", "clusterings", "compare",
+    "Column", "FactorResult", "GeometryResult", "Pairs", "ReconstructionResult", "Row", "Rows",
+    "ScoreTable", "Scores", "Task", "albedo_error", "area_under_roc", "at_least", "brightness",
+    "camera_error", "chance_scores", "choose_rows", "cluster", "cluster_scores", "clusterings", "compare",
     "compare_clusterings", "compare_linear", "cut", "difference", "disentangle", "estimate",
     "evaluate_factors", "evaluate_geometry", "evaluate_reconstruction", "finch", "finch_clusters",
     "finch_levels", "geometry", "geometry_scores", "identify", "light", "light_error", "linear",

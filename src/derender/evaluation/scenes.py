@@ -1,12 +1,13 @@
 """Protocols of decomposed scenes: are geometry, albedo, light and camera the true ones, and the images alike?
 
 Every score is beside constant answers and the same networks untrained. With ``fit_steps`` the model's scenes,
-not the untrained one's, are optimised against their images first.
+not the untrained one's, are optimised against their images first. ``copy_cost`` says how near a copy, such as
+one of rounded weights, comes to its model; the unit is how far two of these images are apart.
 """
 
 import copy
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ from derender.evaluation.image_scores import ImageResult, image_verdicts
 from derender.evaluation.memory import Memory
 from derender.evaluation.pixels import ReconstructionResult, evaluate_reconstruction, mean_image
 from derender.evaluation.score_table import Scores
-from derender.features import Progress, model_fingerprint
+from derender.features import Progress, embed_images, model_fingerprint
 from derender.inputs import as_images, as_model, require_fitting
 from derender.model import Derenderer
 
@@ -143,3 +144,43 @@ def optimised(model: Derenderer, steps: int | None) -> Derenderer:
     fitted = copy.copy(model)
     fitted.decompose = lambda images: model.fit_scenes(images, steps).scene
     return fitted
+
+
+@dataclass(frozen=True)
+class CopyCost:
+    """What changed: by factor, how far an image's feature moved (mean over images, over the root mean square
+    distance of two images' features; 0: not at all), and the mean absolute error of the images re-rendered,
+    0..1, inside each one's mask, by the copy and by the model.
+    """
+
+    moved: dict[str, float]
+    l1: float
+    l1_before: float
+
+
+def copy_cost(
+    model: Derenderer, other: Derenderer, images: np.ndarray, *, progress: Progress | None = None
+) -> CopyCost:
+    """Compare a copy of a model, ``other``, with it on uint8 images (N, 3, H, W).
+
+    ``progress`` is called with (features made, features to make), two of each image.
+
+    Raises:
+        ValueError: fewer than two images, or other factors.
+    """
+    if len(images) < 2:
+        raise ValueError(f"two images or more are needed to compare models, got {len(images)}")
+    names = [[factor.name for factor in one.factors] for one in (model, other)]
+    if names[0] != names[1]:
+        raise ValueError(f"the models have other factors: {', '.join(names[0])}; {', '.join(names[1])}")
+    passes = []
+    for number, one in enumerate((model, other)):
+        report = progress and partial(lambda start, done, of: progress(start * of + done, 2 * of), number)
+        passes.append(embed_images(one, images, progress=report))
+    moved = {}
+    for name in names[0]:
+        own, moved_to = (np.asarray(one[name], np.float64) for one in passes)
+        apart = np.sqrt(2 * own.var(axis=0, ddof=1).sum())  # of two images drawn at random
+        moved[name] = float(np.linalg.norm(own - moved_to, axis=1).mean() / apart) if apart else 0.0
+    errors = [evaluate_reconstruction(one, images).model.l1 for one in (other, model)]
+    return CopyCost(moved, *errors)
