@@ -82,9 +82,8 @@ def brightness(
     light = {name: agreement(one["light"], mean @ LUMA, weights)["r"] for name, one in seen.items()}
     rows = [replace(row, scores={**row.scores, "light": light[row.name]}) for row in rows]
     columns = {"chroma": _CHROMA, "light": _LIGHT}
-    colour = scored_table(
-        "Colour and light", "prediction", rows, columns, intervals=tuple(columns), deviations=()
-    )
+    every = {"intervals": tuple(columns), "deviations": ()}
+    colour = scored_table("Colour and light", "prediction", rows, columns, **every)
     values = {"pictures": len(mean), "brightness": numbers, "colour": numbers_of(rows)}
     return Scores([table, colour], values, how.notes)
 
@@ -101,12 +100,8 @@ def surfaces(
         plain = torch.tensor([1.0, 0.0, 0.0, 0.0], device=batch.device).expand_as(scene.light)
         white = scene.with_parameters(albedo=torch.ones_like(scene.albedo))
         flat, lit = net.render(scene.with_parameters(light=plain)), net.render(white)
-        return (
-            flat.image.cpu(),
-            lit.image.mean(dim=1, keepdim=True).cpu(),
-            batch.cpu(),
-            flat.mask[:, None].cpu() > 0.5,
-        )
+        shading = lit.image.mean(dim=1, keepdim=True)
+        return flat.image.cpu(), shading.cpu(), batch.cpu(), flat.mask[:, None].cpu() > 0.5
 
     parts = map_batches(see, net, images, batch_size=64, progress=progress)
     *maps, inside = map(torch.cat, zip(*parts, strict=True))
@@ -139,11 +134,10 @@ def _by_group(nets: Mapping[str, Any], images: ImageSet, by: str, how: Options) 
     picture = seen["model"]["image"] @ LUMA
     shown = {"image": picture, "albedo": seen["model"]["albedo"] @ LUMA, "light": seen["model"]["light"]}
     found = {what: (means(one, once)[0], means(one, weights)) for what, one in shown.items()}
-    groups = [
-        ScoredRow(f"{name} ({int(number):,})", False, 1,
-                  {what: estimate([own[at]], drawn[:, at]) for what, (own, drawn) in found.items()})
-        for at, (name, number) in enumerate(zip(names, member.sum(axis=0), strict=True))
-    ]  # fmt: skip
+    groups = []
+    for at, (name, number) in enumerate(zip(names, member.sum(axis=0), strict=True)):
+        scores = {what: estimate([own[at]], drawn[:, at]) for what, (own, drawn) in found.items()}
+        groups.append(ScoredRow(f"{name} ({int(number):,})", False, 1, scores))
     columns = {what: Column(what, None, note="mean brightness, 0 to 1") for what in found}
     columns["light"] = Column("light", None, note="mean shading")
     answers = {name: one["albedo"] @ LUMA for name, one in seen.items()} | {"image as albedo": picture}
@@ -151,14 +145,9 @@ def _by_group(nets: Mapping[str, Any], images: ImageSet, by: str, how: Options) 
         ScoredRow(name, at > 0, 1, {"share": estimate(share(one, once), share(one, weights))})
         for at, (name, one) in enumerate(answers.items())
     ]
+    caption = f"Brightness of {by}, {len(group):,} images"
     tables = [
-        scored_table(
-            f"Brightness of {by}, {len(group):,} images",
-            "prediction",
-            shares,
-            {"share": _SHARE},
-            deviations=(),
-        ),
+        scored_table(caption, "prediction", shares, {"share": _SHARE}, deviations=()),
         scored_table(f"Brightness by {by}", by, groups, columns, intervals=tuple(columns), deviations=()),
     ]
     values = {"pictures": len(group), "share": numbers_of(shares), "groups": numbers_of(groups)}

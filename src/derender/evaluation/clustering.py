@@ -98,11 +98,8 @@ def cluster(
     notes = [*how.notes, *left_out, verdict(found.rows[0], "accuracy"), *filter(None, [approximate])]
     if ready.n_dropped:
         why = f"without a label of {', '.join((*names, *mean_by))}"
-        why += (
-            f", or beyond {min_count} to {max_count or 'all'} rows of a class"
-            if min_count > 1 or max_count
-            else ""
-        )
+        if min_count > 1 or max_count:
+            why += f", or beyond {min_count} to {max_count or 'all'} rows of a class"
         notes.append(f"{ready.n_dropped:,} rows {why} left out")
         found = replace(found, n_dropped=found.n_dropped + ready.n_dropped)
     more = {"approximation": approximate, "n_dropped_before": ready.n_dropped, "finch": levels}

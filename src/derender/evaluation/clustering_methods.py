@@ -14,6 +14,7 @@ Tests compare the two. Leaves out its cut of long links, which has no effect in 
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -101,12 +102,11 @@ def clusterings(
         means = MiniBatchKMeans(batch_size=_MINI_BATCH, **how) if many else KMeans(**how)
         return np.asarray(means.fit(features.astype(np.float32, copy=False)).labels_, np.int64)
 
-    return {
-        count: memory.recall_one(
-            "k-means", {**inputs, "seed": seed, "clusters": count}, lambda count=count: k_means(count)
-        )
-        for count in wanted
-    }
+    found = {}
+    for count in wanted:
+        known = {**inputs, "seed": seed, "clusters": count}
+        found[count] = memory.recall_one("k-means", known, partial(k_means, count))
+    return found
 
 
 def finch_hierarchy(features: np.ndarray, memory: Memory | None = None) -> FinchHierarchy:

@@ -255,12 +255,10 @@ class Renderings:
 
         arrays = self.memory.recall("lent whitening", inputs, make)
         names = [name.removesuffix("_map") for name in arrays if name.endswith("_map")]
-        contrasts = {
-            name: Projection(
-                *(torch.from_numpy(arrays[f"{name}_{part}"]) for part in ("mean", "map", "ratios"))
-            )
-            for name in names
-        }
+        contrasts = {}
+        for name in names:
+            parts = (arrays[f"{name}_{part}"] for part in ("mean", "map", "ratios"))
+            contrasts[name] = Projection(*map(torch.from_numpy, parts))
         return Whitening(contrasts, mirrored=names if settings.whitening.mirrored else ())
 
 

@@ -26,6 +26,7 @@ from derender.scene.camera import rotation_matrix
 from derender.scene.light import light_direction
 
 _ALBEDO = "root mean square error after each image's best scale, best 0"
+_CAMERA = "mean angle in degrees of the remaining rotation, best 0"
 _LIGHT = "mean angle in degrees between true and predicted direction, best 0"
 
 
@@ -54,10 +55,7 @@ class FactorResult(ImageResult):
         "albedo_global": (Column("one scale", "low", 4, "the same after one scale for all images"), 1.0),
         "light": (Column("light", "low", 1, _LIGHT), 1.0),
         "aligned": (Column("aligned", "low", 1, "the same after the best rotation of all directions"), 1.0),
-        "camera": (
-            Column("camera", "low", 1, "mean angle in degrees of the remaining rotation, best 0"),
-            1.0,
-        ),
+        "camera": (Column("camera", "low", 1, _CAMERA), 1.0),
     }
     caption = "Albedo, light and camera on {:,} images"
     notes: ClassVar[Mapping[str, str]] = {
@@ -130,9 +128,9 @@ def light_error(
     squares), which forgives a constant error.
     """
     predicted, true = light_in_camera(light_pred, camera_pred), light_in_camera(light_true, camera_true)
-    return _angles(
-        angle_deg(predicted @ _nearest_rotation(predicted.mT @ true) if aligned else predicted, true)
-    )
+    if aligned:
+        predicted = predicted @ _nearest_rotation(predicted.mT @ true)
+    return _angles(angle_deg(predicted, true))
 
 
 def camera_error(camera_pred: Float[Tensor, "n 6"], camera_true: Float[Tensor, "n 6"]) -> AngleScores:

@@ -366,15 +366,10 @@ def score_finetuned(
     others = {name: row.scores for name, row in named.items()}
     rivals = {score: {name: scores[score] for name, scores in others.items()} for score in BOTH}
     controls = (ScoredRow(name, True, 1, scores) for name, scores in others.items())
-    return FinetuneScores(
-        (ScoredRow("fine-tuned", False, 1, ours.scores), *controls),
-        {score: difference(ours.scores[score], rivals[score]) for score in BOTH},
-        asked.kind,
-        asked.names,
-        count,
-        len(test),
-        int((~target.asked.known).sum()),
-    )
+    scored = (ScoredRow("fine-tuned", False, 1, ours.scores), *controls)
+    versus = {score: difference(ours.scores[score], rivals[score]) for score in BOTH}
+    unlabelled = int((~target.asked.known).sum())
+    return FinetuneScores(scored, versus, asked.kind, asked.names, count, len(test), unlabelled)
 
 
 def _features(start: Any, task: FinetuneTask, rows: np.ndarray, kept: Memory) -> dict[str, np.ndarray]:

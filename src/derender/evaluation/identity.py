@@ -91,10 +91,10 @@ def identify(
             {name: [run[near] for run in runs] for name, runs in ready.features.items()}, {label: who[near]},
             controls=ready.controls, resample_count=how.resamples, seed=how.seed, memory=how.memory,
         )  # fmt: skip
-        ward = {
-            row.name: {f"ward {name}": row.scores[name] for name in ("accuracy", "nmi")} for row in found.rows
-        }
-        scored = with_verdicts([replace(row, scores={**row.scores, **ward[row.name]}) for row in scored])
+        ward = {row.name: row.scores for row in found.rows}
+        more = [{f"ward {score}": ward[row.name][score] for score in ("accuracy", "nmi")} for row in scored]
+        wider = zip(scored, more, strict=True)
+        scored = with_verdicts([replace(row, scores={**row.scores, **own}) for row, own in wider])
         note = f"Ward clusters of {int(near.sum()):,} images up to {cluster_within:g} degrees, gallery too"
         columns |= {"ward accuracy": Column("Ward", "high", note=f"purity of {note}")}
         columns |= {"ward nmi": Column("Ward NMI", "high", note="normalised mutual information of the same")}
@@ -274,26 +274,25 @@ def verify(
         caption, "features", scored, columns, intervals=tuple(columns), deviations=(),
         more={error: lambda row: errors.get(row.name)},
     )  # fmt: skip
-    tables = [
-        shown,
-        verdict_table(scored, columns, "Above the strongest control? (paired resamples of pairs)"),
-    ]
+    judged = verdict_table(scored, columns, "Above the strongest control? (paired resamples of pairs)")
     values = {
         "pairs": len(pairs), "folds": n_folds, "images": len(names), "half": half, "standard_error": errors,
         "rows": numbers_of(scored),
     }  # fmt: skip
-    return Scores(tables, values, [*how.notes, verdict(scored[0], "accuracy"), how.memory.summary()], scored)
+    notes = [*how.notes, verdict(scored[0], "accuracy"), how.memory.summary()]
+    return Scores([shown, judged], values, notes, scored)
 
 
 def _in_half(pairs: Pairs, half: str) -> Pairs:
     """The pairs whose people all lie in one half; in each fold as many of one person as of two, the first."""
     if half == "all":
         return pairs
-    sides = (
-        [in_test_half(name.rpartition("_")[0]) == (half == "test") for name in names]
-        for names in (pairs.first, pairs.second)
-    )
-    own, kept = np.all(list(sides), axis=0), []
+
+    def inside(name: str) -> bool:
+        return in_test_half(name.rpartition("_")[0]) == (half == "test")
+
+    own = np.array([inside(a) and inside(b) for a, b in zip(pairs.first, pairs.second, strict=True)])
+    kept: list[int] = []
     for fold in np.unique(pairs.fold):
         both = [np.flatnonzero(own & (pairs.fold == fold) & (pairs.same == same)) for same in (True, False)]
         kept += [row for rows in both for row in rows[: min(map(len, both))].tolist()]

@@ -89,15 +89,11 @@ def image_rows(
     """
     count = max(len(values) for each in scores.values() for values in each.values())
     weights = group_resamples(np.arange(count) if groups is None else groups, resample_count, seed)
-    rows = [
-        ScoredRow(
-            name,
-            at > 0 if controls is None else name in controls,
-            1,
-            {score: _estimate(values, weights) for score, values in each.items()},
-        )
-        for at, (name, each) in enumerate(scores.items())
-    ]
+    quiet = list(scores)[1:] if controls is None else controls
+    rows = []
+    for name, each in scores.items():
+        found = {score: _estimate(values, weights) for score, values in each.items()}
+        rows.append(ScoredRow(name, name in quiet, 1, found))
     return with_verdicts(rows, lower=[name for name, (column, _) in columns.items() if column.best == "low"])
 
 

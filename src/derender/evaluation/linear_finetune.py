@@ -10,6 +10,7 @@ Source: Klinghoffer et al., ECCV 2022, Sec. 4.4 and Table 2 ("Finetune"). Encode
 
 import copy
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -114,11 +115,8 @@ def finetuned_answers(
         }  # fmt: skip
         progress = options.stage(f"fine-tuning {what}, {count:,} labels, seed {seeds[at]}", "epochs")
         how: dict[str, Any] = {"seed": seeds[at], "settings": settings, "progress": progress}
-        return options.memory.recall_one(
-            "finetuned",
-            inputs,
-            lambda: finetune(model, images, task, rows, split.test, factors=chosen, **how),
-        )
+        learn = partial(finetune, model, images, task, rows, split.test, factors=chosen, **how)
+        return options.memory.recall_one("finetuned", inputs, learn)
 
     trained = {name: [opened(run, options.device) for run in runs] for name, runs in models.items()}
     first = next((run for runs in trained.values() for run in runs if isinstance(run, Derenderer)), None)
@@ -141,10 +139,7 @@ def finetuned_answers(
     }
     for name in ready.controls:
         if not name.startswith(UNTRAINED):
-            found[name] = {
-                count: probe_runs(
-                    "linear", ready.features[name], task, rows, split.test, seeds, settings, options.memory
-                )
-                for count, rows in split.train.items()
-            }
+            asked = partial(probe_runs, "linear", ready.features[name], task)
+            how = (split.test, seeds, settings, options.memory)
+            found[name] = {count: asked(rows, *how) for count, rows in split.train.items()}
     return found

@@ -275,9 +275,8 @@ def linear_scores(targets: np.ndarray, probabilities: np.ndarray, kind: str) -> 
         for truth, answer in zip(targets.T, probabilities.T, strict=True)
         if (truth == 1).any()
     ]
-    return LinearScores(
-        float(accuracy), float(balanced), float(np.mean(precisions)) if precisions else float("nan")
-    )
+    precision = float(np.mean(precisions)) if precisions else float("nan")
+    return LinearScores(float(accuracy), float(balanced), precision)
 
 
 def count_scores(

@@ -17,11 +17,9 @@ from derender.evaluation.controls import with_controls
 from derender.evaluation.feature_rows import FeatureSource, chosen_labels, is_model, prepare, rows_of, runs_of
 from derender.evaluation.linear_probing import FINETUNED, LinearComparison, compare_prepared, linear_tables
 from derender.evaluation.options import Options
-from derender.evaluation.paper_tables import ATTRIBUTES, PaperRow, table_named
+from derender.evaluation.paper_tables import ATTRIBUTES, PaperRow, beside_the_paper, table_named
 from derender.evaluation.score_table import (
-    Cell,
     Column,
-    Row,
     Scores,
     ScoreTable,
     interval_column,
@@ -65,10 +63,8 @@ def compare(
     Raises:
         ValueError: an unknown table, or labels, factors or images that do not fit.
     """
-    spec, how = (
-        table_named(table),
-        Options(**{"images": images, "descriptors": table == "identity", **options}),
-    )
+    spec = table_named(table)
+    how = Options(**{"images": images, "descriptors": table == "identity", **options})
     models = {name: [run for run in runs_of(runs) if is_model(run)] for name, runs in features.items()}
     models = {name: runs for name, runs in models.items() if runs}
     numbers = {"table": table, "number": spec.number}
@@ -161,23 +157,6 @@ def compare(
     return Scores(tables, {**numbers, "parts": values}, [*notes, how.memory.summary()])
 
 
-def beside_the_paper(
-    caption: str,
-    columns: Mapping[str, Column],
-    ours: Mapping[str, Mapping[str, Cell]],
-    controls: Sequence[str],
-    paper: Sequence[PaperRow],
-    differs: str,
-) -> ScoreTable:
-    """Rows of cells by column over the paper's lines; the last column is the data, or how ours differ."""
-    rows = [Row(name, (*map(cells.get, columns), differs), name in controls) for name, cells in ours.items()]
-    rows += [
-        Row(f"paper: {line.method}", (*map(line.scores.get, columns), line.dataset), note="paper")
-        for line in paper
-    ]
-    return ScoreTable(caption, "features", (*columns.values(), Column("data")), rows)
-
-
 def heads_table(caption: str, found: LinearComparison, paper: Sequence[PaperRow], differs: str) -> ScoreTable:
     """Accuracies of the paper's head by number of labels, frozen and fine-tuned, over the paper's own."""
     columns, ours, controls = {}, {}, []
@@ -191,9 +170,6 @@ def heads_table(caption: str, found: LinearComparison, paper: Sequence[PaperRow]
     lines: dict[str, dict[str, float]] = {}
     for line in paper:
         lines.setdefault(line.method, {}).update(line.scores)
-    known = [
-        PaperRow(method, paper[0].dataset, scores)
-        for method, scores in lines.items()
-        if set(scores) & set(columns)
-    ]
+    asked = {method: scores for method, scores in lines.items() if set(scores) & set(columns)}
+    known = [PaperRow(method, paper[0].dataset, scores) for method, scores in asked.items()]
     return beside_the_paper(caption, columns, ours, controls, known, differs)

@@ -6,7 +6,7 @@ says so. A further table is a further ``TableSpec`` in ``TABLES``; paper_compari
 """
 
 import csv
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any, Literal
@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from derender.evaluation.feature_rows import attribute_columns
+from derender.evaluation.score_table import Cell, Column, Row, ScoreTable
 from derender.features import FeatureTable, named
 
 ATTRIBUTES = "attributes"
@@ -128,3 +129,20 @@ TABLES = {
 def table_named(name: str) -> TableSpec:
     """One of ``TABLES``; an unknown name is an error that names the nearest."""
     return named(TABLES, name, "table")
+
+
+def beside_the_paper(
+    caption: str,
+    columns: Mapping[str, Column],
+    ours: Mapping[str, Mapping[str, Cell]],
+    controls: Sequence[str],
+    paper: Sequence[PaperRow],
+    differs: str,
+    first: str = "features",
+) -> ScoreTable:
+    """Rows of cells by column over the paper's lines; the last column is the data, or how ours differ."""
+    rows = [Row(name, (*map(cells.get, columns), differs), name in controls) for name, cells in ours.items()]
+    for line in paper:
+        cells = (*map(line.scores.get, columns), line.dataset)
+        rows.append(Row(f"paper: {line.method}", cells, note="paper"))
+    return ScoreTable(caption, first, (*columns.values(), Column("data")), rows)

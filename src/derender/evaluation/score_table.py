@@ -178,13 +178,12 @@ class ScoreTable:
 
     def _marked(self, escape: Callable[[str], str], control: str, best: str) -> list[list[str]]:
         """Escaped names and cells, those of controls and the best of each column in their marks."""
-        return [
-            [
-                (control if row.control else "{}").format(escape(row.name)),
-                *((best if marked else "{}").format(escape(text)) for text, marked in self.texts(row)),
-            ]
-            for row in self.rows
-        ]
+        lines = []
+        for row in self.rows:
+            name = (control if row.control else "{}").format(escape(row.name))
+            cells = [(best if marked else "{}").format(escape(text)) for text, marked in self.texts(row)]
+            lines.append([name, *cells])
+        return lines
 
 
 @dataclass(frozen=True)
@@ -268,15 +267,12 @@ VERDICT_COLUMNS = (
 
 def verdict_table(rows: Sequence[ScoredRow], columns: Mapping[str, Column], caption: str) -> ScoreTable:
     """Which row is above the strongest control, in each score named by a column, and by how much."""
-    found = [
-        Row(
-            f"{row.name}: {columns[name].name}",
-            (one.value, one.low, one.high, one.rival, "yes" if one.above else "no"),
-        )
-        for row in rows
-        for name, one in row.versus.items()
-        if name in columns and isfinite(row.scores[name].low)
-    ]
+    found = []
+    for row in rows:
+        for name, one in row.versus.items():
+            if name in columns and isfinite(row.scores[name].low):
+                cells = (one.value, one.low, one.high, one.rival, "yes" if one.above else "no")
+                found.append(Row(f"{row.name}: {columns[name].name}", cells))
     return ScoreTable(caption, "features: score", VERDICT_COLUMNS, found)
 
 

@@ -153,11 +153,9 @@ def ground_truth_scores(
     if dimensions is not None:
         weights, each = importance(everything, factors, dimensions, seed=seed), binned(everything)
         single = np.stack([_explained(everything, factor) for factor in factors], axis=1)
+        gaps = [_information_gap(each, factor) for factor in factors], _gap(single)
         by_dimension = ModularityScores(
-            *dci(weights),
-            informativeness,
-            float(np.mean([_information_gap(each, factor) for factor in factors])),
-            float(np.mean(_gap(single))),
+            *dci(weights), informativeness, *(float(np.mean(one)) for one in gaps)
         )
         starts = np.cumsum([0, *(values.shape[1] for values in blocks.values())])[:-1]
         grouped = dci(np.add.reduceat(weights, starts, axis=0))

@@ -205,15 +205,10 @@ class RobustnessComparison:
 
     def numbers(self) -> dict[str, Any]:
         """Everything for JSON."""
-        curves = {
-            curve.name: {
-                "title": curve.title,
-                "levels_deg": curve.levels,
-                "n_tested": curve.n_tested,
-                **{score: numbers_of(rows) for score, rows in curve.rows.items()},
-            }
-            for curve in self.curves
-        }
+        curves = {}
+        for curve in self.curves:
+            facts = {"title": curve.title, "levels_deg": curve.levels, "n_tested": curve.n_tested}
+            curves[curve.name] = facts | {score: numbers_of(rows) for score, rows in curve.rows.items()}
         return {**vars(self), "curves": curves}
 
     def tables(self, score: str = "accuracy") -> list[ScoreTable]:

@@ -21,7 +21,7 @@ import numpy as np
 from derender.data import read_masks
 from derender.evaluation.bootstrap import RESAMPLES, ScoredRow, estimate, resamples, with_verdicts
 from derender.evaluation.memory import Memory, content_hash
-from derender.evaluation.paper_tables import SEGMENTATION
+from derender.evaluation.paper_tables import SEGMENTATION, beside_the_paper
 from derender.evaluation.score_table import Cell, Column, Row, Scores, ScoreTable, scored_table, verdict_table
 from derender.evaluation.segmentation import nets
 from derender.evaluation.segmentation.data import CONTROLS, TEST_FRACTION, SegmentationData, divide
@@ -87,15 +87,10 @@ class SegmentationComparison:
         def by_class(values: np.ndarray) -> dict[str, float]:
             return dict(zip(data.classes, values.tolist(), strict=True))
 
-        rows = {
-            row.scored.name: {
-                **row.scored.numbers(),
-                "trainable": row.trainable,
-                "class_iou": by_class(row.class_iou),
-                "losses": row.losses.tolist(),
-            }
-            for row in self.rows
-        }
+        rows = {}
+        for row in self.rows:
+            more = {"trainable": row.trainable, "class_iou": by_class(row.class_iou)}
+            rows[row.scored.name] = {**row.scored.numbers(), **more, "losses": row.losses.tolist()}
         return {
             "n_train": len(data.train), "n_test": len(data.test), "split": data.split, "seeds": self.seeds,
             "settings": self.settings.model_dump(), "train_share": by_class(data.shares(data.train)),
@@ -126,16 +121,13 @@ class SegmentationComparison:
         ]
         heads = (Column("share", note="of the tested pixels"), *columns)
         tables.append(ScoreTable("intersection over union of every class", "class", heads, classes))
-        rows = [
-            Row(one.name, (*(one.scores[name].value for name in COLUMNS), self.differs), one.control)
-            for one in scored
-        ]
-        rows += [
-            Row(f"paper: {one.method}", (*(one.scores[n] for n in COLUMNS), one.dataset), note="paper")
-            for one in SEGMENTATION.paper
-        ]
-        heads = (*COLUMNS.values(), Column("data"))
-        return [*tables, ScoreTable("segmentation, beside the paper's Table 3", "net", heads, rows)]
+        ours = {one.name: {name: one.scores[name].value for name in COLUMNS} for one in scored}
+        controls, caption = (
+            [one.name for one in scored if one.control],
+            "segmentation, beside the paper's Table 3",
+        )
+        paper = beside_the_paper(caption, COLUMNS, ours, controls, SEGMENTATION.paper, self.differs, "net")
+        return [*tables, paper]
 
 
 def segment(
@@ -229,17 +221,12 @@ def segment(
         rows.append((title, True, runs, 0))
     weights = np.concatenate(list(resamples(len(data.test), resample_count)))
     scored = with_verdicts([_scored(title, control, runs, weights) for title, control, runs, _ in rows])
-    made_rows = [
-        SegmentationRow(
-            one,
-            np.mean([class_iou(run["counts"]) for run in runs], axis=0),
-            trainable,
-            np.array([run["losses"] for run in runs if "losses" in run]),
-            runs[0]["shown"],
-        )
-        for one, (_, _, runs, trainable) in zip(scored, rows, strict=True)
-    ]
-    found = SegmentationComparison(tuple(made_rows), data, tuple(seeds), settings, shown)
+    made = []
+    for one, (_, _, runs, trainable) in zip(scored, rows, strict=True):
+        iou = np.mean([class_iou(run["counts"]) for run in runs], axis=0)
+        losses = np.array([run["losses"] for run in runs if "losses" in run])
+        made.append(SegmentationRow(one, iou, trainable, losses, runs[0]["shown"]))
+    found = SegmentationComparison(tuple(made), data, tuple(seeds), settings, shown)
     return Scores(found.tables(), {"data": data.source, **found.numbers()}, notes, result=found)
 
 
