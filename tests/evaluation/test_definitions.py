@@ -11,7 +11,7 @@ ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "reference" / "metrics.md").read_text()
 TABLES = (
     *("evaluation/clustering", "evaluation/clustering_scores", "evaluation/linear_probing"),
-    *("evaluation/paper_comparison", "evaluation/score_table", "evaluation/disentanglement/card"),
+    *("evaluation/paper_tables", "evaluation/score_table", "evaluation/disentanglement/card"),
     *("evaluation/segmentation/compare", "evaluation/robust/compare"),
     *("evaluation/depth", "evaluation/factors", "evaluation/pixels"),
 )
