@@ -135,10 +135,8 @@ def test_features_are_the_map_its_mean_and_its_histogram(seeded, losses):
     assert [tuple(value.shape) for value in features.values()] == [(6, 16), (6, 8 * 8 * 8), (6, 8)]
     torch.testing.assert_close(features["pooled"], features["map"].view(6, 8, 64).mean(dim=2))
     torch.testing.assert_close(features["pooled"], features["histogram"] @ model.codebook.codebook)
-    for names, message in (
-        (("poold",), "vqvae has no feature 'poold'; did you mean 'pooled'"),
-        ((), "has no"),
-    ):
+    unknown = "vqvae has no feature 'poold'; did you mean 'pooled'"
+    for names, message in ((("poold",), unknown), ((), "has no")):
         with pytest.raises(ValueError, match=message):
             model.choose(names)
     with pytest.raises(ValueError, match=r"takes images of shape \(N, 3, 32, 32\), got \(1, 3, 16, 16\)"):

@@ -47,11 +47,7 @@ def small():
 
 def test_an_untrained_twin_has_the_shape_not_the_weights_and_leaves_the_generator(small):
     state = torch.random.get_rng_state()
-    first, again, other = (
-        controls.untrained_twin(small, 0),
-        controls.untrained_twin(small, 0),
-        controls.untrained_twin(small, 1),
-    )
+    first, again, other = (controls.untrained_twin(small, seed) for seed in (0, 0, 1))
     assert torch.equal(torch.random.get_rng_state(), state)
     assert model_fingerprint(first) == model_fingerprint(again) != model_fingerprint(other)
     assert model_fingerprint(first) != model_fingerprint(small)
@@ -68,10 +64,8 @@ def stripes(*images: np.ndarray) -> ImageSet:
 def test_hog_knows_orientations_and_neither_brightness_nor_contrast():
     upright = np.tile(100 + 60 * np.sin(np.arange(32) / 2), (32, 1)).round()
     seen = []
-    table = controls.hog_features(
-        stripes(upright, upright.T, upright + 40, np.full((32, 32), 7)),
-        progress=lambda *counts: seen.append(counts),
-    )
+    given = stripes(upright, upright.T, upright + 40, np.full((32, 32), 7))
+    table = controls.hog_features(given, progress=lambda *counts: seen.append(counts))
     values = table.factors["hog"]
     assert values.shape == (4, 3 * 3 * 2 * 2 * 9) and seen == [(4, 4)]
     assert controls.hog_features(stripes(np.zeros((64, 64)))).factors["hog"].shape == (1, 1764)

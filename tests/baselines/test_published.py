@@ -264,13 +264,8 @@ def test_damaged_and_missing_files_are_one_clear_error(e4e_content, tmp_path):
         load_published_generator(save({"g_ema": [1, 2]}, path))
 
 
-TINY = {
-    "hidden_size": 8,
-    "num_hidden_layers": 2,
-    "num_attention_heads": 2,
-    "image_size": 28,
-    "patch_size": 14,
-}
+TINY = {"hidden_size": 8, "num_hidden_layers": 2, "num_attention_heads": 2}
+TINY |= {"image_size": 28, "patch_size": 14}
 
 
 @pytest.fixture(scope="module")

@@ -22,10 +22,9 @@ FEW = supervised.SupervisedConfig(
 
 
 def test_it_has_the_parameters_of_resnet18():
+    settings = supervised.Resnet18Settings(classes={"kind": tuple(map(str, range(1000)))})
     with torch.device("meta"):
-        model = supervised.Resnet18(
-            supervised.Resnet18Settings(classes={"kind": tuple(map(str, range(1000)))})
-        )
+        model = supervised.Resnet18(settings)
     assert sum(value.numel() for value in model.parameters()) == 11_689_512
 
 
@@ -51,11 +50,8 @@ def test_it_learns_from_few_labels_and_repeats(blobs, tmp_path):
 
 
 def test_accuracy_counts_right_answers_among_known_labels(blobs):
-    model = supervised.Resnet18(
-        supervised.Resnet18Settings(
-            image_size=32, width=4, classes={"side": ("0", "1"), "shade": ("dark", "light")}
-        )
-    )
+    classes = {"side": ("0", "1"), "shade": ("dark", "light")}
+    model = supervised.Resnet18(supervised.Resnet18Settings(image_size=32, width=4, classes=classes))
     with torch.no_grad():
         model.net.classifier[-1].weight.zero_()
         model.net.classifier[-1].bias.copy_(torch.tensor([0.0, 1.0, 1.0, 0.0]))  # always 1, always dark
@@ -82,10 +78,8 @@ def test_every_label_has_its_own_classes(blobs):
     assert names == {"shade": ("dark", "light"), "side": ("0", "1")}
     assert targets.tolist() == [[1, 1], [0, 0]]
     model = supervised.Resnet18(supervised.Resnet18Settings(image_size=32, width=4, classes=names))
-    logits, parts = (
-        model.describe(torch.rand(2, 3, 32, 32))["logits"],
-        model.label_logits(torch.rand(2, 3, 32, 32)),
-    )
+    images = torch.rand(2, 3, 32, 32)
+    logits, parts = model.describe(images)["logits"], model.label_logits(images)
     assert logits.shape == (2, 4) and [part.shape for part in parts] == [(2, 2), (2, 2)]
 
 

@@ -34,14 +34,8 @@ def test_recognition_falls_with_the_light_and_is_chance_for_noise(codes):
     found = identify(table(codes, light_deg=angles), factors=("code",), resamples=50, cache="none")
     rows = found.values["rows"]
     share = {name: one["value"] for name, one in rows["code"]["scores"].items()}
-    assert found.values["probes"] == {
-        "all": 108,
-        "<= 12": 24,
-        "<= 25": 24,
-        "<= 50": 24,
-        "<= 77": 12,
-        "beyond": 24,
-    }
+    groups = {"all": 108, "<= 12": 24, "<= 25": 24, "<= 50": 24, "<= 77": 12, "beyond": 24}
+    assert found.values["probes"] == groups
     assert share["<= 12"] > 0.95 > share["<= 50"] > share["beyond"] + 0.1
     assert share["ward accuracy"] > rows["chance"]["scores"]["ward accuracy"]["value"] + 0.2
     assert rows["chance"]["scores"]["all"]["value"] == pytest.approx(1 / PEOPLE)
@@ -94,17 +88,9 @@ def test_pairs_are_judged_by_a_threshold_from_other_folds(tmp_path, codes):
 
 
 def test_pairs_of_a_half_have_all_people_in_it_and_are_balanced(tmp_path, codes):
-    found = {
-        half: verify(
-            table(codes),
-            written(tmp_path / "p.txt"),
-            half=half,
-            factors=("code",),
-            resamples=20,
-            cache="none",
-        )
-        for half in ("development", "test")
-    }
+    how = {"factors": ("code",), "resamples": 20, "cache": "none"}
+    pairs = written(tmp_path / "p.txt")
+    found = {half: verify(table(codes), pairs, half=half, **how) for half in ("development", "test")}
     people = np.array([f"P{row}" for row in range(PEOPLE)])
     whole = FeatureTable(tuple(people), {"x": np.zeros((PEOPLE, 1))}, {"identity": people})
     assert sum(len(half_of(whole, half)) for half in found) == PEOPLE

@@ -18,6 +18,7 @@ def table(ours: float, controls: dict[str, float | None], best="high") -> ScoreT
 
 TWO = {"pca": 0.5, "pixels": 0.6}
 DEPTHS = {"plane": 3.0, "average": 2.0}
+BEHIND = "behind the strongest control"
 
 
 @pytest.mark.parametrize(
@@ -28,12 +29,7 @@ DEPTHS = {"plane": 3.0, "average": 2.0}
         (0.1, TWO, "high", "behind the strongest control: 0.100 against 0.600 (pixels)"),
         (0.6, TWO, "high", "level with the strongest control: 0.600 (pixels)"),
         (1.0, DEPTHS, "low", "better than every control: 1.000 against 2.000 (average)"),
-        (
-            2.5,
-            DEPTHS,
-            "low",
-            "behind the strongest control: 2.500 against 2.000 (average), but ahead of plane",
-        ),
+        (2.5, DEPTHS, "low", f"{BEHIND}: 2.500 against 2.000 (average), but ahead of plane"),
         (0.0, {"plane": 0.5}, "low", "better than every control: 0.000 against 0.500 (plane)"),
         (0.5, {"missing": None}, "high", "ours: 0.500 (score)"),
     ],

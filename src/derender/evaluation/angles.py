@@ -65,10 +65,8 @@ def agreement_table(
 ) -> tuple[ScoreTable, dict[str, Any]]:
     """A row for each name, all but the first controls, then the constant answer; and the numbers for JSON."""
     answers = {**predicted, "constant answer": np.full(len(true), true.mean())}
-    rows = [
-        ScoredRow(name, at > 0, 1, agreement(np.asarray(own, np.float64), true, weights))
-        for at, (name, own) in enumerate(answers.items())
-    ]
+    scores = {name: agreement(np.asarray(own, np.float64), true, weights) for name, own in answers.items()}
+    rows = [ScoredRow(name, at > 0, 1, own) for at, (name, own) in enumerate(scores.items())]
     shown = ("r", "slope", "error")
     columns = {name: replace(one, digits=digits if one.digits == 2 else 3) for name, one in AGREEMENT.items()}
     table = scored_table(caption, "prediction", rows, columns, intervals=shown, deviations=())

@@ -141,10 +141,8 @@ def _by_group(nets: Mapping[str, Any], images: ImageSet, by: str, how: Options) 
     columns = {what: Column(what, None, note="mean brightness, 0 to 1") for what in found}
     columns["light"] = Column("light", None, note="mean shading")
     answers = {name: one["albedo"] @ LUMA for name, one in seen.items()} | {"image as albedo": picture}
-    shares = [
-        ScoredRow(name, at > 0, 1, {"share": estimate(share(one, once), share(one, weights))})
-        for at, (name, one) in enumerate(answers.items())
-    ]
+    taken = {name: estimate(share(one, once), share(one, weights)) for name, one in answers.items()}
+    shares = [ScoredRow(name, at > 0, 1, {"share": one}) for at, (name, one) in enumerate(taken.items())]
     caption = f"Brightness of {by}, {len(group):,} images"
     tables = [
         scored_table(caption, "prediction", shares, {"share": _SHARE}, deviations=()),

@@ -176,11 +176,8 @@ def chosen_labels(
 
 def attribute_columns(table: FeatureTable, least: int = 0) -> tuple[str, ...]:
     """Yes/no label columns (int8 with 1, 0 and -1 for unknown) that have ``least`` rows of either answer."""
-    return tuple(
-        name
-        for name, values in table.labels.items()
-        if values.dtype == np.int8 and min((values == 0).sum(), (values == 1).sum()) >= least
-    )
+    answers = {name: values for name, values in table.labels.items() if values.dtype == np.int8}
+    return tuple(name for name, own in answers.items() if min((own == 0).sum(), (own == 1).sum()) >= least)
 
 
 def prepare(
@@ -224,13 +221,9 @@ def prepare(
 
     made = [replace(row, tables=tuple(map(arranged, row.tables))) for row in rows]
     table = made[0].tables[0]
-    return Prepared(
-        {row.name: row.arrays() for row in made},
-        {name: table.label(name) for name in labels},
-        table,
-        tuple(row.name for row in rows if row.control),
-        dropped[-1],
-    )
+    features, known = {row.name: row.arrays() for row in made}, {name: table.label(name) for name in labels}
+    controls = tuple(row.name for row in rows if row.control)
+    return Prepared(features, known, table, controls, dropped[-1])
 
 
 def at_least(labels: np.ndarray, count: int, most: int | None = None) -> np.ndarray:

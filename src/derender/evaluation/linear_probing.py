@@ -270,11 +270,8 @@ def linear_scores(targets: np.ndarray, probabilities: np.ndarray, kind: str) -> 
     Values and classes that no row has do not count.
     """
     accuracy, balanced = count_scores(targets, probabilities, kind, np.ones((1, len(targets)), np.float32))[0]
-    precisions = [
-        average_precision_score(truth[truth >= 0], answer[truth >= 0])
-        for truth, answer in zip(targets.T, probabilities.T, strict=True)
-        if (truth == 1).any()
-    ]
+    columns = [(t, t >= 0, p) for t, p in zip(targets.T, probabilities.T, strict=True) if (t == 1).any()]
+    precisions = [average_precision_score(truth[known], answer[known]) for truth, known, answer in columns]
     precision = float(np.mean(precisions)) if precisions else float("nan")
     return LinearScores(float(accuracy), float(balanced), precision)
 

@@ -7,15 +7,10 @@ from tests.evaluation.disentanglement.conftest import card
 from derender.data import ImageSet
 from derender.evaluation.disentanglement.card import dealt, disentangle, shuffled_rows
 from derender.model import Derenderer
-from derender.presets import MODEL_PRESETS
 
 
 def model() -> Derenderer:
-    settings = MODEL_PRESETS["small"]
-    network = settings.network.model_copy(
-        update={"image_size": 32, "width": 4, "light_width": 4, "code_size": 16}
-    )
-    return Derenderer.seeded(settings.model_copy(update={"network": network}), 3).eval()
+    return Derenderer.from_preset("small", seed=3, image_size=32, width=4, light_width=4, code_size=16).eval()
 
 
 def lit_pictures(count: int = 60) -> ImageSet:

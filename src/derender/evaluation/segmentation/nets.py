@@ -173,13 +173,9 @@ def build_variant(model: Any, variant: Variant, data: SegmentationData, seed: in
                 if isinstance(module, nn.Conv2d | nn.BatchNorm2d):
                     module.reset_parameters()
         torch.manual_seed(decoder_seed)
-        net = SegmentationNet(
-            encoders,
-            len(data.classes),
-            frozen=variant.frozen,
-            kept_statistics=variant.pretrained,
-            decoder=model.unet_decoder if variant.decoder else None,
-        ).to(model.device)
+        how = {"frozen": variant.frozen, "kept_statistics": variant.pretrained}
+        decoder = model.unet_decoder if variant.decoder else None
+        net = SegmentationNet(encoders, len(data.classes), decoder=decoder, **how).to(model.device)
     if variant.frozen and not variant.pretrained:
         rows = data.train[:STATISTICS_IMAGES]
         parts = np.array_split(rows, max(1, len(rows) // LARGEST_BATCH))
