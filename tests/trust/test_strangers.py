@@ -1,5 +1,6 @@
 """Files of a run or a model that a stranger wrote: refused in one sentence, in little time and memory."""
 
+import io
 import json
 import os
 import resource
@@ -10,6 +11,7 @@ from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from tests.trust.hostile_files import encoded, png_that_says, smooth
@@ -21,6 +23,8 @@ from derender.cli.console import show_scores
 from derender.data import read_images
 from derender.data.synthetic.settings import FaceSettings, named_settings
 from derender.data.zip_source import ZipSource
+from derender.evaluation.angles import read_columns
+from derender.evaluation.identity import read_pairs
 from derender.evaluation.score_table import Column, Row, ScoreTable
 from derender.interpretation.probe import load_probe
 from derender.learn.plan import read_plan
@@ -234,6 +238,31 @@ def test_only_regular_files_are_read(tmp_path):
             read_bounded(path)
     with pytest.raises(ValueError):
         parse_json("NaN", int)
+
+
+def test_tables_of_pairs_and_angles_are_bounded(tmp_path):
+    columns = partial(read_columns, names=("yaw",))
+    readers = {"pairs.txt": read_pairs, "a.npz": columns, "a.csv": columns, "a.parquet": columns}
+    for name, read in readers.items():
+        file = tmp_path / name
+        for damage in (
+            sparse,
+            os.mkfifo,
+            lambda at: at.symlink_to("/dev/zero"),
+            lambda at: at.write_bytes(b"PK\xff"),
+        ):
+            file.unlink(missing_ok=True)
+            damage(file)
+            with cheaply(), pytest.raises(ValueError, match=f"{name} cannot be read as"):
+                read(file)
+    for numbers, content in ((1 << 40, 1_000), (1 << 27, 300 << 20)):
+        head = io.BytesIO()
+        described = {"descr": "<f8", "fortran_order": False, "shape": (numbers,)}
+        np.lib.format.write_array_header_1_0(head, described)
+        with zipfile.ZipFile(tmp_path / "a.npz", "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr("yaw.npy", head.getvalue() + bytes(content))
+        with cheaply(), pytest.raises(ValueError, match=r"a\.npz cannot be read as"):
+            columns(tmp_path / "a.npz")
 
 
 PLAIN = torch.ones(4, 3, 4, 4)

@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 import torch
@@ -30,6 +31,7 @@ from derender.features.table import named
 from derender.inputs import as_model
 from derender.model import Derenderer
 from derender.scene import Scene
+from derender.storage.bounded import LINES_LIMIT_BYTES, first_line, require_regular
 
 AGREEMENT = {
     "r": Column("r", "high", note="Pearson's correlation, -1 to 1"),
@@ -209,14 +211,18 @@ def read_columns(path: str | Path, names: Sequence[str]) -> dict[str, np.ndarray
     import pyarrow.parquet as parquet
 
     try:
+        require_regular(Path(path), LINES_LIMIT_BYTES)
         if Path(path).suffix == ".npz":
             with np.load(path, allow_pickle=False) as stored:
+                if sum(one.file_size for one in stored.zip.infolist()) > LINES_LIMIT_BYTES:
+                    raise ValueError(f"it unpacks to more than {LINES_LIMIT_BYTES >> 20} MiB")
                 kept = {name: stored[name] for name in stored.files if name in (*names, "name", "file")}
         else:
             table = csv.read_csv(path) if Path(path).suffix == ".csv" else parquet.read_table(path)
             kept = {name: table[name].to_numpy() for name in table.column_names}
-    except (OSError, ValueError, EOFError) as problem:
-        raise ValueError(f"{path} cannot be read as .npz, .csv or .parquet: {problem}") from problem
+    except (OSError, ValueError, EOFError, MemoryError, BadZipFile) as problem:
+        why = first_line(problem)
+        raise ValueError(f"{path} cannot be read as .npz, .csv or .parquet: {why}") from problem
     kept = kept if "name" in kept or "file" not in kept else {**kept, "name": kept["file"]}
     return {name: named(kept, name, f"column of {path}") for name in ("name", *names)}
 

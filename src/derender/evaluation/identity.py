@@ -31,6 +31,7 @@ from derender.evaluation.options import Options
 from derender.evaluation.score_table import Column, Scores, scored_table, verdict, verdict_table
 from derender.features import FeatureTable, missing
 from derender.inputs import as_model
+from derender.storage.bounded import first_line, read_text
 
 CLUSTERED_DEG = 50.0
 FOLDS = 10
@@ -181,7 +182,10 @@ def read_pairs(path: str | Path) -> Pairs:
     Raises:
         ValueError: the file is not of this form, with its line.
     """
-    lines = Path(path).read_text(encoding="utf-8").splitlines()
+    try:
+        lines = read_text(Path(path)).splitlines()
+    except ValueError as problem:
+        raise ValueError(f"{path} cannot be read as pairs: {first_line(problem)}") from problem
     head = lines[0].split() if lines else []
     if len(head) not in (1, 2) or not all(word.isdecimal() and int(word) for word in head):
         raise ValueError(f"{path}, line 1: expected FOLDS PAIRS, as LFW's pairs.txt begins, got {lines[:1]}")
