@@ -4,6 +4,7 @@ import copy
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any, TypeVar
 
 import torch
@@ -146,13 +147,18 @@ class EmbeddingModel(nn.Module):
         return self._fitted(as_batch(images, self.image_size, next(self.parameters()).device), steps)
 
     def _fitted(self, images: Float[Tensor, "n 3 h w"], steps: int) -> Fitted:
-        fitting = self.features.required_fitting()
+        fitting, nets = self.features.required_fitting(), dict[str, Any](self.nets)
+        rows = [row for row in self.factors if not (row.mirrored or row.parameter in ("light", "camera"))]
+        ranged = [partial(row.to_parameter, ranges=self.settings.ranges) for row in rows]
 
         def fitted(portion: Tensor) -> Fitted:
             few = len(portion) if portion.is_cuda else FEW
             with torch.no_grad():
-                scenes = [self.decode(self.encode(part)) for part in portion.split(few)]
-            return fitting.fit(portion, Scene.joined(scenes), self.render, steps)
+                codes = [self.encode(part) for part in portion.split(few)]
+                scene = Scene.joined([self.decode(one) for one in codes])
+                raws = [torch.cat([nets[row.name].decode(one[row.name]) for one in codes]) for row in rows]
+            further = list(zip([row.parameter for row in rows], raws, ranged, strict=True))
+            return fitting.fit(portion, scene, self.render, steps, further)
 
         found = Fitted.joined(by_portions(fitted, images), len(images))
         return replace(found, scene=self.balanced(found.scene))

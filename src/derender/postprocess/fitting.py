@@ -1,8 +1,7 @@
 """Test-time optimisation: scenes fitted per image, from the encoders' prediction down through the renderer.
 
-Geometry and albedo move within a morphable model of the trained model's predictions (morphable.py), light and
-camera freely, so that the rendering comes near the image; coordinates far from their mean cost more. Leaves
-out the parameters of further factors, which stay as predicted.
+Geometry and albedo move within a morphable model of the trained model's predictions (morphable.py), other
+factors freely, so that the rendering comes near the image; coordinates far from their mean cost more.
 """
 
 import math
@@ -35,6 +34,7 @@ _LIGHT = [(0.03, 0.02, 1.2)] * 2 + [(0.03, -math.radians(80), math.radians(80))]
 """Ambient, diffuse, radians; images may be brighter than the ranges allow."""
 _CAMERA = [(0.01, -math.radians(75), math.radians(75))] * 3 + [(0.003, -0.4, 0.4)] * 3
 """Radians, scene units; beyond, little is left in the image."""
+_FURTHER = (0.05, -4.0, 4.0)  # what a network gives before its tanh
 _LATE, _LATE_RATE = 0.6, 0.3  # from this share of the steps on rates are multiplied by this
 _NOISE = 0.03  # mean absolute error, 0..1, that counts as much as coordinates of 1
 _BEYOND = 0.1  # what an error beyond the tolerance still counts
@@ -111,21 +111,21 @@ class Fitting(nn.Module):
     @torch.enable_grad()
     def fit(
         self, images: Float[Tensor, "n 3 h w"], scene: Scene, render: Callable[[Scene], Rendering],
-        steps: int | None = None,
+        steps: int | None = None, further: Sequence[tuple[str, Tensor, Callable[[Tensor], Tensor]]] = (),
     ) -> Fitted:  # fmt: skip
-        """Fit scenes to images in 0..1, each by itself, from a scene on, by so many steps of Adam."""
+        """Fit scenes to images in 0..1, each by itself; ``further``: parameters, raw outputs, their ranges."""
         steps = self.settings.steps if steps is None else steps
         if steps < 1:
             raise ValueError(f"fitting needs 1 step or more, got {steps}")
-        scene = scene.with_parameters(light=scene.light)  # in place of an environment, if there is one
         images, scene = images.detach().clone(), scene.map(lambda value: value.detach().clone())
         coordinates = [
             self.maps.coordinates(name, scene.parameters[name].float()).clamp(-_START_LIMIT, _START_LIMIT)
             for name in PARAMETERS.values()
         ]
-        start = [*coordinates, scene.light.float(), scene.camera.float()]
+        loose = [raw.float().clamp(-0.99, 0.99).atanh() for _, raw, _ in further]
+        start = [*coordinates, *loose, scene.light.float(), scene.camera.float()]
         sizes = [value.shape[1] for value in start]
-        table = [_COORDINATES] * sum(sizes[:-2]) + _LIGHT + _CAMERA
+        table = [_COORDINATES] * sum(sizes[:2]) + [_FURTHER] * sum(sizes[2:-2]) + _LIGHT + _CAMERA
         rates, low, high = images.new_tensor(table).T.contiguous()
         moved = (torch.cat(start, dim=1) / rates).requires_grad_()  # Adam steps as far for any unit
         optimiser = torch.optim.Adam([moved], lr=1.0, betas=(0.9, 0.95), fused=True)
@@ -133,8 +133,11 @@ class Fitting(nn.Module):
         def rendered() -> tuple[Scene, Tensor, list[Tensor]]:
             """The present scenes, the error of each, and their coordinates."""
             *found, light, camera = (moved * rates).split(sizes, dim=1)
+            found, raws = found[:2], found[2:]
             depth, albedo = map(self.maps.maps, PARAMETERS.values(), found)
-            present = Scene(depth, albedo.clamp(0, 1), light, camera, scene.extra)
+            own = {name: ranged(raw.tanh()) for (name, _, ranged), raw in zip(further, raws, strict=True)}
+            values = {"depth": depth, "albedo": albedo.clamp(0, 1), "camera": camera, **scene.extra, **own}
+            present = Scene.from_parameters(values if "environment" in values else values | {"light": light})
             rendering = render(present)
             apart = (rendering.image - images).abs().mean(dim=1)
             beyond = (apart - self.settings.tolerance).clamp(min=0)
