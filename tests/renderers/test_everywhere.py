@@ -1,9 +1,15 @@
-"""Whitening, fitting, panels, swaps, meshes and photographs with a renderer's further factors."""
+"""Features, fitting, panels, swaps and meshes of a model whose renderer has further factors."""
 
+import numpy as np
 import pytest
 import torch
 
 from derender.model import Derenderer
+from derender.photo.frame import Frame
+from derender.report.decomposition import decompose_images
+from derender.report.edits import relit, swapped_factors
+from derender.report.mesh import model_mesh
+from derender.report.opening import OpenedImage
 from derender.training.config import FeatureSettings
 from derender.training.features import make_features
 
@@ -37,3 +43,35 @@ def test_features_and_fitted_scenes_hold_further_factors(model, generator):
     model.renderer.check(found.scene)
     alone = model.fit_scenes(images[1:2], 12).scene
     assert torch.equal(alone.depth[0], found.scene.depth[1])
+
+
+def test_panels_swaps_relighting_and_meshes_show_further_factors(model, generator, tmp_path):
+    images = torch.rand(2, 3, SIZE, SIZE, generator=generator)
+    scene, shown = model.decompose(images), decompose_images(model, images)
+    assert set(model.renderer.maps) < set(shown.columns)
+    written = shown.write(tmp_path, {})
+    for row in model.factors:
+        for column, number in enumerate(row.numbers):
+            own = float(scene.parameters[row.parameter][0, column])
+            assert written[row.name][number.name] == pytest.approx(own)
+    one, other = (
+        OpenedImage(
+            tmp_path / str(at), as_bytes(images[at]), Frame.centred(SIZE, SIZE), {}, scene[at], model.render,
+            None, (0.9, 1.1),
+        )
+        for at in range(2)
+    )  # fmt: skip
+    swaps = swapped_factors(model, one, other)
+    assert list(swaps.stills) == [f"its {row.name}" for row in model.factors]
+    drawn = {
+        np.asarray(still).tobytes() for still in (*swaps.stills.values(), swaps.inputs["reconstruction"])
+    }
+    assert len(drawn) == len(swaps.stills) + 1  # every factor changes the image
+    parameter = next(row.parameter for row in model.factors if row.name == "light")
+    last = list(relit(model, one, like=other).numbers.values())[-1]
+    assert last[parameter] == pytest.approx(scene.parameters[parameter][1].tolist())
+    assert len(model_mesh(model, scene[:1]).faces) > 100
+
+
+def as_bytes(image: torch.Tensor) -> np.ndarray:
+    return (255 * image).round().byte().numpy()

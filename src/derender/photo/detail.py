@@ -8,7 +8,7 @@ albedo, moved to the photograph's colours; the three blend. Around the surface, 
 fade out: hair, neck and background follow. The more shading changes, the more the model's colours weigh: what
 it explained wrongly would otherwise stay in the surface. Shading multiplies coded (sRGB)
 values, as in training: on Extended Yale B that is nearer to the truth than the same ratio in linear light.
-Leaves out cast shadows.
+Highlights and haze that the renderer knows are taken off and drawn anew; what they cannot explain stays.
 """
 
 import torch
@@ -25,10 +25,7 @@ from derender.scene.enlarge import at_size
 GRID = 256
 """Largest side of the grid on which geometry and shading are drawn."""
 
-FACING = (
-    0.15,
-    0.40,
-)  # cosine between surface and ray: below the first the photograph tells nothing, above all
+FACING = (0.15, 0.40)  # cosine between surface and ray: below, a photograph tells nothing, above, all
 MOVED = (0.01, 0.03)  # shares of the side: what moves less than the first is always the photograph's
 LIT = (0.10, 0.25)  # shading, likewise
 LEAST_SHADING, LARGEST_RATIO = 0.05, 20.0
@@ -71,7 +68,7 @@ class PhotoDetail:
         points = to_camera(unproject(own.depth, fov_deg), own.camera)
         self._place = project(points, self.grid, self.grid, fov_deg).permute(0, 3, 1, 2)
         self.renderer = renderer
-        self._shading = self._light(own)
+        self._shading, self._veil = self._light(own), renderer.veil(own, fov_deg)
         self._seen = self._visible(own, points) * _ramp(self._shading, *LIT)
         self._colours = self._completed(own)
         at_home = warp(self._place, own.depth, own.camera, fov_deg)
@@ -83,37 +80,32 @@ class PhotoDetail:
         Albedo is the photograph's, whatever they hold. The mask is 1: around the surface is the photograph.
         """
         scene = at_size(scene, self.grid)
-        count, shading = len(scene), self._light(scene)
-        own = torch.cat((self._place, self._seen, self._shading), dim=1)
+        count, shading, veil = len(scene), self._light(scene), self.renderer.veil(scene, self.fov_deg)
+        own = torch.cat((self._place, self._seen, self._shading, self._veil), dim=1)
         within = self._margin(RIM_SHARE)
         maps = torch.cat((own, own.flip(-1), self._colours, within), dim=1).expand(count, -1, -1, -1)
-        view = warp(torch.cat((maps, shading), dim=1), scene.depth, scene.camera, self.fov_deg)
-        own, mirrored, colours, within, shading = view.image.split((4, 4, 3, 1, 1), dim=1)
+        view = warp(torch.cat((maps, shading, veil), dim=1), scene.depth, scene.camera, self.fov_deg)
+        sizes = (own.shape[1], own.shape[1], 3, 1, 1, veil.shape[1])
+        own, mirrored, colours, within, shading, veil = view.image.split(sizes, dim=1)
         place = own[:, :2] - _look_up(self._off.expand(count, -1, -1, -1), own[:, :2])
         shift, mirror_shift = place - self._pixels(), mirrored[:, :2] - self._pixels()
         moved = shift.norm(dim=1, keepdim=True) / self.grid
         seen = torch.maximum(own[:, 2:3], 1 - _ramp(moved, *MOVED))
-        ratio, mirror_ratio = _ratio(shading, own[:, 3:]), _ratio(shading, mirrored[:, 3:])
+        ratio, mirror_ratio = _ratio(shading, own[:, 3:4]), _ratio(shading, mirrored[:, 3:4])
         mask = (within > 0.99).to(within)
         log_ratio = ratio.log()
         change = (log_ratio.square() * mask).sum(dim=(2, 3)) / mask.sum(dim=(2, 3)).clamp(min=1)
         trust = 1 / (1 + DISTRUST * change.square())
         mask, shift, log_ratio = self._continued(mask, shift, log_ratio)
-        mirror_shift, mirror_ratio, drawn, seen, mirror_seen = (
-            pad(field, (self.rim,) * 4)
-            for field in (mirror_shift, mirror_ratio, colours * shading, seen, (1 - seen) * mirrored[:, 2:3])
+        maps = (mirror_shift, mirror_ratio, colours * shading, seen, (1 - seen) * mirrored[:, 2:3])
+        mirror_shift, mirror_ratio, drawn, seen, mirror_seen, *veils = (
+            pad(field, (self.rim,) * 4) for field in (*maps, own[:, 4:], mirrored[:, 4:], veil)
         )
         seen, mirror_seen = 1 - mask * (1 - seen), mask * mirror_seen
         trust = 1 - mask * (1 - trust[:, :, None, None])
-        fields = (
-            shift,
-            mirror_shift,
-            seen,
-            mirror_seen,
-            log_ratio.exp(),
-            mirror_ratio.clamp(min=DARKEST),
-            drawn,
-        )
+        mirror_ratio = mirror_ratio.clamp(min=DARKEST)
+        fields = (shift, mirror_shift, seen, mirror_seen, log_ratio.exp(), mirror_ratio, drawn)
+        fields += tuple(mask * one for one in veils)
         image = self._composed(fields, trust)
         depth = self._enlarged(pad(view.depth[:, None], (self.rim,) * 4))[:, 0]
         return Rendering(image, depth, torch.ones_like(depth))
@@ -127,6 +119,7 @@ class PhotoDetail:
         shift, mirror_shift = (place - self._pixels() for place in (self._place, self._place.flip(-1)))
         weights = (self._seen, (1 - self._seen) * self._seen.flip(-1))
         fields = (shift, mirror_shift, *weights, bare, bare.flip(-1), self._colours)
+        fields += (self._veil, self._veil.flip(-1), 0 * self._veil)
         return self._composed(tuple(pad(field, (self.rim,) * 4) for field in fields), torch.ones(1, 1, 1, 1))
 
     def _continued(self, mask: Tensor, shift: Tensor, log_ratio: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -152,28 +145,33 @@ class PhotoDetail:
     ) -> Float[Tensor, "n 3 s s"]:
         """Images at the photograph's size, from fields on the wider grid.
 
-        Fields are shifts into the photograph and into its mirror image, weights of both, factors of both, and
-        the model's colours; trust is the weight of the photograph's detail beside these.
+        Fields are shifts into the photograph and into its mirror image, weights of both, factors of both, the
+        model's colours, and veils: of both, and the new one; trust is the weight of detail beside colours.
         """
         trust = trust.expand(-1, -1, *fields[0].shape[-2:])
         channels = [*(field.shape[1] for field in fields), 1]
         *enlarged, trust = self._enlarged(torch.cat((*fields, trust), dim=1)).split(channels, dim=1)
-        shift, mirror_shift, seen, mirror_seen, ratio, mirror_ratio, drawn = enlarged
+        shift, mirror_shift, seen, mirror_seen, ratio, mirror_ratio, drawn, veil, mirror_veil, new = enlarged
         drawn = drawn.clamp(DARKEST, 1)
-        image = seen * self._detailed(shift, ratio, drawn, trust)
+        image = seen * self._detailed(shift, ratio, drawn, trust, veil, new)
         if bool((seen < 1).any()):
-            image = image + mirror_seen * self._detailed(mirror_shift, mirror_ratio, drawn, trust)
-            image = image + (1 - seen - mirror_seen) * drawn
+            other = self._detailed(mirror_shift, mirror_ratio, drawn, trust, mirror_veil, new)
+            image = image + mirror_seen * other + (1 - seen - mirror_seen) * _veiled(drawn, new)
         return image.clamp(0, 1)
 
-    def _detailed(self, shift: Tensor, ratio: Tensor, drawn: Tensor, trust: Tensor) -> Tensor:
-        """The photograph looked up at shifted places, its shading changed."""
+    def _detailed(
+        self, shift: Tensor, ratio: Tensor, drawn: Tensor, trust: Tensor, veil: Tensor, new: Tensor
+    ) -> Tensor:
+        """The photograph looked up at shifted places, its shading and its veil changed."""
         unit = 2 * (self.model_size - 1) / (self.grid - 1) / self.model_size / self.span  # a grid pixel
         places = _square((torch.arange(self.size) + 0.5) * 2 / self.size - 1).to(shift)
         places = places + unit * shift.permute(0, 2, 3, 1)
         photo = self.photo.expand(len(shift), -1, -1, -1)
         found = grid_sample(photo, places, mode="bicubic", padding_mode="border", align_corners=False)
-        return (found * ratio).clamp(DARKEST, 1) ** trust * drawn ** (1 - trust)
+        clear = _cleared(found, veil)
+        kept = clear.clamp(0, 1) if veil.shape[1] else clear
+        surface = (kept * ratio).clamp(DARKEST, 1) ** trust * drawn ** (1 - trust)
+        return _veiled(surface, new) + _veiled(clear, veil) - _veiled(kept, veil)
 
     def _enlarged(self, fields: Tensor) -> Tensor:
         """Fields of the wider grid at the photograph's pixels; its border is continued."""
@@ -198,7 +196,8 @@ class PhotoDetail:
     def _completed(self, own: Scene) -> Float[Tensor, "1 3 g g"]:
         """The model's albedo in the photograph's colours, as far as those reach."""
         photo = self.on_grid(self.photo[None], self.grid)
-        bare = (_look_up(photo, self._place) / self._shading.clamp(min=LIT[0])).clamp(0, 1)
+        bare = _cleared(_look_up(photo, self._place), self._veil) / self._shading.clamp(min=LIT[0])
+        bare = bare.clamp(0, 1)
         inner = self._seen * self._margin(COLOUR_MARGIN)
         weight, mirror_weight = inner, (1 - inner) * inner.flip(-1)
         known = weight + mirror_weight
@@ -236,6 +235,16 @@ def _ratio(shading: Tensor, before: Tensor) -> Tensor:
     """New shading over old, kept within bounds."""
     ratio = shading.clamp(min=LEAST_SHADING) / before.clamp(min=LEAST_SHADING)
     return ratio.clamp(1 / LARGEST_RATIO, LARGEST_RATIO)
+
+
+def _veiled(image: Tensor, veil: Tensor) -> Tensor:
+    """A surface's image behind what `Renderer.veil` found, if anything."""
+    return image * (1 - veil[:, :1]) + veil[:, 1:] if veil.shape[1] else image
+
+
+def _cleared(image: Tensor, veil: Tensor) -> Tensor:
+    """The inverse."""
+    return (image - veil[:, 1:]) / (1 - veil[:, :1]).clamp(min=DARKEST) if veil.shape[1] else image
 
 
 def _look_up(maps: Tensor, place: Float[Tensor, "n 2 h w"], mode: str = "bilinear") -> Tensor:

@@ -20,8 +20,7 @@ from derender.scene.normals import normals_from_depth
 
 SPECULAR = numbers_factor(
     "specular", Number("strength", 0.0, 0.5, start=0.03), Number("exponent", 1.0, 128.0, log=True)
-)
-"""The strength starts near 0: on a shape that is still flat a highlight is a veil, which would stay."""
+)  # on a shape that is still flat a strong highlight is a veil, and stays one
 
 
 def phong(gamma: float = 1.0, mean_diffuse: float = 0.0) -> Renderer:

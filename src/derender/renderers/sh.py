@@ -37,8 +37,7 @@ def sh(colour: bool = False) -> Renderer:
         x = torch.linspace(-1, 1, width, device=scene.depth.device).expand(height, width)
         inside = 1 - x * x - y * y
         normal = torch.stack([-x, -y, inside.clamp(min=0).sqrt()], dim=-1)
-        light = lit(scene, normal.expand(len(scene), -1, -1, -1)) * (inside > 0)
-        return light.expand(-1, 3, -1, -1)
+        return (lit(scene, normal.expand(len(scene), -1, -1, -1)) * (inside > 0)).expand(-1, 3, -1, -1)
 
     light = next(row for row in FACTORS if row.name == "light")
     row = replace(

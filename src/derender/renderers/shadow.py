@@ -43,11 +43,10 @@ def visible(
     towards = -light_direction(light.to(depth.dtype))
     with torch.no_grad():
         if chosen_backend(depth.device, backend) == "numba":
-            from derender.renderers.shadow_numba import lowest_step
-
-            step = lowest_step(depth, towards, focal_px(depth.shape[2], fov_deg))
+            from derender.renderers.shadow_numba import lowest_step as search
         else:
-            step = _lowest_step(depth, towards, focal_px(depth.shape[2], fov_deg))
+            search = _lowest_step
+        step = search(depth, towards, focal_px(depth.shape[2], fov_deg))
     places = step.nonzero(as_tuple=True)  # usually few
     found = clearance(depth, towards, places, step[places], focal_px(depth.shape[2], fov_deg))
     share = (1 + found / math.tan(math.radians(softness_deg))).clamp(0, 1)
