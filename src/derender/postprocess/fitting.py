@@ -113,7 +113,7 @@ class Fitting(nn.Module):
         self, images: Float[Tensor, "n 3 h w"], scene: Scene, render: Callable[[Scene], Rendering],
         steps: int | None = None, further: Sequence[tuple[str, Tensor, Callable[[Tensor], Tensor]]] = (),
     ) -> Fitted:  # fmt: skip
-        """Fit scenes to images in 0..1, each by itself; ``further``: parameters, raw outputs, their ranges."""
+        """Fit scenes to images in 0..1, each by itself; ``further``: parameters, raw outputs, ranges."""
         steps = self.settings.steps if steps is None else steps
         if steps < 1:
             raise ValueError(f"fitting needs 1 step or more, got {steps}")
