@@ -4,7 +4,6 @@ import copy
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
 from typing import Any, TypeVar
 
 import torch
@@ -149,7 +148,7 @@ class EmbeddingModel(nn.Module):
     def _fitted(self, images: Float[Tensor, "n 3 h w"], steps: int) -> Fitted:
         fitting, nets = self.features.required_fitting(), dict[str, Any](self.nets)
         rows = [row for row in self.factors if not (row.mirrored or row.parameter in ("light", "camera"))]
-        ranged = [partial(row.to_parameter, ranges=self.settings.ranges) for row in rows]
+        ranged = [lambda raw, own=row: own.to_parameter(raw, self.settings.ranges) for row in rows]
 
         def fitted(portion: Tensor) -> Fitted:
             few = len(portion) if portion.is_cuda else FEW
