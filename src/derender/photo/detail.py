@@ -105,8 +105,7 @@ class PhotoDetail:
         trust = 1 - mask * (1 - trust[:, :, None, None])
         mirror_ratio = mirror_ratio.clamp(min=DARKEST)
         fields = (shift, mirror_shift, seen, mirror_seen, log_ratio.exp(), mirror_ratio, drawn)
-        fields += tuple(mask * one for one in veils)
-        image = self._composed(fields, trust)
+        image = self._composed((*fields, *(mask * one for one in veils)), trust)
         depth = self._enlarged(pad(view.depth[:, None], (self.rim,) * 4))[:, 0]
         return Rendering(image, depth, torch.ones_like(depth))
 
@@ -159,10 +158,9 @@ class PhotoDetail:
             image = image + mirror_seen * other + (1 - seen - mirror_seen) * _veiled(drawn, new)
         return image.clamp(0, 1)
 
-    def _detailed(
-        self, shift: Tensor, ratio: Tensor, drawn: Tensor, trust: Tensor, veil: Tensor, new: Tensor
-    ) -> Tensor:
-        """The photograph looked up at shifted places, its shading and its veil changed."""
+    def _detailed(self, shift: Tensor, ratio: Tensor, drawn: Tensor, trust: Tensor, *veils: Tensor) -> Tensor:
+        """The photograph looked up at shifted places, its shading changed, and its veil to the second."""
+        veil, new = veils
         unit = 2 * (self.model_size - 1) / (self.grid - 1) / self.model_size / self.span  # a grid pixel
         places = _square((torch.arange(self.size) + 0.5) * 2 / self.size - 1).to(shift)
         places = places + unit * shift.permute(0, 2, 3, 1)
@@ -177,9 +175,8 @@ class PhotoDetail:
         """Fields of the wider grid at the photograph's pixels; its border is continued."""
         places = ((torch.arange(self.size) + 0.5) / self.size - 0.5) * self.span * self.model_size
         across = places / (self.model_size - 1) * (self.grid - 1)  # from the middle, in grid pixels
-        centres = (
-            _square(across * 2 / (self.grid - 1 + 2 * self.rim)).to(fields).expand(len(fields), -1, -1, -1)
-        )
+        centres = _square(across * 2 / (self.grid - 1 + 2 * self.rim)).to(fields)
+        centres = centres.expand(len(fields), -1, -1, -1)
         return grid_sample(fields, centres, padding_mode="border", align_corners=True)
 
     def on_grid(self, image: Float[Tensor, "1 3 s s"], size: int) -> Float[Tensor, "1 3 size size"]:
@@ -189,15 +186,13 @@ class PhotoDetail:
             image = interpolate(image, (side, side), mode="bilinear", antialias=True)
         edge = (1 - 1 / self.model_size) / self.span
         centres = _square(torch.linspace(-edge, edge, size)).to(image)
-        return grid_sample(image, centres, mode="bicubic", padding_mode="border", align_corners=False).clamp(
-            0, 1
-        )
+        found = grid_sample(image, centres, mode="bicubic", padding_mode="border", align_corners=False)
+        return found.clamp(0, 1)
 
     def _completed(self, own: Scene) -> Float[Tensor, "1 3 g g"]:
         """The model's albedo in the photograph's colours, as far as those reach."""
-        photo = self.on_grid(self.photo[None], self.grid)
-        bare = _cleared(_look_up(photo, self._place), self._veil) / self._shading.clamp(min=LIT[0])
-        bare = bare.clamp(0, 1)
+        photo = _look_up(self.on_grid(self.photo[None], self.grid), self._place)
+        bare = (_cleared(photo, self._veil) / self._shading.clamp(min=LIT[0])).clamp(0, 1)
         inner = self._seen * self._margin(COLOUR_MARGIN)
         weight, mirror_weight = inner, (1 - inner) * inner.flip(-1)
         known = weight + mirror_weight
@@ -243,7 +238,6 @@ def _veiled(image: Tensor, veil: Tensor) -> Tensor:
 
 
 def _cleared(image: Tensor, veil: Tensor) -> Tensor:
-    """The inverse."""
     return (image - veil[:, 1:]) / (1 - veil[:, :1]).clamp(min=DARKEST) if veil.shape[1] else image
 
 

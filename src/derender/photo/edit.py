@@ -80,9 +80,8 @@ class Photograph:
             return self
         size = max(1, round(width * share)), max(1, round(height * share))
         small = np.asarray(Image.fromarray(self.pixels).resize(size, Image.Resampling.LANCZOS))
-        frame = Frame(
-            self.frame.x * share, self.frame.y * share, self.frame.side * share, self.frame.roll_deg
-        )
+        x, y, side = (share * value for value in (self.frame.x, self.frame.y, self.frame.side))
+        frame = Frame(x, y, side, self.frame.roll_deg)
         return Photograph.of(small, frame, self.scene, self.detail)
 
     @torch.inference_mode()

@@ -43,5 +43,4 @@ def transmission(
 
 
 def _map(scene: Scene, fov_deg: float) -> Float[Tensor, "n h w"]:
-    """In the canonical view."""
     return transmission(scene.depth, torch.ones_like(scene.depth), scene.extra["haze"][:, 0])

@@ -19,8 +19,7 @@ from derender.scene import Scene
 from derender.scene.camera import focal_px
 from derender.scene.light import light_direction
 
-Places = tuple[Int64[Tensor, " m"], ...]
-"""Image, row and column of some pixels."""
+Places = tuple[Int64[Tensor, " m"], ...]  # image, row and column of some pixels
 _LEAST_SLANT = 1e-4  # of the light against the viewing axis; nearer to it nothing is in shadow
 
 
