@@ -14,14 +14,15 @@ import derender
 from derender.data.synthetic import cars, faces
 
 FOLDER = Path(__file__).with_name("outputs")
-PICTURES = {"faces-64": faces.generate, "rendered-faces-64": faces.generate, "cars-64": cars.generate}
+PICTURES = dict.fromkeys(("faces-64", "faces-128", "rendered-faces-64"), faces.generate)
+PICTURES["cars-64"] = cars.generate
 COUNT, SEED, STRIDE, FIT_STEPS = 3, 7, 4, 2
 ENCODED = {"rendered-faces-64": 192}  # columns of features before the coordinates of fitted scenes
 
 
 def pictures_of(name: str) -> torch.Tensor:
-    """(3, 3, 64, 64) in 0..1: generated images of the model's kind of object."""
-    images = PICTURES[name](COUNT, 64, seed=SEED).images
+    """(3, 3, S, S) in 0..1: generated images of the model's kind of object, at its size."""
+    images = PICTURES[name](COUNT, int(name.rsplit("-")[-1]), seed=SEED).images
     return torch.from_numpy(np.ascontiguousarray(images)).float() / 255
 
 

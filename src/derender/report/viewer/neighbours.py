@@ -23,7 +23,11 @@ from derender.data import ListedStream, open_images, parse_source
 from derender.features import FeatureTable
 from derender.report.viewer.questions import Refused, pixels_of
 
-ROWS = {"faces-64": "portraits.webp", "rendered-faces-64": "faces.png", "cars-64": "cars.png"}
+ROWS = {
+    **dict.fromkeys(("faces-64", "faces-128"), "portraits.webp"),
+    "rendered-faces-64": "faces.png",
+    "cars-64": "cars.png",
+}
 LABELS_SHOWN = 4
 
 
