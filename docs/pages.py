@@ -265,16 +265,6 @@ def million_rows(found: Any) -> Iterator[list[str]]:
     yield from ([name, f"{found['seconds'][key]:.2f}"] for key, name in names.items())
 
 
-def kills(found: Any) -> Iterator[list[str]]:
-    """Commands killed at random moments; rows of commands with the same counts are one."""
-    yield ["command", "kills", "while writing", "finished runs", "bit-identical", "faults"]
-    alike: dict[tuple[int, ...], list[str]] = {}
-    for name, row in found["commands"].items():
-        counts = (row["kills"], row["writing"], row["rounds"], row["survived"], len(row["faults"]))
-        alike.setdefault(counts, []).append(f"`{name}`")
-    yield from ([", ".join(names), *map(str, counts)] for counts, names in alike.items())
-
-
 def page_speed(found: Any) -> Iterator[list[str]]:
     yield ["image, clients at once", "images a CPU second", "CPU ms an image", "memory, MB"]
     for row in found["rows"]:
@@ -340,7 +330,6 @@ SPEED: dict[str, tuple[str, Callable[[Any], Iterator[list[str]]]]] = {
     "renderers-speed": ("renderers_speed.json", renderer_speed),
     "renderers-train": ("renderers_train.json", renderers_trained),
     "table-million": ("table_million.json", million_rows),
-    "kills": ("kills.json", kills),
     "view": ("view.json", page_speed),
     "align": ("align.json", aligned),
     "brightness-races": ("brightness-races.json", scored({"share of brightness": ("share", 1, 3)}, "share")),
