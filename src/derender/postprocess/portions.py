@@ -1,7 +1,7 @@
 """The same result for an image whatever stands beside it: networks see images by fours, a thread each.
 
 Rounding depends on the shape of a batch and on how threads share it, and many steps downhill magnify it. What
-follows the networks gives the same bits for any multiple of four, and large portions take half the time.
+follows the networks gives the same bits for any multiple of four, and large portions take a third less time.
 """
 
 import math
