@@ -45,7 +45,6 @@ from derender.scene.light import light_direction
 from derender.scene.normals import normals_from_depth
 from derender.training.config import resolve
 from derender.training.derender_task import train
-from derender.training.step import concatenate
 
 MAPS = ("depth", "albedo")
 LIGHT = {"yaw_deg": [-60, 60], "pitch_deg": [-30, 45], "ambient": [0.1, 0.3], "diffuse": [0.6, 0.9]}
@@ -106,7 +105,7 @@ def fitted_cell(effect: str, renderer: str, seed: int, given: argparse.Namespace
     model, drawn = derender.load("rendered-faces-64"), renderer_named(renderer)
     truth = generated(effect, seed, given.unseen, 64, 100_000)
     images = torch.from_numpy(truth.images).float() / 255
-    found = concatenate([fitted(model, drawn, batch, given.steps) for batch in images.split(32)])
+    found = Scene.joined([fitted(model, drawn, batch, given.steps) for batch in images.split(32)])
     return scores(found, drawn, truth, effect)
 
 
@@ -160,7 +159,7 @@ def yale(renderer: str, given: argparse.Namespace) -> dict[str, Any]:
             lights.append([float(part) for part in match.groups()])
     pixels = torch.from_numpy(np.stack(images)).float()[:, None].expand(-1, 3, -1, -1) / 255
     model, drawn = derender.load("faces-64"), renderer_named(renderer)
-    scene = concatenate([fitted(model, drawn, batch, given.steps) for batch in pixels.split(32)])
+    scene = Scene.joined([fitted(model, drawn, batch, given.steps) for batch in pixels.split(32)])
     again = drawn(scene, model.fov_deg)
     error = _mean((again.image - pixels).abs().mean(dim=1), again.mask).numpy()
     direction = (rotation_matrix(scene.camera[:, :3]) @ light_direction(scene.light)[:, :, None])[..., 0]

@@ -1,6 +1,7 @@
 """What holds for the whole project: the way imports go, what one costs, how files look."""
 
 import ast
+import importlib.util
 import json
 import re
 import shutil
@@ -258,3 +259,16 @@ def test_make_describes_its_commands():
         ["make", "-s", "help"], cwd=ROOT, capture_output=True, text=True, check=True
     ).stdout
     assert {"make demo", "make test"} <= {" ".join(line.split()[:2]) for line in shown.splitlines()}
+
+
+SCRIPTS = sorted([*(ROOT / "benchmarks").glob("*.py"), *(ROOT / "examples").glob("*.py")])
+
+
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.name)
+def test_scripts_import_what_there_is(script):
+    for node in ast.walk(syntax(script)):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("derender"):
+            home = importlib.import_module(node.module)
+            missing = [name.name for name in node.names if not hasattr(home, name.name)]
+            there = [name for name in missing if importlib.util.find_spec(f"{node.module}.{name}")]
+            assert missing == there, f"{node.module} has no {missing}"

@@ -51,7 +51,7 @@ def test_from_a_run_to_features_and_scores(begun, faces, tmp_path, capsys, refus
     shown = capsys.readouterr()
     assert "16 images in" in shown.err and "0 results computed, 9 found" in shown.err
     assert json.loads(shown.out)["scores"] == told
-    assert run(*words, "--resume") == 0
+    assert run(*words, "--resume", "--force") == 0
     assert "leave out weight" in refused("finetune", "-d", faces, "--out", out, "--resume", "--weight", 3)
     assert "continue with derender finetune --resume" in refused(
         "train", "-d", faces, "--out", out, "--resume"

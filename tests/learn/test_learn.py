@@ -66,5 +66,5 @@ def test_settings_are_resolved_in_one_order(tmp_path):
         finetune_settings(tmp_path)
     joint = finetune_settings(tmp_path, labels=["bright"], factors="light, camera", preset="small")
     assert joint.target.factors == ("light", "camera")
-    with pytest.raises(ValueError, match="a resumed run keeps its settings: leave out labels"):
+    with pytest.raises(FileNotFoundError, match="no run to resume"):
         finetune_settings(tmp_path, labels=["bright"], resume=True)

@@ -23,7 +23,7 @@ from derender.presets import MODEL_PRESETS, ModelSettings, named_preset
 from derender.renderers import renderer_named
 from derender.scene.crop import DEFAULT_CROPS, CropSettings
 from derender.scene.perturb import PerturbSettings
-from derender.settings import Settings, full_key, leaves_of
+from derender.settings import Settings
 from derender.storage.bounded import parse_yaml
 
 
@@ -258,7 +258,7 @@ def resolve(preset: str, overrides: Iterable[str] = (), **explicit: Any) -> Trai
 
 def with_changes(config: Config, overrides: Iterable[str] = (), **explicit: Any) -> Config:
     """The same kind of configuration with changes as in ``resolve``."""
-    leaves = leaves_of(config.model_dump(mode="json"))
+    leaves = _leaves(config.model_dump(mode="json"))
     changes: list[tuple[str, Any]] = []
     for override in overrides:
         key, equals, text = override.partition("=")
@@ -267,7 +267,7 @@ def with_changes(config: Config, overrides: Iterable[str] = (), **explicit: Any)
         changes.append((key.strip(), _read_value(text)))
     changes += [(key.replace("__", "."), value) for key, value in explicit.items() if value is not None]
     for key, value in changes:
-        leaves[full_key(key, leaves)] = value
+        leaves[_full_key(key, leaves)] = value
     tree: dict[str, Any] = {}
     for key, value in leaves.items():
         *parents, last = key.split(".")
@@ -297,12 +297,12 @@ def to_yaml(config: Settings) -> str:
 
 def as_overrides(tree: Mapping[str, Any]) -> list[str]:
     """Plain values, nested or with dotted keys, as the ``key=value`` that ``with_changes`` takes."""
-    return [f"{key}={json.dumps(value)}" for key, value in leaves_of(tree).items()]
+    return [f"{key}={json.dumps(value)}" for key, value in _leaves(tree).items()]
 
 
 def setting_names(kind: type[Settings] = TrainConfig) -> list[str]:
     """Every setting by its dotted name."""
-    return list(leaves_of(kind().model_dump(mode="json")))
+    return list(_leaves(kind().model_dump(mode="json")))
 
 
 def without_removed(tree: dict[str, Any]) -> dict[str, Any]:
@@ -331,3 +331,27 @@ def _read_value(text: str) -> Any:
         with suppress(ValueError):
             return float(value)
     return value
+
+
+def _leaves(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Values by dotted name."""
+    leaves: dict[str, Any] = {}
+    for key, value in tree.items():
+        name = f"{prefix}{key}"
+        leaves |= _leaves(value, f"{name}.") if isinstance(value, dict) else {name: value}
+    return leaves
+
+
+def _full_key(key: str, names: Iterable[str]) -> str:
+    """The dotted name that a key stands for."""
+    if key in names:
+        return key
+    ending = [name for name in names if f".{name}".endswith(f".{key}")]
+    if len(ending) == 1:
+        return ending[0]
+    if ending:
+        raise ValueError(f"{key!r} could mean {' or '.join(ending)}: write it in full")
+    guess = suggestion(key, names) or suggestion(
+        key.rsplit(".", 1)[-1], [name.rsplit(".", 1)[-1] for name in names]
+    )
+    raise ValueError(f"unknown setting {key!r}{guess}: 'derender train --dry-run' lists all of them")
