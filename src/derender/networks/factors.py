@@ -53,6 +53,7 @@ class Factor:
         mirrored: whether the parameter is a map that the flipped twin of a scene shows mirrored.
         perturb: draws, for each row, another physically possible value; None if LOOCC never perturbs it.
         numbers: name and range of each column of the parameter, for reports and sliders; none of a map.
+        rate: share of the learning rate at which its network is trained.
     """
 
     name: str
@@ -62,6 +63,7 @@ class Factor:
     mirrored: bool
     perturb: Callable[[Tensor, Generator, PerturbSettings, SceneRanges], Tensor] | None
     numbers: tuple["Number", ...] = ()
+    rate: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -84,7 +86,7 @@ class Number:
         return self.low + (self.high - self.low) * share
 
 
-def numbers_factor(name: str, *numbers: Number) -> Factor:
+def numbers_factor(name: str, *numbers: Number, rate: float = 1.0) -> Factor:
     """A row of a few numbers, ``Scene.extra[name]`` (N, K); LOOCC draws each anew from its range."""
 
     def valued(shares: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
@@ -100,7 +102,7 @@ def numbers_factor(name: str, *numbers: Number) -> Factor:
         odds = share.new_tensor([one.start / (1 - one.start) for one in numbers])
         return valued(odds * share / (1 - share + odds * share))
 
-    return Factor(name, name, vector_net(len(numbers)), from_raw, False, drawn, numbers)
+    return Factor(name, name, vector_net(len(numbers)), from_raw, False, drawn, numbers, rate)
 
 
 def depth_from_raw(raw: Float[Tensor, "n 1 h w"], ranges: SceneRanges) -> Float[Tensor, "n h w"]:

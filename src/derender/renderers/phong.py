@@ -19,7 +19,7 @@ from derender.scene.light import light_direction
 from derender.scene.normals import normals_from_depth
 
 SPECULAR = numbers_factor(
-    "specular", Number("strength", 0.0, 0.5, start=0.03), Number("exponent", 1.0, 128.0, log=True)
+    "specular", Number("strength", 0.0, 0.5, start=0.03), Number("exponent", 1.0, 128.0, log=True), rate=0.25
 )  # on a shape that is still flat a strong highlight is a veil, and stays one
 
 

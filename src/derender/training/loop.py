@@ -193,7 +193,7 @@ class _Run:
         config, state = self.config, self.state
         position = state.images // config.batch_size
         for group in self.optimiser.param_groups:
-            group["lr"] = config.optimiser.rate(state.images, config.images)
+            group["lr"] = group.get("share", 1.0) * config.optimiser.rate(state.images, config.images)
         noise = random_stream(config.seed, "perturb", position)
         rows = self.train_rows[self.reader.batches.order(position, self.ranks)]
         done = state.images / config.images
@@ -342,14 +342,16 @@ class _Run:
 
 
 def _groups(model: Any) -> list[dict[str, Any]]:
-    """Parameters in their order; networks of a renderer's few numbers have no weight decay.
+    """Parameters in their order; networks of a renderer's few numbers have their own rate, without decay.
 
-    Their gradients are small beside it: it would carry their weights to 0.
+    Their gradients are small beside the decay: it would carry their weights to 0.
     """
-    nets = [model.nets[row.name] for row in getattr(model, "factors", ()) if row.numbers]
-    bare = {id(parameter) for net in nets for parameter in net.parameters()}
-    parts = groupby(model.parameters(), lambda parameter: id(parameter) in bare)
-    return [{"params": list(part), **({"weight_decay": 0.0} if own else {})} for own, part in parts]
+    rows = [row for row in getattr(model, "factors", ()) if row.numbers]
+    rates = {id(parameter): row.rate for row in rows for parameter in model.nets[row.name].parameters()}
+    return [
+        {"params": list(part)} | ({} if rate is None else {"share": rate, "weight_decay": 0.0})
+        for rate, part in groupby(model.parameters(), lambda parameter: rates.get(id(parameter)))
+    ]
 
 
 def _on_host(terms: Mapping[str, Tensor]) -> dict[str, float]:
