@@ -19,7 +19,7 @@ BUDGET = {  # lines, files
     "data": (7_820, 39),
     "evaluation": (8_350, 41),
     "report": (4_700, 32),
-    "cli": (2_480, 36),
+    "cli": (2_490, 36),  # names of bundled models stand in help by themselves
     "training": (3_480, 17),  # highlights learn at a rate of their own
     "baselines": (2_720, 11),
     "render": (1_740, 16),
@@ -35,7 +35,7 @@ BUDGET = {  # lines, files
     "renderers": (670, 8),
     "learn": (1_260, 8),
 }
-TOTAL = (42_480, 283)  # photographs, renderers, identity, pages; on the way to (37_000, 285)
+TOTAL = (42_490, 283)  # photographs, renderers, identity, pages; on the way to (37_000, 285)
 TEST_LINES = 26_900  # on the way to 26_000
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80

@@ -11,15 +11,20 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from derender.cli.console import progress_bar, refuse_existing, report_images, result, write_json
-from derender.storage.places import DEVICES, hub_id, model_folder, require_images, require_known
+from derender.storage.places import (
+    DEVICES,
+    bundled_models,
+    hub_id,
+    model_folder,
+    require_images,
+    require_known,
+)
 
 if TYPE_CHECKING:
     from derender.data import ImageSet
     from derender.model import Derenderer
 
-MODELS = (
-    "Run folder, saved model, Hugging Face Hub id, or a bundled model: faces-64, rendered-faces-64, cars-64."
-)
+MODELS = f"Run folder, saved model, Hugging Face Hub id, or a bundled model: {', '.join(bundled_models())}."
 IMAGES = "Folder, zip, .tar shards or Hugging Face id; ADDRESS::PART for a part of it."
 DATASET = "Layout of the images, if it is not recognised."
 JSON = "Also write the numbers as JSON; - is standard output."
