@@ -53,7 +53,7 @@ def test_pictures_rendered_again_and_pictures_of_known_angles(tiny, rendered, tm
     assert (tmp_path / "curves.svg").read_text().startswith("<svg")
 
 
-def test_tracks_in_light_that_nobody_trained_on(tiny, tmp_path, numbers):
+def test_tracks_in_light_beyond_training(tiny, tmp_path, numbers):
     folder = tmp_path / "tracks"
     settings = FaceSettings(tracks=8, frames=2)
     write(faces.generate(32, 32, 0, settings), folder)

@@ -75,7 +75,7 @@ def _acquired(file: Path) -> int:
             except OSError:
                 lives = True
             owner = None
-            with suppress(ValueError):  # written by nobody yet
+            with suppress(ValueError):  # not written yet
                 owner = parse_json(os.pread(handle, _OWNER_BYTES, 0), _Owner)
             if lives or (owner is not None and owner.host != own.host):
                 who = "another process" if owner is None else f"process {owner.pid} on {owner.host}"
