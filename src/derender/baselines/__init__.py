@@ -95,9 +95,9 @@ def embed_baseline(
 ) -> "Embedded":  # fmt: skip
     """Write the feature table of a baseline or a control to the parquet file ``out``.
 
-    Arguments are ``open_baseline``'s; ``components``, the numbers in pca and noise; ``reading``, how an
-    address of images is read (``dataset``, ``part``, ``limit``); and for networks others of
-    `derender.embed_to_file`.
+    Arguments are ``open_baseline``'s, and for networks those of `derender.embed_to_file`. ``components`` is
+    the number of dimensions of pca and noise. ``reading`` is how an address of images is read: ``dataset``,
+    ``part``, ``limit``.
     """
     from derender.baselines.controls import control_features
     from derender.features import Embedded, embed_to_file

@@ -35,9 +35,9 @@ def control_features(
 ) -> FeatureTable:  # fmt: skip
     """The table of a control by its name, one of ``CONTROLS``, which is also that of its only factor.
 
-    ``images``, an image set or the address of one, are read as by `derender.inputs.as_images`; the principal
-    components of a part are those of the training part. ``components`` are those of pca, and noise has as
-    many dimensions; ``seed`` is of pca's solver and of noise; ``progress`` is called with (images done, all).
+    ``images``, an image set or the address of one, are read as by `derender.inputs.as_images`. The principal
+    components of a part are those of the training part. ``components`` is the number of dimensions of pca and
+    noise, ``seed`` that of pca's solver and of noise. ``progress`` is called with (images done, all).
     """
     whole = as_images(images, image_size, dataset=dataset, limit=limit)
     chosen = part_of(whole, part, model)

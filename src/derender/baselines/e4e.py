@@ -1,15 +1,14 @@
 """e4e: an encoder from an image to the W+ code of a StyleGAN2 generator that stays as it is.
 
-Source: Tov et al., *Designing an Encoder for StyleGAN Image Manipulation* (SIGGRAPH 2021), whose body is that
-of ArcFace (an improved residual net with squeeze-and-excitation) and whose heads are pSp's (Richardson et
-al., CVPR 2021): maps at 1/16, 1/8 and 1/4 of the image feed 3 coarse, 4 middle and all finer codes. The first
-head gives one code for all layers, the others what each adds to it; the generator's mean code is added at the
-end.
+Source: Tov et al., *Designing an Encoder for StyleGAN Image Manipulation* (SIGGRAPH 2021). The body is
+ArcFace's, an improved residual net with squeeze-and-excitation. The heads are pSp's (Richardson et al., CVPR
+2021): maps at 1/16, 1/8 and 1/4 of the image feed 3 coarse, 4 middle and all finer codes. The first head
+gives one code for all layers, the others what each adds to it; the generator's mean code is added at the end.
 
 Losses: squared error and perceptual distance (features learnt without labels from the same images) between
-image and inversion; codes are released one after the other, and their difference from the first is kept
-small, so that W+ stays near W. Instead of e4e's discriminator of codes the first code is drawn towards the
-mean code. Leaves out the identity loss, which needs a face recogniser.
+image and inversion. Codes are released one after the other, and their difference from the first is kept
+small: W+ stays near W. Instead of e4e's discriminator of codes the first code is drawn towards the mean code.
+Leaves out the identity loss, which needs a face recogniser.
 """
 
 from itertools import pairwise

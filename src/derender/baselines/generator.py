@@ -3,9 +3,10 @@
 Source: Karras et al., *Analyzing and Improving the Image Quality of StyleGAN* (CVPR 2020); equalised learning
 rates and the pixel norm: *Progressive Growing of GANs* (ICLR 2018). Configuration F has min(512, 32768 /
 resolution) channels. Images are about -1..1. Codes are w (one vector), W+ (one w for each depth, 18 at 1024
-pixels), and style space: the output of the layers' affine maps on W+, one number for each input channel of
-each layer, colour layers included (9,088 at 1024 pixels). A style scales the inputs of a convolution and its
-norm divides the outputs: the paper's modulated and demodulated weight without one weight per image.
+pixels), and style space: the output of the layers' affine maps on W+. Style space has one number for each
+input channel of each layer, colour layers included (9,088 at 1024 pixels). A style scales the inputs of a
+convolution and its norm divides the outputs: the paper's modulated and demodulated weight without one weight
+per image.
 """
 
 from collections.abc import Sequence
@@ -139,8 +140,8 @@ class EqualConv(nn.Module):
 class ModulatedConv(nn.Module):
     """A convolution whose input channels are scaled by each image's style, and the affine map to it from w.
 
-    With ``demodulate`` every image's kernel of an output channel has norm 1, so inputs of variance 1 give
-    outputs of variance 1 and the style's length does not matter. With ``up`` the image becomes twice as
+    With ``demodulate`` every image's kernel of an output channel has norm 1. So inputs of variance 1 give
+    outputs of variance 1, and the style's length does not matter. With ``up`` the image becomes twice as
     large: a transposed convolution of stride 2, then the filter.
     """
 

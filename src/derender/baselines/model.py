@@ -327,7 +327,7 @@ def read_any_config(path: Path) -> Any:
 
 
 def stored_config(run: Path, name: str) -> Any:
-    """The settings of a run to go on with, which has to be of ``name`` ("derender": of any)."""
+    """The settings of a run to resume, which has to be of ``name`` ("derender": of any)."""
     config = read_any_config(run)
     if isinstance(config, configs.FinetuneConfig):
         raise ValueError(f"{run} was made by derender finetune: continue with derender finetune --resume")

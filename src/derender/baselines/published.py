@@ -1,15 +1,14 @@
 """Networks that others trained: a generator of stylegan2-pytorch, an encoder of encoder4editing, DINOv2.
 
-Generator and encoder: ``stylegan2-ffhq-config-f.pt`` (or any generator that
-https://github.com/rosinality/stylegan2-pytorch trains or converts; its ``g_ema``), and ``e4e_ffhq_encode.pt``
-(https://github.com/omertov/encoder4editing, 1.2 GB; encoder, generator and mean code). The tables below map
-our names to theirs; sizes are read off the file, and the first key that does not fit is named. The files are
-pickles. They are read with torch's reader for weights, which runs no code: a file that asks for any is
-refused.
+Generator: ``g_ema`` of ``stylegan2-ffhq-config-f.pt``, or of any other that
+https://github.com/rosinality/stylegan2-pytorch trains or converts. Encoder, generator and mean code:
+``e4e_ffhq_encode.pt`` (https://github.com/omertov/encoder4editing, 1.2 GB). The tables below map our names to
+theirs; sizes are read off the file, and the first key that does not fit is named. The files are pickles. They
+are read with torch's reader for weights, which runs no code: a file that asks for any is refused.
 
 DINOv2-small: Oquab et al., *DINOv2* (2023); weights facebook/dinov2-small (Apache-2.0), 22 million
-parameters, learnt on 142 million images, read through transformers from the user's Hugging Face cache or a
-folder, as safetensors only. Nothing is ever downloaded here.
+parameters, learnt on 142 million images. They are read through transformers from the user's Hugging Face
+cache or a folder, as safetensors only. Nothing is ever downloaded here.
 """
 
 import pickle
@@ -89,8 +88,8 @@ def published_names(ours: Iterable[str], names: Names) -> dict[str, str]:
 def load_published_generator(path: str | Path) -> Generator:
     """The averaged generator (``g_ema``) of a stylegan2-pytorch file, ready to use.
 
-    A missing file is an error that says where to get it; one that is damaged, needs code to be run, or is of
-    another architecture is named with its first key that does not fit.
+    A missing file is an error that says where to get it. A file that is damaged, needs code to be run, or is
+    of another architecture is named with its first key that does not fit.
     """
     (weights,) = _parts(path, GENERATOR_FILE, "a generator of stylegan2-pytorch", "g_ema")
     with _architecture_of(path):
@@ -250,8 +249,8 @@ class Dinov2(base.BaselineModel):
     ) -> "Dinov2":  # fmt: skip
         """The network with its published weights, ready to embed; ``seed`` is ignored.
 
-        ``source`` is an id in the Hugging Face cache, or a folder with config.json and model.safetensors;
-        weights that are not there, a pickle, or another kind of network are a ValueError.
+        ``source`` is an id in the Hugging Face cache, or a folder with config.json and model.safetensors.
+        Missing weights, a pickle, or another kind of network are a ValueError.
         """
         settings = Dinov2Settings(image_size=image_size or 64, enlarged=enlarged)
         if source is not None:

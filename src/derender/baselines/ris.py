@@ -1,15 +1,15 @@
 """Retrieve in Style as a baseline: the style-space code of an image, weighted by each part's row of a matrix.
 
 Source: Chong et al., *Retrieve in Style* (ICCV 2021), after Collins et al., *Editing in Style* (CVPR 2020).
-Features of a part are style space times how much of each channel belongs to the part (8 x 9,088 numbers with
-the published FFHQ networks); images are compared by cosine and inverted by e4e.
+Features of a part are style space times how much of each channel belongs to the part: 8 x 9,088 numbers with
+the published FFHQ networks. Images are compared by cosine and inverted by e4e.
 
 The catalogue: clusters are found among the activations of random images of the generator, by spherical
 k-means of squared activations of a 32x32 layer. Images with part masks, inverted, show which part each
-cluster is (in the source people name the 18 clusters); the clusters then mark the parts in the random images.
+cluster is (in the source people name the 18 clusters). The clusters then mark the parts in the random images.
 A channel's score for a part is its squared, instance-normalised activation there, averaged. A softmax over
 parts at temperature 0.1, cut below 0.8, assigns a channel to a part, if to any. Channels that make colours
-belong to none; those of the four coarsest layers (2,048 in the published network) belong to hair alone, the
+belong to none. Those of the four coarsest layers (2,048 in the published network) belong to hair alone, the
 rest of them to the pose.
 """
 
@@ -173,8 +173,8 @@ def build_catalogue(
 ) -> Ris:  # fmt: skip
     """Cluster, name and score: a model ready to embed.
 
-    ``images`` are at the encoder's size, ``parts`` are 1 where a pixel shows the part of that name and 0
-    elsewhere; ``progress`` is called with (images done, all).
+    ``images`` are at the encoder's size. ``parts`` are 1 where a pixel shows the part of that name and 0
+    elsewhere. ``progress`` is called with (images done, all).
     """
     net, total, done = e4e.generator, 2 * config.samples + len(images), 0
 
@@ -226,7 +226,7 @@ def spherical_kmeans(
 ) -> Float[Tensor, "k c"]:
     """Centres of unit length such that rows have large cosines with their nearest one.
 
-    Initial centres are far from each other (as in k-means++); a cluster that loses all rows gets the row that
+    Initial centres are far from each other (as in k-means++). A cluster that loses all rows gets the row that
     is farthest from its own centre. Ends when no row changes its cluster.
     """
     if len(vectors) < clusters:
@@ -262,8 +262,8 @@ def name_clusters(
 ) -> Int64[Tensor, " k"]:
     """The part of each of ``count`` clusters, from ``parts``, their shares of every place.
 
-    It is that with the largest share * log(share / the part's share of everything), so that small parts are
-    found where they gather, and of a cluster without places the part that has most.
+    The part has the largest share * log(share / the part's share of everything), so that small parts are
+    found where they gather. A cluster without places gets the part that has most.
     """
     member, flat = one_hot(clusters, count).flatten(0, 2).to(parts), parts.movedim(1, -1).flatten(0, 2)
     shares = (member.T @ flat) / member.sum(dim=0).clamp(min=1)[:, None]

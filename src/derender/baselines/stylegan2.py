@@ -1,8 +1,8 @@
 """StyleGAN2 as a baseline: its discriminator, and how it and the generator learn against each other.
 
 Source: Karras et al. (CVPR 2020): non-saturating logistic loss; R1 and path lengths in every 16th and 4th
-step, weighted by their interval; style mixing. The generator that samples is a moving average, its half-life
-10,000 images and at most a twentieth of those seen (*Training GANs with Limited Data*, 2020). The map of
+step, weighted by their interval; style mixing. The generator that samples is a moving average (*Training GANs
+with Limited Data*, 2020). Its half-life is 10,000 images and at most a twentieth of those seen. The map of
 group deviations: *Progressive Growing of GANs* (ICLR 2018). Both networks see one batch of fakes and move in
 the same step, with one optimiser, so that the common training loop fits. Held-out images are judged by the
 energy distance between them and samples. Leaves out augmentation of the discriminator's input.
