@@ -135,6 +135,8 @@ def test_features_are_the_map_its_mean_and_its_histogram(seeded, losses):
     assert [tuple(value.shape) for value in features.values()] == [(6, 16), (6, 8 * 8 * 8), (6, 8)]
     torch.testing.assert_close(features["pooled"], features["map"].view(6, 8, 64).mean(dim=2))
     torch.testing.assert_close(features["pooled"], features["histogram"] @ model.codebook.codebook)
+    features["pooled"].square().sum().backward()
+    assert model.encoder[0].weight.grad is not None and model.encoder[0].weight.grad.any()  # fine-tuned, too
     unknown = "vqvae has no feature 'poold'; did you mean 'pooled'"
     for names, message in ((("poold",), unknown), ((), "has no")):
         with pytest.raises(ValueError, match=message):

@@ -221,8 +221,12 @@ class Vqvae(base.LoopModel):
         return self.decoder(grid).float() / 2 + 0.5
 
     def describe(self, images: base.Images) -> base.Features:
-        _, entries, indices = self.quantise(self.encode(images))
-        share = one_hot(indices.flatten(1), self.settings.codes).float().mean(dim=1)
+        grid = self.encode(images).float()
+        _, entries, indices = self.quantise(grid)
+        entries = entries + (grid - grid.detach())  # fine-tuning reaches the encoder, values stay the entries
+        chosen = indices.flatten(1)
+        share = torch.zeros(len(chosen), self.settings.codes).to(grid)
+        share = share.scatter_add(1, chosen, torch.ones_like(chosen, dtype=share.dtype)) / chosen.shape[1]
         return {"pooled": entries.mean(dim=(2, 3)), "map": entries.flatten(1), "histogram": share}
 
     def shown(self, images: base.Images, config: Any) -> dict[str, base.Images]:
