@@ -1,5 +1,8 @@
 """Configuration: presets, overrides, and errors that name the nearest key."""
 
+import re
+from pathlib import Path
+
 import pytest
 import torch
 import yaml
@@ -77,9 +80,16 @@ def test_the_papers_preset_begins_and_measures_as_the_paper_does():
     paper, faces = resolve("paper"), resolve("faces")
     assert (paper.geometry_start, faces.geometry_start) == (1.0, 0.1)
     assert (paper.objective.perceptual_rescaled, faces.objective.perceptual_rescaled) == (False, True)
+    assert (paper.objective.loocc_joint, faces.objective.loocc_joint) == (True, False)  # Eq. 6
     size = ["image_size=32", "width=4", "light_width=4"]
     plain, scaled = (
         DerenderTask(resolve("small", [*size, *more])).build().nets["geometry"].decoder.last.weight
         for more in ([], ["geometry_start=1"])
     )
     torch.testing.assert_close(10 * plain, scaled)
+
+
+def test_settings_on_the_page_of_deviations_exist():
+    page = (Path(__file__).parents[2] / "docs" / "explanation" / "deviations.md").read_text()
+    named = re.findall(r"`([a-z_.]+=[a-z0-9.-]+)`", page)
+    assert "geometry_start=1" in named and resolve("faces", named).whitening.pictures == 0

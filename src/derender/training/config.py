@@ -199,7 +199,9 @@ LIGHT_ROBUST = {
 
 _PRESET_CHANGES: dict[str, dict[str, Any]] = {
     "paper": {
-        "objective": {"perceptual": "vgg16", "curvature_weight": 0.0, "perceptual_rescaled": False},
+        "objective": {
+            "perceptual": "vgg16", "curvature_weight": 0.0, "perceptual_rescaled": False, "loocc_joint": True,
+        },
         "geometry_start": 1.0,
         "whitening": {"pictures": 0},
         "brightness": False,
