@@ -1,7 +1,7 @@
 """Arguments of library calls: a model or its name, images or the address of a data set, a device by name.
 
-Every documented call takes either form and resolves it here, so that a command and a Python user get the same
-checks and the same errors.
+Every documented call takes either form and resolves it here: commands and Python users get the same checks
+and errors.
 """
 
 from collections.abc import Callable

@@ -159,7 +159,7 @@ def load(
     Args:
         source: a run folder, a saved folder, the name of a bundled model, or a Hugging Face Hub id.
         device: where to put it.
-        factors, renderer: what it was made with, if its ``config.json`` cannot tell; a user's module that a
+        factors, renderer: what it was made with, if its ``config.json`` cannot tell. A user's module that a
             model of the Hub names is imported only where it is given here.
 
     Raises:

@@ -2,7 +2,7 @@
 
 On the way to a file, reading and decoding, computing, and writing overlap; the queues between them are
 bounded. Parts are written beside the table, in a folder of its name with ``.partial``, until all are there: a
-run that was stopped goes on from them, and gives the same table, bit for bit: its batches are the same.
+stopped run continues from them, and gives the same table, bit for bit: its batches are the same.
 """
 
 import hashlib

@@ -31,8 +31,8 @@ SAME_FITTED = 0.3
 class Found:
     """The rows of a table nearest to an image (or the row of that name) by one factor, nearest first.
 
-    ``own_row`` is the row that ``like`` names, if any; ``same_image`` rows hold the very same image and are
-    left out unless copies are asked for; ``unchecked`` tables do not record which model made them.
+    ``own_row`` is the row that ``like`` names, if any. ``same_image`` rows hold the very same image and are
+    left out unless copies are asked for. ``unchecked`` tables do not record which model made them.
     """
 
     table: FeatureTable

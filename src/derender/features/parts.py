@@ -1,7 +1,7 @@
-"""An unfinished feature table: a folder of parts, each written atomically, for a later run to go on with.
+"""An unfinished feature table: a folder of parts, each written atomically, for a later run to resume.
 
-``plan.json`` is what the parts are made of; a part holds some thousand rows, what a resumed run needs of them
-(positions, digests of pixels), and where to go on. The checksum of a part is in its name: one that is
+``plan.json`` is what the parts are made of. A part holds some thousand rows, what a resumed run needs of them
+(positions, digests of pixels), and where to continue. The checksum of a part is in its name: one that is
 damaged or missing is made again, with those after it. Labels that came with a stream stay as JSON until their
 kinds are known, at the end.
 """

@@ -19,8 +19,8 @@ from derender.features.table import named
 class DisentangledFeatures(TransformerMixin, BaseEstimator):
     """scikit-learn transformer: images in, features of the chosen factors out.
 
-    Images are an array (N, 3, H, W) or (N, H, W, 3), uint8 or float in 0..1, at the model's size, or a
-    sequence of paths (read and resized). Nothing is learned in ``fit``; the model is loaded on first use.
+    Images are a sequence of paths (read and resized) or an array at the model's size: (N, 3, H, W) or (N, H,
+    W, 3), uint8 or float in 0..1. Nothing is learned in ``fit``; the model is loaded on first use.
 
     Args:
         model: a model, a run folder, a saved folder, a Hub id, or a bundled model; by default faces-64.

@@ -1,11 +1,10 @@
 """Leave-one-out, cycle contrastive loss (LOOCC): what was not perturbed must be recognised again.
 
 Source: the paper, section 3.2; NT-Xent from SimCLR (Chen et al. 2020). Left open there: the perturbed factor
-is drawn per image. By factor, an image is absent from the contrast of what was perturbed in it; the loss is
-the mean over all contrasted (image, factor); a factor that fewer than two images kept is dropped.
-Jointly, as Eq. 6 is written, the codes are compared side by side: for each image without the factor that was
-perturbed in it, in all images alike. Leaves out the perturbation
-(scene/perturb.py) and the encoding of the new rendering.
+is drawn per image. By factor, an image is absent from the contrast of what was perturbed in it. The loss is
+the mean over all contrasted (image, factor). A factor that fewer than two images kept is dropped. Jointly, as
+Eq. 6 is written, the codes are compared side by side: for each image without the factor that was perturbed in
+it, in all images alike. Leaves out the perturbation (scene/perturb.py) and the encoding of the new rendering.
 """
 
 from collections.abc import Mapping

@@ -21,8 +21,8 @@ def photometric_loss(
 ) -> Float[Tensor, ""]:
     """Negative log-likelihood of a Laplace distribution around the prediction, averaged over the mask.
 
-    ``sqrt(2) |dI| / sigma + log sigma`` with |dI| averaged over the channels; best sigma is sqrt(2) |dI|, and
-    log(1e-3) = -6.9 the least value. Without sigma it is the plain masked L1.
+    ``sqrt(2) |dI| / sigma + log sigma`` with |dI| averaged over the channels. The best sigma is sqrt(2) |dI|,
+    the least value log(1e-3) = -6.9. Without sigma it is the plain masked L1.
     """
     kept = (mask > 0).unsqueeze(1)
     difference = at_least_float32(prediction) - at_least_float32(target)

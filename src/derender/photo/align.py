@@ -1,8 +1,8 @@
 """The faces of many photographs, each cut out upright where a model expects it, with the way back.
 
 ``boxes.csv`` has a row for every box, accepted or rejected: where the crop lies, the affine transform from
-its pixels to the photograph's, and the reason of a rejection. Photographs are read one after another; a run
-that was stopped goes on after the last photograph that it finished. Leaves out finding (``faces``).
+its pixels to the photograph's, and the reason of a rejection. Photographs are read one after another; a
+stopped run continues after the last photograph that it finished. Leaves out finding (``faces``).
 """
 
 import csv

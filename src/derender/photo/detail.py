@@ -3,12 +3,12 @@
 A model sees 64 or 128 pixels; a photograph has more. Geometry and light vary slowly, so they are drawn on a
 coarse grid and enlarged: where each point of the new image lies in the photograph, and by how much its
 shading changes. The photograph is looked up there at its own resolution. Its own light and viewpoint give it
-back. A point that it does not show is taken from its mirror image where that is seen, else from the model's
-albedo, moved to the photograph's colours; the three blend. Around the surface, motion and shading go on and
-fade out: hair, neck and background follow. The more shading changes, the more the model's colours weigh: what
-it explained wrongly would otherwise stay in the surface. Shading multiplies coded (sRGB)
-values, as in training: on Extended Yale B that is nearer to the truth than the same ratio in linear light.
-Highlights and haze that the renderer knows are taken off and drawn anew; what they cannot explain stays.
+back. A point that it does not show is taken from its mirror image where that is seen. Elsewhere it is the
+model's albedo, moved to the photograph's colours; the three blend. Around the surface, motion and shading go
+on and fade out: hair, neck and background follow. The more shading changes, the more the model's colours
+weigh: what it explained wrongly would otherwise stay in the surface. Shading multiplies coded (sRGB) values,
+as in training: on Extended Yale B that is nearer to the truth than the same ratio in linear light. Highlights
+and haze that the renderer knows are taken off and drawn anew; what they cannot explain stays.
 """
 
 import torch

@@ -1,8 +1,8 @@
 """A photograph in, a photograph out: relit or turned, in its own detail and at its own size.
 
-The part that suits the model is found (a face, or the middle), decomposed, drawn under another light or from
-another side by ``PhotoDetail``, and put back into the photograph. Results have the kind of what was given:
-a Pillow image for a path or a Pillow image, an array for an array, a tensor for a tensor.
+The part that suits the model is found: a face, or the middle. It is decomposed, drawn under another light or
+from another side by ``PhotoDetail``, and put back into the photograph. Results have the kind of what was
+given: a Pillow image for a path or a Pillow image, an array for an array, a tensor for a tensor.
 """
 
 from collections.abc import Callable
@@ -201,8 +201,8 @@ def found_frame(
         model: that is to be given the part.
         frame: "face", the largest face (an error where none is found); "auto", the square part that the model
             reconstructs best; "none", the middle square. None: the largest face if the model is known to be
-            of faces and one is found ("no face" is said where not), else the middle square, as for images no
-            larger than the model's.
+            of faces and one is found, else the middle square ("no face"). Images no larger than the model's
+            give the middle square.
     """
     if frame is not None:
         require_known("frame", frame, FRAMES)

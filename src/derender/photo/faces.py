@@ -66,7 +66,7 @@ class Face:
     def yaw_deg(self) -> float:
         """Turn to the side, with the sign of our cameras, by how far the nose lies beside the middle.
 
-        Fitted to a face mesh's yaw on 70 pictures of LFW (-57 to 58 degrees): its sine correlates with 0.957.
+        Fitted to a face mesh's yaw on 70 images of LFW (-57 to 58 degrees): its sine correlates with 0.957.
         """
         left, right, nose, *mouth = self.points @ np.array([1, 1j])
         down = (mouth[0] + mouth[1] - left - right) / 2

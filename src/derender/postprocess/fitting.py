@@ -1,7 +1,7 @@
 """Test-time optimisation: scenes fitted per image, from the encoders' prediction down through the renderer.
 
 Geometry and albedo move within a morphable model of the trained model's predictions (morphable.py), other
-factors freely, so that the rendering comes near the image; coordinates far from their mean cost more.
+factors freely. The rendering comes near the image; coordinates far from their mean cost more.
 """
 
 import math

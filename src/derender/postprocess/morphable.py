@@ -1,6 +1,6 @@
 """Geometry and albedo as a linear model: a mean map, and the directions in which a model's own maps vary.
 
-A morphable model (Blanz and Vetter, SIGGRAPH 1999) whose examples are a trained model's predictions, each
+A morphable model (Blanz and Vetter, SIGGRAPH 1999) whose examples are a trained model's predictions. Each is
 averaged with its mirror image, for the object is symmetric. A coordinate of 1 is one standard deviation.
 """
 

@@ -1,8 +1,8 @@
 """Encoder activations to features: linear discriminant analysis (LDA) without labels.
 
 The classes are images; the members of a class are renderings of its scene with the other factors changed.
-Within-class covariance normalisation divides each direction by how much renderings of one image differ in it;
-the most discriminative directions are kept and made more even (training/features.py renders).
+Within-class covariance normalisation divides each direction by how much renderings of one image differ in it.
+The most discriminative directions are kept and made more even (training/features.py renders).
 """
 
 from collections.abc import Collection, Mapping

@@ -1,8 +1,8 @@
 """Implementations of an operation: plain torch (the definition), Numba (CPU) or Triton (CUDA), one signature.
 
 Which one runs, and the last two as torch operators with an analytic derivative. An operator's inputs are
-tensors, images first, and a focal length in pixels. Of its outputs, the first few are differentiable and
-those of integers are kept for the derivative, which takes gradients, inputs, kept outputs and focal length.
+tensors, images first, and a focal length in pixels. The first few outputs are differentiable; those of
+integers are kept for the derivative. The derivative takes gradients, inputs, kept outputs and focal length.
 Triton also runs on the CPU in its interpreter, slowly, for tests.
 """
 

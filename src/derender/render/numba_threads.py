@@ -1,10 +1,10 @@
 """How Numba kernels are compiled and run here: one compiled loop per range of images, ranges on threads.
 
-A kernel is compiled with ``nogil`` and takes the range of images it works on; ``over_images`` runs ranges in
-a thread pool as wide as ``torch.get_num_threads()``. This replaces Numba's ``parallel=True``, whose default
-threading layer may not be entered from two Python threads and whose OpenMP layer does not survive a fork.
-Compiled kernels are cached beside the package, or in the user's cache folder (``NUMBA_CACHE_DIR`` overrides)
-where the package is read-only; where no folder can be written, they are compiled in every process.
+A kernel is compiled with ``nogil`` and takes the range of images it works on. ``over_images`` runs ranges in
+a thread pool as wide as ``torch.get_num_threads()``. This replaces Numba's ``parallel=True``: its default
+threading layer may not be entered from two Python threads, and its OpenMP layer does not survive a fork.
+Compiled kernels are cached beside the package, or in the user's cache folder where the package is read-only
+(``NUMBA_CACHE_DIR`` overrides). Where no folder can be written, they are compiled in every process.
 """
 
 import os

@@ -2,8 +2,8 @@
 
 image(p) = canonical image at the canonical coordinates that pixel p sees. The canonical image is albedo times
 Lambertian shading with the light in the canonical frame. Leaves out cast shadows, speculars, clipping at 1
-and gradients at occlusion edges. Shading is computed in float32 at least, under any autocast; where the
-surface lands in the image in float64, so that the identity camera gives the canonical image bit for bit.
+and gradients at occlusion edges. Shading is computed in float32 at least, under any autocast. Where the
+surface lands is computed in float64, so that the identity camera gives the canonical image bit for bit.
 """
 
 from dataclasses import dataclass

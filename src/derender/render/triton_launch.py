@@ -1,10 +1,9 @@
 """How Triton kernels are launched here: one row of programs per image, in the order of the images.
 
-Every kernel works on ``per_image`` lanes of each image (its pixels, vertices or triangles), in blocks that
-never straddle two images, so that sums over a block belong to one image. Kernels run without fused
-multiply-add: which triangle a pixel shows is decided by float64 arithmetic that must round like the
-definition's. With TRITON_INTERPRET=1 in the environment, set before Triton is imported, they run on the CPU,
-slowly, for tests.
+Every kernel works on ``per_image`` lanes of each image: its pixels, vertices or triangles. A block never
+straddles two images, so sums over a block belong to one image. Kernels run without fused multiply-add: which
+triangle a pixel shows is decided by float64 arithmetic that must round like the definition's. With
+TRITON_INTERPRET=1 in the environment, set before Triton is imported, they run on the CPU, slowly, for tests.
 """
 
 import os
@@ -71,9 +70,9 @@ def scattered_sums(
 
     They are made in floating point, or, with ``torch.use_deterministic_algorithms(True)``, as integers, which
     have no order, so that gradients repeat bit for bit. Their unit is set per image by its largest summand
-    and the number of summands, which leaves at least 44 bits below that summand at 512x512. A summand that is
-    not finite makes its image's sums NaN. ``run(mode, units, largest, targets)`` launches the kernel: it adds
-    to ``targets``, in ``units`` (float64, one per image and target) where mode is ADD_INTEGERS; or raises
+    and the number of summands. At 512x512 at least 44 bits are left below that summand. A summand that is not
+    finite makes its image's sums NaN. ``run(mode, units, largest, targets)`` launches the kernel: it adds to
+    ``targets``, in ``units`` (float64, one per image and target) where mode is ADD_INTEGERS; or raises
     ``largest`` (bits of float64) for MEASURE.
     """
     largest = torch.zeros((len(like), len(shapes)), dtype=torch.int64, device=like.device)

@@ -1,9 +1,9 @@
 """What several Triton kernels share; importing this module imports Triton.
 
-``lanes`` finds a program's image and lanes. ``accumulate`` adds to memory that other lanes add to as well: in
-floating point, where the order, and so the last bits, change from run to run; or, for deterministic
-gradients, as integers, whose sums have no order. The integers' unit is set per image by the largest amount
-added anywhere in it, which a first run of the same kernel finds (``note_largest``).
+``lanes`` finds a program's image and lanes. ``accumulate`` adds to memory that other lanes add to as well. In
+floating point the order, and so the last bits, change from run to run. Deterministic gradients are added as
+integers, whose sums have no order. The integers' unit is set per image by the largest amount added anywhere
+in it, which a first run of the same kernel finds (``note_largest``).
 """
 
 from typing import no_type_check

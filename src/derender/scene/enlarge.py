@@ -44,7 +44,7 @@ def cubic_weights(
     """What places between the first (0) and the last (count - 1) of some values take of each value; float64.
 
     ``smooth`` is the uniform cubic B-spline, ``sharp`` the Catmull-Rom spline, which meets every value. Rows
-    sum to 1 and straight lines stay straight; beyond its ends the row of values goes on straight.
+    sum to 1 and straight lines stay straight; beyond its ends the row of values continues straight.
     """
     place = places.double()
     left = place.floor().clamp(0, count - 2).long()

@@ -1,8 +1,8 @@
 """Light from all sides: irradiance in spherical harmonics up to the second order, and its main direction.
 
-An environment is (N, 9) coefficients, grey, or (N, 27), nine of each channel, of the light that falls on a
-surface by its inward normal: E(n) = max(0, sum of c_k Y_k(n)). Source: Ramamoorthi and Hanrahan, SIGGRAPH
-2001. Of light that is nowhere negative the orders' norms are bounded by that of order 0: ``LIMITS``.
+An environment is (N, 9) coefficients, grey, or (N, 27), nine of each channel. They give the light that falls
+on a surface by its inward normal: E(n) = max(0, sum of c_k Y_k(n)). Source: Ramamoorthi and Hanrahan,
+SIGGRAPH 2001. Of light that is nowhere negative the orders' norms are bounded by that of order 0: ``LIMITS``.
 """
 
 import math

@@ -28,8 +28,8 @@ def normals_from_depth(depth: Float[Tensor, "n h w"], fov_deg: float) -> Float[T
 def _relative_slope(depth: Tensor, axis: int) -> Tensor:
     """(next - previous) / (next + previous) along an axis; at the border (next - own) / next or its mirror.
 
-    With points P = d r and rays r that change by a constant s per pixel, P_next - P_previous = (next -
-    previous) r + (next + previous) s: the slope is the ratio of the two coefficients.
+    Points are P = d r, with rays r that change by a constant s per pixel. So P_next - P_previous = (next -
+    previous) r + (next + previous) s, and the slope is the ratio of the two coefficients.
     """
     size = depth.shape[axis]
     previous, following = depth.narrow(axis, 0, size - 1), depth.narrow(axis, 1, size - 1)

@@ -1,7 +1,7 @@
 """Physical augmentation: change one factor of a scene by a random, physically possible amount.
 
-Source: the paper, section 4 (LOOCC): uniform additive perturbations of light (ambient and diffuse +-0.5,
-pitch and yaw +-45 degrees) and camera (pitch +-22.5, yaw +-45 degrees); here uniform over those values that
+Source: the paper, section 4 (LOOCC), uniform additive perturbations. Light: ambient and diffuse +-0.5, pitch
+and yaw +-45 degrees. Camera: pitch +-22.5, yaw +-45 degrees. Here they are uniform over those values that
 keep the result in its bounds, so that nothing piles up there. Geometry and albedo are exchanged between
 images. Which factor changes, and how, is declared in its row (networks/factors.py).
 """

@@ -30,7 +30,7 @@ class Damaged(ValueError):
 
 
 class DamageNoticed(UserWarning):
-    """Something damaged was passed over, and the work goes on from an earlier state."""
+    """Something damaged was passed over, and the work continues from an earlier state."""
 
 
 @contextmanager

@@ -1,7 +1,7 @@
 """Named tensors in a safetensors file that carries its own checksum; and which pickles of weights are safe.
 
-The CRC-32 of names, kinds, shapes and values is in the file's metadata, so that a changed bit is an error and
-not another model; files made elsewhere have none. Published networks exist only as pickles (.pth): torch's
+The CRC-32 of names, kinds, shapes and values is in the file's metadata: a changed bit is an error and not
+another model. Files made elsewhere have none. Published networks exist only as pickles (.pth): torch's
 restricted reader runs no code, but before PyTorch 2.10 a crafted file could corrupt memory through it
 (CVE-2026-24747). derender never writes a pickle.
 """
@@ -117,8 +117,11 @@ def reads_safely() -> bool:
 
 
 def check_pickle(file: Path) -> None:
-    """Raise ValueError where a ``file`` is no regular file, larger than 2 GiB, unpacks to more than it holds,
-    or could, crafted, make the installed PyTorch run code."""
+    """Raise ValueError for a ``file`` that is not safe to unpickle.
+
+    It is no regular file, is larger than 2 GiB, or unpacks to more than it holds; or it could, crafted, make
+    the installed PyTorch run code.
+    """
     try:
         size = require_regular(file, LIMIT_BYTES)
         if zipfile.is_zipfile(file):

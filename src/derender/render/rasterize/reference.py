@@ -113,8 +113,8 @@ def _span(coordinate: Tensor, size: int) -> tuple[Tensor, Tensor]:
 def intersect(vertices: Tensor, triangle: Tensor, focal_px: float) -> tuple[Tensor, Tensor]:
     """Canonical pixel coordinates and depth where each pixel's ray meets its triangle; 0 where there is none.
 
-    With q_k = (x_k, y_k) - (r_x, r_y) z_k for the ray (r_x, r_y, 1), the weights w_k = q_i x q_j are the
-    determinants [r, P_i, P_j], so b = w / sum(w) are perspective-correct: r z = sum b_k P_k.
+    For the ray r = (r_x, r_y, 1) let q_k = (x_k, y_k) - (r_x, r_y) z_k. The weights w_k = q_i x q_j are the
+    determinants [r, P_i, P_j]. So b = w / sum(w) are perspective-correct: r z = sum b_k P_k.
     """
     count, height, width, _ = vertices.shape
     image, v, u = (triangle >= 0).nonzero(as_tuple=True)

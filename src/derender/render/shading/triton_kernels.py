@@ -1,8 +1,8 @@
 """Lambertian shading of a depth map in Triton, a lane per pixel; importing this module imports Triton.
 
 ``forward`` and ``backward`` find a pixel's normal from its four neighbours' depths, as ``scene/normals.py``
-does. ``backward`` leaves the derivatives by the two slopes, and ``gather`` collects them for each depth from
-the pixels whose slope it entered, so that nothing is added by two lanes.
+does. ``backward`` leaves the derivatives by the two slopes. ``gather`` collects them for each depth from the
+pixels whose slope it entered: nothing is added by two lanes.
 """
 
 from typing import no_type_check

@@ -5,7 +5,7 @@ The surface's grid mesh is moved, rasterised (``rasterize``), and its colours lo
 and Triton do it all in one pass over the image, storing neither the moved points nor the canonical
 coordinates. They give the same image, but for rounding, and the same gradients.
 
-Forward is the same bit for bit in every run; backward too on any number of CPU threads, and on a GPU with
+Forward repeats bit for bit in every run. So does backward on any number of CPU threads, and on a GPU with
 torch's deterministic algorithms. ``grid_sample`` is not used: normalising coordinates to -1..1 and back costs
 the identity camera its exactness.
 """

@@ -35,8 +35,8 @@ def move(depth, rotation, offset, focal, points):
 def meet(flat, triangle, width, ray_x, ray_y):
     """Where the ray (ray_x, ray_y, 1) meets a triangle's plane.
 
-    Gives row, column and half of its cell; the places of its vertices, their z, their x and y less the ray's;
-    and their weights, not normalised.
+    Gives row, column and half of its cell. Then come the places of its vertices, their z, their x and y less
+    the ray's, and their weights, not normalised.
     """
     cell, half = np.uint32(triangle) >> 1, np.intp(triangle & 1)
     i, j = np.intp(cell // np.uint32(width - 1)), np.intp(cell % np.uint32(width - 1))

@@ -1,7 +1,7 @@
 """From a depth map and a camera's motion to the image, in Triton; importing this module imports Triton.
 
-``project_depth`` finds where the surface's vertices land; the rasteriser's ``choose`` then decides what each
-pixel shows; ``show`` meets the pixel's ray with its triangle and looks the colour up, all in one lane.
+``project_depth`` finds where the surface's vertices land. The rasteriser's ``choose`` then decides what each
+pixel shows. ``show`` meets the pixel's ray with its triangle and looks the colour up, all in one lane.
 ``show_backward`` is the derivative of ``show``. Points are never stored: a vertex is rotation times its ray
 times its depth, plus offset, in float64. Colours are computed in the image's own dtype.
 """
