@@ -113,7 +113,7 @@ def sentences(text: str) -> list[str]:
     text = re.sub(r"```.*?```|<!--.*?-->|\$\$.*?\$\$", "\n\n", text, flags=re.DOTALL)
     text = re.sub(r"^(?:\||#|:::|!\[).*$", "\n", text, flags=re.MULTILINE)
     text = re.sub(r"!?\[([^\]]*)\]\([^)]*\)", r"\1", text)
-    text = re.sub(r"`[^`]*`|\$[^$]*\$", "code", text)
+    text = re.sub(r"(`+).+?\1|\$[^$]*\$", "code", text, flags=re.DOTALL)
     blocks = re.split(r"\n\s*\n|\n(?=\s*(?:[-*]|\d+\.) )", text)
     return [one for block in blocks for one in re.split(r"(?<=[.!?:])\s+", " ".join(block.split())) if one]
 

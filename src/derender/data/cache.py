@@ -1,9 +1,9 @@
 """Decoded images of a large data set in one file that is mapped into memory; the folder of such files.
 
-The file is the rows, then a JSON note (what they were made from, which files they are, labels that came with
-them), then the note's length and a mark. It counts only if the note's fingerprint is that of the source as it
-is now, its length is right, and a sample of its rows has the recorded checksum; otherwise it is made again.
-One file per source and setting: a new version takes the old one's place.
+The file is the rows, then a JSON note, its length and a mark. The note has what the rows were made from,
+which files they are, and labels that came with them. It counts only if the fingerprint is that of the source
+now, the length is right, and a sample of rows has the recorded checksum. Otherwise it is made again. One file
+per source and setting: a new version takes the old one's place.
 """
 
 import hashlib
@@ -82,7 +82,7 @@ def write_cache(
         file: where.
         fingerprint: of what the rows are made from.
         image_size: side of the images in pixels.
-        fill: calls the function it is given with rows, (n, 3, S, S) uint8, any number of times, and returns
+        fill: calls the function it is given with rows, (n, 3, S, S) uint8, any number of times. It returns
             what is known of them; its "files" name the rows.
     """
     written, storing = 0, True

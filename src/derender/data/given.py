@@ -1,7 +1,7 @@
 """Images as a caller has them: a path, a Pillow image, a NumPy array, a tensor, or several of these.
 
-Arrays may be (H, W, 3), (3, H, W), grey (H, W), or batches (N, H, W, 3) and (N, 3, H, W), of bytes or of
-numbers in 0..1. Leaves out data sets (opening).
+Arrays of bytes, or of numbers in 0..1, may be (H, W, 3), (3, H, W) or grey (H, W). Batches are (N, H, W, 3)
+or (N, 3, H, W). Leaves out data sets (opening).
 """
 
 from collections.abc import Sequence

@@ -1,8 +1,8 @@
 """A Hugging Face data set, streamed: by its id, or as files that the `datasets` library wrote.
 
-The image column is found by its type; class labels become text, texts, numbers and yes/no stay what they
-are, other columns are not read. Nothing but the rows in hand is kept. The library is optional: ``pip
-install 'derender[huggingface]'``.
+The image column is found by its type. Class labels become text; texts, numbers and yes/no stay as they are;
+other columns are not read. Nothing but the rows in hand is kept. The library is optional: ``pip install
+'derender[huggingface]'``.
 
 Not tried against the Hub itself: what is tested are folders in the forms in which the Hub keeps data sets.
 """

@@ -1,13 +1,13 @@
 """One encoded image in, one uint8 (3, S, S) array out.
 
-Orientation from EXIF is applied; grey, palette and CMYK become RGB; transparent pixels are laid over white;
-16-bit images are scaled (65535 becomes 255), never clipped; of an animation the first frame is taken.
-Colour profiles are not applied. Images that are not square are cropped to their centre (``fit="crop"``),
-laid whole on white ("pad"), squeezed ("stretch"), or given room ("room": their edge goes on all around, to a
-square of 31/24 of the longer side); all are then resized with an antialiased Lanczos
-filter. A JPEG much larger than needed is decoded at a reduced scale. Images above ``PIXEL_LIMIT`` and
-damaged ones raise ``Unreadable``, nothing else. A box (left, top, right, bottom in pixels of the upright
-image) cuts out a part first; it is moved and shrunk as far as needed to lie inside the image.
+Orientation from EXIF is applied; grey, palette and CMYK become RGB; transparent pixels are laid over white.
+16-bit images are scaled (65535 becomes 255), never clipped; of an animation the first frame is taken. Colour
+profiles are not applied. Images that are not square are cropped to their centre (``fit="crop"``), laid whole
+on white ("pad"), squeezed ("stretch"), or given room ("room": their edge continues all around, to a square of
+31/24 of the longer side); all are then resized with an antialiased Lanczos filter. A JPEG much larger than
+needed is decoded at a reduced scale. Images above ``PIXEL_LIMIT`` and damaged ones raise ``Unreadable``,
+nothing else. A box (left, top, right, bottom in pixels of the upright image) cuts out a part first. It is
+moved and shrunk as far as needed to lie inside the image.
 """
 
 import importlib

@@ -1,8 +1,8 @@
 """From any source to one array of decoded images with their labels: ``read_images``.
 
-A stream of samples is decoded in order on every core. What is known to fit lies in memory; everything else is
-appended to a cache file, decoded once, and mapped into memory, so that training has random access. Besides
-its pixels, an image takes its name, its labels and about 200 bytes that find copies.
+A stream of samples is decoded in order on every core. What is known to fit lies in memory. Everything else is
+appended to a cache file, decoded once, and mapped into memory: training has random access. Besides its
+pixels, an image takes its name, its labels and about 200 bytes that find copies.
 """
 
 import hashlib

@@ -4,11 +4,11 @@ Masks are only ever resized to the nearest value, after the same crop as their i
 merged as CelebAMask-HQ's owners do it (their g_mask.py): a later class hides an earlier one. Leaves out
 colours as classes, and a number for pixels without a class.
 
-Exact maps are in the camera frame of their image (conventions.md). With a params.csv depth is stored as
-z = 0.8 + value / 65535 * 0.4, normals as (n + 1) / 2 * 255, albedo as 0..255, and value 0 is background.
-Depth maps alone (unsup3d's synthetic faces) are grey: a share v of the largest value is z = 1.1 - 0.2 v, and
-0 is background. The set's own words do not say this, and the archive could not be had to check it: look at
-the average depth first, for which unsup3d gives SIDE 1.990e-2 and MAD 23.26 degrees.
+Exact maps are in the camera frame of their image (conventions.md). A params.csv means: depth is z = 0.8 +
+value / 65535 * 0.4, normals (n + 1) / 2 * 255, albedo 0..255, and value 0 is background. Depth maps alone
+(unsup3d's synthetic faces) are grey: a share v of the largest value is z = 1.1 - 0.2 v, and 0 is background.
+The set's own words do not say this, and the archive could not be had to check it: look at the average depth
+first, for which unsup3d gives SIDE 1.990e-2 and MAD 23.26 degrees.
 """
 
 from concurrent.futures import ThreadPoolExecutor
@@ -94,9 +94,9 @@ def read_masks(
     Args:
         masks: a folder or zip with a mask for every image: that of ``a/b.jpg`` is ``a/b.png``, or the only
             ``b.png`` there is. A file ``classes.txt`` among them, or beside their folder as `derender synth`
-            writes it, names the classes, one a line, the first being number 0; else they are called
-            after their numbers. None takes the data set's own masks, with CelebAMask-HQ's classes and the
-            aspect ratio of their images.
+            writes it, names the classes. It has one a line, the first being number 0. Without it classes are
+            called after their numbers. None takes the data set's own masks, with CelebAMask-HQ's classes and
+            the aspect ratio of their images.
     """
     own = masks is None
     listed = list_images(source, dataset=dataset, subset=subset) if own else None
@@ -148,8 +148,8 @@ def read_ground_truth(
             ``PATH::SUBSET``.
         subset: "test_gt" or "test" by default, or the only subset there is.
         limit: only the first so many.
-        image_size: side to bring images and maps to, where the set is images beside depth maps alone; a
-            set in synface64's format is read at the size it was rendered in.
+        image_size: side to bring images and maps to, where the set is images beside depth maps alone. A set
+            in synface64's format is read at the size it was rendered in.
     """
     place, named, options = parse_source(source)
     with open_source(Path(place).expanduser()) as opened:

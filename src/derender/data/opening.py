@@ -1,11 +1,10 @@
 """From what the user wrote to a stream of images.
 
 A path (of a folder, a zip, an image, a table of paths) may be followed by ``::PART``: a part of the
-official split or any folder. ``shards-{000..009}.tar``, a ``.tar``, a folder of them, ``owner/name`` of a
-Hugging Face data set, a folder or ``.parquet`` in a form of its library are read from front to back; they
-take ``?column=NAME`` (also ``config``, ``revision``) before ``::PART``, and others ``?half=test`` or
-``?half=development`` (``half_of``). A path that exists is always a
-path.
+official split or any folder. Streams are ``shards-{000..009}.tar``, a ``.tar``, a folder of them,
+``owner/name`` of a Hugging Face data set, and a folder or ``.parquet`` in its library's form. They are read
+from front to back and take ``?column=NAME`` (also ``config``, ``revision``) before ``::PART``; others take
+``?half=test`` or ``?half=development`` (``half_of``). A path that exists is always a path.
 """
 
 import hashlib

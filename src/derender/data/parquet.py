@@ -23,8 +23,8 @@ def opened_parquet(file: Path | bytes) -> "pq.ParquetFile":
 
     Raises:
         pyarrow.ArrowException, OSError: it is no parquet file.
-        ValueError: its numbers of rows contradict each other, or its values would take more than 512 MiB and
-            more than 1000 times the size of the file.
+        ValueError: its numbers of rows contradict each other, or its values need more than 512 MiB and more
+            than 1000 times the file's size.
     """
     import pyarrow.parquet as pq
 

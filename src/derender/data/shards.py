@@ -1,6 +1,6 @@
 """WebDataset: tar files whose members belong together where their names agree up to the first dot.
 
-``0001.jpg`` and ``0001.json`` are one sample. A ``.cls`` becomes the label ``class`` (as text), the texts,
+``0001.jpg`` and ``0001.json`` are one sample. A ``.cls`` becomes the label ``class`` (as text). Texts,
 numbers and yes/no values of a ``.json`` object become labels of their own; lists, objects and other members
 are passed over unread. Shards are read from front to back, and nothing is ever extracted, so no name in them
 can do harm. A damaged shard gives what was read before the damage, then one unreadable sample that says so.
@@ -47,8 +47,9 @@ class _Group:
 
 
 class ShardStream(Stream):
-    """Samples of one or more tar files, in order; ``column`` ("jpg", "input.png") is the image to take where
-    samples have several, ``source`` what the user named."""
+    """Samples of one or more tar files, in order. ``column`` ("jpg", "input.png") is the image to take where
+    samples have several, ``source`` the user's address.
+    """
 
     layout = "webdataset"
 

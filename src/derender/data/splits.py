@@ -1,9 +1,9 @@
 """Divides images into train, validation and test, the same way on every machine.
 
 Files are put in the order of a hash of their name and the seed, and that order is cut. So the split depends
-on neither the file system nor a random generator's version, counts are exact, and an image added later
-moves only those few that lie at a cut. With groups (identities), whole groups are ordered and cut: no
-person is on two sides.
+on neither the file system nor a random generator's version, and counts are exact. An image added later moves
+only those few that lie at a cut. With groups (identities), whole groups are ordered and cut: no person is on
+two sides.
 """
 
 import hashlib

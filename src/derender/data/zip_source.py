@@ -1,8 +1,8 @@
 """The members of a zip archive, read in place with Python's ``zipfile``.
 
-Members with absolute names or ``..`` in them and encrypted ones are passed over and listed. Refused are a
-member that reaches into what comes after it (members within each other are how small archives unpack to
-endless ones), another size or CRC-32 than in the directory, and a size beyond ``FILE_LIMIT_BYTES``.
+Members with absolute names or ``..`` in them and encrypted ones are passed over and listed. Refused are
+another size or CRC-32 than in the directory, and a size beyond ``FILE_LIMIT_BYTES``. So is a member that
+reaches into the next: members within each other let small archives unpack to endless ones.
 """
 
 import bz2

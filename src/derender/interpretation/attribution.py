@@ -5,17 +5,18 @@ share is that of Klinghoffer et al. (ECCV 2022, caption of the Grad-CAM figure):
 dimensions, over the sum of all. A zero baseline counts a feature that is large in every image, whether or not
 it distinguishes images; the mean as baseline does not.
 
-Maps: Grad-CAM (Selvaraju et al., ICCV 2017) at the encoder's last spatial convolution, the paper's choice;
-HiResCAM (Draelos and Carin, 2020, arXiv 2011.08891), which multiplies gradient and activation place by
-place; integrated gradients of the pixels through the whole encoder. The answer is the probe's logit by way
-of one factor while the others are held. Grad-CAM averages the gradient over places: it can light up where the
-answer does not look, which HiResCAM cannot. Maps are 4 x 4 at the activations: a region, not an outline.
+Maps are of three kinds. Grad-CAM (Selvaraju et al., ICCV 2017) at the encoder's last spatial convolution is
+the paper's choice. HiResCAM (Draelos and Carin, 2020, arXiv 2011.08891) multiplies gradient and activation
+place by place. The third are integrated gradients of the pixels through the whole encoder. The answer is the
+probe's logit by way of one factor while the others are held. Grad-CAM averages the gradient over places: it
+can light up where the answer does not look, which HiResCAM cannot. Maps are 4 x 4 at the activations: a
+region, not an outline.
 
 Sanity check of maps: Adebayo et al., Sanity Checks for Saliency Maps, NeurIPS 2018. A map that stays the
 same when the encoder's weights are drawn anew shows the image, not the model: do not trust it. One that
 stays with shuffled labels shows the encoder's interest, whatever the question. ``another image`` measures
-how much of a map is the same for every image. The verdict goes by Spearman's rank correlation over the
-places of the map; SSIM is that of the maps at the image's size, each divided by its largest value.
+how much of a map is the same for every image. The verdict goes by Spearman's rank correlation over the places
+of the map. SSIM is that of the maps at the image's size, each divided by its largest value.
 """
 
 import importlib
@@ -69,8 +70,8 @@ def integrated_gradients(
 ) -> tuple[np.ndarray, np.ndarray]:
     """The contribution of each dimension to one answer, from the baseline to the image.
 
-    ``features`` are (N, D), ``target`` is the number of the label or class, ``baseline`` (D,), zero by
-    default, as in the paper; ``output`` is "logit" or "probability"; ``steps`` of the Gauss-Legendre
+    ``features`` are (N, D), ``target`` is the number of the label or class. ``baseline`` (D,) is zero by
+    default, as in the paper. ``output`` is "logit" or "probability". ``steps`` of the Gauss-Legendre
     quadrature are as many as that needs. Returns (N, D) attributions, and (N,) completeness errors: their sum
     less the change of the answer.
     """
@@ -216,7 +217,8 @@ class Similarity:
     """Similarity of the maps of one method and factor before and after a change (of ``CHANGES``).
 
     ``spearman`` is the mean rank correlation over images and seeds, -1..1, 1 for unchanged, and ``spread``
-    its deviation; ``ssim`` at most 1; ``empty`` the share of comparisons left out, a map being empty or flat.
+    its deviation. ``ssim`` is at most 1. ``empty`` is the share of comparisons left out, a map being empty or
+    flat.
     """
 
     method: str

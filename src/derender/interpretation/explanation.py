@@ -39,8 +39,8 @@ LEARNED_SHARE, LEARNED_MOST = 0.4, 500
 class Explained:
     """An explanation of a model's features on labelled images.
 
-    ``shares`` are of each factor in every answer; ``clusters`` and ``pair`` (two file names and parts) are
-    there if requested; ``checks``, how maps answer to fresh weights, are filled when maps are drawn.
+    ``shares`` are of each factor in every answer. ``clusters`` and ``pair`` (two file names and parts) are
+    there if requested. ``checks``, how maps answer to fresh weights, are filled when maps are drawn.
     """
 
     shares: Explanation
@@ -175,7 +175,7 @@ def explain_labels(
     """Shares of each factor, (N, D_f) by name, in the answers to a task, with controls.
 
     ``split`` has one number of training rows and S choices, for the S ``seeds`` of probes and shuffled
-    labels; ``untrained`` are features of untrained encoders for the first seeds. ``head`` is "logistic" or
+    labels. ``untrained`` are features of untrained encoders for the first seeds. ``head`` is "logistic" or
     the paper's "linear", ``output`` "logit" or "probability"; ``baseline`` "zero" (the paper's) or the
     training rows' "mean". ``progress`` is called with (probes done, probes in all).
     """

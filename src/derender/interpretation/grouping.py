@@ -1,8 +1,8 @@
 """Parts by factor of what separates a cluster and of the distance of two images: exact, without a probe.
 
-The squared distance between two features that stand side by side is the sum of the squared distances of each
-factor, and their cosine the sum of each factor's part of the inner product: nothing is approximated. The
-parts depend on the features' scale, as the clustering itself does; ``ratio`` does not.
+Features of factors stand side by side. Their squared distance is the sum of the squared distances of each
+factor, their cosine the sum of each factor's part of the inner product: nothing is approximated. The parts
+depend on the features' scale, as the clustering itself does; ``ratio`` does not.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,9 +17,9 @@ Features = Mapping[str, np.ndarray]
 class ClusterShares:
     """C clusters, of some sizes, each against all other rows, by F factors, (C, F) each.
 
-    ``share`` is the part of the squared distance between the cluster's mean and the mean of the rest, 0..1,
-    and sums to 1 over factors; ``ratio`` the share of the factor's own variance that lies between cluster and
-    rest (eta squared), 0..1, whatever the factor's scale; ``chance`` its mean for rows shuffled.
+    ``share`` is the part of the squared distance between the means of cluster and rest, 0..1, and sums to 1
+    over factors. ``ratio`` is the share of the factor's own variance that lies between cluster and rest (eta
+    squared), 0..1, whatever the factor's scale. ``chance`` is the mean ratio for rows shuffled.
     """
 
     names: tuple[str, ...]
@@ -92,9 +92,7 @@ def cluster_shares(
 def pair_parts(
     features: Features, first: int, second: int, *, pairs: int = 2_000, seed: int = 0
 ) -> PairParts:
-    """Parts of the distance and the cosine between two of N rows, by factor, each (N, D_f); and where they
-    lie among so many random ``pairs``.
-    """
+    """Parts of distance and cosine of two of N rows, by factor, (N, D_f); place among random ``pairs``."""
     rows = [np.asarray(values, np.float64) for values in features.values()]
     generator, count = np.random.default_rng(seed), len(rows[0])
     one = generator.integers(count, size=pairs)

@@ -2,10 +2,10 @@
 
 A question is label columns: classes as they are, numbers cut into bins of equal size.
 
-Two ways to fit: ``logistic``, the penalised regression of ``evaluation/linear_probes.py`` (its weights
-taken back to the features as they are), and ``linear``, the paper's head of ``evaluation/linear_probes.py``.
-Weights of classes are centred over the classes, which changes no probability and makes the logit of a class
-its lead over the mean. Leaves out scores (``derender.evaluation``).
+Two ways to fit are those of ``evaluation/linear_probes.py``. ``logistic`` is the penalised regression, its
+weights taken back to the features as they are. ``linear`` is the paper's head. Weights of classes are centred
+over the classes, which changes no probability and makes the logit of a class its lead over the mean. Leaves
+out scores (``derender.evaluation``).
 """
 
 import json

@@ -16,9 +16,9 @@ from derender.interpretation.probe import Probe
 class ShareRow:
     """Shares of one set of features; S seeds, A labels or classes, F factors.
 
-    ``shares`` (S, A, F) are means over test images of the share of |IG|, 0..1, that sum to 1 over factors;
+    ``shares`` (S, A, F) are means over test images of the share of |IG|, 0..1, that sum to 1 over factors.
     ``low`` and ``high`` (A, F) end the 95 % interval of their mean over seeds. ``auc`` (S, A) is the area
-    under the ROC curve on the test rows, 0.5 at chance, best 1; ``drop`` (S, A, F) is lost when this factor's
+    under the ROC curve on the test rows, 0.5 at chance, best 1. ``drop`` (S, A, F) is lost when this factor's
     features are exchanged between images. ``error`` is the largest completeness error over the largest change
     of an answer.
     """

@@ -1,6 +1,6 @@
 """Library calls that make models: train, whiten, refine, unet, finetune; and compare_plan, many of them.
 
-Each is imported on first use, takes images or the address of a data set, and writes a run folder or the
+Each is imported on first use. It takes images or the address of a data set, and writes a run folder or the
 folder of a model. Of several processes that torchrun starts, the first reads the images and writes.
 """
 

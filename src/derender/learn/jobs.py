@@ -1,7 +1,7 @@
 """The jobs of a plan, what each leaves in the comparison's folder, and the library calls that do them.
 
 A job leaves a note beside its result: a key (the hash of its inputs), how it ended, its cost. A job whose
-note has the same key is not repeated; a training goes on from its last checkpoint.
+note has the same key is not repeated; a training continues from its last checkpoint.
 """
 
 import re
@@ -190,7 +190,7 @@ class Comparison:
 
 
 def train(at: Comparison, job: Job, progress: Callable[..., None]) -> Facts:
-    """Train, or go on with it, or take the run that is there."""
+    """Train, or resume, or take the run that is there."""
     plan, run, facts = at.plan, at.result(job), {}
     kind, in_the_loop = plan.kind(job.method), plan.kind(job.method) not in WITHOUT_LOOP
     if job.where not in plan.methods[job.method].runs:

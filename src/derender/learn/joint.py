@@ -94,10 +94,10 @@ def finetune(
         out: a new run folder, or with ``resume=True`` that of an unfinished run.
         dataset, limit, device, on_images, progress: as for `train`.
         memory: where scores are cached.
-        choices: ``labels`` (names of columns) or ``attributes=True`` (every yes/no label); ``model`` to start
-            from or ``preset`` of fresh weights; ``factors`` whose codes the head takes; ``weight`` of the
-            labels and ``rendering_weight`` in the total; ``labelled``, the number of training images whose
-            labels are used; ``settings`` and ``resume`` as for `train`.
+        choices: ``labels`` (names of columns) or ``attributes=True`` (every yes/no label). ``model`` to start
+            from or ``preset`` of fresh weights. ``factors`` whose codes the head takes. ``weight`` of the
+            labels and ``rendering_weight`` in the total. ``labelled``, the number of training images whose
+            labels are used. ``settings`` and ``resume`` as for `train`.
 
     Raises:
         ValueError: unknown labels, settings that do not fit, or a training that collapsed without a model.

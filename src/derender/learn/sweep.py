@@ -1,7 +1,8 @@
 """A comparison by plan: trainings, feature tables and scores as jobs that are each done once.
 
-A job whose note (``jobs``) says that it is done is not repeated; a training goes on from its last checkpoint.
-With several workers each job has a process of its own, so that one that is killed costs itself alone.
+A job whose note (``jobs``) says that it is done is not repeated; a training continues from its last
+checkpoint. With several workers each job has a process of its own, so that one that is killed costs itself
+alone.
 """
 
 import multiprocessing
@@ -43,7 +44,7 @@ def compare_plan(
     tell: Callable[[str], object] = lambda text: None,
     bar: Callable[..., Any] = no_bar,
 ) -> Scores:
-    """Train, embed and score every method of a plan, or go on with it, and write its tables and charts.
+    """Train, embed and score every method of a plan, or resume it, and write its tables and charts.
 
     Args:
         plan: as ``learn.plan`` reads it from a YAML or TOML file, or that file.

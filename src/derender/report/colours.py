@@ -1,7 +1,7 @@
 """From values to colours: images, depth maps, normals and shading as 8-bit images.
 
-Every function takes one array for a whole set and uses one range for all of it, so that images side by
-side can be compared. Leaves out layout (see ``panel``) and anything that needs a model.
+Every function takes one array for a whole set and uses one range for all of it: images side by side can be
+compared. Leaves out layout (see ``panel``) and anything that needs a model.
 """
 
 import cv2

@@ -38,7 +38,7 @@ Costs = Mapping[str, Mapping[str, Any]]
 class ScoredQuestion:
     """One question under one protocol (and one ``head`` at one ``count`` of labels, for the linear one).
 
-    ``about`` has rows, classes and the like in words; the ``main`` ones of the protocol's columns are in the
+    ``about`` has rows, classes and the like in words. The ``main`` ones of the protocol's columns are in the
     one table, and the first is drawn. ``costs`` are by row, each by the names of ``COST_COLUMNS``; ``absent``
     says by method why it has no row: "failed: ..." or "missing: ...".
     """

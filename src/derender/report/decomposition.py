@@ -1,8 +1,8 @@
 """A decomposition as images and files: input, reconstruction, every factor, another light and another view.
 
 Takes images and the ``Scene`` a model found in them; gives a ``Decomposition``, from which panels, pages and
-files are made. On disk each image has a folder: panel.png, one PNG per column, ``scene.npz`` with all scene
-parameters and normals as the renderer takes them, ``scene.json`` with light and camera in words and degrees.
+files are made. On disk each image has a folder: panel.png and one PNG per column. ``scene.npz`` has all scene
+parameters and normals as the renderer takes them, ``scene.json`` light and camera in words and degrees.
 """
 
 import json

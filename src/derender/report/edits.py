@@ -2,7 +2,7 @@
 
 ``relit``, ``rotated`` and ``swapped_factors`` take an opened image (``opening``) and return an ``Edit``:
 stills, their numbers and the frames of a film. On disk an edit is strip.png (labelled), each still as a PNG
-with transparency, film.gif, film.mp4, and moved.json with the numbers of every still.
+with transparency, film.gif and film.mp4. moved.json has the numbers of every still.
 """
 
 import json

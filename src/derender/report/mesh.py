@@ -1,14 +1,14 @@
 """A scene's surface as a textured triangle mesh in glTF's axes, and the bytes of its files.
 
-Axes change: a scene's x is right, y DOWN, z forward and its normals point inward (conventions.md); the mesh's
-x is right, y UP, z towards the viewer and its normals point outward, as in glTF, so that the object looks
-along +z. That is half a turn about x, (x, y, z) -> (x, -y, 1 - z): handedness stays, and the object's centre
-(0, 0, 1) becomes the origin. Lengths stay scene units. Texture coordinates have their origin at the texture's
-lower left corner. Cells of the pixel grid that are no surface are left out: the border columns that the model
-holds at one depth, cells seen at a grazing angle (on a grid a jump in depth is one) where they reach the
-rim, and pieces apart from the largest. A steep flank inside the surface stays: without it the surface would
-have holes. Values are stored as they are: images are sRGB-coded, as is a base colour in glTF. Leaves out
-closing the back, several objects, and compressed geometry.
+Axes change. A scene's x is right, y DOWN, z forward and its normals point inward (conventions.md). The mesh's
+x is right, y UP, z towards the viewer and its normals point outward, as in glTF: the object looks along +z.
+That is half a turn about x, (x, y, z) -> (x, -y, 1 - z): handedness stays, and the object's centre (0, 0, 1)
+becomes the origin. Lengths stay scene units. Texture coordinates have their origin at the texture's lower
+left corner. Cells of the pixel grid that are no surface are left out: border columns that the model holds at
+one depth, and pieces apart from the largest. So are cells seen at a grazing angle (on a grid a jump in depth
+is one) where they reach the rim. A steep flank inside the surface stays: without it the surface would have
+holes. Values are stored as they are: images are sRGB-coded, as is a base colour in glTF. Leaves out closing
+the back, several objects, and compressed geometry.
 """
 
 import re

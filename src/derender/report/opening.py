@@ -1,8 +1,8 @@
 """Options of the image commands, and opening images by them: files become pixels and scenes.
 
-The part of an image that suits the model is found (a face, by default), decomposed, optimised per image on
-request, and drawn in its own detail unless that is declined. Each field of ``ImageOptions`` is an option of
-every image command (``cli/gathered.py``): a new one is a field here and its use in ``ImageOpener``. Heavy
+The part of an image that suits the model is found: a face, by default. It is decomposed, optimised per image
+on request, and drawn in its own detail unless that is declined. Each field of ``ImageOptions`` is an option
+of every image command (``cli/gathered.py``): a new one is a field here and its use in ``ImageOpener``. Heavy
 packages are imported where they are used: the command line imports this module for its help. Leaves out edits
 (``editing``).
 """
@@ -115,8 +115,8 @@ class OpenedImage:
             "auto", "none", or "no face" where one was looked for in vain).
         scene: one scene, on the model's device.
         render: draws scenes like this one.
-        percentile: of its reconstruction error among the held-out ones, of the middle square's where the
-            part was chosen by that error; None where the model keeps none.
+        percentile: of its reconstruction error among the held-out ones; None where the model keeps none. A
+            part chosen by that error has the middle square's.
         depth_range: nearest and farthest depth of the images that were opened together.
     """
 

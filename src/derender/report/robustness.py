@@ -1,7 +1,7 @@
 """Curves of accuracy over angle: as tables, as a chart, and as one page.
 
-The chart has a panel for each axis; controls are grey and dashed, and shaded is the range that the 95 %
-interval of the first features covers. Leaves out computing anything (``derender.evaluation.robust``).
+The chart has a panel for each axis. Controls are grey and dashed; the 95 % interval of the first features is
+shaded. Leaves out computing anything (``derender.evaluation.robust``).
 """
 
 from itertools import cycle

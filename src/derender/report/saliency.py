@@ -1,8 +1,7 @@
 """Sheets of maps over images: the input, then a column for each factor with its share of the answer.
 
-The arrangement is that of the paper's figure (Klinghoffer et al., ECCV 2022: input, geometry, albedo, light,
-camera); bright is where, and each map is scaled by its own largest value, so that brightness says where and
-the percentage how much.
+The arrangement is that of the paper's figure (Klinghoffer et al., ECCV 2022): input, geometry, albedo, light,
+camera. Each map is scaled by its own largest value: brightness shows where, the percentage how much.
 """
 
 import re

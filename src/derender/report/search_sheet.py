@@ -25,8 +25,8 @@ def search_sheet(
 ) -> list[str]:
     """Write the sheet as PNG; gives the names of images that cannot be read and are left out of it.
 
-    ``images`` is the address of the table's images, by default the one that the table records; ``dataset`` is
-    their layout, or "auto"; ``progress`` is called with (images read, all).
+    ``images`` is the address of the table's images, by default the one that the table records. ``dataset`` is
+    their layout, or "auto". ``progress`` is called with (images read, all).
 
     Raises:
         ValueError: the address is not known, or holds none of the images.

@@ -1,9 +1,8 @@
 """The square crop of an image that a model reconstructs best.
 
 A model learns the crop of its training images; in another one it mistakes eyes for cheeks. Crops on a grid
-are compared by the squared error of their reconstruction inside the mask. The error is divided by the crop's
-own variance, so that smooth crops gain nothing. Leaves out rolled images, small objects, and crops that reach
-beyond the image.
+are compared by the squared error of their reconstruction inside the mask, over the crop's variance: smooth
+crops gain nothing. Leaves out rolled images, small objects, and crops that reach beyond the image.
 """
 
 from collections.abc import Sequence

@@ -117,11 +117,8 @@ def reads_safely() -> bool:
 
 
 def check_pickle(file: Path) -> None:
-    """Raise ValueError for a ``file`` that is not safe to unpickle.
-
-    It is no regular file, is larger than 2 GiB, or unpacks to more than it holds; or it could, crafted, make
-    the installed PyTorch run code.
-    """
+    """Raise ValueError for a ``file`` that is irregular, above 2 GiB, unpacks to more than it holds, or makes
+    the installed PyTorch run code."""
     try:
         size = require_regular(file, LIMIT_BYTES)
         if zipfile.is_zipfile(file):

@@ -1,7 +1,7 @@
 """Checkpoints: weights, optimiser and counters, in files that hold no code.
 
 A checkpoint is a folder of files with checksums. It is written beside the old one, read back, and then takes
-its place, so that a run killed at any moment leaves a whole checkpoint behind; the last but one is kept, too.
+its place. So a run killed at any moment leaves a whole checkpoint behind; the last but one is kept, too.
 """
 
 import json
@@ -30,8 +30,8 @@ _MOMENTS = ("exp_avg", "exp_avg_sq")  # Adam's
 class TrainState:
     """Counters of a run; with the weights and the optimiser they determine everything that follows.
 
-    ``images`` and ``seconds`` so far; the lowest validation loss, None before the first validation, and the
-    number of validations since; the state of the collapse detector.
+    ``images`` and ``seconds`` count the run so far. The lowest validation loss is None before the first
+    validation; then come the number of validations since, and the state of the collapse detector.
     """
 
     __pydantic_config__ = ConfigDict(strict=True, extra="forbid")

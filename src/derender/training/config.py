@@ -1,7 +1,7 @@
 """How a model is trained: one place for every default, one row per preset, strict about names.
 
-Source: the paper, Sec. 4 and its published settings; where the two differ (learning rate 1e-3 in the text,
-1e-4 with weight decay 5e-4 in the settings) the settings hold, because the larger rate collapses.
+Source: the paper, Sec. 4 and its published settings. Where the two differ the settings hold: learning rate
+1e-4 with weight decay 5e-4. The text's 1e-3 collapses.
 """
 
 import json
@@ -232,7 +232,7 @@ def resolve(preset: str, overrides: Iterable[str] = (), **explicit: Any) -> Trai
     Keys are dotted (``optimiser.learning_rate``); a unique last part may stand alone. Values are read as
     YAML. In ``explicit`` dots are written as double underscores and None means not given. With ``start_from``
     the model has that model's settings (without a U-Net decoder) instead of the preset's, before overrides
-    change them; of a larger ``image_size`` than its own it is grown (``maps_only``).
+    change them. A larger ``image_size`` than its own makes it grow (``maps_only``).
 
     Raises:
         ValueError: unknown preset, renderer, factor or key (names the nearest), or a value that does not fit.

@@ -92,8 +92,9 @@ class RefineConfig(FeatureSettings):
 class Refined:
     """The student, in evaluation mode, with features, and how it does on held-out images.
 
-    ``errors`` "before", "now" and "fitted" are the mean masked L1 (0..1) of reconstructions; ``gaps``, by
-    parameter of a scene, how far predictions lie from fitted scenes, "before" and "now", in mean deviations.
+    ``errors`` "before", "now" and "fitted" are the mean masked L1 (0..1) of reconstructions. ``gaps``, by
+    parameter of a scene, are how far predictions lie from fitted scenes, "before" and "now", in mean
+    deviations.
     """
 
     model: Derenderer

@@ -1,9 +1,9 @@
 """Training on several devices: each has its rows of a batch, and values of all rows are exchanged.
 
 Each rank (one process, one device) takes its rows of every batch. What couples the images of a batch goes
-through `Ranks`, with gradient where one is due: a rank's loss is its share of the whole, such that the mean
-over ranks is the loss of the batch, and DDP averages gradients accordingly. Processes are started by torchrun
-and joined by Lightning Fabric. Leaves out splitting a model over devices.
+through `Ranks`, with gradient where one is due: a rank's loss is its share of the whole. The mean over ranks
+is the loss of the batch, and DDP averages gradients accordingly. Processes are started by torchrun and joined
+by Lightning Fabric. Leaves out splitting a model over devices.
 """
 
 import logging

@@ -2,7 +2,7 @@
 
 Whitening: how other factors move a model's activations, measured on its own renderings. For geometry and
 albedo every image is decomposed, rendered with other values of all its vector factors (light and camera), and
-encoded again, several times; mirror images count as views, too, for the object is symmetric. For each vector
+encoded again, several times. Mirror images count as views, too, for the object is symmetric. For each vector
 factor everything but that factor is changed: maps are another image's. Leaves out changing one map beside the
 other, which brought nothing (lab/log.md).
 

@@ -1,7 +1,7 @@
 """The training loop: one process or many (Lightning Fabric), resumable to the same weights.
 
-Everything random is a function of the seed and the number of images seen, so the loop needs only weights,
-optimiser and counters to go on where it stopped.
+Everything random is a function of the seed and the number of images seen. So weights, optimiser and counters
+are enough to continue where a run stopped.
 """
 
 import time

@@ -79,7 +79,7 @@ def refuse_taken(path: Path) -> None:
 
 
 def reopen_run(path: Path, config: Settings) -> RunFolder:
-    """The folder of a run to go on with; no run is a FileNotFoundError, other settings are a ValueError."""
+    """The folder of a run to resume; no run is a FileNotFoundError, other settings are a ValueError."""
     run = RunFolder(path)
     if not run.config.is_file():
         raise FileNotFoundError(f"no run to resume in {path} (no config.yaml): train without --resume first")

@@ -34,8 +34,8 @@ Columns = Mapping[str, Shaped[Tensor, "n ..."]]
 class StepResult(StepLosses):
     """Losses of one batch, and the values that the watcher looks at.
 
-    ``terms`` are every weighted term of the total by name, and the plain masked L1 ("l1"), detached;
-    ``scene`` and ``rendering`` are without the twins; ``codes``, by factor, have gradient, for an objective
+    ``terms`` are every weighted term of the total by name, and the plain masked L1 ("l1"), detached.
+    ``scene`` and ``rendering`` are without the twins. ``codes``, by factor, have gradient, for an objective
     beside this one.
     """
 
@@ -173,7 +173,7 @@ def cycle_loss(
 ) -> Float[Tensor, ""]:  # fmt: skip
     """How far light and camera, predicted from a rendering, are from those it was rendered with; best 0.
 
-    Mean absolute difference (radians, intensities, scene units) over the perturbed vector factors; the
+    Mean absolute difference (radians, intensities, scene units) over the perturbed vector factors. The
     rendered scene is a fixed, exact target for what an image alone leaves open (pitch above all).
     """
     total = rendered.depth.new_zeros(())

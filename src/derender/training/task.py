@@ -70,7 +70,7 @@ class TrainingTask(ABC):
 
     @abstractmethod
     def watch(self, memory: dict[str, Any]) -> FiniteWatch:
-        """A watcher that goes on from ``memory``."""
+        """A watcher that continues from ``memory``."""
 
 
 def compute_step(
@@ -111,8 +111,8 @@ class Progress:
 class TrainResult:
     """How a run ended.
 
-    ``images`` seen and ``seconds`` count resumed parts; ``images_per_second`` and ``waiting`` (share of time,
-    0..1, for images) are of this call; ``validation`` has the last losses by name. ``stopped`` is "images",
+    ``images`` seen and ``seconds`` count resumed parts. ``images_per_second`` and ``waiting`` (share of time,
+    0..1, for images) are of this call. ``validation`` has the last losses by name. ``stopped`` is "images",
     "minutes", "patience" or "collapse"; ``findings`` are the watcher's last; ``model_images`` had been seen
     by the saved weights, None where that is unknown.
     """

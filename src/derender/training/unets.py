@@ -3,7 +3,7 @@
 Segmentation needs features at every resolution, and training by rendering reaches a U-Net's fine levels only
 through a code of 1x1 pixels. A trained model knows more of every pixel that its surface covers: the pixel's
 place on the object, its depth, and the object's colour there. The geometry encoder learns the first two, the
-albedo encoder the last, each through the expanding half of a U-Net that is thrown away; a decoder over both,
+albedo encoder the last, each through the expanding half of a U-Net that is thrown away. A decoder over both,
 which is kept, learns all of it from their features without changing them. Images and targets are zoomed,
 moved and mirrored together. Both also learn the model's own codes of images as they are. Needs no labels.
 Leaves out light and camera, whose encoders stay.
@@ -53,8 +53,8 @@ class PixelTargets:
     """A model's predictions for each pixel of a batch.
 
     ``maps``, by factor, are (N, 3, H, W): geometry is the place on the object (-1..1 across and down) and the
-    depth (-1..1 over the model's range, without the camera's distance), albedo is 0..1; 0 where nothing is
-    covered. ``mask`` (N, H, W) is 1 where the surface is visible; ``codes`` are (N, code).
+    depth (-1..1 over the model's range, without the camera's distance). Albedo is 0..1. All are 0 where
+    nothing is covered. ``mask`` (N, H, W) is 1 where the surface is visible; ``codes`` are (N, code).
     """
 
     maps: dict[str, Tensor]
@@ -83,8 +83,8 @@ def distil_unets(
     """A copy of a trained model with U-Net encoders of geometry and albedo and a decoder that learnt from it.
 
     The same seed gives the same weights on the same machine and thread count; torch's global random state is
-    neither read nor changed. Fewer than two images, images of another size, a model that lacks a factor, or
-    weights that are NaN or infinite in the end are a ValueError.
+    neither read nor changed. A ValueError are fewer than two images, images of another size, a model that
+    lacks a factor, and weights that end as NaN or infinity.
     """
     if len(images) < 2 or images.shape[-1] != model.image_size:
         raise ValueError(

@@ -1,7 +1,7 @@
 """Detects a training that fails while its loss still falls, and explains it in plain words.
 
 Unsupervised geometry can fail in ways that reconstruction does not show. Each sign below is a number measured
-on training batches, smoothed, and compared with a limit; a sign that stays on for a while is a finding. The
+on training batches, smoothed, and compared with a limit. A sign that stays on for a while is a finding. The
 limits were set on healthy and collapsed runs (lab/log.md), the times on runs with batches of 16: networks
 recover by updates, so larger batches get as many updates, not as many images.
 
@@ -158,7 +158,9 @@ class Watcher(FiniteWatch):
     def remembering(
         cls, ranges: SceneRanges, batch_size: int, memory: Mapping[str, Any], ranks: Ranks = ALONE
     ) -> "Watcher":
-        """A watcher that goes on where ``memory`` was taken, or anew; a ValueError of what none gave."""
+        """A watcher that continues where ``memory`` was taken, or starts anew; a ValueError of what none
+        gave.
+        """
         try:
             watcher = cls(ranges, batch_size, **memory)
             numbers = [watcher.last_images, *watcher.averages.values(), *watcher.on_since.values()]

@@ -31,8 +31,9 @@ SHOWN = 8  # images in each row of examples, at most
 
 @dataclass(frozen=True)
 class Shared:
-    """What distinct images share: which rows were compared, the measures by their names in ``CHECKS``, where
-    the mean of edges is symmetric, and orders of these images by the names of their two ends."""
+    """What distinct images share. Rows that were compared; measures by their names in ``CHECKS``; the axis of
+    symmetry; orders of these images by the names of their two ends.
+    """
 
     rows: Int64[np.ndarray, " k"]
     values: Mapping[str, JackknifeEstimate]
@@ -104,7 +105,7 @@ def doctor(
     """Say whether images suit the method: copies, crop, symmetry, view and light. Trains nothing.
 
     Args:
-        images: a folder, zip, shards or data set as ``read_images`` takes it; or a set that was read with
+        images: a folder, zip, shards or data set as ``read_images`` takes it. Or a set that was read with
             ``keep_duplicates=True`` at a multiple of 32 pixels.
         dataset: the layout's name, or "auto" to recognise it.
         limit: examine at most so many images.

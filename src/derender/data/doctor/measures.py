@@ -1,16 +1,15 @@
 """What is measured of images: brightness, colour, near copies; what they share, and in what they vary.
 
-Greys are 0.299 R + 0.587 G + 0.114 B of the values as stored (ITU-R BT.601). Each image becomes a grid of
-6 x 6 cells with the strength of edges in eight orientations (after Dalal and Triggs, Histograms of Oriented
-Gradients, 2005), the mean of its row of cells taken off, length 1. Taking off rows is what distinguishes an
-object from a landscape: of images that look alike wherever they are shifted sideways (noise, textures, sky
-over hills) nothing is left in common, so their agreement is 0 by construction. Edges do not care which side
-of an outline is darker, so one kind of thing in many colours agrees.
+Greys are 0.299 R + 0.587 G + 0.114 B of the values as stored (ITU-R BT.601). Each image becomes a grid of 6 x
+6 cells with the strength of edges in eight orientations (after Dalal and Triggs, HOG, 2005). The mean of each
+row of cells is taken off, and the length is 1. Taking off rows distinguishes an object from a landscape.
+Images that look alike however they are shifted sideways (noise, textures, sky over hills) then agree by 0.
+Edges do not care which side of an outline is darker, so one kind of thing in many colours agrees.
 
 View: how far an image is from its own mirror image, against how far it is from other images' mirror images.
-Light: how much brighter the left of the image's middle is than the right, in its upper and its lower half;
-light from the side moves both together, marks and noise do not, so what the halves share is counted. Leaves
-out light from above or below, views that differ by tilt alone, and more than two kinds of thing.
+Light: how much brighter the left of the image's middle is than the right, in its upper and its lower half.
+Light from the side moves both halves together, marks and noise do not: what the halves share is counted.
+Leaves out light from above or below, views that differ by tilt alone, and more than two kinds of thing.
 """
 
 from collections.abc import Callable
@@ -64,8 +63,8 @@ class Pixels:
 class Originals:
     """Sizes of a sample of files, in pixels, upright.
 
-    ``smaller`` and ``oblong`` are shares, 0..1, of files whose short side is below ``image_size``, and of
-    those whose sides differ by more than a quarter.
+    ``smaller`` is the share, 0..1, of files with a short side below ``image_size``. ``oblong`` is that of
+    files whose sides differ by more than a quarter.
     """
 
     sampled: int
@@ -87,8 +86,9 @@ class JackknifeEstimate:
 
 @dataclass(frozen=True)
 class SymmetryAxis:
-    """The axis about which the mean image of edges is most symmetric: its distance from the middle as a share
-    of the width (right is positive), and the correlation of the two sides about it, -1..1, best 1."""
+    """The axis about which the mean image of edges is most symmetric. Its distance from the middle as a share
+    of the width (right is positive), and the correlation of the two sides, -1..1, best 1.
+    """
 
     offset: float
     correlation: float
@@ -138,8 +138,8 @@ def near_copy_groups(tiny: Float32[np.ndarray, "n d"]) -> Int64[np.ndarray, " n"
     Two images are near copies if their tiny grey versions (rows of length 1, or 0: blank images, which are
     copies of one another) correlate by ``COPY_CORRELATION`` or more: shifted by a pixel or two, brightened,
     compressed again. Candidates come from a k-d tree over the leading principal components, in which no two
-    near copies can be farther apart than in full; groups are connected pairs, so that chains count as one.
-    Leaves out colour, mirrored copies, and copies cropped otherwise.
+    near copies can be farther apart than in full. Groups are connected pairs: chains count as one. Leaves out
+    colour, mirrored copies, and copies cropped otherwise.
     """
     group = np.arange(len(tiny))
     sample = tiny[evenly(len(tiny), _SAMPLE)]
@@ -194,9 +194,8 @@ def measure_originals(source: Source, files: tuple[str, ...], image_size: int) -
 def jackknife(measure: Callable[[Int64[np.ndarray, " k"]], float], count: int) -> JackknifeEstimate:
     """``measure(rows)`` on all rows, and its standard error from leaving out one of 12 groups at a time.
 
-    Rows are dealt to the groups in turn; they count as independent, so where images come in families (many
-    of one person) the true error is larger. Source: Shao and Tu, The Jackknife and Bootstrap (1995),
-    chapter 2.3.
+    Rows are dealt to the groups in turn and count as independent. Where images come in families (many of one
+    person) the true error is larger. Source: Shao and Tu, The Jackknife and Bootstrap (1995), chapter 2.3.
     """
     if count < 2 * GROUPS:
         raise ValueError(f"a jackknife over {GROUPS} groups needs {2 * GROUPS} rows or more, got {count}")
@@ -323,8 +322,8 @@ def split_in_two(
 
     Kinship is agreement across the groups over agreement within them: 1 one kind, 0 nothing shared; the
     median over random splits, with their standard deviation as its error. Structure is made blind to left and
-    right first (a car seen from either side is one kind), then split in two by k-means on half of the images;
-    the other half is dealt out and judged. None where no split leaves both groups large enough to judge.
+    right first (a car seen from either side is one kind). k-means splits half of the images in two; the other
+    half is dealt out and judged. None where no split leaves both groups large enough to judge.
     """
     from sklearn.cluster import KMeans
     from sklearn.decomposition import PCA

@@ -4,15 +4,15 @@ Lists are read as the owners publish them and as their CSV copies; only the attr
 images (``img_align_celeba``) are used whole. Images in the wild (``img_celeba``) show a scene with a face in
 it, so each gets a square box about its face:
 
-- from a list of the user's own, ``boxes.csv``, whose first line is ``file,left,top,width,height`` or
-  ``file,left,top,right,bottom``, with a row for each image;
+- from a list of the user's own, ``boxes.csv``, with a row for each image. Its first line is
+  ``file,left,top,width,height`` or ``file,left,top,right,bottom``;
 - else from ``list_landmarks_celeba.txt``, the box of CelebA-HQ without its rotation (Karras et al.,
-  Progressive Growing of GANs, 2018, appendix C): with the eyes' middle E, their distance e, the middle of
-  the mouth's corners M and m = |E - M|, the side is max(4 e, 3.6 m) and the middle E + 0.1 (E - M).
+  Progressive Growing of GANs, 2018, appendix C). E is the eyes' middle, e their distance, M the middle of the
+  mouth's corners, m = |E - M|. The side is max(4 e, 3.6 m), the middle E + 0.1 (E - M).
 
 CelebAMask-HQ: 30,000 faces with a mask of 19 classes each, in parts as published or merged. Its mapping to
 CelebA gives the official partition. The owners' own script compares that table's count from zero with
-CelebA's numbers, which start at one; here an image is in the part in which CelebA has it.
+CelebA's numbers, which start at one. Here an image is in the part in which CelebA has it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -85,8 +85,8 @@ def _owners_list(
 ) -> _OwnersList | None:
     """The list of that name, as the original text or as a CSV copy, or None when neither is there.
 
-    A row of another length than the others or with another value than the ``codes``, and a list with fewer
-    rows than its first line says, are errors.
+    Errors are a row of another length, a value outside ``codes``, and a list with fewer rows than its first
+    line says.
     """
     file = source.named(f"{stem}.txt", f"{stem}.csv")
     if file is None:

@@ -1,7 +1,7 @@
 """What a data set's layout is, and what all of them read alike: folders, lists, tables, official parts.
 
-Labels are columns aligned with the files. Text columns are string arrays with "" where unknown; numbers are
-float32 with NaN where unknown; yes/no attributes are int8 with 1 yes, 0 no, -1 unknown.
+Labels are columns aligned with the files. Text columns are string arrays with "" where unknown, numbers
+float32 with NaN where unknown. Yes/no attributes are int8 with 1 yes, 0 no, -1 unknown.
 """
 
 import csv
@@ -37,8 +37,8 @@ class Table:
 
     Attributes:
         partition: the owners' own split of each file ("train", "validation", "test"; "" unknown), or None.
-        boxes: (N, 4) left, top, right, bottom of the part of each image that is read, in pixels of the
-            upright image, or None for whole images. NaN: no box is known, and the image is passed over.
+        boxes: (N, 4) left, top, right, bottom, in pixels of the upright image, of the part that is read; None
+            for whole images. NaN: no box is known, and the image is passed over.
         skipped: images that a user's own list names and that are not there, with reasons.
     """
 
@@ -125,8 +125,8 @@ def half_of(rows: T, half: str) -> T:
     """The development or test half of a table, set of images or feature table, or "all" of it.
 
     A hash of its identity or model, else of its file's name without folders and suffix, puts a row into its
-    half. So a person or a shape is in one half only, the same in every set, at every size and on every
-    machine; the halves are about equally large. Choose settings on development, report test.
+    half. So a person or a shape is in one half only, the same in every set, size and machine. The halves are
+    about equally large. Choose settings on development, report test.
 
     Raises:
         ValueError: another half, or one that is empty.

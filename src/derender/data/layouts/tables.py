@@ -1,9 +1,8 @@
 """Images and labels from a table: CSV or Parquet, one row for each image.
 
-``data.csv`` (or metadata.csv, data.parquet, metadata.parquet) beside the images, in a folder or a zip;
-or any table of that kind given in place of a folder. Paths are relative to the table, and none leaves its
-folder. One column, named file, path, image, file_name or filename, holds them; every other column is a
-label:
+``data.csv`` (or metadata.csv, data.parquet, metadata.parquet) beside the images, in a folder or a zip. Or any
+table of that kind given in place of a folder. Paths are relative to the table, and none leaves its folder.
+One column, named file, path, image, file_name or filename, holds them; every other column is a label:
 
 - a column ``split`` or ``partition`` of nothing but train, val, test and the like is the official split;
 - true and false, yes and no, or 0 and 1 only: a yes/no attribute;

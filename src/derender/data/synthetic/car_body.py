@@ -1,12 +1,12 @@
 """The geometry of a car: measures, the body as one smooth grid, boxes and wheels, and one mesh of all.
 
-Stations run along the body's outline seen from the side: 0 lower lip of the front, 1 bumper, 2 nose, 3 cowl,
-4 upper edge of the windscreen, 5 rear end of the roof, 6 lower edge of the rear window, 7 upper edge of the
-tail, 8 rear bumper, 9 lower lip of the rear. At each station a row of numbers says where the middle of the
-car, its upper edge, its waist (the windows' lower edge, or the shoulder of bonnet and boot) and its sill
-are; between stations the rows are interpolated linearly with rounded corners. Across, the surface goes from
-the middle over the crowned top to the edge, down the glass to the waist, and down the side to the sill. The
-half with x > 0 is mirrored, so the body is exactly symmetric. Wheel arches are holes of the paint.
+Stations run along the body's outline seen from the side. In front: 0 lower lip, 1 bumper, 2 nose, 3 cowl, 4
+upper edge of the windscreen. Behind: 5 end of the roof, 6 lower edge of the window, 7 upper edge of the tail,
+8 bumper, 9 lower lip. A row of numbers at each station has the places of the car's middle, upper edge, waist
+and sill. The waist is the windows' lower edge, or the shoulder of bonnet and boot. Between stations rows are
+interpolated linearly with rounded corners. Across, the surface goes from the middle over the crowned top to
+the edge. Then it goes down the glass to the waist, and down the side to the sill. The half with x > 0 is
+mirrored, so the body is exactly symmetric. Wheel arches are holes of the paint.
 
 Points are metres, x right, y UP from the ground, z from the front to the rear; ``join`` turns y down. A
 grid's columns and rows are ordered so that d/dcolumn x d/drow points inwards, as the conventions' normals do.

@@ -1,9 +1,9 @@
 """The paint of a car: windows, lamps, grille, plates, door lines, wheel arches; and what marks its class.
 
-Two charts: (share of the half width, station) on top, where one row of shapes suits every body style, and
-(z, y) in metres beside, where windows follow the body's lines. Police cars, ambulances and sports cars carry
-colours and patterns of the usual kinds (black and white, a blue band, blue and yellow fields, orange stripes
-and a cross or a six-pointed star); none is that of an existing service. Leaves out interiors behind the glass
+There are two charts. (share of the half width, station) is on top, where one row of shapes suits every body
+style. (z, y) in metres is beside, where windows follow the body's lines. Police cars, ambulances and sports
+cars carry usual colours and patterns: black and white, a blue band, blue and yellow fields, orange stripes
+and a cross or a six-pointed star. None is that of an existing service. Leaves out interiors behind the glass
 and lettering that can be read.
 """
 

@@ -25,7 +25,7 @@ DECAL_LENGTH = _OWN + 2 * MOST_CORNERS
 class Paint(NamedTuple):
     """Surfaces as arrays: k has rows ``first[k]`` to ``first[k + 1]`` of ``decals``.
 
-    ``folded`` takes a chart's first coordinate without its sign, so that paint is symmetric; ``holes`` are
+    ``folded`` takes a chart's first coordinate without its sign, so that paint is symmetric. ``holes`` are
     circles (u, v, radius) where there is no surface, of radius 0 where there is no hole.
     """
 

@@ -1,7 +1,7 @@
 """The identity of a procedural face: shape coefficients, skin, hair, brows, eyes and lips.
 
-Traits are correlated loosely as among people (dark skin with dark hair and eyes, heavy brow ridges with
-wide jaws and beards, age with grey hair and folds), and every one stays variable on its own.
+Traits are correlated loosely as among people: dark skin with dark hair and eyes, heavy brow ridges with wide
+jaws and beards, age with grey hair and folds. Each stays variable on its own.
 """
 
 from typing import Any

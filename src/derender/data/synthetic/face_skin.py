@@ -1,7 +1,7 @@
 """The colour of a face (albedo free of shading), its parts, and the hair that grows on it.
 
 Skin tone with mottling, blush, freckles, lines of age and stubble; lips; brows; hair; beard; clothes. Hair is
-part of the head's surface: it grows above a line around the head, given as a row ``q`` for each angle, and
+part of the head's surface. It grows above a line around the head, given as a row ``q`` for each angle. It
 lifts the surface by its thickness, with a soft, uneven edge. Eyes and the inside of the mouth change from
 image to image and are painted over it: lids follow the expression, irises the gaze; the mouth's inside shows
 teeth, dark and tongue as far as the lips have parted. Colours only: no highlights, since albedo holds no
@@ -63,8 +63,9 @@ class HairStyle(NamedTuple):
 
 
 class Skin(NamedTuple):
-    """One person's surface: ``albedo`` (3, rows, columns) 0..1; ``thickness`` of hair and clothes and how far
-    hair hangs ``forward`` (rows, columns) in face pixels; ``parts`` as numbers into MASK_CLASSES."""
+    """One person's surface. ``albedo`` is (3, rows, columns) 0..1. ``thickness`` of hair and clothes and how
+    far hair hangs ``forward`` are (rows, columns) in face pixels. ``parts`` are numbers into MASK_CLASSES.
+    """
 
     albedo: Float32[ndarray, "3 rows columns"]
     thickness: Float32[ndarray, "rows columns"]
@@ -257,8 +258,9 @@ def _hair_distance(grid: FaceGrid, style: HairStyle, who: Identity) -> Float[nda
 
 
 def _hair_thickness(shape: FaceShape, style: HairStyle, volume: float, distance: ndarray) -> Any:
-    """How far hair stands off the head, and how far hanging hair comes forward of the neck (it falls from the
-    temples and makes up for the head's half width), face pixels."""
+    """How far hair stands off the head, and hanging hair comes forward of the neck, in face pixels. Hair
+    falls from the temples and makes up for the head's half width.
+    """
     theta, q = np.abs(shape.grid.theta), shape.grid.q
     crown = 1.0 - smoothstep(-42.0, -26.0, q)
     away = smoothstep(np.deg2rad(28.0), np.deg2rad(66.0), theta)

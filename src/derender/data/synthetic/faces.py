@@ -2,7 +2,7 @@
 
 Each image is a function of the seed and its index alone: asking for more images does not change the first
 ones, nor does the number of threads. In a track (settings.tracks) light, background and expression belong to
-the track, while view, gaze and the expression's strength move from one draw to another along its frames.
+the track. View, gaze and the expression's strength move from one draw to another along its frames.
 Conventions are those of docs/reference/conventions.md; nose tips of neutral faces stand at z = 0.947.
 """
 

@@ -1,9 +1,9 @@
 """Light on generated meshes beyond one lamp on a matt surface: more lamps, gloss, cast shadows and haze.
 
-The same formulas as ``derender.renderers``, evaluated at each sample of a pixel with the mesh's own normals:
-Blinn's highlight, exponential haze by the distance between the nearest and the farthest point seen, and a
-shadow map for each lamp, drawn by the same z-buffer four times as fine as the image. A shadow's edge is
-averaged over 2 x 2 texels. Leaves out light reflected from one part onto another.
+The same formulas as ``derender.renderers``, evaluated at each sample of a pixel with the mesh's own normals.
+There is Blinn's highlight, and exponential haze by the distance between the nearest and the farthest point
+seen. A shadow map for each lamp is drawn by the same z-buffer, four times as fine as the image. A shadow's
+edge is averaged over 2 x 2 texels. Leaves out light reflected from one part onto another.
 """
 
 from typing import NamedTuple, no_type_check

@@ -1,13 +1,13 @@
 """Triangle meshes to images with exact ground truth: a fast forward-only z-buffer, for faces and cars.
 
-Each pixel takes 3 x 3 samples (offsets -1/3, 0, 1/3); the image is their mean, the truth maps are the middle
+Each pixel takes 3 x 3 samples (offsets -1/3, 0, 1/3). The image is their mean, truth maps are the middle
 sample alone, at the pixel's centre. Normals, colours and charts are interpolated with perspective. A face has
 a colour and a part at each vertex. A car's triangles lie on painted surfaces: each has a colour, a part, and
 flat shapes (decals) on its chart, a pair of coordinates that the mesh carries. Shapes are looked up at every
-sample, so their edges are as sharp at 512 pixels as at 32; the last shape that holds a point wins. Unlike
+sample: their edges are as sharp at 512 pixels as at 32. The last shape that holds a point wins. Unlike
 ``derender.render`` this needs no gradient. Gloss, shadows and haze: lighting.py. Leaves out what is seen from
-behind.
-Numba's cache on disk refers to the named tuples by name: who renames one renames the kernels that take it.
+behind. Numba's cache on disk refers to the named tuples by name: who renames one renames the kernels that
+take it.
 """
 
 from functools import lru_cache
@@ -69,8 +69,9 @@ def grid_triangles(rows: int, columns: int, mirrored: float = 0.0) -> Int32[ndar
 @kernel
 @no_type_check
 def draw_mesh(mesh, rotation, translation, light, background, focal_px, out):
-    """Fill ``out``. The mesh is turned by rotation (3,3) and moved to (0, 0, 1) + translation (3,); light is
-    a ``Lighting``, background (S,S,3) 0..1."""
+    """Fill ``out``. The mesh is turned by rotation (3,3) and moved to (0, 0, 1) + translation (3,). Light is
+    a ``Lighting``, background (S,S,3) 0..1.
+    """
     painted = mesh.values.shape[1] == 2
     places = np.empty((len(mesh.vertices), 3), np.float32)  # sample column, row, 1 / z
     more = np.zeros((len(mesh.vertices), 8), np.float32)  # normal, chart or colour, cosine to the light

@@ -147,8 +147,8 @@ class CarViewSettings(Settings):
 
     Azimuth 0 sees the front; above 0 the front moves to the left of the image. With ``azimuth_beyond_deg``
     azimuth is uniform on either side, from there to the range's ends. The rotation in the image plane is
-    normal, clipped at its range's ends, as are the shifts (scene units, right and down; one pixel of 64 is
-    0.0028); a car that a shift would move out of the image is shifted less."""
+    normal, clipped at its range's ends. So are the shifts, in scene units, right and down; one pixel of 64 is
+    0.0028. A car that a shift would move out of the image is shifted less."""
 
     elevation_deg: Annotated[Range, _within(0, 90)] = (25.0, 60.0)
     azimuth_deg: Angles = (-30.0, 30.0)
@@ -266,7 +266,7 @@ def named_settings(
     kind: type[Kind], light: str = "usual", view: str = "usual", overrides: Iterable[str] = (), **own: Any
 ) -> Kind:
     """Settings by the names of their lighting and viewpoints, own values by keyword, then overrides such as
-    ``light.yaw_deg=[-60,60]``; keys are dotted, values are YAML.
+    ``light.yaw_deg=[-60,60]``. Keys are dotted, values are YAML.
 
     Raises:
         ValueError: an unknown name, text that is not key=value, an unknown key (the known ones are listed),

@@ -1,6 +1,6 @@
 """The set of images that generators return, drawn on threads; and the backgrounds they share.
 
-A generator gives the meshes, light and view of a run of consecutive images that show one object; here they
+A generator gives the meshes, light and view of a run of consecutive images that show one object. Here they
 are drawn into the rows of the result. So threads decide when an image is made and nothing else.
 """
 

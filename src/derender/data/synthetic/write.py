@@ -1,11 +1,11 @@
 """Write synthetic images in the layout of the rendered data sets, truth maps included.
 
-``images/NNNNNN.jpg`` (JPEG quality 92, 4:4:4), ``params.csv`` (degrees), ``identities.csv``, and with truth
-``depth/`` (16 bit, z = 0.8 + value/65535*0.4, 0 = background), ``normal/`` (round((n+1)/2*255)), ``albedo/``,
-``mask/`` (255 = object) and ``masks/`` (number of the part, named line by line in ``classes.txt``) as PNG.
-With effects also ``shading/``, ``visible/``, ``highlight/`` and ``transmission/`` (16 bit, value/65535*2).
-Tracks lie at ``tracks/idNNNN/track_NNN/NNN.jpg`` without maps. The column ``expr_weights`` of the
-morphable-model sets has no counterpart here.
+``images/NNNNNN.jpg`` (JPEG quality 92, 4:4:4), ``params.csv`` (degrees), ``identities.csv``. With truth, as
+PNG: ``depth/`` (16 bit, z = 0.8 + value/65535*0.4, 0 = background), ``normal/`` (round((n+1)/2*255)),
+``albedo/``, ``mask/`` (255 = object). ``masks/`` has the number of the part, named line by line in
+``classes.txt``. With effects also ``shading/``, ``visible/``, ``highlight/`` and ``transmission/`` (16 bit,
+value/65535*2). Tracks lie at ``tracks/idNNNN/track_NNN/NNN.jpg`` without maps. The column ``expr_weights`` of
+the morphable-model sets has no counterpart here.
 """
 
 import csv

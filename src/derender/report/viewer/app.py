@@ -2,8 +2,8 @@
 
 Nothing in a request can name a file: the page's own files are read once at the start, images are known by
 names that the shelf made up, examples and rows by number. Bodies are read up to a limit, and all uploads
-together keep no more than another; decoding and computing have one thread each, so that a heavy upload does
-not hold up the sliders of others.
+together keep no more than another. Decoding and computing have one thread each: a heavy upload does not hold
+up the sliders of others.
 """
 
 import asyncio

@@ -1,10 +1,10 @@
 """Requests that the server accepts, and the headers of its answers.
 
-A page on another site can make a visitor's browser send requests here. Three checks stop it: the Host header
-must name this machine and not a foreign name that was made to point here (DNS rebinding); a request that
+A page on another site can make a visitor's browser send requests here. Three checks stop it. The Host header
+must name this machine and not a foreign name that was made to point here (DNS rebinding). A request that
 changes or computes something must come from the page itself (Origin, Sec-Fetch-Site) and carry a header that
-no form can send; and no answer may be framed, embedded, sniffed or stored. Leaves out passwords: everyone who
-can reach the address can use the page.
+no form can send. No answer may be framed, embedded, sniffed or stored. Leaves out passwords: everyone who can
+reach the address can use the page.
 """
 
 import ipaddress
@@ -87,8 +87,8 @@ class Guard:
 def allowed_host(header: str, bound: str) -> bool:
     """Whether a Host header names this machine.
 
-    A server on a loopback address answers to loopback names only; one that listens elsewhere also to any
-    numeric address (which no foreign name server can hand out), to that address's name and to the machine's.
+    A server on a loopback address answers to loopback names only. Elsewhere it also answers to its own and
+    the machine's name, and to any numeric address (no foreign name server can hand one out).
     """
     name = _name_of(header)
     if name is None:

@@ -4,8 +4,8 @@ Examples lie beside this file, eight in a row. portraits.webp, for ``faces-64``:
 ``derender.data.synthetic`` made (seed 7). faces.png, for ``rendered-faces-64``: eight of the 800 images that
 it was tested on, evenly spaced; cars.png: eight of the 1,000 that ``cars-64`` was tested on, evenly by class
 (Kenney and Quaternius, CC0). Heads: geometry ICT-FaceKit, MIT; skins MakeHuman, CC0. They show no real person
-and no model saw them in training. Rows of a table are read from folders, zips and tables of paths in place;
-a stream (tar shards, Hugging Face) is read only from its beginning, so its images are not shown.
+and no model saw them in training. Rows of a table are read from folders, zips and tables of paths in place. A
+stream (tar shards, Hugging Face) is read only from its beginning, so its images are not shown.
 """
 
 from collections.abc import Mapping

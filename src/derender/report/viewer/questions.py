@@ -1,8 +1,8 @@
 """Requests of the page, checked: image, factors of another image, light, camera, size; uploads to pixels.
 
-Every number has bounds and every name a pattern; anything else is refused. Nothing here can name a file, and
-an upload is decoded by its own content, never by its name or stated type (data/decode.py, with tighter bounds
-than a data set needs). Angles are degrees here; ``light_row`` and ``camera_row`` give radians.
+Every number has bounds and every name a pattern; anything else is refused. Nothing here can name a file. An
+upload is decoded by its content, never by name or stated type (data/decode.py, with tighter bounds than a
+data set needs). Angles are degrees here; ``light_row`` and ``camera_row`` give radians.
 """
 
 from collections.abc import Callable

@@ -1,9 +1,9 @@
 """Requests of the page, answered: images opened, shown under other light and view, as maps, mesh, archive.
 
 Takes questions and gives bytes and plain values; knows no HTTP. Opened images stay in memory only, a bounded
-number of them. Factors of several images are joined at the model's size; what is drawn is a photograph with
-the crop changed in its own detail, or the model's rendering. Not safe for several threads at once: the server
-gives it one.
+number of them. Factors of several images are joined at the model's size. Drawn is a photograph with the crop
+changed in its own detail, or the model's rendering. Not safe for several threads at once: the server gives it
+one.
 """
 
 import io
@@ -257,7 +257,7 @@ class Studio:
         return _png(labelled_grid({name: [image] for name, image in columns.items()}))
 
     def archive(self, question: ViewRequest) -> bytes:
-        """A ZIP: the panel, every map, the picture, the mesh, and the settings."""
+        """A ZIP: the panel, every map, the image, the mesh, and the settings."""
         files = {f"{name}.png": _png(image) for name, image in self.maps(question).items()}
         files |= {"panel.png": self.panel(question), "view.png": self.picture(question)}
         files["surface.glb"] = self.mesh(question)
