@@ -20,9 +20,8 @@ from scipy.cluster.hierarchy import linkage
 from sklearn.cluster import AgglomerativeClustering
 from sklearn.metrics import adjusted_rand_score
 
-from derender.evaluation.clustering_methods import finch
+from derender.evaluation.clustering_methods import cut, finch, ward_tree
 from derender.evaluation.clustering_scores import cluster_scores
-from derender.evaluation.ward import cut, ward_tree
 
 ATTRIBUTES = 40
 

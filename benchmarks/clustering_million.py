@@ -26,9 +26,15 @@ from machine import parser, publish
 from sklearn.metrics import adjusted_rand_score
 
 from derender.evaluation import neighbours
-from derender.evaluation.clustering_methods import clusterings, finch
+from derender.evaluation.clustering_methods import (
+    clusterings,
+    cut,
+    cut_leaves,
+    finch,
+    ward_in_cells,
+    ward_tree,
+)
 from derender.evaluation.neighbours import nearest_rows
-from derender.evaluation.ward import cut, cut_leaves, ward_in_cells, ward_tree
 
 CLASSES, DIMENSIONS = 40, 512
 COUNTS = (2, 10, 40, 100)

@@ -14,8 +14,8 @@ from torch import Tensor, nn
 
 from derender.data import GivenImages, as_batch, check_images
 from derender.networks import Factor, NetworkSettings
-from derender.networks.confidence import Confidence, ConfidenceNet
-from derender.networks.unet import pixel_decoder
+from derender.networks.decoders import Confidence, ConfidenceNet
+from derender.networks.encoders import pixel_decoder
 from derender.networks.unsup3d import read_checkpoint
 from derender.postprocess import Features
 from derender.postprocess.embedding import EmbeddingModel

@@ -20,7 +20,7 @@ from sklearn.cluster import AgglomerativeClustering
 from sklearn.metrics import adjusted_rand_score
 from torch import Tensor
 
-from derender.evaluation.ward import cut, ward_tree
+from derender.evaluation.clustering_methods import cut, ward_tree
 from derender.features import embed_images
 from derender.model import Derenderer
 from derender.render import render

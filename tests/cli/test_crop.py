@@ -9,7 +9,7 @@ from PIL import Image
 
 from derender.cli import main
 from derender.report.viewer.neighbours import rendered_examples
-from derender.scene.crop_search import Crop
+from derender.scene.crop import Crop
 
 KNOWN = "rendered-faces-64"
 TRUE = Crop(0.7, 0.1, 0.2)

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from derender.data import list_images, open_source, read_images, read_masks, zip_source
+from derender.data import list_images, open_source, read_images, read_masks
+from derender.data import opening as zip_source
 
 ODD = ["ann lee", "ÄÖ ß 日本", "two\nlines", "quote\"'", "tab\there"]
 ZIPPED = pytest.mark.parametrize("zipped", [False, True])

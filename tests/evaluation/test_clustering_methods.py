@@ -13,12 +13,20 @@ from scipy.cluster.hierarchy import is_valid_linkage, linkage
 from sklearn.metrics import adjusted_rand_score, pairwise_distances
 
 from derender.evaluation import clustering_methods, neighbours
-from derender.evaluation import ward as ward_module
+from derender.evaluation import clustering_methods as ward_module
 from derender.evaluation.clustering import finch_levels
-from derender.evaluation.clustering_methods import approximation, clusterings, finch, finch_clusters
+from derender.evaluation.clustering_methods import (
+    approximation,
+    clusterings,
+    cut,
+    cut_leaves,
+    finch,
+    finch_clusters,
+    ward_in_cells,
+    ward_tree,
+)
 from derender.evaluation.memory import Memory
 from derender.evaluation.neighbours import cells, finite_rows, members, nearest_rows
-from derender.evaluation.ward import cut, cut_leaves, ward_in_cells, ward_tree
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # it says at import that its approximate search is not installed

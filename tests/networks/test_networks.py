@@ -5,7 +5,7 @@ import torch
 
 from derender.model import Derenderer
 from derender.networks import FACTORS, NetworkSettings
-from derender.networks.confidence import ConfidenceNet
+from derender.networks.decoders import ConfidenceNet
 from derender.networks.encoders import IMAGE_SIZES, UNetEncoder
 
 PAPER_PARAMETERS = {

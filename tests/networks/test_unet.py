@@ -7,8 +7,7 @@ import torch
 
 from derender.evaluation.segmentation.nets import SegmentationNet
 from derender.networks import NetworkSettings
-from derender.networks.encoders import UNetEncoder
-from derender.networks.unet import UNetDecoder, pixel_decoder
+from derender.networks.encoders import UNetDecoder, UNetEncoder, pixel_decoder
 
 WIDTH, CLASSES = 4, 5
 

@@ -1,6 +1,6 @@
 """One table and one image of many data sets: what failed keeps its place, shared trainings count once."""
 
-from derender.report.compared import protocol_picture, protocol_table, scores_from, set_tables
+from derender.report.comparison import protocol_picture, protocol_table, scores_from, set_tables
 
 NAN = None
 

@@ -10,8 +10,8 @@ from imageio_ffmpeg import get_ffmpeg_exe
 from PIL import Image
 
 from derender.report.edits import Edit
-from derender.report.films import animated_png, gif, mp4
 from derender.report.panel import row_sheets
+from derender.report.sweeps import animated_png, gif, mp4
 
 
 def frames(count: int = 6, size: tuple[int, int] = (33, 24)) -> list[Image.Image]:

@@ -9,7 +9,7 @@ from PIL import Image
 from derender.interpretation.attribution import Similarity
 from derender.interpretation.tables import sanity_table, unasked, untrusted
 from derender.report.charts import side_by_side
-from derender.report.saliency import overlays
+from derender.report.explanation import overlays
 
 
 def test_an_empty_map_leaves_a_grey_picture_and_a_full_one_lights_its_place():

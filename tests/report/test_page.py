@@ -11,7 +11,8 @@ import pytest
 from PIL import Image
 
 from derender.evaluation.score_table import Column, Row, ScoreTable
-from derender.report import charts, films
+from derender.report import charts
+from derender.report import sweeps as films
 from derender.report.page import TEMPLATES, Page, data_uri, write_whole
 
 HOSTILE = "<script>alert('x')</script>\"&"

@@ -7,7 +7,7 @@ from torch.nn.functional import interpolate
 
 import derender
 from derender.report.viewer.neighbours import rendered_examples
-from derender.scene.crop_search import WHOLE, Crop, as_bytes, best_crop, candidate_crops, crop_errors
+from derender.scene.crop import WHOLE, Crop, as_bytes, best_crop, candidate_crops, crop_errors
 
 TRUE = Crop(0.7, 0.1, 0.2)
 

@@ -12,12 +12,12 @@ from PIL import Image
 
 from derender.data import read_images
 from derender.training import resolve, train
-from derender.training.lock import LOCK_FILE, locked
+from derender.training.process import LOCK_FILE, locked
 
 HOLDS = """
 import sys, time
 from pathlib import Path
-from derender.training.lock import locked
+from derender.training.process import locked
 with locked(Path(sys.argv[1])):
     print("locked", flush=True)
     time.sleep(600)

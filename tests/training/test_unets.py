@@ -5,8 +5,7 @@ import torch
 
 import derender
 from derender.data.synthetic import faces
-from derender.networks.encoders import NetworkSettings, UNetEncoder
-from derender.networks.unet import PIXEL_CHANNELS
+from derender.networks.encoders import PIXEL_CHANNELS, NetworkSettings, UNetEncoder
 from derender.presets import ModelSettings
 from derender.scene.ranges import SceneRanges
 from derender.training import unets

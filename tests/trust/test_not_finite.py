@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from derender.data import ImageSet
 from derender.features.extract import embed_image_set
 from derender.model import Derenderer
-from derender.networks.confidence import Confidence
+from derender.networks.decoders import Confidence
 from derender.objectives import self_features
 from derender.objectives.self_features import SelfFeatures, SelfTraining
 from derender.postprocess import Features

@@ -21,8 +21,8 @@ from derender.baselines.published import read_weights
 from derender.cli import main
 from derender.cli.console import show_scores
 from derender.data import read_images
+from derender.data.opening import ZipSource
 from derender.data.synthetic.settings import FaceSettings, named_settings
-from derender.data.zip_source import ZipSource
 from derender.evaluation.angles import read_columns
 from derender.evaluation.identity import read_pairs
 from derender.evaluation.score_table import Column, Row, ScoreTable

@@ -10,7 +10,7 @@ from derender.evaluation.angles import light, pose
 from derender.evaluation.bootstrap import difference, estimate, resamples
 from derender.evaluation.brightness import brightness
 from derender.evaluation.clustering import cluster, compare_clusterings, finch_levels
-from derender.evaluation.clustering_methods import clusterings, finch, finch_clusters
+from derender.evaluation.clustering_methods import clusterings, cut, finch, finch_clusters, ward_tree
 from derender.evaluation.clustering_scores import chance_scores, cluster_scores
 from derender.evaluation.depth import GeometryResult, evaluate_geometry, geometry_scores
 from derender.evaluation.disentanglement import disentangle
@@ -38,7 +38,6 @@ from derender.evaluation.robust import robustness
 from derender.evaluation.scenes import geometry, reconstruction
 from derender.evaluation.score_table import Column, Row, Scores, ScoreTable
 from derender.evaluation.segmentation import segment
-from derender.evaluation.ward import cut, ward_tree
 
 __all__ = [
     "Column", "FactorResult", "GeometryResult", "Pairs", "ReconstructionResult", "Row", "Rows",

@@ -27,10 +27,9 @@ from derender.data import (
     sample_checksum,
     suggestion,
 )
-from derender.features.blocks import local_blocks, ray_blocks
+from derender.features.blocks import PARTS_FORMAT, Parts, Rows, local_blocks, ray_blocks, rows_of
 from derender.features.extract import check_size, embed_image_set, model_facts, table_labels
 from derender.features.parquet import Columns, write_columns
-from derender.features.parts import PARTS_FORMAT, Parts, Rows, rows_of
 from derender.features.table import FeatureTable, check_names
 from derender.inputs import Progress, as_images, as_model
 from derender.storage.places import model_folder

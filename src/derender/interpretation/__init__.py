@@ -6,9 +6,15 @@ of clusters and pairs; tables: all of it as tables.
 """
 
 from derender.interpretation.explanation import Explained, explain, explain_labels
-from derender.interpretation.grouping import ClusterShares, PairParts, cluster_shares, pair_parts
 from derender.interpretation.probe import Probe, fit_probe, load_probe, question
-from derender.interpretation.tables import Explanation, ShareRow
+from derender.interpretation.tables import (
+    ClusterShares,
+    Explanation,
+    PairParts,
+    ShareRow,
+    cluster_shares,
+    pair_parts,
+)
 
 __all__ = [
     "ClusterShares", "Explained", "Explanation", "PairParts", "Probe", "ShareRow", "cluster_shares",

@@ -25,9 +25,15 @@ from derender.features import FeatureTable, embed_image_set
 from derender.inputs import as_images, as_model
 from derender.interpretation import tables
 from derender.interpretation.attribution import Similarity, captum_attr, factor_shares, integrated_gradients
-from derender.interpretation.grouping import ClusterShares, PairParts, cluster_shares, pair_parts
 from derender.interpretation.probe import Probe, fit_probe, question
-from derender.interpretation.tables import Explanation, ShareRow
+from derender.interpretation.tables import (
+    ClusterShares,
+    Explanation,
+    PairParts,
+    ShareRow,
+    cluster_shares,
+    pair_parts,
+)
 
 Features = Mapping[str, np.ndarray]
 BASELINES = ("zero", "mean")

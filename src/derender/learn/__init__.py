@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from derender.learn.copies import ModelCopy, refine, unet, whiten
-    from derender.learn.joint import Finetuned, finetune, finetune_settings
-    from derender.learn.runs import run_settings, train
+    from derender.learn.runs import Finetuned, finetune, finetune_settings, run_settings, train
     from derender.learn.sweep import compare_plan
 
 __all__ = [

@@ -1,18 +1,20 @@
-"""Code to map or to numbers.
+"""Code to map or to numbers, and image to the per-pixel uncertainty of its reconstruction.
 
 Source: unsup3d's networks as pinned in the paper's appendix. No convolution has a bias; outputs are raw.
 `UpsampledConv2d` and `NarrowConv2d` do less work than the plain layers for the same result, to rounding: a
 convolution is linear in its kernel, so kernels can be combined or shifted before they meet the image.
 """
 
+from dataclasses import dataclass
 from itertools import pairwise
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
+from torch.nn.functional import softplus
 
-from derender.networks.encoders import NetworkSettings, NormReLU, stage_widths
+from derender.networks.encoders import Encoder, NetworkSettings, NormReLU, stage_widths
 from derender.scene.enlarge import doubled
 
 
@@ -112,3 +114,45 @@ class NarrowConv2d(nn.Conv2d):
         kernel = torch.stack(shifted, dim=1).flatten(0, 1).contiguous(memory_format=torch.channels_last)
         blocks = functional.conv2d(input, kernel, stride=self.block, padding=2)
         return functional.pixel_shuffle(blocks, self.block)
+
+
+@dataclass(frozen=True)
+class Confidence:
+    """Standard deviations, positive, of the reconstruction and of its flipped twin.
+
+    ``photometric`` are of colours, (N, 1, H, W), ``perceptual`` of perceptual features, (N, 1, H/4, W/4).
+    """
+
+    photometric: Float[Tensor, "n 1 h w"]
+    photometric_flip: Float[Tensor, "n 1 h w"]
+    perceptual: Float[Tensor, "n 1 h4 w4"]
+    perceptual_flip: Float[Tensor, "n 1 h4 w4"]
+
+
+class ConfidenceNet(nn.Module):
+    """Image to four maps of uncertainty."""
+
+    def __init__(self, settings: NetworkSettings):
+        super().__init__()
+        width, code = settings.width, settings.confidence_code_size
+        self.encoder = Encoder(settings, width, code, normalised=True)
+        previous = 8 * width
+        upsampling: list[nn.Module] = [nn.ConvTranspose2d(code, previous, 4, bias=False), nn.ReLU()]
+        for stage in range(settings.stages - 2):
+            channels = max(4 * width // 2**stage, 2 * width)
+            upsampling += doubling(previous, channels)
+            previous = channels
+        self.trunk = nn.Sequential(*upsampling)
+        self.photometric_head = nn.Sequential(
+            *doubling(previous, width), *doubling(width, width), NarrowConv2d(width, 2)
+        )
+        self.perceptual_head = nn.Conv2d(previous, 2, 3, padding=1, bias=False)
+        self.doublings = settings.doublings
+
+    def forward(self, images: Float[Tensor, "n 3 h w"]) -> Confidence:
+        trunk = self.trunk(self.encoder(images)[:, :, None, None])
+        maps = [self.photometric_head(trunk).float(), self.perceptual_head(trunk).float()]
+        for _ in range(self.doublings):
+            maps = [doubled(one, "smooth") for one in maps]
+        photometric, perceptual = map(softplus, maps)
+        return Confidence(photometric[:, :1], photometric[:, 1:], perceptual[:, :1], perceptual[:, 1:])

@@ -1,9 +1,12 @@
 """Sizes of the networks; image to code: strided convolutions down to 4x4 pixels, then one convolution to 1x1.
 
 Source: unsup3d's networks as pinned in the paper's appendix; the U-Net encoder is the one the paper swaps in
-for segmentation. No convolution has a bias. Input images are 0..1 and are moved to -1..1 here.
+for segmentation, the expanding half that of Ronneberger et al., MICCAI 2015. No convolution before
+a code has a bias. Input images are 0..1 and are moved to -1..1 here.
 """
 
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from typing import Literal
 
 import torch
@@ -174,3 +177,34 @@ def double_convolution(channels_in: int, channels_out: int) -> nn.Sequential:
         layers.append(nn.Conv2d(previous, channels_out, 3, padding=1, bias=False))
         layers += [nn.BatchNorm2d(channels_out), nn.ReLU()]
     return nn.Sequential(*layers)
+
+
+PIXEL_CHANNELS: Mapping[str, int] = {"geometry": 3, "albedo": 3}
+"""Outputs of a trained decoder per pixel, by factor: position on the object across and down, and depth; red,
+green, blue (training/unets.py)."""
+
+
+class UNetDecoder(nn.Module):
+    """Features at every resolution, finest first, of all encoders, to one value a class and pixel."""
+
+    def __init__(self, widths: Sequence[int], encoders: int, outputs: int):
+        super().__init__()
+        self.upsample, self.convolve = nn.ModuleList(), nn.ModuleList()
+        channels = encoders * widths[-1]
+        for _, finer in pairwise(reversed(widths)):
+            self.upsample.append(nn.ConvTranspose2d(channels, finer, 2, stride=2))
+            self.convolve.append(double_convolution((1 + encoders) * finer, finer))
+            channels = finer
+        self.to_outputs = nn.Conv2d(channels, outputs, 1)
+
+    def forward(self, skips: Sequence[Float[Tensor, "n _ _ _"]]) -> Float[Tensor, "n outputs h w"]:
+        *finer, features = skips
+        for up, convolve, skip in zip(self.upsample, self.convolve, reversed(finer), strict=True):
+            features = convolve(torch.cat([skip, up(features)], dim=1))
+        return self.to_outputs(features)
+
+
+def pixel_decoder(settings: NetworkSettings) -> UNetDecoder:
+    """The decoder over the U-Nets of geometry and albedo that a model may have; rendering never asks it."""
+    outputs = sum(PIXEL_CHANNELS.values())
+    return UNetDecoder(unet_widths(settings), len(PIXEL_CHANNELS), outputs).requires_grad_(False)

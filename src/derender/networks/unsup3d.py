@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 from torch.serialization import safe_globals
 
-from derender.networks.confidence import ConfidenceNet
+from derender.networks.decoders import ConfidenceNet
 from derender.networks.encoders import IMAGE_SIZES, NetworkSettings
 from derender.networks.factors import FACTORS
 from derender.storage.tensors import check_pickle, require_plain

@@ -25,7 +25,7 @@ from derender.photo.faces import PROFILE_DEG, UTKFACE, find_faces, frame_of, tem
 from derender.photo.frame import Frame
 from derender.render import Rendering
 from derender.scene import Scene
-from derender.scene.crop_search import SEARCH_SCALE, best_crop
+from derender.scene.crop import SEARCH_SCALE, best_crop
 from derender.storage.places import require_known
 
 AMBIENT_SHARE = 0.35

@@ -1,6 +1,6 @@
 """The square part of a photograph that a model is given: cut out at any size, and put back.
 
-Leaves out finding it (faces.py, scene/crop_search.py).
+Leaves out finding it (faces.py, scene/crop.py).
 """
 
 from dataclasses import dataclass

@@ -22,9 +22,9 @@ from derender.photo import Photograph
 from derender.photo.video import Edit as VideoEdit
 from derender.report import sweeps
 from derender.report.colours import Images, pictures
-from derender.report.films import FILMS
 from derender.report.opening import FilmOptions, OpenedImage
 from derender.report.panel import GridLayout, labelled_grid
+from derender.report.sweeps import FILMS
 from derender.scene import Scene
 from derender.scene.enlarge import at_size
 

@@ -28,9 +28,8 @@ from derender.model import Derenderer
 from derender.report.decomposition import COLUMN_MEANING, decompose_images
 from derender.report.doctor import doctor_values
 from derender.report.explanation import share_chart, share_values
-from derender.report.films import animated_png
 from derender.report.matrices import card_matrices, matrix_sheet
-from derender.report.sweeps import relit_and_rotated
+from derender.report.sweeps import animated_png, relit_and_rotated
 from derender.storage.bounded import read_json
 
 EXAMINED, SCORED, CARD, EXPLAINED = 1_500, 200, 200, 400  # images each part looks at, at most

@@ -29,9 +29,8 @@ from derender.training.config import TrainConfig
 from derender.training.distributed import ALONE, Ranks, this_rank_writes
 from derender.training.features import make_features
 from derender.training.held_out_errors import store_errors
-from derender.training.lock import locked
 from derender.training.loop import MAX_VALIDATION_IMAGES, NOT_RECONSTRUCTION, train_task
-from derender.training.process import deterministic_algorithms
+from derender.training.process import deterministic_algorithms, locked
 from derender.training.run_folder import RunFolder
 from derender.training.step import own_share, training_step
 from derender.training.task import Held, PhaseProgress, Precision, Progress, TrainingTask, TrainResult

@@ -31,11 +31,11 @@ from derender.training.checkpoint import (
     save_checkpoint,
 )
 from derender.training.distributed import open_fabric, ranks_of
-from derender.training.lock import locked
 from derender.training.process import (
     TrainingInterrupted,
     deterministic_algorithms,
     freed_memory_kept,
+    locked,
     stop_on_signal,
 )
 from derender.training.task import (

@@ -25,7 +25,7 @@ from derender.storage.bounded import (
     read_text,
 )
 from derender.training.config import TrainConfig, config_from_tree, to_yaml, without_removed
-from derender.training.lock import LOCK_FILE
+from derender.training.process import LOCK_FILE
 
 FORMAT = 1
 """Of config.yaml, which says so in its first line; one that does not is of this format, too."""

@@ -15,7 +15,7 @@ from torch import Generator, Tensor
 from torch.utils.checkpoint import checkpoint
 
 from derender.model import Derenderer
-from derender.networks.confidence import Confidence
+from derender.networks.decoders import Confidence
 from derender.objectives.loocc import loocc_loss
 from derender.objectives.perceptual import perceptual_loss
 from derender.objectives.perceptual_features import PerceptualFeatures

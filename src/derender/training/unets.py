@@ -20,8 +20,7 @@ from torch.nn.functional import affine_grid, grid_sample
 
 from derender.data import as_float
 from derender.model import Derenderer
-from derender.networks.encoders import UNetEncoder
-from derender.networks.unet import PIXEL_CHANNELS, UNetDecoder
+from derender.networks.encoders import PIXEL_CHANNELS, UNetDecoder, UNetEncoder
 from derender.objectives.self_features import one_cycle
 from derender.render.renderer import warp
 from derender.training.distillation import MEASURED_IMAGES, StudentSettings

@@ -7,8 +7,7 @@ import pytest
 from tests.data.doctor import made
 
 from derender.data import Duplicate, Skipped, read_images
-from derender.data.doctor import CHECKS, doctor
-from derender.data.doctor.findings import judged
+from derender.data.doctor import CHECKS, doctor, judged
 from derender.data.doctor.measures import JackknifeEstimate
 
 

@@ -20,7 +20,7 @@ from derender.report.viewer.neighbours import rendered_examples
 from derender.report.viewer.questions import CropRequest, Light, Place, Refused, ViewRequest
 from derender.report.viewer.server import BoundedProtocol, serving
 from derender.report.viewer.studio import Shelf, Studio
-from derender.scene.crop_search import Crop
+from derender.scene.crop import Crop
 from derender.storage.places import model_folder
 from derender.training.held_out_errors import read_errors
 

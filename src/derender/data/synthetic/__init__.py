@@ -18,8 +18,7 @@ from derender.data.synthetic.settings import (
     ViewSettings,
     named_settings,
 )
-from derender.data.synthetic.synthetic_set import SyntheticSet
-from derender.data.synthetic.write import require_empty, write
+from derender.data.synthetic.synthetic_set import SyntheticSet, require_empty, write
 
 __all__ = [
     "CAR_LIGHTS", "CAR_VIEWS", "LIGHTS", "VIEWS", "CarSettings", "CarViewSettings", "FaceSettings",

@@ -25,8 +25,7 @@ from torch.optim.swa_utils import update_bn
 
 from derender.data import as_float, suggestion
 from derender.evaluation.segmentation.data import SegmentationData
-from derender.networks.encoders import UNetEncoder
-from derender.networks.unet import UNetDecoder
+from derender.networks.encoders import UNetDecoder, UNetEncoder
 from derender.settings import Settings
 from derender.training.process import freed_memory_kept
 

@@ -29,7 +29,7 @@ from derender.inputs import require_fitting
 from derender.model import Derenderer
 from derender.report.colours import pictures
 from derender.report.opening import held_out_errors, readable
-from derender.report.viewer.guard import Guard
+from derender.report.viewer.guard import Body, Guard, Uploads
 from derender.report.viewer.neighbours import Example, Gallery, named_examples, rendered_examples
 from derender.report.viewer.questions import (
     BODY_LIMIT_BYTES,
@@ -47,7 +47,6 @@ from derender.report.viewer.questions import (
 )
 from derender.report.viewer.shelf import KEPT, Shelf
 from derender.report.viewer.studio import Studio, data_url
-from derender.report.viewer.uploads import Body, Uploads
 
 BODY_SECONDS = 30.0
 WORK_SECONDS, LONG_WORK = 30.0, 6

@@ -30,11 +30,10 @@ from derender.photo.edit import MARGIN
 from derender.photo.faces import frame_of, template_of
 from derender.report import colours
 from derender.report.decomposition import factor_images
-from derender.report.films import FILMS
 from derender.report.mesh import model_mesh
 from derender.report.page import data_uri
 from derender.report.panel import labelled_grid
-from derender.report.sweeps import circling_light, swapped, swaying_view
+from derender.report.sweeps import FILMS, circling_light, swapped, swaying_view
 from derender.report.viewer.questions import (
     Camera,
     CropRequest,
