@@ -21,7 +21,6 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module 'derender.learn' has no attribute {name!r}")
-    homes = {"copies": ("ModelCopy", "refine", "unet", "whiten"), "runs": ("run_settings", "train")}
-    homes |= {"sweep": ("compare_plan",)}
-    module = next((home for home, names in homes.items() if name in names), "joint")
+    homes = {"copies": ("ModelCopy", "refine", "unet", "whiten"), "sweep": ("compare_plan",)}
+    module = next((home for home, names in homes.items() if name in names), "runs")
     return getattr(importlib.import_module(f"derender.learn.{module}"), name)
