@@ -4,7 +4,6 @@ import pytest
 import torch
 from torch.torch_version import TorchVersion
 
-from derender.baselines.published import read_weights
 from derender.networks.unsup3d import read_checkpoint
 from derender.objectives.perceptual_features import load_vgg16
 from derender.storage.tensors import UNIT, packed, read_tensors, reads_safely, write_tensors
@@ -45,9 +44,7 @@ def test_torch_is_trusted_from_2_10_on(version, safe, monkeypatch):
     assert reads_safely() is safe
 
 
-@pytest.mark.parametrize(
-    "read", [load_vgg16, read_checkpoint, lambda file: read_weights(file, "the published file")]
-)
+@pytest.mark.parametrize("read", [load_vgg16, read_checkpoint])
 def test_an_older_one_is_not_asked(read, tmp_path, monkeypatch):
     file = tmp_path / "weights.pth"
     torch.save({"weight": torch.zeros(1)}, file)

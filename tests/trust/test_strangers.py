@@ -17,7 +17,6 @@ import torch
 from tests.trust.hostile_files import encoded, png_that_says, smooth
 
 import derender
-from derender.baselines.published import read_weights
 from derender.cli import main
 from derender.cli.console import show_scores
 from derender.data import read_images
@@ -307,7 +306,7 @@ def test_pickles_that_are_pipes_huge_or_unpack_to_more_are_not_opened(tmp_path):
         with cheaply(), pytest.raises(ValueError, match=reason):
             read_checkpoint(tmp_path / f"{name}.pth")
         with cheaply(), pytest.raises((ValueError, FileNotFoundError), match=f"{reason}|no file"):
-            read_weights(tmp_path / f"{name}.pth", "the published file")
+            _read_weights(tmp_path / f"{name}.pth")
 
 
 def test_samples_that_are_pipes_devices_or_giants_do_not_hold_up_a_report(run):

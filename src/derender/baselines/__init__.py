@@ -21,7 +21,7 @@ NETWORKS: Mapping[str, str] = {
     "stylegan2": "stylegan2.Stylegan",
     "e4e": "e4e.E4e",
     "ris": "ris.Ris",
-    "dinov2": "published.Dinov2",
+    "dinov2": "dinov2.Dinov2",
     "untrained": "controls.Untrained",
 }
 """Classes of those with a network, as ``module.name`` in this package."""
@@ -71,7 +71,7 @@ def open_baseline(
 
     Args:
         name: of a baseline that has a network.
-        source: its run folder; for e4e also a published .pt file; for dinov2 an id or a folder of weights
+        source: its run folder; for dinov2 an id or a folder of weights
             (default: facebook/dinov2-small); for untrained the derender model to copy.
         device: "auto", "cpu" or "cuda".
         features: names of the features to compute; by default the baseline's first.

@@ -52,7 +52,7 @@ class E4eSettings(EncoderSettings):
 class InversionObjective(Settings):
     """Which generator, the weights of the terms, and when which code may differ from the first."""
 
-    generator: str | None = None  # run folder of a stylegan2, or a published .pt file
+    generator: str | None = None  # run folder of a stylegan2
     perceptual_weight: float = Field(default=0.8, ge=0)
     delta_weight: float = Field(default=5e-5, ge=0)  # the original's 2e-4, whose images are -1..1
     prior_weight: float = Field(default=1e-4, ge=0)  # a random code is about 42 (squared) from the mean code
@@ -170,13 +170,8 @@ class E4e(LoopModel):
 
     @classmethod
     def open(cls, source: str | Path | None, *, image_size: int | None = None, seed: int = 0) -> Any:
-        """The encoder of a run, or a published one (a .pt file), for such images; see `open_baseline`."""
-        if source is not None and Path(source).suffix.lower() == ".pt":
-            from derender.baselines.published import load_published_e4e
-
-            net = load_published_e4e(source)
-        else:
-            net = super().open(source)
+        """The encoder of a run, for such images; see `open_baseline`."""
+        net = super().open(source)
         net.given_size = image_size
         return net
 
@@ -251,14 +246,10 @@ class E4e(LoopModel):
 
 
 def open_generator(source: str | Path | None) -> Generator:
-    """The averaged generator of a run of ours, or a published one (a .pt file)."""
+    """The averaged generator of a run."""
     if source is None:
         raise ValueError(
-            "name the generator to invert, as in --set generator=RUN (a run of derender train --model "
-            "stylegan2) or a file of stylegan2-pytorch"
+            "name the generator to invert, as in --set generator=RUN (a run of derender train "
+            "--model stylegan2)"
         )
-    if Path(source).suffix.lower() == ".pt":
-        from derender.baselines.published import load_published_generator
-
-        return load_published_generator(source)
     return Stylegan.open(source).generator

@@ -51,7 +51,7 @@ class RisConfig(Settings):
     """How a catalogue is made."""
 
     baseline: Literal["ris"] = "ris"
-    e4e: str | None = None  # run folder of an e4e, or a published .pt file
+    e4e: str | None = None  # run folder of an e4e
     masks: str | None = None  # folder with a mask for each image; None: beside the images
     image_size: int = Field(default=64, ge=32)
     clusters: int = Field(default=18, ge=2)
@@ -130,7 +130,7 @@ class Ris(BaselineModel):
         if config.e4e is None and not resume:
             raise ValueError(
                 "name the encoder whose generator is catalogued, as in --set e4e=RUN (a run of derender "
-                "train --model e4e) or a published file"
+                "train --model e4e)"
             )
         e4e = E4e.open(config.e4e).to(accelerator)
         if e4e.image_size != config.image_size:

@@ -30,7 +30,6 @@ class BaselineOptions:
     """Another network or control in place of our model."""
 
     baseline: Annotated[str | None, _option(f"Instead of our model: {NAMES}.", "NAME")] = None
-    checkpoint: Annotated[str | None, _option("Published e4e file (e4e_ffhq_encode.pt).", "FILE")] = None
     features: Annotated[str | None, _option("Features of a baseline, separated by commas.", "A,B")] = None
     image_size: Annotated[int | None, _option(SIDE, min=8)] = None
     components: Annotated[int, _option("Numbers in pca and noise.", min=1)] = 64
@@ -52,9 +51,7 @@ def embed(
     refuse_existing_file(out, output.force)
     import derender
 
-    name, source, checkpoint = baselines.baseline, model or baselines.checkpoint, baselines.checkpoint
-    if checkpoint is not None and (name != "e4e" or model is not None):
-        raise ValueError("--checkpoint is a published e4e file: give it with --baseline e4e and no --model")
+    name = baselines.baseline
     if name is None and model is None:
         raise ValueError("give --model RUN, or --baseline NAME (see derender embed --help)")
     if engine == "local" and workers is not None:
@@ -64,16 +61,16 @@ def embed(
         how |= {"device": device, "progress": report}
         if name is None:
             how |= {**images.how, "fit_steps": fit_steps, "keep_duplicates": keep_duplicates}
-            done = derender.embed_to_file(images.address, source, out, **how)
+            done = derender.embed_to_file(images.address, model, out, **how)
         else:
             how["features"] = baselines.features and [part.strip() for part in baselines.features.split(",")]
             how |= {option: getattr(baselines, option) for option in ("image_size", "components", "seed")}
             call = derender.baselines.embed_baseline
-            done = call(name, images.address, out, source, reading=images.how, **how)
+            done = call(name, images.address, out, model, reading=images.how, **how)
     named = (f"skipped {visible(row.file, '')}: {row.reason}" for row in done.examples[:NAMED])
     notice("\n".join([done.describe(), *named]))
     sizes = ", ".join(f"{factor} {size}" for factor, size in done.factors.items())
-    if name is None and (odd := derender.features.unlike_training(images.address, source, **images.how)):
+    if name is None and (odd := derender.features.unlike_training(images.address, model, **images.how)):
         notice(odd)
     output.result(f"{done.rows:,} rows in {out}: {sizes}")
     names = ("rows", "factors", "labels", "origin", "skipped", "copies", "resumed")
