@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 import torch
 
+import derender
 from derender.model import Derenderer
+from derender.photo.edit import open_photograph
 from derender.photo.frame import Frame
 from derender.report.decomposition import decompose_images
-from derender.report.edits import relit, swapped_factors
+from derender.report.edits import relit, relit_video, swapped_factors
 from derender.report.mesh import model_mesh
 from derender.report.opening import OpenedImage
 from derender.training.config import FeatureSettings
@@ -71,6 +73,13 @@ def test_panels_swaps_relighting_and_meshes_show_further_factors(model, generato
     last = list(relit(model, one, like=other).numbers.values())[-1]
     assert last[parameter] == pytest.approx(scene.parameters[parameter][1].tolist())
     assert len(model_mesh(model, scene[:1]).faces) > 100
+    photo, light = open_photograph(as_bytes(images[0]).transpose(1, 2, 0), model), scene[1].lighting
+    assert list(light) == [parameter]
+    relit_like = derender.relight(images[0], model, like=images[1])
+    expected = torch.from_numpy(photo.edited(**light)).permute(2, 0, 1) / 255
+    torch.testing.assert_close(relit_like, expected, atol=0.01, rtol=0)
+    moved = relit_video(reach_deg=60, pitch_deg=0, strength=1, like=other, hold=True)(scene)
+    assert torch.equal(moved[parameter], light[parameter].expand(2, -1))
 
 
 def as_bytes(image: torch.Tensor) -> np.ndarray:

@@ -19,6 +19,7 @@ from derender.scene import Scene, environment
 from derender.scene.camera import focal_px
 from derender.scene.light import lambert_shading, light_direction
 from derender.scene.normals import normals_from_depth
+from derender.scene.scene import seen_in_mirror
 from derender.training.config import ObjectiveSettings
 from derender.training.step import training_step
 
@@ -68,6 +69,17 @@ def test_a_training_step_teaches_every_network_of_a_renderer(name, generator):
             args = (torch.Generator().manual_seed(1), objective.perturb, model.settings.ranges)
             changed = row.perturb(scenes.parameters[row.parameter], *args)
             model.renderer.check(scenes.with_parameters(**{row.parameter: changed}))
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_a_scene_in_a_mirror_has_the_mirror_image(name, generator):
+    given, renderer = scene_for(name, generator), renderer_named(name)
+    twin = seen_in_mirror(given, ("specular", "haze"))
+    image, mirrored = (renderer.shade(one, FOV_DEG) for one in (given, twin))
+    apart = (mirrored.flip(-1) - image).abs().amax(dim=1)
+    assert (apart < 1e-6).double().mean() > 0.95  # a ray's steps round to one side
+    view, turned = (renderer(one, FOV_DEG) for one in (given, twin))
+    assert (turned.image.flip(-1) - view.image).abs().mean() < 0.01
 
 
 @pytest.mark.parametrize(("name", "off"), [("phong", [[0.0, 9.0]]), ("haze", None)])

@@ -1,7 +1,5 @@
 """Ranges of scene parameters: the published settings, what each bound lets through, what follows."""
 
-import math
-
 import pytest
 
 from derender.scene.ranges import SceneRanges
@@ -35,7 +33,6 @@ def test_defaults_are_those_published_for_faces_and_bounds_let_through_what_is_p
             SceneRanges(**{name: value})
 
 
-def test_the_border_keeps_its_share_of_any_width_and_the_slope_of_light_is_a_tangent():
+def test_the_border_keeps_its_share_of_any_width():
     assert [SceneRanges().border_columns(width) for width in (32, 64, 128, 256)] == [1, 2, 4, 8]
     assert SceneRanges(border_share=0.1).border_columns(64) == 6
-    assert SceneRanges(light_deg=60.0).light_slope == pytest.approx(math.sqrt(3))

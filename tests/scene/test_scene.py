@@ -43,3 +43,4 @@ def test_unknown_and_missing_parameters_are_named(scene):
         Scene.from_parameters({"depth": scene.depth, "albedo": scene.albedo, "light": scene.light})
     with pytest.raises(ValueError, match="shine is not known"):
         seen_in_mirror(scene)
+    assert torch.equal(seen_in_mirror(scene, ["shine"]).extra["shine"], scene.extra["shine"])

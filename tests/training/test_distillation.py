@@ -5,10 +5,13 @@ import torch
 
 import derender
 from derender.data.synthetic import faces
+from derender.model import Derenderer
 from derender.objectives.reconstruction import masked_l1
 from derender.render import Rendering
 from derender.scene.crop import CropSettings, crop_images
 from derender.training import distillation
+from derender.training.config import FeatureSettings
+from derender.training.features import make_features
 
 FRAMES = CropSettings(nearer=1.15, farther=1.9, shift=0.25)
 LESSONS = distillation.RefiningSettings(
@@ -65,7 +68,7 @@ def test_the_same_seed_teaches_the_same_and_nothing_else_is_touched(model, image
 
 def test_the_confidence_net_stays_and_the_linear_model_is_the_same(model, refined, images):
     theirs, ours = model.state_dict(), refined.model.state_dict()
-    taught = tuple(f"nets.{name}." for name in distillation.FACTORS)
+    taught = tuple(f"nets.{row.name}." for row in model.factors)
     kept = [name for name in theirs if not name.startswith(taught)]
     assert kept and all(torch.equal(ours[name], theirs[name]) for name in kept)
     assert not refined.model.training and not any(p.requires_grad for p in refined.model.parameters())
@@ -135,6 +138,32 @@ def test_a_copy_taught_so_steps_back_from_smaller_faces(model, images):
     assert float(far.mean() - near.mean()) > 0.02, "the part of 0.7 that few examples teach"
 
 
+@pytest.mark.parametrize("renderer", ["phong+haze", "sh"])
+def test_further_factors_are_learnt_too(renderer):
+    """From an untrained model, all of whose scenes are far from the fitted ones."""
+    images = torch.from_numpy(faces.generate(16, image_size=32, seed=9).images)
+    settings = {"whitening": {"pictures": 0}, "fitting": {"examples": 16, "coordinates": 4}}
+    start = Derenderer.from_preset(
+        "small", seed=0, image_size=32, renderer=renderer, width=8, light_width=8
+    ).eval()
+    start = make_features(
+        start.requires_grad_(False), images, SHORT.model_copy(update=FeatureSettings(**settings).__dict__)
+    )
+    refined = distillation.refine(start, images, images, changed(images=400), seed=5)
+    extra = {row.parameter for row in start.factors} - {"depth", "albedo", "light", "camera"}
+    assert extra and {row.parameter for row in start.factors} == set(refined.gaps)
+    assert all(refined.gaps[name]["now"] < 0.9 * refined.gaps[name]["before"] for name in extra)
+    assert refined.errors["now"] < refined.errors["before"]
+    fitted = distillation.fit_scenes(start, images[:16], 2, print).scene(start.fitting.maps)
+    shown, scene = distillation.examples(
+        start, images[:16].float() / 255, fitted, changed(rendered=0.5), torch.Generator().manual_seed(0)
+    )
+    again, seen = start.render(scene[:8]), 0.99
+    covered = (again.mask > seen)[:, None].expand_as(again.image)
+    torch.testing.assert_close(shown[:8][covered], again.image.clamp(0, 1)[covered], atol=1e-4, rtol=0)
+    assert all(not torch.allclose(scene.extra[name][:8], fitted.extra[name][:8]) for name in extra)
+
+
 def test_what_cannot_be_refined_is_named(model, images):
     with pytest.raises(ValueError, match="2 images or more of 64 pixels and one held out, got 1 of 64"):
         distillation.refine(model, images[:1], images[1:])
@@ -157,6 +186,6 @@ def test_only_clear_fits_teach():
     error = torch.tensor([0.02, 0.03, 0.0, 0.01, 0.5])
     light = torch.rand(5, 4)
     light[3, 1] = float("nan")
-    fits = distillation.FittedScenes(torch.rand(5, 3), torch.rand(5, 3), light, torch.rand(5, 6), error)
+    fits = distillation.FittedScenes({"light": light, "camera": torch.rand(5, 6)}, error)
     assert fits.clear(0.2).tolist() == [True, True, False, False, False]
     assert fits.clear(0).tolist() == [True, True, False, False, True]

@@ -145,7 +145,7 @@ def light_from_raw(raw: Float[Tensor, "n 4"], ranges: SceneRanges) -> Float[Tens
     raw = raw.float()
     ends = enumerate((ranges.ambient, ranges.diffuse))
     intensity = [low + (high - low) * (raw[:, i] / 2 + 0.5) for i, (low, high) in ends]
-    pitch, yaw = (raw[:, 2:] * ranges.light_slope).atan().unbind(1)
+    pitch, yaw = (raw[:, 2:] * math.tan(math.radians(ranges.light_deg))).atan().unbind(1)
     return torch.stack([*intensity, pitch, yaw], dim=1)
 
 

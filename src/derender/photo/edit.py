@@ -93,7 +93,7 @@ class Photograph:
         return Rendering(images, torch.zeros_like(images[:, 0]), torch.ones_like(images[:, 0]))
 
     def edited(self, **parameters: Tensor) -> UInt8[np.ndarray, "h w 3"]:
-        """The whole photograph with another ``light`` (1, 4) or ``camera`` (1, 6)."""
+        """The whole photograph with another ``light`` (1, 4), ``camera`` (1, 6) or other vectors."""
         image = self(self.scene.with_parameters(**parameters)).image[0]
         return (255 * image).round().byte().permute(1, 2, 0).numpy()
 
@@ -142,7 +142,7 @@ def relight(
         model: a model, or the name of one.
         yaw_deg, pitch_deg: where the light comes from: left of the image and above are positive; below 90.
         strength: of the light, in multiples of the photograph's own; 0.35 of it is ambient.
-        like: take the light of this image instead.
+        like: take all of the light of this image instead.
         frame, fit_steps: as in `open_photograph`.
 
     Returns:
@@ -157,10 +157,10 @@ def relight(
         raise ValueError(f"strength must be 0 or more, got {strength}")
     other = None
     if like is not None:
-        other = open_photograph(as_photos(like)[0], loaded, frame=frame, fit_steps=fit_steps).scene.light
+        other = open_photograph(as_photos(like)[0], loaded, frame=frame, fit_steps=fit_steps).scene.lighting
 
     def edited(photo: Photograph) -> np.ndarray:
-        return photo.relit(yaw_deg, pitch_deg, strength) if other is None else photo.edited(light=other)
+        return photo.relit(yaw_deg, pitch_deg, strength) if other is None else photo.edited(**other)
 
     return _each(image, lambda one: edited(open_photograph(one, loaded, frame=frame, fit_steps=fit_steps)))
 

@@ -97,11 +97,11 @@ def relit(
     """
     film = film or FilmOptions()
     angle = _angle_text(reach_deg, film.stills)
-    parameter = "light" if like is None else swappable(model, ["light"])["light"]
+    parameter = "light" if like is None else next(iter(like.scene.lighting))
 
     def lights(t: Tensor) -> Tensor:
         if like is not None:
-            own, other = (one.scene.parameters[parameter] for one in (image, like))
+            own, other = (one.scene.lighting[parameter] for one in (image, like))
             return torch.lerp(own, other, t.to(own)[:, None])
         own = float(image.scene.light[0, :2].sum())
         return sweeps.lights_around(t, reach_deg, pitch_deg, strength * own)
@@ -157,7 +157,7 @@ def relit_video(
 
     def edit(scene: Scene) -> dict[str, Tensor]:
         if like is not None:
-            return {"light": like.scene.light.expand(len(scene), 4)}
+            return {name: light.expand(len(scene), -1) for name, light in like.scene.lighting.items()}
         own = float(scene.light[:, :2].sum(dim=1).mean())
         return {"light": sweeps.lights_around(_over_time(scene, hold), reach_deg, pitch_deg, strength * own)}
 

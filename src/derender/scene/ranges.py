@@ -4,8 +4,6 @@ Source: unsup3d's published settings for faces and cats; cars differ in border d
 translation. Angles are degrees here because people write settings; radians everywhere else.
 """
 
-import math
-
 from pydantic import Field, model_validator
 
 from derender.settings import Settings
@@ -42,8 +40,3 @@ class SceneRanges(Settings):
     def border_columns(self, width: int) -> int:
         """How many pixel columns at each side are held at ``border_depth`` (2 at 64 pixels)."""
         return round(self.border_share * width)
-
-    @property
-    def light_slope(self) -> float:
-        """The largest tangent of light pitch and yaw."""
-        return math.tan(math.radians(self.light_deg))

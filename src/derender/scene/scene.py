@@ -3,7 +3,7 @@
 Conventions (axes, signs, units) are written in docs/reference/conventions.md.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -51,6 +51,12 @@ class Scene:
         """Every parameter by name, extras last."""
         return {**{name: getattr(self, name) for name in _FIELDS}, **self.extra}
 
+    @property
+    def lighting(self) -> dict[str, Tensor]:
+        """All of the light, by name: the environment, where there is one, else ``light``."""
+        name = "environment" if "environment" in self.extra else "light"
+        return {name: self.parameters[name]}
+
     @classmethod
     def joined(cls, scenes: "Sequence[Scene]") -> "Scene":
         """Batches of scenes one after the other."""
@@ -94,17 +100,22 @@ class Scene:
 
 
 _FIELDS = ("depth", "albedo", "light", "camera")
-_LIGHT_SIGNS = (1.0, 1.0, 1.0, -1.0)  # ambient, diffuse, pitch, yaw
-_CAMERA_SIGNS = (1.0, -1.0, -1.0, -1.0, 1.0, 1.0)  # rotation about x, y, z; translation along x, y, z
+_SIGNS = {  # in a mirror
+    "light": (1.0, 1.0, 1.0, -1.0),  # ambient, diffuse, pitch, yaw
+    "camera": (1.0, -1.0, -1.0, -1.0, 1.0, 1.0),  # rotation about x, y, z; translation along x, y, z
+    "environment": (1.0, 1.0, 1.0, -1.0, -1.0, 1.0, 1.0, -1.0, 1.0),  # of each channel
+}
 
 
-def seen_in_mirror(scene: Scene) -> Scene:
-    """Scenes whose images are the mirror images of these scenes' images; further factors are a ValueError."""
-    if scene.extra:
-        raise ValueError(f"what a mirror does to {', '.join(scene.extra)} is not known")
-    return Scene(
-        scene.depth.flip(-1),
-        scene.albedo.flip(-1),
-        scene.light * torch.tensor(_LIGHT_SIGNS).to(scene.light),
-        scene.camera * torch.tensor(_CAMERA_SIGNS).to(scene.camera),
-    )
+def seen_in_mirror(scene: Scene, even: Collection[str] = ()) -> Scene:
+    """Scenes whose images are the mirror images of these scenes' images.
+
+    ``even`` are further parameters that stay as they are; those that are not known are a ValueError.
+    """
+    twin = {**scene.parameters, "depth": scene.depth.flip(-1), "albedo": scene.albedo.flip(-1)}
+    for name, value in scene.parameters.items():
+        if name in _SIGNS:
+            twin[name] = value * value.new_tensor(_SIGNS[name] * (value.shape[1] // len(_SIGNS[name])))
+        elif name in scene.extra and name not in even:
+            raise ValueError(f"what a mirror does to {name} is not known")
+    return Scene.from_parameters(twin)

@@ -5,13 +5,14 @@ as long. Here scenes are fitted to the training images once, and a copy of the m
 predict them: from the images, and from renderings of the fitted scenes under other light, from other
 viewpoints and with another's geometry, whose scenes are known exactly. The student's scenes are also asked to
 reconstruct the images. Images in other crops (``reframed``) teach the position of the camera, which rendering
-alone does not. Needs no labels. Leaves out models with further factors, and the confidence net, which stays.
+alone does not. Needs no labels. A renderer's further factors are learnt like light and camera, further maps
+as the model predicts them. Leaves out the confidence net, which stays.
 """
 
 import math
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, UInt8
@@ -20,20 +21,19 @@ from torch import Generator, Tensor, nn
 
 from derender.data import as_float
 from derender.model import Derenderer
+from derender.networks.factors import Number
 from derender.objectives.reconstruction import masked_l1
 from derender.objectives.self_features import one_cycle
 from derender.postprocess.fitting import PARAMETERS, STEPS
 from derender.postprocess.morphable import MorphableMaps
 from derender.scene import Scene, crop
-from derender.scene.perturb import PerturbSettings, perturb_camera, perturb_light
+from derender.scene.perturb import PerturbSettings
 from derender.scene.scene import seen_in_mirror
 from derender.settings import Settings
 from derender.training.config import FeatureSettings
 from derender.training.features import Progress, make_features
 from derender.training.step import fill_uncovered
 
-FACTORS = {**PARAMETERS, "light": "light", "camera": "camera"}
-"""Factors that are distilled, and their parameters of a scene."""
 MEASURED_IMAGES = 256
 """Images on which standard deviations and errors are measured."""
 
@@ -110,16 +110,10 @@ def refine(
 
     The same seed gives the same weights on the same machine and thread count; torch's global random state is
     neither read nor changed. Errors are measured on ``held_out`` images. A ValueError: a model that cannot
-    fit scenes or has further factors; too few images, or of another size; weights that end up not finite.
+    fit scenes; too few images, or of another size; weights that end up not finite.
     """
     config, report = config or RefineConfig(), progress or (lambda *_: None)
     settings = config.refining
-    further = [row.name for row in model.factors if FACTORS.get(row.name) != row.parameter]
-    if further:
-        raise ValueError(
-            f"the renderer {model.renderer.name!r} has a factor {further[0]} that is not the paper's: such a "
-            "model cannot be refined; fit scenes per image instead (--fit-steps)"
-        )
     maps = model.features.required_fitting().maps
     if len(images) < 2 or not len(held_out) or images.shape[-1] != model.image_size:
         raise ValueError(
@@ -145,50 +139,54 @@ def refine(
     return Refined(student, *_compared(model, student, held_out[:MEASURED_IMAGES], settings.fit_steps))
 
 
-class FittedScenes(NamedTuple):
-    """Fitted scenes, compact: coordinates instead of maps; ``error`` is each image's remaining one."""
+@dataclass(frozen=True)
+class FittedScenes:
+    """Fitted scenes, compact; ``error`` is each image's remaining one.
 
-    geometry: Float[Tensor, "n k"]
-    albedo: Float[Tensor, "n k"]
-    light: Float[Tensor, "n 4"]
-    camera: Float[Tensor, "n 6"]
+    ``values`` are parameters of the scene by name, each with N rows, but coordinates of depth and albedo.
+    """
+
+    values: Mapping[str, Tensor]
     error: Float[Tensor, " n"]
 
     def rows(self, rows: Tensor | slice) -> "FittedScenes":
         """Some of the scenes."""
-        return FittedScenes(*(value[rows] for value in self))
+        return FittedScenes({name: value[rows] for name, value in self.values.items()}, self.error[rows])
 
     def clear(self, worst: float) -> Bool[Tensor, " n"]:
         """All but the share with the largest errors, and those that are not finite or out of the image."""
-        finite = torch.stack([value.isfinite().reshape(len(value), -1).all(dim=1) for value in self])
+        columns = (*self.values.values(), self.error)
+        finite = torch.stack([value.isfinite().reshape(len(value), -1).all(dim=1) for value in columns])
         found = finite.all(dim=0) & (self.error > 0)  # where nothing is rendered there is no error
         return found & (self.error <= self.error.quantile(1 - worst))
 
     def scene(self, maps: MorphableMaps) -> Scene:
-        depth, albedo = maps.maps("depth", self.geometry), maps.maps("albedo", self.albedo)
-        return Scene(depth, albedo.clamp(0, 1), self.light, self.camera)
+        fitted = {name: maps.maps(name, self.values[name]) for name in PARAMETERS.values()}
+        return Scene.from_parameters({**self.values, **fitted, "albedo": fitted["albedo"].clamp(0, 1)})
 
 
 def fit_scenes(
     model: Derenderer, images: UInt8[Tensor, "n 3 h w"], steps: int, report: Progress
 ) -> FittedScenes:
     """Scenes fitted to all images, batch by batch."""
-    model, parts = model.with_brightness(None), []  # coordinates are of albedos as decoded
+    model = model.with_brightness(None)  # coordinates are of albedos as decoded
+    parts: list[dict[str, Tensor]] = []
     for start in range(0, len(images), _FIT_BATCH):
         found = model.fit_scenes(as_float(images[start : start + _FIT_BATCH]).to(model.device), steps)
-        own = found.coordinates
-        parts.append((own["geometry"], own["albedo"], found.scene.light, found.scene.camera, found.after))
+        own = {parameter: found.coordinates[name] for name, parameter in PARAMETERS.items()}
+        parts.append({"error": found.after, **found.scene.parameters, **own})
         report(min(start + _FIT_BATCH, len(images)), len(images))
-    return FittedScenes(*(torch.cat(part) for part in zip(*parts, strict=True)))
+    values = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+    return FittedScenes(values, values.pop("error"))
 
 
 def _learn(
     student: Derenderer, images: UInt8[Tensor, "n 3 h w"], maps: MorphableMaps, fitted: FittedScenes,
     config: RefineConfig, generator: Generator, report: Progress,
 ) -> None:  # fmt: skip
-    """Train the student's networks of the four factors in place."""
+    """Train the student's networks of all factors in place."""
     settings = config.refining
-    learning = nn.ModuleList([student.nets[name] for name in FACTORS])
+    learning = nn.ModuleList([student.nets[row.name] for row in student.factors])
     learning.requires_grad_(True).train()
     optimiser = torch.optim.Adam(learning.parameters(), settings.learning_rate)
     few = slice(0, MEASURED_IMAGES)
@@ -222,22 +220,23 @@ def examples(
     settings, ranges = config.refining, model.settings.ranges
     rendered = round(len(images) * settings.rendered)
     exchanged = round(rendered * settings.exchanged)
-    depth = fitted.depth.clone()
-    depth[:exchanged] = depth[:exchanged].roll(1, 0)
-    otherwise = fitted.with_parameters(
-        depth=depth,
-        light=perturb_light(fitted.light, generator, config.perturb, ranges),
-        camera=perturb_camera(fitted.camera, generator, config.perturb, ranges),
-    )[:rendered]
+    changed = {"depth": torch.cat([fitted.depth[:exchanged].roll(1, 0), fitted.depth[exchanged:]])}
+    for row in model.factors:
+        if row.perturb is not None and not row.mirrored:
+            value = fitted.parameters[row.parameter]
+            changed[row.parameter] = row.perturb(value, generator, config.perturb, ranges)
+    otherwise = fitted.with_parameters(**changed)[:rendered]
     shown, scene = images, fitted
     if rendered:
         made = model.render(otherwise)
         filled = fill_uncovered(made.image, made.mask, images[:rendered])
         shown = torch.cat([filled.clamp(0, 1), images[rendered:]])
         scene = Scene.joined([otherwise, fitted[rendered:]])
-    mirrored = torch.rand(len(shown), generator=generator) < 0.5
+    even = [row.parameter for row in model.factors if row.numbers]
+    known = {*even, "environment"} >= set(scene.extra)
+    mirrored = torch.rand(len(shown), generator=generator) < (0.5 if known else 0)
     mirrored[:rendered] = False  # their light and view are any already
-    twin = seen_in_mirror(scene).parameters
+    twin = seen_in_mirror(scene, even).parameters if known else scene.parameters
     both = {name: _where(mirrored, twin[name], value) for name, value in scene.parameters.items()}
     shown, scene = _where(mirrored, shown.flip(-1), shown), Scene.from_parameters(both)
     return _cropped(shown, scene, model, config, generator)
@@ -274,14 +273,17 @@ class SceneUnit:
                 ends = (torch.full_like(value, end) for end in (-1.0, 1.0))
                 least, most = (factor.to_parameter(end, model.settings.ranges) for end in ends)
                 self.able[factor.parameter] = (least != most)[0]
-        self.deviation = {name: _mean_deviation(value) for name, value in fitted.parameters.items()}
+        self.deviation = {
+            row.parameter: _mean_deviation(fitted.parameters[row.parameter], row.numbers)
+            for row in model.factors
+        }
         self.slope = _mean_deviation(_slopes(fitted.depth)).mean()
 
     def gaps(self, predicted: Scene, target: Scene) -> dict[str, Tensor]:
         """By parameter of a scene, mean absolute difference in this unit."""
         gaps = {}
-        for name, value in predicted.parameters.items():
-            apart, deviation = (value - target.parameters[name]).abs(), self.deviation[name]
+        for name, deviation in self.deviation.items():
+            apart = (predicted.parameters[name] - target.parameters[name]).abs()
             if name in self.able:
                 gaps[name] = (apart / deviation)[:, self.able[name]].mean()
             else:
@@ -299,8 +301,10 @@ def _slopes(depth: Float[Tensor, "n h w"]) -> Float[Tensor, "n d"]:
     return torch.cat([depth.diff(dim=-1).flatten(1), depth.diff(dim=-2).flatten(1)], dim=1)
 
 
-def _mean_deviation(value: Float[Tensor, "n ..."]) -> Tensor:
-    return (value - value.mean(dim=0)).abs().mean(dim=0).clamp(min=1e-5)
+def _mean_deviation(value: Float[Tensor, "n ..."], numbers: Sequence[Number] = ()) -> Tensor:
+    """At least a hundredth of each number's range: some images show nothing of an effect."""
+    least = value.new_tensor([0.01 * (one.high - one.low) for one in numbers] or [1e-5])
+    return torch.maximum((value - value.mean(dim=0)).abs().mean(dim=0), least)
 
 
 @torch.no_grad()

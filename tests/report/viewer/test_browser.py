@@ -15,6 +15,7 @@ from PIL import Image
 from derender import load
 from derender.data.synthetic import faces
 from derender.features import FeatureTable, embed_images
+from derender.model import Derenderer
 from derender.report.viewer.app import Application, Viewer
 from derender.report.viewer.neighbours import Example, Gallery
 from derender.report.viewer.server import serving
@@ -187,6 +188,35 @@ def test_a_crop_is_moved_by_mouse_and_keys_and_a_new_picture_resets_swaps(page, 
     page.select_option("#framing", "none")
     page.wait_for_selector(f'body:not([data-ready="{ready}"])')
     assert page.input_value("#framing") == "none"
+
+
+def test_effects_of_a_renderer_have_sliders(browser, rendered):
+    plain = load("rendered-faces-64")
+    settings = plain.settings.model_copy(update={"renderer": "phong+lambert-shadow+haze"})
+    model = Derenderer.seeded(settings, 0)
+    model.load_state_dict(model.state_dict() | plain.state_dict())
+    examples = [Example("face", rendered[0].transpose(1, 2, 0))]
+    with serving(Application(Viewer(Studio(model.eval(), "glossy", Shelf(3)), examples))) as url:
+        shown = browser.new_context().new_page()
+        shown.set_default_timeout(PATIENCE_MS)
+        shown.goto(url)
+        shown.wait_for_selector("body[data-ready]")
+        at_rest(shown)
+        assert shown.locator("#numbers-sliders input").count() == 4
+        for name in ("highlight", "cast shadow", "transmission"):
+            assert shown.locator(f'[id="map-{name}"]').get_attribute("src")
+        before = pixels(shown, "#view-sheet")
+        for name in ("numbers-haze-airlight", "numbers-haze-beta"):
+            shown.focus(f"#{name}")
+            shown.keyboard.press("End")
+            at_rest(shown)
+        assert (pixels(shown, "#view-sheet") - before).mean() > 5  # paler
+        with zipfile.ZipFile(io.BytesIO(saved(shown, "archive")[1])) as archive:
+            assert json.loads(archive.read("settings.json"))["numbers"]["haze"] == pytest.approx([4, 1])
+        shown.click("#reset")
+        at_rest(shown)
+        assert np.abs(pixels(shown, "#view-sheet") - before).mean() < 1
+        shown.context.close()
 
 
 def test_orbit_swap_and_neighbours_by_keyboard(page):
