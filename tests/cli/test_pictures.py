@@ -15,6 +15,7 @@ from tests.cli.conftest import noise
 
 from derender import Derenderer
 from derender.cli import main
+from derender.report.edits import Edit
 from derender.storage.places import ERRORS_FILE
 from derender.training.held_out_errors import HeldOutErrors, write_errors
 
@@ -143,12 +144,27 @@ def test_bad_pictures_are_left_out_and_named(model, photos, tmp_path, capsys):
     assert [folder.name for folder in (tmp_path / "out").iterdir()] == ["0"]
 
 
-def test_a_folder_goes_on_where_it_was_stopped(model, photos, tmp_path, numbers):
+def test_a_folder_goes_on_where_it_was_stopped(model, photos, tmp_path, numbers, monkeypatch):
     folder, out = Path(shutil.copytree(photos, tmp_path / "folder")), tmp_path / "out"
     (folder / "bad.jpg").write_bytes(b"no picture")
     words = ("rotate", "-m", model, folder, "-o", out, "--size", 32, "--stills", 2, "--film", "none")
     told, said = numbers(*words)  # exit code 0: of a folder the others are used
     assert len(told["pictures"]) == 6 and "left out" in said and (out / "sheet.png").exists()
+    sheet, write, left = (out / "sheet.png").read_bytes(), Edit.write, [1, 1, 1]
+    shutil.rmtree(out)
+
+    def interrupted(*how):
+        if not left:
+            raise KeyboardInterrupt
+        left.pop()
+        return write(*how)
+
+    with monkeypatch.context() as stop:
+        stop.setattr(Edit, "write", interrupted)
+        assert main([str(word) for word in words]) == 130
+    assert not (out / "sheet.png").exists() and len(list(out.glob("[0-9]"))) == 3
+    numbers(*words, "--resume")
+    assert (out / "sheet.png").read_bytes() == sheet and not (out / ".sheet").exists()  # with every picture
     shutil.rmtree(out / "3")
     kept = (out / "1" / "strip.png").stat().st_mtime_ns
     told, said = numbers(*words, "--resume")

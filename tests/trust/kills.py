@@ -30,23 +30,11 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 
-import numpy as np
-import torch
 from apart import start, waited
-from PIL import Image
-from safetensors.torch import load_file
+from material import left_in, made_material, made_model, made_runs
 
 from derender.cli import main
-from derender.features import FeatureTable
 from derender.features import embedding as embedding_module
-from derender.model import Derenderer, load
-from derender.photo.video import write_video
-from derender.postprocess import Features
-from derender.report.viewer.neighbours import rendered_examples
-from derender.scene.perturb import PerturbSettings
-from derender.storage.atomic import check_seal
-from derender.training.config import WhiteningSettings
-from derender.training.features import fit_whitening
 
 SIGNALS = {"SIGKILL": signal.SIGKILL, "SIGTERM": signal.SIGTERM, "Ctrl-C": signal.SIGINT}
 CAUSES = (*SIGNALS, "full disk", "exception")
@@ -76,7 +64,8 @@ LEARNS = " ".join(
     )
 )
 MADE = "--data DATA --model MODEL --device cpu"
-TABLES = "--features one=ONE --features two=TWO --resamples 60 --cache OUT/cache --markdown OUT/scores.md"
+SCORED = "--resamples 60 --cache OUT/cache --markdown OUT/scores.md"
+TABLES = f"--features one=ONE --features two=TWO {SCORED}"
 FEW = "--set images=16 --set fitted=8 --set fit_steps=2 --set whitening.pictures=8"
 LABELS = "--label class --set perceptual=none"
 PICTURES = "PHOTO PHOTO2 --model MODEL --device cpu --frame none"
@@ -93,6 +82,10 @@ COMMANDS = {  # what to write, and what is given beside it once the file or fold
         *("run", "config.yaml", "--resume"),
     ),
     "embed": (f"embed {MADE} --batch-size 4 --out", "table.parquet", "", "--force"),
+    "identify": (f"evaluate identify {MADE} {SCORED} --label class --force --json", "scores.json", "", ""),
+    "explain": (f"explain {MADE} --label class --seeds 2 --sheets 1 --rows 3 --out", "why", "", "--force"),
+    "report": ("report RUN DATA --label class --device cpu --force --out", "page.html", "", ""),
+    "plan": ("compare --plan PLAN --device cpu --out", "compared", "", ""),
     "compare": (f"compare --table identity {TABLES} --force --json", "scores.json", "", ""),
     "whiten": (f"whiten {MADE} --set pictures=8 --out", "white", "", "--force"),
     "refine": (f"refine DATA --model rendered-faces-64 --device cpu {FEW} --out", "refined", "", "--force"),
@@ -106,9 +99,6 @@ COMMANDS = {  # what to write, and what is given beside it once the file or fold
     "mesh": (f"mesh {PICTURES} --out", "solid", "", "--force"),
     "video": ("relight CLIP --model MODEL --device cpu --frame none --out", "clips", "", "--force"),
 }
-UNTIMED = ("metrics.jsonl", "environment.json", "state.json", "checksums.json", "report.html", "run.lock")
-UNTIMED += ("sheet.png",)
-"""Files that hold times or checksums of such, and the sheet, which is drawn of whole runs only."""
 
 
 class Injected(Exception):
@@ -146,89 +136,6 @@ class Writes:
         os.kill(os.getpid(), signal.SIGSTOP)
 
 
-def content_of(file: Path) -> bytes:
-    """What a file holds, wherever tensors lie in it; raises unless it is whole."""
-    content = file.read_bytes()
-    match file.suffix:
-        case ".safetensors":
-            tensors = sorted(load_file(file).items())
-            return b"".join(name.encode() + value.numpy().tobytes() for name, value in tensors)
-        case ".parquet":
-            table = FeatureTable.read(file)
-            return "\n".join(table.files).encode() + b"".join(one.tobytes() for one in table.factors.values())
-        case ".json":
-            json.loads(content)
-        case ".png" | ".gif" | ".jpg":
-            with Image.open(file) as image:
-                image.load()
-        case ".mp4" if b"moov" not in content:
-            raise ValueError(f"{file} is cut off")
-        case ".glb" if int.from_bytes(content[8:12], "little") != len(content):
-            raise ValueError(f"{file} is cut off")
-    return content
-
-
-def left_in(folder: Path) -> dict[str, bytes]:
-    """What lies in a folder under final names; raises unless all of it is whole, models load, seals hold."""
-    found = {}
-    for file in sorted(folder.rglob("*")):
-        inner = file.relative_to(folder)
-        if any(part.startswith(".") or part.endswith(".partial") for part in inner.parts):
-            continue
-        if file.is_dir() and inner.parts[0] not in ("cache",):
-            if file.parent.name == "checkpoints":
-                check_seal(file)
-            elif (file / "config.json").exists():
-                load(file)
-        elif file.is_file() and not {"cache", "tensorboard", "samples", "previous"} & set(inner.parts):
-            content = content_of(file)
-            if file.name not in UNTIMED:
-                found[str(inner)] = content
-    return found
-
-
-def made_material(place: Path, pictures: int) -> dict[str, str]:
-    """Smooth random images in two classes, a tenth as many broken ones, two photographs, two tables."""
-    draw, data = np.random.default_rng(0), place / "data"
-    for number in range(pictures):
-        folder = data / "ab"[number % 2]
-        folder.mkdir(parents=True, exist_ok=True)
-        small = Image.fromarray(draw.integers(0, 256, (4, 4, 3), dtype=np.uint8))
-        small.resize((32, 32)).save(folder / f"{number:03d}.png")
-        if number % 10 == 0:
-            (folder / f"broken{number}.png").write_bytes(b"no picture")
-        if number < 2:
-            small.resize((96, 80)).save(place / f"photo{number}.png")
-    identity = np.arange(150) % 6
-    for name in ("one", "two"):
-        geometry = draw.normal(size=(150, 8)) + 2 * np.eye(8)[identity]
-        factors = {"geometry": geometry, "albedo": draw.normal(size=(150, 8))}
-        labels = {"identity": np.array([f"person {value}" for value in identity])}
-        files = tuple(f"{row}.png" for row in range(150))
-        FeatureTable(files, factors, labels).write(place / f"{name}.parquet")
-    faces = rendered_examples("rendered-faces-64", 64)
-    for number in range(3):
-        (place / "faces").mkdir(exist_ok=True)
-        Image.fromarray(faces[number].picture).resize((160, 160)).save(place / "faces" / f"{number}.png")
-    clip = (draw.integers(0, 256, (48, 64, 3), dtype=np.uint8) for _ in range(4))
-    write_video(place / "clip.mp4", clip, (64, 48), 10.0)
-    photos = {
-        "FACES": str(place / "faces"),
-        "CLIP": str(place / "clip.mp4"),
-        "PHOTO2": str(place / "photo1.png"),
-        "PHOTO": str(place / "photo0.png"),
-    }
-    return {"DATA": str(data), **photos, "ONE": str(place / "one.parquet"), "TWO": str(place / "two.parquet")}
-
-
-def made_model(place: Path) -> str:
-    """A small untrained model with whitened features; what it writes is judged by bytes only."""
-    model = Derenderer.from_preset("small", seed=0, image_size=32, width=4, light_width=4)
-    images = torch.rand(8, 3, 32, 32, generator=torch.Generator().manual_seed(0))
-    features = fit_whitening(model, images, WhiteningSettings(views=1), PerturbSettings())
-    return str(model.with_features(Features(features)).save(place / "model"))
-
-
 @dataclass
 class Trial:
     """One command, where it is killed, and what happened.
@@ -259,8 +166,8 @@ class Trial:
         text, out, begun, again = COMMANDS[self.name]
         words = {**self.words, "OUT": str(folder)}
         given = [words.get(word, word) for word in text.split()]
-        given = [word.replace("OUT/", f"{folder}/").replace("=ONE", f"={words['ONE']}") for word in given]
-        given = [word.replace("=TWO", f"={words['TWO']}") for word in given]
+        for mark, end in (("OUT/", f"{folder}/"), ("=ONE", f"={words['ONE']}"), ("=TWO", f"={words['TWO']}")):
+            given = [word.replace(mark, end) for word in given]
         return [*given, str(folder / out), *(again.split() if (folder / out / begun).exists() else [])]
 
     def child(
@@ -417,6 +324,7 @@ def run(given: argparse.Namespace) -> int:
     with tempfile.TemporaryDirectory() as folder:
         words = {**made_material(Path(folder), given.pictures)}
         words["MODEL"] = given.model or made_model(Path(folder))
+        words |= made_runs(Path(folder), words["DATA"], words["MODEL"])
         for name in given.what.split(","):
             if earlier.get(name, {}).get("kills", 0) >= given.kills:
                 continue

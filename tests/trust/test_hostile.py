@@ -7,6 +7,8 @@ tries every command.
 import errno
 import json
 import os
+import resource
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -145,3 +147,23 @@ def test_names_cannot_steer_the_terminal(plain, model, capsys):
     said = capsys.readouterr()
     assert "\x1b" not in said.err + said.out and "\x07" not in said.err + said.out
     assert "\\x1b]0;owned" in said.err
+
+
+def test_a_damaged_heic_or_one_that_claims_gigapixels_is_one_line_and_takes_no_memory():
+    heif = pytest.importorskip("pillow_heif", reason="HEIC photographs need pip install pillow-heif")
+    heif.register_heif_opener()
+    whole = encoded(smooth(0, (256, 192)), "HEIF", quality=80)
+    assert read_image(whole, 16).shape == (3, 16, 16)
+    size = whole.index(b"ispe") + 8  # of the box: version, flags, width, height
+    claims = {
+        side: whole[:size] + struct.pack(">II", side, side) + whole[size + 8 :] for side in (13_000, 60_000)
+    }
+    cut = [whole[: len(whole) * part // 8] for part in range(1, 8)]
+    other = [whole[:32] + encoded(smooth(1), "JPEG"), whole[:32], whole[:size]]
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    for broken in (*claims.values(), *cut, *other):
+        with pytest.raises(Unreadable) as told:
+            read_image(broken, 16)
+        assert "pip install" not in str(told.value) and "\n" not in str(told.value)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000  # KiB
+    assert read_image(encoded(smooth(1), "JPEG"), 16).shape == (3, 16, 16)  # whatever its name

@@ -126,10 +126,13 @@ def _opened(encoded: bytes, pixel_limit: int) -> Iterator[Image.Image]:
         raise
     except Image.UnidentifiedImageError as problem:
         if encoded[4:8] == b"ftyp" and encoded[8:12] in _HEIC_BRANDS:
-            raise Unreadable("a HEIC photograph: pip install pillow-heif, or save it as JPEG") from problem
+            missing = "HEIF" not in _known_formats()
+            why = "pip install pillow-heif, or save it as JPEG" if missing else "damaged; copy it again"
+            raise Unreadable(f"a HEIC photograph: {why}") from problem
         raise Unreadable("not an image in a known format") from problem
     except DECODER_ERRORS as problem:
-        raise Unreadable(f"damaged or unsupported ({problem or type(problem).__name__})") from problem
+        why = " ".join(str(problem).split()) or type(problem).__name__
+        raise Unreadable(f"damaged or unsupported ({why})") from problem
 
 
 def refuse_by_header(head: bytes, size: int) -> None:

@@ -7,6 +7,7 @@ read is left out and listed; the others are written. Leaves out opening (``openi
 """
 
 import json
+import shutil
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -25,6 +26,8 @@ from derender.storage.atomic import atomic_file, atomic_folder
 from derender.training.held_out_errors import OUTLIER_PERCENTILE, unlike
 
 FILM = "film.mp4"
+ROWS = ".sheet"
+"""Folder of the rows of a sheet, a file for each image, until the sheet is drawn."""
 NOTED = {
     "no face": "no face: the middle of {count:,} is shown",
     "profile": "turned by more than 60 degrees, which the model does not know: {count:,}",
@@ -82,7 +85,7 @@ class WrittenImages:
         if more := len(refused) - NAMED:
             lines += [f"and {more:,} more (--json names all)"] if more > 0 else []
         if self.before:
-            lines.append(f"{self.before:,} images were done before (a sheet is drawn of whole runs only)")
+            lines.append(f"{self.before:,} images were done before")
         if self.percentiles:
             span = _span(self.percentiles.values())
             lines.append(f"reconstructed worse than {span} % of the images this model was validated on")
@@ -128,7 +131,7 @@ def write_images(
         edit: makes of an opened image what is written.
         force: replace what is there.
         sheet: also draw a row for every image as sheet.png; by default for two images or more. With
-            ``resume`` none is drawn where images are left out.
+            ``resume`` it shows those of the interrupted run, too; none is drawn where a row is missing.
         beside: images that the edit takes something from; percentiles and crops list them, too.
         resume: leave out images whose folders are there already.
         video: what is done to videos; None refuses them.
@@ -141,28 +144,31 @@ def write_images(
     files = image_files(paths)
     if not files:
         raise ValueError("give at least one image")
-    places = _places(files, out)
-    if resume:
-        files = [file for file in files if not places[file].exists()]
-        if not files:
-            return WrittenImages(out, [], [], {}, {}, before=len(places))
+    places, kept = _places(files, out), out / ROWS
+    done = {file for file in files if resume and places[file].exists()}
+    files = [file for file in files if file not in done]
+    if not files and not kept.exists():
+        return WrittenImages(out, [], [], {}, {}, before=len(places))
     moving = [file for file in files if is_video(file)]
     if moving and video is None:
         raise ValueError(f"{moving[0]} is a video: relight, rotate or swap it")
     read, refused = readable([file for file in files if file not in moving], opener.read, progress)
-    with_sheet = (len(read) > 1 if sheet is None else sheet) and len(files) == len(places)
-    rows: list[tuple[str, dict[str, Image.Image]]] = []
+    shown = {file: kept / f"{places[file].name}.npz" for file in places if file in done or file in read}
+    shown = {file: row for file, row in shown.items() if not is_video(file)}
+    with_sheet = len(shown) > 1 if sheet is None else sheet
+    with_sheet &= all(row.exists() for file, row in shown.items() if file in done)
     records: list[dict[str, Any]] = []
     folders = [places[path] for path in read]
     _require_free([*folders, *(places[path] for path in moving)], out, with_sheet, force or resume)
     images = opener.decomposed(read) if read else []
     for image, folder in zip(images, folders, strict=True):
         made = edit(opener.finer(image))
+        if with_sheet:
+            cells = {name: np.asarray(enlarged(one, SHEET.cell)) for name, one in made.row.items()}
+            with atomic_file(shown[image.path]) as temporary, temporary.open("wb") as stream:
+                np.savez(stream, allow_pickle=False, **cells)
         with atomic_folder(folder) as temporary:
             records.append(made.write(temporary, {"picture": str(image.path), "folder": str(folder)}))
-        if with_sheet and made.row:
-            small = {name: enlarged(one, SHEET.cell) for name, one in made.row.items()}
-            rows.append((image.path.name, small))
         if progress is not None:
             progress(len(records), len(images), description="drawing")
     for path in moving:
@@ -174,10 +180,13 @@ def write_images(
             record = {"picture": str(path), "folder": str(places[path]), **vars(film), "out": FILM}
             (temporary / "moved.json").write_text(json.dumps(record, indent=1), encoding="utf-8")
         records.append(record)
+    rows = [(file.name, _row(row)) for file, row in shown.items()] if with_sheet else []
+    rows = [row for row in rows if row[1]]
     files = _sheet_files(out, len(rows))
     for file, drawn in zip(files, row_sheets(rows), strict=True):
         with atomic_file(file) as temporary:
             drawn.save(temporary, format="PNG")
+    shutil.rmtree(kept, ignore_errors=True)
     every = [*images, *beside]
     percentiles = {str(one.path): one.percentile for one in every if one.percentile is not None}
     framing = {str(one.path): one.framing for one in every}
@@ -186,6 +195,12 @@ def write_images(
         odd = unlike(np.stack([one.pixels for one in every]), [one.percentile or 0 for one in every])
     before = len(places) - len(records) - len(refused)
     return WrittenImages(out, records, files, refused, percentiles, framing, odd, before)
+
+
+def _row(file: Path) -> dict[str, Image.Image]:
+    """The cells of a sheet's row by their names."""
+    with np.load(file) as cells:
+        return {name: Image.fromarray(cells[name]) for name in cells.files}
 
 
 def _places(images: Sequence[Path], out: Path) -> dict[Path, Path]:
