@@ -3,10 +3,12 @@
 import ast
 import importlib
 import importlib.util
+import inspect
 import re
 import shlex
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
@@ -39,10 +41,7 @@ def script(name: str) -> ModuleType:
     return module
 
 
-pages = script("pages")
-
-
-reference = script("reference")
+pages, reference = script("pages"), script("reference")
 COMMANDS = dict(reference.all_commands())
 
 
@@ -123,11 +122,7 @@ def test_prose_is_plain(path):
     text = path.read_text()
     long = [one for one in sentences(text) if len(words_of(one)) > LONGEST_SENTENCE]
     wide = [line for line in text.splitlines() if len(line) > LONGEST_LINE and not line.startswith("|")]
-    words = (
-        []
-        if path.name == "prose.md"
-        else [match[0] for one in sentences(text) for match in BANNED.finditer(one)]
-    )
+    words = [hit[0] for one in sentences(text) for hit in BANNED.finditer(one) if path.name != "prose.md"]
     tables = re.findall(r"((?:^\|.*\n)+)", text, re.MULTILINE)
     large = [
         rows[:60]
@@ -165,27 +160,36 @@ def said(node: ast.AST) -> str:
     return "".join(map(said, parts)) if parts else "X"
 
 
+def docstrings(path: Path) -> Iterator[str]:
+    """Docstrings of a module and of all in it; an argument and a row of a list are texts of their own."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
+            text = inspect.cleandoc(str(node.value.value))
+            yield re.sub(r"^(?=.*\S {2,}\S)|^ +[\w*, ]+: ", "\n\n", text, flags=re.MULTILINE)
+
+
 @pytest.mark.parametrize("path", sorted((ROOT / "src/derender").iterdir()), ids=named)
-def test_messages_of_the_program_are_plain(path):
-    """Errors, notices, help, pages of reports and of the viewer."""
+def test_messages_and_docstrings_of_the_program_are_plain(path):
+    """Errors, notices, help, pages of reports and of the viewer; and what the code says of itself."""
     files = [
         one for one in (path.rglob("*") if path.is_dir() else [path]) if one.suffix in (".py", ".html", ".js")
     ]
-    assert not [f"{named(file)}: {one}" for file in files for text in messages(file) for one in unclear(text)]
-
-
-@pytest.mark.parametrize("name", COMMANDS)
-def test_help_is_plain(name):
-    command = COMMANDS[name]
-    texts = [command.help or "", *(getattr(one, "help", None) or "" for one in command.params)]
-    assert not [one for text in texts for one in unclear(text)]
+    found = [(file, one) for file in files for text in messages(file) for one in unclear(text)]
+    for file in files:
+        texts = docstrings(file) if file.suffix == ".py" else ()
+        found += [(file, one) for text in texts for one in sentences(text) if too_hard(one)]
+    assert not found, "\n".join(f"{named(file)}: {one}" for file, one in found)
 
 
 def unclear(text: str) -> list[str]:
     """Sentences of a text that are too long or hold a banned word."""
     text = re.sub(r"[\w/]+(?:\.\w+)+", "code", text)
     found = sentences(text) if " " in text and "{" not in text and "#version" not in text else []
-    return [one for one in found if len(words_of(one)) > LONGEST_SENTENCE or BANNED.search(one)]
+    return [one for one in found if too_hard(one)]
+
+
+def too_hard(sentence: str) -> bool:
+    return len(words_of(sentence)) > LONGEST_SENTENCE or BANNED.search(sentence) is not None
 
 
 def words_of(sentence: str) -> list[str]:
@@ -203,6 +207,7 @@ def test_a_long_sentence_is_seen(tmp_path):
     for name, count in {"a.py": 1, "a.html": 2, "a.js": 1}.items():
         (tmp_path / name).write_text(shown[name])
         assert len([one for text in messages(tmp_path / name) for one in unclear(text)]) == count
+    assert [too_hard(one) for text in docstrings(tmp_path / "a.py") for one in sentences(text)] == [True]
 
 
 def test_the_readme_is_short_and_its_python_runs(capsys):
@@ -218,11 +223,7 @@ def test_the_readme_is_short_and_its_python_runs(capsys):
 def test_python_blocks_compile(path):
     for block in re.findall(r"```python\n(.*?)```", path.read_text(), re.DOTALL):
         for node in ast.walk(ast.parse(block)):
-            if (
-                isinstance(node, ast.Attribute)
-                and isinstance(node.value, ast.Name)
-                and node.value.id == "derender"
-            ):
+            if isinstance(node, ast.Attribute) and ast.unparse(node.value) == "derender":
                 assert follow(f"derender.{node.attr}"), node.attr
 
 
@@ -253,7 +254,13 @@ def measured(text: str) -> str:
 def test_the_site_builds_without_a_warning(tmp_path):
     words = [
         sys.executable,
-        *["-m", "sphinx", "-W", "--keep-going", "-q", "-b", "html"],
+        "-m",
+        "sphinx",
+        "-W",
+        "--keep-going",
+        "-q",
+        "-b",
+        "html",
         str(DOCS),
         str(tmp_path),
     ]

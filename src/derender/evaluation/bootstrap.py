@@ -1,10 +1,9 @@
 """How sure a score is: resamples of the rows, intervals, and differences to the strongest control.
 
-Source: Efron's percentile bootstrap. Rows are drawn with replacement; what was fitted (clusters, heads)
-stays as it is, so an interval speaks of which images happened to be scored and not of another training.
-All features of a table are scored on the same resamples, which makes their differences paired. Leaves out
-corrections for many comparisons: of twenty rows that are no better than a control, half a one is called
-better by chance.
+Source: Efron's percentile bootstrap. Rows are drawn with replacement. Fitted clusters and heads stay as they
+are: an interval covers the choice of scored images and no other training. All features of a table are scored
+on the same resamples, which makes their differences paired. Leaves out corrections for many comparisons: of
+twenty rows that are no better than a control, half a one is called better by chance.
 """
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -58,9 +57,8 @@ class Difference:
 
 @dataclass(frozen=True)
 class ScoredRow:
-    """Scores of one kind of feature by name, and but for controls (which learned nothing) the differences
-    to the strongest control; ``runs`` counts the seeds behind it.
-    """
+    """Scores of one kind of feature by name, over ``runs`` seeds. Features other than controls, which learned
+    nothing, have their differences to the strongest control."""
 
     name: str
     control: bool

@@ -1,10 +1,10 @@
 """Is albedo as bright as the surface is, or does a dark surface pass for dim light?
 
 On rendered images with true albedo: mean brightness (luma, 0..1) of predicted albedo over the object against
-the true one, distance of their mean colours, and whether the predicted light knows the true brightness, which
-it should not. On photographs there is no true albedo: groups of people (as race of UTKFace) differ in the
-brightness of their images; the share of that difference which albedo takes is 1 where light is the same for
-all groups, 0 where the model explains skin by light. Values are stored (sRGB) ones, as in training.
+the true one, and distance of their mean colours. The predicted light should not know the true brightness;
+whether it does is a score. Photographs have no true albedo, but groups of people (as race of UTKFace) differ
+in the brightness of their images. Albedo takes a share of that difference: 1 where light is the same for all
+groups, 0 where the model explains skin by light. Values are stored (sRGB) ones, as in training.
 """
 
 from collections.abc import Mapping

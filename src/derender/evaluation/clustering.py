@@ -3,9 +3,9 @@
 Source: Klinghoffer et al., ECCV 2022, Sec. 4: Ward's hierarchical clustering with as many clusters as
     classes; accuracy is weighted purity. The paper's CelebA figure is the mean over 40 attributes, each
     with two clusters: one cut of one tree. A row that lacks one of several labels is clustered and does not
-    count for that label; a row without any is left out before. Beside the controls of the images
-    (controls.py) stand ``majority``, the score of one single cluster, and ``chance``, the first features'
-    clusters with rows dealt at random.
+    count for that label; a row without any is left out before. Controls of the images are in controls.py.
+    ``majority`` is the score of one single cluster, ``chance`` that of the first features' clusters with rows
+    dealt at random.
 """
 
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -110,8 +110,8 @@ def cluster(
 class ClusterComparison:
     """Features in the order given, then ``majority`` and ``chance``.
 
-    ``labels`` holds the number of classes by name; ``n_dropped`` rows carry no label and were left out,
-    ``n_missing`` single labels are unknown among the others; ``per_label`` has the scores of each first run.
+    ``labels`` holds the number of classes by name. ``n_dropped`` rows carry no label and were left out;
+    ``n_missing`` single labels are unknown among the others. ``per_label`` has the scores of each first run.
     """
 
     rows: tuple[ScoredRow, ...]
@@ -147,10 +147,10 @@ def compare_clusterings(
 ) -> ClusterComparison:
     """Cluster and score every row of features on the same images.
 
-    ``features`` holds by name one (N, D) array for each run (seed) of the same thing, ``labels`` by name (N,)
-    classes; scores are averaged over them. ``controls`` are names of features that learned nothing. There are
-    ``n_clusters``, by default as many as the label has classes; k-means is fitted with five seeds, each a run
-    of its own. ``memory`` caches the trees.
+    ``features`` holds by name one (N, D) array for each run (seed), ``labels`` by name (N,) classes; scores
+    are averaged over them. ``controls`` are names of features that learned nothing. There are ``n_clusters``,
+    by default as many as the label has classes. k-means is fitted with five seeds, each a run of its own.
+    ``memory`` caches the trees.
     """
     if not labels or not features or not all(features.values()):
         raise ValueError("clustering needs at least one label and one array of features in each row")
@@ -267,8 +267,8 @@ class Level:
 def finch_levels(features: np.ndarray, labels: np.ndarray, memory: Memory | None = None) -> tuple[Level, ...]:
     """Every partition that FINCH finds in (N, D) features, from fine to coarse, against (N,) labels.
 
-    Rows without label are left out before. Purity and NMI grow with the number of clusters, so levels of
-    different features are not comparable by these alone; ARI and the number of clusters are.
+    Rows without label are left out before. Purity and NMI grow with the number of clusters: compare levels of
+    different features by ARI and the number of clusters.
     """
     labels = np.asarray(labels)
     known = ~missing(labels)

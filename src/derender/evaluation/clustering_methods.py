@@ -1,13 +1,13 @@
 """Ways to cluster by name: one fit gives every number of clusters asked for.
 
-``ward`` and ``finch`` build one hierarchy and cut it, so forty attributes cost one tree; ``k-means``
+``ward`` and ``finch`` build one hierarchy and cut it: forty attributes cost one tree. ``k-means``
 (scikit-learn, Euclidean, ten starts) is fitted anew for each number. Ward is Euclidean as in the paper, FINCH
 cosine as in its paper. Above ``EXACT_ROWS`` rows all are approximate, and ``approximation`` says how.
 
 FINCH: Sarfraz, Sharma and Stiefelhagen, CVPR 2019 (the paper's appendix uses it), with cosine distance. Every
 row is linked to its nearest other row; the connected parts are the clusters; their means are the rows of the
 next level. A level that takes away at most one cluster, or leaves only one, ends the hierarchy, as in the
-authors' package `finch-clust`. That package holds several N x N arrays (1.6 GB each for 20,000 rows); here
+authors' package `finch-clust`. That package holds several N x N arrays (1.6 GB each for 20,000 rows). Here
 neighbours are exact in bounded memory up to 100,000 rows, and come from near cells above (neighbours.py).
 Tests compare the two. Leaves out its cut of long links, which has no effect in it.
 

@@ -1,14 +1,14 @@
 """Is the predicted geometry the true geometry? SIDE and MAD, as unsup3d defines them.
 
-Source: Wu, Rupprecht, Vedaldi, CVPR 2020, Sec. 4.1. Both compare depth in the view of the input image,
-where predicted and true mask overlap, eroded by one pixel (the rim is where rasterisers differ). SIDE is
-the standard deviation of log predicted minus log true depth, so a global scale costs nothing; MAD is the
-mean angle between normals. Each image is scored by itself and the images are averaged.
+Source: Wu, Rupprecht, Vedaldi, CVPR 2020, Sec. 4.1. Both compare depth in the view of the input image where
+predicted and true mask overlap. Their overlap is eroded by one pixel: rasterisers differ at the rim. SIDE is
+the standard deviation of log predicted minus log true depth, so a global scale costs nothing. MAD is the mean
+angle between normals. Each image is scored by itself and the images are averaged.
 
 The erosion takes away a pixel when one of its four neighbours is outside: what stays are exactly the pixels
 whose central differences lie inside the mask. On synface64's test_gt with the stored normals the average
-depth then scores SIDE 1.51e-2 and MAD 22.4 degrees, a plane 2.28e-2 and 38.9.
-Leaves out errors of light, camera and albedo (evaluation/factors.py).
+depth then scores SIDE 1.51e-2 and MAD 22.4 degrees. A plane scores 2.28e-2 and 38.9. Leaves out errors of
+light, camera and albedo (evaluation/factors.py).
 """
 
 from collections.abc import Mapping
@@ -48,9 +48,8 @@ class GeometryScores:
 
 @dataclass(frozen=True)
 class GeometryResult(ImageResult):
-    """Errors of the predicted depth beside those of the mean true depth map, of constant depth, and of the
-    same architecture with fresh weights (None without one), all on the same images.
-    """
+    """Errors of the predicted depth beside those of controls, all on the same images. Controls are the mean
+    true depth map, constant depth, and fresh weights (None without an architecture)."""
 
     columns: ClassVar[Columns] = {
         "side": (Column("SIDE x 100", "low", note="scale-invariant depth error times 100, best 0"), 100.0),

@@ -1,10 +1,10 @@
 """How far predicted albedo, light and camera are from the true ones, up to what no image determines.
 
-An image fixes albedo only up to a factor that the light compensates, and the canonical frame only up to one
-rotation for the whole model (which way an average face looks is a convention). So: albedo is compared after
-the best scale per image, and after the best one for the whole set; light in the frame of the camera, as it
-is and after the best rotation for the whole set; camera rotation after the best rotation for the whole set.
-Leaves out translations: at 10 degrees of field of view they trade against depth.
+An image fixes albedo only up to a factor that the light compensates. It fixes the canonical frame only up to
+one rotation for the whole model: which way an average face looks is a convention. So albedo is compared after
+the best scale per image, and after the best one for the whole set. Light, in the frame of the camera, is
+compared as it is and after the best rotation for the whole set. Camera rotation is compared after the best
+rotation for the whole set. Leaves out translations: at 10 degrees of field of view they trade against depth.
 """
 
 from collections.abc import Mapping
@@ -43,11 +43,11 @@ class AngleScores:
 class FactorResult(ImageResult):
     """A model's errors in albedo, light and camera, each beside the best constant answer.
 
-    ``albedo`` is the mean of ``albedo_error`` in the view of the image (control: the mean true albedo),
-    ``albedo_global`` the same after one scale for all images, so that a model that confuses bright skin under
-    weak light with dark skin under strong light scores worse. ``light_aligned`` is after the best rotation of
-    all predictions at once; its control is ``light_control``, too, the mean true direction. The control of
-    ``camera`` never turns. Values per image are (N,). ``untrained`` has fresh weights.
+    ``albedo`` is the mean of ``albedo_error`` in the view of the image (control: the mean true albedo).
+    ``albedo_global`` is that after one scale for all images: confusing bright skin under weak light with dark
+    skin under strong light costs. ``light_aligned`` is after the best rotation of all predictions at once;
+    its control is ``light_control``, too, the mean true direction. The control of ``camera`` never turns.
+    Values per image are (N,). ``untrained`` has fresh weights.
     """
 
     columns: ClassVar[Columns] = {
@@ -100,9 +100,8 @@ def albedo_error(
 ) -> Float[Tensor, " n"]:
     """Root mean square albedo error after the best scale, per image; 0 and up, best 0; NaN in an empty mask.
 
-    One scale for the three channels, so a colour cast costs. The scale is each image's own, and the error
-    at most the root mean square of its true albedo; or, with ``one_scale``, the best for all images
-    together.
+    One scale for the three channels, so a colour cast costs. The scale is each image's own, and the error at
+    most the root mean square of its true albedo. With ``one_scale`` it is the best for all images together.
     """
     inside = mask[:, None].expand_as(albedo_true)
     predicted, true = (torch.where(inside, a.double(), 0.0) for a in (albedo_pred, albedo_true))

@@ -229,8 +229,8 @@ def prepare(
 def at_least(labels: np.ndarray, count: int, most: int | None = None) -> np.ndarray:
     """Indices of the rows whose class has ``count`` members or more; of each class the first ``most``.
 
-    LFW's protocol here is ``at_least(identity, 20, most=20)``: of its 31 people with 20 images one has 530,
-    and with all of them that one person decides the purity (0.35 for any clustering at all).
+    LFW's protocol here is ``at_least(identity, 20, most=20)``. One of its 31 people with 20 images has 530:
+    all of these would decide the purity (0.35 for any clustering at all).
     """
     labels = np.asarray(labels)
     present = np.flatnonzero(~missing(labels))

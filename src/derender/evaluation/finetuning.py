@@ -5,9 +5,9 @@ representation with the target task in mind"). Images without a label take part 
 alone. Held-out images are judged by the labels, which so choose the saved weights.
 
 The test part of the run's own split is scored; neither training nor the choice of weights saw it. The heads
-on frozen features (the paper's, and penalised logistic regression) learn from the very same labels, and so
-does the regression on features of an untrained encoder, on principal components and on pixels. Leaves out
-weights of classes, and a rate of its own for the head.
+on frozen features (the paper's, and penalised logistic regression) learn from the very same labels. So does
+the regression on features of an untrained encoder, on principal components and on pixels. Leaves out weights
+of classes, and a rate of its own for the head.
 """
 
 import copy
@@ -125,9 +125,8 @@ def load_finetuned(source: str | Path, *, device: str | torch.device = "cpu") ->
 
 @dataclass(frozen=True)
 class JointLabels:
-    """The labels asked of all images and (N, A) those that training may see: -1 for training images beyond
-    those labelled and for all tested ones. ``split`` is the run's own; its test part is never seen.
-    """
+    """The labels of all images, and (N, A) those that training may see. The latter are -1 for training images
+    beyond those labelled and for all tested ones. ``split`` is the run's own; its test part is never seen."""
 
     asked: Task
     visible: np.ndarray

@@ -1,8 +1,8 @@
 """Identity of faces: who is this (``identify``), and are these two one person (``verify``)?
 
-Sources: nearest neighbours by the angle of light, as on Yale B (Georghiades et al., PAMI 2001); pairs of LFW
-(Huang et al., 2007), whose threshold for each fold is chosen on the others. Similarity is the cosine after
-the mean of the gallery, or of the other folds' images, is subtracted: codes agree in what all faces share.
+Sources: nearest neighbours by the angle of light, as on Yale B (Georghiades et al., PAMI 2001). Pairs of LFW
+(Huang et al., 2007): the threshold of each fold is chosen on the others. Similarity is the cosine after the
+mean of the gallery, or of the other folds' images, is subtracted: codes agree in what all faces share.
 Nothing else is fitted. Leaves out networks trained on names of people.
 """
 
@@ -53,7 +53,7 @@ def identify(
     Args:
         features: a feature table or its ``.parquet`` file; a model or its name, with ``images``.
         label: the column of people.
-        by: a column of angles, in degrees or (named ..._rad) radians, whose size groups the probes; by
+        by: a column of angles, in degrees or (named ..._rad) radians, whose size groups the probes. By
             default ``light_deg`` where there is one, as in Extended Yale B.
         bins: upper edges of the groups, growing; larger angles are "beyond".
         gallery: ``COLUMN=VALUE`` of the gallery's images; by default one of each person: that of the smallest

@@ -32,8 +32,8 @@ Columns = Mapping[str, tuple[Column, float]]
 class ImageResult:
     """A model's scores beside its controls, all on the same images.
 
-    ``columns`` are of the scores, ``caption`` has a place for the number of images, ``coverage`` is the
-    column of ``coverage`` where rows have that, ``notes`` are on rows, by their name.
+    ``columns`` are of the scores, ``caption`` has a place for the number of images. ``coverage`` is the
+    column of ``coverage`` where rows have that. ``notes`` are on rows, by their name.
     """
 
     columns: ClassVar[Columns]
@@ -106,8 +106,8 @@ def binned_rows(
     bins: Sequence[float] = LIGHT_BINS_DEG,
     **how: Any,
 ) -> tuple[tuple[ScoredRow, ...], dict[str, Column], dict[str, int]]:
-    """Rows of (N,) scores; columns for all, and where there are (N,) angles in degrees for groups by these;
-    and the number of images in each.
+    """Rows of (N,) scores; columns for all and for groups by (N,) angles in degrees; number of images in
+    each.
 
     ``bins`` are upper edges; larger angles are "beyond". ``how`` is that of ``image_rows``.
     """

@@ -1,11 +1,11 @@
 """The paper's head trained together with the encoders under it: models, baselines, and untrained controls.
 
 Source: Klinghoffer et al., ECCV 2022, Sec. 4.4 and Table 2 ("Finetune"). Encoders and head share Adam 2e-4,
-    100 epochs and batches of 64, as the frozen head; the paper does not say whether the encoders had a rate
+    100 epochs and batches of 64, as the frozen head. The paper does not say whether the encoders had a rate
     of their own. Of a baseline the whole network is trained; a ResNet-18 with fresh weights is the paper's
     supervised row. An untrained model under the same protocol is the control: a supervised training from
-    nothing. Controls without an encoder (pixels, principal components) have nothing below the head to
-    train: theirs are the answers of the head alone. Leaves out the rendering objective beside the task.
+    nothing. Controls without an encoder (pixels, principal components) have nothing below the head to train:
+    theirs are the answers of the head alone. Leaves out the rendering objective beside the task.
 """
 
 import copy
@@ -45,7 +45,7 @@ def finetune(
     """Train copies of the factors' encoders with a new head, answer for the test rows: (T, A) probabilities.
 
     The model, ours or a baseline, stays as it was. ``images`` are (N, 3, H, W) uint8, ``rows`` (n,) training
-    rows; the seed is of the head's start and the order of images; ``progress`` is called with (epochs done,
+    rows. The seed is of the head's start and the order of images. ``progress`` is called with (epochs done,
     epochs in all). A ValueError: features without a gradient.
     """
     device = model.device

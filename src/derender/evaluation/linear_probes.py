@@ -1,23 +1,23 @@
 """Kinds of probe by name, with one signature: features and training rows in, probabilities out.
 
-``linear`` is the paper's head, ``centred`` the same on features whose mean over the training rows is 0,
-``logistic`` a penalised regression, ``k-NN`` the ten nearest by cosine of centred features, ``majority`` the
-share of each value among the training rows, which knows no image.
+``linear`` is the paper's head, ``centred`` that head on features whose mean over the training rows is 0.
+``logistic`` is a penalised regression, ``k-NN`` the ten nearest by cosine of centred features. ``majority``,
+the share of each value among the training rows, knows no image.
 
 The paper's head (Klinghoffer et al., ECCV 2022, Sec. 4.4) is one linear layer, sigmoid with binary
 cross-entropy (here also softmax with cross-entropy for classes), Adam 2e-4, 100 epochs, threshold 0.5.
 Features enter as they are. The batch size is not stated; 64 is that of the paper's other trainings. With so
 small a rate and so few steps the head stays near its random start: it measures the features' scale as much as
-their content, which is why the penalised regression stands beside it. The bias moves by
-0.3 at most in 1,600 steps, so on features of mean 0 every answer begins near one half, while others can lean
-on their mean to answer with the majority; ``centred`` makes it the same for all.
+their content, which is why the penalised regression stands beside it. The bias moves by 0.3 at most in 1,600
+steps, so on features of mean 0 every answer begins near one half. Others can lean on their mean to answer
+with the majority; ``centred`` treats all alike.
 
 The objective of the penalised regression is scikit-learn's: C times the sum of the losses plus half the
 squared weights, intercept free; tests hold both to the same answer. Forty labels, six penalties and five
-folds are 1,200 regressions on one set of rows, so all are solved together: the rows are rotated onto their
-principal axes (which changes nothing under this penalty, and makes 12,288 pixels of 1,000 rows 1,000
-numbers), there the curvature has a diagonal bound (Boehning and Lindsay 1988), and accelerated steps scaled
-by it need only two matrix products each. A regression that is solved leaves the others to go on.
+folds are 1,200 regressions on one set of rows, so all are solved together. The rows are rotated onto their
+principal axes: 12,288 pixels of 1,000 rows become 1,000 numbers, and nothing changes under this penalty.
+There the curvature has a diagonal bound (Boehning and Lindsay 1988), and accelerated steps scaled by it need
+only two matrix products each. A solved regression drops out.
 """
 
 from collections.abc import Sequence
@@ -296,7 +296,7 @@ def solve_logistic(
 ) -> np.ndarray:
     """Solve P regressions on parts of the same rows: (R + 1, P, A) weights, the intercept last.
 
-    ``rows`` are (n, R), centred, with columns orthogonal to each other (from ``axes_of``); ``learned``, (n,
+    ``rows`` are (n, R), centred, with columns orthogonal to each other (from ``axes_of``). ``learned``, (n,
     P) bool, are those that each regression learns from, ``c`` (P,) penalties. It stops when the scaled
     gradient is below ``tolerance`` of its start, or after ``most_steps``.
     """

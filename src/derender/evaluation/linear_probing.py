@@ -6,8 +6,8 @@ Source: Klinghoffer et al., ECCV 2022, Sec. 4.4. All features are asked the same
     training rows change together.
 
 Scores are averaged over labels (or classes). Accuracy rewards the majority's answer (0.80 on CelebA):
-balanced accuracy is 0.5 for any constant answer (one over the number of classes), and average precision,
-which needs no threshold, is the label's share for answers that know nothing.
+balanced accuracy is 0.5 for any constant answer (one over the number of classes). Average precision needs no
+threshold, and is the label's share for answers that know nothing.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -254,9 +254,10 @@ def linear_tables(found: LinearComparison) -> list[ScoreTable]:
 
 @dataclass(frozen=True)
 class LinearScores:
-    """How right answers are, 0..1, best 1: share of right answers (at threshold 0.5, or of the likeliest
-    class), its mean over the rows of each value or class, and area under precision over recall of each
-    label or class.
+    """How right answers are, 0..1, best 1.
+
+    Share of right answers (at threshold 0.5, or of the likeliest class) and its mean over the rows of each
+    value or class. Then area under precision over recall of each.
     """
 
     accuracy: float

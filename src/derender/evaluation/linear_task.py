@@ -1,8 +1,8 @@
 """What a linear probe is asked: targets from label columns, rows to learn from and rows to be tested on.
 
 Columns of two values each are asked together, each by a yes or no of its own (multi-label, as CelebA's 40
-attributes); one column of more values is asked as a choice of one (multi-class). The test rows are fixed:
-no seed, no number of labels and no choice of a penalty ever touches them.
+attributes). One column of more values is asked as a choice of one (multi-class). The test rows are fixed: no
+seed, no number of labels and no choice of a penalty ever touches them.
 """
 
 from collections.abc import Mapping, Sequence

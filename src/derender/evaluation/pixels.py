@@ -5,8 +5,8 @@ geometry; and an untrained model. The first two are scored inside the model's ow
 proves nothing about geometry (a copied image has none): read it with evaluation/depth.py.
 
 SSIM: Wang et al., IEEE TIP 2004, computed by torchmetrics: a Gaussian window of 11 x 11 pixels with sigma
-1.5, mean over colours. The centre of a window that reaches over the edge of the mask is left out, and so are
-five pixels at the border of the image. Leaves out several scales and learned similarities.
+1.5, mean over colours. The centre of a window that reaches over the edge of the mask is left out. So are five
+pixels at the border of the image. Leaves out several scales and learned similarities.
 """
 
 from collections.abc import Mapping
@@ -32,7 +32,7 @@ AT_A_TIME = 32  # images: convolutions with windows this large take memory
 class ReconstructionScores:
     """Errors inside the mask; means over images, and (N,) values per image.
 
-    ``l1`` is 0..1, best 0; ``psnr_db`` 0 and up, infinite for a copy; ``ssim`` -1..1, best 1, over images
+    ``l1`` is 0..1, best 0; ``psnr_db`` 0 and up, infinite for a copy. ``ssim`` is -1..1, best 1, over images
     with a window of 11 x 11 pixels inside the mask, NaN without. ``coverage`` is the share of all pixels
     inside the mask; images with an empty mask (``n_empty``) are left out.
     """
@@ -49,8 +49,9 @@ class ReconstructionScores:
 
 @dataclass(frozen=True)
 class ReconstructionResult(ImageResult):
-    """A model's reconstructions beside the mean image and the images from ``n_components`` principal
-    components in the same masks, and an untrained model in its own; None where not requested.
+    """A model's reconstructions beside controls; None where not requested. Controls are the mean image and
+    the images from ``n_components`` principal components in the same masks, and an untrained model in its
+    own.
     """
 
     columns: ClassVar[Columns] = {
@@ -123,7 +124,7 @@ def evaluate_reconstruction(
 ) -> ReconstructionResult:
     """Score a model with ``reconstruct`` and ``device`` on uint8 images (N, 3, H, W) it has not seen.
 
-    The mean image is best that of the training images, by default of ``images``; ``components_of`` are images
+    The mean image is best that of the training images, by default of ``images``. ``components_of`` are images
     that give 64 principal components (fewer where they are fewer than 256), for that control. The rest is as
     of ``evaluate_geometry``.
     """

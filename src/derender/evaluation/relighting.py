@@ -1,10 +1,10 @@
-"""Relighting against photographs: one picture of a person in the light of another person's picture.
+"""Relighting against photographs: one image of a person in the light of another person's image.
 
-Of images with known light, such as the cropped Extended Yale B, each person's most frontal picture takes the
-light that a model predicts for the next person's picture in a light, and is compared with the person's own
-picture in that light, where the model draws a surface. Controls know the same two people: the picture as it
-is, the mean image of all others in that light, and the picture times the ratio of the other person's two.
-Leaves out cast shadows.
+Images have known light, such as the cropped Extended Yale B. Each person's most frontal image takes the light
+that a model predicts for the next person's image in a light. The result is compared with the person's own
+image in that light, where the model draws a surface. Controls know the same two people: the image as it is,
+the mean image of all others in that light, and the image times the ratio of the other person's two. Leaves
+out cast shadows.
 """
 
 from pathlib import Path

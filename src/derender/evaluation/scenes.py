@@ -1,8 +1,8 @@
 """Protocols of decomposed scenes: are geometry, albedo, light and camera the true ones, and the images alike?
 
 Every score is beside constant answers and the same networks untrained. With ``fit_steps`` the model's scenes,
-not the untrained one's, are optimised against their images first. ``copy_cost`` says how near a copy, such as
-one of rounded weights, comes to its model; the unit is how far two of these images are apart.
+not the untrained one's, are optimised against their images first. ``copy_cost`` measures how near a copy,
+such as one of rounded weights, comes to its model. The unit is how far two of these images are apart.
 """
 
 import copy
@@ -50,9 +50,8 @@ def geometry(
 
     Args:
         model: a model, or the name or folder of one.
-        truth: images with exact depth at the model's size, or the path of a rendered set (or of folders
-            image/ and depth/ with PNGs side by side).
-        fit_steps: steps of per-image optimisation; None or 0 for none.
+        truth: images with exact depth at the model's size, or the path of a rendered set, or of folders
+            image/ and depth/ with PNGs. fit_steps: steps of per-image optimisation; None or 0 for none.
         resample_count: bootstrap resamples of the images.
         seed: of the untrained model's weights.
         batch_size: images at a time; changes speed and memory only.

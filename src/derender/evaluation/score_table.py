@@ -29,9 +29,8 @@ LATEX_ARROWS = {"high": r" $\uparrow$", "low": r" $\downarrow$", None: ""}
 
 @dataclass(frozen=True)
 class Column:
-    """One column of numbers: its head, the better end (None where the numbers are no score), digits after the
-    point, a note on range, unit and meaning, and the score whose interval or deviation it holds.
-    """
+    """One column of numbers: its head, the better end (None where they are no score), digits after the point.
+    A note has range, unit and meaning; ``of`` is the score whose interval or deviation the column holds."""
 
     name: str
     best: Literal["high", "low"] | None = None

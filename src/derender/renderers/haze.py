@@ -1,8 +1,8 @@
 """`haze`: air between surface and camera that pales what is far (Koschmieder's law).
 
-image = clear * t + A (1 - t), t = exp(-beta d), with d the distance in the camera's view rescaled to 0..1
-over the surface that is seen; over the whole depth range it would be an even veil, and any albedo explains
-that. Leaves out coloured air, and light that the air scatters twice.
+image = clear * t + A (1 - t), t = exp(-beta d). d is the distance in the camera's view, rescaled to 0..1 over
+the surface that is seen. Over the whole depth range it would be an even veil, and any albedo explains that.
+Leaves out coloured air, and light that the air scatters twice.
 """
 
 import torch

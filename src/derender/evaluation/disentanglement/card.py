@@ -1,10 +1,10 @@
 """The disentanglement card: every score of this package for a model and its controls, over several seeds.
 
-Controls: the same networks untrained (fresh weights for each seed); the model's own features with the rows of
-each factor shuffled, which gives chance; and random pixel values, and whitened principal components, split
-into as many blocks as there are features, which need no encoder. The swap test needs a decoder, so only the
-model and the untrained one have it. Without true factors among the labels that part is left out. A majority's
-answer has no features; it is the chance of every class.
+Controls: the same networks untrained, with fresh weights for each seed. The model's own features with the
+rows of each factor shuffled, which gives chance. Random pixel values, and whitened principal components,
+split into as many blocks as there are features; they need no encoder. The swap test needs a decoder, so only
+the model and the untrained one have it. Without true factors among the labels that part is left out. A
+majority's answer has no features; it is the chance of every class.
 """
 
 from collections.abc import Mapping, Sequence
@@ -77,8 +77,8 @@ _DIMENSIONS = {
 
 @dataclass(frozen=True)
 class FeatureScores:
-    """All scores of one set of features, with one seed; ``truth`` is None where the labels hold no true
-    factors, ``swap`` for features without a decoder.
+    """All scores of one set of features, one seed; None are ``truth`` without true factors among the labels
+    and ``swap`` without a decoder.
     """
 
     pearson: PearsonScores
@@ -309,8 +309,9 @@ def disentangle(
 
 
 def swap_intervals(tests: Sequence[SwapScores]) -> tuple[Interval, Interval]:
-    """The 95 % intervals of the mean over seeds of the swap test's ratio, of features and of decoded
-    parameters; NaN where a ratio is NaN or infinite."""
+    """95 % intervals of the mean over seeds of the swap ratio, of features and of decoded parameters. NaN
+    where a ratio is NaN or infinite.
+    """
     drawn = np.mean([test.resampled for test in tests], axis=0)
     ends = np.full((2, 2), np.nan)
     if len(drawn) and np.isfinite(drawn).all():

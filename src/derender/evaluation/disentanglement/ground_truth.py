@@ -9,8 +9,8 @@ basis:
     by feature    a feature counts for its held-out predictions (ridge, in similarity.py): R2 of a number; of
                   a class, accuracy above that of the largest class, over the possible gain. Blind to scale,
                   order of dimensions and rotations inside a feature. The score to read.
-    by dimension  as published: dimensions compete with each other, so a factor spread over two dimensions of
-                  the right feature costs as much as one held twice by different features.
+    by dimension as published: dimensions compete with each other. A factor spread over two dimensions of the
+                  right feature costs as much as one held twice by different features.
 
 All are 0..1 and best at 1; uninformative features score about 0. None asks whether the right feature holds a
 factor; ``placed`` does. True factors are the labels of a rendered set: numbers stay numbers (light, camera),
@@ -97,7 +97,7 @@ class GroundTruthScores:
     """F features against K true factors, by name.
 
     ``score`` is (F, K): held-out R2 of numbers (negative where the fit does harm), accuracy of classes, best
-    1; ``together`` (K,) the same of all features side by side; ``chance`` (K,) of a constant answer.
+    1. ``together`` (K,) is that of all features side by side, ``chance`` (K,) that of a constant answer.
     ``by_dimension`` and ``grouped_dci`` (importances of dimensions added up by feature) are there where
     requested. ``placed`` is the share of factors that the right feature predicts best, 0..1; NaN where no
     feature has a factor of its own.
@@ -117,9 +117,9 @@ class GroundTruthScores:
 def true_factors(labels: Mapping[str, np.ndarray]) -> tuple[list[TrueFactor], dict[str, str]]:
     """The labels that are factors of a rendered scene, in a fixed order, and by name why others are left out.
 
-    A column is left out when a value is missing or all are the same, and a class column also when it has more
-    classes than a fifth of the rows: such classes are names of single images. A set without a column of light
-    or camera is not a rendered one and has none.
+    A column is left out when a value is missing or all are the same. So is one with more classes than a fifth
+    of the rows: such classes are names of single images. A set without a column of light or camera is not a
+    rendered one and has none.
     """
     read = {_KNOWN[name][0]: _read(labels[name], *_KNOWN[name]) for name in _KNOWN if name in labels}
     factors = [one for one in read.values() if isinstance(one, TrueFactor)]
@@ -175,10 +175,10 @@ def ground_truth_scores(
 def importance(codes: np.ndarray, factors: Sequence[TrueFactor], method: str, *, seed: int = 0) -> np.ndarray:
     """(D, K) importance of each dimension of (N, D) codes for each of K factors; each column adds to 1.
 
-    Absolute weights of a lasso on standardised codes (Eastwood and Williams; a class is regressed as one
-    lasso for each class, the weights added up), or importances of gradient boosted trees (Locatello et al.),
-    which ``seed`` belongs to. A column is 0 where no dimension helps. The lasso's penalty is a fixed share of
-    the largest useful one, so scaling codes or factors changes nothing; a rotation does.
+    Absolute weights of a lasso on standardised codes (Eastwood and Williams), or importances of gradient
+    boosted trees (Locatello et al.), which ``seed`` belongs to. Classes are regressed as one lasso each, the
+    weights added up. A column is 0 where no dimension helps. The lasso's penalty is a fixed share of the
+    largest useful one, so scaling codes or factors changes nothing; a rotation does.
     """
     from sklearn.ensemble import GradientBoostingClassifier, GradientBoostingRegressor
 

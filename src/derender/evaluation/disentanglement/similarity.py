@@ -4,8 +4,8 @@ Pearson: Klinghoffer et al., ECCV 2022, Sec. 5. The paper does not define over w
 both readings are here. With a_i, b_i the vectors of image i in features A and B of N images, and a_p, b_q
 single dimensions over the images:
 
-    per image       mean over i of corr(a_i, b_i), signed; needs vectors of one length and depends on the
-                    order of the dimensions, which has no meaning in a learned code
+    per image mean over i of corr(a_i, b_i), signed. Needs vectors of one length and depends on the order of
+                    the dimensions, which has no meaning in a learned code
     per dimension   mean over p and q of |corr(a_p, b_q)|; shuffled rows score about sqrt(2 / (pi (N - 1)))
 
 CKA: Kornblith et al., ICML 2019; unbiased with the HSIC estimator of Song et al., JMLR 2012. The biased form

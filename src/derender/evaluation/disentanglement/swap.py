@@ -36,9 +36,9 @@ class SwapScores:
 
     ``moved`` and ``moved_parameters`` (of decoded depth, albedo, light and camera) are (F, F): row, the
     factor exchanged, column, what moved; best 1 on the diagonal, 0 elsewhere. (F,) ``moved_pixels`` is the
-    image's own move, ``arrived`` the remaining distance to the donor's feature, ``unexchanged`` the move from
-    an image to its own rendering, both best 0. Each ``ratio`` is the mean of the diagonal over that of the
-    rest, 1 where nothing is disentangled; ``resampled`` (B, 2) has both on resamples of the images.
+    image's own move. ``arrived`` is the remaining distance to the donor's feature, ``unexchanged`` the move
+    from an image to its own rendering, both best 0. Each ``ratio`` is the mean of the diagonal over that of
+    the rest, 1 where nothing is disentangled. ``resampled`` (B, 2) has both on resamples of the images.
     """
 
     factors: tuple[str, ...]
@@ -137,9 +137,8 @@ def swap_test(
 
 
 def diagonal_over_rest(moved: np.ndarray) -> np.ndarray | np.floating:
-    """Mean of the diagonal over mean of the other cells of (F, F, ...) matrices; infinite where these are 0,
-    NaN where all or any are NaN.
-    """
+    """Mean of the diagonal over that of the other cells of (F, F, ...) matrices. Infinite where these are 0,
+    NaN where all or any are NaN."""
     own = np.eye(len(moved), dtype=bool)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.divide(moved[own].mean(axis=0), moved[~own].mean(axis=0))

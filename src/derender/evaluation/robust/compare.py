@@ -190,8 +190,8 @@ class CurveResult:
 class RobustnessComparison:
     """Features side by side, a curve for each axis.
 
-    ``how`` is the source of other lights and views; ``kind`` and ``names`` are of the task, ``head`` and
-    ``seeds`` of the probes, ``n_learned`` their training rows by axis; ``n_dropped`` rows have no label.
+    ``how`` is the source of other lights and views. ``kind`` and ``names`` are of the task, ``head`` and
+    ``seeds`` of the probes, ``n_learned`` their training rows by axis. ``n_dropped`` rows have no label.
     """
 
     curves: tuple[CurveResult, ...]
@@ -268,8 +268,8 @@ def compare_robustness(
 ) -> RobustnessComparison:
     """Probe every row of features along every curve of a trial.
 
-    ``features`` holds by name one (M, D) array for each run of the same features, of all images of the trial;
-    of the (S,) seeds of training subsets, seed s uses run s modulo their number. ``controls`` are names of
+    ``features`` holds by name one (M, D) array for each run of the same features, of all images of the trial.
+    Of the (S,) seeds of training subsets, seed s uses run s modulo their number. ``controls`` are names of
     features that learned nothing, ``head`` one of ``PROBES``; resamples are of the units. ``progress`` is
     called with (probes done, probes in all).
     """

@@ -48,9 +48,9 @@ Progress = Callable[[int, int, str], object]
 class SegmentationRow:
     """One network or control.
 
-    ``scored`` holds ``COLUMNS`` with intervals and differences to the strongest control; ``class_iou`` is
-    (C,), a mean over runs, NaN for classes that no tested mask shows; ``trainable`` counts weights;
-    ``losses`` are (R, epochs), the mean of each epoch; ``shown`` are the first run's (K, S, S) answers for
+    ``scored`` holds ``COLUMNS`` with intervals and differences to the strongest control. ``class_iou`` is
+    (C,), a mean over runs, NaN for classes that no tested mask shows. ``trainable`` counts weights;
+    ``losses`` are (R, epochs), the mean of each epoch. ``shown`` are the first run's (K, S, S) answers for
     the comparison's ``shown`` images.
     """
 

@@ -1,7 +1,7 @@
 """Images with masks, divided into training and test images, and controls without a trained network.
 
 Controls learn from the training images only. Faces are aligned, so the most frequent class at a place already
-draws a face; skin, hair and background differ in colour; and principal components hold the pose of the face.
+draws a face. Skin, hair and background differ in colour; principal components hold the pose of the face.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -23,7 +23,7 @@ _CHUNK = 512
 class SegmentationData:
     """(N, 3, S, S) RGB images with (N, S, S) masks of class numbers, and the names of the classes.
 
-    ``train`` rows are learned from, ``test`` rows scored and no others ever; ``split`` is the rule in words,
+    ``train`` rows are learned from, ``test`` rows scored and no others ever. ``split`` is the rule in words;
     ``source`` and ``layout`` are of the data set.
     """
 
