@@ -1,8 +1,8 @@
 """DINOv2-small: a vision transformer that others trained.
 
 Source: Oquab et al., *DINOv2* (2023); weights facebook/dinov2-small (Apache-2.0), 22 million parameters,
-learnt on 142 million images, read through transformers from the user's Hugging Face cache or a folder, as
-safetensors only. Nothing is ever downloaded here.
+learnt on 142 million images. They are read through transformers from the user's Hugging Face cache or a
+folder, as safetensors only. Nothing is ever downloaded here.
 """
 
 from pathlib import Path

@@ -57,9 +57,9 @@ def ward_tree(features: np.ndarray, sizes: np.ndarray | None = None) -> np.ndarr
 
     With ``sizes``, (N,), each row is the mean of so many.
 
-    Columns: the two clusters merged (rows are 0..N-1, the k-th merge makes N+k), the distance at which
-    (sqrt(2ab/(a+b)) times the distance of the means, as SciPy), the number of rows. The means of N rows are
-    all it holds, and one block of distances.
+    Columns: the two clusters merged (rows are 0..N-1, the k-th merge makes N+k), their distance, the number
+    of rows. The distance is sqrt(2ab/(a+b)) times that of the means, as in SciPy. The means of N rows are all
+    it holds, and one block of distances.
     """
     means = finite_rows(features, "Ward clustering").astype(np.float64, copy=False)
     means = means - means.mean(axis=0)  # keeps the distances, and more of their digits

@@ -1,8 +1,8 @@
 """Sizes of the networks; image to code: strided convolutions down to 4x4 pixels, then one convolution to 1x1.
 
 Source: unsup3d's networks as pinned in the paper's appendix; the U-Net encoder is the one the paper swaps in
-for segmentation, the expanding half that of Ronneberger et al., MICCAI 2015. No convolution before
-a code has a bias. Input images are 0..1 and are moved to -1..1 here.
+for segmentation. Its expanding half is that of Ronneberger et al., MICCAI 2015. No convolution before a code
+has a bias. Input images are 0..1 and are moved to -1..1 here.
 """
 
 from collections.abc import Mapping, Sequence
