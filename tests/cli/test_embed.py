@@ -11,7 +11,7 @@ from PIL import Image
 from tests.cli.conftest import run
 
 from derender import Derenderer, FeatureTable
-from derender.data import decoding
+from derender.data import stream as decoding
 
 
 @pytest.fixture(autouse=True)

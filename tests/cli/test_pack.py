@@ -11,7 +11,7 @@ from derender.cli import main
 from derender.data.synthetic import faces
 from derender.evaluation.scenes import copy_cost
 from derender.model import load
-from derender.storage.packing import pack_model
+from derender.storage.sharing import pack_model
 
 FILES = ("model.safetensors", "whitening.safetensors", "fitting.safetensors")
 

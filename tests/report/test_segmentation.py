@@ -5,7 +5,7 @@ import pytest
 
 from derender.data import MASK_CLASSES
 from derender.report.panel import GridLayout
-from derender.report.segmentation import OPACITY, legend, overlays, palette, segmentation_sheet
+from derender.report.protocols import OPACITY, legend, overlays, palette, segmentation_sheet
 
 
 def test_every_class_has_a_colour_of_its_own():

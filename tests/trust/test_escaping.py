@@ -20,7 +20,7 @@ from derender.report.comparison import comparison_page
 from derender.report.doctor import doctor_page
 from derender.report.explanation import explanation_page, share_chart
 from derender.report.page import Page
-from derender.report.robustness import robustness_page
+from derender.report.protocols import robustness_page
 from derender.report.run import run_page
 from derender.training.config import resolve
 from derender.training.run_folder import append_metrics, start_run

@@ -374,7 +374,7 @@ def test_large_members_are_read_one_at_a_time(tmp_path, monkeypatch):
         return content
 
     monkeypatch.setattr(ZipSource, "read", counted)
-    monkeypatch.setattr("derender.data.decoding.LARGE_BYTES", 100_000)
+    monkeypatch.setattr("derender.data.stream.LARGE_BYTES", 100_000)
     assert len(read_images(tmp_path / "a.zip", 16, workers=2)) == 40 and most == 1
 
 

@@ -22,7 +22,7 @@ def pack(
     """
     from derender.evaluation.scenes import copy_cost
     from derender.inputs import as_model, copy_split
-    from derender.storage.packing import pack_model
+    from derender.storage.sharing import pack_model
 
     output.refuse_existing(out)
     original, chosen = model.open(), None

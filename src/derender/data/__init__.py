@@ -1,38 +1,46 @@
 """Images in: folders, zips, shards and published data sets, decoded once into one array or streamed.
 
-opening       from what the user wrote to a stream of images: open_images
-source, zip_source   named files
+opening       from what the user wrote to a stream of images: open_images; zip archives
+source        named files; parquet files, their sizes checked before they are read
 layouts/      how data sets lie: recognised, and read into a table of files and labels
-stream        images one after another; shards (WebDataset), huggingface
-image         decode one; decoding: a stream, on every core
-image_set     a stream collected into an array: read_images; cache: large sets in a memory map
+stream        images one after another, decoded on every core; shards (WebDataset), huggingface
+image         decode one
+image_set     a stream collected into an array: read_images; its split; cache: large sets in a memory map
 maps          images with masks, with exact depth, normals and albedo
-splits        which rows are for training, validation, test
-parquet       a parquet file, its size checked before it is read
 doctor/       whether a set of images suits the method
 """
 
 from derender.data.cache import cache_folder, sample_checksum
-from derender.data.decoding import (
-    Decoded,
-    Progress,
-    decode_samples,
-    decoded,
-    estimated_total,
-    usable_cores,
-)
 from derender.data.given import GivenImages, as_batch, as_photos, read_photo
 from derender.data.image import READER_VERSION, Unreadable, decode, decode_whole, quiet_pillow, read_image
-from derender.data.image_set import Duplicate, ImageSet, as_float, check_images, read_images
+from derender.data.image_set import (
+    Duplicate,
+    ImageSet,
+    Split,
+    as_float,
+    check_images,
+    read_images,
+    split_indices,
+)
 from derender.data.layouts import LAYOUTS
 from derender.data.layouts.celeba import MASK_CLASSES
 from derender.data.layouts.layout import HALVES, half_of, missing
 from derender.data.maps import GroundTruth, MaskedImages, read_ground_truth, read_masks
 from derender.data.opening import ListedStream, list_images, open_images, open_source, parse_source
-from derender.data.parquet import opened_parquet
-from derender.data.source import Skipped, is_image
-from derender.data.splits import Split, split_indices
-from derender.data.stream import Kinds, Sample, Stream, Value, column_of
+from derender.data.source import Skipped, is_image, opened_parquet
+from derender.data.stream import (
+    Decoded,
+    Kinds,
+    Progress,
+    Sample,
+    Stream,
+    Value,
+    column_of,
+    decode_samples,
+    decoded,
+    estimated_total,
+    usable_cores,
+)
 from derender.storage.places import nearest_sibling, suggestion
 
 __all__ = [

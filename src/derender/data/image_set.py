@@ -1,13 +1,18 @@
-"""From any source to one array of decoded images with their labels: ``read_images``.
+"""From any source to one array of decoded images with their labels: ``read_images``; and its split.
 
 A stream of samples is decoded in order on every core. What is known to fit lies in memory. Everything else is
 appended to a cache file, decoded once, and mapped into memory: training has random access. Besides its
 pixels, an image takes its name, its labels and about 200 bytes that find copies.
+
+A split into train, validation and test is the same on every machine. Files are put in the order of a hash of
+their name and the seed, and that order is cut: it depends on neither the file system nor a random generator's
+version, and counts are exact. An image added later moves only those few that lie at a cut. With groups
+(identities), whole groups are ordered and cut: no person is on two sides.
 """
 
 import hashlib
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -20,13 +25,69 @@ from jaxtyping import Float, Shaped, UInt8
 from torch import Tensor
 
 from derender.data.cache import cache_file, cache_folder, read_cache, write_cache
-from derender.data.decoding import Decoded, Progress, decoded, estimated_total
 from derender.data.image import READER_VERSION, Unreadable, check_fit, quiet_pillow
 from derender.data.layouts.layout import Labels, missing, text_column
 from derender.data.opening import open_images
 from derender.data.source import Skipped
-from derender.data.stream import Kinds, Stream, Value, column_of
+from derender.data.stream import Decoded, Kinds, Progress, Stream, Value, column_of, decoded, estimated_total
 from derender.storage.places import suggestion
+
+
+@dataclass(frozen=True)
+class Split:
+    """Three disjoint, sorted arrays of row numbers that together are all rows."""
+
+    train: np.ndarray
+    validation: np.ndarray
+    test: np.ndarray
+
+
+def split_indices(
+    files: int | Sequence[str],
+    fractions: tuple[float, float, float] = (0.8, 0.1, 0.1),
+    *,
+    seed: int = 0,
+    groups: Sequence[object] | np.ndarray | None = None,
+) -> Split:
+    """Split rows, given by their file names (or only their number), in these fractions.
+
+    Without groups the three counts are the fractions of the total, made whole. With groups, each cut is the
+    one between groups that comes nearest. A group "" or NaN is unknown: such rows stand alone.
+    """
+    if any(not 0 <= fraction <= 1 for fraction in fractions) or abs(sum(fractions) - 1) > 1e-6:
+        raise ValueError(f"split fractions must be three numbers in 0..1 that add up to 1, got {fractions}")
+    names = [str(row) for row in range(files)] if isinstance(files, int) else list(files)
+    keys = names
+    if groups is not None:
+        if len(groups) != len(names):
+            raise ValueError(f"expected one group for each of {len(names)} images, got {len(groups)}")
+        alone = [str(group) in ("", "nan") for group in groups]
+        rows = zip(names, groups, alone, strict=True)
+        keys = [f"file {name}" if single else f"group {group}" for name, group, single in rows]
+    members: dict[str, list[int]] = {}
+    for row, key in enumerate(keys):
+        members.setdefault(key, []).append(row)
+
+    def digest(key: str) -> bytes:
+        return hashlib.sha256(f"{seed}\0{key}".encode("utf-8", "surrogateescape")).digest()
+
+    ordered = sorted(members, key=digest)
+    ends = np.cumsum([0, *(len(members[key]) for key in ordered)])
+    targets = np.cumsum(_counts(len(names), fractions))
+    cuts = [int(np.abs(ends - end).argmin()) for end in targets[:2]]
+    parts = (ordered[: cuts[0]], ordered[cuts[0] : cuts[1]], ordered[cuts[1] :])
+    return Split(*(np.array(sorted(row for key in part for row in members[key]), np.int64) for part in parts))
+
+
+def _counts(total: int, fractions: tuple[float, float, float]) -> list[int]:
+    """Whole numbers in these proportions that add up to the total (largest remainders round up)."""
+    exact = [total * fraction for fraction in fractions]
+    counts = [int(value + 1e-9) for value in exact]
+    by_remainder = sorted(range(3), key=lambda part: counts[part] - exact[part])
+    for part in by_remainder[: total - sum(counts)]:
+        counts[part] += 1
+    return counts
+
 
 MEMORY_LIMIT_BYTES = 2 << 30
 """Sets larger than this (175,000 images of 64 x 64) lie in a memory-mapped file instead of memory."""

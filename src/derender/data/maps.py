@@ -20,7 +20,6 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 from PIL import Image
 
-from derender.data.decoding import Progress, usable_cores
 from derender.data.image import fit_square, opened_image, quiet_pillow, upright_size
 from derender.data.image_set import ImageSet, read_images
 from derender.data.layouts.celeba import MASK_CLASSES, parts_of
@@ -28,6 +27,7 @@ from derender.data.layouts.layout import Labels, Table, half_of, stem_of
 from derender.data.layouts.rendered import CAMERA, DEPTH_PAIRS, LIGHT, SYNFACE, pairs_of, rendered_folders
 from derender.data.opening import list_images, open_source, parse_source
 from derender.data.source import Source
+from derender.data.stream import Progress, usable_cores
 from derender.storage.bounded import read_bounded
 
 CLASSES_FILE = "classes.txt"

@@ -1,7 +1,7 @@
 """The whole story on built-in data: generate faces, train, score unseen ones beside controls, write one page.
 
-story   runs it and gives the measured values; page turns them into a report;
-opening shows edited photographs before anything is trained
+story runs it, shows edited photographs before anything is trained, and gives the measured values; page turns
+them into a report
 """
 
 from derender.demo.page import demo_page

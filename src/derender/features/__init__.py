@@ -1,7 +1,7 @@
 """Features extracted once, kept in one table, scored many times.
 
 table: the value; parquet: its file; extract: model and images in, features out; transformer: the same for
-scikit-learn; embedding: any images to a table in memory or a file (blocks, parts: its halves); neighbours:
+scikit-learn; embedding: any images to a table in memory or a file (blocks: on the way there); neighbours:
 nearest rows by one factor.
 """
 

@@ -1,8 +1,8 @@
 """Which factor made an answer, and where in the image it was seen.
 
 probe: label columns as a question, and a linear probe of it; attribution: integrated gradients by factor,
-maps over the image and their sanity check; explanation: shares over seeds beside controls; grouping: parts
-of clusters and pairs; tables: all of it as tables.
+maps over the image and their sanity check; explanation: shares over seeds beside controls; tables: all of
+it as tables, and parts of clusters and pairs.
 """
 
 from derender.interpretation.explanation import Explained, explain, explain_labels

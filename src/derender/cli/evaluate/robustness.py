@@ -57,7 +57,7 @@ def robustness(
         )  # fmt: skip
     published.publish(scores, models=model)
     if out is not None:
-        from derender.report.robustness import write_curves
+        from derender.report.protocols import write_curves
 
         write_curves(scores.result, shown, ", ".join(model), out)
         result(f"curves in {out}", published.json_file)

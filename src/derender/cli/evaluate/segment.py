@@ -46,7 +46,7 @@ def segment(
             memory=memory, progress=report,
         )  # fmt: skip
     if out is not None:
-        from derender.report.segmentation import write_overlays
+        from derender.report.protocols import write_overlays
 
         result(f"overlays {write_overlays(scores.result, out)}", published.json_file)
     published.publish(scores, memory, "runs", model=trained.model)

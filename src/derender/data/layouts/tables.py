@@ -30,8 +30,7 @@ from derender.data.layouts.layout import (
     stem_of,
     text_column,
 )
-from derender.data.parquet import opened_parquet
-from derender.data.source import FileSource, Skipped, Source, is_image
+from derender.data.source import FileSource, Skipped, Source, is_image, opened_parquet
 
 TABLE_SUFFIXES = (".csv", ".parquet")
 PATH_COLUMNS = ("file", "path", "image", "file_name", "filename")

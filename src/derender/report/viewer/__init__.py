@@ -4,8 +4,7 @@ questions   requests of the page, checked; uploads to pixels
 studio      requests to images, meshes and archives, without HTTP
 shelf       opened images, in memory only
 neighbours  images to begin with; rows of a feature table near to an image
-uploads     bodies as they arrive, within a bound of memory
-guard       hosts, origins and headers that the server accepts
+guard       hosts, origins and headers that the server accepts; bodies, within a bound of memory
 app         addresses, and bounds on size and time
 server      a socket, and uvicorn on it
 page/       HTML, CSS and JavaScript, which need nothing from elsewhere
