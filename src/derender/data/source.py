@@ -5,7 +5,7 @@ can write anywhere. Nested archives are not opened. A folder is walked once: hid
 left out, and links are followed, each real folder once, so that loops end.
 
 A parquet file is opened only if what its footer claims can be. Readers reserve memory for as many rows as the
-footer names: one changed byte of a file of 2 kB can ask for 18 GB. Leaves out the pages behind the footer, and
+footer names: one changed byte of a file of 2 kB can ask for 18 GB. Leaves out the pages behind the footer and
 the columns of single row groups: of a damaged footer pyarrow 26 looks at those with C++ exceptions that end
 the process.
 """
