@@ -126,29 +126,20 @@ def held_out(x: np.ndarray, y: np.ndarray, *, folds: int = 5, seed: int = 0) -> 
     return predicted
 
 
-def fit_predict(
-    x: np.ndarray, y: np.ndarray, x_new: np.ndarray, penalties: tuple[float, ...] = PENALTIES
-) -> np.ndarray:
+def fit_predict(x: np.ndarray, y: np.ndarray, x_new: np.ndarray) -> np.ndarray:
     """Ridge with an intercept from (N, D) to (N, T), applied to (M, D): (M, T) predictions.
 
-    ``penalties`` are relative to the mean squared singular value of the centred features; each target gets
-    the one with the smallest leave-one-out error.
+    ``PENALTIES`` are relative to the mean squared singular value of the centred features that is not 0.
     """
-    x_mean, y_mean = x.mean(axis=0), y.mean(axis=0)
-    u, power, back = _decomposed(x - x_mean)
-    centred = y - y_mean
-    projected = u.T @ centred
-    square, full = np.square(u), np.square(centred).sum(axis=0)
-    best, chosen = np.full(y.shape[1], np.inf), np.zeros_like(projected)
-    for penalty in penalties if len(power) else ():
-        shrink = (power / (power + penalty * power.mean()))[:, None]
-        leverage = square @ shrink + 1 / len(x)
-        left = centred - u @ (shrink * projected)
-        error = np.square(left / np.maximum(1 - leverage, 1e-9)).sum(axis=0)
-        better = (error < best) & (full > 0)
-        best = np.where(better, error, best)
-        chosen = np.where(better, shrink * projected, chosen)
-    return y_mean + (x_new - x_mean) @ (back @ chosen)
+    from sklearn.linear_model import RidgeCV
+
+    centred = x - x.mean(axis=0)
+    power = np.linalg.eigvalsh(centred @ centred.T if x.shape[1] > len(x) else centred.T @ centred)
+    alive = power > 1e-11 * max(power[-1], 1e-300)
+    if not alive.any():
+        return np.tile(y.mean(axis=0), (len(x_new), 1))
+    ridge = RidgeCV(np.array(PENALTIES) * power[alive].mean(), alpha_per_target=True)
+    return ridge.fit(x, y).predict(x_new).reshape(len(x_new), -1)
 
 
 def side_by_side(features: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -166,21 +157,6 @@ def side_by_side(features: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
                 f"feature {name!r}: {bad} of {len(values)} rows are not finite: drop them or check the model"
             )
     return blocks
-
-
-def _decomposed(x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Left singular vectors (N, R), squared singular values (R,), and (D, R) from coefficients of the former
-    to weights of the dimensions, of centred features. From the smaller Gram matrix, several times as fast as
-    the decomposition of x; directions with less than 1e-11 of the strongest's power are dropped.
-    """
-    wide = x.shape[1] > len(x)
-    power, vectors = np.linalg.eigh(x @ x.T if wide else x.T @ x)
-    keep = power > 1e-11 * max(power[-1], 1e-300)
-    power, vectors = power[keep], vectors[:, keep]
-    if wide:
-        return vectors, power, x.T @ (vectors / power)
-    root = np.sqrt(power)
-    return x @ (vectors / root), power, vectors / root
 
 
 def _centred(values: np.ndarray) -> np.ndarray:
