@@ -19,6 +19,7 @@ import tempfile
 import textwrap
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from statistics import fmean, stdev
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -242,15 +243,48 @@ def renderer_speed(found: Any) -> Iterator[list[str]]:
 
 
 def renderers_trained(found: Any) -> Iterator[list[str]]:
-    """Errors of models trained with each renderer, by effect, mean over seeds."""
-    yield ["effect in the images, renderer", "normals, degrees", "albedo error", "L1", "seeds"]
+    """Errors of models trained with each renderer, by effect: mean and standard deviation over seeds."""
+    digits = {"normal_deg": 1, "albedo": 3, "albedo_chroma": 4, "l1": 4}
+    titles = ("normals, degrees", "albedo error", "chroma error", "L1", "seeds")
+    yield ["effect in the images: renderer", *titles]
+    for (effect, name), ones in _trained(found).items():
+        means = (_spread([one[key] for one in ones], n) for key, n in digits.items())
+        yield [f"{effect}: {name}", *means, ", ".join(str(one["seed"]) for one in ones)]
+
+
+def effect_numbers(found: Any) -> Iterator[list[str]]:
+    """Rank correlation and median errors of an effect's own numbers in trained models."""
+    yield ["number, renderer", "rank correlation", "median error", "after the best line", "of a constant"]
+    ends = ("spearman", "median_error", "median_error_of_line", "median_error_of_constant")
+    for (_, name), ones in _trained(found).items():
+        for number in [key.removesuffix("_spearman") for key in ones[0] if key.endswith("_spearman")]:
+            means = (_spread([one[f"{number}_{end}"] for one in ones], 2) for end in ends)
+            yield [f"{number.replace('_', ' ')}: {name}", *means]
+
+
+def _trained(found: Any) -> dict[tuple[str, str], list[Any]]:
+    """Cells of every seed by effect and renderer, in the order of a table."""
     groups: dict[tuple[str, str], list[Any]] = {}
-    for one in found["cells"]:
+    order = ["none", "shadows", "gloss", "lamps", "haze"]
+    for one in sorted(found["cells"], key=lambda one: (order.index(one["effect"]), one["seed"])):
         groups.setdefault((one["effect"], one["renderer"]), []).append(one)
-    for (effect, name), ones in groups.items():
-        digits = {"normal_deg": 1, "albedo": 3, "l1": 4}
-        means = (f"{sum(one[key] for one in ones) / len(ones):.{n}f}" for key, n in digits.items())
-        yield [f"{effect}: {name}", *means, str(len(ones))]
+    return groups
+
+
+def _spread(values: list[float], digits: int) -> str:
+    text = f"{fmean(values):.{digits}f}"
+    return text if len(values) < 2 else f"{text} ± {stdev(values):.{digits}f}"
+
+
+def renderers_yale(found: Any) -> Iterator[list[str]]:
+    """Residuals by the light's angle, and its azimuth and elevation, of scenes fitted to Extended Yale B."""
+    residuals = {"L1 to 25°": "0_25", "25° to 50°": "25_50", "50° to 77°": "50_78"}
+    yield ["renderer", *residuals, *(f"{what}: r, error" for what in ("azimuth", "elevation"))]
+    for one in found["cells"]:
+        shown = [f"{one[f'residual_{span}']:.4f}" for span in residuals.values()]
+        for what in ("azimuth", "elevation"):
+            shown.append(f"{one[f'{what}_correlation']:.3f}, {one[f'{what}_mean_error_deg']:.1f}°")
+        yield [one["renderer"], *shown]
 
 
 def million_rows(found: Any) -> Iterator[list[str]]:
@@ -329,6 +363,8 @@ SPEED: dict[str, tuple[str, Callable[[Any], Iterator[list[str]]]]] = {
     "renderers": ("renderers_fit.json", renderers),
     "renderers-speed": ("renderers_speed.json", renderer_speed),
     "renderers-train": ("renderers_train.json", renderers_trained),
+    "renderers-numbers": ("renderers_train.json", effect_numbers),
+    "renderers-yale": ("renderers_yaleb.json", renderers_yale),
     "table-million": ("table_million.json", million_rows),
     "view": ("view.json", page_speed),
     "align": ("align.json", aligned),

@@ -12,6 +12,8 @@ from derender.render import render_scene
 from derender.renderers import RENDERERS, Renderer, recorded_renderer, renderer_named
 from derender.scene import Scene
 from derender.storage.places import CONFIG_FILE
+from derender.training.config import to_yaml
+from derender.training.run_folder import reopen_run
 
 TINY = {"image_size": 32, "width": 8, "light_width": 4}
 ALL = "phong(gamma=2.2)+lambert-shadow(softness_deg=8)+haze"
@@ -94,6 +96,12 @@ def test_settings_of_a_run_name_renderer_and_factors():
         run_settings(renderer="phng")
     with pytest.raises(ValueError, match="made with the renderer 'lambert', not 'haze'"):
         run_settings(renderer="haze", start_from="faces-64")
+
+
+def test_a_run_is_resumed_with_its_renderer(tmp_path):
+    (tmp_path / "config.yaml").write_text(to_yaml(run_settings(preset="small", renderer="phong+haze")))
+    with pytest.raises(ValueError, match=r"trained with another model\.renderer \(phong\+haze, now haze\)"):
+        reopen_run(tmp_path, run_settings(preset="small", renderer="haze"))
 
 
 def _scene(**extra) -> Scene:

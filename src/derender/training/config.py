@@ -260,7 +260,7 @@ def resolve(preset: str, overrides: Iterable[str] = (), **explicit: Any) -> Trai
 
 def with_changes(config: Config, overrides: Iterable[str] = (), **explicit: Any) -> Config:
     """The same kind of configuration with changes as in ``resolve``."""
-    leaves = _leaves(config.model_dump(mode="json"))
+    leaves = settings_by_name(config.model_dump(mode="json"))
     changes: list[tuple[str, Any]] = []
     for override in overrides:
         key, equals, text = override.partition("=")
@@ -299,12 +299,12 @@ def to_yaml(config: Settings) -> str:
 
 def as_overrides(tree: Mapping[str, Any]) -> list[str]:
     """Plain values, nested or with dotted keys, as the ``key=value`` that ``with_changes`` takes."""
-    return [f"{key}={json.dumps(value)}" for key, value in _leaves(tree).items()]
+    return [f"{key}={json.dumps(value)}" for key, value in settings_by_name(tree).items()]
 
 
 def setting_names(kind: type[Settings] = TrainConfig) -> list[str]:
     """Every setting by its dotted name."""
-    return list(_leaves(kind().model_dump(mode="json")))
+    return list(settings_by_name(kind().model_dump(mode="json")))
 
 
 def without_removed(tree: dict[str, Any]) -> dict[str, Any]:
@@ -335,12 +335,12 @@ def _read_value(text: str) -> Any:
     return value
 
 
-def _leaves(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+def settings_by_name(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Values by dotted name."""
     leaves: dict[str, Any] = {}
     for key, value in tree.items():
         name = f"{prefix}{key}"
-        leaves |= _leaves(value, f"{name}.") if isinstance(value, dict) else {name: value}
+        leaves |= settings_by_name(value, f"{name}.") if isinstance(value, dict) else {name: value}
     return leaves
 
 

@@ -24,7 +24,7 @@ from derender.storage.bounded import (
     read_bounded,
     read_text,
 )
-from derender.training.config import TrainConfig, config_from_tree, to_yaml, without_removed
+from derender.training.config import TrainConfig, config_from_tree, settings_by_name, to_yaml, without_removed
 from derender.training.process import LOCK_FILE
 
 FORMAT = 1
@@ -83,11 +83,12 @@ def reopen_run(path: Path, config: Settings) -> RunFolder:
     run = RunFolder(path)
     if not run.config.is_file():
         raise FileNotFoundError(f"no run to resume in {path} (no config.yaml): train without --resume first")
-    stored = read_config(path, type(config)).model_dump(mode="json")
-    for key, asked in config.model_dump(mode="json").items():
-        if key not in _MAY_CHANGE_ON_RESUME and asked != stored[key]:
+    both = (one.model_dump(mode="json") for one in (read_config(path, type(config)), config))
+    stored, asked = map(settings_by_name, both)
+    for key in {**stored, **asked}:
+        if key.partition(".")[0] not in _MAY_CHANGE_ON_RESUME and asked.get(key) != stored.get(key):
             raise ValueError(
-                f"{path} was trained with another {key} ({stored[key]}, now {asked}): "
+                f"{path} was trained with another {key} ({stored.get(key)}, now {asked.get(key)}): "
                 "resume with the same settings, or start a new run in another folder"
             )
     for written in (run.last, run.best, run.model, run.config, run.metrics, run.perceptual):
