@@ -7,6 +7,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.special import expit, softmax
 from sklearn.linear_model import LogisticRegression
 from sklearn.metrics import accuracy_score, average_precision_score, balanced_accuracy_score
 from sklearn.neighbors import KNeighborsClassifier
@@ -19,12 +20,10 @@ from derender.evaluation.linear_probes import (
     HEADS,
     PROBES,
     HeadSettings,
-    axes_of,
-    fit_logistic,
+    logistic_weights,
     majority_answers,
     nearest_answers,
     probe,
-    solve_logistic,
     train_heads,
 )
 from derender.evaluation.linear_probing import compare_linear, count_scores, linear_scores
@@ -153,33 +152,31 @@ def test_penalised_regression_is_scikit_learns(kind, rows, dimensions):
     features[:, 0] = 3.0  # a constant tells nothing
     classes = (features[:, 1] / features[:, 1].std() + rng.normal(size=rows + 20) * 0.3).argsort().argsort()
     targets = (classes[:, None] * 3 // len(classes) == np.arange(3)).astype(np.int8)
-    axes = axes_of(features[:rows])
-    inside, c = axes.apply(features), np.array([0.3, 20.0])
-    every = np.ones((rows, 2), bool)
-    weights = solve_logistic(inside[:rows], targets[:rows], every, c, kind, tolerance=1e-8)
-    standard = (features - axes.mean) / axes.scale
-    for at, penalty in enumerate(c):
-        logits = inside @ weights[:-1, at] + weights[-1, at]
-        oracle = LogisticRegression(C=penalty, tol=1e-9, max_iter=10_000)
+    deviation = features[:rows].std(axis=0) * (dimensions - 1) ** 0.5
+    deviation[0] = np.inf
+    standard = (features - features[:rows].mean(axis=0)) / deviation
+    for penalty in (0.3, 20.0):
+        how = {"kind": kind, "penalties": (penalty,), "folds": 2}
+        weight, bias, _ = logistic_weights(features[:rows], targets[:rows], **how)
+        logits, oracle = features @ weight + bias, LogisticRegression(C=penalty, tol=1e-9, max_iter=10_000)
         if kind == "classes":
             expected = oracle.fit(standard[:rows], targets[:rows].argmax(axis=1)).predict_proba(standard)
-            found = np.exp(logits) / np.exp(logits).sum(axis=1, keepdims=True)
-            np.testing.assert_allclose(found, expected, atol=2e-4)
+            np.testing.assert_allclose(softmax(logits, axis=1), expected, atol=2e-4)
         else:
             for label in range(3):
                 expected = oracle.fit(standard[:rows], targets[:rows, label]).predict_proba(standard)[:, 1]
-                np.testing.assert_allclose(1 / (1 + np.exp(-logits[:, label])), expected, atol=2e-4)
+                np.testing.assert_allclose(expit(logits[:, label]), expected, atol=2e-4)
 
 
 def test_each_label_gets_the_penalty_that_plain_cross_validation_chooses():
     features, columns = problem(100, seed=2)
     targets, grid = task_of(columns).targets, (1e-3, 1e-1, 10.0)
     targets[5, 0] = -1
-    answers, chosen = fit_logistic(
-        features[:60], targets[:60], features[60:], kind="labels", penalties=grid, folds=4
-    )
-    axes, fold = axes_of(features[:60]), np.random.default_rng(0).permutation(60) % 4
-    standard = (features - axes.mean) / axes.scale
+    how = {"kind": "labels", "penalties": grid, "folds": 4}
+    weight, bias, chosen = logistic_weights(features[:60], targets[:60], **how)
+    answers, fold = expit(features[60:] @ weight + bias), np.random.default_rng(0).permutation(60) % 4
+    learned_from = features[:60]
+    standard = (features - learned_from.mean(axis=0)) / (learned_from.std(axis=0) * features.shape[1] ** 0.5)
     for label in range(3):
         known = targets[:60, label] >= 0
         losses = []

@@ -21,7 +21,6 @@ only two matrix products each. A solved regression drops out.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -93,7 +92,7 @@ def probe(
     def answers(own: np.ndarray, seed: int) -> np.ndarray:
         if head == "k-NN":
             return nearest_answers(features[own], targets[own], features[tested])
-        return fit_logistic(features[own], targets[own], features[tested], kind=kind, seed=seed)[0]
+        return logistic_answers(features[own], targets[own], features[tested], kind=kind, seed=seed)
 
     def make() -> np.ndarray:
         if papers:
@@ -215,25 +214,9 @@ def probabilities(logits: Tensor, kind: str) -> Tensor:
     return logits.softmax(dim=-1) if kind == "classes" else logits.sigmoid()
 
 
-@dataclass(frozen=True)
-class Axes:
-    """How features become what is regressed on: standardised, scaled, rotated."""
-
-    mean: np.ndarray
-    scale: np.ndarray
-    rotation: np.ndarray
-
-    def apply(self, features: np.ndarray) -> np.ndarray:
-        """(N, D) features as (N, R)."""
-        found = np.empty((len(features), self.rotation.shape[1]))
-        for start in range(0, len(features), BLOCK_ROWS):
-            block = np.asarray(features[start : start + BLOCK_ROWS], np.float64)
-            found[start : start + BLOCK_ROWS] = ((block - self.mean) / self.scale) @ self.rotation
-        return found
-
-
-def axes_of(features: np.ndarray) -> Axes:
-    """Fit to (n, D) training rows; R is their rank."""
+def rotated(features: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(n, D) rows standardised, scaled and rotated to (n, R) for their rank R; their mean; (D, R) the way
+    back from weights."""
     features = np.asarray(features, np.float64)
     mean, deviation = features.mean(axis=0), features.std(axis=0)
     scale = np.where(deviation > 1e-8 * max(deviation.max(), 1e-300), deviation, np.inf)
@@ -242,46 +225,53 @@ def axes_of(features: np.ndarray) -> Axes:
     wide = rows.shape[0] < rows.shape[1]
     value, vector = np.linalg.eigh(rows @ rows.T if wide else rows.T @ rows)
     kept = value > max(value.max(), 0) * 1e-10
-    vector = vector[:, kept]
-    return Axes(mean, scale, rows.T @ (vector / np.sqrt(value[kept])) if wide else vector)
+    rotation = rows.T @ (vector[:, kept] / np.sqrt(value[kept])) if wide else vector[:, kept]
+    return rows @ rotation, mean, rotation / scale[:, None]
 
 
-def fit_logistic(
+def logistic_weights(
     features: np.ndarray,
     targets: np.ndarray,
-    tested: np.ndarray,
     *,
     kind: str,
     penalties: Sequence[float] = PENALTIES,
     folds: int = FOLDS,
     seed: int = 0,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Choose C on the training rows alone, fit on all of them, answer for (T, D) others.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Choose C by cross-validation and fit on all rows: (D, A) weights, (A,) biases, and the chosen C.
 
     ``features`` are (n, D), ``targets`` (n, A) in -1 (unknown), 0, 1, one-hot for classes. Of kind "labels"
-    each label has its C, of "classes" all have one. Returns (T, A) probabilities, and the chosen C: (A,) or
-    (1,).
+    each label has its C, (A,), of "classes" all have one, (1,).
     """
     if len(features) < folds or folds < 2:
         raise ValueError(
             f"{len(features)} rows cannot be cut into {folds} folds: a penalty is chosen on {max(folds, 2)} "
             "labelled rows or more; give more, or choose the linear or the k-NN head"
         )
-    axes = axes_of(features)
-    rows, labels = axes.apply(features), np.asarray(targets, np.float64)
+    (rows, mean, back), labels = rotated(features), np.asarray(targets, np.float64)
     fold = np.random.default_rng(seed).permutation(len(rows)) % folds
     learned = np.repeat([fold != number for number in range(folds)], len(penalties), axis=0).T
     single, c = rows.astype(np.float32), np.tile(np.asarray(penalties, np.float64), folds)
     weights = solve_logistic(single, labels, learned, c, kind, tolerance=1e-3)
-    loss = _losses(_logits(single, weights), labels, kind)  # (n, problems, A or 1)
-    loss = np.where(learned[:, :, None], 0.0, loss).reshape(len(rows), folds, len(penalties), -1)
-    chosen = np.asarray(penalties)[loss.sum(axis=(0, 1)).argmin(axis=0)]  # (A,) or (1,)
+    logits = np.tensordot(single, weights[:-1], axes=1) + weights[-1]  # (n, problems, A)
+    loss = np.where(learned[:, :, None], 0.0, _losses(logits, labels, kind))
+    loss = loss.reshape(len(rows), folds, len(penalties), -1)
+    chosen = np.asarray(penalties)[loss.sum(axis=(0, 1)).argmin(axis=0)]
     distinct, own = np.unique(chosen, return_inverse=True)
-    every = np.ones((len(rows), len(distinct)), bool)
-    answer = _logits(axes.apply(tested), solve_logistic(rows, labels, every, distinct, kind))
-    if kind == "classes":
-        return softmax(answer[:, own[0]], axis=1), chosen
-    return expit(answer[:, own, np.arange(labels.shape[1])]), chosen
+    found = solve_logistic(rows, labels, np.ones((len(rows), len(distinct)), bool), distinct, kind)
+    picked = found[:, own, np.arange(labels.shape[1])] if kind == "labels" else found[:, own[0]]
+    weight = back @ picked[:-1]
+    return weight, picked[-1] - mean @ weight, chosen
+
+
+def logistic_answers(
+    features: np.ndarray, targets: np.ndarray, tested: np.ndarray, *, kind: str, seed: int = 0
+) -> np.ndarray:
+    """(T, A) probabilities of ``logistic_weights`` for (T, D) others."""
+    weight, bias, _ = logistic_weights(features, targets, kind=kind, seed=seed)
+    blocks = np.array_split(tested, len(tested) // BLOCK_ROWS + 1)
+    logits = np.concatenate([np.asarray(block, np.float64) @ weight for block in blocks]) + bias
+    return softmax(logits, axis=1) if kind == "classes" else expit(logits)
 
 
 def solve_logistic(
@@ -296,7 +286,7 @@ def solve_logistic(
 ) -> np.ndarray:
     """Solve P regressions on parts of the same rows: (R + 1, P, A) weights, the intercept last.
 
-    ``rows`` are (n, R), centred, with columns orthogonal to each other (from ``axes_of``). ``learned``, (n,
+    ``rows`` are (n, R), centred, with columns orthogonal to each other (from ``rotated``). ``learned``, (n,
     P) bool, are those that each regression learns from, ``c`` (P,) penalties. It stops when the scaled
     gradient is below ``tolerance`` of its start, or after ``most_steps``.
     """
@@ -336,11 +326,6 @@ def solve_logistic(
                 return found
     found[:, left] = weights
     return found
-
-
-def _logits(rows: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """(N, P, A) logits of (N, R) rows."""
-    return np.tensordot(rows, weights[:-1], axes=1) + weights[-1]
 
 
 def _losses(logits: np.ndarray, targets: np.ndarray, kind: str) -> np.ndarray:

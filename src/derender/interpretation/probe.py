@@ -21,10 +21,8 @@ from derender.data import suggestion
 from derender.evaluation.linear_probes import (
     PAPER_HEAD,
     HeadSettings,
-    axes_of,
-    fit_logistic,
     fitted_heads,
-    solve_logistic,
+    logistic_weights,
 )
 from derender.evaluation.linear_task import Task, task_of
 from derender.features import missing
@@ -240,7 +238,9 @@ def fit_probe(
     sizes = {name: values.shape[1] for name, values in features.items()}
     x, y = np.concatenate(list(features.values()), axis=1)[rows], task.targets[rows]
     if head == "logistic":
-        weight, bias = _logistic(x, y, task.kind, seed)
+        how = {"kind": task.kind, "penalties": PENALTIES, "folds": min(FOLDS, len(x)), "seed": seed}
+        weight, bias, _ = logistic_weights(x, y, **how)
+        weight = weight.T
     else:
         how = {"kind": task.kind, "seeds": [seed], "settings": settings}
         _, found, start = fitted_heads(x, y, np.arange(len(x))[None], **how)
@@ -248,15 +248,3 @@ def fit_probe(
     if task.kind == "classes":
         weight, bias = weight - weight.mean(axis=0), bias - bias.mean()
     return Probe(task.kind, task.names, sizes, weight.astype(np.float32), bias.astype(np.float32), head)
-
-
-def _logistic(x: np.ndarray, targets: np.ndarray, kind: str, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    folds = min(FOLDS, len(x))
-    _, chosen = fit_logistic(x, targets, x[:1], kind=kind, penalties=PENALTIES, folds=folds, seed=seed)
-    axes, distinct = axes_of(x), np.unique(chosen)
-    every = np.ones((len(x), len(distinct)), bool)
-    found = solve_logistic(axes.apply(x), targets.astype(np.float64), every, distinct, kind)
-    own, answers = np.searchsorted(distinct, chosen), np.arange(targets.shape[1])
-    picked = found[:, own, answers] if kind == "labels" else found[:, own[0]]  # (R + 1, A)
-    weight = (axes.rotation @ picked[:-1]) / axes.scale[:, None]
-    return weight.T, picked[-1] - axes.mean @ weight
