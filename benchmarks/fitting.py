@@ -56,6 +56,10 @@ def main() -> None:
     if not same:
         raise SystemExit("the fitted coordinates differ: nothing is reported")
     fitting["ms_per_image"] = 1000 * fitting["now_s"] / len(few)
+    began = time.process_time()
+    for _ in range(10):
+        model.decompose(few)
+    fitting["feed_forward_ms_per_image"] = 100 * (time.process_time() - began) / len(few)
     files = tuple(f"{number:03d}.png" for number in range(options.scored))
     images = ImageSet(images=pixels[: options.scored], files=files)
     scoring, (old, new) = in_turns(lambda: disentangle(model, images, seeds=(0,)).values["rows"], 1)

@@ -196,9 +196,18 @@ def million(found: Any) -> Iterator[list[str]]:
 
 
 def shares(found: Any) -> Iterator[list[str]]:
-    yield ["ratio, median of five rounds", "ratio", "least to most"]
+    yield ["median of five rounds", "ratio", "least to most", "images or rows a second"]
     for row in found["rows"]:
-        yield [row["what"], f"{row['ratio']:.2f}", f"{row['least']:.2f} to {row['most']:.2f}"]
+        speeds = f"{row['ours_per_second']:,.0f} / {row['theirs_per_second']:,.0f}"
+        yield [row["what"], f"{row['ratio']:.2f}", f"{row['least']:.2f} to {row['most']:.2f}", speeds]
+
+
+def fitting(found: Any) -> Iterator[list[str]]:
+    yield [f"{found['images']} scenes of 64 pixels, one thread", "CPU ms an image"]
+    before = 1000 * found["fit"]["portions_of_4_s"] / found["images"]
+    yield ["feed-forward", f"{found['fit']['feed_forward_ms_per_image']:.1f}"]
+    yield [f"optimised for {found['steps']} steps, portions of 64", f"{found['fit']['ms_per_image']:.1f}"]
+    yield [f"optimised for {found['steps']} steps, portions of four", f"{before:.1f}"]
 
 
 def scored(columns: dict[str, tuple[str, float, int]], *where: str) -> Callable[[Any], Iterator[list[str]]]:
@@ -352,6 +361,7 @@ SPEED: dict[str, tuple[str, Callable[[Any], Iterator[list[str]]]]] = {
     "step-memory": ("step_memory.json", step_memory),
     "million": ("clustering_million.json", million),
     "bench": ("bench.json", shares),
+    "fitting": ("fitting.json", fitting),
     "heads-generated": ("generated/heads.json", scored(DEPTH, "intervals", "geometry")),
     "factors-generated": ("generated/heads.json", scored(FACTORS, "intervals", "factors")),
     "brightness-generated": ("generated/brightness.json", scored(BRIGHTNESS, "brightness")),

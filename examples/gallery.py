@@ -5,7 +5,8 @@
     .venv/bin/python examples/gallery.py --only swap                 # one picture
 
 Every picture is evenly spaced through its data and none is chosen. Only rendered or generated data belongs
-here: show no image of a real person. Look at the pictures before you commit them.
+here: show no image of a real person. Look at the pictures before you commit them. `faces-128` draws generated
+heads no better than these models, and its edits in a photograph's own pixels look like those of `faces-64`.
 """
 
 import argparse
@@ -22,8 +23,9 @@ import derender
 from derender.cli import main as command
 from derender.data import as_float, read_ground_truth
 from derender.evaluation.depth import predicted_depth
+from derender.photo import open_photograph
 from derender.report import colours
-from derender.report.panel import GridLayout, labelled_grid
+from derender.report.panel import GridLayout, contact_sheet, labelled_grid
 from derender.scene.normals import normals_from_depth
 
 OUT = Path(__file__).resolve().parents[1] / "docs" / "images" / "gallery"
@@ -36,7 +38,7 @@ def run(*words: object) -> None:
         raise SystemExit(code)
 
 
-def keep(picture: Path | Image.Image, name: str, width: int = 1600) -> None:
+def keep(picture: Path | Image.Image, name: str, width: int = 1700) -> None:
     """A picture in 24-bit colour on white, at most so wide."""
     drawn = picture if isinstance(picture, Image.Image) else Image.open(picture)
     drawn = colours.on_background(drawn) if drawn.mode == "RGBA" else drawn.convert("RGB")
@@ -45,10 +47,16 @@ def keep(picture: Path | Image.Image, name: str, width: int = 1600) -> None:
     drawn.save(OUT / name, quality=88, method=6) if name.endswith(".webp") else drawn.save(OUT / name)
 
 
+def side(yaw_deg: float) -> str:
+    """An angle of light in words; yaw above 0 lights the left of the image."""
+    return f"{abs(yaw_deg):.0f}° {'left' if yaw_deg > 0 else 'right'}"
+
+
 def decompose(data: str, work: Path) -> None:
     """Predicted maps of `rendered-faces-64` beside the true ones, in the view of the image."""
     model, truth = derender.load("rendered-faces-64"), read_ground_truth(data, image_size=64)
     rows = np.linspace(0, len(truth) - 1, FACES).round().astype(int)
+    lights = [f"light {side(one)}" for one in np.degrees(truth.light[rows, 3])]
     images, mask = truth.images[rows], truth.mask[rows]
     depth, covered = predicted_depth(model, images)
     both = (covered & torch.as_tensor(mask)).float()
@@ -65,7 +73,7 @@ def decompose(data: str, work: Path) -> None:
         "albedo": colours.pictures(flat.image, both),
         "true albedo": colours.pictures(truth.albedo[rows], mask),
     }
-    keep(labelled_grid(columns, layout=GridLayout(cell=CELL)), "decompose.webp")
+    keep(labelled_grid(columns, lights, layout=GridLayout(cell=CELL)), "decompose.webp", 1800)
 
 
 def swap(data: str, work: Path) -> None:
@@ -76,7 +84,9 @@ def swap(data: str, work: Path) -> None:
     run(
         "swap", "--model", "faces-64", *files[1:], "--from", files[0], "--size", CELL, "--out", work / "mixed"
     )
-    parts = ("its geometry", "its albedo", "its light", "its camera")
+    opened = open_photograph(np.asarray(Image.open(files[0])), derender.load("faces-64"))
+    light = side(np.degrees(float(opened.scene.light[0, 3])))
+    parts = ("its geometry", "its albedo", f"its light, {light}", "its camera")
     stills = {part: f"still-{number:02d}.png" for number, part in enumerate(parts, 1)}
     columns = {"input": [Image.open(file) for file in files[1:]], "the other": [Image.open(files[0])] * 3}
     for part, still in stills.items():
@@ -85,18 +95,19 @@ def swap(data: str, work: Path) -> None:
 
 
 def search(data: str, work: Path) -> None:
-    """The nearest by geometry and by lighting, of one image."""
-    truth = read_ground_truth(data, limit=SEARCHED, image_size=64)
-    query = work / "query.png"
-    Image.fromarray(truth.images[len(truth) // 2].transpose(1, 2, 0)).save(query)
-    given = ("--model", "rendered-faces-64")
-    table = work / "features.parquet"
-    run("embed", *given, "--data", data, "--limit", SEARCHED, "--fit-steps", 0, "--out", table)
+    """The nearest by geometry and by lighting, of one image, with their true angle of light."""
+    truth, model = read_ground_truth(data, image_size=64), derender.load("rendered-faces-64")
+    table, pixels = derender.embed(data, model, fit_steps=0), colours.pictures(truth.images)
     for factor in ("geometry", "light"):
-        found = work / f"{factor}.png"
-        run("search", "--features", table, "--like", query, *given, "--factor", factor, "-k", 6,
-            "--data", data, "--out", found)  # fmt: skip
-        keep(found, f"search_{factor}.webp")
+        query = len(truth) // 2
+        found = derender.search(table, like=truth.files[query], model=model, factor=factor, k=6)
+        rows = [query, *(truth.files.index(file) for file in found.files)]
+        captions = [f"light {side(np.degrees(truth.light[row, 3]))}" for row in rows]
+        captions[0] = f"query, {captions[0]}"
+        sheet = contact_sheet(
+            [pixels[row] for row in rows], captions, 7, f"nearest by {factor}", GridLayout(CELL)
+        )
+        keep(sheet, f"search_{factor}.webp")
 
 
 def explain(data: str, work: Path) -> None:

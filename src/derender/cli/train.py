@@ -19,7 +19,7 @@ LOOCC = "Contrast over none, light, light+camera or all factors; names joined by
 Loocc = Annotated[str | None, typer.Option("--loocc", help=LOOCC)]
 RENDERER = "How scenes make images: lambert, lambert-shadow, phong, sh, haze, or several joined by +."
 Renderer = Annotated[str | None, typer.Option("--renderer", metavar="NAME", help=RENDERER)]
-GENERATOR = "stylegan2 run of e4e, or its published .pt."
+GENERATOR = "Run of stylegan2 for which e4e is trained."
 Generator = Annotated[str | None, typer.Option("--generator", metavar="RUN", help=GENERATOR)]
 CONFIG = "Settings in YAML, such as a run's; options come after."
 ConfigFile = Annotated[str | None, typer.Option("--config", metavar="FILE", help=CONFIG)]

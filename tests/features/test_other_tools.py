@@ -1,0 +1,47 @@
+"""Feature tables in DuckDB and FAISS: the code blocks of docs/how-to/scale.md, where these are installed."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from derender.features import FeatureTable, search
+
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "how-to" / "scale.md"
+
+
+@pytest.fixture
+def table(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    geometry = np.random.default_rng(3).normal(size=(40, 8)).astype(np.float32)
+    made = FeatureTable(
+        files=tuple(f"{row:02d}.png" for row in range(40)),
+        factors={"geometry": geometry},
+        labels={"kind": np.array(["jeep"] * 30 + ["sports"] * 10)},
+    )
+    made.write("features.parquet")
+    return made
+
+
+def block_of(tool: str) -> str:
+    pytest.importorskip(tool, reason=f"needs pip install {tool}")
+    (block,) = [one for one in re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL) if tool in one]
+    return block
+
+
+def test_duckdb_counts_the_rows_of_each_kind(table):
+    block = block_of("duckdb").replace("duckdb.sql", "found = duckdb.sql")
+    names: dict[str, Any] = {}
+    exec(block, names)
+    assert sorted(names["found"].fetchall()) == [("jeep", 30), ("sports", 10)]
+
+
+def test_faiss_finds_the_rows_that_search_finds(table):
+    names: dict[str, Any] = {}
+    exec(block_of("faiss"), names)
+    for row, (similarity, nearest) in enumerate(zip(names["similarity"], names["neighbours"], strict=True)):
+        found = search(table, table.files[row], factor="geometry", k=9)
+        assert list(nearest) == [row, *found.rows]
+        np.testing.assert_allclose(similarity[1:], 1 - np.array(found.distances), atol=1e-6)
