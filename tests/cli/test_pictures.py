@@ -5,6 +5,7 @@ import json
 import os
 import re
 import shutil
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from tests.cli.conftest import noise
 from derender import Derenderer
 from derender.cli import main
 from derender.report.edits import Edit
+from derender.report.opening import ImageOptions
 from derender.storage.places import ERRORS_FILE
 from derender.training.held_out_errors import HeldOutErrors, write_errors
 
@@ -38,6 +40,15 @@ def table(model, photos) -> str:
     path = photos.parent / "F.parquet"
     assert main(["embed", "--model", model, "--data", str(photos), "--out", str(path)]) == 0
     return str(path)
+
+
+@pytest.mark.parametrize("command", ["decompose", "relight", "rotate", "swap", "mesh"])
+def test_every_field_of_the_image_options_is_an_option(command, capsys):
+    assert main([command, "--help"]) == 0
+    shown = capsys.readouterr().out
+    for field in fields(ImageOptions):
+        named = f"--{field.name.replace('_', '-')}" in shown
+        assert named != field.metadata.get("hidden", False), field.name
 
 
 def test_relight_sweeps_and_says_which_light(model, photos, tmp_path, numbers):

@@ -203,10 +203,8 @@ KNOWN = {  # files, how they are read; labels, and partition
     "parquet": ({**images("a b/1.png", "ünï/2.png", "new\nline.png"), "data.parquet": as_parquet()}, {},
         {"age": [31, NAN, 4.5], "smiles": [1, -1, 0], "id": ["007", "12", "9"]}, ["train", "validation",
         "test"]),
-    "a split of one's own": ({"data.csv": "file,split\n1.png,fold1\n", "1.png": None}, {},
-        {"split": ["fold1"]}, None),
-    "relative paths": ({"a/metadata.csv": "file_name,x\n1.png,3\n./2.png,4\n", **images("a/1.png",
-        "a/2.png")}, {}, {"x": [3, 4]}, None),
+    "own split": ({"a/metadata.csv": "file_name,x,split\n1.png,3,one\n./2.png,4,two\n", **images("a/1.png",
+        "a/2.png")}, {}, {"x": [3, 4], "split": ["one", "two"]}, None),
     "a table first": ({"data.csv": f"file,mood\n24_0_1_{CHIP},good\n", f"24_0_1_{CHIP}": None}, {},
         {"mood": ["good"]}, None),
     "classes in parts": (images("test/cat/2.png", "train/cat/1.png", "train/dog/1.png", "val/dog/4.png"), {},
@@ -224,8 +222,7 @@ def test_labels_and_parts_are_those_published(tree, name):
             assert table.labels[column].tolist() == values, column
         else:
             np.testing.assert_allclose(table.labels[column], values, rtol=1e-6, err_msg=column)
-            kinds = (np.dtype(np.float32), np.dtype(np.int8))
-            assert table.labels[column].dtype in kinds
+            assert table.labels[column].dtype in (np.float32, np.int8)
     assert (None if table.partition is None else table.partition.tolist()) == partition
 
 
@@ -234,10 +231,10 @@ def test_labels_and_parts_are_those_published(tree, name):
     [
         (images("cats/siamese/1.jpg", "dogs/pug/2.jpg"), "classes"),
         (images("train/0/1.png", "train/1/2.png", "test/0/3.png"), "classes"),
-        (images("one/0/1.png", "one/1/2.png"), "classes"),
         (images("train/1.png", "test/2.png"), "folder"),
         (images("cat/1.png", "dog/2.png", "3.png"), "folder"),
         (images("only/1.png", "only/2.png"), "folder"),
+        (images("one/0/1.png", "one/1/2.png"), "classes"),
         (images(*(f"{name}.png" for name in IDS)), "folder"),  # scraped images are named by a checksum
         ({"metadata.csv": "camera,lens\nx,y\n", "1.png": None}, "folder"),
     ],
@@ -270,7 +267,6 @@ FAULTS = [
     ({**ATTRIBUTES, "img_align_celeba.zip": "x"}, {}, r"list_attr_celeba\.txt and img_align_celeba"),
     ({**WILD, **MARKED, "list_eval_partition.txt": "000001.jpg 3\n"}, {}, r"line 1: .* of 0 \(train\), .*"),
     ({**WILD, "list_landmarks_celeba.txt": LANDMARKS.replace("lefteye_x", "x")}, {}, "no column 'lefteye"),
-    ({**ALIGNED, **ATTRIBUTES, **PARTITION}, {"subset": "tests"}, "no part 'tests': its parts are test,"),
     ({**SYNFACE, TRAIN: PARAMS.replace("file", "name")}, {"dataset": "synface"}, "no column 'file'; its"),
     ({**SYNFACE, TRAIN: f"{PARAMS}{ROW}{',x' * 12}\n"}, {}, "column 'strength' holds something that is no"),
     ({**SYNFACE, TRAIN: PARAMS + "x" * 200_000}, {}, "is no CSV table"),
@@ -286,7 +282,6 @@ FAULTS = [
     ({**CARS, "metadata.csv": "fullId,wnlemmas,name,tags\n3dw.ffff,,x,y\n"}, {}, "names none of the models"),
     (images("a/1.jpg"), {"dataset": "face_tracks"}, r"NAME\.ids .* or every image in IDENTITY/TRACK/"),
     ({**EPISODES, "ids/buffy.ids": "1 giles\n"}, {}, r"buffy\.ids in .*, line 1: expected a first line"),
-    ({**EPISODES, "ids/buffy.ids": BUFFY + "x giles\n"}, {}, "line 5: .* got 'x giles'"),
     ({**EPISODES, "ids/buffy.ids": BUFFY + "13 dawn\n"}, {}, "line 5: track 13 has two names"),
     ({"x.ids": BUFFY, "77/1.jpg": None}, {}, r"expected NAME\.ids with some image in NAME/N"),
     ({"data.csv": "name,x\n1.png,2\n", "1.png": None}, AS, r"no column of paths \(file, path, .*columns"),
@@ -330,8 +325,7 @@ def test_faults_of_addresses_archives_and_nested_columns(tree, tmp_path, encoded
 @pytest.mark.parametrize(
     ("cells", "expected"),
     [
-        (["1", "0", ""], np.array([1, 0, -1], np.int8)),
-        (["True", "no", "NO"], np.array([1, 0, 0], np.int8)),
+        (["True", "no", "NO", ""], np.array([1, 0, 0, -1], np.int8)),
         (["1", "0", "2"], np.array([1, 0, 2], np.float32)),
         (["-1", "1.5e3", ""], np.array([-1, 1500, NAN], np.float32)),
         (["01", "2"], np.array(["01", "2"])),

@@ -12,7 +12,7 @@ from derender.baselines.controls import pixel_features
 from derender.data import read_images
 from derender.evaluation import at_least, chance_scores, cluster, cluster_scores, compare_clusterings
 from derender.evaluation.clustering import clustering_table
-from derender.evaluation.clustering_scores import CLUSTER_COLUMNS, METRICS
+from derender.evaluation.clustering_scores import CLUSTER_COLUMNS, METRICS, metric
 from derender.evaluation.score_table import verdict, verdict_table
 from derender.features import FeatureTable
 
@@ -187,6 +187,22 @@ def test_tables_show_scores_intervals_and_the_strongest_control():
     assert verdict(found.rows[1], "nmi").startswith("noise: 0.")
     same = compare({"ours": features["noise"], "noise": features["noise"]}, {"who": who}).rows[0]
     assert any(word in verdict(same, "ari") for word in ("not distinguished from", "below"))
+
+
+def test_a_metric_declared_once_is_scored_judged_and_shown(monkeypatch):
+    for declared in (METRICS, CLUSTER_COLUMNS):
+        monkeypatch.setitem(declared, "rows", None)  # gone after the test
+
+    @metric("rows", "pure rows", "share of rows in clusters of one class")
+    def pure_rows(table: np.ndarray) -> np.ndarray:
+        pure = (table > 0).sum(axis=1) == 1
+        return (table.sum(axis=1) * pure).sum(axis=1) / table.sum(axis=(1, 2))
+
+    features, who = problem()
+    found = compare(features, {"who": who})
+    assert found.rows[0].scores["rows"].value == 1 and found.rows[0].versus["rows"].above
+    assert clustering_table(found).values()["ours"]["pure rows"] == 1
+    assert "ours: pure rows" in verdict_table(found.rows, CLUSTER_COLUMNS, "above?").values()
 
 
 @pytest.fixture(scope="module")

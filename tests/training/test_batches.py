@@ -45,13 +45,6 @@ def test_about_half_of_the_images_are_mirrored():
     assert 0.42 < mirrored.float().mean() < 0.58
 
 
-def test_a_batch_larger_than_the_set_is_refused():
-    with pytest.raises(
-        ValueError, match="batch_size 64 is more than the 12 training images: set batch_size=6"
-    ):
-        Batches(numbered(12), 64, 0, True)
-
-
 def test_a_reader_gives_the_same_batches_in_any_order():
     batches = Batches(numbered(12), 4, 3, True)
     reader = Reader(batches)

@@ -2,7 +2,7 @@
 
 A regular file's size is compared with a limit before any of it is read. JSON goes through pydantic, which
 bounds depth and digits; YAML is measured, aliases unfolded, before anything is built of it. Every refusal is
-one sentence. Leaves out tensors (``tensors.py``) and images (``data/decoding.py``).
+one sentence. Leaves out tensors (``tensors.py``) and images (``data/image.py``).
 """
 
 import stat
