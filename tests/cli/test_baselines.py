@@ -81,6 +81,20 @@ def test_resnet18_trains_on_labels_and_embeds(faces, tmp_path, refused):
     assert FeatureTable.read(out).factors["pooled"].shape == (24, 32)
 
 
+def test_e4e_inverts_a_generator_of_64_pixels(faces, tmp_path):
+    common = ("image_size=64", "batch_size=4", "images=4")
+    sizes = settings(*common, "style_size=4", "mapping_layers=1", "channel_max=4")
+    assert call("train", "--model", "stylegan2", "--data", faces, "--out", tmp_path / "gan", *sizes) == 0
+    few = settings(*common, "width=2", "units=[1,1,1,1]", "first_release=0")
+    own = ["--generator", tmp_path / "gan", *few, *settings("self_features_steps=1", "release_every=1")]
+    assert call("train", "--model", "e4e", "--data", faces, "--out", tmp_path / "e4e", *own) == 0
+    out = tmp_path / "table.parquet"
+    embed = ["embed", "--baseline", "e4e", "--model", tmp_path / "e4e", "--data", faces, "--out", out]
+    assert call(*embed) == 0
+    codes = FeatureTable.read(out).factors["w+"].reshape(24, 10, 4)  # two for each of 4, 8, ... 64 pixels
+    assert codes.std(axis=0).min() > 0 and (codes[:, 1] != codes[:, 0]).any()  # the first step releases it
+
+
 def test_bad_words_are_one_line(run, faces, tmp_path, refused):
     out = tmp_path / "t.parquet"
     embed = ("embed", "--data", faces, "--out", out)
