@@ -61,6 +61,7 @@ def test_a_model_of_before_renderers_loads_as_lambert(tmp_path):
         ("nothing.here:glow", "no renderer 'nothing.here:glow'.*PYTHONPATH"),
         ("yaml:dump", "'yaml:dump' is a function, not a derender.renderers.Renderer"),
         ("this:x", "names a module of Python itself"),
+        ("numpy.f2py.__main__:x", "names a program, which would run"),
         (".:x", "cannot read the renderer"),
         ("..os:x", "cannot read the renderer"),
         ("phong(gamma=" + "[" * 180 + ")", "more than 50 levels"),
@@ -84,6 +85,15 @@ def test_a_users_module_is_imported_except_for_a_downloaded_model(tmp_path, monk
     with pytest.raises(ValueError, match=r"someone/model was downloaded and wants the code .*my_glow:GLOW"):
         recorded_renderer(name, None, "someone/model")
     assert recorded_renderer(name, name, "someone/model").gamma == 2.0
+
+
+@pytest.mark.parametrize("line", ["raise RuntimeError('no')", "import sys; sys.exit(3)", "1 / 0", "def"])
+def test_a_module_that_fails_or_ends_the_program_is_one_line(line, tmp_path, monkeypatch):
+    name = f"fails_{abs(hash(line))}"
+    (tmp_path / f"{name}.py").write_text(line)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    with pytest.raises(ValueError, match=rf"no renderer '{name}:x': importing it ends in \w+"):
+        renderer_named(f"{name}:x")
 
 
 def test_settings_of_a_run_name_renderer_and_factors():

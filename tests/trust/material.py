@@ -13,6 +13,7 @@ import torch
 from PIL import Image
 from safetensors.torch import load_file
 
+from derender.baselines import load_baseline
 from derender.features import FeatureTable
 from derender.model import Derenderer, load
 from derender.photo.video import write_video
@@ -73,7 +74,7 @@ def left_in(folder: Path) -> dict[str, bytes]:
             if file.parent.name == "checkpoints":
                 check_seal(file)
             elif (file / "config.json").exists():
-                load(file)
+                (load_baseline if "baseline" in (file / "config.json").read_text() else load)(file)
         elif file.is_file() and not APART & set(inner.parts):
             content = content_of(file)
             if file.name not in UNTIMED:

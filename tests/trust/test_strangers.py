@@ -189,6 +189,16 @@ def test_json_of_a_stranger_is_one_line_of_error_or_read_and_takes_no_memory(nam
             assert "not a regular file" in str(error) or "no " in str(error) or "cannot" in str(error)
 
 
+@pytest.mark.parametrize("given", [64, 0, -1, 1e308, True, [16], 2**70, "NaN"])
+def test_sizes_that_a_model_cannot_have_grown_from_are_named(given, run):
+    file = run / "model" / "config.json"
+    config = json.loads(file.read_text())
+    config["settings"]["network"]["grown_from"] = given
+    file.write_text(json.dumps(config))
+    with cheaply(), pytest.raises(ValueError, match=r"is damaged \(network.*: .*\): copy or train"):
+        derender.load(run)
+
+
 def test_metrics_name_the_line_and_forgive_one_cut_off_at_the_end(run):
     with (run / "metrics.jsonl").open("a") as file:
         file.write('{"kind": "train", "ima')

@@ -118,6 +118,8 @@ def _imported(name: str, settings: str | None) -> Renderer:
         raise ValueError(f"renderer {name!r} takes no settings here: set them where it is made")
     if module.partition(".")[0] in sys.stdlib_module_names:  # a stranger's model may name any
         raise ValueError(f"no renderer {name!r}: it names a module of Python itself")
+    if module.endswith(".__main__"):
+        raise ValueError(f"no renderer {name!r}: it names a program, which would run")
     try:
         found = getattr(importlib.import_module(module), thing)
     except (ImportError, AttributeError) as error:
@@ -125,6 +127,8 @@ def _imported(name: str, settings: str | None) -> Renderer:
             f"no renderer {name!r} ({error}): put the folder of {module.partition('.')[0]} on PYTHONPATH, or "
             "install it"
         ) from error
+    except (Exception, SystemExit) as error:  # whatever a module does when it is imported
+        raise ValueError(f"no renderer {name!r}: importing it ends in {error!r}") from error
     if not isinstance(found, Renderer):
         raise ValueError(f"{name!r} is a {type(found).__name__}, not a derender.renderers.Renderer")
     return replace(found, name=name)

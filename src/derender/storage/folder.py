@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from derender.settings import Settings
 from derender.storage.atomic import atomic_file
-from derender.storage.bounded import read_json, read_text
+from derender.storage.bounded import first_line, read_json, read_text
 from derender.storage.places import CONFIG_FILE, SPLIT_FILE, TENSOR_FILES, TEXT_FILES, WEIGHTS_FILE
 from derender.storage.tensors import check_fit, read_tensors, write_tensors
 
@@ -118,7 +118,7 @@ def naming_damage(folder: Path) -> Iterator[None]:
         yield
     except (RuntimeError, ValueError) as error:
         raise ValueError(
-            f"{folder} is damaged ({str(error).splitlines()[0]}): copy or train the model again"
+            f"{folder} is damaged ({first_line(error)}): copy or train the model again"
         ) from error
 
 

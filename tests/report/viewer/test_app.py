@@ -21,6 +21,7 @@ from derender.report.viewer.questions import CropRequest, Light, Place, Refused,
 from derender.report.viewer.server import BoundedProtocol, serving
 from derender.report.viewer.studio import Shelf, Studio
 from derender.scene.crop import Crop
+from derender.scene.ranges import SceneRanges
 from derender.storage.places import model_folder
 from derender.training.held_out_errors import read_errors
 
@@ -258,5 +259,21 @@ def test_further_factors_move_and_swap(renderer):
         ({"haze": [1.0]}, r"haze must be \(N, 2\): beta, airlight"),
         ({"glow": [1.0]}, "this model has no 'glow'; it has specular, haze"),
     ):
-        with pytest.raises(Refused, match=message):
-            studio.view(asked.model_copy(update={"numbers": numbers}))
+        for answer in (studio.view, studio.settings):
+            with pytest.raises(Refused, match=message):
+                answer(asked.model_copy(update={"numbers": numbers}))
+
+
+def test_a_model_of_wider_ranges_than_the_page_has_opens_at_its_bounds():
+    ranges = SceneRanges(ambient=(3, 4), light_deg=89.9, rotation_deg=89.9, translation_xy=1e6)
+    model = Derenderer.from_preset("small", seed=0, image_size=32, width=4, light_width=4)
+    model = Derenderer.seeded(model.settings.model_copy(update={"ranges": ranges}), 0)
+    for name in ("light", "camera"):
+        model.nets[name].decoder.linear.weight.data *= 1e4
+    studio = Studio(model.eval().requires_grad_(False), "wide")
+    found = studio.open(np.full((48, 48, 3), 99, np.uint8))
+    assert found["light"]["ambient"] == 2 and abs(found["light"]["yaw_deg"]) == 89
+    assert {abs(one) for one in found["camera"]["rotation_deg"]} == {89}
+    shown = {name: found[name] for name in ("picture", "light", "camera")}
+    assert studio.view(ViewRequest.model_validate(shown))
+    assert Light.of(torch.tensor([torch.nan, -1, 0, torch.nan])).ambient == 0

@@ -26,9 +26,10 @@ PIXEL_LIMIT = 40_000_000
 KINDS = "JPEG, PNG, WebP, AVIF, BMP, GIF, TIFF, PPM"
 
 ImageId = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{22}$")]
-Angle = Annotated[float, Field(ge=-89, le=89)]
-Strength = Annotated[float, Field(ge=0, le=2)]
-Shift = Annotated[float, Field(ge=-0.5, le=0.5)]
+STRONGEST, FARTHEST, STEEPEST_DEG = 2.0, 0.5, 89.0
+Angle = Annotated[float, Field(ge=-STEEPEST_DEG, le=STEEPEST_DEG)]
+Strength = Annotated[float, Field(ge=0, le=STRONGEST)]
+Shift = Annotated[float, Field(ge=-FARTHEST, le=FARTHEST)]
 
 
 class Refused(Exception):
@@ -59,8 +60,10 @@ class Light(_Checked):
 
     @classmethod
     def of(cls, light: Float[Tensor, "4"]) -> "Light":
-        ambient, diffuse, pitch, yaw = light.tolist()
-        return cls(ambient=ambient, diffuse=diffuse, pitch_deg=degrees(pitch), yaw_deg=degrees(yaw))
+        """The nearest that the page can ask for: a model may have wider ranges."""
+        ambient, diffuse = light[:2].nan_to_num().clamp(0, STRONGEST).tolist()
+        pitch_deg, yaw_deg = _degrees(light[2:])
+        return cls(ambient=ambient, diffuse=diffuse, pitch_deg=pitch_deg, yaw_deg=yaw_deg)
 
     def light_row(self) -> Float[Tensor, "1 4"]:
         return torch.tensor([[self.ambient, self.diffuse, radians(self.pitch_deg), radians(self.yaw_deg)]])
@@ -74,11 +77,16 @@ class Camera(_Checked):
 
     @classmethod
     def of(cls, camera: Float[Tensor, "6"]) -> "Camera":
-        numbers = camera.tolist()
-        return cls(rotation_deg=[degrees(angle) for angle in numbers[:3]], translation=numbers[3:])
+        """The nearest that the page can ask for."""
+        shifts = camera[3:].nan_to_num().clamp(-FARTHEST, FARTHEST).tolist()
+        return cls(rotation_deg=_degrees(camera[:3]), translation=shifts)
 
     def camera_row(self) -> Float[Tensor, "1 6"]:
         return torch.tensor([[*map(radians, self.rotation_deg), *self.translation]])
+
+
+def _degrees(angles: Float[Tensor, " k"]) -> list[float]:
+    return [min(max(degrees(one), -STEEPEST_DEG), STEEPEST_DEG) for one in angles.nan_to_num().tolist()]
 
 
 class ViewRequest(_Checked):

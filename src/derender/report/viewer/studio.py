@@ -287,13 +287,13 @@ class Studio:
 
     def settings(self, question: ViewRequest) -> dict[str, Any]:
         """Light and camera in numbers, and how the image was made."""
-        scene = self.shelf.get(question.picture).scene
+        scene = self.scene(question)
         return {
             "derender": __version__,
             "model": self.name,
             "light": (question.light or Light.of(scene.light[0])).model_dump(),
             "camera": (question.camera or Camera.of(scene.camera[0])).model_dump(),
-            "numbers": self._numbers(scene) | question.numbers,
+            "numbers": self._numbers(scene),
             "from_another_picture": sorted(question.swaps),
             "size": self._size(question),
         }
