@@ -39,9 +39,11 @@ from derender.features import embedding as embedding_module
 SIGNALS = {"SIGKILL": signal.SIGKILL, "SIGTERM": signal.SIGTERM, "Ctrl-C": signal.SIGINT}
 CAUSES = (*SIGNALS, "full disk", "exception")
 CAME_THROUGH, INJECTED = 0, 86
-ENDINGS = {"SIGKILL": (-9,), "SIGTERM": (-15, 130), "Ctrl-C": (130,), "full disk": (2,)}
+ENDINGS = {"SIGKILL": (-9,), "SIGTERM": (-15, 130), "Ctrl-C": (130,), "full disk": (2, INJECTED)}
 ENDINGS["exception"] = (INJECTED, 2)
 """Exit codes of an attempt that was ended by each cause; 0 if it came through before or in spite of it."""
+FAILED = ": failed: "
+"""Of a job of a plan, which goes on without it: counted as if it had ended the plan."""
 
 PRELOADED = {
     "derender",
@@ -269,6 +271,8 @@ class Trial:
             while code != CAME_THROUGH and done <= kills:
                 cause, began = CAUSES[done % len(CAUSES)] if done < kills else "nothing", time.monotonic()
                 code = self.attempt(folder, cause)
+                if code == CAME_THROUGH and FAILED in self.log.read_text(errors="replace"):
+                    code = INJECTED
                 if code == CAME_THROUGH:  # it takes no longer than that: draw earlier moments
                     self.seconds = min(self.seconds, time.monotonic() - began)
                     continue

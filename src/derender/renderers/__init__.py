@@ -116,19 +116,15 @@ def _imported(name: str, settings: str | None) -> Renderer:
     module, _, thing = name.partition(":")
     if settings is not None:
         raise ValueError(f"renderer {name!r} takes no settings here: set them where it is made")
-    if module.partition(".")[0] in sys.stdlib_module_names:  # a stranger's model may name any
-        raise ValueError(f"no renderer {name!r}: it names a module of Python itself")
-    if module.endswith(".__main__"):
-        raise ValueError(f"no renderer {name!r}: it names a program, which would run")
+    if module.partition(".")[0] in sys.stdlib_module_names or ".__main__" in module:  # a stranger's
+        raise ValueError(f"no renderer {name!r}: it names a module of Python itself or a program")
     try:
         found = getattr(importlib.import_module(module), thing)
-    except (ImportError, AttributeError) as error:
-        raise ValueError(
-            f"no renderer {name!r} ({error}): put the folder of {module.partition('.')[0]} on PYTHONPATH, or "
-            "install it"
-        ) from error
     except (Exception, SystemExit) as error:  # whatever a module does when it is imported
-        raise ValueError(f"no renderer {name!r}: importing it ends in {error!r}") from error
+        raise ValueError(
+            f"no renderer {name!r} ({error!r}): put the folder of {module.partition('.')[0]} on PYTHONPATH, "
+            "or install it"
+        ) from error
     if not isinstance(found, Renderer):
         raise ValueError(f"{name!r} is a {type(found).__name__}, not a derender.renderers.Renderer")
     return replace(found, name=name)
