@@ -12,6 +12,7 @@ heads no better than these models, and its edits in a photograph's own pixels lo
 import argparse
 import sys
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -47,6 +48,14 @@ def keep(picture: Path | Image.Image, name: str, width: int = 1700) -> None:
     drawn.save(OUT / name, quality=88, method=6) if name.endswith(".webp") else drawn.save(OUT / name)
 
 
+def grid(rows: Mapping[str, list[Image.Image]], heads: list[str]) -> Image.Image:
+    """A row for each entry under its name, narrow enough for a page to show tiles at their size."""
+    columns = zip(*rows.values(), strict=True)
+    return labelled_grid(
+        dict(zip(heads, map(list, columns), strict=True)), list(rows), layout=GridLayout(CELL)
+    )
+
+
 def side(yaw_deg: float) -> str:
     """An angle of light in words; yaw above 0 lights the left of the image."""
     return f"{abs(yaw_deg):.0f}° {'left' if yaw_deg > 0 else 'right'}"
@@ -56,14 +65,14 @@ def decompose(data: str, work: Path) -> None:
     """Predicted maps of `rendered-faces-64` beside the true ones, in the view of the image."""
     model, truth = derender.load("rendered-faces-64"), read_ground_truth(data, image_size=64)
     rows = np.linspace(0, len(truth) - 1, FACES).round().astype(int)
-    lights = [f"light {side(one)}" for one in np.degrees(truth.light[rows, 3])]
+    heads = [f"{n}: light {side(yaw)}" for n, yaw in enumerate(np.degrees(truth.light[rows, 3]), 1)]
     images, mask = truth.images[rows], truth.mask[rows]
     depth, covered = predicted_depth(model, images)
     both = (covered & torch.as_tensor(mask)).float()
     filled = torch.where(covered, depth, torch.ones_like(depth))
     scene = model.decompose(as_float(images))
     flat = model.render(scene.with_parameters(light=torch.tensor([[1.0, 0, 0, 0]]).expand(FACES, 4)))
-    columns = {
+    maps = {
         "input": colours.pictures(images),
         "reconstruction": colours.pictures(model.render(scene).image),
         "depth": colours.depth_maps(depth, both),
@@ -73,7 +82,7 @@ def decompose(data: str, work: Path) -> None:
         "albedo": colours.pictures(flat.image, both),
         "true albedo": colours.pictures(truth.albedo[rows], mask),
     }
-    keep(labelled_grid(columns, lights, layout=GridLayout(cell=CELL)), "decompose.webp", 1800)
+    keep(grid(maps, heads), "decompose.webp")
 
 
 def swap(data: str, work: Path) -> None:
@@ -88,10 +97,10 @@ def swap(data: str, work: Path) -> None:
     light = side(np.degrees(float(opened.scene.light[0, 3])))
     parts = ("its geometry", "its albedo", f"its light, {light}", "its camera")
     stills = {part: f"still-{number:02d}.png" for number, part in enumerate(parts, 1)}
-    columns = {"input": [Image.open(file) for file in files[1:]], "the other": [Image.open(files[0])] * 3}
+    drawn = {"input": [Image.open(file) for file in files[1:]], "the other": [Image.open(files[0])] * 3}
     for part, still in stills.items():
-        columns[part] = [Image.open(work / "mixed" / file.stem / still) for file in files[1:]]
-    keep(labelled_grid(columns, layout=GridLayout(cell=CELL)), "swap.webp")
+        drawn[part] = [Image.open(work / "mixed" / file.stem / still) for file in files[1:]]
+    keep(grid(drawn, ["1", "2", "3"]), "swap.webp")
 
 
 def search(data: str, work: Path) -> None:
@@ -100,12 +109,12 @@ def search(data: str, work: Path) -> None:
     table, pixels = derender.embed(data, model, fit_steps=0), colours.pictures(truth.images)
     for factor in ("geometry", "light"):
         query = len(truth) // 2
-        found = derender.search(table, like=truth.files[query], model=model, factor=factor, k=6)
+        found = derender.search(table, like=truth.files[query], model=model, factor=factor, k=7)
         rows = [query, *(truth.files.index(file) for file in found.files)]
         captions = [f"light {side(np.degrees(truth.light[row, 3]))}" for row in rows]
         captions[0] = f"query, {captions[0]}"
         sheet = contact_sheet(
-            [pixels[row] for row in rows], captions, 7, f"nearest by {factor}", GridLayout(CELL)
+            [pixels[row] for row in rows], captions, 4, f"nearest by {factor}", GridLayout(CELL)
         )
         keep(sheet, f"search_{factor}.webp")
 

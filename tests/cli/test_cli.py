@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from PIL import Image
 from tests.cli.conftest import TINY, run, settings
 
 from derender import FeatureTable
-from derender.cli import main
+from derender.cli import console, main
 from derender.cli.console import duration
 from derender.report.decomposition import COLUMN_MEANING
 from derender.settings import plain
@@ -254,3 +255,13 @@ def test_json_holds_no_nan_and_names_every_number():
     values = plain({"a": float("nan"), "b": np.array([1.5, np.inf]), "c": Path("x"), 3: (np.int64(2), None)})
     assert values == {"a": None, "b": [1.5, None], "c": "x", "3": [2, None]}
     assert [duration(seconds) for seconds in (9.4, 75, 3720)] == ["9 s", "1 min 15 s", "1 h 2 min"]
+
+
+def test_time_left_is_counted_from_the_first_item_of_a_phase(monkeypatch, capsys):
+    """Compiled code and the phase before do not make a minute into hours."""
+    clock = SimpleNamespace(now=0.0, monotonic=lambda: clock.now)
+    monkeypatch.setattr(console, "time", clock)
+    with console.progress_bar("work") as say:
+        for clock.now, done, phase in ((5000.0, 1, "before"), (5050.0, 1, "next"), (5090.0, 5, "next")):
+            say(done, 11, description=phase)
+    assert "next: 5 of 11 images, 1 min 0 s left" in capsys.readouterr().err

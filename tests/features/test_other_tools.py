@@ -16,31 +16,26 @@ PAGE = Path(__file__).resolve().parents[2] / "docs" / "how-to" / "scale.md"
 def table(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     geometry = np.random.default_rng(3).normal(size=(40, 8)).astype(np.float32)
-    made = FeatureTable(
-        files=tuple(f"{row:02d}.png" for row in range(40)),
-        factors={"geometry": geometry},
-        labels={"kind": np.array(["jeep"] * 30 + ["sports"] * 10)},
-    )
+    files, kinds = tuple(f"{row:02d}.png" for row in range(40)), np.array(["jeep"] * 30 + ["sports"] * 10)
+    made = FeatureTable(files=files, factors={"geometry": geometry}, labels={"kind": kinds})
     made.write("features.parquet")
     return made
 
 
-def block_of(tool: str) -> str:
+def run(tool: str) -> dict[str, Any]:
     pytest.importorskip(tool, reason=f"needs pip install {tool}")
     (block,) = [one for one in re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL) if tool in one]
-    return block
+    names: dict[str, Any] = {}
+    exec(block.replace("duckdb.sql", "found = duckdb.sql"), names)
+    return names
 
 
 def test_duckdb_counts_the_rows_of_each_kind(table):
-    block = block_of("duckdb").replace("duckdb.sql", "found = duckdb.sql")
-    names: dict[str, Any] = {}
-    exec(block, names)
-    assert sorted(names["found"].fetchall()) == [("jeep", 30), ("sports", 10)]
+    assert sorted(run("duckdb")["found"].fetchall()) == [("jeep", 30), ("sports", 10)]
 
 
 def test_faiss_finds_the_rows_that_search_finds(table):
-    names: dict[str, Any] = {}
-    exec(block_of("faiss"), names)
+    names = run("faiss")
     for row, (similarity, nearest) in enumerate(zip(names["similarity"], names["neighbours"], strict=True)):
         found = search(table, table.files[row], factor="geometry", k=9)
         assert list(nearest) == [row, *found.rows]

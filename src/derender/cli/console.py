@@ -84,15 +84,19 @@ def progress_bar(description: str, unit: str = "images") -> Iterator[Callable[..
 
     Where standard error is no terminal, a plain line appears every half minute instead.
     """
-    console, begin = Console(stderr=True), time.monotonic()
-    last = begin
+    console, last = Console(stderr=True), time.monotonic()
+    phase, first, begin = "", 0, last
 
     def say(done: int, total: int, note: str = "", description: str = description, unit: str = unit) -> None:
-        nonlocal last
+        nonlocal last, phase, first, begin
+        if description != phase:  # its first item may wait for compiled code: the rest is estimated without
+            phase, first, begin = description, done, time.monotonic()
         if time.monotonic() - last >= PLAIN_LINE_EVERY_SECONDS:
             last = time.monotonic()
-            left = f", {duration((total - done) * (last - begin) / done)} left" if done else ""
-            notice(f"{description}: {done:,} of {total:,} {unit}{left} {note}".rstrip())
+            each = (last - begin) / max(1, done - first)
+            left = f", {duration((total - done) * each)} left" if done > first else ""
+            count = f"{description}: {done:,} of {total:,} {unit}".rstrip()
+            notice(f"{count}{left} {note}".rstrip())
 
     if not console.is_terminal or not is_main_process():
         yield say

@@ -7,8 +7,8 @@ colours as classes, and a number for pixels without a class.
 Exact maps are in the camera frame of their image (conventions.md). A params.csv means: depth is z = 0.8 +
 value / 65535 * 0.4, normals (n + 1) / 2 * 255, albedo 0..255, and value 0 is background. Depth maps alone
 (unsup3d's synthetic faces) are grey: a share v of the largest value is z = 1.1 - 0.2 v, and 0 is background.
-The set's own words do not say this, and the archive could not be had to check it: look at the average depth
-first, for which unsup3d gives SIDE 1.990e-2 and MAD 23.26 degrees.
+The set does not state this, and it is untested on the archive. Look at the average depth first, for which
+unsup3d gives SIDE 1.990e-2 and MAD 23.26 degrees.
 """
 
 from concurrent.futures import ThreadPoolExecutor

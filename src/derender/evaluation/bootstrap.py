@@ -102,8 +102,7 @@ def estimate(runs: Runs, resampled: np.ndarray, *, centred: bool = False, most: 
     """The mean over ``runs`` with its percentile interval, from (B,) means over runs on each resample.
 
     ``centred`` moves the resamples so that their mean is the value, and none exceeds ``most``. Scores of
-    clusters need it: a row drawn twice agrees with itself, which makes every resample look purer than the
-    rows are.
+    clusters need it: duplicated rows inflate purity.
     """
     value = float(np.mean(runs))
     if centred:

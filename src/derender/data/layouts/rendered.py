@@ -9,9 +9,9 @@ depth maps in folders side by side, as unsup3d's synthetic faces lie:
 
 ShapeNet's cars: folders train, val and test of images whose paths hold the model's id.
 unsup3d released the paper's images (github.com/elliottwu/unsup3d, issue 18). Those of 128 x 128 are cropped
-to rows 8 to 108 and columns 14 to 114. We could not see the archive itself: a model's id is taken to be 24 to
-32 hexadecimal digits in the path. Images named by such digits may be anything. So the layout is recognised
-only beside ShapeNet's table or below a folder 02958343, the number of its cars. Else ask for it by name. That
+to rows 8 to 108 and columns 14 to 114. Untested on the archive itself: a model's id is taken to be 24 to 32
+hexadecimal digits in the path. Images named by such digits may be anything. So the layout is recognised only
+beside ShapeNet's table or below a folder 02958343, the number of its cars. Else ask for it by name. That
 table (``02958343.csv`` or ``metadata.csv``) gives names, and by words in them the label ``class``, one of
 five or "". The paper's fifth is Ferrari, which is among its words here.
 

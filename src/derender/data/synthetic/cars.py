@@ -8,11 +8,11 @@ jeep's fittings: everything mounted on the body is a rounded box or a wheel. It 
 measures, in mirror images or across the middle. Leaves out rust, dirt and damage; no existing car is drawn.
 
 Each image is a function of the seed and its index alone: asking for more images does not change the first
-ones, nor does the number of threads. Conventions are those of reference/conventions.md and of the rendered
-development set: a car's bounding box is centred on (0, 0, 1). The view is a turntable's: M = Rz(inplane)
-Rx(elevation) Ry(azimuth) takes the upright car, front towards the viewer, to the camera. The canonical frame
-is the car seen from straight ahead and 42.5 degrees above. So the camera's rotation is R = M Rx(42.5)^-1,
-given by its Euler angles."""
+ones, nor does the number of threads. Conventions are those of reference/conventions.md and of `syncar`: a
+car's bounding box is centred on (0, 0, 1). The view is a turntable's: M = Rz(inplane) Rx(elevation)
+Ry(azimuth) takes the upright car, front towards the viewer, to the camera. The canonical frame is the car
+seen from straight ahead and 42.5 degrees above. So the camera's rotation is R = M Rx(42.5)^-1, given by its
+Euler angles."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass

@@ -1,6 +1,6 @@
 """Which views, lighting and objects generated images show, and how settings' ranges turn into drawn values.
 
-Defaults follow the rendered development sets. Angles are degrees because people write settings; radians
+Defaults follow the sets `synface` and `syncar`. Angles are degrees because people write settings; radians
 everywhere else. A setting changes only what it names: the random numbers behind each image do not depend on
 it, so the same seed shows the same people in another light. ``LIGHTS``, ``VIEWS``, ``CAR_LIGHTS`` and
 ``CAR_VIEWS`` name whole sets of them: "wide" is outside what "usual" ever shows.
