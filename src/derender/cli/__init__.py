@@ -29,7 +29,6 @@ from derender.cli import (
     finetune,
     importing,
     models,
-    pack,
     report,
     search,
     synth,
@@ -65,10 +64,10 @@ def _options(
 
 
 for one in (
-    demo.demo, align.align, doctor.doctor, train.train, copies.whiten, distil.refine, distil.unet, pack.pack,
-    embed.embed, evaluate, explain.explain, finetune.finetune, importing.import_checkpoint, compare.compare,
-    models.models, report.report, decompose.decompose, edits.relight, edits.rotate, edits.swap,
-    decompose.mesh, search.search, view.view, synth, bench.bench,
+    demo.demo, align.align, doctor.doctor, train.train, copies.whiten, distil.refine, distil.unet,
+    models.pack, embed.embed, evaluate, explain.explain, finetune.finetune, importing.import_checkpoint,
+    compare.compare, models.models, report.report, decompose.decompose, edits.relight, edits.rotate,
+    edits.swap, decompose.mesh, search.search, view.view, synth, bench.bench,
 ):  # fmt: skip
     one.register(app)
 

@@ -1,12 +1,16 @@
-"""`derender models`: the trained models that are bundled."""
+"""`derender models` and `pack`: the models that are bundled, and one of your own in fewer bytes."""
 
-from derender.cli import options
-from derender.cli.console import result, write_json
+from typing import Annotated
+
+import typer
+
+from derender.cli.console import notice, progress_bar, result, write_json
 from derender.cli.gathered import command
+from derender.cli.options import Json, OutModel, Output, PartOfImages, TrainedModel
 
 
 @command("models", "models --json models.json")
-def models(json_file: options.Json = None) -> None:
+def models(json_file: Json = None) -> None:
     """List the bundled models: their names, sizes, and what each was trained on."""
     from derender.storage.places import bundled, bundled_models
 
@@ -15,3 +19,40 @@ def models(json_file: options.Json = None) -> None:
         about = f"{row['image_size']} pixels, {row['megabytes']} MB. {row['about']}"
         result(f"{row['name']:<20}{about}", json_file)
     write_json(json_file, {"models": rows})
+
+
+MAPS = "Storage of the large maps of features: bytes or float16."
+Maps = Annotated[str, typer.Option("--maps", help=MAPS, metavar="KIND")]
+
+
+@command("pack", "pack photos/ --model runs/mine --out mine")
+def pack(
+    images: PartOfImages, model: TrainedModel, out: OutModel, output: Output, maps: Maps = "bytes"
+) -> None:
+    """Write a copy of a model in fewer bytes: weights in float16, large maps in bytes or float16.
+
+    Card, held-out errors and split are copied. With images, the loss of quality is measured on them.
+    """
+    from derender.evaluation.scenes import copy_cost
+    from derender.inputs import as_model, copy_split
+    from derender.storage.sharing import pack_model
+
+    output.refuse_existing(out)
+    original, chosen = model.open(), None
+    if images.optional_address is not None:
+        chosen = images.read(original.image_size, model=model.model, at_least=2)
+    packed = pack_model(model.model, out, maps=maps, overwrite=output.force)
+    copy_split(packed.folder, model.model)
+    sizes = {"before": sum(packed.before.values()), "after": sum(packed.after.values())}
+    notice(f"{sizes['after'] / 1e6:,.2f} MB, before {sizes['before'] / 1e6:,.2f} MB")
+    values = {"model": packed.folder, "bytes": sizes}
+    if chosen is not None:
+        copy = as_model(packed.folder, device=model.device)
+        with progress_bar("comparing") as report:
+            cost = copy_cost(original, copy, chosen.images, progress=report)
+        moved = ", ".join(f"{name} {share:.2%}" for name, share in cost.moved.items())
+        notice(f"features moved, as a share of the distance between two images: {moved}")
+        notice(f"reconstruction L1 {cost.l1:.5f}, before {cost.l1_before:.5f}")
+        values |= {"pictures": len(chosen), "cost": cost}
+    output.result(f"model {packed.folder}")
+    output.write(values)

@@ -77,10 +77,12 @@ def identify(
     probe = np.flatnonzero(known & ~shown & np.isin(who, who[shown]))
     if len(probe) == 0:
         raise ValueError("no probe shows a person of the gallery: give more than one image of each person")
-    right = {
-        name: np.mean([_recognised(run, who, shown, probe, centred) for run in runs], axis=0)
-        for name, runs in ready.features.items()
-    }
+
+    def recognised(run: np.ndarray) -> np.ndarray:
+        codes = unit_rows(run - run[shown].mean(axis=0) * centred)
+        return who[shown][(codes[probe] @ codes[shown].T).argmax(axis=1)] == who[probe]
+
+    right = {name: np.mean(list(map(recognised, runs)), axis=0) for name, runs in ready.features.items()}
     right["chance"] = (who[shown] == who[probe, None]).mean(axis=1)
     scored, columns, probes = binned_rows(
         right, None if angle is None else angle[probe], bins=bins, controls=(*ready.controls, "chance"),
@@ -145,14 +147,6 @@ def _gallery(
         own = np.flatnonzero(known & (who == person))
         chosen[own[0 if angle is None else int(np.argmin(angle[own]))]] = True
     return chosen
-
-
-def _recognised(
-    run: np.ndarray, who: np.ndarray, shown: np.ndarray, probe: np.ndarray, centred: bool
-) -> np.ndarray:
-    """Whether the nearest image of the gallery shows the person of each probe, (P,)."""
-    codes = unit_rows(run - run[shown].mean(axis=0) * centred)
-    return who[shown][(codes[probe] @ codes[shown].T).argmax(axis=1)] == who[probe]
 
 
 @dataclass(frozen=True)

@@ -85,8 +85,12 @@ def relight(
         alike = [[place[one, lit[row]] for one in others if (one, lit[row]) in place] for row in targets]
         ratio = photos[shown].clamp(min=0.02) / photos[place[others[0], lit[source]]].clamp(min=0.02)
         with torch.inference_mode():
-            found = _relit(model, photos[source], scenes[source], scenes.light[shown])
+            target = scenes[[source] * len(shown)].with_parameters(light=scenes.light[shown])
+            edited = PhotoDetail(photos[source], scenes[source], model.fov_deg)(target)
+            rendered = model.render(at_size(target, photos.shape[-1]))
             mask = _mask(model, scenes[source], photos.shape[-1], read.layout)
+        found = {"photograph relit": edited, "model's rendering": rendered}
+        found = {name: drawn.image.clamp(0, 1).cpu() for name, drawn in found.items()}
         answers = (
             photos[source].expand_as(ratio),
             torch.stack([photos[near].mean(dim=0) for near in alike]),
@@ -112,17 +116,6 @@ def relight(
         values[title.lower()] = numbers_of(scored)
         notes += [f"{title}, {note}" for note in image_verdicts(scored[0], {"all": (columns["all"], 1.0)})]
     return Scores(tables, values, notes)
-
-
-def _relit(
-    model: Derenderer, photo: Float[Tensor, "3 s s"], scene: Scene, light: Float[Tensor, "n 4"]
-) -> dict[str, Tensor]:
-    """The photograph in N lights, in its own detail and as the model renders it."""
-    target = scene[[0] * len(light)].with_parameters(light=light)
-    return {
-        "photograph relit": PhotoDetail(photo, scene, model.fov_deg)(target).image.clamp(0, 1).cpu(),
-        "model's rendering": model.render(at_size(target, photo.shape[-1])).image.clamp(0, 1).cpu(),
-    }
 
 
 def _mask(model: Derenderer, scene: Scene, size: int, layout: str) -> Float[Tensor, "1 s s"]:

@@ -140,12 +140,10 @@ def swapped_factors(
 ) -> Edit:  # fmt: skip
     """The image with one factor of another, for each of ``factors`` by itself (default: every factor)."""
     parameters = swappable(model, factors)
-    stills = {
-        f"its {name}": sweeps.drawn(
-            sweeps.swapped(image.scene, donor.scene, parameter), _drawn_by(image, donor, parameter)
-        )[0]
-        for name, parameter in parameters.items()
-    }
+    stills = {}
+    for name, parameter in parameters.items():
+        render = (donor if parameter == "albedo" else image).render  # of whom the surface's colours are
+        stills[f"its {name}"] = sweeps.drawn(sweeps.swapped(image.scene, donor.scene, parameter), render)[0]
     numbers = {f"its {name}": {"factor": name, "from": str(donor.path)} for name in parameters}
     return Edit(_inputs(model, image, donor), stills, numbers)
 
@@ -185,11 +183,6 @@ def swapped_video(parameters: Sequence[str], donor: OpenedImage) -> VideoEdit:
 def _over_time(scene: Scene, hold: bool) -> Tensor:
     """Places of a sweep for the frames of a video."""
     return torch.ones(len(scene)) if hold else sweeps.there_and_back(len(scene))
-
-
-def _drawn_by(image: OpenedImage, donor: OpenedImage, parameter: str) -> sweeps.Render:
-    """What draws a swap: surface colours are of the image that gives the albedo."""
-    return donor.render if parameter == "albedo" else image.render
 
 
 def swappable(model: Derenderer, factors: Sequence[str] = ()) -> dict[str, str]:

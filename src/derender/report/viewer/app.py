@@ -254,7 +254,8 @@ class Application:
         """Bytes that the studio makes for a question."""
         question = await self._question(request, kind)
         content = await self._work(self._computing, make, question, patience=patience)
-        return Response(content, media_type=_media_type(content))
+        known = (kind for start, kind in MEDIA_TYPES.items() if content.startswith(start))
+        return Response(content, media_type=next(known, "video/mp4"))
 
     async def crop(self, request: Request) -> Response:
         """Decompose an opened image again."""
@@ -315,11 +316,6 @@ def _thumbnail(gallery: Gallery, row: int) -> str | None:
         return data_url(pictures(gallery.picture(row, THUMBNAIL)[None])[0])
     except Refused:
         return None
-
-
-def _media_type(content: bytes) -> str:
-    """What bytes are, by their first ones."""
-    return next((kind for start, kind in MEDIA_TYPES.items() if content.startswith(start)), "video/mp4")
 
 
 def _page_file(name: str, media_type: str) -> Answer:
