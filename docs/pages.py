@@ -309,6 +309,14 @@ def million_rows(found: Any) -> Iterator[list[str]]:
     yield from ([name, f"{found['seconds'][key]:.2f}"] for key, name in names.items())
 
 
+def true_factors(found: Any) -> Iterator[list[str]]:
+    model, untrained = (found["rows"][name][0]["truth"] for name in ("model", "untrained encoder"))
+    yield ["true factor", *model["features"], "untrained, all"]
+    for place, name in enumerate(model["factors"]):
+        scores = (row[place] for row in (*model["score"], untrained["together"]))
+        yield [name, *(f"{round(score, 2) + 0:.2f}" for score in scores)]
+
+
 def page_speed(found: Any) -> Iterator[list[str]]:
     yield ["image, clients at once", "images a CPU second", "CPU ms an image", "memory, MB"]
     for row in found["rows"]:
@@ -361,6 +369,7 @@ SPEED: dict[str, tuple[str, Callable[[Any], Iterator[list[str]]]]] = {
     "memory": ("embedding_memory.json", memory),
     "step-memory": ("step_memory.json", step_memory),
     "million": ("clustering_million.json", million),
+    "true-factors": ("true-factors.json", true_factors),
     "bench": ("bench.json", shares),
     "fitting": ("fitting.json", fitting),
     "heads-generated": ("generated/heads.json", scored(DEPTH, "intervals", "geometry")),
