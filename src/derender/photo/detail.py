@@ -11,15 +11,18 @@ as in training: on Extended Yale B that is nearer to the truth than the same rat
 and haze that the renderer knows are taken off and drawn anew; what they cannot explain stays.
 """
 
+from math import radians, tan
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample, interpolate, max_pool2d, pad
 
+from derender.photo.foreground import foreground
 from derender.render import Rendering, warp
 from derender.renderers import Renderer
 from derender.scene import Scene
-from derender.scene.camera import project, to_camera, unproject
+from derender.scene.camera import constant, project, to_camera, unproject
 from derender.scene.enlarge import at_size
 
 GRID = 256
@@ -32,8 +35,11 @@ LEAST_SHADING, LARGEST_RATIO = 0.05, 20.0
 DISTRUST = 4.0  # the weight of the photograph's detail is 1 / (1 + DISTRUST m²), m the mean squared log ratio
 HIDDEN_BEHIND = 0.01  # scene units that a point may lie behind what is seen there
 FEATHER_SHARE = 1 / 32  # width of the blends, of the image's width
-COLOUR_SHARE = 1 / 12  # reach of the colours carried over to what is not seen
-COLOUR_MARGIN = 0.25  # of the canonical map, left out of what colours are carried over from
+COLOUR_SHARE = 1 / 32  # reach of the colours carried over to what is not seen
+COLOUR_MARGIN = 0.08  # of the canonical map, left out of what colours are carried over from
+OUTLINE_SHARE = 0.012  # of the side: what is left out along the object's outline
+DEEP_SHARE = 0.4  # of the crop's width: how deep the object goes on behind its outline
+SIDE_STEPS = 16  # in which its side is drawn as it comes round
 RIM_SHARE = 0.05  # of the side: the surface's rim, where a model's depth ends in a wall
 FADE_SHARE = 1 / 8  # reach of motion and shading beyond the surface
 DARKEST = 1e-3
@@ -69,7 +75,11 @@ class PhotoDetail:
         self._place = project(points, self.grid, self.grid, fov_deg).permute(0, 3, 1, 2)
         self.renderer = renderer
         self._shading, self._veil = self._light(own), renderer.veil(own, fov_deg)
-        self._seen = self._visible(own, points) * _ramp(self._shading, *LIT)
+        crop, self._camera = self.on_grid(self.photo[None], self.grid)[0], own.camera
+        shown = _eroded(foreground(crop), round(OUTLINE_SHARE * self.grid))
+        self._shows = _look_up(shown, self._place)
+        self._object = pad(shown, (self.rim,) * 4, mode="replicate")
+        self._seen = self._visible(own, points) * _ramp(self._shading, *LIT) * self._shows
         self._colours = self._completed(own)
         at_home = warp(self._place, own.depth, own.camera, fov_deg)
         self._off = (at_home.image - self._pixels()) * at_home.mask[:, None]  # what rounding leaves
@@ -83,10 +93,10 @@ class PhotoDetail:
         count, shading, veil = len(scene), self._light(scene), self.renderer.veil(scene, self.fov_deg)
         own = torch.cat((self._place, self._seen, self._shading, self._veil), dim=1)
         within = self._margin(RIM_SHARE)
-        maps = torch.cat((own, own.flip(-1), self._colours, within), dim=1).expand(count, -1, -1, -1)
+        maps = torch.cat((own, own.flip(-1), self._colours, within, self._shows), dim=1).expand(count, -1, -1, -1)
         view = warp(torch.cat((maps, shading, veil), dim=1), scene.depth, scene.camera, self.fov_deg)
-        sizes = (own.shape[1], own.shape[1], 3, 1, 1, veil.shape[1])
-        own, mirrored, colours, within, shading, veil = view.image.split(sizes, dim=1)
+        sizes = (own.shape[1], own.shape[1], 3, 1, 1, 1, veil.shape[1])
+        own, mirrored, colours, within, shows, shading, veil = view.image.split(sizes, dim=1)
         place = own[:, :2] - _look_up(self._off.expand(count, -1, -1, -1), own[:, :2])
         shift, mirror_shift = place - self._pixels(), mirrored[:, :2] - self._pixels()
         moved = shift.norm(dim=1, keepdim=True) / self.grid
@@ -97,15 +107,21 @@ class PhotoDetail:
         change = (log_ratio.square() * mask).sum(dim=(2, 3)) / mask.sum(dim=(2, 3)).clamp(min=1)
         trust = 1 / (1 + DISTRUST * change.square())
         mask, shift, log_ratio = self._continued(mask, shift, log_ratio)
-        maps = (mirror_shift, mirror_ratio, colours * shading, seen, (1 - seen) * mirrored[:, 2:3])
-        mirror_shift, mirror_ratio, drawn, seen, mirror_seen, *veils = (
+        maps = (mirror_shift, mirror_ratio, seen, (1 - seen) * mirrored[:, 2:3], shows)
+        mirror_shift, mirror_ratio, seen, mirror_seen, shows, *veils = (
             pad(field, (self.rim,) * 4) for field in (*maps, own[:, 4:], mirrored[:, 4:], veil)
         )
-        seen, mirror_seen = 1 - mask * (1 - seen), mask * mirror_seen
+        covered = view.mask[:, None].to(colours)
+        drawn = pad(_filled(colours * shading * covered, covered), (self.rim,) * 4, mode="replicate")
+        turned = _ramp(moved.amax(dim=(2, 3), keepdim=True), *MOVED)
+        object_there = _look_up(self._object.expand(count, -1, -1, -1), self._pixels(self.rim) + shift + self.rim)
+        outline = self._with_sides(torch.maximum(shows, object_there * (1 - pad(covered, (self.rim,) * 4))), scene)
+        seen = (1 - mask * (1 - seen)) * torch.maximum(object_there, 1 - turned)
+        mirror_seen = mask * mirror_seen
         trust = 1 - mask * (1 - trust[:, :, None, None])
         mirror_ratio = mirror_ratio.clamp(min=DARKEST)
         fields = (shift, mirror_shift, seen, mirror_seen, log_ratio.exp(), mirror_ratio, drawn)
-        image = self._composed((*fields, *(mask * one for one in veils)), trust)
+        image = self._composed((*fields, *(mask * one for one in veils)), trust, outline)
         depth = self._enlarged(pad(view.depth[:, None], (self.rim,) * 4))[:, 0]
         return Rendering(image, depth, torch.ones_like(depth))
 
@@ -119,7 +135,8 @@ class PhotoDetail:
         weights = (self._seen, (1 - self._seen) * self._seen.flip(-1))
         fields = (shift, mirror_shift, *weights, bare, bare.flip(-1), self._colours)
         fields += (self._veil, self._veil.flip(-1), 0 * self._veil)
-        return self._composed(tuple(pad(field, (self.rim,) * 4) for field in fields), torch.ones(1, 1, 1, 1))
+        fields = tuple(pad(field, (self.rim,) * 4) for field in fields)
+        return self._composed(fields, torch.ones(1, 1, 1, 1))
 
     def _continued(self, mask: Tensor, shift: Tensor, log_ratio: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """How far inside the surface, 0..1; shift and ratio continue around it and fade. On the wide grid."""
@@ -139,23 +156,45 @@ class PhotoDetail:
         rise = torch.ones_like(depth) if self.rim == 0 else (depth / self.rim).clamp(max=1)
         return rise * rise[:, None]
 
+    def _with_sides(self, shows: Float[Tensor, "n 1 g g"], scene: Scene) -> Float[Tensor, "n 1 g g"]:
+        """Where the object is in new views: what the photograph shows of it, and the side that comes round."""
+        back = 1 + DEEP_SHARE * 2 * tan(radians(self.fov_deg / 2))
+        axis = constant(((0.0, 0.0, 1.0), (0.0, 0.0, back)), shows)[None, None]
+        ends = [
+            project(to_camera(axis.expand(len(camera), -1, -1, -1), camera), self.grid, self.grid, self.fov_deg)
+            for camera in (scene.camera, self._camera)
+        ]
+        along = (ends[0] - ends[1])[:, :, 1:] - (ends[0] - ends[1])[:, :, :1]
+        places = self._pixels(self.rim).permute(0, 2, 3, 1)
+        parts = [
+            _look_up(shows, (places - along * step / SIDE_STEPS).permute(0, 3, 1, 2) + self.rim)
+            for step in range(SIDE_STEPS + 1)
+        ]
+        return torch.stack(parts).amax(dim=0)
+
     def _composed(
-        self, fields: tuple[Tensor, ...], trust: Float[Tensor, "n 1 h w"]
-    ) -> Float[Tensor, "n 3 s s"]:
+        self, fields: tuple[Tensor, ...], trust: Float[Tensor, "n 1 h w"],
+        outline: Float[Tensor, "n 1 h w"] | None = None,
+    ) -> Float[Tensor, "n 3 s s"]:  # fmt: skip
         """Images at the photograph's size, from fields on the wider grid.
 
         Fields are shifts into the photograph and into its mirror image, weights of both, factors of both, the
         model's colours, and veils: of both, and the new one; trust is the weight of detail beside colours.
+        Around the outline, by default the whole image, is the photograph as it stands.
         """
-        trust = trust.expand(-1, -1, *fields[0].shape[-2:])
-        channels = [*(field.shape[1] for field in fields), 1]
-        *enlarged, trust = self._enlarged(torch.cat((*fields, trust), dim=1)).split(channels, dim=1)
-        shift, mirror_shift, seen, mirror_seen, ratio, mirror_ratio, drawn, veil, mirror_veil, new = enlarged
-        drawn = drawn.clamp(DARKEST, 1)
+        fields += (trust,) if outline is None else (trust, outline)
+        channels = [field.shape[1] for field in fields]
+        shape = (-1, -1, *fields[0].shape[-2:])
+        enlarged = self._enlarged(torch.cat([field.expand(shape) for field in fields], dim=1)).split(channels, dim=1)
+        shift, mirror_shift, seen, mirror_seen, ratio, mirror_ratio, drawn, veil, mirror_veil, new = enlarged[:10]
+        drawn, trust = drawn.clamp(DARKEST, 1), enlarged[10]
         image = seen * self._detailed(shift, ratio, drawn, trust, veil, new)
         if bool((seen < 1).any()):
             other = self._detailed(mirror_shift, mirror_ratio, drawn, trust, mirror_veil, new)
             image = image + mirror_seen * other + (1 - seen - mirror_seen) * _veiled(drawn, new)
+        if outline is not None and bool((enlarged[11] < 1).any()):
+            still = self._detailed(0 * shift, ratio, drawn, trust, veil, new)
+            image = still + enlarged[11] * (image - still)
         return image.clamp(0, 1)
 
     def _detailed(self, shift: Tensor, ratio: Tensor, drawn: Tensor, trust: Tensor, *veils: Tensor) -> Tensor:
@@ -198,7 +237,8 @@ class PhotoDetail:
         known = weight + mirror_weight
         difference = weight * bare + mirror_weight * bare.flip(-1) - known * own.albedo
         reach = COLOUR_SHARE * self.grid
-        return (own.albedo + _blurred(difference, reach) / _blurred(known, reach).clamp(min=0.05)).clamp(0, 1)
+        difference = _filled(_blurred(difference, reach), _blurred(known, reach).clamp(min=1e-3))
+        return (own.albedo + difference).clamp(0, 1)
 
     def _visible(self, own: Scene, points: Tensor) -> Float[Tensor, "1 1 g g"]:
         """How well the photograph shows each canonical point, 0..1."""
@@ -217,8 +257,9 @@ class PhotoDetail:
         edge = round(share * self.grid)
         return pad(torch.ones_like(self._seen[..., edge:-edge, edge:-edge]), (edge,) * 4)
 
-    def _pixels(self) -> Float[Tensor, "1 2 g g"]:
-        return _square(torch.arange(self.grid).float()).permute(0, 3, 1, 2).to(self.photo)
+    def _pixels(self, rim: int = 0) -> Float[Tensor, "1 2 g g"]:
+        along = torch.arange(-rim, self.grid + rim).float()
+        return _square(along).permute(0, 3, 1, 2).to(self.photo)
 
 
 def _square(along: Tensor) -> Float[Tensor, "1 k k 2"]:
