@@ -5,7 +5,8 @@ coarse grid and enlarged: where each point of the new image lies in the photogra
 shading changes. The photograph is looked up there at its own resolution. Its own light and viewpoint give it
 back. A point that it does not show is taken from its mirror image where that is seen. Elsewhere it is the
 model's albedo, moved to the photograph's colours; the three blend. Around the surface, motion and shading go
-on and fade out: hair, neck and background follow. The more shading changes, the more the model's colours
+on and fade out: hair and neck follow. A background that colours tell apart (foreground.py) stays, and the
+side that comes round is drawn in the object's colours. The more shading changes, the more the model's colours
 weigh: what it explained wrongly would otherwise stay in the surface. Shading multiplies coded (sRGB) values,
 as in training: on Extended Yale B that is nearer to the truth than the same ratio in linear light. Highlights
 and haze that the renderer knows are taken off and drawn anew; what they cannot explain stays.
@@ -93,7 +94,8 @@ class PhotoDetail:
         count, shading, veil = len(scene), self._light(scene), self.renderer.veil(scene, self.fov_deg)
         own = torch.cat((self._place, self._seen, self._shading, self._veil), dim=1)
         within = self._margin(RIM_SHARE)
-        maps = torch.cat((own, own.flip(-1), self._colours, within, self._shows), dim=1).expand(count, -1, -1, -1)
+        maps = torch.cat((own, own.flip(-1), self._colours, within, self._shows), dim=1)
+        maps = maps.expand(count, -1, -1, -1)
         view = warp(torch.cat((maps, shading, veil), dim=1), scene.depth, scene.camera, self.fov_deg)
         sizes = (own.shape[1], own.shape[1], 3, 1, 1, 1, veil.shape[1])
         own, mirrored, colours, within, shows, shading, veil = view.image.split(sizes, dim=1)
@@ -114,9 +116,11 @@ class PhotoDetail:
         covered = view.mask[:, None].to(colours)
         drawn = pad(_filled(colours * shading * covered, covered), (self.rim,) * 4, mode="replicate")
         turned = _ramp(moved.amax(dim=(2, 3), keepdim=True), *MOVED)
-        object_there = _look_up(self._object.expand(count, -1, -1, -1), self._pixels(self.rim) + shift + self.rim)
-        outline = self._with_sides(torch.maximum(shows, object_there * (1 - pad(covered, (self.rim,) * 4))), scene)
-        seen = (1 - mask * (1 - seen)) * torch.maximum(object_there, 1 - turned)
+        came_from = self._pixels(self.rim) + shift + self.rim
+        source = _look_up(self._object.expand(count, -1, -1, -1), came_from)
+        beside = 1 - pad(covered, (self.rim,) * 4)  # where the surface is not: around it all goes on
+        outline = self._with_sides(torch.maximum(shows, source * beside), scene)
+        seen = (1 - mask * (1 - seen)) * torch.maximum(source, 1 - turned)
         mirror_seen = mask * mirror_seen
         trust = 1 - mask * (1 - trust[:, :, None, None])
         mirror_ratio = mirror_ratio.clamp(min=DARKEST)
@@ -157,20 +161,20 @@ class PhotoDetail:
         return rise * rise[:, None]
 
     def _with_sides(self, shows: Float[Tensor, "n 1 g g"], scene: Scene) -> Float[Tensor, "n 1 g g"]:
-        """Where the object is in new views: what the photograph shows of it, and the side that comes round."""
+        """Where the object is in new views: what the photograph shows, and the side that comes round."""
         back = 1 + DEEP_SHARE * 2 * tan(radians(self.fov_deg / 2))
         axis = constant(((0.0, 0.0, 1.0), (0.0, 0.0, back)), shows)[None, None]
-        ends = [
-            project(to_camera(axis.expand(len(camera), -1, -1, -1), camera), self.grid, self.grid, self.fov_deg)
-            for camera in (scene.camera, self._camera)
-        ]
-        along = (ends[0] - ends[1])[:, :, 1:] - (ends[0] - ends[1])[:, :, :1]
-        places = self._pixels(self.rim).permute(0, 2, 3, 1)
-        parts = [
-            _look_up(shows, (places - along * step / SIDE_STEPS).permute(0, 3, 1, 2) + self.rim)
-            for step in range(SIDE_STEPS + 1)
-        ]
-        return torch.stack(parts).amax(dim=0)
+
+        def across(camera: Float[Tensor, "n 6"]) -> Float[Tensor, "n 1 1 2"]:
+            """By how many pixels the back lies beside the front."""
+            points = to_camera(axis.expand(len(camera), -1, -1, -1), camera)
+            front, behind = project(points, self.grid, self.grid, self.fov_deg).split(1, dim=2)
+            return behind - front
+
+        along = (across(scene.camera) - across(self._camera)).permute(0, 3, 1, 2)
+        places = self._pixels(self.rim) + self.rim
+        steps = [along * step / SIDE_STEPS for step in range(SIDE_STEPS + 1)]
+        return torch.stack([_look_up(shows, places - step) for step in steps]).amax(dim=0)
 
     def _composed(
         self, fields: tuple[Tensor, ...], trust: Float[Tensor, "n 1 h w"],
@@ -182,19 +186,20 @@ class PhotoDetail:
         model's colours, and veils: of both, and the new one; trust is the weight of detail beside colours.
         Around the outline, by default the whole image, is the photograph as it stands.
         """
-        fields += (trust,) if outline is None else (trust, outline)
-        channels = [field.shape[1] for field in fields]
         shape = (-1, -1, *fields[0].shape[-2:])
-        enlarged = self._enlarged(torch.cat([field.expand(shape) for field in fields], dim=1)).split(channels, dim=1)
-        shift, mirror_shift, seen, mirror_seen, ratio, mirror_ratio, drawn, veil, mirror_veil, new = enlarged[:10]
-        drawn, trust = drawn.clamp(DARKEST, 1), enlarged[10]
+        fields += (trust, torch.ones_like(trust) if outline is None else outline)
+        fields = tuple(field.expand(shape) for field in fields)
+        channels = [field.shape[1] for field in fields]
+        *enlarged, trust, outline = self._enlarged(torch.cat(fields, dim=1)).split(channels, dim=1)
+        shift, mirror_shift, seen, mirror_seen, ratio, mirror_ratio, drawn, veil, mirror_veil, new = enlarged
+        drawn = drawn.clamp(DARKEST, 1)
         image = seen * self._detailed(shift, ratio, drawn, trust, veil, new)
         if bool((seen < 1).any()):
             other = self._detailed(mirror_shift, mirror_ratio, drawn, trust, mirror_veil, new)
             image = image + mirror_seen * other + (1 - seen - mirror_seen) * _veiled(drawn, new)
-        if outline is not None and bool((enlarged[11] < 1).any()):
+        if bool((outline < 1).any()):
             still = self._detailed(0 * shift, ratio, drawn, trust, veil, new)
-            image = still + enlarged[11] * (image - still)
+            image = still + outline * (image - still)
         return image.clamp(0, 1)
 
     def _detailed(self, shift: Tensor, ratio: Tensor, drawn: Tensor, trust: Tensor, *veils: Tensor) -> Tensor:
