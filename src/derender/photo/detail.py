@@ -105,6 +105,7 @@ class PhotoDetail:
         seen = torch.maximum(own[:, 2:3], 1 - _ramp(moved, *MOVED))
         ratio, mirror_ratio = _ratio(shading, own[:, 3:4]), _ratio(shading, mirrored[:, 3:4])
         mask = (within > 0.99).to(within)
+        turned = _ramp((moved * mask).amax(dim=(2, 3), keepdim=True), *MOVED)
         log_ratio = ratio.log()
         change = (log_ratio.square() * mask).sum(dim=(2, 3)) / mask.sum(dim=(2, 3)).clamp(min=1)
         trust = 1 / (1 + DISTRUST * change.square())
@@ -115,7 +116,6 @@ class PhotoDetail:
         )
         covered = view.mask[:, None].to(colours)
         drawn = pad(_filled(colours * shading * covered, covered), (self.rim,) * 4, mode="replicate")
-        turned = _ramp(moved.amax(dim=(2, 3), keepdim=True), *MOVED)
         came_from = self._pixels(self.rim) + shift + self.rim
         source = _look_up(self._object.expand(count, -1, -1, -1), came_from)
         beside = 1 - pad(covered, (self.rim,) * 4)  # where the surface is not: around it all goes on
