@@ -25,7 +25,7 @@ BUDGET = {  # lines, files
     "render": (1_740, 16),
     "features": (1_460, 9),
     "interpretation": (1_200, 6),
-    "photo": (1_410, 7),  # photographs in their own pixels
+    "photo": (1_505, 8),  # photographs in their own pixels; the outline of what is turned
     "networks": (750, 7),
     "storage": (950, 9),
     "objectives": (730, 6),
@@ -36,7 +36,7 @@ BUDGET = {  # lines, files
     "learn": (1_260, 8),
 }
 TOTAL = (42_490, 283)  # photographs, renderers, identity, pages; on the way to (37_000, 285)
-TEST_LINES = 26_900  # on the way to 26_000
+TEST_LINES = 27_000  # on the way to 26_000
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80
 SHARED_BY_COMMANDS = {"__init__.py", "console.py", "gathered.py", "options.py", "scoring.py"}
