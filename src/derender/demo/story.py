@@ -153,10 +153,10 @@ class DemoSettings(Settings):
 
 FULL = DemoSettings()
 QUICK = DemoSettings(
-    train_pictures=1_500, test_pictures=160, images=2_400, minutes=0.5, fit_steps=0, shown=6, films=3,
+    train_pictures=1_000, test_pictures=120, images=1_600, minutes=0.4, fit_steps=0, shown=6, films=3,
     overrides=(
-        "warmup_images=500", "objective.self_features_steps=60", "whitening.pictures=400",
-        "fitting.examples=300",
+        "warmup_images=400", "objective.self_features_steps=60", "whitening.pictures=200",
+        "fitting.examples=200",
     ),
 )  # fmt: skip
 
