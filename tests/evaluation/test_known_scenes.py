@@ -138,7 +138,7 @@ def test_relighting_by_the_true_ratio_is_best(tmp_path):
 
 
 def test_brightness_of_the_true_albedo_has_slope_1(made, scenes):
-    from derender.evaluation.brightness import surfaces
+    from derender.evaluation.photometry import surfaces
 
     skin = np.linspace(0.2, 0.9, 24)
     scenes = scenes.with_parameters(

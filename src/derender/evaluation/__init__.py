@@ -8,7 +8,6 @@ function states its range and its best value. docs/reference/metrics.md has a ta
 
 from derender.evaluation.angles import light, pose
 from derender.evaluation.bootstrap import difference, estimate, resamples
-from derender.evaluation.brightness import brightness
 from derender.evaluation.clustering import cluster, compare_clusterings, finch_levels
 from derender.evaluation.clustering_methods import clusterings, cut, finch, finch_clusters, ward_tree
 from derender.evaluation.clustering_scores import chance_scores, cluster_scores
@@ -27,13 +26,13 @@ from derender.evaluation.linear_probes import majority_answers, probe
 from derender.evaluation.linear_probing import compare_linear, linear, linear_scores
 from derender.evaluation.linear_task import Rows, Task, choose_rows, task_of
 from derender.evaluation.paper_comparison import compare
+from derender.evaluation.photometry import brightness, relight
 from derender.evaluation.pixels import (
     ReconstructionResult,
     evaluate_reconstruction,
     mean_image,
     reconstruction_scores,
 )
-from derender.evaluation.relighting import relight
 from derender.evaluation.robust import robustness
 from derender.evaluation.scenes import geometry, reconstruction
 from derender.evaluation.score_table import Column, Row, Scores, ScoreTable
