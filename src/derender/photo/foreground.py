@@ -1,6 +1,6 @@
 """Which pixels of a photograph show the object: those whose colours resemble its middle more than its sides.
 
-A model's surface has no outline: it goes on behind what the photograph shows around the object. What
+A model's surface has no outline: it continues behind the surroundings of the object. What
 resembles both, as hair against a dark wall, counts as the object.
 """
 
