@@ -255,11 +255,14 @@ def renderer_speed(found: Any) -> Iterator[list[str]]:
 def renderers_trained(found: Any) -> Iterator[list[str]]:
     """Errors of models trained with each renderer, by effect: mean and standard deviation over seeds."""
     digits = {"normal_deg": 1, "albedo": 3, "albedo_chroma": 4, "l1": 4}
-    titles = ("normals, degrees", "albedo error", "chroma error", "L1", "seeds")
+    titles = ("normals, degrees", "albedo error", "chroma error", "L1", "albedo / lambert", "seeds")
     yield ["effect in the images: renderer", *titles]
-    for (effect, name), ones in _trained(found).items():
-        means = (_spread([one[key] for one in ones], n) for key, n in digits.items())
-        yield [f"{effect}: {name}", *means, ", ".join(str(one["seed"]) for one in ones)]
+    groups = _trained(found)
+    for (effect, name), ones in groups.items():
+        means = [_spread([one[key] for one in ones], n) for key, n in digits.items()]
+        plain = {one["seed"]: one["albedo"] for one in groups[effect, "lambert"]}
+        ratio = _spread([one["albedo"] / plain[one["seed"]] for one in ones], 2)
+        yield [f"{effect}: {name}", *means, ratio, ", ".join(str(one["seed"]) for one in ones)]
 
 
 def effect_numbers(found: Any) -> Iterator[list[str]]:

@@ -54,10 +54,7 @@ def renderer_named(name: str) -> Renderer:
     if not all(parts):
         raise ValueError(f"cannot read the renderer {name!r}: write NAME, NAME(setting=value) or NAME+NAME")
     made = [_one(part["name"], part["settings"]) for part in parts if part is not None]
-    renderer = made[0]
-    for other in made[1:]:
-        renderer = renderer + other
-    return renderer
+    return sum(made[1:], made[0])
 
 
 def as_renderer(given: str | Render | None, stored: str) -> Renderer:

@@ -28,7 +28,9 @@ def sh(colour: bool = False) -> Renderer:
         return environment.bounded(raw.float(), (mean[0], mean[1]))
 
     def lit(scene: Scene, normal: Tensor) -> Tensor:
-        return environment.irradiance(_environment(scene, channels), normal)
+        light = scene.extra.get("environment")
+        light = environment.from_light(scene.light, channels) if light is None else light
+        return environment.irradiance(light, normal)
 
     def ball(scene: Scene, fov_deg: float) -> Tensor:
         """A white ball in the light, as large as the image."""
@@ -45,9 +47,3 @@ def sh(colour: bool = False) -> Renderer:
         perturb=exchange,
     )  # fmt: skip
     return Renderer("sh", (row,), irradiance=lit, maps={"a ball in this light": ball})
-
-
-def _environment(scene: Scene, channels: int) -> Float[Tensor, "n k"]:
-    if "environment" in scene.extra:
-        return scene.extra["environment"]
-    return environment.from_light(scene.light, channels)
