@@ -52,6 +52,11 @@ def test_embed_then_cluster_as_with_our_own(run, faces, tmp_path, capsys):
     shown = capsys.readouterr().out
     assert "pixels" in shown and "PCA (6)" in shown
     assert "untrained" not in shown  # what is not known: an untrained encoder like a VQ-VAE's
+    at_once = ["evaluate", "linear", "--model", run, "--data", faces, "--label", "class", "--counts", 4]
+    assert (
+        call(*at_once, "--finetune", "--epochs", 1, "--seeds", 1, "--heads", "linear", "--resamples", 2) == 0
+    )
+    assert "fine-tuned" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(("name", "size"), [("pixels", 3072), ("pca", 4), ("hog", 324), ("noise", 4)])

@@ -29,11 +29,11 @@ UNTIMED += ("clustering.md", "clustering.tex", "clustering.html")
 """Files that hold times or checksums of such."""
 APART = {"cache", "tensorboard", "samples", "previous", "jobs", "logs"}
 PLAN = """
-images: 64
+images: 48
 image_size: 32
 settings: {image_size: 32, checkpoint_every: 16, validate_every: 32, batch_size: 8, deterministic: true}
 train: {own: {data: DATA}}
-methods: {ae: {settings: {width: 4, code_size: 8}}, derender: {settings: SMALL}, hog: {}, pixels: {}}
+methods: {ae: {settings: {width: 4, code_size: 8}}, vqvae: {settings: {width: 4, codes: 8}}, hog: {}}
 score: {own: {data: DATA, trained_on: own, label: class}}
 untrained_seeds: 1
 resamples: 50
@@ -118,13 +118,13 @@ def made_material(place: Path, pictures: int) -> dict[str, str]:
 
 def made_runs(place: Path, data: str, model: str) -> dict[str, str]:
     """The folder of a training with that model, and a plan of two trainings."""
-    run, sizes = place / "run", "{width: 8, light_width: 4, perceptual: none, whitening.pictures: 8}"
+    run = place / "run"
     shutil.copytree(model, run / "model")
     (run / "config.yaml").write_text(to_yaml(resolve("small", ["image_size=32", "width=4", "light_width=4"])))
     rows = [{"kind": "train", "images": 16 * row, "seconds": row, "l1": 1 / (row + 1)} for row in range(9)]
     (run / "metrics.jsonl").write_text("".join(f"{json.dumps(row)}\n" for row in rows))
     plan = place / "plan.yaml"
-    plan.write_text(PLAN.replace("DATA", json.dumps(data)).replace("SMALL", sizes))
+    plan.write_text(PLAN.replace("DATA", json.dumps(data)))
     return {"RUN": str(run), "PLAN": str(plan)}
 
 

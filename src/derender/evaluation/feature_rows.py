@@ -136,7 +136,8 @@ def embedded_table(
         memory, "embedding", {"weights": weights, "images": images.images}, images,
         lambda: embed_images(model, images.images, progress=progress),
     )  # fmt: skip
-    origin = {"settings": model.settings.model_dump(mode="json"), "weights": weights}
+    origin = {"model": type(model).__name__, "settings": model.settings.model_dump(mode="json")}
+    origin["weights"] = weights
     return replace(table, origin={**table.origin, **origin})
 
 
