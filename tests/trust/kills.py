@@ -45,16 +45,7 @@ ENDINGS["exception"] = (INJECTED, 2)
 FAILED = ": failed: "
 """Of a job of a plan, which goes on without it: counted as if it had ended the plan."""
 
-PRELOADED = {
-    "derender",
-    "torch",
-    "lightning_fabric",
-    "tensorboard",
-    "matplotlib",
-    "sklearn",
-    "scipy",
-    "numba",
-}
+PRELOADED = set(["derender", "torch", "lightning_fabric", "tensorboard", "matplotlib", "sklearn", "scipy", "numba"])
 DISK_MEGABYTES = 400
 
 LEARNS = " ".join(
@@ -65,6 +56,7 @@ LEARNS = " ".join(
         "whitening.pictures=8",
     )
 )
+RUN = ("run", "config.yaml", "--resume")
 MADE = "--data DATA --model MODEL --device cpu"
 SCORED = "--resamples 60 --cache OUT/cache --markdown OUT/scores.md"
 TABLES = f"--features one=ONE --features two=TWO {SCORED}"
@@ -73,15 +65,10 @@ LABELS = "--label class --set perceptual=none"
 PICTURES = "PHOTO PHOTO2 --model MODEL --device cpu --frame none"
 FILM = f"{PICTURES} --size 64 --stills 2 --film gif,mp4 --frames 6"
 COMMANDS = {  # what to write, and what is given beside it once the file or folder named third is there
-    "train": (
-        f"train --data DATA --preset small --device cpu {LEARNS} --out",
-        "run",
-        "config.yaml",
-        "--resume",
-    ),
+    "train": (f"train --data DATA --preset small --device cpu {LEARNS} --out", *RUN),
     "finetune": (
         f"finetune --data DATA --preset small --device cpu {LEARNS} {LABELS} --out",
-        *("run", "config.yaml", "--resume"),
+        *RUN,
     ),
     "embed": (f"embed {MADE} --batch-size 4 --out", "table.parquet", "", "--force"),
     "identify": (f"evaluate identify {MADE} {SCORED} --label class --force --json", "scores.json", "", ""),
@@ -298,8 +285,7 @@ class Trial:
 
     def numbers_told(self) -> dict[str, object]:
         """For ``--json``."""
-        names = ("writing", "rounds", "survived", "faults")
-        counts = {name: getattr(self, name) for name in names}
+        counts = {name: getattr(self, name) for name in ("writing", "rounds", "survived", "faults")}
         date = f"{datetime.now(UTC):%Y-%m-%d}"
         return {"date": date, "kills": self.kills.total(), "by_cause": dict(self.kills), **counts}
 
