@@ -45,7 +45,16 @@ ENDINGS["exception"] = (INJECTED, 2)
 FAILED = ": failed: "
 """Of a job of a plan, which goes on without it: counted as if it had ended the plan."""
 
-PRELOADED = set(["derender", "torch", "lightning_fabric", "tensorboard", "matplotlib", "sklearn", "scipy", "numba"])
+PRELOADED = {
+    "derender",
+    "torch",
+    "lightning_fabric",
+    "tensorboard",
+    "matplotlib",
+    "sklearn",
+    "scipy",
+    "numba",
+}
 DISK_MEGABYTES = 400
 
 LEARNS = " ".join(

@@ -181,7 +181,8 @@ def compare_plan(
     plan, out = (plan if isinstance(plan, Plan) else read_plan(plan)), Path(out)
     if out.exists() and not out.is_dir():
         raise ValueError(f"{out} is a file: give the name of a folder")
-    if out.is_dir() and any(out.iterdir()) and not (out / "plan.yaml").is_file():
+    others = out.is_dir() and any(one.name[0] != "." for one in out.iterdir())  # . files: of a kill
+    if others and not (out / "plan.yaml").is_file():
         raise ValueError(f"{out} is not empty and holds no comparison: choose another folder")
     with atomic_file(out / "plan.yaml") as temporary:
         temporary.write_text(to_yaml(plan))

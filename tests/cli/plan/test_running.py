@@ -111,6 +111,8 @@ def test_the_same_command_again_does_nothing_twice(plan, whole, capsys):
 
 def test_killed_in_the_middle_it_ends_with_the_very_table(plan, whole):
     out = plan.parent / "killed"
+    out.mkdir()
+    (out / ".plan.yaml-left").write_text("")  # by a kill at the very beginning
     words = ["compare", "--plan", str(plan), "--out", str(out)]
     done = subprocess.run([sys.executable, "-c", KILLED, *words], capture_output=True, timeout=250)
     assert done.returncode == -signal.SIGKILL

@@ -266,7 +266,8 @@ def test_further_factors_move_and_swap(renderer):
 
 def test_a_model_of_wider_ranges_than_the_page_has_opens_at_its_bounds():
     ranges = SceneRanges(ambient=(3, 4), light_deg=89.9, rotation_deg=89.9, translation_xy=1e6)
-    model = Derenderer(Derenderer.from_preset("small").settings.model_copy(update={"ranges": ranges}))
+    settings = Derenderer.from_preset("small").settings.model_copy(update={"ranges": ranges})
+    model = Derenderer.seeded(settings, 0)
     for name in ("light", "camera"):
         model.nets[name].decoder.linear.weight.data *= 1e4
     studio = Studio(model.eval().requires_grad_(False), "wide")
