@@ -5,25 +5,21 @@ coarse grid and enlarged: where each point of the new image lies in the photogra
 shading changes. The photograph is looked up there at its own resolution. Its own light and viewpoint give it
 back. A point that it does not show is taken from its mirror image where that is seen. Elsewhere it is the
 model's albedo, moved to the photograph's colours; the three blend. Around the surface, motion and shading go
-on and fade out: hair and neck follow. A background that colours tell apart (foreground.py) stays, and the
-side that comes round is drawn in the object's colours. The more shading changes, the more the model's colours
+on and fade out: hair, neck and background follow. The more shading changes, the more the model's colours
 weigh: what it explained wrongly would otherwise stay in the surface. Shading multiplies coded (sRGB) values,
 as in training: on Extended Yale B that is nearer to the truth than the same ratio in linear light. Highlights
 and haze that the renderer knows are taken off and drawn anew; what they cannot explain stays.
 """
-
-from math import radians, tan
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample, interpolate, max_pool2d, pad
 
-from derender.photo.foreground import foreground
 from derender.render import Rendering, warp
 from derender.renderers import Renderer
 from derender.scene import Scene
-from derender.scene.camera import constant, project, to_camera, unproject
+from derender.scene.camera import project, to_camera, unproject
 from derender.scene.enlarge import at_size
 
 GRID = 256
@@ -36,11 +32,8 @@ LEAST_SHADING, LARGEST_RATIO = 0.05, 20.0
 DISTRUST = 4.0  # the weight of the photograph's detail is 1 / (1 + DISTRUST m²), m the mean squared log ratio
 HIDDEN_BEHIND = 0.01  # scene units that a point may lie behind what is seen there
 FEATHER_SHARE = 1 / 32  # width of the blends, of the image's width
-COLOUR_SHARE = 1 / 32  # reach of the colours carried over to what is not seen
-COLOUR_MARGIN = 0.08  # of the canonical map, left out of what colours are carried over from
-OUTLINE_SHARE = 0.012  # of the side: what is left out along the object's outline
-DEEP_SHARE = 0.4  # of the crop's width: how deep the object goes on behind its outline
-SIDE_STEPS = 16  # in which its side is drawn as it comes round
+COLOUR_SHARE = 1 / 12  # reach of the colours carried over to what is not seen
+COLOUR_MARGIN = 0.25  # of the canonical map, left out of what colours are carried over from
 RIM_SHARE = 0.05  # of the side: the surface's rim, where a model's depth ends in a wall
 FADE_SHARE = 1 / 8  # reach of motion and shading beyond the surface
 DARKEST = 1e-3
@@ -76,11 +69,7 @@ class PhotoDetail:
         self._place = project(points, self.grid, self.grid, fov_deg).permute(0, 3, 1, 2)
         self.renderer = renderer
         self._shading, self._veil = self._light(own), renderer.veil(own, fov_deg)
-        crop, self._camera = self.on_grid(self.photo[None], self.grid)[0], own.camera
-        shown = _eroded(foreground(crop), round(OUTLINE_SHARE * self.grid))
-        self._shows = _look_up(shown, self._place)
-        self._object = pad(shown, (self.rim,) * 4, mode="replicate")
-        self._seen = self._visible(own, points) * _ramp(self._shading, *LIT) * self._shows
+        self._seen = self._visible(own, points) * _ramp(self._shading, *LIT)
         self._colours = self._completed(own)
         at_home = warp(self._place, own.depth, own.camera, fov_deg)
         self._off = (at_home.image - self._pixels()) * at_home.mask[:, None]  # what rounding leaves
@@ -94,38 +83,29 @@ class PhotoDetail:
         count, shading, veil = len(scene), self._light(scene), self.renderer.veil(scene, self.fov_deg)
         own = torch.cat((self._place, self._seen, self._shading, self._veil), dim=1)
         within = self._margin(RIM_SHARE)
-        maps = torch.cat((own, own.flip(-1), self._colours, within, self._shows), dim=1)
-        maps = maps.expand(count, -1, -1, -1)
+        maps = torch.cat((own, own.flip(-1), self._colours, within), dim=1).expand(count, -1, -1, -1)
         view = warp(torch.cat((maps, shading, veil), dim=1), scene.depth, scene.camera, self.fov_deg)
-        sizes = (own.shape[1], own.shape[1], 3, 1, 1, 1, veil.shape[1])
-        own, mirrored, colours, within, shows, shading, veil = view.image.split(sizes, dim=1)
+        sizes = (own.shape[1], own.shape[1], 3, 1, 1, veil.shape[1])
+        own, mirrored, colours, within, shading, veil = view.image.split(sizes, dim=1)
         place = own[:, :2] - _look_up(self._off.expand(count, -1, -1, -1), own[:, :2])
         shift, mirror_shift = place - self._pixels(), mirrored[:, :2] - self._pixels()
         moved = shift.norm(dim=1, keepdim=True) / self.grid
         seen = torch.maximum(own[:, 2:3], 1 - _ramp(moved, *MOVED))
         ratio, mirror_ratio = _ratio(shading, own[:, 3:4]), _ratio(shading, mirrored[:, 3:4])
         mask = (within > 0.99).to(within)
-        turned = _ramp((moved * mask).amax(dim=(2, 3), keepdim=True), *MOVED)
         log_ratio = ratio.log()
         change = (log_ratio.square() * mask).sum(dim=(2, 3)) / mask.sum(dim=(2, 3)).clamp(min=1)
         trust = 1 / (1 + DISTRUST * change.square())
         mask, shift, log_ratio = self._continued(mask, shift, log_ratio)
-        maps = (mirror_shift, mirror_ratio, seen, (1 - seen) * mirrored[:, 2:3], shows)
-        mirror_shift, mirror_ratio, seen, mirror_seen, shows, *veils = (
+        maps = (mirror_shift, mirror_ratio, colours * shading, seen, (1 - seen) * mirrored[:, 2:3])
+        mirror_shift, mirror_ratio, drawn, seen, mirror_seen, *veils = (
             pad(field, (self.rim,) * 4) for field in (*maps, own[:, 4:], mirrored[:, 4:], veil)
         )
-        covered = view.mask[:, None].to(colours)
-        drawn = pad(_filled(colours * shading * covered, covered), (self.rim,) * 4, mode="replicate")
-        came_from = self._pixels(self.rim) + shift + self.rim
-        source = _look_up(self._object.expand(count, -1, -1, -1), came_from)
-        beside = 1 - pad(covered, (self.rim,) * 4)  # where the surface is not: around it all goes on
-        outline = self._with_sides(torch.maximum(shows, source * beside), scene)
-        seen = (1 - mask * (1 - seen)) * torch.maximum(source, 1 - turned)
-        mirror_seen = mask * mirror_seen
+        seen, mirror_seen = 1 - mask * (1 - seen), mask * mirror_seen
         trust = 1 - mask * (1 - trust[:, :, None, None])
         mirror_ratio = mirror_ratio.clamp(min=DARKEST)
         fields = (shift, mirror_shift, seen, mirror_seen, log_ratio.exp(), mirror_ratio, drawn)
-        image = self._composed((*fields, *(mask * one for one in veils)), trust, outline)
+        image = self._composed((*fields, *(mask * one for one in veils)), trust)
         depth = self._enlarged(pad(view.depth[:, None], (self.rim,) * 4))[:, 0]
         return Rendering(image, depth, torch.ones_like(depth))
 
@@ -139,8 +119,7 @@ class PhotoDetail:
         weights = (self._seen, (1 - self._seen) * self._seen.flip(-1))
         fields = (shift, mirror_shift, *weights, bare, bare.flip(-1), self._colours)
         fields += (self._veil, self._veil.flip(-1), 0 * self._veil)
-        fields = tuple(pad(field, (self.rim,) * 4) for field in fields)
-        return self._composed(fields, torch.ones(1, 1, 1, 1))
+        return self._composed(tuple(pad(field, (self.rim,) * 4) for field in fields), torch.ones(1, 1, 1, 1))
 
     def _continued(self, mask: Tensor, shift: Tensor, log_ratio: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """How far inside the surface, 0..1; shift and ratio continue around it and fade. On the wide grid."""
@@ -160,46 +139,23 @@ class PhotoDetail:
         rise = torch.ones_like(depth) if self.rim == 0 else (depth / self.rim).clamp(max=1)
         return rise * rise[:, None]
 
-    def _with_sides(self, shows: Float[Tensor, "n 1 g g"], scene: Scene) -> Float[Tensor, "n 1 g g"]:
-        """Where the object is in new views: what the photograph shows, and the side that comes round."""
-        back = 1 + DEEP_SHARE * 2 * tan(radians(self.fov_deg / 2))
-        axis = constant(((0.0, 0.0, 1.0), (0.0, 0.0, back)), shows)[None, None]
-
-        def across(camera: Float[Tensor, "n 6"]) -> Float[Tensor, "n 1 1 2"]:
-            """By how many pixels the back lies beside the front."""
-            points = to_camera(axis.expand(len(camera), -1, -1, -1), camera)
-            front, behind = project(points, self.grid, self.grid, self.fov_deg).split(1, dim=2)
-            return behind - front
-
-        along = (across(scene.camera) - across(self._camera)).permute(0, 3, 1, 2)
-        places = self._pixels(self.rim) + self.rim
-        steps = [along * step / SIDE_STEPS for step in range(SIDE_STEPS + 1)]
-        return torch.stack([_look_up(shows, places - step) for step in steps]).amax(dim=0)
-
     def _composed(
-        self, fields: tuple[Tensor, ...], trust: Float[Tensor, "n 1 h w"],
-        outline: Float[Tensor, "n 1 h w"] | None = None,
-    ) -> Float[Tensor, "n 3 s s"]:  # fmt: skip
+        self, fields: tuple[Tensor, ...], trust: Float[Tensor, "n 1 h w"]
+    ) -> Float[Tensor, "n 3 s s"]:
         """Images at the photograph's size, from fields on the wider grid.
 
         Fields are shifts into the photograph and into its mirror image, weights of both, factors of both, the
         model's colours, and veils: of both, and the new one; trust is the weight of detail beside colours.
-        Around the outline, by default the whole image, is the photograph as it stands.
         """
-        shape = (-1, -1, *fields[0].shape[-2:])
-        fields += (trust, torch.ones_like(trust) if outline is None else outline)
-        fields = tuple(field.expand(shape) for field in fields)
-        channels = [field.shape[1] for field in fields]
-        *enlarged, trust, outline = self._enlarged(torch.cat(fields, dim=1)).split(channels, dim=1)
+        trust = trust.expand(-1, -1, *fields[0].shape[-2:])
+        channels = [*(field.shape[1] for field in fields), 1]
+        *enlarged, trust = self._enlarged(torch.cat((*fields, trust), dim=1)).split(channels, dim=1)
         shift, mirror_shift, seen, mirror_seen, ratio, mirror_ratio, drawn, veil, mirror_veil, new = enlarged
         drawn = drawn.clamp(DARKEST, 1)
         image = seen * self._detailed(shift, ratio, drawn, trust, veil, new)
         if bool((seen < 1).any()):
             other = self._detailed(mirror_shift, mirror_ratio, drawn, trust, mirror_veil, new)
             image = image + mirror_seen * other + (1 - seen - mirror_seen) * _veiled(drawn, new)
-        if bool((outline < 1).any()):
-            still = self._detailed(0 * shift, ratio, drawn, trust, veil, new)
-            image = still + outline * (image - still)
         return image.clamp(0, 1)
 
     def _detailed(self, shift: Tensor, ratio: Tensor, drawn: Tensor, trust: Tensor, *veils: Tensor) -> Tensor:
@@ -242,8 +198,7 @@ class PhotoDetail:
         known = weight + mirror_weight
         difference = weight * bare + mirror_weight * bare.flip(-1) - known * own.albedo
         reach = COLOUR_SHARE * self.grid
-        difference = _filled(_blurred(difference, reach), _blurred(known, reach).clamp(min=1e-3))
-        return (own.albedo + difference).clamp(0, 1)
+        return (own.albedo + _blurred(difference, reach) / _blurred(known, reach).clamp(min=0.05)).clamp(0, 1)
 
     def _visible(self, own: Scene, points: Tensor) -> Float[Tensor, "1 1 g g"]:
         """How well the photograph shows each canonical point, 0..1."""
@@ -262,9 +217,8 @@ class PhotoDetail:
         edge = round(share * self.grid)
         return pad(torch.ones_like(self._seen[..., edge:-edge, edge:-edge]), (edge,) * 4)
 
-    def _pixels(self, rim: int = 0) -> Float[Tensor, "1 2 g g"]:
-        along = torch.arange(-rim, self.grid + rim).float()
-        return _square(along).permute(0, 3, 1, 2).to(self.photo)
+    def _pixels(self) -> Float[Tensor, "1 2 g g"]:
+        return _square(torch.arange(self.grid).float()).permute(0, 3, 1, 2).to(self.photo)
 
 
 def _square(along: Tensor) -> Float[Tensor, "1 k k 2"]:
