@@ -11,7 +11,8 @@ from derender.networks import FACTORS
 from derender.render import render_scene
 from derender.renderers import RENDERERS, Renderer, recorded_renderer, renderer_named
 from derender.scene import Scene
-from derender.storage.places import CONFIG_FILE
+from derender.storage import places
+from derender.storage.places import CONFIG_FILE, bundled_renderers
 from derender.training.config import to_yaml
 from derender.training.run_folder import reopen_run
 
@@ -133,3 +134,17 @@ def test_a_renderer_refuses_scenes_that_are_not_its_own():
     broken = Renderer("mine", specular=lambda scene, normal, fov_deg: normal[None, ..., 0, 0].log() - 9)
     with pytest.raises(ValueError, match="renderer 'mine' makes NaN or infinity of finite scenes"):
         broken(_scene(), 10.0)
+
+
+def test_a_file_with_a_function_of_its_name_is_a_renderer(tmp_path, monkeypatch):
+    """One new file is all: names, errors and help read this list."""
+    assert set(bundled_renderers()) == set(RENDERERS)
+    (tmp_path / "renderers").mkdir()
+    (tmp_path / "storage").mkdir()
+    for name, text in {
+        "mirror_ball": "\ndef mirror_ball():\n    pass\n",
+        "tools": "\ndef other():\n",
+    }.items():
+        (tmp_path / "renderers" / f"{name}.py").write_text(text)
+    monkeypatch.setattr(places, "__file__", str(tmp_path / "storage" / "places.py"))
+    assert bundled_renderers() == {"mirror-ball": "mirror_ball"}

@@ -13,8 +13,8 @@ from derender.model import Derenderer
 from derender.render import Rendering, available_backends, render_scene
 from derender.renderers import RENDERERS, renderer_named
 from derender.renderers.haze import through_haze, transmission
+from derender.renderers.lambert_shadow import _lowest_step, clearance, visible
 from derender.renderers.phong import highlight
-from derender.renderers.shadow import _lowest_step, clearance, visible
 from derender.scene import Scene, environment
 from derender.scene.camera import focal_px
 from derender.scene.light import lambert_shading, light_direction

@@ -8,6 +8,7 @@ from derender.cli.console import is_main_process, notice, result, write_json
 from derender.cli.gathered import command
 from derender.cli.options import DataOptions, Device, Json, Settings
 from derender.cli.runs import DryRun, OutRun, Resume, dry_run_shown, report_run, run_progress
+from derender.storage.places import bundled_renderers
 
 MODEL = "Instead of derender: vqvae, simclr, ae, beta-vae, resnet18, stylegan2, e4e or ris."
 Network = Annotated[str | None, typer.Option("--model", metavar="NAME", help=MODEL)]
@@ -17,7 +18,7 @@ START_FROM = "Begin with a trained model's weights: a run folder, a bundled name
 StartFrom = Annotated[str | None, typer.Option("--start-from", metavar="MODEL", help=START_FROM)]
 LOOCC = "Contrast over none, light, light+camera or all factors; names joined by +."
 Loocc = Annotated[str | None, typer.Option("--loocc", help=LOOCC)]
-RENDERER = "How scenes make images: lambert, lambert-shadow, phong, sh, haze, or several joined by +."
+RENDERER = f"How scenes make images: {', '.join(bundled_renderers())}, or several joined by +."
 Renderer = Annotated[str | None, typer.Option("--renderer", metavar="NAME", help=RENDERER)]
 GENERATOR = "Run of stylegan2 for which e4e is trained."
 Generator = Annotated[str | None, typer.Option("--generator", metavar="RUN", help=GENERATOR)]

@@ -1,7 +1,8 @@
 """Renderers by name: the built-in ones, their combinations, and those of a user's own module.
 
-A name is that of a file here, with settings in parentheses, and + between those that combine:
-``phong(gamma=2.2)+lambert-shadow+haze``. ``package.module:thing`` is the ``Renderer`` called thing there.
+A name is that of a file here and of the function in it, with settings in parentheses, and + between those
+that combine: ``phong(gamma=2.2)+lambert-shadow+haze``. ``package.module:thing`` is the ``Renderer`` called
+thing there.
 """
 
 import importlib
@@ -15,15 +16,10 @@ from typing import Any
 
 from derender.data import suggestion
 from derender.render import Rendering
-from derender.renderers.haze import haze
-from derender.renderers.lambert import lambert
-from derender.renderers.phong import phong
 from derender.renderers.renderer import FunctionRenderer, Renderer
-from derender.renderers.sh import sh
-from derender.renderers.shadow import lambert_shadow
 from derender.scene import Scene
 from derender.storage.bounded import parse_yaml
-from derender.storage.places import bundled_models
+from derender.storage.places import bundled_models, bundled_renderers
 
 __all__ = [
     "RENDERERS", "Render", "Renderer", "as_renderer", "brings_code", "recorded_renderer", "renderer_named",
@@ -33,8 +29,9 @@ Render = Callable[[Scene, float], Rendering]
 """Anything that draws scenes with a horizontal field of view in degrees, such as a ``Renderer``."""
 
 RENDERERS: dict[str, Callable[..., Renderer]] = {
-    "lambert": lambert, "lambert-shadow": lambert_shadow, "phong": phong, "sh": sh, "haze": haze,
-}  # fmt: skip
+    name: getattr(importlib.import_module(f"{__name__}.{file}"), file)
+    for name, file in bundled_renderers().items()
+}
 _PART = re.compile(r"\s*(?P<name>\w[\w.-]*(:\w+)?)\s*(\((?P<settings>[^()]*)\))?\s*")
 
 

@@ -32,6 +32,13 @@ def bundled_models() -> tuple[str, ...]:
     return tuple(sorted(folder.parent.name for folder in PRETRAINED.glob(f"*/{CONFIG_FILE}")))
 
 
+def bundled_renderers() -> dict[str, str]:
+    """The modules of `derender.renderers` that hold a function of their own name, by the renderer's name."""
+    files = sorted((Path(__file__).parents[1] / "renderers").glob("*.py"))
+    own = (file.stem for file in files if f"\ndef {file.stem}(" in file.read_text(encoding="utf-8"))
+    return {name.replace("_", "-"): name for name in own}
+
+
 def bundled(name: str) -> dict[str, Any]:
     """A bundled model's name, image size in pixels, size in megabytes, and what it was trained on."""
     folder = PRETRAINED / name
