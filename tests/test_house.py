@@ -36,7 +36,7 @@ BUDGET = {  # lines, files
     "learn": (1_260, 6),
 }
 TOTAL = (42_100, 259)  # photographs, renderers, identity, pages; on the way to (37_000, 270)
-TEST_LINES = 26_900  # on the way to 26_000
+TEST_LINES = 26_950  # on the way to 26_000
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80
 SHARED_BY_COMMANDS = {"__init__.py", "console.py", "gathered.py", "options.py", "scoring.py"}

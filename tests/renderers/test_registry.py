@@ -140,11 +140,7 @@ def test_a_file_with_a_function_of_its_name_is_a_renderer(tmp_path, monkeypatch)
     """One new file is all: names, errors and help read this list."""
     assert set(bundled_renderers()) == set(RENDERERS)
     (tmp_path / "renderers").mkdir()
-    (tmp_path / "storage").mkdir()
-    for name, text in {
-        "mirror_ball": "\ndef mirror_ball():\n    pass\n",
-        "tools": "\ndef other():\n",
-    }.items():
-        (tmp_path / "renderers" / f"{name}.py").write_text(text)
+    for file, function in {"mirror_ball": "mirror_ball", "tools": "other"}.items():
+        (tmp_path / "renderers" / f"{file}.py").write_text(f"\ndef {function}():\n")
     monkeypatch.setattr(places, "__file__", str(tmp_path / "storage" / "places.py"))
     assert bundled_renderers() == {"mirror-ball": "mirror_ball"}
