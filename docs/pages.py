@@ -252,13 +252,14 @@ def renderer_speed(found: Any) -> Iterator[list[str]]:
         yield [one["renderer"], *(f"{one[key]:.{digits}f}" for key, digits in cells)]
 
 
-def renderers_trained(found: Any) -> Iterator[list[str]]:
-    """Errors of models trained with each renderer, by effect: mean and standard deviation over seeds."""
+def renderers_trained(found: Any, clear: bool = False) -> Iterator[list[str]]:
+    """Errors of models trained with each renderer, by effect or of ``clear`` images: mean, deviation."""
     digits = {"normal_deg": 1, "albedo": 3, "albedo_chroma": 4, "l1": 4}
     titles = ("normals, degrees", "albedo error", "chroma error", "L1", "albedo / lambert", "seeds")
     yield ["effect in the images: renderer", *titles]
     groups = _trained(found)
-    for (effect, name), ones in groups.items():
+    for effect, name in [pair for pair in groups if (pair[0] == "none") == clear]:
+        ones = groups[effect, name]
         means = [_spread([one[key] for one in ones], n) for key, n in digits.items()]
         plain = {one["seed"]: one["albedo"] for one in groups[effect, "lambert"]}
         ratio = _spread([one["albedo"] / plain[one["seed"]] for one in ones], 2)
@@ -386,6 +387,7 @@ SPEED: dict[str, tuple[str, Callable[[Any], Iterator[list[str]]]]] = {
     "renderers": ("renderers_fit.json", renderers),
     "renderers-speed": ("renderers_speed.json", renderer_speed),
     "renderers-train": ("renderers_train.json", renderers_trained),
+    "renderers-clear": ("renderers_train.json", lambda found: renderers_trained(found, clear=True)),
     "renderers-numbers": ("renderers_train.json", effect_numbers),
     "renderers-yale": ("renderers_yaleb.json", renderers_yale),
     "table-million": ("table_million.json", million_rows),
