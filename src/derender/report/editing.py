@@ -199,7 +199,7 @@ def write_images(
 
 def _row(file: Path) -> dict[str, Image.Image]:
     """The cells of a sheet's row by their names."""
-    with np.load(file) as cells:
+    with np.load(file, allow_pickle=False) as cells:
         return {name: Image.fromarray(cells[name]) for name in cells.files}
 
 
