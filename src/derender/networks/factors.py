@@ -52,7 +52,7 @@ class Factor:
         to_parameter: gives a raw network output its physical range.
         mirrored: whether the parameter is a map that the flipped twin of a scene shows mirrored.
         perturb: draws, for each row, another physically possible value; None if LOOCC never perturbs it.
-        numbers: name and range of each column of the parameter, for reports and sliders; none of a map.
+        numbers: name and range of each column, for reports and sliders; none of a map. A mirror changes none.
         rate: share of the learning rate at which its network is trained.
     """
 
