@@ -152,3 +152,16 @@ def test_settings_that_make_no_sense_are_named(folder, tmp_path, capsys, command
     assert run(command, folder, tmp_path / "mine", setting) == 2
     assert message in capsys.readouterr().err
     assert not (tmp_path / "mine").exists()
+
+
+@pytest.mark.parametrize(
+    ("command", "change", "shown"),
+    [
+        ("whiten", "whitening.pictures=77", "pictures: 77"),
+        ("refine", "refining.images=88", "images: 88"),
+        ("unet", "unet_width=9", "unet_width: 9"),
+    ],
+)
+def test_a_dry_run_shows_all_settings_and_writes_nothing(folder, tmp_path, capsys, command, change, shown):
+    assert run(command, folder, tmp_path / "copy", change, words=("--dry-run",)) == 0
+    assert shown in capsys.readouterr().out and not (tmp_path / "copy").exists()

@@ -4,11 +4,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
-from typer import Option
+from typer import Exit, Option
 
 from derender.cli.console import notice, progress_bar, report_images
 from derender.cli.gathered import command
 from derender.cli.options import OutModel, Output, PartOfImages, Seed, TrainedModel
+from derender.cli.runs import DryRun, dry_run_shown
 
 SETTINGS = "Change a setting, as whitening.pictures=2000; the reference of settings lists all."
 Changes = Annotated[list[str] | None, Option("--set", metavar="KEY=VALUE", help=SETTINGS)]
@@ -18,9 +19,14 @@ MeanOnly = Annotated[bool, Option("--mean-only", help=MEAN_ONLY)]
 
 def copied(
     make: Callable[..., Any], doing: str, images: PartOfImages, model: TrainedModel, out: Path,
-    output: Output, settings: list[str] | None, **more: Any,
+    output: Output, settings: list[str] | None, dry_run: bool, **more: Any,
 ) -> dict[str, Any]:  # fmt: skip
     """Make and report a copy by a call of `derender.learn`; gives its measurements by name."""
+    from derender import learn
+
+    if dry_run:
+        dry_run_shown(learn.copy_settings(make.__name__, settings or ()), output.json_file)
+        raise Exit
     output.refuse_existing(out)
     with progress_bar(doing) as report:
         made = make(
@@ -35,7 +41,7 @@ def copied(
 @command("whiten", "whiten photos/ --model rendered-faces-64 --out mine")
 def whiten(
     images: PartOfImages, model: TrainedModel, out: OutModel, output: Output, settings: Changes = None,
-    mean_only: MeanOnly = False, seed: Seed = 0,
+    mean_only: MeanOnly = False, seed: Seed = 0, dry_run: DryRun = False,
 ) -> None:  # fmt: skip
     """Write a copy of a model whose features move as little as possible with other factors.
 
@@ -45,7 +51,7 @@ def whiten(
     from derender import learn
 
     how = {"mean_only": mean_only, "seed": seed}
-    scores = copied(learn.whiten, "re-rendering", images, model, out, output, settings, **how)
+    scores = copied(learn.whiten, "re-rendering", images, model, out, output, settings, dry_run, **how)
     for name, ratios in scores["between_over_within"].items():
         clear = sum(ratio > 1 for ratio in ratios)
         differ = f"in {clear} images differ more than one does where other factors change"

@@ -8,6 +8,7 @@ from derender.cli.console import notice
 from derender.cli.copies import copied
 from derender.cli.gathered import command
 from derender.cli.options import OutModel, Output, PartOfImages, Seed, TrainedModel
+from derender.cli.runs import DryRun
 
 REFINING = "Change a setting, as images=50000 or reframed=0.85; the reference of settings lists all."
 UNETS = "Change a setting, as images=50000 or unet_width=32; the reference of settings lists all."
@@ -18,7 +19,7 @@ UNets = Annotated[list[str] | None, Option("--set", metavar="KEY=VALUE", help=UN
 @command("refine", "refine photos/ --model runs/mine --part train --out refined")
 def refine(
     images: PartOfImages, model: TrainedModel, out: OutModel, output: Output, settings: Refining = None,
-    seed: Seed = 0,
+    seed: Seed = 0, dry_run: DryRun = False,
 ) -> None:  # fmt: skip
     """Write a copy of a model that predicts at once the scenes that test-time optimisation finds slowly.
 
@@ -28,7 +29,7 @@ def refine(
     """
     from derender import learn
 
-    scores = copied(learn.refine, "refining", images, model, out, output, settings, seed=seed)
+    scores = copied(learn.refine, "refining", images, model, out, output, settings, dry_run, seed=seed)
     errors = scores["errors"]
     notice(
         f"{scores['held_out']} held-out images: reconstructed with an error of {errors['now']:.4f}, before "
@@ -42,7 +43,7 @@ def refine(
 @command("unet", "unet photos/ --model faces-64 --out faces-unet")
 def unet(
     images: PartOfImages, model: TrainedModel, out: OutModel, output: Output, settings: UNets = None,
-    seed: Seed = 0,
+    seed: Seed = 0, dry_run: DryRun = False,
 ) -> None:  # fmt: skip
     """Write a copy of a model with U-Net encoders that learn its scenes pixel by pixel, without labels.
 
@@ -51,7 +52,7 @@ def unet(
     """
     from derender import learn
 
-    scores = copied(learn.unet, "distilling", images, model, out, output, settings, seed=seed)
+    scores = copied(learn.unet, "distilling", images, model, out, output, settings, dry_run, seed=seed)
     errors = scores["errors"]
     notice(
         f"mean errors against {model.model}: place {errors['place']:.2f} pixels, depth {errors['depth']:.1%} "

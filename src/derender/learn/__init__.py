@@ -8,19 +8,19 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from derender.learn.copies import ModelCopy, refine, unet, whiten
+    from derender.learn.copies import ModelCopy, copy_settings, refine, unet, whiten
     from derender.learn.runs import Finetuned, finetune, finetune_settings, run_settings, train
     from derender.learn.sweep import compare_plan
 
 __all__ = [
-    "Finetuned", "ModelCopy", "compare_plan", "finetune", "finetune_settings", "refine", "run_settings",
-    "train", "unet", "whiten",
+    "Finetuned", "ModelCopy", "compare_plan", "copy_settings", "finetune", "finetune_settings", "refine",
+    "run_settings", "train", "unet", "whiten",
 ]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module 'derender.learn' has no attribute {name!r}")
-    homes = {"copies": ("ModelCopy", "refine", "unet", "whiten"), "sweep": ("compare_plan",)}
+    homes = {"copies": ("ModelCopy", "copy_settings", "refine", "unet", "whiten"), "sweep": ("compare_plan",)}
     module = next((home for home, names in homes.items() if name in names), "runs")
     return getattr(importlib.import_module(f"derender.learn.{module}"), name)

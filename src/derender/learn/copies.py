@@ -24,6 +24,9 @@ CopyProgress = Callable[[int, int], object]
 """Called with (done, total), once for each part of the work."""
 
 
+_SETTINGS = {"whiten": FeatureSettings, "refine": RefineConfig, "unet": UNetSettings}
+
+
 @dataclass(frozen=True)
 class ModelCopy:
     """A model made of another one: where it lies, the model, number of images, measurements by name."""
@@ -36,6 +39,11 @@ class ModelCopy:
     def values(self) -> dict[str, Any]:
         """Everything as JSON takes it."""
         return {"model": self.folder, "pictures": self.images, **self.scores}
+
+
+def copy_settings(command: str, settings: Changes = ()) -> Any:
+    """All settings of `whiten`, `refine` or `unet` after these changes; an unknown one is a ValueError."""
+    return with_changes(_SETTINGS[command](), texts_of(settings))
 
 
 def whiten(
@@ -59,7 +67,7 @@ def whiten(
     Returns:
         The copy; "between_over_within" has the ratio of each direction by factor.
     """
-    features = with_changes(FeatureSettings(), texts_of(settings))
+    features = copy_settings("whiten", settings)
     if features.whitening.pictures < 2:
         raise ValueError("whitening needs 2 images or more: set whitening.pictures=2000")
     if mean_only and settings:
@@ -88,7 +96,7 @@ def refine(
     Returns:
         The copy; "held_out" is the number of held-out images, "errors" and "gaps" are those of `Refined`.
     """
-    config = with_changes(RefineConfig(), texts_of(settings))
+    config = copy_settings("refine", settings)
     work = _Copying(model, images, Path(out), 10, **how)
     work.model.features.required_fitting(str(work.model.source or "this model"))
     split = split_indices(work.images.files, (0.9, 0.1, 0.0), seed=seed)
@@ -110,7 +118,7 @@ def unet(
     Returns:
         The copy; "errors" are those of `DistilledUNets`.
     """
-    config = with_changes(UNetSettings(), texts_of(settings))
+    config = copy_settings("unet", settings)
     work = _Copying(model, images, Path(out), 2, **how)
     made = distil_unets(work.model, work.pixels, config, seed=seed, progress=work.progress)
     return work.saved(made.model, {"errors": made.errors}, split=work.part == "train")
