@@ -68,8 +68,8 @@ def test_the_same_seed_teaches_the_same_and_nothing_else_is_touched(model, image
 
 def test_the_confidence_net_stays_and_the_linear_model_is_the_same(model, refined, images):
     theirs, ours = model.state_dict(), refined.model.state_dict()
-    taught = tuple(f"nets.{row.name}." for row in model.factors)
-    kept = [name for name in theirs if not name.startswith(taught)]
+    learned = tuple(f"nets.{row.name}." for row in model.factors)
+    kept = [name for name in theirs if not name.startswith(learned)]
     assert kept and all(torch.equal(ours[name], theirs[name]) for name in kept)
     assert not refined.model.training and not any(p.requires_grad for p in refined.model.parameters())
     assert model.fitting is not None and refined.model.fitting is not None
@@ -126,14 +126,14 @@ def test_pictures_in_other_frames_come_with_the_camera_that_sees_them_so(model, 
 
 
 def test_a_copy_taught_so_steps_back_from_smaller_faces(model, images):
-    taught = distillation.refine(
+    learned = distillation.refine(
         model, images, images, framed(images=480, rendered=0, fit_steps=4), seed=5
     ).model
-    assert taught.settings.ranges.translation_z == pytest.approx(0.9 / 0.75)
+    assert learned.settings.ranges.translation_z == pytest.approx(0.9 / 0.75)
     assert model.settings.ranges.translation_z == 0
     pictures = images.float() / 255
     smaller = crop_images(pictures, torch.tensor([[[1.7, 0, 0], [0, 1.7, 0]]]).expand(len(pictures), 2, 3))
-    near, far = (taught.decompose(one).camera[:, 5] for one in (pictures, smaller))
+    near, far = (learned.decompose(one).camera[:, 5] for one in (pictures, smaller))
     assert (far > near).float().mean() > 0.9
     assert float(far.mean() - near.mean()) > 0.02, "the part of 0.7 that few examples teach"
 
