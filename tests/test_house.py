@@ -16,7 +16,7 @@ SOURCES = sorted(PACKAGE.rglob("*.py"))
 TESTS = sorted((ROOT / "tests").rglob("*.py"))
 
 BUDGET = {  # lines, files
-    "data": (7_820, 33),
+    "data": (7_910, 34),  # the generated benchmark
     "evaluation": (8_280, 39),
     "report": (4_690, 27),
     "cli": (2_510, 35),  # names of bundled models stand in help by themselves
@@ -35,8 +35,8 @@ BUDGET = {  # lines, files
     "renderers": (690, 8),
     "learn": (1_260, 6),
 }
-TOTAL = (42_100, 259)  # photographs, renderers, identity, pages; on the way to (37_000, 270)
-TEST_LINES = 26_950  # on the way to 26_000
+TOTAL = (42_200, 260)  # the generated benchmark; on the way to (37_000, 270)
+TEST_LINES = 26_980  # on the way to 26_000
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80
 SHARED_BY_COMMANDS = {"__init__.py", "console.py", "gathered.py", "options.py", "scoring.py"}

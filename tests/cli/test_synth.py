@@ -2,10 +2,13 @@
 
 import csv
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from tests.cli.conftest import run
+
+from derender.data.synthetic import benchmark
 
 
 @pytest.fixture(scope="module")
@@ -74,6 +77,7 @@ def test_a_folder_of_cars_holds_what_was_requested(car_folder):
         ("faces", ["--expressions", "smug"], "expressions must be one or more of neutral, happiness"),
         ("faces", ["--tracks", "2", "--count", "5"], "--count does not go with --tracks"),
         ("faces", ["--model", "nowhere.npz"], "nowhere.npz does not exist: expected a morphable model"),
+        ("faces", ["--benchmark", "--count", "5"], "--benchmark has settings of its own"),
         ("cars", ["--classes", "tank"], "classes must be one or more of sedan"),
         ("cars", ["--view", "side"], "view must be one of usual, wide, frontal"),
         ("cars", ["--set", "view.azimuth_deg=[50,10]"], "view.azimuth_deg"),
@@ -85,3 +89,24 @@ def test_bad_input_is_one_line_and_leaves_nothing(folder, capsys, kind, argument
     said = capsys.readouterr().err.strip()
     assert message in said and len(said.splitlines()) == 1
     assert not (folder / "bad").exists()
+
+
+@pytest.mark.parametrize("kind", ["faces", "cars"])
+def test_the_benchmark_has_fixed_sets_of_different_people(kind, folder, monkeypatch):
+    small = {
+        name: replace(part, count=48 if name == "tracks" else 16)
+        for name, part in benchmark.PARTS[kind].items()
+    }
+    monkeypatch.setitem(benchmark.PARTS, kind, small)
+    assert run("synth", kind, "--benchmark", "--out", folder / f"all-{kind}", "--image-size", 16) == 0
+    tables = {}
+    for name, part in small.items():
+        with (folder / f"all-{kind}" / name / "params.csv").open() as file:
+            tables[name] = list(csv.DictReader(file))
+        assert len(tables[name]) == part.count
+        assert (folder / f"all-{kind}" / name / "depth").exists() == (name == "test")
+    assert len({rows[0]["lx"] for rows in tables.values()}) == len(tables)  # no draw is that of another part
+    if kind == "cars":
+        assert {row["class"] for row in tables["test"]} <= {*benchmark.FIVE_CLASSES[9:-1].split(",")}
+    else:
+        assert (folder / "all-faces" / "tracks" / "tracks" / "id0000" / "track_007" / "005.jpg").exists()

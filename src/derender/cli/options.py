@@ -148,3 +148,21 @@ class TrainedModel:
         from derender.inputs import as_model
 
         return as_model(self.model, device=self.device, fit_steps=fit_steps)
+
+
+@dataclass(frozen=True)
+class GeneratedOptions:
+    """The options of both kinds of generated images."""
+
+    out: OutFolder
+    count: Annotated[int | None, typer.Option("--count", "-n", min=1, help="Number of images (1000).")] = None
+    image_size: Annotated[int, typer.Option(min=16, max=1024, help="Width and height in pixels.")] = 64
+    seed: Seed = 0
+    light: Annotated[str, typer.Option(help="Range of lighting: usual, wide, frontal.")] = "usual"
+    view: Annotated[str, typer.Option(help="Range of viewpoints: usual, wide, frontal.")] = "usual"
+    truth: Annotated[bool, typer.Option(help="Write the maps of ground truth too.")] = True
+    benchmark: Annotated[
+        bool, typer.Option("--benchmark", help="Write the fixed sets of published scores.")
+    ] = False
+    overrides: Settings = None
+    json_file: Json = None

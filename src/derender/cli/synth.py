@@ -1,48 +1,43 @@
 """`derender synth`: rendered images with exact depth, normals, albedo, parts, light and camera."""
 
-from dataclasses import dataclass
-from functools import partial
 from typing import Annotated, Any
 
 from typer import Option, Typer
 
-from derender.cli import options
 from derender.cli.console import progress_bar, result, write_json
 from derender.cli.gathered import command
+from derender.cli.options import GeneratedOptions
 
 
-@dataclass(frozen=True)
-class Request:
-    """The options of both kinds of generated images."""
+def generate(
+    request: GeneratedOptions, kind: str, count: int, objects: str, names: list[str],
+    model: str | None = None, **own: Any,
+) -> None:  # fmt: skip
+    from derender.data import synthetic
 
-    out: options.OutFolder
-    count: Annotated[int | None, Option("--count", "-n", min=1, help="Number of images (1000).")] = None
-    image_size: Annotated[int, Option(min=16, max=1024, help="Width and height in pixels.")] = 64
-    seed: options.Seed = 0
-    light: Annotated[str, Option(help="Range of lighting: usual, wide, frontal.")] = "usual"
-    view: Annotated[str, Option(help="Range of viewpoints: usual, wide, frontal.")] = "usual"
-    truth: Annotated[bool, Option(help="Write the maps of ground truth too.")] = True
-    overrides: options.Settings = None
-    json_file: options.Json = None
-
-    def generate(self, call: Any, count: int, objects: str, kind: Any, names: list[str], **own: Any) -> None:
-        from derender.data.synthetic import named_settings, require_empty, write
-
-        require_empty(self.out)
-        settings = named_settings(kind, self.light, self.view, [*names, *(self.overrides or [])], **own)
+    size, file = request.image_size, request.json_file
+    if request.benchmark:
+        if GeneratedOptions(request.out, image_size=size, benchmark=True, json_file=file) != request:
+            raise ValueError("--benchmark has settings of its own: only --image-size goes with it")
         with progress_bar("generating") as report:
-            made = call(count, self.image_size, self.seed, settings, report)
-        with progress_bar("writing") as report:
-            write(made, self.out, self.truth, report)
-        different = len(set(made.identity.tolist()))
-        result(f"{count:,} images of {different:,} {objects} in {self.out}", self.json_file)
-        facts = {"count": count, objects: different, "image_size": self.image_size, "seed": self.seed}
-        write_json(self.json_file, {"out": self.out, **facts, "settings": settings.model_dump(mode="json")})
+            synthetic.write_benchmark(kind, request.out, size, report)
+        result(f"the benchmark of generated {kind} in {request.out}", file)
+        return
+    settings = synthetic.named_settings(
+        synthetic.KINDS[kind][1], request.light, request.view, [*names, *(request.overrides or [])], **own
+    )
+    with progress_bar("generating") as report:
+        how = (size, request.seed, settings, request.truth, report, model)
+        made = synthetic.write_generated(kind, request.out, count, *how)
+    different = len(set(made.identity.tolist()))
+    result(f"{count:,} images of {different:,} {objects} in {request.out}", file)
+    facts = {"count": count, objects: different, "image_size": size, "seed": request.seed}
+    write_json(file, {"out": request.out, **facts, "settings": settings.model_dump(mode="json")})
 
 
 @command("faces", "synth faces --out made/ --count 500 --light wide")
 def faces(
-    request: Request,
+    request: GeneratedOptions,
     identities: Annotated[int | None, Option(min=1, help="Number of people; default: 8 images each.")] = None,
     tracks: Annotated[int, Option(min=0, help="Number of sequences of each person, instead of images.")] = 0,
     frames: Annotated[int, Option(min=1, help="Number of images in a sequence.")] = 6,
@@ -50,27 +45,23 @@ def faces(
     model: Annotated[str | None, Option(metavar="FILE", help="Morphable model (.npz) to use.")] = None,
 ) -> None:
     """Generate faces with ground truth; the folder reads back as data for training and for evaluation."""
-    from derender.data.synthetic import FaceSettings, faces
-
     if tracks and request.count is not None:
         raise ValueError("--count does not go with --tracks: say --identities, --tracks and --frames")
     count = (identities or 12) * tracks * frames or request.count or 1000
     names = [f"expressions=[{expressions}]"] if expressions else []
-    each = -(-count // identities) if identities and not tracks else FaceSettings().pictures_per_identity
+    each = -(-count // identities) if identities and not tracks else 8
     own = {"tracks": tracks, "frames": frames, "pictures_per_identity": each}
-    request.generate(partial(faces.generate, model=model), count, "identities", FaceSettings, names, **own)
+    generate(request, "faces", count, "identities", names, model, **own)
 
 
 @command("cars", "synth cars --out made/ --classes police,jeep")
 def cars(
-    request: Request,
+    request: GeneratedOptions,
     classes: Annotated[str, Option(metavar="A,B", help="Only these classes; default: all twelve.")] = "",
 ) -> None:
     """Generate cars of twelve classes with ground truth; the folder reads back as the layout syncar."""
-    from derender.data.synthetic import CarSettings, cars
-
     names = [f"classes=[{classes}]"] if classes else []
-    request.generate(cars.generate, request.count or 1000, "models", CarSettings, names)
+    generate(request, "cars", request.count or 1000, "models", names)
 
 
 def register(app: Typer) -> None:

@@ -7,7 +7,7 @@ import pytest
 from tests.data.doctor import made
 
 from derender.data import Duplicate, Skipped, read_images
-from derender.data.doctor import CHECKS, doctor, judged
+from derender.data.doctor import CHECKS, doctor, judged, quick_verdict
 from derender.data.doctor.measures import JackknifeEstimate
 
 
@@ -23,6 +23,12 @@ def test_varied_faces_are_only_few_and_an_examination_can_be_repeated():
     assert {name for name, level in levels(found).items() if level != "good"} == {"number"}
     assert found.mean is not None and found.mean.shape == (3, 64, 64)
     assert len(found.examples["most typical"]) == 8
+
+
+def test_the_quick_check_of_a_sample_does_not_count_images():
+    few, many = (made.as_set(made.generated("faces", count)) for count in (144, 420))
+    assert "144 distinct images are too few" in quick_verdict(few)
+    assert quick_verdict(many) == ""
 
 
 @pytest.mark.parametrize("kind", ["landscapes", "noise"])

@@ -1,0 +1,86 @@
+"""Folders of generated images: any, and the benchmark, whose sets anyone can make again."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from derender.data.synthetic import cars, faces
+from derender.data.synthetic.settings import CarSettings, FaceSettings, named_settings
+from derender.data.synthetic.synthetic_set import SyntheticSet, require_empty, write
+from derender.storage.atomic import atomic_folder
+
+
+@dataclass(frozen=True)
+class BenchmarkPart:
+    """One folder of a benchmark: its seed, its size, and how its settings differ from the usual ones."""
+
+    seed: int
+    count: int
+    ranges: str = "usual"
+    overrides: tuple[str, ...] = ()
+    truth: bool = False
+
+
+KINDS = {"faces": (faces.generate, FaceSettings), "cars": (cars.generate, CarSettings)}
+"""By kind: the generator and its settings."""
+
+FIVE_CLASSES = "classes=[police,ambulance,limousine,jeep,sports]"
+PARTS = {
+    "faces": {
+        "train": BenchmarkPart(20261, 12_000),
+        "test": BenchmarkPart(20263, 800, truth=True),
+        "tracks": BenchmarkPart(20264, 12 * 20 * 6, "wide", ("tracks=20", "frames=6")),
+    },
+    "cars": {
+        "train": BenchmarkPart(20262, 8_000),
+        "test": BenchmarkPart(20265, 1_000, overrides=(FIVE_CLASSES, "pictures_per_model=1"), truth=True),
+    },
+}
+"""By kind and folder. No person or car is in two of them, for all seeds differ."""
+
+
+def write_generated(
+    kind: str, folder: Path | str, count: int, image_size: int = 64, seed: int = 0,
+    settings: FaceSettings | CarSettings | None = None, truth: bool = True,
+    progress: Callable[[int, int], None] | None = None, model: Path | str | None = None,
+) -> SyntheticSet:  # fmt: skip
+    """Generate "faces" or "cars" into a new folder, which appears when it is complete; gives the set, too.
+
+    Args:
+        truth: write depth, normals, albedo, masks and parts beside the images.
+        model: file of a morphable model of faces to use; None: the built-in one.
+
+    Raises:
+        FileExistsError: the folder holds something.
+        ValueError: a number that no set can have.
+    """
+    require_empty(Path(folder))
+    more = {} if model is None else {"model": model}
+    made = KINDS[kind][0](count, image_size, seed, settings, progress, **more)
+    write(made, folder, truth)
+    return made
+
+
+def write_benchmark(
+    kind: str, folder: Path | str, image_size: int = 64, progress: Callable[[int, int], None] | None = None
+) -> Path:
+    """Generate the benchmark of "faces" or "cars" in a new folder, which appears when it is complete.
+
+    Args:
+        image_size: 16 to 1024 pixels; scores are published at 64.
+        progress: called with the number of images generated so far, and that of all.
+
+    Raises:
+        FileExistsError: the folder holds something.
+        ValueError: a size that no set can have.
+    """
+    require_empty(folder := Path(folder))
+    total, before = sum(part.count for part in PARTS[kind].values()), 0
+    with atomic_folder(folder) as temporary:
+        for name, part in PARTS[kind].items():
+            chosen = named_settings(KINDS[kind][1], part.ranges, part.ranges, part.overrides)
+            so_far = None if progress is None else lambda done, _, at=before: progress(at + done, total)
+            size, seed = image_size, part.seed
+            write_generated(kind, temporary / name, part.count, size, seed, chosen, part.truth, so_far)
+            before += part.count
+    return folder
