@@ -9,7 +9,7 @@ from pathlib import Path
 
 import torch
 
-from derender.data import ImageSet, read_images, split_indices, suggestion
+from derender.data import ImageSet, read_images, split_indices
 from derender.model import Derenderer, load
 from derender.storage.folder import SplitRecord, read_split, write_split
 from derender.storage.places import DEVICES, model_folder, require_known
@@ -83,8 +83,7 @@ def as_images(
 
 def part_of(images: ImageSet, part: str, model: str | Path | None) -> ImageSet:
     """The images of one part of the split of ``model``: a run, or a model that was saved from one."""
-    if part not in PARTS:
-        raise ValueError(f"unknown part {part!r}{suggestion(part, PARTS)}: choose {', '.join(PARTS)}")
+    require_known("part", part, PARTS)
     if part == "all":
         return images
     if model is None:

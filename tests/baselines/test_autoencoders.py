@@ -137,7 +137,7 @@ def test_features_are_the_map_its_mean_and_its_histogram(seeded, losses):
     torch.testing.assert_close(features["pooled"], features["histogram"] @ model.codebook.codebook)
     features["pooled"].square().sum().backward()
     assert model.encoder[0].weight.grad is not None and model.encoder[0].weight.grad.any()  # fine-tuned, too
-    unknown = "vqvae has no feature 'poold'; did you mean 'pooled'"
+    unknown = "unknown feature of vqvae 'poold'; did you mean 'pooled'"
     for names, message in ((("poold",), unknown), ((), "has no")):
         with pytest.raises(ValueError, match=message):
             model.choose(names)

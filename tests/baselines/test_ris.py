@@ -171,5 +171,5 @@ def test_a_catalogue_lies_in_a_folder(catalogue, tmp_path):
         assert np.array_equal(values.numpy(), found[name].numpy())
     again.choose(("pose",))
     assert list(again.embed(images)) == ["pose"]
-    with pytest.raises(ValueError, match=r"ris has no feature 'hiar'.*'hair'"):
+    with pytest.raises(ValueError, match=r"unknown feature of ris 'hiar'.*'hair'"):
         again.choose(("hiar",))

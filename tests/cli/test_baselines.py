@@ -107,7 +107,7 @@ def test_bad_words_are_one_line(run, faces, tmp_path, refused):
     assert "give --model RUN, or --baseline NAME" in refused(*embed)
     for name in ("vqvae", "untrained"):
         assert f"the baseline {name} needs a model" in refused(*embed, "--baseline", name)
-    assert "has no feature 'maps'; did you mean 'map'" in refused(
+    assert "unknown feature of vqvae 'maps'; did you mean 'map'" in refused(
         *embed, "--baseline", "vqvae", "--model", run, "--features", "maps"
     )
     assert "holds the baseline 'vqvae'" in refused(*embed, "--model", run)

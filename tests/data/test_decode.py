@@ -146,7 +146,7 @@ def test_room_continues_the_edge_all_around(encoded):
 
 
 def test_unknown_fit_names_the_nearest(encoded):
-    message = r"unknown fit 'crops'; did you mean 'crop'\? \(known: crop, pad, stretch, room\)"
+    message = r"unknown fit 'crops'; did you mean 'crop'\?: choose crop, pad, stretch or room"
     with pytest.raises(ValueError, match=message):
         read_image(encoded(0), 8, fit="crops")
 

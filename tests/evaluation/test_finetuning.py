@@ -204,7 +204,7 @@ def test_bad_input_is_named_before_a_folder_is_made(pictures, tmp_path):
         target_of(replace(pictures, labels={"shade": shade}), config())
     with pytest.raises(ValueError, match="48 with shade: set labelled=48 or fewer"):
         target_of(pictures, config(target__labelled=49))
-    with pytest.raises(ValueError, match="no factor 'geomtry'; did you mean 'geometry'"):
+    with pytest.raises(ValueError, match="unknown factor 'geomtry'; did you mean 'geometry'"):
         train_task(task(pictures, target__factors=["geomtry"]), pictures, tmp_path / "run")
     wide = derender.Derenderer.from_preset("small", seed=0, image_size=32, width=8, light_width=4)
     with pytest.raises(ValueError, match=r"leave out settings of model\.network"):

@@ -147,7 +147,7 @@ def test_blocks_of_several_workers_make_the_same_table(model, source, tmp_path, 
     done = embed_to_file(source, model, out, batch_size=16, keep_duplicates=keep, engine="ray")
     assert_same(out, expected)
     assert (done.rows, done.skipped, done.copies) == (len(expected), 6, 4)
-    with pytest.raises(ValueError, match="no engine 'rai'; did you mean 'ray'"):
+    with pytest.raises(ValueError, match="unknown engine 'rai'; did you mean 'ray'"):
         embed_to_file(source, model, out, engine="rai")
 
 

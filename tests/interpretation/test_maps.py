@@ -187,7 +187,7 @@ def test_known_maps(model, images):
     ("method", "factor", "targets", "message"),
     [
         ("gradcam", "geometry", [0, 0, 0], "did you mean 'grad-cam'"),
-        ("grad-cam", "shape", [0, 0, 0], "no factor 'shape'"),
+        ("grad-cam", "shape", [0, 0, 0], "unknown factor of the probe 'shape'"),
         ("grad-cam", "geometry", [0], "3 images need as many targets, got 1"),
     ],
 )

@@ -44,10 +44,9 @@ def __getattr__(name: str) -> Any:
 
 def network_type(name: str, among: Sequence[str] = TRAINED) -> Any:
     """The class of a baseline that is trained here; an unknown name is an error that suggests the closest."""
-    from derender.data import suggestion
+    from derender.storage.places import require_known
 
-    if name not in among:
-        raise ValueError(f"no baseline {name!r}{suggestion(name, among)}: choose one of {', '.join(among)}")
+    require_known("baseline", name, among)
     if name in CONTROLS:
         raise ValueError(f"the baseline {name} has no network: its table comes from control_features")
     module, _, kind = NETWORKS[name].partition(".")

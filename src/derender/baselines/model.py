@@ -22,11 +22,11 @@ from pydantic import ValidationError
 from torch import Generator, Tensor, nn
 
 from derender.baselines import network_type
-from derender.data import ImageSet, split_indices, suggestion
+from derender.data import ImageSet, split_indices
 from derender.settings import Settings
 from derender.storage.atomic import new_folder
 from derender.storage.folder import FORMAT, saved_config
-from derender.storage.places import CONFIG_FILE, WEIGHTS_FILE
+from derender.storage.places import CONFIG_FILE, WEIGHTS_FILE, require_known
 from derender.storage.tensors import read_tensors, write_tensors
 from derender.training import config as configs
 from derender.training import run_folder
@@ -117,10 +117,7 @@ class BaselineModel(nn.Module, ABC):
     def choose(self, names: tuple[str, ...]) -> None:
         """Make ``embed`` return these features from now on."""
         for name in names or ("",):
-            if name not in self.features:
-                close = suggestion(name, self.features)
-                known = ", ".join(self.features)
-                raise ValueError(f"{self.name} has no feature {name!r}{close}; it has {known}")
+            require_known(f"feature of {self.name}", name, self.features)
         self.chosen = tuple(names)
 
     def save(self, folder: str | Path, *, overwrite: bool = False) -> Path:

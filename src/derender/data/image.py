@@ -29,7 +29,7 @@ from PIL.Image import Resampling, Transpose
 
 from derender.data.source import FILE_LIMIT_BYTES, Source
 from derender.storage.bounded import read_bounded
-from derender.storage.places import suggestion
+from derender.storage.places import require_known
 
 READER_VERSION = 1
 """Goes up whenever the same file would decode to other pixels, so that cached images are made again."""
@@ -70,7 +70,7 @@ def read_image(
 
     A file that does not exist raises FileNotFoundError; one that is no usable image raises ``Unreadable``.
     """
-    check_fit(fit)
+    require_known("fit", fit, FITS)
     name = "the given bytes" if isinstance(image, bytes) else str(image)
     try:
         encoded = image if isinstance(image, bytes) else read_bounded(Path(image), FILE_LIMIT_BYTES)
@@ -78,12 +78,6 @@ def read_image(
             return decode(encoded, image_size, fit)
     except ValueError as problem:
         raise Unreadable(f"{name} cannot be used as an image: {problem}") from problem
-
-
-def check_fit(fit: str) -> None:
-    """An unknown ``fit`` is an error that names the known ones."""
-    if fit not in FITS:
-        raise ValueError(f"unknown fit {fit!r}{suggestion(fit, FITS)} (known: {', '.join(FITS)})")
 
 
 def decode(

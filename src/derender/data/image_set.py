@@ -25,12 +25,12 @@ from jaxtyping import Float, Shaped, UInt8
 from torch import Tensor
 
 from derender.data.cache import cache_file, cache_folder, read_cache, write_cache
-from derender.data.image import READER_VERSION, Unreadable, check_fit, quiet_pillow
+from derender.data.image import FITS, READER_VERSION, Unreadable, quiet_pillow
 from derender.data.layouts.layout import Labels, missing, text_column
 from derender.data.opening import open_images
 from derender.data.source import Skipped
 from derender.data.stream import Decoded, Kinds, Progress, Stream, Value, column_of, decoded, estimated_total
-from derender.storage.places import suggestion
+from derender.storage.places import require_known, suggestion
 
 
 @dataclass(frozen=True)
@@ -222,7 +222,7 @@ def read_images(
         raise ValueError(f"image_size must be in 1..4096 pixels, got {image_size}")
     if limit is not None and limit < 1:
         raise ValueError(f"limit must be 1 or more, got {limit}")
-    check_fit(fit)
+    require_known("fit", fit, FITS)
     with open_images(source, dataset=dataset, subset=subset, limit=limit) as stream:
 
         def fill(append: Callable[[np.ndarray], object]) -> dict[str, Any]:

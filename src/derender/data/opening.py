@@ -45,7 +45,7 @@ from derender.data.source import (
     is_image,
 )
 from derender.data.stream import Sample, Stream
-from derender.storage.places import SUFFIXES, nearest_sibling, suggestion
+from derender.storage.places import SUFFIXES, nearest_sibling, require_known
 
 _HEADER_BYTES = 30
 _ENCRYPTED, _STEP = 1, 4096
@@ -285,10 +285,7 @@ def parse_source(source: str | Path) -> tuple[str, str | None, dict[str, str]]:
         return left, part or None, {}
     options = dict(parse_qsl(query, keep_blank_values=True))
     for name in options:
-        if name not in _OPTIONS:
-            raise ValueError(
-                f"{text}: unknown option {name!r}{suggestion(name, _OPTIONS)} (known: {', '.join(_OPTIONS)})"
-            )
+        require_known(f"option of {text}", name, _OPTIONS)
     return place, part or None, options
 
 

@@ -24,7 +24,7 @@ from jaxtyping import Float, UInt8
 from torch import Generator, Tensor, nn
 
 from derender.baselines.controls import untrained_twin
-from derender.data import ImageSet, Split, split_indices, suggestion
+from derender.data import ImageSet, Split, split_indices
 from derender.evaluation.bootstrap import RESAMPLES, Difference, ScoredRow, difference, numbers_of
 from derender.evaluation.controls import control_rows
 from derender.evaluation.linear_probes import head_loss, probabilities
@@ -33,7 +33,7 @@ from derender.evaluation.linear_task import Rows, Task, task_of
 from derender.evaluation.memory import Memory
 from derender.evaluation.options import Options
 from derender.evaluation.score_table import ScoreTable, scored_table
-from derender.features import embed_images, map_batches, model_fingerprint
+from derender.features import embed_images, map_batches, model_fingerprint, named
 from derender.inputs import Progress
 from derender.model import Derenderer, load
 from derender.objectives.perceptual_features import PerceptualFeatures
@@ -143,7 +143,7 @@ def target_of(images: ImageSet, config: FinetuneConfig) -> JointLabels:
     if not target.labels:
         known = ", ".join(images.labels) or "no labels"
         raise ValueError(f"name a label to learn; the images have {known}")
-    named = ", ".join(target.labels)
+    names = ", ".join(target.labels)
     asked = task_of({name: images.label(name) for name in target.labels})
     split = split_indices(images.files, config.split, seed=config.seed)
     labelled = split.train[asked.known[split.train]]
@@ -151,13 +151,13 @@ def target_of(images: ImageSet, config: FinetuneConfig) -> JointLabels:
         if target.labelled > len(labelled):
             raise ValueError(
                 f"{target.labelled:,} labelled images were requested, the training part has "
-                f"{len(labelled):,} with {named}: set labelled={len(labelled)} or fewer"
+                f"{len(labelled):,} with {names}: set labelled={len(labelled)} or fewer"
             )
         labelled = np.random.default_rng(config.seed).permutation(labelled)[: target.labelled]
     known = asked.targets[labelled]
     if not ((known == 1).any(axis=0) & (known == 0).any(axis=0)).any():
         raise ValueError(
-            f"the {len(labelled)} labelled images to learn from have one class of {named} only: use more of "
+            f"the {len(labelled)} labelled images to learn from have one class of {names} only: use more of "
             "them, or another seed"
         )
     visible = np.full_like(asked.targets, -1)
@@ -187,10 +187,9 @@ class FinetuneTask(TrainingTask):
                 "the networks of a pre-trained model are given: leave out settings of model.network and "
                 "model.ranges"
             )
-        known = [factor.name for factor in (self.start or Derenderer(self.config.model)).factors]
+        known = {factor.name: factor for factor in (self.start or Derenderer(self.config.model)).factors}
         for name in self.config.target.factors:
-            if name not in known:
-                raise ValueError(f"no factor {name!r}{suggestion(name, known)}: there is {', '.join(known)}")
+            named(known, name, "factor")
 
     def build(self) -> FinetunedModel:
         """The model to start from with a fresh head, the same for the same seed."""
@@ -360,9 +359,9 @@ def score_finetuned(
     (paper,) = compare_linear(frozen_alone, asked, rows, (seed,), heads=("linear",), **how).parts
     ours, majority = joint.rows
     frozen, *controls = logistic.rows[: len(features)]
-    named = {"frozen, logistic": frozen, "frozen, paper's head": paper.rows[0]}
-    named |= {f"{row.name}, logistic": row for row in controls} | {"majority": majority}
-    others = {name: row.scores for name, row in named.items()}
+    beside = {"frozen, logistic": frozen, "frozen, paper's head": paper.rows[0]}
+    beside |= {f"{row.name}, logistic": row for row in controls} | {"majority": majority}
+    others = {name: row.scores for name, row in beside.items()}
     rivals = {score: {name: scores[score] for name, scores in others.items()} for score in BOTH}
     controls = (ScoredRow(name, True, 1, scores) for name, scores in others.items())
     scored = (ScoredRow("fine-tuned", False, 1, ours.scores), *controls)

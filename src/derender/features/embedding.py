@@ -25,14 +25,13 @@ from derender.data import (
     estimated_total,
     open_images,
     sample_checksum,
-    suggestion,
 )
 from derender.features.blocks import PARTS_FORMAT, Parts, Rows, local_blocks, ray_blocks, rows_of
 from derender.features.extract import check_size, embed_image_set, model_facts, table_labels
 from derender.features.parquet import Columns, write_columns
 from derender.features.table import FeatureTable, check_names
 from derender.inputs import Progress, as_images, as_model
-from derender.storage.places import model_folder
+from derender.storage.places import model_folder, require_known
 from derender.training.held_out_errors import read_errors, reconstruction_percentile, unlike
 
 PART_ROWS = 4096
@@ -127,8 +126,7 @@ def embed_to_file(
         )
     if batch_size < 1:
         raise ValueError(f"batch_size must be 1 or more, got {batch_size}")
-    if engine not in ENGINES:
-        raise ValueError(f"no engine {engine!r}{suggestion(engine, ENGINES)}: choose {' or '.join(ENGINES)}")
+    require_known("engine", engine, ENGINES)
     if engine == "ray" and (part != "all" or not isinstance(images, str | Path)):
         raise ValueError("engine 'ray' embeds all images of an address: use part 'all', and name a data set")
     net, made_by = _network(model, device, fit_steps)

@@ -18,6 +18,7 @@ from derender.features.extract import embed_images, model_fingerprint
 from derender.features.table import FeatureTable, named
 from derender.inputs import as_model
 from derender.postprocess.fitting import PARAMETERS
+from derender.storage.places import require_known
 
 METRICS = ("cosine", "euclidean")
 BLOCK_ROWS = 4096
@@ -140,10 +141,7 @@ def nearest(
     or the query does not fit.
     """
     rows = named(table.factors, factor, "factor")
-    if metric not in METRICS:
-        raise ValueError(
-            f"unknown metric {metric!r}{suggestion(metric, METRICS)}; there is {', '.join(METRICS)}"
-        )
+    require_known("metric", metric, METRICS)
     if len(query) != rows.shape[1]:
         raise ValueError(
             f"{factor} has {rows.shape[1]} numbers in this table, the query {len(query)}: "

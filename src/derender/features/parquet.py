@@ -17,7 +17,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from pydantic import TypeAdapter
 
-from derender.data import opened_parquet, suggestion
+from derender.data import opened_parquet
+from derender.features.table import named
 from derender.storage.atomic import atomic_file
 from derender.storage.bounded import parse_json
 
@@ -94,10 +95,7 @@ def read_columns(path: Path, only: str | None = None) -> Columns:
     described = _described(schema.metadata, path)
     lists = [name for name in schema.names if name != "file" and _is_list(schema.field(name).type)]
     names = described.get("factors", lists)
-    if only is not None and only not in names:
-        there = ", ".join(names) or "none"
-        raise ValueError(f"unknown factor {only!r}{suggestion(only, names)}; there is {there}")
-    factors = names if only is None else [only]
+    factors = names if only is None else [named(dict.fromkeys(names, only), only, "factor")]
     with _readable(path):
         table = opened.read([name for name in schema.names if name not in names or name in factors])
     others = [name for name in table.column_names if name != "file"]

@@ -33,10 +33,11 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from derender.baselines.controls import untrained_twin
-from derender.data import suggestion
 from derender.evaluation.pixels import masked_ssim
+from derender.features import named
 from derender.interpretation.probe import Probe
 from derender.networks.encoders import activations
+from derender.storage.places import require_known
 
 OUTPUTS = ("logit", "probability")
 STEPS = {"logit": 2, "probability": 32}  # a logit is linear in the features: any number is exact
@@ -75,10 +76,7 @@ def integrated_gradients(
     quadrature are as many as that needs. Returns (N, D) attributions, and (N,) completeness errors: their sum
     less the change of the answer.
     """
-    if output not in OUTPUTS:
-        raise ValueError(
-            f"unknown output {output!r}{suggestion(output, OUTPUTS)}; there is {', '.join(OUTPUTS)}"
-        )
+    require_known("output", output, OUTPUTS)
     if features.ndim != 2 or features.shape[1] != probe.weight.shape[1]:
         raise ValueError(f"the probe takes features (N, {probe.weight.shape[1]}), got {features.shape}")
     together = output == "probability" and probe.kind == "classes"  # only there the other answers matter
@@ -130,10 +128,7 @@ def saliency(
     (n,) label or class of each image is explained; None explains the feature itself (half its squared
     length).
     """
-    if method not in METHODS:
-        raise ValueError(
-            f"unknown method {method!r}{suggestion(method, METHODS)}; there is {', '.join(METHODS)}"
-        )
+    require_known("method", method, METHODS)
     weight = None if probe is None else factor_weights(probe, factor, targets).to(images)
     if weight is not None and len(weight) != len(images):
         raise ValueError(f"{len(images)} images need as many targets, got {len(weight)}")
@@ -149,9 +144,8 @@ def saliency(
 
 def factor_weights(probe: Probe, factor: str, targets: Sequence[int] | np.ndarray) -> Float[Tensor, "n code"]:
     """The probe's weights on one factor's feature, for the target of each image."""
-    if factor not in probe.sizes:
-        raise ValueError(f"the probe has no factor {factor!r}; it has {', '.join(probe.factors)}")
-    return torch.from_numpy(probe.weight[np.asarray(targets, np.int64), probe.slices[factor]])
+    columns = named(probe.slices, factor, "factor of the probe")
+    return torch.from_numpy(probe.weight[np.asarray(targets, np.int64), columns])
 
 
 def score(code: Float[Tensor, "n c"], weight: Tensor | None) -> Float[Tensor, " n"]:

@@ -34,6 +34,7 @@ from derender.interpretation.tables import (
     cluster_shares,
     pair_parts,
 )
+from derender.storage.places import require_known
 
 Features = Mapping[str, np.ndarray]
 BASELINES = ("zero", "mean")
@@ -185,8 +186,7 @@ def explain_labels(
     the paper's "linear", ``output`` "logit" or "probability"; ``baseline`` "zero" (the paper's) or the
     training rows' "mean". ``progress`` is called with (probes done, probes in all).
     """
-    if baseline not in BASELINES:
-        raise ValueError(f"unknown baseline {baseline!r}; there is {', '.join(BASELINES)}")
+    require_known("baseline", baseline, BASELINES)
     if len(split.train) != 1:
         raise ValueError(f"an explanation learns from one number of rows, got {len(split.train)}")
     ((count, train),) = split.train.items()

@@ -29,6 +29,7 @@ from derender.features import missing
 from derender.settings import Settings
 from derender.storage.atomic import new_folder
 from derender.storage.bounded import read_json
+from derender.storage.places import require_known
 from derender.storage.tensors import read_tensors
 
 HEADS = ("logistic", "linear")
@@ -233,8 +234,7 @@ def fit_probe(
     ``head`` is "logistic" or "linear"; the seed is of folds, or of the start and the order of rows;
     ``settings`` are of the paper's head.
     """
-    if head not in HEADS:
-        raise ValueError(f"unknown head {head!r}{suggestion(head, HEADS)}; there is {', '.join(HEADS)}")
+    require_known("head", head, HEADS)
     sizes = {name: values.shape[1] for name, values in features.items()}
     x, y = np.concatenate(list(features.values()), axis=1)[rows], task.targets[rows]
     if head == "logistic":

@@ -19,7 +19,7 @@ from derender.storage import hub
 from derender.storage.atomic import new_folder
 from derender.storage.bounded import parse_json, read_bounded
 from derender.storage.folder import ErrorsFile, texts_beside
-from derender.storage.places import CARD_FILE, ERRORS_FILE, SPLIT_FILE, model_folder
+from derender.storage.places import CARD_FILE, ERRORS_FILE, SPLIT_FILE, model_folder, require_known
 from derender.storage.tensors import UNIT, packed, read_described, write_tensors
 
 
@@ -148,8 +148,7 @@ def pack_model(
     FileExistsError: ``folder`` exists, without ``overwrite``; a FileNotFoundError: no model is at ``source``;
     a ValueError: it is damaged, or a weight is no number of half precision.
     """
-    if maps not in KINDS:
-        raise ValueError(f"unknown kind of maps {maps!r}: choose {' or '.join(KINDS)}")
+    require_known("kind of maps", maps, KINDS)
     folder, own = Path(folder), model_folder(source)
     files.read_config(own)
     before, after = {}, {}

@@ -151,7 +151,7 @@ def test_bad_input_is_named(data, model):
         divide(pictures, masks, NAMES, labelled=99)
     with pytest.raises(ValueError, match="leaves 1 images to learn from and 1 to test on"):
         divide(pictures.select([0, 1]), masks[:2], NAMES, test_fraction=0.5)
-    with pytest.raises(ValueError, match="no variant 'joined'; did you mean 'joint'"):
+    with pytest.raises(ValueError, match="unknown variant 'joined'; did you mean 'joint'"):
         chosen_variants(model, ["joined"])
     plain = Derenderer.from_preset("small", seed=0, image_size=32, width=4, light_width=4)
     with pytest.raises(ValueError, match=r"no U-Net encoder for geometry.*--set encoder=unet"):

@@ -22,7 +22,7 @@ from derender.data.layouts.layout import (
 from derender.data.layouts.rendered import DEPTH_PAIRS, SHAPENET_CARS, SYNCAR, SYNFACE, SYNFACE_TRACKS
 from derender.data.layouts.tables import TABLE
 from derender.data.source import Source
-from derender.storage.places import suggestion
+from derender.storage.places import require_known
 
 
 def _class(file: str) -> str:
@@ -65,9 +65,7 @@ LAYOUTS = (
 def layout_named(name: str) -> Layout:
     """The layout of that name; an unknown name is an error with a suggestion."""
     by_name = {layout.name: layout for layout in LAYOUTS}
-    if name.lower() not in by_name:
-        known = f"(known: auto, {', '.join(by_name)})"
-        raise ValueError(f"unknown data set {name!r}{suggestion(name, by_name)} {known}")
+    require_known("data set", name.lower(), tuple(by_name))
     return by_name[name.lower()]
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from derender.data.source import Skipped, Source
-from derender.storage.places import suggestion
+from derender.storage.places import require_known
 
 Labels = dict[str, np.ndarray]
 
@@ -131,8 +131,7 @@ def half_of(rows: T, half: str) -> T:
     Raises:
         ValueError: another half, or one that is empty.
     """
-    if half not in HALVES:
-        raise ValueError(f"unknown half {half!r}{suggestion(half, HALVES)}: choose {', '.join(HALVES)}")
+    require_known("half", half, HALVES)
     if half == "all":
         return rows
     keys = list(map(stem_of, rows.files))

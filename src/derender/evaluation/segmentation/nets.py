@@ -23,8 +23,9 @@ from torch import Tensor, nn
 from torch.nn.functional import cross_entropy
 from torch.optim.swa_utils import update_bn
 
-from derender.data import as_float, suggestion
+from derender.data import as_float
 from derender.evaluation.segmentation.data import SegmentationData
+from derender.features import named
 from derender.networks.encoders import UNetDecoder, UNetEncoder
 from derender.settings import Settings
 from derender.training.process import freed_memory_kept
@@ -86,14 +87,9 @@ def chosen_variants(model: Any, names: Sequence[str] | None = None) -> dict[str,
     own_decoder = getattr(model, "unet_decoder", None) is not None
     if names is None:
         names = [name for name, variant in VARIANTS.items() if own_decoder or not variant.decoder]
-    for name in names:
-        if name not in VARIANTS:
-            raise ValueError(
-                f"no variant {name!r}{suggestion(name, VARIANTS)}: there is {', '.join(VARIANTS)}"
-            )
     if not names:
         raise ValueError(f"name a variant: there is {', '.join(VARIANTS)}")
-    chosen = {name: VARIANTS[name] for name in dict.fromkeys(names)}
+    chosen = {name: named(VARIANTS, name, "variant") for name in names}
     for factor in sorted({factor for variant in chosen.values() for factor in variant.factors}):
         encoder = getattr(model.nets[factor], "encoder", None) if factor in model.nets else None
         if not isinstance(encoder, UNetEncoder):
