@@ -4,12 +4,11 @@ Every documented call takes either form and resolves it here: commands and Pytho
 and errors.
 """
 
-from collections.abc import Callable
 from pathlib import Path
 
 import torch
 
-from derender.data import ImageSet, read_images, split_indices
+from derender.data import ImageSet, Progress, read_images, split_indices
 from derender.model import Derenderer, load
 from derender.storage.folder import SplitRecord, read_split, write_split
 from derender.storage.places import DEVICES, model_folder, require_known
@@ -17,9 +16,6 @@ from derender.training.config import TrainConfig
 from derender.training.run_folder import read_config_tree
 
 PARTS = ("all", "train", "validation", "test")
-
-Progress = Callable[[int, int], object]
-"""Called with (done, total)."""
 
 
 def as_model(

@@ -16,9 +16,9 @@ from derender.evaluation.finetuning import (
     FinetuneTask,
     load_finetuned,
     score_finetuned,
-    target_loss,
     target_of,
 )
+from derender.evaluation.linear_probes import head_loss
 from derender.evaluation.memory import Memory
 from derender.report.run import run_page
 from derender.training.batches import random_stream
@@ -174,7 +174,10 @@ def test_labels_beyond_those_asked_for_and_those_tested_stay_hidden(pictures):
     assert ((smaller >= 0) <= (target.visible >= 0)).all()
 
 
-def test_target_loss_is_torchs_cross_entropy_over_what_is_known():
+def test_the_loss_of_a_head_is_torchs_cross_entropy_over_what_is_known():
+    def target_loss(logits, targets, kind):
+        return head_loss(logits[None], targets[None], kind)[0]
+
     torch.manual_seed(0)
     logits, classes = torch.randn(6, 3), torch.tensor([0, 1, 2, 2, 1, 0])
     targets = torch.nn.functional.one_hot(classes, 3).float()

@@ -13,7 +13,8 @@ from PIL import Image
 from derender.evaluation.score_table import Column, Row, ScoreTable
 from derender.report import charts
 from derender.report import sweeps as films
-from derender.report.page import TEMPLATES, Page, data_uri, write_whole
+from derender.report.page import TEMPLATES, Page, data_uri
+from derender.storage.atomic import write_whole
 
 HOSTILE = "<script>alert('x')</script>\"&"
 EVERY_BLOCK = TEMPLATES.from_string("""{% extends "page.html" %}{% import "blocks.html" as b %}

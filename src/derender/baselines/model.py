@@ -45,14 +45,14 @@ SheetOf = Callable[[Callable[[Any, Tensor], dict[str, Tensor]]], Any]
 """Makes the loop's drawing function from one that gives images by column."""
 
 
-def optional(package: str, needed_for: str) -> ModuleType:
-    """A package that only some baselines need; ValueError with the extra to install where it is missing."""
+def optional(package: str, needed_for: str, extra: str = "baselines") -> ModuleType:
+    """A package that only a few calls need; ValueError with the extra to install where it is missing."""
     try:
         return importlib.import_module(package)
     except ImportError as error:
         raise ValueError(
             f"{needed_for} needs the package {package.split('.')[0]}, which is not here ({error}): "
-            "pip install 'derender[baselines]'"
+            f"pip install 'derender[{extra}]'"
         ) from error
 
 

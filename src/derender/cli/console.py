@@ -145,7 +145,7 @@ def write_json(target: str | None, values: Mapping[str, Any]) -> None:
     if target == "-":
         sys.stdout.write(text)
     else:
-        from derender.report.page import write_whole
+        from derender.storage.atomic import write_whole
 
         write_whole(target, text.encode("utf-8", errors="replace"))
 

@@ -114,7 +114,7 @@ class Published:
         self, scores: "Scores", memory: "Memory | None" = None, what: str = "results", **values: Any
     ) -> None:
         """Show tables and notes, and write every form that was requested; ``values`` are further numbers."""
-        from derender.storage.atomic import atomic_file
+        from derender.storage.atomic import write_whole
 
         values, notes, tables = {**scores.values, **values}, list(scores.notes), scores.tables
         if (half := values.get("half", "all")) != "all":
@@ -129,8 +129,7 @@ class Published:
         write_json(self.json_file, values)
         for file, form in ((self.markdown, scores.to_markdown), (self.latex, scores.to_latex)):
             if file is not None:
-                with atomic_file(Path(file)) as temporary:
-                    temporary.write_text(form(), encoding="utf-8")
+                write_whole(file, form())
         if self.html is not None:
             from derender.report.comparison import comparison_page
 

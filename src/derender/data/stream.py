@@ -132,7 +132,7 @@ def column_of(name: str, rows: Iterable[Mapping[str, Value]], kind: str | None) 
     return text_column("" if value is None else str(value) for value in values)
 
 
-Progress = Callable[[int, int], object]  # called with (images done, images in all), from the calling thread
+Progress = Callable[[int, int], object]  # called with (done, total), from the calling thread
 CHUNK = 32  # images that one thread decodes before it hands them on
 DIGEST_BYTES = 16
 

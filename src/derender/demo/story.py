@@ -8,7 +8,6 @@ model is scored on the same faces. Leaves out the last page (see ``page``) and o
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +26,7 @@ from derender.learn import train as train_on
 from derender.model import Derenderer, load
 from derender.photo import find_faces, open_photograph
 from derender.report.evidence import run_evidence
-from derender.report.page import Page
+from derender.report.page import Page, image_bytes
 from derender.report.run import decomposition_sheet, run_page
 from derender.settings import Settings
 from derender.training.config import TrainConfig, resolve
@@ -108,9 +107,7 @@ def portraits(side: int) -> list[Photo]:
 
 
 def _jpeg(photo: Photo) -> bytes:
-    stream = BytesIO()
-    Image.fromarray(np.ascontiguousarray(photo)).save(stream, "JPEG", quality=88)
-    return stream.getvalue()
+    return image_bytes(Image.fromarray(np.ascontiguousarray(photo)), "JPEG", quality=88)
 
 
 Report = Callable[[str, int, int, str], None]

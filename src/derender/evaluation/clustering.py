@@ -286,9 +286,8 @@ def finch_table(name: str, levels: Sequence[Level], classes: int) -> ScoreTable:
         CLUSTER_COLUMNS["nmi"],
         CLUSTER_COLUMNS["ari"],
     )
-    cells = [
-        (one.scores["accuracy"], one.chance["accuracy"], one.scores["nmi"], one.scores["ari"])
-        for one in levels
-    ]
-    rows = [Row(f"{level.clusters:,} clusters", own) for level, own in zip(levels, cells, strict=True)]
+    rows = []
+    for one in levels:
+        cells = one.scores["accuracy"], one.chance["accuracy"], one.scores["nmi"], one.scores["ari"]
+        rows.append(Row(f"{one.clusters:,} clusters", cells))
     return ScoreTable(f"FINCH on {name}: partitions found, {classes} classes", "partition", columns, rows)

@@ -263,21 +263,9 @@ class FinetuneStep(nn.Module):
         weight = target.rendering_weight
         terms = {name: value if name == "l1" else weight * value for name, value in result.terms.items()}
         labels = self.labels[rows.to(self.labels.device, non_blocking=True)]
-        loss = target.weight * target_loss(head(codes), labels, head.kind)
+        loss = target.weight * head_loss(head(codes)[None], labels[None], head.kind)[0]
         total = weight * result.total + loss
         return total, Held(replace(result, total=total, terms={**terms, "target": loss.detach()}))
-
-
-def target_loss(logits: Float[Tensor, "n a"], targets: Float[Tensor, "n a"], kind: str) -> Float[Tensor, ""]:
-    """Mean cross-entropy over images with a known class, or over known labels; 0 where none is known.
-
-    ``targets`` are -1 (unknown), 0, 1; for classes one-hot, or all -1.
-    """
-    if kind == "labels":
-        return head_loss(logits[None], targets[None], kind)[0]
-    known = (targets >= 0).any(dim=1)
-    each = -(logits.log_softmax(dim=1) * targets.clamp(min=0)).sum(dim=1)
-    return (each * known).sum() / known.sum().clamp(min=1)
 
 
 @dataclass(frozen=True)

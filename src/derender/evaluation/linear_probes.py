@@ -199,9 +199,14 @@ def fitted_heads(
 
 
 def head_loss(logits: Tensor, targets: Tensor, kind: str) -> Tensor:
-    """Mean loss of each of S heads on (S, B, A) logits: (S,)."""
+    """Mean loss of each of S heads on (S, B, A) logits: (S,), over known labels or rows of a known class.
+
+    ``targets`` are -1 (unknown), 0, 1; for classes one-hot, or all -1. 0 where none is known.
+    """
     if kind == "classes":
-        return -(torch.log_softmax(logits, dim=-1) * targets).sum(dim=-1).mean(dim=1)
+        each = -(torch.log_softmax(logits, dim=-1) * targets.clamp(min=0)).sum(dim=-1)
+        known = (targets >= 0).any(dim=-1)
+        return (each * known).sum(dim=1) / known.sum(dim=1).clamp(min=1)
     known = (targets >= 0).float()
     each = torch.nn.functional.binary_cross_entropy_with_logits(
         logits, targets.clamp(min=0), weight=known, reduction="none"

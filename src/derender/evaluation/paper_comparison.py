@@ -17,7 +17,7 @@ from derender.evaluation.controls import with_controls
 from derender.evaluation.feature_rows import FeatureSource, chosen_labels, is_model, prepare, rows_of, runs_of
 from derender.evaluation.linear_probing import FINETUNED, LinearComparison, compare_prepared, linear_tables
 from derender.evaluation.options import Options
-from derender.evaluation.paper_tables import ATTRIBUTES, PaperRow, beside_the_paper, table_named
+from derender.evaluation.paper_tables import ATTRIBUTES, TABLES, PaperRow, beside_the_paper
 from derender.evaluation.score_table import (
     Column,
     Scores,
@@ -27,6 +27,7 @@ from derender.evaluation.score_table import (
     verdict_table,
 )
 from derender.evaluation.segmentation import SegmentSettings, segment
+from derender.features import named
 from derender.inputs import as_model
 
 PAPER_VARIANTS = ("joint", "geometry", "albedo", "joint-frozen", "random")
@@ -63,7 +64,7 @@ def compare(
     Raises:
         ValueError: an unknown table, or labels, factors or images that do not fit.
     """
-    spec = table_named(table)
+    spec = named(TABLES, table, "table")
     how = Options(**{"images": images, "descriptors": table == "identity", **options})
     models = {name: [run for run in runs_of(runs) if is_model(run)] for name, runs in features.items()}
     models = {name: runs for name, runs in models.items() if runs}

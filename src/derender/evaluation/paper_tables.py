@@ -16,7 +16,7 @@ from jaxtyping import Bool
 
 from derender.evaluation.feature_rows import attribute_columns
 from derender.evaluation.score_table import Cell, Column, Row, ScoreTable
-from derender.features import FeatureTable, named
+from derender.features import FeatureTable
 
 ATTRIBUTES = "attributes"
 
@@ -124,11 +124,6 @@ TABLES = {
     "cars": TableSpec(4, "cluster", (CARS,)),
 }
 """By name on the command line, in the order of the paper's tables: parts of one come after the whole."""
-
-
-def table_named(name: str) -> TableSpec:
-    """One of ``TABLES``; an unknown name is an error that names the nearest."""
-    return named(TABLES, name, "table")
 
 
 def beside_the_paper(

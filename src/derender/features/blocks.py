@@ -43,7 +43,7 @@ from derender.data import (
 from derender.features.extract import as_batch, evaluating, factor_codes
 from derender.features.parquet import Columns, factor_column, factor_values
 from derender.features.table import check_finite
-from derender.storage.atomic import Damaged, DamageNoticed, atomic_file, measured
+from derender.storage.atomic import Damaged, DamageNoticed, atomic_file, measured, write_whole
 from derender.storage.bounded import parse_json, read_json
 
 OpenStream = Callable[[], AbstractContextManager[Stream]]
@@ -259,8 +259,7 @@ class Parts:
         if folder.exists():
             self._require(json.loads(json.dumps(plan)), fresh)
         folder.mkdir(parents=True, exist_ok=True)
-        with atomic_file(folder / PLAN) as temporary:
-            temporary.write_text(json.dumps(plan))
+        write_whole(folder / PLAN, json.dumps(plan))
         files = sorted(folder.glob("part-*.parquet"))
         for number, file in enumerate(files):
             try:

@@ -11,10 +11,10 @@ import torch
 from torch import Tensor, nn
 
 import derender
-from derender.data import ImageSet, as_float
+from derender.data import ImageSet, Progress, as_float
 from derender.features.table import FeatureTable
+from derender.training import process
 
-Progress = Callable[[int, int], object]
 T = TypeVar("T")
 
 
@@ -57,13 +57,8 @@ def map_batches(
 @contextmanager
 def evaluating(model: Any) -> Iterator[None]:
     """The model in evaluation mode and without gradients meanwhile, and afterwards as it was."""
-    was_training = model.training
-    model.eval()
-    try:
-        with torch.inference_mode():
-            yield
-    finally:
-        model.train(was_training)
+    with process.evaluating(model), torch.inference_mode():
+        yield
 
 
 def as_batch(images: np.ndarray, device: torch.device) -> Tensor:

@@ -19,7 +19,6 @@ how much of a map is the same for every image. The verdict goes by Spearman's ra
 of the map. SSIM is that of the maps at the image's size, each divided by its largest value.
 """
 
-import importlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from types import ModuleType
@@ -33,6 +32,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from derender.baselines.controls import untrained_twin
+from derender.baselines.model import optional
 from derender.evaluation.pixels import masked_ssim
 from derender.features import named
 from derender.interpretation.probe import Probe
@@ -51,13 +51,7 @@ CHANGES = ("random weights", "shuffled labels", "another image")
 
 def captum_attr() -> ModuleType:
     """captum's attribution methods; ValueError with the extra to install where it is missing."""
-    try:
-        return importlib.import_module("captum.attr")
-    except ImportError as error:
-        raise ValueError(
-            f"integrated gradients need the package captum, which is not here ({error}): "
-            "pip install 'derender[explain]'"
-        ) from error
+    return optional("captum.attr", "an explanation", "explain")
 
 
 def integrated_gradients(

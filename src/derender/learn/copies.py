@@ -1,6 +1,5 @@
 """Copies of a trained model: whitened, refined by knowledge distillation, or with U-Net encoders."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -8,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from derender.data import ImageSet, split_indices
+from derender.data import ImageSet, Progress, split_indices
 from derender.inputs import as_images, as_model, copy_split
 from derender.learn.runs import Changes, OnImages, texts_of
 from derender.model import Derenderer
@@ -19,10 +18,6 @@ from derender.training.distillation import refine as distil
 from derender.training.features import make_features, recentre
 from derender.training.held_out_errors import store_errors
 from derender.training.unets import UNetSettings, distil_unets
-
-CopyProgress = Callable[[int, int], object]
-"""Called with (done, total), once for each part of the work."""
-
 
 _SETTINGS = {"whiten": FeatureSettings, "refine": RefineConfig, "unet": UNetSettings}
 
@@ -130,7 +125,7 @@ class _Copying:
     def __init__(
         self, model: Derenderer | str | Path, images: ImageSet | str | Path, out: Path, at_least: int, *,
         part: str = "all", device: str = "auto", overwrite: bool = False, on_images: OnImages | None = None,
-        progress: CopyProgress | None = None, **reading: Any,
+        progress: Progress | None = None, **reading: Any,
     ):  # fmt: skip
         if out.exists() and not overwrite:
             raise FileExistsError(f"{out} exists already: choose another folder or pass overwrite=True")

@@ -26,7 +26,7 @@ from derender.evaluation.feature_rows import FeatureRow, chosen_labels, prepare
 from derender.evaluation.linear_probing import compare_prepared
 from derender.evaluation.memory import content_hash
 from derender.evaluation.options import Options, aligned
-from derender.evaluation.paper_tables import ATTRIBUTES, table_named
+from derender.evaluation.paper_tables import ATTRIBUTES, TABLES
 from derender.features import FeatureTable, embed_image_set
 from derender.inputs import as_images, as_model, split_of
 from derender.learn.plan import OURS, WITHOUT_LOOP, Plan
@@ -34,7 +34,7 @@ from derender.learn.runs import train as train_run
 from derender.model import Derenderer
 from derender.presets import MODEL_PRESETS
 from derender.settings import Settings, plain
-from derender.storage.atomic import atomic_file
+from derender.storage.atomic import write_whole
 from derender.storage.bounded import read_json
 from derender.storage.folder import SplitRecord
 from derender.training import TrainingInterrupted
@@ -147,8 +147,7 @@ class Comparison:
     def leave(self, job: Job, **how: Any) -> Note:
         """Write a job's note."""
         note = Note(job=job.name, key=self.key(job), **how)
-        with atomic_file(self.file("jobs", job, ".json")) as temporary:
-            temporary.write_text(note.model_dump_json(indent=1))
+        write_whole(self.file("jobs", job, ".json"), note.model_dump_json(indent=1))
         return note
 
     def known(self, job: Job) -> Note | None:
@@ -271,7 +270,7 @@ def score(at: Comparison, job: Job, progress: Callable[..., None]) -> Facts:
         labels, _ = chosen_labels(table, None, True)
     questions = {job.where: (labels, rules)}
     if scored.table is not None:
-        parts = [part for part in table_named(scored.table).parts if part.columns(table)]
+        parts = [part for part in TABLES[scored.table].parts if part.columns(table)]
         if not parts:
             have = ", ".join(table.labels) or "none"
             raise ValueError(f"table {scored.table!r} needs other labels than {scored.data} has ({have})")

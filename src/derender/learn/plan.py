@@ -13,7 +13,8 @@ from pydantic import BeforeValidator, Field
 
 from derender.baselines import BASELINES, CONTROLS, TRAINED, baseline_config
 from derender.data import suggestion
-from derender.evaluation.paper_tables import table_named
+from derender.evaluation.paper_tables import TABLES
+from derender.features import named
 from derender.settings import Settings
 from derender.storage.bounded import YAML_LIMIT, parse_yaml, read_text
 from derender.training.config import as_overrides, config_from_tree, resolve
@@ -187,7 +188,7 @@ def _score_faults(plan: Plan, name: str, scored: ScoredSet) -> Iterator[str]:
     if (scored.table is None) == (not scored.label):
         yield f"{name} needs a table (identity, emotion, ...) or a label, not both"
     if scored.table is not None:
-        if table_named(scored.table).kind == "segment":
+        if named(TABLES, scored.table, "table").kind == "segment":
             yield f"{name}: segmentation trains nets of its own: use derender compare --table segmentation"
         if scored.mean_by or scored.min_count > 1 or scored.max_count is not None:
             yield f"{name}: mean_by, min_count and max_count go with label, not with table"

@@ -36,9 +36,8 @@ from derender.report.comparison import (
     scores_from,
     set_tables,
 )
-from derender.report.page import write_whole
 from derender.settings import plain
-from derender.storage.atomic import atomic_file
+from derender.storage.atomic import write_whole
 from derender.training import TrainingInterrupted
 from derender.training.config import to_yaml
 
@@ -184,8 +183,7 @@ def compare_plan(
     others = out.is_dir() and any(one.name[0] != "." for one in out.iterdir())  # . files: of a kill
     if others and not (out / "plan.yaml").is_file():
         raise ValueError(f"{out} is not empty and holds no comparison: choose another folder")
-    with atomic_file(out / "plan.yaml") as temporary:
-        temporary.write_text(to_yaml(plan))
+    write_whole(out / "plan.yaml", to_yaml(plan))
     at = Comparison(plan, out, device, inf if minutes is None else time.time() + 60 * minutes, bar)
     jobs, notes = jobs_of(plan), {}
     lanes: dict[Job, list[Job]] = defaultdict(list)

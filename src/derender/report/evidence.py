@@ -16,7 +16,7 @@ from jaxtyping import UInt8
 
 from derender.baselines import read_any_config
 from derender.baselines.controls import untrained_features
-from derender.data import GroundTruth, ImageSet, as_float, read_ground_truth, split_indices
+from derender.data import GroundTruth, ImageSet, Progress, as_float, read_ground_truth, split_indices
 from derender.data.doctor import EXAMINED_PX, doctor
 from derender.evaluation import evaluate_factors, evaluate_geometry, evaluate_reconstruction, mean_image
 from derender.evaluation.disentanglement import disentangle
@@ -36,7 +36,6 @@ EXAMINED, SCORED, CARD, EXPLAINED = 1_500, 200, 200, 400  # images each part loo
 SHOWN, FILMED, TRUTH_SHOWN = 5, 2, 100
 FEWEST_OF_A_CLASS, MOST_CLASSES = 10, 12
 
-Progress = Callable[[int, int], object]
 Values = dict[str, Any]
 """What a section of ``templates/run.html`` shows, by name."""
 

@@ -16,7 +16,8 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from derender.evaluation.disentanglement import DisentanglementCard
-from derender.report.page import png_bytes, write_whole
+from derender.report.page import png_bytes
+from derender.storage.atomic import write_whole
 
 MAP = colormaps["Blues"].with_extremes(bad="#d9d9d9")
 CELL_NUMBERS_UP_TO = 400  # cells; larger matrices are shown without numbers

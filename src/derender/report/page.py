@@ -20,7 +20,7 @@ from PIL import Image
 
 from derender import __version__
 from derender.evaluation.score_table import Interval, ScoreTable
-from derender.storage.atomic import atomic_file
+from derender.storage.atomic import write_whole
 
 LONGEST_WORD = 24  # characters of a cell that is kept on one line
 TEMPLATES = Environment(
@@ -67,18 +67,16 @@ class Page:
         return write_whole(path, self.html().encode("utf-8", errors="replace"))
 
 
-def write_whole(path: str | Path, content: bytes) -> Path:
-    """Write a file whole or not at all; a failure leaves the old one. Makes the folder."""
-    with atomic_file(Path(path)) as temporary:
-        temporary.write_bytes(content)
-    return Path(path)
+def image_bytes(image: Image.Image, form: str = "PNG", **how: Any) -> bytes:
+    """The file of an image; ``how`` are Pillow's words for that form."""
+    stream = BytesIO()
+    image.save(stream, format=form, **how)
+    return stream.getvalue()
 
 
 def png_bytes(image: Image.Image) -> bytes:
     """A compact PNG file."""
-    stream = BytesIO()
-    image.save(stream, format="PNG", optimize=True)
-    return stream.getvalue()
+    return image_bytes(image, optimize=True)
 
 
 def data_uri(source: Image.Image | bytes) -> str:

@@ -22,8 +22,9 @@ from derender.evaluation.segmentation import SegmentationComparison
 from derender.report import colours
 from derender.report.charts import SERIES, side_by_side
 from derender.report.colours import Images
-from derender.report.page import Page, png_bytes, write_whole
+from derender.report.page import Page, png_bytes
 from derender.report.panel import INK, PAPER, GridLayout, labelled_grid, shortened
+from derender.storage.atomic import write_whole
 
 CONTROL_LINES = ((0, (5, 2)), (0, (1, 1)), (0, (3, 1, 1, 1)), (0, (6, 1, 1, 1, 1, 1)))
 

@@ -5,7 +5,6 @@ With ``evidence`` (data, decompositions, films, scores, card, explanation) the p
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import reduce
-from io import BytesIO
 from math import isfinite
 from operator import getitem
 from pathlib import Path
@@ -22,7 +21,7 @@ from derender.model import Derenderer
 from derender.report import charts, colours
 from derender.report.decomposition import decompose_images
 from derender.report.evidence import Evidence, recorded_environment
-from derender.report.page import Page
+from derender.report.page import Page, image_bytes
 from derender.report.panel import labelled_grid
 from derender.training.config import TrainConfig, setting_names
 from derender.training.run_folder import RunFolder, read_metrics
@@ -139,15 +138,15 @@ def _samples(run: RunFolder) -> tuple[list[tuple[bytes, str]], list[str]]:
     sheets, made, unread = sorted(run.samples.glob("*.png")), [], []
     shown = min(SHEETS_SHOWN, len(sheets))
     for place in np.linspace(0, len(sheets) - 1, shown).round().astype(int):
-        stream, name = BytesIO(), sheets[place].stem
+        name = sheets[place].stem
         try:
             small = Image.fromarray(read_photo(sheets[place], SHEET_PIXEL_LIMIT))
         except (ValueError, OSError) as problem:
             unread.append(str(problem))
             continue
         small.thumbnail((SHEET_PX, 16 * SHEET_PX), Image.Resampling.LANCZOS)
-        small.save(stream, format="JPEG", quality=86)
-        made.append((stream.getvalue(), f"{int(name):,}" if name.isdigit() else name))
+        shown_as = f"{int(name):,}" if name.isdigit() else name
+        made.append((image_bytes(small, "JPEG", quality=86), shown_as))
     return made, unread
 
 

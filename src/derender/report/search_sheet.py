@@ -1,18 +1,18 @@
 """Contact sheet of a search: the query, then the nearest images with their distances."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from derender.data import Unreadable, decode, open_images, quiet_pillow, read_image
+from derender.data import Progress, Unreadable, decode, open_images, quiet_pillow, read_image
 from derender.features.neighbours import Found
 from derender.report.colours import pictures
-from derender.report.page import png_bytes, write_whole
+from derender.report.page import png_bytes
 from derender.report.panel import GridLayout, contact_sheet
+from derender.storage.atomic import write_whole
 
 CELL = 192
-Progress = Callable[[int, int], object]
 
 
 def search_sheet(

@@ -55,6 +55,13 @@ def atomic_file(path: Path, *, durable: bool = False) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
+def write_whole(path: str | Path, content: str | bytes) -> Path:
+    """Write bytes, or text as UTF-8, whole or not at all; a failure leaves the old file."""
+    with atomic_file(Path(path)) as temporary:
+        temporary.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return Path(path)
+
+
 @contextmanager
 def atomic_folder(folder: Path, *, previous: Path | None = None) -> Iterator[Path]:
     """Give a temporary folder to fill; it takes the place of ``folder``, if nothing is raised.

@@ -12,7 +12,7 @@ from pydantic import AfterValidator, Field
 from torch import Tensor, nn
 
 from derender.settings import Settings
-from derender.storage.atomic import atomic_file
+from derender.storage.atomic import write_whole
 from derender.storage.bounded import first_line, read_json, read_text
 from derender.storage.places import CONFIG_FILE, SPLIT_FILE, TENSOR_FILES, TEXT_FILES, WEIGHTS_FILE
 from derender.storage.tensors import check_fit, read_tensors, write_tensors
@@ -89,10 +89,8 @@ def write_model(
 
 def write_config(folder: Path, factors: Sequence[str], settings: Mapping[str, Any]) -> None:
     """Write a saved model's ``config.json``; complete or not at all."""
-    with atomic_file(folder / CONFIG_FILE) as temporary:
-        temporary.write_text(
-            json.dumps({"format": FORMAT, "factors": list(factors), "settings": settings}, indent=1)
-        )
+    config = {"format": FORMAT, "factors": list(factors), "settings": settings}
+    write_whole(folder / CONFIG_FILE, json.dumps(config, indent=1))
 
 
 def read_weights(folder: Path, build: Callable[[], Net]) -> Net:
@@ -149,8 +147,7 @@ class SplitRecord:
 
 def write_split(folder: Path, split: SplitRecord) -> None:
     """Write the file into a saved model's folder; complete or not at all."""
-    with atomic_file(folder / SPLIT_FILE) as temporary:
-        temporary.write_text(json.dumps(asdict(split)) + "\n")
+    write_whole(folder / SPLIT_FILE, json.dumps(asdict(split)) + "\n")
 
 
 def read_split(folder: Path) -> SplitRecord | None:

@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, UInt8
 from pydantic import Field
 from torch import Generator, Tensor, nn
 
-from derender.data import as_float
+from derender.data import Progress, as_float
 from derender.model import Derenderer
 from derender.networks.factors import Number
 from derender.objectives.reconstruction import masked_l1
@@ -31,7 +31,7 @@ from derender.scene.perturb import PerturbSettings
 from derender.scene.scene import seen_in_mirror
 from derender.settings import Settings
 from derender.training.config import FeatureSettings
-from derender.training.features import Progress, make_features
+from derender.training.features import make_features
 from derender.training.step import fill_uncovered
 
 MEASURED_IMAGES = 256

@@ -20,7 +20,7 @@ from jaxtyping import Float, Int64, Shaped
 from torch import Generator, Tensor
 from torch.nn.functional import grid_sample
 
-from derender.data import as_float
+from derender.data import Progress, as_float
 from derender.model import Derenderer
 from derender.networks import Factor
 from derender.postprocess import Features
@@ -48,8 +48,6 @@ LENGTH_IMAGES = 256  # that are fitted to measure the length of fitted coordinat
 
 Describe = Callable[[Float[Tensor, "n 3 h w"]], Mapping[str, Float[Tensor, "n _"]]]
 """Activations by name of images in 0..1: the code, then the rest."""
-Progress = Callable[[int, int], object]
-"""Called with (images done, images in all)."""
 
 
 def make_features(

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from derender.data import as_float
 from derender.model import load
-from derender.storage.atomic import atomic_file
+from derender.storage.atomic import write_whole
 from derender.storage.bounded import read_json
 from derender.storage.folder import QUANTILES, ErrorsFile
 from derender.storage.places import ERRORS_FILE, bundled_models, model_folder
@@ -146,10 +146,8 @@ def store_errors(folder: Path, held_out: UInt8[Tensor, "n 3 h w"]) -> HeldOutErr
 def write_errors(folder: Path, errors: HeldOutErrors) -> Path:
     """Write the file into a saved model's folder, atomically."""
     quantiles = [float(f"{value:.6g}") for value in errors.quantiles.tolist()]
-    with atomic_file(folder / ERRORS_FILE) as temporary:
-        stored = ErrorsFile(pictures=errors.pictures, quantiles=quantiles)
-        temporary.write_text(stored.model_dump_json() + "\n")
-    return folder / ERRORS_FILE
+    stored = ErrorsFile(pictures=errors.pictures, quantiles=quantiles)
+    return write_whole(folder / ERRORS_FILE, stored.model_dump_json() + "\n")
 
 
 def read_errors(folder: Path) -> HeldOutErrors | None:

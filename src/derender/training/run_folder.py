@@ -15,7 +15,7 @@ from typing_extensions import TypedDict
 
 from derender.data import ImageSet, Split
 from derender.settings import Settings
-from derender.storage.atomic import atomic_file, remove_abandoned
+from derender.storage.atomic import remove_abandoned, write_whole
 from derender.storage.bounded import (
     LINES_LIMIT_BYTES,
     first_line,
@@ -61,8 +61,8 @@ def start_run(path: Path, config: Settings, data: dict[str, Any], device: str) -
     refuse_taken(path)
     run = RunFolder(path)
     run.samples.mkdir(parents=True, exist_ok=True)
-    _write(path / "environment.json", json.dumps({**environment(device), "data": data}, indent=1))
-    _write(run.config, f"format: {FORMAT}\n{to_yaml(config)}")
+    write_whole(path / "environment.json", json.dumps({**environment(device), "data": data}, indent=1))
+    write_whole(run.config, f"format: {FORMAT}\n{to_yaml(config)}")
     return run
 
 
@@ -93,7 +93,7 @@ def reopen_run(path: Path, config: Settings) -> RunFolder:
             )
     for written in (run.last, run.best, run.model, run.config, run.metrics, run.perceptual):
         remove_abandoned(written)
-    _write(run.config, f"format: {FORMAT}\n{to_yaml(config)}")
+    write_whole(run.config, f"format: {FORMAT}\n{to_yaml(config)}")
     return run
 
 
@@ -180,7 +180,7 @@ def read_metrics(path: Path) -> list[dict[str, Any]]:
 def drop_metrics_after(run: RunFolder, images: int) -> None:
     """Drop rows written after a checkpoint, so that a resumed run writes them once."""
     kept = [row for row in read_metrics(run.path) if row.get("images", 0) <= images]
-    _write(run.metrics, "".join(json.dumps(row) + "\n" for row in kept))
+    write_whole(run.metrics, "".join(json.dumps(row) + "\n" for row in kept))
 
 
 def environment(device: str) -> dict[str, Any]:
@@ -209,8 +209,3 @@ def describe_data(images: ImageSet, split: Split) -> dict[str, Any]:
     counts: dict[str, Any] = {"pictures": images, "train": split.train, "validation": split.validation}
     counts |= {"test": split.test, "skipped": images.skipped, "duplicates": images.duplicates}
     return {"layout": images.layout, **{name: len(values) for name, values in counts.items()}}
-
-
-def _write(path: Path, text: str) -> None:
-    with atomic_file(path) as temporary:
-        temporary.write_text(text)

@@ -18,13 +18,12 @@ from pydantic import Field
 from torch import Generator, Tensor, nn
 from torch.nn.functional import affine_grid, grid_sample
 
-from derender.data import as_float
+from derender.data import Progress, as_float
 from derender.model import Derenderer
 from derender.networks.encoders import PIXEL_CHANNELS, UNetDecoder, UNetEncoder
 from derender.objectives.self_features import one_cycle
 from derender.render.renderer import warp
 from derender.training.distillation import MEASURED_IMAGES, StudentSettings
-from derender.training.features import Progress
 
 ZOOM = (0.7, 1.25)
 SHIFT = 0.15

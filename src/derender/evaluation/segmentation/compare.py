@@ -122,10 +122,8 @@ class SegmentationComparison:
         heads = (Column("share", note="of the tested pixels"), *columns)
         tables.append(ScoreTable("intersection over union of every class", "class", heads, classes))
         ours = {one.name: {name: one.scores[name].value for name in COLUMNS} for one in scored}
-        controls, caption = (
-            [one.name for one in scored if one.control],
-            "segmentation, beside the paper's Table 3",
-        )
+        controls = [one.name for one in scored if one.control]
+        caption = "segmentation, beside the paper's Table 3"
         paper = beside_the_paper(caption, COLUMNS, ours, controls, SEGMENTATION.paper, self.differs, "net")
         return [*tables, paper]
 

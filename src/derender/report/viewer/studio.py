@@ -31,7 +31,7 @@ from derender.photo.faces import frame_of, template_of
 from derender.report import colours
 from derender.report.decomposition import factor_images
 from derender.report.mesh import model_mesh
-from derender.report.page import data_uri
+from derender.report.page import data_uri, image_bytes
 from derender.report.panel import labelled_grid
 from derender.report.sweeps import FILMS, circling_light, swapped, swaying_view
 from derender.report.viewer.questions import (
@@ -222,7 +222,7 @@ class Studio:
         if question.detail == "photo":
             side = max(self.shelf.get(_source(question)).photo.shape[:2])
             question = question.model_copy(update={"whole": True, "size": side})
-        return _png(self._drawn(question))
+        return image_bytes(self._drawn(question))
 
     def film(self, question: FilmRequest) -> bytes:
         """GIF or MP4: the light circles, or the view goes from side to side."""
@@ -253,11 +253,11 @@ class Studio:
     def panel(self, question: ViewRequest) -> bytes:
         """All maps and the view with their names in one PNG."""
         columns = self.maps(question) | {"view": self._drawn(question)}
-        return _png(labelled_grid({name: [image] for name, image in columns.items()}))
+        return image_bytes(labelled_grid({name: [image] for name, image in columns.items()}))
 
     def archive(self, question: ViewRequest) -> bytes:
         """A ZIP: the panel, every map, the image, the mesh, and the settings."""
-        files = {f"{name}.png": _png(image) for name, image in self.maps(question).items()}
+        files = {f"{name}.png": image_bytes(image) for name, image in self.maps(question).items()}
         files |= {"panel.png": self.panel(question), "view.png": self.picture(question)}
         files["surface.glb"] = self.mesh(question)
         files["settings.json"] = (json.dumps(self.settings(question), indent=1) + "\n").encode()
@@ -366,18 +366,10 @@ def _resized(photo: UInt8[np.ndarray, "h w 3"], scale: float) -> UInt8[np.ndarra
 def _encoded(image: Image.Image) -> bytes:
     """As fast as a page needs it: JPEG, or PNG where there is transparency."""
     if image.mode != "RGB":
-        return _png(image, quick=True)
-    stream = io.BytesIO()
-    image.save(stream, format="JPEG", quality=92)
-    return stream.getvalue()
+        return image_bytes(image, compress_level=1)
+    return image_bytes(image, "JPEG", quality=92)
 
 
 def data_url(image: Image.Image) -> str:
     """An image that travels inside JSON."""
-    return data_uri(_png(image, quick=True))
-
-
-def _png(image: Image.Image, quick: bool = False) -> bytes:
-    stream = io.BytesIO()
-    image.save(stream, format="PNG", compress_level=1 if quick else 6)
-    return stream.getvalue()
+    return data_uri(image_bytes(image, compress_level=1))
