@@ -70,7 +70,7 @@ def test_swapping_takes_one_parameter():
     mixed = sweeps.swapped(scene, donor, "light")
     torch.testing.assert_close(mixed.light, donor.light)
     torch.testing.assert_close(mixed.albedo, scene.albedo)
-    with pytest.raises(ValueError, match="no 'geometry'; this scene has depth, albedo"):
+    with pytest.raises(ValueError, match="unknown parameter 'geometry'; there is depth, albedo"):
         sweeps.swapped(scene, donor, "geometry")
 
 

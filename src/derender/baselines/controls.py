@@ -57,13 +57,14 @@ def control_table(images: ImageSet, name: str, values: np.ndarray, facts: Mappin
     return FeatureTable(images.files, {name: values.astype(np.float32)}, table_labels(images), origin)
 
 
-def _flat(images: ImageSet) -> np.ndarray:
-    return np.asarray(images.images, np.float32).reshape(len(images), -1) / 255
+def flat_pixels(images: np.ndarray) -> np.ndarray:
+    """(N, H * W * 3) in 0..1."""
+    return np.asarray(images, np.float32).reshape(len(images), -1) / 255
 
 
 def pixel_features(images: ImageSet) -> FeatureTable:
     """Pixels themselves, in 0..1, flattened: factor ``pixels``."""
-    return control_table(images, "pixels", _flat(images), {})
+    return control_table(images, "pixels", flat_pixels(images.images), {})
 
 
 def pca_features(
@@ -84,9 +85,9 @@ def pca_features(
         raise ValueError(
             f"PCA fitted on images {shape} does not take {images.images.shape[1:]}: read both at one size"
         )
-    pca = PCA(components, whiten=True, random_state=seed).fit(_flat(source))
+    pca = PCA(components, whiten=True, random_state=seed).fit(flat_pixels(source.images))
     facts = {"components": components, "whiten": True, "fitted_on": len(source), "seed": seed}
-    return control_table(images, "pca", pca.transform(_flat(images)), facts)
+    return control_table(images, "pca", pca.transform(flat_pixels(images.images)), facts)
 
 
 def hog_features(images: ImageSet, *, progress: Progress | None = None) -> FeatureTable:

@@ -22,7 +22,7 @@ from pydantic import ValidationError
 from torch import Generator, Tensor, nn
 
 from derender.baselines import network_type
-from derender.data import ImageSet, split_indices
+from derender.data import ImageSet, check_images, split_indices
 from derender.settings import Settings
 from derender.storage.atomic import new_folder
 from derender.storage.folder import FORMAT, saved_config
@@ -105,12 +105,7 @@ class BaselineModel(nn.Module, ABC):
 
     def embed(self, images: Images) -> Features:
         """The chosen features of images in 0..1, by name."""
-        size = self.image_size
-        if tuple(images.shape[1:]) != (3, size, size):
-            raise ValueError(
-                f"this {self.name} takes images of shape (N, 3, {size}, {size}), got "
-                f"{tuple(images.shape)}: read them with image_size={size}"
-            )
+        check_images(images, self.image_size)
         every = self.describe(images)
         return {name: every[name] for name in self.chosen}
 

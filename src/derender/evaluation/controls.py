@@ -25,6 +25,7 @@ from derender.baselines import read_any_config
 from derender.baselines.controls import (
     DESCRIPTORS,
     control_table,
+    flat_pixels,
     pca_features,
     pixel_features,
     untrained_twin,
@@ -219,7 +220,7 @@ class Renderings:
     def components(self, images: ImageSet, progress: Progress | None = None) -> FeatureTable:
         """Principal components of the lent images, whitened by their renderings: factor ``pca``."""
         count = self.n_components
-        pca = PCA(count, random_state=0).fit(_flat(self.images))
+        pca = PCA(count, random_state=0).fit(flat_pixels(self.images))
         mean = torch.from_numpy(pca.mean_).float()
         components: Any = pca.components_
         axes = torch.from_numpy(components.T.copy()).float()
@@ -232,7 +233,7 @@ class Renderings:
 
         whitening = self._fitted(described, f"pca {count} None", progress)
         views = [images.images, images.images[..., ::-1]] if whitening.mirrored else [images.images]
-        codes = torch.cat([projected(torch.from_numpy(_flat(one))) for one in views], dim=1)
+        codes = torch.cat([projected(torch.from_numpy(flat_pixels(one))) for one in views], dim=1)
         origin = {"control": "pca", "components": count, "whitened": True, "fitted_on": len(self.images)}
         return control_table(images, "pca", whitening({"pca": codes})["pca"].numpy(), origin)
 
@@ -272,7 +273,3 @@ def _whitening_settings(model: Derenderer) -> FeatureSettings:
     if settings.whitening.pictures < 2:
         raise ValueError(f"{folder} was trained without whitening: nothing to compare")
     return settings
-
-
-def _flat(images: np.ndarray) -> np.ndarray:
-    return np.asarray(images, np.float32).reshape(len(images), -1) / 255

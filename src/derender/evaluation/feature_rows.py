@@ -1,7 +1,7 @@
 """Rows of a comparison: feature tables of the same images, checked against each other, and their labels.
 
-A row is one kind of feature; several tables in one row are runs of the same thing (seeds). ``rows_of`` makes
-rows of tables and models, ``prepare`` the arrays that protocols take. Leaves out controls (controls.py) and
+A row is one kind of feature; several tables in one row are runs of the same thing (seeds). ``row_of`` makes
+one of tables and models, ``prepare`` the arrays that protocols take. Leaves out controls (controls.py) and
 scores.
 """
 
@@ -61,19 +61,13 @@ class Prepared:
         return {"files": self.table.files, "partition": self.table.labels.get("partition")}
 
 
-def rows_of(
-    sources: Mapping[str, FeatureSource | Sequence[FeatureSource]], options: Options
-) -> list[FeatureRow]:
-    """A row for each name (one source, or several runs): tables as they are, models applied to the images.
+def row_of(name: str, runs: FeatureSource | Sequence[FeatureSource], options: Options) -> FeatureRow:
+    """A row of one source or several runs: tables as they are, models applied to the images.
 
     Where a table has none of the factors chosen, all that it has are used.
     """
-    return [_row(name, runs_of(runs), options) for name, runs in sources.items()]
-
-
-def _row(name: str, runs: Sequence[FeatureSource], options: Options) -> FeatureRow:
     tables = []
-    for run in runs:
+    for run in runs_of(runs):
         if isinstance(run, FeatureTable):
             tables.append(run)
         elif not is_model(run):
@@ -97,7 +91,7 @@ def one_row(features: FeatureSource, options: Options) -> FeatureRow:
         ValueError: a table lacks a factor, and all of them are not the defaults.
     """
     chosen = options.chosen
-    row = _row("all" if chosen is None else " + ".join(chosen), [features], options)
+    row = row_of("all" if chosen is None else " + ".join(chosen), features, options)
     if chosen is None or row.factors is not None:
         return row
     table = row.tables[0]
@@ -165,7 +159,7 @@ def chosen_labels(
         for name in names:
             table.label(name)
         return names, []
-    columns, names = attribute_columns(table), attribute_columns(table, least)
+    columns, names = attribute_columns(table.labels), attribute_columns(table.labels, least)
     if not columns:
         raise ValueError(f"there is no yes/no label; there is {', '.join(table.labels) or 'no label'}")
     rows = "no row" if least == 1 else f"fewer than {least} rows"
@@ -175,9 +169,9 @@ def chosen_labels(
     return names, [f"left out, with {rows} of one of their answers: {', '.join(left)}"] if left else []
 
 
-def attribute_columns(table: FeatureTable, least: int = 0) -> tuple[str, ...]:
+def attribute_columns(labels: Mapping[str, np.ndarray], least: int = 0) -> tuple[str, ...]:
     """Yes/no label columns (int8 with 1, 0 and -1 for unknown) that have ``least`` rows of either answer."""
-    answers = {name: values for name, values in table.labels.items() if values.dtype == np.int8}
+    answers = {name: values for name, values in labels.items() if values.dtype == np.int8}
     return tuple(name for name, own in answers.items() if min((own == 0).sum(), (own == 1).sum()) >= least)
 
 

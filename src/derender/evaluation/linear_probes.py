@@ -92,7 +92,10 @@ def probe(
     def answers(own: np.ndarray, seed: int) -> np.ndarray:
         if head == "k-NN":
             return nearest_answers(features[own], targets[own], features[tested])
-        return logistic_answers(features[own], targets[own], features[tested], kind=kind, seed=seed)
+        weight, bias, _ = logistic_weights(features[own], targets[own], kind=kind, seed=seed)
+        blocks = np.array_split(features[tested], len(tested) // BLOCK_ROWS + 1)
+        logits = np.concatenate([np.asarray(block, np.float64) @ weight for block in blocks]) + bias
+        return softmax(logits, axis=1) if kind == "classes" else expit(logits)
 
     def make() -> np.ndarray:
         if papers:
@@ -267,16 +270,6 @@ def logistic_weights(
     picked = found[:, own, np.arange(labels.shape[1])] if kind == "labels" else found[:, own[0]]
     weight = back @ picked[:-1]
     return weight, picked[-1] - mean @ weight, chosen
-
-
-def logistic_answers(
-    features: np.ndarray, targets: np.ndarray, tested: np.ndarray, *, kind: str, seed: int = 0
-) -> np.ndarray:
-    """(T, A) probabilities of ``logistic_weights`` for (T, D) others."""
-    weight, bias, _ = logistic_weights(features, targets, kind=kind, seed=seed)
-    blocks = np.array_split(tested, len(tested) // BLOCK_ROWS + 1)
-    logits = np.concatenate([np.asarray(block, np.float64) @ weight for block in blocks]) + bias
-    return softmax(logits, axis=1) if kind == "classes" else expit(logits)
 
 
 def solve_logistic(

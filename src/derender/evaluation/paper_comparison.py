@@ -14,7 +14,7 @@ from derender.evaluation.clustering import clustering_table, compare_clusterings
 from derender.evaluation.clustering_methods import METHODS
 from derender.evaluation.clustering_scores import CLUSTER_COLUMNS
 from derender.evaluation.controls import with_controls
-from derender.evaluation.feature_rows import FeatureSource, chosen_labels, is_model, prepare, rows_of, runs_of
+from derender.evaluation.feature_rows import FeatureSource, chosen_labels, is_model, prepare, row_of, runs_of
 from derender.evaluation.linear_probing import FINETUNED, LinearComparison, compare_prepared, linear_tables
 from derender.evaluation.options import Options
 from derender.evaluation.paper_tables import ATTRIBUTES, TABLES, PaperRow, beside_the_paper
@@ -98,7 +98,7 @@ def compare(
         raise ValueError("finetune trains the encoders of models: give the linear table, models and images")
     if supervised and not finetune:
         raise ValueError("supervised is a row among fine-tuned models: give finetune, too")
-    rows = with_controls(rows_of(features, how), how)
+    rows = with_controls([row_of(name, runs, how) for name, runs in features.items()], how)
     first = rows[0].tables[0]
     parts = [part for part in spec.parts if part.columns(first)]
     if not parts:

@@ -62,7 +62,7 @@ class Part:
     def columns(self, table: FeatureTable) -> tuple[str, ...]:
         """The label columns of a table that answer the question; empty if it has none."""
         if self.labels == (ATTRIBUTES,):
-            return attribute_columns(table)
+            return attribute_columns(table.labels)
         return next(((name,) for name in self.labels if name in table.labels), ())
 
     def rows(self, table: FeatureTable) -> dict[str, Any]:

@@ -128,7 +128,8 @@ def explain(
         if name not in images.files:
             raise ValueError(f"{images.source} has no image {name!r}{suggestion(name, images.files)}")
     table = embed_image_set(net, images, batch_size=batch_size, progress=progress("embedding"))
-    names = (labels,) if isinstance(labels, str) else tuple(dict.fromkeys(labels)) or attribute_columns(table)
+    names = (labels,) if isinstance(labels, str) else tuple(dict.fromkeys(labels))
+    names = names or attribute_columns(table.labels)
     if not names:
         raise ValueError(f"there is no yes/no label; there is {', '.join(table.labels) or 'no label'}")
     task = question(table.labels, names, bins=bins, min_count=min_count, source=images.source)

@@ -5,7 +5,7 @@ anything is trained.
 """
 
 import tomllib
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -147,11 +147,6 @@ def read_plan(path: str | Path) -> Plan:
     return plan
 
 
-def _unknown(what: str, name: str, names: Collection[str]) -> Iterator[str]:
-    if name not in names:
-        yield f"unknown {what} {name!r}{suggestion(name, names)}; there is {', '.join(names) or 'none'}"
-
-
 def _faults(plan: Plan) -> Iterator[str]:
     """What in a plan does not fit the rest of it."""
     if not (plan.methods and plan.score):
@@ -162,8 +157,7 @@ def _faults(plan: Plan) -> Iterator[str]:
     for name, method in plan.methods.items():
         own = bool(method.settings or method.settings_on or method.runs)
         if (like := method.like) is not None:
-            yield from _unknown("like", like, plan.methods)
-            if plan.methods[like].like is not None:
+            if named(plan.methods, like, "like").like is not None:
                 yield f"method {name!r} is like {like!r}, which is like another: name that one"
             if own or method.kind or method.model:
                 yield f"method {name!r} is like {like!r}: it takes features and whitened alone"
@@ -171,7 +165,7 @@ def _faults(plan: Plan) -> Iterator[str]:
             choices = f"{suggestion(kind, KINDS)}: choose {', '.join(KINDS)}"
             yield f"method {name!r} is of no known kind{choices}"
         for where in (*method.runs, *method.settings_on):
-            yield from _unknown("training set", where, plan.train)
+            named(plan.train, where, "training set")
         given = [plan.settings, method.settings, *method.settings_on.values()]
         for key in RESERVED:
             if any(key in one for one in given):
@@ -199,8 +193,7 @@ def _score_faults(plan: Plan, name: str, scored: ScoredSet) -> Iterator[str]:
         if scored.part != "all":
             yield f"{name}: part {scored.part} is of a training set: give trained_on"
         return
-    yield from _unknown("training set", scored.trained_on, plan.train)
-    learnt = plan.train[scored.trained_on]
+    learnt = named(plan.train, scored.trained_on, "training set")
     if scored.part != "all":
         if (scored.data, scored.dataset, scored.limit) != (learnt.data, learnt.dataset, learnt.limit):
             other = f"the images of {scored.trained_on!r}: give the same data, dataset and limit"

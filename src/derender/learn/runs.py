@@ -6,10 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from derender.baselines import baseline_config, image_size_of, read_any_config, stored_config, train_baseline
 from derender.data import ImageSet
+from derender.evaluation.feature_rows import attribute_columns
 from derender.evaluation.finetuning import (
     FinetuneScores,
     FinetuneTask,
@@ -239,7 +238,9 @@ def finetune(
     if on_images is not None:
         on_images(images)
     if choices.get("attributes"):
-        config = with_changes(config, target__labels=_attributes(images))
+        if not (columns := attribute_columns(images.labels, 1)):
+            raise ValueError(f"{images.source} has no yes/no label: name one in labels")
+        config = with_changes(config, target__labels=list(columns))
     task = FinetuneTask(config, images.images, target_of(images, config), start)
     how = {"resume": resume, "progress": report, "accelerator": accelerator}
     from derender.report.run import decomposition_sheet, run_page
@@ -255,12 +256,3 @@ def finetune(
         tuned, task, memory=memory, progress=lambda *counts: report(Progress("scoring", *counts))
     )
     return Finetuned(run, scores, config.start)
-
-
-def _attributes(images: ImageSet) -> list[str]:
-    """Every yes/no column that has both values."""
-    answers = {name: values for name, values in images.labels.items() if values.dtype == np.int8}
-    varied = [name for name, values in answers.items() if {0, 1} <= set(values.tolist())]
-    if not varied:
-        raise ValueError(f"{images.source} has no yes/no label: name one in labels")
-    return varied

@@ -16,19 +16,6 @@ from derender.photo.frame import Frame
 from derender.photo.video import EditedVideo, edit_video, is_video
 
 __all__ = [
-    "Aligned",
-    "EditedVideo",
-    "Face",
-    "Frame",
-    "PhotoDetail",
-    "Photograph",
-    "align",
-    "edit_video",
-    "face_candidates",
-    "find_faces",
-    "found_frame",
-    "is_video",
-    "open_photograph",
-    "relight",
-    "rotate",
-]
+    "Aligned", "EditedVideo", "Face", "Frame", "PhotoDetail", "Photograph", "align", "edit_video",
+    "face_candidates", "find_faces", "found_frame", "is_video", "open_photograph", "relight", "rotate",
+]  # fmt: skip

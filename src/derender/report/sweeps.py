@@ -19,6 +19,7 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
+from derender.features import named
 from derender.photo.edit import AMBIENT_SHARE
 from derender.photo.video import write_video
 from derender.render import Rendering
@@ -83,10 +84,7 @@ def swapped(scene: Scene, donor: Scene, parameter: str) -> Scene:
     """The scenes with one parameter (depth, albedo, light, camera) of a single other scene."""
     if len(donor) != 1:
         raise ValueError(f"a swap takes from one scene, got {len(donor)}: pass donor[index]")
-    if parameter not in donor.parameters:
-        names = ", ".join(donor.parameters)
-        raise ValueError(f"the other scene has no {parameter!r}; this scene has {names}")
-    value = donor.parameters[parameter]
+    value = named(donor.parameters, parameter, "parameter")
     return scene.with_parameters(**{parameter: value.expand(len(scene), *value.shape[1:])})
 
 
