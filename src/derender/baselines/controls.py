@@ -46,7 +46,8 @@ def control_features(
     if name in DESCRIPTORS:
         return DESCRIPTORS[name](chosen, progress=progress)
     if name == "noise":
-        return noise_features(chosen, dimensions=components, seed=seed)
+        noise = np.random.default_rng(seed).standard_normal((len(chosen), components))
+        return control_table(chosen, name, noise, {"seed": seed})  # the chance level of any protocol
     fit_on = chosen if part == "all" else part_of(whole, "train", model)
     return pca_features(chosen, components=components, fit_on=fit_on, seed=seed)
 
@@ -156,12 +157,6 @@ def _each(images: ImageSet, describe: Any, progress: Progress | None) -> np.ndar
         if progress is not None and (len(rows) % 64 == 0 or len(rows) == len(images)):
             progress(len(rows), len(images))
     return np.stack(rows)
-
-
-def noise_features(images: ImageSet, *, dimensions: int = 64, seed: int = 0) -> FeatureTable:
-    """Normal noise independent of the images, factor ``noise``: the chance level of any protocol."""
-    noise = np.random.default_rng(seed).standard_normal((len(images), dimensions))
-    return control_table(images, "noise", noise, {"seed": seed})
 
 
 def untrained_twin(model: Any, seed: int) -> Any:

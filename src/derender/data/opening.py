@@ -148,11 +148,7 @@ _HASHED_AT_ONCE = 10_000
 
 
 class ListedStream(Stream):
-    """The images of a folder, zip or table, in the order of its layout; all are known beforehand.
-
-    Attributes:
-        files: where they are read; closed with the stream.
-    """
+    """The images of ``files``, a folder, zip or table, in the order of its layout; it closes them."""
 
     def __init__(
         self, files: Source, layout: Layout, table: Table, subset: str | None = None, half: str = "all"

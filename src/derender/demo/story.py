@@ -89,8 +89,11 @@ def opening(address: str | Path | None = None, side: int = 512) -> Opening:
             photo.edited(light=donor.scene.light) for photo, donor in zip(photos, donors, strict=True)
         ],
     }
-    names = [f"photograph {row + 1}" for row in range(len(shown))]
-    return Opening({name: [_jpeg(one) for one in edited] for name, edited in columns.items()}, names, source)
+    shown_as = {
+        name: [image_bytes(Image.fromarray(np.ascontiguousarray(one)), "JPEG", quality=88) for one in edited]
+        for name, edited in columns.items()
+    }
+    return Opening(shown_as, [f"photograph {row + 1}" for row in range(len(shown))], source)
 
 
 def portraits(side: int) -> list[Photo]:
@@ -104,10 +107,6 @@ def portraits(side: int) -> list[Photo]:
         )  # fmt: skip
         made.append(faces.generate(1, side, SEED + row, settings=settings).images[0].transpose(1, 2, 0))
     return made
-
-
-def _jpeg(photo: Photo) -> bytes:
-    return image_bytes(Image.fromarray(np.ascontiguousarray(photo)), "JPEG", quality=88)
 
 
 Report = Callable[[str, int, int, str], None]
@@ -213,10 +212,6 @@ def run_demo(
     """Generate, train, score; the training's run folder is ``out/run``.
 
     ``opened`` is called with ``out/report.html`` once that shows photographs, before anything is trained.
-
-    Raises:
-        FileExistsError: ``out`` is not empty.
-        ValueError: training collapsed before it saved a model.
     """
     out = Path(out)
     live = _open(out, None, settings, report, opened)

@@ -120,12 +120,7 @@ def by_appearance(names: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class LeafTree:
-    """Ward's tree over leaves.
-
-    Attributes:
-        leaf: (N,) the leaf of each row, integers from 0.
-        tree: (leaves - 1, 4) merges of leaves, as ``ward_tree`` gives them.
-    """
+    """Ward's tree over leaves: (N,) the leaf of each row, and (leaves - 1, 4) merges, as of ``ward_tree``."""
 
     leaf: np.ndarray
     tree: np.ndarray

@@ -87,8 +87,7 @@ def row_of(name: str, runs: FeatureSource | Sequence[FeatureSource], options: Op
 def one_row(features: FeatureSource, options: Options) -> FeatureRow:
     """The row of one table or model, named after its factors.
 
-    Raises:
-        ValueError: a table lacks a factor, and all of them are not the defaults.
+    The default factors are all where a table has none of them; others that it lacks are a ValueError.
     """
     chosen = options.chosen
     row = row_of("all" if chosen is None else " + ".join(chosen), features, options)
@@ -147,11 +146,7 @@ def cached_table(
 def chosen_labels(
     table: FeatureTable, label: str | Sequence[str] | None, attributes: bool, least: int = 1
 ) -> tuple[tuple[str, ...], list[str]]:
-    """Label columns by name, or every yes/no column that has ``least`` rows of either answer; and notes.
-
-    Raises:
-        ValueError: neither or both were given, or no such label exists.
-    """
+    """Label columns by name, or every yes/no column that has ``least`` rows of either answer; and notes."""
     if bool(label) == attributes:
         raise ValueError("give either label, a name or several, or attributes")
     if not attributes:

@@ -324,11 +324,9 @@ class Parts:
         pa.default_memory_pool().release_unused()
 
     def columns(self, origin: Mapping[str, Any], known: Mapping[str, np.ndarray] | None) -> Iterator[Columns]:
-        """The finished table, part by part.
+        """The finished table, part by part, with its ``origin``.
 
-        Args:
-            origin: where it comes from.
-            known: labels of all images, where they were known beforehand; None: the stream's.
+        ``known`` are labels of all images, where they were known beforehand; None: the stream's.
         """
         kinds = Kinds()
         for (texts,) in self._read("labels") if known is None else ():

@@ -97,15 +97,12 @@ def open_viewer(
     """A model with images to begin with and rows to search, and notes on what is missing.
 
     Args:
-        model: trained.
-        source: where it was loaded from.
+        model, source: trained, and where it was loaded from.
         images: image files to begin with; without any, rendered ones for the bundled models.
         table: features made by this model, for nearest neighbours.
-        data: place of the table's images, if not as the table records it.
-        dataset: layout of that place.
+        data, dataset: place of the table's images, if not as the table records it, and its layout.
         keep: opened images held in memory.
-        fit_steps: of test-time optimisation of each scene.
-        frame: how the part of each image is found that the model is given (``photo.found_frame``).
+        fit_steps, frame: as ``Studio`` takes them.
     """
     if fit_steps:
         require_fitting(model, source)
@@ -131,11 +128,7 @@ Answer = Callable[[Request], Awaitable[Response]]
 class Application:
     """The answers, and the threads that work them out; an ASGI application as ``guarded``.
 
-    Args:
-        viewer: the content.
-        host: the address that the server listens on.
-        body_seconds: within which a body has to arrive.
-        work_seconds: within which an answer has to be there, waiting for others included.
+    A body has to arrive within ``body_seconds``, an answer within ``work_seconds``, waiting included.
     """
 
     def __init__(
@@ -204,7 +197,7 @@ class Application:
         """Decompose the image in the body."""
         with self._uploads.one() as body:
             await self._receive(request, body, BODY_LIMIT_BYTES)
-            photo = await self._work(self._decoding, _decoded, body)
+            photo = await self._work(self._decoding, lambda: photo_of(bytes(body.content)))
         return await self._opened(photo)
 
     async def open_example(self, request: Request) -> Response:
@@ -304,10 +297,6 @@ class Application:
         if body.dropped:
             raise Refused(503, "too many files are arriving at once: try again in a moment")
         body.whole = True
-
-
-def _decoded(body: Body) -> Any:
-    return photo_of(bytes(body.content))
 
 
 def _thumbnail(gallery: Gallery, row: int) -> str | None:

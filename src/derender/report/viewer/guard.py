@@ -34,17 +34,12 @@ SECURITY_HEADERS = {
 }
 
 
+@dataclass(frozen=True)
 class Guard:
-    """An application that answers only requests of its own page.
+    """An application that answers only requests of its own page, at the address its server listens on."""
 
-    Args:
-        app: the application.
-        host: the address that the server listens on.
-    """
-
-    def __init__(self, app: ASGIApp, host: str):
-        self.app = app
-        self.host = host
+    app: ASGIApp
+    host: str
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":

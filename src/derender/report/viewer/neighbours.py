@@ -33,12 +33,7 @@ LABELS_SHOWN = 4
 
 @dataclass(frozen=True)
 class Example:
-    """An image to choose.
-
-    Attributes:
-        name: shown on the page.
-        picture: its pixels.
-    """
+    """An image to choose, and its name on the page."""
 
     name: str
     picture: UInt8[np.ndarray, "h w 3"]
@@ -70,13 +65,8 @@ def rendered_examples(model: str, image_size: int | None = None) -> list[Example
 class Gallery:
     """A table and the place of its images.
 
-    Args:
-        table: made by ``derender embed``.
-        source: place of the images; by default as the table records it.
-        dataset: the layout's name, or "auto".
-
-    Attributes:
-        without_pictures: why no image can be shown, or "".
+    ``source`` is that place, by default as the table records it, ``dataset`` its layout's name, or "auto".
+    ``without_pictures`` says why no image can be shown, or is "".
     """
 
     def __init__(self, table: FeatureTable, source: str | None = None, dataset: str = "auto"):

@@ -33,12 +33,7 @@ Shift = Annotated[float, Field(ge=-FARTHEST, le=FARTHEST)]
 
 
 class Refused(Exception):
-    """A request that is not granted.
-
-    Attributes:
-        status: HTTP status, 4xx or 503.
-        message: the reason and the remedy, in one sentence for the person at the page.
-    """
+    """A request that is not granted: an HTTP status, and the reason and the remedy in one sentence."""
 
     def __init__(self, status: int, message: str):
         super().__init__(message)
@@ -130,11 +125,9 @@ class Place(_Checked):
 
 
 class CropRequest(_Checked):
-    """An opened image to be decomposed again.
+    """An opened image to be decomposed again, with its scene optimised against it or not.
 
-    Attributes:
-        crop: the part that the model is given, or how it is found; the same as before if left out.
-        fit: whether the scene is optimised against the image.
+    ``crop`` is the part that the model is given, or how it is found; the same as before if left out.
     """
 
     picture: ImageId
