@@ -39,15 +39,11 @@ class Skipped:
 
 
 class Source(ABC):
-    """Named files, read by name.
-
-    Attributes:
-        skipped: files that cannot be opened (unsafe names, broken links, no permission, encrypted).
-    """
+    """Named files, read by name."""
 
     path: Path  # the folder or file that the user named
     files: tuple[str, ...]  # every regular file, as sorted posix paths relative to the source
-    skipped: tuple[Skipped, ...] = ()
+    skipped: tuple[Skipped, ...] = ()  # not to be opened: unsafe names, broken links, encrypted
 
     @abstractmethod
     def read(self, file: str) -> bytes:

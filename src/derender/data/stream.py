@@ -30,26 +30,18 @@ _EXACT_IN_FLOAT32 = 1 << 24
 
 @dataclass(frozen=True)
 class Sample:
-    """One image on its way.
-
-    Attributes:
-        read: gives its encoded bytes, or raises ValueError or OSError with the reason. Any thread may call
-            it, once.
-        share: how much of the stream lies before the next sample, 0..1; None where that is unknown.
-        labels: value by column; a column that is not here is unknown for this image.
-        box: the part of the image that is read (``Table.boxes``), or None for all of it.
-        size: gives the number of these bytes, 0 where they are in memory already.
-        fit: what becomes of it if it is not square and its reader does not say.
-    """
+    """One image on its way."""
 
     file: str  # its name, unique in the stream
+    # gives its encoded bytes, or raises ValueError or OSError with the reason; any thread may call it, once
     read: Callable[[], bytes]
-    share: float | None = None
+    share: float | None = None  # how much of the stream lies before the next sample, 0..1; None: unknown
+    # value by column; a column that is not here is unknown for this image
     labels: Mapping[str, Value] = field(default_factory=dict)
     partition: str = ""  # the owners' own split ("train", "validation", "test"), or ""
-    box: np.ndarray | None = None
-    fit: str = "crop"
-    size: Callable[[], int] = int
+    box: np.ndarray | None = None  # the part that is read (``Table.boxes``), or None for all of it
+    fit: str = "crop"  # what becomes of it if it is not square and its reader does not say
+    size: Callable[[], int] = int  # gives the number of these bytes, 0 where they are in memory already
 
 
 class Stream(ABC):

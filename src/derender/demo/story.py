@@ -159,36 +159,26 @@ QUICK = DemoSettings(
 
 @dataclass(frozen=True)
 class DemoResult:
-    """The content of the page; scores are of the unseen images.
-
-    Attributes:
-        config: the training's resolved configuration.
-        geometry: of scenes optimised for ``settings.fit_steps``; ``geometry_beside`` without steps, and by
-            the bundled model where the images have its size.
-        opening: photographs edited by a bundled model.
-        seen: images of the training.
-        truth: the unseen images with everything that made them.
-        clustering: Ward clusters by identity, of features and controls.
-        clusters: (N,) the cluster of each unseen image by the model's features.
-        seconds: time of each stage.
-    """
+    """The content of the page; scores are of the unseen images."""
 
     settings: DemoSettings
     seed: int
-    config: TrainConfig
+    config: TrainConfig  # the training's resolved configuration
     trained: TrainResult
     model: Derenderer
     bundled: Derenderer
-    opening: Opening
-    seen: ImageSet
-    truth: GroundTruth
+    opening: Opening  # photographs edited by a bundled model
+    seen: ImageSet  # images of the training
+    truth: GroundTruth  # the unseen images with everything that made them
+    # of scenes optimised for ``settings.fit_steps``; ``geometry_beside`` without steps, and by the bundled
+    # model where the images have its size
     geometry: evaluation.GeometryResult
     geometry_beside: dict[str, evaluation.GeometryResult]
     factors: evaluation.FactorResult
     reconstruction: evaluation.ReconstructionResult
-    clustering: ScoreTable
-    clusters: np.ndarray
-    seconds: dict[str, float]
+    clustering: ScoreTable  # Ward clusters by identity, of features and controls
+    clusters: np.ndarray  # (N,) the cluster of each unseen image by the model's features
+    seconds: dict[str, float]  # time of each stage
 
     @property
     def optimised(self) -> Derenderer:

@@ -45,19 +45,14 @@ COLUMN_MEANING = {
 
 @dataclass(frozen=True)
 class Decomposition:
-    """Images of N decomposed images, one list of N per column.
+    """Images of N decomposed images, one list of N per column."""
 
-    Attributes:
-        columns: column name to N images, in the order of a panel: those of ``COLUMN_MEANING``, then the
-            renderer's own, then further factors whose parameter is a map.
-        scene: the N scenes.
-        fov_deg: horizontal field of view.
-        numbers: rows of further factors whose parameter is a few named numbers, by parameter.
-    """
-
+    # column name to N images, in the order of a panel: those of ``COLUMN_MEANING``, then the renderer's own,
+    # then further factors whose parameter is a map
     columns: Mapping[str, colours.Images]
-    scene: Scene
-    fov_deg: float
+    scene: Scene  # the N scenes
+    fov_deg: float  # horizontal field of view
+    # rows of further factors whose parameter is a few named numbers, by parameter
     numbers: Mapping[str, Factor] = field(default_factory=dict)
 
     def __len__(self) -> int:

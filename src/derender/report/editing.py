@@ -51,27 +51,18 @@ class Edited(Protocol):
 
 @dataclass(frozen=True)
 class WrittenImages:
-    """What ``write_images`` made.
+    """What ``write_images`` made."""
 
-    Attributes:
-        out: the folder.
-        images: a record for each image, as its JSON file holds it.
-        sheets: files with a row for every image.
-        refused: reasons why other images cannot be read, by path.
-        percentiles: of the reconstruction errors, by path; empty where the model keeps none.
-        framing: the part of each image that is shown, and how it was found, by path.
-        before: number of images that were left out, for their folders were there.
-        unlike: how images differ from those the model was validated on (``held_out_errors.unlike``).
-    """
-
-    out: Path
-    images: Sequence[dict[str, Any]]
-    sheets: Sequence[Path]
-    refused: Mapping[str, str]
+    out: Path  # the folder
+    images: Sequence[dict[str, Any]]  # a record for each image, as its JSON file holds it
+    sheets: Sequence[Path]  # files with a row for every image
+    refused: Mapping[str, str]  # reasons why other images cannot be read, by path
+    # of the reconstruction errors, by path; empty where the model keeps none
     percentiles: Mapping[str, float]
+    # the part of each image that is shown, and how it was found, by path
     framing: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    unlike: str = ""
-    before: int = 0
+    unlike: str = ""  # how images differ from those the model was validated on (``held_out_errors.unlike``)
+    before: int = 0  # number of images that were left out, for their folders were there
 
     @property
     def out_of_distribution(self) -> dict[str, float]:

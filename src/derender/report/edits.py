@@ -35,23 +35,14 @@ FILM_SIZE = 512
 
 @dataclass(frozen=True)
 class Edit:
-    """One edited image.
+    """One edited image."""
 
-    Attributes:
-        inputs: what it was made from, by label; these come first in the strip.
-        stills: what came out, by label.
-        numbers: what holds in each still, by the same labels: anything JSON can hold.
-        frames: of a film; empty for none.
-        films: kinds of film that are written.
-        seconds: length of the film.
-    """
-
-    inputs: Mapping[str, Image.Image]
-    stills: Mapping[str, Image.Image]
-    numbers: Mapping[str, Any]
-    frames: Images = field(default_factory=list)
-    films: Sequence[str] = ()
-    seconds: float = 2.4
+    inputs: Mapping[str, Image.Image]  # what it was made from, by label; these come first in the strip
+    stills: Mapping[str, Image.Image]  # what came out, by label
+    numbers: Mapping[str, Any]  # what holds in each still, by the same labels: anything JSON can hold
+    frames: Images = field(default_factory=list)  # of a film; empty for none
+    films: Sequence[str] = ()  # kinds of film that are written
+    seconds: float = 2.4  # length of the film
 
     @property
     def row(self) -> dict[str, Image.Image]:

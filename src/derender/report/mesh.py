@@ -38,23 +38,14 @@ GRAZING_DEG = 85.0
 
 @dataclass(frozen=True)
 class Mesh:
-    """A textured triangle mesh; x right, y up, z towards the viewer.
+    """A textured triangle mesh; x right, y up, z towards the viewer."""
 
-    Attributes:
-        vertices: (V, 3) scene units, the object's centre at the origin.
-        normals: (V, 3) unit length, outward.
-        uv: (V, 2) 0..1, from the lower left corner of the texture.
-        faces: (F, 3) vertex numbers, counter-clockwise seen from outside.
-        texture: albedo, first row at the top.
-        trimmed: share of the grid's cells that were left out, 0..1.
-    """
-
-    vertices: Float32[np.ndarray, "v 3"]
-    normals: Float32[np.ndarray, "v 3"]
-    uv: Float32[np.ndarray, "v 2"]
-    faces: Int64[np.ndarray, "f 3"]
-    texture: Image.Image
-    trimmed: float
+    vertices: Float32[np.ndarray, "v 3"]  # (V, 3) scene units, the object's centre at the origin
+    normals: Float32[np.ndarray, "v 3"]  # (V, 3) unit length, outward
+    uv: Float32[np.ndarray, "v 2"]  # (V, 2) 0..1, from the lower left corner of the texture
+    faces: Int64[np.ndarray, "f 3"]  # (F, 3) vertex numbers, counter-clockwise seen from outside
+    texture: Image.Image  # albedo, first row at the top
+    trimmed: float  # share of the grid's cells that were left out, 0..1
 
     def files(self, name: str, form: str = "glb") -> dict[str, bytes]:
         """File name to content: ``NAME.glb``, or ``NAME.obj``, ``NAME.mtl`` and ``NAME.png``.

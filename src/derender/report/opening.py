@@ -105,29 +105,20 @@ class FilmOptions:
 
 @dataclass(frozen=True)
 class OpenedImage:
-    """One decomposed image.
+    """One decomposed image."""
 
-    Attributes:
-        path: its file.
-        pixels: (3, S, S) uint8 at the model's size.
-        frame: the part of the file that they show.
-        framing: the same as JSON has it: beside the middle square, in pixels, and how it was found ("face",
-            "auto", "none", or "no face" where one was looked for in vain).
-        scene: one scene, on the model's device.
-        render: draws scenes like this one.
-        percentile: of its reconstruction error among the held-out ones; None where the model keeps none. A
-            part chosen by that error has the middle square's.
-        depth_range: nearest and farthest depth of the images that were opened together.
-    """
-
-    path: Path
-    pixels: "np.ndarray"
-    frame: "Frame"
+    path: Path  # its file
+    pixels: "np.ndarray"  # (3, S, S) uint8 at the model's size
+    frame: "Frame"  # the part of the file that they show
+    # the same as JSON has it: beside the middle square, in pixels, and how it was found ("face", "auto",
+    # "none", or "no face" where one was looked for in vain)
     framing: Mapping[str, Any]
-    scene: "Scene"
-    render: "Callable[[Scene], Rendering]"
+    scene: "Scene"  # one scene, on the model's device
+    render: "Callable[[Scene], Rendering]"  # draws scenes like this one
+    # of its reconstruction error among the held-out ones; None where the model keeps none. A part chosen by
+    # that error has the middle square's.
     percentile: float | None
-    depth_range: tuple[float, float]
+    depth_range: tuple[float, float]  # nearest and farthest depth of the images that were opened together
 
     @property
     def detail(self) -> "PhotoDetail | None":

@@ -36,23 +36,14 @@ DIRECTIONS = {"high": "higher is better", "low": "lower is better", None: ""}
 
 @dataclass(frozen=True)
 class Page:
-    """A whole report.
+    """A whole report."""
 
-    Attributes:
-        template: the name of one, or one; its block ``main`` holds the sections.
-        title: the heading and the browser's title.
-        lead: one or two sentences under it.
-        values: what the template shows, by name.
-        footer: where the page comes from; plain text.
-        refresh_s: seconds after which a browser loads the file anew; None: never.
-    """
-
-    template: str | Template
-    title: str
-    lead: str
-    values: Mapping[str, Any] = field(default_factory=dict)
-    footer: str = f"derender {__version__}"
-    refresh_s: int | None = None
+    template: str | Template  # the name of one, or one; its block ``main`` holds the sections
+    title: str  # the heading and the browser's title
+    lead: str  # one or two sentences under it
+    values: Mapping[str, Any] = field(default_factory=dict)  # what the template shows, by name
+    footer: str = f"derender {__version__}"  # where the page comes from; plain text
+    refresh_s: int | None = None  # seconds after which a browser loads the file anew; None: never
 
     def html(self) -> str:
         """The complete document."""

@@ -31,22 +31,15 @@ def random_stream(seed: int, purpose: str, position: int) -> Generator:
 
 @dataclass(frozen=True)
 class Batches:
-    """Batches of a training set that lies on the device as bytes, or in a file that is mapped into memory.
+    """Batches of a training set that lies on the device as bytes, or in a file that is mapped into memory."""
 
-    Attributes:
-        images: (N, 3, H, W) uint8; ``rows`` of them (None: all) are the training set.
-        batch_size: images in every batch; at most as many as there are.
-        seed, horizontal_flips: of the order and the flips; each image is mirrored with probability one half.
-        reframed, reframe: the share of images that are shown in another crop, and how far it is moved.
-    """
-
-    images: UInt8[Tensor, "n 3 h w"]
-    batch_size: int
-    seed: int
-    horizontal_flips: bool
+    images: UInt8[Tensor, "n 3 h w"]  # (N, 3, H, W) uint8; ``rows`` of them (None: all) are the training set
+    batch_size: int  # images in every batch; at most as many as there are
+    seed: int  # of the order and the flips
+    horizontal_flips: bool  # each image is mirrored with probability one half
     rows: Int64[np.ndarray, " k"] | None = None
-    reframed: float = 0.0
-    reframe: CropSettings = DEFAULT_CROPS
+    reframed: float = 0.0  # the share of images that are shown in another crop
+    reframe: CropSettings = DEFAULT_CROPS  # and how far it is moved
 
     def __post_init__(self) -> None:
         if self.batch_size > len(self):

@@ -62,15 +62,11 @@ class PixelTargets:
 
 @dataclass(frozen=True)
 class DistilledUNets:
-    """A model with U-Net encoders and a decoder over both, and how well the encoders learnt.
+    """A model with U-Net encoders and a decoder over both, and how well the encoders learnt."""
 
-    Attributes:
-        model: the copy, in evaluation mode and without whitening or fitting.
-        errors: mean absolute error of up to 256 images: "place" (pixels), "depth" (share of the range),
-        "albedo" (0..1), and "reconstruction" of the copy beside "reconstruction before".
-    """
-
-    model: Derenderer
+    model: Derenderer  # the copy, in evaluation mode and without whitening or fitting
+    # mean absolute error of up to 256 images: "place" (pixels), "depth" (share of the range), "albedo"
+    # (0..1), and "reconstruction" of the copy beside "reconstruction before"
     errors: dict[str, float]
 
 

@@ -69,22 +69,17 @@ def verdict_of(findings: Sequence[CheckFinding]) -> Verdict:
 
 @dataclass(frozen=True)
 class Check:
-    """How a measure is judged and told.
-
-    Attributes:
-        good, bad: the finding as a clause, in order and not.
-        noted: of a share (less is better) the value from which on it is worth a note; None for what is better
-            the larger it is.
-    """
+    """How a measure is judged and told."""
 
     name: str  # of the finding
     label: str  # of the measure, in tables
     note: str  # what it is, and which way is better
     objects: float | None  # past this a set does not suit; None: it never objects
     struggles: float | None  # past this the method will struggle; None: it never does
-    good: str
-    bad: str
+    good: str  # the finding as a clause where it is in order
+    bad: str  # and where not
     advice: str  # what to do about it
+    # of a share (less is better) what is worth a note; None for what is better the larger it is
     noted: float | None = None
 
 
@@ -197,21 +192,17 @@ class Shared:
 
 @dataclass(frozen=True)
 class Examination:
-    """What was found in images.
-
-    Attributes:
-        verdict, findings: whether the set suits the method, and one finding for each thing looked at.
-        examples: rows of images by what they show ("most typical", "least typical", "one group", ...).
-    """
+    """What was found in images."""
 
     images: ImageSet  # those examined
-    verdict: Verdict
-    findings: tuple[CheckFinding, ...]
+    verdict: Verdict  # whether the set suits the method
+    findings: tuple[CheckFinding, ...]  # one for each thing looked at
     values: Mapping[str, JackknifeEstimate]  # every measured number by its name in ``CHECKS``
     group: Int64[np.ndarray, " n"]  # the first image of each image's group of copies and near copies
     identical: int  # copies to the last pixel, the first of each not counted
     originals: measures.Originals | None  # sizes of the files, or None for a stream
     shared: Shared | None  # None where too few distinct images show anything
+    # rows of images by what they show ("most typical", "least typical", "one group", ...)
     examples: Mapping[str, tuple[int, ...]]
 
     @property

@@ -33,20 +33,16 @@ MOSTLY = 0.9
 
 @dataclass(frozen=True)
 class Table:
-    """The images of a data set before any is decoded.
-
-    Attributes:
-        partition: the owners' own split of each file ("train", "validation", "test"; "" unknown), or None.
-        boxes: (N, 4) left, top, right, bottom, in pixels of the upright image, of the part that is read; None
-            for whole images. NaN: no box is known, and the image is passed over.
-        skipped: images that a user's own list names and that are not there, with reasons.
-    """
+    """The images of a data set before any is decoded."""
 
     files: tuple[str, ...]  # images, as named by the source
     labels: Labels = field(default_factory=dict)  # columns by name, one value per file
+    # the owners' own split of each file ("train", "validation", "test"; "" unknown), or None
     partition: np.ndarray | None = None
+    # left, top, right, bottom, in pixels of the upright image, of the part that is read; None for whole
+    # images. NaN: no box is known, and the image is passed over.
     boxes: Float32[np.ndarray, "n 4"] | None = None
-    skipped: tuple[Skipped, ...] = ()
+    skipped: tuple[Skipped, ...] = ()  # images that a user's own list names and that are not there
 
     def select(self, rows: np.ndarray) -> "Table":
         """The same table with only these rows."""
@@ -61,26 +57,20 @@ class Table:
 
 @dataclass(frozen=True)
 class Layout:
-    """One row of ``LAYOUTS``.
-
-    Attributes:
-        recognise: whether a source looks like it, from the names of its files (and a header line).
-        load: every image with its labels; None where nothing is laid out so.
-        expected: which files there must be, for messages.
-        fit: what becomes of images that are not square (data/image.py).
-        default_parts: the first of these that is there is read unless a part is asked for; () for all images.
-    """
+    """One row of ``LAYOUTS``."""
 
     name: str  # what the user writes to ask for this layout
     title: str  # what it is, in a few words
+    # whether a source looks like it, from the names of its files (and a header line)
     recognise: Callable[[Source], bool]
-    load: Callable[[Source], Table | None]
-    expected: str = ""
+    load: Callable[[Source], Table | None]  # every image with its labels; None where nothing is laid out so
+    expected: str = ""  # which files there must be, for messages
     home: str = ""  # where the owners publish it; "" for layouts without owners
     terms: str = ""  # on what terms the owners give it, in a few words; "" for layouts without owners
     split_from: str = ""  # the file that gives the official split, for messages
+    # the first of these that is there is read unless a part is asked for; () for all images
     default_parts: Sequence[str] = ()
-    fit: str = "crop"
+    fit: str = "crop"  # what becomes of images that are not square (data/image.py)
 
     def read(
         self, source: Source, subset: str | None = None, default_parts: Sequence[str] | None = None

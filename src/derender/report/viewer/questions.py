@@ -85,27 +85,18 @@ def _degrees(angles: Float[Tensor, " k"]) -> list[float]:
 
 
 class ViewRequest(_Checked):
-    """An image as it is to be shown.
+    """An image as it is to be shown."""
 
-    Attributes:
-        image: the name it got when it was opened.
-        swaps: other opened images that give their geometry, albedo or light.
-        light: instead of the image's own.
-        camera: instead of the image's own.
-        numbers: of the renderer's further factors, instead of the image's own.
-        size: longer side in pixels; the model's own if left out, and never less.
-        detail: whose pixels are drawn, the photograph's or the model's.
-        whole: all of the photograph, not only the part around the crop.
-    """
-
-    picture: ImageId
+    picture: ImageId  # the name it got when it was opened
+    # other opened images that give their geometry, albedo or light
     swaps: dict[Literal["geometry", "albedo", "light"], ImageId] = {}
-    light: Light | None = None
-    camera: Camera | None = None
-    numbers: dict[str, list[float]] = {}
+    light: Light | None = None  # instead of the image's own
+    camera: Camera | None = None  # instead of the image's own
+    numbers: dict[str, list[float]] = {}  # of the renderer's further factors, instead of the image's own
+    # longer side in pixels; the model's own if left out, and never less
     size: Annotated[int, Field(ge=8, le=LARGEST_SIZE)] | None = None
-    detail: Literal["photo", "model"] = "photo"
-    whole: bool = False
+    detail: Literal["photo", "model"] = "photo"  # whose pixels are drawn, the photograph's or the model's
+    whole: bool = False  # all of the photograph, not only the part around the crop
 
 
 class FilmRequest(ViewRequest):

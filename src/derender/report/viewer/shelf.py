@@ -20,25 +20,15 @@ KEPT_BYTES = 400_000_000
 
 @dataclass(frozen=True)
 class ShownImage:
-    """One opened image.
+    """One opened image."""
 
-    Attributes:
-        photo: the photograph, its longer side at most ``studio.LARGEST_PHOTO``.
-        faces: the frames of the faces found in it.
-        frame: the part that the model was given.
-        framed: how that was found: "face", "auto", "none", "no face" or "own".
-        pixels: that part at the model's size.
-        scene: one scene, on the CPU.
-        features: by factor, (D,) each.
-    """
-
-    photo: UInt8[np.ndarray, "h w 3"]
-    faces: tuple[Frame, ...]
-    frame: Frame
-    framed: str
-    pixels: UInt8[np.ndarray, "3 s s"]
-    scene: Scene
-    features: Mapping[str, np.ndarray]
+    photo: UInt8[np.ndarray, "h w 3"]  # the photograph, its longer side at most ``studio.LARGEST_PHOTO``
+    faces: tuple[Frame, ...]  # the frames of the faces found in it
+    frame: Frame  # the part that the model was given
+    framed: str  # how that was found: "face", "auto", "none", "no face" or "own"
+    pixels: UInt8[np.ndarray, "3 s s"]  # that part at the model's size
+    scene: Scene  # one scene, on the CPU
+    features: Mapping[str, np.ndarray]  # by factor, (D,) each
 
 
 class Shelf:

@@ -65,24 +65,16 @@ FILM_LIGHT_DEG, FILM_VIEW_DEG = 50.0, 20.0
 
 @dataclass
 class Studio:
-    """A model and the images opened with it.
+    """A model and the images opened with it."""
 
-    Attributes:
-        model: in evaluation mode.
-        name: of the model, on the page.
-        shelf: the opened images.
-        held_out: reconstruction errors that were stored with the model; None if there are none.
-        table: features to look for neighbours in; None for none.
-        fit_steps: of test-time optimisation of each scene; 0 shows feed-forward scenes.
-        frame: how the part of an image is found that the model is given (``photo.found_frame``).
-    """
-
-    model: Derenderer
-    name: str
-    shelf: Shelf = field(default_factory=Shelf)
+    model: Derenderer  # in evaluation mode
+    name: str  # of the model, on the page
+    shelf: Shelf = field(default_factory=Shelf)  # the opened images
+    # reconstruction errors that were stored with the model; None if there are none
     held_out: HeldOutErrors | None = None
-    table: FeatureTable | None = None
-    fit_steps: int = 0
+    table: FeatureTable | None = None  # features to look for neighbours in; None for none
+    fit_steps: int = 0  # of test-time optimisation of each scene; 0 shows feed-forward scenes
+    # how the part of an image is found that the model is given (``photo.found_frame``)
     frame: str | None = None
     _photographs: OrderedDict[tuple[str, int, bool], Photograph] = field(default_factory=OrderedDict)
 
