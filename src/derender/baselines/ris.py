@@ -222,12 +222,12 @@ def build_catalogue(
 
 
 def spherical_kmeans(
-    vectors: Float[Tensor, "n c"], clusters: int, generator: RandomGenerator, *, rounds: int = 50
+    vectors: Float[Tensor, "n c"], clusters: int, generator: RandomGenerator
 ) -> Float[Tensor, "k c"]:
     """Centres of unit length such that rows have large cosines with their nearest one.
 
     Initial centres are far from each other (as in k-means++). A cluster that loses all rows gets the row that
-    is farthest from its own centre. Ends when no row changes its cluster.
+    is farthest from its own centre. Ends when no row changes its cluster, or after 50 rounds.
     """
     if len(vectors) < clusters:
         raise ValueError(
@@ -240,7 +240,7 @@ def spherical_kmeans(
         drawn = torch.multinomial(far.cpu(), 1, generator=generator).to(rows.device)
         centres = torch.cat([centres, rows[drawn]])
     assigned = torch.full((len(rows),), -1, device=rows.device)
-    for _ in range(rounds):
+    for _ in range(50):
         cosine, found = (rows @ centres.T).max(dim=1)
         if torch.equal(found, assigned):
             break

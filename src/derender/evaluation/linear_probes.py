@@ -50,7 +50,7 @@ NEIGHBOURS = 10
 PENALTIES = (1e-2, 1e-1, 1.0, 1e1, 1e2, 1e3)
 """C for rows whose mean squared length is 1: standardised features divided by the root of their number."""
 FOLDS = 5
-BLOCK_ROWS = 1_024
+BLOCK_ROWS, MOST_STEPS = 1_024, 2_000
 
 
 class HeadSettings(Settings):
@@ -280,13 +280,12 @@ def solve_logistic(
     kind: str,
     *,
     tolerance: float = 1e-5,
-    most_steps: int = 2_000,
 ) -> np.ndarray:
     """Solve P regressions on parts of the same rows: (R + 1, P, A) weights, the intercept last.
 
     ``rows`` are (n, R), centred, with columns orthogonal to each other (from ``rotated``). ``learned``, (n,
     P) bool, are those that each regression learns from, ``c`` (P,) penalties. It stops when the scaled
-    gradient is below ``tolerance`` of its start, or after ``most_steps``.
+    gradient is below ``tolerance`` of its start, or after ``MOST_STEPS``.
     """
     dtype = rows.dtype
     design = np.column_stack((rows, np.ones(len(rows), dtype)))
@@ -300,7 +299,7 @@ def solve_logistic(
     found = np.zeros((design.shape[1], len(c), targets.shape[1]), dtype)
     weights = ahead = found.copy()
     momentum, start, left = np.ones((1, len(c), 1), dtype), None, np.arange(len(c))
-    for step in range(most_steps):
+    for step in range(MOST_STEPS):
         logits = np.tensordot(design, ahead, axes=1)
         answer = expit(logits) if kind == "labels" else softmax(logits, axis=2)
         slope = np.tensordot(design.T, (answer - truth) * counted, axes=1) * strength + ridge * ahead

@@ -101,14 +101,9 @@ def _regrouped(chunks: Iterable[Decoded], size: int) -> Iterator[Decoded]:
 
 
 class BlockEmbedder:
-    """Embeds blocks of a stream; best called with blocks in ascending order, which it reads through once.
+    """Embeds blocks of ``size`` samples; best called in ascending order, as it reads the stream through once.
 
-    Args:
-        model: as for `embed_to_file`.
-        open_stream: opens the stream.
-        size: samples in a block.
-        fit: how images that are not square are read.
-        threads: torch's threads; None leaves them.
+    ``threads`` are torch's; None leaves them.
     """
 
     def __init__(

@@ -148,10 +148,10 @@ def decomposed(model: Derenderer, image: OpenedImage) -> Decomposition:
     return decomposition(pixels, image.textured, model.render, model.fov_deg, image.depth_range, model)
 
 
-def scene_numbers(scene: Scene, index: int = 0) -> dict[str, Any]:
+def scene_numbers(scene: Scene) -> dict[str, Any]:
     """Light and camera of one scene, angles in degrees."""
-    ambient, diffuse, pitch, yaw = scene.light[index].tolist()
-    *rotation, x, y, z = scene.camera[index].tolist()
+    ambient, diffuse, pitch, yaw = scene.light[0].tolist()
+    *rotation, x, y, z = scene.camera[0].tolist()
     strengths = {"ambient": ambient, "diffuse": diffuse}
     return {
         "light": {**strengths, "pitch_deg": degrees(pitch), "yaw_deg": degrees(yaw)},

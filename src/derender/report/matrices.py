@@ -20,6 +20,7 @@ from derender.report.page import png_bytes
 from derender.storage.atomic import write_whole
 
 MAP = colormaps["Blues"].with_extremes(bad="#d9d9d9")
+ACROSS = 3  # matrices in a row of the sheet
 CELL_NUMBERS_UP_TO = 400  # cells; larger matrices are shown without numbers
 
 
@@ -67,17 +68,17 @@ def write_card(card: DisentanglementCard, title: str, file: Path) -> None:
     write_whole(file, png_bytes(matrix_sheet(card_matrices(card), title)))
 
 
-def matrix_sheet(matrices: Sequence[Matrix], title: str = "", columns: int = 3) -> Image.Image:
+def matrix_sheet(matrices: Sequence[Matrix], title: str = "") -> Image.Image:
     """All matrices on one white sheet; a matrix that is much wider than high takes a row of its own."""
     if not matrices:
         raise ValueError("a sheet needs at least one matrix")
     wide = [matrix for matrix in matrices if matrix.values.shape[1] >= 1.6 * matrix.values.shape[0]]
     square = [matrix for matrix in matrices if matrix not in wide]
-    heights = [3.9] * -(-len(square) // columns) + [3.4] * len(wide)
-    figure = Figure(figsize=(3.9 * columns, sum(heights)), layout="constrained", dpi=110)
-    grid = figure.add_gridspec(len(heights), columns, height_ratios=heights, hspace=0.08, wspace=0.06)
+    heights = [3.9] * -(-len(square) // ACROSS) + [3.4] * len(wide)
+    figure = Figure(figsize=(3.9 * ACROSS, sum(heights)), layout="constrained", dpi=110)
+    grid = figure.add_gridspec(len(heights), ACROSS, height_ratios=heights, hspace=0.08, wspace=0.06)
     for place, matrix in enumerate(square):
-        _draw(figure.add_subplot(grid[place // columns, place % columns]), matrix)
+        _draw(figure.add_subplot(grid[place // ACROSS, place % ACROSS]), matrix)
     for place, matrix in enumerate(wide, len(heights) - len(wide)):
         _draw(figure.add_subplot(grid[place, :]), matrix)
     if title:

@@ -105,11 +105,11 @@ def circling_light(scene: Scene, frames: int = LOOP_FRAMES, reach_deg: float = L
     return varied(scene, light=light)
 
 
-def nodding_view(scene: Scene, frames: int = LOOP_FRAMES, reach_deg: float = LOOP_VIEW_DEG) -> Scene:
+def nodding_view(scene: Scene, frames: int = LOOP_FRAMES) -> Scene:
     """One scene while it rotates to either side and nods a little; a loop around the frontal view."""
     angle, camera = _angles(frames), torch.zeros(frames, 6)
-    camera[:, 0] = radians(reach_deg) * 0.25 * (2 * angle).sin()
-    camera[:, 1] = radians(reach_deg) * angle.sin()
+    camera[:, 0] = radians(LOOP_VIEW_DEG) * 0.25 * (2 * angle).sin()
+    camera[:, 1] = radians(LOOP_VIEW_DEG) * angle.sin()
     return varied(scene, camera=camera)
 
 

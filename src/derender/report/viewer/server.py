@@ -146,14 +146,14 @@ def serve(application: "Application", listener: socket.socket) -> None:
 
 
 @contextmanager
-def serving(application: "Application", host: str = "127.0.0.1", port: int = 0) -> Iterator[str]:
-    """Answer in a thread meanwhile; gives the address."""
-    listener = listen(host, port)
+def serving(application: "Application") -> Iterator[str]:
+    """Answer in a thread meanwhile, at any free port; gives the address."""
+    listener = listen("127.0.0.1", 0)
     server = server_for(application)
     thread = Thread(target=server.run, kwargs={"sockets": [listener]}, name="view-server")
     thread.start()
     try:
-        yield address_of(listener, host)
+        yield address_of(listener, "127.0.0.1")
     finally:
         server.should_exit = True
         thread.join()
