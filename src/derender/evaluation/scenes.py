@@ -51,7 +51,8 @@ def geometry(
     Args:
         model: a model, or the name or folder of one.
         truth: images with exact depth at the model's size, or the path of a rendered set, or of folders
-            image/ and depth/ with PNGs. fit_steps: steps of per-image optimisation; None or 0 for none.
+            image/ and depth/ with PNGs.
+        fit_steps: steps of per-image optimisation; None or 0 for none.
         resample_count: bootstrap resamples of the images.
         seed: of the untrained model's weights.
         batch_size: images at a time; changes speed and memory only.

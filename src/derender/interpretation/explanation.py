@@ -18,7 +18,7 @@ from derender.baselines.controls import untrained_features
 from derender.data import ImageSet, suggestion
 from derender.evaluation.bootstrap import LEVEL, resamples
 from derender.evaluation.clustering_methods import clusterings
-from derender.evaluation.feature_rows import attribute_columns
+from derender.evaluation.feature_rows import chosen_labels
 from derender.evaluation.linear_task import Rows, Task, choose_rows
 from derender.evaluation.score_table import Scores
 from derender.features import FeatureTable, embed_image_set
@@ -129,9 +129,8 @@ def explain(
             raise ValueError(f"{images.source} has no image {name!r}{suggestion(name, images.files)}")
     table = embed_image_set(net, images, batch_size=batch_size, progress=progress("embedding"))
     names = (labels,) if isinstance(labels, str) else tuple(dict.fromkeys(labels))
-    names = names or attribute_columns(table.labels)
     if not names:
-        raise ValueError(f"there is no yes/no label; there is {', '.join(table.labels) or 'no label'}")
+        names, _ = chosen_labels(table, None, True, least=0)
     task = question(table.labels, names, bins=bins, min_count=min_count, source=images.source)
     split = split_rows(task, table, count, range(seed, seed + seeds), groups)
     untrained = [

@@ -90,12 +90,12 @@ def train(
         images: an image set at the model's size, or a folder, zip, shards or Hugging Face id.
         out: a new run folder, or with ``resume`` that of an unfinished run.
         config: all settings as `run_settings` gives them, or a YAML file.
-        resume: continue the run in ``out``; without other arguments with its own settings. dataset, limit:
-        the layout's name, or "auto" to recognise it; read at most so many images. device: "auto", "cpu" or
-        "cuda". page: write a report page, for which the data are examined. on_images, progress: called with
-        the images once they are read; called after every step. choices: ``model``, ``preset``,
-        ``start_from``, ``loocc``, ``renderer`` and ``settings`` as for
-            `run_settings`.
+        resume: continue the run in ``out``; without other arguments with its own settings.
+        dataset, limit: the layout's name, or "auto" to recognise it; read at most so many images.
+        device: "auto", "cpu" or "cuda".
+        page: write a report page, for which the data are examined.
+        on_images, progress: called with the images once they are read; called after every step.
+        choices: model, preset, start_from, loocc, renderer and settings as for `run_settings`.
 
     Raises:
         FileExistsError: ``out`` is not empty and ``resume`` was not requested.
