@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from derender.baselines.controls import untrained_twin
 from derender.data import as_float
 from derender.evaluation.controls import UNTRAINED
 from derender.evaluation.feature_rows import ModelSource, Prepared, opened
@@ -121,10 +122,7 @@ def finetuned_answers(
     trained = {name: [opened(run, options.device) for run in runs] for name, runs in models.items()}
     first = next((run for runs in trained.values() for run in runs if isinstance(run, Derenderer)), None)
     if first is not None:
-        trained[UNTRAINED] = [
-            Derenderer.seeded(first.settings, seed, factors=first.factors).to(first.device).eval()
-            for seed in seeds
-        ]
+        trained[UNTRAINED] = [untrained_twin(first, seed) for seed in seeds]
     if supervised:
         from derender.baselines.supervised import fresh_resnet18
 
